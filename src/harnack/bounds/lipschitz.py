@@ -1,0 +1,38 @@
+"""The step of sphere tracing (Hart 1996)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import drjit as dr
+
+from harnack.backend.extrema import fmin
+
+from harnack.bounds.bound import Bound
+from harnack.certify import Certificate, LipschitzCertificate
+
+if TYPE_CHECKING:
+    from harnack.backend import Mask, Real
+
+_ROUND_DOWN = 1.0 - 1e-6
+
+
+@dataclass(frozen=True)
+class LipschitzStep(Bound):
+    """Gap over constant, no further than the constant holds.
+
+    Proof. |f(p+tv) - f(p)| <= K t for t < radius, and a level is at least min(gap) away in
+    value, so it is not met for t < min(gap)/K. Source: Hart 1996, Theorem 1.
+    """
+
+    def accepts(self, certificate: Certificate) -> bool:
+        return isinstance(certificate, LipschitzCertificate)
+
+    def step(self, certificate: Certificate, slope: Real) -> Real:
+        assert isinstance(certificate, LipschitzCertificate)
+        gap = fmin(certificate.gap_down, certificate.gap_up)
+        return fmin(gap / certificate.constant, certificate.radius) * _ROUND_DOWN
+
+    def covers(self, certificate: Certificate, slope: Real, length: Real) -> Mask:
+        return length <= self.step(certificate, slope)

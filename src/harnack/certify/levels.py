@@ -1,0 +1,51 @@
+"""Which levels bracket a value: the question every certificate is asked.
+
+An angle-valued function is known modulo its period, so its levels form a ladder: every
+asked-for level plus every multiple of the period (paper, Alg. 2, with the reduction that the
+printed algorithm leaves out: both bracketing levels are found from the reduced difference).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import drjit as dr
+
+from harnack.backend.extrema import clamp, fmin
+
+if TYPE_CHECKING:
+    from harnack.backend import Real
+
+
+@dataclass(frozen=True)
+class Levels:
+    """A finite set of target levels, repeated with `period` if there is one.
+
+    `values` may be Python floats or size-1 Dr.Jit arrays of the backend in use (so that a level
+    can change without a kernel being compiled again, or carry derivatives).
+    """
+
+    values: tuple[Real, ...]
+    period: float | None = None
+
+    def gaps(self, f: Real) -> tuple[Real, Real]:
+        """Distances (down, up) >= 0 in value from f to the next level below and above.
+
+        Either is infinite when there is no such level. A value on a level has both a gap of
+        zero on one side and, for a ladder, of at most one period on the other.
+        """
+        scalar = type(f)
+        down, up = scalar(math.inf), scalar(math.inf)
+        for level in self.values:
+            above = f - level  # > 0: the level lies below f
+            if self.period is not None:
+                reduced = above - self.period * dr.floor(above / self.period)
+                below_gap = clamp(reduced, 0, self.period)
+                above_gap = self.period - below_gap
+            else:
+                below_gap = dr.select(above >= 0, above, math.inf)
+                above_gap = dr.select(above <= 0, -above, math.inf)
+            down, up = fmin(down, below_gap), fmin(up, above_gap)
+        return down, up

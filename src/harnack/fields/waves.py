@@ -1,0 +1,219 @@
+"""Sums of sine waves: their terms, values and gradients, and proved bounds of the sum.
+
+Every Laplacian eigenfunction that separates in Cartesian coordinates is a product of sines and
+cosines, and every such product is a sum of plane waves: terms are evaluated as they are written
+(a product needs one sine and cosine a coordinate), and bounded as plane waves.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from harnack.backend import Real, Vec3
+
+__all__ = ["Factor", "PlaneWave", "Product", "Term", "WaveBounds", "cosine", "sine"]
+
+
+@dataclass(frozen=True)
+class Factor:
+    """sin or cos of (frequency * coordinate + phase); made by `sine` and `cosine`."""
+
+    frequency: float
+    phase: float
+    is_cosine: bool
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.frequency) and math.isfinite(self.phase)):
+            raise ValueError(f"a factor needs finite numbers, not {self.frequency}, {self.phase}")
+        if self.frequency == 0:
+            raise ValueError("a factor of frequency 0 is a constant: multiply the amplitude by it")
+
+
+def sine(frequency: float = 1.0, phase: float = 0.0) -> Factor:
+    """sin(frequency * coordinate + phase); frequency in radians per unit length."""
+    return Factor(float(frequency), float(phase), False)
+
+
+def cosine(frequency: float = 1.0, phase: float = 0.0) -> Factor:
+    """cos(frequency * coordinate + phase); frequency in radians per unit length."""
+    return Factor(float(frequency), float(phase), True)
+
+
+@dataclass(frozen=True)
+class Product:
+    """amplitude times a factor of each coordinate; a coordinate left out does not enter.
+
+    Product(2.0, x=sine(3.0), y=cosine(4.0)) is 2 sin(3x) cos(4y), an eigenfunction of the
+    Laplacian with eigenvalue -(9 + 16).
+    """
+
+    amplitude: float
+    x: Factor | None = None
+    y: Factor | None = None
+    z: Factor | None = None
+
+    @property
+    def factors(self) -> tuple[tuple[int, Factor], ...]:
+        """(axis, factor) of each coordinate that enters."""
+        named = enumerate((self.x, self.y, self.z))
+        return tuple((axis, factor) for axis, factor in named if factor is not None)
+
+
+@dataclass(frozen=True)
+class PlaneWave:
+    """amplitude * cos(wave_vector . p + phase), eigenvalue -|wave_vector|^2."""
+
+    amplitude: float
+    wave_vector: tuple[float, float, float]
+    phase: float = 0.0
+
+
+Term = Product | PlaneWave
+
+
+def checked_terms(terms: Iterable[Term]) -> tuple[Term, ...]:
+    """The terms as a tuple. ValueError or TypeError names the first one that will not do."""
+    checked = tuple(terms)
+    if not checked:
+        raise ValueError("a sum needs at least one term")
+    for n, term in enumerate(checked):
+        if isinstance(term, PlaneWave):
+            numbers: Sequence[float] = (term.amplitude, *term.wave_vector, term.phase)
+            if len(numbers) != 5:
+                raise ValueError(f"term {n}: a wave vector is three numbers: {term.wave_vector}")
+        elif isinstance(term, Product):  # pyright: ignore[reportUnnecessaryIsInstance]
+            numbers = (term.amplitude,)
+        else:
+            raise TypeError(f"term {n} must be a Product or a PlaneWave, not {term!r}")
+        if not all(math.isfinite(v) for v in numbers):
+            raise ValueError(f"term {n} holds numbers that are not finite: {term}")
+    return checked
+
+
+def evaluate_terms(terms: Sequence[Term], p: Vec3) -> tuple[Real, list[Real]]:
+    """Value and the three gradient components of the sum at p, a vector of Dr.Jit arrays."""
+    known: dict[Any, tuple[Real, Real]] = {}
+
+    def sine_and_cosine(axis: int, factor: Factor) -> tuple[Real, Real]:
+        key = (axis, factor.frequency, factor.phase)
+        if key not in known:
+            known[key] = dr.sincos(_angle(factor.frequency * p[axis], factor.phase))
+        return known[key]
+
+    value, gradient = p[0] * 0.0, [p[0] * 0.0 for _ in range(3)]
+    for term in terms:
+        if isinstance(term, PlaneWave):
+            k = term.wave_vector
+            angle = _angle(k[0] * p[0] + k[1] * p[1] + k[2] * p[2], term.phase)
+            s, c = dr.sincos(angle)
+            value += term.amplitude * c
+            for axis in range(3):
+                if k[axis] != 0:
+                    gradient[axis] -= term.amplitude * k[axis] * s
+            continue
+        values: list[tuple[int, Real, Real]] = []  # axis, factor, its derivative
+        for axis, factor in term.factors:
+            s, c = sine_and_cosine(axis, factor)
+            f, derivative = (c, -s) if factor.is_cosine else (s, c)
+            values.append((axis, f, factor.frequency * derivative))
+        value += _product([f for _, f, _ in values], term.amplitude)
+        for axis, _, derivative in values:
+            others = [f for other, f, _ in values if other != axis]
+            gradient[axis] += _product([*others, derivative], term.amplitude)
+    return value, gradient
+
+
+def _angle(angle: Real, phase: float) -> Real:
+    return angle + phase if phase else angle
+
+
+def _product(factors: Sequence[Real], amplitude: float) -> Real:
+    product: Real = None
+    for factor in factors:
+        product = factor if product is None else product * factor
+    if product is None:
+        return amplitude
+    return product if amplitude == 1.0 else amplitude * product
+
+
+@dataclass(frozen=True)
+class WaveBounds:
+    """A sum of waves f = sum_i A_i cos(k_i . p + phase_i), A_i > 0, and what is proved of it.
+
+    largest_value: |f| <= sum A_i.
+    largest_curvature: |v . H v| <= sum A_i (k_i . v)^2 for the Hessian H and a unit v, at most
+        the largest eigenvalue of the matrix sum A_i k_i k_i^T.
+    largest_gradient: |v . grad f| <= sum A_i |k_i . v|, at most sum A_i |k_i|, and by
+        Cauchy-Schwarz at most sqrt(sum A_i) sqrt(sum A_i (k_i . v)^2).
+    The gyroid's three terms give 3, 2 and sqrt 6 (true: 3/2, 2, sqrt 3).
+    """
+
+    wavenumbers: tuple[float, ...]
+    amplitudes: tuple[float, ...]
+    largest_value: float
+    largest_gradient: float
+    largest_curvature: float
+
+    @classmethod
+    def of(cls, terms: Iterable[Term]) -> WaveBounds:
+        """The bounds of a sum, equal wave vectors added up first."""
+        waves: dict[tuple[float, ...], complex] = {}
+        for term in terms:
+            for k, amplitude in _plane_waves(term):
+                waves[k] = waves.get(k, 0.0) + amplitude
+        vectors = np.array(list(waves))
+        sizes = np.abs(np.array(list(waves.values())))
+        # All sums below are of positive numbers: a few roundings, covered by this factor.
+        up = 1.0 + 1e-12
+        matrix: npt.NDArray[np.float64] = np.einsum("n,ni,nj->ij", sizes, vectors, vectors)
+        curvature = float(np.linalg.eigvalsh(matrix)[-1]) * up
+        lengths = np.linalg.norm(vectors, axis=1)
+        value = float(sizes.sum()) * up
+        gradient = min(float(sizes @ lengths) * up, math.sqrt(value * max(curvature, 0.0)))
+        return cls(
+            tuple(float(v) for v in lengths),
+            tuple(float(v) for v in sizes),
+            value,
+            gradient,
+            curvature,
+        )
+
+
+def _plane_waves(term: Term) -> list[tuple[tuple[float, ...], complex]]:
+    """(k, A) with term = sum of Re(A exp(i k . p)), k and -k written the same way.
+
+    A product cos a cos b cos c is the mean of cos(a +- b +- c) over the signs.
+    """
+    if isinstance(term, PlaneWave):
+        phasor = term.amplitude * complex(math.cos(term.phase), math.sin(term.phase))
+        return [_canonical(term.wave_vector, phasor)]
+    waves: list[tuple[tuple[float, ...], complex]] = [((0.0, 0.0, 0.0), complex(term.amplitude))]
+    for position, (axis, factor) in enumerate(term.factors):
+        phasor = complex(math.cos(factor.phase), math.sin(factor.phase))
+        phasor *= 1 if factor.is_cosine else -1j  # sin t = cos(t - pi/2)
+        signs = (1.0,) if position == 0 else (1.0, -1.0)
+        waves = [
+            (
+                tuple(v + sign * factor.frequency * (i == axis) for i, v in enumerate(k)),
+                amplitude * (phasor if sign > 0 else phasor.conjugate()) / len(signs),
+            )
+            for k, amplitude in waves
+            for sign in signs
+        ]
+    return [_canonical(k, amplitude) for k, amplitude in waves]
+
+
+def _canonical(k: Sequence[float], amplitude: complex) -> tuple[tuple[float, ...], complex]:
+    """cos(k.p + t) = cos(-k.p - t): the first component that is not zero is made positive."""
+    leading = next((v for v in k if v != 0), 0.0)
+    if leading < 0:
+        return tuple(-v + 0.0 for v in k), amplitude.conjugate()
+    return tuple(v + 0.0 for v in k), amplitude

@@ -1,0 +1,173 @@
+"""Whether a closed curve provably lies on the boundary of a convex body.
+
+That is the hypothesis of Theorems B.1 and C.1 of Gillespie, Yang, Botsch and Crane, 'Ray Tracing
+Harmonic Functions' (2024): a connected curve P without self-intersections on the boundary of a
+convex set. Then the 2 pi level of its solid angle lies in the hull of P, and a segment crosses
+that level at most once, which gives the lower bound -4 pi.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from harnack.geometry.convex_volume import BoolArray, FloatArray
+
+MAX_VERTICES = 2048
+"""Longer curves are not examined: the tests take quadratic time."""
+
+# All relative to the curve's size.
+TOLERANCE = 1e-12  # a vertex may lie this far off a supporting plane
+ROUNDING = 1e-14  # bound of the rounding errors of a height above a plane
+MIN_SEPARATION = 1e-9  # edges nearer than this count as touching
+MIN_ANGLE = 1e-6  # so do edges that fold back at a smaller angle (radians)
+
+
+def is_convex_position(loops: tuple[FloatArray, ...]) -> bool:
+    """Whether it is proved that the theorems apply to these (validated) loops.
+
+    True means: one loop; edges that share no vertex are at least 1e-9 apart (all lengths
+    relative to the curve's size), none folds back; and either all vertices lie within 1e-12 of
+    one plane (then P is on the boundary of its flat hull, a degenerate convex set), or every
+    edge has a plane through it that no vertex exceeds by more than 1e-12. False means: no proof
+    found, as for more than 2048 vertices; it says nothing about the curve.
+
+    Stability. Where no vertex exceeds the plane of an edge, that edge lies on the boundary of
+    the hull H, and nothing is left to say. Otherwise let each point move along the normal of its
+    edge until it leaves H: by at most delta = 1e-12. At a vertex the edges' normals n and n' may
+    send it to two places; both lie in the wedge { a n + b n', a, b >= 0 } at the vertex, where
+    n.x <= delta and n'.x <= delta leave |x| <= 2 delta / (1 + n.n'), and n.n' >= -0.9 is
+    required, so a path of that size on the boundary joins them. It cannot meet another edge
+    (1e-9 away); crossings with its neighbour, near the common vertex, are cut off as loops of
+    area below 1e-15. So the theorems hold for a curve within w = 2e-11 of P, and the two
+    solid angles differ by at most 2 w / r for each edge at distance r: at r = 1e-4 that is less
+    than the rounding of the solid angle itself in single precision.
+    """
+    if len(loops) != 1 or not 3 <= len(loops[0]) <= MAX_VERTICES:
+        return False
+    lower, upper = loops[0].min(axis=0), loops[0].max(axis=0)
+    size = float((upper - lower).max())
+    if not 0.0 < size < np.inf:
+        return False
+    x = (loops[0] - 0.5 * (lower + upper)) / size
+    return (_is_flat(x) or _lies_on_hull(x)) and _is_simple(x)
+
+
+def _is_flat(x: FloatArray) -> bool:
+    axes: FloatArray = np.linalg.svd(x - x.mean(axis=0), full_matrices=False)[2]
+    return bool(np.ptp(x @ axes[2]) <= TOLERANCE)
+
+
+def _lies_on_hull(x: FloatArray) -> bool:
+    """Whether every edge has a supporting plane, and neighbours' planes are not opposite."""
+    count = len(x)
+    normals = np.empty((count, 3))
+    is_strict = np.empty(count, dtype=np.bool_)
+    rows = max(1, 200_000 // count)
+    for begin in range(0, count, rows):
+        part = np.arange(begin, min(begin + rows, count))
+        normals[part], excess, is_strict[part] = _supporting_planes(x, part)
+        if excess.max() > TOLERANCE:
+            return False
+    following = np.roll(normals, -1, axis=0)
+    is_exact = is_strict & np.roll(is_strict, -1)
+    return bool((is_exact | ((normals * following).sum(axis=1) >= -0.9)).all())
+
+
+def _supporting_planes(
+    x: FloatArray, part: np.ndarray[tuple[int], np.dtype[np.intp]]
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """For the edges from vertices `part`: a plane that contains the edge and supports all of x.
+
+    Projected along the edge, the vertices have to leave an angle of at least pi free; the
+    normal (k, 3) points to the middle of the largest free angle. Also by how far the vertices
+    exceed the plane (k,), and whether all but the edge's ends stay below it beyond rounding.
+    """
+    count = len(x)
+    start = x[part]
+    edge = x[(part + 1) % count] - start
+    edge /= np.linalg.norm(edge, axis=1, keepdims=True)
+    least = np.eye(3)[np.argmin(np.abs(edge), axis=1)]
+    across = np.cross(edge, least)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    up = np.cross(edge, across)
+    offset = x[None, :, :] - start[:, None, :]
+    a: FloatArray = np.einsum("kni,ki->kn", offset, across)
+    b: FloatArray = np.einsum("kni,ki->kn", offset, up)
+    angle = _free_direction(a, b)
+    c, s = np.cos(angle), np.sin(angle)
+    height = c[:, None] * a + s[:, None] * b
+    excess = height.max(axis=1)
+    rows = np.arange(len(part))
+    height[rows, part] = -np.inf
+    height[rows, (part + 1) % count] = -np.inf
+    normals = c[:, None] * across + s[:, None] * up
+    return normals, excess, height.max(axis=1) < -ROUNDING
+
+
+def _free_direction(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Middle of the largest angle free of the points (a, b)[k, :] as seen from the origin: (k,).
+
+    Points at the origin, where the edge itself is, have no direction and take their farthest
+    companion's.
+    """
+    distance = np.hypot(a, b)
+    angle = np.arctan2(b, a)
+    farthest = np.take_along_axis(angle, distance.argmax(axis=1)[:, None], axis=1)
+    angle = np.sort(np.where(distance > 1e-10, angle, farthest), axis=1)
+    gap = np.diff(angle, axis=1, append=angle[:, :1] + 2.0 * np.pi)
+    widest = gap.argmax(axis=1)[:, None]
+    middle = np.take_along_axis(angle, widest, axis=1) + 0.5 * np.take_along_axis(gap, widest, 1)
+    return middle[:, 0]
+
+
+def _is_simple(x: FloatArray) -> bool:
+    """Whether edges without a common vertex are MIN_SEPARATION apart, and none folds back."""
+    count = len(x)
+    ends = np.roll(x, -1, axis=0)
+    direction = (ends - x) / np.linalg.norm(ends - x, axis=1, keepdims=True)
+    turned = direction + np.roll(direction, -1, axis=0)
+    if np.linalg.norm(turned, axis=1).min() < MIN_ANGLE:
+        return False
+    low, high = np.minimum(x, ends) - MIN_SEPARATION, np.maximum(x, ends)
+    near = np.triu(np.ones((count, count), dtype=np.bool_), k=2)
+    near[0, count - 1] = False
+    for axis in range(3):
+        near &= low[:, None, axis] <= high[None, :, axis]
+        near &= low[None, :, axis] <= high[:, None, axis]
+    first, second = np.nonzero(near)
+    for begin in range(0, len(first), 100_000):
+        i, j = first[begin : begin + 100_000], second[begin : begin + 100_000]
+        if segment_clearance_lower(x[i], ends[i], x[j], ends[j]).min() < MIN_SEPARATION:
+            return False
+    return True
+
+
+def segment_clearance_lower(
+    p1: FloatArray, q1: FloatArray, p2: FloatArray, q2: FloatArray
+) -> FloatArray:
+    """Lower bound of the distance of segments p1 q1 and p2 q2, (k, 3) each: (k,), not above it.
+
+    The nearest points are found by alternating projection (after Ericson, 'Real-Time Collision
+    Detection', 5.1.9). However well that went, the width of the slab between the segments across
+    the line that joins them is a lower bound, and the distance itself if it went well.
+    """
+    d1, d2, r = q1 - p1, q2 - p2, p1 - p2
+    a, e, b = _dot(d1, d1), _dot(d2, d2), _dot(d1, d2)
+    c, f = _dot(d1, r), _dot(d2, r)
+    determinant = a * e - b * b
+    safe = np.where(determinant > 0.0, determinant, 1.0)
+    s = np.where(determinant > 0.0, np.clip((b * f - c * e) / safe, 0.0, 1.0), 0.0)
+    t = np.zeros_like(s)
+    for _ in range(3):
+        t = np.clip((b * s + f) / e, 0.0, 1.0)
+        s = np.clip((b * t - c) / a, 0.0, 1.0)
+    across = (p2 + t[:, None] * d2) - (p1 + s[:, None] * d1)
+    length = np.sqrt(_dot(across, across))
+    n = across / np.where(length > 0.0, length, 1.0)[:, None]
+    nearest = np.minimum(_dot(n, p2), _dot(n, q2))
+    farthest = np.maximum(_dot(n, p1), _dot(n, q1))
+    return np.maximum(nearest - farthest, 0.0)
+
+
+def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    return (a * b).sum(axis=1)

@@ -1,0 +1,12 @@
+"""First hits of rays with level sets, every step proved."""
+
+from __future__ import annotations
+
+from harnack.tracer.hits import Hits, trace
+from harnack.tracer.level_set import LevelSet, level_set
+from harnack.tracer.march import PreparedLevelSet, Trace
+from harnack.tracer.tolerance import Status, Tolerance
+
+__all__ = [
+    "Hits", "LevelSet", "PreparedLevelSet", "Status", "Tolerance", "Trace", "level_set", "trace",
+]  # fmt: skip

@@ -1,0 +1,69 @@
+"""Derivatives of hits, by implicit differentiation at the hit.
+
+A marching loop is not differentiable in any useful sense: its derivative depends on where it
+stopped. The hit, f(o + t d; theta) = level, defines t(theta), and
+
+    dt = (dlevel - df|_t) / (grad f . d),
+
+which is what these functions attach to a detached t.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+
+if TYPE_CHECKING:
+    from harnack.backend import Mask, Real, Vec3
+    from harnack.tracer.march import PreparedLevelSet
+
+# Newton steps from the tolerance to rounding before the derivative is taken.
+_POLISH = 4
+
+
+def wants_derivatives(prepared: PreparedLevelSet, o: Vec3, d: Vec3) -> bool:
+    """Whether rays, levels or the field's parameters have derivatives enabled."""
+    parameters: list[Any] = [o, d, *prepared.levels.values, *prepared.field.parameters()]
+    return any(dr.grad_enabled(p) for p in parameters)
+
+
+def attach(
+    prepared: PreparedLevelSet, o: Vec3, d: Vec3, t: Real, hit: Mask, normal: Vec3
+) -> tuple[Real, Vec3]:
+    """t polished to rounding with its derivative attached, and the normal at that point.
+
+    Normals carry no derivative (they would need the Hessian).
+    """
+    backend = prepared.backend
+    with dr.suspend_grad():
+        at = dr.select(hit, t, 0)
+        here, along = dr.detach(o), dr.detach(d)
+        for _ in range(_POLISH):
+            x = dr.fma(backend.Array3f(at), along, here)
+            sample = prepared.sample(x)
+            miss = _to_nearest(prepared, sample.value)
+            slope = dr.dot(sample.gradient, along)
+            step = dr.select(hit & (slope != 0), miss / slope, 0)
+            # A grazing ray has no crossing to converge to; stay near the proved point.
+            limit = 4 * prepared.tolerance.distance
+            at = at + dr.clip(step, -limit, limit)
+        x = dr.fma(backend.Array3f(at), along, here)
+        sample = prepared.sample(x)
+        slope = dr.dot(sample.gradient, along)
+        length = dr.norm(sample.gradient)
+        normal = dr.select(hit & (length > 0), sample.gradient / length, normal)
+        dr.eval(at, x, slope, normal)
+    value = prepared.field.differentiable_value(dr.fma(backend.Array3f(at), d, o))
+    change = value - dr.detach(value)
+    for level in prepared.levels.values[:1]:
+        change = change - (level - dr.detach(level))
+    usable = hit & (slope != 0)
+    moved = at - dr.select(usable, change / slope, 0)
+    return dr.select(hit, moved, t), normal
+
+
+def _to_nearest(prepared: PreparedLevelSet, f: Real) -> Real:
+    """level - f for the nearest level."""
+    down, up = prepared.levels.gaps(f)
+    return dr.select(up < down, up, -down)

@@ -1,0 +1,163 @@
+"""`trace`: rays and a field in, a list of hits out. NumPy in, NumPy out; Dr.Jit stays Dr.Jit."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import backend_of, choose_backend, to_float, to_numpy, to_vector3
+from harnack.tracer.derivatives import attach, wants_derivatives
+from harnack.tracer.level_set import LevelSet, level_set
+from harnack.tracer.tolerance import Status, Tolerance
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Precision, Real, Vec3
+    from harnack.bounds import Bound, Longest
+    from harnack.fields.field import Field
+    from harnack.geometry import Volume
+
+
+@dataclass(frozen=True)
+class Hits:
+    """The ends of n rays, as NumPy arrays or, if the rays were Dr.Jit arrays, as Dr.Jit arrays.
+
+    t: (n,) ray parameter of the hit, inf for a miss; for a ray that ran out of steps, how far
+        it is proved free.
+    position: (n, 3) point at t, NaN for a miss.
+    normal: (n, 3) unit normal grad f/|grad f|, zero where there is no hit.
+    value: (n,) f at the last accepted point; of an angle-valued field up to its period.
+    evaluations: (n,) how many times the field was evaluated.
+    status: (n,) a `Status`.
+    """
+
+    t: Any
+    position: Any
+    normal: Any
+    value: Any
+    evaluations: Any
+    status: Any
+
+    @property
+    def hit(self) -> Any:
+        """(n,) mask of rays that hit."""
+        return self.status == int(Status.HIT)
+
+
+def trace(
+    field: Field | LevelSet,
+    origins: Any,
+    directions: Any,
+    *,
+    level: Any = None,
+    t_min: Any = 0.0,
+    t_max: Any = math.inf,
+    tolerance: float | Tolerance = 1e-4,
+    max_steps: int = 1000,
+    bound: str | Bound | Longest | None = None,
+    clip: Volume | None = None,
+    overstep: float = 1.4,
+    precision: Precision | None = None,
+) -> Hits:
+    """First hits of rays with a level set of a field; no hit is ever missed.
+
+    field: what to trace; or a `LevelSet`, which then holds all the settings.
+    origins, directions: (n, 3) array-likes (one of them may be (1, 3)), or Dr.Jit 3-vectors.
+        Directions need not be unit; t counts multiples of the *unit* direction, so it is a
+        length.
+    level: level or levels; None for the field's default. May be a Dr.Jit number.
+    t_min, t_max: (n,) or a number. An infinite t_max ends in a proved miss wherever the
+        field knows how far its surface reaches.
+    tolerance: a length, or a `Tolerance`. In single precision not below about 1e-6 of the
+        size of the coordinates.
+    bound: None for the sharpest known; "classic" for the published rule, "slope", "caps".
+    precision: "single" or "double" for NumPy input; Dr.Jit input keeps its own.
+
+    With Dr.Jit input, t, position and normal carry derivatives with respect to whatever had
+    them enabled: rays, level, vertices of the field (implicit differentiation at the hit).
+
+    Raises ValueError or TypeError for shapes that do not match, NaN, directions of length zero,
+    an empty or negative interval, or a level that no surface has.
+    """
+    surface = (
+        field
+        if isinstance(field, LevelSet)
+        else level_set(
+            field, level, clip=clip, tolerance=tolerance,
+            max_steps=max_steps, bound=bound, overstep=overstep,
+        )
+    )  # fmt: skip
+    given = [a for a in (origins, directions) if dr.is_array_v(type(a))]
+    if given and precision is not None:
+        raise ValueError("precision follows Dr.Jit rays; give it only with NumPy ones")
+    backend = backend_of(given[0]) if given else choose_backend(precision or "single")
+    o, d, near, far = _rays(backend, origins, directions, t_min, t_max)
+    hits = _trace(surface, backend, o, d, near, far)
+    return hits if given else _as_numpy(hits, max(dr.width(o), dr.width(d), dr.width(near)))
+
+
+def _rays(
+    backend: Backend, origins: Any, directions: Any, t_min: Any, t_max: Any
+) -> tuple[Vec3, Vec3, Real, Real]:
+    o = to_vector3(backend, origins, "origins")
+    d = to_vector3(backend, directions, "directions")
+    near, far = to_float(backend, t_min, "t_min"), to_float(backend, t_max, "t_max")
+    widths = {"origins": o, "directions": d, "t_min": near, "t_max": far}
+    lengths = {name: dr.width(array) for name, array in widths.items()}
+    n = max(lengths.values()) if min(lengths.values()) > 0 else 0
+    for name, length in lengths.items():
+        if length not in (1, n):
+            raise ValueError(f"{name} has {length} entries where the others have {n}; give 1 or {n}")
+    length = dr.norm(d)
+    if n and not dr.is_array_v(type(directions)):
+        _check_numpy_rays(to_numpy(length), to_numpy(near), to_numpy(far))
+    return o, d / length, near, far
+
+
+def _check_numpy_rays(length: Any, near: Any, far: Any) -> None:
+    zero = np.flatnonzero(~(length > 0))
+    if zero.size:
+        raise ValueError(
+            f"directions: entry {zero[0]} has length zero; a ray needs a direction"
+        )
+    if (near < 0).any():
+        raise ValueError("t_min must be >= 0: rays run forwards")
+    empty = np.flatnonzero(~(near <= far))
+    if empty.size:
+        raise ValueError(f"t_max is smaller than t_min for ray {empty[0]}: swap them")
+
+
+def _trace(
+    surface: LevelSet, backend: Backend, o: Vec3, d: Vec3, near: Real, far: Real
+) -> Hits:
+    prepared = surface.prepare(backend)
+    with dr.suspend_grad():
+        end = prepared.first_hit(dr.detach(o), dr.detach(d), dr.detach(near), dr.detach(far))
+        hit = end.status == int(Status.HIT)
+        length = dr.norm(end.gradient)
+        normal = dr.select(hit & (length > 0), end.gradient / length, 0)
+    t = end.t
+    if wants_derivatives(prepared, o, d):
+        t, normal = attach(prepared, o, d, t, hit, normal)
+    position = dr.select(dr.isfinite(t), dr.fma(backend.Array3f(t), d, o), dr.nan)
+    hits = Hits(t, position, normal, end.value, end.evaluations, end.status)
+    dr.eval(hits.t, hits.position, hits.normal, hits.value, hits.evaluations, hits.status)
+    return hits
+
+
+def _as_numpy(hits: Hits, n: int) -> Hits:
+    def flat(array: Any) -> Any:
+        values = to_numpy(array)
+        return np.broadcast_to(values, (n, *values.shape[1:])).copy()
+
+    return Hits(
+        flat(hits.t),
+        flat(hits.position),
+        flat(hits.normal),
+        flat(hits.value),
+        flat(hits.evaluations).astype(np.int64),
+        flat(hits.status).astype(np.int64),
+    )

@@ -1,0 +1,124 @@
+"""A surface to trace: a field, its levels, a clip volume, and how closely to look."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+
+from harnack.bounds import Bound, Longest, choose_bound
+from harnack.certify import Levels
+from harnack.geometry import Intersection
+from harnack.tracer.march import PreparedLevelSet
+from harnack.tracer.tolerance import Tolerance
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Real
+    from harnack.fields.field import Field
+    from harnack.geometry import Volume
+
+
+@dataclass(frozen=True)
+class LevelSet:
+    """A surface: where a field takes one of some levels, and how closely to trace it.
+
+    levels: None for the field's default, a number, several, or Dr.Jit numbers.
+    clip: a volume to cut the surface with, besides the field's own domain.
+    solid: (low, high) makes it the closed solid {low <= f <= high} cut by its volume, whose
+        levels are the finite ends; only renderers look at it.
+    overstep: steps are this much longer than proved, and kept if the bound at the far end,
+        looking back, covers the rest (Keinert et al. 2014). 1 turns it off.
+    """
+
+    field: Field
+    levels: tuple[Real, ...] = ()
+    clip: Volume | None = None
+    tolerance: Tolerance = field(default_factory=Tolerance)
+    max_steps: int = 1000
+    bound: Longest = field(default_factory=choose_bound)
+    overstep: float = 1.4
+    solid: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if self.max_steps < 1:
+            raise ValueError(f"max_steps must be at least 1, not {self.max_steps}")
+        if not 1 <= self.overstep < 2:
+            raise ValueError(f"overstep must lie in [1, 2), not {self.overstep}")
+
+    @property
+    def volume(self) -> Volume | None:
+        """What rays are clipped to: domain, proved extent and clip together; None for all space."""
+        numbers = tuple(_number(level) for level in self.levels)
+        parts = [self.field.domain, self.field.extent(numbers), self.clip]
+        kept = list(dict.fromkeys(part for part in parts if part is not None))
+        if not kept:
+            return None
+        return kept[0] if len(kept) == 1 else Intersection(tuple(kept))
+
+    def prepare(self, backend: Backend) -> PreparedLevelSet:
+        """Everything uploaded to a backend, ready to be traced in a recorded kernel."""
+        volume = self.volume
+        levels = tuple(
+            level if dr.is_array_v(type(level)) else dr.opaque(backend.Float, float(level))
+            for level in self.levels
+        )
+        return PreparedLevelSet(
+            backend,
+            self.field.prepare(backend),
+            Levels(levels, self.field.period),
+            None if volume is None else volume.prepare(backend),
+            self.bound,
+            self.tolerance,
+            self.max_steps,
+            self.overstep,
+        )
+
+
+def level_set(
+    field: Field,
+    level: Any = None,
+    *,
+    clip: Volume | None = None,
+    tolerance: float | Tolerance = 1e-4,
+    max_steps: int = 1000,
+    bound: str | Bound | Longest | None = None,
+    overstep: float = 1.4,
+    solid: tuple[float, float] | None = None,
+) -> LevelSet:
+    """A `LevelSet` from what users write: a level or several, a tolerance, a bound's name.
+
+    Raises ValueError for a level that is not a finite number or that the field cannot have.
+    """
+    if solid is not None:
+        if level is not None:
+            raise ValueError("give either level or solid: the ends of a solid are its levels")
+        low, high = solid
+        if not low < high or not (math.isfinite(low) or math.isfinite(high)):
+            raise ValueError(f"solid must be (low, high) with low < high, one finite, not {solid}")
+        if field.period is not None:
+            raise ValueError("an angle-valued field has no inside: solid needs a real-valued one")
+        level = [end for end in (low, high) if math.isfinite(end)]
+    asked = _as_levels(field.default_level if level is None else level)
+    for one in asked:
+        if not math.isfinite(_number(one)):
+            raise ValueError(f"level must be finite, not {_number(one)}")
+    field.check_levels(tuple(_number(one) for one in asked))
+    tolerance = tolerance if isinstance(tolerance, Tolerance) else Tolerance(float(tolerance))
+    return LevelSet(
+        field, asked, clip, tolerance, max_steps, choose_bound(bound), overstep, solid
+    )
+
+
+def _as_levels(level: Any) -> tuple[Any, ...]:
+    if isinstance(level, Sequence):
+        if not level:
+            raise ValueError("level: give at least one")
+        return tuple(level)  # type: ignore[arg-type]
+    return (level,)
+
+
+def _number(level: Any) -> float:
+    return float(dr.detach(level)[0]) if dr.is_array_v(type(level)) else float(level)

@@ -1,0 +1,53 @@
+"""When a point of a ray counts as a hit, and how a ray can end."""
+
+from __future__ import annotations
+
+import enum
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import drjit as dr
+
+if TYPE_CHECKING:
+    from harnack.backend import Mask, Real, Vec3
+
+
+class Status(enum.IntEnum):
+    """How a ray ended."""
+
+    MISS = 0
+    """It is proved that the ray meets no level between t_min and t_max."""
+    HIT = 1
+    """The ray is proved free up to t, where the surface is within tolerance."""
+    OUT_OF_STEPS = 2
+    """The ray is proved free up to t; what follows is not known. Raise max_steps."""
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """When a point is close enough to a level to be a hit.
+
+    distance: |f - level| <= distance * |grad f|, a length to first order (paper, Sec. 3.1.2).
+    per_length: added to `distance` for each unit of t: half the angle of a pixel makes the
+        tolerance grow with its footprint.
+    value: also a hit where |f - level| <= value, whatever the gradient.
+    """
+
+    distance: float = 1e-4
+    per_length: float = 0.0
+    value: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("distance", "per_length", "value"):
+            number = getattr(self, name)
+            if not (math.isfinite(number) and number >= 0):
+                raise ValueError(f"tolerance: {name} must be finite and >= 0, not {number!r}")
+        if self.distance == 0 and self.value == 0 and self.per_length == 0:
+            raise ValueError("tolerance must be positive: a level set is never met exactly")
+
+    def reached(self, gap: Real, gradient: Vec3, t: Real) -> Mask:
+        """Whether a level `gap` away in value is within tolerance at ray parameter t."""
+        length = dr.fma(t, self.per_length, self.distance) if self.per_length else self.distance
+        close = gap * gap <= (length * length) * dr.squared_norm(gradient)
+        return close | (gap <= self.value) if self.value > 0 else close

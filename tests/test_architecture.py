@@ -1,0 +1,133 @@
+"""The shape of the code: which room may import from which, and how long things may get."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+SOURCE = Path(__file__).parent.parent / "src" / "harnack"
+FILES = sorted(SOURCE.rglob("*.py"))
+
+# Each room imports from itself and from the rooms before it.
+ROOMS = (
+    "backend",
+    "geometry",
+    "tree",
+    "fields",
+    "certify",
+    "bounds",
+    "tracer",
+    "render",
+    "gallery",
+    "view",
+    "cli",
+)
+FREE = ("__init__", "__main__", "testing")  # at the top: may import from any room
+LONGEST_FILE = 320
+LONGEST_FUNCTION = 45
+
+
+def room_of(parts: tuple[str, ...]) -> str:
+    """The room of a dotted module name below harnack, given as its parts."""
+    return parts[0] if parts else "__init__"
+
+
+def imported_modules(tree: ast.Module, package: tuple[str, ...]) -> list[tuple[str, ...]]:
+    """Modules below harnack that a file of `package` imports, at its top or within a function."""
+    modules: list[tuple[str, ...]] = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            modules += [tuple(alias.name.split(".")) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            stem = tuple(node.module.split(".")) if node.module else ()
+            if node.level:
+                stem = package[: len(package) - node.level + 1] + stem
+            # "from harnack import tracer" names a module behind "import".
+            names = [(alias.name,) for alias in node.names] if stem == ("harnack",) else [()]
+            modules += [stem + name for name in names]
+    return [module[1:] for module in modules if module[:1] == ("harnack",)]
+
+
+def misplaced_imports(path: Path, source: str) -> list[str]:
+    """Imports of the file at `path` (relative to harnack) that go against the order of rooms."""
+    parts = path.with_suffix("").parts
+    room = room_of(parts)
+    if room in FREE or room == "_version":
+        return []
+    if room not in ROOMS:
+        return [f"{path} is in no known room: {', '.join(ROOMS)}"]
+    package = ("harnack", *parts[:-1])
+    wrong: list[str] = []
+    for module in imported_modules(ast.parse(source), package):
+        target = room_of(module)
+        if target == "_version":
+            continue
+        if target not in ROOMS or ROOMS.index(target) > ROOMS.index(room):
+            wrong.append(f"{path} imports harnack.{'.'.join(module)}")
+    return wrong
+
+
+def code_lines(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+    """Lines of a function without its docstring, where the proofs are."""
+    length = (function.end_lineno or function.lineno) - function.lineno + 1
+    if ast.get_docstring(function) is not None:
+        docstring = function.body[0]
+        length -= (docstring.end_lineno or docstring.lineno) - docstring.lineno + 1
+    return length
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(SOURCE)))
+def test_file_imports_from_earlier_rooms_and_stays_short(path: Path) -> None:
+    source = path.read_text(encoding="utf-8")
+    assert misplaced_imports(path.relative_to(SOURCE), source) == []
+    assert len(source.splitlines()) <= LONGEST_FILE
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            assert code_lines(node) <= LONGEST_FUNCTION, f"{node.name} is too long"
+
+
+def test_modules_have_names_that_say_something() -> None:
+    vague = {"utils", "util", "helpers", "misc", "common"}
+    names = {part for path in FILES for part in path.relative_to(SOURCE).with_suffix("").parts}
+    assert names & vague == set()
+
+
+def test_package_imports_backend_before_anything_that_may_load_drjit() -> None:
+    tree = ast.parse((SOURCE / "__init__.py").read_text(encoding="utf-8"))
+    harmless = {("_version",)}
+    rooms = [module for module in imported_modules(tree, ("harnack",)) if module not in harmless]
+    assert rooms[0][0] == "backend"
+
+
+def test_docstrings_do_not_count_as_code() -> None:
+    (function,) = ast.parse('def f():\n    """One.\n\n    Two.\n    """\n    return 1\n').body
+    assert isinstance(function, ast.FunctionDef)
+    assert code_lines(function) == 2
+
+
+@pytest.mark.parametrize(
+    ("path", "source", "wrong"),
+    [
+        ("bounds/slope.py", "from harnack.certify.ball import Ball", False),
+        ("bounds/slope.py", "from harnack.bounds.solve import newton", False),
+        ("bounds/slope.py", "import numpy, harnack.backend", False),
+        ("bounds/slope.py", "from harnack._version import __version__", False),
+        ("bounds/slope.py", "import harnack.tracer", True),
+        ("bounds/slope.py", "from harnack import tracer", True),
+        ("bounds/slope.py", "from .. import tracer", True),
+        ("bounds/slope.py", "from ..tracer import march", True),
+        ("bounds/slope.py", "from ..certify import ball", False),
+        ("bounds/slope.py", "from . import solve", False),
+        ("bounds/slope.py", "def f():\n    from harnack.cli import main", True),
+        ("bounds/slope.py", "from harnack.testing import check_bound", True),
+        ("tracer.py", "from harnack.cli import main", True),
+        ("tracer.py", "from . import bounds", False),
+        ("testing.py", "import harnack.cli", False),
+        ("__init__.py", "import harnack.cli", False),
+        ("misc/thing.py", "", True),
+    ],
+)
+def test_the_order_of_rooms_is_seen(path: str, source: str, wrong: bool) -> None:
+    assert bool(misplaced_imports(Path(path), source)) == wrong
