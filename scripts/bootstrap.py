@@ -39,7 +39,7 @@ import llvm  # noqa: E402
 def main() -> None:
     apt = Apt() if shutil.which("apt-get") and shutil.which("dpkg") else None
     make_venv(apt)
-    run([*PIP, "install", "--quiet", "--editable", f"{ROOT}[dev,bench]"])
+    run([*PIP, "install", "--quiet", "--editable", f"{ROOT}[dev]"])
     provide_libraries(apt)
     if subprocess.run([str(VENV_PYTHON), "-c", DOCTOR], cwd=ROOT, check=False).returncode:
         sys.exit("setup: harnack cannot run yet; see the advice above")

@@ -52,6 +52,11 @@ class Backend:
     def __repr__(self) -> str:
         return f"Backend({self.name}, {self.precision})"
 
+    @property
+    def epsilon(self) -> float:
+        """The distance from 1 to the next number of this precision."""
+        return 2.0**-23 if self.precision == "single" else 2.0**-52
+
 
 @functools.cache
 def _backend(name: BackendName, precision: Precision) -> Backend:

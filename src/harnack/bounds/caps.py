@@ -42,7 +42,7 @@ class Caps(Bound):
     at most those sign changes, in that order, and where it starts negative it turns once.
     """
 
-    rounds: int = 5
+    rounds: int = 4
 
     def accepts(self, certificate: Certificate) -> bool:
         return (

@@ -41,7 +41,7 @@ class Slope(Bound):
     slope; the better of the two is kept on each side.
     """
 
-    rounds: int = 5
+    rounds: int = 4
 
     def accepts(self, certificate: Certificate) -> bool:
         return isinstance(certificate, BallCertificate)

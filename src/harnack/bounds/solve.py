@@ -60,6 +60,9 @@ def _next(q: Real, k: Real, previous_q: Real, previous_k: Real, gap: Real) -> Re
     slope = dr.select(run == 0, 0, (k - previous_k) / run)
     constant = dr.fma(-slope, q, k)
     root = dr.sqrt(fmax(dr.fma(constant, constant, 4 * slope * gap), 0))
-    below = constant + root
-    candidate = 2 * gap / below
+    # Both forms are the root; each cancels where the other is used.
+    rises = constant > 0
+    above = dr.select(rises, 2 * gap, root - constant)
+    below = dr.select(rises, constant + root, 2 * slope)
+    candidate = above / below
     return dr.select((below > 0) & dr.isfinite(candidate), candidate, LARGEST_FRACTION)

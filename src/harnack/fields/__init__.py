@@ -3,6 +3,25 @@
 from __future__ import annotations
 
 from harnack.fields.field import Field, HarmonicBall, Lipschitz, Sample
+from harnack.fields.periodic import EigenfunctionSum, Gyroid, SchwarzD, SchwarzP
+from harnack.fields.polynomial import HarmonicPolynomial, SphericalHarmonic
 from harnack.fields.solid_angle import SolidAngle
+from harnack.fields.waves import PlaneWave, Product, cosine, sine
 
-__all__ = ["Field", "HarmonicBall", "Lipschitz", "Sample", "SolidAngle"]
+__all__ = [
+    "EigenfunctionSum",
+    "Field",
+    "Gyroid",
+    "HarmonicBall",
+    "HarmonicPolynomial",
+    "Lipschitz",
+    "PlaneWave",
+    "Product",
+    "Sample",
+    "SchwarzD",
+    "SchwarzP",
+    "SolidAngle",
+    "SphericalHarmonic",
+    "cosine",
+    "sine",
+]

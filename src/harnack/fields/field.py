@@ -44,11 +44,17 @@ Knowledge = HarmonicBall | Lipschitz
 
 @dataclass(frozen=True)
 class Sample:
-    """One evaluation at a point p: value f(p), gradient (3,), and what is known near p."""
+    """One evaluation at a point p: value f(p), gradient (3,), and what is known near p.
+
+    error: how far rounding may have moved `value` from f at the point given, beyond eight units
+        in its last place (and beyond |gradient| times the rounding of the point itself, which
+        the tracer accounts for). Steps are shortened by it.
+    """
 
     value: Real
     gradient: Vec3
     known: tuple[Knowledge, ...]
+    error: Real = 0.0
 
 
 class Field(abc.ABC):

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
-import numpy as np
 
-from harnack.backend import backend_of
-from harnack.backend.extrema import fmax, fmin
-from harnack.fields.field import Field, HarmonicBall, Lipschitz, Sample
+from harnack.backend.extrema import fmin
+from harnack.fields.extension import ExtensionRange
+from harnack.fields.field import Field, Lipschitz, Sample
 from harnack.fields.waves import (
     PlaneWave,
     Product,
@@ -40,7 +39,7 @@ __all__ = [
     "sine",
 ]
 
-# Promised ends are moved out, and constants up, by this much for the roundings of float32.
+# Constants are moved up by this much for the roundings of float32.
 _ROUNDING = 1e-5
 
 
@@ -61,17 +60,19 @@ class EigenfunctionSum(Field):
 
     def __init__(self, terms: Iterable[Term], *, domain: Volume | None = None) -> None:
         self.terms = checked_terms(terms)
-        self.waves = WaveBounds.of(self.terms)
-        lengths = [2 * math.pi / k for k in self.waves.wavenumbers if k > 0]
-        if not lengths or self.waves.largest_curvature <= 0:
-            raise ValueError("the sum is constant: it has no level sets")
-        self.domain = Ball(radius=max(lengths)) if domain is None else domain
-        self._extension = ExtensionRange.best(self)
+        self.waves = self._bounds()
+        longest = 2 * math.pi / min(self.waves.wavenumbers)
+        self.domain = Ball(radius=longest) if domain is None else domain
+        self._extension = ExtensionRange.best(self.waves)
+
+    def _bounds(self) -> WaveBounds:
+        return WaveBounds.of(self.terms)
 
     @property
-    def largest_value(self) -> float:
-        """Proved: |f| never exceeds it."""
-        return self.waves.largest_value
+    def value_range(self) -> tuple[float, float]:
+        """Proved: the values of f stay within it."""
+        middle, most = self.waves.constant, self.waves.largest_value
+        return middle - most, middle + most
 
     @property
     def steepness(self) -> float:
@@ -97,11 +98,12 @@ class EigenfunctionSum(Field):
 
     def check_levels(self, levels: tuple[float, ...]) -> None:
         """ValueError for a level that is proved to lie outside the range of the function."""
+        least, most = self.value_range
         for level in levels:
-            if abs(level) > self.largest_value:
+            if not least <= level <= most:
                 raise ValueError(
                     f"no surface has level {level:g}: the function stays within "
-                    f"[-{self.largest_value:g}, {self.largest_value:g}]"
+                    f"[{least:g}, {most:g}]"
                 )
 
     def wall_levels(self, half_width: float, *, level: float | None = None) -> tuple[float, float]:
@@ -114,10 +116,11 @@ class EigenfunctionSum(Field):
         if not 0 < half_width < math.inf:
             raise ValueError(f"the half width of a wall must be positive, not {half_width!r}")
         low, high = middle - half_width, middle + half_width
-        if low < -self.largest_value and high > self.largest_value:
+        least, most = self.value_range
+        if low < least or high > most:
             raise ValueError(
-                f"a wall of half width {half_width:g} fills all of space: the function stays "
-                f"within [-{self.largest_value:g}, {self.largest_value:g}]; take a smaller one"
+                f"a wall from {low:g} to {high:g} has a side without surface: the function stays "
+                f"within [{least:g}, {most:g}]; take a smaller half width or thickness"
             )
         return low, high
 
@@ -135,103 +138,10 @@ class EigenfunctionSum(Field):
     def describe(self) -> dict[str, Any]:
         return {
             "terms": len(self.terms),
-            "largest value": self.largest_value,
+            "range": self.value_range,
             "steepness": self.steepness,
             "radius of the harmonic ball": self._extension.radius,
         }
-
-
-@dataclass(frozen=True)
-class ExtensionRange:
-    """What the harmonic extension of a sum of waves stays within on B(p, R) of R^4.
-
-    With f = sum f_i, Laplacian f_i = -kappa_i^2 f_i and |f_i| <= A_i, the extension is
-    F(y, w) = sum cosh(kappa_i w) f_i(y): harmonic, F(., 0) = f, and smaller than the paper's
-    exp(kappa w) f. Take any wavenumber kappa, and alpha = cosh(kappa R) - 1,
-    E = sum A_i |cosh(kappa_i R) - cosh(kappa R)|. Then
-
-        F = cosh(kappa w) f + (rest),   |rest| <= E w^2/R^2,   cosh(kappa w) <= 1 + alpha w^2/R^2,
-
-    as (cosh(a w) - cosh(b w))/w^2 is a power series in w^2 with coefficients of one sign. Put
-    x = |y-p|/R, so w^2/R^2 <= 1 - x^2. By Taylor |f(y) - f(p)| <= D x with
-    D = min(G R, |grad f(p)| R + H R^2/2), G and H bounds of the gradient and the Hessian. Hence
-    -F <= Dx - f + (1-x^2) E where Dx <= f (there f(y) >= 0), at most
-    D - f or, if D < 2E, E + D^2/(4E) - f; and where Dx > f
-
-        -F <= h(x) = (1 + alpha (1-x^2)) (Dx - f) + (1-x^2) E,
-
-    a cubic that on x >= 0 is largest at its one critical point
-    x* = D(1+alpha) / (sqrt((alpha f - E)^2 + 3 alpha (1+alpha) D^2) - (alpha f - E)) or, if that
-    is beyond it, at x = 1. The upper end is the same with -f. Neither end need exceed
-    cosh(kappa R) sup|f| + E.
-    """
-
-    radius: float
-    alpha: float
-    spread: float  # E
-    largest: float
-    steepness: float
-    curvature: float
-
-    @classmethod
-    def best(cls, field: EigenfunctionSum) -> ExtensionRange:
-        """The radius that is best where it matters, near level 0 at a gradient of mean size.
-
-        There a step loses to the second-order term of the bound, which is proportional to
-        (f - lower)/R^2. For the gyroid R = 1.06 (cell 2 pi), the best of those traced too.
-        """
-        k = np.array(field.waves.wavenumbers)
-        a = np.array(field.waves.amplitudes)
-        typical = math.sqrt(0.5 * float(a**2 @ k**2))
-        scale = 1 / math.sqrt(float(a**2 @ k**2) / float(a[k > 0] @ a[k > 0]))
-        radii = scale * np.geomspace(0.02, 8.0, 300)
-        radii = radii[radii * k.max() < 30.0]  # cosh stays far from overflow
-        trials = [cls.at(field, float(r)) for r in radii]
-        return min(trials, key=lambda trial: trial._below_host(typical) / trial.radius**2)
-
-    @classmethod
-    def at(cls, field: EigenfunctionSum, radius: float) -> ExtensionRange:
-        """The numbers of one radius; kappa is the weighted median, which makes E smallest."""
-        growth = np.cosh(radius * np.array(field.waves.wavenumbers))
-        amplitudes = np.array(field.waves.amplitudes)
-        order = np.argsort(growth)
-        mass = np.cumsum(amplitudes[order])
-        middle = growth[order][int(np.searchsorted(mass, 0.5 * mass[-1]))]
-        spread = float(amplitudes @ np.abs(growth - middle)) * (1 + 1e-12)
-        largest = float(middle) * field.largest_value + spread
-        return cls(
-            radius, float(middle) - 1, spread, largest, field.steepness, field.curvature
-        )
-
-    def ball(self, f: Real, slope: Real) -> HarmonicBall:
-        """The promise at a point with value f and |grad f| = slope."""
-        r = self.radius
-        rise = fmin(self.steepness * r, slope * r + 0.5 * self.curvature * r * r)
-        out = 1 + _ROUNDING
-        real = backend_of(f).Float
-        lower, upper = -out * self._below(f, rise), out * self._below(-f, rise)
-        return HarmonicBall(real(r), lower, upper, dimension=4)
-
-    def _below(self, f: Real, rise: Real) -> Real:
-        """A bound of -F on the ball where |f(y) - f| <= rise |y-p|/R."""
-        alpha, e = self.alpha, self.spread
-        b = alpha * f - e
-        root = dr.sqrt(b * b + 3 * alpha * (1 + alpha) * rise * rise)
-        x = fmin((1 + alpha) * rise / (root - b), 1.0)
-        weight = 1 - x * x
-        falling = (1 + alpha * weight) * (rise * x - f) + weight * e
-        level = rise
-        if e > 0:
-            level = dr.select(rise < 2 * e, e + rise * rise / (4 * e), rise)
-        return fmin(fmax(falling, level - f), self.largest)
-
-    def _below_host(self, slope: float) -> float:
-        """The same at f = 0 in Python floats, for choosing the radius."""
-        r, alpha, e = self.radius, self.alpha, self.spread
-        rise = min(self.steepness * r, slope * r + 0.5 * self.curvature * r * r)
-        x = np.linspace(0.0, 1.0, 101)
-        falling = (1 + alpha * (1 - x * x)) * rise * x + (1 - x * x) * e
-        return min(float(falling.max()), self.largest)
 
 
 def _wavenumber(cell: float) -> float:
@@ -251,13 +161,12 @@ class _CubicSurface(EigenfunctionSum):
         self._wavenumber = _wavenumber(cell)
         super().__init__(terms, domain=Ball(radius=self.cell) if domain is None else domain)
 
-    @property
-    def largest_value(self) -> float:
-        return self._largest_value
-
-    @property
-    def steepness(self) -> float:
-        return self._steepness * self._wavenumber
+    def _bounds(self) -> WaveBounds:
+        return replace(
+            super()._bounds(),
+            largest_value=self._largest_value,
+            largest_gradient=self._steepness * self._wavenumber,
+        )
 
 
 class Gyroid(_CubicSurface):

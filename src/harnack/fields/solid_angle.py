@@ -107,7 +107,8 @@ class SolidAngle(Field):
         on = self._device
         sums = sum_over_edges(on.edges, on.unit(p), variation=self.certificate == "edges")
         # Coordinates of size `magnitude` (in units of the curve) carry its rounding.
-        rounding = 4 * on.epsilon * (1 + on.magnitude)
+        epsilon = on.edges.backend.epsilon
+        rounding = 4 * epsilon * (1 + on.magnitude)
         distance = sums.distance * (1 - _ROUNDING) - rounding
         if self.certificate == "edges":
             ball = self._edge_ball(sums, distance)
@@ -118,7 +119,9 @@ class SolidAngle(Field):
         apart = (sums.distance > rounding) & dr.isfinite(sums.angle)
         steep = on.edges.backend.Array3f(0, 0, 2 / rounding)
         gradient = dr.select(apart, sums.gradient, steep) / on.size
-        return Sample(dr.select(apart, sums.angle, 0), gradient, (ball,))
+        # Each of n factors turns the product by a few roundings, of random sign.
+        error = epsilon * (8 + 2 * math.sqrt(sum(len(loop) for loop in self.loops)))
+        return Sample(dr.select(apart, sums.angle, 0), gradient, (ball,), error)
 
     def _edge_ball(self, sums: EdgeSums, distance: Real) -> HarmonicBall:
         assert self._device is not None
@@ -175,10 +178,6 @@ class _OnDevice:
     centre: Vec3
     size: Real
     magnitude: float
-
-    @property
-    def epsilon(self) -> float:
-        return 1.2e-7 if self.edges.backend.precision == "single" else 2.3e-16
 
     def unit(self, p: Vec3) -> Vec3:
         return (self.edges.backend.Array3f(p) - self.centre) / self.size

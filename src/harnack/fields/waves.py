@@ -146,9 +146,9 @@ def _product(factors: Sequence[Real], amplitude: float) -> Real:
 
 @dataclass(frozen=True)
 class WaveBounds:
-    """A sum of waves f = sum_i A_i cos(k_i . p + phase_i), A_i > 0, and what is proved of it.
+    """A sum f = constant + sum_i A_i cos(k_i . p + phase_i), A_i > 0, and what is proved of it.
 
-    largest_value: |f| <= sum A_i.
+    largest_value: |f - constant| <= sum A_i.
     largest_curvature: |v . H v| <= sum A_i (k_i . v)^2 for the Hessian H and a unit v, at most
         the largest eigenvalue of the matrix sum A_i k_i k_i^T.
     largest_gradient: |v . grad f| <= sum A_i |k_i . v|, at most sum A_i |k_i|, and by
@@ -158,17 +158,22 @@ class WaveBounds:
 
     wavenumbers: tuple[float, ...]
     amplitudes: tuple[float, ...]
+    constant: float
     largest_value: float
     largest_gradient: float
     largest_curvature: float
 
     @classmethod
     def of(cls, terms: Iterable[Term]) -> WaveBounds:
-        """The bounds of a sum, equal wave vectors added up first."""
+        """The bounds of a sum, equal wave vectors added up first. ValueError for a constant."""
         waves: dict[tuple[float, ...], complex] = {}
         for term in terms:
             for k, amplitude in _plane_waves(term):
                 waves[k] = waves.get(k, 0.0) + amplitude
+        constant = waves.pop((0.0, 0.0, 0.0), 0j).real
+        waves = {k: amplitude for k, amplitude in waves.items() if amplitude != 0}
+        if not waves:
+            raise ValueError("the sum is constant: it has no level sets")
         vectors = np.array(list(waves))
         sizes = np.abs(np.array(list(waves.values())))
         # All sums below are of positive numbers: a few roundings, covered by this factor.
@@ -177,10 +182,11 @@ class WaveBounds:
         curvature = float(np.linalg.eigvalsh(matrix)[-1]) * up
         lengths = np.linalg.norm(vectors, axis=1)
         value = float(sizes.sum()) * up
-        gradient = min(float(sizes @ lengths) * up, math.sqrt(value * max(curvature, 0.0)))
+        gradient = min(float(sizes @ lengths) * up, math.sqrt(value * curvature))
         return cls(
             tuple(float(v) for v in lengths),
             tuple(float(v) for v in sizes),
+            constant,
             value,
             gradient,
             curvature,

@@ -116,8 +116,6 @@ def _numbered(loops: Any) -> list[tuple[int, Any]]:
 
 def _validate_loop(loop: Any, name: str) -> FloatArray:
     vertices = _as_vertices(loop, name)
-    if len(vertices) > MAX_VERTICES:
-        raise TooManyVerticesError(_too_many(name, len(vertices)))
     bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
     if bad.size:
         raise NonFiniteVertexError(
@@ -144,11 +142,13 @@ def _as_vertices(loop: Any, name: str) -> FloatArray:
         raise CurveShapeError(f"{name} must hold real numbers, not {array.dtype}")
     if array.ndim != 2 or array.shape[1] != 3:
         hint = ""
-        if array.ndim == 2 and array.shape[0] == 3:
-            hint = "; transpose it"
-        elif array.ndim == 2 and array.shape[1] == 2:
+        if array.ndim == 2 and array.shape[1] == 2:
             hint = "; append a column of zeros to a planar curve"
+        elif array.ndim == 2 and array.shape[0] == 3:
+            hint = "; transpose it"
         raise CurveShapeError(f"{name} must have shape (n, 3), not {array.shape}{hint}")
+    if len(array) > MAX_VERTICES:
+        raise TooManyVerticesError(_too_many(name, len(array)))
     return np.array(array, dtype=np.float64, order="C")
 
 

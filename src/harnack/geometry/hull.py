@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import drjit as dr
 import numpy as np
 import numpy.typing as npt
 import scipy.spatial
 
-from harnack.backend import Backend
-from harnack.geometry.convex_volume import FloatArray, as_points, checked_distance
-from harnack.geometry.polytope import PlaneTable, Polytope
+from harnack.backend import Backend, Real, Vec3, backend_of
+from harnack.geometry.convex_volume import FloatArray, as_points, checked_distance, rounding
+from harnack.geometry.polytope import Planes, PlaneTable, Polytope, Slacks
 
 MAX_PLANES = 2048
 """Nearly parallel facets beyond this number are dropped; what is left is a little larger."""
@@ -68,6 +70,12 @@ class ConvexHull(Polytope):
 
     def _uploaded(self) -> PlaneTable | None:
         return self._buffer
+
+    def _slacks(self, table: Planes, o: Vec3, d: Vec3) -> Callable[[Vec3, Real], Slacks]:
+        """As |n| = 1, |n|.|o| <= |o| serves all planes; in a bounded volume that is enough."""
+        eps = rounding(backend_of(o))
+        room, speed = eps * (dr.norm(o) + table.reach), eps * dr.norm(d)
+        return lambda _n, _h: (room, speed)
 
     def prepare(self, backend: Backend) -> ConvexHull:
         return replace(self, _buffer=PlaneTable.upload(backend, self.planes()))

@@ -22,9 +22,9 @@ def read_loops_text(path: Path, data: bytes) -> list[tuple[FloatArray, Place]]:
         if not words:
             continue
         place = Place(path, f"line {number}")
+        numbers = np.array([as_number(word, place) for word in words])
         if len(words) % 3:
             raise place.error(f"{len(words)} numbers: a loop is x y z repeated, so a multiple of 3")
-        numbers = np.array([as_number(word, place) for word in words])
         loops.append((numbers.reshape(-1, 3), place))
     if not loops:
         raise Place(path).error("there are no loops: write one a line, x y z repeated")

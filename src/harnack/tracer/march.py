@@ -73,6 +73,9 @@ class PreparedLevelSet:
         reach, or the bound at the trial point looking back covers step - reach; then all up to it
         is free. Otherwise the ray goes back to base + reach, which needs no such test. A ray ends
         as a miss when base + reach passes its end, as a hit only at an accepted point.
+
+        In rounded arithmetic a surface could slip through between the two looks, so both see
+        it nearer by the rounding of value and position together (`_blur`).
         """
         real, vector = self.backend.Float, self.backend.Array3f
         count, flag = self.backend.UInt32, self.backend.Bool
@@ -80,6 +83,7 @@ class PreparedLevelSet:
         start, end = self.clip(o, d, real(t_min), real(t_max))
         bound = self.bound
         running = flag(active) & (start < end)
+        size = fmax(fmax(dr.abs(o.x), dr.abs(o.y)), dr.abs(o.z))
 
         def body(
             base: Real, step: Real, reach: Real, f: Real, g: Vec3, n: Any, status: Any, active: Mask
@@ -87,12 +91,15 @@ class PreparedLevelSet:
             t = base + step
             sample = self.field.evaluate(dr.fma(vector(t), d, o))
             down, up = self.levels.gaps(sample.value)
-            certificates = certify(sample, down, up)
+            steepness = dr.norm(sample.gradient)
+            blur = self._blur(sample, steepness, size + t)
+            certificates = certify(sample, fmax(down - blur, real(0)), fmax(up - blur, real(0)))
             slope = dr.dot(sample.gradient, d)
             accepted = step <= reach
             if self.overstep > 1:
                 accepted |= bound.covers(certificates, -slope, step - reach)
-            hit = accepted & self.tolerance.reached(fmin(down, up), sample.gradient, t)
+            close = fmax(self.tolerance.in_value(steepness, t), 2 * blur)
+            hit = accepted & (fmin(down, up) <= close)
             forward = fmax(bound.step(certificates, slope), real(0))
             step = dr.select(accepted, self.overstep * forward, reach)
             reach = dr.select(accepted, forward, reach)
@@ -117,3 +124,9 @@ class PreparedLevelSet:
         final = dr.while_loop(initial, running_lanes, body, label="harnack")
         base, _, _, f, g, n, status, _ = final
         return base, f, g, n, status
+
+    def _blur(self, sample: Sample, steepness: Real, size: Real) -> Real:
+        """What rounding may have done to f at a point whose coordinates are at most `size`."""
+        epsilon = self.backend.epsilon
+        position = 4 * epsilon * size
+        return dr.fma(steepness, position, dr.fma(8 * epsilon, dr.abs(sample.value), sample.error))

@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING
 
 import drjit as dr
 
+from harnack.backend.extrema import fmax
+
 if TYPE_CHECKING:
-    from harnack.backend import Mask, Real, Vec3
+    from harnack.backend import Real
 
 
 class Status(enum.IntEnum):
@@ -32,6 +34,9 @@ class Tolerance:
     per_length: added to `distance` for each unit of t: half the angle of a pixel makes the
         tolerance grow with its footprint.
     value: also a hit where |f - level| <= value, whatever the gradient.
+
+    Where rounding leaves the distance to the level less certain than this, that uncertainty is
+    the tolerance: about 1e-6 of the coordinates' size in single precision, 1e-15 in double.
     """
 
     distance: float = 1e-4
@@ -46,8 +51,8 @@ class Tolerance:
         if self.distance == 0 and self.value == 0 and self.per_length == 0:
             raise ValueError("tolerance must be positive: a level set is never met exactly")
 
-    def reached(self, gap: Real, gradient: Vec3, t: Real) -> Mask:
-        """Whether a level `gap` away in value is within tolerance at ray parameter t."""
+    def in_value(self, steepness: Real, t: Real) -> Real:
+        """How far in value a level may be from f to be a hit, where |grad f| = steepness."""
         length = dr.fma(t, self.per_length, self.distance) if self.per_length else self.distance
-        close = gap * gap <= (length * length) * dr.squared_norm(gradient)
-        return close | (gap <= self.value) if self.value > 0 else close
+        close = steepness * length
+        return fmax(close, type(close)(self.value)) if self.value > 0 else close

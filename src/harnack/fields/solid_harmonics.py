@@ -1,0 +1,154 @@
+"""Real solid harmonics r^l Y_lm in Cartesian coordinates, up to degree 12, and their sums.
+
+r^l Y_lm = N_lm Q_l^m(z, r^2) C_m(x, y), where C_m + i S_m = (x + iy)^m (S_m for m < 0) and Q_l^m
+is r^(l-m) times the m-th derivative of the Legendre polynomial P_l, as a function of z/r: a
+polynomial in z and r^2. Both obey recurrences that lose no accuracy (that of Q is the upward
+recurrence of associated Legendre functions), where a sum of monomials cancels: at degree 12 by
+three digits. Arithmetic only, so one code serves Dr.Jit arrays, NumPy arrays and Python floats.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+
+LARGEST_DEGREE = 12
+
+Weights: TypeAlias = Mapping[tuple[int, int], float]  #: (l, m) -> coefficient of r^l Y_lm
+Monomials: TypeAlias = Mapping[tuple[int, int, int], float]  #: (i, j, k) -> that of x^i y^j z^k
+
+
+def normalisation(l: int, m: int) -> float:  # noqa: E741
+    """N_lm, with which the real Y_lm have unit mean square integral over the unit sphere."""
+    order = abs(m)
+    ratio = math.factorial(l - order) / math.factorial(l + order)
+    return math.sqrt((2 * l + 1) / (4 * math.pi) * ratio * (2 if order else 1))
+
+
+def odd_factorial(m: int) -> float:
+    """(2m-1)!! = 1 * 3 * ... * (2m-1), the value of Q_m^m."""
+    return float(math.prod(range(1, 2 * m, 2)))
+
+
+class Legendre:
+    """Q_l^m / (2m-1)!! at one point, each computed once.
+
+    Without the size of Q_m^m float32 holds them all; the weights of a sum take that factor up.
+    """
+
+    def __init__(self, z: Any, r2: Any) -> None:
+        self.z = z
+        self.r2 = r2
+        self._known: dict[tuple[int, int], Any] = {}
+
+    def __call__(self, l: int, m: int) -> Any:  # noqa: E741
+        """The value; 0.0 where l < m."""
+        if l <= m:
+            return 1.0 if l == m else 0.0
+        if (l, m) not in self._known:
+            below, below2 = self(l - 1, m), self(l - 2, m)
+            q = (2 * l - 1) / (l - m) * (self.z * below)
+            if l > m + 1:
+                q = q - (l + m - 1) / (l - m) * (self.r2 * below2)
+            self._known[l, m] = q
+        return self._known[l, m]
+
+
+def evaluate(weights: Weights, x: Any, y: Any, z: Any) -> tuple[Any, tuple[Any, Any, Any]]:
+    """Value and gradient of sum c_lm r^l Y_lm.
+
+    With Q = Q_l^m: dQ/dz at fixed r^2 is Q_l^(m+1), and 2 dQ/d(r^2) = -Q_(l-1)^(m+1), whence
+
+        d/dx = -x Q_(l-1)^(m+1) C_m + m Q C_(m-1),   d/dz = (l+m) Q_(l-1)^m C_m,
+        d/dy = -y Q_(l-1)^(m+1) C_m - m Q S_(m-1)    (S_m: S for C, C and + for -S).
+    """
+    q = Legendre(z, x * x + y * y + z * z)
+    zero = 0.0 * z
+    f, gx, gy, gz = zero, zero, zero, zero
+    c, s, c_below, s_below = zero + 1.0, zero, zero, zero
+    for m in range(max(abs(m) for _, m in weights) + 1):
+        if m > 0:
+            c_below, s_below, c, s = c, s, x * c - y * s, x * s + y * c
+        for order, basis, dx, dy in ((m, c, c_below, -s_below), (-m, s, s_below, c_below)):
+            if m == 0 and basis is s:
+                continue
+            column = [(key[0], w) for key, w in weights.items() if key[1] == order]
+            if not column:
+                continue
+            at_m, at_next, rate = _column(sorted(column), m, q)
+            f = f + at_m * basis
+            gz = gz + rate * basis
+            gx = gx - (x * at_next) * basis
+            gy = gy - (y * at_next) * basis
+            if m > 0:
+                gx, gy = gx + (m * at_m) * dx, gy + (m * at_m) * dy
+    return f, (gx, gy, gz)
+
+
+def _column(column: Sequence[tuple[int, float]], m: int, q: Legendre) -> tuple[Any, Any, Any]:
+    """Sums over l of c_lm N_lm times Q_l^m, Q_(l-1)^(m+1) and (l+m) Q_(l-1)^m."""
+    at_m, at_next, rate = 0.0, 0.0, 0.0
+    for l, weight in column:  # noqa: E741
+        a = weight * normalisation(l, m) * odd_factorial(m)
+        at_m = at_m + a * q(l, m)
+        if l > m:
+            rate = rate + (a * (l + m)) * q(l - 1, m)
+        if l > m + 1:
+            at_next = at_next + (a * (2 * m + 1)) * q(l - 1, m + 1)
+    return at_m, at_next, rate
+
+
+def laplacian(coefficients: Monomials) -> tuple[dict[tuple[int, int, int], float], float]:
+    """The Laplacian's coefficients, and the largest one relative to the terms it is summed from."""
+    total: dict[tuple[int, int, int], float] = {}
+    size: dict[tuple[int, int, int], float] = {}
+    for powers, coefficient in coefficients.items():
+        for axis in range(3):
+            n = powers[axis]
+            if n >= 2:
+                lowered = (
+                    powers[0] - 2 * (axis == 0),
+                    powers[1] - 2 * (axis == 1),
+                    powers[2] - 2 * (axis == 2),
+                )
+                term = n * (n - 1) * coefficient
+                total[lowered] = total.get(lowered, 0.0) + term
+                size[lowered] = size.get(lowered, 0.0) + abs(term)
+    worst = max((abs(total[k]) / size[k] for k in total if size[k] > 0), default=0.0)
+    return {k: v for k, v in total.items() if abs(v) > 1e-12 * size[k]}, worst
+
+
+def from_monomials(coefficients: Monomials) -> dict[tuple[int, int], float]:
+    """The weights of a harmonic polynomial.
+
+    A harmonic function is determined by its values and its z-derivatives on the plane z = 0. On
+    the circle r = 1 there they are the Fourier series with coefficients c_lm N_lm Q_l^m(0, 1)
+    (l - m even) and c_lm N_lm (l+m) Q_(l-1)^m(0, 1) (l - m odd), of degree at most 12: sampled
+    at 64 points they are read off exactly.
+    """
+    n = 64
+    angles = 2 * np.pi * np.arange(n) / n
+    x, y = np.cos(angles), np.sin(angles)
+    q = Legendre(0.0, 1.0)
+    weights: dict[tuple[int, int], float] = {}
+    for l in range(max(sum(powers) for powers in coefficients) + 1):  # noqa: E741
+        parts = [np.zeros(n), np.zeros(n)]  # f_l and its z-derivative at z = 0
+        scale = 0.0
+        for (i, j, k), coefficient in coefficients.items():
+            if i + j + k == l:
+                scale = max(scale, abs(coefficient))
+                if k < 2:
+                    parts[k] += coefficient * x**i * y**j
+        spectra = [np.fft.rfft(part) / n for part in parts]
+        for m in range(l + 1):
+            odd = (l - m) % 2
+            size = normalisation(l, m) * odd_factorial(m)
+            size *= (l + m) * q(l - 1, m) if odd else q(l, m)
+            harmonic = complex(spectra[odd][m]) * (2 if m else 1) / size
+            for order, weight in ((m, harmonic.real), (-m, -harmonic.imag)):
+                if abs(weight) > 1e-13 * scale:
+                    weights[l, order] = weight
+    return weights

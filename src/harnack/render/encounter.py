@@ -1,0 +1,108 @@
+"""Where a ray meets one of our surfaces: polished, with a normal that faces the right way.
+
+Everything here is in the surface's own coordinates and knows no Mitsuba; `interaction` turns it
+into what a BSDF is asked with.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+
+from harnack.backend import Mask, Real, Vec3  # at run time: Dr.Jit reads Encounter's annotations
+from harnack.tracer import Status
+
+if TYPE_CHECKING:
+    from harnack.tracer import PreparedLevelSet, Trace
+
+# Polishing moves a hit by at most this many tolerances: along a ray that only grazes the surface
+# there is no crossing to converge to.
+_POLISH = 2.0
+# A ray leaves a surface this many tolerances away from it, so as not to meet it again there.
+_CLEARANCE = 4.0
+# A grazing ray's normal is turned until it faces the ray's side under this sine.
+_GRAZING = 1e-3
+
+
+@dataclass
+class Encounter:
+    """What rays meet first. Lanes that meet nothing have met = lost = False and t = inf.
+
+    t: ray parameter; of a lost ray, how far it is proved free.
+    met: there is a surface at t.
+    lost: the ray ran out of steps behind t.
+    position, normal: of the surface. The normal is unit and points to the side of larger values
+        or, of a solid, out of it.
+    clearance: how far off the surface the next ray has to start.
+    evaluations: of the field.
+    """
+
+    t: Real
+    met: Mask
+    lost: Mask
+    position: Vec3
+    normal: Vec3
+    clearance: Real
+    evaluations: Any
+
+
+def meet_surface(
+    prepared: PreparedLevelSet, o: Vec3, d: Vec3, t_max: Real, active: Mask
+) -> Encounter:
+    """Where rays o + t d, |d| = 1, 0 <= t <= t_max, first meet the level set.
+
+    One Newton step along the ray, one evaluation there, and one projection along its gradient
+    take a hit from within tolerance to the surface. The proof tells which side of the surface
+    the ray comes from; a normal that says otherwise (the step went past the point where a
+    grazing ray is nearest) is turned to that side.
+    """
+    vector = prepared.backend.Array3f
+    trace = prepared.first_hit(o, d, 0, t_max, active)
+    met = trace.status == int(Status.HIT)
+    reach = _reach(prepared, trace)
+    gap = to_nearest_level(prepared, trace.value)
+    slope = dr.dot(trace.gradient, d)
+    step = dr.select(met & (slope != 0), gap / slope, 0)
+    step = dr.clip(step, -_POLISH * reach, _POLISH * reach)
+    t = dr.maximum(dr.select(met, trace.t, 0) + step, 0)
+    p = dr.fma(vector(t), d, o)
+    sample = prepared.sample(p)
+    length = dr.norm(sample.gradient)
+    normal = dr.select(length > 0, sample.gradient / length, -d)
+    rest = dr.select(length > 0, to_nearest_level(prepared, sample.value) / length, 0)
+    rest = dr.clip(rest, -_POLISH * reach, _POLISH * reach)
+    # gap > 0: the level is above, so the ray comes from the side of smaller values.
+    side = dr.select(gap > 0, prepared.backend.Float(1), -1)
+    return Encounter(
+        dr.select(met, t, trace.t),
+        met,
+        trace.status == int(Status.OUT_OF_STEPS),
+        dr.fma(vector(rest), normal, p),
+        facing(normal, d, side),
+        _CLEARANCE * reach,
+        trace.evaluations + dr.select(met, prepared.backend.UInt32(1), 0),
+    )
+
+
+def _reach(prepared: PreparedLevelSet, trace: Trace) -> Real:
+    """How far from the surface a hit may be by its tolerance, to first order."""
+    tolerance = prepared.tolerance
+    t = dr.select(dr.isfinite(trace.t), trace.t, 0)
+    reach = dr.fma(t, tolerance.per_length, tolerance.distance)
+    length = dr.norm(trace.gradient)
+    return reach + dr.select(length > 0, tolerance.value / length, 0)
+
+
+def facing(normal: Vec3, d: Vec3, side: Real) -> Vec3:
+    """The normal, turned if need be such that side * (normal . d) > 0."""
+    along = dr.dot(normal, d)
+    turned = dr.normalize(normal + (side * _GRAZING - along) * d)
+    return dr.select(side * along >= _GRAZING, normal, turned)
+
+
+def to_nearest_level(prepared: PreparedLevelSet, f: Real) -> Real:
+    """level - f for the level nearest to f."""
+    down, up = prepared.levels.gaps(f)
+    return dr.select(up < down, up, -down)

@@ -1,0 +1,91 @@
+"""Where a surface really is: found by tracing it from all sides.
+
+The volume that a surface is proved to lie in can be many times larger than the surface. A
+picture wants to be filled by what there is to see.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from harnack.backend import to_float, to_numpy, to_vector3
+from harnack.geometry.convex_volume import FloatArray
+from harnack.render.placement import PlacedSurface, Placement
+from harnack.tracer import Tolerance
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend
+    from harnack.tracer import LevelSet
+
+# Rays a side of the grid on each of the six faces of the box.
+_GRID = 48
+
+
+def visible_points(surface: LevelSet, backend: Backend) -> FloatArray:
+    """Points (n, 3) of the surface, as seen from the six sides of the box it lies in.
+
+    Raises:
+        ValueError: it has no bounds; nothing is found of it.
+    """
+    volume = surface.volume
+    ends = None if volume is None else np.array(volume.bounds())
+    if ends is None or not np.isfinite(ends).all():
+        raise ValueError(
+            "the surface reaches to infinity: give it a clip, "
+            "such as clip=harnack.Ball((0, 0, 0), 1)"
+        )
+    points = _probe(surface, backend, *ends)
+    if len(points) == 0:
+        raise ValueError(
+            "nothing is to be seen of this surface: no ray of a grid on the sides of its box "
+            f"{ends[0].round(3).tolist()} to {ends[1].round(3).tolist()} meets it; "
+            "try another level or clip"
+        )
+    # Once more, as closely as the surface fills.
+    margin = 0.6 * float((ends[1] - ends[0]).max()) / _GRID
+    lower = np.maximum(points.min(axis=0) - margin, ends[0])
+    upper = np.minimum(points.max(axis=0) + margin, ends[1])
+    closer = _probe(surface, backend, lower, upper)
+    return np.concatenate([points, closer])
+
+
+def _probe(
+    surface: LevelSet, backend: Backend, lower: FloatArray, upper: FloatArray
+) -> FloatArray:
+    """First encounters of parallel rays from the six sides of a box."""
+    size = float(np.linalg.norm(upper - lower))
+    rough = replace(surface, tolerance=Tolerance(1e-4 * size))
+    placed = PlacedSurface.of(rough, Placement.identity(), backend)
+    o, d, length = _rays(lower, upper, 0.01 * size)
+    met = placed.meet(
+        to_vector3(backend, o),
+        to_vector3(backend, d),
+        to_float(backend, length),
+        backend.Bool(True),
+    )
+    points: FloatArray = to_numpy(met.position)[to_numpy(met.met)]
+    return points.astype(np.float64)
+
+
+def _rays(
+    lower: FloatArray, upper: FloatArray, gap: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Origins, directions and lengths of a grid of rays through the box along each axis."""
+    cell = (np.arange(_GRID) + 0.5) / _GRID
+    u, v = (grid.ravel() for grid in np.meshgrid(cell, cell))
+    origins: list[FloatArray] = []
+    directions: list[FloatArray] = []
+    lengths: list[FloatArray] = []
+    for axis in range(3):
+        across = [(axis + 1) % 3, (axis + 2) % 3]
+        for sign in (1.0, -1.0):
+            o = np.empty((len(u), 3))
+            o[:, across] = lower[across] + np.column_stack([u, v]) * (upper - lower)[across]
+            o[:, axis] = lower[axis] - gap if sign > 0 else upper[axis] + gap
+            origins.append(o)
+            directions.append(np.tile(sign * np.eye(3)[axis], (len(u), 1)))
+            lengths.append(np.full(len(u), upper[axis] - lower[axis] + 2 * gap))
+    return np.concatenate(origins), np.concatenate(directions), np.concatenate(lengths)

@@ -1,0 +1,194 @@
+"""A path tracer that sees Mitsuba's shapes and ours."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from harnack.backend import Mask, Real  # needed at run time: Dr.Jit reads annotations of _Path
+from harnack.render.interaction import connecting_ray, leaving_ray
+from harnack.render.variant import load_mitsuba
+from harnack.render.world import World
+
+PLUGIN = "harnack_path"
+# What a ray that ran out of steps is drawn in: nothing in nature is this colour.
+LOST_COLOUR = (1.0, 0.0, 1.0)
+
+
+@dataclass
+class _Path:
+    """What a path remembers from one vertex to the next.
+
+    previous, pdf, delta: the last vertex and how it sampled the ray, for the weights of lights
+        that the ray finds.
+    eta: product of relative refractive indices; keeps Russian roulette from ending paths in glass.
+    """
+
+    ray: Any
+    radiance: Any
+    throughput: Any
+    eta: Real
+    depth: Any
+    previous: Any
+    pdf: Real
+    delta: Mask
+    lost: Mask
+    valid: Mask
+    active: Mask
+
+
+class PathTracer:
+    """Path tracing with multiple importance sampling of lights and BSDFs (Veach 1997)."""
+
+    def __init__(self, mi: Any, max_depth: int, rr_depth: int, hide_emitters: bool) -> None:
+        self.mi = mi
+        self.max_depth = max_depth
+        self.rr_depth = rr_depth
+        self.hide_emitters = hide_emitters
+        self.lost_colour = mi.load_dict({"type": "srgb", "color": list(LOST_COLOUR)})
+
+    def trace(self, scene: Any, sampler: Any, ray: Any, active: Mask) -> tuple[Any, Mask, Mask]:
+        """Radiance along rays, whether they met a surface, whether a ray of the path got lost."""
+        mi, world = self.mi, World.of(self.mi, scene)
+        start = _Path(
+            ray=mi.Ray3f(dr.detach(ray)),
+            radiance=mi.Spectrum(0),
+            throughput=mi.Spectrum(1),
+            eta=mi.Float(1),
+            depth=mi.UInt32(0),
+            previous=dr.zeros(mi.SurfaceInteraction3f),
+            pdf=mi.Float(1),
+            delta=mi.Bool(True),
+            lost=mi.Bool(False),
+            valid=mi.Bool(False),
+            active=mi.Bool(active),
+        )
+
+        def body(path: _Path, sampler: Any) -> tuple[_Path, Any]:
+            return self._vertex(world, path, sampler), sampler
+
+        def running(path: _Path, sampler: Any) -> Mask:
+            del sampler
+            return path.active
+
+        path, _ = dr.while_loop((start, sampler), running, body, label="harnack path")
+        return path.radiance, path.valid, path.lost
+
+    def _vertex(self, world: World, path: _Path, sampler: Any) -> _Path:
+        """Finds the next vertex of paths, collects its light and samples where to go on."""
+        mi = self.mi
+        si, clearance, lost = world.intersect(path.ray, False, path.active)
+        radiance = path.radiance + self._emitted(world.scene, path, si, path.active & ~lost)
+        shown = path.throughput * mi.Spectrum(self.lost_colour.eval(si, lost))
+        radiance += dr.select(path.active & lost, shown, 0)
+        active = path.active & si.is_valid() & (path.depth + 1 < self.max_depth)
+        bsdf = si.bsdf()
+        radiance += self._lit(world, path, si, clearance, bsdf, sampler, active)
+
+        sample, weight = bsdf.sample(
+            mi.BSDFContext(), si, sampler.next_1d(active), sampler.next_2d(active), active
+        )
+        throughput = path.throughput * weight
+        eta = path.eta * sample.eta
+        brightest = dr.max(throughput)
+        active &= brightest > 0
+        # Russian roulette, without the factor eta^-2 that radiance takes on in glass.
+        keep = dr.minimum(brightest * eta * eta, 0.95)
+        gamble = path.depth + 1 >= self.rr_depth
+        active &= ~gamble | (sampler.next_1d(active) < keep)
+        throughput = dr.select(gamble, throughput / keep, throughput)
+        return _Path(
+            ray=leaving_ray(mi, si, clearance, si.to_world(sample.wo)),
+            radiance=radiance,
+            throughput=throughput,
+            eta=eta,
+            depth=path.depth + 1,
+            previous=si,
+            pdf=sample.pdf,
+            delta=mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta),
+            lost=path.lost | (path.active & lost),
+            valid=path.valid | ((path.depth == 0) & (si.is_valid() | lost)),
+            active=active,
+        )
+
+    def _emitted(self, scene: Any, path: _Path, si: Any, active: Mask) -> Any:
+        """Light that a vertex, or the environment behind no vertex, sends along the ray."""
+        mi = self.mi
+        if self.hide_emitters:
+            active = active & (path.depth > 0)
+        found = mi.DirectionSample3f(scene, si, path.previous)
+        other = scene.pdf_emitter_direction(path.previous, found, active & ~path.delta)
+        weight = _power_heuristic(path.pdf, other)
+        light = path.throughput * weight * found.emitter.eval(si, active)
+        return dr.select(active, light, 0)
+
+    def _lit(
+        self, world: World, path: _Path, si: Any, clearance: Real, bsdf: Any, sampler: Any, active: Mask
+    ) -> Any:
+        """Light that a vertex scatters along the ray from a sampled point of an emitter."""
+        mi = self.mi
+        active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        light, weight = world.scene.sample_emitter_direction(
+            si, sampler.next_2d(active), False, active
+        )
+        active &= light.pdf > 0
+        scattered, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(light.d), active)
+        active &= dr.max(scattered) > 0
+        active &= ~world.occluded(connecting_ray(mi, si, clearance, light.p), active)
+        share = dr.select(light.delta, 1, _power_heuristic(light.pdf, pdf))
+        return dr.select(active, path.throughput * scattered * weight * share, 0)
+
+
+def _power_heuristic(a: Real, b: Real) -> Real:
+    """Veach's power heuristic with exponent 2."""
+    a, b = a * a, b * b
+    weight = a / (a + b)
+    return dr.select(dr.isfinite(weight), weight, 0)
+
+
+@functools.cache
+def integrator_class(variant: str) -> Any:
+    """The plugin's class; Mitsuba's classes differ from variant to variant."""
+    mi = load_mitsuba()
+    if mi.variant() != variant:
+        raise RuntimeError(f"the variant changed from {variant} to {mi.variant()}")
+
+    class HarnackPath(mi.SamplingIntegrator):
+        """max_depth: longest path in edges, -1 for no limit. rr_depth: where Russian roulette
+        begins. hide_emitters: whether lights and environment are invisible to the camera."""
+
+        def __init__(self, props: Any) -> None:
+            mi.SamplingIntegrator.__init__(self, props)
+            max_depth, rr_depth = props.get("max_depth", 12), props.get("rr_depth", 5)
+            if max_depth < -1 or rr_depth < 1:
+                raise ValueError(
+                    f"max_depth must be -1 (no limit) or >= 0 and rr_depth >= 1, "
+                    f"not {max_depth} and {rr_depth}"
+                )
+            unlimited = 2**32 - 1
+            depth = unlimited if max_depth == -1 else max_depth
+            self.tracer = PathTracer(mi, depth, rr_depth, props.get("hide_emitters", False))
+            self.lost = mi.UInt32(0)
+
+        def sample(
+            self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Mask = True
+        ) -> tuple[Any, Mask, list[Any]]:
+            del medium
+            radiance, valid, lost = self.tracer.trace(scene, sampler, ray, active)
+            dr.scatter_add(self.lost, mi.UInt32(1), mi.UInt32(0), lost)
+            return radiance, valid, []
+
+        def take_lost(self) -> int:
+            """How many paths ran out of steps since the last call."""
+            count = int(self.lost[0])
+            self.lost = mi.UInt32(0)
+            return count
+
+        def to_string(self) -> str:
+            return f"HarnackPath[max_depth = {self.tracer.max_depth}]"
+
+    return HarnackPath
+

@@ -1,0 +1,85 @@
+"""Named materials: Mitsuba BSDF dictionaries that look well in the studio."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+Dictionary = dict[str, Any]
+Colour = tuple[float, float, float]
+
+
+def _rgb(colour: Colour) -> Dictionary:
+    """A colour as linear sRGB reflectance."""
+    return {"type": "rgb", "value": list(colour)}
+
+
+def _glazed(colour: Colour, roughness: float) -> Dictionary:
+    """A coloured base under a clear coat."""
+    return {
+        "type": "roughplastic",
+        "diffuse_reflectance": _rgb(colour),
+        "alpha": roughness,
+        "nonlinear": True,
+    }
+
+
+def _metal(name: str, roughness: float) -> Dictionary:
+    return {"type": "roughconductor", "material": name, "alpha": roughness, "distribution": "ggx"}
+
+
+@dataclass(frozen=True)
+class Material:
+    """What a surface is made of.
+
+    front: BSDF of the side of larger values (the normal's side); of a solid, its outside.
+    back: of the other side of an open surface; None for the same as the front.
+    closed: light passes through it, so that only a solid can be made of it.
+    """
+
+    front: Dictionary
+    back: Dictionary | None = None
+    closed: bool = False
+
+    def bsdf(self, *, solid: bool) -> Dictionary:
+        """The BSDF's dictionary; open surfaces are seen from both sides."""
+        if solid or self.closed:
+            return self.front
+        nested: Dictionary = {"type": "twosided", "front": self.front}
+        return nested if self.back is None else {**nested, "back": self.back}
+
+
+MATERIALS: Mapping[str, Material] = {
+    "two-tone": Material(
+        _glazed((0.84, 0.30, 0.14), 0.22), _glazed((0.07, 0.25, 0.40), 0.22)
+    ),
+    "clay": Material({"type": "diffuse", "reflectance": _rgb((0.72, 0.62, 0.53))}),
+    "porcelain": Material(_glazed((0.84, 0.83, 0.80), 0.06)),
+    "plastic": Material(_glazed((0.62, 0.05, 0.07), 0.10)),
+    "gold": Material(_metal("Au", 0.14)),
+    "copper": Material(_metal("Cu", 0.16)),
+    "silver": Material(_metal("Ag", 0.12)),
+    "glass": Material({"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}, closed=True),
+    "frosted": Material(
+        {"type": "roughdielectric", "int_ior": 1.5, "ext_ior": 1.0, "alpha": 0.12}, closed=True
+    ),
+}
+"""Materials by name."""
+
+
+def material(wanted: str | Material | Mapping[str, Any] | None) -> Material:
+    """A material from its name, or from a BSDF dictionary used as it stands.
+
+    Raises:
+        ValueError: there is no material of that name.
+    """
+    if wanted is None:
+        return MATERIALS["two-tone"]
+    if isinstance(wanted, Material):
+        return wanted
+    if isinstance(wanted, Mapping):
+        return Material(dict(wanted), closed=True)
+    if wanted not in MATERIALS:
+        raise ValueError(f"unknown material {wanted!r}; there are {', '.join(MATERIALS)}")
+    return MATERIALS[wanted]

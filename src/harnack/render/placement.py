@@ -1,0 +1,137 @@
+"""A level set put somewhere in the world: moved, turned, scaled alike in all directions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import numpy as np
+import numpy.typing as npt
+
+from harnack.geometry.convex_volume import FloatArray
+from harnack.render.encounter import Encounter, meet_surface
+from harnack.render.solid import Solid
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.geometry import Volume
+    from harnack.tracer import LevelSet, PreparedLevelSet
+
+
+@dataclass(frozen=True)
+class Placement:
+    """x -> scale * rotation @ x + translation, from a surface's coordinates to the world's.
+
+    rotation: (3, 3) orthogonal; mirrors are welcome.
+    """
+
+    scale: float
+    rotation: FloatArray
+    translation: FloatArray
+
+    @classmethod
+    def identity(cls) -> Placement:
+        """Surfaces stay where they are."""
+        return cls(1.0, np.eye(3), np.zeros(3))
+
+    @classmethod
+    def of(cls, world_from_local: npt.ArrayLike) -> Placement:
+        """From a matrix (4, 4).
+
+        Raises:
+            ValueError: not finite, or one that bends lengths: lengths along a ray have to keep
+                their ratios, or the proved steps would not hold.
+        """
+        matrix = np.asarray(world_from_local, dtype=np.float64)
+        if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+            raise ValueError("to_world must be a finite matrix of shape (4, 4)")
+        linear = matrix[:3, :3]
+        scale = float(np.cbrt(abs(np.linalg.det(linear))))
+        close = scale > 0 and np.allclose(linear @ linear.T, scale**2 * np.eye(3), atol=1e-4 * scale**2)
+        if not close or not np.allclose(matrix[3], (0, 0, 0, 1)):
+            raise ValueError(
+                "to_world must be made of translations, rotations, mirrors and one scale for all "
+                f"axes, and this one is not:\n{matrix}"
+            )
+        return cls(scale, linear / scale, matrix[:3, 3])
+
+    @property
+    def matrix(self) -> FloatArray:
+        """The map as a matrix (4, 4)."""
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = self.scale * self.rotation, self.translation
+        return matrix
+
+    def apply(self, points: npt.ArrayLike) -> FloatArray:
+        """Points (n, 3) of the surface, in the world."""
+        local = np.asarray(points, dtype=np.float64)
+        return self.scale * local @ self.rotation.T + self.translation
+
+    def world_bounds(self, volume: Volume) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper corner, (3,) each, of a box in the world that holds a volume's."""
+        ends = np.array(volume.bounds())
+        corners = self.apply([[ends[i, 0], ends[j, 1], ends[k, 2]] for i, j, k in np.ndindex(2, 2, 2)])
+        return corners.min(axis=0), corners.max(axis=0)
+
+
+@dataclass(frozen=True)
+class PlacedSurface:
+    """A level set or solid on a backend, to be met by rays of the world.
+
+    rows: of the rotation; all numbers are kernel parameters.
+    """
+
+    prepared: PreparedLevelSet
+    solid: Solid | None
+    scale: Real
+    rows: tuple[Vec3, Vec3, Vec3]
+    translation: Vec3
+
+    @classmethod
+    def of(cls, surface: LevelSet, placement: Placement, backend: Backend) -> PlacedSurface:
+        """Everything uploaded."""
+
+        def vector(numbers: FloatArray) -> Vec3:
+            return backend.Array3f(*(dr.opaque(backend.Float, float(x)) for x in numbers))
+
+        prepared = surface.prepare(backend)
+        solid = None if surface.solid is None else Solid.of(surface, prepared)
+        rows = tuple(vector(row) for row in placement.rotation)
+        scale = dr.opaque(backend.Float, placement.scale)
+        return cls(prepared, solid, scale, rows, vector(placement.translation))
+
+    def meet(self, o: Vec3, d: Vec3, t_max: Real, active: Mask) -> Encounter:
+        """Where rays of the world, |d| = 1, first meet it, in coordinates of the world."""
+        o, d, t_max = self._local_ray(o, d, t_max)
+        if self.solid is not None:
+            met = self.solid.meet(o, d, t_max, active)
+        else:
+            met = meet_surface(self.prepared, o, d, t_max, active)
+        position = self.scale * self._to_world(met.position) + self.translation
+        return replace(
+            met,
+            t=self.scale * met.t,
+            position=position,
+            normal=self._to_world(met.normal),
+            clearance=self.scale * met.clearance,
+        )
+
+    def occludes(self, o: Vec3, d: Vec3, t_max: Real, active: Mask) -> Mask:
+        """Whether it lies on rays of the world; what is not proved free counts as lying there."""
+        o, d, t_max = self._local_ray(o, d, t_max)
+        if self.solid is not None:
+            return self.solid.occludes(o, d, t_max, active)
+        return self.prepared.occluded(o, d, 0, t_max, active)
+
+    def _local_ray(self, o: Vec3, d: Vec3, t_max: Real) -> tuple[Vec3, Vec3, Real]:
+        backend = self.prepared.backend
+        local = self._to_local(backend.Array3f(o) - self.translation) / self.scale
+        return local, self._to_local(d), backend.Float(t_max) / self.scale
+
+    def _to_world(self, v: Vec3) -> Vec3:
+        return self.prepared.backend.Array3f(*(dr.dot(row, v) for row in self.rows))
+
+    def _to_local(self, v: Vec3) -> Vec3:
+        x, y, z = self.prepared.backend.Array3f(v)
+        return self.rows[0] * x + self.rows[1] * y + self.rows[2] * z

@@ -1,0 +1,166 @@
+"""A small photo studio: ground, lights and a camera that frames what stands there.
+
+Surfaces are scaled to a stage of radius about 1 that stands on the ground z = 0, so that lights,
+shadows and tolerances of Mitsuba's rays suit every size.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from harnack.geometry.convex_volume import FloatArray
+from harnack.render.carrier import shape
+from harnack.render.framing import visible_points
+from harnack.render.placement import Placement
+from harnack.render.variant import mitsuba_backend
+
+if TYPE_CHECKING:
+    from harnack.render.materials import Material
+    from harnack.tracer import LevelSet
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A view of the stage.
+
+    azimuth, elevation: of the direction the camera looks from, in degrees; azimuth 0 is +x and
+        90 is +y, elevation 90 is straight from above.
+    fov: the larger of the horizontal and vertical angle of view, in degrees.
+    zoom: 1 frames the surface tightly with a margin; more comes closer.
+    turn: degrees by which the surface is turned about the x, y and z axes, in this order, before
+        it is put on the ground.
+    """
+
+    azimuth: float = -60.0
+    elevation: float = 28.0
+    fov: float = 26.0
+    zoom: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.fov < 170:
+            raise ValueError(f"fov must lie between 0 and 170 degrees, not {self.fov}")
+        if not 0 < self.zoom < math.inf:
+            raise ValueError(f"zoom must be positive, not {self.zoom}")
+        if not abs(self.elevation) <= 90:
+            raise ValueError(f"elevation must lie within -90 and 90 degrees, not {self.elevation}")
+
+    def frame(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Unit vectors of the world: to the right, up, and back to the camera."""
+        a, e = math.radians(self.azimuth), math.radians(self.elevation)
+        back = np.array([math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)])
+        right = np.array([-math.sin(a), math.cos(a), 0.0])
+        return right, np.cross(back, right), back
+
+    def fit(self, points: FloatArray, size: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+        """Origin and target such that all points (n, 3) are in the picture of (width, height).
+
+        Along each image axis the picture's edges are planes through the origin; the points'
+        supports in the directions of these planes' normals give origin and distance.
+        """
+        right, up, back = self.frame()
+        larger = max(size)
+        x, y, z = points @ right, points @ up, points @ back
+        origin = np.zeros(3)
+        distance = -math.inf
+        for across, axis, extent in ((x, right, size[0]), (y, up, size[1])):
+            slope = math.tan(math.radians(self.fov) / 2) * extent / larger * _FILLED
+            # |across - c| <= slope (distance - z) for all points.
+            high, low = (across + slope * z).max(), (across - slope * z).min()
+            origin = origin + (high + low) / 2 * axis
+            distance = max(distance, (high - low) / (2 * slope))
+        middle = float(z.max() + z.min()) / 2
+        origin = origin + (middle + (distance - middle) / self.zoom) * back
+        return origin, origin - back
+
+
+# The part of the picture that the surface fills at zoom 1.
+_FILLED = 0.86
+
+
+def studio(
+    mi: Any,
+    surfaces: Sequence[LevelSet],
+    materials: Sequence[Material],
+    *,
+    size: tuple[int, int],
+    camera: Camera,
+    max_depth: int,
+    bare: bool = False,
+) -> dict[str, Any]:
+    """A scene dictionary of surfaces on the stage.
+
+    bare: only surfaces and camera, without ground and lights.
+    """
+    backend = mitsuba_backend(mi)
+    points = np.concatenate([visible_points(surface, backend) for surface in surfaces])
+    placement = on_ground(points)
+    scene: dict[str, Any] = {
+        "type": "scene",
+        "integrator": {"type": "harnack_path", "max_depth": max_depth},
+        "sensor": _sensor(mi, camera, placement.apply(points), size),
+    }
+    for k, (surface, material) in enumerate(zip(surfaces, materials, strict=True)):
+        bsdf = material.bsdf(solid=surface.solid is not None)
+        scene[f"surface{k}"] = shape(surface, bsdf=bsdf, to_world=placement.matrix)
+    return scene if bare else {**scene, **_ground(mi), **_lights(mi)}
+
+
+def on_ground(points: FloatArray) -> Placement:
+    """Scales points (n, 3) to half a diagonal of 1 and puts them on the ground."""
+    lower, upper = points.min(axis=0), points.max(axis=0)
+    scale = 2.0 / max(float(np.linalg.norm(upper - lower)), 1e-30)
+    foot = np.array([*(lower + upper)[:2] / 2, lower[2]])
+    return Placement(scale, np.eye(3), -scale * foot)
+
+
+def _sensor(mi: Any, camera: Camera, points: FloatArray, size: tuple[int, int]) -> dict[str, Any]:
+    origin, target = camera.fit(points, size)
+    _, up, _ = camera.frame()
+    look = mi.ScalarTransform4f().look_at(
+        origin=origin.tolist(), target=target.tolist(), up=up.tolist()
+    )
+    return {
+        "type": "perspective",
+        "fov": camera.fov,
+        "fov_axis": "larger",
+        "near_clip": 1e-3,
+        "to_world": look,
+        "film": {
+            "type": "hdrfilm",
+            "width": size[0],
+            "height": size[1],
+            "rfilter": {"type": "gaussian"},
+            "pixel_format": "rgb",
+            "component_format": "float32",
+        },
+        "sampler": {"type": "independent"},
+    }
+
+
+def _ground(mi: Any) -> dict[str, Any]:
+    transform = mi.ScalarTransform4f().translate([0, 0, -0.002]).scale(80)
+    return {
+        "ground": {
+            "type": "disk",
+            "to_world": transform,
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.62, 0.61, 0.60]}},
+        }
+    }
+
+
+def _lights(mi: Any) -> dict[str, Any]:
+    look = mi.ScalarTransform4f().look_at
+    key = look(origin=[3.0, -2.2, 5.0], target=[0, 0, 0.3], up=[0, 0, 1]).scale(1.5)
+    return {
+        "key": {
+            "type": "rectangle",
+            "to_world": key,
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [9.0, 8.5, 7.8]}},
+        },
+        "fill": {"type": "constant", "radiance": {"type": "rgb", "value": [0.32, 0.36, 0.42]}},
+    }

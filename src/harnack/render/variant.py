@@ -1,0 +1,38 @@
+"""Mitsuba, imported when it is first needed, with a variant that our surfaces can be drawn in."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from typing import Any
+
+from harnack.backend import Backend, backend_of, choose_backend
+
+_USABLE = re.compile(r"(llvm|cuda)_ad_(mono|rgb|spectral)(_double)?")
+
+
+def load_mitsuba() -> Any:
+    """The `mitsuba` module, with a variant set.
+
+    A variant that was set before stays. If none was, it becomes cuda_ad_rgb or llvm_ad_rgb, as
+    `harnack.backend.choose_backend` finds a device.
+
+    Raises:
+        RuntimeError: the variant that is set has no vectorised arrays, or tracks polarisation.
+        LLVMNotFoundError: LLVM is wanted and there is none that Dr.Jit can work with.
+    """
+    mi = importlib.import_module("mitsuba")
+    if mi.variant() is None:
+        mi.set_variant(f"{choose_backend().name}_ad_rgb")
+    elif _USABLE.fullmatch(mi.variant()) is None:
+        raise RuntimeError(
+            f"the Mitsuba variant is {mi.variant()}, and surfaces are traced with Dr.Jit arrays "
+            "that have derivatives and no polarisation: call "
+            'mitsuba.set_variant("llvm_ad_rgb") or ("cuda_ad_rgb") before the scene is made'
+        )
+    return mi
+
+
+def mitsuba_backend(mi: Any) -> Backend:
+    """Our name for the arrays of the variant that is set."""
+    return backend_of(mi.Float(0))

@@ -1,0 +1,139 @@
+"""The longest steps that can be proved, by bisection in double precision on the host.
+
+Each is the place where an extremal function of the proof reaches a level, so a bound that steps
+further is wrong and one that steps less far gives something away. Nothing here is taken from
+`harnack.bounds` but the classes that say which proof is meant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import to_numpy
+from harnack.bounds import Bound, Caps, Classic, LipschitzStep, Slope
+from harnack.certify import BallCertificate, LipschitzCertificate
+from harnack.testing.poisson import FloatArray, cap_movement, kernel_movement, poles_movement
+
+if TYPE_CHECKING:
+    from harnack.certify import Certificate
+
+__all__ = ["exact_step", "on_host"]
+
+
+def exact_step(bound: Bound, certificate: Certificate, slope: FloatArray) -> FloatArray:
+    """The longest step (n,) that this proof allows from a certificate of NumPy arrays (n,).
+
+    No longer than the radius. Raises TypeError for a bound whose extremal functions are not
+    known here.
+    """
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        if isinstance(certificate, LipschitzCertificate):
+            if not isinstance(bound, LipschitzStep):
+                raise TypeError(f"no exact step is known for {type(bound).__name__}")
+            gap = np.minimum(certificate.gap_down, certificate.gap_up)
+            return np.minimum(gap / certificate.constant, certificate.radius)
+        for kind, fraction in _FRACTIONS.items():
+            if isinstance(bound, kind):
+                return certificate.radius * fraction(certificate, slope)
+    raise TypeError(f"no exact step is known for {type(bound).__name__}")
+
+
+def on_host(certificate: Certificate, lanes: int) -> Certificate:
+    """The same certificate with NumPy arrays (lanes,) in the place of numbers and Dr.Jit arrays."""
+
+    def host(value: object) -> FloatArray:
+        array = to_numpy(value) if dr.is_array_v(value) else np.asarray(value)
+        return np.broadcast_to(array.astype(np.float64), (lanes,))
+
+    if isinstance(certificate, LipschitzCertificate):
+        c = certificate
+        return LipschitzCertificate(
+            host(c.constant), host(c.radius), host(c.gap_down), host(c.gap_up)
+        )
+    b = certificate
+    return BallCertificate(
+        host(b.radius),
+        None if b.room_below is None else host(b.room_below),
+        None if b.room_above is None else host(b.room_above),
+        host(b.gap_down),
+        host(b.gap_up),
+        b.dimension,
+    )
+
+
+def largest_free(movement: Callable[[FloatArray], FloatArray], gap: FloatArray) -> FloatArray:
+    """The q in [0, 1] at which `movement` first exceeds the gap, which it does at most once."""
+    low, high = np.zeros_like(gap), np.ones_like(gap)
+    for _ in range(110):
+        middle = 0.5 * (low + high)
+        free = movement(middle) <= gap
+        low, high = np.where(free, middle, low), np.where(free, high, middle)
+    return low
+
+
+def _sides(c: BallCertificate) -> list[tuple[FloatArray, float, FloatArray, FloatArray]]:
+    """(u, sign, gap away from the end, gap towards it) of the positive functions u at p."""
+    sides: list[tuple[FloatArray, float, FloatArray, FloatArray]] = []
+    if c.room_below is not None:
+        sides.append((c.room_below, 1.0, c.gap_up, c.gap_down))
+    if c.room_above is not None:
+        sides.append((c.room_above, -1.0, c.gap_down, c.gap_up))
+    return sides
+
+
+def _classic(c: BallCertificate, slope: FloatArray) -> FloatArray:
+    """Point masses at the poles."""
+    del slope
+    best = np.zeros_like(c.radius)
+    for u, _, away, toward in _sides(c):
+        n = c.dimension
+        up = largest_free(lambda q, n=n, u=u: u * poles_movement(q, 1.0, n), away)
+        down = largest_free(lambda q, n=n, u=u: -u * poles_movement(q, -1.0, n), toward)
+        best = np.maximum(best, np.minimum(up, down))
+    return best
+
+
+def _slope(c: BallCertificate, slope: FloatArray) -> FloatArray:
+    """Two point masses at the poles; a ring of mass at one latitude."""
+    n = c.dimension
+    reach = {1.0: np.zeros_like(c.radius), -1.0: np.zeros_like(c.radius)}
+    for u, sign, away, toward in _sides(c):
+        m = np.where(u > 0, np.clip(sign * c.radius * slope / (n * u), -1, 1), 0.0)
+        chord = largest_free(lambda q, m=m, u=u: u * poles_movement(q, m, n), away)
+        jensen = largest_free(lambda q, m=m, u=u: -u * kernel_movement(q, m, n), toward)
+        reach[sign] = np.maximum(reach[sign], chord)
+        reach[-sign] = np.maximum(reach[-sign], jensen)
+    return np.minimum(reach[1.0], reach[-1.0])
+
+
+def _caps(c: BallCertificate, slope: FloatArray) -> FloatArray:
+    """Two caps on the axis, and all but two caps."""
+    assert c.room_below is not None
+    assert c.room_above is not None
+    span = c.room_below + c.room_above
+    reach: list[FloatArray] = []
+    for below, above, sign, gap in (
+        (c.room_below, c.room_above, 1.0, c.gap_up),
+        (c.room_above, c.room_below, -1.0, c.gap_down),
+    ):
+        p, rest = below / span, above / span
+        shift = np.where(rest > 0, sign * c.radius * slope / (3 * span * rest), 0.0)
+        shift = np.clip(shift, -p, p)
+        ahead, behind = p + shift, p - shift
+
+        def up(q: FloatArray, b: FloatArray = ahead, a: FloatArray = behind) -> FloatArray:
+            return span * (cap_movement(q, b, 3) + cap_movement(-q, a, 3))
+
+        reach.append(largest_free(up, gap))
+    return np.minimum(reach[0], reach[1])
+
+
+_FRACTIONS: dict[type[Bound], Callable[[BallCertificate, FloatArray], FloatArray]] = {
+    Classic: _classic,
+    Slope: _slope,
+    Caps: _caps,
+}

@@ -1,0 +1,156 @@
+"""Poisson integrals along an axis, in double precision on the host.
+
+A positive harmonic function on the unit ball of R^n is a Poisson integral of a positive measure
+on the sphere. Along an axis only the latitude s of its mass counts, s = 1 ahead and s = -1
+behind. Everything is written as a movement, the value at q minus that at the centre, free of
+cancellation at small q, and shares no formula with `harnack.bounds`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray: TypeAlias = npt.NDArray[np.float64]
+
+# Below this |q| the movement of a cap is a power series, whose terms fall like q^l.
+_SERIES_BELOW = 0.25
+_TERMS = 30
+
+
+def kernel_movement(q: npt.ArrayLike, s: npt.ArrayLike, dimension: int) -> FloatArray:
+    """P(q, s) - 1 with P = (1-q^2)/(1+q^2-2qs)^(n/2), for 0 <= q < 1 and -1 <= s <= 1."""
+    q, s = np.asarray(q, np.float64), np.asarray(s, np.float64)
+    near = (1 - q) ** 2 + 2 * q * (1 - s)  # accurate where q and s are near 1
+    log = np.where(q < 0.5, np.log1p(np.maximum(q * (q - 2 * s), -0.99)), np.log(near))
+    return np.expm1(np.log1p(-q * q) - 0.5 * dimension * log)
+
+
+def poles_movement(q: npt.ArrayLike, mean: npt.ArrayLike, dimension: int) -> FloatArray:
+    """(1+m)/2 P(q, 1) + (1-m)/2 P(q, -1) - 1.
+
+    With P(q, +-1) = exp(S +- D), S = (1-n/2) log(1-q^2) and D = n artanh(q), it is
+    exp(S) (cosh D + m sinh D) - 1.
+    """
+    q, m = np.asarray(q, np.float64), np.asarray(mean, np.float64)
+    log_square, odd = (1 - 0.5 * dimension) * np.log1p(-q * q), dimension * np.arctanh(q)
+    # cosh D + m sinh D - 1 in two ways: the second does not cancel near m = -1.
+    plain = 2 * np.sinh(0.5 * odd) ** 2 + m * np.sinh(odd)
+    near_minus_one = (1 + m) * np.sinh(odd) + np.expm1(-odd)
+    rest = np.where(m < -0.5, near_minus_one, plain)
+    return np.expm1(log_square) + np.exp(log_square) * rest
+
+
+def cap_mass(height: npt.ArrayLike, dimension: int) -> FloatArray:
+    """The share of the sphere in the cap s >= 1 - height, 0 <= height <= 2."""
+    b = np.asarray(height, np.float64)
+    if dimension == 3:
+        return 0.5 * b
+    angle = _cap_angle(b)
+    if dimension == 2:
+        return angle / math.pi
+    return (angle - np.sin(angle) * np.cos(angle)) / math.pi
+
+
+def cap_slope(height: npt.ArrayLike, dimension: int) -> FloatArray:
+    """The derivative of `cap_movement` at q = 0."""
+    b = np.asarray(height, np.float64)
+    if dimension == 3:
+        return 0.75 * b * (2 - b)
+    sine = np.sin(_cap_angle(b))
+    return 2 / math.pi * sine if dimension == 2 else 8 / (3 * math.pi) * sine**3
+
+
+def cap_movement(q: npt.ArrayLike, height: npt.ArrayLike, dimension: int) -> FloatArray:
+    """The Poisson integral at q of the cap's indicator, minus `cap_mass`; -1 < q < 1.
+
+    A cap behind is a cap ahead with -q.
+    """
+    q, b = np.broadcast_arrays(np.asarray(q, np.float64), np.asarray(height, np.float64))
+    small = np.abs(q) < _SERIES_BELOW
+    series = _cap_series(np.where(small, q, 0.0), b, dimension)
+    closed = _cap_closed(np.where(small, 0.5, q), b, dimension) - cap_mass(b, dimension)
+    return np.where(small, series, closed)
+
+
+def _cap_angle(height: FloatArray) -> FloatArray:
+    return 2 * np.arcsin(np.sqrt(np.clip(0.5 * height, 0, 1)))
+
+
+def _cap_series(q: FloatArray, b: FloatArray, dimension: int) -> FloatArray:
+    """Sum of c_l q^l, l >= 1: the expansion of P in Gegenbauer polynomials, integrated.
+
+    n = 3: the integral of P_l over [s, 1] is (1-s^2) P_l'(s)/(l(l+1)), and P_{l+1}' =
+    P_{l-1}' + (2l+1) P_l.
+    """
+    total, power = np.zeros_like(q), np.ones_like(q)
+    angle, s = _cap_angle(b), 1 - b
+    p0, p1 = np.ones_like(s), s
+    d0, d1 = np.zeros_like(s), np.ones_like(s)
+    for degree in range(1, _TERMS + 1):
+        power = power * q
+        k = 2 * degree + 1
+        if dimension == 2:
+            c = 2 / math.pi * np.sin(degree * angle) / degree
+        elif dimension == 3:
+            c = 0.5 * k / (degree * (degree + 1)) * b * (2 - b) * d1
+            d0, d1 = d1, d0 + k * p1
+            p0, p1 = p1, (k * s * p1 - degree * p0) / (degree + 1)
+        else:
+            ends = np.sin(degree * angle) / degree - np.sin((degree + 2) * angle) / (degree + 2)
+            c = (degree + 1) / math.pi * ends
+        total = total + c * power
+    return total
+
+
+def _cap_closed(q: FloatArray, b: FloatArray, dimension: int) -> FloatArray:
+    if dimension == 3:  # the integral of (1-q^2)/2 (1+q^2-2qs)^(-3/2) over [1-b, 1]
+        s = np.sqrt((1 - q) ** 2 + 2 * q * b)
+        return b * (1 + q) / (s * (s + 1 - q))
+    angle = _cap_angle(b)
+    if dimension == 2:
+        return 2 / math.pi * np.arctan2((1 + q) * np.sin(angle / 2), (1 - q) * np.cos(angle / 2))
+    # n = 4: the sums over j of q^j sin(j angle) and of q^j sin(j angle)/j.
+    z = q * np.exp(1j * angle)
+    plain, over_j = (z / (1 - z)).imag, -np.log(1 - z).imag
+    return (angle + plain + over_j - (plain - over_j) / (q * q)) / math.pi
+
+
+@dataclass(frozen=True)
+class AxialFunctions:
+    """Harmonic functions u on balls of R^n along an axis, one a row.
+
+    kind: "points" for rings of point masses at latitudes `places`, "caps" for boundary values
+        that are sums of indicators of caps of heights `places`.
+    places, weights: (rows, k). In kind "points" the weights are masses, >= 0.
+    radius: (rows,) of the balls.
+    """
+
+    kind: str
+    places: FloatArray
+    weights: FloatArray
+    radius: FloatArray
+    dimension: int
+
+    @property
+    def slope(self) -> FloatArray:
+        """(rows,) derivative along the axis at the centre."""
+        if self.kind == "points":
+            each = self.dimension * self.places
+        else:
+            each = cap_slope(self.places, self.dimension)
+        return (self.weights * each).sum(axis=1) / self.radius
+
+    def movement(self, t: FloatArray) -> FloatArray:
+        """u(t) - u(0) at distances t (rows, m) along the axis, 0 <= t < radius: (rows, m)."""
+        q = t / self.radius[:, None]
+        total = np.zeros_like(q)
+        for j in range(self.places.shape[1]):
+            place, weight = self.places[:, j, None], self.weights[:, j, None]
+            each = kernel_movement if self.kind == "points" else cap_movement
+            total += weight * each(q, place, self.dimension)
+        return total
