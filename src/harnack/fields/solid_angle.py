@@ -12,9 +12,10 @@ import numpy.typing as npt
 
 from harnack.backend import backend_of, to_numpy
 from harnack.fields.edge_angles import differentiable_angle
+from harnack.fields.edge_extent import tight_extent
 from harnack.fields.edge_sums import EdgeBuffer, EdgeSums, sum_over_edges, upload
 from harnack.fields.field import Field, HarmonicBall, Sample
-from harnack.geometry import Box, ConvexHull, is_convex_position, validate_loops
+from harnack.geometry import ConvexHull, is_convex_position, total_length, validate_loops
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
@@ -75,6 +76,7 @@ class SolidAngle(Field):
         self._centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
         self._size = float(np.linalg.norm(points - self._centre, axis=1).max())
         self._device: _OnDevice | None = None
+        self._extents: dict[tuple[float, ...], Volume | None] = {}
 
     def _choose(self, asked: CertificateName) -> Literal["edges", "range"]:
         if asked == "auto":
@@ -148,8 +150,14 @@ class SolidAngle(Field):
         cut into simple loops, bounds |area| <= 2 pi - sqrt(4 pi^2 - t^2) =: phi(t) (isoperimetry
         on the sphere; phi is convex with phi(0) = 0, so the pieces add up to at most phi of the
         whole). So |Omega| < l wherever L/rho < sqrt(l (4 pi - l)): a level at distance l from
-        the multiples of 4 pi lies within rho = L/sqrt(l (4 pi - l)) of the curves.
+        the multiples of 4 pi lies within rho = L/sqrt(l (4 pi - l)) of the curves. Cells of that
+        box that are proved to hold no level are then cut away (`tight_extent`).
         """
+        if levels not in self._extents:
+            self._extents[levels] = self._extent(levels)
+        return self._extents[levels]
+
+    def _extent(self, levels: tuple[float, ...]) -> Volume | None:
         points = np.concatenate(self.loops)
         away = [abs(math.remainder(float(level), _PERIOD)) for level in levels]
         nearest = min(away)
@@ -157,9 +165,8 @@ class SolidAngle(Field):
             return None
         if self.convex_position and nearest > 2 * math.pi * (1 - 1e-9):
             return ConvexHull.of(points).padded(1e-4 * self._size)
-        length = sum(float(np.linalg.norm(np.roll(v, -1, 0) - v, axis=1).sum()) for v in self.loops)
-        reach = 1.0001 * length / math.sqrt(nearest * (_PERIOD - nearest))
-        return Box(points.min(axis=0), points.max(axis=0)).padded(reach)
+        reach = 1.0001 * total_length(self.loops) / math.sqrt(nearest * (_PERIOD - nearest))
+        return tight_extent(self.loops, points.min(axis=0) - reach, points.max(axis=0) + reach, levels)
 
     def describe(self) -> dict[str, Any]:
         return {

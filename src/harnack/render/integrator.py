@@ -80,7 +80,8 @@ class PathTracer:
     def _vertex(self, world: World, path: _Path, sampler: Any) -> _Path:
         """Finds the next vertex of paths, collects its light and samples where to go on."""
         mi = self.mi
-        si, clearance, lost = world.intersect(path.ray, False, path.active)
+        si, met = world.intersect(path.ray, path.active)
+        clearance, lost = met.clearance, met.lost
         radiance = path.radiance + self._emitted(world.scene, path, si, path.active & ~lost)
         shown = path.throughput * mi.Spectrum(self.lost_colour.eval(si, lost))
         radiance += dr.select(path.active & lost, shown, 0)

@@ -127,11 +127,11 @@ class PlacedSurface:
     def _local_ray(self, o: Vec3, d: Vec3, t_max: Real) -> tuple[Vec3, Vec3, Real]:
         backend = self.prepared.backend
         local = self._to_local(backend.Array3f(o) - self.translation) / self.scale
-        return local, self._to_local(d), backend.Float(t_max) / self.scale
+        return local, self._to_local(backend.Array3f(d)), backend.Float(t_max) / self.scale
 
     def _to_world(self, v: Vec3) -> Vec3:
         return self.prepared.backend.Array3f(*(dr.dot(row, v) for row in self.rows))
 
     def _to_local(self, v: Vec3) -> Vec3:
-        x, y, z = self.prepared.backend.Array3f(v)
+        x, y, z = v
         return self.rows[0] * x + self.rows[1] * y + self.rows[2] * z

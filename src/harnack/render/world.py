@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 
+from harnack.backend import Mask
 from harnack.render.carrier import is_carrier
+from harnack.render.encounter import Encounter
 from harnack.render.interaction import surface_interaction
-
-if TYPE_CHECKING:
-    from harnack.backend import Mask, Real
+from harnack.render.variant import mitsuba_backend
 
 
 @dataclass(frozen=True)
@@ -27,26 +27,36 @@ class World:
         """Finds the carriers in a scene."""
         return cls(mi, scene, tuple(s for s in scene.shapes() if is_carrier(s)))
 
-    def intersect(self, ray: Any, coherent: bool, active: Mask) -> tuple[Any, Real, Mask]:
-        """The first thing that rays meet: (interaction, clearance, lost).
+    def intersect(self, ray: Any, active: Mask) -> tuple[Any, Encounter]:
+        """The first thing that rays meet, as interaction and as encounter.
 
-        clearance: how far off the surface the next ray has to start, at least.
-        lost: the ray ran out of steps before anything that is known to be there; its
-            interaction is not valid.
+        Where the encounter is lost (the ray ran out of steps before anything that is known to be
+        there) the interaction is not valid.
         """
         mi = self.mi
-        si = self.scene.ray_intersect(ray, mi.RayFlags.All, coherent, active)
-        nearest = dr.minimum(si.t, ray.maxt)
-        clearance, lost = mi.Float(0), mi.Bool(False)
+        si = self.scene.ray_intersect(ray, mi.RayFlags.All, False, active)
+        first = self._of_scene(si, active)
+        limit = dr.minimum(si.t, ray.maxt)
         for carrier in self.carriers:
-            met = carrier.placed.meet(ray.o, ray.d, nearest, active)
-            ours = surface_interaction(mi, met, ray, mi.ShapePtr(carrier))
+            met = carrier.placed.meet(ray.o, ray.d, limit, active)
+            evaluations = first.evaluations + met.evaluations
             event = met.met | met.lost
-            si = dr.select(event, ours, si)
-            clearance = dr.select(met.met, met.clearance, clearance)
-            lost = (lost & ~event) | met.lost
-            nearest = dr.select(event, met.t, nearest)
-        return si, clearance, lost
+            si = dr.select(event, surface_interaction(mi, met, ray, mi.ShapePtr(carrier)), si)
+            first = replace(dr.select(event, met, first), evaluations=evaluations)
+            limit = dr.select(event, met.t, limit)
+        return si, first
+
+    def _of_scene(self, si: Any, active: Mask) -> Encounter:
+        mi, vector = self.mi, mitsuba_backend(self.mi).Array3f
+        return Encounter(
+            t=si.t,
+            met=active & si.is_valid(),
+            lost=mi.Bool(False),
+            position=vector(si.p),
+            normal=vector(si.n),
+            clearance=mi.Float(0),
+            evaluations=mi.UInt32(0),
+        )
 
     def occluded(self, ray: Any, active: Mask) -> Mask:
         """Whether anything lies on the rays. What is not proved free counts as lying there."""

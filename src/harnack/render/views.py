@@ -1,0 +1,127 @@
+"""Pictures of what the tracer did: normals, evaluations, status, depth. One ray a pixel.
+
+All of them are exact, not averaged: the ray goes through the middle of the pixel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import numpy.typing as npt
+
+from harnack.backend import to_numpy
+from harnack.render.colormap import viridis
+from harnack.render.images import as_bytes
+from harnack.render.integrator import LOST_COLOUR
+from harnack.render.world import World
+from harnack.tracer import Status
+
+FloatArray = npt.NDArray[np.floating[Any]]
+
+_BACKGROUND = (0.10, 0.10, 0.11)
+_STATUS_COLOURS = {
+    Status.MISS: _BACKGROUND,
+    Status.HIT: (0.93, 0.93, 0.90),
+    Status.OUT_OF_STEPS: LOST_COLOUR,
+}
+
+
+@dataclass(frozen=True)
+class View:
+    """First hits of the rays through the middles of all pixels.
+
+    depth: (h, w) distance from the camera, inf where nothing is met. Where the ray ran out of
+        steps, how far it is proved free.
+    normal: (h, w, 3) unit, zero where nothing is met; of a level set it points to larger values.
+    evaluations: (h, w) of all the scene's fields.
+    status: (h, w) a `Status`; shapes of Mitsuba count as hits.
+    """
+
+    depth: FloatArray
+    normal: FloatArray
+    evaluations: npt.NDArray[np.int64]
+    status: npt.NDArray[np.int64]
+
+
+def look(mi: Any, scene: Any, sensor: Any) -> View:
+    """What a sensor sees first."""
+    width, height = (int(n) for n in sensor.film().crop_size())
+    ray = _middle_rays(mi, sensor, width, height)
+    _, first = World.of(mi, scene).intersect(ray, mi.Bool(True))
+    dr.eval(first)
+
+    def image(values: Any) -> Any:
+        flat = to_numpy(values)
+        return np.broadcast_to(flat, (width * height, *flat.shape[1:])).reshape(
+            height, width, *flat.shape[1:]
+        )
+
+    status = np.where(image(first.met), int(Status.HIT), int(Status.MISS))
+    status = np.where(image(first.lost), int(Status.OUT_OF_STEPS), status)
+    normal = np.where(image(first.met)[..., None], image(first.normal), 0)
+    evaluations = image(first.evaluations).astype(np.int64)
+    return View(image(first.t).copy(), normal, evaluations, status)
+
+
+def _middle_rays(mi: Any, sensor: Any, width: int, height: int) -> Any:
+    index = dr.arange(mi.UInt32, width * height)
+    pixel = mi.Vector2f(index % width, index // width)
+    place = (pixel + 0.5) / mi.ScalarVector2f(width, height)
+    ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, mi.Point2f(place), mi.Point2f(0.5))
+    return mi.Ray3f(ray)
+
+
+def normal_picture(view: View) -> npt.NDArray[np.uint8]:
+    """x, y, z from [-1, 1] as red, green, blue."""
+    met = (view.status == int(Status.HIT))[..., None]
+    return _with_lost(view, np.where(met, 0.5 + 0.5 * view.normal, _BACKGROUND))
+
+
+def depth_picture(view: View) -> npt.NDArray[np.uint8]:
+    """Near is bright, far is dark."""
+    met = view.status == int(Status.HIT)
+    if not met.any():
+        return _with_lost(view, np.broadcast_to(_BACKGROUND, (*view.depth.shape, 3)))
+    near, far = view.depth[met].min(), view.depth[met].max()
+    level = (far - np.where(met, view.depth, far)) / max(far - near, 1e-6 * far, 1e-30)
+    grey = np.where(met, 0.25 + 0.75 * level, 0.0)[..., None]
+    return _with_lost(view, np.where(met[..., None], grey, _BACKGROUND))
+
+
+def evaluations_picture(view: View) -> npt.NDArray[np.uint8]:
+    """Zero is dark blue; the 99.5th percentile, and all above it, is yellow."""
+    top = max(float(np.percentile(view.evaluations, 99.5)), 1.0)
+    return _with_lost(view, viridis(view.evaluations / top))
+
+
+def status_picture(view: View) -> npt.NDArray[np.uint8]:
+    """Misses dark, hits white, out of steps magenta."""
+    picture = np.zeros((*view.status.shape, 3))
+    for status, colour in _STATUS_COLOURS.items():
+        picture[view.status == int(status)] = colour
+    return as_bytes(picture)
+
+
+def _with_lost(view: View, picture: FloatArray) -> npt.NDArray[np.uint8]:
+    lost = (view.status == int(Status.OUT_OF_STEPS))[..., None]
+    return as_bytes(np.where(lost, LOST_COLOUR, picture))
+
+
+@dataclass(frozen=True)
+class Show:
+    """What to take from a view as numbers, and how to draw it."""
+
+    numbers: Callable[[View], Any]
+    picture: Callable[[View], npt.NDArray[np.uint8]]
+
+
+VIEWS = {
+    "normal": Show(lambda view: view.normal, normal_picture),
+    "evaluations": Show(lambda view: view.evaluations, evaluations_picture),
+    "status": Show(lambda view: view.status, status_picture),
+    "depth": Show(lambda view: view.depth, depth_picture),
+}
