@@ -41,8 +41,8 @@ class _SolidHarmonics(Field):
     ball of radius |p| + R about the origin, where `BallRange` bounds the polynomial. The paper
     takes the fixed ball |y| <= 1.25 size; near level 0 a step loses to the second-order term of
     the bound, proportional to (range on |y| <= |p|+R)/R^2, so R is chosen to make that least:
-    2|p|/(l-2) for a single degree l > 2. In traces of Y_(8,4) this took 18.6 evaluations a ray
-    with the slope bound, the fixed ball 30 (25 at best, for 1.1), of Y_(12,5) 24 and 61.
+    2|p|/(l-2) for a single degree l > 2. With the slope bound Y_(8,4) took 19 evaluations a ray,
+    with the fixed ball 30 (27 at best, for 1.15); Y_(12,5) took 24 and 61 (50).
     """
 
     def __init__(self, weights: Weights, known: BallRange, size: float, domain: Volume) -> None:

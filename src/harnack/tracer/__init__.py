@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from harnack.tracer.hits import Hits, trace
-from harnack.tracer.level_set import LevelSet, level_set
+from harnack.tracer.surface import LevelSet, level_set
 from harnack.tracer.march import PreparedLevelSet, Trace
 from harnack.tracer.tolerance import Status, Tolerance
 

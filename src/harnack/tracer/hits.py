@@ -11,7 +11,7 @@ import numpy as np
 
 from harnack.backend import backend_of, choose_backend, to_float, to_numpy, to_vector3
 from harnack.tracer.derivatives import attach, wants_derivatives
-from harnack.tracer.level_set import LevelSet, level_set
+from harnack.tracer.surface import LevelSet, level_set
 from harnack.tracer.tolerance import Status, Tolerance
 
 if TYPE_CHECKING:

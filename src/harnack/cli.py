@@ -1,0 +1,187 @@
+"""The command line: arguments to calls to files."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from harnack._version import __version__
+from harnack.backend import doctor
+from harnack.fields import SolidAngle
+from harnack.gallery import SCENES, Scene
+from harnack.geometry import read_loops
+from harnack.render import MATERIALS, SHOW_MODES, render
+
+_CURVES = (".obj", ".ply", ".loops")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; 0 on success, 1 for what went wrong, 2 for wrong usage, 130 for Ctrl-C."""
+    options = _parser().parse_args(arguments)
+    errors = Console(stderr=True)
+    try:
+        return int(options.run(options))
+    except KeyboardInterrupt:
+        errors.print("stopped; nothing was written for the picture in progress")
+        return 130
+    except (ValueError, TypeError, OSError, RuntimeError) as error:
+        errors.print(f"[bold red]error:[/] {error}", highlight=False, soft_wrap=True)
+        return 1
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="harnack", description="Guaranteed ray tracing of harmonic and other surfaces."
+    )
+    parser.add_argument("--version", action="version", version=f"harnack {__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    one = commands.add_parser(
+        "render", help="draw one picture",
+        description="Draw a gallery scene, the surface spanned by the curves of a file (.obj, "
+        ".ply, .loops), or a Mitsuba scene (.xml).",
+    )  # fmt: skip
+    one.add_argument("scene", metavar="SCENE", help="a name from `harnack gallery --list`, or a file")
+    one.add_argument("-o", "--output", metavar="FILE", help="picture, .png or .exr (SCENE.png)")
+    one.add_argument("--level", type=parse_level, help="level to draw; pi is understood: 2pi, pi/2")
+    one.add_argument("--material", choices=sorted(MATERIALS), help="what it is made of")
+    one.add_argument("--show", choices=SHOW_MODES, help="what to draw (color)")
+    one.add_argument(
+        "--boundary", action="store_true", help="take the boundary of a file's faces as the curves"
+    )
+    _add_quality(one)
+    one.set_defaults(run=_render)
+    many = commands.add_parser("gallery", help="draw or list the named scenes")
+    many.add_argument("names", nargs="*", metavar="NAME", help="scenes to draw (all)")
+    many.add_argument("--list", action="store_true", help="list them and draw nothing")
+    many.add_argument("--demo", action="store_true", help="draw only those of `make demo`")
+    many.add_argument("-o", "--output", metavar="FOLDER", default="out", help="folder (out)")
+    _add_quality(many)
+    many.set_defaults(run=_gallery)
+    check = commands.add_parser("doctor", help="say what is installed, what works, what is missing")
+    check.set_defaults(run=_doctor)
+    return parser
+
+
+def _add_quality(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--size", type=parse_size, metavar="WxH", help="pixels (800x600)")
+    parser.add_argument("--spp", type=_positive, metavar="N", help="samples a pixel (64)")
+    parser.add_argument("--seed", type=int, default=0, help="another seed, other noise (0)")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """"800x600" as (800, 600)."""
+    match = re.fullmatch(r"(\d+)x(\d+)", text)
+    if not match:
+        raise argparse.ArgumentTypeError(f"{text!r} is no size; write it as 800x600")
+    width, height = int(match[1]), int(match[2])
+    if not (0 < width <= 16384 and 0 < height <= 16384):
+        raise argparse.ArgumentTypeError(f"{text}: each side must be 1 to 16384 pixels")
+    return width, height
+
+
+def parse_level(text: str) -> float:
+    """A number, or a multiple of pi such as "2pi", "1.5*pi", "-pi/2"."""
+    match = re.fullmatch(r"([+-]?[\d.]*(?:e[+-]?\d+)?)\s*\*?\s*(pi)?\s*(?:/\s*([\d.]+))?", text.strip())
+    try:
+        if not match:
+            raise ValueError
+        head, has_pi, below = match.groups()
+        if head in ("", "+", "-"):
+            if not has_pi:
+                raise ValueError
+            head += "1"
+        return float(head) * (math.pi if has_pi else 1.0) / float(below or 1.0)
+    except (ValueError, ZeroDivisionError):
+        raise argparse.ArgumentTypeError(f"{text!r} is no level; write 0.5, 2pi or pi/3") from None
+
+
+def _positive(text: str) -> int:
+    number = int(text) if text.isdigit() else 0
+    if not 1 <= number <= 1_000_000:
+        raise argparse.ArgumentTypeError(f"{text!r} must be a number from 1 to 1000000")
+    return number
+
+
+def _quality(options: Any) -> dict[str, Any]:
+    asked = {"size": options.size, "spp": options.spp}
+    chosen = {name: value for name, value in asked.items() if value is not None}
+    return {**chosen, "seed": options.seed, "progress": not options.quiet}
+
+
+def _render(options: Any) -> int:
+    source = Path(options.scene)
+    target = Path(options.output or f"{source.stem}.png")
+    settings = _quality(options)
+    if options.show is not None:
+        settings["show"] = options.show
+    if options.scene in SCENES:
+        _draw_scene(SCENES[options.scene], target, options, settings)
+    elif source.suffix.lower() == ".xml":
+        if options.level is not None or options.material is not None:
+            raise ValueError("level and material of a Mitsuba scene are set in its own file")
+        if not source.is_file():
+            raise ValueError(f"there is no file {source}")
+        render(str(source), target, **settings)
+    elif source.suffix.lower() in _CURVES:
+        field = SolidAngle(read_loops(source, boundary=options.boundary))
+        said = ", ".join(f"{key}: {value}" for key, value in field.describe().items())
+        Console().print(f"{source}: {said}", highlight=False)
+        render(field, target, level=options.level, material=options.material, **settings)
+    else:
+        raise ValueError(
+            f"{options.scene!r} is no scene: give a name from `harnack gallery --list`, a curve "
+            f"file ({', '.join(_CURVES)}) or a Mitsuba scene (.xml)"
+        )
+    Console().print(f"wrote {target}", highlight=False)
+    return 0
+
+
+def _draw_scene(scene: Scene, target: Path, options: Any, settings: dict[str, Any]) -> None:
+    if options.material is not None:
+        settings["material"] = options.material
+    if options.level is not None:
+        surfaces = scene.surfaces()
+        if len(surfaces) != 1 or surfaces[0].solid is not None:
+            raise ValueError(f"scene {scene.name} has levels of its own; --level does not apply")
+        settings["level"] = options.level
+    scene.render(target, **settings)
+
+
+def _gallery(options: Any) -> int:
+    console = Console()
+    if options.list:
+        for scene in SCENES.values():
+            console.print(f"[bold]{scene.name:16}[/]{scene.title}", highlight=False)
+        return 0
+    for name in options.names:
+        if name not in SCENES:
+            raise ValueError(f"no scene is named {name!r}; there are {', '.join(SCENES)}")
+    wanted = [SCENES[name] for name in options.names] or list(SCENES.values())
+    if options.demo:
+        wanted = [scene for scene in wanted if scene.in_demo]
+    folder = Path(options.output)
+    folder.mkdir(parents=True, exist_ok=True)
+    for index, scene in enumerate(wanted, start=1):
+        console.print(f"{index}/{len(wanted)} [bold]{scene.name}[/]: {scene.title}", highlight=False)
+        target = folder / f"{scene.name}.png"
+        scene.render(target, **_quality(options))
+        console.print(f"    {target}", highlight=False)
+    console.print(f"{len(wanted)} pictures in {folder.resolve()}", highlight=False)
+    return 0
+
+
+def _doctor(options: Any) -> int:
+    del options
+    return 0 if doctor.render_report(Console()) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
