@@ -30,6 +30,7 @@ from harnack.fields import (
     cosine,
     sine,
 )
+from harnack.fields.field import Curvature
 from harnack.fields.solid_harmonics import evaluate, from_monomials
 from harnack.fields.sphere_range import BallRange, proved_range, range_of_harmonic, unit_sphere
 from harnack.geometry import Ball, Box, HalfSpace
@@ -384,6 +385,28 @@ def test_lipschitz_constants_keep_their_promise(name: str) -> None:
             step = float(promise.radius) * u
             change = np.abs(value(field, p[i] + step) - f[i])
             assert (change <= constant[i] * np.linalg.norm(step, axis=1) + 1e-12).all()
+
+
+@pytest.mark.parametrize("name", [n for n in FIELDS if n != "Y_00"])
+def test_curvature_keeps_its_promise(name: str) -> None:
+    field = FIELDS[name]
+    p = points_in(field, 200)
+    f, g = value(field, p), gradient(field, p)
+    known = [k for k in field.evaluate(to_vector3(DOUBLE, p)).known if isinstance(k, Curvature)]
+    assert known
+    u = on_unit_sphere(2000) * np.random.default_rng(1).random(2000)[:, None]
+    # A global promise is tried on a few periods.
+    scale = 6 / field.curvature**0.5 if isinstance(field, EigenfunctionSum) else 1.0
+    for promise in known:
+        constant, radius = (
+            to_numpy(v) + np.zeros(len(p)) if dr.is_array_v(type(v)) else np.full(len(p), v)
+            for v in (promise.constant, promise.radius)
+        )
+        radius = np.where(np.isfinite(radius), radius, scale)
+        for i in range(len(p)):
+            y = radius[i] * u
+            off = np.abs(value(field, p[i] + y) - f[i] - y @ g[i])
+            assert (off <= 0.5 * constant[i] * np.sum(y * y, axis=1) + 1e-12).all()
 
 
 @pytest.mark.parametrize("name", PERIODIC)

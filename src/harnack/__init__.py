@@ -9,8 +9,25 @@ from __future__ import annotations
 # First of all imports: it decides which LLVM Dr.Jit loads, which happens on `import drjit`.
 from harnack import backend
 from harnack._version import __version__
-from harnack.bounds import Bound, Caps, Classic, LipschitzStep, Longest, Slope
-from harnack.fields import Field, HarmonicBall, Lipschitz, Sample, SolidAngle
+from harnack.bounds import Bound, Caps, Classic, CurvatureStep, LipschitzStep, Longest, Slope
+from harnack.fields import (
+    Curvature,
+    EigenfunctionSum,
+    Field,
+    Gyroid,
+    HarmonicBall,
+    HarmonicPolynomial,
+    Lipschitz,
+    PlaneWave,
+    Product,
+    Sample,
+    SchwarzD,
+    SchwarzP,
+    SolidAngle,
+    SphericalHarmonic,
+    cosine,
+    sine,
+)
 from harnack.geometry import Ball, Box, ConvexHull, HalfSpace, Intersection
 from harnack.tracer import Hits, LevelSet, Status, Tolerance, level_set, trace
 
@@ -21,22 +38,34 @@ __all__ = [
     "Caps",
     "Classic",
     "ConvexHull",
+    "Curvature",
+    "CurvatureStep",
+    "EigenfunctionSum",
     "Field",
+    "Gyroid",
     "HalfSpace",
     "HarmonicBall",
+    "HarmonicPolynomial",
     "Hits",
     "Intersection",
     "LevelSet",
     "Lipschitz",
     "LipschitzStep",
     "Longest",
+    "PlaneWave",
+    "Product",
     "Sample",
+    "SchwarzD",
+    "SchwarzP",
     "Slope",
     "SolidAngle",
+    "SphericalHarmonic",
     "Status",
     "Tolerance",
     "__version__",
     "backend",
+    "cosine",
     "level_set",
+    "sine",
     "trace",
 ]

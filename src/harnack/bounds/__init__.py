@@ -5,15 +5,26 @@ from __future__ import annotations
 from harnack.bounds.bound import Bound
 from harnack.bounds.caps import Caps
 from harnack.bounds.classic import Classic
+from harnack.bounds.curvature import CurvatureStep
 from harnack.bounds.lipschitz import LipschitzStep
 from harnack.bounds.longest import Longest
 from harnack.bounds.slope import Slope
 
-__all__ = ["Bound", "Caps", "Classic", "LipschitzStep", "Longest", "Slope", "choose_bound"]
+__all__ = [
+    "Bound",
+    "Caps",
+    "Classic",
+    "CurvatureStep",
+    "LipschitzStep",
+    "Longest",
+    "Slope",
+    "choose_bound",
+]
 
 _NAMED: dict[str, tuple[Bound, ...]] = {
     "classic": (Classic(), LipschitzStep()),
     "slope": (Slope(), LipschitzStep()),
+    "curvature": (CurvatureStep(), Caps(), Slope(), LipschitzStep()),
     "caps": (Caps(), Slope(), LipschitzStep()),
     "lipschitz": (LipschitzStep(),),
 }
@@ -22,14 +33,15 @@ _NAMED: dict[str, tuple[Bound, ...]] = {
 def choose_bound(bound: str | Bound | Longest | None = None) -> Longest:
     """The bound asked for: a name, a `Bound`, a `Longest`, or None for the sharpest known.
 
-    Names: "classic" (the published rule), "slope", "caps" (the default: caps where both ends
-    are known, the slope bound elsewhere) and "lipschitz". Raises ValueError for another name.
+    Names: "classic" (the published rule), "slope", "caps" (caps where both ends are known, the
+    slope bound elsewhere), "lipschitz", and "curvature" (the default: Taylor's formula alone
+    where second derivatives are bounded, else as "caps"). Raises ValueError for another name.
     """
     if isinstance(bound, Longest):
         return bound
     if isinstance(bound, Bound):
         return Longest((bound,))
-    name = "caps" if bound is None else bound
+    name = "curvature" if bound is None else bound
     if name not in _NAMED:
         raise ValueError(f"unknown bound {bound!r}; choose one of {', '.join(sorted(_NAMED))}")
     return Longest(_NAMED[name])

@@ -9,7 +9,7 @@ with the slope turned round, so it costs one evaluation of the proof and no solv
 from __future__ import annotations
 
 import abc
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real
@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 
 class Bound(abc.ABC):
     """A safe step from a certificate. Knows no field and no ray, only values and a slope."""
+
+    sufficient: ClassVar[bool] = False
+    """Whether a certificate that this bound accepts makes others not worth asking."""
 
     @abc.abstractmethod
     def accepts(self, certificate: Certificate) -> bool:

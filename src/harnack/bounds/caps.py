@@ -10,8 +10,8 @@ import drjit as dr
 from harnack.backend.extrema import clamp, fmin
 
 from harnack.bounds.bound import Bound
-from harnack.bounds.classic import fraction
 from harnack.bounds.solve import LARGEST_FRACTION, largest_covered
+from harnack.bounds.start import safe_starts
 from harnack.certify import BallCertificate, Certificate
 
 if TYPE_CHECKING:
@@ -55,10 +55,10 @@ class Caps(Bound):
     def step(self, certificate: Certificate, slope: Real) -> Real:
         assert isinstance(certificate, BallCertificate)
         up, down = _movements(certificate, slope)
-        start = fraction(certificate)
+        from_up, from_down = safe_starts(certificate, slope)
         q = fmin(
-            largest_covered(up, certificate.gap_up, start, self.rounds),
-            largest_covered(down, certificate.gap_down, start, self.rounds),
+            largest_covered(up, certificate.gap_up, from_up, self.rounds),
+            largest_covered(down, certificate.gap_down, from_down, self.rounds),
         )
         return q * certificate.radius
 

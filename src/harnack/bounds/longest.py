@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import drjit as dr
-
 from harnack.backend.extrema import fmax
 
 if TYPE_CHECKING:
@@ -33,6 +31,8 @@ class Longest:
                 if bound.accepts(certificate):
                     chosen.append((bound, certificate))
                     break
+        if any(bound.sufficient for bound, _ in chosen):
+            chosen = [pair for pair in chosen if pair[0].sufficient]
         if not chosen:
             names = ", ".join(type(b).__name__ for b in self.bounds)
             kinds = ", ".join(type(c).__name__ for c in certificates) or "none"

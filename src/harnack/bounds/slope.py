@@ -6,7 +6,6 @@ convex function: a point mass ring at one latitude, and two point masses at the 
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -15,12 +14,14 @@ import drjit as dr
 from harnack.backend.extrema import clamp, fmax, fmin
 
 from harnack.bounds.bound import Bound
-from harnack.bounds.classic import fraction
-from harnack.bounds.solve import LARGEST_FRACTION, largest_covered
+from harnack.bounds.solve import Enclosure, is_covered, largest_covered
 from harnack.certify import BallCertificate, Certificate
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real
+
+# A chord whose gap is this many times u is not reached within the ball, but for 1e-6 of it.
+_NEVER = 1e18
 
 
 @dataclass(frozen=True)
@@ -41,91 +42,127 @@ class Slope(Bound):
     slope; the better of the two is kept on each side.
     """
 
-    rounds: int = 4
+    rounds: int = 6
 
     def accepts(self, certificate: Certificate) -> bool:
         return isinstance(certificate, BallCertificate)
 
     def step(self, certificate: Certificate, slope: Real) -> Real:
         assert isinstance(certificate, BallCertificate)
-        c, start = certificate, fraction(certificate)
-        moves = _movements(c, slope)
-        q = type(start)(1)
-        for gap, alternatives in ((c.gap_up, moves[0]), (c.gap_down, moves[1])):
-            side = type(start)(0)
-            for movement in alternatives:
-                side = fmax(side, largest_covered(movement, gap, start, self.rounds))
+        q = type(certificate.gap_up)(1)
+        for alternatives in _enclosures(certificate, slope):
+            side = type(q)(0)
+            for enclosure in alternatives:
+                side = fmax(side, largest_covered(enclosure, self.rounds))
             q = fmin(q, side)
-        return q * c.radius
+        return q * certificate.radius
 
     def covers(self, certificate: Certificate, slope: Real, length: Real) -> Mask:
         assert isinstance(certificate, BallCertificate)
-        c = certificate
-        q = length / c.radius
-        inside = q <= LARGEST_FRACTION
-        q = fmin(q, LARGEST_FRACTION)
-        up, down = _movements(c, slope)
-        least_up = functools.reduce(fmin, (movement(q) for movement in up))
-        least_down = functools.reduce(fmin, (movement(q) for movement in down))
-        free = (q * least_up <= c.gap_up) & (q * least_down <= c.gap_down)
-        return (length <= 0) | (inside & free)
+        q = length / certificate.radius
+        covered = q <= 1
+        q = clamp(q, 0, 1)
+        for alternatives in _enclosures(certificate, slope):
+            free = None
+            for enclosure in alternatives:
+                proved = is_covered(enclosure, q)
+                free = proved if free is None else free | proved
+            covered = covered & free
+        return (length <= 0) | covered
 
 
-def _movements(c: BallCertificate, slope: Real):
-    """Functions k(q) with f(p+tv) - f(p) <= q k(q), and the same for f(p) - f(p+tv)."""
-    up, down = [], []
-    n = c.dimension
-    for u, sign, away, toward in (
-        (c.room_below, 1.0, up, down),  # u = f - lower, rising
-        (c.room_above, -1.0, down, up),  # u = upper - f, rising as f falls
+def _enclosures(c: BallCertificate, slope: Real) -> tuple[list[Enclosure], list[Enclosure]]:
+    """What keeps f from the level above, and from the level below."""
+    up: list[Enclosure] = []
+    down: list[Enclosure] = []
+    for u, sign, gap_away, away, gap_toward, toward in (
+        (c.room_below, 1.0, c.gap_up, up, c.gap_down, down),  # u = f - lower
+        (c.room_above, -1.0, c.gap_down, down, c.gap_up, up),  # u = upper - f
     ):
         if u is None:
             continue
-        moment = sign * c.radius * slope / n  # u m
-        moment = clamp(moment, -u, u)
-        mean = dr.select(u > 0, moment / u, 0)
-        away.append(_Chord(u, moment, n))
-        toward.append(_Jensen(u, mean, n))
+        # u = 0 forces u to vanish identically: no level is ever reached.
+        share = dr.select(u > 0, 1 / u, dr.inf)
+        mean = dr.select(u > 0, clamp(sign * c.radius * slope * share / c.dimension, -1, 1), 0)
+        away.append(_Chord.of(fmin(gap_away * share, _NEVER), mean, c.dimension))
+        toward.append(_Jensen(fmin(gap_toward * share, 1), mean, c.dimension))
     return up, down
 
 
 @dataclass(frozen=True)
 class _Chord:
-    """u [(1+m)/2 P(q,1) + (1-m)/2 P(q,-1)] - u = q k(q)."""
+    """(1+m)/2 P(q,1) + (1-m)/2 P(q,-1) <= w = 1 + gap/u.
 
-    u: Real
-    moment: Real
+    Multiplied by (1-q)^K with K = n-1 the left side is
+
+        B(q) = (1+m)/2 (1+q) + (1-m)/2 (1-q)^(2n-1)/... = (1-q)^K + q A(q)/(1+q)^K,
+
+    and B^(1/K) <= w^(1/K) (1-q) has no pole: with W = w^(1/K) it says q k(q) <= W - 1, where
+    k = W + (B^(1/K) - 1)/q.
+    """
+
+    gap: Real
+    reach: Real  # W
+    mean: Real
     dimension: int
 
+    @classmethod
+    def of(cls, gap: Real, mean: Real, dimension: int) -> _Chord:
+        w = 1 + gap
+        if dimension == 2:
+            return cls(gap, w, mean, dimension)
+        if dimension == 3:
+            reach = dr.sqrt(w)
+            return cls(gap / (reach + 1), reach, mean, dimension)
+        reach = dr.cbrt(w)
+        return cls(gap / dr.fma(reach, reach + 1, 1), reach, mean, dimension)
+
+    def start(self) -> tuple[Real, Real]:
+        n, k = self.dimension, self.dimension - 1
+        first = n * self.mean - k
+        second = n * (1 - self.mean) - 0.5 * (k - 1) / (k * k) * first * first
+        return self.reach + first / k, second
+
     def __call__(self, q: Real) -> Real:
-        with_v, against_v = 0.5 * (self.u + self.moment), 0.5 * (self.u - self.moment)
-        return with_v * _rise(q, self.dimension) - against_v * _rise(-q, self.dimension)
+        m, r = self.mean, 1 / (1 + q)
+        if self.dimension == 2:
+            return self.reach + (2 * (q + m) * r - 1)
+        s = q * q
+        if self.dimension == 3:
+            b = dr.fma(r * r, q * (5 - s) + m * (3 + s), q - 2)  # (B - 1)/q
+            root = dr.sqrt(fmax(dr.fma(q, b, 1), 0))
+            return self.reach + b / (root + 1)
+        a = q * (9 + s * (s - 2)) + 4 * m * (1 + s)
+        b = dr.fma(r * r * r, a, q * (3 - q) - 3)
+        root = dr.cbrt(fmax(dr.fma(q, b, 1), 0))
+        return self.reach + b / dr.fma(root, root + 1, 1)
 
 
 @dataclass(frozen=True)
 class _Jensen:
-    """u - u P(q, m) = q k(q)."""
+    """P(q, m) >= 1 - gap/u.
 
-    u: Real
+    With D = 1+q^2-2qm it says (1-g) D^(n/2) <= 1-q^2, that is q k(q) <= g with
+    k = (1-g) (D^(n/2) - 1 + q^2)/q + g q. q k(q) is convex.
+    """
+
+    gap: Real
     mean: Real
     dimension: int
+
+    def start(self) -> tuple[Real, Real]:
+        n, m, rest = self.dimension, self.mean, 1 - self.gap
+        second = 1 + 0.5 * n * (1 + (n - 2) * m * m)
+        return -rest * n * m, dr.fma(rest, second, self.gap)
 
     def __call__(self, q: Real) -> Real:
         e = q - 2 * self.mean
         d = dr.fma(q, e, 1)
         if self.dimension == 2:
-            return self.u * 2 * (q - self.mean) / d
-        if self.dimension == 4:
-            return self.u * dr.fma(e, d + 1, q) / (d * d)
-        x = dr.sqrt(d)
-        return self.u * (q + e * (d + x + 1) / (x + 1)) / (d * x)
-
-
-def _rise(q: Real, n: int) -> Real:
-    """((1+q)/(1-q)^(n-1) - 1)/q without cancellation."""
-    r = 1 / (1 - q)
-    if n == 2:
-        return 2 * r
-    if n == 3:
-        return (3 - q) * r * r
-    return dr.fma(q, q - 3, 4) * r * r * r
+            rise = q + e
+        elif self.dimension == 4:
+            rise = dr.fma(e, d + 1, q)
+        else:
+            x = dr.sqrt(fmax(d, 0))
+            rise = q + e * (d + x + 1) / (x + 1)
+        return dr.fma(1 - self.gap, rise, self.gap * q)

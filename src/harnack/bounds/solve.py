@@ -1,15 +1,17 @@
 """The largest stretch that an enclosure proves free, found from the safe side.
 
-Enclosures are exact at p, so they are written as f(p) + q k(q) with q = t/R: the movement
-q k(q) is compared with the gap to the level, and nothing large is ever subtracted. Near a
-surface the gap is tiny, and an answer found to an absolute accuracy would stall the march; this
-solver is accurate relative to the answer.
+Every enclosure of this room proves that f meets no level at distance q R as long as
+
+    q k(q) <= gap,
+
+with a k that has no poles on [0, 1] and a dimensionless gap: nothing large is ever subtracted,
+and an answer is accurate relative to itself. Near a surface the gap is tiny, and an answer found
+to an absolute accuracy would stall the march.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol
 
 import drjit as dr
 
@@ -18,51 +20,80 @@ from harnack.backend.extrema import clamp, fmax
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real
 
-# The open ball: at q = 1 the enclosures are 0 * inf.
-LARGEST_FRACTION = 1.0 - 1e-5
-# The last candidate is pulled back this far so that it ends on the safe side of the root.
+# Answers are shortened by this much, for the roundings of the two sides of the comparison.
 PULL_BACK = 1.0 - 2e-6
+# k is the difference of numbers of order one: so many units in the last place are added to it,
+# which covers their rounding and that of the slope that came in.
+_ROUNDINGS = 16.0
 
 
-def largest_covered(movement: Callable[[Real], Real], gap: Real, start: Real, rounds: int) -> Real:
-    """The largest q in [0, 1) with q k(q) <= gap, to about 1e-5 relative, never beyond it.
+class Enclosure(Protocol):
+    """q k(q) <= gap is proved free, and q k(q) crosses the gap upwards at most once on [0, 1]."""
 
-    `movement` is k, with the property that q k(q) crosses each gap > 0 upwards at most once, and
-    `start` a q that is known to be safe (a coarser closed-form proof).
+    gap: Real
 
-    Why it is safe: only a q at which q k(q) <= gap was *evaluated* is returned, or `start`; by
-    the single crossing, all smaller q are then safe too. The candidates only affect length:
-    each solves the quadratic q (k_i + k' (q - q_i)) = gap, k' the secant slope of k through the
-    last two points, which converges like the secant method.
+    def __call__(self, q: Real) -> Real:
+        """k(q)."""
+        ...
+
+    def start(self) -> tuple[Real, Real]:
+        """k(0) and k'(0), for a first guess: no proof rests on them."""
+        ...
+
+
+def rounding(real: Any) -> float:
+    """What is added to k in the precision of `real`."""
+    return _ROUNDINGS * float(dr.epsilon(real))
+
+
+def is_covered(enclosure: Enclosure, q: Real) -> Mask:
+    """Whether all of [0, q] is proved free, for 0 <= q <= 1."""
+    slack = rounding(type(q))
+    return q * (enclosure(q) + slack) <= enclosure.gap * PULL_BACK
+
+
+def largest_covered(enclosure: Enclosure, rounds: int) -> Real:
+    """The largest covered q in [0, 1), to about 1e-5 relative, never beyond it.
+
+    Why it is safe: only a q at which q k(q) <= gap was *evaluated* is returned; by the single
+    crossing, all smaller q are then free too. The candidates only affect length: each solves
+    q (k_i + k' (q - q_i)) = gap, with k' the slope of k through the last two points (so the
+    parabola through them and the start), which converges like the secant method; the last one
+    is where the chord from the best covered to the best uncovered point reaches the gap, which
+    is covered if q k(q) is convex.
     """
-    zero = type(gap)(0)
-    largest = type(gap)(LARGEST_FRACTION)
-    safe = clamp(start, 0, LARGEST_FRACTION)
-    unsafe = largest
-    free = largest * movement(largest) <= gap
-    previous_q, previous_k = zero, movement(zero)
-    q, k = fmax(safe, 1e-9), movement(fmax(safe, 1e-9))
+    real = type(enclosure.gap)
+    gap, slack = enclosure.gap, rounding(real)
+    previous_q = real(0)
+    previous_k, bend = enclosure.start()
+    q = clamp(_root(gap, previous_k, bend), 0, 1)
+    safe, below = real(0), -gap  # q k(q) - gap at the ends of the bracket
+    unsafe, above = real(1), real(dr.inf)
     for i in range(rounds):
-        candidate = _next(q, k, previous_q, previous_k, gap)
-        candidate = clamp(candidate, safe, unsafe)
-        candidate = candidate * PULL_BACK if i == rounds - 1 else candidate
+        if i == rounds - 1:
+            part = dr.select(dr.isfinite(above), below / (below - above), 1)
+            q = fmax(safe, dr.select(dr.isfinite(above), dr.fma(part, unsafe - safe, safe), q))
+            q = q * PULL_BACK
+        k = enclosure(q) + slack
+        excess = dr.fma(q, k, -gap)
+        good: Mask = excess <= 0
+        better = good & (q >= safe)
+        safe, below = dr.select(better, q, safe), dr.select(better, excess, below)
+        worse = ~good & (q <= unsafe)
+        unsafe, above = dr.select(worse, q, unsafe), dr.select(worse, excess, above)
+        run = q - previous_q
+        bend = dr.select(run == 0, 0, (k - previous_k) / run)
         previous_q, previous_k = q, k
-        q, k = candidate, movement(candidate)
-        good: Mask = q * k <= gap
-        safe = dr.select(good & (q > safe), q, safe)
-        unsafe = dr.select(good, unsafe, q)
-    return dr.select(free, largest, safe)
+        q = clamp(_root(gap, dr.fma(-bend, q, k), bend), safe, unsafe)
+    return safe * PULL_BACK
 
 
-def _next(q: Real, k: Real, previous_q: Real, previous_k: Real, gap: Real) -> Real:
-    """The positive root of x (k + k' (x - q)) = gap with the secant slope k'."""
-    run = q - previous_q
-    slope = dr.select(run == 0, 0, (k - previous_k) / run)
-    constant = dr.fma(-slope, q, k)
+def _root(gap: Real, constant: Real, slope: Real) -> Real:
+    """The positive root of x (constant + slope x) = gap, or 1 if there is none."""
     root = dr.sqrt(fmax(dr.fma(constant, constant, 4 * slope * gap), 0))
     # Both forms are the root; each cancels where the other is used.
     rises = constant > 0
     above = dr.select(rises, 2 * gap, root - constant)
     below = dr.select(rises, constant + root, 2 * slope)
     candidate = above / below
-    return dr.select((below > 0) & dr.isfinite(candidate), candidate, LARGEST_FRACTION)
+    return dr.select((below > 0) & dr.isfinite(candidate), candidate, 1)

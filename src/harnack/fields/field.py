@@ -39,7 +39,15 @@ class Lipschitz:
     radius: Real = float("inf")
 
 
-Knowledge = HarmonicBall | Lipschitz
+@dataclass(frozen=True)
+class Curvature:
+    """|f(y) - f(p) - grad f(p).(y-p)| <= constant |y-p|^2/2 for every y with |y-p| < radius."""
+
+    constant: Real
+    radius: Real = float("inf")
+
+
+Knowledge = HarmonicBall | Lipschitz | Curvature
 
 
 @dataclass(frozen=True)
@@ -68,6 +76,9 @@ class Field(abc.ABC):
 
     default_level: float = 0.0
     """The level drawn when none is asked for."""
+
+    overstep: float = 1.4
+    """The over-stepping factor that needs the fewest evaluations, by experiment; at least 1."""
 
     domain: Volume | None = None
     """Where the field may be evaluated and is drawn; None for all of space. Rays are clipped to

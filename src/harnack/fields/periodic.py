@@ -11,7 +11,7 @@ import drjit as dr
 
 from harnack.backend.extrema import fmin
 from harnack.fields.extension import ExtensionRange
-from harnack.fields.field import Field, Lipschitz, Sample
+from harnack.fields.field import Curvature, Field, Lipschitz, Sample
 from harnack.fields.waves import (
     PlaneWave,
     Product,
@@ -58,6 +58,8 @@ class EigenfunctionSum(Field):
     `curvature` H bounds the Hessian, and never above `steepness`.
     """
 
+    overstep = 1.0
+
     def __init__(self, terms: Iterable[Term], *, domain: Volume | None = None) -> None:
         self.terms = checked_terms(terms)
         self.waves = self._bounds()
@@ -91,7 +93,13 @@ class EigenfunctionSum(Field):
         reach = 0.9 * self.steepness / self.curvature  # the best by experiment, gyroid and P
         local = (slope + 0.5 * self.curvature * reach) * (1 + _ROUNDING)
         lipschitz = Lipschitz(fmin(local, self.steepness * (1 + _ROUNDING)), reach)
-        return Sample(value, gradient, (self._extension.ball(value, slope), lipschitz))
+        known = (
+            self._extension.ball(value, slope),
+            lipschitz,
+            Curvature(self.curvature * (1 + _ROUNDING)),
+        )
+        error = 8 * dr.epsilon(type(value)) * self.waves.largest_value
+        return Sample(value, gradient, known, error)
 
     def differentiable_value(self, p: Vec3) -> Real:
         return evaluate_terms(self.terms, p)[0]

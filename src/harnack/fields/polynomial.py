@@ -11,7 +11,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend.extrema import fmax
-from harnack.fields.field import Field, HarmonicBall, Sample
+from harnack.fields.field import Curvature, Field, HarmonicBall, Sample
 from harnack.fields.solid_harmonics import (
     LARGEST_DEGREE,
     Weights,
@@ -31,6 +31,8 @@ __all__ = ["HarmonicPolynomial", "SphericalHarmonic"]
 # Promised ends are moved out by this much of their distance for the roundings of float32.
 _ROUNDING = 1e-5
 # Radii of harmonic balls tried, in units of the ball about the domain.
+# Radii of the balls on which the Hessian is bounded (by experiment: two of unlike size).
+_REACHES = ((0.25, 0.05), (1.0, 0.1))
 _RADII = np.geomspace(0.1, 8.0, 200)
 
 
@@ -67,7 +69,15 @@ class _SolidHarmonics(Field):
         lower, upper = self._known.at(distance + radius)
         margin = _ROUNDING * (upper - lower)
         ball = HarmonicBall(radius * self._size, lower - margin, upper + margin)
-        return Sample(value, type(p)(*gradient) / self._size, (ball,))
+        known = (ball, *(self._curvature(distance, *reach) for reach in _REACHES))
+        error = 8 * dr.epsilon(type(value)) * fmax(upper, -lower)
+        return Sample(value, type(p)(*gradient) / self._size, known, error)
+
+    def _curvature(self, distance: Real, share: float, least: float) -> Curvature:
+        """The Hessian's bound on a ball of radius share |p|/(l-2), at least `least` sizes."""
+        radius = fmax(share / max(self.degree - 2, 0.5) * distance, least)
+        constant = self._known.curvature(distance + radius) * (1 + _ROUNDING)
+        return Curvature(constant / self._size**2, radius * self._size)
 
     def _radius(self, distance: Real) -> Real:
         if self._inner < self._outer:

@@ -129,6 +129,20 @@ class BallRange:
             lower, upper = (lower + low) * s, (upper + high) * s
         return lower + self.constant, upper + self.constant
 
+    def curvature(self, s: Real) -> Real:
+        """A bound of all directional second derivatives on |y| <= s.
+
+        If |f_l| <= M on the unit sphere, |grad f_l| <= l M there: along a great circle f_l is a
+        trigonometric polynomial T of degree l, radially its derivative is l T, and
+        T'^2 + l^2 T^2 <= l^2 M^2 (Bernstein-Szego). A directional derivative of f_l is again
+        homogeneous and harmonic, of degree l-1, so |v.H v| <= l (l-1) M |y|^(l-2).
+        """
+        total = 0.0 * s
+        most = {degree: max(-low, high) for degree, low, high in self.ends}
+        for degree in range(max(most, default=0), 1, -1):
+            total = total * s + degree * (degree - 1) * most.get(degree, 0.0)
+        return total
+
     def at(self, s: Real) -> tuple[Real, Real]:
         """Lower and upper bound on |y| <= s, a Dr.Jit array, from everything known."""
         lower, upper = self.by_degree(s)

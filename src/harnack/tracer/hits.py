@@ -56,10 +56,10 @@ def trace(
     t_min: Any = 0.0,
     t_max: Any = math.inf,
     tolerance: float | Tolerance = 1e-4,
-    max_steps: int = 1000,
+    max_steps: int = 2000,
     bound: str | Bound | Longest | None = None,
     clip: Volume | None = None,
-    overstep: float = 1.4,
+    overstep: float | None = None,
     precision: Precision | None = None,
 ) -> Hits:
     """First hits of rays with a level set of a field; no hit is ever missed.

@@ -37,7 +37,7 @@ class LevelSet:
     levels: tuple[Real, ...] = ()
     clip: Volume | None = None
     tolerance: Tolerance = field(default_factory=Tolerance)
-    max_steps: int = 1000
+    max_steps: int = 2000
     bound: Longest = field(default_factory=choose_bound)
     overstep: float = 1.4
     solid: tuple[float, float] | None = None
@@ -83,9 +83,9 @@ def level_set(
     *,
     clip: Volume | None = None,
     tolerance: float | Tolerance = 1e-4,
-    max_steps: int = 1000,
+    max_steps: int = 2000,
     bound: str | Bound | Longest | None = None,
-    overstep: float = 1.4,
+    overstep: float | None = None,
     solid: tuple[float, float] | None = None,
 ) -> LevelSet:
     """A `LevelSet` from what users write: a level or several, a tolerance, a bound's name.
@@ -107,6 +107,7 @@ def level_set(
             raise ValueError(f"level must be finite, not {_number(one)}")
     field.check_levels(tuple(_number(one) for one in asked))
     tolerance = tolerance if isinstance(tolerance, Tolerance) else Tolerance(float(tolerance))
+    overstep = field.overstep if overstep is None else overstep
     return LevelSet(
         field, asked, clip, tolerance, max_steps, choose_bound(bound), overstep, solid
     )

@@ -1,0 +1,54 @@
+"""The step from a bound of the second derivatives: Taylor's formula, in closed form."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import drjit as dr
+
+from harnack.backend.extrema import fmin
+from harnack.bounds.bound import Bound
+from harnack.certify import Certificate, CurvatureCertificate
+
+if TYPE_CHECKING:
+    from harnack.backend import Mask, Real
+
+_ROUND_DOWN = 1.0 - 1e-6
+_LARGEST_GAP = 1e30  # stands for "no level on this side": its square root stays finite
+
+
+@dataclass(frozen=True)
+class CurvatureStep(Bound):
+    """The first place where the parabolas through f(p) could reach a level.
+
+    Proof. With s the slope and H the constant, f(p+tv) lies between f + s t -+ H t^2/2 (Taylor).
+    The upper parabola is convex and starts below the level a gap g above, so it first meets it
+    at the positive root of s t + H t^2/2 = g, written without cancellation:
+    2g/(s + r) for s > 0, (r - s)/H otherwise, r = sqrt(s^2 + 2 H g); the lower one with -s.
+    Exact to second order at p, so it converges quadratically at the surface.
+    """
+
+    sufficient: ClassVar[bool] = True
+
+    def accepts(self, certificate: Certificate) -> bool:
+        return isinstance(certificate, CurvatureCertificate)
+
+    def step(self, certificate: Certificate, slope: Real) -> Real:
+        assert isinstance(certificate, CurvatureCertificate)
+        c = certificate
+        up, down = _root(c.gap_up, slope, c.constant), _root(c.gap_down, -slope, c.constant)
+        return fmin(fmin(up, down), c.radius) * _ROUND_DOWN
+
+    def covers(self, certificate: Certificate, slope: Real, length: Real) -> Mask:
+        assert isinstance(certificate, CurvatureCertificate)
+        c = certificate
+        bend = 0.5 * c.constant * length * length
+        free = (bend + slope * length <= c.gap_up) & (bend - slope * length <= c.gap_down)
+        return (length <= 0) | ((length <= c.radius) & free)
+
+
+def _root(gap: Real, rate: Real, curvature: Real) -> Real:
+    gap = fmin(gap, _LARGEST_GAP)
+    root = dr.sqrt(dr.fma(rate, rate, 2 * curvature * gap))
+    return dr.select(rate > 0, 2 * gap / (rate + root), (root - rate) / curvature)
