@@ -7,11 +7,9 @@ from typing import TYPE_CHECKING
 
 import drjit as dr
 
-from harnack.backend.extrema import clamp, fmin
-
+from harnack.backend.extrema import clamp, fmax, fmin
 from harnack.bounds.bound import Bound
-from harnack.bounds.solve import LARGEST_FRACTION, largest_covered
-from harnack.bounds.start import safe_starts
+from harnack.bounds.solve import is_covered, largest_covered, rounding
 from harnack.certify import BallCertificate, Certificate
 
 if TYPE_CHECKING:
@@ -28,10 +26,14 @@ class Caps(Bound):
     moment, integral P g is largest for the indicator of {s <= s1} u {s >= s2} (bathtub principle:
     P minus the chord through s1, s2 is positive exactly there), two caps about v of heights
     b = p + mu/(1-p) ahead and a = p - mu/(1-p) behind, which depend on p and mu alone. The
-    integral over caps is elementary; freed of its cancellation at small q it reads
+    integral over caps is elementary,
 
-        U - c = (C-c) [ b (1+q)/(s1 (s1+1-q)) + a (1-q)/(s2 (s2+1+q)) ],
-        s1^2 = (1-q)^2 + 2qb,   s2^2 = (1+q)^2 - 2qa.
+        U = c + (C-c) [1 - (1-q^2)/(2q) (1/s1 - 1/s2)],
+        s1^2 = (1-q)^2 + 2qb,   s2^2 = (1+q)^2 - 2qa,
+
+    and as s2^2 - s1^2 = 4q (1-p), U <= f + gap is the same as
+
+        (1 - gap/(C-f)) s1 s2 (s1+s2)/2 <= 1-q^2.
 
     The lower bound is the complement: C - (C-c)(...) with p -> 1-p, mu -> -mu. |mu| <= p (1-p)
     holds in exact arithmetic and is enforced.
@@ -54,59 +56,62 @@ class Caps(Bound):
 
     def step(self, certificate: Certificate, slope: Real) -> Real:
         assert isinstance(certificate, BallCertificate)
-        up, down = _movements(certificate, slope)
-        from_up, from_down = safe_starts(certificate, slope)
-        q = fmin(
-            largest_covered(up, certificate.gap_up, from_up, self.rounds),
-            largest_covered(down, certificate.gap_down, from_down, self.rounds),
-        )
+        up, down = _enclosures(certificate, slope)
+        q = fmin(largest_covered(up, self.rounds), largest_covered(down, self.rounds))
         return q * certificate.radius
 
     def covers(self, certificate: Certificate, slope: Real, length: Real) -> Mask:
         assert isinstance(certificate, BallCertificate)
-        up, down = _movements(certificate, slope)
+        up, down = _enclosures(certificate, slope)
         q = length / certificate.radius
-        inside = q <= LARGEST_FRACTION
-        q = fmin(q, LARGEST_FRACTION)
-        free = (q * up(q) <= certificate.gap_up) & (q * down(q) <= certificate.gap_down)
-        return (length <= 0) | (inside & free)
+        inside = q <= 1
+        q = clamp(q, 0, 1)
+        return (length <= 0) | (inside & is_covered(up, q) & is_covered(down, q))
 
 
-def _movements(c: BallCertificate, slope: Real) -> tuple[_TwoCaps, _TwoCaps]:
-    assert c.room_below is not None
-    assert c.room_above is not None
-    span = c.room_below + c.room_above
-    p, rest = c.room_below / span, c.room_above / span
-    mu = c.radius * slope / (3 * span)
-    mu = clamp(mu, -p * rest, p * rest)
-    return _two_caps(span, p, rest, mu), _two_caps(span, rest, p, -mu)
+def _enclosures(c: BallCertificate, slope: Real) -> tuple[_TwoCaps, _TwoCaps]:
+    """What keeps f from the level above, and from the level below."""
+    below, above = c.room_below, c.room_above
+    assert below is not None
+    assert above is not None
+    share = 1 / (below + above)
+    p, rest = below * share, above * share
+    mu = c.radius * slope * share / 3
+    return _two_caps(c.gap_up, above, p, rest, mu), _two_caps(c.gap_down, below, rest, p, -mu)
 
 
-def _two_caps(span: Real, p: Real, rest: Real, mu: Real) -> _TwoCaps:
-    shift = dr.select(rest > 0, mu / rest, 0)
-    return _TwoCaps(span, clamp(p + shift, 0, 1), clamp(p - shift, 0, 1))
+def _two_caps(gap: Real, room: Real, p: Real, rest: Real, mu: Real) -> _TwoCaps:
+    # Without room f is constant: no level is ever reached.
+    slack = rounding(type(gap)) * p
+    shift = dr.select(rest > 0, mu / rest, 0) + slack
+    shift = fmax(fmin(shift, p), -p)  # the worst one, p, if the slope is not a number
+    return _TwoCaps(dr.select(gap < room, gap / room, 1), p, rest, shift)
 
 
 @dataclass(frozen=True)
 class _TwoCaps:
-    """U - f = q k(q) for cap heights `ahead` (b) and `behind` (a)."""
+    """(1-g) S(q) <= 1-q^2 with S = s1 s2 (s1+s2)/2, g = gap/(C-f) and heights b, a of the caps.
 
-    span: Real
-    ahead: Real
-    behind: Real
+    That is q k(q) <= g with k = (1-g) (S - 1 + q^2)/q + g q.
+    """
+
+    gap: Real
+    p: Real
+    rest: Real  # 1 - p, accurate where it is small
+    shift: Real  # mu/(1-p)
+
+    def start(self) -> tuple[Real, Real]:
+        x, y, rest = self.rest - self.shift, self.rest + self.shift, 1 - self.gap
+        second = 2.5 - 0.75 * dr.fma(x, x, y * y) - x * y + 2 * self.shift * self.shift
+        return 3 * rest * self.shift, dr.fma(rest, second, self.gap)
 
     def __call__(self, q: Real) -> Real:
-        return self.span * (_cap(self.ahead, q) - _cap(self.behind, -q))
-
-
-def _cap(b: Real, q: Real) -> Real:
-    """(b (1+q)/(s (s+1-q)) - b/2)/q with s^2 = (1-q)^2 + 2qb, without cancellation.
-
-    The numerator 2(1+q) - s^2 - s(1-q), with s - 1 = q (q - 2 beta)/(s+1) and beta = 1 - b, is
-    q [3 + 2 beta - q - (1-q)(q - 2 beta)/(s+1)].
-    """
-    beta = 1 - b
-    back = 1 - q
-    s = dr.sqrt(dr.fma(back, back, 2 * q * b))
-    e = q - 2 * beta
-    return 0.5 * b * (3 - q + 2 * beta - back * e / (s + 1)) / (s * (s + back))
+        # s = 1 + q x with x = e/(s+1), as s^2 = 1 + q e.
+        e1, e2 = q - 2 * (self.rest - self.shift), q + 2 * (self.rest + self.shift)
+        back, on = 1 - q, 1 + q
+        s1 = dr.sqrt(dr.fma(back, back, 2 * q * (self.p + self.shift)))
+        s2 = dr.sqrt(dr.fma(on, on, -2 * q * (self.p - self.shift)))
+        both = 1 / ((s1 + 1) * (s2 + 1))
+        total = dr.fma(e1, s2 + 1, e2 * (s1 + 1)) * both  # x1 + x2
+        rise = q * dr.fma(e1 * e2, both, 1) + total * dr.fma(0.5 * s1, s2, 1)
+        return dr.fma(1 - self.gap, rise, self.gap * q)

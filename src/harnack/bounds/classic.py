@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 import drjit as dr
 
 from harnack.backend.extrema import clamp, fmax, fmin
-
 from harnack.bounds.bound import Bound
 from harnack.certify import BallCertificate, Certificate
 
@@ -36,7 +35,7 @@ class Classic(Bound):
 
         n = 2:  |v-u| / (u+v)         n = 3:  2 |v-u| / (u + 2v + sqrt(u (u + 8v)))
 
-    and for n = 4 the cubic is solved by Newton's method from the safe side (`_quartic_space`).
+    and for n = 4 the cubic is solved by Newton's method from the safe side (`_quartic_growing`).
     A level at or below `lower` cannot be reached inside the ball: the step is R.
     """
 
@@ -88,15 +87,19 @@ def _space(u: Real, v: Real, gap: Real) -> Real:
 
 
 def _quartic_growing(u: Real, v: Real, gap: Real) -> Real:
-    """(1+q)/(1-q)^3 = v/u: h(q) = gap - q (u + v (3 - 3q + q^2)) is decreasing and convex, so
-    Newton's method from the left stays on the left, the safe side. 1 - (u/v)^(1/4) is a safe
-    start because (1+q)(1-q) <= 1."""
-    q = fmax(gap / (u + 3 * v), 1 - dr.sqrt(dr.sqrt(u / v)) - 1e-6)
-    q = clamp(q, 0, 1)
-    for _ in range(5):
+    """(1+q)/(1-q)^3 = w, w = v/u. Newton's method from the safe side, in two forms.
+
+    For w < 2: h(q) = gap - q (u + v (3 - 3q + q^2)) is decreasing and convex, from the left. That
+    cancels for large w, where y = 1-q is the root of the convex w y^3 + y - 2, from the right."""
+    q = gap / (u + 3 * v)
+    for _ in range(4):
         h = gap - q * (u + v * (3 - 3 * q + q * q))
         q = q + fmax(h, 0) / (u + 3 * v * (1 - q) * (1 - q))
-    return q
+    w = v / u
+    y = fmin(dr.cbrt(2 / w), 1)
+    for _ in range(4):
+        y = y - (y * dr.fma(w * y, y, 1) - 2) / dr.fma(3 * w * y, y, 1)
+    return dr.select(v < 2 * u, q, dr.fma(y, -1 - 1e-6, 1))
 
 
 def _quartic_falling(u: Real, v: Real, gap: Real) -> Real:

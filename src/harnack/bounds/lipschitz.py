@@ -5,10 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import drjit as dr
-
 from harnack.backend.extrema import fmin
-
 from harnack.bounds.bound import Bound
 from harnack.certify import Certificate, LipschitzCertificate
 

@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING
 import drjit as dr
 
 from harnack.backend.extrema import clamp, fmax, fmin
-
 from harnack.bounds.bound import Bound
-from harnack.bounds.solve import Enclosure, is_covered, largest_covered
+from harnack.bounds.solve import Enclosure, is_covered, largest_covered, rounding
 from harnack.certify import BallCertificate, Certificate
 
 if TYPE_CHECKING:
@@ -42,7 +41,7 @@ class Slope(Bound):
     slope; the better of the two is kept on each side.
     """
 
-    rounds: int = 6
+    rounds: int = 4
 
     def accepts(self, certificate: Certificate) -> bool:
         return isinstance(certificate, BallCertificate)
@@ -83,9 +82,12 @@ def _enclosures(c: BallCertificate, slope: Real) -> tuple[list[Enclosure], list[
             continue
         # u = 0 forces u to vanish identically: no level is ever reached.
         share = dr.select(u > 0, 1 / u, dr.inf)
-        mean = dr.select(u > 0, clamp(sign * c.radius * slope * share / c.dimension, -1, 1), 0)
-        away.append(_Chord.of(fmin(gap_away * share, _NEVER), mean, c.dimension))
-        toward.append(_Jensen(fmin(gap_toward * share, 1), mean, c.dimension))
+        mean = dr.select(u > 0, sign * c.radius * slope * share / c.dimension, 0)
+        slack = rounding(type(slope))
+        # A slope that is not a number counts as the worst one, in either place.
+        steep, flat = fmax(fmin(mean + slack, 1), -1), clamp(mean - slack, -1, 1)
+        away.append(_Chord.of(fmin(gap_away * share, _NEVER), steep, c.dimension))
+        toward.append(_Jensen(fmin(gap_toward * share, 1), flat, c.dimension))
     return up, down
 
 
@@ -93,49 +95,44 @@ def _enclosures(c: BallCertificate, slope: Real) -> tuple[list[Enclosure], list[
 class _Chord:
     """(1+m)/2 P(q,1) + (1-m)/2 P(q,-1) <= w = 1 + gap/u.
 
-    Multiplied by (1-q)^K with K = n-1 the left side is
-
-        B(q) = (1+m)/2 (1+q) + (1-m)/2 (1-q)^(2n-1)/... = (1-q)^K + q A(q)/(1+q)^K,
-
-    and B^(1/K) <= w^(1/K) (1-q) has no pole: with W = w^(1/K) it says q k(q) <= W - 1, where
-    k = W + (B^(1/K) - 1)/q.
+    The left side times (1-q)^K, K = n-1, is B = (1-q)^K + q A/(1+q)^K with a polynomial A, and
+    B^(1/K) <= w^(1/K) (1-q) has no pole: it says q k(q) <= g with g = w^(1/K) - 1 and
+    k = g + 1 + (B^(1/K) - 1)/q.
     """
 
-    gap: Real
-    reach: Real  # W
+    gap: Real  # g
     mean: Real
     dimension: int
 
     @classmethod
     def of(cls, gap: Real, mean: Real, dimension: int) -> _Chord:
-        w = 1 + gap
-        if dimension == 2:
-            return cls(gap, w, mean, dimension)
         if dimension == 3:
-            reach = dr.sqrt(w)
-            return cls(gap / (reach + 1), reach, mean, dimension)
-        reach = dr.cbrt(w)
-        return cls(gap / dr.fma(reach, reach + 1, 1), reach, mean, dimension)
+            gap = gap / (dr.sqrt(1 + gap) + 1)
+        elif dimension == 4:
+            root = dr.cbrt(1 + gap)
+            gap = gap / dr.fma(root, root + 1, 1)
+        return cls(gap, mean, dimension)
 
     def start(self) -> tuple[Real, Real]:
         n, k = self.dimension, self.dimension - 1
         first = n * self.mean - k
         second = n * (1 - self.mean) - 0.5 * (k - 1) / (k * k) * first * first
-        return self.reach + first / k, second
+        return self.gap + n * self.mean / k, second
 
     def __call__(self, q: Real) -> Real:
-        m, r = self.mean, 1 / (1 + q)
+        m, r, s = self.mean, 1 / (1 + q), q * q
         if self.dimension == 2:
-            return self.reach + (2 * (q + m) * r - 1)
-        s = q * q
+            return self.gap + 2 * (q + m) * r
         if self.dimension == 3:
-            b = dr.fma(r * r, q * (5 - s) + m * (3 + s), q - 2)  # (B - 1)/q
-            root = dr.sqrt(fmax(dr.fma(q, b, 1), 0))
-            return self.reach + b / (root + 1)
+            c = dr.fma(q * (5 - s) + m * (3 + s), r * r, q)  # (B - 1)/q + 2
+            root = dr.sqrt(fmax(dr.fma(q, c - 2, 1), 0))
+            share = 1 / (root + 1)
+            return self.gap + share * (c + q * (c - 2) * share)
         a = q * (9 + s * (s - 2)) + 4 * m * (1 + s)
-        b = dr.fma(r * r * r, a, q * (3 - q) - 3)
-        root = dr.cbrt(fmax(dr.fma(q, b, 1), 0))
-        return self.reach + b / dr.fma(root, root + 1, 1)
+        c = dr.fma(a, r * r * r, q * (3 - q))  # (B - 1)/q + 3
+        root = dr.cbrt(fmax(dr.fma(q, c - 3, 1), 0))
+        share = 1 / dr.fma(root, root + 1, 1)
+        return self.gap + share * (c + q * (c - 3) * share * (root + 2))
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ to an absolute accuracy would stall the march.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import drjit as dr
 
@@ -30,7 +30,8 @@ _ROUNDINGS = 16.0
 class Enclosure(Protocol):
     """q k(q) <= gap is proved free, and q k(q) crosses the gap upwards at most once on [0, 1]."""
 
-    gap: Real
+    @property
+    def gap(self) -> Real: ...
 
     def __call__(self, q: Real) -> Real:
         """k(q)."""
@@ -53,7 +54,10 @@ def is_covered(enclosure: Enclosure, q: Real) -> Mask:
 
 
 def largest_covered(enclosure: Enclosure, rounds: int) -> Real:
-    """The largest covered q in [0, 1), to about 1e-5 relative, never beyond it.
+    """The largest covered q in [0, 1), never beyond it.
+
+    Four rounds end within 1e-5 of it for four balls in five, and within a few percent wherever
+    the extremal measure is not concentrated in 1e-3 of the sphere; twelve end within 1e-5.
 
     Why it is safe: only a q at which q k(q) <= gap was *evaluated* is returned; by the single
     crossing, all smaller q are then free too. The candidates only affect length: each solves
@@ -62,7 +66,7 @@ def largest_covered(enclosure: Enclosure, rounds: int) -> Real:
     is where the chord from the best covered to the best uncovered point reaches the gap, which
     is covered if q k(q) is convex.
     """
-    real = type(enclosure.gap)
+    real = cast("Any", type(enclosure.gap))
     gap, slack = enclosure.gap, rounding(real)
     previous_q = real(0)
     previous_k, bend = enclosure.start()
@@ -74,8 +78,9 @@ def largest_covered(enclosure: Enclosure, rounds: int) -> Real:
             part = dr.select(dr.isfinite(above), below / (below - above), 1)
             q = fmax(safe, dr.select(dr.isfinite(above), dr.fma(part, unsafe - safe, safe), q))
             q = q * PULL_BACK
-        k = enclosure(q) + slack
-        excess = dr.fma(q, k, -gap)
+        # Candidates aim at twice the slack, so that rounding does not fail them.
+        k = enclosure(q) + 2 * slack
+        excess = dr.fma(q, k - slack, -gap)
         good: Mask = excess <= 0
         better = good & (q >= safe)
         safe, below = dr.select(better, q, safe), dr.select(better, excess, below)

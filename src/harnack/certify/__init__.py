@@ -33,7 +33,7 @@ Certificate = BallCertificate | LipschitzCertificate | CurvatureCertificate
 def certify(sample: Sample, gap_down: Real, gap_up: Real) -> tuple[Certificate, ...]:
     """One certificate for each thing that the sample knows, in the same order."""
     return tuple(
-        from_ball(known, sample.value, gap_down, gap_up)
+        from_ball(known, sample.value, gap_down, gap_up, sample.error)
         if isinstance(known, HarmonicBall)
         else from_curvature(known, gap_down, gap_up)
         if isinstance(known, Curvature)

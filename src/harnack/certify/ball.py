@@ -39,19 +39,26 @@ class BallCertificate:
     dimension: int
 
 
-def from_ball(ball: HarmonicBall, f: Real, gap_down: Real, gap_up: Real) -> BallCertificate:
-    """The certificate of a harmonic ball at a point with value f.
+def from_ball(
+    ball: HarmonicBall, f: Real, gap_down: Real, gap_up: Real, error: Real = 0.0
+) -> BallCertificate:
+    """The certificate of a harmonic ball at a point with value f, known up to `error`.
 
-    A promise that excludes f itself by rounding is widened to include it; a radius that is not
-    a positive number gives a certificate that proves nothing (radius 0).
+    The ends of the promise are moved out by the error and eight units in the last place of f:
+    a promise that seems to leave f no room would otherwise prove f constant. A radius that is
+    not a positive number, or a NaN anywhere, gives a certificate that proves nothing (radius 0).
     """
+    blur = dr.fma(8 * float(dr.epsilon(type(f))), dr.abs(f), error)
+    proved = ball.radius > 0
 
     def room(end: Real, sign: float) -> Real | None:
+        nonlocal proved
         if isinstance(end, float) and math.isinf(end):
             return None
-        return fmax(sign * (end - f), 0)
+        distance = sign * (end - f)
+        proved = proved & (distance == distance)  # not NaN
+        return fmax(distance, 0) + blur
 
-    radius = dr.select(ball.radius > 0, ball.radius * RADIUS_SLACK, 0)
-    return BallCertificate(
-        radius, room(ball.lower, -1.0), room(ball.upper, 1.0), gap_down, gap_up, ball.dimension
-    )
+    below, above = room(ball.lower, -1.0), room(ball.upper, 1.0)
+    radius = dr.select(proved, ball.radius * RADIUS_SLACK, 0)
+    return BallCertificate(radius, below, above, gap_down, gap_up, ball.dimension)

@@ -60,17 +60,33 @@ def shape(
         surface = level_set(surface, **settings)
     props = mi.Properties()
     props["bsdf"] = as_bsdf(mi, bsdf)
-    placement = Placement.identity() if to_world is None else Placement.of(as_matrix(to_world))
-    return _carrier_class(mi.variant())(props, surface, placement)
+    if to_world is not None:
+        props["to_world"] = mi.ScalarTransform4f(as_matrix(to_world))
+    return from_properties(mi, props, surface)
 
 
-def as_bsdf(mi: Any, bsdf: Mapping[str, Any] | Any) -> Any:
+def from_properties(mi: Any, props: Any, surface: LevelSet) -> Any:
+    """The shape of a surface with the `to_world` and the BSDF that a plug-in's properties hold.
+
+    Raises:
+        ValueError: as `shape`; or the properties hold an emitter or a medium.
+    """
+    placement = Placement.identity()
+    if "to_world" in props:
+        placement = Placement.of(as_matrix(props["to_world"]))
+    made = _carrier_class(mi.variant())(props, surface, placement)
+    if made.emitter() is not None or made.is_medium_transition():
+        raise ValueError("surfaces that are traced can neither emit light nor bound a medium")
+    return made
+
+
+def as_bsdf(mi: Any, bsdf: Any) -> Any:
     """A BSDF object, from one, its dictionary, or None."""
     if bsdf is None:
         bsdf = {"type": "twosided", "nested": {"type": "diffuse"}}
-    made = mi.load_dict(dict(bsdf)) if isinstance(bsdf, Mapping) else bsdf
+    made: Any = mi.load_dict({**bsdf}) if isinstance(bsdf, Mapping) else bsdf
     if not isinstance(made, mi.BSDF):
-        raise TypeError(f"bsdf must be a BSDF or its dictionary, not {type(bsdf).__name__}")
+        raise TypeError(f"bsdf must be a BSDF or its dictionary, not {type(made).__name__}")
     return made
 
 
@@ -115,4 +131,3 @@ def _carrier_class(variant: str) -> Any:
 def is_carrier(shape: Any) -> bool:
     """Whether a Mitsuba shape carries one of our surfaces."""
     return isinstance(getattr(shape, "placed", None), PlacedSurface)
-

@@ -28,4 +28,7 @@ def viridis(x: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
     Equal differences look equally large, and it reads well in grey and for the colour-blind.
     """
     x = np.clip(np.nan_to_num(x), 0.0, 1.0).astype(np.float64)
-    return np.clip(np.polynomial.polynomial.polyval(x, _VIRIDIS).transpose(*range(1, x.ndim + 1), 0), 0, 1)
+    colours = np.zeros((*x.shape, 3))
+    for coefficients in _VIRIDIS[::-1]:  # Horner
+        colours = colours * x[..., None] + coefficients
+    return np.clip(colours, 0.0, 1.0)

@@ -15,13 +15,13 @@ from harnack.backend import Mask, Real, Vec3  # at run time: Dr.Jit reads Encoun
 from harnack.tracer import Status
 
 if TYPE_CHECKING:
-    from harnack.tracer import PreparedLevelSet, Trace
+    from harnack.tracer import PreparedLevelSet
 
 # Polishing moves a hit by at most this many tolerances: along a ray that only grazes the surface
 # there is no crossing to converge to.
 _POLISH = 2.0
 # A ray leaves a surface this many tolerances away from it, so as not to meet it again there.
-_CLEARANCE = 4.0
+CLEARANCE = 4.0
 # A grazing ray's normal is turned until it faces the ray's side under this sine.
 _GRAZING = 1e-3
 
@@ -36,6 +36,7 @@ class Encounter:
     position, normal: of the surface. The normal is unit and points to the side of larger values
         or, of a solid, out of it.
     clearance: how far off the surface the next ray has to start.
+    value: of the field, close to the surface; of no meaning where nothing is met.
     evaluations: of the field.
     """
 
@@ -45,6 +46,7 @@ class Encounter:
     position: Vec3
     normal: Vec3
     clearance: Real
+    value: Real
     evaluations: Any
 
 
@@ -61,38 +63,45 @@ def meet_surface(
     vector = prepared.backend.Array3f
     trace = prepared.first_hit(o, d, 0, t_max, active)
     met = trace.status == int(Status.HIT)
-    reach = _reach(prepared, trace)
     gap = to_nearest_level(prepared, trace.value)
     slope = dr.dot(trace.gradient, d)
-    step = dr.select(met & (slope != 0), gap / slope, 0)
-    step = dr.clip(step, -_POLISH * reach, _POLISH * reach)
+    reach = _POLISH * _uncertainty(prepared, trace.gradient, trace.t, trace.value)
+    step = dr.select(met & (slope != 0), dr.clip(gap / slope, -reach, reach), 0)
     t = dr.maximum(dr.select(met, trace.t, 0) + step, 0)
     p = dr.fma(vector(t), d, o)
     sample = prepared.sample(p)
     length = dr.norm(sample.gradient)
     normal = dr.select(length > 0, sample.gradient / length, -d)
-    rest = dr.select(length > 0, to_nearest_level(prepared, sample.value) / length, 0)
-    rest = dr.clip(rest, -_POLISH * reach, _POLISH * reach)
+    uncertainty = _uncertainty(prepared, sample.gradient, t, sample.value, sample.error)
+    rest = to_nearest_level(prepared, sample.value) / length
+    rest = dr.select(length > 0, dr.clip(rest, -reach, reach), 0)
     # gap > 0: the level is above, so the ray comes from the side of smaller values.
     side = dr.select(gap > 0, prepared.backend.Float(1), -1)
     return Encounter(
-        dr.select(met, t, trace.t),
-        met,
-        trace.status == int(Status.OUT_OF_STEPS),
-        dr.fma(vector(rest), normal, p),
-        facing(normal, d, side),
-        _CLEARANCE * reach,
-        trace.evaluations + dr.select(met, prepared.backend.UInt32(1), 0),
+        t=dr.select(met, t, trace.t),
+        met=met,
+        lost=trace.status == int(Status.OUT_OF_STEPS),
+        position=dr.fma(vector(rest), normal, p),
+        normal=facing(normal, d, side),
+        clearance=CLEARANCE * uncertainty,
+        value=sample.value,
+        evaluations=trace.evaluations + dr.select(met, prepared.backend.UInt32(1), 0),
     )
 
 
-def _reach(prepared: PreparedLevelSet, trace: Trace) -> Real:
-    """How far from the surface a hit may be by its tolerance, to first order."""
-    tolerance = prepared.tolerance
-    t = dr.select(dr.isfinite(trace.t), trace.t, 0)
-    reach = dr.fma(t, tolerance.per_length, tolerance.distance)
-    length = dr.norm(trace.gradient)
-    return reach + dr.select(length > 0, tolerance.value / length, 0)
+def _uncertainty(
+    prepared: PreparedLevelSet, gradient: Vec3, t: Real, f: Real, error: Real = 0.0
+) -> Real:
+    """How far from the level a point may lie and still be a hit, to first order.
+
+    That is the tolerance, or what rounding of f (`Sample.error`) amounts to if that is more; the
+    rounding of positions is far below what Mitsuba's rays keep off surfaces anyway.
+    """
+    steepness = dr.norm(gradient)
+    t = dr.select(dr.isfinite(t), t, 0)
+    rounding = 2 * (error + 8 * prepared.backend.epsilon * dr.abs(f))
+    close = dr.maximum(prepared.tolerance.in_value(steepness, t), rounding)
+    return dr.select(steepness > 0, close / steepness, prepared.tolerance.distance)
 
 
 def facing(normal: Vec3, d: Vec3, side: Real) -> Vec3:

@@ -52,9 +52,7 @@ def visible_points(surface: LevelSet, backend: Backend) -> FloatArray:
     return np.concatenate([points, closer])
 
 
-def _probe(
-    surface: LevelSet, backend: Backend, lower: FloatArray, upper: FloatArray
-) -> FloatArray:
+def _probe(surface: LevelSet, backend: Backend, lower: FloatArray, upper: FloatArray) -> FloatArray:
     """First encounters of parallel rays from the six sides of a box."""
     size = float(np.linalg.norm(upper - lower))
     rough = replace(surface, tolerance=Tolerance(1e-4 * size))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +18,8 @@ PLUGIN = "harnack_path"
 # What a ray that ran out of steps is drawn in: nothing in nature is this colour.
 LOST_COLOUR = (1.0, 0.0, 1.0)
 
+_UNLIMITED = 2**32 - 1
+
 
 @dataclass
 class _Path:
@@ -25,6 +28,8 @@ class _Path:
     previous, pdf, delta: the last vertex and how it sampled the ray, for the weights of lights
         that the ray finds.
     eta: product of relative refractive indices; keeps Russian roulette from ending paths in glass.
+    spread, spread_before: whether a rough surface has scattered the path up to the last vertex,
+        and up to the one before that.
     """
 
     ray: Any
@@ -35,20 +40,46 @@ class _Path:
     previous: Any
     pdf: Real
     delta: Mask
+    spread: Mask
+    spread_before: Mask
     lost: Mask
     valid: Mask
     active: Mask
 
 
 class PathTracer:
-    """Path tracing with multiple importance sampling of lights and BSDFs (Veach 1997)."""
+    """Path tracing with multiple importance sampling of lights and BSDFs (Veach 1997).
 
-    def __init__(self, mi: Any, max_depth: int, rr_depth: int, hide_emitters: bool) -> None:
+    max_depth: longest path in edges, -1 for no limit. rr_depth: where Russian roulette begins.
+    hide_emitters: whether lights and environment are invisible to the camera.
+    clamp: the most that a path may bring of light that was spread by a rough surface before its
+        last scattering. A finite one takes some light away, and with it the white specks of
+        sharp reflections and caustics that paths find too rarely.
+    """
+
+    def __init__(
+        self,
+        mi: Any,
+        max_depth: int = 12,
+        rr_depth: int = 4,
+        hide_emitters: bool = False,
+        clamp: float = math.inf,
+    ) -> None:
+        if max_depth < -1 or rr_depth < 1:
+            raise ValueError(
+                "max_depth must be -1 (no limit) or >= 0 and rr_depth >= 1, "
+                f"not {max_depth} and {rr_depth}"
+            )
         self.mi = mi
-        self.max_depth = max_depth
+        self.max_depth = _UNLIMITED if max_depth == -1 else max_depth
         self.rr_depth = rr_depth
         self.hide_emitters = hide_emitters
+        self.clamp = clamp
         self.lost_colour = mi.load_dict({"type": "srgb", "color": list(LOST_COLOUR)})
+
+    def with_depth(self, max_depth: int) -> PathTracer:
+        """The same with another longest path."""
+        return PathTracer(self.mi, max_depth, self.rr_depth, self.hide_emitters, self.clamp)
 
     def trace(self, scene: Any, sampler: Any, ray: Any, active: Mask) -> tuple[Any, Mask, Mask]:
         """Radiance along rays, whether they met a surface, whether a ray of the path got lost."""
@@ -62,6 +93,8 @@ class PathTracer:
             previous=dr.zeros(mi.SurfaceInteraction3f),
             pdf=mi.Float(1),
             delta=mi.Bool(True),
+            spread=mi.Bool(False),
+            spread_before=mi.Bool(False),
             lost=mi.Bool(False),
             valid=mi.Bool(False),
             active=mi.Bool(active),
@@ -80,7 +113,7 @@ class PathTracer:
     def _vertex(self, world: World, path: _Path, sampler: Any) -> _Path:
         """Finds the next vertex of paths, collects its light and samples where to go on."""
         mi = self.mi
-        si, met = world.intersect(path.ray, path.active)
+        si, met = world.intersect(path.ray, path.previous, path.active)
         clearance, lost = met.clearance, met.lost
         radiance = path.radiance + self._emitted(world.scene, path, si, path.active & ~lost)
         shown = path.throughput * mi.Spectrum(self.lost_colour.eval(si, lost))
@@ -92,6 +125,7 @@ class PathTracer:
         sample, weight = bsdf.sample(
             mi.BSDFContext(), si, sampler.next_1d(active), sampler.next_2d(active), active
         )
+        delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
         throughput = path.throughput * weight
         eta = path.eta * sample.eta
         brightest = dr.max(throughput)
@@ -109,7 +143,9 @@ class PathTracer:
             depth=path.depth + 1,
             previous=si,
             pdf=sample.pdf,
-            delta=mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta),
+            delta=delta,
+            spread=path.spread | ~delta,
+            spread_before=path.spread,
             lost=path.lost | (path.active & lost),
             valid=path.valid | ((path.depth == 0) & (si.is_valid() | lost)),
             active=active,
@@ -124,10 +160,24 @@ class PathTracer:
         other = scene.pdf_emitter_direction(path.previous, found, active & ~path.delta)
         weight = _power_heuristic(path.pdf, other)
         light = path.throughput * weight * found.emitter.eval(si, active)
-        return dr.select(active, light, 0)
+        return dr.select(active, self._limited(light, path.spread_before), 0)
+
+    def _limited(self, light: Any, indirect: Mask) -> Any:
+        """Light, dimmed to at most `clamp` in every channel where it is indirect."""
+        if self.clamp == math.inf:
+            return light
+        excess = dr.max(light) / self.clamp
+        return dr.select(indirect & (excess > 1), light / excess, light)
 
     def _lit(
-        self, world: World, path: _Path, si: Any, clearance: Real, bsdf: Any, sampler: Any, active: Mask
+        self,
+        world: World,
+        path: _Path,
+        si: Any,
+        clearance: Real,
+        bsdf: Any,
+        sampler: Any,
+        active: Mask,
     ) -> Any:
         """Light that a vertex scatters along the ray from a sampled point of an emitter."""
         mi = self.mi
@@ -140,7 +190,8 @@ class PathTracer:
         active &= dr.max(scattered) > 0
         active &= ~world.occluded(connecting_ray(mi, si, clearance, light.p), active)
         share = dr.select(light.delta, 1, _power_heuristic(light.pdf, pdf))
-        return dr.select(active, path.throughput * scattered * weight * share, 0)
+        found = path.throughput * scattered * weight * share
+        return dr.select(active, self._limited(found, path.spread), 0)
 
 
 def _power_heuristic(a: Real, b: Real) -> Real:
@@ -158,20 +209,17 @@ def integrator_class(variant: str) -> Any:
         raise RuntimeError(f"the variant changed from {variant} to {mi.variant()}")
 
     class HarnackPath(mi.SamplingIntegrator):
-        """max_depth: longest path in edges, -1 for no limit. rr_depth: where Russian roulette
-        begins. hide_emitters: whether lights and environment are invisible to the camera."""
+        """Mitsuba's interface to `PathTracer`, whose arguments are the plug-in's properties."""
 
         def __init__(self, props: Any) -> None:
             mi.SamplingIntegrator.__init__(self, props)
-            max_depth, rr_depth = props.get("max_depth", 12), props.get("rr_depth", 5)
-            if max_depth < -1 or rr_depth < 1:
-                raise ValueError(
-                    f"max_depth must be -1 (no limit) or >= 0 and rr_depth >= 1, "
-                    f"not {max_depth} and {rr_depth}"
-                )
-            unlimited = 2**32 - 1
-            depth = unlimited if max_depth == -1 else max_depth
-            self.tracer = PathTracer(mi, depth, rr_depth, props.get("hide_emitters", False))
+            self.tracer = PathTracer(
+                mi,
+                props.get("max_depth", 12),
+                props.get("rr_depth", 4),
+                props.get("hide_emitters", False),
+                props.get("clamp", math.inf),
+            )
             self.lost = mi.UInt32(0)
 
         def sample(
@@ -192,4 +240,3 @@ def integrator_class(variant: str) -> Any:
             return f"HarnackPath[max_depth = {self.tracer.max_depth}]"
 
     return HarnackPath
-

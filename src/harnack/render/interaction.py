@@ -54,7 +54,4 @@ def connecting_ray(mi: Any, si: Any, clearance: Real, target: Vec3) -> Any:
     o = leaving_from(mi, si, clearance, target - si.p)
     way = target - o
     length = dr.norm(way)
-    return mi.Ray3f(
-        o, way / length, length * (1 - mi.math.ShadowEpsilon), si.time, si.wavelengths
-    )
-
+    return mi.Ray3f(o, way / length, length * (1 - mi.math.ShadowEpsilon), si.time, si.wavelengths)

@@ -51,14 +51,12 @@ class Material:
 
 
 MATERIALS: Mapping[str, Material] = {
-    "two-tone": Material(
-        _glazed((0.84, 0.30, 0.14), 0.22), _glazed((0.07, 0.25, 0.40), 0.22)
-    ),
+    "two-tone": Material(_glazed((0.84, 0.30, 0.14), 0.22), _glazed((0.07, 0.25, 0.40), 0.22)),
     "clay": Material({"type": "diffuse", "reflectance": _rgb((0.72, 0.62, 0.53))}),
     "porcelain": Material(_glazed((0.84, 0.83, 0.80), 0.06)),
     "plastic": Material(_glazed((0.62, 0.05, 0.07), 0.10)),
-    "gold": Material(_metal("Au", 0.14)),
-    "copper": Material(_metal("Cu", 0.16)),
+    "gold": Material(_metal("Au", 0.10)),
+    "copper": Material(_metal("Cu", 0.12)),
     "silver": Material(_metal("Ag", 0.12)),
     "glass": Material({"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}, closed=True),
     "frosted": Material(
@@ -68,7 +66,7 @@ MATERIALS: Mapping[str, Material] = {
 """Materials by name."""
 
 
-def material(wanted: str | Material | Mapping[str, Any] | None) -> Material:
+def material_of(wanted: str | Material | Mapping[str, Any] | None) -> Material:
     """A material from its name, or from a BSDF dictionary used as it stands.
 
     Raises:

@@ -4,42 +4,48 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    TaskProgressColumn,
+    TextColumn,
+    TimeRemainingColumn,
+)
 
-from harnack.fields.field import Field
+from harnack.fields import Field
+from harnack.render.exposure import expose
 from harnack.render.images import check_picture_path, tone_mapped, write_image
-from harnack.render import materials
+from harnack.render.integrator import PathTracer
+from harnack.render.materials import Material, material_of
 from harnack.render.plugins import register
-from harnack.render.studio import Camera, studio
+from harnack.render.studio import Camera, Exhibit, studio
 from harnack.render.views import VIEWS, look
 from harnack.tracer import LevelSet, level_set
 
 ShowMode = Literal["color", "normal", "evaluations", "status", "depth"]
 SHOW_MODES: tuple[str, ...] = ("color", *VIEWS)
 Image = npt.NDArray[Any]
-
-# Camera rays of one pass: the bar moves and Ctrl-C works between passes.
-_RAYS_A_PASS = 2**20
+MaterialLike = str | Material | Mapping[str, Any]
 
 
 def render(
     what: Any,
     path: str | os.PathLike[str] | None = None,
     *,
-    show: ShowMode = "color",
+    show: ShowMode | str = "color",
     size: tuple[int, int] | None = None,
     spp: int | None = None,
-    material: Any = None,
+    material: MaterialLike | Sequence[MaterialLike] | None = None,
     camera: Camera | None = None,
-    max_depth: int = 12,
+    backdrop: str | None = None,
+    max_depth: int | None = None,
     seed: int = 0,
     progress: bool = True,
     **settings: Any,
@@ -47,39 +53,55 @@ def render(
     """Draw fields or a Mitsuba scene, and write the picture to `path` if there is one.
 
     what: a field, a `LevelSet` or a list of them, drawn in the studio; or a Mitsuba scene, its
-        dictionary, or the path of its XML file, with surfaces made by `harnack.render.shape`.
+        dictionary, or the path of its XML file.
     path: .png (8-bit sRGB, tone mapped) or .exr (the numbers).
     show: "color"; or what one ray a pixel found: "normal", "evaluations" (of the fields),
         "status" and "depth".
     size: (width, height) in pixels, by default (800, 600) or the scene's own.
-    spp: samples a pixel of a color picture, by default 64 or the scene's own.
-    material: a name of `MATERIALS`, a `Material` or a BSDF dictionary; one for each surface.
-    camera: where the studio is seen from.
-    max_depth: longest light path, in edges; -1 for no limit.
+    spp: samples a pixel of a color picture, by default 64 or the scene's own. Some samplers
+        round it up.
+    max_depth: longest light path in edges, -1 for no limit; by default 12 or the scene's own.
     seed: another seed, other noise; the same seed, the same picture.
-    settings: of the surface, as `harnack.level_set` takes them: level, clip, tolerance, solid, ...
 
-    Returns the numbers: (h, w, 3) linear sRGB radiance, (h, w, 3) normals, or (h, w).
+    In the studio only:
+
+    material: a name of `MATERIALS`, a `Material` or a BSDF dictionary; a list, one for each
+        surface.
+    camera: where the stage is seen from.
+    backdrop: "light" or "dark".
+    settings: of the surfaces, as `harnack.level_set` takes them: level, clip, solid, ...; those
+        of a `LevelSet` are replaced. Without a tolerance, a field gets one that suits its size.
+
+    Returns the numbers: (h, w, 3) linear sRGB radiance; (h, w, 3) normals; or (h, w), of which
+    depths are in units of the (first) surface's coordinates.
 
     A ray that runs out of steps is drawn magenta, and a warning says how many there were.
 
-    Raises ValueError before anything is drawn for an unknown file type, mode or material.
+    Raises ValueError before anything is drawn for an unknown file type, mode or material,
+    settings that make no surface, or a surface without bounds.
     """
     target = None if path is None else check_picture_path(path)
-    if show not in SHOW_MODES:
-        raise ValueError(f"show must be one of {', '.join(SHOW_MODES)}, not {show!r}")
+    _check(show, size, spp)
     mi = register()
-    if _is_scene(what):
-        scene = _loaded(mi, what)
+    in_studio = isinstance(what, Field | LevelSet | list | tuple)
+    if in_studio:
+        exhibits = _exhibits(what, material, settings)
+        made = studio(
+            mi, exhibits, size=size or (800, 600), camera=camera or Camera(),
+            backdrop=backdrop or "light", bare=show != "color",
+        )  # fmt: skip
+        scene, unit = mi.load_dict(made.scene), made.unit
     else:
-        scene = _in_studio(mi, what, material, size, camera, max_depth, show != "color", settings)
+        _refuse({"material": material, "camera": camera, "backdrop": backdrop, **settings})
+        scene, unit = _loaded(mi, what, size), 1.0
     sensor = scene.sensors()[0]
     if show == "color":
-        integrator = _integrator(mi, scene, max_depth)
-        image = _radiance(mi, scene, sensor, integrator, spp or 64, seed, progress)
+        tracer = _tracer(mi, scene, max_depth)
+        spp = spp or int(sensor.sampler().sample_count())
+        image = _radiance(mi, scene, sensor, tracer, spp, seed, progress)
         drawn = tone_mapped(image)
     else:
-        view = look(mi, scene, sensor)
+        view = look(mi, scene, sensor, unit)
         image, drawn = VIEWS[show].numbers(view), VIEWS[show].picture(view)
     if target is not None:
         exact = target.suffix.lower() == ".exr"
@@ -87,65 +109,102 @@ def render(
     return image
 
 
-def _is_scene(what: Any) -> bool:
-    return not isinstance(what, (Field, LevelSet, Sequence)) or isinstance(what, str)
+def _check(show: str, size: tuple[int, int] | None, spp: int | None) -> None:
+    if show not in SHOW_MODES:
+        raise ValueError(f"show must be one of {', '.join(SHOW_MODES)}, not {show!r}")
+    if size is not None and (len(size) != 2 or min(size) < 1):
+        raise ValueError(f"size must be (width, height) in pixels, not {size}")
+    if spp is not None and spp < 1:
+        raise ValueError(f"spp must be at least 1, not {spp}")
 
 
-def _loaded(mi: Any, what: Any) -> Any:
-    if isinstance(what, mi.Scene):
-        return what
-    if isinstance(what, Mapping):
-        return mi.load_dict(dict(what))
-    return mi.load_file(str(what))
+def _refuse(given: Mapping[str, Any]) -> None:
+    """Settings of the studio make no sense for a scene that has everything already."""
+    wrong = [name for name, value in given.items() if value is not None]
+    if wrong:
+        raise ValueError(f"{', '.join(wrong)}: a Mitsuba scene is drawn as it is")
 
 
-def _in_studio(
-    mi: Any, what: Any, asked: Any, size: Any, camera: Any, max_depth: int, bare: bool, settings: Any
-) -> Any:
-    surfaces = [
-        one if isinstance(one, LevelSet) else level_set(one, **settings)
-        for one in (what if isinstance(what, Sequence) else [what])
-    ]
-    names = asked if isinstance(asked, Sequence) and not isinstance(asked, str) else [asked] * len(surfaces)
-    made = [materials.material(name) for name in names]
-    return mi.load_dict(
-        studio(
-            mi, surfaces, made,
-            size=size or (800, 600), camera=camera or Camera(), max_depth=max_depth, bare=bare,
+def _exhibits(what: Any, materials: Any, settings: Mapping[str, Any]) -> list[Exhibit]:
+    given: list[Any] = [what] if isinstance(what, Field | LevelSet) else list(what)
+    if not given:
+        raise ValueError("there is nothing to draw: give at least one field")
+    for one in given:
+        if not isinstance(one, Field | LevelSet):
+            raise TypeError(f"a list to draw holds fields and level sets, not {one!r}")
+    listed: bool = isinstance(materials, list | tuple)
+    names: list[Any] = [*materials] if listed else [materials] * len(given)
+    if len(names) != len(given):
+        raise ValueError(
+            f"give one material or {len(given)}, one for each surface, not {len(names)}"
         )
-    )  # fmt: skip
+    fitted = "tolerance" not in settings
+    return [
+        Exhibit(_surface(one, settings), material_of(name), fitted and isinstance(one, Field))
+        for one, name in zip(given, names, strict=True)
+    ]
 
 
-def _integrator(mi: Any, scene: Any, max_depth: int) -> Any:
-    own = scene.integrator()
-    if hasattr(own, "take_lost"):
-        return own
-    return mi.load_dict({"type": "harnack_path", "max_depth": max_depth})
+def _surface(one: Field | LevelSet, settings: Mapping[str, Any]) -> LevelSet:
+    if isinstance(one, Field):
+        return level_set(one, **settings)
+    if not settings:
+        return one
+    own: dict[str, Any] = {
+        "clip": one.clip, "tolerance": one.tolerance, "max_steps": one.max_steps,
+        "bound": one.bound, "overstep": one.overstep,
+    }  # fmt: skip
+    if "level" not in settings and "solid" not in settings:
+        own |= {"level": one.levels} if one.solid is None else {"solid": one.solid}
+    return level_set(one.field, **{**own, **settings})
+
+
+def _loaded(mi: Any, what: Any, size: tuple[int, int] | None) -> Any:
+    if isinstance(what, mi.Scene):
+        scene = what
+    elif isinstance(what, Mapping):
+        scene = mi.load_dict({**what})
+    elif isinstance(what, str | os.PathLike):
+        scene = mi.load_file(os.fspath(what))
+    else:
+        raise TypeError(
+            "draw a field, a LevelSet, a list of them, or a Mitsuba scene, its dictionary or the "
+            f"path of its file, not {what!r}"
+        )
+    if not scene.sensors():
+        raise ValueError("the scene has no sensor to look through")
+    if size is not None:
+        params = mi.traverse(scene.sensors()[0])
+        params["film.size"] = size
+        params.update()
+    return scene
+
+
+def _tracer(mi: Any, scene: Any, max_depth: int | None) -> PathTracer:
+    own = getattr(scene.integrator(), "tracer", None)
+    if not isinstance(own, PathTracer):
+        return PathTracer(mi, 12 if max_depth is None else max_depth)
+    return own if max_depth is None else own.with_depth(max_depth)
 
 
 def _radiance(
-    mi: Any, scene: Any, sensor: Any, integrator: Any, spp: int, seed: int, progress: bool
-) -> npt.NDArray[np.float32]:
-    width, height = sensor.film().crop_size()
-    step = max(1, _RAYS_A_PASS // (int(width) * int(height)))
-    passes = [min(step, spp - done) for done in range(0, spp, step)]
-    total = np.zeros((int(height), int(width), 3))
-    integrator.take_lost()
-    with _bar(progress, spp) as advance:
-        for index, count in enumerate(passes):
-            image = integrator.render(scene, sensor, seed=(seed * 0x9E3779B1 + index) % 2**32, spp=count)
-            total += count * np.array(image)[..., :3]
-            advance(count)
-    lost = integrator.take_lost()
+    mi: Any, scene: Any, sensor: Any, tracer: PathTracer, spp: int, seed: int, progress: bool
+) -> Image:
+    with _bar(progress) as advance:
+        image, lost = expose(mi, scene, sensor, tracer, spp=spp, seed=seed, advance=advance)
     if lost:
-        warnings.warn(f"{lost} rays ran out of steps and are drawn magenta", stacklevel=3)
-    return (total / spp).astype(np.float32)
+        warnings.warn(
+            f"{lost} light paths ran out of steps and are drawn magenta; raise max_steps",
+            stacklevel=3,
+        )
+    return image
 
 
 @contextmanager
-def _bar(shown: bool, total: int) -> Iterator[Callable[[int], None]]:
-    columns = (TextColumn("rendering"), BarColumn(), TextColumn("{task.completed}/{task.total} spp"), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), disable=not shown, transient=True) as bar:
-        task = bar.add_task("", total=total)
-        yield lambda count: bar.advance(task, count)
-
+def _bar(shown: bool) -> Generator[Callable[[float], None]]:
+    """A progress bar on stderr; what it yields is told what part has been finished."""
+    columns = (TextColumn("rendering"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, disable=not shown, transient=True) as bar:
+        task = bar.add_task("", total=1.0)
+        yield lambda part: bar.advance(task, part)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -48,7 +49,8 @@ class Placement:
             raise ValueError("to_world must be a finite matrix of shape (4, 4)")
         linear = matrix[:3, :3]
         scale = float(np.cbrt(abs(np.linalg.det(linear))))
-        close = scale > 0 and np.allclose(linear @ linear.T, scale**2 * np.eye(3), atol=1e-4 * scale**2)
+        gram: FloatArray = np.matmul(linear, np.transpose(linear))
+        close = scale > 0 and np.allclose(gram, scale**2 * np.eye(3), atol=1e-4 * scale**2)
         if not close or not np.allclose(matrix[3], (0, 0, 0, 1)):
             raise ValueError(
                 "to_world must be made of translations, rotations, mirrors and one scale for all "
@@ -65,13 +67,15 @@ class Placement:
 
     def apply(self, points: npt.ArrayLike) -> FloatArray:
         """Points (n, 3) of the surface, in the world."""
-        local = np.asarray(points, dtype=np.float64)
-        return self.scale * local @ self.rotation.T + self.translation
+        local: FloatArray = np.asarray(points, dtype=np.float64)
+        turned: FloatArray = np.matmul(local, np.transpose(self.rotation))
+        return self.scale * turned + self.translation
 
     def world_bounds(self, volume: Volume) -> tuple[FloatArray, FloatArray]:
         """Lower and upper corner, (3,) each, of a box in the world that holds a volume's."""
-        ends = np.array(volume.bounds())
-        corners = self.apply([[ends[i, 0], ends[j, 1], ends[k, 2]] for i, j, k in np.ndindex(2, 2, 2)])
+        lower, upper = volume.bounds()
+        ends = [[float(a), float(b)] for a, b in zip(lower, upper, strict=True)]
+        corners = self.apply(list(itertools.product(*ends)))
         return corners.min(axis=0), corners.max(axis=0)
 
 
@@ -101,11 +105,15 @@ class PlacedSurface:
         scale = dr.opaque(backend.Float, placement.scale)
         return cls(prepared, solid, scale, rows, vector(placement.translation))
 
-    def meet(self, o: Vec3, d: Vec3, t_max: Real, active: Mask) -> Encounter:
-        """Where rays of the world, |d| = 1, first meet it, in coordinates of the world."""
+    def meet(self, o: Vec3, d: Vec3, t_max: Real, active: Mask, leaves: Real = 0.0) -> Encounter:
+        """Where rays of the world, |d| = 1, first meet it, in coordinates of the world.
+
+        leaves: of a ray that starts on this very surface, 1 or -1 for the side of the normal that
+            it goes to; else 0.
+        """
         o, d, t_max = self._local_ray(o, d, t_max)
         if self.solid is not None:
-            met = self.solid.meet(o, d, t_max, active)
+            met = self.solid.meet(o, d, t_max, active, leaves)
         else:
             met = meet_surface(self.prepared, o, d, t_max, active)
         position = self.scale * self._to_world(met.position) + self.translation

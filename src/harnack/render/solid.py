@@ -13,11 +13,10 @@ from typing import TYPE_CHECKING
 
 import drjit as dr
 
-from harnack.render.encounter import Encounter, facing, meet_surface
+from harnack.render.encounter import CLEARANCE, Encounter, facing, meet_surface
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
-    from harnack.geometry import Volume
     from harnack.tracer import LevelSet, PreparedLevelSet
 
 
@@ -38,64 +37,61 @@ class Solid:
         low, high = (next(finite) if math.isfinite(end) else end for end in surface.solid)
         return cls(prepared, low, high)
 
-    def holds(self, p: Vec3) -> Mask:
+    def _holds(self, p: Vec3) -> Mask:
         """Whether points of the volume belong to the solid."""
         f = self.prepared.sample(p).value
         return (f >= self.low) & (f <= self.high)
 
-    def meet(self, o: Vec3, d: Vec3, t_max: Real, active: Mask) -> Encounter:
-        """Where rays o + t d, |d| = 1, 0 <= t <= t_max, first cross the boundary of the solid."""
-        volume = self.prepared.volume
-        if volume is None:
-            return self._meet_levels(o, d, t_max, active)
-        start, end, entering, through = self._ends(o, d, t_max, active)
-        inner = self._meet_levels(o, d, t_max, active & ~entering)
-        last = self._at(o, d, end, through)
-        leaving = through & ~entering & ~inner.met & ~inner.lost & (end < t_max)
-        leaving &= self.holds(last)
-        position = dr.select(entering, self._at(o, d, start, through), last)
-        cap = replace(
-            inner,
-            t=dr.select(entering, start, end),
-            met=entering | leaving,
-            position=position,
-            normal=_cap_normal(volume, position, d, entering),
-            clearance=dr.zeros(self.prepared.backend.Float),
-            evaluations=inner.evaluations + dr.select(through, type(inner.evaluations)(2), 0),
+    def meet(self, o: Vec3, d: Vec3, t_max: Real, active: Mask, leaves: Real = 0.0) -> Encounter:
+        """Where rays o + t d, |d| = 1, 0 <= t <= t_max, first cross the boundary of the solid.
+
+        leaves: of a ray that starts at the boundary, 1 if it goes out of the solid there, -1 if
+            it goes in; else 0. Such a ray starts off the boundary by a clearance, and where the
+            solid or a gap in it is thinner than that, it slips through: it then crosses back at
+            once, straight on. So going in and going out always alternate, and no light is lost
+            at the sharp rims of caps.
+        """
+        zero = self.prepared.backend.Float(0)
+        start, end = self.prepared.clip(o, d, zero, t_max)
+        through = active & (start < end)
+        start = dr.select(through, start, 0)
+        within = through & self._holds(self._at(o, d, start))
+        inside = within & (start <= 0)
+        slipped = active & (((leaves < 0) & ~inside) | ((leaves > 0) & inside))
+        entering = within & ~inside & ~slipped
+        met = self._meet_levels(o, d, t_max, active & ~entering & ~slipped)
+        met = replace(met, evaluations=met.evaluations + type(met.evaluations)(dr.select(through, 1, 0)))
+        leaving = inside & ~slipped & ~met.met & ~met.lost & (end < t_max)
+        capped = entering | leaving | slipped
+        t = dr.select(capped & ~slipped, dr.select(leaving, end, start), 0)
+        position = self._at(o, d, t)
+        outwards = dr.select(leaving | (leaves < 0), zero + 1, -1)
+        normal = outwards * d
+        if self.prepared.volume is not None:
+            cap = facing(self.prepared.volume.outward_normal(position), d, outwards)
+            normal = dr.select(slipped, normal, cap)
+        clearance = zero + CLEARANCE * self.prepared.tolerance.distance
+        crossed = replace(
+            met, t=t, met=capped, position=position, normal=normal, clearance=clearance
         )
-        return dr.select(cap.met, cap, inner)
+        return dr.select(capped, crossed, met)
 
     def occludes(self, o: Vec3, d: Vec3, t_max: Real, active: Mask) -> Mask:
         """Whether the boundary lies on rays; what is not proved free counts as lying there."""
-        if self.prepared.volume is None:
-            return self.prepared.occluded(o, d, 0, t_max, active)
-        _, end, entering, through = self._ends(o, d, t_max, active)
-        inner = self.prepared.occluded(o, d, 0, t_max, active & ~entering)
-        leaving = through & (end < t_max) & self.holds(self._at(o, d, end, through))
-        return entering | inner | leaving
-
-    def _ends(self, o: Vec3, d: Vec3, t_max: Real, active: Mask) -> tuple[Real, Real, Mask, Mask]:
-        """The part of rays in the volume: its start and end, whether the start is on a cap, and
-        whether there is such a part."""
-        real = self.prepared.backend.Float
-        start, end = self.prepared.clip(o, d, real(0), real(t_max))
+        start, end = self.prepared.clip(o, d, self.prepared.backend.Float(0), t_max)
         through = active & (start < end)
-        entering = through & (start > 0) & self.holds(self._at(o, d, start, through))
-        return start, end, entering, through
-
-    def _at(self, o: Vec3, d: Vec3, t: Real, usable: Mask) -> Vec3:
-        t = dr.select(usable & dr.isfinite(t), t, 0)
-        return dr.fma(self.prepared.backend.Array3f(t), d, o)
+        start = dr.select(through, start, 0)
+        within = through & self._holds(self._at(o, d, start))
+        capped = within & ((start > 0) | (end < t_max))
+        return capped | self.prepared.occluded(o, d, 0, t_max, active & ~capped)
 
     def _meet_levels(self, o: Vec3, d: Vec3, t_max: Real, active: Mask) -> Encounter:
         """The first level set inside the volume, its normal turned out of the solid."""
         met = meet_surface(self.prepared, o, d, t_max, active)
-        f = self.prepared.sample(met.position).value
-        at_low = dr.abs(f - self.low) < dr.abs(f - self.high)
-        return replace(met, normal=dr.select(at_low, -met.normal, met.normal))
+        at_low = dr.abs(met.value - self.low) < dr.abs(met.value - self.high)
+        normal = dr.select(at_low, -met.normal, met.normal)
+        return replace(met, normal=normal)
 
-
-def _cap_normal(volume: Volume, position: Vec3, d: Vec3, entering: Mask) -> Vec3:
-    """The volume's outward normal, against rays that enter and along those that leave."""
-    side = dr.select(entering, type(position.x)(-1), 1)
-    return facing(volume.outward_normal(position), d, side)
+    def _at(self, o: Vec3, d: Vec3, t: Real) -> Vec3:
+        t = dr.select(dr.isfinite(t), t, 0)
+        return dr.fma(self.prepared.backend.Array3f(t), d, o)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,12 +16,13 @@ import numpy as np
 from harnack.geometry.convex_volume import FloatArray
 from harnack.render.carrier import shape
 from harnack.render.framing import visible_points
+from harnack.render.lighting import ground, lights
 from harnack.render.placement import Placement
 from harnack.render.variant import mitsuba_backend
+from harnack.tracer import LevelSet, Tolerance
 
 if TYPE_CHECKING:
     from harnack.render.materials import Material
-    from harnack.tracer import LevelSet
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class Camera:
         it is put on the ground.
     """
 
-    azimuth: float = -60.0
+    azimuth: float = -50.0
     elevation: float = 28.0
     fov: float = 26.0
     zoom: float = 1.0
@@ -78,36 +79,64 @@ class Camera:
         return origin, origin - back
 
 
+# Of fitted surfaces, on the stage.
+_TOLERANCE = 1e-4
+# Light of one path, where white is 1.
+_CLAMP = 2.0
 # The part of the picture that the surface fills at zoom 1.
 _FILLED = 0.86
 
 
+@dataclass(frozen=True)
+class Exhibit:
+    """A surface on the stage.
+
+    fitted: whether to give it a tolerance that suits its size in place of its own.
+    """
+
+    surface: LevelSet
+    material: Material
+    fitted: bool = False
+
+
+@dataclass(frozen=True)
+class Studio:
+    """A scene dictionary, and the length in it of a unit of the surfaces' coordinates."""
+
+    scene: dict[str, Any]
+    unit: float
+
+
 def studio(
     mi: Any,
-    surfaces: Sequence[LevelSet],
-    materials: Sequence[Material],
+    exhibits: Sequence[Exhibit],
     *,
     size: tuple[int, int],
     camera: Camera,
-    max_depth: int,
+    backdrop: str = "light",
     bare: bool = False,
-) -> dict[str, Any]:
-    """A scene dictionary of surfaces on the stage.
+) -> Studio:
+    """Surfaces on the stage, seen in a picture of (width, height) pixels.
 
     bare: only surfaces and camera, without ground and lights.
     """
     backend = mitsuba_backend(mi)
-    points = np.concatenate([visible_points(surface, backend) for surface in surfaces])
+    points = np.concatenate([visible_points(one.surface, backend) for one in exhibits])
     placement = on_ground(points)
     scene: dict[str, Any] = {
         "type": "scene",
-        "integrator": {"type": "harnack_path", "max_depth": max_depth},
+        "integrator": {"type": "harnack_path", "clamp": _CLAMP},
         "sensor": _sensor(mi, camera, placement.apply(points), size),
     }
-    for k, (surface, material) in enumerate(zip(surfaces, materials, strict=True)):
-        bsdf = material.bsdf(solid=surface.solid is not None)
+    for k, one in enumerate(exhibits):
+        surface = one.surface
+        if one.fitted:
+            surface = replace(surface, tolerance=Tolerance(_TOLERANCE / placement.scale))
+        bsdf = one.material.bsdf(solid=surface.solid is not None)
         scene[f"surface{k}"] = shape(surface, bsdf=bsdf, to_world=placement.matrix)
-    return scene if bare else {**scene, **_ground(mi), **_lights(mi)}
+    if not bare:
+        scene |= {**ground(mi, backdrop), **lights(mi, camera.azimuth)}
+    return Studio(scene, placement.scale)
 
 
 def on_ground(points: FloatArray) -> Placement:
@@ -138,29 +167,5 @@ def _sensor(mi: Any, camera: Camera, points: FloatArray, size: tuple[int, int]) 
             "pixel_format": "rgb",
             "component_format": "float32",
         },
-        "sampler": {"type": "independent"},
-    }
-
-
-def _ground(mi: Any) -> dict[str, Any]:
-    transform = mi.ScalarTransform4f().translate([0, 0, -0.002]).scale(80)
-    return {
-        "ground": {
-            "type": "disk",
-            "to_world": transform,
-            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.62, 0.61, 0.60]}},
-        }
-    }
-
-
-def _lights(mi: Any) -> dict[str, Any]:
-    look = mi.ScalarTransform4f().look_at
-    key = look(origin=[3.0, -2.2, 5.0], target=[0, 0, 0.3], up=[0, 0, 1]).scale(1.5)
-    return {
-        "key": {
-            "type": "rectangle",
-            "to_world": key,
-            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [9.0, 8.5, 7.8]}},
-        },
-        "fill": {"type": "constant", "radiance": {"type": "rgb", "value": [0.32, 0.36, 0.42]}},
+        "sampler": {"type": "multijitter", "sample_count": 64},
     }

@@ -34,8 +34,8 @@ _STATUS_COLOURS = {
 class View:
     """First hits of the rays through the middles of all pixels.
 
-    depth: (h, w) distance from the camera, inf where nothing is met. Where the ray ran out of
-        steps, how far it is proved free.
+    depth: (h, w) distance from the camera in the unit asked for, inf where nothing is met. Where
+        the ray ran out of steps, how far it is proved free.
     normal: (h, w, 3) unit, zero where nothing is met; of a level set it points to larger values.
     evaluations: (h, w) of all the scene's fields.
     status: (h, w) a `Status`; shapes of Mitsuba count as hits.
@@ -47,11 +47,11 @@ class View:
     status: npt.NDArray[np.int64]
 
 
-def look(mi: Any, scene: Any, sensor: Any) -> View:
-    """What a sensor sees first."""
+def look(mi: Any, scene: Any, sensor: Any, unit: float = 1.0) -> View:
+    """What a sensor sees first. unit: of depths, in lengths of the scene."""
     width, height = (int(n) for n in sensor.film().crop_size())
     ray = _middle_rays(mi, sensor, width, height)
-    _, first = World.of(mi, scene).intersect(ray, mi.Bool(True))
+    _, first = World.of(mi, scene).intersect(ray, dr.zeros(mi.SurfaceInteraction3f), mi.Bool(True))
     dr.eval(first)
 
     def image(values: Any) -> Any:
@@ -64,7 +64,7 @@ def look(mi: Any, scene: Any, sensor: Any) -> View:
     status = np.where(image(first.lost), int(Status.OUT_OF_STEPS), status)
     normal = np.where(image(first.met)[..., None], image(first.normal), 0)
     evaluations = image(first.evaluations).astype(np.int64)
-    return View(image(first.t).copy(), normal, evaluations, status)
+    return View(image(first.t) / unit, normal, evaluations, status)
 
 
 def _middle_rays(mi: Any, sensor: Any, width: int, height: int) -> Any:

@@ -27,8 +27,10 @@ class World:
         """Finds the carriers in a scene."""
         return cls(mi, scene, tuple(s for s in scene.shapes() if is_carrier(s)))
 
-    def intersect(self, ray: Any, active: Mask) -> tuple[Any, Encounter]:
+    def intersect(self, ray: Any, start: Any, active: Mask) -> tuple[Any, Encounter]:
         """The first thing that rays meet, as interaction and as encounter.
+
+        start: the interaction that rays leave, not valid for rays that come from a camera.
 
         Where the encounter is lost (the ray ran out of steps before anything that is known to be
         there) the interaction is not valid.
@@ -38,10 +40,13 @@ class World:
         first = self._of_scene(si, active)
         limit = dr.minimum(si.t, ray.maxt)
         for carrier in self.carriers:
-            met = carrier.placed.meet(ray.o, ray.d, limit, active)
+            shape = mi.ShapePtr(carrier)
+            side = dr.sign(dr.dot(start.n, ray.d))
+            leaves = dr.select(start.is_valid() & (start.shape == shape), side, 0)
+            met = carrier.placed.meet(ray.o, ray.d, limit, active, leaves)
             evaluations = first.evaluations + met.evaluations
             event = met.met | met.lost
-            si = dr.select(event, surface_interaction(mi, met, ray, mi.ShapePtr(carrier)), si)
+            si = dr.select(event, surface_interaction(mi, met, ray, shape), si)
             first = replace(dr.select(event, met, first), evaluations=evaluations)
             limit = dr.select(event, met.t, limit)
         return si, first
@@ -55,6 +60,7 @@ class World:
             position=vector(si.p),
             normal=vector(si.n),
             clearance=mi.Float(0),
+            value=mi.Float(0),
             evaluations=mi.UInt32(0),
         )
 

@@ -14,8 +14,8 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import to_numpy
-from harnack.bounds import Bound, Caps, Classic, LipschitzStep, Slope
-from harnack.certify import BallCertificate, LipschitzCertificate
+from harnack.bounds import Bound, Caps, Classic, CurvatureStep, LipschitzStep, Slope
+from harnack.certify import BallCertificate, CurvatureCertificate, LipschitzCertificate
 from harnack.testing.poisson import FloatArray, cap_movement, kernel_movement, poles_movement
 
 if TYPE_CHECKING:
@@ -31,15 +31,16 @@ def exact_step(bound: Bound, certificate: Certificate, slope: FloatArray) -> Flo
     known here.
     """
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        if isinstance(certificate, LipschitzCertificate):
-            if not isinstance(bound, LipschitzStep):
-                raise TypeError(f"no exact step is known for {type(bound).__name__}")
+        if isinstance(certificate, LipschitzCertificate) and isinstance(bound, LipschitzStep):
             gap = np.minimum(certificate.gap_down, certificate.gap_up)
             return np.minimum(gap / certificate.constant, certificate.radius)
-        for kind, fraction in _FRACTIONS.items():
-            if isinstance(bound, kind):
-                return certificate.radius * fraction(certificate, slope)
-    raise TypeError(f"no exact step is known for {type(bound).__name__}")
+        if isinstance(certificate, CurvatureCertificate) and isinstance(bound, CurvatureStep):
+            return _parabolas(certificate, slope)
+        if isinstance(certificate, BallCertificate):
+            for kind, fraction in _FRACTIONS.items():
+                if isinstance(bound, kind):
+                    return certificate.radius * fraction(certificate, slope)
+    raise TypeError(f"no exact step is known for {bound!r} and {type(certificate).__name__}")
 
 
 def on_host(certificate: Certificate, lanes: int) -> Certificate:
@@ -49,20 +50,11 @@ def on_host(certificate: Certificate, lanes: int) -> Certificate:
         array = to_numpy(value) if dr.is_array_v(value) else np.asarray(value)
         return np.broadcast_to(array.astype(np.float64), (lanes,))
 
-    if isinstance(certificate, LipschitzCertificate):
-        c = certificate
-        return LipschitzCertificate(
-            host(c.constant), host(c.radius), host(c.gap_down), host(c.gap_up)
-        )
-    b = certificate
-    return BallCertificate(
-        host(b.radius),
-        None if b.room_below is None else host(b.room_below),
-        None if b.room_above is None else host(b.room_above),
-        host(b.gap_down),
-        host(b.gap_up),
-        b.dimension,
-    )
+    fields = {
+        key: value if value is None or key == "dimension" else host(value)
+        for key, value in vars(certificate).items()
+    }
+    return type(certificate)(**fields)
 
 
 def largest_free(movement: Callable[[FloatArray], FloatArray], gap: FloatArray) -> FloatArray:
@@ -73,6 +65,19 @@ def largest_free(movement: Callable[[FloatArray], FloatArray], gap: FloatArray) 
         free = movement(middle) <= gap
         low, high = np.where(free, middle, low), np.where(free, high, middle)
     return low
+
+
+def _parabolas(c: CurvatureCertificate, slope: FloatArray) -> FloatArray:
+    """Second derivatives of plus and minus the constant."""
+    h, r = c.constant, c.radius
+
+    def up(q: FloatArray) -> FloatArray:
+        return slope * q * r + 0.5 * h * (q * r) ** 2
+
+    def down(q: FloatArray) -> FloatArray:
+        return -slope * q * r + 0.5 * h * (q * r) ** 2
+
+    return r * np.minimum(largest_free(up, c.gap_up), largest_free(down, c.gap_down))
 
 
 def _sides(c: BallCertificate) -> list[tuple[FloatArray, float, FloatArray, FloatArray]]:
@@ -123,13 +128,25 @@ def _caps(c: BallCertificate, slope: FloatArray) -> FloatArray:
         p, rest = below / span, above / span
         shift = np.where(rest > 0, sign * c.radius * slope / (3 * span * rest), 0.0)
         shift = np.clip(shift, -p, p)
-        ahead, behind = p + shift, p - shift
 
-        def up(q: FloatArray, b: FloatArray = ahead, a: FloatArray = behind) -> FloatArray:
-            return span * (cap_movement(q, b, 3) + cap_movement(-q, a, 3))
+        def up(
+            q: FloatArray, p: FloatArray = p, rest: FloatArray = rest, shift: FloatArray = shift
+        ) -> FloatArray:
+            two_caps = cap_movement(q, p + shift, 3) + cap_movement(-q, p - shift, 3)
+            is_thin = (rest < 0.01) & (q < 0.5)
+            return span * np.where(is_thin, -_belt(q, -shift, rest), two_caps)
 
         reach.append(largest_free(up, gap))
     return np.minimum(reach[0], reach[1])
+
+
+def _belt(q: FloatArray, middle: FloatArray, half: FloatArray) -> FloatArray:
+    """The movement of the indicator of |s - middle| <= half, for small half, by quadrature."""
+    nodes, weights = np.polynomial.legendre.leggauss(12)
+    total = np.zeros_like(q)
+    for x, w in zip(nodes, weights, strict=True):
+        total += 0.5 * w * half * kernel_movement(q, np.clip(middle + half * x, -1, 1), 3)
+    return total
 
 
 _FRACTIONS: dict[type[Bound], Callable[[BallCertificate, FloatArray], FloatArray]] = {

@@ -7,7 +7,7 @@ for a bound, and the bound how far the ray is free.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import drjit as dr
 
@@ -20,6 +20,11 @@ if TYPE_CHECKING:
     from harnack.bounds import Longest
     from harnack.fields.field import Field, Sample
     from harnack.geometry import Volume
+
+
+# base, step, reach, value, gradient, evaluations, status, active: see `_advance`.
+State: TypeAlias = "tuple[Any, ...]"
+_STATUS = 6
 
 
 @dataclass(frozen=True)
@@ -59,15 +64,27 @@ class PreparedLevelSet:
     def occluded(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask = True) -> Mask:
         """Whether the surface lies between t_min and t_max. Out of steps counts as occluded:
         what is not proved free must not let light through."""
-        return self._march(o, d, t_min, t_max, active)[-1] != int(Status.MISS)
+        return self._march(o, d, t_min, t_max, active)[_STATUS] != int(Status.MISS)
 
     def first_hit(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask = True) -> Trace:
         """The first hit of rays o + t d, |d| = 1, for t_min <= t <= t_max. Inactive rays miss."""
-        t, f, g, evaluations, status = self._march(o, d, t_min, t_max, active)
+        t, _, _, f, g, evaluations, status, _ = self._march(o, d, t_min, t_max, active)
         missed = status == int(Status.MISS)
         return Trace(dr.select(missed, dr.inf, t), f, g, evaluations, status)
 
-    def _march(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask) -> Any:
+    def _march(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask) -> State:
+        """The end state of rays."""
+        real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
+        o, d = vector(o), vector(d)
+        start, end = self.clip(o, d, real(t_min), real(t_max))
+        running = self.backend.Bool(active) & (start < end)
+        state: State = (
+            real(start), real(0), real(0), real(0), vector(0), count(0),
+            count(int(Status.MISS)), running,
+        )  # fmt: skip
+        return self._advance(o, d, end, state)
+
+    def _advance(self, o: Vec3, d: Vec3, end: Real, state: State) -> State:
         """The loop. Proof that no hit is missed: `base` is a point up to which the ray is free,
         `reach` a proved length from there. A trial point base + step is accepted only if step <=
         reach, or the bound at the trial point looking back covers step - reach; then all up to it
@@ -77,17 +94,12 @@ class PreparedLevelSet:
         In rounded arithmetic a surface could slip through between the two looks, so both see
         it nearer by the rounding of value and position together (`_blur`).
         """
-        real, vector = self.backend.Float, self.backend.Array3f
-        count, flag = self.backend.UInt32, self.backend.Bool
-        o, d = vector(o), vector(d)
-        start, end = self.clip(o, d, real(t_min), real(t_max))
-        bound = self.bound
-        running = flag(active) & (start < end)
+        real, vector, bound = self.backend.Float, self.backend.Array3f, self.bound
         size = fmax(fmax(dr.abs(o.x), dr.abs(o.y)), dr.abs(o.z))
 
         def body(
             base: Real, step: Real, reach: Real, f: Real, g: Vec3, n: Any, status: Any, active: Mask
-        ) -> Any:
+        ) -> State:
             t = base + step
             sample = self.field.evaluate(dr.fma(vector(t), d, o))
             down, up = self.levels.gaps(sample.value)
@@ -108,22 +120,15 @@ class PreparedLevelSet:
             g = dr.select(accepted, sample.gradient, g)
             n = n + 1
             free = base + reach >= end
-            status = dr.select(
-                hit, int(Status.HIT), dr.select(free, int(Status.MISS), int(Status.OUT_OF_STEPS))
-            )
+            ended = dr.select(free, int(Status.MISS), int(Status.OUT_OF_STEPS))
+            status = self.backend.UInt32(dr.select(hit, int(Status.HIT), ended))
             active = active & ~(hit | free | (n >= self.max_steps))
-            return base, fmin(step, end - base), reach, f, g, n, count(status), active
+            return base, fmin(step, end - base), reach, f, g, n, status, active
 
-        def running_lanes(*state: Any) -> Mask:
+        def running(*state: Any) -> Mask:
             return state[-1]
 
-        initial = (
-            real(start), real(0), real(0), real(0), vector(0), count(0),
-            count(int(Status.MISS)), running,
-        )  # fmt: skip
-        final = dr.while_loop(initial, running_lanes, body, label="harnack")
-        base, _, _, f, g, n, status, _ = final
-        return base, f, g, n, status
+        return dr.while_loop(state, running, body, label="harnack")
 
     def _blur(self, sample: Sample, steepness: Real, size: Real) -> Real:
         """What rounding may have done to f at a point whose coordinates are at most `size`."""

@@ -1,0 +1,101 @@
+"""Radiance of all pixels of a sensor, band by band.
+
+Each band of pixels gets all its samples at once, so that samplers can stratify them, and every
+pixel averages its own samples only. So there are no sums whose order threads could change: the
+same seed gives the same picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import numpy.typing as npt
+
+from harnack.backend import to_numpy
+from harnack.render.integrator import PathTracer
+
+# Paths of one band: about a second or two on a CPU, and Ctrl-C works between bands.
+_PATHS_A_BAND = 2**18
+# The pixel's filter: samples are drawn from a Gaussian of this standard deviation, in pixels,
+# cut at two pixels from its middle (Ernst et al. 2006, filter importance sampling).
+_FILTER_DEVIATION = 0.45
+_FILTER_REACH = 2.0
+
+
+def expose(
+    mi: Any,
+    scene: Any,
+    sensor: Any,
+    tracer: PathTracer,
+    *,
+    spp: int,
+    seed: int,
+    advance: Callable[[float], None],
+) -> tuple[npt.NDArray[np.float32], int]:
+    """Linear sRGB radiance (h, w, 3), and how many paths ran out of steps.
+
+    spp: samples a pixel, at least; some samplers only know squares and the like.
+    advance: told what part of the picture has been finished since the last call.
+    """
+    width, height = (int(n) for n in sensor.film().crop_size())
+    sampler = sensor.sampler().clone()
+    sampler.set_sample_count(spp)
+    spp = int(sampler.sample_count())
+    sampler.set_samples_per_wavefront(spp)
+    image = np.empty((width * height, 3), dtype=np.float32)
+    lost = 0
+    for band, (start, stop) in enumerate(_bands(width * height, max(1, _PATHS_A_BAND // spp))):
+        sampler.seed(_mixed(seed, band), (stop - start) * spp)
+        pixel = dr.arange(mi.UInt32, (stop - start) * spp) // dr.opaque(mi.UInt32, spp)
+        pixel += dr.opaque(mi.UInt32, start)
+        place = mi.Vector2f(pixel % width, pixel // width) + _in_pixel(mi, sampler.next_2d())
+        ray, weight = _camera_ray(mi, sensor, sampler, place / mi.ScalarVector2f(width, height))
+        radiance, _, got_lost = tracer.trace(scene, sampler, ray, mi.Bool(True))
+        colour = _as_rgb(mi, radiance * weight, ray.wavelengths)
+        dr.eval(colour, got_lost)  # one kernel; sums would otherwise each start their own
+        image[start:stop] = to_numpy(_mean_of_blocks(colour, spp))
+        lost += int(dr.count(got_lost)[0])
+        advance((stop - start) / (width * height))
+    return image.reshape(height, width, 3), lost
+
+
+def _bands(pixels: int, step: int) -> Iterator[tuple[int, int]]:
+    for start in range(0, pixels, step):
+        yield start, min(start + step, pixels)
+
+
+def _mixed(seed: int, band: int) -> int:
+    """A seed for the band: neighbouring seeds share none."""
+    return int(np.random.SeedSequence((seed % 2**63, band)).generate_state(1)[0])
+
+
+def _in_pixel(mi: Any, sample: Any) -> Any:
+    """A place in the pixel or near it, distributed as the filter."""
+    edge = float(dr.erf(_FILTER_REACH / _FILTER_DEVIATION / np.sqrt(2)))
+    gauss = dr.erfinv(edge * (2 * sample - 1)) * (np.sqrt(2) * _FILTER_DEVIATION)
+    return mi.Vector2f(gauss) + 0.5
+
+
+def _camera_ray(mi: Any, sensor: Any, sampler: Any, place: Any) -> tuple[Any, Any]:
+    time = sensor.shutter_open()
+    if sensor.shutter_open_time() > 0:
+        time = time + sampler.next_1d() * sensor.shutter_open_time()
+    wavelength = sampler.next_1d() if mi.is_spectral else 0
+    lens = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+    return sensor.sample_ray(time, wavelength, mi.Point2f(place), lens)
+
+
+def _as_rgb(mi: Any, radiance: Any, wavelengths: Any) -> Any:
+    if mi.is_spectral:
+        matching = mi.cie1931_xyz(wavelengths)
+        xyz = mi.Color3f(*(dr.mean(radiance * channel) for channel in matching))
+        return mi.xyz_to_srgb(xyz)
+    return mi.Color3f(radiance[0]) if mi.is_monochromatic else mi.Color3f(radiance)
+
+
+def _mean_of_blocks(colour: Any, spp: int) -> Any:
+    """The mean of each `spp` neighbouring lanes."""
+    return type(colour)(*(dr.block_sum(channel, spp) / spp for channel in colour))

@@ -1,0 +1,290 @@
+"""`check_bound`: functions that keep a certificate's promise, and levels put where they go.
+
+A bound is right if no function that the certificate allows meets a level within its step. The
+functions drawn here include the extremal ones of the proofs in `harnack.bounds`, so a bound
+that is a thousandth too long is found out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from harnack.backend import choose_backend, to_numpy
+from harnack.certify import BallCertificate, CurvatureCertificate, LipschitzCertificate
+from harnack.testing.failures import BrokenPromiseError
+from harnack.testing.poisson import AxialFunctions, FloatArray, cap_mass, kernel_movement
+
+if TYPE_CHECKING:
+    from harnack.backend import Precision
+    from harnack.bounds import Bound
+    from harnack.certify import Certificate
+
+__all__ = ["Trial", "check_bound", "trials"]
+
+_SAMPLES = 48
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Functions along rays, (rows,), and certificates at t = 0 whose promise they keep.
+
+    movement: f(t) - f(0) for t (rows, m) with 0 <= t < reach, the distance of the promise.
+    slope: f'(0). The gaps of the certificates are such that levels are met.
+    """
+
+    name: str
+    certificate: Certificate
+    slope: FloatArray
+    reach: FloatArray
+    movement: Callable[[FloatArray], FloatArray]
+
+
+def check_bound(
+    bound: Bound,
+    *,
+    rng: np.random.Generator | int = 0,
+    rows: int = 400,
+    precision: Precision = "double",
+) -> None:
+    """Test a bound against random functions of every kind of certificate that it accepts.
+
+    rng: a generator or a seed. rows: how many functions of each kind.
+
+    Checked: steps are numbers in [0, reach]; no level is met within a step; `covers` agrees with
+    `step`; no level is met within any length that is covered.
+
+    Raises:
+        BrokenPromiseError: with the numbers of the first function that shows it.
+        ValueError: it accepts none of the certificates there are.
+    """
+    accepted = 0
+    generator = np.random.default_rng(rng)
+    for trial in trials(generator, rows):
+        on_device, slope = _upload(trial, precision)
+        if bound.accepts(on_device):
+            accepted += 1
+            _check_trial(bound, trial, on_device, slope, generator, precision)
+    if not accepted:
+        raise ValueError(f"{bound!r} accepts none of the certificates there are")
+
+
+def trials(rng: np.random.Generator, rows: int) -> Iterator[Trial]:
+    """One trial of each kind: harmonic in 2, 3, 4 dimensions, Lipschitz, bounded curvature."""
+    with np.errstate(all="ignore"):
+        for dimension in (2, 3, 4):
+            yield _positive(rng, rows, dimension, mirrored=False)
+            yield _positive(rng, rows, dimension, mirrored=True)
+            yield _bounded(rng, rows, dimension)
+        yield _lipschitz(rng, rows)
+        yield _curved(rng, rows)
+
+
+def _positive(rng: np.random.Generator, rows: int, n: int, *, mirrored: bool) -> Trial:
+    """f - lower (mirrored: upper - f) is the Poisson integral of one, two or three rings."""
+    radius, mass = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
+    places = rng.uniform(-1, 1, (rows, 3))
+    close = rng.choice([-1.0, 1.0], (rows, 3)) * (1 - 10 ** rng.uniform(-8, 0, (rows, 3)))
+    places = np.where(rng.random((rows, 3)) < 0.3, close, places)
+    shares = rng.dirichlet([0.7] * 3, rows)
+    kind = rng.integers(0, 3, rows)
+    shares[kind == 0] = (1, 0, 0)  # equality in Jensen's inequality
+    poles = kind == 1  # equality in the chord's
+    places[poles, :2] = (1, -1)
+    shares[poles, 2] = 0
+    shares /= shares.sum(axis=1, keepdims=True)
+    u = AxialFunctions("points", places, shares * mass[:, None], radius, n)
+    sign = -1.0 if mirrored else 1.0
+    rooms = (None, mass) if mirrored else (mass, None)
+    return _with_gaps(
+        rng,
+        f"positive harmonic, n = {n}, {'upper' if mirrored else 'lower'} end known",
+        mass,
+        radius,
+        sign * u.slope,
+        lambda t: sign * u.movement(t),
+        lambda down, up: BallCertificate(radius, *rooms, down, up, n),
+    )
+
+
+def _bounded(rng: np.random.Generator, rows: int, n: int) -> Trial:
+    """Boundary values in [lower, upper]: steps at random heights, among them two caps."""
+    radius, span = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
+    heights = np.sort(rng.uniform(0, 2, (rows, 3)), axis=1)
+    thin = rng.random(rows) < 0.2
+    heights[thin] *= 10 ** rng.uniform(-4, 0, thin.sum())[:, None]
+    values = rng.uniform(0, 1, (rows, 4))  # from the cap ahead to what lies behind the third
+    kind = rng.integers(0, 3, rows)
+    values[kind == 0] = (1, 0, 0, 1)  # equality in the upper cap bound
+    values[kind == 1] = (0, 1, 1, 0)  # and in the lower one
+    weights = values[:, :3] - values[:, 1:]
+    u = AxialFunctions("caps", heights, weights * span[:, None], radius, n)
+    mean = values[:, 3] + (weights * cap_mass(heights, n)).sum(axis=1)
+    below, above = span * mean, span * (1 - mean)
+    return _with_gaps(
+        rng,
+        f"bounded harmonic, n = {n}",
+        np.minimum(below, above),
+        radius,
+        u.slope,
+        u.movement,
+        lambda down, up: BallCertificate(radius, below, above, down, up, n),
+    )
+
+
+def _lipschitz(rng: np.random.Generator, rows: int) -> Trial:
+    """Straight and zigzag lines of slope at most the constant."""
+    radius, constant = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
+    knots = np.sort(rng.uniform(0, 1, (rows, 2)), axis=1) * radius[:, None]
+    slopes = rng.uniform(-1, 1, (rows, 3)) * constant[:, None]
+    straight = rng.random(rows) < 0.4
+    slopes[straight] = (rng.choice([-1.0, 1.0], rows) * constant)[straight, None]
+
+    def movement(t: FloatArray) -> FloatArray:
+        bends = np.maximum(t[:, :, None] - knots[:, None, :], 0)
+        return slopes[:, :1] * t + (bends * np.diff(slopes, axis=1)[:, None, :]).sum(axis=2)
+
+    return _with_gaps(
+        rng,
+        "Lipschitz",
+        constant * radius,
+        radius,
+        slopes[:, 0],
+        movement,
+        lambda down, up: LipschitzCertificate(constant, radius, down, up),
+    )
+
+
+def _curved(rng: np.random.Generator, rows: int) -> Trial:
+    """Parabolas whose second derivative jumps once, at most the constant in size."""
+    radius, constant = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
+    bends = rng.uniform(-1, 1, (rows, 2)) * constant[:, None]
+    extremal = rng.random(rows) < 0.5
+    bends[extremal] = (rng.choice([-1.0, 1.0], rows) * constant)[extremal, None]
+    knot = rng.uniform(0, 1, rows) * radius
+    slope = constant * radius * rng.choice([-1.0, 1.0], rows) * 10 ** rng.uniform(-4, 1, rows)
+
+    def movement(t: FloatArray) -> FloatArray:
+        late = np.maximum(t - knot[:, None], 0)
+        turn = (bends[:, 1] - bends[:, 0])[:, None]
+        return slope[:, None] * t + 0.5 * bends[:, :1] * t * t + 0.5 * turn * late * late
+
+    return _with_gaps(
+        rng,
+        "bounded curvature",
+        constant * radius**2,
+        radius,
+        slope,
+        movement,
+        lambda down, up: CurvatureCertificate(constant, radius, down, up),
+    )
+
+
+def _with_gaps(
+    rng: np.random.Generator,
+    name: str,
+    scale: FloatArray,
+    reach: FloatArray,
+    slope: FloatArray,
+    movement: Callable[[FloatArray], FloatArray],
+    certificate: Callable[[FloatArray, FloatArray], Certificate],
+) -> Trial:
+    """Levels where the function is at a random place, and others at random."""
+    rows = len(scale)
+    down, up = scale * _log_uniform(rng, rows, -9, 2), scale * _log_uniform(rng, rows, -9, 2)
+    place = np.where(rng.random(rows) < 0.5, rng.random(rows), _log_uniform(rng, rows, -8, 0))
+    met = movement((place * reach)[:, None])[:, 0]
+    is_met = (rng.random(rows) < 0.8) & (met != 0) & np.isfinite(met)
+    up = np.where(is_met & (met > 0), met, up)
+    down = np.where(is_met & (met < 0), -met, down)
+    far = rng.random(rows) < 0.5  # else the other level is often met first
+    up = np.where(is_met & far & (met < 0), np.inf, up)
+    down = np.where(is_met & far & (met > 0), np.inf, down)
+    return Trial(name, certificate(down, up), slope, reach, movement)
+
+
+def _log_uniform(rng: np.random.Generator, rows: int, low: float, high: float) -> FloatArray:
+    return 10 ** rng.uniform(low, high, rows)
+
+
+def _upload(trial: Trial, precision: Precision) -> tuple[Certificate, Any]:
+    """The certificates and slopes as Dr.Jit arrays."""
+    backend = choose_backend(precision)
+    fields = {
+        key: backend.Float(value) if isinstance(value, np.ndarray) else value
+        for key, value in vars(trial.certificate).items()
+    }
+    return type(trial.certificate)(**fields), backend.Float(trial.slope)
+
+
+def _check_trial(
+    bound: Bound,
+    trial: Trial,
+    certificate: Certificate,
+    slope: Any,
+    rng: np.random.Generator,
+    precision: Precision,
+) -> None:
+    rows = len(trial.slope)
+    real = type(slope)
+    step = to_numpy(bound.step(certificate, slope)).astype(np.float64)
+    met = _meets(trial, np.minimum(step, trial.reach), precision)
+    _require(trial, ~met, bound, "meets no level within the step {length}", step)
+    good = (step >= 0) & (step <= trial.reach * (1 + 1e-6))
+    _require(trial, good, bound, "is known up to {reach}, and the step {length} is a part", step)
+    # In single precision both are rounded, each on its safe side.
+    shares = [1 - 1e-5 if precision == "double" else 0.98, *rng.uniform(0.01, 0.98, 2)]
+    for share in shares:
+        length = step * share
+        free = to_numpy(bound.covers(certificate, slope, real(length)))
+        _require(trial, free, bound, "is covered for {length}, within its step", length)
+    lengths = [step * (1 + 10 ** rng.uniform(-4, 0, rows)), trial.reach * rng.random(rows)]
+    for length in lengths:
+        covered = to_numpy(bound.covers(certificate, slope, real(length)))
+        inside = np.minimum(length, trial.reach)
+        wrong = covered & (_meets(trial, inside, precision) | (length > trial.reach * (1 + 1e-6)))
+        _require(trial, ~wrong, bound, "meets no level within {length}, which is covered", length)
+
+
+def _meets(trial: Trial, length: FloatArray, precision: Precision) -> FloatArray:
+    """Whether the functions are seen to meet a level strictly within the length, (rows,)."""
+    tolerance = 1e-9 if precision == "double" else 1e-5
+    shares = np.concatenate([np.linspace(0, 1, _SAMPLES // 2), 1 - np.geomspace(1e-7, 0.5, 24)])
+    t = (1 - tolerance) * length[:, None] * shares
+    with np.errstate(all="ignore"):
+        moved = trial.movement(t)
+        # Rounding of the inputs moves a function by so much at most.
+        q = np.minimum(t / trial.reach[:, None], 1 - 1e-12)
+        growth = kernel_movement(q, 1.0, 4) + 1
+    slack = 0.0
+    if precision == "single":
+        slack = 2e-6 * _size(trial)[:, None] * growth
+    c = trial.certificate
+    over = moved > c.gap_up[:, None] * (1 + tolerance) + slack
+    under = -moved > c.gap_down[:, None] * (1 + tolerance) + slack
+    return (over | under).any(axis=1)
+
+
+def _size(trial: Trial) -> FloatArray:
+    rooms = [vars(trial.certificate).get(name) for name in ("room_below", "room_above")]
+    known = [room for room in rooms if room is not None]
+    return sum(known, np.abs(trial.slope) * trial.reach)
+
+
+def _require(trial: Trial, good: Any, bound: Bound, promise: str, length: FloatArray) -> None:
+    bad = np.flatnonzero(~good)
+    if not bad.size:
+        return
+    row = bad[0]
+    numbers = {
+        key: float(value[row]) if isinstance(value, np.ndarray) else value
+        for key, value in vars(trial.certificate).items()
+    }
+    what = promise.format(reach=float(trial.reach[row]), length=float(length[row]))
+    raise BrokenPromiseError(
+        f"{bound!r} does not keep its promise ({trial.name}): f {what}. Wrong in {bad.size} of "
+        f"{len(good)} trials; the first: {numbers}, slope = {float(trial.slope[row])!r}"
+    )

@@ -1,0 +1,284 @@
+"""Our surfaces in Mitsuba scenes: energy, agreement with Mitsuba's own shapes, interplay."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+
+import harnack as hk
+from harnack.fields.field import Field, Lipschitz, Sample
+from harnack.render import picture, register, render, shape
+
+mi = register()
+T = mi.ScalarTransform4f
+
+
+class Sphere(Field):
+    """Distance to a sphere about the origin."""
+
+    def __init__(self, radius: float = 1.0) -> None:
+        self.radius = radius
+        self.domain = hk.Ball(radius=2.0 * radius)
+
+    def evaluate(self, p: Any) -> Sample:
+        distance = dr.norm(p)
+        return Sample(distance - self.radius, p / distance, (Lipschitz(1.0),))
+
+
+class Plane(Field):
+    """Height over the plane z = 0."""
+
+    def __init__(self) -> None:
+        self.domain = hk.Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+
+    def evaluate(self, p: Any) -> Sample:
+        up = type(p)(0.0, 0.0, 1.0)
+        return Sample(dr.dot(p, up), up, (Lipschitz(1.0),))
+
+
+def red() -> dict[str, Any]:
+    return {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.02, 0.02]}}
+
+
+def sensor(origin: tuple[float, float, float] = (2.7, -3.0, 1.5), size: int = 48) -> dict[str, Any]:
+    return {
+        "type": "perspective",
+        "fov": 40,
+        "to_world": T().look_at(origin=list(origin), target=[0, 0, 0], up=[0, 0, 1]),
+        "film": {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}},
+        "sampler": {"type": "multijitter"},
+    }
+
+
+def lamp() -> dict[str, Any]:
+    return {
+        "type": "rectangle",
+        "to_world": T().look_at(origin=[2, -2, 5], target=[0, 0, 0], up=[0, 1, 0]),
+        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [10.0, 9.0, 8.0]}},
+    }
+
+
+def drawn(members: dict[str, Any], spp: int = 16, depth: int = 8, **kw: Any) -> np.ndarray:
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "harnack_path", "max_depth": depth},
+        "sensor": sensor(**kw),
+        **members,
+    }
+    return render(scene, spp=spp, progress=False)
+
+
+GYROID = hk.Gyroid(1.0, domain=hk.Ball(radius=1.0))
+
+
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-4, 1e-5])
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"solid": (-math.inf, 0.0)},
+        {"solid": (-0.3, 0.3)},
+        {"solid": (-0.3, 0.3), "clip": hk.Box((-0.6, -0.6, -0.6), (0.6, 0.6, 0.6))},
+        {"solid": (0.2, math.inf), "clip": hk.HalfSpace((0.3, -1.0, 0.2), 0.2)},
+    ],
+    ids=["half", "wall", "box", "halfspace"],
+)
+def test_glass_neither_takes_nor_gives_light(tolerance: float, settings: dict[str, Any]) -> None:
+    """White furnace: under constant light a lossless solid cannot be seen, in any pixel."""
+    glass = shape(GYROID, bsdf={"type": "dielectric"}, tolerance=tolerance, **settings)
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "harnack_path", "max_depth": -1, "rr_depth": 100_000},
+        "sensor": sensor(),
+        "light": {"type": "constant"},
+        "glass": glass,
+    }
+    image = render(scene, spp=4, progress=False)
+    np.testing.assert_allclose(image, 1.0, atol=1e-3)
+
+
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-4, 1e-5])
+def test_open_white_surface_takes_no_light(tolerance: float) -> None:
+    white = {"type": "twosided", "nested": {"type": "diffuse", "reflectance": 1.0}}
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "harnack_path", "max_depth": -1, "rr_depth": 100_000},
+        "sensor": sensor(),
+        # Found by paths alone, so that there is no noise.
+        "light": {"type": "constant", "sampling_weight": 0.0},
+        "dark": {"type": "point", "intensity": 0.0},
+        "surface": shape(GYROID, bsdf=white, tolerance=tolerance),
+    }
+    image = render(scene, spp=4, progress=False)
+    np.testing.assert_allclose(image, 1.0, atol=1e-3)
+
+
+BSDFS: dict[str, dict[str, Any]] = {
+    "diffuse": red(),
+    "roughconductor": {"type": "roughconductor", "material": "Au", "alpha": 0.2},
+    "dielectric": {"type": "dielectric", "int_ior": 1.5},
+    "roughdielectric": {"type": "roughdielectric", "alpha": 0.2},
+    "principled": {"type": "principled", "roughness": 0.3, "metallic": 0.4, "spec_tint": 0.5},
+}
+
+
+@pytest.mark.parametrize("name", BSDFS)
+def test_solid_sphere_looks_like_mitsubas(name: str) -> None:
+    surroundings = {
+        "sky": {"type": "constant", "radiance": 0.4},
+        "lamp": lamp(),
+        "ground": {"type": "rectangle", "to_world": T().translate([0, 0, -1]).scale(6)},
+    }
+    ours = shape(Sphere(), bsdf=BSDFS[name], solid=(-math.inf, 0.0))
+    theirs = {"type": "sphere", "bsdf": BSDFS[name]}
+    a = drawn({**surroundings, "ball": ours}, spp=256, size=24)
+    b = drawn({**surroundings, "ball": theirs}, spp=256, size=24)
+    assert a.mean() == pytest.approx(b.mean(), rel=0.005)
+    blocks = [image.reshape(4, 6, 4, 6, 3).mean(axis=(1, 3)) for image in (a, b)]
+    np.testing.assert_allclose(*blocks, rtol=0.06)
+
+
+def test_shadows_fall_both_ways() -> None:
+    sun = {"type": "directional", "direction": [0, 0, -1], "irradiance": 3.0}
+    above = {"type": "sphere", "center": [0, 0, 2], "radius": 0.4}
+    plane = shape(Plane(), bsdf={"type": "twosided", "nested": red()})
+    floor = {"type": "rectangle", "to_world": T().translate([0, 0, -0.01]).scale(3)}
+    view = {"origin": (0.0, -4.0, 3.0)}
+    lit = drawn({"sun": sun, "plane": plane}, **view)
+    shaded = drawn({"sun": sun, "plane": plane, "ball": above}, **view)
+    middle = np.s_[22:26, 22:26]
+    assert lit[middle].max() > 0.5
+    assert shaded[middle].max() < 0.01
+    ball = shape(Sphere(0.4), to_world=T().translate([0, 0, 2]), bsdf=red())
+    assert drawn({"sun": sun, "floor": floor}, **view)[middle].min() > 0.3
+    assert drawn({"sun": sun, "floor": floor, "ball": ball}, **view)[middle].max() < 0.05
+
+
+def test_reflections_show_both_ways() -> None:
+    sky = {"type": "constant"}
+    mirror = {"type": "conductor"}
+    view = {"origin": (0.0, -4.0, 0.0)}
+    middle = np.s_[23:25, 23:25]
+    # Behind the camera, so that it is seen in the mirror only.
+    behind = T().translate([0, -7, 0])
+    seen = drawn({"sky": sky, "mirror": {"type": "sphere", "bsdf": mirror},
+                  "red": shape(Sphere(2.0), bsdf=red(), to_world=behind)}, **view)  # fmt: skip
+    assert seen[middle][..., 0].mean() > 3 * seen[middle][..., 1].mean()
+    seen = drawn({"sky": sky, "mirror": shape(Sphere(), bsdf=mirror, solid=(-math.inf, 0.0)),
+                  "red": {"type": "sphere", "radius": 2, "to_world": behind, "bsdf": red()}},
+                 **view)  # fmt: skip
+    assert seen[middle][..., 0].mean() > 3 * seen[middle][..., 1].mean()
+
+
+def test_nearer_of_two_surfaces_hides_the_other_in_either_order() -> None:
+    green = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.02, 0.8, 0.02]}}
+    near = shape(Sphere(0.5), bsdf=red(), to_world=T().translate([0, -2, 0]))
+    far = shape(Sphere(1.0), bsdf=green)
+    view = {"origin": (0.0, -6.0, 0.0)}
+    sky = {"type": "constant"}
+    a = drawn({"sky": sky, "a": near, "b": far}, **view)
+    b = drawn({"sky": sky, "a": far, "b": near}, **view)
+    for image in (a, b):
+        assert image[24, 24, 0] > 5 * image[24, 24, 1]
+        assert image[24, 34, 1] > 5 * image[24, 34, 0]
+
+
+def test_to_world_moves_turns_and_scales() -> None:
+    to_world = T().translate([0.3, 0.2, -0.1]).rotate([0.6, 0.0, 0.8], 40).scale(0.5)
+    grid = hk.Gyroid(1.0, domain=hk.Ball(radius=1.0))
+    moved = shape(grid, to_world=to_world, solid=(-0.3, 0.3))
+    view = picture.look(mi, *_scene_and_sensor(moved))
+    points = np.array(to_world.inverse() @ mi.Point3f(_positions(view).T)).T
+    f = _gyroid(points)
+    on_wall = np.abs(np.abs(f) - 0.3) < 0.01
+    on_cap = (np.abs(np.linalg.norm(points, axis=1) - 1) < 1e-3) & (np.abs(f) < 0.31)
+    assert len(points) > 300
+    assert (on_wall | on_cap).all()
+    assert on_wall.sum() > 100
+    assert on_cap.sum() > 20
+
+
+def _gyroid(p: np.ndarray) -> np.ndarray:
+    x, y, z = 2 * np.pi * p.T
+    return np.sin(x) * np.cos(y) + np.sin(y) * np.cos(z) + np.sin(z) * np.cos(x)
+
+
+def _scene_and_sensor(member: Any) -> tuple[Any, Any]:
+    scene = mi.load_dict({"type": "scene", "sensor": sensor(), "member": member})
+    return scene, scene.sensors()[0]
+
+
+def _positions(view: Any) -> np.ndarray:
+    """World positions of the pixels' hits, from the camera of `sensor`."""
+    camera = mi.load_dict(sensor())
+    n = view.depth.shape[0]
+    y, x = np.mgrid[0:n, 0:n].reshape(2, -1)
+    place = mi.Point2f((x + 0.5) / n, (y + 0.5) / n)
+    ray, _ = camera.sample_ray(0.0, 0.5, place, mi.Point2f(0.5))
+    t = view.depth.ravel()
+    hit = np.isfinite(t)
+    o, d = np.array(ray.o).T, np.array(ray.d).T
+    return (np.broadcast_to(o, d.shape) + t[:, None] * d)[hit]
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        (lambda: shape(hk.SolidAngle([[0, 0, 0], [1, 0, 0], [0, 1, 0]]), level=0.0), "infinity"),
+        (lambda: shape(GYROID, to_world=np.diag([1.0, 2.0, 1.0, 1.0])), "one scale"),
+        (lambda: shape(GYROID, to_world=np.zeros((4, 4))), "one scale"),
+        (lambda: shape(GYROID, to_world=np.full((4, 4), np.nan)), "finite"),
+        (lambda: shape(GYROID, bsdf={"type": "rectangle"}), "BSDF"),
+        (lambda: shape(hk.level_set(GYROID), level=0.1), "level"),
+        (lambda: mi.load_dict({"type": "harnack_path", "max_depth": -2}), "max_depth"),
+    ],
+)
+def test_errors_say_what_is_wrong(bad: tuple[Callable[[], Any], str]) -> None:
+    make, word = bad
+    with pytest.raises((ValueError, TypeError, RuntimeError), match=word):
+        make()
+
+
+def test_xml_scene_names_our_surfaces(tmp_path: Any) -> None:
+    square = np.array([[1, -1, 0], [1, 1, 0], [-1, 1, 0], [-1, -1, 0.3]], dtype=float)
+    np.savetxt(tmp_path / "square.loops", square.reshape(1, -1))
+    (tmp_path / "scene.xml").write_text(
+        """<scene version="3.0.0">
+        <integrator type="harnack_path"><integer name="max_depth" value="3"/></integrator>
+        <sensor type="perspective">
+            <transform name="to_world">
+                <lookat origin="0,-8,5" target="0,0,0" up="0,0,1"/></transform>
+            <film type="hdrfilm">
+                <integer name="width" value="40"/><integer name="height" value="20"/></film>
+        </sensor>
+        <emitter type="constant"/>
+        <shape type="harnack"><string name="file" value="square.loops"/>
+            <transform name="to_world"><translate x="-1.5"/></transform>
+            <bsdf type="twosided"><bsdf type="diffuse"/></bsdf></shape>
+        <shape type="harnack"><string name="field" value="gyroid"/>
+            <float name="cell" value="1"/><float name="clip_radius" value="1"/>
+            <float name="low" value="-0.3"/><float name="high" value="0.3"/>
+            <transform name="to_world"><translate x="1.5"/></transform>
+            <bsdf type="diffuse"/></shape>
+        </scene>"""
+    )
+    status = render(tmp_path / "scene.xml", show="status")
+    assert status.shape == (20, 40)
+    left, right = status[:, :20], status[:, 20:]
+    assert (left == hk.Status.HIT).sum() > 20
+    assert (right == hk.Status.HIT).sum() > 20
+    with pytest.raises(ValueError, match="as it is"):
+        render(tmp_path / "scene.xml", material="gold")
+
+
+def test_xml_shape_with_a_misspelt_property_is_refused() -> None:
+    text = (
+        '<scene version="3.0.0"><shape type="harnack"><string name="field" value="gyroid"/>'
+        '<float name="levle" value="1"/></shape></scene>'
+    )
+    with pytest.raises(RuntimeError, match="levle"):
+        mi.load_string(text)
