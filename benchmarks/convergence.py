@@ -34,9 +34,7 @@ def meshed(loop: np.ndarray, rings: int = 320, spokes: int = 960) -> tuple[np.nd
     inner = (s[1:-1, None, None] * border[None])[..., :2].reshape(-1, 2)
     xy = np.concatenate([[[0.0, 0.0]], inner])
     start = np.column_stack([xy, np.full(len(xy), 3.0)])
-    hits = hk.trace(
-        hk.SolidAngle(loop), start, [[0, 0, -1.0]], precision="double", tolerance=1e-10
-    )
+    hits = hk.trace(hk.SolidAngle(loop), start, [[0, 0, -1.0]], precision="double", tolerance=1e-10)
     assert (hits.status == hk.Status.HIT).all()
     vertices = np.concatenate([hits.position, border])
     k = np.arange(spokes)

@@ -142,6 +142,63 @@ def test_solid_sphere_looks_like_mitsubas(name: str) -> None:
     np.testing.assert_allclose(*blocks, rtol=0.06)
 
 
+def _mesh_of_gyroid(cells: int) -> dict[str, Any]:
+    """Marching cubes on the whole box; the mesh's own normals from the gradient of f."""
+    measure = pytest.importorskip("skimage.measure")
+    axis = np.linspace(-0.6, 0.6, cells)
+    grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
+    values = _gyroid(grid.reshape(-1, 3)).reshape(cells, cells, cells)
+    vertices, faces, _, _ = measure.marching_cubes(values, 0.0, spacing=(axis[1] - axis[0],) * 3)
+    vertices = vertices + axis[0]
+    step = 1e-5 * np.eye(3)
+    gradient = [_gyroid(vertices + h) - _gyroid(vertices - h) for h in step]
+    normals = np.stack(gradient, axis=-1)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    props = mi.Properties()
+    props["bsdf"] = mi.load_dict({"type": "twosided", "nested": red()})
+    mesh = mi.Mesh("gyroid", len(vertices), len(faces), props=props, has_vertex_normals=True)
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = vertices.astype(np.float32).ravel()
+    params["vertex_normals"] = normals.astype(np.float32).ravel()
+    params["faces"] = faces.astype(np.uint32).ravel()
+    params.update()
+    return {"gyroid": mesh}
+
+
+def _lit_gyroid(tolerance: float) -> dict[str, Any]:
+    box = hk.Box((-0.6, -0.6, -0.6), (0.6, 0.6, 0.6))
+    bsdf = {"type": "twosided", "nested": red()}
+    field = hk.Gyroid(1.0, domain=box)
+    return {"gyroid": shape(field, bsdf=bsdf, tolerance=tolerance)}
+
+
+LIGHTS = {"sky": {"type": "constant", "radiance": 0.3}, "lamp": lamp()}
+
+
+def test_gyroid_looks_like_its_mesh() -> None:
+    ours = drawn({**LIGHTS, **_lit_gyroid(1e-4)}, spp=196, size=64)
+    mesh = drawn({**LIGHTS, **_mesh_of_gyroid(160)}, spp=196, size=64)
+    assert ours.mean() == pytest.approx(mesh.mean(), rel=0.005)
+    for channel in range(3):
+        assert ours[..., channel].mean() == pytest.approx(mesh[..., channel].mean(), rel=0.005)
+    blocks = [image.reshape(8, 8, 8, 8, 3).mean(axis=(1, 3)) for image in (ours, mesh)]
+    np.testing.assert_allclose(*blocks, rtol=0.06, atol=0.005)
+
+
+def test_tolerances_draw_the_same_picture() -> None:
+    """No black, no specks: with the tolerance, only noise and outlines change."""
+    images = [drawn({**LIGHTS, **_lit_gyroid(t)}, spp=64) for t in (1e-3, 1e-4, 1e-5)]
+    for image in images[:2]:
+        assert image.mean() == pytest.approx(images[2].mean(), rel=0.01)
+        difference = np.abs(image - images[2]).max(axis=-1)
+        assert np.mean(difference > 0.15) < 0.01
+        assert np.mean(difference) < 0.03
+    surface = images[0][..., 0] - images[0][..., 1] > 0.02  # red: the sky is grey
+    assert surface.mean() > 0.2
+    dark = [np.mean(image[surface].max(axis=-1) < 0.01) for image in images]
+    assert max(dark) < 0.002
+
+
 def test_shadows_fall_both_ways() -> None:
     sun = {"type": "directional", "direction": [0, 0, -1], "irradiance": 3.0}
     above = {"type": "sphere", "center": [0, 0, 2], "radius": 0.4}
@@ -188,11 +245,12 @@ def test_nearer_of_two_surfaces_hides_the_other_in_either_order() -> None:
 
 
 def test_to_world_moves_turns_and_scales() -> None:
-    to_world = T().translate([0.3, 0.2, -0.1]).rotate([0.6, 0.0, 0.8], 40).scale(0.5)
+    to_world = T().translate([0.3, 0.2, -0.1]).rotate([0.6, 0.0, 0.8], 40).scale(0.8)
     grid = hk.Gyroid(1.0, domain=hk.Ball(radius=1.0))
     moved = shape(grid, to_world=to_world, solid=(-0.3, 0.3))
     view = picture.look(mi, *_scene_and_sensor(moved))
-    points = np.array(to_world.inverse() @ mi.Point3f(_positions(view).T)).T
+    inverse = np.linalg.inv(np.array(to_world.matrix, dtype=float).reshape(4, 4))
+    points = _positions(view) @ inverse[:3, :3].T + inverse[:3, 3]
     f = _gyroid(points)
     on_wall = np.abs(np.abs(f) - 0.3) < 0.01
     on_cap = (np.abs(np.linalg.norm(points, axis=1) - 1) < 1e-3) & (np.abs(f) < 0.31)

@@ -47,7 +47,9 @@ def _parser() -> argparse.ArgumentParser:
         description="Draw a gallery scene, the surface spanned by the curves of a file (.obj, "
         ".ply, .loops), or a Mitsuba scene (.xml).",
     )  # fmt: skip
-    one.add_argument("scene", metavar="SCENE", help="a name from `harnack gallery --list`, or a file")
+    one.add_argument(
+        "scene", metavar="SCENE", help="a name from `harnack gallery --list`, or a file"
+    )
     one.add_argument("-o", "--output", metavar="FILE", help="picture, .png or .exr (SCENE.png)")
     one.add_argument("--level", type=parse_level, help="level to draw; pi is understood: 2pi, pi/2")
     one.add_argument("--material", choices=sorted(MATERIALS), help="what it is made of")
@@ -77,7 +79,7 @@ def _add_quality(parser: argparse.ArgumentParser) -> None:
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """"800x600" as (800, 600)."""
+    """ "800x600" as (800, 600)."""
     match = re.fullmatch(r"(\d+)x(\d+)", text)
     if not match:
         raise argparse.ArgumentTypeError(f"{text!r} is no size; write it as 800x600")
@@ -89,7 +91,9 @@ def parse_size(text: str) -> tuple[int, int]:
 
 def parse_level(text: str) -> float:
     """A number, or a multiple of pi such as "2pi", "1.5*pi", "-pi/2"."""
-    match = re.fullmatch(r"([+-]?[\d.]*(?:e[+-]?\d+)?)\s*\*?\s*(pi)?\s*(?:/\s*([\d.]+))?", text.strip())
+    match = re.fullmatch(
+        r"([+-]?[\d.]*(?:e[+-]?\d+)?)\s*\*?\s*(pi)?\s*(?:/\s*([\d.]+))?", text.strip()
+    )
     try:
         if not match:
             raise ValueError
@@ -170,7 +174,9 @@ def _gallery(options: Any) -> int:
     folder = Path(options.output)
     folder.mkdir(parents=True, exist_ok=True)
     for index, scene in enumerate(wanted, start=1):
-        console.print(f"{index}/{len(wanted)} [bold]{scene.name}[/]: {scene.title}", highlight=False)
+        console.print(
+            f"{index}/{len(wanted)} [bold]{scene.name}[/]: {scene.title}", highlight=False
+        )
         target = folder / f"{scene.name}.png"
         scene.render(target, **_quality(options))
         console.print(f"    {target}", highlight=False)

@@ -92,9 +92,7 @@ def _periodic(kind: Any, *, solid: tuple[float, float], box: bool = False) -> li
 
 def _eigenfunctions() -> list[LevelSet]:
     """The paper's Fig. 21: the 1/2 level of a sum of two eigenfunctions."""
-    terms = [
-        Product(1.0, x=sine(k), y=sine(k), z=sine(k)) for k in (6.0, 2.0)
-    ]
+    terms = [Product(1.0, x=sine(k), y=sine(k), z=sine(k)) for k in (6.0, 2.0)]
     side = math.pi / 2
     domain = Box((-side, -side, -side), (side, side, side))
     solid = (0.5, math.inf)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
@@ -36,7 +36,7 @@ class Levels:
         Either is infinite when there is no such level. A value on a level has both a gap of
         zero on one side and, for a ladder, of at most one period on the other.
         """
-        scalar = type(f)
+        scalar: Any = type(f)
         down, up = scalar(math.inf), scalar(math.inf)
         for level in self.values:
             above = f - level  # > 0: the level lies below f

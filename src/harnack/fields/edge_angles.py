@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def differentiable_angle(backend: Backend, loops: tuple[Any, ...], x: Vec3) -> Real:
-    """Omega(x) in steradians, modulo 4 pi, of closed loops given as (n, 3) arrays or Dr.Jit vectors.
+    """Omega(x) in steradians, modulo 4 pi, of closed loops: (n, 3) arrays or Dr.Jit vectors.
 
     Memory grows with points times vertices. The formula is that of `sum_over_edges`, with one
     angle an edge instead of a product: an angle may jump by 4 pi, its derivative does not.

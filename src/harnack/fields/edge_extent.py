@@ -91,6 +91,4 @@ def _wrapped(centres: FloatArray, half: FloatArray) -> ConvexHull:
     normals = np.array([v for v in itertools.product((-1, 0, 1), repeat=3) if any(v)], float)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     offsets = (centres @ normals.T).max(axis=0) + np.abs(normals) @ half
-    return ConvexHull(
-        normals, offsets, (centres - half).min(axis=0), (centres + half).max(axis=0)
-    )
+    return ConvexHull(normals, offsets, (centres - half).min(axis=0), (centres + half).max(axis=0))

@@ -158,7 +158,7 @@ def spinor(a: Vec3) -> tuple[Real, Real, Spinor]:
     length = dr.sqrt(dr.fma(a.z, a.z, dr.fma(a.x, a.x, a.y * a.y)))
     s = length + dr.abs(a.z)
     up = a.z >= 0
-    real = type(a.x)
+    real: Any = type(a.x)
     chi = (
         dr.select(up, s, a.x),
         dr.select(up, real(0), -a.y),

@@ -129,9 +129,7 @@ class SolidAngle(Field):
         assert self._device is not None
         r = _REACH * distance
         variation = 2 * r * (sums.first + r / (1 - _REACH) * sums.second) * (1 + _ROUNDING)
-        return HarmonicBall(
-            r * self._device.size, sums.angle - variation, sums.angle + variation
-        )
+        return HarmonicBall(r * self._device.size, sums.angle - variation, sums.angle + variation)
 
     def parameters(self) -> tuple[Any, ...]:
         return () if self.vertices is None else (self.vertices,)
@@ -166,7 +164,9 @@ class SolidAngle(Field):
         if self.convex_position and nearest > 2 * math.pi * (1 - 1e-9):
             return ConvexHull.of(points).padded(1e-4 * self._size)
         reach = 1.0001 * total_length(self.loops) / math.sqrt(nearest * (_PERIOD - nearest))
-        return tight_extent(self.loops, points.min(axis=0) - reach, points.max(axis=0) + reach, levels)
+        return tight_extent(
+            self.loops, points.min(axis=0) - reach, points.max(axis=0) + reach, levels
+        )
 
     def describe(self) -> dict[str, Any]:
         return {

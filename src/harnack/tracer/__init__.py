@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from harnack.tracer.hits import Hits, trace
-from harnack.tracer.surface import LevelSet, level_set
 from harnack.tracer.march import PreparedLevelSet, Trace
+from harnack.tracer.surface import LevelSet, level_set
 from harnack.tracer.tolerance import Status, Tolerance
 
 __all__ = [

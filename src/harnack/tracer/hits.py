@@ -110,7 +110,9 @@ def _rays(
     n = max(lengths.values()) if min(lengths.values()) > 0 else 0
     for name, length in lengths.items():
         if length not in (1, n):
-            raise ValueError(f"{name} has {length} entries where the others have {n}; give 1 or {n}")
+            raise ValueError(
+                f"{name} has {length} entries where the others have {n}; give 1 or {n}"
+            )
     length = dr.norm(d)
     if n and not dr.is_array_v(type(directions)):
         _check_numpy_rays(to_numpy(length), to_numpy(near), to_numpy(far))
@@ -120,9 +122,7 @@ def _rays(
 def _check_numpy_rays(length: Any, near: Any, far: Any) -> None:
     zero = np.flatnonzero(~(length > 0))
     if zero.size:
-        raise ValueError(
-            f"directions: entry {zero[0]} has length zero; a ray needs a direction"
-        )
+        raise ValueError(f"directions: entry {zero[0]} has length zero; a ray needs a direction")
     if (near < 0).any():
         raise ValueError("t_min must be >= 0: rays run forwards")
     empty = np.flatnonzero(~(near <= far))
@@ -130,9 +130,7 @@ def _check_numpy_rays(length: Any, near: Any, far: Any) -> None:
         raise ValueError(f"t_max is smaller than t_min for ray {empty[0]}: swap them")
 
 
-def _trace(
-    surface: LevelSet, backend: Backend, o: Vec3, d: Vec3, near: Real, far: Real
-) -> Hits:
+def _trace(surface: LevelSet, backend: Backend, o: Vec3, d: Vec3, near: Real, far: Real) -> Hits:
     prepared = surface.prepare(backend)
     with dr.suspend_grad():
         end = prepared.first_hit(dr.detach(o), dr.detach(d), dr.detach(near), dr.detach(far))

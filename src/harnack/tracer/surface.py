@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -36,9 +37,9 @@ class LevelSet:
     field: Field
     levels: tuple[Real, ...] = ()
     clip: Volume | None = None
-    tolerance: Tolerance = field(default_factory=Tolerance)
+    tolerance: Tolerance = dataclasses.field(default_factory=Tolerance)
     max_steps: int = 2000
-    bound: Longest = field(default_factory=choose_bound)
+    bound: Longest = dataclasses.field(default_factory=choose_bound)
     overstep: float = 1.4
     solid: tuple[float, float] | None = None
 
@@ -108,9 +109,7 @@ def level_set(
     field.check_levels(tuple(_number(one) for one in asked))
     tolerance = tolerance if isinstance(tolerance, Tolerance) else Tolerance(float(tolerance))
     overstep = field.overstep if overstep is None else overstep
-    return LevelSet(
-        field, asked, clip, tolerance, max_steps, choose_bound(bound), overstep, solid
-    )
+    return LevelSet(field, asked, clip, tolerance, max_steps, choose_bound(bound), overstep, solid)
 
 
 def _as_levels(level: Any) -> tuple[Any, ...]:

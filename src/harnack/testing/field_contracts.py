@@ -1,0 +1,244 @@
+"""`check_field`: everything that a field promises, sampled."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from harnack.backend import choose_backend, to_numpy, to_vector3
+from harnack.fields.field import Curvature, HarmonicBall, Lipschitz
+from harnack.testing.failures import BrokenPromiseError
+from harnack.testing.poisson import FloatArray
+from harnack.testing.walks import Look, look_at, movements, random_directions, random_points
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from harnack.fields.field import Field, Knowledge
+
+__all__ = ["check_field"]
+
+# Nodes and weights of a derivative by central differences, with an error of order h^4.
+_NODES = np.array([-2.0, -1.0, 1.0, 2.0])
+_WEIGHTS = np.array([1.0, -8.0, 8.0, -1.0]) / 12
+
+
+def check_field(
+    field: Field,
+    points: FloatArray | None = None,
+    *,
+    rng: np.random.Generator | int = 0,
+    count: int = 200,
+    levels: Sequence[float] | None = None,
+    directions: int = 12,
+) -> None:
+    """Test what a field promises by sampling it in double precision.
+
+    points: (n, 3) where to look; by default `count` random ones in its domain or, if it has
+        none, around its default surface.
+    levels: whose `extent` to test; by default the default level.
+    directions: how many ways to walk from each point within each promise.
+
+    Checked: values and gradients are numbers, alike in both precisions within `Sample.error`;
+    the gradient is that of the value; f is harmonic where a ball of dimension 2 or 3 says so;
+    `differentiable_value` is the value; the lift of f keeps each promise (`HarmonicBall`,
+    `Lipschitz`, `Curvature`) on the way to random points of its ball; some step is possible at
+    most points; no level set leaves its `extent`.
+
+    Raises:
+        BrokenPromiseError: naming the promise and the point where it is broken.
+    """
+    generator = np.random.default_rng(rng)
+    if points is None:
+        points = random_points(field, generator, count)
+    levels = (field.default_level,) if levels is None else tuple(levels)
+    look = look_at(field, points)
+    _check_numbers(field, points, look)
+    _check_gradient(field, points, look)
+    _check_rounding(field, points, look)
+    _check_differentiable_value(field, points, look)
+    for known in look.known:
+        _check_promise(field, points, look, known, generator, directions)
+    for level in levels:
+        _check_extent(field, level, generator, count)
+
+
+def _check_numbers(field: Field, points: FloatArray, look: Look) -> None:
+    if field.period is not None and not 0 < field.period < np.inf:
+        raise BrokenPromiseError(f"period must be None or a positive number, not {field.period!r}")
+    _require(np.isfinite(look.value), "the value is not a finite number", points)
+    _require(np.isfinite(look.gradient).all(axis=1), "the gradient is not finite", points)
+    if not look.known:
+        raise BrokenPromiseError("nothing is known: without a promise no step is possible")
+    for known in look.known:
+        numbers = [value for key, value in vars(known).items() if key != "dimension"]
+        name = type(known).__name__
+        _require(~np.isnan(numbers).any(axis=0), f"{name} has a NaN", points)
+        if isinstance(known, HarmonicBall):
+            if known.dimension not in (2, 3, 4):
+                raise BrokenPromiseError(f"HarmonicBall has dimension {known.dimension!r}")
+            inside = (known.lower <= look.value) & (look.value <= known.upper)
+            _require(inside, "HarmonicBall: the value is not within [lower, upper]", points)
+            bounded = np.isfinite(known.lower) | np.isfinite(known.upper)
+            _require(bounded, "HarmonicBall: both ends are infinite", points)
+        else:
+            _require(known.constant >= 0, f"{name}: the constant is negative", points)
+    usable = np.any([known.radius > 0 for known in look.known], axis=0)
+    if usable.mean() < 0.5:
+        raise BrokenPromiseError(
+            "the radius of every promise is 0 at most points: no step is possible there"
+        )
+
+
+def _scale(points: FloatArray, look: Look) -> FloatArray:
+    """A length (n,) over which the field is smooth: the smallest radius that is promised."""
+    size = float(np.ptp(points, axis=0).max()) or 1.0
+    radii = [known.radius for known in look.known if isinstance(known, HarmonicBall)]
+    smooth = np.min([np.full(len(points), size), *radii], axis=0)
+    return np.maximum(smooth, 1e-9 * size)
+
+
+def _check_gradient(field: Field, points: FloatArray, look: Look) -> None:
+    """By central differences of the value; and the Laplacian by those of the gradient."""
+    h = 2e-3 * _scale(points, look)
+    derivative, laplacian = np.zeros_like(points), np.zeros(len(points))
+    bend = np.zeros(len(points))
+    for axis in range(3):
+        for node, weight in zip(_NODES, _WEIGHTS, strict=True):
+            there = points.copy()
+            there[:, axis] += node * h
+            other = look_at(field, there)
+            move = other.value - look.value
+            if field.period is not None:
+                move -= field.period * np.round(move / field.period)
+            derivative[:, axis] += weight * move / h
+            second = weight * other.gradient[:, axis] / h
+            laplacian += second
+            bend += np.abs(second)
+    length = np.linalg.norm(look.gradient, axis=1)
+    off = np.linalg.norm(derivative - look.gradient, axis=1)
+    magnitude = np.abs(look.value) + (field.period or 0)
+    tolerance = 1e-6 * length + (1e-12 * magnitude + 1e-12 * length * _size(points)) / h
+    # What the differences leave out is a share h^4 of what f does on the scale of the ball.
+    tolerance += 1e-6 * bend * h
+    _require(off <= tolerance, "the gradient is not that of the value", points, off)
+    if any(isinstance(one, HarmonicBall) and one.dimension < 4 for one in look.known):
+        tolerance = 1e-6 * bend + 1e-11 * length * (1 + _size(points) / h) / h
+        good = np.abs(laplacian) <= tolerance
+        _require(good, "HarmonicBall: f is not harmonic, its Laplacian is not 0", points, laplacian)
+
+
+def _size(points: FloatArray) -> FloatArray:
+    return np.abs(points).max(axis=1)
+
+
+def _check_rounding(field: Field, points: FloatArray, look: Look) -> None:
+    """In single precision the value is off by `error`, eight units in its last place, and what
+    the rounding of the point does."""
+    single = points.astype(np.float32).astype(np.float64)
+    exact, rounded = look_at(field, single), look_at(field, single, "single")
+    off = rounded.value - exact.value
+    if field.period is not None:
+        off -= field.period * np.round(off / field.period)
+    unit = 2.0**-24
+    length = np.linalg.norm(exact.gradient, axis=1)
+    allowed = rounded.error + unit * (8 * np.abs(exact.value) + 8 * length * _size(points))
+    singular = np.min([one.radius for one in look.known], axis=0) < 1e-4 * np.ptp(points)
+    good = (np.abs(off) <= allowed) | singular
+    _require(good, "Sample.error: in single precision the value is off by more", points, off)
+
+
+def _check_differentiable_value(field: Field, points: FloatArray, look: Look) -> None:
+    backend = choose_backend("double")
+    prepared = field.prepare(backend)
+    value = prepared.differentiable_value(to_vector3(backend, points, "points"))
+    off = np.abs(to_numpy(value) - look.value)
+    if field.period is not None:
+        off = np.abs(off - field.period * np.round(off / field.period))
+    good = off <= 1e-9 * (1 + np.abs(look.value))
+    _require(good, "differentiable_value is not the value", points, off)
+
+
+def _check_promise(
+    field: Field,
+    points: FloatArray,
+    look: Look,
+    known: Knowledge,
+    rng: np.random.Generator,
+    directions: int,
+) -> None:
+    """Walk from each point to the border of the promise, or across the points' size."""
+    name = type(known).__name__
+    reach = np.minimum(known.radius, 2 * float(np.ptp(points, axis=0).max()) + 1e-300)
+    # Denser towards the border, where singularities may lie.
+    share = 1 - np.linspace(1, 0.03, 80) ** 2
+    for _ in range(directions):
+        d = random_directions(rng, len(points))
+        t = reach[:, None] * share
+        moved, _ = movements(field, points, d, t)
+        rounding = 1e-9 * (np.abs(look.value)[:, None] + (field.period or 0) + np.abs(moved))
+        if isinstance(known, HarmonicBall):
+            over = moved - (known.upper - look.value)[:, None]
+            under = (known.lower - look.value)[:, None] - moved
+            excess = np.maximum(over, under) - rounding
+        elif isinstance(known, Lipschitz):
+            excess = np.abs(moved) - known.constant[:, None] * t - rounding
+        else:
+            assert isinstance(known, Curvature)
+            slope = np.einsum("nk,nk->n", look.gradient, d)[:, None]
+            bent = np.abs(moved - slope * t) - 0.5 * known.constant[:, None] * t * t
+            excess = bent - rounding
+        worst = excess.argmax(axis=1)
+        rows = np.arange(len(points))
+        there = points + t[rows, worst, None] * d
+        message = f"{name}: f leaves what is promised here by more than rounding"
+        _require(excess.max(axis=1) <= 0, message, points, excess.max(axis=1), there)
+
+
+def _check_extent(field: Field, level: float, rng: np.random.Generator, count: int) -> None:
+    """No crossing of the level on segments outside the extent."""
+    volume = field.extent((level,))
+    if volume is None:
+        return
+    lower, upper = volume.bounds()
+    middle, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
+    if not np.isfinite(half).all():
+        return
+    start = middle + rng.uniform(-2.5, 2.5, (count, 3)) * half
+    d = random_directions(rng, count)
+    t = np.linspace(0, 3 * float(half.max()), 160) * np.ones((count, 1))
+    at = start[:, None] + t[..., None] * d[:, None]
+    outside = ~volume.contains_points(at.reshape(-1, 3)).reshape(t.shape)
+    if field.domain is not None:
+        outside &= field.domain.contains_points(at.reshape(-1, 3)).reshape(t.shape)
+    moved, steepness = movements(field, start, d, t)
+    above = look_at(field, start).value[:, None] + moved - level
+    cell = np.floor(above / field.period) if field.period is not None else np.sign(above)
+    # To first order, farther from the level than a thousandth of the extent.
+    gap = np.abs(above)
+    if field.period is not None:
+        gap = np.abs(above - field.period * np.round(above / field.period))
+    clear = gap > 1e-3 * float(half.max()) * steepness
+    crossed = (cell[:, 1:] != cell[:, :-1]) & clear[:, 1:] & clear[:, :-1]
+    crossed &= outside[:, 1:] & outside[:, :-1]
+    message = f"extent: the surface of level {level:g} leaves {volume}; seen from here"
+    _require(~crossed.any(axis=1), message, at[np.arange(count), crossed.argmax(axis=1)])
+
+
+def _require(
+    good: FloatArray | np.ndarray,
+    message: str,
+    points: FloatArray,
+    amount: FloatArray | None = None,
+    there: FloatArray | None = None,
+) -> None:
+    bad = np.flatnonzero(~np.asarray(good))
+    if not bad.size:
+        return
+    worst = bad[0] if amount is None else bad[np.abs(amount[bad]).argmax()]
+    by = "" if amount is None else f" (by {amount[worst]:.3g})"
+    where = "" if there is None else f", at {there[worst].tolist()}"
+    raise BrokenPromiseError(
+        f"{message}{by}: point {points[worst].tolist()}{where}; {bad.size} of {len(points)} points"
+    )
