@@ -81,8 +81,7 @@ def published(scene: Scene) -> Row:
     field = scene.make()
     assert isinstance(field, hk.SolidAngle)
     open_field = WithoutExtent(list(field.loops), certificate="paper")
-    row = measure(scene, ("classic, as published (no clip)", "classic", 1.75), open_field)
-    return row
+    return measure(scene, ("classic, as published (no clip)", "classic", 1.75), open_field)
 
 
 def machine() -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -93,8 +94,7 @@ class SolidAngle(Field):
     def prepare(self, backend: Backend) -> SolidAngle:
         if self._device is not None and self._device.edges.backend is backend:
             return self
-        prepared = object.__new__(SolidAngle)
-        prepared.__dict__.update(self.__dict__)
+        prepared = copy.copy(self)
         # Centred and scaled to unit size: products of eight lengths stay far from overflow.
         unit = tuple((loop - self._centre) / self._size for loop in self.loops)
         centre = backend.Array3f(*(dr.opaque(backend.Float, float(c)) for c in self._centre))

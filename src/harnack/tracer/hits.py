@@ -110,9 +110,7 @@ def _rays(
     n = max(lengths.values()) if min(lengths.values()) > 0 else 0
     for name, length in lengths.items():
         if length not in (1, n):
-            raise ValueError(
-                f"{name} has {length} entries where the others have {n}; give 1 or {n}"
-            )
+            raise ValueError(f"{name} has {length} entries, the others have {n}; give 1 or {n}")
     length = dr.norm(d)
     if n and not dr.is_array_v(type(directions)):
         _check_numpy_rays(to_numpy(length), to_numpy(near), to_numpy(far))
