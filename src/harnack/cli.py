@@ -20,6 +20,7 @@ from harnack.geometry import read_loops
 from harnack.render import MATERIALS, SHOW_MODES, render
 
 _CURVES = (".obj", ".ply", ".loops")
+_DEMO_SIZE = (480, 360)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -62,7 +63,7 @@ def _parser() -> argparse.ArgumentParser:
     many = commands.add_parser("gallery", help="draw or list the named scenes")
     many.add_argument("names", nargs="*", metavar="NAME", help="scenes to draw (all)")
     many.add_argument("--list", action="store_true", help="list them and draw nothing")
-    many.add_argument("--demo", action="store_true", help="draw only those of `make demo`")
+    many.add_argument("--demo", action="store_true", help="only those of `make demo`, small")
     many.add_argument("-o", "--output", metavar="FOLDER", default="out", help="folder (out)")
     _add_quality(many)
     many.set_defaults(run=_gallery)
@@ -170,7 +171,7 @@ def _gallery(options: Any) -> int:
             raise ValueError(f"no scene is named {name!r}; there are {', '.join(SCENES)}")
     wanted = [SCENES[name] for name in options.names] or list(SCENES.values())
     if options.demo:
-        wanted = [scene for scene in wanted if scene.in_demo]
+        wanted = [scene for scene in wanted if scene.demo_spp > 0]
     folder = Path(options.output)
     folder.mkdir(parents=True, exist_ok=True)
     for index, scene in enumerate(wanted, start=1):
@@ -178,7 +179,8 @@ def _gallery(options: Any) -> int:
             f"{index}/{len(wanted)} [bold]{scene.name}[/]: {scene.title}", highlight=False
         )
         target = folder / f"{scene.name}.png"
-        scene.render(target, **_quality(options))
+        small = {"size": _DEMO_SIZE, "spp": scene.demo_spp} if options.demo else {}
+        scene.render(target, **{**small, **_quality(options)})
         console.print(f"    {target}", highlight=False)
     console.print(f"{len(wanted)} pictures in {folder.resolve()}", highlight=False)
     return 0

@@ -15,6 +15,7 @@ import numpy as np
 
 from harnack.fields import (
     EigenfunctionSum,
+    Field,
     Gyroid,
     HarmonicPolynomial,
     Product,
@@ -39,6 +40,7 @@ class Scene:
     """A picture waiting to be made.
 
     surfaces: makes the level sets; materials: one name for each of them (or one for all).
+    demo_spp: samples a pixel in `make demo`, 0 for not in it; few, to keep it to a few minutes.
     """
 
     name: str
@@ -47,7 +49,7 @@ class Scene:
     materials: tuple[str, ...] = ("two-tone",)
     camera: Camera = field(default_factory=Camera)
     show: str = "color"
-    in_demo: bool = False
+    demo_spp: int = 0
 
     def render(self, path: Any = None, **settings: Any) -> Any:
         """The picture, as `harnack.render` makes it; settings override the scene's own."""
@@ -65,10 +67,9 @@ def _curve(loops: Any, level: Any = None, **settings: Any) -> list[LevelSet]:
 
 def _levels() -> list[LevelSet]:
     """Five levels of one polygon, cut open."""
-    polygon = SolidAngle(shapes.wavy_polygon(48))
     cut = HalfSpace((0.5, -0.9, 0.0), 0.0)
-    levels = (k * math.pi for k in (1.0, 1.5, 2.0, 2.5, 3.0))
-    return [level_set(polygon, level, clip=cut, tolerance=_DRAWN) for level in levels]
+    levels = [k * math.pi for k in (1.0, 1.5, 2.0, 2.5, 3.0)]
+    return _curve(shapes.wavy_polygon(48), levels, clip=cut)
 
 
 def _holes() -> list[LevelSet]:
@@ -99,72 +100,116 @@ def _eigenfunctions() -> list[LevelSet]:
     return [level_set(EigenfunctionSum(terms, domain=domain), solid=solid, tolerance=_DRAWN)]
 
 
-def _scenes() -> tuple[Scene, ...]:
-    return (
-        Scene(
-            "polygon", "a nonplanar polygon", lambda: _curve(shapes.wavy_polygon(64)), in_demo=True
-        ),
-        Scene(
-            "levels", "five level sets of a nonplanar polygon, cut open", _levels,
-            ("two-tone",), Camera(azimuth=-62, elevation=22), in_demo=True,
-        ),
-        Scene(
-            "evaluations", "evaluations a ray, as the paper's Fig. 22",
-            lambda: _curve(shapes.wavy_polygon(64)), show="evaluations", in_demo=True,
-        ),
-        Scene(
-            "trefoil", "a Seifert surface of the trefoil knot",
-            lambda: _curve(shapes.torus_knot(2, 3, 96)), in_demo=True,
-            camera=Camera(elevation=38),
-        ),
-        Scene(
-            "figure-eight", "a Seifert surface of the figure-eight knot",
-            lambda: _curve(shapes.figure_eight_knot(120)), camera=Camera(elevation=38),
-        ),
-        Scene(
-            "hopf", "a Seifert surface of the Hopf link",
-            lambda: _curve(shapes.hopf_link(48)), in_demo=True,
-        ),
-        Scene(
-            "borromean", "a Seifert surface of the Borromean rings",
-            lambda: _curve(shapes.borromean_rings(48)),
-        ),
-        Scene("holes", "a polygon with holes", _holes, ("plastic",), in_demo=True),
-        Scene("coil", "a coil of five turns", lambda: _curve(shapes.coil(5, 160)), ("copper",)),
-        Scene(
-            "harmonic", "level set of a spherical harmonic, l = 5, m = 3",
-            lambda: [level_set(SphericalHarmonic(5, 3), tolerance=_DRAWN)], in_demo=True,
-        ),
-        Scene(
-            "polynomial", "the harmonic polynomial of the paper's Eq. 8",
-            lambda: [
-                level_set(
-                    HarmonicPolynomial({(2, 1, 0): 1.0, (0, 1, 2): -1.0}), tolerance=_DRAWN
-                )
-            ],
-        ),
-        Scene(
-            "gyroid", "a gyroid wall in glass, cut to a ball",
-            lambda: _periodic(Gyroid, solid=(-0.35, 0.35)), ("glass",), in_demo=True,
-        ),
-        Scene(
-            "gyroid-gold", "half of space behind the gyroid in gold, cut to a box",
-            lambda: _periodic(Gyroid, solid=(-math.inf, 0.0), box=True), ("gold",), in_demo=True,
-        ),
-        Scene(
-            "schwarz-p", "Schwarz's primitive surface as a wall, cut to a box",
-            lambda: _periodic(SchwarzP, solid=(-0.25, 0.25), box=True), ("porcelain",),
-        ),
-        Scene(
-            "schwarz-d", "Schwarz's diamond surface as a wall, cut to a ball",
-            lambda: _periodic(SchwarzD, solid=(-0.15, 0.15)), ("copper",),
-        ),
-        Scene(
-            "eigenfunctions", "a sum of Laplacian eigenfunctions (the paper's Fig. 21)",
-            _eigenfunctions, ("clay",),
-        ),
-    )  # fmt: skip
+def _harmonic(field: Field) -> list[LevelSet]:
+    return [level_set(field, tolerance=_DRAWN)]
 
 
-SCENES: Mapping[str, Scene] = MappingProxyType({scene.name: scene for scene in _scenes()})
+_CURVES = (
+    Scene(
+        "polygon",
+        "a nonplanar polygon",
+        lambda: _curve(shapes.wavy_polygon(64)),
+        demo_spp=36,
+    ),
+    Scene(
+        "levels",
+        "five level sets of a nonplanar polygon, cut open",
+        _levels,
+        camera=Camera(azimuth=-62, elevation=24),
+        demo_spp=25,
+    ),
+    Scene(
+        "evaluations",
+        "evaluations a ray, as the paper's Fig. 22",
+        lambda: _curve(shapes.wavy_polygon(64)),
+        show="evaluations",
+        demo_spp=1,
+    ),
+    Scene(
+        "trefoil",
+        "a Seifert surface of the trefoil knot",
+        lambda: _curve(shapes.torus_knot(2, 3, 96)),
+        camera=Camera(azimuth=-80, elevation=52),
+        demo_spp=25,
+    ),
+    Scene(
+        "figure-eight",
+        "a Seifert surface of the figure-eight knot",
+        lambda: _curve(shapes.figure_eight_knot(120)),
+        camera=Camera(elevation=48),
+    ),
+    Scene(
+        "hopf",
+        "a Seifert surface of the Hopf link",
+        lambda: _curve(shapes.hopf_link(48)),
+        demo_spp=25,
+    ),
+    Scene(
+        "borromean",
+        "a Seifert surface of the Borromean rings",
+        lambda: _curve(shapes.borromean_rings(48)),
+    ),
+    Scene(
+        "holes",
+        "a polygon with holes",
+        _holes,
+        ("plastic",),
+        Camera(azimuth=-50, elevation=42),
+        demo_spp=25,
+    ),
+    Scene("coil", "a coil of five turns", lambda: _curve(shapes.coil(5, 160)), ("copper",)),
+)
+
+_HARMONICS = (
+    Scene(
+        "harmonic",
+        "level set of a spherical harmonic, l = 5, m = 3",
+        lambda: _harmonic(SphericalHarmonic(5, 3)),
+        demo_spp=36,
+    ),
+    Scene(
+        "polynomial",
+        "the harmonic polynomial of the paper's Eq. 8",
+        lambda: _harmonic(HarmonicPolynomial({(2, 1, 0): 1.0, (0, 1, 2): -1.0})),
+    ),
+)
+
+_SOLIDS = (
+    Scene(
+        "gyroid",
+        "a gyroid wall in glass, cut to a ball",
+        lambda: _periodic(Gyroid, solid=(-0.35, 0.35)),
+        ("glass",),
+        demo_spp=144,
+    ),
+    Scene(
+        "gyroid-gold",
+        "half of space behind the gyroid in gold, cut to a box",
+        lambda: _periodic(Gyroid, solid=(-math.inf, 0.0), box=True),
+        ("gold",),
+        demo_spp=64,
+    ),
+    Scene(
+        "schwarz-p",
+        "Schwarz's primitive surface as a wall, cut to a box",
+        lambda: _periodic(SchwarzP, solid=(-0.25, 0.25), box=True),
+        ("porcelain",),
+    ),
+    Scene(
+        "schwarz-d",
+        "Schwarz's diamond surface as a wall, cut to a ball",
+        lambda: _periodic(SchwarzD, solid=(-0.15, 0.15)),
+        ("copper",),
+    ),
+    Scene(
+        "eigenfunctions",
+        "a sum of Laplacian eigenfunctions (the paper's Fig. 21)",
+        _eigenfunctions,
+        ("clay",),
+    ),
+)
+
+SCENES: Mapping[str, Scene] = MappingProxyType(
+    {scene.name: scene for scene in (*_CURVES, *_HARMONICS, *_SOLIDS)}
+)
 """All scenes by name."""

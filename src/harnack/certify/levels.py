@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 
@@ -36,8 +36,8 @@ class Levels:
         Either is infinite when there is no such level. A value on a level has both a gap of
         zero on one side and, for a ladder, of at most one period on the other.
         """
-        scalar: Any = type(f)
-        down, up = scalar(math.inf), scalar(math.inf)
+        down: Real = math.inf
+        up: Real = math.inf
         for level in self.values:
             above = f - level  # > 0: the level lies below f
             if self.period is not None:

@@ -158,11 +158,10 @@ def spinor(a: Vec3) -> tuple[Real, Real, Spinor]:
     length = dr.sqrt(dr.fma(a.z, a.z, dr.fma(a.x, a.x, a.y * a.y)))
     s = length + dr.abs(a.z)
     up = a.z >= 0
-    real: Any = type(a.x)
     chi = (
         dr.select(up, s, a.x),
-        dr.select(up, real(0), -a.y),
+        dr.select(up, 0, -a.y),
         dr.select(up, a.x, s),
-        dr.select(up, a.y, real(0)),
+        dr.select(up, a.y, 0),
     )
     return length, s, chi

@@ -84,7 +84,7 @@ def as_bsdf(mi: Any, bsdf: Any) -> Any:
     """A BSDF object, from one, its dictionary, or None."""
     if bsdf is None:
         bsdf = {"type": "twosided", "nested": {"type": "diffuse"}}
-    made: Any = mi.load_dict({**bsdf}) if isinstance(bsdf, Mapping) else bsdf
+    made: Any = mi.load_dict({**bsdf}, parallel=False) if isinstance(bsdf, Mapping) else bsdf
     if not isinstance(made, mi.BSDF):
         raise TypeError(f"bsdf must be a BSDF or its dictionary, not {type(made).__name__}")
     return made

@@ -90,9 +90,9 @@ def _camera_ray(mi: Any, sensor: Any, sampler: Any, place: Any) -> tuple[Any, An
 
 def _as_rgb(mi: Any, radiance: Any, wavelengths: Any) -> Any:
     if mi.is_spectral:
-        matching = mi.cie1931_xyz(wavelengths)
-        xyz = mi.Color3f(*(dr.mean(radiance * channel) for channel in matching))
-        return mi.xyz_to_srgb(xyz)
+        matching = [mi.cie1931_xyz(wavelength) for wavelength in wavelengths]
+        xyz = sum(value * weights for value, weights in zip(radiance, matching, strict=True))
+        return mi.xyz_to_srgb(xyz * (mi.MI_CIE_Y_NORMALIZATION / len(matching)))
     return mi.Color3f(radiance[0]) if mi.is_monochromatic else mi.Color3f(radiance)
 
 

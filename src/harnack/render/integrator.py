@@ -75,7 +75,9 @@ class PathTracer:
         self.rr_depth = rr_depth
         self.hide_emitters = hide_emitters
         self.clamp = clamp
-        self.lost_colour = mi.load_dict({"type": "srgb", "color": list(LOST_COLOUR)})
+        self.lost_colour = mi.load_dict(
+            {"type": "srgb", "color": list(LOST_COLOUR)}, parallel=False
+        )
 
     def with_depth(self, max_depth: int) -> PathTracer:
         """The same with another longest path."""

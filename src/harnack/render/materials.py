@@ -35,16 +35,30 @@ class Material:
 
     front: BSDF of the side of larger values (the normal's side); of a solid, its outside.
     back: of the other side of an open surface; None for the same as the front.
-    closed: light passes through it, so that only a solid can be made of it.
+    two_sided: whether open surfaces are to be seen from both sides. A BSDF that takes care of
+        that itself does not want it.
+    transparent: light passes through it, so that only a solid can be made of it.
     """
 
     front: Dictionary
     back: Dictionary | None = None
-    closed: bool = False
+    two_sided: bool = True
+    transparent: bool = False
 
     def bsdf(self, *, solid: bool) -> Dictionary:
-        """The BSDF's dictionary; open surfaces are seen from both sides."""
-        if solid or self.closed:
+        """The BSDF's dictionary for a solid or an open surface.
+
+        Raises:
+            ValueError: the material is transparent, and the surface is open.
+        """
+        if solid:
+            return self.front
+        if self.transparent:
+            raise ValueError(
+                "light passes through this material, so what is made of it needs an inside: give "
+                "solid=(low, high), for instance solid=(-math.inf, level)"
+            )
+        if not self.two_sided:
             return self.front
         nested: Dictionary = {"type": "twosided", "front": self.front}
         return nested if self.back is None else {**nested, "back": self.back}
@@ -58,9 +72,9 @@ MATERIALS: Mapping[str, Material] = {
     "gold": Material(_metal("Au", 0.10)),
     "copper": Material(_metal("Cu", 0.12)),
     "silver": Material(_metal("Ag", 0.12)),
-    "glass": Material({"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}, closed=True),
+    "glass": Material({"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}, transparent=True),
     "frosted": Material(
-        {"type": "roughdielectric", "int_ior": 1.5, "ext_ior": 1.0, "alpha": 0.12}, closed=True
+        {"type": "roughdielectric", "int_ior": 1.5, "ext_ior": 1.0, "alpha": 0.12}, transparent=True
     ),
 }
 """Materials by name."""
@@ -77,7 +91,7 @@ def material_of(wanted: str | Material | Mapping[str, Any] | None) -> Material:
     if isinstance(wanted, Material):
         return wanted
     if isinstance(wanted, Mapping):
-        return Material(dict(wanted), closed=True)
+        return Material(dict(wanted), two_sided=False)
     if wanted not in MATERIALS:
         raise ValueError(f"unknown material {wanted!r}; there are {', '.join(MATERIALS)}")
     return MATERIALS[wanted]

@@ -90,7 +90,7 @@ def render(
             mi, exhibits, size=size or (800, 600), camera=camera or Camera(),
             backdrop=backdrop or "light", bare=show != "color",
         )  # fmt: skip
-        scene, unit = mi.load_dict(made.scene), made.unit
+        scene, unit = mi.load_dict(made.scene, parallel=False), made.unit
     else:
         _refuse({"material": material, "camera": camera, "backdrop": backdrop, **settings})
         scene, unit = _loaded(mi, what, size), 1.0
@@ -163,9 +163,9 @@ def _loaded(mi: Any, what: Any, size: tuple[int, int] | None) -> Any:
     if isinstance(what, mi.Scene):
         scene = what
     elif isinstance(what, Mapping):
-        scene = mi.load_dict({**what})
+        scene = mi.load_dict({**what}, parallel=False)
     elif isinstance(what, str | os.PathLike):
-        scene = mi.load_file(os.fspath(what))
+        scene = mi.load_file(os.fspath(what), parallel=False)
     else:
         raise TypeError(
             "draw a field, a LevelSet, a list of them, or a Mitsuba scene, its dictionary or the "

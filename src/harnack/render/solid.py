@@ -60,7 +60,9 @@ class Solid:
         slipped = active & (((leaves < 0) & ~inside) | ((leaves > 0) & inside))
         entering = within & ~inside & ~slipped
         met = self._meet_levels(o, d, t_max, active & ~entering & ~slipped)
-        met = replace(met, evaluations=met.evaluations + type(met.evaluations)(dr.select(through, 1, 0)))
+        met = replace(
+            met, evaluations=met.evaluations + type(met.evaluations)(dr.select(through, 1, 0))
+        )
         leaving = inside & ~slipped & ~met.met & ~met.lost & (end < t_max)
         capped = entering | leaving | slipped
         t = dr.select(capped & ~slipped, dr.select(leaving, end, start), 0)

@@ -164,7 +164,7 @@ def _sensor(mi: Any, camera: Camera, points: FloatArray, size: tuple[int, int]) 
             "width": size[0],
             "height": size[1],
             "rfilter": {"type": "gaussian"},
-            "pixel_format": "rgb",
+            "pixel_format": "luminance" if mi.is_monochromatic else "rgb",
             "component_format": "float32",
         },
         "sampler": {"type": "multijitter", "sample_count": 64},

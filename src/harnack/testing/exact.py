@@ -69,7 +69,13 @@ def largest_free(movement: Callable[[FloatArray], FloatArray], gap: FloatArray) 
 
 def _parabolas(c: CurvatureCertificate, slope: FloatArray) -> FloatArray:
     """Second derivatives of plus and minus the constant."""
-    h, r = c.constant, c.radius
+    h = c.constant
+    # An infinite radius is replaced by one within which a level is surely met.
+    gaps = np.minimum((c.gap_down, c.gap_up), 1e30)
+    steep = np.abs(slope)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        bent = 4 * (steep / h + np.sqrt(2 * gaps.min(axis=0) / h))
+        r = np.minimum(c.radius, np.where(h > 0, bent, 2 * gaps.max(axis=0) / steep))
 
     def up(q: FloatArray) -> FloatArray:
         return slope * q * r + 0.5 * h * (q * r) ** 2

@@ -173,15 +173,16 @@ def _check_promise(
     reach = np.minimum(known.radius, 2 * float(np.ptp(points, axis=0).max()) + 1e-300)
     # Denser towards the border, where singularities may lie.
     share = 1 - np.linspace(1, 0.03, 80) ** 2
-    for _ in range(directions):
-        d = random_directions(rng, len(points))
+    steepest = look.gradient / np.maximum(np.linalg.norm(look.gradient, axis=1), 1e-300)[:, None]
+    for k in range(directions):
+        # Singularities tend to lie along the gradient.
+        ways = (steepest, -steepest, random_directions(rng, len(points)))
+        d = ways[min(k, 2)]
         t = reach[:, None] * share
         moved, _ = movements(field, points, d, t)
         rounding = 1e-9 * (np.abs(look.value)[:, None] + (field.period or 0) + np.abs(moved))
         if isinstance(known, HarmonicBall):
-            over = moved - (known.upper - look.value)[:, None]
-            under = (known.lower - look.value)[:, None] - moved
-            excess = np.maximum(over, under) - rounding
+            excess = _beyond_ball(known, look.value, moved, share) - rounding
         elif isinstance(known, Lipschitz):
             excess = np.abs(moved) - known.constant[:, None] * t - rounding
         else:
@@ -196,6 +197,22 @@ def _check_promise(
         _require(excess.max(axis=1) <= 0, message, points, excess.max(axis=1), there)
 
 
+def _beyond_ball(
+    ball: HarmonicBall, value: FloatArray, moved: FloatArray, share: FloatArray
+) -> FloatArray:
+    """By how much f is outside [lower, upper], or moves by more than Harnack's inequality allows
+    a positive harmonic function: then it is not harmonic on the ball."""
+    n = ball.dimension
+    up = (1 + share) / (1 - share) ** (n - 1) - 1
+    down = 1 - (1 - share) / (1 + share) ** (n - 1)
+    below, above = (value - ball.lower)[:, None], (ball.upper - value)[:, None]
+    with np.errstate(invalid="ignore"):  # 0 * inf, where nothing is known
+        rise = np.fmin(np.fmin(below * up, above), above * down)
+        fall = np.fmin(np.fmin(above * up, below), below * down)
+    # A radius cut short only makes the comparison weaker for q <= 1.
+    return np.maximum(moved - rise * (1 + 1e-9), -moved - fall * (1 + 1e-9))
+
+
 def _check_extent(field: Field, level: float, rng: np.random.Generator, count: int) -> None:
     """No crossing of the level on segments outside the extent."""
     volume = field.extent((level,))
@@ -208,22 +225,34 @@ def _check_extent(field: Field, level: float, rng: np.random.Generator, count: i
     start = middle + rng.uniform(-2.5, 2.5, (count, 3)) * half
     d = random_directions(rng, count)
     t = np.linspace(0, 3 * float(half.max()), 160) * np.ones((count, 1))
-    at = start[:, None] + t[..., None] * d[:, None]
-    outside = ~volume.contains_points(at.reshape(-1, 3)).reshape(t.shape)
-    if field.domain is not None:
-        outside &= field.domain.contains_points(at.reshape(-1, 3)).reshape(t.shape)
     moved, steepness = movements(field, start, d, t)
     above = look_at(field, start).value[:, None] + moved - level
-    cell = np.floor(above / field.period) if field.period is not None else np.sign(above)
-    # To first order, farther from the level than a thousandth of the extent.
-    gap = np.abs(above)
-    if field.period is not None:
-        gap = np.abs(above - field.period * np.round(above / field.period))
-    clear = gap > 1e-3 * float(half.max()) * steepness
-    crossed = (cell[:, 1:] != cell[:, :-1]) & clear[:, 1:] & clear[:, :-1]
-    crossed &= outside[:, 1:] & outside[:, :-1]
-    message = f"extent: the surface of level {level:g} leaves {volume}; seen from here"
-    _require(~crossed.any(axis=1), message, at[np.arange(count), crossed.argmax(axis=1)])
+    # To first order, farther from the level than a thousandth of the extent: no grazing.
+    clear = _gap(field, above) > 1e-3 * float(half.max()) * steepness
+    crossed = (_cell(field, above[:, 1:]) != _cell(field, above[:, :-1])) & clear[:, 1:]
+    row, column = np.nonzero(crossed & clear[:, :-1])
+    low, high, offset = t[row, column], t[row, column + 1], above[row, column]
+    for _ in range(4):  # to 1e-6 of the interval
+        part = low[:, None] + (high - low)[:, None] * np.linspace(0, 1, 33)
+        there = offset[:, None] + movements(field, start[row], d[row], part)[0]
+        first = (_cell(field, there) != _cell(field, there[:, :1])).argmax(axis=1)
+        some = np.arange(len(row))
+        low, high = part[some, first - 1], part[some, first]
+        offset = there[some, first - 1]
+    at = start[row] + high[:, None] * d[row]
+    inside = volume.contains_points(at)
+    if field.domain is not None:
+        inside |= ~field.domain.contains_points(at)
+    _require(inside, f"extent: the surface of level {level:g} leaves {volume} here", at)
+
+
+def _cell(field: Field, above: FloatArray) -> FloatArray:
+    return np.sign(above) if field.period is None else np.floor(above / field.period)
+
+
+def _gap(field: Field, above: FloatArray) -> FloatArray:
+    whole = 0.0 if field.period is None else field.period * np.round(above / field.period)
+    return np.abs(above - whole)
 
 
 def _require(

@@ -1,7 +1,7 @@
 """First crossings by dense sampling in double precision, sharing nothing with the tracer.
 
 The solid angle is that of van Oosterom and Strackee (1983), one arctangent for each triangle of
-a fan about the centroid of each loop, where the library multiplies spinors. Nothing here proves
+a fan about a point near the centroid of each loop, where the library multiplies spinors. Nothing here proves
 anything: samples are so dense that only grazing rays can be judged wrongly, and those are
 judged by `nearness` instead.
 """
@@ -23,6 +23,9 @@ FloatArray: TypeAlias = npt.NDArray[np.float64]
 # Sizes of temporary arrays, chosen to stay within a core's cache.
 _PAIRS_AT_ONCE = 16_384
 _HALVINGS = 14
+# From the centroid to the apex, in sizes of the loop: a point in line with the apex and a vertex
+# is 0/0, and the points that people choose are in line with the centroid.
+_ASIDE = np.array([0.0513, 0.0271, 0.0387])
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,8 @@ class CurveOracle:
         for loop in self.loops:
             closed = np.concatenate([loop, loop[:1]]).T
             p = [closed[k] - x[:, k, None] for k in range(3)]
-            c = [loop[:, k].mean() - x[:, k, None] for k in range(3)]
+            apex = loop.mean(axis=0) + np.ptp(loop, axis=0).max() * _ASIDE
+            c = [apex[k] - x[:, k, None] for k in range(3)]
             length, pc, lc = _length(p), _dot(p, c), _length(c)
             a, la, ac = [q[:, :-1] for q in p], length[:, :-1], pc[:, :-1]
             b, lb, bc = [q[:, 1:] for q in p], length[:, 1:], pc[:, 1:]

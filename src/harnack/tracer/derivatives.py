@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
+from harnack.certify import Levels
+
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
     from harnack.tracer.march import PreparedLevelSet
@@ -56,11 +58,24 @@ def attach(
         dr.eval(at, x, slope, normal)
     value = prepared.field.differentiable_value(dr.fma(backend.Array3f(at), d, o))
     change = value - dr.detach(value)
-    for level in prepared.levels.values[:1]:
-        change = change - (level - dr.detach(level))
+    change = change - _change_of_nearest(prepared, sample.value)
     usable = hit & (slope != 0)
     moved = at - dr.select(usable, change / slope, 0)
     return dr.select(hit, moved, t), normal
+
+
+def _change_of_nearest(prepared: PreparedLevelSet, f: Real) -> Real:
+    """level - detach(level), a zero with a derivative, of the level nearest to f in each lane."""
+    nearest, change = dr.inf, prepared.backend.Float(0)
+    for level in prepared.levels.values:
+        with dr.suspend_grad():
+            one = Levels((dr.detach(level),), prepared.levels.period)
+            down, up = one.gaps(f)
+            gap = dr.select(up < down, up, down)
+            closer = gap < nearest
+            nearest = dr.select(closer, gap, nearest)
+        change = dr.select(closer, level - dr.detach(level), change)
+    return change
 
 
 def _to_nearest(prepared: PreparedLevelSet, f: Real) -> Real:

@@ -1,0 +1,376 @@
+"""Every field keeps its promises; every bound keeps clear of levels in every field."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import math
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+
+import harnack as hk
+from harnack import fields
+from harnack.bounds import Bound, Caps, Classic, CurvatureStep, LipschitzStep, Slope
+from harnack.fields import Curvature, Field, HarmonicBall, Lipschitz, PlaneWave, Product, Sample
+from harnack.fields import cosine, sine
+from harnack.geometry import shapes
+from harnack.testing import BrokenPromiseError, Scaled, check_field
+from harnack.testing.step_contracts import check_steps
+
+BOUNDS = (Classic(), Slope(), Caps(), LipschitzStep(), CurvatureStep())
+
+
+class Charges(Field):
+    """The potential of point charges: positive, harmonic up to the nearest, no upper end."""
+
+    default_level = 2.5
+    domain = hk.Ball(radius=3.0)
+
+    def evaluate(self, p: Any) -> Sample:
+        value, gradient, nearest = 0.0, type(p)(0.0), math.inf
+        for centre in ((-0.8, 0.0, 0.0), (0.8, 0.0, 0.0), (0.0, 0.9, 0.3)):
+            away = p - type(p)(*centre)
+            r = dr.norm(away)
+            value, gradient = value + 1 / r, gradient - away / (r * r * r)
+            nearest = dr.minimum(nearest, r)
+        return Sample(value, gradient, (HarmonicBall(nearest, 0.0, math.inf),))
+
+
+class Azimuth(Field):
+    """The angle about the z axis: harmonic in the plane, known modulo 2 pi."""
+
+    period = 2 * math.pi
+    default_level = 1.0
+    domain = hk.Box((-2, -2, -2), (2, 2, 2))
+
+    def evaluate(self, p: Any) -> Sample:
+        square = p.x * p.x + p.y * p.y
+        angle = dr.atan2(p.y, p.x)
+        gradient = type(p)(-p.y / square, p.x / square, 0.0)
+        # Seen from a point at distance r, the disk of radius r is within a quarter turn.
+        ball = HarmonicBall(dr.sqrt(square), angle - 0.5 * math.pi, angle + 0.5 * math.pi, 2)
+        return Sample(angle, gradient, (ball,))
+
+
+class Plane(Field):
+    """x: the simplest function, known to be Lipschitz and straight."""
+
+    domain = hk.Ball(radius=2.0)
+
+    def evaluate(self, p: Any) -> Sample:
+        return Sample(p.x, type(p)(1.0, 0.0, 0.0), (Lipschitz(1.0), Curvature(0.0)))
+
+
+def moved(loops: Any, scale: float, shift: float) -> list[np.ndarray]:
+    loops = loops if isinstance(loops, list) else [loops]
+    return [scale * (loop + shift * np.array([1.0, -0.5, 0.3])) for loop in loops]
+
+
+_RNG = np.random.default_rng(5)
+CURVES: dict[str, Field] = {
+    "triangle": hk.SolidAngle([[0, 0, 0], [1, 0, 0], [0, 1, 0.4]]),
+    "wavy": hk.SolidAngle(shapes.wavy_polygon(24)),
+    "wavy by edges": hk.SolidAngle(shapes.wavy_polygon(24), certificate="edges"),
+    "flat": hk.SolidAngle(shapes.regular_polygon(9)),
+    "trefoil": hk.SolidAngle(shapes.torus_knot(2, 3, 60)),
+    "figure eight, small": hk.SolidAngle(moved(shapes.figure_eight_knot(48), 1e-3, 0.5)),
+    "coil": hk.SolidAngle(shapes.coil(5, 80, height=0.4)),
+    "coil on its axis, large": hk.SolidAngle(moved(shapes.coil(3, 50, route="axis"), 1e3, 1.0)),
+    "Hopf link": hk.SolidAngle(shapes.hopf_link(20)),
+    "Borromean rings": hk.SolidAngle(shapes.borromean_rings(20)),
+    "holes": hk.SolidAngle(shapes.square_with_holes(12)),
+    "spiky": hk.SolidAngle(shapes.spiky_polygon(_RNG, 17)),
+    "random": hk.SolidAngle(shapes.random_closed_curve(_RNG, 40)),
+}
+REAL: dict[str, Field] = {
+    "Y 2,0": hk.SphericalHarmonic(2, 0),
+    "Y 5,3": hk.SphericalHarmonic(5, 3),
+    "Y 12,-7, large": hk.SphericalHarmonic(12, -7, radius=50.0),
+    "Eq. 8": hk.HarmonicPolynomial({(2, 1, 0): 1, (0, 1, 2): -1}),
+    "polynomial off centre": hk.HarmonicPolynomial(
+        {(2, 1, 0): 1, (0, 1, 2): -1, (1, 0, 0): 0.3, (0, 0, 0): 0.1, (1, 1, 1): 0.5},
+        domain=hk.Ball((0.3, 0.0, -0.2), 1.5),
+    ),
+    "gyroid": hk.Gyroid(),
+    "gyroid, small": hk.Gyroid(cell=0.01, domain=hk.Box((0, 0, 0), (0.03, 0.02, 0.02))),
+    "P": hk.SchwarzP(cell=2.0),
+    "D": hk.SchwarzD(cell=100.0),
+    "Fig. 21": hk.EigenfunctionSum(
+        [Product(1.0, sine(6), sine(6), sine(6)), Product(1.0, sine(2), sine(2), sine(2))]
+    ),
+    "plane waves": hk.EigenfunctionSum(
+        [
+            PlaneWave(0.7, (1.0, -2.0, 0.5), 0.3),
+            Product(0.4, x=cosine(2.0), y=sine(3.0, 0.2)),
+            Product(0.25),
+        ]
+    ),
+}
+OWN: dict[str, Field] = {"charges": Charges(), "azimuth": Azimuth(), "plane": Plane()}
+FIELDS = {**CURVES, **REAL, **OWN}
+# One or two of each kind for what is tried with every bound on every run.
+SOME = ("wavy", "trefoil", "coil", "holes", "Y 5,3", "gyroid", "charges", "azimuth", "plane")
+
+
+def bounds_for(field: Field) -> list[Bound]:
+    """Those that accept something, without a kernel."""
+    kinds = {
+        "SolidAngle": (Classic, Slope, Caps),
+        "SphericalHarmonic": (Classic, Slope, Caps, CurvatureStep),
+        "HarmonicPolynomial": (Classic, Slope, Caps, CurvatureStep),
+        "Charges": (Classic, Slope),
+        "Azimuth": (Classic, Slope),
+        "Plane": (LipschitzStep, CurvatureStep),
+    }.get(type(field).__name__, (Classic, Slope, LipschitzStep, CurvatureStep))
+    return [bound for bound in BOUNDS if isinstance(bound, kinds)]
+
+
+PAIRS = [(name, bound) for name in FIELDS for bound in bounds_for(FIELDS[name])]
+SOME_PAIRS = [pair for pair in PAIRS if pair[0] in SOME]
+
+
+def name_of(value: object) -> str:
+    return value if isinstance(value, str) else type(value).__name__
+
+
+def test_every_field_there_is_is_tested() -> None:
+    exported = {
+        kind
+        for kind in vars(fields).values()
+        if inspect.isclass(kind) and issubclass(kind, Field) and not inspect.isabstract(kind)
+    }
+    assert exported <= {type(field) for field in FIELDS.values()}
+    known = {vars(hk)[name] for name in ("Classic", "Slope", "Caps", "LipschitzStep")}
+    assert known <= {type(bound) for bound in BOUNDS}
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_fields_keep_their_promises(name: str) -> None:
+    field = FIELDS[name]
+    levels = (1.0, 5.0) if isinstance(field, hk.SolidAngle) else ()
+    check_field(field, count=60, directions=4, levels=(field.default_level, *levels))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("name", FIELDS)
+def test_fields_keep_their_promises_at_many_points(name: str, seed: int) -> None:
+    field = FIELDS[name]
+    levels = (0.6, 3.0, 5.0, 9.0) if isinstance(field, hk.SolidAngle) else ()
+    check_field(field, rng=seed, count=2000, levels=(field.default_level, *levels))
+
+
+@pytest.mark.parametrize(("name", "bound"), SOME_PAIRS, ids=name_of)
+def test_no_level_lies_within_a_step(name: str, bound: Bound) -> None:
+    assert check_steps(FIELDS[name], bound, count=150) > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("precision", ["double", "single"])
+@pytest.mark.parametrize(("name", "bound"), PAIRS, ids=name_of)
+def test_no_level_lies_within_many_steps(name: str, bound: Bound, precision: str) -> None:
+    for seed in range(2):
+        found = check_steps(FIELDS[name], bound, rng=seed, count=4000, precision=precision)  # type: ignore[arg-type]
+        assert found > 0
+
+
+@pytest.mark.parametrize("precision", ["double", "single"])
+@pytest.mark.parametrize(("name", "bound"), SOME_PAIRS, ids=name_of)
+def test_mutation_is_seen_in_every_field(name: str, bound: Bound, precision: str) -> None:
+    """A thousandth more is too much."""
+    with pytest.raises(BrokenPromiseError):
+        check_steps(FIELDS[name], Scaled(bound, 1.001), count=150, precision=precision)  # type: ignore[arg-type]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "bound"), PAIRS, ids=name_of)
+def test_mutation_is_seen_in_all_fields(name: str, bound: Bound) -> None:
+    with pytest.raises(BrokenPromiseError):
+        check_steps(FIELDS[name], Scaled(bound, 1.001))
+
+
+def test_levels_inside_a_step_are_seen_without_a_reference() -> None:
+    """Where the bound is attained in the field, sampling alone finds a step too long."""
+
+    @dataclasses.dataclass(frozen=True)
+    class Foreign(Bound):
+        """A bound that `harnack.testing.exact` knows nothing about."""
+
+        factor: float
+
+        def accepts(self, certificate: Any) -> bool:
+            return LipschitzStep().accepts(certificate)
+
+        def step(self, certificate: Any, slope: Any) -> Any:
+            return self.factor * LipschitzStep().step(certificate, slope)
+
+        def covers(self, certificate: Any, slope: Any, length: Any) -> Any:
+            return length <= self.step(certificate, slope)
+
+    class AlongX(Plane):
+        """All directions look along the gradient."""
+
+        def evaluate(self, p: Any) -> Sample:
+            return Sample(dr.norm(p), p / dr.norm(p), (Lipschitz(1.0),))
+
+    assert check_steps(AlongX(), Foreign(1.0)) == 1
+    with pytest.raises(BrokenPromiseError, match="a level lies within the step"):
+        check_steps(AlongX(), Foreign(1.05), count=4000)
+
+
+@dataclasses.dataclass
+class Broken(Field):
+    """Another field, with something wrong."""
+
+    of: Field
+    change: Callable[[Any, Sample], Sample]
+    differentiable: float = 0.0
+    around: hk.Ball | None = None
+
+    def __post_init__(self) -> None:
+        self.period = self.of.period  # type: ignore[misc]
+        self.default_level = self.of.default_level
+        self.domain = self.of.domain
+
+    def evaluate(self, p: Any) -> Sample:
+        return self.change(p, self.of.evaluate(p))
+
+    def extent(self, levels: tuple[float, ...]) -> Any:
+        return self.around or self.of.extent(levels)
+
+    def differentiable_value(self, p: Any) -> Any:
+        return self.of.evaluate(p).value + self.differentiable
+
+
+def changed(sample: Sample, **new: Any) -> Sample:
+    return dataclasses.replace(sample, **new)
+
+
+def with_known(sample: Sample, **new: Any) -> Sample:
+    return changed(sample, known=tuple(dataclasses.replace(one, **new) for one in sample.known))
+
+
+def narrower(factor: float) -> Callable[[Any, Sample], Sample]:
+    def change(p: Any, s: Sample) -> Sample:
+        (ball,) = s.known
+        assert isinstance(ball, HarmonicBall)
+        lower = s.value + factor * (ball.lower - s.value)
+        upper = s.value + factor * (ball.upper - s.value)
+        return with_known(s, lower=lower, upper=upper)
+
+    return change
+
+
+def only(kind: type, **scaled: float) -> Callable[[Any, Sample], Sample]:
+    """Keep promises of a kind, some of their numbers multiplied."""
+
+    def change(p: Any, s: Sample) -> Sample:
+        kept = [one for one in s.known if isinstance(one, kind)]
+        return changed(
+            s,
+            known=tuple(
+                dataclasses.replace(one, **{k: getattr(one, k) * x for k, x in scaled.items()})
+                for one in kept
+            ),
+        )
+
+    return change
+
+
+def kinked(p: Any, s: Sample) -> Sample:
+    """Value and gradient agree, but the function is not harmonic."""
+    bend = 1e-3 * dr.squared_norm(p)
+    return changed(s, value=s.value + bend, gradient=s.gradient + 2e-3 * p)
+
+
+COIL = CURVES["coil"]
+TREFOIL = CURVES["trefoil"]
+GYROID = REAL["gyroid"]
+POLYNOMIAL = REAL["Y 5,3"]
+BROKEN: dict[str, tuple[Field, str]] = {
+    "gradient a little off": (
+        Broken(TREFOIL, lambda p, s: changed(s, gradient=s.gradient * 1.0001)),
+        "gradient is not that of the value",
+    ),
+    "gradient turned round": (
+        Broken(POLYNOMIAL, lambda p, s: changed(s, gradient=-s.gradient)),
+        "gradient is not that of the value",
+    ),
+    "not harmonic": (Broken(POLYNOMIAL, kinked), "not harmonic"),
+    "infinite gradient": (
+        Broken(POLYNOMIAL, lambda p, s: changed(s, gradient=s.gradient / 0.0)),
+        "gradient is not finite",
+    ),
+    "a NaN value": (
+        Broken(POLYNOMIAL, lambda p, s: changed(s, value=dr.select(p.x > 0.5, dr.nan, s.value))),
+        "value is not a finite number",
+    ),
+    "a jump that is no period": (
+        Broken(POLYNOMIAL, lambda p, s: changed(s, value=dr.select(p.x > 0, s.value + 9, s.value))),
+        "HarmonicBall|gradient",
+    ),
+    "nothing known": (Broken(POLYNOMIAL, lambda p, s: changed(s, known=())), "nothing is known"),
+    "range of the paper": (
+        hk.SolidAngle(shapes.coil(5, 80, height=0.2), certificate="paper"),
+        "HarmonicBall: f leaves",
+    ),
+    "range too narrow": (Broken(TREFOIL, narrower(0.3)), "HarmonicBall: f leaves"),
+    "range of charges with a lid": (
+        Broken(OWN["charges"], lambda p, s: with_known(s, upper=s.value + 40)),
+        "HarmonicBall: f leaves",
+    ),
+    "ball too large": (
+        Broken(OWN["charges"], only(HarmonicBall, radius=1.5)),
+        "HarmonicBall: f leaves|Laplacian",
+    ),
+    "value outside its range": (
+        Broken(POLYNOMIAL, lambda p, s: changed(s, value=s.value + 100)),
+        "value is not within",
+    ),
+    "no ends": (
+        Broken(OWN["charges"], lambda p, s: with_known(s, lower=-math.inf)),
+        "both ends are infinite",
+    ),
+    "five dimensions": (
+        Broken(OWN["charges"], lambda p, s: with_known(s, dimension=5)),
+        "dimension 5",
+    ),
+    "no radius": (
+        Broken(OWN["charges"], lambda p, s: with_known(s, radius=0 * s.value)),
+        "no step is possible",
+    ),
+    "Lipschitz constant too small": (
+        Broken(GYROID, only(Lipschitz, constant=0.8)),
+        "Lipschitz: f leaves",
+    ),
+    "curvature too small": (Broken(GYROID, only(Curvature, constant=0.8)), "Curvature: f leaves"),
+    "error too small": (
+        Broken(POLYNOMIAL, lambda p, s: changed(s, value=s.value + 1e3 - 1e3)),
+        "single precision",
+    ),
+    "differentiable value": (
+        Broken(POLYNOMIAL, lambda p, s: s, differentiable=1e-3),
+        "differentiable_value",
+    ),
+    "extent too small": (
+        Broken(COIL, lambda p, s: s, around=hk.Ball(radius=0.5)),
+        "extent: the surface",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_broken_promises_are_seen(name: str) -> None:
+    field, message = BROKEN[name]
+    with pytest.raises(BrokenPromiseError, match=message):
+        check_field(field, count=400)
+
+
+def test_failure_names_the_point() -> None:
+    field = Broken(POLYNOMIAL, lambda p, s: changed(s, gradient=s.gradient * 1.01))
+    with pytest.raises(BrokenPromiseError, match=r"point \[0\.25, 0\.5, -0\.25\]; 1 of 1 points"):
+        check_field(field, np.array([[0.25, 0.5, -0.25]]))

@@ -1,0 +1,282 @@
+"""`render`: files, modes, settings, determinism, and errors before any work."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import harnack as hk
+from harnack.geometry import shapes
+from harnack.render import MATERIALS, SHOW_MODES, Camera, Material, picture, register, render
+from harnack.render.colormap import viridis
+from harnack.render.images import tone_mapped
+from harnack.render.studio import on_ground
+
+mi = register()
+SMALL: dict[str, Any] = {"size": (40, 30), "progress": False}
+POLYGON = hk.SolidAngle(shapes.wavy_polygon(24))
+GYROID = hk.Gyroid(1.0, domain=hk.Ball(radius=1.0))
+
+
+def draw(what: Any = POLYGON, path: Any = None, **settings: Any) -> np.ndarray:
+    return render(what, path, **{**SMALL, "spp": 4, **settings})
+
+
+def read(path: Path) -> np.ndarray:
+    return np.array(mi.Bitmap(str(path)))
+
+
+def test_a_png_and_an_exr_are_written(tmp_path: Path) -> None:
+    image = draw(path=tmp_path / "a.png")
+    assert image.shape == (30, 40, 3)
+    assert image.dtype == np.float32
+    assert np.isfinite(image).all()
+    np.testing.assert_array_equal(read(tmp_path / "a.png"), tone_mapped(image))
+    again = draw(path=tmp_path / "a.exr")
+    np.testing.assert_allclose(read(tmp_path / "a.exr"), again, rtol=1e-3)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.exr", "a.png"]
+
+
+def test_the_same_seed_draws_the_same_picture() -> None:
+    first = draw(seed=3)
+    np.testing.assert_array_equal(first, draw(seed=3))
+    other = draw(seed=4)
+    assert not np.array_equal(first, other)
+    assert first.mean() == pytest.approx(other.mean(), rel=0.03)
+
+
+def test_bands_leave_no_seam(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = draw(spp=64)
+    monkeypatch.setattr("harnack.render.exposure._PATHS_A_BAND", 64 * 50)
+    bands = draw(spp=64)
+    assert not np.array_equal(whole, bands)
+    assert np.abs(whole - bands).mean() < 0.02
+
+
+@pytest.mark.parametrize("show", SHOW_MODES)
+def test_every_mode_makes_numbers_and_a_picture(show: str, tmp_path: Path) -> None:
+    image = draw(path=tmp_path / "a.png", show=show)
+    assert image.shape[:2] == (30, 40)
+    drawn = read(tmp_path / "a.png")
+    assert drawn.shape == (30, 40, 3)
+    assert drawn.std() > 5
+
+
+def test_modes_agree_with_each_other() -> None:
+    status, depth = draw(show="status"), draw(show="depth")
+    normal, evaluations = draw(show="normal"), draw(show="evaluations")
+    hit = status == hk.Status.HIT
+    assert 0.2 < hit.mean() < 0.8
+    assert (status[~hit] == hk.Status.MISS).all()
+    np.testing.assert_array_equal(np.isfinite(depth), hit)
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=-1)[hit], 1, atol=1e-5)
+    assert (normal[~hit] == 0).all()
+    assert evaluations.dtype.kind == "i"
+    assert (evaluations[hit] >= 2).all()
+    assert (evaluations[0] == 0).any()  # a ray that misses the hull costs nothing
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_pictures_of_large_and_small_surfaces_are_alike(scale: float) -> None:
+    field = hk.SolidAngle(scale * shapes.wavy_polygon(24))
+    depth = draw(field, show="depth") / scale
+    reference = draw(show="depth")
+    hit = np.isfinite(depth) & np.isfinite(reference)
+    assert (np.isfinite(depth) != np.isfinite(reference)).mean() < 0.01
+    np.testing.assert_allclose(depth[hit], reference[hit], rtol=2e-3)
+
+
+def test_out_of_steps_is_never_background(tmp_path: Path) -> None:
+    status = draw(path=tmp_path / "a.png", show="status", max_steps=4)
+    lost = status == hk.Status.OUT_OF_STEPS
+    assert lost.sum() > 20
+    assert (read(tmp_path / "a.png")[lost] == (255, 0, 255)).all()
+    with pytest.warns(UserWarning, match=r"\d+ light paths ran out of steps"):
+        image = draw(max_steps=4, tolerance=1e-4)
+    assert image[lost].mean(axis=0)[1] < 0.5 * image[lost].mean(axis=0)[0]
+
+
+def test_nothing_is_lost_and_nothing_is_said_with_enough_steps() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        draw()
+
+
+def test_settings_of_a_level_set_are_replaced() -> None:
+    surface = hk.level_set(POLYGON, 2.5 * math.pi, tolerance=1e-3)
+    replaced = draw([surface], show="depth", level=math.pi)
+    expected = draw(hk.level_set(POLYGON, math.pi, tolerance=1e-3), show="depth")
+    np.testing.assert_array_equal(replaced, expected)
+    solid = hk.level_set(GYROID, solid=(-0.3, 0.3))
+    half = hk.HalfSpace((0, 0, 1), 0.0)
+    clipped = draw(solid, show="depth", clip=half)
+    expected = draw(hk.level_set(GYROID, solid=(-0.3, 0.3), clip=half), show="depth")
+    np.testing.assert_array_equal(clipped, expected)
+    assert not np.array_equal(clipped, draw(solid, show="depth"))
+
+
+@pytest.mark.parametrize("name", MATERIALS)
+def test_every_material_draws(name: str) -> None:
+    image = draw(GYROID, material=name, solid=(-0.3, 0.3))
+    assert np.isfinite(image).all()
+    assert 0.1 < image.mean() < 1.2
+
+
+def test_materials_are_told_apart_and_one_may_be_given_for_each_surface() -> None:
+    pair = [hk.level_set(GYROID, level) for level in (-0.5, 0.5)]
+    gold, mixed = draw(pair, material="gold"), draw(pair, material=["gold", "porcelain"])
+    assert np.abs(gold - mixed).mean() > 0.01
+    own = draw(pair, material=Material({"type": "diffuse"}))
+    dictionary = draw(pair, material={"type": "twosided", "nested": {"type": "diffuse"}})
+    np.testing.assert_allclose(own, dictionary, atol=1e-6)
+
+
+def test_camera_and_backdrop_change_the_picture() -> None:
+    default = draw()
+    assert np.abs(default - draw(camera=Camera(azimuth=10))).mean() > 0.02
+    assert draw(backdrop="dark").mean() < 0.7 * default.mean()
+
+
+@pytest.mark.parametrize("size", [(60, 20), (20, 60), (40, 40)])
+@pytest.mark.parametrize("elevation", [-30.0, 0.0, 35.0, 90.0])
+def test_the_camera_frames_the_surface(size: tuple[int, int], elevation: float) -> None:
+    camera = Camera(azimuth=25.0, elevation=elevation)
+    hit = draw(show="status", size=size, camera=camera) == hk.Status.HIT
+    edge = np.concatenate([hit[0], hit[-1], hit[:, 0], hit[:, -1]])
+    assert not edge.any()
+    filled = max(hit.any(axis=0).mean(), hit.any(axis=1).mean())
+    assert 0.7 < filled <= 0.95
+    closer = draw(show="status", size=size, camera=Camera(25.0, elevation, zoom=1.5))
+    assert (closer == hk.Status.HIT).sum() > hit.sum()
+
+
+def test_surfaces_stand_on_the_ground() -> None:
+    rng = np.random.default_rng(1)
+    points = rng.uniform((5, -3, 2), (9, -2, 3), (100, 3))
+    stage = on_ground(points).apply(points)
+    assert stage[:, 2].min() == pytest.approx(0, abs=1e-12)
+    extent = stage.max(axis=0) - stage.min(axis=0)
+    assert np.linalg.norm(extent) == pytest.approx(2)
+    assert np.abs(stage.max(axis=0) + stage.min(axis=0))[:2].max() < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("settings", "word"),
+    [
+        ({"path": "a.jpg"}, r"\.png or \.exr"),
+        ({"path": "nowhere/a.png"}, "create the folder"),
+        ({"show": "colour"}, "show must be one of"),
+        ({"size": (0, 3)}, "size must be"),
+        ({"spp": 0}, "spp must be"),
+        ({"material": "cheese"}, "unknown material 'cheese'"),
+        ({"material": ["gold", "gold"]}, "one material"),
+        ({"backdrop": "plaid"}, "backdrop must be"),
+        ({"level": math.nan}, "finite"),
+        ({"what": []}, "nothing to draw"),
+        ({"what": [3]}, "holds fields"),
+        ({"what": 3}, "draw a field"),
+        ({"what": {"type": "scene"}}, "no sensor"),
+        ({"what": {"type": "scene"}, "level": 3.0}, "as it is"),
+        ({"what": hk.level_set(POLYGON, clip=hk.Ball((9, 9, 9), 0.1))}, "nothing is to be seen"),
+        ({"what": hk.level_set(POLYGON, 0.0)}, "infinity"),
+        ({"material": "glass"}, "solid"),
+    ],
+)
+def test_errors_come_early_and_say_what_to_do(settings: dict[str, Any], word: str) -> None:
+    with pytest.raises((ValueError, TypeError, FileNotFoundError), match=word):
+        draw(**settings)
+
+
+@pytest.mark.parametrize("values", [{"fov": 0}, {"zoom": -1.0}, {"elevation": 100.0}])
+def test_cameras_that_cannot_be_are_refused(values: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=next(iter(values))):
+        Camera(**values)
+
+
+def test_ctrl_c_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.png").write_bytes(b"old")
+
+    def interrupted(*_: Any, **settings: Any) -> Any:
+        settings["advance"](0.5)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(picture, "expose", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        draw(path=tmp_path / "a.png", progress=True)
+    assert [p.name for p in tmp_path.iterdir()] == ["a.png"]
+    assert (tmp_path / "a.png").read_bytes() == b"old"
+
+
+def test_tone_mapping_keeps_order_and_range() -> None:
+    x = np.linspace(0, 8, 500, dtype=np.float32)
+    mapped = tone_mapped(x)
+    assert mapped[0] == 0
+    assert mapped[-1] == 255
+    assert (np.diff(mapped.astype(int)) >= 0).all()
+    assert tone_mapped(np.array([0.21586], np.float32))[0] == 128  # sRGB's middle grey
+    assert tone_mapped(np.array([np.nan], np.float32))[0] == 0
+
+
+def test_viridis_is_viridis() -> None:
+    x = np.linspace(0, 1, 64).reshape(8, 8)
+    colours = viridis(x)
+    assert colours.shape == (8, 8, 3)
+    np.testing.assert_allclose(colours[0, 0], (0.267, 0.005, 0.329), atol=0.02)
+    np.testing.assert_allclose(colours[-1, -1], (0.993, 0.906, 0.144), atol=0.02)
+    luminance = (colours @ (0.2126, 0.7152, 0.0722)).ravel()
+    assert (np.diff(luminance) > 0).all()
+
+
+def in_a_new_process(code: str) -> str:
+    run = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=300
+    )
+    assert run.returncode == 0, run.stderr
+    return run.stdout.strip().splitlines()[-1]
+
+
+def test_mitsuba_is_imported_only_to_draw() -> None:
+    code = "import sys, harnack, harnack.render; print('mitsuba' in sys.modules)"
+    assert in_a_new_process(code) == "False"
+
+
+DRAW = """
+import harnack as hk, mitsuba as mi
+from harnack.render import render
+from harnack.geometry.shapes import wavy_polygon
+{before}
+try:
+    image = render(hk.SolidAngle(wavy_polygon(12)), size=(24, 18), spp=64, progress=False)
+    print(mi.variant(), *image.mean(axis=(0, 1)))
+except RuntimeError as error:
+    print(error)
+"""
+
+
+def test_a_variant_is_chosen_if_there_is_none() -> None:
+    assert in_a_new_process(DRAW.format(before="")).split()[0] in ("llvm_ad_rgb", "cuda_ad_rgb")
+
+
+@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_spectral_polarized"])
+def test_a_variant_that_cannot_work_is_refused_and_kept(variant: str) -> None:
+    said = in_a_new_process(DRAW.format(before=f"mi.set_variant('{variant}')"))
+    assert f"the Mitsuba variant is {variant}" in said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral", "llvm_ad_mono"])
+def test_other_variants_draw_the_same_picture(variant: str) -> None:
+    name, *mean = in_a_new_process(DRAW.format(before=f"mi.set_variant('{variant}')")).split()
+    assert name == variant
+    _, *rgb = in_a_new_process(DRAW.format(before="mi.set_variant('llvm_ad_rgb')")).split()
+    ours, reference = (np.array(values, dtype=float) for values in (mean, rgb))
+    if variant == "llvm_ad_mono":
+        ours, reference = ours[:1], reference @ np.array([[0.2126], [0.7152], [0.0722]])
+    np.testing.assert_allclose(ours, reference, rtol=0.05)

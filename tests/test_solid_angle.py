@@ -1,0 +1,263 @@
+"""The solid angle of curves against an independent formula, its gradient, and its extents."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import harnack as hk
+from harnack.backend import choose_backend, to_numpy, to_vector3
+from harnack.geometry import shapes, validate_loops
+from harnack.testing.oracle import CurveOracle, first_crossings, gap_to_levels
+
+FOUR_PI = 4 * math.pi
+CURVES: dict[str, list[np.ndarray]] = {
+    "triangle": [np.array([[1.0, 0, 0], [-0.5, 0.8, 0.1], [-0.4, -0.9, 0.3]])],
+    "square": [shapes.regular_polygon(4)],
+    "wavy": [shapes.wavy_polygon(12)],
+    "wavy, padded": [shapes.wavy_polygon(50)],
+    "fine": [shapes.wavy_polygon(1000)],
+    "trefoil": [shapes.torus_knot(2, 3, 60)],
+    "coil": [shapes.coil(6, 150)],
+    "link": shapes.hopf_link(20),
+    "holes": shapes.square_with_holes(),
+    "rings": shapes.borromean_rings(17),
+    "spiky": [shapes.spiky_polygon(np.random.default_rng(0), 21)],
+}
+PRECISIONS = ["double", "single"]
+
+
+def unit(v: np.ndarray) -> np.ndarray:
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def points_beside(loops: list[np.ndarray], distance: float, n: int, seed: int = 0) -> np.ndarray:
+    """Points at a distance from random points of edges, the first vertex of a loop among them."""
+    rng = np.random.default_rng(seed)
+    a = np.concatenate(loops)
+    e = np.concatenate([np.roll(loop, -1, axis=0) for loop in loops]) - a
+    k = rng.integers(len(a), size=n)
+    foot = a[k] + rng.uniform(0.1, 0.9, (n, 1)) * e[k]
+    foot[: n // 4] = loops[-1][0]
+    across = np.cross(e[k], rng.normal(size=(n, 3)))
+    across[: n // 4] = rng.normal(size=(n // 4, 3))
+    return foot + distance * unit(across)
+
+
+def points_in_line(loops: list[np.ndarray]) -> np.ndarray:
+    """Straight above and below vertices and midpoints of edges, along each axis."""
+    a = np.concatenate(loops)
+    middle = 0.5 * (a + np.concatenate([np.roll(loop, -1, axis=0) for loop in loops]))
+    steps = [s * axis for axis in np.eye(3) for s in (-2.0, -0.3, 0.3, 2.0)]
+    return np.concatenate([place + step for place in (a[:12], middle[:12]) for step in steps])
+
+
+def all_points(loops: list[np.ndarray]) -> np.ndarray:
+    rng = np.random.default_rng(1)
+    far = unit(rng.normal(size=(40, 3)))
+    parts = [rng.uniform(-1.5, 1.5, (300, 3)), points_in_line(loops)]
+    parts += [points_beside(loops, 10.0**-k, 100, k) for k in range(1, 7)]
+    parts += [10.0**k * far for k in range(1, 5)]
+    return np.concatenate(parts).astype(np.float32).astype(np.float64)
+
+
+def away_from_curve(loops: list[np.ndarray], x: np.ndarray, precision: str) -> np.ndarray:
+    """Points that rounding tells from the curve itself."""
+    limit = 1e-5 if precision == "single" else 1e-9
+    return x[CurveOracle(loops)(x).smooth > limit]
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("name", CURVES)
+def test_values_and_gradients(name: str, precision: str) -> None:
+    """Within the stated error and that of the position, everywhere."""
+    loops, backend = CURVES[name], choose_backend(precision)  # type: ignore[arg-type]
+    x = away_from_curve(loops, all_points(loops), precision)
+    sample = hk.SolidAngle(loops).evaluate(to_vector3(backend, x))
+    truth, steep = CurveOracle(loops)(x), CurveOracle(loops)(x).steepness
+    size = 1 + np.abs(x).max(axis=1)
+    off = gap_to_levels(to_numpy(sample.value) - truth.value, [0.0], FOUR_PI)
+    # The last term is the rounding of the truth.
+    allowed = sample.error + 4 * backend.epsilon * (2 + steep * size) + 1e-10
+    worst = np.argmax(off / allowed)
+    assert off[worst] <= allowed[worst], (x[worst], off[worst], truth.smooth[worst])
+    # A gradient changes by about itself over the distance to the curve.
+    wrong = np.linalg.norm(to_numpy(sample.gradient) - truth.gradient, axis=1)
+    edges = sum(len(loop) for loop in loops)
+    total = sum_of_edge_fields(loops, x)
+    blur = backend.epsilon * total * (4 * math.sqrt(edges) + 8 * size / truth.smooth)
+    worst = np.argmax(wrong / blur)
+    assert wrong[worst] <= blur[worst], (x[worst], wrong[worst], blur[worst])
+
+
+def sum_of_edge_fields(loops: list[np.ndarray], x: np.ndarray) -> np.ndarray:
+    """A bound of the sum over the edges of the sizes of their gradients, which may cancel."""
+    total, distance = np.zeros(len(x)), CurveOracle(loops)(x).smooth
+    for loop in loops:
+        for a, b in zip(loop, np.roll(loop, -1, axis=0), strict=True):
+            length = np.linalg.norm(b - a)
+            d = np.maximum(np.linalg.norm(x - 0.5 * (a + b), axis=1) - 0.5 * length, distance)
+            total += np.minimum(length / d**2, 2 / d)
+    return total
+
+
+@pytest.mark.parametrize("name", CURVES)
+def test_gradients_are_derivatives_of_values(name: str) -> None:
+    loops, backend = CURVES[name], choose_backend("double")
+    x = np.concatenate(
+        [points_beside(loops, 10.0**-k, 60, k) for k in range(5)]
+        + [np.random.default_rng(2).uniform(-2, 2, (100, 3))]
+    )
+    field, distance = hk.SolidAngle(loops), CurveOracle(loops)(x).smooth
+    gradient = to_numpy(field.evaluate(to_vector3(backend, x)).gradient)
+
+    def value(points: np.ndarray) -> np.ndarray:
+        return to_numpy(field.evaluate(to_vector3(backend, points)).value)
+
+    h = 1e-4 * distance
+    for k, axis in enumerate(np.eye(3)):
+        step = h[:, None] * axis
+        move = value(x + step) - value(x - step)
+        slope = (np.remainder(move + 2 * math.pi, FOUR_PI) - 2 * math.pi) / (2 * h)
+        scale = sum_of_edge_fields(loops, x)
+        assert (np.abs(slope - gradient[:, k]) <= 1e-6 * scale + 1e-13 / h).all()
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_a_point_on_the_curve_is_close_to_every_level(precision: str) -> None:
+    loops, backend = CURVES["wavy"], choose_backend(precision)  # type: ignore[arg-type]
+    x = np.concatenate([loops[0], 0.5 * (loops[0] + np.roll(loops[0], 1, axis=0))])
+    sample = hk.SolidAngle(loops).evaluate(to_vector3(backend, x))
+    steep = np.linalg.norm(to_numpy(sample.gradient), axis=1)
+    assert np.isfinite(to_numpy(sample.value)).all()
+    assert (steep > 1e5).all()
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("scale", [1e-20, 1e-3, 1e3, 1e15])
+def test_scale_and_translation(scale: float, precision: str) -> None:
+    """Omega does not change; gradients and radii scale. Moving costs the rounding of a point."""
+    loops, backend = CURVES["link"], choose_backend(precision)  # type: ignore[arg-type]
+    x = np.random.default_rng(3).uniform(-1.5, 1.5, (200, 3)).astype(np.float32).astype(float)
+    x = x[CurveOracle(loops)(x).smooth > 0.02]
+    shift = np.array([2.0, -1.0, 0.5])
+    plain = hk.SolidAngle(loops).evaluate(to_vector3(backend, x))
+    moved = hk.SolidAngle([scale * (loop + shift) for loop in loops]).evaluate(
+        to_vector3(backend, scale * (x + shift))
+    )
+    off = gap_to_levels(to_numpy(moved.value) - to_numpy(plain.value), [0.0], FOUR_PI)
+    steep = np.linalg.norm(to_numpy(plain.gradient), axis=1)
+    assert (off <= 2 * moved.error + 16 * backend.epsilon * (1 + 4 * steep)).all()
+    scaled = scale * to_numpy(moved.gradient)
+    np.testing.assert_allclose(
+        scaled, to_numpy(plain.gradient), rtol=0, atol=2e3 * backend.epsilon * steep.max()
+    )
+    radius, before = to_numpy(moved.known[0].radius) / scale, to_numpy(plain.known[0].radius)
+    np.testing.assert_allclose(radius, before, rtol=3e-3 if precision == "single" else 1e-9)
+
+
+def test_loops_add_up_and_reversal_changes_the_sign() -> None:
+    backend, loops = choose_backend("double"), CURVES["link"]
+    x = to_vector3(backend, np.random.default_rng(4).uniform(-1, 1, (100, 3)))
+
+    def value(parts: list[np.ndarray]) -> np.ndarray:
+        return to_numpy(hk.SolidAngle(parts).evaluate(x).value)
+
+    together, apart = value(loops), value(loops[:1]) + value(loops[1:])
+    np.testing.assert_allclose(gap_to_levels(together - apart, [0.0], FOUR_PI), 0, atol=1e-12)
+    reverse = value([loop[::-1] for loop in loops])
+    np.testing.assert_allclose(gap_to_levels(together + reverse, [0.0], FOUR_PI), 0, atol=1e-12)
+
+
+def test_sign_and_size_above_a_disk() -> None:
+    """A counter-clockwise circle seen from above: Omega = 2 pi (1 - z/sqrt(z^2+1)), sign of the
+    paper's Eq. 10."""
+    field = hk.SolidAngle(shapes.regular_polygon(512))
+    z = np.array([0.5, 1.0, 3.0])
+    x = to_vector3(choose_backend("double"), np.column_stack([0 * z, 0 * z, z]))
+    value = to_numpy(field.evaluate(x).value)
+    expected = 2 * math.pi * (1 - z / np.sqrt(z * z + 1))
+    np.testing.assert_allclose(np.abs(value), expected, rtol=1e-4)
+    oracle = CurveOracle([shapes.regular_polygon(512)])(np.column_stack([0 * z, 0 * z, z])).value
+    np.testing.assert_allclose(value, oracle, rtol=1e-12)
+
+
+# --- extents --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("levels", [(2 * math.pi,), (0.5,), (3.0, 11.0)], ids=str)
+@pytest.mark.parametrize("name", CURVES)
+def test_no_level_lies_outside_the_extent(name: str, levels: tuple[float, ...]) -> None:
+    """On random segments, none of whose points is in the extent."""
+    loops = CURVES[name]
+    extent = hk.SolidAngle(loops).extent(levels)
+    assert extent is not None
+    lower, upper = extent.bounds()
+    centre, reach = 0.5 * (lower + upper), 0.5 * np.linalg.norm(upper - lower)
+    rng = np.random.default_rng(5)
+    o = centre + reach * rng.uniform(0.3, 1.5, (3000, 1)) * unit(rng.normal(size=(3000, 3)))
+    d, length = unit(rng.normal(size=(3000, 3))), 0.3 * reach
+    along = np.linspace(0, length, 20)
+    x = o[:, None] + along[:, None] * d[:, None]
+    outside = ~extent.contains_points(x.reshape(-1, 3)).reshape(len(o), -1).any(axis=1)
+    o, d = o[outside][:400], d[outside][:400]
+    assert len(o) > 100
+    crossings = first_crossings(
+        CurveOracle(loops), o, d, 0.0, length,
+        levels=levels, period=FOUR_PI, depth=1e-6, spacing=0.1, finest=1e-4,
+    )  # fmt: skip
+    found = np.isfinite(crossings.beyond)
+    # A crossing on a segment that dips into the extent between its twenty points does not count.
+    at = (o + crossings.beyond[:, None] * d)[found]
+    assert extent.contains_points(at).all(), at
+
+
+class Unbounded(hk.SolidAngle):
+    """Of which nobody knows where its levels are."""
+
+    def extent(self, levels: tuple[float, ...]) -> None:
+        del levels
+
+    def prepare(self, backend: object) -> Unbounded:
+        prepared = super().prepare(backend)  # type: ignore[arg-type]
+        other = object.__new__(Unbounded)
+        other.__dict__.update(prepared.__dict__)
+        return other
+
+
+@pytest.mark.parametrize("level", [2 * math.pi, 1.0])
+@pytest.mark.parametrize("name", ["trefoil", "coil", "link", "rings", "holes", "wavy"])
+def test_the_extent_holds_every_hit_found_without_it(name: str, level: float) -> None:
+    loops = CURVES[name]
+    rng = np.random.default_rng(6)
+    o = 4.0 * unit(rng.normal(size=(1500, 3)))
+    d = unit(rng.uniform(-1.2, 1.2, (1500, 3)) - o)
+    free = hk.trace(Unbounded(loops), o, d, level=level, t_max=9.0, max_steps=500)
+    assert free.hit.sum() > 200
+    extent = hk.SolidAngle(loops).extent((level,))
+    assert extent is not None
+    assert extent.padded(1e-3).contains_points(free.position[free.hit]).all()
+    bounded = hk.trace(hk.SolidAngle(loops), o, d, level=level)
+    # Rays that graze the border within the tolerance may go either way.
+    assert (bounded.hit & ~free.hit).sum() + (free.hit & ~bounded.hit).sum() <= 3
+    both = bounded.hit & free.hit
+    assert np.quantile(np.abs(bounded.t - free.t)[both], 0.99) < 1e-3
+
+
+def test_extent_of_a_multiple_of_the_period_is_unknown() -> None:
+    """Omega vanishes on unbounded sets, of a planar curve on the rest of its plane."""
+    assert hk.SolidAngle(CURVES["square"]).extent((0.0,)) is None
+    assert hk.SolidAngle(CURVES["square"]).extent((1.0, FOUR_PI)) is None
+
+
+def test_convex_position_is_found_out() -> None:
+    assert hk.SolidAngle(CURVES["wavy"]).describe()["certificate"] == "range"
+    for name in ("trefoil", "coil", "link", "holes", "spiky"):
+        assert hk.SolidAngle(CURVES[name]).describe()["certificate"] == "edges"
+    with pytest.raises(ValueError, match="convex"):
+        hk.SolidAngle(CURVES["trefoil"], certificate="convex")
+    with pytest.raises(ValueError, match="unknown certificate"):
+        hk.SolidAngle(CURVES["trefoil"], certificate="best")  # type: ignore[arg-type]
+    assert len(validate_loops(CURVES["link"])) == 2
