@@ -4,7 +4,7 @@ BIN := .venv/bin
 STAMP := .venv/.setup-stamp
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow lint format bench clean
+.PHONY: help setup demo test test-slow lint format images bench clean
 
 help:
 	@echo "make setup      install everything into .venv"
@@ -13,6 +13,7 @@ help:
 	@echo "make test-slow  run the slow tests"
 	@echo "make lint       check style and types"
 	@echo "make format     apply the style"
+	@echo "make images     render the pictures of the README into docs/images"
 	@echo "make bench      run the benchmarks; they write their tables into the docs"
 	@echo "make clean      remove .venv, out/ and caches"
 
@@ -40,6 +41,9 @@ lint: $(STAMP)
 format: $(STAMP)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+images: $(STAMP)
+	$(BIN)/harnack gallery --demo -o docs/images
 
 bench: $(STAMP)
 	$(BIN)/python -m pip install --quiet --editable '.[bench]'

@@ -1,9 +1,9 @@
 """First crossings by dense sampling in double precision, sharing nothing with the tracer.
 
 The solid angle is that of van Oosterom and Strackee (1983), one arctangent for each triangle of
-a fan about a point near the centroid of each loop, where the library multiplies spinors. Nothing here proves
-anything: samples are so dense that only grazing rays can be judged wrongly, and those are
-judged by `nearness` instead.
+a fan about a point near the centroid of each loop, where the library multiplies spinors. Nothing
+here proves anything. A crossing that it reports is one, for the function is on the far side of a
+level by more than rounding; what a ray that barely grazes a level does may escape it.
 """
 
 from __future__ import annotations
@@ -73,7 +73,8 @@ class CurveOracle:
             length, pc, lc = _length(p), _dot(p, c), _length(c)
             a, la, ac = [q[:, :-1] for q in p], length[:, :-1], pc[:, :-1]
             b, lb, bc = [q[:, 1:] for q in p], length[:, 1:], pc[:, 1:]
-            cross, ab = _cross(a, b), _dot(a, b)
+            e = np.diff(closed)
+            cross, ab = _cross(a, e), _dot(a, b)  # a x e = a x b, which cancels far away
             solid = np.arctan2(_dot(cross, c), la * lb * lc + ab * lc + ac * lb + bc * la)
             value += 2 * solid.sum(axis=1)
             square = _dot(cross, cross)
@@ -83,7 +84,7 @@ class CurveOracle:
                 inverse = np.where(ab > 0, 1 / plain, plain / square)
                 weight = (la + lb) / (la * lb) * inverse
             gradient += np.stack([(weight * part).sum(axis=1) for part in cross], axis=1)
-            near = np.minimum(near, _distance(a, ab - la * la, np.diff(closed)))
+            near = np.minimum(near, _distance(a, ab - la * la, e))
         return Look(_wrap(value, 4 * math.pi), gradient, near)
 
 
@@ -91,7 +92,7 @@ def _dot(a: Sequence[FloatArray], b: Sequence[FloatArray]) -> FloatArray:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _cross(a: Sequence[FloatArray], b: Sequence[FloatArray]) -> list[FloatArray]:
+def _cross(a: Sequence[FloatArray], b: Sequence[FloatArray] | FloatArray) -> list[FloatArray]:
     return [a[i] * b[j] - a[j] * b[i] for i, j in ((1, 2), (2, 0), (0, 1))]
 
 
