@@ -15,8 +15,17 @@ import pytest
 import harnack as hk
 from harnack import fields
 from harnack.bounds import Bound, Caps, Classic, CurvatureStep, LipschitzStep, Slope
-from harnack.fields import Curvature, Field, HarmonicBall, Lipschitz, PlaneWave, Product, Sample
-from harnack.fields import cosine, sine
+from harnack.fields import (
+    Curvature,
+    Field,
+    HarmonicBall,
+    Lipschitz,
+    PlaneWave,
+    Product,
+    Sample,
+    cosine,
+    sine,
+)
 from harnack.geometry import shapes
 from harnack.testing import BrokenPromiseError, Scaled, check_field
 from harnack.testing.step_contracts import check_steps
@@ -156,12 +165,12 @@ def test_fields_keep_their_promises(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("name", FIELDS)
 def test_fields_keep_their_promises_at_many_points(name: str, seed: int) -> None:
     field = FIELDS[name]
     levels = (0.6, 3.0, 5.0, 9.0) if isinstance(field, hk.SolidAngle) else ()
-    check_field(field, rng=seed, count=2000, levels=(field.default_level, *levels))
+    check_field(field, rng=seed, count=800, levels=(field.default_level, *levels))
 
 
 @pytest.mark.parametrize(("name", "bound"), SOME_PAIRS, ids=name_of)
@@ -174,7 +183,7 @@ def test_no_level_lies_within_a_step(name: str, bound: Bound) -> None:
 @pytest.mark.parametrize(("name", "bound"), PAIRS, ids=name_of)
 def test_no_level_lies_within_many_steps(name: str, bound: Bound, precision: str) -> None:
     for seed in range(2):
-        found = check_steps(FIELDS[name], bound, rng=seed, count=4000, precision=precision)  # type: ignore[arg-type]
+        found = check_steps(FIELDS[name], bound, rng=seed, count=2000, precision=precision)  # type: ignore[arg-type]
         assert found > 0
 
 

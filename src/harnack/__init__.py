@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 # First of all imports: it decides which LLVM Dr.Jit loads, which happens on `import drjit`.
-from harnack import backend
+from harnack import backend, geometry, testing
 from harnack._version import __version__
 from harnack.bounds import Bound, Caps, Classic, CurvatureStep, LipschitzStep, Longest, Slope
 from harnack.fields import (
@@ -65,7 +65,9 @@ __all__ = [
     "__version__",
     "backend",
     "cosine",
+    "geometry",
     "level_set",
     "sine",
+    "testing",
     "trace",
 ]

@@ -25,7 +25,9 @@ Spinor: TypeAlias = "tuple[Real, Real, Real, Real]"
 
 # A degenerate padding edge has this for 1/length^2: no angle, no gradient, no variation.
 _PADDING = 1e30
-_RENORMALISE_EVERY = 4
+# Often, and without squares: beside a vertex or far away, the product of a few factors leaves the
+# range of float32.
+_RENORMALISE_EVERY = 2
 
 
 @dataclass(frozen=True)
@@ -123,7 +125,7 @@ def sum_over_edges(edges: EdgeBuffer, x: Vec3, *, variation: bool) -> EdgeSums:
             re, im = inner_product(ca, cb)
             zr, zi = dr.fma(zr, re, -(zi * im)), dr.fma(zr, im, zi * re)
             if j % _RENORMALISE_EVERY == _RENORMALISE_EVERY - 1:
-                scale = dr.rsqrt(dr.fma(zr, zr, zi * zi))
+                scale = dr.rcp(dr.abs(zr) + dr.abs(zi))
                 zr, zi = zr * scale, zi * scale
             e = q - p
             weight = (la + lb) * (sa * sb) / (la * lb * dr.fma(re, re, im * im))

@@ -26,6 +26,7 @@ __all__ = [
     "edges",
     "is_convex_position",
     "read_loops",
+    "shapes",
     "total_length",
     "validate_loops",
     "write_atomically",

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.geometry.files import write_atomically
+from harnack.render.exr import exr_bytes
 
 FloatImage = npt.NDArray[np.float32]
 
@@ -46,6 +47,9 @@ def as_bytes(image: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.uint8]:
 
 
 def write_image(mi: Any, path: Path, image: npt.NDArray[Any]) -> None:
-    """Write (h, w) or (h, w, c) floats as EXR or bytes as PNG; no half-written file is left."""
+    """Write (h, w) or (h, w, 3) floats as EXR or bytes as PNG; no half-written file is left."""
     with write_atomically(path) as partial:
-        mi.Bitmap(np.ascontiguousarray(image)).write(str(partial))
+        if path.suffix.lower() == ".exr":
+            partial.write_bytes(exr_bytes(image))
+        else:
+            mi.Bitmap(np.ascontiguousarray(image)).write(str(partial))

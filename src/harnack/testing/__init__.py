@@ -1,8 +1,7 @@
-"""Tests of fields and bounds: for the library's own, and for those that users write.
+"""Tests of fields and bounds, for the library's own and for those that users write.
 
-    from harnack.testing import check_bound, check_field
-    check_field(MyField())
-    check_bound(MyBound())
+`check_field(MyField())` samples every promise of a field, `check_bound(MyBound())` tries a bound
+on random functions of every kind, among them the extremal ones. Both raise `BrokenPromiseError`.
 """
 
 from __future__ import annotations

@@ -9,14 +9,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from harnack.backend import choose_backend, to_numpy
 from harnack.certify import BallCertificate, CurvatureCertificate, LipschitzCertificate
 from harnack.testing.failures import BrokenPromiseError
-from harnack.testing.poisson import AxialFunctions, FloatArray, cap_mass, kernel_movement
+from harnack.testing.poisson import (
+    AxialFunctions,
+    BoolArray,
+    FloatArray,
+    cap_mass,
+    kernel_movement,
+)
 
 if TYPE_CHECKING:
     from harnack.backend import Precision
@@ -229,7 +235,7 @@ def _check_trial(
     precision: Precision,
 ) -> None:
     rows = len(trial.slope)
-    real = type(slope)
+    real = cast("Any", type(slope))
     step = to_numpy(bound.step(certificate, slope)).astype(np.float64)
     met = _meets(trial, np.minimum(step, trial.reach), precision)
     _require(trial, ~met, bound, "meets no level within the step {length}", step)
@@ -249,7 +255,7 @@ def _check_trial(
         _require(trial, ~wrong, bound, "meets no level within {length}, which is covered", length)
 
 
-def _meets(trial: Trial, length: FloatArray, precision: Precision) -> FloatArray:
+def _meets(trial: Trial, length: FloatArray, precision: Precision) -> BoolArray:
     """Whether the functions are seen to meet a level strictly within the length, (rows,)."""
     tolerance = 1e-9 if precision == "double" else 1e-5
     shares = np.concatenate([np.linspace(0, 1, _SAMPLES // 2), 1 - np.geomspace(1e-7, 0.5, 24)])
@@ -269,9 +275,11 @@ def _meets(trial: Trial, length: FloatArray, precision: Precision) -> FloatArray
 
 
 def _size(trial: Trial) -> FloatArray:
-    rooms = [vars(trial.certificate).get(name) for name in ("room_below", "room_above")]
-    known = [room for room in rooms if room is not None]
-    return sum(known, np.abs(trial.slope) * trial.reach)
+    size = np.abs(trial.slope) * trial.reach
+    for name in ("room_below", "room_above"):
+        room: FloatArray | None = vars(trial.certificate).get(name)
+        size = size if room is None else size + room
+    return size
 
 
 def _require(trial: Trial, good: Any, bound: Bound, promise: str, length: FloatArray) -> None:
@@ -279,10 +287,8 @@ def _require(trial: Trial, good: Any, bound: Bound, promise: str, length: FloatA
     if not bad.size:
         return
     row = bad[0]
-    numbers = {
-        key: float(value[row]) if isinstance(value, np.ndarray) else value
-        for key, value in vars(trial.certificate).items()
-    }
+    entries: dict[str, Any] = vars(trial.certificate)
+    numbers = {k: float(x[row]) if np.ndim(x) else x for k, x in entries.items()}
     what = promise.format(reach=float(trial.reach[row]), length=float(length[row]))
     raise BrokenPromiseError(
         f"{bound!r} does not keep its promise ({trial.name}): f {what}. Wrong in {bad.size} of "

@@ -7,8 +7,9 @@ further is wrong and one that steps less far gives something away. Nothing here 
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
@@ -50,11 +51,12 @@ def on_host(certificate: Certificate, lanes: int) -> Certificate:
         array = to_numpy(value) if dr.is_array_v(value) else np.asarray(value)
         return np.broadcast_to(array.astype(np.float64), (lanes,))
 
-    fields = {
-        key: value if value is None or key == "dimension" else host(value)
+    fields: dict[str, Any] = {
+        key: host(value)
         for key, value in vars(certificate).items()
+        if value is not None and key != "dimension"
     }
-    return type(certificate)(**fields)
+    return dataclasses.replace(certificate, **fields)
 
 
 def largest_free(movement: Callable[[FloatArray], FloatArray], gap: FloatArray) -> FloatArray:
@@ -71,19 +73,20 @@ def _parabolas(c: CurvatureCertificate, slope: FloatArray) -> FloatArray:
     """Second derivatives of plus and minus the constant."""
     h = c.constant
     # An infinite radius is replaced by one within which a level is surely met.
-    gaps = np.minimum((c.gap_down, c.gap_up), 1e30)
+    down, up = np.minimum(c.gap_down, 1e30), np.minimum(c.gap_up, 1e30)
     steep = np.abs(slope)
     with np.errstate(divide="ignore", invalid="ignore"):
-        bent = 4 * (steep / h + np.sqrt(2 * gaps.min(axis=0) / h))
-        r = np.minimum(c.radius, np.where(h > 0, bent, 2 * gaps.max(axis=0) / steep))
+        bent: FloatArray = 4 * (steep / h + np.sqrt(2 * np.minimum(down, up) / h))
+        straight: FloatArray = 2 * np.maximum(down, up) / steep
+        r: FloatArray = np.minimum(c.radius, np.where(h > 0, bent, straight))
 
-    def up(q: FloatArray) -> FloatArray:
+    def rise(q: FloatArray) -> FloatArray:
         return slope * q * r + 0.5 * h * (q * r) ** 2
 
-    def down(q: FloatArray) -> FloatArray:
+    def fall(q: FloatArray) -> FloatArray:
         return -slope * q * r + 0.5 * h * (q * r) ** 2
 
-    return r * np.minimum(largest_free(up, c.gap_up), largest_free(down, c.gap_down))
+    return r * np.minimum(largest_free(rise, c.gap_up), largest_free(fall, c.gap_down))
 
 
 def _sides(c: BallCertificate) -> list[tuple[FloatArray, float, FloatArray, FloatArray]]:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.fields.field import Curvature, HarmonicBall, Lipschitz
 from harnack.testing.failures import BrokenPromiseError
-from harnack.testing.poisson import FloatArray
+from harnack.testing.poisson import BoolArray, FloatArray
 from harnack.testing.walks import Look, look_at, movements, random_directions, random_points
 
 if TYPE_CHECKING:
@@ -231,6 +231,8 @@ def _check_extent(field: Field, level: float, rng: np.random.Generator, count: i
     clear = _gap(field, above) > 1e-3 * float(half.max()) * steepness
     crossed = (_cell(field, above[:, 1:]) != _cell(field, above[:, :-1])) & clear[:, 1:]
     row, column = np.nonzero(crossed & clear[:, :-1])
+    if not row.size:
+        return
     low, high, offset = t[row, column], t[row, column + 1], above[row, column]
     for _ in range(4):  # to 1e-6 of the interval
         part = low[:, None] + (high - low)[:, None] * np.linspace(0, 1, 33)
@@ -256,13 +258,14 @@ def _gap(field: Field, above: FloatArray) -> FloatArray:
 
 
 def _require(
-    good: FloatArray | np.ndarray,
+    good: Any,
     message: str,
     points: FloatArray,
     amount: FloatArray | None = None,
     there: FloatArray | None = None,
 ) -> None:
-    bad = np.flatnonzero(~np.asarray(good))
+    broken: BoolArray = ~np.asarray(good, dtype=np.bool_)
+    bad = np.flatnonzero(broken)
     if not bad.size:
         return
     worst = bad[0] if amount is None else bad[np.abs(amount[bad]).argmax()]

@@ -83,7 +83,7 @@ class CurveOracle:
             with np.errstate(divide="ignore", invalid="ignore"):
                 inverse = np.where(ab > 0, 1 / plain, plain / square)
                 weight = (la + lb) / (la * lb) * inverse
-            gradient += np.stack([(weight * part).sum(axis=1) for part in cross], axis=1)
+                gradient += np.stack([(weight * part).sum(axis=1) for part in cross], axis=1)
             near = np.minimum(near, _distance(a, ab - la * la, e))
         return Look(_wrap(value, 4 * math.pi), gradient, near)
 

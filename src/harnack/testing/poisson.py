@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 FloatArray: TypeAlias = npt.NDArray[np.float64]
+BoolArray: TypeAlias = npt.NDArray[np.bool_]
 
 # Below this |q| the movement of a cap is a power series, whose terms fall like q^l.
 _SERIES_BELOW = 0.25
@@ -115,8 +116,9 @@ def _cap_closed(q: FloatArray, b: FloatArray, dimension: int) -> FloatArray:
     if dimension == 2:
         return 2 / math.pi * np.arctan2((1 + q) * np.sin(angle / 2), (1 - q) * np.cos(angle / 2))
     # n = 4: the sums over j of q^j sin(j angle) and of q^j sin(j angle)/j.
-    z = q * np.exp(1j * angle)
-    plain, over_j = (z / (1 - z)).imag, -np.log(1 - z).imag
+    along, across = q * np.cos(angle), q * np.sin(angle)
+    plain = across / ((1 - along) ** 2 + across**2)
+    over_j = np.arctan2(across, 1 - along)
     return (angle + plain + over_j - (plain - over_j) / (q * q)) / math.pi
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import numpy as np
@@ -108,7 +108,7 @@ def _check_covers(
     directions: FloatArray, step: FloatArray, gaps: tuple[FloatArray, FloatArray],
     rng: np.random.Generator,
 ) -> None:  # fmt: skip
-    real = type(slope)
+    real = cast("Any", type(slope))
 
     def covered(length: FloatArray) -> Any:
         return to_numpy(bound.covers(certificate, slope, real(length))) & np.ones(len(step), bool)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
@@ -32,15 +33,14 @@ def look_at(field: Field, points: FloatArray, precision: Precision = "double") -
     """The field at points (n, 3), all numbers of its promises as float64 arrays (n,)."""
     n = len(points)
     sample = _sample(field, points, precision)
-    known = tuple(
-        type(one)(
-            **{
-                key: value if key == "dimension" else _spread(value, n)
-                for key, value in vars(one).items()
-            }
-        )
-        for one in sample.known
-    )
+
+    def on_host(one: Knowledge) -> Knowledge:
+        numbers: dict[str, Any] = {
+            key: _spread(value, n) for key, value in vars(one).items() if key != "dimension"
+        }
+        return dataclasses.replace(one, **numbers)
+
+    known = tuple(on_host(one) for one in sample.known)
     return Look(
         _spread(sample.value, n),
         np.broadcast_to(to_numpy(sample.gradient), (n, 3)).astype(np.float64),

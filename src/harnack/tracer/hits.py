@@ -95,6 +95,8 @@ def trace(
         raise ValueError("precision follows Dr.Jit rays; give it only with NumPy ones")
     backend = backend_of(given[0]) if given else choose_backend(precision or "single")
     o, d, near, far = _rays(backend, origins, directions, t_min, t_max)
+    if min(dr.width(array) for array in (o, d, near, far)) == 0:
+        return _no_hits(backend, as_numpy=not given)
     hits = _trace(surface, backend, o, d, near, far)
     return hits if given else _as_numpy(hits, max(dr.width(o), dr.width(d), dr.width(near)))
 
@@ -142,6 +144,13 @@ def _trace(surface: LevelSet, backend: Backend, o: Vec3, d: Vec3, near: Real, fa
     hits = Hits(t, position, normal, end.value, end.evaluations, end.status)
     dr.eval(hits.t, hits.position, hits.normal, hits.value, hits.evaluations, hits.status)
     return hits
+
+
+def _no_hits(backend: Backend, *, as_numpy: bool) -> Hits:
+    number, vector = dr.zeros(backend.Float, 0), dr.zeros(backend.Array3f, 0)
+    count = dr.zeros(backend.UInt32, 0)
+    hits = Hits(number, vector, vector, number, count, count)
+    return _as_numpy(hits, 0) if as_numpy else hits
 
 
 def _as_numpy(hits: Hits, n: int) -> Hits:

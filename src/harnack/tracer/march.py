@@ -128,7 +128,12 @@ class PreparedLevelSet:
         def running(*state: Any) -> Mask:
             return state[-1]
 
-        return dr.while_loop(state, running, body, label="harnack")
+        try:
+            return dr.while_loop(state, running, body, label="harnack")
+        except RuntimeError as error:  # Dr.Jit wraps what the body raises
+            if isinstance(error.__cause__, ValueError):
+                raise error.__cause__ from None
+            raise
 
     def _blur(self, sample: Sample, steepness: Real, size: Real) -> Real:
         """What rounding may have done to f at a point whose coordinates are at most `size`."""
