@@ -19,7 +19,7 @@ ROOMS = (
     "certify",
     "bounds",
     "tracer",
-    "render",
+    "rendering",
     "gallery",
     "view",
     "cli",

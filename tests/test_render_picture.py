@@ -14,11 +14,11 @@ import pytest
 
 import harnack as hk
 from harnack.geometry import shapes
-from harnack.render import MATERIALS, SHOW_MODES, Camera, Material, picture, register, render
-from harnack.render.colormap import viridis
-from harnack.render.exr import exr_bytes
-from harnack.render.images import tone_mapped
-from harnack.render.studio import on_ground
+from harnack.rendering import MATERIALS, SHOW_MODES, Camera, Material, picture, register, render
+from harnack.rendering.colormap import viridis
+from harnack.rendering.exr import exr_bytes
+from harnack.rendering.images import tone_mapped
+from harnack.rendering.studio import on_ground
 
 mi = register()
 SMALL: dict[str, Any] = {"size": (40, 30), "progress": False}
@@ -82,7 +82,7 @@ def test_the_same_seed_draws_the_same_picture() -> None:
 
 def test_bands_leave_no_seam(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = draw(spp=64)
-    monkeypatch.setattr("harnack.render.exposure._PATHS_A_BAND", 64 * 50)
+    monkeypatch.setattr("harnack.rendering.exposure._PATHS_A_BAND", 64 * 50)
     bands = draw(spp=64)
     assert not np.array_equal(whole, bands)
     assert np.abs(whole - bands).mean() < 0.02
@@ -271,13 +271,13 @@ def in_a_new_process(code: str) -> str:
 
 
 def test_mitsuba_is_imported_only_to_draw() -> None:
-    code = "import sys, harnack, harnack.render; print('mitsuba' in sys.modules)"
+    code = "import sys, harnack, harnack.rendering; print('mitsuba' in sys.modules)"
     assert in_a_new_process(code) == "False"
 
 
 DRAW = """
 import harnack as hk, mitsuba as mi
-from harnack.render import render
+from harnack.rendering import render
 from harnack.geometry.shapes import wavy_polygon
 {before}
 try:

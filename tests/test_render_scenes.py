@@ -12,7 +12,7 @@ import pytest
 
 import harnack as hk
 from harnack.fields.field import Field, Lipschitz, Sample
-from harnack.render import picture, register, render, shape
+from harnack.rendering import picture, register, render, shape
 
 mi = register()
 T = mi.ScalarTransform4f

@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 # First of all imports: it decides which LLVM Dr.Jit loads, which happens on `import drjit`.
-from harnack import backend, geometry, testing
+from harnack import backend, geometry, rendering, testing
 from harnack._version import __version__
 from harnack.bounds import Bound, Caps, Classic, CurvatureStep, LipschitzStep, Longest, Slope
 from harnack.fields import (
@@ -29,6 +29,7 @@ from harnack.fields import (
     sine,
 )
 from harnack.geometry import Ball, Box, ConvexHull, HalfSpace, Intersection
+from harnack.rendering import render
 from harnack.tracer import Hits, LevelSet, Status, Tolerance, level_set, trace
 
 __all__ = [
@@ -67,6 +68,8 @@ __all__ = [
     "cosine",
     "geometry",
     "level_set",
+    "render",
+    "rendering",
     "sine",
     "testing",
     "trace",

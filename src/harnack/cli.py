@@ -17,7 +17,7 @@ from harnack.backend import doctor
 from harnack.fields import SolidAngle
 from harnack.gallery import SCENES, Scene
 from harnack.geometry import read_loops
-from harnack.render import MATERIALS, SHOW_MODES, render
+from harnack.rendering import MATERIALS, SHOW_MODES, render
 
 _CURVES = (".obj", ".ply", ".loops")
 _DEMO_SIZE = (480, 360)

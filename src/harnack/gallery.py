@@ -26,7 +26,7 @@ from harnack.fields import (
     sine,
 )
 from harnack.geometry import Ball, Box, HalfSpace, shapes
-from harnack.render import Camera, render
+from harnack.rendering import Camera, render
 from harnack.tracer import LevelSet, Tolerance, level_set
 
 Surfaces = Callable[[], "list[LevelSet]"]
@@ -52,7 +52,7 @@ class Scene:
     demo_spp: int = 0
 
     def render(self, path: Any = None, **settings: Any) -> Any:
-        """The picture, as `harnack.render` makes it; settings override the scene's own."""
+        """The picture, as `harnack.rendering` makes it; settings override the scene's own."""
         surfaces = self.surfaces()
         names = self.materials * len(surfaces) if len(self.materials) == 1 else self.materials
         chosen: dict[str, Any] = {

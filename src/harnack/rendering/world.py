@@ -8,10 +8,10 @@ from typing import Any
 import drjit as dr
 
 from harnack.backend import Mask
-from harnack.render.carrier import is_carrier
-from harnack.render.encounter import Encounter
-from harnack.render.interaction import surface_interaction
-from harnack.render.variant import mitsuba_backend
+from harnack.rendering.carrier import is_carrier
+from harnack.rendering.encounter import Encounter
+from harnack.rendering.interaction import surface_interaction
+from harnack.rendering.variant import mitsuba_backend
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harnack.render.placement import PlacedSurface, Placement
-from harnack.render.variant import load_mitsuba, mitsuba_backend
+from harnack.rendering.placement import PlacedSurface, Placement
+from harnack.rendering.variant import load_mitsuba, mitsuba_backend
 from harnack.tracer import LevelSet, level_set
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def shape(
         scene = mitsuba.load_dict({
             "type": "scene",
             "integrator": {"type": "harnack_path"},
-            "surface": harnack.render.shape(field, bsdf={"type": "roughconductor"}),
+            "surface": harnack.rendering.shape(field, bsdf={"type": "roughconductor"}),
             ...
         })
 

@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.geometry.convex_volume import FloatArray
-from harnack.render.encounter import Encounter, meet_surface
-from harnack.render.solid import Solid
+from harnack.rendering.encounter import Encounter, meet_surface
+from harnack.rendering.solid import Solid
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3

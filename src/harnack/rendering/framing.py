@@ -13,7 +13,7 @@ import numpy as np
 
 from harnack.backend import to_float, to_numpy, to_vector3
 from harnack.geometry.convex_volume import FloatArray
-from harnack.render.placement import PlacedSurface, Placement
+from harnack.rendering.placement import PlacedSurface, Placement
 from harnack.tracer import Tolerance
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.geometry.files import write_atomically
-from harnack.render.exr import exr_bytes
+from harnack.rendering.exr import exr_bytes
 
 FloatImage = npt.NDArray[np.float32]
 

@@ -14,15 +14,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harnack.geometry.convex_volume import FloatArray
-from harnack.render.carrier import shape
-from harnack.render.framing import visible_points
-from harnack.render.lighting import ground, lights
-from harnack.render.placement import Placement
-from harnack.render.variant import mitsuba_backend
+from harnack.rendering.carrier import shape
+from harnack.rendering.framing import visible_points
+from harnack.rendering.lighting import ground, lights
+from harnack.rendering.placement import Placement
+from harnack.rendering.variant import mitsuba_backend
 from harnack.tracer import LevelSet, Tolerance
 
 if TYPE_CHECKING:
-    from harnack.render.materials import Material
+    from harnack.rendering.materials import Material
 
 
 @dataclass(frozen=True)

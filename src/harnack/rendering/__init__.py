@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from harnack.render.carrier import shape
-from harnack.render.materials import MATERIALS, Material
-from harnack.render.picture import SHOW_MODES, render
-from harnack.render.plugins import register, register_surfaces
-from harnack.render.studio import Camera
+from harnack.rendering.carrier import shape
+from harnack.rendering.materials import MATERIALS, Material
+from harnack.rendering.picture import SHOW_MODES, render
+from harnack.rendering.plugins import register, register_surfaces
+from harnack.rendering.studio import Camera
 
 __all__ = [
     "MATERIALS",

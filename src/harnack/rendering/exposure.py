@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import to_numpy
-from harnack.render.integrator import PathTracer
+from harnack.rendering.integrator import PathTracer
 
 # Paths of one band: about a second or two on a CPU, and Ctrl-C works between bands.
 _PATHS_A_BAND = 2**18

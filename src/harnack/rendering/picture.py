@@ -20,13 +20,13 @@ from rich.progress import (
 )
 
 from harnack.fields import Field
-from harnack.render.exposure import expose
-from harnack.render.images import check_picture_path, tone_mapped, write_image
-from harnack.render.integrator import PathTracer
-from harnack.render.materials import Material, material_of
-from harnack.render.plugins import register
-from harnack.render.studio import Camera, Exhibit, studio
-from harnack.render.views import VIEWS, look
+from harnack.rendering.exposure import expose
+from harnack.rendering.images import check_picture_path, tone_mapped, write_image
+from harnack.rendering.integrator import PathTracer
+from harnack.rendering.materials import Material, material_of
+from harnack.rendering.plugins import register
+from harnack.rendering.studio import Camera, Exhibit, studio
+from harnack.rendering.views import VIEWS, look
 from harnack.tracer import LevelSet, level_set
 
 ShowMode = Literal["color", "normal", "evaluations", "status", "depth"]

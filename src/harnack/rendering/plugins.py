@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Any
 
 from harnack.fields import Gyroid, SchwarzD, SchwarzP, SolidAngle, SphericalHarmonic
 from harnack.geometry import Ball, Box, Intersection, read_loops
-from harnack.render import carrier, integrator
-from harnack.render.variant import load_mitsuba
+from harnack.rendering import carrier, integrator
+from harnack.rendering.variant import load_mitsuba
 from harnack.tracer import LevelSet, level_set
 
 if TYPE_CHECKING:

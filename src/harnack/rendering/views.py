@@ -14,10 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import to_numpy
-from harnack.render.colormap import viridis
-from harnack.render.images import as_bytes
-from harnack.render.integrator import LOST_COLOUR
-from harnack.render.world import World
+from harnack.rendering.colormap import viridis
+from harnack.rendering.images import as_bytes
+from harnack.rendering.integrator import LOST_COLOUR
+from harnack.rendering.world import World
 from harnack.tracer import Status
 
 FloatArray = npt.NDArray[np.floating[Any]]
