@@ -1,7 +1,7 @@
 """Guaranteed ray tracing of harmonic and other implicit surfaces.
 
-    import harnack as hk
-    hits = hk.trace(hk.SolidAngle(vertices), origins, directions)
+import harnack as hk
+hits = hk.trace(hk.SolidAngle(vertices), origins, directions)
 """
 
 from __future__ import annotations

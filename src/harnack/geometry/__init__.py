@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from harnack.geometry import shapes
 from harnack.geometry.curves import (
     CurveError,
     bounding_box,

@@ -52,7 +52,9 @@ def shape(
     Raises:
         ValueError: the surface has no bounds and no `clip`, or `to_world` is no similarity.
     """
-    mi = load_mitsuba()
+    from harnack.rendering.plugins import register  # not above: plugins are made of carriers
+
+    mi = register()
     if isinstance(surface, LevelSet):
         if settings:
             raise ValueError(f"{', '.join(settings)}: a LevelSet holds its settings already")
