@@ -16,12 +16,13 @@ from .scenes import Scene, WithoutExtent, camera
 
 WIDTH = 512
 REPEATS = 5
-RULES: tuple[tuple[str, str, float], ...] = (
+RULES: tuple[tuple[str, str | None, float | None], ...] = (
     ("classic", "classic", 1.75),
     ("slope", "slope", 1.0),
     ("slope, over-stepping", "slope", 1.4),
     ("caps", "caps", 1.0),
     ("caps, over-stepping", "caps", 1.4),
+    ("default", None, None),
 )
 
 
@@ -49,7 +50,9 @@ def threads() -> int:
     return dr.thread_count()
 
 
-def measure(scene: Scene, rule: tuple[str, str, float], field: hk.Field | None = None) -> Row:
+def measure(
+    scene: Scene, rule: tuple[str, str | None, float | None], field: hk.Field | None = None
+) -> Row:
     """Trace the camera's rays and count."""
     name, bound, overstep = rule
     backend = choose_backend()

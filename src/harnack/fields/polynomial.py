@@ -70,8 +70,7 @@ class _SolidHarmonics(Field):
         margin = _ROUNDING * (upper - lower)
         ball = HarmonicBall(radius * self._size, lower - margin, upper + margin)
         known = (ball, *(self._curvature(distance, *reach) for reach in _REACHES))
-        low, high = self._known.at(distance)
-        error = 8 * dr.epsilon(type(value)) * fmax(high, -low)
+        error = 8 * dr.epsilon(type(value)) * fmax(upper, -lower)
         return Sample(value, type(p)(*gradient) / self._size, known, error)
 
     def _curvature(self, distance: Real, share: float, least: float) -> Curvature:

@@ -11,10 +11,10 @@ from harnack.geometry.convex_volume import FloatArray
 
 # Radiances of the environment, linear sRGB: at the horizon, overhead, and of a soft strip of
 # light behind the stage that draws edges and gives metal something to reflect.
-_HORIZON = np.array([0.20, 0.20, 0.21])
-_ZENITH = np.array([0.40, 0.44, 0.50])
-_STRIP = np.array([0.80, 0.76, 0.70])
-_KEY = (4.9, 4.65, 4.35)
+_HORIZON = np.array([0.17, 0.17, 0.18])
+_ZENITH = np.array([0.36, 0.40, 0.46])
+_STRIP = np.array([0.70, 0.66, 0.60])
+_KEY = (6.9, 6.6, 6.2)
 # Reflectance of the ground.
 _BACKDROPS = {"light": (0.74, 0.73, 0.715), "dark": (0.055, 0.058, 0.065)}
 # (height, width) of the environment's bitmap.
@@ -78,7 +78,7 @@ def environment(azimuth: float) -> Any:
     rise = np.clip(z, 0, 1)[..., None] ** 0.7
     image = _HORIZON + (_ZENITH - _HORIZON) * rise
     strip = _direction(azimuth + 125, 28)
-    image += _STRIP * np.exp((d @ strip - 1) / 0.12)[..., None]
+    image += _STRIP * np.exp((d @ strip - 1) / 0.14)[..., None]
     return image.astype(np.float32)
 
 

@@ -25,7 +25,7 @@ from harnack.rendering.images import check_picture_path, tone_mapped, write_imag
 from harnack.rendering.integrator import PathTracer
 from harnack.rendering.materials import Material, material_of
 from harnack.rendering.plugins import register
-from harnack.rendering.studio import Camera, Exhibit, studio
+from harnack.rendering.studio import Camera, Exhibit, stratified, studio
 from harnack.rendering.views import VIEWS, look
 from harnack.tracer import LevelSet, level_set
 
@@ -98,6 +98,7 @@ def render(
     if show == "color":
         tracer = _tracer(mi, scene, max_depth)
         spp = spp or int(sensor.sampler().sample_count())
+        spp = stratified(spp) if in_studio else spp
         image = _radiance(mi, scene, sensor, tracer, spp, seed, progress)
         drawn = tone_mapped(image)
     else:

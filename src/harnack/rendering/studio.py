@@ -139,6 +139,12 @@ def studio(
     return Studio(scene, placement.scale)
 
 
+def stratified(spp: int) -> int:
+    """The samples a pixel, at least `spp`, that the studio's sampler can arrange in a grid."""
+    rows = max(1, math.isqrt(spp))
+    return rows * -(-spp // rows)
+
+
 def on_ground(points: FloatArray) -> Placement:
     """Scales points (n, 3) to half a diagonal of 1 and puts them on the ground."""
     lower, upper = points.min(axis=0), points.max(axis=0)
