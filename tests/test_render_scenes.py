@@ -301,6 +301,47 @@ def test_errors_say_what_is_wrong(bad: tuple[Callable[[], Any], str]) -> None:
         make()
 
 
+def test_mitsubas_own_render_draws_the_same_picture() -> None:
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "harnack_path", "max_depth": 6},
+            "sensor": sensor(),
+            **LIGHTS,
+            **_lit_gyroid(1e-4),
+        }
+    )
+    theirs = np.array(mi.render(scene, spp=64))
+    ours = render(scene, spp=64, progress=False)
+    assert scene.integrator().take_lost() == 0
+    assert theirs.mean() == pytest.approx(ours.mean(), rel=0.01)
+    # The filters differ: a pixel's square here, a Gaussian there.
+    blocks = [image.reshape(6, 8, 6, 8, 3).mean(axis=(1, 3)) for image in (ours, theirs)]
+    np.testing.assert_allclose(*blocks, rtol=0.1, atol=0.02)
+    with pytest.raises(ValueError, match="size"):
+        render(scene, size=(20, 20))
+
+
+def test_mitsubas_own_render_shows_and_counts_what_was_lost() -> None:
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "harnack_path"},
+            "sensor": sensor(),
+            "sky": {"type": "constant", "radiance": 0.0},
+            "surface": shape(GYROID, max_steps=3),
+        }
+    )
+    image = np.array(mi.render(scene, spp=4))
+    lost = scene.integrator().take_lost()
+    assert lost > 1000
+    assert scene.integrator().take_lost() == 0
+    # All that shines is magenta: red and blue in full, no green.
+    assert image[..., 1].max() == 0
+    assert image[..., 0].sum() == pytest.approx(lost / 4, rel=0.05)
+    np.testing.assert_allclose(image[..., 0], image[..., 2], atol=1e-5)
+
+
 def test_xml_scene_names_our_surfaces(tmp_path: Any) -> None:
     square = np.array([[1, -1, 0], [1, 1, 0], [-1, 1, 0], [-1, -1, 0.3]], dtype=float)
     np.savetxt(tmp_path / "square.loops", square.reshape(1, -1))

@@ -7,6 +7,7 @@ same seed gives the same picture.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -42,7 +43,7 @@ def expose(
     """
     width, height = (int(n) for n in sensor.film().crop_size())
     sampler = sensor.sampler().clone()
-    sampler.set_sample_count(spp)
+    sampler.set_sample_count(_whole_grid(spp) if "Multijitter" in str(sampler) else spp)
     spp = int(sampler.sample_count())
     sampler.set_samples_per_wavefront(spp)
     image = np.empty((width * height, 3), dtype=np.float32)
@@ -60,6 +61,12 @@ def expose(
         lost += int(dr.count(got_lost)[0])
         advance((stop - start) / (width * height))
     return image.reshape(height, width, 3), lost
+
+
+def _whole_grid(spp: int) -> int:
+    """The samples of the nearly square grid that multi-jittering rounds up to (and warns of)."""
+    across = max(1, math.isqrt(spp))
+    return across * -(-spp // across)
 
 
 def _bands(pixels: int, step: int) -> Iterator[tuple[int, int]]:

@@ -14,7 +14,7 @@ from harnack.geometry.convex_volume import FloatArray
 _HORIZON = np.array([0.17, 0.17, 0.18])
 _ZENITH = np.array([0.36, 0.40, 0.46])
 _STRIP = np.array([0.70, 0.66, 0.60])
-_KEY = (6.9, 6.6, 6.2)
+_KEY = (4.7, 4.5, 4.25)
 # Reflectance of the ground.
 _BACKDROPS = {"light": (0.74, 0.73, 0.715), "dark": (0.055, 0.058, 0.065)}
 # (height, width) of the environment's bitmap.
@@ -54,7 +54,7 @@ def lights(mi: Any, azimuth: float) -> dict[str, Any]:
     return {
         "key": {
             "type": "disk",
-            "to_world": look.scale(1.9),
+            "to_world": look.scale(2.2),
             "emitter": {"type": "area", "radiance": {"type": "rgb", "value": list(_KEY)}},
         },
         "fill": {

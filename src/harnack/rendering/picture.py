@@ -162,6 +162,8 @@ def _surface(one: Field | LevelSet, settings: Mapping[str, Any]) -> LevelSet:
 
 def _loaded(mi: Any, what: Any, size: tuple[int, int] | None) -> Any:
     if isinstance(what, mi.Scene):
+        if size is not None:
+            raise ValueError("size: a loaded scene has its own; set film.size of its sensor")
         scene = what
     elif isinstance(what, Mapping):
         scene = mi.load_dict({**what}, parallel=False)
