@@ -342,6 +342,33 @@ def test_mitsubas_own_render_shows_and_counts_what_was_lost() -> None:
     np.testing.assert_allclose(image[..., 0], image[..., 2], atol=1e-5)
 
 
+def test_pictures_differentiate_with_respect_to_materials() -> None:
+    bsdf = {"type": "twosided", "nested": red()}
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "harnack_path", "max_depth": 4, "rr_depth": 99},
+            "sensor": sensor(size=24),
+            **LIGHTS,
+            "surface": shape(GYROID, bsdf=bsdf),
+        }
+    )
+    params = mi.traverse(scene)
+    name = next(key for key in params.keys() if "reflectance" in key)  # noqa: SIM118
+
+    def picture_of(reflectance: float) -> Any:
+        params[name] = mi.Color3f(reflectance, 0.02, 0.02)
+        dr.enable_grad(params[name])
+        params.update()
+        return mi.render(scene, params, spp=64, seed=1)
+
+    ahead, behind = (np.array(picture_of(r))[..., 0].mean() for r in (0.82, 0.78))
+    image = picture_of(0.8)
+    dr.backward(dr.mean(image) * 3)  # a mean over three channels, of which one changes
+    derivative = np.array(dr.grad(params[name])).ravel()[0]
+    assert derivative == pytest.approx((ahead - behind) / 0.04, rel=0.03)
+
+
 def test_xml_scene_names_our_surfaces(tmp_path: Any) -> None:
     square = np.array([[1, -1, 0], [1, 1, 0], [-1, 1, 0], [-1, -1, 0.3]], dtype=float)
     np.savetxt(tmp_path / "square.loops", square.reshape(1, -1))

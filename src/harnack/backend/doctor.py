@@ -83,7 +83,8 @@ def _llvm() -> list[Finding]:
     for library in find_libraries():
         version = "unknown" if library.major is None else library.major
         verdict = library.refusal or "acceptable"
-        findings.append(Finding("LLVM found", f"{library.path}, version {version}: {verdict}"))
+        name = "LLVM passed over" if library.refusal else "LLVM found"
+        findings.append(Finding(name, f"{library.path}, version {version}: {verdict}"))
     return findings
 
 

@@ -97,7 +97,7 @@ def trace(
     o, d, near, far = _rays(backend, origins, directions, t_min, t_max)
     if min(dr.width(array) for array in (o, d, near, far)) == 0:
         return _no_hits(backend, as_numpy=not given)
-    hits = _trace(surface, backend, o, d, near, far)
+    hits = _trace(surface, backend, o, d, near, far, differentiable=bool(given))
     return hits if given else _as_numpy(hits, max(dr.width(o), dr.width(d), dr.width(near)))
 
 
@@ -130,7 +130,16 @@ def _check_numpy_rays(length: Any, near: Any, far: Any) -> None:
         raise ValueError(f"t_max is smaller than t_min for ray {empty[0]}: swap them")
 
 
-def _trace(surface: LevelSet, backend: Backend, o: Vec3, d: Vec3, near: Real, far: Real) -> Hits:
+def _trace(
+    surface: LevelSet,
+    backend: Backend,
+    o: Vec3,
+    d: Vec3,
+    near: Real,
+    far: Real,
+    *,
+    differentiable: bool,
+) -> Hits:
     prepared = surface.prepare(backend)
     with dr.suspend_grad():
         end = prepared.first_hit(dr.detach(o), dr.detach(d), dr.detach(near), dr.detach(far))
@@ -138,7 +147,7 @@ def _trace(surface: LevelSet, backend: Backend, o: Vec3, d: Vec3, near: Real, fa
         length = dr.norm(end.gradient)
         normal = dr.select(hit & (length > 0), end.gradient / length, 0)
     t = end.t
-    if wants_derivatives(prepared, o, d):
+    if differentiable and wants_derivatives(prepared, o, d):
         t, normal = attach(prepared, o, d, t, hit, normal)
     position = dr.select(dr.isfinite(t), dr.fma(backend.Array3f(t), d, o), dr.nan)
     hits = Hits(t, position, normal, end.value, end.evaluations, end.status)

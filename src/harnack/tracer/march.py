@@ -131,9 +131,7 @@ class PreparedLevelSet:
         try:
             return dr.while_loop(state, running, body, label="harnack")
         except RuntimeError as error:  # Dr.Jit wraps what the body raises
-            if isinstance(error.__cause__, ValueError):
-                raise error.__cause__ from None
-            raise
+            raise (error.__cause__ or error) from None
 
     def _blur(self, sample: Sample, steepness: Real, size: Real) -> Real:
         """What rounding may have done to f at a point whose coordinates are at most `size`."""
