@@ -22,7 +22,6 @@ RULES: tuple[tuple[str, str | None, float | None], ...] = (
     ("slope, over-stepping", "slope", 1.4),
     ("caps", "caps", 1.0),
     ("caps, over-stepping", "caps", 1.4),
-    ("default", None, None),
 )
 
 
