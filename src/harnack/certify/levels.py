@@ -49,3 +49,8 @@ class Levels:
                 above_gap = dr.select(above <= 0, -above, math.inf)
             down, up = fmin(down, below_gap), fmin(up, above_gap)
         return down, up
+
+    def to_nearest(self, f: Real) -> Real:
+        """level - f for the level nearest to f."""
+        down, up = self.gaps(f)
+        return dr.select(up < down, up, -down)

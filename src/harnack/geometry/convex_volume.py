@@ -78,16 +78,6 @@ def rounding(backend: Backend) -> float:
     return 10.0 * float(dr.epsilon(backend.Float))
 
 
-def smaller(a: Real, b: Real) -> Real:
-    """The smaller one; unlike dr.minimum a single instruction, as NaN is of no concern."""
-    return dr.select(a < b, a, b)
-
-
-def larger(a: Real, b: Real) -> Real:
-    """The larger one; unlike dr.maximum a single instruction, as NaN is of no concern."""
-    return dr.select(a > b, a, b)
-
-
 def emptied(t0: Real, t1: Real) -> tuple[Real, Real]:
     """The interval, or (inf, -inf) where it holds at most a point."""
     full = t0 < t1

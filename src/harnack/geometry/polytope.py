@@ -13,15 +13,14 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import Backend, Mask, Real, Vec3, aligned, backend_of
+from harnack.backend.extrema import fmax, fmin
 from harnack.geometry.convex_volume import (
     BoolArray,
     FloatArray,
     Volume,
     as_points,
     emptied,
-    larger,
     rounding,
-    smaller,
 )
 
 MAX_UNROLLED = 32
@@ -172,8 +171,8 @@ class Polytope(Volume):
             speed = dr.dot(n, d) - speed_slack
             t = room / speed
             leaving = speed > 0
-            t1 = dr.select(leaving, smaller(t, t1), t1)
-            t0 = dr.select(leaving | (room >= 0), t0, larger(dr.abs(t), t0))
+            t1 = dr.select(leaving, fmin(t, t1), t1)
+            t0 = dr.select(leaving | (room >= 0), t0, fmax(dr.abs(t), t0))
             return t0, t1
 
         lanes = dr.zeros(backend.Float, dr.width(o, d, t_min, t_max))

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import Backend, Mask, Real, Vec3, backend_of
+from harnack.backend.extrema import fmax, fmin
 from harnack.geometry.convex_volume import (
     BoolArray,
     FloatArray,
@@ -21,9 +22,7 @@ from harnack.geometry.convex_volume import (
     checked_distance,
     checked_point,
     emptied,
-    larger,
     rounding,
-    smaller,
 )
 from harnack.geometry.hull import ConvexHull
 from harnack.geometry.polytope import PlaneTable, Polytope
@@ -68,10 +67,10 @@ class Ball(Volume):
         clearance = dr.norm(dr.fma(d, along, from_center))
         slack = rounding(backend) * (dr.norm(from_center) + dr.norm(c) + r)
         reach = r + slack
-        half = dr.sqrt(larger((reach - clearance) * (reach + clearance), 0.0))
+        half = dr.sqrt(fmax((reach - clearance) * (reach + clearance), 0.0))
         half = (half + slack) / speed
-        t0 = larger(along - half, t_min)
-        t1 = smaller(along + half, t_max)
+        t0 = fmax(along - half, t_min)
+        t1 = fmin(along + half, t_max)
         return emptied(t0, dr.select(clearance <= reach, t1, -dr.inf))
 
     def contains(self, p: Vec3) -> Mask:
@@ -214,7 +213,7 @@ class Intersection(Volume):
     def signed_distance(self, p: Vec3) -> Real:
         distance = self.volumes[0].signed_distance(p)
         for volume in self.volumes[1:]:
-            distance = larger(volume.signed_distance(p), distance)
+            distance = fmax(volume.signed_distance(p), distance)
         return distance
 
     def outward_normal(self, p: Vec3) -> Vec3:

@@ -63,7 +63,7 @@ def meet_surface(
     vector = prepared.backend.Array3f
     trace = prepared.first_hit(o, d, 0, t_max, active)
     met = trace.status == int(Status.HIT)
-    gap = to_nearest_level(prepared, trace.value)
+    gap = prepared.levels.to_nearest(trace.value)
     slope = dr.dot(trace.gradient, d)
     reach = _POLISH * _uncertainty(prepared, trace.gradient, trace.t, trace.value)
     step = dr.select(met & (slope != 0), dr.clip(gap / slope, -reach, reach), 0)
@@ -73,7 +73,7 @@ def meet_surface(
     length = dr.norm(sample.gradient)
     normal = dr.select(length > 0, sample.gradient / length, -d)
     uncertainty = _uncertainty(prepared, sample.gradient, t, sample.value, sample.error)
-    rest = to_nearest_level(prepared, sample.value) / length
+    rest = prepared.levels.to_nearest(sample.value) / length
     rest = dr.select(length > 0, dr.clip(rest, -reach, reach), 0)
     # gap > 0: the level is above, so the ray comes from the side of smaller values.
     side = dr.select(gap > 0, prepared.backend.Float(1), -1)
@@ -109,9 +109,3 @@ def facing(normal: Vec3, d: Vec3, side: Real) -> Vec3:
     along = dr.dot(normal, d)
     turned = dr.normalize(normal + (side * _GRAZING - along) * d)
     return dr.select(side * along >= _GRAZING, normal, turned)
-
-
-def to_nearest_level(prepared: PreparedLevelSet, f: Real) -> Real:
-    """level - f for the level nearest to f."""
-    down, up = prepared.levels.gaps(f)
-    return dr.select(up < down, up, -down)

@@ -44,7 +44,7 @@ def attach(
         for _ in range(_POLISH):
             x = dr.fma(backend.Array3f(at), along, here)
             sample = prepared.sample(x)
-            miss = _to_nearest(prepared, sample.value)
+            miss = prepared.levels.to_nearest(sample.value)
             slope = dr.dot(sample.gradient, along)
             step = dr.select(hit & (slope != 0), miss / slope, 0)
             # A grazing ray has no crossing to converge to; stay near the proved point.
@@ -76,9 +76,3 @@ def _change_of_nearest(prepared: PreparedLevelSet, f: Real) -> Real:
             nearest = dr.select(closer, gap, nearest)
         change = dr.select(closer, level - dr.detach(level), change)
     return change
-
-
-def _to_nearest(prepared: PreparedLevelSet, f: Real) -> Real:
-    """level - f for the nearest level."""
-    down, up = prepared.levels.gaps(f)
-    return dr.select(up < down, up, -down)
