@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import datetime
+from collections.abc import Callable
 from pathlib import Path
 
 from rich.progress import track
@@ -11,25 +12,58 @@ from rich.progress import track
 import harnack as hk
 
 from .convergence import plot
+from .growth import growth
 from .rays import RULES, WIDTH, Row, machine, measure, published
 from .scenes import others, polygons
+from .winding import throughput
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
+SECTIONS = ("rays", "convergence", "winding")
 
 
 def main() -> None:
     """Parse arguments, measure, write."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("--out", type=Path, default=DOCS / "benchmarks.md")
-    parser.add_argument("--no-convergence", action="store_true", help="skip the plot (needs igl)")
+    parser.add_argument("--no-convergence", action="store_true", help="skip that section")
+    parser.add_argument("--only", choices=SECTIONS, help="rewrite one section of the page")
+    parser.add_argument("--bunny", type=Path, help="a surface file, for the winding numbers")
     arguments = parser.parse_args()
-    text = [_heading(), _rays()]
-    if not arguments.no_convergence:
-        text.append(_convergence(arguments.out.with_name("convergence.png")))
+    names = [arguments.only] if arguments.only else list(SECTIONS)
+    if arguments.no_convergence and "convergence" in names:
+        names.remove("convergence")
+    write: dict[str, Callable[[], str]] = {
+        "rays": _rays,
+        "convergence": lambda: _convergence(arguments.out.with_name("convergence.png")),
+        "winding": lambda: _winding(arguments.bunny, arguments.out.with_name("growth.png")),
+    }
+    if arguments.only and not arguments.out.exists():
+        parser.error(f"{arguments.out} is not there; write all of it first, without --only")
+    texts = {name: write[name]() for name in names}
+    # Read late: measuring takes minutes, in which the page may have been changed.
+    page = arguments.out.read_text(encoding="utf-8") if arguments.only else _heading()
+    for name, text in texts.items():
+        page = merged(page, name, text)
     temporary = arguments.out.with_suffix(".tmp")
-    temporary.write_text("\n".join(text), encoding="utf-8")
+    temporary.write_text(page, encoding="utf-8")
     temporary.replace(arguments.out)
     print(f"wrote {arguments.out}")
+
+
+def merged(page: str, name: str, text: str) -> str:
+    """The page with a section in place of the one of that name, or at its end."""
+    begin, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
+    section = f"{begin}\n\n{text}\n{end}"
+    if begin not in page:
+        return f"{page}\n{section}\n"
+    before, rest = page.split(begin, 1)
+    if end not in rest:
+        raise ValueError(f"the page has {begin!r} and no {end!r} after it")
+    return before + section + rest.split(end, 1)[1]
+
+
+def _winding(surface: Path | None, picture: Path) -> str:
+    return throughput(surface) + "\n" + growth(picture)
 
 
 def _heading() -> str:

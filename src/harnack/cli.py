@@ -14,12 +14,11 @@ from rich.console import Console
 
 from harnack._version import __version__
 from harnack.backend import doctor
-from harnack.fields import SolidAngle
 from harnack.gallery import SCENES, Scene
-from harnack.geometry import read_loops
+from harnack.geometry.surfaces import SURFACE_FILES
+from harnack.opening import UP_AXES, open_surface
 from harnack.rendering import MATERIALS, SHOW_MODES, render
 
-_CURVES = (".obj", ".ply", ".loops")
 _DEMO_SIZE = (480, 360)
 
 
@@ -43,23 +42,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"harnack {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    one = commands.add_parser(
-        "render", help="draw one picture",
-        description="Draw a gallery scene, the surface spanned by the curves of a file (.obj, "
-        ".ply, .loops), or a Mitsuba scene (.xml).",
-    )  # fmt: skip
-    one.add_argument(
-        "scene", metavar="SCENE", help="a name from `harnack gallery --list`, or a file"
-    )
-    one.add_argument("-o", "--output", metavar="FILE", help="picture, .png or .exr (SCENE.png)")
-    one.add_argument("--level", type=parse_level, help="level to draw; pi is understood: 2pi, pi/2")
-    one.add_argument("--material", choices=sorted(MATERIALS), help="what it is made of")
-    one.add_argument("--show", choices=SHOW_MODES, help="what to draw (color)")
-    one.add_argument(
-        "--boundary", action="store_true", help="take the boundary of a file's faces as the curves"
-    )
-    _add_quality(one)
-    one.set_defaults(run=_render)
+    _add_render(commands)
     many = commands.add_parser("gallery", help="draw or list the named scenes")
     many.add_argument("names", nargs="*", metavar="NAME", help="scenes to draw (all)")
     many.add_argument("--list", action="store_true", help="list them and draw nothing")
@@ -70,6 +53,43 @@ def _parser() -> argparse.ArgumentParser:
     check = commands.add_parser("doctor", help="say what is installed, what works, what is missing")
     check.set_defaults(run=_doctor)
     return parser
+
+
+def _add_render(commands: Any) -> None:
+    one = commands.add_parser(
+        "render", help="draw one picture",
+        description="Draw a gallery scene, the surface of a file, or a Mitsuba scene (.xml). "
+        f"Surface files are {', '.join(SURFACE_FILES)}: meshes with any defects, point clouds, "
+        "and curves; what a file was taken for is printed.",
+    )  # fmt: skip
+    one.add_argument(
+        "scene", metavar="SCENE", help="a name from `harnack gallery --list`, or a file"
+    )
+    one.add_argument("-o", "--output", metavar="FILE", help="picture, .png or .exr (SCENE.png)")
+    one.add_argument(
+        "--level", type=parse_level,
+        help="level to draw (1/2 for meshes, 2pi for curves); pi is understood: 2pi, pi/2",
+    )  # fmt: skip
+    one.add_argument("--material", choices=sorted(MATERIALS), help="what it is made of")
+    one.add_argument("--show", choices=SHOW_MODES, help="what to draw (color)")
+    file = one.add_argument_group("surface files")
+    file.add_argument(
+        "--as", dest="as_", choices=("winding", "dipole", "loops"),
+        help="take the file as a mesh, as points with normals (of a mesh: the centers of its "
+        "faces) or as curves (of a mesh: its boundary), whatever it looks like",
+    )  # fmt: skip
+    file.add_argument(
+        "--boundary", action="store_true", help="take the boundary of a file's faces as the curves"
+    )
+    file.add_argument(
+        "--normals", choices=("estimate",), help="estimate the normals of a point cloud"
+    )
+    file.add_argument(
+        "--up", choices=UP_AXES,
+        help="the file's axis that points up (y for .glb and .gltf, else z; most .obj need y)",
+    )  # fmt: skip
+    _add_quality(one)
+    one.set_defaults(run=_render)
 
 
 def _add_quality(parser: argparse.ArgumentParser) -> None:
@@ -127,26 +147,47 @@ def _render(options: Any) -> int:
     settings = _quality(options)
     if options.show is not None:
         settings["show"] = options.show
+    kind = source.suffix.lower()
+    if options.scene in SCENES or kind == ".xml":
+        _refuse_file_options(options)
     if options.scene in SCENES:
         _draw_scene(SCENES[options.scene], target, options, settings)
-    elif source.suffix.lower() == ".xml":
+    elif kind == ".xml":
         if options.level is not None or options.material is not None:
             raise ValueError("level and material of a Mitsuba scene are set in its own file")
         if not source.is_file():
             raise ValueError(f"there is no file {source}")
         render(str(source), target, **settings)
-    elif source.suffix.lower() in _CURVES:
-        field = SolidAngle(read_loops(source, boundary=options.boundary))
-        said = ", ".join(f"{key}: {value}" for key, value in field.describe().items())
-        Console().print(f"{source}: {said}", highlight=False)
-        render(field, target, level=options.level, material=options.material, **settings)
+    elif kind in SURFACE_FILES:
+        _draw_file(source, target, options, settings)
     else:
         raise ValueError(
-            f"{options.scene!r} is no scene: give a name from `harnack gallery --list`, a curve "
-            f"file ({', '.join(_CURVES)}) or a Mitsuba scene (.xml)"
+            f"{options.scene!r} is no scene: give a name from `harnack gallery --list`, a surface "
+            f"file ({', '.join(SURFACE_FILES)}) or a Mitsuba scene (.xml)"
         )
     Console().print(f"wrote {target}", highlight=False)
     return 0
+
+
+def _refuse_file_options(options: Any) -> None:
+    given = {
+        "--as": options.as_, "--boundary": options.boundary, "--normals": options.normals,
+        "--up": options.up,
+    }  # fmt: skip
+    for name, value in given.items():
+        if value:
+            raise ValueError(f"{name} is for surface files ({', '.join(SURFACE_FILES)}) only")
+
+
+def _draw_file(source: Path, target: Path, options: Any, settings: dict[str, Any]) -> None:
+    opened = open_surface(
+        source, as_=options.as_, boundary=options.boundary, normals=options.normals, up=options.up
+    )
+    facts = ", ".join(f"{key}: {value}" for key, value in opened.field.describe().items())
+    console = Console(highlight=False, soft_wrap=True)
+    console.print(f"{source}: {opened.said}", markup=False)
+    console.print(f"{type(opened.field).__name__}: {facts}", markup=False)
+    render(opened.field, target, level=options.level, material=options.material, **settings)
 
 
 def _draw_scene(scene: Scene, target: Path, options: Any, settings: dict[str, Any]) -> None:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from harnack.backend import Mask, Real
 
 _ROUND_DOWN = 1.0 - 1e-6
-_LARGEST_GAP = 1e30  # stands for "no level on this side": its square root stays finite
+_LARGEST_GAP = 1e30  # and beyond: there is no level on this side
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,8 @@ class CurvatureStep(Bound):
 
 
 def _root(gap: Real, rate: Real, curvature: Real) -> Real:
-    gap = fmin(gap, _LARGEST_GAP)
+    none = gap >= _LARGEST_GAP
+    gap = dr.select(none, 0, gap)
     root = dr.sqrt(dr.fma(rate, rate, 2 * curvature * gap))
-    return dr.select(rate > 0, 2 * gap / (rate + root), (root - rate) / curvature)
+    first = dr.select(rate > 0, 2 * gap / (rate + root), (root - rate) / curvature)
+    return dr.select(none, dr.inf, first)

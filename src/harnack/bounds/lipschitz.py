@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import drjit as dr
+
 from harnack.backend.extrema import fmin
 from harnack.bounds.bound import Bound
 from harnack.certify import Certificate, LipschitzCertificate
@@ -29,7 +31,9 @@ class LipschitzStep(Bound):
     def step(self, certificate: Certificate, slope: Real) -> Real:
         assert isinstance(certificate, LipschitzCertificate)
         gap = fmin(certificate.gap_down, certificate.gap_up)
-        return fmin(gap / certificate.constant, certificate.radius) * _ROUND_DOWN
+        # A constant of zero proves everything, unless f is on a level already.
+        free = dr.select(gap > 0, gap / certificate.constant, 0)
+        return fmin(free, certificate.radius) * _ROUND_DOWN
 
     def covers(self, certificate: Certificate, slope: Real, length: Real) -> Mask:
         return length <= self.step(certificate, slope)

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from harnack.fields.dipole import DipolePotential
 from harnack.fields.field import Curvature, Field, HarmonicBall, Lipschitz, Sample
 from harnack.fields.periodic import EigenfunctionSum, Gyroid, SchwarzD, SchwarzP
 from harnack.fields.polynomial import HarmonicPolynomial, SphericalHarmonic
+from harnack.fields.screened import ScreenedWindingNumber
+from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.fields.solid_angle import SolidAngle
 from harnack.fields.waves import PlaneWave, Product, cosine, sine
+from harnack.fields.winding_number import WindingNumber
 
 __all__ = [
+    "NO_SHEET",
+    "Crossing",
     "Curvature",
+    "DipolePotential",
     "EigenfunctionSum",
     "Field",
     "Gyroid",
@@ -21,8 +28,10 @@ __all__ = [
     "Sample",
     "SchwarzD",
     "SchwarzP",
+    "ScreenedWindingNumber",
     "SolidAngle",
     "SphericalHarmonic",
+    "WindingNumber",
     "cosine",
     "sine",
 ]

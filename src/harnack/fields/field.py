@@ -11,8 +11,10 @@ import abc
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from harnack.fields.sheets import NO_SHEET, Crossing
+
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Real, Vec3
+    from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.geometry import Volume
 
 
@@ -56,13 +58,15 @@ class Sample:
 
     error: how far rounding may have moved `value` from f at the point given, beyond eight units
         in its last place (and beyond |gradient| times the rounding of the point itself, which
-        the tracer accounts for). Steps are shortened by it.
+        the tracer accounts for), or an approximation has. Steps are shortened by it.
+    gradient_error: how far an approximation may have moved `gradient`, as a length.
     """
 
     value: Real
     gradient: Vec3
     known: tuple[Knowledge, ...]
     error: Real = 0.0
+    gradient_error: Real = 0.0
 
 
 class Field(abc.ABC):
@@ -83,6 +87,10 @@ class Field(abc.ABC):
     domain: Volume | None = None
     """Where the field may be evaluated and is drawn; None for all of space. Rays are clipped to
     it, and what a sample promises need only hold for p in it."""
+
+    has_sheets: bool = False
+    """Whether f jumps across sheets (see `harnack.fields.sheets`). Then `next_crossing` and
+    `between` are needed, and what `evaluate` promises is about f with the jumps taken out."""
 
     @abc.abstractmethod
     def evaluate(self, p: Vec3) -> Sample:
@@ -124,6 +132,73 @@ class Field(abc.ABC):
         """
         return self.evaluate(p).value
 
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        """Rows of the symmetric matrix of second derivatives at p, in f per length squared.
+
+        Curvatures and second-order distances ask for it; tracing needs none.
+        """
+        del p
+        raise NotImplementedError(
+            f"{type(self).__name__} gives no second derivatives: define its method hessian(p), or "
+            'ask for what needs none, such as signed_distance(..., method="first")'
+        )
+
+    def closest_on_boundary(self, p: Vec3) -> Vec3 | None:
+        """The closest point of the curve in which every level set ends; None where none does.
+
+        Only distances ask for it, while no loop is being recorded. Ends at `domain` do not count.
+        """
+        del p
+        return None
+
     def describe(self) -> dict[str, Any]:
         """What a person would want to know about the choices this field made by itself."""
         return {}
+
+    # Of fields with sheets only. All may be called while a loop is being recorded, for rays
+    # o + t d with |d| = 1; answers for lanes that are not active are not looked at.
+
+    def next_crossing(
+        self, o: Vec3, d: Vec3, after: Crossing, t_max: Real, active: Mask
+    ) -> Crossing:
+        """The first crossing strictly after another one, with t <= t_max.
+
+        Crossings are ordered by (t, sheet): sheets crossed at the same t come one after the other
+        by their index. NO_SHEET is the largest index, so that nothing follows it at the same t.
+        Every crossing of a walk along the ray must come up in that order, at the same t and with
+        the same jump, whatever the walk began with. Where there is none, t = inf, sheet =
+        NO_SHEET, jump = 0.
+        """
+        del o, d, after, t_max, active
+        return Crossing(float("inf"), NO_SHEET, 0.0, (0.0, 0.0, 0.0))
+
+    def offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
+        """A number of this field's own at the start of a ray, handed back by `between`.
+
+        The tracer adds the jump of every crossing that it passes. Crossings with t <= t_min are
+        behind the start (`next_crossing` after (t_min, NO_SHEET)), all others ahead of it.
+        """
+        del o, d, t_min, active
+        return 0.0
+
+    def between(self, o: Vec3, d: Vec3, behind: Crossing, ahead: Crossing, offset: Real) -> Field:
+        """The field as seen on the stretch of the ray between two successive crossings.
+
+        `evaluate` of the field returned is asked at points p = o + t d with behind.t <= t <=
+        ahead.t, to rounding. It gives the value continued along the stretch, *also at its ends*:
+        at ahead.t what f is just before that sheet, at behind.t just behind that one, even where
+        rounding puts p on the other side or the two t are equal. What it promises is about the
+        smooth function that continues these values through all sheets; the tracer uses it on the
+        stretch only.
+
+        behind: the crossing last passed, or the start of the ray with sheet NO_SHEET.
+        ahead: the next one, or t = inf and sheet NO_SHEET.
+        offset: `offset` at the start of the ray plus all jumps since.
+        """
+        del o, d, behind, ahead, offset
+        return self
+
+    def distance_to_sheets(self, p: Vec3) -> Real:
+        """Distance from p to the nearest sheet; inf where there is none."""
+        del p
+        return float("inf")

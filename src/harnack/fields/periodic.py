@@ -20,6 +20,7 @@ from harnack.fields.waves import (
     checked_terms,
     cosine,
     evaluate_terms,
+    hessian_of_terms,
     sine,
 )
 from harnack.geometry.volumes import Ball
@@ -103,6 +104,11 @@ class EigenfunctionSum(Field):
 
     def differentiable_value(self, p: Vec3) -> Real:
         return evaluate_terms(self.terms, p)[0]
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        """Rows of the Hessian; its trace is that of the sum's Laplacian, not zero."""
+        x, y, z = (type(p)(*row) for row in hessian_of_terms(self.terms, p))
+        return x, y, z
 
     def check_levels(self, levels: tuple[float, ...]) -> None:
         """ValueError for a level that is proved to lie outside the range of the function."""

@@ -17,6 +17,7 @@ from harnack.fields.solid_harmonics import (
     Weights,
     evaluate,
     from_monomials,
+    hessian,
     laplacian,
 )
 from harnack.fields.sphere_range import BallRange, range_of_harmonic
@@ -72,6 +73,12 @@ class _SolidHarmonics(Field):
         known = (ball, *(self._curvature(distance, *reach) for reach in _REACHES))
         error = 8 * dr.epsilon(type(value)) * fmax(upper, -lower)
         return Sample(value, type(p)(*gradient) / self._size, known, error)
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        """Rows of the Hessian, free of trace to rounding."""
+        s, share = p / self._size, 1 / self._size**2
+        xx, yy, zz, xy, xz, yz = (share * one for one in hessian(self._weights, s.x, s.y, s.z))
+        return type(p)(xx, xy, xz), type(p)(xy, yy, yz), type(p)(xz, yz, zz)
 
     def _curvature(self, distance: Real, share: float, least: float) -> Curvature:
         """The Hessian's bound on a ball of radius share |p|/(l-2), at least `least` sizes."""

@@ -14,6 +14,8 @@ import numpy.typing as npt
 from harnack.backend import backend_of, to_numpy
 from harnack.fields.edge_angles import differentiable_angle
 from harnack.fields.edge_extent import tight_extent
+from harnack.fields.edge_hessian import hessian_over_edges
+from harnack.fields.edge_nearest import Segments, closest_on_segments, uncancelled_edges
 from harnack.fields.edge_sums import EdgeBuffer, EdgeSums, sum_over_edges, upload
 from harnack.fields.field import Field, HarmonicBall, Sample
 from harnack.geometry import ConvexHull, is_convex_position, total_length, validate_loops
@@ -130,6 +132,26 @@ class SolidAngle(Field):
         r = _REACH * distance
         variation = 2 * r * (sums.first + r / (1 - _REACH) * sums.second) * (1 + _ROUNDING)
         return HarmonicBall(r * self._device.size, sums.angle - variation, sums.angle + variation)
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        """Rows of the Hessian, free of trace to rounding. It grows without limit at the curve."""
+        if self._device is None:
+            return self.prepare(backend_of(p)).hessian(p)
+        on = self._device
+        x, y, z = hessian_over_edges(on.edges, on.unit(p))
+        share = 1 / (on.size * on.size)
+        return x * share, y * share, z * share
+
+    def closest_on_boundary(self, p: Vec3) -> Vec3 | None:
+        """The closest point of the curve, edges that cancel left out (`uncancelled_edges`)."""
+        if self._device is None:
+            return self.prepare(backend_of(p)).closest_on_boundary(p)
+        on = self._device
+        start, end = ((q - self._centre) / self._size for q in uncancelled_edges(self.loops))
+        if not len(start):
+            return None
+        nearest = closest_on_segments(Segments.upload(on.edges.backend, start, end), on.unit(p))
+        return nearest * on.size + on.centre
 
     def parameters(self) -> tuple[Any, ...]:
         return () if self.vertices is None else (self.vertices,)

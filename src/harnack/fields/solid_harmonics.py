@@ -88,6 +88,71 @@ def evaluate(weights: Weights, x: Any, y: Any, z: Any) -> tuple[Any, tuple[Any, 
     return f, (gx, gy, gz)
 
 
+def hessian(weights: Weights, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any, Any, Any, Any]:
+    """xx, yy, zz, xy, xz, yz derivatives of sum c_lm r^l Y_lm.
+
+    The rules of `evaluate` applied twice to Q B with B = C_m or S_m. With Q' = Q_(l-1)^(m+1),
+    Q" = Q_(l-2)^(m+2), and B_x etc. the derivatives of B (B_yy = -B_xx):
+
+        xx = (x^2 Q" - Q') B - 2 x Q' B_x + Q B_xx,   xy = xy Q" B - Q' (x B_y + y B_x) + Q B_xy,
+        xz = (l+m) (Q_(l-1)^m B_x - x Q_(l-2)^(m+1) B),   zz = (l+m) (l+m-1) Q_(l-2)^m B
+
+    and yy, yz alike.
+    """
+    q = Legendre(z, x * x + y * y + z * z)
+    zero = 0.0 * z
+    total = [zero] * 6
+    powers = [(zero, zero), (zero, zero), (zero + 1.0, zero)]  # C and S of m-2, m-1, m
+    for m in range(max(abs(m) for _, m in weights) + 1):
+        if m > 0:
+            c, s = powers[2]
+            powers = [*powers[1:], (x * c - y * s, x * s + y * c)]
+        (c2, s2), (c1, s1), (c, s) = powers
+        square = m * (m - 1)
+        bases = (
+            (m, (c, m * c1, -m * s1, square * c2, -square * s2)),
+            (-m, (s, m * s1, m * c1, square * s2, square * c2)),
+        )
+        for order, basis in bases[: 2 if m else 1]:
+            column = [(key[0], w) for key, w in weights.items() if key[1] == order]
+            if column:
+                terms = _second_rates(_second_column(sorted(column), m, q), basis, x, y)
+                total = [one + term for one, term in zip(total, terms, strict=True)]
+    return total[0], total[1], total[2], total[3], total[4], total[5]
+
+
+def _second_rates(sums: Sequence[Any], basis: Sequence[Any], x: Any, y: Any) -> tuple[Any, ...]:
+    """The six derivatives from sums over l (`_second_column`) and B, B_x, B_y, B_xx, B_xy."""
+    at_m, at_next, at_second, rate, rate_next, rate_twice = sums
+    b, bx, by, bxx, bxy = basis
+    return (
+        (x * x * at_second - at_next) * b - 2 * x * at_next * bx + at_m * bxx,
+        (y * y * at_second - at_next) * b - 2 * y * at_next * by - at_m * bxx,
+        rate_twice * b,
+        x * y * at_second * b - at_next * (x * by + y * bx) + at_m * bxy,
+        rate * bx - x * rate_next * b,
+        rate * by - y * rate_next * b,
+    )
+
+
+def _second_column(
+    column: Sequence[tuple[int, float]], m: int, q: Legendre
+) -> tuple[Any, Any, Any, Any, Any, Any]:
+    """Sums over l of c_lm N_lm times Q_l^m, Q_(l-1)^(m+1), Q_(l-2)^(m+2), (l+m) Q_(l-1)^m,
+    (l+m) Q_(l-2)^(m+1) and (l+m) (l+m-1) Q_(l-2)^m."""
+    at_m, at_next, rate = _column(column, m, q)
+    at_second, rate_next, rate_twice = 0.0, 0.0, 0.0
+    for l, weight in column:  # noqa: E741
+        a = weight * normalisation(l, m) * odd_factorial(m)
+        if l > m + 1:
+            rate_twice = rate_twice + (a * (l + m) * (l + m - 1)) * q(l - 2, m)
+        if l > m + 2:
+            rate_next = rate_next + (a * (l + m) * (2 * m + 1)) * q(l - 2, m + 1)
+        if l > m + 3:
+            at_second = at_second + (a * (2 * m + 1) * (2 * m + 3)) * q(l - 2, m + 2)
+    return at_m, at_next, at_second, rate, rate_next, rate_twice
+
+
 def _column(column: Sequence[tuple[int, float]], m: int, q: Legendre) -> tuple[Any, Any, Any]:
     """Sums over l of c_lm N_lm times Q_l^m, Q_(l-1)^(m+1) and (l+m) Q_(l-1)^m."""
     at_m, at_next, rate = 0.0, 0.0, 0.0

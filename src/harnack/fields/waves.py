@@ -98,16 +98,25 @@ def checked_terms(terms: Iterable[Term]) -> tuple[Term, ...]:
     return checked
 
 
+class _FactorRates:
+    """Factors and their derivatives at p; each sine and cosine is computed once."""
+
+    def __init__(self, p: Vec3) -> None:
+        self._p = p
+        self._known: dict[Any, tuple[Real, Real]] = {}
+
+    def __call__(self, axis: int, factor: Factor) -> tuple[Real, Real]:
+        """The factor and its derivative along the axis."""
+        key = (axis, factor.frequency, factor.phase)
+        if key not in self._known:
+            self._known[key] = dr.sincos(_angle(factor.frequency * self._p[axis], factor.phase))
+        s, c = self._known[key]
+        return (c, -factor.frequency * s) if factor.is_cosine else (s, factor.frequency * c)
+
+
 def evaluate_terms(terms: Sequence[Term], p: Vec3) -> tuple[Real, list[Real]]:
     """Value and the three gradient components of the sum at p, a vector of Dr.Jit arrays."""
-    known: dict[Any, tuple[Real, Real]] = {}
-
-    def sine_and_cosine(axis: int, factor: Factor) -> tuple[Real, Real]:
-        key = (axis, factor.frequency, factor.phase)
-        if key not in known:
-            known[key] = dr.sincos(_angle(factor.frequency * p[axis], factor.phase))
-        return known[key]
-
+    rates = _FactorRates(p)
     value, gradient = p[0] * 0.0, [p[0] * 0.0 for _ in range(3)]
     for term in terms:
         if isinstance(term, PlaneWave):
@@ -119,16 +128,40 @@ def evaluate_terms(terms: Sequence[Term], p: Vec3) -> tuple[Real, list[Real]]:
                 if k[axis] != 0:
                     gradient[axis] -= term.amplitude * k[axis] * s
             continue
-        values: list[tuple[int, Real, Real]] = []  # axis, factor, its derivative
-        for axis, factor in term.factors:
-            s, c = sine_and_cosine(axis, factor)
-            f, derivative = (c, -s) if factor.is_cosine else (s, c)
-            values.append((axis, f, factor.frequency * derivative))
+        values = [(axis, *rates(axis, factor)) for axis, factor in term.factors]
         value += _product([f for _, f, _ in values], term.amplitude)
         for axis, _, derivative in values:
             others = [f for other, f, _ in values if other != axis]
             gradient[axis] += _product([*others, derivative], term.amplitude)
     return value, gradient
+
+
+def hessian_of_terms(terms: Sequence[Term], p: Vec3) -> list[list[Real]]:
+    """The matrix of second derivatives of the sum at p, three rows of three.
+
+    A plane wave has -k k^T times itself. A factor of a product has -frequency^2 times itself as
+    its second derivative, and another axis differentiates another factor.
+    """
+    rates = _FactorRates(p)
+    upper = {(i, j): p[0] * 0.0 for i in range(3) for j in range(i, 3)}
+    for term in terms:
+        if isinstance(term, PlaneWave):
+            k = term.wave_vector
+            angle = _angle(k[0] * p[0] + k[1] * p[1] + k[2] * p[2], term.phase)
+            wave = term.amplitude * dr.cos(angle)
+            for i, j in upper:
+                if k[i] * k[j] != 0:
+                    upper[i, j] -= k[i] * k[j] * wave
+            continue
+        frequency = {axis: factor.frequency for axis, factor in term.factors}
+        value = {axis: rates(axis, factor) for axis, factor in term.factors}
+        for i, j in upper:
+            if i in value and j in value:
+                order = {axis: (axis == i) + (axis == j) for axis in value}
+                factors = [value[axis][1 if n == 1 else 0] for axis, n in order.items()]
+                product = _product(factors, term.amplitude)
+                upper[i, j] += -(frequency[i] ** 2) * product if i == j else product
+    return [[upper[min(i, j), max(i, j)] for j in range(3)] for i in range(3)]
 
 
 def _angle(angle: Real, phase: float) -> Real:

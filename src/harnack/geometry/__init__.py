@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from harnack.geometry import shapes
+from harnack.geometry import mesh_shapes, shapes
+from harnack.geometry.cloud_normals import estimate_normals
+from harnack.geometry.clouds import CloudError, estimate_areas, validate_cloud
 from harnack.geometry.curves import (
     CurveError,
     bounding_box,
@@ -12,23 +14,43 @@ from harnack.geometry.curves import (
     validate_loops,
 )
 from harnack.geometry.files import FileFormatError, read_loops, write_atomically
+from harnack.geometry.meshes import (
+    MeshError,
+    validate_mesh,
+    without_zero_area_faces,
+    zero_area_faces,
+)
+from harnack.geometry.surfaces import Cloud, Loops, Mesh, read_surface
 from harnack.geometry.volumes import Ball, Box, ConvexHull, HalfSpace, Intersection, Volume
 
 __all__ = [
     "Ball",
     "Box",
+    "Cloud",
+    "CloudError",
     "ConvexHull",
     "CurveError",
     "FileFormatError",
     "HalfSpace",
     "Intersection",
+    "Loops",
+    "Mesh",
+    "MeshError",
     "Volume",
     "bounding_box",
     "edges",
+    "estimate_areas",
+    "estimate_normals",
     "is_convex_position",
+    "mesh_shapes",
     "read_loops",
+    "read_surface",
     "shapes",
     "total_length",
+    "validate_cloud",
     "validate_loops",
+    "validate_mesh",
+    "without_zero_area_faces",
     "write_atomically",
+    "zero_area_faces",
 ]

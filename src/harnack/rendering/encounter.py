@@ -6,7 +6,7 @@ into what a BSDF is asked with.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -15,7 +15,7 @@ from harnack.backend import Mask, Real, Vec3  # at run time: Dr.Jit reads Encoun
 from harnack.tracer import Status
 
 if TYPE_CHECKING:
-    from harnack.tracer import PreparedLevelSet
+    from harnack.tracer import PreparedLevelSet, Trace
 
 # Polishing moves a hit by at most this many tolerances: along a ray that only grazes the surface
 # there is no crossing to converge to.
@@ -36,7 +36,8 @@ class Encounter:
     position, normal: of the surface. The normal is unit and points to the side of larger values
         or, of a solid, out of it.
     clearance: how far off the surface the next ray has to start.
-    value: of the field, close to the surface; of no meaning where nothing is met.
+    value: of the field, close to the surface or, of a sheet, just before it; of no meaning where
+        nothing is met.
     evaluations: of the field.
     """
 
@@ -59,14 +60,17 @@ def meet_surface(
     take a hit from within tolerance to the surface. The proof tells which side of the surface
     the ray comes from; a normal that says otherwise (the step went past the point where a
     grazing ray is nearest) is turned to that side.
+
+    A hit on a sheet of a field that jumps is where it is, and faces the side of larger values.
     """
     vector = prepared.backend.Array3f
     trace = prepared.first_hit(o, d, 0, t_max, active)
     met = trace.status == int(Status.HIT)
+    smooth = met & ~trace.on_sheet if prepared.field.has_sheets else met
     gap = prepared.levels.to_nearest(trace.value)
     slope = dr.dot(trace.gradient, d)
     reach = _POLISH * _uncertainty(prepared, trace.gradient, trace.t, trace.value)
-    step = dr.select(met & (slope != 0), dr.clip(gap / slope, -reach, reach), 0)
+    step = dr.select(smooth & (slope != 0), dr.clip(gap / slope, -reach, reach), 0)
     t = dr.maximum(dr.select(met, trace.t, 0) + step, 0)
     p = dr.fma(vector(t), d, o)
     sample = prepared.sample(p)
@@ -75,9 +79,11 @@ def meet_surface(
     uncertainty = _uncertainty(prepared, sample.gradient, t, sample.value, sample.error)
     rest = prepared.levels.to_nearest(sample.value) / length
     rest = dr.select(length > 0, dr.clip(rest, -reach, reach), 0)
+    if prepared.field.has_sheets:  # behind one, the value says nothing about this surface
+        rest = dr.select(dr.abs(rest) * length <= dr.abs(gap), rest, 0)
     # gap > 0: the level is above, so the ray comes from the side of smaller values.
     side = dr.select(gap > 0, prepared.backend.Float(1), -1)
-    return Encounter(
+    encounter = Encounter(
         t=dr.select(met, t, trace.t),
         met=met,
         lost=trace.status == int(Status.OUT_OF_STEPS),
@@ -85,7 +91,33 @@ def meet_surface(
         normal=facing(normal, d, side),
         clearance=CLEARANCE * uncertainty,
         value=sample.value,
-        evaluations=trace.evaluations + dr.select(met, prepared.backend.UInt32(1), 0),
+        evaluations=trace.evaluations + dr.select(smooth, prepared.backend.UInt32(1), 0),
+    )
+    if not prepared.field.has_sheets:
+        return encounter
+    return dr.select(trace.on_sheet, _on_sheet(prepared, o, d, trace, encounter), encounter)
+
+
+def _on_sheet(
+    prepared: PreparedLevelSet, o: Vec3, d: Vec3, trace: Trace, encounter: Encounter
+) -> Encounter:
+    """Encounters with sheets: t is exact to rounding, and so is the plane of the normal.
+
+    The ray comes from the side of smaller values if it runs along the normal. The next ray keeps
+    as far away as from a level set, and no less than several roundings of the position.
+    """
+    t = dr.select(trace.on_sheet, trace.t, 0)
+    p = dr.fma(prepared.backend.Array3f(t), d, o)
+    side = dr.mulsign(prepared.backend.Float(1), dr.dot(trace.gradient, d))
+    rounding = 4 * prepared.backend.epsilon * (dr.max(dr.abs(o)) + t)
+    tolerance = prepared.tolerance.in_value(prepared.backend.Float(1), t)
+    return replace(
+        encounter,
+        t=t,
+        position=p,
+        normal=facing(trace.gradient, d, side),
+        clearance=CLEARANCE * dr.maximum(tolerance, rounding),
+        value=trace.value,
     )
 
 

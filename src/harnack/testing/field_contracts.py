@@ -42,9 +42,10 @@ def check_field(
 
     Checked: values and gradients are numbers, alike in both precisions within `Sample.error`;
     the gradient is that of the value; f is harmonic where a ball of dimension 2 or 3 says so;
-    `differentiable_value` is the value; the lift of f keeps each promise (`HarmonicBall`,
-    `Lipschitz`, `Curvature`) on the way to random points of its ball; some step is possible at
-    most points; no level set leaves its `extent`.
+    `differentiable_value` is the value; `hessian`, where there is one, is symmetric, the
+    derivative of the gradient and, of a harmonic f, without trace; the lift of f keeps each
+    promise (`HarmonicBall`, `Lipschitz`, `Curvature`) on the way to random points of its ball;
+    some step is possible at most points; no level set leaves its `extent`.
 
     Raises:
         BrokenPromiseError: naming the promise and the point where it is broken.
@@ -58,6 +59,7 @@ def check_field(
     _check_gradient(field, points, look)
     _check_rounding(field, points, look)
     _check_differentiable_value(field, points, look)
+    _check_hessian(field, points, look)
     for known in look.known:
         _check_promise(field, points, look, known, generator, directions)
     for level in levels:
@@ -160,6 +162,40 @@ def _check_differentiable_value(field: Field, points: FloatArray, look: Look) ->
         off = np.abs(off - field.period * np.round(off / field.period))
     good = off <= 1e-9 * (1 + np.abs(look.value))
     _require(good, "differentiable_value is not the value", points, off)
+
+
+def _check_hessian(field: Field, points: FloatArray, look: Look) -> None:
+    """By central differences of the gradient, of two orders: they tell how far to trust them."""
+    backend = choose_backend("double")
+    try:
+        rows = field.prepare(backend).hessian(to_vector3(backend, points, "points"))
+    except NotImplementedError:
+        return
+    n = len(points)
+    hessian = np.stack([np.broadcast_to(to_numpy(row), (n, 3)) for row in rows], axis=1)
+    _require(np.isfinite(hessian).all(axis=(1, 2)), "the Hessian is not finite", points)
+    scale = _scale(points, look)
+    length = np.linalg.norm(look.gradient, axis=1)
+    size = np.abs(hessian).max(axis=(1, 2)) + length / scale
+    skew = np.abs(hessian - hessian.transpose(0, 2, 1)).max(axis=(1, 2))
+    _require(skew <= 1e-9 * size, "the Hessian is not symmetric", points, skew)
+    if any(isinstance(one, HarmonicBall) and one.dimension < 4 for one in look.known):
+        trace = np.abs(np.trace(hessian, axis1=1, axis2=2))
+        _require(trace <= 1e-9 * size, "f is harmonic, but its Hessian has a trace", points, trace)
+    h = 2e-3 * scale
+    fine, coarse = np.zeros_like(hessian), np.zeros_like(hessian)
+    for axis in range(3):
+        for node, weight in zip(_NODES, _WEIGHTS, strict=True):
+            there = points.copy()
+            there[:, axis] += node * h
+            change = look_at(field, there).gradient / h[:, None]
+            fine[:, :, axis] += weight * change
+            coarse[:, :, axis] += (0.5 * node if abs(node) == 1 else 0.0) * change
+    off = np.abs(fine - hessian).max(axis=(1, 2))
+    tolerance = 1e-7 * size + 0.1 * np.abs(fine - coarse).max(axis=(1, 2))
+    tolerance += 1e-11 * length * (1 + _size(points) / h) / h
+    good = off <= tolerance
+    _require(good, "the Hessian is not the derivative of the gradient", points, off)
 
 
 def _check_promise(

@@ -5,7 +5,8 @@ stopped. The hit, f(o + t d; theta) = level, defines t(theta), and
 
     dt = (dlevel - df|_t) / (grad f . d),
 
-which is what these functions attach to a detached t.
+which is what these functions attach to a detached t. A hit on a sheet of a field that jumps lies
+on a plane, n . (o + t d) = const, whatever the level: dt = -(n . (do + t dd))/(n . d).
 """
 
 from __future__ import annotations
@@ -15,28 +16,47 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 
 from harnack.certify import Levels
+from harnack.tracer.tolerance import Status
 
 if TYPE_CHECKING:
-    from harnack.backend import Mask, Real, Vec3
-    from harnack.tracer.march import PreparedLevelSet
+    from harnack.backend import Real, Vec3
+    from harnack.tracer.march import PreparedLevelSet, Trace
 
 # Newton steps from the tolerance to rounding before the derivative is taken.
 _POLISH = 4
 
 
 def wants_derivatives(prepared: PreparedLevelSet, o: Vec3, d: Vec3) -> bool:
-    """Whether rays, levels or the field's parameters have derivatives enabled."""
-    parameters: list[Any] = [o, d, *prepared.levels.values, *prepared.field.parameters()]
-    return any(dr.grad_enabled(p) for p in parameters)
+    """Whether rays, levels or the field's parameters have derivatives enabled.
+
+    Raises:
+        NotImplementedError: parameters of a field with sheets have. They move the sheets, and
+            the derivative of that is not known here; zero would be wrong.
+    """
+    parameters = prepared.field.parameters()
+    of_field = any(dr.grad_enabled(p) for p in parameters)
+    if of_field and prepared.field.has_sheets:
+        name = type(prepared.field).__name__
+        raise NotImplementedError(
+            f"hits of a field with sheets cannot be differentiated by its parameters: detach "
+            f"those of this {name} (derivatives by rays and levels are attached)"
+        )
+    rest: list[Any] = [o, d, *prepared.levels.values]
+    return of_field or any(dr.grad_enabled(p) for p in rest)
 
 
 def attach(
-    prepared: PreparedLevelSet, o: Vec3, d: Vec3, t: Real, hit: Mask, normal: Vec3
+    prepared: PreparedLevelSet, o: Vec3, d: Vec3, end: Trace, normal: Vec3
 ) -> tuple[Real, Vec3]:
     """t polished to rounding with its derivative attached, and the normal at that point.
 
-    Normals carry no derivative (they would need the Hessian).
+    normal: unit, as traced. Normals carry no derivative (they would need the Hessian). At hits
+    on sheets t is exact already, and does not depend on the level.
     """
+    t, hit = end.t, end.status == int(Status.HIT)
+    if prepared.field.has_sheets:
+        t = _on_plane(prepared, o, d, end)
+        hit &= ~end.on_sheet
     backend = prepared.backend
     with dr.suspend_grad():
         at = dr.select(hit, t, 0)
@@ -62,6 +82,16 @@ def attach(
     usable = hit & (slope != 0)
     moved = at - dr.select(usable, change / slope, 0)
     return dr.select(hit, moved, t), normal
+
+
+def _on_plane(prepared: PreparedLevelSet, o: Vec3, d: Vec3, end: Trace) -> Real:
+    """t with the derivative of the intersection with a plane at hits on sheets."""
+    with dr.suspend_grad():
+        at = dr.select(end.on_sheet, end.t, 0)
+        slope = dr.dot(end.gradient, dr.detach(d))
+    x = dr.fma(prepared.backend.Array3f(at), d, o)
+    change = dr.dot(end.gradient, x - dr.detach(x))
+    return end.t - dr.select(end.on_sheet & (slope != 0), change / slope, 0)
 
 
 def _change_of_nearest(prepared: PreparedLevelSet, f: Real) -> Real:

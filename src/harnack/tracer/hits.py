@@ -28,10 +28,14 @@ class Hits:
     t: (n,) ray parameter of the hit, inf for a miss; for a ray that ran out of steps, how far
         it is proved free.
     position: (n, 3) point at t, NaN for a miss.
-    normal: (n, 3) unit normal grad f/|grad f|, zero where there is no hit.
-    value: (n,) f at the last accepted point; of an angle-valued field up to its period.
+    normal: (n, 3) unit normal grad f/|grad f|, or of the sheet that was hit, to its side of
+        larger f; zero where there is no hit.
+    value: (n,) f at the last accepted point; of an angle-valued field up to its period. Where a
+        sheet was hit, f just before it.
     evaluations: (n,) how many times the field was evaluated.
     status: (n,) a `Status`.
+    sheet: (n,) index of the sheet, such as a triangle, that was hit; -1 where none was: misses,
+        hits of a smooth level set, and all rays of fields that have no sheets.
     """
 
     t: Any
@@ -40,6 +44,7 @@ class Hits:
     value: Any
     evaluations: Any
     status: Any
+    sheet: Any
 
     @property
     def hit(self) -> Any:
@@ -146,19 +151,22 @@ def _trace(
         hit = end.status == int(Status.HIT)
         length = dr.norm(end.gradient)
         normal = dr.select(hit & (length > 0), end.gradient / length, 0)
+        sheet = dr.full(backend.Int32, -1, dr.width(end.status))
+        if prepared.field.has_sheets:
+            sheet = dr.reinterpret_array(backend.Int32, end.sheet)  # NO_SHEET becomes -1
     t = end.t
     if differentiable and wants_derivatives(prepared, o, d):
-        t, normal = attach(prepared, o, d, t, hit, normal)
+        t, normal = attach(prepared, o, d, end, normal)
     position = dr.select(dr.isfinite(t), dr.fma(backend.Array3f(t), d, o), dr.nan)
-    hits = Hits(t, position, normal, end.value, end.evaluations, end.status)
-    dr.eval(hits.t, hits.position, hits.normal, hits.value, hits.evaluations, hits.status)
+    hits = Hits(t, position, normal, end.value, end.evaluations, end.status, sheet)
+    dr.eval(*vars(hits).values())
     return hits
 
 
 def _no_hits(backend: Backend, *, as_numpy: bool) -> Hits:
     number, vector = dr.zeros(backend.Float, 0), dr.zeros(backend.Array3f, 0)
     count = dr.zeros(backend.UInt32, 0)
-    hits = Hits(number, vector, vector, number, count, count)
+    hits = Hits(number, vector, vector, number, count, count, dr.zeros(backend.Int32, 0))
     return _as_numpy(hits, 0) if as_numpy else hits
 
 
@@ -174,4 +182,5 @@ def _as_numpy(hits: Hits, n: int) -> Hits:
         flat(hits.value),
         flat(hits.evaluations).astype(np.int64),
         flat(hits.status).astype(np.int64),
+        flat(hits.sheet).astype(np.int64),
     )

@@ -7,35 +7,44 @@ for a bound, and the bound how far the ray is free.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
 from harnack.backend.extrema import fmax, fmin
 from harnack.certify import Levels, certify
+from harnack.fields.sheets import NO_SHEET, Crossing
+from harnack.tracer.stretches import STATUS, State, Walk, loop, meet
 from harnack.tracer.tolerance import Status, Tolerance
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.bounds import Longest
+    from harnack.certify import Certificate
     from harnack.fields.field import Field, Sample
     from harnack.geometry import Volume
 
 
-# base, step, reach, value, gradient, evaluations, status, active: see `_advance`.
-State: TypeAlias = "tuple[Any, ...]"
-_STATUS = 6
-
-
 @dataclass(frozen=True)
 class Trace:
-    """Ends of rays, as Dr.Jit arrays. t is where the proof of freedom ends (inf for a miss)."""
+    """Ends of rays, as Dr.Jit arrays. t is where the proof of freedom ends (inf for a miss).
+
+    A ray that hits a sheet (see `harnack.fields.sheets`) has its index in `sheet`, NO_SHEET
+    elsewhere; its t is that of the crossing, `value` is f just before it, and `gradient` is the
+    sheet's unit normal, to the side of larger f.
+    """
 
     t: Real
     value: Real
     gradient: Vec3
     evaluations: Any
     status: Any
+    sheet: Any
+
+    @property
+    def on_sheet(self) -> Mask:
+        """Mask of the rays that hit a sheet."""
+        return self.sheet != NO_SHEET
 
 
 @dataclass(frozen=True)
@@ -64,16 +73,17 @@ class PreparedLevelSet:
     def occluded(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask = True) -> Mask:
         """Whether the surface lies between t_min and t_max. Out of steps counts as occluded:
         what is not proved free must not let light through."""
-        return self._march(o, d, t_min, t_max, active)[_STATUS] != int(Status.MISS)
+        return self._march(o, d, t_min, t_max, active)[0][STATUS] != int(Status.MISS)
 
     def first_hit(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask = True) -> Trace:
         """The first hit of rays o + t d, |d| = 1, for t_min <= t <= t_max. Inactive rays miss."""
-        t, _, _, f, g, evaluations, status, _ = self._march(o, d, t_min, t_max, active)
+        state, sheet = self._march(o, d, t_min, t_max, active)
+        t, _, _, f, g, evaluations, status, _ = state
         missed = status == int(Status.MISS)
-        return Trace(dr.select(missed, dr.inf, t), f, g, evaluations, status)
+        return Trace(dr.select(missed, dr.inf, t), f, g, evaluations, status, sheet)
 
-    def _march(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask) -> State:
-        """The end state of rays."""
+    def _march(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask) -> tuple[State, Any]:
+        """The end state of rays, and the index of the sheet that each hit."""
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
         o, d = vector(o), vector(d)
         start, end = self.clip(o, d, real(t_min), real(t_max))
@@ -82,9 +92,21 @@ class PreparedLevelSet:
             real(start), real(0), real(0), real(0), vector(0), count(0),
             count(int(Status.MISS)), running,
         )  # fmt: skip
-        return self._advance(o, d, end, state)
+        if not self.field.has_sheets:
+            return self._advance(self.field, o, d, end, state), count(NO_SHEET)
 
-    def _advance(self, o: Vec3, d: Vec3, end: Real, state: State) -> State:
+        def march(field: Field, stop: Real, ahead: Crossing, state: State) -> State:
+            return self._advance(field, o, d, stop, state, ahead)
+
+        walk = Walk(
+            self.backend, self.field, o, d, real(start), real(end),
+            self.max_steps, self.overstep, march,
+        )  # fmt: skip
+        return walk.run(state)
+
+    def _advance(
+        self, field: Field, o: Vec3, d: Vec3, end: Real, state: State, ahead: Crossing | None = None
+    ) -> State:
         """The loop. Proof that no hit is missed: `base` is a point up to which the ray is free,
         `reach` a proved length from there. A trial point base + step is accepted only if step <=
         reach, or the bound at the trial point looking back covers step - reach; then all up to it
@@ -93,6 +115,10 @@ class PreparedLevelSet:
 
         In rounded arithmetic a surface could slip through between the two looks, so both see
         it nearer by the rounding of value and position together (`_blur`).
+
+        ahead: of a field with sheets, the crossing at `end`, on lanes where there is one. Those
+        lanes look at that point as well. Accepted there, they hit the sheet or have passed it: a
+        miss, with the step that the value behind the sheet allows from there.
         """
         real, vector, bound = self.backend.Float, self.backend.Array3f, self.bound
         size = fmax(fmax(dr.abs(o.x), dr.abs(o.y)), dr.abs(o.z))
@@ -101,18 +127,24 @@ class PreparedLevelSet:
             base: Real, step: Real, reach: Real, f: Real, g: Vec3, n: Any, status: Any, active: Mask
         ) -> State:
             t = base + step
-            sample = self.field.evaluate(dr.fma(vector(t), d, o))
-            down, up = self.levels.gaps(sample.value)
+            if ahead is not None:  # the crossing exactly
+                t = dr.select(step >= end - base, end, t)
+            sample = field.evaluate(dr.fma(vector(t), d, o))
+            gaps = self.levels.gaps(sample.value)
             steepness = dr.norm(sample.gradient)
             blur = self._blur(sample, steepness, size + t)
-            certificates = certify(sample, fmax(down - blur, real(0)), fmax(up - blur, real(0)))
+            certificates = self._certify(sample, gaps, blur)
             slope = dr.dot(sample.gradient, d)
             accepted = step <= reach
+            doubt = sample.gradient_error
             if self.overstep > 1:
-                accepted |= bound.covers(certificates, -slope, step - reach)
+                accepted |= _covers(bound, certificates, -slope, doubt, step - reach)
             close = fmax(self.tolerance.in_value(steepness, t), 2 * blur)
-            hit = accepted & (fmin(down, up) <= close)
-            forward = fmax(bound.step(certificates, slope), real(0))
+            hit, met = accepted & (fmin(*gaps) <= close), None
+            if ahead is not None:
+                met = meet(ahead, accepted & (t == end), sample.value, blur, self.levels)
+                certificates = self._certify(sample, met.gaps, blur)
+            forward = fmax(_step(bound, certificates, slope, doubt), real(0))
             step = dr.select(accepted, self.overstep * forward, reach)
             reach = dr.select(accepted, forward, reach)
             base = dr.select(accepted, t, base)
@@ -120,21 +152,55 @@ class PreparedLevelSet:
             g = dr.select(accepted, sample.gradient, g)
             n = n + 1
             free = base + reach >= end
+            if met is not None:
+                free = dr.select(met.awaited, met.passed, free)
             ended = dr.select(free, int(Status.MISS), int(Status.OUT_OF_STEPS))
             status = self.backend.UInt32(dr.select(hit, int(Status.HIT), ended))
+            if met is not None:
+                status, g = met.mark(status, g)
             active = active & ~(hit | free | (n >= self.max_steps))
             return base, fmin(step, end - base), reach, f, g, n, status, active
 
-        def running(*state: Any) -> Mask:
-            return state[-1]
+        return loop(state, body, "harnack")
 
-        try:
-            return dr.while_loop(state, running, body, label="harnack")
-        except RuntimeError as error:  # Dr.Jit wraps what the body raises
-            raise (error.__cause__ or error) from None
+    def _certify(
+        self, sample: Sample, gaps: tuple[Real, Real], blur: Real
+    ) -> tuple[Certificate, ...]:
+        """What is known about levels these gaps (down, up) away, known up to `blur`."""
+        (down, up), real = gaps, self.backend.Float
+        return certify(sample, fmax(down - blur, real(0)), fmax(up - blur, real(0)))
 
     def _blur(self, sample: Sample, steepness: Real, size: Real) -> Real:
         """What rounding may have done to f at a point whose coordinates are at most `size`."""
         epsilon = self.backend.epsilon
         position = 4 * epsilon * size
         return dr.fma(steepness, position, dr.fma(8 * epsilon, dr.abs(sample.value), sample.error))
+
+
+def _step(bound: Longest, certificates: tuple[Certificate, ...], slope: Real, doubt: Real) -> Real:
+    """The longest proved step where the slope is known up to `doubt` (0: exactly).
+
+    Proof. A bound encloses f along the ray; both ends of the enclosure do not fall as the slope
+    grows (more of the measure or of its caps lies ahead), so what slope + doubt proves about
+    levels above and slope - doubt about levels below holds for every slope in between.
+    """
+    if isinstance(doubt, float) and doubt == 0.0:
+        return bound.step(certificates, slope)
+    best = type(slope)(0)
+    for one, certificate in bound.pairs(certificates):
+        steps = [fmax(one.step(certificate, slope + s), best * 0) for s in (doubt, -doubt)]
+        best = fmax(fmin(*steps), best)
+    return best
+
+
+def _covers(
+    bound: Longest, certificates: tuple[Certificate, ...], slope: Real, doubt: Real, length: Real
+) -> Mask:
+    """Whether the length is proved free whatever the slope is, up to `doubt`; see `_step`."""
+    if isinstance(doubt, float) and doubt == 0.0:
+        return bound.covers(certificates, slope, length)
+    free = length <= 0
+    for one, certificate in bound.pairs(certificates):
+        ends = (one.covers(certificate, slope + s, length) for s in (doubt, -doubt))
+        free |= next(ends) & next(ends)
+    return free

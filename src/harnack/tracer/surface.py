@@ -48,6 +48,8 @@ class LevelSet:
             raise ValueError(f"max_steps must be at least 1, not {self.max_steps}")
         if not 1 <= self.overstep < 2:
             raise ValueError(f"overstep must lie in [1, 2), not {self.overstep}")
+        if self.field.has_sheets and self.field.period is not None:
+            raise ValueError("a field with sheets must be real-valued: its period must be None")
 
     @property
     def volume(self) -> Volume | None:
@@ -101,6 +103,11 @@ def level_set(
             raise ValueError(f"solid must be (low, high) with low < high, one finite, not {solid}")
         if field.period is not None:
             raise ValueError("an angle-valued field has no inside: solid needs a real-valued one")
+        if field.has_sheets:
+            raise ValueError(
+                "a field that jumps across sheets has no closed solid: values between low and "
+                "high may end at a sheet, with no level there; draw its level set without solid"
+            )
         level = [end for end in (low, high) if math.isfinite(end)]
     asked = _as_levels(field.default_level if level is None else level)
     for one in asked:

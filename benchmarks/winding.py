@@ -1,0 +1,160 @@
+"""Winding numbers at points: how fast and how exact, against libigl's fast winding number."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import numpy.typing as npt
+
+from harnack.fields.batch import morton_order
+from harnack.fields.winding_number import WindingNumber
+from harnack.geometry import read_surface
+from harnack.geometry.mesh_shapes import MeshArrays, bumpy_sphere, remove_faces
+
+from .rays import machine
+
+POINTS = 1_000_000
+CHECKED = 2_000
+REPEATS = 5
+LIBIGL = "libigl, value"
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One way to compute winding numbers. Seconds are medians, for all points.
+
+    kernel: what of `seconds` is computing, without sorting and transfers; NaN if not known.
+    """
+
+    method: str
+    seconds: float
+    kernel: float
+    median_error: float
+    largest_error: float
+
+
+def libigl(vertices: FloatArray, faces: Any, points: FloatArray) -> FloatArray:
+    """libigl's fast winding number of a mesh: order 2, accuracy 2, single precision inside."""
+    import igl
+
+    return igl.fast_winding_number(vertices, faces, points)
+
+
+def query_points(vertices: FloatArray, n: int = POINTS) -> FloatArray:
+    """(n, 3) points, uniform in the bounding box made half as large again about its centre."""
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    unit = np.random.default_rng(1).uniform(-0.75, 0.75, (n, 3))
+    return 0.5 * (low + high) + unit * (high - low)
+
+
+def cube_points(n: int = POINTS) -> FloatArray:
+    """(n, 3) points, uniform in [-1.5, 1.5]^3."""
+    return np.random.default_rng(1).uniform(-1.5, 1.5, (n, 3))
+
+
+def seconds_of(call: Callable[[], Any]) -> float:
+    """Wall time of one call."""
+    start = time.perf_counter()
+    call()
+    return time.perf_counter() - start
+
+
+def kernel_seconds(call: Callable[[], Any]) -> float:
+    """What Dr.Jit's kernels take of one call: the median of three."""
+    found: list[float] = []
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        for _ in range(3):
+            dr.kernel_history_clear()
+            call()
+            history = dr.kernel_history((dr.KernelType.JIT,))
+            found.append(1e-3 * sum(float(entry["execution_time"]) for entry in history))
+    return float(np.median(found))
+
+
+def compare(mesh: MeshArrays, points: FloatArray, method: Any) -> list[Row]:
+    """libigl, then `value` and `value_and_gradient` of harnack: in turn, medians of REPEATS."""
+    vertices, faces = mesh
+    field = WindingNumber(vertices, faces, method=method)
+    calls: dict[str, Callable[[], Any]] = {
+        LIBIGL: lambda: libigl(vertices, faces, points),
+        f"{method}, value": lambda: field.value(points),
+        f"{method}, value and gradient": lambda: field.value_and_gradient(points)[0],
+    }
+    exact = WindingNumber(vertices, faces, method="exact")
+    truth = exact.value(points[:CHECKED], precision="double")
+    # The first calls compile, and show the errors.
+    errors = {name: np.abs(call()[:CHECKED] - truth) for name, call in calls.items()}
+    taken: dict[str, list[float]] = {name: [] for name in calls}
+    builds: list[float] = []
+    for _ in range(REPEATS):
+        # libigl builds its tree in every call.
+        builds.append(seconds_of(lambda: libigl(vertices, faces, points[:10])))
+        for name, call in calls.items():
+            taken[name].append(seconds_of(call))
+    taken[LIBIGL] = [total - float(np.median(builds)) for total in taken[LIBIGL]]
+    return [
+        Row(
+            name,
+            float(np.median(taken[name])),
+            float("nan") if name == LIBIGL else kernel_seconds(call),
+            float(np.median(errors[name])),
+            float(errors[name].max()),
+        )
+        for name, call in calls.items()
+    ]
+
+
+def throughput(surface: Path | None = None) -> str:
+    """The section of the page; surface: the file of one more mesh."""
+    closed = bumpy_sphere(6)
+    damaged = closed[0], remove_faces(closed[1], 0.1, 0)
+    cube = cube_points()
+    groups = [
+        ("bumpy sphere, 10 % of faces removed", damaged, cube, "tree"),
+        ("bumpy sphere, closed", closed, cube, "exact"),
+    ]
+    if surface is not None:
+        read: Any = read_surface(surface, "winding")
+        mesh = np.asarray(read.vertices, np.float64), np.asarray(read.faces, np.int64)
+        groups += [(surface.stem, mesh, query_points(mesh[0]), m) for m in ("exact", "tree")]
+    lines = [
+        "## Winding numbers at points\n",
+        f"{POINTS:,} points, in [-1.5, 1.5]^3 or in the bounding box made half as large again, on "
+        f"{machine()} for both libraries, which take turns; medians of {REPEATS} runs. libigl is "
+        "`igl.fast_winding_number` (order 2, accuracy 2), less the time of a call with 10 points, "
+        "which is the time to build its tree. harnack in single precision, its tree as by default "
+        "(order 2, accuracy 2) and built before; its seconds are those of the call on NumPy "
+        f"arrays, with sorting the points ({_sorting(cube):.2f} s) and transfers; *kernel* is "
+        "what is computing. Errors are against the exact winding number in double precision at "
+        f"{CHECKED:,} of the points.\n",
+        "| mesh | faces | method | seconds | kernel | million points/s | speed, libigl = 1 "
+        "| median error | largest error |",
+        "|---|---:|---|---:|---:|---:|---:|---:|---:|",
+    ]
+    for name, mesh, points, method in groups:
+        rows = compare(mesh, points, method)
+        for row in rows:
+            lines.append(_line(name, len(mesh[1]), row, rows[0].seconds))
+            print(lines[-1], flush=True)
+    return "\n".join(lines) + "\n"
+
+
+def _sorting(points: FloatArray) -> float:
+    return float(np.median([seconds_of(lambda: morton_order(points)) for _ in range(REPEATS)]))
+
+
+def _line(mesh: str, faces: int, row: Row, libigl_seconds: float) -> str:
+    kernel = "" if np.isnan(row.kernel) else f"{row.kernel:.3f}"
+    return (
+        f"| {mesh} | {faces:,} | {row.method} | {row.seconds:.3f} | {kernel} "
+        f"| {POINTS / row.seconds / 1e6:.2f} | {libigl_seconds / row.seconds:.2f} "
+        f"| {row.median_error:.1e} | {row.largest_error:.1e} |"
+    )

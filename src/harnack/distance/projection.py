@@ -1,0 +1,208 @@
+"""The closest point of a level set, by descent: onto the level, then along it.
+
+What is found is a point of the level set, to rounding, with x - y at right angles to the surface
+and no way to come nearer in its neighbourhood. It is a *local* minimum of the distance: another
+part of the surface may be nearer still, so the distance is an upper bound of the true one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+
+from harnack.backend.extrema import clamp, fmax, fmin
+from harnack.distance.tangent import Eigen, TangentPlane
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.certify import Levels
+    from harnack.fields.field import Field
+
+__all__ = ["Descent"]
+
+_STEPS_TO_LEVEL = 60
+_STEPS_ALONG = 60
+_LEAST_SHARE = 1e-7  # of a step: shorter ones are given up
+_LEAST_BEND = 0.05  # of the distance's second derivatives: steps are no longer than 20 gradients
+_INDEFINITE = -1e-3
+# No minimum is looked for within this share of the distance from where f is singular; what the
+# boundary of the surface is longer by is half its square.
+_RIM = 1e-5
+
+
+@dataclass(frozen=True)
+class _Place:
+    """A point y and the field there: gradient, the length by which rounding may have moved the
+    level, the radius of the ball on which f is smooth."""
+
+    y: Vec3
+    gradient: Vec3
+    noise: Real
+    reach: Real
+
+    def parts(self) -> tuple[Any, ...]:
+        """The fields in the order of the constructor, as loops want them."""
+        return self.y, self.gradient, self.noise, self.reach
+
+    def where(self, mask: Mask, other: _Place) -> tuple[Any, ...]:
+        """Its parts in some lanes, another's elsewhere."""
+        pairs = zip(self.parts(), other.parts(), strict=True)
+        return tuple(dr.select(mask, one, two) for one, two in pairs)
+
+
+@dataclass(frozen=True)
+class Descent:
+    """The search for closest points of the level set of a prepared field."""
+
+    backend: Backend
+    field: Field
+    levels: Levels
+    has_hessian: bool
+
+    @classmethod
+    def of(cls, backend: Backend, field: Field, levels: Levels) -> Descent:
+        try:
+            field.hessian(backend.Array3f(0))
+        except NotImplementedError:
+            return cls(backend, field, levels, False)
+        return cls(backend, field, levels, True)
+
+    def closest(self, x: Vec3, start: Vec3) -> tuple[Vec3, Mask]:
+        """The closest point y to x that is found from `start`, and whether it is one (see above).
+
+        A step along the surface is Newton's for |x-y|^2/2: with r = x - y, tangential part t, and
+        the Hessian A in tangential coordinates, the surface near y is y + w - (w.Aw/(2|g|)) n + ..
+        and half the squared distance falls by t.w - w.Bw/2 with B = 1 + (r.n) A/|g|. Where an
+        eigenvalue of B is not positive its size is taken instead, so that the step still goes
+        down; where t vanishes as well, y is a saddle or a maximum of the distance (x is beyond a
+        centre of curvature), left along that eigenvector. The step ends with Newton's method
+        back to the level, and counts if it came no farther from x, else a quarter is tried.
+
+        y is accepted if |t| <= 4 sqrt(epsilon) |r| and a few roundings: then, by the same formula,
+        |r| exceeds the local minimum by a share 8 epsilon/(least eigenvalue of B).
+        """
+        real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
+        mask = self.backend.Bool
+        x = vector(x)
+        first, on_level = self._to_level(start, mask(True))
+
+        def body(
+            y: Vec3,
+            g: Vec3,
+            noise: Real,
+            reach: Real,
+            share: Real,
+            found: Mask,
+            n: Any,
+            active: Mask,
+        ) -> tuple[Any, ...]:
+            here = _Place(y, g, noise, reach)
+            move, settled = self._step_along(x, here, share)
+            going = active & ~settled
+            there, on_level = self._to_level(y + move, going)
+            limit = dr.norm(x - y) * (1 + 8 * self.backend.epsilon) + 4 * noise
+            better = going & on_level & (dr.norm(x - there.y) <= limit)
+            share = dr.select(better, fmin(4 * share, 1), 0.25 * share)
+            found |= active & settled
+            # Where f ceases to be smooth the surface ends: no minimum inside it.
+            inner = there.reach > _RIM * dr.norm(x - there.y)
+            active = going & inner & (n < _STEPS_ALONG) & (share > _LEAST_SHARE)
+            return *there.where(better, here), share, found, n + 1, active
+
+        def more(*state: Any) -> Mask:
+            return state[-1]
+
+        state = (*first.parts(), real(1), mask(False), count(0), mask(on_level))
+        y, _, _, _, _, found, _, _ = dr.while_loop(state, more, body, label="along the level")
+        return y, found
+
+    def _look(self, y: Vec3) -> tuple[Real, _Place]:
+        """f - level at y, and the place."""
+        sample, real = self.field.evaluate(y), self.backend.Float
+        size = fmax(fmax(dr.abs(y.x), dr.abs(y.y)), dr.abs(y.z))
+        epsilon, steepness = self.backend.epsilon, dr.norm(sample.gradient)
+        blur = dr.fma(8 * epsilon, dr.abs(sample.value), sample.error)
+        noise = dr.fma(4 * epsilon, size, blur / steepness)
+        reach = real(0)
+        for known in sample.known:
+            radius = real(known.radius)
+            reach = fmax(reach, dr.select(dr.isfinite(radius), radius, 0))
+        reach = dr.select(reach > 0, reach, dr.inf)
+        above = real(-self.levels.to_nearest(sample.value))
+        return above, _Place(y, self.backend.Array3f(sample.gradient), noise, reach)
+
+    def _to_level(self, start: Vec3, active: Mask) -> tuple[_Place, Mask]:
+        """From `start` to the nearest level by Newton's method along the gradient.
+
+        A step is no longer than the ball on which f is known to be smooth, and counts if it comes
+        nearer to a level. Returns the end, and whether it is on a level to rounding.
+        """
+        real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
+
+        def is_close(above: Real, place: _Place) -> Mask:
+            return dr.abs(above) <= 2 * dr.norm(place.gradient) * place.noise
+
+        def body(
+            above: Real, y: Vec3, g: Vec3, noise: Real, reach: Real,
+            share: Real, close: Mask, n: Any, active: Mask,
+        ) -> tuple[Any, ...]:  # fmt: skip
+            here, steepness = _Place(y, g, noise, reach), dr.norm(g)
+            length = share * clamp(-above / steepness, -reach, reach)
+            above2, there = self._look(dr.fma(vector(length / steepness), g, y))
+            better = active & (dr.abs(above2) < dr.abs(above))
+            share = dr.select(better, fmin(2 * share, 1), 0.25 * share)
+            close |= better & is_close(above2, there)
+            active &= ~close & (n < _STEPS_TO_LEVEL) & (share > _LEAST_SHARE)
+            above = dr.select(better, above2, above)
+            return above, *there.where(better, here), share, close, n + 1, active
+
+        def more(*state: Any) -> Mask:
+            return state[-1]
+
+        above, first = self._look(vector(start))
+        close = is_close(above, first)
+        state = (above, *first.parts(), real(1), close, count(0), active & ~close)
+        _, *place, _, close, _, _ = dr.while_loop(state, more, body, label="to the level")
+        return _Place(*place), close
+
+    def _step_along(self, x: Vec3, here: _Place, share: Real) -> tuple[Vec3, Mask]:
+        """The tangential step, and whether y already is a local minimum of the distance."""
+        plane = TangentPlane.of(here.gradient)
+        r = x - here.y
+        distance = dr.norm(r)
+        uu, vv, uv = self._second_derivatives(here.y, plane, fmin(here.reach, distance))
+        lift = dr.dot(r, plane.n) / plane.steepness
+        bend = Eigen.of(dr.fma(lift, uu, 1), dr.fma(lift, vv, 1), lift * uv)  # of B
+        tu, tv = dr.dot(r, plane.u), dr.dot(r, plane.v)
+        slant = dr.sqrt(dr.fma(tu, tu, tv * tv))
+        level = slant <= dr.fma(4 * self.backend.epsilon**0.5, distance, 8 * here.noise)
+        saddle = level & (bend.least < _INDEFINITE)
+        most, least = bend.coordinates(tu, tv)
+        most = most / fmax(dr.abs(bend.most), _LEAST_BEND)
+        least = least / fmax(dr.abs(bend.least), _LEAST_BEND)
+        least = dr.select(saddle, 0.5 * distance, least)
+        length = dr.sqrt(dr.fma(most, most, least * least))
+        limit = share * dr.select(saddle, length, fmin(here.reach, distance))
+        scale = dr.select(length > 0, fmin(limit / length, 1), 0)
+        a, b = bend.combination(scale * most, scale * least)
+        vector = self.backend.Array3f
+        return dr.fma(vector(a), plane.u, vector(b) * plane.v), level & ~saddle
+
+    def _second_derivatives(
+        self, y: Vec3, plane: TangentPlane, size: Real
+    ) -> tuple[Real, Real, Real]:
+        """u.Au, v.Av, u.Av; by differences of the gradient where the field has no Hessian, for
+        their errors only cost steps."""
+        if self.has_hessian:
+            return plane.restricted(self.field.hessian(y))
+        vector = self.backend.Array3f
+        h = fmax(self.backend.epsilon**0.5 * size, 1e-30)
+        ahead, aside = (
+            (self.field.evaluate(dr.fma(vector(h), way, y)).gradient
+             - self.field.evaluate(dr.fma(vector(-h), way, y)).gradient) * (0.5 / h)
+            for way in (plane.u, plane.v)
+        )  # fmt: skip
+        cross = 0.5 * (dr.dot(plane.v, ahead) + dr.dot(plane.u, aside))
+        return dr.dot(plane.u, ahead), dr.dot(plane.v, aside), cross

@@ -1,0 +1,174 @@
+"""The solid angle of edges as a real number that follows a direction: no jumps along rays.
+
+The antipodal method (Martens, Trettner and Bessmeltsev 2026): with the apex of every edge's
+triangle at infinity against the direction d, an edge e from a to b (seen from x) has the solid
+angle Omega_e = 2 arg F_e with F_e = (s_a s_b + a'.b') - i (a' x b'), where a' is a seen along d
+(two numbers) and s_a = |a| - a.d. Then
+
+    w(x) = turns of all crossings of the ray from x along d  +  1/(4 pi) sum_e Omega_e(x)
+
+is the winding number of *any* triangles with these boundary edges: F_e crosses the negative axis
+exactly where the ray from x along d passes through e, and there the crossings change by as much.
+As x moves along d itself, that ray only gets shorter, so that sum_e Omega_e is continuous on the
+whole ray off the edges, and the jumps of w are those of the triangles passed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import aligned
+from harnack.backend.extrema import clamp, fmin
+from harnack.fields.edge_hessian import SymmetricSum, edge_rates
+from harnack.tree.triangles import side
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.tree.hierarchy import FloatArray, IntArray
+
+# Where an edge is nowhere near the ray, its factor has this for an imaginary part of zero.
+_TINY = 1e-30
+
+
+@dataclass(frozen=True)
+class LiftedEdges:
+    """Directed edges on the device, one packet each: lower end, direction, higher end, 1/length^2.
+
+    The ends are ordered by vertex index, as those of triangles are (`tree.triangles`), so that
+    `side` gives the same bits here and there; direction is 1 if the edge runs from lower to
+    higher, -1 if it runs back.
+    """
+
+    backend: Backend
+    buffer: Any
+    count: Any
+
+    @classmethod
+    def upload(cls, backend: Backend, vertices: FloatArray, edges: IntArray) -> LiftedEdges:
+        """Edges (k, 2) between vertices (n, 3); weights are repetitions."""
+        low, high = vertices[edges.min(axis=1)], vertices[edges.max(axis=1)]
+        direction = np.where(edges[:, 0] < edges[:, 1], 1.0, -1.0)[:, None]
+        square = ((high - low) ** 2).sum(axis=1, keepdims=True)
+        table = np.concatenate([low, direction, high, 1 / np.maximum(square, 1e-300)], axis=1)
+        values = table.ravel()
+        cast = values.astype(np.float32) if backend.precision == "single" else values
+        return cls(backend, aligned(backend, cast), dr.opaque(backend.UInt32, len(edges)))
+
+
+@dataclass(frozen=True)
+class LiftedSums:
+    """Sums over all edges at x, as far as they were asked for, in the coordinates of the frame.
+
+    angle: sum of Omega_e; gradient, hessian: its derivatives; distance: to the nearest edge;
+    first, second: sums of a/(d sqrt(d^2+a^2)) and of the same over d, as in `edge_sums`.
+    """
+
+    angle: Real
+    gradient: Vec3
+    hessian: SymmetricSum
+    distance: Real
+    first: Real
+    second: Real
+
+
+def lifted_sums(
+    edges: LiftedEdges, place: Callable[[Vec3], Vec3], *, derivatives: int, variation: bool
+) -> LiftedSums:
+    """All sums in one loop over the edges.
+
+    place: gives a vertex as (u, v, z) seen from x: across the direction, and along it.
+    derivatives: 0 for the angle alone, 1 with the gradient, 2 with the Hessian.
+
+    The angles are added up as a product of factors and a count of how often it goes round. s_a
+    is taken as |a'|^2/(|a| + a.d) where a.d > 0, so that nothing cancels. The field of an edge is
+    (1/|a|+1/|b|)/(|a||b|+a.b) a x b; beside the edge (a.b < 0) the bracket is
+    |a x b|^2/(|a||b|-a.b) instead.
+    """
+    backend = edges.backend
+    real, vector = backend.Float, backend.Array3f
+
+    def body(i: Any, winding: Any, sizes: Any, *sums: Any) -> Any:
+        row = dr.gather(backend.ArrayXf, edges.buffer, i, shape=(8, 1))
+        direction, inverse = row[3], row[7]
+        a, b = place(vector(row[0], row[1], row[2])), place(vector(row[4], row[5], row[6]))
+        la, lb = dr.norm(a), dr.norm(b)
+        im = -side((a.x, a.y), (b.x, b.y))
+        re = dr.fma(_s(a, la), _s(b, lb), dr.fma(a.x, b.x, a.y * b.y))
+        im = direction * dr.select(im == 0, _TINY, im)
+        zr, zi, turns = winding
+        winding = times(zr, zi, turns, re, im)
+        if derivatives >= 1:
+            c, weight = _field(a, b, la, lb)
+            g = dr.fma(vector(direction * weight), c, sums[0])
+            rest = sums[1:]
+            if derivatives == 2:
+                u, v = edge_rates(a, b - a, inverse)
+                rest = SymmetricSum(*rest).plus(direction * u, v).parts()
+            sums = (g, *rest)
+        if variation:
+            sizes = _with_variation(a, b - a, inverse, *sizes)
+        return i + 1, winding, sizes, *sums
+
+    def more(i: Any, *_: Any) -> Mask:
+        return i < edges.count
+
+    zero = SymmetricSum.zero(real)
+    sums: tuple[Any, ...] = ()
+    if derivatives >= 1:
+        sums = (vector(0), *(zero.parts() if derivatives == 2 else ()))
+    one, none = real(1), real(0)
+    start = (backend.UInt32(0), (one, none, real(0)), (real(dr.inf), real(0), real(0)), *sums)
+    _, (zr, zi, turns), (d2, s1, s2), *rest = dr.while_loop(start, more, body, label="lift")
+    angle = 2 * dr.fma(2 * dr.pi, turns, dr.atan2(zi, zr))
+    gradient = rest[0] if derivatives >= 1 else vector(0)
+    hessian = SymmetricSum(*rest[1:]) if derivatives == 2 else zero
+    return LiftedSums(angle, gradient, hessian, dr.sqrt(d2), s1, s2)
+
+
+def _field(a: Vec3, b: Vec3, la: Real, lb: Real) -> tuple[Vec3, Real]:
+    """a x b, and what Biot and Savart's law multiplies it by; 0 in line with the edge."""
+    c = dr.cross(a, b)
+    dot, both, square = dr.dot(a, b), la * lb, dr.squared_norm(c)
+    bracket = dr.select(dot < 0, square / (both - dot), both + dot)
+    return c, dr.select(square > 0, (la + lb) / (both * bracket), 0)
+
+
+def _with_variation(
+    a: Vec3, e: Vec3, inverse: Real, d2: Real, s1: Real, s2: Real
+) -> tuple[Real, Real, Real]:
+    """Least squared distance and the two sums of `LiftedSums`, with one edge more."""
+    foot = clamp(-dr.dot(a, e) * inverse, type(d2)(0), type(d2)(1))
+    near = dr.squared_norm(a + e * foot)
+    first = dr.rsqrt(near * dr.fma(near, 4 * inverse, 1))
+    return fmin(near, d2), s1 + first, dr.fma(first, dr.rsqrt(near), s2)
+
+
+def _s(a: Vec3, length: Real) -> Real:
+    across = dr.fma(a.x, a.x, a.y * a.y)
+    return dr.select(a.z > 0, across / (length + a.z), length - a.z)
+
+
+def times(zr: Real, zi: Real, turns: Real, re: Real, im: Real) -> tuple[Real, Real, Real]:
+    """The product z (re + i im), of length about one, and how often it has gone round.
+
+    Arguments lie in (-pi, pi]; that of the product is their sum if they have different signs;
+    otherwise the sum has left the interval exactly if its imaginary part has the other sign.
+    """
+    pr, pi = dr.fma(zr, re, -(zi * im)), dr.fma(zr, im, zi * re)
+    scale = dr.rcp(dr.abs(pr) + dr.abs(pi))
+    one = type(zr)(1)
+    # One of them is then longer than pi/2; to ask for it keeps an underflow from counting.
+    left = (zr < 0) | (re < 0)
+    over = dr.select((zi >= 0) & (im >= 0) & (pi < 0) & left, one, 0)
+    under = dr.select((zi < 0) & (im < 0) & (pi >= 0) & left, one, 0)
+    some = dr.isfinite(scale)
+    return (
+        dr.select(some, pr * scale, zr),
+        dr.select(some, pi * scale, zi),
+        turns + over - under,
+    )

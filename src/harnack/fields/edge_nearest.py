@@ -1,0 +1,80 @@
+"""The closest point of the curve in which the level sets of a solid angle end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+import numpy.typing as npt
+
+from harnack.backend import aligned
+from harnack.backend.extrema import clamp
+from harnack.geometry.singular import weld_vertices
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Vec3
+
+__all__ = ["Segments", "closest_on_segments", "uncancelled_edges"]
+
+FloatArray = npt.NDArray[np.float64]
+
+
+def uncancelled_edges(loops: tuple[FloatArray, ...]) -> tuple[FloatArray, FloatArray]:
+    """Starts and ends (k, 3) of the edges of closed loops that are not run back elsewhere.
+
+    Around an edge that is run n times net, the solid angle changes by 4 pi n: unless n = 0 it
+    takes every value modulo 4 pi next to each of its points, so that every level set ends there.
+    Edges are compared as wholes: of two that overlap in part and run opposite ways, both stay.
+    """
+    start = np.concatenate(loops)
+    end = np.concatenate([np.roll(loop, -1, axis=0) for loop in loops])
+    index = weld_vertices(np.concatenate([start, end])).reshape(2, -1)
+    low, high = index.min(axis=0), index.max(axis=0)
+    pairs, first, which = np.unique(
+        np.column_stack([low, high]), axis=0, return_index=True, return_inverse=True
+    )
+    net = np.bincount(which.ravel(), np.where(index[0] == low, 1, -1), len(pairs))
+    kept = first[net != 0]
+    return start[kept], end[kept]
+
+
+@dataclass(frozen=True)
+class Segments:
+    """Line segments on the device: records of start, 1/length^2, end and a zero."""
+
+    backend: Backend
+    buffer: Any
+    count: Any
+
+    @classmethod
+    def upload(cls, backend: Backend, start: FloatArray, end: FloatArray) -> Segments:
+        """Segments (k, 3) to (k, 3), k >= 1, none of length zero."""
+        inverse = 1 / ((end - start) ** 2).sum(axis=1, keepdims=True)
+        records = np.concatenate([start, inverse, end, np.zeros_like(inverse)], axis=1).ravel()
+        single = backend.precision == "single"
+        values = records.astype(np.float32) if single else records
+        return cls(backend, aligned(backend, values), dr.opaque(backend.UInt32, len(start)))
+
+
+def closest_on_segments(segments: Segments, x: Vec3) -> Vec3:
+    """The point of the segments that is closest to x."""
+    backend = segments.backend
+    vector, index = backend.Array3f, backend.UInt32
+    x = vector(x)
+
+    def body(i: Any, nearest: Any, best: Vec3) -> Any:
+        row = dr.gather(backend.ArrayXf, segments.buffer, i, shape=(8, 1))
+        p, q = vector(row[0], row[1], row[2]), vector(row[4], row[5], row[6])
+        share = clamp(dr.dot(x - p, q - p) * row[3], 0, 1)
+        foot = dr.fma(vector(share), q - p, p)
+        square = dr.squared_norm(x - foot)
+        closer = square < nearest
+        return i + 1, dr.select(closer, square, nearest), dr.select(closer, foot, best)
+
+    def more(i: Any, *_: Any) -> Any:
+        return i < segments.count
+
+    start = (index(0), backend.Float(dr.inf), vector(0))
+    return dr.while_loop(start, more, body, label="nearest edge")[2]

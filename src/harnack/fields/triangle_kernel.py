@@ -1,0 +1,74 @@
+"""What one triangle adds to the winding number near it: value, gradient, Hessian, certificate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
+
+import drjit as dr
+
+from harnack.backend.extrema import clamp
+from harnack.fields.edge_hessian import SymmetricSum, edge_rates
+from harnack.tree.triangles import EDGES, PARITY, corners_of
+
+if TYPE_CHECKING:
+    from harnack.backend import Real, Vec3
+
+_PAIRS = ((0, 1, 1.0), (1, 2, 1.0), (0, 2, -1.0))
+
+
+@dataclass(frozen=True)
+class NearTriangle:
+    """A triangle of a record, seen from x: corners less x, and their lengths."""
+
+    corners: tuple[Vec3, Vec3, Vec3]
+    lengths: tuple[Real, Real, Real]
+    parity: Real
+    inverse: tuple[Real, Real, Real]
+
+    @classmethod
+    def of(cls, row: list[Real], x: Vec3) -> NearTriangle:
+        """From the numbers of a record (`tree.triangles`)."""
+        p, q, r = corners_of(row, type(x))
+        corners = (p - x, q - x, r - x)
+        lengths = (dr.norm(corners[0]), dr.norm(corners[1]), dr.norm(corners[2]))
+        return cls(corners, lengths, row[PARITY], (row[EDGES], row[EDGES + 1], row[EDGES + 2]))
+
+    def factor(self) -> tuple[Real, Real]:
+        """re + i im, its argument half the solid angle (van Oosterom and Strackee 1983)."""
+        (a, b, c), (la, lb, lc) = self.corners, self.lengths
+        re = dr.fma(
+            la * lb, lc, dr.fma(dr.dot(a, b), lc, dr.fma(dr.dot(b, c), la, dr.dot(c, a) * lb))
+        )
+        # (b - a) x (c - a) does not cancel where all three are far away and close together.
+        return re, self.parity * dr.dot(a, dr.cross(b - a, c - a))
+
+    def gradient(self) -> Vec3:
+        """Of the solid angle: Biot and Savart's field of the three edges (paper, Eq. 11)."""
+        vector = cast("Any", type(self.corners[0]))
+        total = vector(0)
+        for i, j, sign in _PAIRS:
+            a, b, la, lb = self.corners[i], self.corners[j], self.lengths[i], self.lengths[j]
+            c = dr.cross(a, b - a)
+            dot, both, square = dr.dot(a, b), la * lb, dr.squared_norm(c)
+            bracket = dr.select(dot < 0, square / (both - dot), both + dot)
+            weight = dr.select(square > 0, sign * (la + lb) / (both * bracket), 0)
+            total = dr.fma(vector(weight), c, total)
+        return self.parity * total
+
+    def add_hessian(self, total: SymmetricSum, active: Any) -> SymmetricSum:
+        """The Hessian of the solid angle added to a sum, where active."""
+        sign = dr.select(active, self.parity, 0)
+        for (i, j, turn), inverse in zip(_PAIRS, self.inverse, strict=True):
+            c, rate = edge_rates(self.corners[i], self.corners[j] - self.corners[i], inverse)
+            total = total.plus(dr.select(active, sign * turn * c, 0), dr.select(active, rate, 0))
+        return total
+
+    def squared_distances(self) -> tuple[Real, Real, Real]:
+        """To the three edges, in the order of the record's inverse lengths."""
+        out: list[Real] = []
+        for (i, j, _), inverse in zip(_PAIRS, self.inverse, strict=True):
+            a, e = self.corners[i], self.corners[j] - self.corners[i]
+            foot = clamp(-dr.dot(a, e) * inverse, type(inverse)(0), type(inverse)(1))
+            out.append(dr.squared_norm(dr.fma(type(a)(foot), e, a)))
+        return out[0], out[1], out[2]

@@ -1,0 +1,115 @@
+"""A mesh made ready for winding numbers: welded, duplicates cancelled, scaled, in a tree."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from harnack.fields.multipole import Level, all_levels, triangle_dipoles
+from harnack.geometry import MeshError, validate_mesh
+from harnack.geometry.singular import net_faces, singular_edges, weld_vertices
+from harnack.tree import Hierarchy, build_hierarchy
+from harnack.tree.hierarchy import FloatArray, IntArray
+from harnack.tree.triangles import MOST_TRIANGLES, triangle_records
+
+# Triangles of a leaf at most, and children of a node: by experiment.
+_LEAF_SIZE, _ARITY = 8, 4
+
+
+@dataclass(frozen=True)
+class WindingMesh:
+    """What the evaluators of a winding number are made of. Double precision, in NumPy.
+
+    vertices: (n, 3), as given. triangles: (m, 3) indices of welded vertices; a face given k times
+        (less the times that it is given turned round) is here k times. source: (m,) the face
+        that each triangle comes from.
+    singular: (k, 2) directed edges at which triangles do not cancel, an edge of weight 2 twice.
+    centre, size: `unit_vertices` = (vertices - centre)/size, with a power of two for a size, so
+        that lengths can be scaled to and fro without rounding.
+    """
+
+    vertices: FloatArray
+    triangles: IntArray
+    source: IntArray
+    singular: IntArray
+    centre: FloatArray
+    size: float
+
+    @classmethod
+    def of(cls, vertices: npt.ArrayLike, faces: npt.ArrayLike) -> WindingMesh:
+        """From vertices (n, 3) and faces (m, 3).
+
+        Raises:
+            MeshError: as `validate_mesh`; or all faces cancel; or there are too many.
+        """
+        x, f = validate_mesh(vertices, faces)
+        net = net_faces(weld_vertices(x)[f])
+        if len(net.faces) == 0:
+            raise MeshError("faces: every face is cancelled by its own copy turned round")
+        if net.multiplicity.sum() >= MOST_TRIANGLES:
+            raise MeshError(
+                f"faces: at most {MOST_TRIANGLES - 1} are possible; cut the mesh in parts"
+            )
+        edges, weights = singular_edges(net.faces, net.multiplicity)
+        low, high = x[net.faces].min(axis=(0, 1)), x[net.faces].max(axis=(0, 1))
+        size = 2.0 ** np.ceil(np.log2(0.5 * float((high - low).max())))
+        return cls(
+            x,
+            np.repeat(net.faces, net.multiplicity, axis=0),
+            np.repeat(net.source, net.multiplicity),
+            np.repeat(edges, weights, axis=0),
+            0.5 * (low + high),
+            float(size),
+        )
+
+    @functools.cached_property
+    def unit_vertices(self) -> FloatArray:
+        """(n, 3) vertices about the origin, of size about one."""
+        return (self.vertices - self.centre) / self.size
+
+    @functools.cached_property
+    def corners(self) -> FloatArray:
+        """(m, 3, 3) corners of the triangles, in unit coordinates."""
+        return self.unit_vertices[self.triangles]
+
+    @functools.cached_property
+    def tree(self) -> Hierarchy:
+        """Over the triangles' centroids."""
+        return build_hierarchy(self.corners.mean(axis=1), leaf_size=_LEAF_SIZE, arity=_ARITY)
+
+    @functools.cached_property
+    def records(self) -> FloatArray:
+        """(m, 14), as `tree.triangles` describes."""
+        return triangle_records(self.unit_vertices, self.triangles)
+
+    @functools.cached_property
+    def levels(self) -> list[Level]:
+        """Moments of the nodes."""
+        points, normals = triangle_dipoles(self.corners)
+        low, high = self.corners.min(axis=1), self.corners.max(axis=1)
+        return all_levels(self.tree, points, normals, low, high)
+
+    @functools.cached_property
+    def singular_flags(self) -> FloatArray:
+        """(m, 3): 1 for each edge 01, 12 and 02 of a record that is singular, else 0."""
+        count = len(self.vertices)
+        keys = np.unique(self.singular.min(axis=1) * count + self.singular.max(axis=1))
+        ends = np.sort(self.triangles, axis=1)
+        edges = ends[:, [0, 1, 0]] * count + ends[:, [1, 2, 2]]
+        return np.isin(edges, keys).astype(np.float64)
+
+    @property
+    def area(self) -> float:
+        """Of all triangles."""
+        p, q, r = np.moveaxis(self.corners, 1, 0)
+        cross = np.linalg.norm(np.cross(q - p, r - p), axis=1)
+        return float(0.5 * cross.sum() * self.size**2)
+
+    @property
+    def boundary_length(self) -> float:
+        """Of all singular edges."""
+        ends = self.vertices[self.singular]
+        return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum())

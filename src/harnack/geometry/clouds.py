@@ -1,0 +1,282 @@
+"""Point clouds with normals: what is accepted, and the area that each point stands for.
+
+A cloud is a sample of a surface: points (n, 3), unit normals (n, 3) to the positive (outer) side,
+and areas (n,) whose sum is about the area of the surface. Points at the same position are allowed:
+their dipoles add, which is what two layers of a surface that touch there should do.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import scipy.spatial
+
+from harnack.geometry.convex_volume import FloatArray
+from harnack.geometry.meshes import IntArray
+from harnack.geometry.singular import weld_vertices
+
+__all__ = ["CloudError", "estimate_areas", "validate_cloud"]
+
+MAX_POINTS = 100_000_000
+# Points per step: the temporary arrays of one step then stay in the cache of one core.
+_CHUNK = 4096
+
+
+class CloudError(ValueError):
+    """A point cloud that cannot be used; the message says why and what to do."""
+
+
+def validate_cloud(
+    points: npt.ArrayLike, normals: npt.ArrayLike | None, areas: npt.ArrayLike
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Points (n, 3), unit normals (n, 3) and areas (n,), float64 copies that cannot be written to.
+
+    normals: of any length but zero. areas: positive, in the square of the points' unit; one number
+    stands for all. `estimate_areas` and `estimate_normals` find what is missing.
+
+    Raises:
+        CloudError: not numbers of these shapes, or no points; a value that is not finite; a normal
+            of length zero; an area that is not positive; coordinates above 1e100.
+    """
+    x = checked_points(points)
+    n = checked_normals(normals, len(x))
+    a = _as_numbers(areas, "the areas")
+    if a.ndim == 0:
+        a = np.full(len(x), float(a))
+    if a.shape != (len(x),):
+        raise CloudError(f"there are {len(x):,} points: the areas must have shape ({len(x)},), not "
+                         f"{a.shape}")  # fmt: skip
+    bad = np.flatnonzero(~((a > 0.0) & (a < np.inf)))
+    if bad.size:
+        raise CloudError(
+            f"the area of point {bad[0]} is {a[bad[0]]:g}{_and_more(bad.size)}: areas must be "
+            "positive and finite; remove points that stand for no area"
+        )
+    for array in (x, n, a):
+        array.setflags(write=False)
+    return x, n, a
+
+
+def checked_points(points: Any) -> FloatArray:
+    """A fresh array (n, 3) of finite points, n >= 1.
+
+    Raises:
+        CloudError: it is not one, or holds coordinates above 1e100.
+    """
+    x = _as_numbers(points, "the points")
+    if x.size == 0:
+        raise CloudError("there are no points: give an array (n, 3)")
+    _check_rows(x, "the points")
+    _check_finite(x, "point")
+    if (size := float(np.abs(x).max())) > 1e100:
+        raise CloudError(f"coordinates up to {size:g} are too large: choose units nearer to 1")
+    return x
+
+
+def checked_normals(normals: Any, count: int) -> FloatArray:
+    """A fresh array (count, 3) of normals, scaled to unit length.
+
+    Raises:
+        CloudError: it is missing or not one, or a normal is zero or not finite.
+    """
+    if normals is None:
+        raise CloudError(
+            "the cloud has no normals, which say where outside is: give them, or estimate them "
+            "with harnack.geometry.estimate_normals(points) and look at the result"
+        )
+    n = _as_numbers(normals, "the normals")
+    _check_rows(n, "the normals")
+    if len(n) != count:
+        raise CloudError(
+            f"there are {count:,} points but {len(n):,} normals: every point needs one normal"
+        )
+    _check_finite(n, "normal")
+    longest = np.abs(n).max(axis=1, keepdims=True)
+    bad = np.flatnonzero(longest == 0.0)
+    if bad.size:
+        raise CloudError(
+            f"normal {bad[0]} is zero{_and_more(bad.size)}: remove these points, or estimate all "
+            "normals with harnack.geometry.estimate_normals(points)"
+        )
+    n = n / longest  # first, so that squares neither overflow nor vanish
+    return n / np.linalg.norm(n, axis=1, keepdims=True)
+
+
+def estimate_areas(
+    points: npt.ArrayLike, normals: npt.ArrayLike, neighbours: int = 20
+) -> FloatArray:
+    """The area (n,) that each point of a cloud stands for: its Voronoi cell in the tangent plane.
+
+    After Barill et al. 2018, section 3.1, who project the nearest neighbours to the tangent plane
+    and take the area of the point's Voronoi cell among them. Here the tangent plane is cut out of
+    the point's cell in space instead: the same for points in a plane, but a point on the other
+    side of a thin wall takes nothing away, since its bisecting plane is parallel to the tangent
+    plane. Points at the same position share the cell.
+
+    Points beyond the farthest neighbour, at distance R, can cut the cell only beyond R/2; so within
+    the disc of that radius the cell is exact, and there it ends. At the rim of an open surface a
+    cell may reach out without end: where all neighbours lie on one side (of a line through the
+    point), their mirror images bound the cell too, so that it reaches out as far as in.
+
+    neighbours: how many; more cost time, fewer cut large cells of uneven samples.
+
+    Raises:
+        CloudError: as `validate_cloud`; all points are at one position; fewer than 3 neighbours.
+    """
+    x = checked_points(points)
+    n = checked_normals(normals, len(x))
+    check_neighbours(neighbours)
+    welded = weld_vertices(x)
+    positions, where = np.unique(welded, return_inverse=True)
+    sharing = np.bincount(where)[where]
+    tree = point_tree(x[positions])
+    areas = np.empty(len(x))
+
+    def estimate(part: slice) -> None:
+        nearest, distance = nearest_others(tree, x[part], neighbours)
+        offsets = tree.data[nearest] - x[part, None]
+        areas[part] = _cell_areas(offsets, n[part], 0.5 * distance[:, -1])
+
+    in_parts(estimate, len(x))
+    return areas / sharing
+
+
+def _as_numbers(values: Any, name: str) -> FloatArray:
+    try:
+        array = np.asarray(values)
+    except (ValueError, OverflowError):
+        raise CloudError(f"{name} are ragged: every row needs as many numbers") from None
+    if array.dtype.kind not in "fiu":
+        raise CloudError(f"{name} must be real numbers, not {array.dtype}")
+    if array.size > 3 * MAX_POINTS:
+        raise CloudError(f"{name} have shape {array.shape}: at most {MAX_POINTS:,} are accepted")
+    return np.array(array, dtype=np.float64, order="C")
+
+
+def _check_rows(array: FloatArray, name: str) -> None:
+    if array.ndim != 2 or array.shape[1] != 3:
+        hint = "; transpose it" if array.ndim == 2 and array.shape[0] == 3 else ""
+        raise CloudError(f"{name} must have shape (n, 3), not {array.shape}{hint}")
+
+
+def _check_finite(array: FloatArray, name: str) -> None:
+    bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
+    if bad.size:
+        row = ", ".join(f"{v:g}" for v in array[bad[0]])
+        raise CloudError(
+            f"{name} {bad[0]} is ({row}){_and_more(bad.size)}: its components must be finite; "
+            "remove the point"
+        )
+
+
+def _and_more(count: int) -> str:
+    return f" (and {count - 1:,} more)" if count > 1 else ""
+
+
+def check_neighbours(neighbours: int) -> None:
+    """Raises CloudError for fewer than 3 neighbours, which say nothing about a surface."""
+    if neighbours < 3:
+        raise CloudError(f"at least 3 neighbours are needed, not {neighbours}")
+
+
+def point_tree(points: FloatArray) -> Any:
+    """A tree for `nearest_others`. points: (n, 3), all different.
+
+    Raises:
+        CloudError: there is one point only.
+    """
+    if len(points) < 2:
+        raise CloudError("all points are at one position: a surface needs points beside each other")
+    spatial: Any = scipy.spatial
+    return spatial.cKDTree(points)
+
+
+def nearest_others(tree: Any, points: FloatArray, count: int) -> tuple[IntArray, FloatArray]:
+    """Indices and distances (m, k) of the points nearest to some points (m, 3) of a tree.
+
+    A point does not count as its own neighbour. Nearest first; k = count, or all there are.
+
+    Raises:
+        CloudError: they lie so close that squared distances vanish.
+    """
+    distance, index = tree.query(points, k=min(count + 1, tree.n))
+    if distance[:, -1].min() < 1e-100:
+        raise CloudError(f"a point and its {count} neighbours all lie within 1e-100: remove some")
+    return index[:, 1:], distance[:, 1:]
+
+
+def in_parts(work: Callable[[slice], None], count: int) -> None:
+    """Calls `work` for slices that make up range(count), on all cores."""
+    parts = [slice(k, min(k + _CHUNK, count)) for k in range(0, count, _CHUNK)]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for _ in pool.map(work, parts):
+            pass
+
+
+def _cell_areas(offsets: FloatArray, normals: FloatArray, radii: FloatArray) -> FloatArray:
+    """Areas of cells in tangent planes, cut off at `radii`: (m,).
+
+    offsets: (m, k, 3) from the points to their neighbours. normals: (m, 3). radii: (m,).
+    """
+    offsets = offsets / radii[:, None, None]
+    u, v = _tangents(normals)
+    # The plane that bisects the offset d meets the tangent plane in the line q . y = |d|^2/2.
+    q = np.stack([np.einsum("mkj,mj->mk", offsets, axis) for axis in (u, v)])
+    b = 0.5 * np.einsum("mkj,mkj->mk", offsets, offsets)
+    areas = _disc_cut_by_lines(q, b)
+    angle = np.sort(np.arctan2(q[1], q[0]), axis=1)
+    gap = np.diff(angle, axis=1, append=angle[:, :1] + 2.0 * np.pi).max(axis=1)
+    rim = gap >= np.pi
+    if rim.any():
+        areas[rim] = _disc_cut_by_lines(
+            np.concatenate([q[:, rim], -q[:, rim]], axis=2), np.concatenate([b[rim]] * 2, axis=1)
+        )
+    return areas * radii * radii
+
+
+def _tangents(n: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Two unit vectors each, (m, 3), orthogonal to n (m, 3) and each other (Duff et al. 2017)."""
+    sign = np.copysign(1.0, n[:, 2])
+    a = -1.0 / (sign + n[:, 2])
+    b = n[:, 0] * n[:, 1] * a
+    u = np.column_stack([1.0 + sign * n[:, 0] ** 2 * a, sign * b, -sign * n[:, 0]])
+    v = np.column_stack([b, sign + n[:, 1] ** 2 * a, -n[:, 1]])
+    return u, v
+
+
+def _disc_cut_by_lines(q: FloatArray, b: FloatArray) -> FloatArray:
+    """Area of { y : |y| <= 1, q_i . y <= b_i for all i }, b_i > 0, by lines q (2, m, k): (m,).
+
+    On line j, at distance h_j from the center, the others and the circle leave an interval of the
+    position s along it. The region is star shaped, so its area is the sum of the triangles between
+    these intervals and the center, and of circular sectors in the directions that remain.
+    """
+    length = np.sqrt(q[0] ** 2 + q[1] ** 2)
+    crosses = length > b  # the others miss the disc
+    length = np.where(crosses, length, 1.0)
+    x, y = (np.where(crosses, component / length, 0.0) for component in (q[0], q[1]))
+    h = np.where(crosses, b / length, 1.0)
+    half_chord = np.sqrt(np.maximum(1.0 - h * h, 0.0))
+    low, high = -half_chord, half_chord
+    number = np.arange(len(x[0]), dtype=np.int64)
+    for i in range(q.shape[2]):
+        xi, yi, hi = x[:, i, None], y[:, i, None], h[:, i, None]
+        slope = yi * x - xi * y  # how fast line j nears line i, going along it
+        room = hi - h * (xi * x + yi * y)
+        parallel = np.abs(slope) < 1e-12
+        bound = room / np.where(parallel, 1.0, slope)
+        low = np.where(slope < -1e-12, np.maximum(low, bound), low)
+        high = np.where(slope > 1e-12, np.minimum(high, bound), high)
+        # Of equal lines the first counts.
+        hidden = parallel & (room < np.where(number > i, 1e-12, -1e-12))
+        high = np.where(hidden, -np.inf, high)
+    used = low < high
+    low, high = np.where(used, low, 0.0), np.where(used, high, 0.0)
+    triangles = (0.5 * h * (high - low)).sum(axis=1)
+    angles = (np.arctan2(high, h) - np.arctan2(low, h)).sum(axis=1)
+    return triangles + 0.5 * np.maximum(2.0 * np.pi - angles, 0.0)

@@ -1,0 +1,218 @@
+"""Triangle meshes: what is accepted, and faces without an area.
+
+A mesh is an array (n, 3) of vertices and an array (m, 3) of faces, indices of vertices counted from
+0. The positive side of a face is the one from which its vertices run counter-clockwise. A mesh may
+have holes, cross itself, repeat faces or turn them round; nothing need be joined to anything.
+"""
+
+from __future__ import annotations
+
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from harnack.geometry.convex_volume import BoolArray, FloatArray
+
+__all__ = [
+    "IntArray",
+    "MeshError",
+    "validate_mesh",
+    "without_zero_area_faces",
+    "zero_area_faces",
+]
+
+IntArray: TypeAlias = npt.NDArray[np.int64]
+
+MAX_VERTICES = 100_000_000
+MAX_FACES = 100_000_000
+
+# Twice the area, over the square of the longest edge, up to which a face counts as flat.
+ZERO_AREA = 8.0 * float(np.finfo(np.float64).eps)
+
+
+class MeshError(ValueError):
+    """A mesh that cannot be used; the message says why and what to do."""
+
+
+def validate_mesh(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> tuple[FloatArray, IntArray]:
+    """Vertices (n, 3) float64 and faces (m, 3) int64 of a mesh: copies that cannot be written to.
+
+    Vertices that no face uses are kept, and checked like the rest.
+
+    Raises:
+        MeshError: not numbers of these shapes, faces that are not triangles of integers, nothing
+            at all; a coordinate that is not finite; an index without a vertex; a face of zero area
+            as `zero_area_faces` has it; sizes whose squares overflow or vanish.
+    """
+    x, triangles = _checked_arrays(vertices, faces)
+    flat, longest = _measure(x, triangles)
+    if flat.any():
+        raise MeshError(_flat_message(x, triangles, np.flatnonzero(flat)))
+    _check_size(longest)
+    x.setflags(write=False)
+    triangles.setflags(write=False)
+    return x, triangles
+
+
+def zero_area_faces(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> IntArray:
+    """Indices of the faces that count as without area: (k,).
+
+    A face does if twice its area is at most 8 units in the last place (2^-49) of the square of its
+    longest edge: if its vertices lie on a line, or two of them are equal, up to the rounding of a
+    cross product. So it does not depend on the scale of the mesh, and not on where it lies. Such a
+    face has no normal to speak of.
+
+    Raises:
+        MeshError: as `validate_mesh`, but for zero area.
+    """
+    return np.flatnonzero(_measure(*_checked_arrays(vertices, faces))[0])
+
+
+def without_zero_area_faces(
+    vertices: npt.ArrayLike, faces: npt.ArrayLike
+) -> tuple[FloatArray, IntArray]:
+    """The mesh without the faces of `zero_area_faces`, as `validate_mesh` returns it.
+
+    All vertices stay, so indices keep their meaning. A face without area adds nothing to a winding
+    number. Where one filled a gap of no width (a vertex in the middle of its neighbour's edge), the
+    edges at that gap become boundary edges on top of each other: they still cancel in every sum,
+    they only make what counts distances to boundary edges more careful than need be.
+
+    Raises:
+        MeshError: as `validate_mesh`; no face has an area.
+    """
+    x, triangles = _checked_arrays(vertices, faces)
+    flat, longest = _measure(x, triangles)
+    if flat.all():
+        raise MeshError(
+            f"all {len(triangles):,} faces have zero area: the vertices of each lie on a line; "
+            "check which column of the faces is which, and that coordinates were not rounded away"
+        )
+    _check_size(longest)
+    kept = triangles[~flat]
+    x.setflags(write=False)
+    kept.setflags(write=False)
+    return x, kept
+
+
+def _checked_arrays(vertices: Any, faces: Any) -> tuple[FloatArray, IntArray]:
+    """Fresh arrays of the right types and shapes, with finite vertices and indices in range."""
+    x = _as_vertices(vertices)
+    triangles = _as_faces(faces, len(x))
+    return x, triangles
+
+
+def _as_vertices(vertices: Any) -> FloatArray:
+    array = _as_array(vertices, "the vertices", "every vertex needs three coordinates")
+    if array.size == 0:
+        raise MeshError("there are no vertices: give an array (n, 3)")
+    if array.dtype.kind not in "fiu":
+        raise MeshError(f"the vertices must be real numbers, not {array.dtype}")
+    if array.ndim != 2 or array.shape[1] != 3:
+        hint = "; transpose it" if array.ndim == 2 and array.shape[0] == 3 else ""
+        raise MeshError(f"the vertices must have shape (n, 3), not {array.shape}{hint}")
+    if len(array) > MAX_VERTICES:
+        raise MeshError(f"{len(array):,} vertices are too many: at most {MAX_VERTICES:,}")
+    x = np.array(array, dtype=np.float64, order="C")
+    bad = np.flatnonzero(~np.isfinite(x).all(axis=1))
+    if bad.size:
+        raise MeshError(
+            f"vertex {bad[0]} is {_point(x[bad[0]])}{_and_more(bad.size)}: coordinates must be "
+            "finite; remove it and the faces that use it"
+        )
+    if (size := float(np.abs(x).max())) > 1e100:
+        raise MeshError(f"coordinates up to {size:g} are too large: choose units nearer to 1")
+    return x
+
+
+def _as_faces(faces: Any, count: int) -> IntArray:
+    array = _as_array(faces, "the faces", "every face needs three indices; triangulate polygons")
+    if array.size == 0:
+        raise MeshError("there are no faces: give an array (m, 3) of vertex indices")
+    if array.ndim != 2 or array.shape[1] != 3:
+        hint = ""
+        if array.ndim == 2 and array.shape[1] == 4:
+            hint = ": these look like quadrilaterals, triangulate them (a b c d -> a b c, a c d)"
+        elif array.ndim == 2 and array.shape[0] == 3:
+            hint = ": transpose it"
+        raise MeshError(f"the faces must have shape (m, 3), not {array.shape}{hint}")
+    if array.dtype.kind not in "iu":
+        hint = ": convert them with .astype(int)" if array.dtype.kind == "f" else ""
+        raise MeshError(f"the faces must be integer indices of vertices, not {array.dtype}{hint}")
+    if len(array) > MAX_FACES:
+        raise MeshError(f"{len(array):,} faces are too many: at most {MAX_FACES:,}; decimate them")
+    _check_range(array, count)
+    return np.array(array, dtype=np.int64, order="C")
+
+
+def _check_range(faces: npt.NDArray[Any], count: int) -> None:
+    if int(faces.min()) >= 0 and int(faces.max()) < count:
+        return
+    outside = (faces < 0) | (faces >= count)
+    bad = np.flatnonzero(outside.any(axis=1))
+    first = faces[bad[0]]
+    index = int(first[outside[bad[0]]][0])
+    hint = ""
+    if index == count and int(faces.min()) == 1:
+        hint = "; these indices seem to count from 1: subtract 1"
+    raise MeshError(
+        f"face {bad[0]} is {tuple(map(int, first))}{_and_more(bad.size)}, but vertex {index} is "
+        f"out of range: there are {count:,} vertices, counted from 0{hint}"
+    )
+
+
+def _as_array(values: Any, name: str, ragged: str) -> npt.NDArray[Any]:
+    try:
+        array = np.asarray(values)
+    except (ValueError, OverflowError):
+        raise MeshError(f"{name} are ragged: {ragged}") from None
+    if array.dtype == object:
+        raise MeshError(f"{name} are no array of numbers: {ragged}")
+    return array
+
+
+def _measure(x: FloatArray, faces: IntArray) -> tuple[BoolArray, FloatArray]:
+    """Whether each face counts as flat, and its longest edge in the maximum norm: (m,) each.
+
+    Edges are scaled before they are multiplied, so that nothing overflows or underflows.
+    """
+    a, b, c = (np.ascontiguousarray(x[corner].T) for corner in faces.T)
+    u, v, w = b - a, c - a, c - b  # (3, m) each: rows are x, y, z
+    longest = np.max([np.abs(edge).max(axis=0) for edge in (u, v, w)], axis=0)
+    scale = np.where(longest > 0.0, longest, 1.0)
+    u, v, w = u / scale, v / scale, w / scale
+    normal = (u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0])
+    twice_area = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
+    longest_square = np.max([(edge * edge).sum(axis=0) for edge in (u, v, w)], axis=0)
+    return twice_area <= ZERO_AREA * longest_square, longest
+
+
+def _check_size(longest: FloatArray) -> None:
+    """No face so small that the squares of its edges vanish. Zero-area faces were seen before."""
+    small = np.flatnonzero((longest > 0.0) & (longest < 1e-100))
+    if small.size:
+        raise MeshError(
+            f"the edges of face {small[0]}{_and_more(small.size)} are only "
+            f"{longest[small[0]]:g} long: choose units nearer to 1, or remove it"
+        )
+
+
+def _flat_message(x: FloatArray, faces: IntArray, flat: IntArray) -> str:
+    a, b, c = (x[k] for k in faces[flat[0]])
+    repeated = bool((a == b).all() or (b == c).all() or (c == a).all())
+    why = "two of its vertices are equal" if repeated else "its vertices lie on a line"
+    count = f"{flat.size:,} of {len(faces):,} faces have" if flat.size > 1 else "one face has"
+    return (
+        f"{count} zero area, first face {flat[0]} with vertices {_point(a)}, {_point(b)}, "
+        f"{_point(c)}: {why}; harnack.geometry.without_zero_area_faces(vertices, faces) removes "
+        "such faces"
+    )
+
+
+def _point(vertex: FloatArray) -> str:
+    return "(" + ", ".join(f"{v:g}" for v in vertex) + ")"
+
+
+def _and_more(count: int) -> str:
+    return f" (and {count - 1:,} more)" if count > 1 else ""

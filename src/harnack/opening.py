@@ -1,0 +1,107 @@
+"""From a surface file to a field: which field, which way is up, and saying so."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from harnack.fields import DipolePotential, Field, SolidAngle, WindingNumber
+from harnack.geometry import (
+    Cloud,
+    FileFormatError,
+    Loops,
+    Mesh,
+    read_loops,
+    read_surface,
+)
+from harnack.geometry.convex_volume import FloatArray
+from harnack.geometry.surfaces import ReadAs
+
+__all__ = ["UP_AXES", "Axis", "OpenedSurface", "open_surface"]
+
+Axis = Literal["x", "y", "z"]
+
+# Rotations that turn the named axis to z. From y, the front of a glTF model (z) turns to -y,
+# which is where the studio's camera stands.
+_UPRIGHT: dict[str, FloatArray] = {
+    "x": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
+    "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+    "z": np.eye(3),
+}
+UP_AXES: tuple[str, ...] = tuple(_UPRIGHT)
+_Y_UP_BY_STANDARD = (".glb", ".gltf")
+# Where `read_loops` itself takes the boundary of faces.
+_LOOP_FILES = (".obj", ".ply", ".loops")
+
+
+@dataclass(frozen=True, eq=False)
+class OpenedSurface:
+    """A field made of a file. said: what was decided and why, in one line."""
+
+    field: Field
+    said: str
+
+
+def open_surface(
+    path: str | os.PathLike[str],
+    *,
+    as_: ReadAs | None = None,
+    boundary: bool = False,
+    normals: Literal["estimate"] | None = None,
+    up: Axis | None = None,
+) -> OpenedSurface:
+    """The field of a surface file: meshes wind, clouds are dipoles, curves span solid angles.
+
+    as_: "winding", "dipole" or "loops" instead of what `read_surface` decides. boundary: the
+    curves that bound the faces. normals: "estimate" finds those of a point cloud, and replaces
+    those of the file. up: the file's axis that turns to z, by default y for glTF, whose standard
+    says so, and z for all others, which do not say.
+
+    Raises:
+        FileFormatError: as `read_surface`; a point cloud without normals.
+        ValueError: settings that contradict each other or the file, or that no field accepts.
+    """
+    path = Path(path)
+    if boundary and as_ not in (None, "loops"):
+        raise ValueError(f"--boundary takes faces as curves, which contradicts --as {as_}")
+    surface = _read(path, as_, boundary)
+    if normals is not None and not isinstance(surface, Cloud):
+        raise ValueError(
+            f"{path}: normals are estimated for point clouds, and this is something else: "
+            f"{surface.said}; leave --normals out, or take its points with --as dipole"
+        )
+    axis = up or ("y" if path.suffix.lower() in _Y_UP_BY_STANDARD else "z")
+    try:
+        field = _field(surface, normals, _UPRIGHT[axis])
+    except ValueError as error:
+        raise FileFormatError(f"{path}: {error}") from error
+    return OpenedSurface(field, f"{surface.said}; {axis} is up")
+
+
+def _read(path: Path, as_: ReadAs | None, boundary: bool) -> Mesh | Cloud | Loops:
+    if boundary and path.suffix.lower() in _LOOP_FILES:
+        loops = tuple(read_loops(path, boundary=True))
+        noun = "loop" if len(loops) == 1 else "loops"
+        count = f"{len(loops):,} {noun} of {sum(map(len, loops)):,} vertices"
+        return Loops(loops, f"{count}: the boundary of the faces, as asked")
+    return read_surface(path, "loops" if boundary else as_)
+
+
+def _field(surface: Mesh | Cloud | Loops, normals: str | None, rotation: FloatArray) -> Field:
+    if isinstance(surface, Mesh):
+        return WindingNumber(surface.vertices @ rotation.T, surface.faces)
+    if isinstance(surface, Loops):
+        return SolidAngle([loop @ rotation.T for loop in surface.loops])
+    points = surface.points @ rotation.T
+    if normals == "estimate":
+        return DipolePotential(points, normals, surface.areas)
+    if surface.normals is None:
+        raise ValueError(
+            f"{surface.said}. Its normals are missing, which say where outside is: add them to "
+            "the file, or let them be estimated with --normals estimate"
+        )
+    return DipolePotential(points, surface.normals @ rotation.T, surface.areas)

@@ -1,0 +1,269 @@
+"""Triangles as records of a tree, and the rays that cross them.
+
+A record (16 numbers) holds the corners in the order of their vertices' indices, so that an edge
+shared by two triangles has the same two ends in the same order in both: what is decided about the
+edge is decided alike, to the last bit, and no ray slips through between them or counts one twice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend.extrema import fmax, fmin
+from harnack.tree.hierarchy import FloatArray, Hierarchy, IntArray
+from harnack.tree.packed import PackedTree, pack
+from harnack.tree.walk import Node, State, for_each, walk
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Mask, Real, Vec3
+
+# Columns of a record; 0 to 8 are the corners.
+PARITY, INDEX, EDGES = 9, 10, 11
+# Triangles are numbered in floats; single precision counts no further.
+MOST_TRIANGLES = 2**24
+NO_TRIANGLE = 0xFFFFFFFF
+
+
+def triangle_records(vertices: FloatArray, faces: IntArray) -> FloatArray:
+    """(m, 14): corners ordered by index; +1 or -1 for whether that keeps or turns the face;
+    the face's number; 1/length^2 of the edges 01, 12 and 02."""
+    order = np.argsort(faces, axis=1, kind="stable")
+    corners = vertices[np.take_along_axis(faces, order, axis=1)]
+    even = np.isin(order @ np.array([9, 3, 1]), (5, 15, 19))  # 012, 120, 201 in base three
+    edges = corners[:, [1, 2, 2]] - corners[:, [0, 1, 0]]
+    square = (edges * edges).sum(axis=2)
+    inverse = np.where(square > 0, 1 / np.where(square > 0, square, 1), 0)
+    parity = np.where(even, 1.0, -1.0)[:, None]
+    number = np.arange(len(faces), dtype=np.float64)[:, None]
+    return np.concatenate([corners.reshape(-1, 9), parity, number, inverse], axis=1)
+
+
+def in_slots(tree: Hierarchy, records: FloatArray) -> FloatArray:
+    """Records (leaves, leaf_size, c); empty slots are points at the leaf's first corner."""
+    placed = tree.gather(records)
+    empty = tree.slots < 0
+    first = np.tile(placed[:, 0, :3], 3)
+    placed[empty, :9] = np.broadcast_to(first[:, None], (*empty.shape, 9))[empty]
+    placed[empty, PARITY], placed[empty, INDEX] = 1.0, -1.0
+    placed[empty, EDGES : EDGES + 3] = 0.0
+    return placed
+
+
+def box_levels(tree: Hierarchy, low: FloatArray, high: FloatArray) -> list[FloatArray]:
+    """Boxes (k, 6) of the nodes of all levels, from those of primitives (n, 3)."""
+    low, high = tree.gather(low, np.inf).min(axis=1), tree.gather(high, -np.inf).max(axis=1)
+    levels = [np.concatenate([low, high], axis=1)]
+    for arity in tree.arities:
+        low = low.reshape(-1, arity, 3).min(axis=1)
+        high = high.reshape(-1, arity, 3).max(axis=1)
+        levels.append(np.concatenate([low, high], axis=1))
+    return levels
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Rays o + t d seen along themselves: right-handed unit vectors u, v and d."""
+
+    o: Vec3
+    u: Vec3
+    v: Vec3
+    d: Vec3
+
+    @classmethod
+    def along(cls, backend: Backend, o: Vec3, d: Vec3) -> Frame:
+        """A frame of rays, |d| = 1 (Duff et al. 2017)."""
+        vector = backend.Array3f
+        o, d = vector(o), vector(d)
+        sign = dr.select(d.z >= 0, backend.Float(1), -1)
+        a = -1 / (sign + d.z)
+        b = d.x * d.y * a
+        u = vector(dr.fma(sign * d.x, d.x * a, 1), sign * b, -sign * d.x)
+        v = vector(b, dr.fma(d.y, d.y * a, sign), -d.y)
+        return cls(o, u, v, d)
+
+    def across(self, p: Vec3) -> tuple[Real, Real]:
+        """Where p is in the plane that the rays are normal to."""
+        a = p - self.o
+        return dr.dot(a, self.u), dr.dot(a, self.v)
+
+    def depth(self, p: Vec3) -> Real:
+        """Where p is along the rays."""
+        return dr.dot(p - self.o, self.d)
+
+
+@dataclass(frozen=True)
+class Upwards:
+    """The frame of rays from points o along the z axis, for which there is nothing to compute."""
+
+    o: Vec3
+
+    def across(self, p: Vec3) -> tuple[Real, Real]:
+        """As `Frame.across`."""
+        return p.x - self.o.x, p.y - self.o.y
+
+    def depth(self, p: Vec3) -> Real:
+        """As `Frame.depth`."""
+        return p.z - self.o.z
+
+
+def side(a: tuple[Real, Real], b: tuple[Real, Real]) -> Real:
+    """Twice the area of (0, a, b): its sign says on which side of the edge ab a ray passes.
+
+    The same bits wherever it is asked about the same edge, if a and b come in the same order.
+    """
+    return dr.fma(a[0], b[1], -(a[1] * b[0]))
+
+
+@dataclass(frozen=True)
+class TriangleRays:
+    """Crossings of rays with triangles, by a tree of boxes."""
+
+    tree: PackedTree
+
+    @classmethod
+    def of(cls, backend: Backend, tree: Hierarchy, records: FloatArray) -> TriangleRays:
+        """From the records of `triangle_records`."""
+        corners = records[:, :9].reshape(-1, 3, 3)
+        levels = box_levels(tree, corners.min(axis=1), corners.max(axis=1))
+        return cls(pack(backend, tree, levels, in_slots(tree, records)))
+
+    def next(
+        self, frame: Frame, after: tuple[Real, Any], t_max: Real, active: Mask
+    ) -> tuple[Real, Any, Real, Vec3]:
+        """The first crossing behind `after` = (t, number) with t <= t_max, ordered by (t, number).
+
+        Gives t (inf for none), the triangle's number (NO_TRIANGLE), the turn (1 where its normal
+        by the right-hand rule looks along the ray, -1 where it looks back, 0) and that normal
+        (unit).
+        """
+        real, index, vector = (
+            self.tree.backend.Float,
+            self.tree.backend.UInt32,
+            self.tree.backend.Array3f,
+        )
+        t_after, n_after = real(after[0]), index(after[1])
+        inside = self._boxes(frame)
+
+        def visit(node: Node, state: State) -> tuple[Mask, State]:
+            limit = fmin(state[0], t_max)
+            open_ = inside(node, t_after, limit)
+            return open_, for_each(node, open_ & node.is_leaf, nearer, state)
+
+        def nearer(row: list[Real], active: Mask, state: State) -> State:
+            best, number, turn, normal = state
+            t, here = crossing(row, frame)
+            n = index(fmax(row[INDEX], real(0)))
+            later = (t > t_after) | ((t == t_after) & (n > n_after) & (n_after != NO_TRIANGLE))
+            first = (t < best) | ((t == best) & (n < number))
+            taken = active & (here != 0) & later & first & (t <= t_max)
+            return (
+                dr.select(taken, t, best),
+                dr.select(taken, n, number),
+                dr.select(taken, here, turn),
+                dr.select(taken, normal_of(row, vector), normal),
+            )
+
+        start = (real(dr.inf), index(NO_TRIANGLE), real(0), vector(0))
+        best, number, turn, normal = walk(self.tree, visit, start, active)
+        return best, number, turn, normal * dr.rsqrt(fmax(dr.squared_norm(normal), real(1e-37)))
+
+    def turns_ahead(self, frame: Frame | Upwards, t_min: Real, active: Mask = True) -> Real:
+        """The sum of turns of all crossings with t > t_min."""
+        real = self.tree.backend.Float
+        inside = self._boxes(frame) if isinstance(frame, Frame) else self._columns(frame)
+
+        def visit(node: Node, state: State) -> tuple[Mask, State]:
+            open_ = inside(node, real(t_min), real(dr.inf))
+            return open_, for_each(node, open_ & node.is_leaf, add, state)
+
+        def add(row: list[Real], active: Mask, state: State) -> State:
+            t, turn = crossing(row, frame)
+            return (state[0] + dr.select(active & (t > t_min), turn, 0),)
+
+        return walk(self.tree, visit, (real(0),), active)[0]
+
+    def _boxes(self, frame: Frame) -> Any:
+        """A test whether rays meet a node's box between two t; it errs towards yes only."""
+        backend = self.tree.backend
+        vector = backend.Array3f
+        d = frame.d
+        # Never zero: 1e-18 of the box's size is far below its padding.
+        steep = dr.select(dr.abs(d) < 1e-18, dr.select(d < 0, vector(-1e-18), vector(1e-18)), d)
+        inverse = dr.rcp(steep)
+        o = frame.o
+        size = fmax(fmax(dr.abs(o.x), dr.abs(o.y)), dr.abs(o.z))
+        pad = 16 * backend.epsilon * (1 + size)
+
+        def inside(node: Node, t_min: Real, t_max: Real) -> Mask:
+            low, high = vector(*node.head[:3]) - pad, vector(*node.head[3:]) + pad
+            a, b = (low - o) * inverse, (high - o) * inverse
+            near = fmax(fmax(fmin(a.x, b.x), fmin(a.y, b.y)), fmin(a.z, b.z))
+            far = fmin(fmin(fmax(a.x, b.x), fmax(a.y, b.y)), fmax(a.z, b.z))
+            slack = 8 * backend.epsilon * dr.abs(far) + pad
+            return (near <= far + slack) & (far + slack >= t_min) & (near - slack <= t_max)
+
+        return inside
+
+    def _columns(self, frame: Upwards) -> Any:
+        backend, o = self.tree.backend, frame.o
+        size = fmax(fmax(dr.abs(o.x), dr.abs(o.y)), dr.abs(o.z))
+        pad = 4 * backend.epsilon * (1 + size)
+
+        def inside(node: Node, t_min: Real, t_max: Real) -> Mask:
+            del t_min, t_max
+            x0, y0, _, x1, y1, z1 = node.head
+            return (
+                (o.x >= x0 - pad) & (o.x <= x1 + pad)
+                & (o.y >= y0 - pad) & (o.y <= y1 + pad) & (o.z <= z1 + pad)
+            )  # fmt: skip
+
+        return inside
+
+
+def corners_of(row: list[Real], vector: Any) -> tuple[Vec3, Vec3, Vec3]:
+    """The corners of a record."""
+    return vector(*row[0:3]), vector(*row[3:6]), vector(*row[6:9])
+
+
+def normal_of(row: list[Real], vector: Any) -> Vec3:
+    """The normal of a record's triangle by the right-hand rule, of any length."""
+    p, q, r = corners_of(row, vector)
+    return row[PARITY] * dr.cross(q - p, r - p)
+
+
+def crossing(row: list[Real], frame: Frame | Upwards) -> tuple[Real, Real]:
+    """t and turn of a ray with the triangle of a record; the turn is 0 where it passes by.
+
+    In the plane across the ray, the turn is the winding number of the triangle about the ray:
+    over its edges, +1 for each that crosses the half-line v = 0, u > 0 upwards and -1 downwards.
+    Upwards means from v <= 0 to v > 0, which v alone decides; that u > 0 there is the sign of
+    `side`. Both are the same for all triangles around a vertex or an edge, so that what one of
+    them counts its neighbour discounts: the sum over a closed surface is right whatever the
+    rounding did, and rays through edges and vertices need no special case.
+    """
+    vector = cast("Any", type(frame.o))
+    p, q, r = corners_of(row, vector)
+    a, b, c = frame.across(p), frame.across(q), frame.across(r)
+    ab, bc, ac = side(a, b), side(b, c), side(a, c)
+    up_a, up_b, up_c = a[1] > 0, b[1] > 0, c[1] > 0
+
+    def upwards(from_up: Mask, to_up: Mask, left: Real) -> Real:
+        one = type(left)(1)
+        return dr.select(~from_up & to_up & (left > 0), one, 0) - dr.select(
+            from_up & ~to_up & (left < 0), one, 0
+        )
+
+    turn = row[PARITY] * (
+        upwards(up_a, up_b, ab) + upwards(up_b, up_c, bc) - upwards(up_a, up_c, ac)
+    )
+    za, zb, zc = frame.depth(p), frame.depth(q), frame.depth(r)
+    total = bc - ac + ab
+    t = dr.fma(bc, za, dr.fma(-ac, zb, ab * zc)) / total
+    low, high = fmin(za, fmin(zb, zc)), fmax(za, fmax(zb, zc))
+    # Of a triangle seen edge on, any point will do that lies in it.
+    t = dr.select(dr.isfinite(t), fmin(fmax(t, low), high), low)
+    return t, turn

@@ -1,0 +1,226 @@
+"""`harnack render FILE`: every format, what it is taken for, overrides and errors."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from harnack.cli import main
+from harnack.fields import DipolePotential, SolidAngle, WindingNumber
+from harnack.geometry import shapes
+from harnack.geometry.mesh_shapes import icosphere
+from harnack.opening import open_surface
+
+Run = Callable[..., tuple[int, str, str]]
+
+TALL = np.array([1.0, 1.0, 1.6])
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Run:
+    """Renders a file to picture.png; the exit code, what was said and what was complained of."""
+
+    def render(path: Path, *arguments: str) -> tuple[int, str, str]:
+        target = str(tmp_path / "picture.png")
+        small = ["--show", "normal", "--size", "32x24", "--quiet"]
+        code = main(["render", str(path), "-o", target, *small, *arguments])
+        said, complaint = capsys.readouterr()
+        return code, said, complaint.replace("\n", " ")
+
+    return render
+
+
+def tall_ball(missing: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """An ellipsoid along z, some faces of which may be missing at the end of the list."""
+    x, faces = icosphere(1)
+    return x * TALL, faces[: len(faces) - missing]
+
+
+def write_mesh(path: Path, missing: int = 0) -> Path:
+    mesh = trimesh.Trimesh(*tall_ball(missing), process=False)
+    if path.suffix == ".gltf":
+        for name, data in mesh.export(file_type="gltf").items():
+            (path.parent / (path.name if name.endswith(".gltf") else name)).write_bytes(data)
+    else:
+        mesh.export(path)
+    return path
+
+
+def write_cloud(path: Path, *, with_normals: bool = True) -> Path:
+    x = tall_ball()[0]
+    normals = x / TALL**2
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    names = "xyz" if not with_normals else ("x", "y", "z", "nx", "ny", "nz")
+    header = f"ply\nformat ascii 1.0\nelement vertex {len(x)}\n"
+    header += "".join(f"property float {name}\n" for name in names) + "end_header"
+    np.savetxt(
+        path, np.hstack([x, normals]) if with_normals else x,
+        header=header if path.suffix == ".ply" else "", comments="",
+    )  # fmt: skip
+    return path
+
+
+def picture(tmp_path: Path) -> np.ndarray:
+    import mitsuba as mi
+
+    return np.array(mi.Bitmap(str(tmp_path / "picture.png")))
+
+
+def extent_of(path: Path, **settings: Any) -> np.ndarray:
+    """Sides of the box around what a mesh file becomes."""
+    field = open_surface(path, **settings).field
+    assert isinstance(field, WindingNumber)
+    return np.ptp(field.mesh.vertices, axis=0)
+
+
+@pytest.mark.parametrize("kind", ["obj", "ply", "stl", "off", "glb", "gltf"])
+def test_a_closed_mesh_of_any_format_is_drawn_by_its_winding_number(run, tmp_path, kind):
+    code, said, _ = run(write_mesh(tmp_path / f"a.{kind}"))
+    assert code == 0
+    assert "80 triangles without singular edges: a closed mesh" in said
+    assert "WindingNumber: triangles: 80, singular edges: 0" in said
+    assert f"; {'y' if kind in ('glb', 'gltf') else 'z'} is up" in said
+    image = picture(tmp_path)
+    assert image.shape[:2] == (24, 32)
+    assert len(np.unique(image.reshape(-1, image.shape[2]), axis=0)) > 10
+
+
+def test_a_mesh_with_holes_is_drawn_by_its_winding_number(run, tmp_path):
+    code, said, _ = run(write_mesh(tmp_path / "a.obj", missing=20), "--level", "0.4")
+    assert code == 0
+    assert "a mesh with holes or faces turned round" in said
+    assert "WindingNumber: triangles: 60" in said
+
+
+@pytest.mark.parametrize("kind", ["xyz", "ply"])
+def test_a_cloud_is_drawn_by_its_dipoles(run, tmp_path, kind):
+    code, said, _ = run(write_cloud(tmp_path / f"a.{kind}"))
+    assert code == 0
+    assert "42 points with normals, no faces: a point cloud" in said
+    assert "DipolePotential: points: 42, normals: given, areas: estimated" in said
+    assert len(np.unique(picture(tmp_path))) > 10
+
+
+def test_curves_are_drawn_by_their_solid_angle(run, tmp_path):
+    path = tmp_path / "a.loops"
+    path.write_text(" ".join(f"{c:.6f}" for c in shapes.wavy_polygon(12).ravel()) + "\n")
+    code, said, _ = run(path, "--level", "1.5pi", "--material", "copper")
+    assert code == 0
+    assert "1 loop of 12 vertices: curves" in said
+    assert "SolidAngle: loops: 1, vertices: 12" in said
+
+
+@pytest.mark.parametrize(
+    ("options", "field", "said"),
+    [
+        (["--as", "winding"], "WindingNumber: triangles: 60", "a mesh with holes"),
+        (["--as", "dipole"], "DipolePotential: points: 60, normals: given, areas: given",
+         "60 triangles, each taken as a point"),
+        (["--as", "dipole", "--normals", "estimate"], "normals: estimated, areas: given", "60"),
+        (["--as", "loops"], "SolidAngle: loops: ", "the boundary of the faces, as asked"),
+        (["--boundary"], "SolidAngle: loops: ", "the boundary of the faces, as asked"),
+        (["--boundary", "--as", "loops"], "SolidAngle: loops: ", "the boundary of the faces"),
+    ],
+)  # fmt: skip
+def test_the_same_file_is_taken_as_asked(run, tmp_path, options, field, said):
+    code, printed, _ = run(write_mesh(tmp_path / "a.obj", missing=20), *options)
+    assert code == 0
+    assert field in printed
+    assert said in printed
+
+
+@pytest.mark.parametrize("kind", ["obj", "stl"])
+def test_a_boundary_is_the_same_by_either_name(tmp_path, kind):
+    path = write_mesh(tmp_path / f"a.{kind}", missing=20)
+    fields = [open_surface(path, boundary=True).field, open_surface(path, as_="loops").field]
+    edges = []
+    for field in fields:
+        assert isinstance(field, SolidAngle)
+        ends = [np.hstack([loop, np.roll(loop, -1, axis=0)]) for loop in field.loops]
+        edges.append(sorted(np.concatenate(ends).round(6).tolist()))
+    assert edges[0] == edges[1]
+
+
+def test_normals_of_a_cloud_are_estimated_if_asked(run, tmp_path):
+    path = write_cloud(tmp_path / "a.xyz", with_normals=False)
+    code, said, _ = run(path, "--normals", "estimate")
+    assert code == 0
+    assert "normals: estimated, areas: estimated" in said
+    field = open_surface(path, normals="estimate").field
+    assert isinstance(field, DipolePotential)
+    assert ((field.normals * field.points).sum(axis=1) > 0.0).all()  # outward
+
+
+@pytest.mark.parametrize("up", ["x", "y", "z"])
+def test_the_axis_named_up_turns_to_z(tmp_path, up):
+    tall = write_mesh(tmp_path / "a.stl")
+    sides = np.ptp(tall_ball()[0], axis=0)
+    assert extent_of(tall, up=up)[2] == pytest.approx(sides["xyz".index(up)], rel=1e-6)
+    field = open_surface(tall, up=up).field
+    assert isinstance(field, WindingNumber)
+    assert field.value([[0.0, 0.0, 0.0]])[0] == pytest.approx(1.0, abs=1e-4)  # not mirrored
+
+
+def test_up_turns_points_and_normals_of_a_cloud_together(tmp_path):
+    path = write_cloud(tmp_path / "a.xyz")
+    plain, turned = (open_surface(path, up=up).field for up in ("z", "y"))
+    assert isinstance(plain, DipolePotential)
+    assert isinstance(turned, DipolePotential)
+    np.testing.assert_allclose(turned.points[:, 2], plain.points[:, 1])
+    np.testing.assert_allclose(turned.normals[:, 2], plain.normals[:, 1])
+    np.testing.assert_allclose(turned.areas, plain.areas, rtol=1e-9)
+
+
+def test_gltf_is_y_up_by_its_standard_and_other_formats_z_up(tmp_path):
+    sides = np.ptp(tall_ball()[0], axis=0)
+    for kind, expected in (("glb", sides[1]), ("off", sides[2])):
+        path = write_mesh(tmp_path / f"a.{kind}")
+        assert extent_of(path)[2] == pytest.approx(expected, rel=1e-6)
+    assert extent_of(tmp_path / "a.glb", up="z")[2] == pytest.approx(sides[2], rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "options", "complaint"),
+    [
+        ("a.xyz", "0 0 0\n1 0 0\n0 1 0\n0 0 1\n", [],
+         r"a.xyz: 4 points without faces or normals: .* --normals estimate"),
+        ("a.xyz", "0 0 0\n1 0 0\n", ["--normals", "estimate"], "a.xyz: .*at least 4"),
+        ("a.xyz", "0 0 0\n1 0 0\n", ["--as", "winding"], "it holds points only"),
+        ("a.step", "ISO-10303-21;", [], r"a.step' is no scene: .*\.glb, .*\.xyz"),
+        ("a.stl", "", [], "a.stl: the file is empty"),
+        ("a.obj", "", [], "a.obj: the file is empty"),
+        ("a.glb", None, [], "a.glb: there is no such file"),
+        ("a.gltf", json.dumps({"asset": {"version": "2.0"}}), [], "a.gltf: "),
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", ["--normals", "estimate"],
+         "normals are estimated for point clouds.* --as dipole"),
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", ["--boundary", "--as", "dipole"],
+         "--boundary takes faces as curves, which contradicts --as dipole"),
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", ["--level", "0"], "level 0 "),
+        ("a.xml", "<scene/>", ["--up", "y"], "--up is for surface files"),
+        ("trefoil", None, ["--as", "loops"], "--as is for surface files"),
+    ],
+)  # fmt: skip
+def test_errors_say_what_to_do_and_nothing_is_written(
+    run, tmp_path, name, content, options, complaint
+):
+    path = tmp_path / name if "." in name else Path(name)
+    if content is not None:
+        path.write_text(content)
+    code, _, said = run(path, *options)
+    assert code == 1
+    assert not (tmp_path / "picture.png").exists()
+    assert re.search(complaint, said), said
+
+
+def test_a_closed_mesh_has_no_boundary_to_draw(run, tmp_path):
+    for kind in ("obj", "glb"):
+        code, _, said = run(write_mesh(tmp_path / f"a.{kind}"), "--boundary")
+        assert code == 1
+        assert "closed surface, which has no boundary" in said

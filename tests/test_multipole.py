@@ -1,0 +1,366 @@
+"""Moments of clusters of dipoles: identities, sums, derivatives, and what truncation may cost.
+
+Harmonics have degree l and order m.
+"""
+
+# ruff: noqa: E741
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from harnack.backend import choose_backend, to_numpy
+from harnack.fields.multipole import (
+    Level,
+    all_levels,
+    cartesian,
+    moved,
+    of_dipoles,
+    regular,
+    sup_norm,
+    triangle_dipoles,
+    truncation,
+)
+from harnack.fields.multipole_kernel import far_terms
+from harnack.fields.winding_tree import node_columns
+from harnack.tree import Hierarchy, build_hierarchy
+
+ORDERS = [0, 1, 2]
+
+
+def at(harmonics: Any, l: int, m: int) -> Any:
+    """For any m."""
+    if abs(m) > l or l < 0:
+        return 0.0
+    return harmonics[l, m] if m >= 0 else (-1) ** m * np.conj(harmonics[l, -m])
+
+
+def irregular(x: np.ndarray, order: int) -> Any:
+    """I_lm = (l+m)! (l-m)! R_lm / r^(2l+1)."""
+    r = np.linalg.norm(x, axis=-1)
+    return {
+        (l, m): math.factorial(l + m) * math.factorial(l - m) * value / r ** (2 * l + 1)
+        for (l, m), value in regular(x, order).items()
+    }
+
+
+def dipole_sum(x: np.ndarray, y: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """f at x (k, 3) of dipoles `normal` (s, 3) at y (s, 3)."""
+    d = y - x[:, None]
+    return ((normal * d).sum(axis=-1) / np.linalg.norm(d, axis=-1) ** 3).sum(axis=1)
+
+
+def dipole_gradient(x: np.ndarray, y: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Of the same by x."""
+    d = y - x[:, None]
+    r = np.linalg.norm(d, axis=-1, keepdims=True)
+    along = (normal * d).sum(axis=-1, keepdims=True)
+    return (3 * along * d / r**5 - normal / r**3).sum(axis=1)
+
+
+def solid_angles(x: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Sum over triangles (s, 3, 3), at x (k, 3)."""
+    a, b, c = np.moveaxis(corners[None] - x[:, None, None], 2, 0)
+    la, lb, lc = (np.linalg.norm(v, axis=-1) for v in (a, b, c))
+    re = la * lb * lc
+    for u, v, w in ((a, b, lc), (b, c, la), (c, a, lb)):
+        re = re + (u * v).sum(axis=-1) * w
+    return 2 * np.arctan2((a * np.cross(b, c)).sum(axis=-1), re).sum(axis=1)
+
+
+def unit(v: np.ndarray) -> np.ndarray:
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def cluster(seed: int, count: int = 12) -> tuple[np.ndarray, np.ndarray]:
+    """Dipoles of all kinds: in a plane, in a ball, equal or opposite or random ones."""
+    rng = np.random.default_rng(seed)
+    y = rng.normal(size=(count, 3)) * rng.choice([1.0, 0.1, 1e-3], 3)
+    normal = rng.normal(size=(count, 3)) * 10 ** rng.uniform(-2, 1, (count, 1))
+    if seed % 3 == 0:
+        normal[:] = normal[0]
+    elif seed % 3 == 1:
+        normal[::2] = -normal[1::2]
+    return y, normal
+
+
+def level_of(y: np.ndarray, normal: np.ndarray) -> Level:
+    """The cluster as one leaf."""
+    tree = Hierarchy(np.zeros((1, 1), np.int64), ())
+    low, high = y.min(axis=0)[None], y.max(axis=0)[None]
+    return all_levels(tree, y[None], normal[None], low, high)[0]
+
+
+def terms(level: Level, x: np.ndarray, order: int, derivatives: int) -> Any:
+    """Value, gradient and Hessian that a node alone gives at x (k, 3)."""
+    backend = choose_backend("double")
+    c = [dr.opaque(backend.Float, float(v)) for v in cartesian(level.moments, order)[0]]
+    r = x - level.centre[0]
+    inverse = backend.Float(1 / np.linalg.norm(r, axis=1))
+    found = far_terms(c, backend.Array3f(r.T), inverse, derivatives)
+    out = [to_numpy(found.value)]
+    if found.gradient is not None:
+        out.append(np.stack([to_numpy(v) for v in found.gradient], axis=1))
+    if found.hessian is not None:
+        rows = found.hessian.rows(backend.Array3f)
+        out.append(np.stack([np.stack([to_numpy(v) for v in row], 1) for row in rows], axis=1))
+    return out
+
+
+# --- solid harmonics ------------------------------------------------------------------------
+
+
+def test_addition_theorem_of_the_potential() -> None:
+    """1/|x - y| = sum conj(R_lm(y)) I_lm(x): this says which harmonics they are."""
+    rng = np.random.default_rng(0)
+    x, y = 3 * unit(rng.normal(size=(20, 3))), 0.3 * unit(rng.normal(size=(20, 3)))
+    near, far = regular(y, 14), irregular(x, 14)
+    total = sum(
+        np.conj(at(near, l, m)) * at(far, l, m) for l in range(15) for m in range(-l, l + 1)
+    )
+    np.testing.assert_allclose(total, 1 / np.linalg.norm(x - y, axis=1), rtol=1e-13)
+
+
+def test_addition_theorem_of_regular_harmonics() -> None:
+    rng = np.random.default_rng(1)
+    a, b = rng.normal(size=(2, 10, 3))
+    ra, rb, both = regular(a, 5), regular(b, 5), regular(a + b, 5)
+    for (l, m), value in both.items():
+        total = sum(
+            at(ra, k, j) * at(rb, l - k, m - j) for k in range(l + 1) for j in range(-k, k + 1)
+        )
+        np.testing.assert_allclose(total, value, rtol=1e-11, atol=1e-12)
+
+
+def test_derivatives_of_regular_harmonics() -> None:
+    rng = np.random.default_rng(2)
+    x, h = rng.normal(size=(10, 3)), 1e-4
+
+    def along(axis: int, l: int, m: int) -> Any:
+        """Exact for degree 4, by five points."""
+        step = h * np.eye(3)[axis]
+        one, two = (regular(x + k * step, 5)[l, m] - regular(x - k * step, 5)[l, m] for k in (1, 2))
+        return (8 * one - two) / (12 * h)
+
+    here = regular(x, 5)
+    for l, m in here:
+        dx, dy, dz = (along(axis, l, m) for axis in range(3))
+        np.testing.assert_allclose(dz, at(here, l - 1, m) + 0 * dz, atol=1e-9)
+        np.testing.assert_allclose(dx + 1j * dy, -at(here, l - 1, m + 1) + 0 * dz, atol=1e-9)
+        np.testing.assert_allclose(dx - 1j * dy, at(here, l - 1, m - 1) + 0 * dz, atol=1e-9)
+
+
+# --- moments --------------------------------------------------------------------------------
+
+
+def test_moments_are_coefficients_of_the_field() -> None:
+    y, normal = cluster(2)
+    y *= 0.02 / np.linalg.norm(y, axis=1).max()
+    moments = of_dipoles(y[None], normal[None])
+    x = 2 * unit(np.random.default_rng(0).normal(size=(30, 3)))
+    far = irregular(x, 5)
+    total = -sum(
+        np.conj(at(moments, l, m)) * at(far, l, m) for l in range(1, 6) for m in range(-l, l + 1)
+    )
+    expected = dipole_sum(x, y, normal)
+    # The next term is smaller by the ratio to the fifth power: 1e-10.
+    np.testing.assert_allclose(total.real, expected, atol=1e-8 * np.abs(normal).sum())
+    np.testing.assert_allclose(total.imag, 0, atol=1e-12 * np.abs(normal).sum())
+
+
+@given(seed=st.integers(0, 1000))
+def test_moments_moved_are_moments(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    d, normal = rng.normal(size=(2, 4, 6, 3))
+    shift = rng.normal(size=(4, 3))
+    expected = of_dipoles(d + shift[:, None], normal)
+    found = moved(of_dipoles(d, normal), shift)
+    assert found.keys() == expected.keys()
+    for key, value in expected.items():
+        np.testing.assert_allclose(found[key], value, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("n", [1, 2, 9, 100, 333])
+def test_nodes_have_the_moments_of_what_they_hold(n: int) -> None:
+    rng = np.random.default_rng(n)
+    corners = rng.normal(size=(n, 1, 3)) + 0.3 * rng.normal(size=(n, 3, 3))
+    tree = build_hierarchy(corners.mean(axis=1))
+    points, normals = triangle_dipoles(corners)
+    levels = all_levels(tree, points, normals, corners.min(axis=1), corners.max(axis=1))
+    assert [len(level.centre) for level in levels] == list(tree.counts)
+    held = tree.slots
+    for level, arity in zip(levels, (*tree.arities, 1), strict=True):
+        for node in range(len(level.centre)):
+            rows = held[node][held[node] >= 0]
+            d = (points[rows] - level.centre[node]).reshape(1, -1, 3)
+            a = normals[rows].reshape(1, -1, 3)
+            size = np.linalg.norm(a, axis=-1)
+            far = np.linalg.norm(corners[rows] - level.centre[node], axis=-1).max()
+            assert far <= level.radius[node] * (1 + 1e-12)
+            assert level.area[node] == pytest.approx(size.sum())
+            assert level.spread[node] == pytest.approx((size * (d * d).sum(axis=-1)).sum())
+            assert np.abs((size[..., None] * d).sum(axis=1)).max() <= 1e-10 * (1 + size.sum())
+            for key, value in of_dipoles(d, a).items():
+                np.testing.assert_allclose(level.moments[key][node], value[0], atol=1e-8)
+        held = held.reshape(len(held) // arity, -1)
+
+
+def test_nodes_without_area_have_a_centre() -> None:
+    """Two turned copies cancel as dipoles but keep their areas; nothing at all has none."""
+    y = np.array([[0.0, 0, 0], [2.0, 0, 0]])
+    level = level_of(y, np.zeros((2, 3)))
+    np.testing.assert_array_equal(level.centre, [[1.0, 0, 0]])
+    assert level.area.tolist() == [0]
+    assert all(np.isfinite(value).all() for value in truncation(level, 2 * level.radius))
+
+
+def test_triangle_dipoles_integrate_to_degree_four() -> None:
+    rng = np.random.default_rng(0)
+    corners = rng.normal(size=(5, 3, 3))
+    points, normals = triangle_dipoles(corners)
+    normal = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    np.testing.assert_allclose(normals.sum(axis=1), normal)
+    share = np.linalg.norm(normals, axis=2) / np.linalg.norm(normal, axis=1)[:, None]
+    # Over a triangle the mean of u^i v^j w^k is 2 i! j! k!/(i+j+k+2)!, barycentric u, v, w.
+    for n in range(200):
+        i, j, k = rng.integers(0, 5, 3) if n else (0, 0, 0)
+        if i + j + k > 4:
+            continue
+        weights = np.linalg.solve(
+            np.moveaxis(corners, 1, 2)[:, None], points[..., None]
+        )[..., 0]  # fmt: skip
+        power = weights[..., 0] ** i * weights[..., 1] ** j * weights[..., 2] ** k
+        exact = 2 * math.factorial(i) * math.factorial(j) * math.factorial(k)
+        exact /= math.factorial(i + j + k + 2)
+        np.testing.assert_allclose((share * power).sum(axis=1), exact, rtol=1e-9)
+
+
+# --- terms ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_cartesian_terms_are_the_harmonics(order: int) -> None:
+    for seed in range(6):
+        level = level_of(*cluster(seed))
+        x = level.centre + 3 * np.random.default_rng(seed).normal(size=(50, 3))
+        far = irregular(x - level.centre, order + 1)
+        expected = -sum(
+            np.conj(at(level.moments, l, m)) * at(far, l, m)
+            for l in range(1, order + 2)
+            for m in range(-l, l + 1)
+        )
+        assert np.abs(expected.imag).max() <= 1e-10 * np.abs(expected).max()
+        (value,) = terms(level, x, order, 0)
+        np.testing.assert_allclose(value, expected.real, atol=1e-12 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_derivatives_of_terms(order: int) -> None:
+    h = 1e-4
+    for seed in range(6):
+        level = level_of(*cluster(seed))
+        x = level.centre + 2 * unit(np.random.default_rng(seed).normal(size=(40, 3)))
+        value, gradient, hessian = terms(level, x, order, 2)
+        np.testing.assert_array_equal(value, terms(level, x, order, 0)[0])
+        np.testing.assert_array_equal(gradient, terms(level, x, order, 1)[1])
+        for axis in range(3):
+            step = h * np.eye(3)[axis]
+            (v1, g1), (v0, g0) = (terms(level, x + s * step, order, 1) for s in (1, -1))
+            (v3, g3), (v2, g2) = (terms(level, x + 2 * s * step, order, 1) for s in (1, -1))
+            slope = (8 * (v1 - v0) - (v3 - v2)) / (12 * h)
+            bend = (8 * (g1 - g0) - (g3 - g2)) / (12 * h)
+            scale = np.abs(hessian).max()
+            np.testing.assert_allclose(gradient[:, axis], slope, atol=1e-9 * scale)
+            np.testing.assert_allclose(hessian[:, axis], bend, atol=1e-8 * scale)
+        np.testing.assert_array_equal(hessian, np.swapaxes(hessian, 1, 2))
+        trace = np.trace(hessian, axis1=1, axis2=2)
+        np.testing.assert_allclose(trace, 0, atol=1e-12 * np.abs(hessian).max())
+
+
+# --- bounds ---------------------------------------------------------------------------------
+
+
+def test_sup_norm_bounds_every_term() -> None:
+    ways = unit(np.random.default_rng(0).normal(size=(500, 3)))
+    far = irregular(ways, 5)
+    for seed in range(10):
+        level = level_of(*cluster(seed))
+        for l in range(1, 6):
+            term = sum(np.conj(at(level.moments, l, m)) * at(far, l, m) for m in range(-l, l + 1))
+            bound = sup_norm(level.moments, l)[0]
+            assert np.abs(term).max() <= bound * (1 + 1e-12)
+            if l == 1:  # of a dipole it is the largest value
+                assert np.abs(term).max() >= 0.95 * bound
+
+
+def viewpoints(level: Level, q: float, seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    r = level.radius[0] / q * np.where(np.arange(60) < 30, 1.0, rng.uniform(1, 4, 60))
+    return level.centre[0] + r[:, None] * unit(rng.normal(size=(60, 3)))
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("accuracy", [1.5, 2.0, 4.0])
+def test_truncation_is_bounded(order: int, accuracy: float) -> None:
+    """In value and gradient, from the accepting distance on, and not by much too much."""
+    k = order + 2
+    used = []
+    for seed in range(30):
+        y, normal = cluster(seed, 2 if seed % 5 == 4 else 12)
+        level = level_of(y, normal)
+        nearest = accuracy * level.radius
+        e, g = (bound[0] for bound in truncation(level, nearest, order))
+        x = viewpoints(level, 1 / accuracy, seed)
+        r = np.linalg.norm(x - level.centre[0], axis=1)
+        value, gradient = terms(level, x, order, 1)
+        off = np.abs(value - dipole_sum(x, y, normal))
+        slope = np.linalg.norm(gradient - dipole_gradient(x, y, normal), axis=1)
+        tiny = 1e-12 * np.linalg.norm(normal, axis=1).sum()
+        assert (off <= e / r ** (k + 1) * (1 + 1e-9) + tiny / r**2).all()
+        assert (slope <= g / r ** (k + 2) * (1 + 1e-9) + tiny / r**3).all()
+        used.append((off / (e / r ** (k + 1))).max())
+    assert max(used) > 0.2
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_truncation_is_bounded_for_triangles(order: int) -> None:
+    """Whose quadrature points stand for them: the solid angle itself is within the bound."""
+    k = order + 2
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        corners = rng.normal(size=(8, 1, 3)) * rng.choice([0.1, 1.0], 3)
+        corners = corners + rng.choice([0.1, 1.0]) * rng.normal(size=(8, 3, 3))
+        tree = build_hierarchy(corners.mean(axis=1))
+        low, high = corners.min(axis=1), corners.max(axis=1)
+        level = all_levels(tree, *triangle_dipoles(corners), low, high)[-1]
+        for accuracy in (1.5, 2.0, 4.0):
+            e = truncation(level, accuracy * level.radius, order)[0][0]
+            x = viewpoints(level, 1 / accuracy, seed)
+            r = np.linalg.norm(x - level.centre[0], axis=1)
+            off = np.abs(terms(level, x, order, 0)[0] - solid_angles(x, corners))
+            assert (off <= e / r ** (k + 1) + 1e-12).all()
+
+
+@pytest.mark.parametrize("accuracy", [1.5, 2.0, 4.0])
+def test_sums_over_dipoles_are_bounded(accuracy: float) -> None:
+    """V of `node_columns`: sum a/rho^3 <= V/r^3 and sum a/rho^4 <= V/r^4."""
+    for seed in range(30):
+        y, normal = cluster(seed)
+        level = level_of(y, normal)
+        columns = node_columns(level, accuracy, 2)[0]
+        np.testing.assert_array_equal(columns[:3], level.centre[0])
+        assert columns[3] == pytest.approx(accuracy * level.radius[0])
+        x = viewpoints(level, 1 / accuracy, seed)
+        r = np.linalg.norm(x - level.centre[0], axis=1)
+        rho = np.linalg.norm(x[:, None] - y, axis=2)
+        area = np.linalg.norm(normal, axis=1)
+        for power in (3, 4):
+            total = (area / rho**power).sum(axis=1)
+            assert (total <= columns[5] / r**power * (1 + 1e-12)).all()
