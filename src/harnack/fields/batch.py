@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import numpy as np
@@ -41,44 +41,45 @@ def at_points(
     if not np.isfinite(given).all():
         bad = np.flatnonzero(~np.isfinite(given).all(axis=1))
         raise ValueError(f"points has NaN or infinite values: entry {bad[0]}")
+    if not len(given):
+        return tuple(one[:0] for one in at_points(np.zeros((1, 3)), kernel, precision))
     number = np.float64 if precision == "double" else np.float32
-    order = morton_order(given)
     parts: list[tuple[npt.NDArray[Any], ...]] = []
-    for start in range(0, max(len(given), 1), _AT_ONCE):
-        some = given[order[start : start + _AT_ONCE]].astype(number)
-        x = backend.Array3f(*(aligned(backend, some[:, k]) for k in range(3)))
-        results = kernel(backend, x)
-        dr.eval(*results)
-        parts.append(tuple(_wide(to_numpy(one), len(some)) for one in results))
-    gathered: list[npt.NDArray[Any]] = []
-    for pieces in zip(*parts, strict=True):
-        sorted_values = np.concatenate(pieces)
-        values = np.empty_like(sorted_values)
-        values[order] = sorted_values
-        gathered.append(values)
-    return tuple(gathered)
+    for start in range(0, len(given), _AT_ONCE):
+        some = given[start : start + _AT_ONCE]
+        x = backend.Array3f(*(aligned(backend, some[:, k].astype(number)) for k in range(3)))
+        order = morton_order(backend, x)
+        results = kernel(backend, dr.gather(backend.Array3f, x, order))
+        places = [_back_in_place(one, order, len(some)) for one in results]
+        dr.eval(*places)
+        parts.append(tuple(to_numpy(one) for one in places))
+    return tuple(np.concatenate(pieces) for pieces in zip(*parts, strict=True))
 
 
-def _wide(values: npt.NDArray[Any], n: int) -> npt.NDArray[Any]:
-    return np.broadcast_to(values, (n, *values.shape[1:]))
+def _back_in_place(values: Any, order: Any, n: int) -> Any:
+    """Values of the points in the order visited, in the order given."""
+    kind = cast("Any", type(values))
+    if dr.depth_v(kind) == 1:
+        out = dr.zeros(kind, n)
+        dr.scatter(out, values, order)
+        return out
+    return kind([_back_in_place(one, order, n) for one in values])
 
 
-def morton_order(points: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
-    """An order that visits points (n, 3) cell by cell, cells along a Morton curve."""
-    if len(points) < 2:
-        return np.arange(len(points))
-    low = points.min(axis=0)
-    size = float((points.max(axis=0) - low).max())
-    cells = ((points - low) * ((2**_BITS - 1e-3) / max(size, 1e-300))).astype(np.uint16)
-    key = np.zeros(len(points), np.uint16)
+def morton_order(backend: Backend, x: Vec3) -> Any:
+    """An order that visits points cell by cell, cells along a Morton curve (a Dr.Jit UInt32)."""
+    index, vector = backend.UInt32, backend.Array3f
+    n = dr.width(x)
+    if n < 2:
+        return dr.arange(index, n)
+    low = vector(*(dr.min(one) for one in x))
+    sides = [dr.max(x[k] - low[k]) for k in range(3)]
+    size = dr.maximum(dr.maximum(sides[0], sides[1]), sides[2])
+    scale = (2**_BITS - 1e-3) / dr.maximum(size, 1e-30)
+    key = index(0)
     for axis in range(3):
-        key |= _spread(cells[:, axis]) << np.uint16(axis)
-    return np.argsort(key, kind="stable")
-
-
-def _spread(x: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint16]:
-    """Five bits with two zeros between each and the next."""
-    spread = np.zeros_like(x)
-    for bit in range(_BITS):
-        spread |= (x & np.uint16(1 << bit)) << np.uint16(2 * bit)
-    return spread
+        cell = index((x[axis] - low[axis]) * scale)
+        for bit in range(_BITS):
+            key |= (cell & (1 << bit)) << (2 * bit + axis)
+    keys = to_numpy(key).astype(np.uint16)
+    return index(np.argsort(keys, kind="stable").astype(np.uint32))

@@ -147,7 +147,9 @@ class DipolePotential(Field):
             for one in s.known
             if isinstance(one, HarmonicBall)
         )
-        return Sample(s.value, s.gradient / on.size, known, s.error, s.gradient_error / on.size)
+        return Sample(
+            s.value, s.gradient / on.size, known, s.error, s.gradient_error / on.size, s.normal
+        )
 
     def check_levels(self, levels: tuple[float, ...]) -> None:
         for level in levels:

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 _REACH, _ROUNDING = 0.5, 2e-5
 _LEAF_SIZE, _ARITY = 8, 4
+# Beside a point means within this part (of its area, in squared distance).
+_BESIDE = 0.04
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,7 @@ class DipoleTree:
         real, vector = self.backend.Float, self.backend.Array3f
 
         def visit(node: Node, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
-            value, g, error, slope_error, clear, s1, s2 = state
+            value, g, error, slope_error, clear, s1, s2, nearest = state
             r, length, far = _far(node, x)
             c = node.payload(far)
             inverse = dr.select(far, dr.rcp(length), 0)
@@ -114,11 +116,12 @@ class DipoleTree:
                 dr.select(far, fmin(apart, clear), clear),
                 dr.fma(node.head[5], cube, s1),
                 dr.fma(node.head[5], cube * inverse, s2),
+                nearest,
             )
             return ~far, for_each(node, ~far & node.is_leaf, add, state)
 
         def add(row: list[Real], active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
-            value, g, error, slope_error, clear, s1, s2 = state
+            value, g, error, slope_error, clear, s1, s2, nearest = state
             one, slope, _ = _dipole(row, x, 1)
             near = dr.norm(vector(*row[:3]) - x)
             cube = dr.select(active, row[6] / (near * near * near), 0)
@@ -130,14 +133,16 @@ class DipoleTree:
                 dr.select(active, fmin(near, clear), clear),
                 s1 + cube,
                 s2 + cube / near,
+                dr.select(active & (near <= clear), vector(*row[3:6]), nearest),
             )
 
-        start = (real(0), vector(0), real(0), real(0), real(dr.inf), real(0), real(0))
+        start = (real(0), vector(0), real(0), real(0), real(dr.inf), real(0), real(0), vector(0))
         return self._certified(*walk(self.tree, visit, start))
 
     def _certified(
-        self, value: Real, g: Vec3, error: Real, slope_error: Real, clear: Real, s1: Real, s2: Real
-    ) -> Sample:
+        self, value: Real, g: Vec3, error: Real, slope_error: Real, clear: Real, s1: Real,
+        s2: Real, nearest: Vec3,
+    ) -> Sample:  # fmt: skip
         epsilon = self.backend.epsilon
         distance = clear * (1 - _ROUNDING) - 8 * epsilon
         r = _REACH * distance
@@ -146,12 +151,18 @@ class DipoleTree:
         # On a point itself all values meet: a gradient that says so.
         apart = (clear > 16 * epsilon) & dr.isfinite(value) & dr.isfinite(dr.squared_norm(g))
         steep = self.backend.Array3f(0, 0, 4 * math.pi / (8 * epsilon))
+        # Where one point's own field drowns the others', the surface has that point's normal; f
+        # is larger on the other side.
+        weight = dr.norm(nearest)
+        beside = (clear * clear < _BESIDE * weight) & (weight > 0)
+        normal = dr.select(beside, -nearest / weight, dr.normalize(g))
         return Sample(
             dr.select(apart, value, 0),
             dr.select(apart, g, steep),
             (ball,),
             error + self.rounding,
             dr.select(apart, slope_error, 0),
+            normal,
         )
 
 

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import numpy as np
@@ -31,8 +31,10 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.tree.hierarchy import FloatArray, IntArray
 
+# Edges a trip of the loop; those that fill the last one have no length and no direction.
+_CHUNK = 4
 # Where an edge is nowhere near the ray, its factor has this for an imaginary part of zero.
-_TINY = 1e-30
+_TINY = 1e-36
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ class LiftedEdges:
 
     backend: Backend
     buffer: Any
-    count: Any
+    trips: Any
 
     @classmethod
     def upload(cls, backend: Backend, vertices: FloatArray, edges: IntArray) -> LiftedEdges:
@@ -55,9 +57,13 @@ class LiftedEdges:
         direction = np.where(edges[:, 0] < edges[:, 1], 1.0, -1.0)[:, None]
         square = ((high - low) ** 2).sum(axis=1, keepdims=True)
         table = np.concatenate([low, direction, high, 1 / np.maximum(square, 1e-300)], axis=1)
-        values = table.ravel()
+        padding = np.tile(table[:1], (-len(table) % _CHUNK, 1))
+        padding[:, 4:7], padding[:, 3] = padding[:, :3], 0.0
+        values = np.concatenate([table, padding]).ravel()
         cast = values.astype(np.float32) if backend.precision == "single" else values
-        return cls(backend, aligned(backend, cast), dr.opaque(backend.UInt32, len(edges)))
+        return cls(
+            backend, aligned(backend, cast), dr.opaque(backend.UInt32, -(-len(edges) // _CHUNK))
+        )
 
 
 @dataclass(frozen=True)
@@ -92,42 +98,69 @@ def lifted_sums(
     backend = edges.backend
     real, vector = backend.Float, backend.Array3f
 
-    def body(i: Any, winding: Any, sizes: Any, *sums: Any) -> Any:
-        row = dr.gather(backend.ArrayXf, edges.buffer, i, shape=(8, 1))
-        direction, inverse = row[3], row[7]
-        a, b = place(vector(row[0], row[1], row[2])), place(vector(row[4], row[5], row[6]))
-        la, lb = dr.norm(a), dr.norm(b)
-        im = -side((a.x, a.y), (b.x, b.y))
-        re = dr.fma(_s(a, la), _s(b, lb), dr.fma(a.x, b.x, a.y * b.y))
-        im = direction * dr.select(im == 0, _TINY, im)
-        zr, zi, turns = winding
-        winding = times(zr, zi, turns, re, im)
-        if derivatives >= 1:
-            c, weight = _field(a, b, la, lb)
-            g = dr.fma(vector(direction * weight), c, sums[0])
-            rest = sums[1:]
-            if derivatives == 2:
-                u, v = edge_rates(a, b - a, inverse)
-                rest = SymmetricSum(*rest).plus(direction * u, v).parts()
-            sums = (g, *rest)
-        if variation:
-            sizes = _with_variation(a, b - a, inverse, *sizes)
-        return i + 1, winding, sizes, *sums
+    def body(i: Any, *state: Any) -> Any:
+        for j in range(_CHUNK):
+            row = dr.gather(backend.ArrayXf, edges.buffer, i * _CHUNK + j, shape=(8, 1))
+            state = _with_edge(vector, row, place, derivatives, variation, *state)
+        return i + 1, *state
 
     def more(i: Any, *_: Any) -> Mask:
-        return i < edges.count
+        return i < edges.trips
 
-    zero = SymmetricSum.zero(real)
-    sums: tuple[Any, ...] = ()
-    if derivatives >= 1:
-        sums = (vector(0), *(zero.parts() if derivatives == 2 else ()))
-    one, none = real(1), real(0)
-    start = (backend.UInt32(0), (one, none, real(0)), (real(dr.inf), real(0), real(0)), *sums)
+    sums = (vector(0), *SymmetricSum.zero(real).parts())[: (0, 1, 7)[derivatives]]
+    winding, sizes = (real(1), real(0), real(0)), (real(dr.inf), real(0), real(0))
+    start = (backend.UInt32(0), winding, sizes, *sums)
     _, (zr, zi, turns), (d2, s1, s2), *rest = dr.while_loop(start, more, body, label="lift")
     angle = 2 * dr.fma(2 * dr.pi, turns, dr.atan2(zi, zr))
-    gradient = rest[0] if derivatives >= 1 else vector(0)
-    hessian = SymmetricSum(*rest[1:]) if derivatives == 2 else zero
-    return LiftedSums(angle, gradient, hessian, dr.sqrt(d2), s1, s2)
+    return LiftedSums(
+        angle,
+        rest[0] if derivatives >= 1 else vector(0),
+        SymmetricSum(*rest[1:]) if derivatives == 2 else SymmetricSum.zero(real),
+        dr.sqrt(d2),
+        s1,
+        s2,
+    )
+
+
+def _with_edge(
+    vector: Any, row: Any, place: Callable[[Vec3], Vec3], derivatives: int, variation: bool,
+    winding: Any, sizes: Any, *sums: Any,
+) -> Any:  # fmt: skip
+    """The sums with the edge of a record added."""
+    direction, inverse = row[3], row[7]
+    a, b = place(vector(row[0], row[1], row[2])), place(vector(row[4], row[5], row[6]))
+    la, lb = dr.norm(a), dr.norm(b)
+    re, im = _factor(a, b, la, lb)
+    im = direction * im
+    zr, zi, turns = winding
+    winding = times(zr, zi, turns, re, im)
+    if derivatives >= 1:
+        c, weight = _field(a, b, la, lb)
+        g = dr.fma(vector(direction * weight), c, sums[0])
+        rest = sums[1:]
+        if derivatives == 2:
+            u, v = edge_rates(a, b - a, inverse)
+            rest = SymmetricSum(*rest).plus(direction * u, v).parts()
+        sums = (g, *rest)
+    if variation:
+        sizes = _with_variation(a, b - a, inverse, *sizes)
+    return winding, sizes, *sums
+
+
+def _factor(a: Vec3, b: Vec3, la: Real, lb: Real) -> tuple[Real, Real]:
+    """F_e of the edge from a to b.
+
+    A ray exactly through an edge or a vertex is decided as `tree.triangles.crossing` does: as if
+    it passed at v, and then u, infinitely little below zero.
+    """
+    real = cast("Any", type(la))
+    in_line = (a.x == 0) & (a.y == 0), (b.x == 0) & (b.y == 0)
+    ax, bx = dr.select(in_line[0], real(-1e-18), a.x), dr.select(in_line[1], real(-1e-18), b.x)
+    im = -side((ax, a.y), (bx, b.y))
+    re = dr.fma(_s(a, la), _s(b, lb), dr.fma(ax, bx, a.y * b.y))
+    re = dr.select(in_line[0] & in_line[1], 1, re)
+    tie = dr.select(a.y == b.y, ax - bx, b.y - a.y)
+    return re, dr.select(im == 0, dr.mulsign(real(_TINY), tie), im)
 
 
 def _field(a: Vec3, b: Vec3, la: Real, lb: Real) -> tuple[Vec3, Real]:

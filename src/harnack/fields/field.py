@@ -60,6 +60,8 @@ class Sample:
         in its last place (and beyond |gradient| times the rounding of the point itself, which
         the tracer accounts for), or an approximation has. Steps are shortened by it.
     gradient_error: how far an approximation may have moved `gradient`, as a length.
+    normal: (3,) unit, what to shade with where the gradient is no guide (beside a singular point
+        of the surface); None for the gradient's own direction. No step looks at it.
     """
 
     value: Real
@@ -67,6 +69,7 @@ class Sample:
     known: tuple[Knowledge, ...]
     error: Real = 0.0
     gradient_error: Real = 0.0
+    normal: Vec3 | None = None
 
 
 class Field(abc.ABC):

@@ -13,7 +13,7 @@ from harnack.geometry import MeshError, validate_mesh
 from harnack.geometry.singular import net_faces, singular_edges, weld_vertices
 from harnack.tree import Hierarchy, build_hierarchy
 from harnack.tree.hierarchy import FloatArray, IntArray
-from harnack.tree.triangles import MOST_TRIANGLES, triangle_records
+from harnack.tree.triangles import MOST_TRIANGLES, PARITY, triangle_records
 
 # Triangles of a leaf at most, and children of a node: by experiment.
 _LEAF_SIZE, _ARITY = 8, 4
@@ -23,16 +23,17 @@ _LEAF_SIZE, _ARITY = 8, 4
 class WindingMesh:
     """What the evaluators of a winding number are made of. Double precision, in NumPy.
 
-    vertices: (n, 3), as given. triangles: (m, 3) indices of welded vertices; a face given k times
-        (less the times that it is given turned round) is here k times. source: (m,) the face
-        that each triangle comes from.
+    vertices: (n, 3), as given. faces: (m, 3) indices of welded vertices, no two alike.
+    multiplicity: (m,) how often each is given, less the times that it is given turned round.
+    source: (m,) the face that it comes from.
     singular: (k, 2) directed edges at which triangles do not cancel, an edge of weight 2 twice.
     centre, size: `unit_vertices` = (vertices - centre)/size, with a power of two for a size, so
         that lengths can be scaled to and fro without rounding.
     """
 
     vertices: FloatArray
-    triangles: IntArray
+    faces: IntArray
+    multiplicity: IntArray
     source: IntArray
     singular: IntArray
     centre: FloatArray
@@ -58,8 +59,9 @@ class WindingMesh:
         size = 2.0 ** np.ceil(np.log2(0.5 * float((high - low).max())))
         return cls(
             x,
-            np.repeat(net.faces, net.multiplicity, axis=0),
-            np.repeat(net.source, net.multiplicity),
+            net.faces,
+            net.multiplicity,
+            net.source,
             np.repeat(edges, weights, axis=0),
             0.5 * (low + high),
             float(size),
@@ -69,6 +71,11 @@ class WindingMesh:
     def unit_vertices(self) -> FloatArray:
         """(n, 3) vertices about the origin, of size about one."""
         return (self.vertices - self.centre) / self.size
+
+    @functools.cached_property
+    def triangles(self) -> IntArray:
+        """(k, 3) faces, each as often as it counts."""
+        return np.repeat(self.faces, self.multiplicity, axis=0)
 
     @functools.cached_property
     def corners(self) -> FloatArray:
@@ -81,9 +88,26 @@ class WindingMesh:
         return build_hierarchy(self.corners.mean(axis=1), leaf_size=_LEAF_SIZE, arity=_ARITY)
 
     @functools.cached_property
+    def ray_tree(self) -> Hierarchy:
+        """Over the centroids of faces, each once: a ray crosses all of its copies at once."""
+        if len(self.faces) == len(self.triangles):
+            return self.tree
+        centroids = self.unit_vertices[self.faces].mean(axis=1)
+        return build_hierarchy(centroids, leaf_size=_LEAF_SIZE, arity=_ARITY)
+
+    @functools.cached_property
+    def ray_records(self) -> FloatArray:
+        """(m, 14) of the faces, as `tree.triangles` describes; turns count by multiplicity."""
+        records = triangle_records(self.unit_vertices, self.faces)
+        records[:, PARITY] *= self.multiplicity
+        return records
+
+    @functools.cached_property
     def records(self) -> FloatArray:
-        """(m, 14), as `tree.triangles` describes."""
-        return triangle_records(self.unit_vertices, self.triangles)
+        """(k, 14) of the triangles, with the numbers of their faces."""
+        return np.repeat(
+            triangle_records(self.unit_vertices, self.faces), self.multiplicity, axis=0
+        )
 
     @functools.cached_property
     def levels(self) -> list[Level]:

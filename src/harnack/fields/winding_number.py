@@ -19,6 +19,7 @@ from harnack.fields.winding_exact import ExactWinding
 from harnack.fields.winding_mesh import WindingMesh
 from harnack.fields.winding_tree import TreeWinding
 from harnack.geometry import Box
+from harnack.tree.nearest import distance_to_triangles
 from harnack.tree.triangles import Frame, TriangleRays
 
 if TYPE_CHECKING:
@@ -120,7 +121,11 @@ class WindingNumber(Field):
         return np.moveaxis(rows, 2, 0)
 
     def error_bound(self, points: Any, *, precision: Precision = "single") -> FloatArray:
-        """How far `value` may be from w at most: the tree's truncation, proved, and rounding."""
+        """How far `value` may be from w at most: the tree's truncation, proved, and rounding.
+
+        Rounding of the points themselves comes on top: w is steep beside singular edges and
+        jumps at the triangles.
+        """
         bound = self._at(points, precision, 0)[2]
         return bound + self._batch_rounding(precision)
 
@@ -150,7 +155,7 @@ class WindingNumber(Field):
 
     def _upload(self, backend: Backend, accuracy: float) -> _OnDevice:
         mesh = self.mesh
-        rays = TriangleRays.of(backend, mesh.tree, mesh.records)
+        rays = TriangleRays.of(backend, mesh.ray_tree, mesh.ray_records)
         if self.method == "exact":
             winding = ExactWinding.of(backend, mesh, rays)
         else:
@@ -196,7 +201,8 @@ class WindingNumber(Field):
         return _Stretch(on, frame, behind, ahead, offset)
 
     def distance_to_sheets(self, p: Vec3) -> Real:
-        raise NotImplementedError
+        on = self._on(p)
+        return distance_to_triangles(on.rays, on.unit(p)) * on.size
 
     def _on(self, p: Vec3) -> _OnDevice:
         if self._device is None:

@@ -76,6 +76,7 @@ def meet_surface(
     sample = prepared.sample(p)
     length = dr.norm(sample.gradient)
     normal = dr.select(length > 0, sample.gradient / length, -d)
+    shading = normal if sample.normal is None else sample.normal
     uncertainty = _uncertainty(prepared, sample.gradient, t, sample.value, sample.error)
     rest = prepared.levels.to_nearest(sample.value) / length
     rest = dr.select(length > 0, dr.clip(rest, -reach, reach), 0)
@@ -88,7 +89,7 @@ def meet_surface(
         met=met,
         lost=trace.status == int(Status.OUT_OF_STEPS),
         position=dr.fma(vector(rest), normal, p),
-        normal=facing(normal, d, side),
+        normal=facing(shading, d, side),
         clearance=CLEARANCE * uncertainty,
         value=sample.value,
         evaluations=trace.evaluations + dr.select(smooth, prepared.backend.UInt32(1), 0),

@@ -1,0 +1,54 @@
+"""The distance to the nearest triangle, by a tree of boxes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, cast
+
+import drjit as dr
+
+from harnack.backend.extrema import clamp, fmax, fmin
+from harnack.tree.triangles import TriangleRays, corners_of
+from harnack.tree.walk import Node, State, for_each, walk
+
+if TYPE_CHECKING:
+    from harnack.backend import Mask, Real, Vec3
+
+
+def distance_to_triangles(rays: TriangleRays, x: Vec3) -> Real:
+    """From x to the nearest point of the triangles; boxes that are farther are passed by."""
+    tree = rays.tree
+    real, vector = tree.backend.Float, tree.backend.Array3f
+    x = vector(x)
+
+    def visit(node: Node, state: State) -> tuple[Mask, State]:
+        low, high = vector(*node.head[:3]), vector(*node.head[3:])
+        outside = dr.select(x < low, low - x, dr.select(x > high, x - high, 0))
+        closer = dr.squared_norm(outside) < state[0]
+        return closer, for_each(node, closer & node.is_leaf, nearer, state)
+
+    def nearer(row: list[Real], active: Mask, state: State) -> State:
+        return (dr.select(active, fmin(squared_distance(row, x), state[0]), state[0]),)
+
+    return dr.sqrt(walk(tree, visit, (real(dr.inf),))[0])
+
+
+def squared_distance(row: list[Real], x: Vec3) -> Real:
+    """From x to the triangle of a record: to its plane over its inside, else to its edges."""
+    vector = cast("Any", type(x))
+    p, q, r = corners_of(row, vector)
+    best = fmin(_to_segment(p, q, x), fmin(_to_segment(q, r, x), _to_segment(p, r, x)))
+    n = dr.cross(q - p, r - p)
+    square = dr.squared_norm(n)
+    inside = square > 0
+    for a, b in ((p, q), (q, r), (r, p)):
+        inside &= dr.dot(dr.cross(b - a, x - a), n) >= 0
+    height = dr.dot(x - p, n)
+    return dr.select(inside, fmin(best, height * height / fmax(square, type(square)(1e-37))), best)
+
+
+def _to_segment(a: Vec3, b: Vec3, x: Vec3) -> Real:
+    e = b - a
+    square = dr.squared_norm(e)
+    share = dr.select(square > 0, dr.dot(x - a, e) / square, 0)
+    share = clamp(share, type(square)(0), type(square)(1))
+    return dr.squared_norm(x - a - e * share)
