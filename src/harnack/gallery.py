@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from harnack.fields import (
+    DipolePotential,
     EigenfunctionSum,
     Field,
     Gyroid,
@@ -23,9 +24,10 @@ from harnack.fields import (
     SchwarzP,
     SolidAngle,
     SphericalHarmonic,
+    WindingNumber,
     sine,
 )
-from harnack.geometry import Ball, Box, HalfSpace, shapes
+from harnack.geometry import Ball, Box, HalfSpace, mesh_shapes, shapes
 from harnack.rendering import Camera, render
 from harnack.tracer import LevelSet, Tolerance, level_set
 
@@ -101,6 +103,54 @@ def _eigenfunctions() -> list[LevelSet]:
 
 
 def _harmonic(field: Field) -> list[LevelSet]:
+    return [level_set(field, tolerance=_DRAWN)]
+
+
+def _cut_mesh() -> list[LevelSet]:
+    """A bumpy sphere with round holes cut into it."""
+    vertices, faces = mesh_shapes.bumpy_sphere(4)
+    middles = vertices[faces].mean(axis=1)
+    middles /= np.linalg.norm(middles, axis=1, keepdims=True)
+    holes = np.random.default_rng(3).normal(size=(8, 3))
+    holes /= np.linalg.norm(holes, axis=1, keepdims=True)
+    whole = (middles @ holes.T < math.cos(0.26)).all(axis=1)
+    return [level_set(WindingNumber(vertices, faces[whole]), tolerance=_DRAWN)]
+
+
+def _soup() -> list[LevelSet]:
+    """Loose triangles: every one shrunk about its middle, a tenth of them missing."""
+    vertices, faces = mesh_shapes.bumpy_sphere(3)
+    faces = mesh_shapes.remove_faces(faces, 0.1, seed=1)
+    corners = vertices[faces]
+    middle = corners.mean(axis=1, keepdims=True)
+    loose = (middle + 0.93 * (corners - middle)).reshape(-1, 3)
+    field = WindingNumber(loose, np.arange(len(loose)).reshape(-1, 3), method="tree")
+    return [level_set(field, tolerance=_DRAWN)]
+
+
+def _cloud() -> list[LevelSet]:
+    """Oriented points on a bumpy sphere, and nothing else."""
+    vertices, faces = mesh_shapes.bumpy_sphere(5)
+    p, q, r = np.moveaxis(vertices[faces], 1, 0)
+    normals = np.cross(q - p, r - p)
+    chosen = np.random.default_rng(2).choice(len(faces), 4000, replace=False)
+    points = (p + q + r)[chosen] / 3
+    return [level_set(DipolePotential(points, normals[chosen]), tolerance=_DRAWN)]
+
+
+def _knot_cloud() -> list[LevelSet]:
+    """Oriented points on a tube around a trefoil."""
+    curve = shapes.torus_knot(2, 3, 240)
+    along = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    u = np.cross(along, (0.0, 0.0, 1.0))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    v = np.cross(along, u)
+    turn = np.linspace(0, 2 * math.pi, 24, endpoint=False)[None, :, None]
+    normals = np.cos(turn) * u[:, None] + np.sin(turn) * v[:, None]
+    radius = 0.09 * float(np.ptp(curve))
+    points = curve[:, None] + radius * normals
+    field = DipolePotential(points.reshape(-1, 3), normals.reshape(-1, 3))
     return [level_set(field, tolerance=_DRAWN)]
 
 
@@ -209,7 +259,43 @@ _SOLIDS = (
     ),
 )
 
+# Most of these are drawn as normals: light paths through them take minutes on a CPU.
+_MESHES = (
+    Scene(
+        "cut-mesh",
+        "a mesh with holes, mended by its winding number",
+        _cut_mesh,
+        ("plastic",),
+        demo_spp=4,
+    ),
+    Scene(
+        "soup",
+        "a soup of loose triangles, mended by its winding number",
+        _soup,
+        ("clay",),
+        show="normal",
+        demo_spp=1,
+    ),
+    Scene(
+        "cloud",
+        "a surface through 4,000 oriented points",
+        _cloud,
+        ("porcelain",),
+        show="normal",
+        demo_spp=1,
+    ),
+    Scene(
+        "knot-cloud",
+        "a trefoil tube through 5,760 oriented points",
+        _knot_cloud,
+        ("copper",),
+        Camera(azimuth=-80, elevation=52),
+        show="normal",
+        demo_spp=1,
+    ),
+)
+
 SCENES: Mapping[str, Scene] = MappingProxyType(
-    {scene.name: scene for scene in (*_CURVES, *_HARMONICS, *_SOLIDS)}
+    {scene.name: scene for scene in (*_CURVES, *_HARMONICS, *_SOLIDS, *_MESHES)}
 )
 """All scenes by name."""
