@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.backend import choose_backend, to_numpy
+from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.fields.winding_number import WindingNumber
 from harnack.geometry import MeshError
 from harnack.geometry.mesh_shapes import (
@@ -559,3 +559,33 @@ def test_points_that_are_refused() -> None:
     with pytest.raises(TypeError, match="real numbers"):
         field.value(np.array([["a", "b", "c"]]))
     assert field.value(np.zeros((0, 3))).shape == (0,)
+
+
+@pytest.mark.parametrize("method", ["exact", "tree"])
+def test_lifts_stay_within_their_promise(method: str) -> None:
+    """The continuous lift of w, followed along segments in the ball, against [lower, upper]."""
+    vertices, faces = bumpy_sphere(2)
+    faces = remove_faces(faces, 0.15, seed=4)
+    field = WindingNumber(vertices, faces, method=method)
+    exact = WindingNumber(vertices, faces, method="exact")
+    rng = np.random.default_rng(7)
+    x = rng.uniform(-1.4, 1.4, (300, 3))
+    backend = choose_backend("double")
+    sample = field.prepare(backend).evaluate(to_vector3(backend, x))
+    (ball,) = sample.known
+    value, radius = to_numpy(sample.value), to_numpy(ball.radius)
+    room = np.stack([to_numpy(ball.lower) - value, to_numpy(ball.upper) - value])
+    slack = 2 * np.broadcast_to(to_numpy(type(sample.value)(sample.error)), value.shape) + 1e-9
+    assert (radius > 0).all()
+    largest = 0.0
+    for _ in range(6):
+        d = rng.normal(size=x.shape)
+        d /= np.linalg.norm(d, axis=1, keepdims=True)
+        t = np.linspace(0, 0.999, 65)[:, None, None] * radius[:, None]
+        y = (x + t * d).reshape(-1, 3)
+        w = exact.value(y, precision="double").reshape(65, -1)
+        moved = np.unwrap(w, axis=0, period=1.0) - w[0]
+        assert (moved >= room[0] - slack).all()
+        assert (moved <= room[1] + slack).all()
+        largest = max(largest, float((np.abs(moved) / np.abs(room).max(axis=0)).max()))
+    assert largest > 0.1  # the promise is not an empty one
