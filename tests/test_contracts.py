@@ -147,6 +147,8 @@ def bounds_for(field: Field) -> list[Bound]:
         "Charges": (Classic, Slope),
         "Azimuth": (Classic, Slope),
         "Plane": (LipschitzStep, CurvatureStep),
+        "DipolePotential": (Classic, Slope),
+        "ScreenedWindingNumber": (CurvatureStep,),
     }.get(type(field).__name__, (Classic, Slope, LipschitzStep, CurvatureStep))
     return [bound for bound in BOUNDS if isinstance(bound, kinds)]
 
