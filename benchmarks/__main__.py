@@ -11,6 +11,7 @@ from rich.progress import track
 
 import harnack as hk
 
+from .agreement import agreement
 from .convergence import plot
 from .growth import growth
 from .rays import RULES, WIDTH, Row, machine, measure, published
@@ -18,7 +19,7 @@ from .scenes import others, polygons
 from .winding import throughput
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
-SECTIONS = ("rays", "convergence", "winding")
+SECTIONS = ("rays", "convergence", "winding", "agreement")
 
 
 def main() -> None:
@@ -28,13 +29,19 @@ def main() -> None:
     parser.add_argument("--no-convergence", action="store_true", help="skip that section")
     parser.add_argument("--only", choices=SECTIONS, help="rewrite one section of the page")
     parser.add_argument("--bunny", type=Path, help="a surface file, for the winding numbers")
+    parser.add_argument("--meshes", type=Path, help="a folder of surface files, for agreement")
     arguments = parser.parse_args()
     names = [arguments.only] if arguments.only else list(SECTIONS)
     if arguments.no_convergence and "convergence" in names:
         names.remove("convergence")
+    if arguments.meshes is None:
+        if arguments.only == "agreement":
+            parser.error("agreement needs a folder of surface files: --meshes FOLDER")
+        names = [name for name in names if name != "agreement"]
     write: dict[str, Callable[[], str]] = {
         "rays": _rays,
         "convergence": lambda: _convergence(arguments.out.with_name("convergence.png")),
+        "agreement": lambda: agreement(arguments.meshes),
         "winding": lambda: _winding(arguments.bunny, arguments.out.with_name("growth.png")),
     }
     if arguments.only and not arguments.out.exists():

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
+from pathlib import Path
 
 # First, as a user's program would: it decides which LLVM Dr.Jit loads.
 import harnack.backend  # noqa: F401  # isort: skip
 
 import drjit as dr
+import pytest
 from hypothesis import HealthCheck, settings
 
 # A first example compiles kernels, so its time says nothing: no deadline, no too-slow check.
@@ -33,3 +36,15 @@ def _share_cores() -> None:
 
 
 _share_cores()
+
+
+@pytest.fixture
+def save(tmp_path: Path) -> Callable[[str, str | bytes], Path]:
+    """Writes a file of that name and content into the test's own folder."""
+
+    def write(name: str, content: str | bytes) -> Path:
+        path = tmp_path / name
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return path
+
+    return write

@@ -86,7 +86,7 @@ def test_a_closed_mesh_of_any_format_is_drawn_by_its_winding_number(run, tmp_pat
     assert code == 0
     assert "80 triangles without singular edges: a closed mesh" in said
     assert "WindingNumber: triangles: 80, singular edges: 0" in said
-    assert f"; {'y' if kind in ('glb', 'gltf') else 'z'} is up" in said
+    assert f"; {'y' if kind in ('obj', 'glb', 'gltf') else 'z'} is up" in said
     image = picture(tmp_path)
     assert image.shape[:2] == (24, 32)
     assert len(np.unique(image.reshape(-1, image.shape[2]), axis=0)) > 10
@@ -115,6 +115,38 @@ def test_curves_are_drawn_by_their_solid_angle(run, tmp_path):
     assert code == 0
     assert "1 loop of 12 vertices: curves" in said
     assert "SolidAngle: loops: 1, vertices: 12" in said
+
+
+def test_meshes_and_clouds_are_shaded_and_curves_drawn_in_color(tmp_path, capsys):
+    mesh = write_mesh(tmp_path / "a.stl", missing=20)
+    cloud = write_cloud(tmp_path / "a.xyz")
+    curve = tmp_path / "a.loops"
+    curve.write_text(" ".join(f"{c:.6f}" for c in shapes.wavy_polygon(12).ravel()) + "\n")
+    target = str(tmp_path / "picture.png")
+    pictures = []
+    for path, shaded in ((mesh, True), (cloud, True), (curve, False)):
+        small = ["-o", target, "--size", "32x24", "--spp", "1", "--quiet"]
+        assert main(["render", str(path), *small]) == 0
+        assert ("drawn shaded; --show color" in capsys.readouterr().out) == shaded
+        pictures.append(picture(tmp_path))
+        assert main(["render", str(path), *small, "--show", "shaded" if shaded else "color"]) == 0
+        assert "drawn shaded" not in capsys.readouterr().out
+        np.testing.assert_array_equal(picture(tmp_path), pictures[-1])
+    outside = pictures[1][12, 16].astype(int)
+    assert outside[0] >= outside[1] >= outside[2] > 90  # eggshell
+
+
+def test_the_camera_goes_where_it_is_sent(run, tmp_path):
+    mesh = write_mesh(tmp_path / "a.stl", missing=20)
+    assert run(mesh)[0] == 0
+    usual = picture(tmp_path)
+    assert run(mesh, "--azimuth", "-50", "--elevation", "28")[0] == 0
+    np.testing.assert_array_equal(picture(tmp_path), usual)
+    assert run(mesh, "--azimuth", "60")[0] == 0
+    assert (picture(tmp_path) != usual).mean() > 0.1
+    code, _, said = run(mesh, "--elevation", "91")
+    assert code == 1
+    assert "elevation must lie within" in said
 
 
 @pytest.mark.parametrize(
@@ -178,9 +210,9 @@ def test_up_turns_points_and_normals_of_a_cloud_together(tmp_path):
     np.testing.assert_allclose(turned.areas, plain.areas, rtol=1e-9)
 
 
-def test_gltf_is_y_up_by_its_standard_and_other_formats_z_up(tmp_path):
+def test_gltf_and_obj_are_y_up_and_other_formats_z_up(tmp_path):
     sides = np.ptp(tall_ball()[0], axis=0)
-    for kind, expected in (("glb", sides[1]), ("off", sides[2])):
+    for kind, expected in (("glb", sides[1]), ("obj", sides[1]), ("off", sides[2])):
         path = write_mesh(tmp_path / f"a.{kind}")
         assert extent_of(path)[2] == pytest.approx(expected, rel=1e-6)
     assert extent_of(tmp_path / "a.glb", up="z")[2] == pytest.approx(sides[2], rel=1e-6)

@@ -14,6 +14,7 @@ import pytest
 
 import harnack as hk
 from harnack import fields
+from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.bounds import Bound, Caps, Classic, CurvatureStep, LipschitzStep, Slope
 from harnack.fields import (
     Curvature,
@@ -27,7 +28,9 @@ from harnack.fields import (
     sine,
 )
 from harnack.geometry import shapes
+from harnack.geometry.mesh_shapes import bumpy_sphere, icosphere, remove_faces
 from harnack.testing import BrokenPromiseError, Scaled, check_field
+from harnack.testing.direct_sums import dipole_sum, winding_sum
 from harnack.testing.step_contracts import check_steps
 
 BOUNDS = (Classic(), Slope(), Caps(), LipschitzStep(), CurvatureStep())
@@ -161,15 +164,28 @@ def name_of(value: object) -> str:
     return value if isinstance(value, str) else type(value).__name__
 
 
+# Fields that are approximate: clusters far away are taken as wholes, and what that leaves out is
+# bounded. And fields that jump: what they promise holds with their jumps taken out.
+_DAMAGED = (bumpy_sphere(2)[0], remove_faces(bumpy_sphere(2)[1], 0.1, seed=0))
+_CLOUD = (lambda x: (x, x, np.full(len(x), 4 * math.pi / len(x))))(icosphere(3)[0])
+APPROXIMATE: dict[str, Field] = {
+    "dipoles, accuracy 2": hk.DipolePotential(*_CLOUD, accuracy=2.0),
+    "dipoles, accuracy 4": hk.DipolePotential(*_CLOUD, accuracy=4.0),
+    "screened by tree": hk.ScreenedWindingNumber(*_CLOUD, length=0.7, method="tree"),
+    "mesh by tree, accuracy 2": hk.WindingNumber(*_DAMAGED, method="tree", accuracy=2.0),
+    "mesh by tree, accuracy 4": hk.WindingNumber(*_DAMAGED, method="tree", accuracy=4.0),
+    "mesh, exact": hk.WindingNumber(*_DAMAGED, method="exact"),
+    "closed mesh, exact": hk.WindingNumber(*icosphere(1), method="exact"),
+}
+
+
 def test_every_field_there_is_is_tested() -> None:
     exported = {
         kind
         for kind in vars(fields).values()
         if inspect.isclass(kind) and issubclass(kind, Field) and not inspect.isabstract(kind)
     }
-    # What fields with sheets promise holds with their jumps taken out: test_winding.py.
-    exported = {kind for kind in exported if not kind.has_sheets}
-    assert exported <= {type(field) for field in FIELDS.values()}
+    assert exported <= {type(field) for field in (*FIELDS.values(), *APPROXIMATE.values())}
     known = {vars(hk)[name] for name in ("Classic", "Slope", "Caps", "LipschitzStep")}
     assert known <= {type(bound) for bound in BOUNDS}
 
@@ -179,6 +195,107 @@ def test_fields_keep_their_promises(name: str) -> None:
     field = FIELDS[name]
     levels = (1.0, 5.0) if isinstance(field, hk.SolidAngle) else ()
     check_field(field, count=60, directions=4, levels=(field.default_level, *levels))
+
+
+@pytest.mark.parametrize("name", APPROXIMATE)
+def test_approximate_and_jumping_fields_keep_their_promises(name: str) -> None:
+    check_field(APPROXIMATE[name], count=60, directions=4)
+
+
+def samples(field: Field, x: np.ndarray) -> tuple[Sample, Any]:
+    """A sample in double precision and a function that makes its numbers arrays (n,) or (n, 3)."""
+    backend = choose_backend("double")
+    sample = field.prepare(backend).evaluate(to_vector3(backend, x))
+
+    def on_host(one: Any) -> np.ndarray:
+        array = to_numpy(one) if dr.is_array_v(type(one)) else np.asarray(one)
+        return np.broadcast_to(array, (len(x), *array.shape[1:]))
+
+    return sample, on_host
+
+
+def check_promises(sample: Sample, on_host: Any, x: np.ndarray, lift: Any) -> None:
+    """The exact function, continued, moves within each promise: `lift` says how far."""
+    value, gradient = on_host(sample.value), on_host(sample.gradient)
+    rng, largest = np.random.default_rng(3), 0.0
+    for known in sample.known:
+        reach = np.minimum(on_host(known.radius), 10.0)
+        for share in (0.3, 0.9, 0.999):
+            d = rng.normal(size=x.shape)
+            d *= (share * reach / np.linalg.norm(d, axis=1))[:, None]
+            moved = lift(x, d)
+            if isinstance(known, HarmonicBall):
+                up, down = on_host(known.upper) - value, on_host(known.lower) - value
+            else:
+                assert isinstance(known, Curvature)
+                length = np.linalg.norm(d, axis=1)
+                room = 0.5 * on_host(known.constant) * length**2
+                room = room + on_host(sample.gradient_error) * length
+                moved = moved - (gradient * d).sum(axis=1)
+                up, down = room, -room
+            assert (moved >= down - 1e-9).all()
+            assert (moved <= up + 1e-9).all()
+            largest = max(largest, float((np.abs(moved) / np.maximum(up, -down)).max()))
+    assert largest > 0.05  # the promises are not empty
+
+
+def spread(n: int, seed: int = 2) -> np.ndarray:
+    """Points around the unit sphere, half of them close to it."""
+    x = np.random.default_rng(seed).uniform(-1.6, 1.6, (n, 3))
+    near = x[: n // 2]
+    near *= (1 + 0.1 * near[:, :1]) / np.linalg.norm(near, axis=1, keepdims=True)
+    return x
+
+
+@pytest.mark.parametrize("accuracy", [2.0, 3.0, 4.0])
+def test_what_a_tree_of_dipoles_leaves_out_is_within_its_bounds(accuracy: float) -> None:
+    points, normals, areas = _CLOUD
+    x, exact = spread(400), dipole_sum(points, areas[:, None] * normals)
+    sample, on_host = samples(hk.DipolePotential(*_CLOUD, accuracy=accuracy), x)
+    value, gradient = exact(x)
+    off = np.abs(on_host(sample.value) - value)
+    slant = np.linalg.norm(on_host(sample.gradient) - gradient, axis=1)
+    assert (off <= on_host(sample.error)).all()
+    assert (slant <= on_host(sample.gradient_error) + 1e-12).all()
+    assert off.max() > 1e-6  # there is something to bound
+    check_promises(sample, on_host, x, lambda x, d: exact(x + d)[0] - value)
+
+
+@pytest.mark.parametrize("accuracy", [2.0, 3.0, 4.0])
+@pytest.mark.parametrize("order", [0, 1, 2])
+def test_what_a_tree_of_triangles_leaves_out_is_within_its_bounds(
+    order: int, accuracy: float
+) -> None:
+    vertices, faces = _DAMAGED
+    x, exact = spread(400), winding_sum(vertices[faces])
+    field = hk.WindingNumber(vertices, faces, method="tree", order=order, accuracy=accuracy)
+    sample, on_host = samples(field, x)
+    value, gradient = exact(x), np.zeros_like(x)
+    # Biot and Savart for all three edges of every triangle, each with an integral of its own.
+    for k in range(3):
+        a, b = (vertices[faces[:, i]] - x[:, None] for i in (k, (k + 1) % 3))
+        la, lb = np.linalg.norm(a, axis=2), np.linalg.norm(b, axis=2)
+        weight = (1 / la + 1 / lb) / (la * lb + (a * b).sum(axis=2))
+        gradient += (weight[..., None] * np.cross(a, b)).sum(axis=1) / (4 * math.pi)
+    off = np.abs(on_host(sample.value) - value)
+    slant = np.linalg.norm(on_host(sample.gradient) - gradient, axis=1)
+    assert (off <= on_host(sample.error)).all()
+    assert (slant <= on_host(sample.gradient_error) + 1e-9).all()
+    assert off.max() > 1e-6
+
+    def lift(x: np.ndarray, d: np.ndarray) -> np.ndarray:
+        """How far w moves with its jumps, which are whole numbers, taken out on the way."""
+        way = np.linspace(0, 1, 65)[:, None, None] * d + x
+        w = exact(way.reshape(-1, 3)).reshape(65, -1)
+        return (np.unwrap(w, axis=0, period=1.0) - w[0])[-1]
+
+    check_promises(sample, on_host, x, lift)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", APPROXIMATE)
+def test_approximate_and_jumping_fields_keep_their_promises_at_many_points(name: str) -> None:
+    check_field(APPROXIMATE[name], rng=1, count=600)
 
 
 @pytest.mark.slow
@@ -282,11 +399,17 @@ def with_known(sample: Sample, **new: Any) -> Sample:
 
 def narrower(factor: float) -> Callable[[Any, Sample], Sample]:
     def change(p: Any, s: Sample) -> Sample:
-        (ball,) = s.known
-        assert isinstance(ball, HarmonicBall)
-        lower = s.value + factor * (ball.lower - s.value)
-        upper = s.value + factor * (ball.upper - s.value)
-        return with_known(s, lower=lower, upper=upper)
+        balls = [one for one in s.known if isinstance(one, HarmonicBall)]
+        assert balls
+        narrow = (
+            dataclasses.replace(
+                ball,
+                lower=s.value + factor * (ball.lower - s.value),
+                upper=s.value + factor * (ball.upper - s.value),
+            )
+            for ball in balls
+        )
+        return changed(s, known=tuple(narrow))
 
     return change
 
@@ -317,7 +440,20 @@ COIL = CURVES["coil"]
 TREFOIL = CURVES["trefoil"]
 GYROID = REAL["gyroid"]
 POLYNOMIAL = REAL["Y 5,3"]
+TREE = APPROXIMATE["dipoles, accuracy 2"]
 BROKEN: dict[str, tuple[Field, str]] = {
+    "truncation not told": (
+        Broken(TREE, lambda p, s: changed(s, error=0.0, gradient_error=0.0)),
+        "gradient is not that of the value",
+    ),
+    "gradient of a tree a little off": (
+        Broken(TREE, lambda p, s: changed(s, gradient=s.gradient * 1.0001)),
+        "gradient is not that of the value at more than half",
+    ),
+    "range of a tree too small": (
+        Broken(APPROXIMATE["dipoles, accuracy 4"], narrower(0.03)),
+        "HarmonicBall: f leaves",
+    ),
     "gradient a little off": (
         Broken(TREFOIL, lambda p, s: changed(s, gradient=s.gradient * 1.0001)),
         "gradient is not that of the value",

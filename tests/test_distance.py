@@ -417,12 +417,8 @@ def test_newton_leaves_symmetric_stationary_points() -> None:
     x = np.column_stack([t, 0 * t, 0 * t])
     exact = -b * np.sqrt(1 - t**2 / (a**2 - b**2))
     for field in (Ellipsoid(a, b), Ellipsoid2(a, b)):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # nothing is found from the centre, where grad f = 0
-            found = signed_distance(field, x)
-        moving = t != 0
-        assert np.abs(found - exact)[moving].max() < 1e-12
-        assert np.isnan(found[~moving]).all()
+        # At the centre, where grad f = 0, a descent begins at a point that is seen.
+        assert np.abs(signed_distance(field, x) - exact).max() < 1e-12
 
 
 @pytest.mark.parametrize("name", CURVED)
@@ -503,24 +499,73 @@ def test_the_rim_of_a_disk_belongs_to_it() -> None:
         assert np.median(lower / (scale * exact)) > 0.3
 
 
-def test_points_without_a_foot_are_counted() -> None:
-    """From the centre of a sphere every way is as good: no gradient, no descent."""
-    with pytest.warns(RuntimeWarning, match=r"signed_distance: no closest .* 1 of 3 points"):
-        found = signed_distance(Ellipsoid2(1, 1, 1), [[0, 0, 0], [0.5, 0, 0], [0, 3, 0]])
-    assert np.isnan(found[0])
-    assert found[1:] == pytest.approx([-0.5, 2.0])
+def test_points_without_a_descent_see_the_surface() -> None:
+    """From the centre of a sphere every way is as good: no gradient."""
+    found = signed_distance(Ellipsoid2(1, 1, 1), [[0, 0, 0], [0.5, 0, 0], [0, 3, 0]])
+    assert found == pytest.approx([-1, -0.5, 2.0])
+    assert np.linalg.norm(closest_points(Ellipsoid2(1, 1, 1), [[0, 0, 0]])) == pytest.approx(1)
+
+
+def test_points_without_a_surface_are_counted() -> None:
+    """|p| = 1 has no point in a box from 2 to 3."""
+
+    class Elsewhere(Bare):
+        domain = hk.Box((2, 2, 2), (3, 3, 3))
+
+    field, x = Elsewhere(), [[2.5, 2.1, 2.0], [2.5, 2.5, 3.0]]
+    with pytest.warns(RuntimeWarning, match=r"signed_distance: no closest .* 2 of 2 points"):
+        assert np.isnan(signed_distance(field, x)).all()
     with pytest.warns(RuntimeWarning, match=r"closest_points: no closest .* 1 of 1 points"):
-        assert np.isnan(closest_points(Ellipsoid2(), [[0, 0, 0]])).all()
+        assert np.isnan(closest_points(field, x[:1])).all()
 
 
-def test_feet_outside_the_domain_are_none() -> None:
-    """The plane x = 0.9 within the unit ball: beside the part that is left of it, nothing."""
+def test_feet_lie_in_the_domain() -> None:
+    """The plane x = 0.9 within the unit ball: beside the part that is left of it, its rim."""
     field = hk.HarmonicPolynomial({(1, 0, 0): 1.0})
-    x = [[0.5, 0.0, 0.0], [0.5, 0.7, 0.0]]
-    with pytest.warns(RuntimeWarning, match="1 of 2 points"):
-        found = signed_distance(field, x, level=0.9)
+    x = np.array([[0.5, 0.0, 0.0], [0.5, 0.7, 0.0]])
+    found, feet = signed_distance(field, x, level=0.9), closest_points(field, x, level=0.9)
     assert found[0] == pytest.approx(-0.4)
-    assert np.isnan(found[1])
+    rim = math.hypot(0.4, 0.7 - math.sqrt(0.19))
+    assert rim <= -found[1] < 2 * rim
+    assert feet[:, 0] == pytest.approx(0.9)
+    assert (np.linalg.norm(feet, axis=1) <= 1 + 1e-12).all()
+
+
+def on_sphere(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points spread over the unit sphere, their normals and areas."""
+    k = np.arange(n) + 0.5
+    z, turn = 1 - 2 * k / n, np.pi * (1 + np.sqrt(5)) * k
+    flat = np.sqrt(1 - z * z)
+    points = np.column_stack([flat * np.cos(turn), flat * np.sin(turn), z])
+    return points, points, np.full(n, 4 * np.pi / n)
+
+
+@pytest.mark.parametrize("n", [60, 600])
+@pytest.mark.parametrize("kind", ["dipoles", "dipoles by tree", "screened", "barely screened"])
+def test_every_point_has_a_distance_from_a_cloud(kind: str, n: int) -> None:
+    """Far from the points f is nearly constant, and its gradient leads nowhere."""
+    cloud = on_sphere(n)
+    field = {
+        "dipoles": lambda: hk.DipolePotential(*cloud, accuracy=100.0),
+        "dipoles by tree": lambda: hk.DipolePotential(*cloud),
+        "screened": lambda: hk.ScreenedWindingNumber(*cloud, length=0.7),
+        "barely screened": lambda: hk.ScreenedWindingNumber(*cloud, length=5.0),
+    }[kind]()
+    rng = np.random.default_rng(0)
+    x = np.concatenate([rng.uniform(-2, 2, (150, 3)), rng.normal(size=(10, 3)) * 20])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found, y = signed_distance(field, x), closest_points(field, x)
+    assert np.allclose(np.linalg.norm(x - y, axis=1), np.abs(found), rtol=1e-12)
+    look = look_at(field, y)
+    steepness = np.linalg.norm(look.gradient, axis=1)
+    off = np.abs(look.value - field.default_level)
+    assert (off <= 2 * look.error + 1e-12 * steepness).all()
+    assert (signed_distance(field, x, method="lower") / found <= 1 + 1e-9).all()
+    # The level sets pass through all points: that bounds the distance, but the foot is a minimum.
+    nearest, _ = cKDTree(cloud[0]).query(x)
+    assert (np.abs(found) <= nearest + 1e-9).mean() > 0.98
+    assert (np.abs(found) <= 1.5 * nearest).all()
 
 
 # --- the proved lower bound --------------------------------------------------------------------
@@ -658,7 +703,7 @@ def test_the_lower_bound_holds_in_random_directions() -> None:
         room = np.inf if field.period is None else field.period - np.abs(above)
         for _ in range(20):
             d = unit(rng.normal(size=(len(x), 3)))
-            moved, _ = movements(field, x, d, lower[:, None] * np.linspace(0, 1, 17))
+            moved = movements(field, x, d, lower[:, None] * np.linspace(0, 1, 17)).moved
             away = np.sign(above)[:, None] * moved  # from the nearest level in value
             assert (away >= -np.abs(above)[:, None] - 1e-12).all(), name
             assert (away <= np.broadcast_to(room, len(x))[:, None] + 1e-12).all(), name

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import os
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,16 +16,6 @@ from harnack.geometry.files import FileFormatError, read_loops, write_atomically
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 CORNERS = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
-
-
-@pytest.fixture
-def save(tmp_path):
-    def write(name: str, content: str | bytes) -> Path:
-        path = tmp_path / name
-        path.write_bytes(content if isinstance(content, bytes) else content.encode())
-        return path
-
-    return write
 
 
 def as_lists(loops) -> list:

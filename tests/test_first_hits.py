@@ -14,6 +14,7 @@ from scipy.special import lpmv
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.geometry import shapes
+from harnack.geometry.mesh_shapes import icosphere
 from harnack.testing.oracle import CurveOracle, Function, Look, first_crossings, gap_to_levels
 
 FOUR_PI = 4 * math.pi
@@ -398,3 +399,79 @@ def test_real_valued_fields(name: str, bound: str | None) -> None:
     rounding = 2 * (to_numpy(sample.error + 0 * sample.value) + 1e-6 * np.abs(here.value))
     gap = gap_to_levels(here.value, levels)
     assert (gap <= SHARE * tolerance * here.steepness + rounding).all()
+
+
+# --- meshes by tree ---------------------------------------------------------------------------
+
+
+def mesh_rays(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """From inside the unit sphere, from near it and from far away."""
+    rng = np.random.default_rng(seed)
+    radius = np.repeat([0.5, 0.9, 1.5, 8.0, 60.0], n // 5)[:, None]
+    o = radius * unit(rng.normal(size=(len(radius), 3)))
+    o = o.astype(np.float32).astype(np.float64)
+    return o, unit(1.2 * unit(rng.normal(size=o.shape)) * rng.random((len(o), 1)) - o)
+
+
+@pytest.mark.parametrize("precision", ["single", "double"])
+@pytest.mark.parametrize("subdivisions", range(4))
+def test_small_closed_meshes_by_tree(subdivisions: int, precision: Any) -> None:
+    """Where no edge is open and no cluster far, nothing bounds the ball but the triangles."""
+    mesh = icosphere(subdivisions)
+    o, d = mesh_rays(500, subdivisions)
+    limits: Any = {"t_max": 70.0, "tolerance": 1e-5, "precision": precision}
+    exact = hk.trace(hk.WindingNumber(*mesh, method="exact"), o, d, **limits)
+    tree = hk.trace(hk.WindingNumber(*mesh, method="tree"), o, d, **limits)
+    assert exact.hit.sum() > 400
+    assert not exact.hit.all()
+    np.testing.assert_array_equal(tree.status, exact.status)
+    np.testing.assert_array_equal(tree.sheet, exact.sheet)
+    np.testing.assert_allclose(tree.t[exact.hit], exact.t[exact.hit], rtol=1e-5, atol=1e-5)
+    assert (tree.evaluations < 200).all()
+
+
+@pytest.mark.parametrize("precision", ["single", "double"])
+@pytest.mark.parametrize("method", ["exact", "tree"])
+def test_rays_through_a_flat_mesh(method: Any, precision: Any) -> None:
+    """Rays meet the plane z = 0 exactly, where a triangle's own solid angle has no sign. A tree
+    counted the triangle that was met to the wrong side there, and the ray passed it."""
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(7.0), np.arange(7.0)))
+    vertices = np.column_stack([x, y, 0 * x]) - [3.0, 3.0, 0.0]
+    low = (np.arange(6)[:, None] * 7 + np.arange(6)).ravel()
+    faces = np.concatenate([
+        np.column_stack([low, low + 1, low + 8]), np.column_stack([low, low + 8, low + 7])
+    ])  # fmt: skip
+    rng = np.random.default_rng(0)
+    steps = rng.integers(-20, 21, (400, 2)) / 8 + 1 / 32
+    for height in (2.0, -2.0):
+        o = np.column_stack([steps, np.full(len(steps), height)])
+        d = np.tile([0.0, 0.0, -np.sign(height)], (len(o), 1))
+        hits = hk.trace(
+            hk.WindingNumber(vertices, faces, method=method), o, d, level=0.49,
+            tolerance=1e-5, precision=precision,
+        )  # fmt: skip
+        assert hits.hit.all()
+        assert (np.abs(hits.position[:, 2]) < 0.2).all()
+        if height > 0:  # on this side w is negative up to the mesh
+            assert (hits.sheet >= 0).all()
+
+
+def test_rays_beside_an_edge_of_a_mesh_by_tree() -> None:
+    """Beside an edge a triangle's solid angle turns by 2 pi within the rounding of a point, also
+    where another triangle cancels the edge."""
+    vertices, faces = icosphere(3)
+    rng = np.random.default_rng(0)
+    face = vertices[faces[rng.integers(len(faces), size=40_000)]]
+    share = rng.random((len(face), 1))
+    target = share * face[:, 0] + (1 - share) * face[:, 1]
+    o = 2.5 * unit(rng.normal(size=target.shape))
+    o = np.where((o * target).sum(axis=1, keepdims=True) < 0, -o, o)
+    o = o.astype(np.float32).astype(np.float64)
+    d = unit(target - o)
+    steep = (d * target).sum(axis=1) < -0.3
+    o, d = o[steep], d[steep]
+    exact = hk.trace(hk.WindingNumber(vertices, faces, method="exact"), o, d)
+    tree = hk.trace(hk.WindingNumber(vertices, faces, method="tree"), o, d)
+    assert exact.hit.all()
+    assert tree.hit.all()
+    np.testing.assert_allclose(tree.t, exact.t, atol=1e-5)

@@ -142,17 +142,22 @@ def test_faces_without_area_can_be_removed():
 # --- welding and duplicates --------------------------------------------------------------------
 
 
+def plainly_welded(x: np.ndarray) -> np.ndarray:
+    """By comparing every position with all before it; -0.0 equals 0.0."""
+    return np.array([(x == row).all(axis=1).argmax() for row in x])
+
+
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(1, 40), kinds=st.integers(1, 3))
 def test_welding_agrees_with_the_plain_one(seed, n, kinds):
     rng = np.random.default_rng(seed)
     x = rng.integers(0, kinds + 1, size=(n, 3)) * rng.choice([-0.1, 0.1, 1e300], size=(n, 3))
-    np.testing.assert_array_equal(weld_vertices(x), chains.weld(x))
+    np.testing.assert_array_equal(weld_vertices(x), plainly_welded(x))
 
 
 def test_welding_survives_equal_hashes(monkeypatch):
     monkeypatch.setattr(singular, "_GOLDEN", np.uint64(0))  # every row then has the same hash
     x = np.random.default_rng(0).integers(0, 3, size=(100, 3)).astype(float)
-    np.testing.assert_array_equal(weld_vertices(x), chains.weld(x))
+    np.testing.assert_array_equal(weld_vertices(x), plainly_welded(x))
 
 
 def naive_net(faces) -> Counter:

@@ -17,22 +17,46 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from harnack.backend import choose_backend, to_numpy
+from harnack.fields import moments
+from harnack.fields.far_clusters import node_columns
 from harnack.fields.multipole import (
     Level,
     all_levels,
     cartesian,
-    moved,
-    of_dipoles,
-    regular,
     sup_norm,
-    triangle_dipoles,
+    triangle_levels,
+    triangle_rule,
     truncation,
 )
 from harnack.fields.multipole_kernel import far_terms
-from harnack.fields.winding_tree import node_columns
 from harnack.tree import Hierarchy, build_hierarchy
 
 ORDERS = [0, 1, 2]
+
+
+def complex_of(pairs: Any) -> Any:
+    """Real and imaginary parts as one array."""
+    return {key: np.asarray(re) + 1j * np.asarray(im) for key, (re, im) in pairs.items()}
+
+
+def regular(x: np.ndarray, order: int) -> Any:
+    """R_lm at x (..., 3)."""
+    return complex_of(moments.regular(x[..., 0], x[..., 1], x[..., 2], order))
+
+
+def of_dipoles(d: np.ndarray, normal: np.ndarray) -> Any:
+    """M_lm of clusters of dipoles (k, s, 3)."""
+    pairs = moments.of_dipole(
+        moments.regular(*np.moveaxis(d, -1, 0), moments.KNOWN - 1), *np.moveaxis(normal, -1, 0)
+    )
+    return {key: value.sum(axis=1) for key, value in complex_of(pairs).items()}
+
+
+def triangle_dipoles(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points and normals (n, 6, 3) that stand for triangles (n, 3, 3)."""
+    barycentric, weights = triangle_rule()
+    normal = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return barycentric @ corners, weights[:, None] * normal[:, None]
 
 
 def at(harmonics: Any, l: int, m: int) -> Any:
@@ -163,11 +187,11 @@ def test_derivatives_of_regular_harmonics() -> None:
 def test_moments_are_coefficients_of_the_field() -> None:
     y, normal = cluster(2)
     y *= 0.02 / np.linalg.norm(y, axis=1).max()
-    moments = of_dipoles(y[None], normal[None])
+    held = of_dipoles(y[None], normal[None])
     x = 2 * unit(np.random.default_rng(0).normal(size=(30, 3)))
     far = irregular(x, 5)
     total = -sum(
-        np.conj(at(moments, l, m)) * at(far, l, m) for l in range(1, 6) for m in range(-l, l + 1)
+        np.conj(at(held, l, m)) * at(far, l, m) for l in range(1, 6) for m in range(-l, l + 1)
     )
     expected = dipole_sum(x, y, normal)
     # The next term is smaller by the ratio to the fifth power: 1e-10.
@@ -181,19 +205,23 @@ def test_moments_moved_are_moments(seed: int) -> None:
     d, normal = rng.normal(size=(2, 4, 6, 3))
     shift = rng.normal(size=(4, 3))
     expected = of_dipoles(d + shift[:, None], normal)
-    found = moved(of_dipoles(d, normal), shift)
+    given = {key: (value.real, value.imag) for key, value in of_dipoles(d, normal).items()}
+    found = complex_of(moments.moved(given, *shift.T))
     assert found.keys() == expected.keys()
     for key, value in expected.items():
         np.testing.assert_allclose(found[key], value, rtol=1e-10, atol=1e-10)
 
 
+@pytest.mark.parametrize("spread", [True, False])
 @pytest.mark.parametrize("n", [1, 2, 9, 100, 333])
-def test_nodes_have_the_moments_of_what_they_hold(n: int) -> None:
+def test_nodes_have_the_moments_of_what_they_hold(n: int, spread: bool) -> None:
+    """Of triangles, or of the dipoles that stand for them: the same moments."""
     rng = np.random.default_rng(n)
     corners = rng.normal(size=(n, 1, 3)) + 0.3 * rng.normal(size=(n, 3, 3))
     tree = build_hierarchy(corners.mean(axis=1))
     points, normals = triangle_dipoles(corners)
-    levels = all_levels(tree, points, normals, corners.min(axis=1), corners.max(axis=1))
+    boxes = corners.min(axis=1), corners.max(axis=1)
+    levels = triangle_levels(tree, corners) if spread else all_levels(tree, points, normals, *boxes)
     assert [len(level.centre) for level in levels] == list(tree.counts)
     held = tree.slots
     for level, arity in zip(levels, (*tree.arities, 1), strict=True):
@@ -330,6 +358,22 @@ def test_truncation_is_bounded(order: int, accuracy: float) -> None:
 
 
 @pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("accuracy", [1.5, 4.0])
+def test_bounds_are_not_rounded_below_their_series(order: int, accuracy: float) -> None:
+    """Their closed form, in single precision, against the series that it sums."""
+    for seed in range(40):
+        level = level_of(*cluster(seed))
+        r, k = accuracy * level.radius[0], order + 2
+        powers = [(l, l * (level.radius[0] / r) ** (l - 3) / r**2) for l in range(6, 200)]
+        parts = [(l, level.spread[0] * term * r**k / r) for l, term in powers]
+        parts += [(l, sup_norm(level.moments, l)[0] / r ** (l - k)) for l in range(k, 6)]
+        e, g = truncation(level, np.array([r]), order)
+        value, slope = sum(one for _, one in parts), sum((l + 1) * one for l, one in parts)
+        assert value <= np.float32(e[0]) <= value * (1 + 2e-6)
+        assert slope <= np.float32(g[0]) <= slope * (1 + 2e-6)
+
+
+@pytest.mark.parametrize("order", ORDERS)
 def test_truncation_is_bounded_for_triangles(order: int) -> None:
     """Whose quadrature points stand for them: the solid angle itself is within the bound."""
     k = order + 2
@@ -338,8 +382,7 @@ def test_truncation_is_bounded_for_triangles(order: int) -> None:
         corners = rng.normal(size=(8, 1, 3)) * rng.choice([0.1, 1.0], 3)
         corners = corners + rng.choice([0.1, 1.0]) * rng.normal(size=(8, 3, 3))
         tree = build_hierarchy(corners.mean(axis=1))
-        low, high = corners.min(axis=1), corners.max(axis=1)
-        level = all_levels(tree, *triangle_dipoles(corners), low, high)[-1]
+        level = triangle_levels(tree, corners)[-1]
         for accuracy in (1.5, 2.0, 4.0):
             e = truncation(level, accuracy * level.radius, order)[0][0]
             x = viewpoints(level, 1 / accuracy, seed)
@@ -350,17 +393,17 @@ def test_truncation_is_bounded_for_triangles(order: int) -> None:
 
 @pytest.mark.parametrize("accuracy", [1.5, 2.0, 4.0])
 def test_sums_over_dipoles_are_bounded(accuracy: float) -> None:
-    """V of `node_columns`: sum a/rho^3 <= V/r^3 and sum a/rho^4 <= V/r^4."""
+    """V of `node_columns`: sum a/rho^4 <= V/r^4 and sum a/rho^5 <= V/r^5."""
     for seed in range(30):
         y, normal = cluster(seed)
         level = level_of(y, normal)
-        columns = node_columns(level, accuracy, 2)[0]
+        columns = node_columns(level, 5.0, 2, accuracy)[0]
         np.testing.assert_array_equal(columns[:3], level.centre[0])
         assert columns[3] == pytest.approx(accuracy * level.radius[0])
         x = viewpoints(level, 1 / accuracy, seed)
         r = np.linalg.norm(x - level.centre[0], axis=1)
         rho = np.linalg.norm(x[:, None] - y, axis=2)
         area = np.linalg.norm(normal, axis=1)
-        for power in (3, 4):
+        for power in (4, 5):
             total = (area / rho**power).sum(axis=1)
             assert (total <= columns[5] / r**power * (1 + 1e-12)).all()

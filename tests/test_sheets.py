@@ -23,10 +23,13 @@ from harnack.backend import (
     to_numpy,
 )  # fmt: skip
 from harnack.backend.extrema import clamp, fmax, fmin
-from harnack.certify import Levels
+from harnack.bounds import Caps, CurvatureStep, Longest, Slope
+from harnack.certify import BallCertificate, CurvatureCertificate, Levels
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.rendering.encounter import meet_surface
+from harnack.testing.exact import exact_step, on_host
 from harnack.testing.jump_oracle import first_side_changes, judge
+from harnack.tracer import march
 from harnack.tracer.stretches import meet
 
 FOUR_PI = 4 * math.pi
@@ -592,6 +595,84 @@ def test_gradients_known_up_to_an_error(bound: Any, overstep: float, direction: 
     assert not passes(0.5, choose_backend("single").Float(0.5))
     assert not passes(1.0, 0.0)
     assert not passes(1.0, 0.3)
+
+
+# --- steps with slopes known up to an error ------------------------------------------------------
+
+
+def doubtful(rows: int, seed: int) -> list[tuple[Any, Any, Any, Any]]:
+    """(bound, certificate, slope, doubt) of all kinds; slopes so large that they matter."""
+    rng, real = np.random.default_rng(seed), choose_backend("double").Float
+
+    def around_one() -> np.ndarray:
+        return 10 ** rng.uniform(-1, 1, rows)
+
+    radius, below, above, down, up = (around_one() for _ in range(5))
+    down, up = down * np.minimum(below, above), up * np.minimum(below, above)
+    slope = 2 * rng.uniform(-1, 1, rows) * np.minimum(below, above) / radius
+    doubt = around_one() * 0.2 * np.abs(slope)
+    ball = BallCertificate(
+        *map(real, (radius, below, above, np.minimum(down, below), np.minimum(up, above))), 3
+    )
+    curved = CurvatureCertificate(*map(real, (around_one(), radius, down, up)))
+    return [
+        (bound, certificate, real(slope), real(doubt))
+        for bound, certificate in ((Slope(), ball), (Caps(), ball), (CurvatureStep(), curved))
+    ]
+
+
+def check_doubtful_steps(step: Any, covers: Any) -> None:
+    """Steps are as long as the extremal functions of the worst slope allow, and no longer."""
+    for bound, certificate, slope, doubt in doubtful(2000, 0):
+        host, middle, off = on_host(certificate, 2000), to_numpy(slope), to_numpy(doubt)
+        exact = np.minimum(*(exact_step(bound, host, middle + s * off) for s in (1, -1)))
+        alone = exact_step(bound, host, middle)
+        some = Longest((bound,))
+        found = to_numpy(step(some, (certificate,), slope, doubt))
+        ratio = found / exact
+        assert ratio.max() <= 1 + 1e-12, bound
+        assert ratio.min() > 0.99, bound
+        assert np.median(ratio) > 1 - 1e-4, bound
+        assert (alone > 1.01 * exact).mean() > 0.3  # the error does shorten them
+        free = [
+            to_numpy(covers(some, (certificate,), slope, doubt, type(slope)(share * exact)))
+            for share in (0.999, 1.0001)
+        ]
+        inside = exact < 0.999 * host.radius
+        assert free[0].all(), bound
+        assert not free[1][inside].any(), bound
+
+
+def test_steps_are_those_of_the_worst_slope() -> None:
+    check_doubtful_steps(march._step, march._covers)
+
+
+@pytest.mark.parametrize("factor", [1.001, 1.00001])
+def test_steps_too_long_for_the_worst_slope_are_seen(factor: float) -> None:
+    def longer(*given: Any) -> Any:
+        return factor * march._step(*given)
+
+    def further(*given: Any) -> Any:
+        *others, length = given
+        return march._covers(*others, length / 1.001)
+
+    with pytest.raises(AssertionError):
+        check_doubtful_steps(longer, march._covers)
+    with pytest.raises(AssertionError):
+        check_doubtful_steps(march._step, further)
+
+
+def test_steps_that_ignore_the_error_of_the_slope_are_seen() -> None:
+    def step(some: Any, certificates: Any, slope: Any, doubt: Any) -> Any:
+        return march._step(some, certificates, slope, 0 * doubt)
+
+    def covers(some: Any, certificates: Any, slope: Any, doubt: Any, length: Any) -> Any:
+        return march._covers(some, certificates, slope, 0 * doubt, length)
+
+    with pytest.raises(AssertionError):
+        check_doubtful_steps(step, march._covers)
+    with pytest.raises(AssertionError):
+        check_doubtful_steps(march._step, covers)
 
 
 # --- parts of rays --------------------------------------------------------------------------

@@ -27,16 +27,6 @@ SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 FORMATS = ("obj", "stl", "stl_ascii", "off", "ply", "ply_ascii", "glb")
 
 
-@pytest.fixture
-def save(tmp_path):
-    def write(name: str, content: str | bytes) -> Path:
-        path = tmp_path / name
-        path.write_bytes(content if isinstance(content, bytes) else content.encode())
-        return path
-
-    return write
-
-
 def exported(vertices, faces, kind: str) -> bytes:
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     options = {"encoding": "ascii"} if kind == "ply_ascii" else {}

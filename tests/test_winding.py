@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -9,9 +10,13 @@ from typing import Any
 import drjit as dr
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
+from harnack.fields.edge_trails import EdgeTrails, closed_trails
+from harnack.fields.field import HarmonicBall
 from harnack.fields.winding_number import WindingNumber
 from harnack.geometry import MeshError
 from harnack.geometry.mesh_shapes import (
@@ -143,7 +148,7 @@ def test_derivatives_are_those_of_the_value(method: Any) -> None:
     corners = vertices[faces]
     field = WindingNumber(vertices, faces, method=method, accuracy=8.0)
     value, gradient = field.value_and_gradient(x, precision="double")
-    np.testing.assert_array_equal(value, field.value(x, precision="double"))
+    np.testing.assert_allclose(value, field.value(x, precision="double"), rtol=0, atol=1e-14)
     np.testing.assert_array_equal(gradient, field.gradient(x, precision="double"))
     hessian = field.hessian(x, precision="double")
     assert gradient.shape == (len(x), 3)
@@ -324,6 +329,107 @@ def test_points_in_line_with_vertices_and_edges(missing: int, method: Any, preci
         expected = direct_sum(corners, x[off])
         value = field.value(x[off], precision=precision)
         assert (np.abs(value - expected) <= field.error_bound(x[off], precision=precision)).all()
+
+
+def lattice_squares(n: int, count: int, seed: int) -> Mesh:
+    """Some of the squares between the points of a lattice n^3, each as two triangles."""
+    rng = np.random.default_rng(seed)
+    lattice = np.stack(np.meshgrid(*3 * [np.arange(n + 1.0)], indexing="ij"), axis=-1)
+    strides = np.array([(n + 1) ** 2, n + 1, 1])
+    axis = rng.integers(3, size=count)
+    corner = rng.integers(n, size=(count, 3))
+    # Squares across an axis reach from 0 to n along it.
+    corner[np.arange(count), axis] = rng.integers(n + 1, size=count)
+    base, u, v = corner @ strides, strides[(axis + 1) % 3], strides[(axis + 2) % 3]
+    first = np.stack([base, base + u, base + u + v], axis=1)
+    second = np.stack([base, base + u + v, base + v], axis=1)
+    return lattice.reshape(-1, 3), np.unique(np.concatenate([first, second]), axis=0)
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("count", [6, 60, 300])
+def test_lattices_are_all_ties(count: int, precision: Any) -> None:
+    """Vertical rays through vertices, along edges, and through diagonals of a lattice's squares."""
+    vertices, faces = lattice_squares(4, count, seed=count)
+    field = WindingNumber(vertices, faces, method="exact")
+    steps = np.arange(-0.5, 5, 0.5)
+    x = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
+    backend = choose_backend("double")
+    apart = to_numpy(field.prepare(backend).distance_to_sheets(to_vector3(backend, x)))
+    x = x[apart > 0.2]
+    assert len(x) > 300
+    expected = direct_sum(vertices[faces], x)
+    off = np.abs(field.value(x, precision=precision) - expected)
+    assert (off <= field.error_bound(x, precision=precision)).all()
+    # Nearly every such ray meets an edge or the line that it lies on.
+    trails = EdgeTrails.upload(backend, vertices, field.mesh.singular)
+    ways = backend.Float(np.where(np.arange(len(x)) % 2, 1.0, -1.0))
+    assert to_numpy(trails.turns(to_vector3(backend, x), ways)[1]).mean() > 0.3
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_hard_points(precision: Any) -> None:
+    """In line with vertices and edges, beside edges of all lengths, and far away."""
+    rng = np.random.default_rng(0)
+    vertices, faces = damaged_sphere(2)
+    tiny, more = icosphere(1)
+    vertices, faces = merged(
+        (vertices, faces),
+        (1e-3 * tiny + [0.2, 0.1, 0.3], more[3:]),
+        (1e-6 * tiny, more[5:]),
+    )
+    vertices = rounded(vertices)
+    field = WindingNumber(vertices, faces, method="exact")
+    ends = vertices[field.mesh.singular]
+    middle = rounded(0.5 * (ends[:, 0] + ends[:, 1]))
+    below = rng.uniform(0.1, 2, (len(ends), 1)) * [0, 0, -1]
+    # Rays go away from the middle, which is at a height of about zero.
+    inwards = below * np.sign(middle[:, 2:] + 1e-9) / 4
+    length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1, keepdims=True)
+    beside = 0.1 * length * unit(rng.normal(size=below.shape))
+    x = np.concatenate([
+        ends[:, 0] + inwards, middle + inwards, ends[:, 0] + below, middle + below,
+        middle + beside, ends[:, 0] + beside,
+        1e3 * below + middle, 10 ** rng.uniform(1, 8, below.shape) * unit(middle), 1e6 * below,
+    ])  # fmt: skip
+    x = rounded(x)
+    found, gradient = field.value_and_gradient(x, precision=precision)
+    expected = direct_sum(vertices[faces], x)
+    # The last places of a point count where the gradient is large.
+    places = 2.0 ** (-22 if precision == "single" else -51) * (1 + np.abs(x).max(axis=1))
+    bound = field.error_bound(x, precision=precision) + places * np.linalg.norm(gradient, axis=1)
+    for value in (field.value(x, precision=precision), found):
+        assert (np.abs(value - expected) <= bound).all()
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_lengths_far_apart(precision: Any) -> None:
+    """Products of lengths leave float32: a triangle from far away, and a tiny one from close by."""
+    rng = np.random.default_rng(0)
+    field = WindingNumber(*OCTANT, method="exact")
+    far = 10 ** rng.uniform(1, 12, (500, 1)) * unit(rng.normal(size=(500, 3)))
+    assert (np.abs(field.value(far, precision=precision)) < 1e-2).all()
+    tiny = 1e-10 if precision == "single" else 1e-70
+    # The tiny one is where coordinates are small: in the middle.
+    centred = merged(OCTANT, (-OCTANT[0], OCTANT[1]), (tiny * OCTANT[0] + tiny, OCTANT[1]))
+    field = WindingNumber(*centred, method="exact")
+    x = tiny * rng.uniform(-3, 3, (500, 3)).astype(np.float32)
+    off = np.abs(field.value(x, precision=precision) - direct_sum(centred[0][centred[1]], x))
+    assert (off <= field.error_bound(x, precision=precision)).all()
+
+
+@given(st.lists(st.lists(st.integers(0, 9), min_size=1, max_size=12), min_size=1, max_size=5))
+def test_trails_take_every_edge_once(walks: list[list[int]]) -> None:
+    pairs = [(a, b) for walk in walks for a, b in zip(walk, walk[1:] + walk[:1], strict=True)]
+    trails = closed_trails(np.array(pairs))
+    assert all(trail[0] == trail[-1] and len(trail) > 1 for trail in trails)
+    found = [pair for trail in trails for pair in itertools.pairwise(trail.tolist())]
+    assert sorted(found) == sorted(pairs)
+
+
+def test_edges_that_are_not_closed_are_refused() -> None:
+    with pytest.raises(ValueError, match="not closed, more go to vertex 2"):
+        closed_trails(np.array([[0, 1], [1, 2]]))
 
 
 def test_auto_takes_the_exact_method_for_few_edges() -> None:
@@ -572,7 +678,7 @@ def test_lifts_stay_within_their_promise(method: str) -> None:
     x = rng.uniform(-1.4, 1.4, (300, 3))
     backend = choose_backend("double")
     sample = field.prepare(backend).evaluate(to_vector3(backend, x))
-    (ball,) = sample.known
+    ball = next(one for one in sample.known if isinstance(one, HarmonicBall))
     value, radius = to_numpy(sample.value), to_numpy(ball.radius)
     room = np.stack([to_numpy(ball.lower) - value, to_numpy(ball.upper) - value])
     slack = 2 * np.broadcast_to(to_numpy(type(sample.value)(sample.error)), value.shape) + 1e-9

@@ -7,6 +7,7 @@ import math
 import re
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from harnack.backend import doctor
 from harnack.gallery import SCENES, Scene
 from harnack.geometry.surfaces import SURFACE_FILES
 from harnack.opening import UP_AXES, open_surface
-from harnack.rendering import MATERIALS, SHOW_MODES, render
+from harnack.rendering import MATERIALS, SHOW_MODES, Camera, render
 
 _DEMO_SIZE = (480, 360)
 
@@ -71,7 +72,15 @@ def _add_render(commands: Any) -> None:
         help="level to draw (1/2 for meshes, 2pi for curves); pi is understood: 2pi, pi/2",
     )  # fmt: skip
     one.add_argument("--material", choices=sorted(MATERIALS), help="what it is made of")
-    one.add_argument("--show", choices=SHOW_MODES, help="what to draw (color)")
+    one.add_argument(
+        "--show", choices=SHOW_MODES,
+        help="what to draw: color follows light paths, shaded lights first hits by a formula, "
+        "without noise (shaded for meshes and clouds, else color)",
+    )  # fmt: skip
+    for name, what in (("azimuth", "is turned"), ("elevation", "looks down")):
+        one.add_argument(
+            f"--{name}", type=float, metavar="DEG", help=f"how far the camera {what}, in degrees"
+        )
     file = one.add_argument_group("surface files")
     file.add_argument(
         "--as", dest="as_", choices=("winding", "dipole", "loops"),
@@ -86,7 +95,7 @@ def _add_render(commands: Any) -> None:
     )
     file.add_argument(
         "--up", choices=UP_AXES,
-        help="the file's axis that points up (y for .glb and .gltf, else z; most .obj need y)",
+        help="the file's axis that points up (y for .glb, .gltf and surfaces in .obj, else z)",
     )  # fmt: skip
     _add_quality(one)
     one.set_defaults(run=_render)
@@ -94,7 +103,10 @@ def _add_render(commands: Any) -> None:
 
 def _add_quality(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", type=parse_size, metavar="WxH", help="pixels (800x600)")
-    parser.add_argument("--spp", type=_positive, metavar="N", help="samples a pixel (64)")
+    parser.add_argument(
+        "--spp", type=_positive, metavar="N",
+        help="samples a pixel (64; 9 at edges of shaded pictures)",
+    )  # fmt: skip
     parser.add_argument("--seed", type=int, default=0, help="another seed, other noise (0)")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
 
@@ -147,6 +159,8 @@ def _render(options: Any) -> int:
     settings = _quality(options)
     if options.show is not None:
         settings["show"] = options.show
+    if options.azimuth is not None or options.elevation is not None:
+        settings["camera"] = _camera(options)
     kind = source.suffix.lower()
     if options.scene in SCENES or kind == ".xml":
         _refuse_file_options(options)
@@ -169,6 +183,13 @@ def _render(options: Any) -> int:
     return 0
 
 
+def _camera(options: Any) -> Camera:
+    """The camera asked for; angles that were not given stay those of the scene or the studio."""
+    usual = SCENES[options.scene].camera if options.scene in SCENES else Camera()
+    angles = {"azimuth": options.azimuth, "elevation": options.elevation}
+    return replace(usual, **{name: value for name, value in angles.items() if value is not None})
+
+
 def _refuse_file_options(options: Any) -> None:
     given = {
         "--as": options.as_, "--boundary": options.boundary, "--normals": options.normals,
@@ -187,7 +208,11 @@ def _draw_file(source: Path, target: Path, options: Any, settings: dict[str, Any
     console = Console(highlight=False, soft_wrap=True)
     console.print(f"{source}: {opened.said}", markup=False)
     console.print(f"{type(opened.field).__name__}: {facts}", markup=False)
-    render(opened.field, target, level=options.level, material=options.material, **settings)
+    if options.show is None and opened.show != "color":
+        settings["show"] = opened.show
+        console.print(f"drawn {opened.show}; --show color follows light paths, in minutes")
+    material = options.material or opened.material
+    render(opened.field, target, level=options.level, material=material, **settings)
 
 
 def _draw_scene(scene: Scene, target: Path, options: Any, settings: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""From a surface file to a field: which field, which way is up, and saying so."""
+"""From a surface file to a field: which field, which way is up, how to draw it, and saying so."""
 
 from __future__ import annotations
 
@@ -34,16 +34,24 @@ _UPRIGHT: dict[str, FloatArray] = {
 }
 UP_AXES: tuple[str, ...] = tuple(_UPRIGHT)
 _Y_UP_BY_STANDARD = (".glb", ".gltf")
+_Y_UP_BY_HABIT = (".obj",)
 # Where `read_loops` itself takes the boundary of faces.
 _LOOP_FILES = (".obj", ".ply", ".loops")
 
 
 @dataclass(frozen=True, eq=False)
 class OpenedSurface:
-    """A field made of a file. said: what was decided and why, in one line."""
+    """A field made of a file.
+
+    said: what was decided and why, in one line. show, material: how it is drawn unless asked for
+    otherwise: surfaces of meshes and clouds shaded, which takes one ray a pixel, for each of them
+    costs many times what one through a curve's surface does.
+    """
 
     field: Field
     said: str
+    show: str
+    material: str
 
 
 def open_surface(
@@ -59,7 +67,7 @@ def open_surface(
     as_: "winding", "dipole" or "loops" instead of what `read_surface` decides. boundary: the
     curves that bound the faces. normals: "estimate" finds those of a point cloud, and replaces
     those of the file. up: the file's axis that turns to z, by default y for glTF, whose standard
-    says so, and z for all others, which do not say.
+    says so, and for meshes and clouds of .obj files, most of which have it so; else z.
 
     Raises:
         FileFormatError: as `read_surface`; a point cloud without normals.
@@ -74,12 +82,24 @@ def open_surface(
             f"{path}: normals are estimated for point clouds, and this is something else: "
             f"{surface.said}; leave --normals out, or take its points with --as dipole"
         )
-    axis = up or ("y" if path.suffix.lower() in _Y_UP_BY_STANDARD else "z")
+    is_curve = isinstance(surface, Loops)
+    axis, why = (up, "as asked") if up is not None else _usual_up(path, is_curve=is_curve)
     try:
         field = _field(surface, normals, _UPRIGHT[axis])
     except ValueError as error:
         raise FileFormatError(f"{path}: {error}") from error
-    return OpenedSurface(field, f"{surface.said}; {axis} is up")
+    show, material = ("color", "two-tone") if is_curve else ("shaded", "eggshell")
+    return OpenedSurface(field, f"{surface.said}; {axis} is up, {why}", show, material)
+
+
+def _usual_up(path: Path, *, is_curve: bool) -> tuple[Axis, str]:
+    """The axis that is up in files of this kind, and why."""
+    kind = path.suffix.lower()
+    if kind in _Y_UP_BY_STANDARD:
+        return "y", "the standard of the format"
+    if kind in _Y_UP_BY_HABIT and not is_curve:
+        return "y", "as in most .obj files"
+    return "z", "for want of a standard (--up turns it)"
 
 
 def _read(path: Path, as_: ReadAs | None, boundary: bool) -> Mesh | Cloud | Loops:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -9,6 +10,7 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
+from harnack.distance.around import nearest_seen
 from harnack.distance.batches import FloatArray, in_batches
 from harnack.distance.projection import Descent
 from harnack.tracer import trace
@@ -54,13 +56,17 @@ def find_closest(backend: Backend, surface: LevelSet, levels: Levels, points: An
     """The closest of these: the end of the descent from the point, and of five more that start
     half its length from the point, away from its end and to the four sides; the closest point of
     the curve that the surface ends in; the closest point of the sheets, if the surface is there.
+
+    Where that is none, the end of the descent from the nearest point that rays find
+    (`nearest_seen`).
     """
     field = surface.field
     prepared = field.prepare(backend)
+    surface = dataclasses.replace(surface, field=prepared)  # uploaded once
     descent = Descent.of(backend, prepared, levels)
 
     def descend(p: Vec3, start: Vec3) -> tuple[Real | Vec3, ...]:
-        foot, found = descent.closest(p, start)
+        foot, found, _ = descent.closest(p, start)
         return dr.select(found, foot, dr.nan), foot
 
     def look(p: Vec3) -> tuple[Real | Vec3, ...]:
@@ -86,7 +92,28 @@ def find_closest(backend: Backend, surface: LevelSet, levels: Levels, points: An
     feet, _ = in_batches(backend, descend, several, np.concatenate(starts))
     for part in np.split(_within(field, feet), len(starts)):
         found = found.or_nearer(part)
-    return found
+    return _with_seen(backend, surface, descent, found)
+
+
+def _with_seen(backend: Backend, surface: LevelSet, descent: Descent, found: Closest) -> Closest:
+    """With feet for points that have none: from the nearest point that is seen, down to where the
+    descent ends. That is a point of the surface even where it is no minimum."""
+    lost = np.flatnonzero(np.isnan(found.feet[:, 0]))
+    if not lost.size:
+        return found
+
+    def descend(p: Vec3, start: Vec3) -> tuple[Real | Vec3, ...]:
+        foot, _, on_level = descent.closest(p, start)
+        return (dr.select(on_level, foot, start),)
+
+    x = found.points[lost]
+    seen = nearest_seen(backend, surface, x)
+    some = ~np.isnan(seen[:, 0])
+    feet = np.full_like(found.feet, np.nan)
+    (feet[lost[some]],) = in_batches(backend, descend, x[some], seen[some])
+    # The way down may leave the domain; what is seen lies within.
+    feet[lost] = np.where(np.isnan(_within(surface.field, feet[lost])), seen, feet[lost])
+    return found.or_nearer(feet)
 
 
 def _ways(away: FloatArray) -> tuple[FloatArray, ...]:

@@ -69,8 +69,9 @@ class Descent:
             return cls(backend, field, levels, False)
         return cls(backend, field, levels, True)
 
-    def closest(self, x: Vec3, start: Vec3) -> tuple[Vec3, Mask]:
-        """The closest point y to x that is found from `start`, and whether it is one (see above).
+    def closest(self, x: Vec3, start: Vec3) -> tuple[Vec3, Mask, Mask]:
+        """The closest point y to x that is found from `start`, whether it is one (see above), and
+        whether it is a point of the level set at all.
 
         A step along the surface is Newton's for |x-y|^2/2: with r = x - y, tangential part t, and
         the Hessian A in tangential coordinates, the surface near y is y + w - (w.Aw/(2|g|)) n + ..
@@ -116,7 +117,7 @@ class Descent:
 
         state = (*first.parts(), real(1), mask(False), count(0), mask(on_level))
         y, _, _, _, _, found, _, _ = dr.while_loop(state, more, body, label="along the level")
-        return y, found
+        return y, found, on_level
 
     def _look(self, y: Vec3) -> tuple[Real, _Place]:
         """f - level at y, and the place."""

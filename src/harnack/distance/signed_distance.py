@@ -48,7 +48,8 @@ def signed_distance(
             field's `hessian`.
         "newton": to a point of the surface found by search, the closest in its neighbourhood
             (`closest_points`). Exact to rounding if it is the closest of all, else too long in
-            size: an upper bound. NaN, with a RuntimeWarning that counts them, where none is found.
+            size: an upper bound. NaN, with a RuntimeWarning that counts them, where no surface is
+            found at all, as where there is none.
             The slowest by far: some hundred evaluations.
         "lower": never longer in size than the true distance, with proof: no level lies in the
             ball of that radius about the point, not even outside the field's domain. Of first
@@ -95,9 +96,11 @@ def closest_points(
     Each lies on the surface to rounding, and no point of the surface in its neighbourhood is
     nearer; one elsewhere may be, though several descents are tried (`find_closest`). The curve in
     which the level sets of a field end counts as part of them, such as the vertices and edges of
-    a solid angle. NaN, with a RuntimeWarning that counts them, where every descent ends at a
-    critical point of f or outside the field's domain: the surface is cut there, and what is
-    closest may be its rim. Raises as `signed_distance`.
+    a solid angle. Where every descent ends at a critical or singular point of f, or outside the
+    field's domain, the nearest point of the surface that some rays find is taken, and from there
+    as far down as descent leads: that need not be a minimum, such as where the rim of a surface
+    cut by the domain is closest. NaN, with a RuntimeWarning that counts them, where rays find no
+    surface either. Raises as `signed_distance`.
     """
     backend = choose_backend(precision)
     surface = _surface(field, level)
@@ -127,8 +130,8 @@ def _warn_of_nan(name: str, found: Closest) -> None:
     lost = int(np.isnan(found.feet[:, 0]).sum())
     if lost:
         warnings.warn(
-            f"{name}: no closest point was found for {lost} of {len(found.feet)} points (NaN); "
-            "every descent from there ends at a critical point of f or outside the field's domain",
+            f"{name}: no closest point was found for {lost} of {len(found.feet)} points (NaN): no "
+            "descent from there ends on the surface, and no ray that was tried meets it",
             RuntimeWarning,
             stacklevel=3,
         )

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend import aligned, choose_backend, to_numpy, to_vector3
+from harnack.backend import backend_of, choose_backend, to_numpy, to_vector3
+from harnack.fields.field import Field
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Precision, Vec3
+    from harnack.backend import Backend, Precision, Real, Vec3
+    from harnack.fields.edge_hessian import SymmetricSum
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -21,6 +25,84 @@ _AT_ONCE = 1 << 20
 # Cells along an axis, as a power of two; three of them make a key of 15 bits, which NumPy sorts
 # by radix.
 _BITS = 5
+
+
+@dataclass(frozen=True)
+class Values:
+    """What a field is at points: value, a bound of its error and, as far as they were asked for,
+    gradient and Hessian; in the field's own units."""
+
+    value: Real
+    error: Real
+    gradient: Vec3 | None = None
+    hessian: SymmetricSum | None = None
+
+
+class BatchedField(Field):
+    """A field whose values, derivatives and error bounds can be had at many points at once.
+
+    Subclasses define `values_at`.
+    """
+
+    @abc.abstractmethod
+    def values_at(self, x: Vec3, derivatives: int) -> Values:
+        """Everything at points x, a Dr.Jit 3-vector of any backend and precision.
+
+        derivatives: 0 for the value alone, 1 with the gradient, 2 with the Hessian. Not called
+        while a loop is recorded, unless derivatives is 2.
+        """
+
+    def value(self, points: Any, *, precision: Precision = "single") -> FloatArray:
+        """The values at points (n, 3): (n,)."""
+        return self._at(points, precision, 0, lambda at: (at.value,))[0]
+
+    def gradient(self, points: Any, *, precision: Precision = "single") -> FloatArray:
+        """The gradients at points (n, 3): (n, 3)."""
+        return self._at(points, precision, 1, lambda at: (at.gradient,))[0]
+
+    def value_and_gradient(
+        self, points: Any, *, precision: Precision = "single"
+    ) -> tuple[FloatArray, FloatArray]:
+        """Values (n,) and gradients (n, 3) together, for little more than one of them."""
+        value, gradient = self._at(points, precision, 1, lambda at: (at.value, at.gradient))
+        return value, gradient
+
+    def hessian(self, p: Any, *, precision: Precision = "single") -> Any:
+        """The second derivatives at p (n, 3): (n, 3, 3), symmetric.
+
+        Given a Dr.Jit 3-vector, three rows, as `Field.hessian` describes.
+        """
+        if dr.is_array_v(type(p)):
+            return _hessian(self.values_at(p, 2)).rows(backend_of(p).Array3f)
+        rows = self._at(p, precision, 2, lambda at: _hessian(at).parts())
+        xx, yy, zz, xy, xz, yz = rows
+        return np.moveaxis(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), 2, 0)
+
+    def error_bound(self, points: Any, *, precision: Precision = "single") -> FloatArray:
+        """How far `value` may be from the field at most: truncation, proved, and rounding.
+
+        Rounding of the points themselves comes on top.
+        """
+        return self._at(points, precision, 0, lambda at: (at.error,))[0]
+
+    def _at(
+        self,
+        points: Any,
+        precision: Precision,
+        derivatives: int,
+        wanted: Callable[[Values], tuple[Any, ...]],
+    ) -> tuple[FloatArray, ...]:
+        def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
+            del backend
+            return wanted(self.values_at(x, derivatives))
+
+        return at_points(points, kernel, precision)
+
+
+def _hessian(values: Values) -> SymmetricSum:
+    if values.hessian is None:
+        raise RuntimeError("values_at(x, 2) gave no Hessian")
+    return values.hessian
 
 
 def at_points(
@@ -47,12 +129,14 @@ def at_points(
     parts: list[tuple[npt.NDArray[Any], ...]] = []
     for start in range(0, len(given), _AT_ONCE):
         some = given[start : start + _AT_ONCE]
-        x = backend.Array3f(*(aligned(backend, some[:, k].astype(number)) for k in range(3)))
+        x = backend.Array3f(*(backend.Float(some[:, k].astype(number)) for k in range(3)))
         order = morton_order(backend, x)
         results = kernel(backend, dr.gather(backend.Array3f, x, order))
         places = [_back_in_place(one, order, len(some)) for one in results]
         dr.eval(*places)
         parts.append(tuple(to_numpy(one) for one in places))
+    if len(parts) == 1:
+        return parts[0]
     return tuple(np.concatenate(pieces) for pieces in zip(*parts, strict=True))
 
 
@@ -73,7 +157,7 @@ def morton_order(backend: Backend, x: Vec3) -> Any:
     if n < 2:
         return dr.arange(index, n)
     low = vector(*(dr.min(one) for one in x))
-    sides = [dr.max(x[k] - low[k]) for k in range(3)]
+    sides = [dr.max(x[k]) - low[k] for k in range(3)]
     size = dr.maximum(dr.maximum(sides[0], sides[1]), sides[2])
     scale = (2**_BITS - 1e-3) / dr.maximum(size, 1e-30)
     key = index(0)

@@ -12,21 +12,23 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import backend_of
-from harnack.fields.batch import at_points
-from harnack.fields.dipole_tree import DipoleTree
-from harnack.fields.field import Field, HarmonicBall, Sample
+from harnack.fields.batch import BatchedField, Values
+from harnack.fields.dipole_tree import DipoleTree, hierarchy_of
+from harnack.fields.edge_hessian import SymmetricSum
+from harnack.fields.field import Field, Sample, lengthened
 from harnack.geometry import Box, CloudError, estimate_areas, estimate_normals, validate_cloud
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Precision, Real, Vec3
+    from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.geometry import Volume
+    from harnack.tree import Hierarchy
 
 FloatArray = npt.NDArray[np.float64]
 
 _VALUES, _TRACED = 2.0, 4.0
 
 
-class DipolePotential(Field):
+class DipolePotential(BatchedField):
     """f(x) = sum a_i n_i.(p_i - x)/|p_i - x|^3 of oriented points (paper, Eq. 12).
 
     With a_i the areas that the points stand for, f is about 4 pi inside and 0 outside: the
@@ -39,11 +41,14 @@ class DipolePotential(Field):
         default 2 for values at points and 4 for tracing, where hits are as sharp as the proved
         bound of what that leaves out. At least 1.5.
 
+    `moved` gives the field of points that have moved.
+
     Raises CloudError (a ValueError) for what is no oriented point cloud.
     """
 
     period: ClassVar[float | None] = None
     default_level: float = 2 * math.pi
+    has_detail = True
 
     def __init__(
         self,
@@ -74,47 +79,37 @@ class DipolePotential(Field):
         self._centre = 0.5 * (low + high)
         extent = max(0.5 * float((high - low).max()), math.sqrt(float(self.areas.sum())) / 4)
         self._size = 2.0 ** math.ceil(math.log2(extent))
+        self._hierarchy: Hierarchy | None = None
         self._batches: dict[Backend, _OnDevice] = {}
         self._device: _OnDevice | None = None
 
-    def value(self, points: Any, *, precision: Precision = "single") -> FloatArray:
-        """f at points (n, 3): (n,)."""
-        return self._at(points, precision, 0)[0]
+    def moved(
+        self, points: Any, normals: Any | Literal["estimate"] = None, areas: Any = None
+    ) -> DipolePotential:
+        """The potential of as many points (n, 3) elsewhere; normals and areas as for a new one.
 
-    def gradient(self, points: Any, *, precision: Precision = "single") -> FloatArray:
-        """The gradient of f at points (n, 3): (n, 3)."""
-        return self._at(points, precision, 1)[1]
-
-    def error_bound(self, points: Any, *, precision: Precision = "single") -> FloatArray:
-        """How far `value` may be from f at most: truncation, proved, and rounding."""
-        return self._at(points, precision, 0)[-1]
-
-    def hessian(self, p: Any, *, precision: Precision = "single") -> Any:
-        """The second derivatives of f at p (n, 3): (n, 3, 3), symmetric and free of trace.
-
-        Given a Dr.Jit 3-vector, three rows, as `Field.hessian` describes.
+        The tree, if there is one, keeps its shape and gets new centres, radii, moments and bounds.
+        All that is promised is computed from where the points are now, so a tree whose points moved
+        far is slower than a new one, never wrong. Raises CloudError as for a new field.
         """
-        if dr.is_array_v(type(p)):
-            on = self._batch(backend_of(p))
-            vector = on.tree.backend.Array3f
-            parts = on.tree.at(on.unit(p), 2)[2:8]
-            xx, yy, zz, xy, xz, yz = (part / self._size**2 for part in parts)
-            return vector(xx, xy, xz), vector(xy, yy, yz), vector(xz, yz, zz)
-        xx, yy, zz, xy, xz, yz = self._at(p, precision, 2)[2].T
-        return np.moveaxis(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), 2, 0)
+        field = DipolePotential(points, normals, areas, accuracy=self.accuracy)
+        if len(field.points) != len(self.points):
+            raise CloudError(
+                f"points: {len(field.points)} of them, where {len(self.points)} were before: "
+                "moving points keeps their number and their order"
+            )
+        field._hierarchy = self._hierarchy
+        return field
 
-    def _at(self, points: Any, precision: Precision, derivatives: int) -> tuple[FloatArray, ...]:
-        def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
-            on = self._batch(backend)
-            value, *rest, error = on.tree.at(on.unit(x), derivatives)
-            out: list[Any] = [value]
-            if derivatives >= 1:
-                out.append(rest[0] / self._size)
-            if derivatives == 2:
-                out.append(backend.ArrayXf([part / self._size**2 for part in rest[1:]]))
-            return *out, error + on.tree.rounding
-
-        return at_points(points, kernel, precision)
+    def values_at(self, x: Vec3, derivatives: int) -> Values:
+        on = self._batch(backend_of(x))
+        value, *rest, error = on.tree.at(on.unit(x), derivatives)
+        error = error + on.tree.rounding
+        gradient = rest[0] / self._size if derivatives >= 1 else None
+        if derivatives < 2:
+            return Values(value, error, gradient)
+        hessian = SymmetricSum(*(part / self._size**2 for part in rest[1:]))
+        return Values(value, error, gradient, hessian)
 
     def _batch(self, backend: Backend) -> _OnDevice:
         """The evaluator for points, which is made once a backend."""
@@ -126,30 +121,30 @@ class DipolePotential(Field):
         unit = (self.points - self._centre) / self._size
         # Areas shrink with the square of lengths, and the potential knows no scale.
         moments = (self.areas / self._size**2)[:, None] * self.normals
-        tree = DipoleTree.of(backend, unit, moments, accuracy)
+        if self._hierarchy is None:
+            self._hierarchy = hierarchy_of(unit)
+        tree = DipoleTree.of(backend, self._hierarchy, unit, moments, accuracy)
         centre = backend.Array3f(*(dr.opaque(backend.Float, float(c)) for c in self._centre))
         return _OnDevice(tree, centre, dr.opaque(backend.Float, self._size))
 
     def prepare(self, backend: Backend) -> DipolePotential:
-        if self._device is not None and self._device.tree.backend is backend:
+        if self._device is not None and self._device.tree.clusters.backend is backend:
             return self
+        device = self._upload(backend, self.accuracy or _TRACED)
         prepared = copy.copy(self)
-        prepared._device = self._upload(backend, self.accuracy or _TRACED)
+        prepared._device = device
         return prepared
 
     def evaluate(self, p: Vec3) -> Sample:
         on = self._device
         if on is None:
             return self.prepare(backend_of(p)).evaluate(p)
-        s = on.tree.sample(on.unit(p))
-        known = tuple(
-            HarmonicBall(one.radius * on.size, one.lower, one.upper)
-            for one in s.known
-            if isinstance(one, HarmonicBall)
-        )
-        return Sample(
-            s.value, s.gradient / on.size, known, s.error, s.gradient_error / on.size, s.normal
-        )
+        return on.sample(p, True)
+
+    def at_detail(self, fine: Mask) -> Field:
+        if self._device is None:
+            raise RuntimeError("prepare(backend) comes before at_detail")
+        return _AtDetail(self._device, fine)
 
     def check_levels(self, levels: tuple[float, ...]) -> None:
         for level in levels:
@@ -177,4 +172,17 @@ class _OnDevice:
     size: Real
 
     def unit(self, p: Vec3) -> Vec3:
-        return (self.tree.backend.Array3f(p) - self.centre) / self.size
+        return (self.tree.clusters.backend.Array3f(p) - self.centre) / self.size
+
+    def sample(self, p: Vec3, fine: Mask) -> Sample:
+        return lengthened(self.tree.sample(self.unit(p), fine), self.size)
+
+
+class _AtDetail(Field):
+    """A potential that is looked at closely on some lanes only."""
+
+    def __init__(self, on: _OnDevice, fine: Mask) -> None:
+        self._on, self._fine = on, fine
+
+    def evaluate(self, p: Vec3) -> Sample:
+        return self._on.sample(p, self._fine)

@@ -10,40 +10,43 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend.extrema import fmin
-from harnack.fields.edge_hessian import SymmetricSum
-from harnack.fields.field import HarmonicBall, Sample
+from harnack.fields.far_clusters import FarClusters
 from harnack.fields.multipole import all_levels
-from harnack.fields.multipole_kernel import far_terms
-from harnack.fields.winding_tree import node_columns
-from harnack.tree import NO_PRIMITIVE, Node, PackedTree, build_hierarchy, for_each, pack, walk
+from harnack.tree import NO_PRIMITIVE, Node, build_hierarchy, for_each
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.fields.field import Sample
+    from harnack.tree import Hierarchy
     from harnack.tree.hierarchy import FloatArray
 
-_REACH, _ROUNDING = 0.5, 2e-5
 _LEAF_SIZE, _ARITY = 8, 4
 # Beside a point means within this part (of its area, in squared distance).
 _BESIDE = 0.04
+
+
+def hierarchy_of(points: FloatArray) -> Hierarchy:
+    """Which of the points (n, 3) lie in which leaf."""
+    return build_hierarchy(points, leaf_size=_LEAF_SIZE, arity=_ARITY)
 
 
 @dataclass(frozen=True)
 class DipoleTree:
     """sum_i m_i.(y_i - x)/|y_i - x|^3 on a backend; a record holds y_i, m_i and |m_i|."""
 
-    backend: Backend
-    tree: PackedTree
-    accuracy: float
+    clusters: FarClusters
     rounding: float
 
     @classmethod
     def of(
-        cls, backend: Backend, points: FloatArray, moments: FloatArray, accuracy: float
-    ) -> DipoleTree:
-        """From points (n, 3) of size about one and moments (n, 3), area times normal."""
-        tree = build_hierarchy(points, leaf_size=_LEAF_SIZE, arity=_ARITY)
+        cls, backend: Backend, tree: Hierarchy, points: FloatArray, moments: FloatArray,
+        accuracy: float,
+    ) -> DipoleTree:  # fmt: skip
+        """From points (n, 3) of size about one and moments (n, 3), area times normal.
+
+        tree: `hierarchy_of` these points, or of where they were once.
+        """
         levels = all_levels(tree, points[:, None], moments[:, None], points, points)
-        nodes = [node_columns(level, accuracy, 2) for level in levels]
         weight = np.linalg.norm(moments, axis=1, keepdims=True)
         rows = tree.gather(np.concatenate([points, moments, weight], axis=1))
         empty = tree.slots == NO_PRIMITIVE
@@ -51,29 +54,10 @@ class DipoleTree:
         # Rounded terms, most of them of the size of their share of the whole, random in sign.
         area = float(weight.sum())
         rounding = backend.epsilon * (16 + math.sqrt(len(points)) / 8) * max(1.0, area)
-        return cls(backend, pack(backend, tree, nodes, rows), accuracy, rounding)
+        return cls(FarClusters.of(backend, tree, levels, rows, accuracy), rounding)
 
     def at(self, x: Vec3, derivatives: int) -> tuple[Any, ...]:
         """Value, gradient and Hessian's parts (as asked for), and the truncation bound, last."""
-        real, vector = self.backend.Float, self.backend.Array3f
-        zero = SymmetricSum.zero(real).parts()
-        sums: tuple[Any, ...] = (vector(0), *zero)[: (0, 1, 7)[derivatives]]
-
-        def visit(node: Node, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
-            error, value, *rest = state
-            r, length, far = _far(node, x)
-            inverse = dr.select(far, dr.rcp(length), 0)
-            c = node.payload(far)
-            terms = far_terms(c, r, inverse, derivatives)
-            error = dr.fma(c[15], inverse * (inverse * inverse) ** 2, error)
-            value = value + dr.select(far, terms.value, 0)
-            if derivatives >= 1:
-                rest[0] = rest[0] + dr.select(far, terms.gradient, 0)
-            if derivatives == 2 and terms.hessian is not None:
-                pairs = zip(rest[1:], terms.hessian.parts(), strict=True)
-                rest[1:] = [old + dr.select(far, new, 0) for old, new in pairs]
-            near = ~far & node.is_leaf
-            return ~far, (error, *for_each(node, near, add, (value, *rest)))
 
         def add(row: list[Real], active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
             value, *rest = state
@@ -86,90 +70,49 @@ class DipoleTree:
                 rest[1:] = [old + dr.select(active, new, 0) for old, new in pairs]
             return value, *rest
 
-        error, *rest = walk(self.tree, visit, (real(0), real(0), *sums))
-        return *rest, error
+        def leaf(node: Node, near: Mask, sums: tuple[Any, ...]) -> tuple[Any, ...]:
+            return for_each(node, near, add, sums)
 
-    def sample(self, x: Vec3) -> Sample:
-        """Value, gradient and certificate at x.
+        return self.clusters.at(x, derivatives, leaf)
 
-        Certificate. Let r = D/2, with D the least distance to near points and of r - R over far
-        nodes. A dipole a at rho >= D has a gradient of at most 2a/rho^3, so that on B(x, r) it
-        moves f by at most a ((rho-r)^-2 - rho^-2) <= a (2r/rho^3 + 8r^2/rho^4), because
-        (1-t)^-2 - 1 - 2t <= 8t^2 for t <= 1/2. `node_columns` bounds the sums over far nodes.
+    def sample(self, x: Vec3, fine: Mask) -> Sample:
+        """Value, gradient and certificate at x: see `far_clusters.Nearby.sample`.
+
+        Rounding. Coordinates rounded by epsilon each move a dipole a at rho by at most
+        2 epsilon a/rho^3 in value; the four roundings of its term, by 4 epsilon a/rho^2.
         """
-        real, vector = self.backend.Float, self.backend.Array3f
-
-        def visit(node: Node, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
-            value, g, error, slope_error, clear, s1, s2, nearest = state
-            r, length, far = _far(node, x)
-            c = node.payload(far)
-            inverse = dr.select(far, dr.rcp(length), 0)
-            terms = far_terms(c, r, inverse, 1)
-            cube = inverse * inverse * inverse
-            decay = cube * inverse * inverse
-            apart = dr.fma(node.head[3], -1 / self.accuracy, length)
-            state = (
-                value + dr.select(far, terms.value, 0),
-                g + dr.select(far, terms.gradient, 0),
-                dr.fma(c[15], decay, error),
-                dr.fma(node.head[4], decay * inverse, slope_error),
-                dr.select(far, fmin(apart, clear), clear),
-                dr.fma(node.head[5], cube, s1),
-                dr.fma(node.head[5], cube * inverse, s2),
-                nearest,
-            )
-            return ~far, for_each(node, ~far & node.is_leaf, add, state)
+        vector, real = self.clusters.backend.Array3f, self.clusters.backend.Float
+        epsilon = self.clusters.backend.epsilon
 
         def add(row: list[Real], active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
-            value, g, error, slope_error, clear, s1, s2, nearest = state
+            value, g, error, slope_error, clear, s4, s5, rounded, nearest = state
             one, slope, _ = _dipole(row, x, 1)
             near = dr.norm(vector(*row[:3]) - x)
-            cube = dr.select(active, row[6] / (near * near * near), 0)
+            inverse = dr.rcp(near)
+            cube = dr.select(active, row[6] * (inverse * inverse * inverse), 0)
             return (
                 value + dr.select(active, one, 0),
                 g + dr.select(active, slope, 0),
                 error,
                 slope_error,
                 dr.select(active, fmin(near, clear), clear),
-                s1 + cube,
-                s2 + cube / near,
+                dr.fma(cube, inverse, s4),
+                dr.fma(cube * inverse, inverse, s5),
+                dr.fma(cube, dr.fma(4, near, 2), rounded),
                 dr.select(active & (near <= clear), vector(*row[3:6]), nearest),
             )
 
-        start = (real(0), vector(0), real(0), real(0), real(dr.inf), real(0), real(0), vector(0))
-        return self._certified(*walk(self.tree, visit, start))
+        def leaf(node: Node, near: Mask, sums: tuple[Any, ...]) -> tuple[Any, ...]:
+            return for_each(node, near, add, sums)
 
-    def _certified(
-        self, value: Real, g: Vec3, error: Real, slope_error: Real, clear: Real, s1: Real,
-        s2: Real, nearest: Vec3,
-    ) -> Sample:  # fmt: skip
-        epsilon = self.backend.epsilon
-        distance = clear * (1 - _ROUNDING) - 8 * epsilon
-        r = _REACH * distance
-        variation = 2 * r * (s1 + 4 * r * s2) * (1 + _ROUNDING)
-        ball = HarmonicBall(r, value - variation, value + variation)
-        # On a point itself all values meet: a gradient that says so.
-        apart = (clear > 16 * epsilon) & dr.isfinite(value) & dr.isfinite(dr.squared_norm(g))
-        steep = self.backend.Array3f(0, 0, 4 * math.pi / (8 * epsilon))
+        found, (rounded, nearest) = self.clusters.near(x, fine, leaf, (real(0), vector(0)))
         # Where one point's own field drowns the others', the surface has that point's normal; f
         # is larger on the other side.
         weight = dr.norm(nearest)
-        beside = (clear * clear < _BESIDE * weight) & (weight > 0)
-        normal = dr.select(beside, -nearest / weight, dr.normalize(g))
-        return Sample(
-            dr.select(apart, value, 0),
-            dr.select(apart, g, steep),
-            (ball,),
-            error + self.rounding,
-            dr.select(apart, slope_error, 0),
-            normal,
-        )
-
-
-def _far(node: Node, x: Vec3) -> tuple[Vec3, Real, Mask]:
-    r = x - type(x)(*node.head[:3])
-    length = dr.norm(r)
-    return r, length, length > node.head[3]
+        beside = (found.clear * found.clear < _BESIDE * weight) & (weight > 0)
+        normal = dr.select(beside, -nearest / weight, dr.normalize(found.gradient))
+        rounded = dr.select(dr.isfinite(rounded), epsilon * rounded, 0)
+        return found.sample(1.0, self.rounding + rounded, normal)
 
 
 def _dipole(row: list[Real], x: Vec3, derivatives: int) -> tuple[Real, Vec3, list[Real]]:

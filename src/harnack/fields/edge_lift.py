@@ -23,8 +23,10 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import aligned
-from harnack.backend.extrema import clamp, fmin
+from harnack.backend.extrema import fmin
+from harnack.fields.edge_field import edge_field, edge_variation
 from harnack.fields.edge_hessian import SymmetricSum, edge_rates
+from harnack.tree.nearest import squared_distance_to_segment
 from harnack.tree.triangles import side
 
 if TYPE_CHECKING:
@@ -91,9 +93,7 @@ def lifted_sums(
     derivatives: 0 for the angle alone, 1 with the gradient, 2 with the Hessian.
 
     The angles are added up as a product of factors and a count of how often it goes round. s_a
-    is taken as |a'|^2/(|a| + a.d) where a.d > 0, so that nothing cancels. The field of an edge is
-    (1/|a|+1/|b|)/(|a||b|+a.b) a x b; beside the edge (a.b < 0) the bracket is
-    |a x b|^2/(|a||b|-a.b) instead.
+    is taken as |a'|^2/(|a| + a.d) where a.d > 0, so that nothing cancels.
     """
     backend = edges.backend
     real, vector = backend.Float, backend.Array3f
@@ -135,7 +135,7 @@ def _with_edge(
     zr, zi, turns = winding
     winding = times(zr, zi, turns, re, im)
     if derivatives >= 1:
-        c, weight = _field(a, b, la, lb)
+        c, weight = edge_field(a, b, la, lb)
         g = dr.fma(vector(direction * weight), c, sums[0])
         rest = sums[1:]
         if derivatives == 2:
@@ -143,7 +143,10 @@ def _with_edge(
             rest = SymmetricSum(*rest).plus(direction * u, v).parts()
         sums = (g, *rest)
     if variation:
-        sizes = _with_variation(a, b - a, inverse, *sizes)
+        d2, s1, s2 = sizes
+        square = squared_distance_to_segment(a, b - a, inverse)
+        first, second = edge_variation(square, inverse)
+        sizes = fmin(square, d2), s1 + first, s2 + second
     return winding, sizes, *sums
 
 
@@ -161,24 +164,6 @@ def _factor(a: Vec3, b: Vec3, la: Real, lb: Real) -> tuple[Real, Real]:
     re = dr.select(in_line[0] & in_line[1], 1, re)
     tie = dr.select(a.y == b.y, ax - bx, b.y - a.y)
     return re, dr.select(im == 0, dr.mulsign(real(_TINY), tie), im)
-
-
-def _field(a: Vec3, b: Vec3, la: Real, lb: Real) -> tuple[Vec3, Real]:
-    """a x b, and what Biot and Savart's law multiplies it by; 0 in line with the edge."""
-    c = dr.cross(a, b)
-    dot, both, square = dr.dot(a, b), la * lb, dr.squared_norm(c)
-    bracket = dr.select(dot < 0, square / (both - dot), both + dot)
-    return c, dr.select(square > 0, (la + lb) / (both * bracket), 0)
-
-
-def _with_variation(
-    a: Vec3, e: Vec3, inverse: Real, d2: Real, s1: Real, s2: Real
-) -> tuple[Real, Real, Real]:
-    """Least squared distance and the two sums of `LiftedSums`, with one edge more."""
-    foot = clamp(-dr.dot(a, e) * inverse, type(d2)(0), type(d2)(1))
-    near = dr.squared_norm(a + e * foot)
-    first = dr.rsqrt(near * dr.fma(near, 4 * inverse, 1))
-    return fmin(near, d2), s1 + first, dr.fma(first, dr.rsqrt(near), s2)
 
 
 def _s(a: Vec3, length: Real) -> Real:

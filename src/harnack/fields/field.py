@@ -72,6 +72,20 @@ class Sample:
     normal: Vec3 | None = None
 
 
+def lengthened(sample: Sample, size: Real) -> Sample:
+    """The sample of x -> f(x / size), at the place that moves there."""
+    known: list[Knowledge] = []
+    for one in sample.known:
+        if isinstance(one, HarmonicBall):
+            known.append(HarmonicBall(one.radius * size, one.lower, one.upper, one.dimension))
+        elif isinstance(one, Lipschitz):
+            known.append(Lipschitz(one.constant / size, one.radius * size))
+        else:
+            known.append(Curvature(one.constant / (size * size), one.radius * size))
+    gradient, doubt = sample.gradient / size, sample.gradient_error / size
+    return Sample(sample.value, gradient, tuple(known), sample.error, doubt, sample.normal)
+
+
 class Field(abc.ABC):
     """A scalar function on R^3 whose level sets can be traced with a proof.
 
@@ -94,6 +108,9 @@ class Field(abc.ABC):
     has_sheets: bool = False
     """Whether f jumps across sheets (see `harnack.fields.sheets`). Then `next_crossing` and
     `between` are needed, and what `evaluate` promises is about f with the jumps taken out."""
+
+    has_detail: bool = False
+    """Whether a rougher look at f costs less; then `at_detail` is needed."""
 
     @abc.abstractmethod
     def evaluate(self, p: Vec3) -> Sample:
@@ -157,6 +174,15 @@ class Field(abc.ABC):
     def describe(self) -> dict[str, Any]:
         """What a person would want to know about the choices this field made by itself."""
         return {}
+
+    def at_detail(self, fine: Mask) -> Field:
+        """This field, evaluated as closely as ever on lanes that are fine, roughly on others.
+
+        A rough sample is as true as any: it states a larger `error`. The tracer looks closely
+        where that error matters.
+        """
+        del fine
+        return self
 
     # Of fields with sheets only. All may be called while a loop is being recorded, for rays
     # o + t d with |d| = 1; answers for lanes that are not active are not looked at.

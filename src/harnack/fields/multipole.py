@@ -1,35 +1,37 @@
-"""Multipole moments of dipoles about the nodes of a tree, and what leaving terms out may cost.
+"""Moments of dipoles about the nodes of a tree, and what leaving terms out may cost.
 
-The potential of dipoles a_i n_i at y_i = c + d_i is, seen from x = c + r,
-
-    f(x) = sum_i a_i n_i.(y_i - x)/|y_i - x|^3 = -sum_i a_i n_i.grad_y 1/|x - y_i|
-         = -sum_{l>=1} sum_m conj(M_lm) I_lm(r),      M_lm = sum_i a_i n_i.grad R_lm(d_i)
-
-with solid harmonics R_lm = r^l P_lm(cos t) e^(im p)/(l+m)! and I_lm = (l-m)! P_lm e^(im p)/r^(l+1)
-(no Condon-Shortley phase; R_l,-m = (-1)^m conj R_lm). 1/|x-y| = sum conj(R_lm(y)) I_lm(x),
-R_lm(a+b) = sum R_l'm'(a) R_l-l',m-m'(b), d/dz R_lm = R_l-1,m, (d/dx + i d/dy) R_lm = -R_l-1,m+1,
-(d/dx - i d/dy) R_lm = R_l-1,m-1. All of these are held by tests. Plain NumPy in double precision.
+`moments` says what they are. All in double precision: sums over dipoles and over children in
+Dr.Jit, on many threads and without temporaries, the rest, of one row a node, in NumPy.
 """
+
+# Harmonics have degree l.
+# ruff: noqa: E741
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
+import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from harnack.tree import Hierarchy
+from harnack.backend import choose_backend, to_numpy
+from harnack.backend.extrema import fmax, fmin
+from harnack.fields.moments import KEYS, KNOWN, Pairs, moved, of_dipole, regular
+from harnack.tree import NO_PRIMITIVE, Hierarchy
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Real, Vec3
 
 FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
-Moments = dict[tuple[int, int], ComplexArray]
-
-# Terms up to here are computed. Dipole, quadrupole and octupole (orders 0, 1 and 2 of Barill et
-# al. 2018) are kept, the others measure what is left out.
-_KNOWN = 5
-_DEGREES = tuple((degree, m) for degree in range(1, _KNOWN + 1) for m in range(degree + 1))
-_LEAVES_AT_ONCE = 8192
+Moments = dict[tuple[int, int], npt.NDArray[np.complex128]]
+# Degree, order, and 0 for the real or 1 for the imaginary part.
+_PARTS = tuple((l, m, part) for l, m in KEYS for part in range(2 if m else 1))
+# A bound that is rounded to single precision a few times, down each time, is one still.
+_ROOM = 1 + 2.0**-20
 
 
 @dataclass(frozen=True)
@@ -49,121 +51,170 @@ class Level:
     moments: Moments
 
 
-def regular(d: FloatArray, order: int) -> Moments:
-    """R_lm(d) for l <= order, 0 <= m <= l."""
-    x, y, z = np.moveaxis(d, -1, 0)
-    r2, across = x * x + y * y + z * z, x + 1j * y
-    out: Moments = {(0, 0): np.ones(x.shape, np.complex128)}
-    for m in range(order + 1):
-        if m:
-            out[m, m] = out[m - 1, m - 1] * across / (2 * m)
-        for l in range(m + 1, order + 1):  # noqa: E741
-            above = (2 * l - 1) * z * out[l - 1, m]
-            if l - 2 >= m:
-                above = above - r2 * out[l - 2, m]
-            out[l, m] = above / ((l + m) * (l - m))
-    return out
-
-
-def _at(values: Moments, l: int, m: int) -> ComplexArray | float:  # noqa: E741
-    """R_lm or M_lm for any m; zero where |m| > l."""
-    if abs(m) > l:
-        return 0.0
-    return values[l, m] if m >= 0 else (-1) ** m * values[l, -m].conj()
-
-
-def of_dipoles(d: FloatArray, normal: FloatArray) -> Moments:
-    """M_lm of dipoles `normal` (k, s, 3), areas in their lengths, at d (k, s, 3): sums over s."""
-    harmonics = regular(d, _KNOWN - 1)
-    across = 0.5 * (normal[..., 0] + 1j * normal[..., 1])
-    nz = normal[..., 2]
-    return {
-        (degree, m): np.asarray(
-            nz * _at(harmonics, degree - 1, m)
-            - across.conj() * _at(harmonics, degree - 1, m + 1)
-            + across * _at(harmonics, degree - 1, m - 1)
-        ).sum(axis=1)
-        for degree, m in _DEGREES
-    }
-
-
-def moved(moments: Moments, shift: FloatArray) -> Moments:
-    """Moments about c of dipoles whose moments about c + shift (k, 3) are given."""
-    harmonics = regular(shift, _KNOWN - 1)
-    out: Moments = {}
-    for l, m in moments:  # noqa: E741
-        total = moments[l, m].copy()
-        for k in range(1, l):
-            for j in range(-k, k + 1):
-                if abs(m - j) <= l - k:
-                    total += _at(moments, k, j) * _at(harmonics, l - k, m - j)
-        out[l, m] = total
-    return out
-
-
-def all_levels(tree: Hierarchy, points: FloatArray, normals: FloatArray, low: FloatArray,
-               high: FloatArray) -> list[Level]:  # fmt: skip
+def all_levels(
+    tree: Hierarchy, points: FloatArray, normals: FloatArray, low: FloatArray, high: FloatArray
+) -> list[Level]:
     """Moments of the nodes of all levels, from the leaves to the root.
 
     points, normals: (n, s, 3) dipoles of each of n primitives; a normal's length is its area.
     low, high: (n, 3) boxes that hold the primitives.
     """
-    low, high = tree.gather(low, np.inf).min(axis=1), tree.gather(high, -np.inf).max(axis=1)
-    levels = [_leaves(tree, points, normals, low, high)]
+    backend, each = choose_backend("double"), points.shape[1]
+    p, n, lows, highs = (backend.Float(x.ravel()) for x in (points, normals, low, high))
+
+    def primitive(i: Any) -> _Primitive:
+        dipoles = [
+            _Dipole(_row(backend, n, i * each + k), ((1.0, _row(backend, p, i * each + k)),))
+            for k in range(each)
+        ]
+        return _Primitive(dipoles, _row(backend, lows, i), _row(backend, highs, i))
+
+    return _levels(backend, tree, primitive)
+
+
+def triangle_levels(tree: Hierarchy, corners: FloatArray) -> list[Level]:
+    """Moments of the nodes of all levels, for triangles (n, 3, 3): exact up to rounding."""
+    backend = choose_backend("double")
+    buffer = backend.Float(corners.ravel())
+    rule = tuple(zip(*(part.tolist() for part in triangle_rule()), strict=True))
+
+    def primitive(i: Any) -> _Primitive:
+        a, b, c = (_row(backend, buffer, 3 * i + k) for k in range(3))
+        points = [(weight, a * u + b * v + c * w) for (u, v, w), weight in rule]
+        dipole = _Dipole(0.5 * dr.cross(b - a, c - a), points)
+        return _Primitive([dipole], fmin(fmin(a, b), c), fmax(fmax(a, b), c))
+
+    return _levels(backend, tree, primitive)
+
+
+@dataclass(frozen=True)
+class _Dipole:
+    """A dipole that is spread over points, with weights of sum 1. Its area is its length."""
+
+    normal: Vec3
+    points: Sequence[tuple[float, Vec3]]
+
+
+@dataclass(frozen=True)
+class _Primitive:
+    """Its dipoles, and a box that holds it."""
+
+    dipoles: Sequence[_Dipole]
+    low: Vec3
+    high: Vec3
+
+
+def _row(backend: Backend, buffer: Real, i: Any) -> Vec3:
+    return backend.Array3f(*(dr.gather(backend.Float, buffer, 3 * i + k) for k in range(3)))
+
+
+def _levels(
+    backend: Backend, tree: Hierarchy, primitive: Callable[[Any], _Primitive]
+) -> list[Level]:
+    level, parts, low, high = _leaves(backend, tree, primitive)
+    levels = [level]
     for arity in tree.arities:
         low = low.reshape(-1, arity, 3).min(axis=1)
         high = high.reshape(-1, arity, 3).max(axis=1)
-        levels.append(_parents(levels[-1], arity, low, high))
+        level, parts = _parents(backend, level, parts, low, high)
+        levels.append(level)
     return levels
 
 
-def _leaves(tree: Hierarchy, points: FloatArray, normals: FloatArray, low: FloatArray,
-            high: FloatArray) -> Level:  # fmt: skip
-    parts: list[Level] = []
-    for start in range(0, len(tree.slots), _LEAVES_AT_ONCE):
-        rows = slice(start, start + _LEAVES_AT_ONCE)
-        some = Hierarchy(tree.slots[rows], ())
-        p = some.gather(points).reshape(len(some.slots), -1, 3)
-        n = some.gather(normals).reshape(len(some.slots), -1, 3)
-        size = np.linalg.norm(n, axis=2)
-        area = size.sum(axis=1)
-        centre = _centre((size[..., None] * p).sum(axis=1), area, low[rows], high[rows])
-        d = p - centre[:, None]
-        spread = (size * (d * d).sum(axis=2)).sum(axis=1)
-        reach = _reach(centre, low[rows], high[rows])
-        parts.append(Level(centre, reach, area, spread, of_dipoles(d, n)))
-    joined = {
-        key: np.concatenate([part.moments[key] for part in parts]) for key in parts[0].moments
-    }
-    return Level(
-        np.concatenate([part.centre for part in parts]),
-        np.concatenate([part.radius for part in parts]),
-        np.concatenate([part.area for part in parts]),
-        np.concatenate([part.spread for part in parts]),
-        joined,
-    )
+def _leaves(
+    backend: Backend, tree: Hierarchy, primitive: Callable[[Any], _Primitive]
+) -> tuple[Level, list[Real], FloatArray, FloatArray]:
+    """The leaves, their `_PARTS` on the backend, and boxes around them.
+
+    One lane a leaf, which looks at its primitives twice: for the centre, and about it.
+    """
+    index, real, vector = backend.UInt32, backend.Float, backend.Array3f
+    filled = tree.slots != NO_PRIMITIVE
+    slots = index(np.where(filled, tree.slots, 0).astype(np.uint32).ravel())
+    first = dr.arange(index, len(filled)) * tree.leaf_size
+    end = first + index(filled.sum(axis=1).astype(np.uint32))
+
+    def visit(body: Callable[..., tuple[Any, ...]], state: tuple[Any, ...]) -> tuple[Any, ...]:
+        def step(slot: Any, *state: Any) -> tuple[Any, ...]:
+            return slot + 1, *body(primitive(dr.gather(index, slots, slot)), *state)
+
+        def more(slot: Any, *_: Any) -> Any:
+            return slot < end
+
+        return dr.while_loop((first, *state), more, step, label="slots")[1:]
+
+    def measured(of: _Primitive, low: Vec3, high: Vec3, area: Real, weighted: Vec3) -> Any:
+        for one in of.dipoles:
+            size = dr.norm(one.normal)
+            area, weighted = area + size, weighted + size * sum(w * p for w, p in one.points)
+        return fmin(low, of.low), fmax(high, of.high), area, weighted
+
+    def summed(of: _Primitive, spread: Real, *parts: Real) -> tuple[Any, ...]:
+        for one in of.dipoles:
+            away = [(weight, point - centre) for weight, point in one.points]
+            spread = spread + dr.norm(one.normal) * sum(w * dr.squared_norm(d) for w, d in away)
+            more = _flat(_spread_out(one.normal, away))
+            parts = tuple(a + b for a, b in zip(parts, more, strict=True))
+        return spread, *parts
+
+    nothing = (vector(dr.inf), vector(-dr.inf), real(0), vector(0))
+    low, high, area, weighted = visit(measured, nothing)
+    # The mean of positions by area, or the box's middle where there is no area.
+    centre = dr.select(area > 0, weighted / dr.select(area > 0, area, 1), 0.5 * (low + high))
+    spread, *parts = visit(summed, (real(0),) * (1 + len(_PARTS)))
+    dr.eval(low, high, area, centre, spread, *parts)
+    boxes = to_numpy(low), to_numpy(high)
+    at, moments = to_numpy(centre), _moments_of(parts)
+    level = Level(at, _reach(at, *boxes), to_numpy(area), to_numpy(spread), moments)
+    return level, list(parts), *boxes
 
 
-def _parents(children: Level, arity: int, low: FloatArray, high: FloatArray) -> Level:
-    area = children.area.reshape(-1, arity).sum(axis=1)
-    weighted = (children.area[:, None] * children.centre).reshape(-1, arity, 3).sum(axis=1)
-    centre = _centre(weighted, area, low, high)
-    shift = children.centre - np.repeat(centre, arity, axis=0)
-    moments = moved(children.moments, shift)
-    summed = {key: value.reshape(-1, arity).sum(axis=1) for key, value in moments.items()}
+def _spread_out(normal: Vec3, points: Sequence[tuple[float, Vec3]]) -> Pairs:
+    means: Pairs = {}
+    for weight, d in points:
+        for key, (re, im) in regular(d.x, d.y, d.z, KNOWN - 1).items():
+            a, b = means.get(key, (0.0, 0.0))
+            means[key] = a + weight * re, b + weight * im
+    return of_dipole(means, normal.x, normal.y, normal.z)
+
+
+def _flat(moments: Pairs) -> list[Any]:
+    """Real and imaginary parts, as many as there are in `_PARTS`."""
+    return [moments[l, m][part] for l, m, part in _PARTS]
+
+
+def _moments_of(parts: Sequence[Real]) -> Moments:
+    out = {key: np.zeros(dr.width(parts[0]), np.complex128) for key in KEYS}
+    for (l, m, part), values in zip(_PARTS, parts, strict=True):
+        if part:
+            out[l, m].imag = to_numpy(values)
+        else:
+            out[l, m].real = to_numpy(values)
+    return out
+
+
+def _parents(
+    backend: Backend, below: Level, parts: list[Real], low: FloatArray, high: FloatArray
+) -> tuple[Level, list[Real]]:
+    """The level above, whose boxes are given, and its `_PARTS`."""
+    count, arity = len(low), len(below.area) // len(low)
+    area = below.area.reshape(-1, arity).sum(axis=1)
+    weighted = (below.area[:, None] * below.centre).reshape(-1, arity, 3).sum(axis=1)
+    some = (area > 0)[:, None]
+    centre = np.where(some, weighted / np.where(some, area[:, None], 1), 0.5 * (low + high))
+    shift = below.centre - np.repeat(centre, arity, axis=0)
+    given: Pairs = dict.fromkeys(KEYS, (0.0, 0.0))
+    for (l, m, part), values in zip(_PARTS, parts, strict=True):
+        given[l, m] = (given[l, m][0], values) if part else (values, 0.0)
+    found = _flat(moved(given, *(backend.Float(one.copy()) for one in shift.T)))
+    dr.eval(*found)
+    first = arity * dr.arange(backend.UInt32, count)
+    sums = [sum(dr.gather(backend.Float, one, first + k) for k in range(arity)) for one in found]
+    dr.eval(*sums)
     # About its own mean a child has no first moment, so that the squares add up.
-    wider = children.spread + children.area * (shift * shift).sum(axis=1)
+    wider = below.spread + below.area * (shift * shift).sum(axis=1)
     spread = wider.reshape(-1, arity).sum(axis=1)
-    return Level(centre, _reach(centre, low, high), area, spread, summed)
-
-
-def _centre(
-    weighted: FloatArray, area: FloatArray, low: FloatArray, high: FloatArray
-) -> FloatArray:
-    """The mean of positions weighted by area, or the box's middle where there is no area."""
-    some = area > 0
-    mean = weighted / np.where(some, area, 1)[:, None]
-    return np.where(some[:, None], mean, 0.5 * (low + high))
+    return Level(centre, _reach(centre, low, high), area, spread, _moments_of(sums)), sums
 
 
 def _reach(centre: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
@@ -171,7 +222,7 @@ def _reach(centre: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
     return np.linalg.norm(np.maximum(high - centre, centre - low), axis=1)
 
 
-def sup_norm(moments: Moments, l: int) -> FloatArray:  # noqa: E741
+def sup_norm(moments: Moments, l: int) -> FloatArray:
     """A bound of |term l| r^(l+1) over all directions.
 
     For unit x, y the addition theorem gives sum_m |I_lm(x)|^2 / ((l+m)!(l-m)!) = P_l(1) = 1, so
@@ -196,7 +247,7 @@ def truncation(level: Level, nearest: FloatArray, order: int = 2) -> tuple[Float
     -(l+1) has, by the same inequality, a gradient of at most l+1 times its largest value on the
     sphere through the point; the rest is then sum_{l>=6} l (l+1) q^(l-1)
     = q^5 (42 - 70q + 30q^2)/(1-q)^3. Each term times r^(k+1) (r^(k+2)) falls or stays as r
-    grows, so the value at `nearest` serves.
+    grows, so the value at `nearest` serves. A little is added, for single precision to take away.
     """
     r = np.maximum(nearest, 1e-300)
     q = np.minimum(level.radius / r, 0.99)
@@ -204,10 +255,10 @@ def truncation(level: Level, nearest: FloatArray, order: int = 2) -> tuple[Float
     rest = level.spread * level.radius**3 / r ** (6 - k)
     value = rest * (6 - 5 * q) / (1 - q) ** 2
     slope = rest * (42 - 70 * q + 30 * q * q) / (1 - q) ** 3
-    for l in range(k, _KNOWN + 1):  # noqa: E741
+    for l in range(k, KNOWN + 1):
         term = sup_norm(level.moments, l) / r ** (l - k)
         value, slope = value + term, slope + (l + 1) * term
-    return value, slope
+    return _ROOM * value, _ROOM * slope
 
 
 def cartesian(moments: Moments, order: int = 2) -> FloatArray:
@@ -240,19 +291,15 @@ def cartesian(moments: Moments, order: int = 2) -> FloatArray:
     return kept
 
 
-def triangle_dipoles(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Points and normals (n, 6, 3) that have the moments l <= 5 of triangles (n, 3, 3) exactly.
+def triangle_rule() -> tuple[FloatArray, FloatArray]:
+    """Barycentric coordinates (6, 3) of points in a triangle, and their weights (6,), sum 1.
 
-    They are integrals of polynomials of degree at most four: Dunavant's six-point rule (1985).
+    They integrate polynomials of degree at most four exactly, and so give exact moments for
+    l <= 5: Dunavant's six-point rule (1985).
     """
     rule = ((0.445948490915965, 0.223381589678011), (0.091576213509771, 0.109951743655322))
-    weights: list[float] = []
-    barycentric: list[tuple[float, float, float]] = []
-    for corner, weight in rule:
+    points: list[tuple[float, float, float]] = []
+    for corner, _ in rule:
         apex = 1 - 2 * corner
-        for one in ((apex, corner, corner), (corner, apex, corner), (corner, corner, apex)):
-            barycentric.append(one)
-            weights.append(weight)
-    points = np.einsum("qv,nvk->nqk", np.array(barycentric), corners)
-    normal = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return points, np.array(weights)[None, :, None] * normal[:, None]
+        points += [(apex, corner, corner), (corner, apex, corner), (corner, corner, apex)]
+    return np.array(points), np.repeat([weight for _, weight in rule], 3)

@@ -13,8 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import backend_of, choose_backend, to_numpy, to_vector3
-from harnack.fields.batch import at_points
-from harnack.fields.field import Curvature, Field, Sample
+from harnack.fields.batch import BatchedField, Values
+from harnack.fields.edge_hessian import SymmetricSum
+from harnack.fields.field import Curvature, Sample
 from harnack.fields.screened_kernel import mean_at_dipoles, promises
 from harnack.fields.screened_tree import PlainSum, TreeSum, dipole_rows
 from harnack.geometry import Box
@@ -22,7 +23,7 @@ from harnack.geometry.clouds import estimate_areas, validate_cloud
 from harnack.geometry.meshes import validate_mesh
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Precision, Real, Vec3
+    from harnack.backend import Backend, Real, Vec3
     from harnack.geometry import Volume
 
 FloatArray = npt.NDArray[np.float64]
@@ -35,7 +36,7 @@ _MOST_CELLS, _FINEST = 4096, 5
 _SMALLEST_LEVEL = 1e-20
 
 
-class ScreenedWindingNumber(Field):
+class ScreenedWindingNumber(BatchedField):
     """w(x) = (1/4 pi) sum_i a_i n_i.(y_i - x) (1 + rho_i/l) exp(-rho_i/l)/rho_i^3, rho_i = |y_i-x|.
 
     Minus the derivative of the Yukawa kernel exp(-rho/l)/rho along n_i at y_i; as l grows, the
@@ -115,6 +116,7 @@ class ScreenedWindingNumber(Field):
         self._kappa = self._size / self.length
         self.default_level = mean_at_dipoles(self._rows, self._kappa)
         self._device: _OnDevice | None = None
+        self._batches: dict[Backend, ScreenedWindingNumber] = {}
         self._extents: dict[tuple[float, ...], Volume | None] = {}
 
     @classmethod
@@ -156,25 +158,16 @@ class ScreenedWindingNumber(Field):
             corners.mean(axis=1), normals, areas, length=length, method=method, accuracy=accuracy
         )
 
-    def value(self, points: Any, *, precision: Precision = "single") -> FloatArray:
-        """w at points (n, 3): (n,)."""
-        return self._at(points, precision)[0]
-
-    def gradient(self, points: Any, *, precision: Precision = "single") -> FloatArray:
-        """The gradient of w at points (n, 3): (n, 3)."""
-        return self._at(points, precision)[1]
-
-    def error_bound(self, points: Any, *, precision: Precision = "single") -> FloatArray:
-        """How far `value` may be from w (n,): what the tree left out, proved, and rounding."""
-        return self._at(points, precision)[2]
-
-    def _at(self, points: Any, precision: Precision) -> tuple[FloatArray, ...]:
-        def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
-            sample = self.prepare(backend).evaluate(x)
-            rounding = 8 * backend.epsilon * dr.abs(sample.value)
-            return sample.value, sample.gradient, sample.error + rounding
-
-        return at_points(points, kernel, precision)
+    def values_at(self, x: Vec3, derivatives: int) -> Values:
+        backend = backend_of(x)
+        if backend not in self._batches:
+            self._batches[backend] = self.prepare(backend)
+        prepared = self._batches[backend]
+        sample = prepared.evaluate(x)
+        rounding = 8 * backend.epsilon * dr.abs(sample.value)
+        # The trace of the Hessian is w/l^2; it grows without limit at the points.
+        hessian = prepared._hessian(x) if derivatives == 2 else None
+        return Values(sample.value, sample.error + rounding, sample.gradient, hessian)
 
     def prepare(self, backend: Backend) -> ScreenedWindingNumber:
         if self._device is not None and self._device.sum.backend is backend:
@@ -191,7 +184,7 @@ class ScreenedWindingNumber(Field):
     def evaluate(self, p: Vec3) -> Sample:
         if self._device is None:
             return self.prepare(backend_of(p)).evaluate(p)
-        on = self._device
+        on = self._on
         sums = on.sum.sums(on.unit(p))
         epsilon = on.sum.backend.epsilon
         # Terms rounded each and added with random signs; positions, rounded once.
@@ -211,14 +204,16 @@ class ScreenedWindingNumber(Field):
             dr.select(apart, sums.gradient_error / on.size, 0),
         )
 
-    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """Rows of the Hessian; its trace is w/l^2. It grows without limit at the points."""
+    @property
+    def _on(self) -> _OnDevice:
         if self._device is None:
-            return self.prepare(backend_of(p)).hessian(p)
-        on = self._device
-        x, y, z = on.sum.hessian(on.unit(p)).rows(on.sum.backend.Array3f)
+            raise RuntimeError("prepare(backend) comes first")
+        return self._device
+
+    def _hessian(self, p: Vec3) -> SymmetricSum:
+        on = self._on
         share = 1 / (on.size * on.size)
-        return x * share, y * share, z * share
+        return SymmetricSum(*(part * share for part in on.sum.hessian(on.unit(p)).parts()))
 
     def differentiable_value(self, p: Vec3) -> Real:
         """w to first order about p: its value and, in reverse and forward mode, its gradient."""

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 
-from harnack.backend.extrema import clamp
+from harnack.fields.edge_field import edge_field
 from harnack.fields.edge_hessian import SymmetricSum, edge_rates
+from harnack.tree.nearest import squared_distance_to_segment
 from harnack.tree.triangles import EDGES, PARITY, corners_of
 
 if TYPE_CHECKING:
@@ -49,11 +50,8 @@ class NearTriangle:
         total = vector(0)
         for i, j, sign in _PAIRS:
             a, b, la, lb = self.corners[i], self.corners[j], self.lengths[i], self.lengths[j]
-            c = dr.cross(a, b - a)
-            dot, both, square = dr.dot(a, b), la * lb, dr.squared_norm(c)
-            bracket = dr.select(dot < 0, square / (both - dot), both + dot)
-            weight = dr.select(square > 0, sign * (la + lb) / (both * bracket), 0)
-            total = dr.fma(vector(weight), c, total)
+            c, weight = edge_field(a, b, la, lb)
+            total = dr.fma(vector(sign * weight), c, total)
         return self.parity * total
 
     def add_hessian(self, total: SymmetricSum, active: Any) -> SymmetricSum:
@@ -66,9 +64,10 @@ class NearTriangle:
 
     def squared_distances(self) -> tuple[Real, Real, Real]:
         """To the three edges, in the order of the record's inverse lengths."""
-        out: list[Real] = []
-        for (i, j, _), inverse in zip(_PAIRS, self.inverse, strict=True):
-            a, e = self.corners[i], self.corners[j] - self.corners[i]
-            foot = clamp(-dr.dot(a, e) * inverse, type(inverse)(0), type(inverse)(1))
-            out.append(dr.squared_norm(dr.fma(type(a)(foot), e, a)))
-        return out[0], out[1], out[2]
+        first, second, third = (
+            squared_distance_to_segment(
+                self.corners[i], self.corners[j] - self.corners[i], self.inverse[k]
+            )
+            for k, (i, j, _) in enumerate(_PAIRS)
+        )
+        return first, second, third

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from harnack.fields.multipole import Level, all_levels, triangle_dipoles
+from harnack.fields.multipole import Level, triangle_levels
 from harnack.geometry import MeshError, validate_mesh
 from harnack.geometry.singular import net_faces, singular_edges, weld_vertices
 from harnack.tree import Hierarchy, build_hierarchy
@@ -17,6 +18,8 @@ from harnack.tree.triangles import MOST_TRIANGLES, PARITY, triangle_records
 
 # Triangles of a leaf at most, and children of a node: by experiment.
 _LEAF_SIZE, _ARITY = 8, 4
+# What vertices may move under: properties that depend on faces, or that are as good for others.
+_SHARED = ("triangles", "tree", "ray_tree", "singular_flags")
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,7 @@ class WindingMesh:
     multiplicity: (m,) how often each is given, less the times that it is given turned round.
     source: (m,) the face that it comes from.
     singular: (k, 2) directed edges at which triangles do not cancel, an edge of weight 2 twice.
+    given: (g, 3) all faces, as given. welded: (n,) the vertex that stands for each.
     centre, size: `unit_vertices` = (vertices - centre)/size, with a power of two for a size, so
         that lengths can be scaled to and fro without rounding.
     """
@@ -36,6 +40,8 @@ class WindingMesh:
     multiplicity: IntArray
     source: IntArray
     singular: IntArray
+    given: IntArray
+    welded: IntArray
     centre: FloatArray
     size: float
 
@@ -47,7 +53,8 @@ class WindingMesh:
             MeshError: as `validate_mesh`; or all faces cancel; or there are too many.
         """
         x, f = validate_mesh(vertices, faces)
-        net = net_faces(weld_vertices(x)[f])
+        welded = weld_vertices(x)
+        net = net_faces(welded[f])
         if len(net.faces) == 0:
             raise MeshError("faces: every face is cancelled by its own copy turned round")
         if net.multiplicity.sum() >= MOST_TRIANGLES:
@@ -55,17 +62,45 @@ class WindingMesh:
                 f"faces: at most {MOST_TRIANGLES - 1} are possible; cut the mesh in parts"
             )
         edges, weights = singular_edges(net.faces, net.multiplicity)
-        low, high = x[net.faces].min(axis=(0, 1)), x[net.faces].max(axis=(0, 1))
-        size = 2.0 ** np.ceil(np.log2(0.5 * float((high - low).max())))
         return cls(
             x,
             net.faces,
             net.multiplicity,
             net.source,
             np.repeat(edges, weights, axis=0),
-            0.5 * (low + high),
-            float(size),
+            f,
+            welded,
+            *_centre_and_size(x, net.faces),
         )
+
+    def moved(self, vertices: npt.ArrayLike) -> WindingMesh:
+        """The mesh with its vertices (n, 3) elsewhere. What follows from the faces alone is shared,
+        and so is the shape of the trees that there are; positions, boxes and moments are not.
+
+        Raises:
+            MeshError: as `validate_mesh`; another number of vertices; vertices that coincided, so
+                that faces were joined there, come apart.
+        """
+        x, given = validate_mesh(vertices, self.given)
+        if len(x) != len(self.vertices):
+            raise MeshError(
+                f"vertices: {len(x)} of them, where {len(self.vertices)} were before: moving "
+                "vertices keeps their number and their order"
+            )
+        apart = (x != x[self.welded]).any(axis=1)
+        if apart.any():
+            torn = given[apart[given]]
+            if len(torn):
+                i = int(torn[0])
+                raise MeshError(
+                    f"vertices: {i} and {self.welded[i]} were at the same place, where faces were "
+                    "joined, and now are not: make a new winding number of this mesh"
+                )
+        centre, size = _centre_and_size(x, self.faces)
+        mesh = dataclasses.replace(self, vertices=x, centre=centre, size=size)
+        made = vars(self)
+        vars(mesh).update({name: made[name] for name in _SHARED if name in made})
+        return mesh
 
     @functools.cached_property
     def unit_vertices(self) -> FloatArray:
@@ -85,7 +120,8 @@ class WindingMesh:
     @functools.cached_property
     def tree(self) -> Hierarchy:
         """Over the triangles' centroids."""
-        return build_hierarchy(self.corners.mean(axis=1), leaf_size=_LEAF_SIZE, arity=_ARITY)
+        a, b, c = np.moveaxis(self.corners, 1, 0)
+        return build_hierarchy((a + b + c) / 3, leaf_size=_LEAF_SIZE, arity=_ARITY)
 
     @functools.cached_property
     def ray_tree(self) -> Hierarchy:
@@ -105,6 +141,8 @@ class WindingMesh:
     @functools.cached_property
     def records(self) -> FloatArray:
         """(k, 14) of the triangles, with the numbers of their faces."""
+        if len(self.faces) == len(self.triangles):
+            return self.ray_records
         return np.repeat(
             triangle_records(self.unit_vertices, self.faces), self.multiplicity, axis=0
         )
@@ -112,18 +150,22 @@ class WindingMesh:
     @functools.cached_property
     def levels(self) -> list[Level]:
         """Moments of the nodes."""
-        points, normals = triangle_dipoles(self.corners)
-        low, high = self.corners.min(axis=1), self.corners.max(axis=1)
-        return all_levels(self.tree, points, normals, low, high)
+        return triangle_levels(self.tree, self.corners)
 
     @functools.cached_property
     def singular_flags(self) -> FloatArray:
         """(m, 3): 1 for each edge 01, 12 and 02 of a record that is singular, else 0."""
         count = len(self.vertices)
-        keys = np.unique(self.singular.min(axis=1) * count + self.singular.max(axis=1))
+        keys = np.sort(self.singular.min(axis=1) * count + self.singular.max(axis=1))
+        at_ends = np.zeros(count, np.bool_)
+        at_ends[self.singular] = True
+        flags = np.zeros((len(self.triangles), 3))
         ends = np.sort(self.triangles, axis=1)
-        edges = ends[:, [0, 1, 0]] * count + ends[:, [1, 2, 2]]
-        return np.isin(edges, keys).astype(np.float64)
+        for k, (i, j) in enumerate(((0, 1), (1, 2), (0, 2))):
+            near = np.flatnonzero(at_ends[ends[:, i]] & at_ends[ends[:, j]])
+            edges: IntArray = ends[near, i] * count + ends[near, j]
+            flags[near, k] = keys.take(np.searchsorted(keys, edges), mode="clip") == edges
+        return flags
 
     @property
     def area(self) -> float:
@@ -137,3 +179,11 @@ class WindingMesh:
         """Of all singular edges."""
         ends = self.vertices[self.singular]
         return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum())
+
+
+def _centre_and_size(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, float]:
+    used = np.zeros(len(vertices), np.bool_)
+    used[faces] = True
+    low, high = vertices[used].min(axis=0), vertices[used].max(axis=0)
+    size = 2.0 ** np.ceil(np.log2(0.5 * float((high - low).max())))
+    return 0.5 * (low + high), float(size)

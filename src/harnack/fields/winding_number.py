@@ -12,10 +12,11 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import backend_of
-from harnack.fields.batch import at_points
-from harnack.fields.field import Field, HarmonicBall, Sample
+from harnack.fields.batch import BatchedField, Values
+from harnack.fields.edge_hessian import SymmetricSum
+from harnack.fields.field import Field, Sample, lengthened
 from harnack.fields.sheets import Crossing
-from harnack.fields.winding_exact import ExactWinding
+from harnack.fields.winding_exact import ExactWinding, rounding_of_sum
 from harnack.fields.winding_mesh import WindingMesh
 from harnack.fields.winding_tree import TreeWinding
 from harnack.geometry import Box
@@ -23,7 +24,7 @@ from harnack.tree.nearest import distance_to_triangles
 from harnack.tree.triangles import Frame, TriangleRays
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Mask, Precision, Real, Vec3
+    from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.geometry import Volume
 
 MethodName = Literal["auto", "exact", "tree"]
@@ -35,7 +36,7 @@ _MOST_EDGES = 2048
 _TRACED = 4.0
 
 
-class WindingNumber(Field):
+class WindingNumber(BatchedField):
     """w of a triangle mesh: how often it winds around a point (Jacobson et al. 2013).
 
     For a closed mesh 1 inside and 0 outside; for a mesh with holes, cracks, duplicated or flipped
@@ -50,7 +51,8 @@ class WindingNumber(Field):
         radius; more is slower and sharper. At least 1.5; by default 2 for values at points and 4
         for tracing. order: of the tree: 0 (dipoles), 1 or 2 (octupoles).
 
-    Hits on triangles have `Hits.sheet`; `faces_of_sheets` gives the face of each.
+    Hits on triangles have `Hits.sheet`; `faces_of_sheets` gives the face of each. `moved` gives the
+    field for the same faces when vertices have moved.
 
     Raises MeshError (a ValueError) for meshes that `validate_mesh` rejects.
     """
@@ -83,69 +85,38 @@ class WindingNumber(Field):
         self._batches: dict[Backend, _OnDevice] = {}
         self._device: _OnDevice | None = None
 
+    def moved(self, vertices: Any) -> WindingNumber:
+        """The winding number of the same faces with their vertices (n, 3) elsewhere, for less work.
+
+        Faces are not joined and sorted into a tree again: the tree keeps its shape, and gets new
+        centres, radii, moments and bounds. All that is promised is computed from where the vertices
+        are now, so a tree whose vertices moved far is slower than a new one, never wrong.
+
+        Raises MeshError as for a new mesh, and for vertices that coincided and come apart.
+        """
+        field = copy.copy(self)
+        field.mesh = self.mesh.moved(vertices)
+        field._batches, field._device = {}, None
+        return field
+
     @property
     def faces_of_sheets(self) -> npt.NDArray[np.int64]:
         """The face, as given, of each sheet."""
         return self.mesh.source
 
-    def value(self, points: Any, *, precision: Precision = "single") -> FloatArray:
-        """w at points (n, 3): (n,)."""
-        return self._at(points, precision, 0)[0]
-
-    def gradient(self, points: Any, *, precision: Precision = "single") -> FloatArray:
-        """The gradient of w at points (n, 3): (n, 3)."""
-        return self._at(points, precision, 1)[1]
-
-    def value_and_gradient(
-        self, points: Any, *, precision: Precision = "single"
-    ) -> tuple[FloatArray, FloatArray]:
-        """w (n,) and its gradient (n, 3) together, for little more than one of them."""
-        value, gradient, *_ = self._at(points, precision, 1)
-        return value, gradient
-
-    def hessian(self, p: Any, *, precision: Precision = "single") -> Any:
-        """The second derivatives of w at p (n, 3): (n, 3, 3), symmetric and free of trace.
-
-        Given a Dr.Jit 3-vector, three rows, as `Field.hessian` describes.
-        """
-        if dr.is_array_v(type(p)):
-            on = self._batch(backend_of(p))
-            parts = on.winding.at(on.unit(p), 2)[2]
-            zero = on.winding.backend.Array3f(0)
-            if parts is None:
-                return zero, zero, zero
-            rows = parts.rows(on.winding.backend.Array3f)
-            return tuple(row / self.mesh.size**2 for row in rows)
-        xx, yy, zz, xy, xz, yz = self._at(p, precision, 2)[3].T
-        rows = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        return np.moveaxis(rows, 2, 0)
-
-    def error_bound(self, points: Any, *, precision: Precision = "single") -> FloatArray:
-        """How far `value` may be from w at most: the tree's truncation, proved, and rounding.
-
-        Rounding of the points themselves comes on top: w is steep beside singular edges and
-        jumps at the triangles.
-        """
-        bound = self._at(points, precision, 0)[2]
-        return bound + self._batch_rounding(precision)
-
-    def _batch_rounding(self, precision: Precision) -> float:
-        epsilon = 2.0**-23 if precision == "single" else 2.0**-52
-        return epsilon * (16 + math.sqrt(len(self.mesh.triangles)))
-
-    def _at(self, points: Any, precision: Precision, derivatives: int) -> tuple[FloatArray, ...]:
-        def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
-            on = self._batch(backend)
-            value, gradient, hessian, error = on.winding.at(on.unit(x), derivatives)
+    def values_at(self, x: Vec3, derivatives: int) -> Values:
+        on = self._batch(backend_of(x))
+        winding, x = on.winding, on.unit(x)
+        if isinstance(winding, ExactWinding):
+            rounding = winding.rounding
             if derivatives == 0:
-                return value, backend.Float(0), error
-            if hessian is None or derivatives == 1:
-                rest = (dr.zeros(backend.ArrayXf, (6, 1)),) if derivatives == 2 else ()
-                return value, gradient / self.mesh.size, error, *rest
-            packed = backend.ArrayXf(hessian.parts())
-            return value, gradient / self.mesh.size, error, packed / self.mesh.size**2
-
-        return at_points(points, kernel, precision)
+                return Values(winding.values(x), winding.backend.Float(rounding))
+        else:
+            rounding = rounding_of_sum(winding.backend, len(self.mesh.triangles))
+        value, gradient, hessian, error = winding.at(x, derivatives)
+        if derivatives == 2:
+            hessian = on.scaled_hessian(hessian)
+        return Values(value, error + rounding, gradient / on.size, hessian)
 
     def _batch(self, backend: Backend) -> _OnDevice:
         """The evaluator for points, which is made once a backend."""
@@ -178,7 +149,7 @@ class WindingNumber(Field):
         frame = Frame.along(on.winding.backend, on.unit(p), up)
         turns = on.winding.start(frame, 0, True)
         nowhere = Crossing(0.0, on.no_sheet, on.winding.backend.Float(0), up)
-        return on.scaled(on.winding.on_stretch(frame, frame.o, nowhere, nowhere, turns))
+        return on.scaled(on.winding.on_stretch(frame, frame.o, nowhere, nowhere, turns, True))
 
     def next_crossing(
         self, o: Vec3, d: Vec3, after: Crossing, t_max: Real, active: Mask
@@ -265,35 +236,35 @@ class _OnDevice:
     def unit(self, p: Vec3) -> Vec3:
         return (self.winding.backend.Array3f(p) - self.centre) / self.size
 
+    def scaled_hessian(self, hessian: SymmetricSum | None) -> SymmetricSum:
+        """A Hessian, None for zero, in the coordinates of the mesh as given."""
+        if hessian is None:
+            return SymmetricSum.zero(self.winding.backend.Float)
+        share = 1 / (self.size * self.size)
+        return SymmetricSum(*(part * share for part in hessian.parts()))
+
     def scaled(self, sample: Sample) -> Sample:
         """A sample in the coordinates of the mesh as given."""
-        known = tuple(
-            HarmonicBall(one.radius * self.size, one.lower, one.upper)
-            if isinstance(one, HarmonicBall)
-            else one
-            for one in sample.known
-        )
-        return Sample(
-            sample.value,
-            sample.gradient / self.size,
-            known,
-            sample.error,
-            sample.gradient_error / self.size,
-        )
+        return lengthened(sample, self.size)
 
 
 class _Stretch(Field):
     """A winding number as seen on a stretch of rays."""
 
     def __init__(
-        self, on: _OnDevice, frame: Frame, behind: Crossing, ahead: Crossing, offset: Real
-    ) -> None:
-        self._on, self._frame = on, frame
+        self, on: _OnDevice, frame: Frame, behind: Crossing, ahead: Crossing, offset: Real,
+        fine: Mask = True,
+    ) -> None:  # fmt: skip
+        self.has_detail = isinstance(on.winding, TreeWinding)
+        self._on, self._frame, self._fine = on, frame, fine
         self._behind, self._ahead, self._offset = behind, ahead, offset
+
+    def at_detail(self, fine: Mask) -> Field:
+        return _Stretch(self._on, self._frame, self._behind, self._ahead, self._offset, fine)
 
     def evaluate(self, p: Vec3) -> Sample:
         on = self._on
         sample = on.winding.on_stretch(
-            self._frame, on.unit(p), self._behind, self._ahead, self._offset
+            self._frame, on.unit(p), self._behind, self._ahead, self._offset, self._fine
         )
         return on.scaled(sample)

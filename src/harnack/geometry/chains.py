@@ -1,13 +1,9 @@
-"""Joining edges to closed loops, by integer index after welding equal positions."""
+"""Joining edges to closed loops, by integer index."""
 
 from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
-
-import numpy as np
-
-from harnack.geometry.convex_volume import FloatArray
 
 Edge = tuple[int, int]
 
@@ -19,14 +15,6 @@ class OpenChainError(ValueError):
         super().__init__(f"{count} edges meet at vertex {vertex}")
         self.vertex = vertex
         self.count = count
-
-
-def weld(vertices: FloatArray) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-    """For each vertex (n, 3) the index of the first vertex at exactly the same position: (n,)."""
-    _, first, inverse = np.unique(
-        vertices + 0.0, axis=0, return_index=True, return_inverse=True
-    )  # + 0.0 makes -0.0 equal to 0.0
-    return np.asarray(first[inverse.reshape(-1)])
 
 
 def boundary_edges(faces: Iterable[Sequence[int]]) -> list[Edge]:

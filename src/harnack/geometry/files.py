@@ -11,13 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
-from harnack.geometry.chains import Edge, OpenChainError, boundary_edges, join, weld
+from harnack.geometry.chains import Edge, OpenChainError, boundary_edges, join
 from harnack.geometry.convex_volume import FloatArray
 from harnack.geometry.curves import CurveError, validate_loops
 from harnack.geometry.file_format import Contents, FileFormatError, Place, read_bytes
 from harnack.geometry.loops_text import read_loops_text
 from harnack.geometry.obj import read_obj
 from harnack.geometry.ply import read_ply
+from harnack.geometry.singular import weld_vertices
 
 __all__ = ["FileFormatError", "read_loops", "write_atomically"]
 
@@ -76,7 +77,7 @@ def _all_loops(contents: Contents) -> list[PlacedLoop]:
 
 
 def _joined_polylines(contents: Contents) -> list[PlacedLoop]:
-    x, same = contents.vertices, weld(contents.vertices)
+    x, same = contents.vertices, weld_vertices(contents.vertices)
     loops: list[PlacedLoop] = []
     open_edges: list[Edge] = []
     places: dict[int, Place] = {}
@@ -114,7 +115,7 @@ def _boundary_loops(contents: Contents) -> list[PlacedLoop]:
     place = Place(contents.path)
     if not contents.faces:
         raise place.error("it has no faces to take the boundary of")
-    same = weld(contents.vertices)
+    same = weld_vertices(contents.vertices)
     remaining = boundary_edges(same[list(face.indices)].tolist() for face in contents.faces)
     if not remaining:
         raise place.error("its faces form a closed surface, which has no boundary")

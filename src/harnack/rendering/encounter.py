@@ -39,6 +39,7 @@ class Encounter:
     value: of the field, close to the surface or, of a sheet, just before it; of no meaning where
         nothing is met.
     evaluations: of the field.
+    mended: of a field with sheets, met between them: there the surface spans what they leave open.
     """
 
     t: Real
@@ -49,6 +50,7 @@ class Encounter:
     clearance: Real
     value: Real
     evaluations: Any
+    mended: Mask
 
 
 def meet_surface(
@@ -93,6 +95,7 @@ def meet_surface(
         clearance=CLEARANCE * uncertainty,
         value=sample.value,
         evaluations=trace.evaluations + dr.select(smooth, prepared.backend.UInt32(1), 0),
+        mended=smooth & prepared.field.has_sheets,
     )
     if not prepared.field.has_sheets:
         return encounter
@@ -119,6 +122,7 @@ def _on_sheet(
         normal=facing(trace.gradient, d, side),
         clearance=CLEARANCE * dr.maximum(tolerance, rounding),
         value=trace.value,
+        mended=prepared.backend.Bool(False),
     )
 
 

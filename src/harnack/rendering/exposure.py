@@ -8,7 +8,7 @@ same seed gives the same picture.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from harnack.backend import to_numpy
 from harnack.rendering.integrator import PathTracer
+from harnack.rendering.pixels import bands, film_places
 
 # Paths of one band: about a second or two on a CPU, and Ctrl-C works between bands.
 _PATHS_A_BAND = 2**18
@@ -48,16 +49,16 @@ def expose(
     sampler.set_samples_per_wavefront(spp)
     image = np.empty((width * height, 3), dtype=np.float32)
     lost = 0
-    for band, (start, stop) in enumerate(_bands(width * height, max(1, _PATHS_A_BAND // spp))):
+    for band, (start, stop) in enumerate(bands(width * height, max(1, _PATHS_A_BAND // spp))):
         sampler.seed(_mixed(seed, band), (stop - start) * spp)
         pixel = dr.arange(mi.UInt32, (stop - start) * spp) // dr.opaque(mi.UInt32, spp)
         pixel += dr.opaque(mi.UInt32, start)
-        place = mi.Vector2f(pixel % width, pixel // width) + _in_pixel(mi, sampler.next_2d())
-        ray, weight = _camera_ray(mi, sensor, sampler, place / mi.ScalarVector2f(width, height))
+        place = film_places(mi, pixel, _in_pixel(mi, sampler.next_2d()), (width, height))
+        ray, weight = _camera_ray(mi, sensor, sampler, place)
         radiance, _, got_lost = tracer.trace(scene, sampler, ray, mi.Bool(True))
-        colour = _as_rgb(mi, radiance * weight, ray.wavelengths)
+        colour = as_rgb(mi, radiance * weight, ray.wavelengths)
         dr.eval(colour, got_lost)  # one kernel; sums would otherwise each start their own
-        image[start:stop] = to_numpy(_mean_of_blocks(colour, spp))
+        image[start:stop] = to_numpy(mean_of_blocks(colour, spp))
         lost += int(dr.count(got_lost)[0])
         advance((stop - start) / (width * height))
     return image.reshape(height, width, 3), lost
@@ -67,11 +68,6 @@ def _whole_grid(spp: int) -> int:
     """The samples of the nearly square grid that multi-jittering rounds up to (and warns of)."""
     across = max(1, math.isqrt(spp))
     return across * -(-spp // across)
-
-
-def _bands(pixels: int, step: int) -> Iterator[tuple[int, int]]:
-    for start in range(0, pixels, step):
-        yield start, min(start + step, pixels)
 
 
 def _mixed(seed: int, band: int) -> int:
@@ -92,10 +88,11 @@ def _camera_ray(mi: Any, sensor: Any, sampler: Any, place: Any) -> tuple[Any, An
         time = time + sampler.next_1d() * sensor.shutter_open_time()
     wavelength = sampler.next_1d() if mi.is_spectral else 0
     lens = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
-    return sensor.sample_ray(time, wavelength, mi.Point2f(place), lens)
+    return sensor.sample_ray(time, wavelength, place, lens)
 
 
-def _as_rgb(mi: Any, radiance: Any, wavelengths: Any) -> Any:
+def as_rgb(mi: Any, radiance: Any, wavelengths: Any) -> Any:
+    """A spectrum of the variant in linear sRGB."""
     if mi.is_spectral:
         matching = [mi.cie1931_xyz(wavelength) for wavelength in wavelengths]
         xyz = sum(value * weights for value, weights in zip(radiance, matching, strict=True))
@@ -103,6 +100,6 @@ def _as_rgb(mi: Any, radiance: Any, wavelengths: Any) -> Any:
     return mi.Color3f(radiance[0]) if mi.is_monochromatic else mi.Color3f(radiance)
 
 
-def _mean_of_blocks(colour: Any, spp: int) -> Any:
+def mean_of_blocks(colour: Any, spp: int) -> Any:
     """The mean of each `spp` neighbouring lanes."""
     return type(colour)(*(dr.block_sum(channel, spp) / spp for channel in colour))

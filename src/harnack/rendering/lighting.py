@@ -15,6 +15,8 @@ _HORIZON = np.array([0.17, 0.17, 0.18])
 _ZENITH = np.array([0.36, 0.40, 0.46])
 _STRIP = np.array([0.70, 0.66, 0.60])
 _KEY = (4.7, 4.5, 4.25)
+# The height of the floor: a hair below what stands on it.
+FLOOR = -0.002
 # Reflectance of the ground.
 _BACKDROPS = {"light": (0.74, 0.73, 0.715), "dark": (0.055, 0.058, 0.065)}
 # (height, width) of the environment's bitmap.
@@ -22,14 +24,14 @@ _ENVIRONMENT_SIZE = (64, 128)
 
 
 def ground(mi: Any, backdrop: str) -> dict[str, Any]:
-    """A wide floor, a hair below what stands on it.
+    """A wide floor.
 
     Raises:
         ValueError: unknown backdrop.
     """
     if backdrop not in _BACKDROPS:
         raise ValueError(f"backdrop must be one of {', '.join(_BACKDROPS)}, not {backdrop!r}")
-    floor = mi.ScalarTransform4f().translate([0, 0, -0.002]).scale(100)
+    floor = mi.ScalarTransform4f().translate([0, 0, FLOOR]).scale(100)
     colour = {"type": "rgb", "value": list(_BACKDROPS[backdrop])}
     return {
         "ground": {

@@ -66,6 +66,7 @@ class Material:
 
 MATERIALS: Mapping[str, Material] = {
     "two-tone": Material(_glazed((0.80, 0.255, 0.11), 0.22), _glazed((0.07, 0.25, 0.40), 0.22)),
+    "eggshell": Material(_glazed((0.66, 0.13, 0.06), 0.3), _glazed((0.80, 0.74, 0.64), 0.3)),
     "clay": Material({"type": "diffuse", "reflectance": _rgb((0.72, 0.62, 0.53))}),
     "porcelain": Material(_glazed((0.84, 0.83, 0.80), 0.06)),
     "plastic": Material(_glazed((0.62, 0.05, 0.07), 0.10)),

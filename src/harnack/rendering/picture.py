@@ -25,13 +25,18 @@ from harnack.rendering.images import check_picture_path, tone_mapped, write_imag
 from harnack.rendering.integrator import PathTracer
 from harnack.rendering.materials import Material, material_of
 from harnack.rendering.plugins import register
+from harnack.rendering.shaded import shaded
 from harnack.rendering.studio import Camera, Exhibit, stratified, studio
 from harnack.rendering.views import VIEWS, look
 from harnack.tracer import LevelSet, level_set
 
-ShowMode = Literal["color", "normal", "evaluations", "status", "depth"]
-SHOW_MODES: tuple[str, ...] = ("color", *VIEWS)
+ShowMode = Literal["color", "shaded", "normal", "evaluations", "status", "depth"]
+SHOW_MODES: tuple[str, ...] = ("color", "shaded", *VIEWS)
+# Modes with ground and lights, and what they send out.
+_LIT = {"color": "light paths", "shaded": "rays"}
+_EDGE_SPP = 9
 Image = npt.NDArray[Any]
+Advance = Callable[[float], None]
 MaterialLike = str | Material | Mapping[str, Any]
 
 
@@ -55,11 +60,12 @@ def render(
     what: a field, a `LevelSet` or a list of them, drawn in the studio; or a Mitsuba scene, its
         dictionary, or the path of its XML file.
     path: .png (8-bit sRGB, tone mapped) or .exr (the numbers).
-    show: "color"; or what one ray a pixel found: "normal", "evaluations" (of the fields),
+    show: "color" follows light paths; "shaded" lights first hits by a formula, in seconds and
+        without noise; or what one ray a pixel found: "normal", "evaluations" (of the fields),
         "status" and "depth".
     size: (width, height) in pixels, by default (800, 600) or the scene's own.
-    spp: samples a pixel of a color picture, by default 64 or the scene's own. Some samplers
-        round it up.
+    spp: samples a pixel of a color picture, by default 64 or the scene's own, and of the edges
+        of a shaded one, by default 9. Some samplers round it up.
     max_depth: longest light path in edges, -1 for no limit; by default 12 or the scene's own.
     seed: another seed, other noise; the same seed, the same picture.
 
@@ -71,6 +77,9 @@ def render(
     backdrop: "light" or "dark".
     settings: of the surfaces, as `harnack.level_set` takes them: level, clip, solid, ...; those
         of a `LevelSet` are replaced. Without a tolerance, a field gets one that suits its size.
+
+    In shaded pictures, the side of larger values of an open surface in one color is darker, and
+    what spans the gaps of a mesh is amber, or teal on warm colors.
 
     Returns the numbers: (h, w, 3) linear sRGB radiance; (h, w, 3) normals; or (h, w), of which
     depths are in units of the (first) surface's coordinates.
@@ -85,25 +94,25 @@ def render(
     mi = register()
     in_studio = isinstance(what, Field | LevelSet | list | tuple)
     if in_studio:
-        exhibits = _exhibits(what, material, settings)
         made = studio(
-            mi, exhibits, size=size or (800, 600), camera=camera or Camera(),
-            backdrop=backdrop or "light", bare=show != "color",
+            mi, _exhibits(what, material, settings), size=size or (800, 600),
+            camera=camera or Camera(), backdrop=backdrop or "light", bare=show not in _LIT,
         )  # fmt: skip
         scene, unit = mi.load_dict(made.scene, parallel=False), made.unit
     else:
         _refuse({"material": material, "camera": camera, "backdrop": backdrop, **settings})
         scene, unit = _loaded(mi, what, size), 1.0
-    sensor = scene.sensors()[0]
-    if show == "color":
-        tracer = _tracer(mi, scene, max_depth)
-        spp = spp or int(sensor.sampler().sample_count())
-        spp = stratified(spp) if in_studio else spp
-        image = _radiance(mi, scene, sensor, tracer, spp, seed, progress)
-        drawn = tone_mapped(image)
-    else:
-        view = look(mi, scene, sensor, unit)
+    if show in VIEWS:
+        view = look(mi, scene, scene.sensors()[0], unit)
         image, drawn = VIEWS[show].numbers(view), VIEWS[show].picture(view)
+    else:
+        with _bar(progress) as advance:
+            if show == "shaded":
+                image, lost = _shaded(mi, scene, spp, in_studio, advance)
+            else:
+                image, lost = _radiance(mi, scene, spp, in_studio, max_depth, seed, advance)
+        _warn_of(lost, _LIT[show])
+        drawn = tone_mapped(image)
     if target is not None:
         exact = target.suffix.lower() == ".exr"
         write_image(mi, target, image.astype(np.float32) if exact else drawn)
@@ -190,21 +199,38 @@ def _tracer(mi: Any, scene: Any, max_depth: int | None) -> PathTracer:
     return own if max_depth is None else own.with_depth(max_depth)
 
 
-def _radiance(
-    mi: Any, scene: Any, sensor: Any, tracer: PathTracer, spp: int, seed: int, progress: bool
-) -> Image:
-    with _bar(progress) as advance:
-        image, lost = expose(mi, scene, sensor, tracer, spp=spp, seed=seed, advance=advance)
+def _warn_of(lost: int, what: str) -> None:
     if lost:
         warnings.warn(
-            f"{lost} light paths ran out of steps and are drawn magenta; raise max_steps",
-            stacklevel=3,
+            f"{lost} {what} ran out of steps and are drawn magenta; raise max_steps", stacklevel=3
         )
-    return image
+
+
+def _radiance(
+    mi: Any,
+    scene: Any,
+    spp: int | None,
+    in_studio: bool,
+    max_depth: int | None,
+    seed: int,
+    advance: Advance,
+) -> tuple[Image, int]:
+    sensor = scene.sensors()[0]
+    tracer = _tracer(mi, scene, max_depth)
+    spp = spp or int(sensor.sampler().sample_count())
+    spp = stratified(spp) if in_studio else spp
+    return expose(mi, scene, sensor, tracer, spp=spp, seed=seed, advance=advance)
+
+
+def _shaded(
+    mi: Any, scene: Any, spp: int | None, in_studio: bool, advance: Advance
+) -> tuple[Image, int]:
+    sensor = scene.sensors()[0]
+    return shaded(mi, scene, sensor, spp=spp or _EDGE_SPP, on_floor=in_studio, advance=advance)
 
 
 @contextmanager
-def _bar(shown: bool) -> Generator[Callable[[float], None]]:
+def _bar(shown: bool) -> Generator[Advance]:
     """A progress bar on stderr; what it yields is told what part has been finished."""
     columns = (TextColumn("rendering"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     console = Console(stderr=True)

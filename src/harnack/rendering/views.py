@@ -17,6 +17,7 @@ from harnack.backend import to_numpy
 from harnack.rendering.colormap import viridis
 from harnack.rendering.images import as_bytes
 from harnack.rendering.integrator import LOST_COLOUR
+from harnack.rendering.pixels import film_places
 from harnack.rendering.world import World
 from harnack.tracer import Status
 
@@ -69,9 +70,8 @@ def look(mi: Any, scene: Any, sensor: Any, unit: float = 1.0) -> View:
 
 def _middle_rays(mi: Any, sensor: Any, width: int, height: int) -> Any:
     index = dr.arange(mi.UInt32, width * height)
-    pixel = mi.Vector2f(index % width, index // width)
-    place = (pixel + 0.5) / mi.ScalarVector2f(width, height)
-    ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, mi.Point2f(place), mi.Point2f(0.5))
+    place = film_places(mi, index, mi.Vector2f(0.5), (width, height))
+    ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, place, mi.Point2f(0.5))
     return mi.Ray3f(ray)
 
 

@@ -62,6 +62,7 @@ class World:
             clearance=mi.Float(0),
             value=mi.Float(0),
             evaluations=mi.UInt32(0),
+            mended=mi.Bool(False),
         )
 
     def occluded(self, ray: Any, active: Mask) -> Mask:

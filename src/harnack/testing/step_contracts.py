@@ -129,7 +129,7 @@ def _meets(
 ) -> Any:  # fmt: skip
     """Whether the lift is seen to move by more than a gap within the length, (n,)."""
     share = np.concatenate([np.linspace(0, 0.98, 40), 1 - np.geomspace(0.01, 1e-6, 8)])
-    moved, _ = movements(field, points, directions, length[:, None] * share)
+    moved = movements(field, points, directions, length[:, None] * share).moved
     rounding = 1e-12 * (1 + np.abs(look_at(field, points).value[:, None]))
     down, up = gaps
     return ((moved > up[:, None] + rounding) | (-moved > down[:, None] + rounding)).any(axis=1)

@@ -10,22 +10,32 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import choose_backend, to_numpy, to_vector3
+from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.testing.poisson import FloatArray
 
 if TYPE_CHECKING:
     from harnack.backend import Precision
     from harnack.fields.field import Field, Knowledge, Sample
 
-__all__ = ["Look", "look_at", "movements", "random_directions", "random_points"]
+__all__ = [
+    "Look",
+    "Walk",
+    "jumps",
+    "look_at",
+    "movements",
+    "random_directions",
+    "random_points",
+]
 
 
 @dataclass(frozen=True)
 class Look:
-    """A field at n points: value (n,), gradient (n, 3), rounding error (n,), promises (n,) each."""
+    """A field at n points: value (n,), gradient (n, 3), their errors and promises (n,) each."""
 
     value: FloatArray
     gradient: FloatArray
     error: FloatArray
+    gradient_error: FloatArray
     known: tuple[Knowledge, ...]
 
 
@@ -45,18 +55,31 @@ def look_at(field: Field, points: FloatArray, precision: Precision = "double") -
         _spread(sample.value, n),
         np.broadcast_to(to_numpy(sample.gradient), (n, 3)).astype(np.float64),
         _spread(sample.error, n),
+        _spread(sample.gradient_error, n),
         known,
     )
 
 
-def movements(
-    field: Field, start: FloatArray, direction: FloatArray, lengths: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+@dataclass(frozen=True)
+class Walk:
+    """What was met on the way to points of n rays, each array (n, m).
+
+    moved: how far the continuous lift of f has moved since the first point. jumped: by how much f
+    has jumped besides, across sheets. steepness: |gradient|. error: `Sample.error`.
+    """
+
+    moved: FloatArray
+    jumped: FloatArray
+    steepness: FloatArray
+    error: FloatArray
+
+
+def movements(field: Field, start: FloatArray, direction: FloatArray, lengths: FloatArray) -> Walk:
     """How far the continuous lift of f moves along rays: f(start + t direction) - f(start).
 
-    start, direction: (n, 3). lengths: t (n, m), each row rising from 0. Returns the movements
-    (n, m) and |gradient| there (n, m). A value known modulo the period is continued to the one
-    that the mean of the gradients at both ends of an interval predicts.
+    start, direction: (n, 3), unit directions. lengths: t (n, m), each row rising from 0. A value
+    known modulo the period is continued to the one that the mean of the gradients at both ends of
+    an interval predicts; jumps across sheets are taken out.
     """
     n, m = lengths.shape
     points = start[:, None] + lengths[..., None] * direction[:, None]
@@ -71,7 +94,31 @@ def movements(
         expected = np.clip(expected, -0.5 * field.period, 0.5 * field.period)
         move -= field.period * np.round((move - expected) / field.period)
     total = np.concatenate([np.zeros((n, 1)), np.cumsum(move, axis=1)], axis=1)
-    return total, np.linalg.norm(gradient, axis=2)
+    jumped = jumps(field, start, direction, lengths)
+    return Walk(total - jumped, jumped, np.linalg.norm(gradient, axis=2), look.error.reshape(n, m))
+
+
+def jumps(
+    field: Field, start: FloatArray, direction: FloatArray, lengths: FloatArray
+) -> FloatArray:
+    """By how much f has jumped (n, m) since the first of the lengths (n, m) along rays, as
+    `next_crossing` says."""
+    total = np.zeros_like(lengths)
+    if not field.has_sheets:
+        return total
+    backend = choose_backend("double")
+    prepared = field.prepare(backend)
+    o, d = to_vector3(backend, start), to_vector3(backend, direction)
+    first, far = (backend.Float(np.ascontiguousarray(lengths[:, k])) for k in (0, -1))
+    behind = Crossing(first, backend.UInt32(NO_SHEET), backend.Float(0), d)
+    while True:
+        behind = prepared.next_crossing(o, d, behind, far, backend.Bool(True))
+        t, jump = (_spread(one, len(start)) for one in (behind.t, behind.jump))
+        ahead = np.isfinite(t)
+        if not ahead.any():
+            return total
+        passed = ahead[:, None] & (lengths >= t[:, None])
+        total += np.where(passed, np.where(ahead, jump, 0)[:, None], 0)
 
 
 def random_points(field: Field, rng: np.random.Generator, n: int) -> FloatArray:

@@ -25,6 +25,11 @@ if TYPE_CHECKING:
     from harnack.geometry import Volume
 
 
+# A rough look is too rough if a level is nearer than this many times its error, and will do again
+# from where one is farther than this many times the error of a close look.
+_VAGUE, _PLAIN = 2.0, 20.0
+
+
 @dataclass(frozen=True)
 class Trace:
     """Ends of rays, as Dr.Jit arrays. t is where the proof of freedom ends (inf for a miss).
@@ -78,7 +83,7 @@ class PreparedLevelSet:
     def first_hit(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask = True) -> Trace:
         """The first hit of rays o + t d, |d| = 1, for t_min <= t <= t_max. Inactive rays miss."""
         state, sheet = self._march(o, d, t_min, t_max, active)
-        t, _, _, f, g, evaluations, status, _ = state
+        t, _, _, f, g, evaluations, _, status, _ = state
         missed = status == int(Status.MISS)
         return Trace(dr.select(missed, dr.inf, t), f, g, evaluations, status, sheet)
 
@@ -90,7 +95,7 @@ class PreparedLevelSet:
         running = self.backend.Bool(active) & (start < end)
         state: State = (
             real(start), real(0), real(0), real(0), vector(0), count(0),
-            count(int(Status.MISS)), running,
+            self.backend.Bool(False), count(int(Status.MISS)), running,
         )  # fmt: skip
         if not self.field.has_sheets:
             return self._advance(self.field, o, d, end, state), count(NO_SHEET)
@@ -111,7 +116,8 @@ class PreparedLevelSet:
         `reach` a proved length from there. A trial point base + step is accepted only if step <=
         reach, or the bound at the trial point looking back covers step - reach; then all up to it
         is free. Otherwise the ray goes back to base + reach, which needs no such test. A ray ends
-        as a miss when base + reach passes its end, as a hit only at an accepted point.
+        as a miss when base + reach passes its end, as a hit only at an accepted point. A point is
+        not accepted on a look that is too rough (`_is_vague`), but looked at again.
 
         In rounded arithmetic a surface could slip through between the two looks, so both see
         it nearer by the rounding of value and position together (`_blur`).
@@ -124,44 +130,61 @@ class PreparedLevelSet:
         size = fmax(fmax(dr.abs(o.x), dr.abs(o.y)), dr.abs(o.z))
 
         def body(
-            base: Real, step: Real, reach: Real, f: Real, g: Vec3, n: Any, status: Any, active: Mask
-        ) -> State:
+            base: Real, step: Real, reach: Real, f: Real, g: Vec3, n: Any, fine: Mask, status: Any,
+            active: Mask,
+        ) -> State:  # fmt: skip
             t = base + step
             if ahead is not None:  # the crossing exactly
                 t = dr.select(step >= end - base, end, t)
-            sample = field.evaluate(dr.fma(vector(t), d, o))
-            gaps = self.levels.gaps(sample.value)
-            steepness = dr.norm(sample.gradient)
+            beyond = None if ahead is None else (ahead, t == end)
+            seen = field.at_detail(fine) if field.has_detail else field
+            sample = seen.evaluate(dr.fma(vector(t), d, o))
+            gaps, steepness = self.levels.gaps(sample.value), dr.norm(sample.gradient)
             blur = self._blur(sample, steepness, size + t)
             certificates = self._certify(sample, gaps, blur)
-            slope = dr.dot(sample.gradient, d)
+            slope, doubt = dr.dot(sample.gradient, d), sample.gradient_error
             accepted = step <= reach
-            doubt = sample.gradient_error
             if self.overstep > 1:
                 accepted |= _covers(bound, certificates, -slope, doubt, step - reach)
-            close = fmax(self.tolerance.in_value(steepness, t), 2 * blur)
-            hit, met = accepted & (fmin(*gaps) <= close), None
-            if ahead is not None:
-                met = meet(ahead, accepted & (t == end), sample.value, blur, self.levels)
+            within = self.tolerance.in_value(steepness, t)
+            vague = ~fine & self._is_vague(sample.value, blur, within, beyond) & field.has_detail
+            accepted &= ~vague
+            fine = vague | (fine & ~(accepted & (fmin(*gaps) > _PLAIN * blur)))
+            hit, met = accepted & (fmin(*gaps) <= fmax(within, 2 * blur)), None
+            if beyond is not None:
+                met = meet(beyond[0], accepted & beyond[1], sample.value, blur, self.levels)
                 certificates = self._certify(sample, met.gaps, blur)
             forward = fmax(_step(bound, certificates, slope, doubt), real(0))
-            step = dr.select(accepted, self.overstep * forward, reach)
-            reach = dr.select(accepted, forward, reach)
-            base = dr.select(accepted, t, base)
-            f = dr.select(accepted, sample.value, f)
-            g = dr.select(accepted, sample.gradient, g)
-            n = n + 1
-            free = base + reach >= end
+            step = dr.select(accepted, self.overstep * forward, dr.select(vague, step, reach))
+            reach, base = dr.select(accepted, forward, reach), dr.select(accepted, t, base)
+            f, g = dr.select(accepted, sample.value, f), dr.select(accepted, sample.gradient, g)
+            n, free = n + 1, base + reach >= end
             if met is not None:
                 free = dr.select(met.awaited, met.passed, free)
-            ended = dr.select(free, int(Status.MISS), int(Status.OUT_OF_STEPS))
-            status = self.backend.UInt32(dr.select(hit, int(Status.HIT), ended))
+            status = self._status(hit, free)
             if met is not None:
                 status, g = met.mark(status, g)
             active = active & ~(hit | free | (n >= self.max_steps))
-            return base, fmin(step, end - base), reach, f, g, n, status, active
+            return base, fmin(step, end - base), reach, f, g, n, fine, status, active
 
         return loop(state, body, "harnack")
+
+    def _status(self, hit: Mask, free: Mask) -> Any:
+        """Of a ray that goes no farther."""
+        ended = dr.select(free, int(Status.MISS), int(Status.OUT_OF_STEPS))
+        return self.backend.UInt32(dr.select(hit, int(Status.HIT), ended))
+
+    def _is_vague(
+        self, value: Real, blur: Real, within: Real, beyond: tuple[Crossing, Mask] | None
+    ) -> Mask:
+        """Whether a rough look is too rough: it shortens the step by much, or may be all that
+        makes a hit. beyond: the crossing at the end of the stretch, and whether this is there."""
+        gap = fmin(*self.levels.gaps(value))
+        if beyond is not None:
+            ahead, there = beyond
+            behind = self.levels.gaps(value + ahead.jump)
+            gap = dr.select(there & (ahead.sheet != NO_SHEET), fmin(gap, fmin(*behind)), gap)
+        return (gap < _VAGUE * blur) & (2 * blur > within)
 
     def _certify(
         self, sample: Sample, gaps: tuple[Real, Real], blur: Real

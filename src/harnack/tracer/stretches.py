@@ -25,9 +25,10 @@ if TYPE_CHECKING:
     from harnack.certify import Levels
     from harnack.fields.field import Field
 
-# base, step, reach, value, gradient, evaluations, status, active: see `PreparedLevelSet._advance`.
+# base, step, reach, value, gradient, evaluations, fine, status, active: see
+# `PreparedLevelSet._advance`.
 State: TypeAlias = "tuple[Any, ...]"
-REACH, EVALUATIONS, STATUS, ACTIVE = 2, 5, 6, 7
+REACH, EVALUATIONS, STATUS, ACTIVE = 2, 5, 7, 8
 
 ON_SHEET = max(Status) + 1
 """Status of a ray that hit a sheet, until `Walk` turns it into a plain HIT."""

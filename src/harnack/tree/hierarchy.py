@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +17,10 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 NO_PRIMITIVE = -1
+# So many points and their indices stay in the cache.
+_POINTS_AT_ONCE = 1 << 17
+# NumPy reduces rows that are not longer more slowly than column after column.
+_LONG_ROW = 48
 
 
 @dataclass(frozen=True)
@@ -64,50 +69,80 @@ class Hierarchy:
 
     def gather(self, values: FloatArray, empty: float = 0.0) -> FloatArray:
         """Values of primitives (n, ...) in slots: (leaves, leaf_size, ...), `empty` elsewhere."""
-        out = values[np.maximum(self.slots, 0)]
-        out[self.slots == NO_PRIMITIVE] = empty
+        out = values.take(self.slots, axis=0, mode="clip")
+        leaf, slot = np.nonzero(self.slots == NO_PRIMITIVE)
+        out[leaf, slot] = empty
         return out
 
 
 def build_hierarchy(points: FloatArray, *, leaf_size: int = 8, arity: int = 4) -> Hierarchy:
-    """A tree over points (n, 3), n >= 1: each split halves a node along its longest side.
+    """A tree over finite points (n, 3), n >= 1: each split halves a node along its longest side.
 
     arity: 2 or 4 (two splits at once; the root may have 2 children).
 
-    O(n log n): each of log2(n / leaf_size) levels is one partial sort.
+    O(n log n): each of log2(n / leaf_size) levels is one partial sort. Nodes that fit into the
+    cache are split down to their leaves, one after the other: threads would make it no faster.
     """
     if arity not in (2, 4):
         raise ValueError(f"arity must be 2 or 4, not {arity}")
     rows = np.arange(len(points), dtype=np.int64)[None]
+    x = np.array(points.T, dtype=np.float64, order="C")[:, None]
     depth = max(0, math.ceil(math.log2(len(points) / leaf_size)))
-    for _ in range(depth):
-        rows = _split(points, rows)
+    left = depth
+    while left and rows.shape[1] > _POINTS_AT_ONCE:
+        rows, x = _split(rows, x)
+        left -= 1
+    at_once = max(1, _POINTS_AT_ONCE // rows.shape[1])
+    leaves: list[IntArray] = []
+    for start in range(0, len(rows), at_once):
+        some, places = rows[start : start + at_once], x[:, start : start + at_once]
+        for _ in range(left):
+            some, places = _split(some, places)
+        leaves.append(some)
+    slots = np.concatenate(leaves)
     if arity == 2:
-        return Hierarchy(rows, (2,) * depth)
-    return Hierarchy(rows, (4,) * (depth // 2) + (2,) * (depth % 2))
+        return Hierarchy(slots, (2,) * depth)
+    return Hierarchy(slots, (4,) * (depth // 2) + (2,) * (depth % 2))
 
 
-def _split(points: FloatArray, rows: IntArray) -> IntArray:
-    """Rows (k, w) of indices, of which the last may be empty, halved: (2k, ceil(w/2)).
+def _split(rows: IntArray, x: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Nodes' points, rows (k, w) of indices and positions x (3, k, w), halved: (2k, ceil(w/2)).
 
-    If each row holds w or w - 1 indices, each of the new ones holds ceil(w/2) or one less.
+    The last of a row may be empty: NO_PRIMITIVE, at NaN, which sorts behind all numbers. If each
+    row holds w or w - 1 points, each of the new ones holds ceil(w/2) or one less.
     """
-    width = rows.shape[1]
-    half = (width + 1) // 2
-    empty = rows == NO_PRIMITIVE
-    p = points[np.maximum(rows, 0)]
-    low = np.where(empty[..., None], np.inf, p).min(axis=1)
-    high = np.where(empty[..., None], -np.inf, p).max(axis=1)
-    axis = (high - low).argmax(axis=1)
-    key = np.take_along_axis(p, axis[:, None, None], axis=2)[..., 0]
-    key[empty] = np.inf
-    middle = width // 2
-    order = np.argpartition(key, sorted({middle, width - 1}), axis=1)
-    rows = np.take_along_axis(rows, order, axis=1)
-    left, right = rows[:, :half].copy(), np.full((len(rows), half), NO_PRIMITIVE, np.int64)
-    right[:, : width - half] = rows[:, half:]
-    if width % 2:  # 2m + 1 slots for 2m primitives: m on either side
-        short = rows[:, -1] == NO_PRIMITIVE
-        right[short, : half - 1] = rows[short, half - 1 : width - 1]
-        left[short, half - 1] = NO_PRIMITIVE
-    return np.stack([left, right], axis=1).reshape(-1, half)
+    count, width = rows.shape
+    half, middle = (width + 1) // 2, width // 2
+    key = x[_sides(x).argmax(axis=0), np.arange(count)]
+    order = cast("IntArray", np.argpartition(key, middle, axis=1))
+    short = np.flatnonzero(np.isnan(key[:, -1]))
+    at = (order[short] == width - 1).argmax(axis=1)  # the empty slot: somewhere on the right
+    order[short, at], order[short, -1] = order[short, -1], width - 1
+    if width % 2:  # m points of 2m on either side, the empty slot on the left
+        order[short, -1], order[short, middle] = order[short, middle], width - 1
+    order += np.arange(0, rows.size, width, dtype=np.int64)[:, None]
+    return _halves(rows, order, half, NO_PRIMITIVE), np.stack(
+        [_halves(one, order, half, np.nan) for one in x]
+    )
+
+
+def _sides(x: FloatArray) -> FloatArray:
+    """Lengths (3, k) of the boxes of rows of points (3, k, w)."""
+    if x.shape[2] > _LONG_ROW:
+        return np.fmax.reduce(x, axis=2) - np.fmin.reduce(x, axis=2)
+    low = high = x[..., 0]
+    for k in range(1, x.shape[2]):
+        low, high = np.fmin(low, x[..., k]), np.fmax(high, x[..., k])
+    return high - low
+
+
+def _halves(values: npt.NDArray[Any], order: IntArray, half: int, empty: float) -> Any:
+    """Rows (k, w) in an order, a flat index each, cut in two (2k, half), `empty` at the end."""
+    count, width = order.shape
+    out = np.empty((count, 2, half), values.dtype)
+    flat = values.reshape(-1)
+    out[:, 0] = flat[order[:, :half]]
+    out[:, 1, : width - half] = flat[order[:, half:]]
+    if width % 2:
+        out[:, 1, half - 1] = empty
+    return out.reshape(-1, half)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 
 from harnack.backend.extrema import clamp, fmax, fmin
-from harnack.tree.triangles import TriangleRays, corners_of
+from harnack.tree.triangles import EDGES, TriangleRays, corners_of
 from harnack.tree.walk import Node, State, for_each, walk
 
 if TYPE_CHECKING:
@@ -36,7 +36,14 @@ def squared_distance(row: list[Real], x: Vec3) -> Real:
     """From x to the triangle of a record: to its plane over its inside, else to its edges."""
     vector = cast("Any", type(x))
     p, q, r = corners_of(row, vector)
-    best = fmin(_to_segment(p, q, x), fmin(_to_segment(q, r, x), _to_segment(p, r, x)))
+    first, second, third = row[EDGES : EDGES + 3]
+    best = fmin(
+        squared_distance_to_segment(p - x, q - p, first),
+        fmin(
+            squared_distance_to_segment(q - x, r - q, second),
+            squared_distance_to_segment(p - x, r - p, third),
+        ),
+    )
     n = dr.cross(q - p, r - p)
     square = dr.squared_norm(n)
     inside = square > 0
@@ -46,9 +53,8 @@ def squared_distance(row: list[Real], x: Vec3) -> Real:
     return dr.select(inside, fmin(best, height * height / fmax(square, type(square)(1e-37))), best)
 
 
-def _to_segment(a: Vec3, b: Vec3, x: Vec3) -> Real:
-    e = b - a
-    square = dr.squared_norm(e)
-    share = dr.select(square > 0, dr.dot(x - a, e) / square, 0)
-    share = clamp(share, type(square)(0), type(square)(1))
-    return dr.squared_norm(x - a - e * share)
+def squared_distance_to_segment(a: Vec3, e: Vec3, inverse: Real) -> Real:
+    """From the origin to the segment from a to a + e; inverse = 1/|e|^2, anything finite for 0."""
+    real, vector = cast("Any", type(inverse)), cast("Any", type(a))
+    share = clamp(-dr.dot(a, e) * inverse, real(0), real(1))
+    return dr.squared_norm(dr.fma(vector(share), e, a))

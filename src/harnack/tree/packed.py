@@ -10,7 +10,6 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend import aligned
 from harnack.tree.hierarchy import FloatArray, Hierarchy
 
 if TYPE_CHECKING:
@@ -69,29 +68,39 @@ def pack(
     numbers, sizes = tree.preorder()
     extra = levels[0].shape[1] - _HEAD
     packets = 1 - (-extra // PACKET)
-    table = np.zeros((tree.node_count, PACKET * packets))
+    table = np.zeros((tree.node_count, PACKET * packets), _number(backend))
     for depth, (number, size, values) in enumerate(zip(numbers, sizes, levels, strict=True)):
         table[number, :_HEAD] = values[:, :_HEAD]
         table[number, _HEAD] = number + size
         table[number, _HEAD + 1] = np.arange(len(number)) if depth == 0 else -1
         table[number, PACKET : PACKET + extra] = values[:, _HEAD:]
     width = primitives.shape[2]
-    primitive_packets = -(-width // PACKET)
-    flat = np.zeros((*primitives.shape[:2], PACKET * primitive_packets))
-    flat[..., :width] = primitives
     return PackedTree(
         backend,
         _upload(backend, table),
         packets,
         dr.opaque(backend.UInt32, tree.node_count),
-        _upload(backend, flat),
-        primitive_packets,
+        _upload(backend, primitives.reshape(-1, width)),
+        -(-width // PACKET),
         tree.leaf_size,
     )
 
 
-def _upload(backend: Backend, table: FloatArray) -> Real:
-    values: npt.NDArray[Any] = table.ravel()
-    if backend.precision == "single":
-        values = values.astype(np.float32)
-    return aligned(backend, values)
+def _number(backend: Backend) -> type[np.floating[Any]]:
+    return np.float32 if backend.precision == "single" else np.float64
+
+
+def _upload(backend: Backend, table: npt.NDArray[Any]) -> Real:
+    """Rows (n, c), filled up with zeros to whole packets: aligned, as `backend.aligned` has it.
+
+    The filling is done by Dr.Jit, on many threads and without another copy in NumPy.
+    """
+    rows, width = table.shape
+    padded = -(-width // PACKET) * PACKET
+    mapped = backend.Float(np.array(table, _number(backend), order="C").ravel())
+    # Dr.Jit must not see that this may be the array itself, which need not be aligned.
+    lane = dr.arange(backend.UInt32, rows * padded) ^ dr.opaque(backend.UInt32, 0)
+    row, column = lane // padded, lane % padded
+    copy = dr.gather(backend.Float, mapped, row * width + column, column < width)
+    dr.eval(copy)
+    return copy

@@ -1,0 +1,278 @@
+"""Real meshes, whole and damaged: winding numbers and first hits against direct sums."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+import harnack as hk
+from harnack.fields.winding_number import WindingNumber
+from harnack.geometry import read_surface
+from harnack.geometry.mesh_shapes import (
+    MeshArrays,
+    duplicate_faces,
+    flip_faces,
+    icosphere,
+    remove_faces,
+)
+from harnack.testing.direct_sums import winding_sum
+from harnack.testing.jump_oracle import first_side_changes, judge
+
+from .plain_hits import PlainHits
+
+FORMATS = (".obj", ".ply", ".off", ".stl", ".glb")
+POINTS = 100_000
+RAYS = 2_000
+CHECKED = 2_000
+SAMPLES = 384
+DAMAGE = ("none", "holes", "flips", "duplicates", "self-intersections")
+METHODS: tuple[tuple[Any, int], ...] = (("exact", 2), ("tree", 0), ("tree", 1), ("tree", 2))
+# Of the size of the mesh: tolerance of the trace, and how far a hit may be from the surface.
+TOLERANCE, REACH = 2e-5, 3e-4
+# Faces that are damaged at most: each makes three boundary edges, which the oracle pays for.
+_MOST = 300
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PointRow:
+    """Winding numbers of one mesh at points by one method; errors are against the direct sum.
+
+    outside: points with an error larger than the bound. used: the largest share of the bound.
+    """
+
+    mesh: str
+    faces: int
+    edges: int
+    method: str
+    outside: int
+    median: float
+    largest: float
+    used: float
+
+
+@dataclass(frozen=True)
+class RayRow:
+    """First hits on one mesh by one method.
+
+    missed, early: hits that the oracle contradicts. explained: early hits at which w differs from
+    the level by no more than its bound allows. plain: rays of a closed mesh that were compared
+    with the triangles themselves, and other: how many of them differ.
+    """
+
+    mesh: str
+    damage: str
+    level: float
+    edges: int
+    method: str
+    hits: int
+    smooth: int
+    missed: int
+    early: int
+    explained: int
+    out_of_steps: int
+    plain: int
+    other: int
+
+
+def read(path: Path) -> MeshArrays:
+    """Vertices and faces of a surface file, moved and scaled to a largest coordinate of one."""
+    surface: Any = read_surface(path, "winding")
+    vertices = np.asarray(surface.vertices, np.float64)
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    vertices = (vertices - 0.5 * (low + high)) / (0.5 * float((high - low).max()))
+    return _rounded(vertices), np.asarray(surface.faces, np.int64)
+
+
+def damaged(mesh: MeshArrays, kind: str, seed: int) -> MeshArrays:
+    """The mesh after one kind of damage."""
+    vertices, faces = mesh
+    share = min(0.05, _MOST / len(faces))
+    if kind == "holes":  # four large ones and many small ones
+        centre = vertices[faces].mean(axis=1)
+        rng = np.random.default_rng(seed)
+        for seen in centre[rng.integers(len(faces), size=4)]:
+            nearest = np.argsort(((vertices[faces].mean(axis=1) - seen) ** 2).sum(axis=1))
+            faces = np.delete(faces, nearest[: len(centre) // 200], axis=0)
+        faces = remove_faces(faces, share, seed)
+    elif kind == "flips":
+        faces = flip_faces(faces, share, seed)
+    elif kind == "duplicates":
+        faces = duplicate_faces(faces, share, seed)
+        faces = duplicate_faces(faces, 0.5 * share, seed + 1, turned=True)
+    elif kind == "self-intersections":
+        ball, more = icosphere(3)
+        faces = np.concatenate([remove_faces(faces, 0.5 * share, seed), more + len(vertices)])
+        vertices = np.concatenate([vertices, _rounded(0.35 * ball + [0.2, 0.1, 0.05])])
+    elif kind != "none":
+        raise ValueError(f"unknown damage {kind!r}")
+    return vertices, faces
+
+
+def at_points(name: str, mesh: MeshArrays) -> Iterator[PointRow]:
+    """Every method at random points of the bounding cube made half as large again."""
+    vertices, faces = mesh
+    x = _rounded(np.random.default_rng(1).uniform(-1.5, 1.5, (POINTS, 3)))
+    expected = winding_sum(vertices[faces])(x)
+    for method, order in METHODS:
+        field = WindingNumber(vertices, faces, method=method, order=order)
+        off = np.abs(field.value(x) - expected)
+        bound = field.error_bound(x)
+        yield PointRow(
+            name, len(faces), len(field.mesh.singular),
+            method if method == "exact" else f"{method}, order {order}",
+            int((off > bound).sum()), float(np.median(off)), float(off.max()),
+            float((off / bound).max()),
+        )  # fmt: skip
+
+
+def along_rays(
+    name: str, mesh: MeshArrays, damage: str, seed: int, level: float
+) -> Iterator[RayRow]:
+    """First hits by both methods. Raises AssertionError if the oracle is not the direct sum."""
+    vertices, faces = mesh
+    o, d = rays(mesh, RAYS, seed)
+    oracle = WindingNumber(vertices, faces, method="exact")
+    edges = oracle.mesh.vertices[oracle.mesh.singular]
+
+    def exact(x: FloatArray) -> FloatArray:
+        return oracle.value(x, precision="double")
+
+    some = o + np.random.default_rng(seed).uniform(0, 3, (RAYS, 1)) * d
+    assert np.abs(exact(some) - winding_sum(vertices[faces])(some)).max() < 1e-9
+    far = 6.0
+    truth = first_side_changes(exact, o, d, 0.0, far, level=level, samples=SAMPLES)
+    plain = None if len(edges) else PlainHits.of(mesh, exact, o, d, TOLERANCE)
+    for method in ("exact", "tree"):
+        field: Any = WindingNumber(vertices, faces, method=method)
+        hits = hk.trace(field, o, d, level=level, t_max=far, tolerance=TOLERANCE)
+        t = np.where(hits.hit, hits.t, np.inf).astype(np.float64)
+        verdict = judge(
+            t, exact, o, d, 0.0, far,
+            level=level, reach=REACH, edges=edges, truth=truth, samples=SAMPLES,
+        )  # fmt: skip
+        early = verdict.early
+        at = o[early] + t[early, None] * d[early]
+        yield RayRow(
+            name, damage, level, len(edges), method,
+            verdict.hits, int((hits.hit & (hits.sheet < 0)).sum()),
+            len(verdict.missed), len(early),
+            int(_explained(field, exact, level, at, d[early]).sum()),
+            int((hits.status == hk.Status.OUT_OF_STEPS).sum()),
+            0 if plain is None else int(plain.clear.sum()),
+            0 if plain is None else plain.others(t),
+        )  # fmt: skip
+
+
+def _explained(
+    field: WindingNumber, exact: Callable[[FloatArray], FloatArray], level: float, x: FloatArray,
+    d: FloatArray,
+) -> npt.NDArray[np.bool_]:  # fmt: skip
+    """Whether w just before or just behind points of rays is within its bound of the level.
+
+    A trace takes a point for a hit within twice the bound of the field it traces.
+    """
+    traced = WindingNumber(
+        field.mesh.vertices, field.mesh.triangles, method=field.method, accuracy=4.0
+    )
+    near = np.zeros(len(x), np.bool_)
+    for aside in (-TOLERANCE, TOLERANCE) if len(x) else ():
+        there = x + aside * d
+        near |= np.abs(exact(there) - level) <= 2 * traced.error_bound(there) + TOLERANCE
+    return near
+
+
+def rays(mesh: MeshArrays, n: int, seed: int) -> tuple[FloatArray, FloatArray]:
+    """From outside and inside, past vertices and edges of the mesh, and anywhere."""
+    vertices, faces = mesh
+    rng = np.random.default_rng(seed)
+    o = 2.6 * _unit(rng.normal(size=(n, 3)))
+    o[: n // 4] = rng.uniform(-1.1, 1.1, (n // 4, 3))
+    low, high = vertices.min(axis=0) - 0.05, vertices.max(axis=0) + 0.05
+    target = rng.uniform(low, high, (n, 3))
+    m = n // 2
+    face = vertices[faces[rng.integers(len(faces), size=m)]]
+    weights = rng.dirichlet(np.ones(3), m)
+    weights[: m // 4] = [1, 0, 0]
+    weights[m // 4 : m // 2] = [0.5, 0.5, 0]
+    aside = 10 ** rng.uniform(-4, -2, (m, 1)) * _unit(rng.normal(size=(m, 3)))
+    target[n - m :] = np.einsum("nv,nvk->nk", weights, face) + aside
+    return _rounded(o), _unit(_rounded(target) - _rounded(o))
+
+
+def _unit(v: FloatArray) -> FloatArray:
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def _rounded(v: FloatArray) -> FloatArray:
+    """To single precision, so that all methods are asked about the same mesh and points."""
+    return v.astype(np.float32).astype(np.float64)
+
+
+def agreement(folder: Path) -> str:
+    """Compare, and return the section of the page.
+
+    Raises FileNotFoundError if the folder holds no mesh.
+    """
+    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in FORMATS)
+    if not paths:
+        raise FileNotFoundError(f"no {', '.join(FORMATS)} in {folder}")
+    points: list[PointRow] = []
+    hits: list[RayRow] = []
+    for path in paths:
+        mesh = read(path)
+        for point_row in at_points(path.stem, mesh):
+            points.append(point_row)
+            print(point_row, flush=True)
+        # Of a flat mesh w stays below 1/2 and comes near it only at the mesh: a level in between.
+        level = 0.25 if np.ptp(mesh[0], axis=0).min() == 0 else 0.5
+        for seed, kind in enumerate(DAMAGE):
+            for ray_row in along_rays(path.stem, damaged(mesh, kind, seed), kind, seed, level):
+                hits.append(ray_row)
+                print(ray_row, flush=True)
+    return _section(points, hits)
+
+
+def _section(points: list[PointRow], hits: list[RayRow]) -> str:
+    broken = {(row.mesh, row.damage) for row in hits if row.edges}
+    lines = [
+        "## Agreement with direct sums\n",
+        f"Winding numbers of meshes from public collections at {POINTS:,} random points of the "
+        "bounding cube made half as large again, single precision, against a sum over all "
+        "triangles in double precision. *Outside* counts errors larger than `error_bound`; *used* "
+        "is the largest share of it.\n",
+        "| mesh | triangles | boundary edges | method | outside | median error | largest error "
+        "| used |",
+        "|---|---:|---:|---|---:|---:|---:|---:|",
+    ]
+    lines += [
+        f"| {row.mesh} | {row.faces:,} | {row.edges:,} | {row.method} | {row.outside} "
+        f"| {row.median:.1e} | {row.largest:.1e} | {row.used:.2f} |"
+        for row in points
+    ]
+    lines += [
+        "",
+        f"First hits of {RAYS:,} rays each, half of them aimed at vertices and edges, on "
+        f"{len(broken)} meshes with boundary edges and on closed ones; tolerance {TOLERANCE:g} of "
+        f"the size. Against the sides of the exact w at {SAMPLES + 1} points a ray: *missed* hits "
+        f"are more than {REACH:g} late, *early* ones have no surface that near; of these, at the "
+        "*explained* ones w is within twice its bound of the level. *Plain* rays pass every edge "
+        "of a closed mesh clearly; *other* counts those not hit where they first meet a triangle "
+        "across which w passes the level. A flat mesh is traced at 1/4: its w stays below 1/2.\n",
+        "| mesh | damage | level | boundary edges | method | hits | off the mesh | missed | early "
+        "| explained | out of steps | plain | other |",
+        "|---|---|---:|---:|---|---:|---:|---:|---:|---:|---:|---:|---:|",
+    ]
+    lines += [
+        f"| {row.mesh} | {row.damage} | {row.level:g} | {row.edges:,} | {row.method} | {row.hits} "
+        f"| {row.smooth} | {row.missed} | {row.early} | {row.explained} | {row.out_of_steps} "
+        f"| {row.plain} | {row.other} |"
+        for row in hits
+    ]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,235 @@
+"""Sums over a tree of dipoles: far nodes as multipoles, leaves by whoever knows what is in them.
+
+What the trees of triangles and of points share: which nodes count as far, what they add, and what
+their sums prove about the field near a point.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend.extrema import fmin
+from harnack.fields.edge_hessian import SymmetricSum
+from harnack.fields.field import Curvature, HarmonicBall, Sample
+from harnack.fields.multipole import Level, cartesian, truncation
+from harnack.fields.multipole_kernel import far_terms
+from harnack.tree import Node, PackedTree, pack, walk
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.tree.hierarchy import FloatArray, Hierarchy
+
+# A rough look takes nodes as a whole beyond this many times their radius.
+_ROUGH = 2.5
+# Parts of the free distance out to which curvatures are stated: the shorter, the smaller.
+_REACHES = (0.15, 0.35, 0.6)
+_ROUNDING = 2e-5
+# The free distance, in units of the whole, where nothing bounds it.
+_FAR = 1e4
+
+Sums: TypeAlias = "tuple[Any, ...]"
+AddLeaf: TypeAlias = "Callable[[Node, Mask, Sums], Sums]"
+
+
+def node_columns(level: Level, accuracy: float, order: int, rough: float) -> FloatArray:
+    """Numbers of nodes as the walks below read them.
+
+    centre, accepting distance, gradient error G, V | 15 coefficients, value error E. A node may be
+    taken as a whole beyond `rough` times its radius R, E and G hold beyond `accuracy` times R, and
+
+        sum a/rho^4 <= V/r^4 and sum a/rho^5 <= V/r^5
+
+    for its dipoles a at distances rho: about the centre the first moment vanishes, so
+    sum a rho^-p <= r^-p (area + sum a psi(|d|/r)) with psi(q) = (1-q)^-p - 1 - p q, Taylor's
+    remainder on the way towards x; psi/q^2 grows with q and with p, so p = 5 at q = R/r serves.
+    """
+    accept = rough * level.radius
+    value, slope = truncation(level, accuracy * level.radius, order)
+    q = 1 / rough
+    psi = (1 - q) ** -5 - 1 - 5 * q
+    bound = level.area + level.spread / np.maximum(level.radius, 1e-300) ** 2 * psi
+    head = np.stack([accept, slope, bound], axis=1)
+    return np.concatenate(
+        [level.centre, head, cartesian(level.moments, order), value[:, None]], axis=1
+    )
+
+
+@dataclass(frozen=True)
+class FarClusters:
+    """The walks over a tree of nodes as `node_columns` lays them out.
+
+    looser: the errors of a rough look are at most this many times those stored.
+    """
+
+    backend: Backend
+    tree: PackedTree
+    accuracy: float
+    rough: float
+    order: int
+    looser: float
+
+    @classmethod
+    def of(
+        cls,
+        backend: Backend,
+        tree: Hierarchy,
+        levels: list[Level],
+        primitives: FloatArray,
+        accuracy: float,
+        order: int = 2,
+    ) -> FarClusters:
+        """Everything uploaded. primitives: records in their slots, as `tree.pack` takes them.
+
+        E and G are stored once for both looks: as large as the closer one needs, and no less than
+        what the rough one needs over `looser`, the middle of the ratio of both.
+        """
+        rough = min(accuracy, _ROUGH)
+        nodes = [node_columns(level, accuracy, order, rough) for level in levels]
+        looser = 1.0
+        if rough < accuracy:
+            roughly = [truncation(level, rough * level.radius, order) for level in levels]
+            leaves = nodes[0][:, 21] > 0
+            if leaves.any():
+                looser = float(np.median(roughly[0][0][leaves] / nodes[0][leaves, 21]))
+            for columns, (value, slope) in zip(nodes, roughly, strict=True):
+                columns[:, 21] = np.maximum(columns[:, 21], value / looser)
+                columns[:, 4] = np.maximum(columns[:, 4], slope / looser)
+        packed = pack(backend, tree, nodes, primitives)
+        return cls(backend, packed, accuracy, rough, order, looser)
+
+    def at(self, x: Vec3, derivatives: int, add_leaf: AddLeaf) -> tuple[Any, ...]:
+        """Value, gradient and Hessian's parts (as asked for), and the truncation bound, last.
+
+        add_leaf(node, mask, sums): the sums with the contents of a leaf added where the mask is.
+        """
+        real, vector = self.backend.Float, self.backend.Array3f
+        zero = SymmetricSum.zero(real).parts()
+        sums: Sums = (vector(0), *zero)[: (0, 1, 7)[derivatives]]
+
+        def visit(node: Node, state: Sums) -> tuple[Mask, Sums]:
+            error, value, *rest = state
+            r, length, far = self._far(node, x, True)
+            inverse = dr.select(far, dr.rcp(length), 0)
+            c = node.payload(far)
+            terms = far_terms(c, r, inverse, derivatives)
+            error = dr.fma(c[15], self._decay(inverse), error)
+            value = value + dr.select(far, terms.value, 0)
+            if derivatives >= 1:
+                rest[0] = rest[0] + dr.select(far, terms.gradient, 0)
+            if derivatives == 2 and terms.hessian is not None:
+                pairs = zip(rest[1:], terms.hessian.parts(), strict=True)
+                rest[1:] = [old + dr.select(far, new, 0) for old, new in pairs]
+            return ~far, (error, *add_leaf(node, ~far & node.is_leaf, (value, *rest)))
+
+        error, *rest = walk(self.tree, visit, (real(0), real(0), *sums))
+        return *rest, error
+
+    def near(self, x: Vec3, fine: Mask, add_leaf: AddLeaf, own: Sums = ()) -> tuple[Nearby, Sums]:
+        """All sums that a certificate at x needs, and those of the caller's own.
+
+        fine: where to look closely; elsewhere nodes are taken as a whole from `rough` on.
+        add_leaf: as for `at`, of the sums of `Nearby` in their order and then the own ones.
+        """
+        real, vector = self.backend.Float, self.backend.Array3f
+
+        def visit(node: Node, state: Sums) -> tuple[Mask, Sums]:
+            value, g, error, slope_error, clear, s4, s5, *rest = state
+            r, length, far = self._far(node, x, fine)
+            c = node.payload(far)
+            inverse = dr.select(far, dr.rcp(length), 0)
+            terms = far_terms(c, r, inverse, 1)
+            decay, fourth = self._decay(inverse), (inverse * inverse) ** 2
+            apart = dr.fma(node.head[3], -1 / self.rough, length)
+            state = (
+                value + dr.select(far, terms.value, 0),
+                g + dr.select(far, terms.gradient, 0),
+                dr.fma(c[15], decay, error),
+                dr.fma(node.head[4], decay * inverse, slope_error),
+                dr.select(far, fmin(apart, clear), clear),
+                dr.fma(node.head[5], fourth, s4),
+                dr.fma(node.head[5], fourth * inverse, s5),
+                *rest,
+            )
+            return ~far, add_leaf(node, ~far & node.is_leaf, state)
+
+        start = (real(0), vector(0), real(0), real(0), real(_FAR), real(0), real(0), *own)
+        sums = walk(self.tree, visit, start)
+        looser = dr.select(fine, real(1), self.looser)
+        value, g, error, slope_error = *sums[:2], looser * sums[2], looser * sums[3]
+        return Nearby(self.backend, value, g, error, slope_error, *sums[4:7]), sums[7:]
+
+    def _far(self, node: Node, x: Vec3, fine: Mask) -> tuple[Vec3, Real, Mask]:
+        """x from the node's centre, its length, and whether that is enough."""
+        r = x - self.backend.Array3f(*node.head[:3])
+        length = dr.norm(r)
+        closer = dr.select(fine, self.backend.Float(self.accuracy / self.rough), 1)
+        return r, length, length > node.head[3] * closer
+
+    def _decay(self, inverse: Real) -> Real:
+        """r^-(order + 3), as the first term left out."""
+        power = inverse * inverse * inverse
+        for _ in range(self.order):
+            power = power * inverse
+        return power
+
+
+@dataclass(frozen=True)
+class Nearby:
+    """What sums over a tree tell about f near x.
+
+    error, slope_error: what was left out of value and gradient. clear: a distance from x within
+    which f is harmonic. s4, s5: bounds of sum a/rho^4 and sum a/rho^5 over dipoles a at rho.
+    """
+
+    backend: Backend
+    value: Real
+    gradient: Vec3
+    error: Real
+    slope_error: Real
+    clear: Real
+    s4: Real
+    s5: Real
+
+    def sample(self, share: float, rounding: Real, normal: Vec3 | None = None) -> Sample:
+        """`share` times f, with what is known of it.
+
+        Certificate. Along a line the k-th derivative of a dipole a at rho is at most
+        (k+1)! a/rho^(k+2) (it is a mixed derivative of a/rho, whose tensor is symmetric and takes
+        its largest value on equal vectors), so that Taylor's remainder after the linear term is at
+        most a ((rho-t)^-2 - rho^-2 - 2t rho^-3) = a t^2 rho^-4 phi(t/rho), phi(q) =
+        (3-2q)/(1-q)^2. phi is convex: on [0, b] it lies below 3 + rise q, rise = (phi(b)-3)/b =
+        (4-3b)/(1-b)^2. With t <= r = b clear and rho >= clear,
+        |f(y) - f(x) - g.(y-x)| <= t^2 (3 s4 + rise r s5).
+        A ball of that radius bounds f by |g| r more, and holds harmonic f.
+        """
+        epsilon, g = self.backend.epsilon, share * self.gradient
+        distance = self.clear * (1 - _ROUNDING) - 8 * epsilon
+        bends = [self._bend(share, b, b * distance) for b in _REACHES]
+        slope, widest = dr.norm(g) + share * self.slope_error, bends[-1]
+        r = widest.radius
+        variation = (1 + _ROUNDING) * r * dr.fma(0.5 * r, widest.constant, slope)
+        value = share * self.value
+        ball = HarmonicBall(r, value - variation, value + variation)
+        # On a singular point itself all values meet: a gradient that says so.
+        apart = (self.clear > 16 * epsilon) & dr.isfinite(value) & dr.isfinite(dr.squared_norm(g))
+        steep = self.backend.Array3f(0, 0, share * 4 * math.pi / (8 * epsilon))
+        return Sample(
+            dr.select(apart, value, 0),
+            dr.select(apart, g, steep),
+            (*bends, ball),
+            share * self.error + rounding,
+            dr.select(apart, share * self.slope_error, 0),
+            normal,
+        )
+
+    def _bend(self, share: float, b: float, r: Real) -> Curvature:
+        """What is known out to r = b times the free distance."""
+        rise = (4 - 3 * b) / (1 - b) ** 2
+        third = 3 * self.s4
+        return Curvature((2 + 2 * _ROUNDING) * share * dr.fma(r * rise, self.s5, third), r)

@@ -1,0 +1,20 @@
+"""Named scenes, shared by the command line, the docs and the tests. No numerics.
+
+A scene is data: fields, levels, materials and a camera. `Scene.render` hands them to the renderer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from harnack.gallery.classic import CURVES, HARMONICS, SOLIDS
+from harnack.gallery.damaged import MESHES
+from harnack.gallery.scene import Scene
+
+__all__ = ["SCENES", "Scene"]
+
+SCENES: Mapping[str, Scene] = MappingProxyType(
+    {scene.name: scene for scene in (*CURVES, *HARMONICS, *SOLIDS, *MESHES)}
+)
+"""All scenes by name."""

@@ -1,0 +1,174 @@
+"""Scenes of curves, harmonic polynomials and periodic surfaces."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from harnack.fields import (
+    EigenfunctionSum,
+    Field,
+    Gyroid,
+    HarmonicPolynomial,
+    Product,
+    SchwarzD,
+    SchwarzP,
+    SolidAngle,
+    SphericalHarmonic,
+    sine,
+)
+from harnack.gallery.scene import DRAWN, Scene
+from harnack.geometry import Ball, Box, HalfSpace, shapes
+from harnack.rendering import Camera
+from harnack.tracer import LevelSet, level_set
+
+
+def _curve(loops: Any, level: Any = None, **settings: Any) -> list[LevelSet]:
+    return [level_set(SolidAngle(loops), level, tolerance=DRAWN, **settings)]
+
+
+def _levels() -> list[LevelSet]:
+    """Five levels of one polygon, cut open."""
+    cut = HalfSpace((0.5, -0.9, 0.0), 0.0)
+    levels = [k * math.pi for k in (1.0, 1.5, 2.0, 2.5, 3.0)]
+    return _curve(shapes.wavy_polygon(48), levels, clip=cut)
+
+
+def _holes() -> list[LevelSet]:
+    """A square with three holes, bent like a sheet in the wind so that no plane contains it."""
+    loops: list[Any] = []
+    for loop in shapes.square_with_holes(24):
+        x, y, _ = loop.T
+        loops.append(np.column_stack([x, y, 0.25 * np.sin(2.2 * x) + 0.2 * np.cos(2.0 * y)]))
+    edge = loops[0]
+    s = np.linspace(0, 1, 10, endpoint=False)[:, None]
+    fine = [(1 - s) * a + s * b for a, b in zip(edge, np.roll(edge, -1, axis=0), strict=True)]
+    outer = np.concatenate(fine)
+    outer[:, 2] = 0.25 * np.sin(2.2 * outer[:, 0]) + 0.2 * np.cos(2.0 * outer[:, 1])
+    return _curve([outer, *loops[1:]])
+
+
+def _periodic(kind: Any, *, solid: tuple[float, float], box: bool = False) -> list[LevelSet]:
+    domain = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)) if box else Ball(radius=1.0)
+    return [level_set(kind(1.0, domain=domain), solid=solid, tolerance=DRAWN)]
+
+
+def _eigenfunctions() -> list[LevelSet]:
+    """The paper's Fig. 21: the 1/2 level of a sum of two eigenfunctions."""
+    terms = [Product(1.0, x=sine(k), y=sine(k), z=sine(k)) for k in (6.0, 2.0)]
+    side = math.pi / 2
+    domain = Box((-side, -side, -side), (side, side, side))
+    solid = (0.5, math.inf)
+    return [level_set(EigenfunctionSum(terms, domain=domain), solid=solid, tolerance=DRAWN)]
+
+
+def _harmonic(field: Field) -> list[LevelSet]:
+    return [level_set(field, tolerance=DRAWN)]
+
+
+CURVES = (
+    Scene(
+        "polygon",
+        "a nonplanar polygon",
+        lambda: _curve(shapes.wavy_polygon(64)),
+        demo_spp=36,
+    ),
+    Scene(
+        "levels",
+        "five level sets of a nonplanar polygon, cut open",
+        _levels,
+        camera=Camera(azimuth=-62, elevation=24),
+        demo_spp=25,
+    ),
+    Scene(
+        "evaluations",
+        "evaluations a ray, as the paper's Fig. 22",
+        lambda: _curve(shapes.wavy_polygon(64)),
+        show="evaluations",
+        demo_spp=1,
+    ),
+    Scene(
+        "trefoil",
+        "a Seifert surface of the trefoil knot",
+        lambda: _curve(shapes.torus_knot(2, 3, 96)),
+        camera=Camera(azimuth=-80, elevation=52),
+        demo_spp=25,
+    ),
+    Scene(
+        "figure-eight",
+        "a Seifert surface of the figure-eight knot",
+        lambda: _curve(shapes.figure_eight_knot(120)),
+        camera=Camera(elevation=48),
+    ),
+    Scene(
+        "hopf",
+        "a Seifert surface of the Hopf link",
+        lambda: _curve(shapes.hopf_link(48)),
+        demo_spp=25,
+    ),
+    Scene(
+        "borromean",
+        "a Seifert surface of the Borromean rings",
+        lambda: _curve(shapes.borromean_rings(48)),
+    ),
+    Scene(
+        "holes",
+        "a polygon with holes",
+        _holes,
+        ("plastic",),
+        Camera(azimuth=-50, elevation=42),
+        demo_spp=25,
+    ),
+    Scene("coil", "a coil of five turns", lambda: _curve(shapes.coil(5, 160)), ("copper",)),
+)
+
+HARMONICS = (
+    Scene(
+        "harmonic",
+        "level set of a spherical harmonic, l = 5, m = 3",
+        lambda: _harmonic(SphericalHarmonic(5, 3)),
+        demo_spp=36,
+    ),
+    Scene(
+        "polynomial",
+        "the harmonic polynomial of the paper's Eq. 8",
+        lambda: _harmonic(HarmonicPolynomial({(2, 1, 0): 1.0, (0, 1, 2): -1.0})),
+    ),
+)
+
+SOLIDS = (
+    Scene(
+        "gyroid",
+        "a gyroid wall in glass, cut to a ball",
+        lambda: _periodic(Gyroid, solid=(-0.35, 0.35)),
+        ("glass",),
+        demo_spp=144,
+    ),
+    Scene(
+        "gyroid-gold",
+        "half of space behind the gyroid in gold, cut to a box",
+        lambda: _periodic(Gyroid, solid=(-math.inf, 0.0), box=True),
+        ("gold",),
+        demo_spp=64,
+    ),
+    Scene(
+        "schwarz-p",
+        "Schwarz's primitive surface as a wall, cut to a box",
+        lambda: _periodic(SchwarzP, solid=(-0.25, 0.25), box=True),
+        ("porcelain",),
+    ),
+    Scene(
+        "schwarz-d",
+        "Schwarz's diamond surface as a wall, cut to a ball",
+        lambda: _periodic(SchwarzD, solid=(-0.15, 0.15)),
+        ("copper",),
+    ),
+    Scene(
+        "eigenfunctions",
+        "a sum of Laplacian eigenfunctions (the paper's Fig. 21)",
+        _eigenfunctions,
+        ("clay",),
+    ),
+)

@@ -1,0 +1,41 @@
+"""A named picture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from harnack.rendering import Camera, render
+from harnack.tracer import LevelSet, Tolerance
+
+Surfaces = Callable[[], "list[LevelSet]"]
+
+# Fine enough that no pixel of a demo picture shows it, coarse enough for shadow rays to be quick.
+DRAWN = Tolerance(2e-4)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A picture waiting to be made.
+
+    surfaces: makes the level sets; materials: one name for each of them (or one for all).
+    demo_spp: samples a pixel in `make demo`, 0 for not in it; few, to keep it to a few minutes.
+    """
+
+    name: str
+    title: str
+    surfaces: Surfaces
+    materials: tuple[str, ...] = ("two-tone",)
+    camera: Camera = field(default_factory=Camera)
+    show: str = "color"
+    demo_spp: int = 0
+
+    def render(self, path: Any = None, **settings: Any) -> Any:
+        """The picture, as `harnack.rendering` makes it; settings override the scene's own."""
+        surfaces = self.surfaces()
+        names = self.materials * len(surfaces) if len(self.materials) == 1 else self.materials
+        chosen: dict[str, Any] = {
+            "material": list(names), "camera": self.camera, "show": self.show, **settings,
+        }  # fmt: skip
+        return render(surfaces, path, **chosen)

@@ -1,0 +1,217 @@
+"""Shaded pictures: one ray a pixel, more where the picture has edges, and no noise.
+
+The rays through the middles of all pixels are traced first. Pixels that differ visibly from a
+neighbour are then drawn again as the mean of a fixed grid of samples: outlines are smooth, and
+the inside of a surface costs one ray a pixel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import numpy.typing as npt
+
+from harnack.backend import to_numpy
+from harnack.rendering.exposure import as_rgb, mean_of_blocks
+from harnack.rendering.floor import Floor
+from harnack.rendering.images import tone_mapped
+from harnack.rendering.integrator import LOST_COLOUR
+from harnack.rendering.occlusion import visible_sky
+from harnack.rendering.pixels import bands, film_places, grid_offsets
+from harnack.rendering.shading import Light, of_mended, of_side, reflectance
+from harnack.rendering.world import World
+
+# Rays of one band.
+_RAYS_A_BAND = 2**17
+# Neighbours that differ by more than this, of 255, are an edge.
+_EDGE = 16
+# The share of the time that is spent on the first rays, as the progress bar guesses.
+_FIRST = 0.6
+
+
+@dataclass
+class _Seen:
+    """What rays meet first. light: shone by an emitter or the environment, or magenta for lost."""
+
+    position: Any
+    normal: Any
+    eye: Any
+    width: Any
+    colour: Any
+    light: Any
+    glossy: Any
+    met: Any
+    lost: Any
+
+
+def shaded(
+    mi: Any,
+    scene: Any,
+    sensor: Any,
+    *,
+    spp: int,
+    on_floor: bool,
+    advance: Callable[[float], None],
+) -> tuple[npt.NDArray[np.float32], int]:
+    """Linear sRGB radiance (h, w, 3), and how many rays ran out of steps.
+
+    spp: rays of a pixel on an edge, at least; 1 for one ray a pixel everywhere.
+    on_floor: whether the scene is a studio's, whose floor shows shadows.
+    advance: told what part of the picture has been finished since the last call.
+
+    Raises:
+        ValueError: the Mitsuba variant is spectral, whose four wavelengths a ray are no colour.
+    """
+    if mi.is_spectral:
+        raise ValueError(
+            f"shaded pictures know red, green and blue, and the Mitsuba variant is {mi.variant()}: "
+            'set one such as "llvm_ad_rgb", or draw in color'
+        )
+    painter = _Painter(mi, World.of(mi, scene), sensor, on_floor=on_floor)
+    count = painter.size[0] * painter.size[1]
+    parts: list[_Seen] = []
+    for start, stop in bands(count, _RAYS_A_BAND):
+        pixel = dr.arange(mi.UInt32, stop - start) + dr.opaque(mi.UInt32, start)
+        seen = painter.look(pixel, mi.Vector2f(0.5))
+        dr.eval(seen)
+        dr.sync_thread()
+        parts.append(seen)
+        advance(_FIRST * (stop - start) / count)
+    seen = _joined(parts)
+    sky = visible_sky(mi, seen.position, seen.normal, seen.width, painter.size)
+    dr.eval(sky)
+    image = to_numpy(painter.paint(seen, sky)).reshape(*painter.size[::-1], 3)
+    lost = int(dr.count(seen.lost)[0])
+    edges = np.flatnonzero(_edges(image)) if spp > 1 else np.empty(0, dtype=np.int64)
+    offsets = grid_offsets(spp)
+    for start, stop in bands(len(edges), max(1, _RAYS_A_BAND // len(offsets))):
+        chosen = edges[start:stop]
+        colour, gone = painter.refine(chosen, offsets, seen.position, sky)
+        image.reshape(-1, 3)[chosen] = colour
+        lost += gone
+        advance((1 - _FIRST) * (stop - start) / len(edges))
+    return image, lost
+
+
+class _Painter:
+    """A sensor in a world, and its light."""
+
+    def __init__(self, mi: Any, world: World, sensor: Any, *, on_floor: bool) -> None:
+        self.mi, self.world, self.sensor = mi, world, sensor
+        width, height = (int(n) for n in sensor.film().crop_size())
+        self.size = (width, height)
+        matrix = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
+        self.light = Light.of(matrix)
+        self.floor = Floor.of(world, self.light) if on_floor else None
+
+    def look(self, pixel: Any, offset: Any) -> _Seen:
+        """What rays through places in pixels meet first."""
+        mi, scene = self.mi, self.world.scene
+        place = film_places(mi, pixel, offset, self.size)
+        ray, weight = self.sensor.sample_ray_differential(
+            self.sensor.shutter_open(), 0.5, place, mi.Point2f(0.5)
+        )
+        plain = mi.Ray3f(ray)
+        si, first = self.world.intersect(plain, dr.zeros(mi.SurfaceInteraction3f), mi.Bool(True))
+        lost = first.lost | dr.zeros(mi.Bool, dr.width(pixel))
+        met = first.met & ~lost
+        inside, open_surface = si.wi.z > 0, self._is_open(si)
+        colour, other = (self._reflectance(si, side) * weight for side in (1, -1))
+        colour, other = (as_rgb(mi, c, ray.wavelengths) for c in (colour, other))
+        colour, other = reflectance(colour), reflectance(other)
+        colour = of_mended(of_side(colour, other, inside & open_surface), first.mended)
+        shone = si.emitter(scene).eval(si, ~lost) * weight
+        light = dr.select(lost, mi.Color3f(LOST_COLOUR), as_rgb(mi, shone, ray.wavelengths))
+        normal = mi.Vector3f(dr.mulsign(mi.Vector3f(si.n), -dr.dot(si.n, ray.d)))
+        t = dr.select(met, first.t, 0)
+        width = dr.norm(ray.o_x + t * ray.d_x - ray.o - t * ray.d)
+        flags = si.bsdf().flags()
+        glossy = mi.has_flag(flags, mi.BSDFFlags.Glossy) | mi.has_flag(flags, mi.BSDFFlags.Delta)
+        position = dr.select(met, mi.Vector3f(si.p), dr.nan)
+        return _Seen(position, normal, -ray.d, width, colour, light, glossy, met, lost)
+
+    def _reflectance(self, si: Any, side: int) -> Any:
+        """Of the side that is seen (1) or the other (-1), seen straight on."""
+        mi = self.mi
+        straight = mi.SurfaceInteraction3f(si)
+        straight.wi = mi.Vector3f(0, 0, dr.mulsign(mi.Float(side), si.wi.z))
+        return si.bsdf().eval_diffuse_reflectance(straight, si.is_valid())
+
+    def _is_open(self, si: Any) -> Any:
+        """Whether it is one of our surfaces, and has an inside to be looked at."""
+        found = self.mi.Bool(False)
+        for carrier in self.world.carriers:
+            if carrier.surface.solid is None:
+                found |= si.shape == self.mi.ShapePtr(carrier)
+        return found
+
+    def paint(self, seen: _Seen, sky: Any) -> Any:
+        """Radiance towards the eye."""
+        key = 1.0
+        if self.floor is not None:
+            key, above = self.floor.at(seen.position)
+            sky = dr.minimum(sky, above)
+        lit = self.light.on(seen.colour, seen.normal, seen.eye, seen.glossy, sky, key)
+        return dr.select(seen.met, lit, 0) + seen.light
+
+    def refine(
+        self, chosen: Any, offsets: Any, position: Any, sky: Any
+    ) -> tuple[npt.NDArray[np.float32], int]:
+        """Means (n, 3) of samples in chosen pixels, and how many of them were lost."""
+        mi, spp = self.mi, len(offsets)
+        lane = dr.arange(mi.UInt32, len(chosen) * spp)
+        many = dr.opaque(mi.UInt32, spp)
+        pixel = dr.gather(mi.UInt32, mi.UInt32(chosen.astype(np.uint32)), lane // many)
+        table = mi.Vector2f(np.ascontiguousarray(offsets.T, dtype=np.float32))
+        seen = self.look(pixel, dr.gather(mi.Vector2f, table, lane % many))
+        colour = self.paint(seen, self._nearest_sky(seen, pixel, position, sky))
+        dr.eval(colour, seen.lost)
+        return to_numpy(mean_of_blocks(colour, spp)), int(dr.count(seen.lost)[0])
+
+    def _nearest_sky(self, seen: _Seen, pixel: Any, position: Any, sky: Any) -> Any:
+        """The sky over what of the pixel's surroundings lies nearest to the sample."""
+        mi = self.mi
+        columns, rows = self.size
+        x, y = mi.Int32(pixel % columns), mi.Int32(pixel // columns)
+        nearest, found = mi.Float(dr.inf), mi.Float(1)
+        for dx, dy in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)):
+            u, v = dr.clip(x + dx, 0, columns - 1), dr.clip(y + dy, 0, rows - 1)
+            other = mi.UInt32(v * columns + u)
+            away = dr.norm(dr.gather(mi.Vector3f, position, other) - seen.position)
+            nearer = away < nearest  # not where NaN: nothing is there
+            nearest = dr.select(nearer, away, nearest)
+            found = dr.select(nearer, dr.gather(mi.Float, sky, other), found)
+        return found
+
+
+def _joined(parts: list[_Seen]) -> _Seen:
+    """Bands of what was seen as one."""
+    if len(parts) == 1:
+        return parts[0]
+    names = list(vars(parts[0]))
+    return _Seen(*(_concatenated([getattr(part, name) for part in parts]) for name in names))
+
+
+def _concatenated(arrays: list[Any]) -> Any:
+    if dr.depth_v(arrays[0]) == 1:
+        return dr.concat(arrays)
+    return type(arrays[0])(
+        *(dr.concat([array[k] for array in arrays]) for k in range(len(arrays[0])))
+    )
+
+
+def _edges(image: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
+    """Pixels (h, w) that differ visibly from one of their four neighbours."""
+    shown = tone_mapped(image).astype(np.int64)
+    edge = np.zeros(shown.shape[:2], dtype=np.bool_)
+    across = (np.abs(np.diff(shown, axis=1)) > _EDGE).any(axis=-1)
+    down = (np.abs(np.diff(shown, axis=0)) > _EDGE).any(axis=-1)
+    edge[:, 1:] |= across
+    edge[:, :-1] |= across
+    edge[1:] |= down
+    edge[:-1] |= down
+    return edge
