@@ -15,6 +15,7 @@ import drjit as dr
 from harnack.fields.edge_lift import LiftedEdges, LiftedSums, lifted_sums
 from harnack.fields.edge_trails import EdgeTrails
 from harnack.fields.field import HarmonicBall, Lipschitz, Sample
+from harnack.fields.winding_mesh import rounding_of_sum
 from harnack.tree.triangles import Frame, TriangleRays, Upwards, crossing
 from harnack.tree.walk import Node, State, for_each, walk
 
@@ -154,11 +155,3 @@ def _turns_along(rays: TriangleRays, x: Vec3, way: Real) -> Real:
         return (state[0] + dr.select(active & (way * t > 0), turn, 0),)
 
     return walk(tree, visit, (real(0),))[0]
-
-
-def rounding_of_sum(backend: Backend, terms: int) -> float:
-    """How far rounding may move w, a sum of so many terms, each rounded a few times.
-
-    Errors are random in sign, so that they add up as the root of their number.
-    """
-    return backend.epsilon * (16 + math.sqrt(terms))

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +17,9 @@ from harnack.geometry.singular import net_faces, singular_edges, weld_vertices
 from harnack.tree import Hierarchy, build_hierarchy
 from harnack.tree.hierarchy import FloatArray, IntArray
 from harnack.tree.triangles import MOST_TRIANGLES, PARITY, triangle_records
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend
 
 # Triangles of a leaf at most, and children of a node: by experiment.
 _LEAF_SIZE, _ARITY = 8, 4
@@ -187,3 +192,11 @@ def _centre_and_size(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray,
     low, high = vertices[used].min(axis=0), vertices[used].max(axis=0)
     size = 2.0 ** np.ceil(np.log2(0.5 * float((high - low).max())))
     return 0.5 * (low + high), float(size)
+
+
+def rounding_of_sum(backend: Backend, terms: int) -> float:
+    """How far rounding may move w, a sum of so many terms, each rounded a few times.
+
+    Errors are random in sign, so that they add up as the root of their number.
+    """
+    return backend.epsilon * (16 + math.sqrt(terms))

@@ -16,7 +16,7 @@ from harnack.fields.batch import BatchedField, Values
 from harnack.fields.edge_hessian import SymmetricSum
 from harnack.fields.field import Field, Sample, lengthened
 from harnack.fields.sheets import Crossing
-from harnack.fields.winding_exact import ExactWinding, rounding_of_sum
+from harnack.fields.winding_exact import ExactWinding
 from harnack.fields.winding_mesh import WindingMesh
 from harnack.fields.winding_tree import TreeWinding
 from harnack.geometry import Box
@@ -107,16 +107,12 @@ class WindingNumber(BatchedField):
     def values_at(self, x: Vec3, derivatives: int) -> Values:
         on = self._batch(backend_of(x))
         winding, x = on.winding, on.unit(x)
-        if isinstance(winding, ExactWinding):
-            rounding = winding.rounding
-            if derivatives == 0:
-                return Values(winding.values(x), winding.backend.Float(rounding))
-        else:
-            rounding = rounding_of_sum(winding.backend, len(self.mesh.triangles))
+        if isinstance(winding, ExactWinding) and derivatives == 0:
+            return Values(winding.values(x), winding.backend.Float(winding.rounding))
         value, gradient, hessian, error = winding.at(x, derivatives)
         if derivatives == 2:
             hessian = on.scaled_hessian(hessian)
-        return Values(value, error + rounding, gradient / on.size, hessian)
+        return Values(value, error + winding.rounding, gradient / on.size, hessian)
 
     def _batch(self, backend: Backend) -> _OnDevice:
         """The evaluator for points, which is made once a backend."""

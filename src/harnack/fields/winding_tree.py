@@ -19,6 +19,7 @@ from harnack.fields.edge_hessian import SymmetricSum
 from harnack.fields.edge_lift import times
 from harnack.fields.far_clusters import FarClusters
 from harnack.fields.triangle_kernel import NearTriangle
+from harnack.fields.winding_mesh import rounding_of_sum
 from harnack.tree import Node, for_each
 from harnack.tree.triangles import EDGES, INDEX, NO_TRIANGLE, in_slots
 
