@@ -393,7 +393,7 @@ def test_truncation_is_bounded_for_triangles(order: int) -> None:
 
 @pytest.mark.parametrize("accuracy", [1.5, 2.0, 4.0])
 def test_sums_over_dipoles_are_bounded(accuracy: float) -> None:
-    """V of `node_columns`: sum a/rho^4 <= V/r^4 and sum a/rho^5 <= V/r^5."""
+    """Area and K of `node_columns`: sum a/rho^p <= (area + K/r^2)/r^p for p = 4 and 5."""
     for seed in range(30):
         y, normal = cluster(seed)
         level = level_of(y, normal)
@@ -406,4 +406,5 @@ def test_sums_over_dipoles_are_bounded(accuracy: float) -> None:
         area = np.linalg.norm(normal, axis=1)
         for power in (4, 5):
             total = (area / rho**power).sum(axis=1)
-            assert (total <= columns[5] / r**power * (1 + 1e-12)).all()
+            bound = (columns[4] + columns[5] / r**2) / r**power
+            assert (total <= bound * (1 + 1e-12)).all()

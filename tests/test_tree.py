@@ -73,25 +73,24 @@ def test_other_arities_are_refused(arity: int) -> None:
 
 @pytest.mark.parametrize("n", SIZES)
 @pytest.mark.parametrize("arity", [2, 4])
-def test_preorder_is_depth_first(n: int, arity: int) -> None:
+def test_links_lead_depth_first_and_keep_siblings_together(n: int, arity: int) -> None:
     tree = build_hierarchy(points(n), leaf_size=2, arity=arity)
-    numbers, sizes = tree.preorder()
-    visited: list[tuple[int, int, int]] = []
+    number, first, after = tree.links()
+    assert sorted(np.concatenate(number).tolist()) == list(range(tree.node_count))
+    assert (first[0] == 0).all()
 
-    def visit(level: int, node: int) -> int:
-        number = len(visited)
-        visited.append((level, node, number))
-        if level:
-            children = tree.arities[level - 1]
-            for k in range(children):
-                visit(level - 1, node * children + k)
-        assert sizes[level] == len(visited) - number
-        return number
+    def visit(level: int, node: int, following: int) -> None:
+        assert after[level][node] == following
+        if not level:
+            return
+        arity = tree.arities[level - 1]
+        children = number[level - 1][node * arity : (node + 1) * arity].tolist()
+        assert children == list(range(first[level][node], first[level][node] + arity))
+        for k in range(arity):
+            visit(level - 1, node * arity + k, [*children, following][k + 1])
 
-    visit(len(tree.arities), 0)
-    assert len(visited) == tree.node_count
-    for level, node, number in visited:
-        assert numbers[level][node] == number
+    assert number[-1][0] == 0
+    visit(len(tree.arities), 0, tree.node_count)
 
 
 def test_gather_fills_empty_slots() -> None:
@@ -171,14 +170,14 @@ def test_payload_and_leaves_are_those_of_the_node() -> None:
     tree = build_hierarchy(points(100), leaf_size=4)
     levels = [np.random.default_rng(0).normal(size=(k, 6 + 13)) for k in tree.counts]
     packed = pack(backend, tree, levels, tree.slots[..., None].astype(float))
-    numbers, sizes = tree.preorder()
+    number, first, after = tree.links()
     for level, values in enumerate(levels):
         for node in (0, len(values) // 2, len(values) - 1):
-            i = backend.UInt32(int(numbers[level][node]))
-            row = [float(v[0]) for k in range(3) for v in packed.node(i, k)]
+            i = backend.UInt32(int(number[level][node]))
+            row = [float(v[0]) for v in packed.head(i) + packed.payload(i, True)]
             assert row[:6] == values[node, :6].tolist()
-            assert row[6] == numbers[level][node] + sizes[level]
-            assert row[7] == (node if level == 0 else -1)
+            assert row[6] == after[level][node]
+            assert row[7] == (node if level == 0 else -first[level][node])
             assert row[8:21] == values[node, 6:].tolist()
             assert row[21:] == [0, 0, 0]
 

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 # Edges of a record: its five vertices and the number of its edges fill two packets of eight.
 _EDGES, _PACKETS = 4, 2
-# Points of a lane.
-_POINTS = 8
+# Points of a lane: as many as registers hold, by experiment.
+_POINTS = 3
 # Sides closer to zero than this many rounding errors of their products are not trusted; theirs
 # are six at most, those of `tree.triangles.side` one.
 _UNSURE = 16
@@ -143,7 +143,7 @@ class EdgeTrails:
         """1/(4 pi) times the sum of Omega_e at points x, and whether to doubt it.
 
         way: 1 for the direction d = z; -1 for x and the edges mirrored in a plane z = const.
-        The lanes of one kernel take eight points each. Doubt is where a side is nearer to zero
+        Each lane of the kernel takes several points. Doubt is where a side is nearer to zero
         than rounding can tell, where a factor is (beside an edge or a short one), and far away.
         """
         dr.eval(x, way)

@@ -40,21 +40,20 @@ AddLeaf: TypeAlias = "Callable[[Node, Mask, Sums], Sums]"
 def node_columns(level: Level, accuracy: float, order: int, rough: float) -> FloatArray:
     """Numbers of nodes as the walks below read them.
 
-    centre, accepting distance, gradient error G, V | 15 coefficients, value error E. A node may be
-    taken as a whole beyond `rough` times its radius R, E and G hold beyond `accuracy` times R, and
+    centre, accepting distance, area, K | 15 coefficients, value error E. A node may be taken as a
+    whole beyond `rough` times its radius R, E holds beyond `accuracy` times R, and
 
-        sum a/rho^4 <= V/r^4 and sum a/rho^5 <= V/r^5
+        sum a/rho^p <= (area + K/r^2)/r^p, p = 4 and 5,
 
     for its dipoles a at distances rho: about the centre the first moment vanishes, so
     sum a rho^-p <= r^-p (area + sum a psi(|d|/r)) with psi(q) = (1-q)^-p - 1 - p q, Taylor's
-    remainder on the way towards x; psi/q^2 grows with q and with p, so p = 5 at q = R/r serves.
+    remainder on the way towards x; psi/q^2 grows with q and with p, so that p = 5 and q = 1/rough
+    serve: K = psi/q^2 sum a |d|^2.
     """
-    accept = rough * level.radius
-    value, slope = truncation(level, accuracy * level.radius, order)
+    value = truncation(level, accuracy * level.radius, order)[0]
     q = 1 / rough
-    psi = (1 - q) ** -5 - 1 - 5 * q
-    bound = level.area + level.spread / np.maximum(level.radius, 1e-300) ** 2 * psi
-    head = np.stack([accept, slope, bound], axis=1)
+    wide = level.spread * ((1 - q) ** -5 - 1 - 5 * q) / q**2
+    head = np.stack([rough * level.radius, level.area, wide], axis=1)
     return np.concatenate(
         [level.centre, head, cartesian(level.moments, order), value[:, None]], axis=1
     )
@@ -64,7 +63,8 @@ def node_columns(level: Level, accuracy: float, order: int, rough: float) -> Flo
 class FarClusters:
     """The walks over a tree of nodes as `node_columns` lays them out.
 
-    looser: the errors of a rough look are at most this many times those stored.
+    looser: the errors of a rough look are at most this many times those stored. steeper: errors
+    of gradients are at most this many times those of values, over r.
     """
 
     backend: Backend
@@ -73,6 +73,7 @@ class FarClusters:
     rough: float
     order: int
     looser: float
+    steeper: float
 
     @classmethod
     def of(
@@ -86,22 +87,22 @@ class FarClusters:
     ) -> FarClusters:
         """Everything uploaded. primitives: records in their slots, as `tree.pack` takes them.
 
-        E and G are stored once for both looks: as large as the closer one needs, and no less than
-        what the rough one needs over `looser`, the middle of the ratio of both.
+        E is stored once for both looks: as large as the closer one needs, and no less than what
+        the rough one needs over `looser`, the middle of the ratio of both.
         """
         rough = min(accuracy, _ROUGH)
         nodes = [node_columns(level, accuracy, order, rough) for level in levels]
-        looser = 1.0
-        if rough < accuracy:
-            roughly = [truncation(level, rough * level.radius, order) for level in levels]
-            leaves = nodes[0][:, 21] > 0
-            if leaves.any():
-                looser = float(np.median(roughly[0][0][leaves] / nodes[0][leaves, 21]))
-            for columns, (value, slope) in zip(nodes, roughly, strict=True):
-                columns[:, 21] = np.maximum(columns[:, 21], value / looser)
-                columns[:, 4] = np.maximum(columns[:, 4], slope / looser)
+        bounds = [truncation(level, accuracy * level.radius, order) for level in levels]
+        roughly = [truncation(level, rough * level.radius, order) for level in levels]
+        looser = _middle(roughly[0][0], bounds[0][0])
+        steeper = 0.0
+        for columns, (value, slope), close in zip(nodes, roughly, bounds, strict=True):
+            columns[:, -1] = np.maximum(columns[:, -1], value / looser)
+            least = np.maximum(close[1], slope / looser)
+            some = columns[:, -1] > 0
+            steeper = max(steeper, float((least[some] / columns[some, -1]).max(initial=0.0)))
         packed = pack(backend, tree, nodes, primitives)
-        return cls(backend, packed, accuracy, rough, order, looser)
+        return cls(backend, packed, accuracy, rough, order, looser, steeper * (1 + 1e-6))
 
     def at(self, x: Vec3, derivatives: int, add_leaf: AddLeaf) -> tuple[Any, ...]:
         """Value, gradient and Hessian's parts (as asked for), and the truncation bound, last.
@@ -144,16 +145,17 @@ class FarClusters:
             c = node.payload(far)
             inverse = dr.select(far, dr.rcp(length), 0)
             terms = far_terms(c, r, inverse, 1)
-            decay, fourth = self._decay(inverse), (inverse * inverse) ** 2
+            decay, square = self._decay(inverse), inverse * inverse
+            fourth = dr.fma(node.head[5], square, node.head[4]) * (square * square)
             apart = dr.fma(node.head[3], -1 / self.rough, length)
             state = (
                 value + dr.select(far, terms.value, 0),
                 g + dr.select(far, terms.gradient, 0),
                 dr.fma(c[15], decay, error),
-                dr.fma(node.head[4], decay * inverse, slope_error),
+                dr.fma(c[15], decay * inverse, slope_error),
                 dr.select(far, fmin(apart, clear), clear),
-                dr.fma(node.head[5], fourth, s4),
-                dr.fma(node.head[5], fourth * inverse, s5),
+                s4 + fourth,
+                dr.fma(fourth, inverse, s5),
                 *rest,
             )
             return ~far, add_leaf(node, ~far & node.is_leaf, state)
@@ -161,7 +163,7 @@ class FarClusters:
         start = (real(0), vector(0), real(0), real(0), real(_FAR), real(0), real(0), *own)
         sums = walk(self.tree, visit, start)
         looser = dr.select(fine, real(1), self.looser)
-        value, g, error, slope_error = *sums[:2], looser * sums[2], looser * sums[3]
+        value, g, error, slope_error = *sums[:2], looser * sums[2], looser * self.steeper * sums[3]
         return Nearby(self.backend, value, g, error, slope_error, *sums[4:7]), sums[7:]
 
     def _far(self, node: Node, x: Vec3, fine: Mask) -> tuple[Vec3, Real, Mask]:
@@ -177,6 +179,12 @@ class FarClusters:
         for _ in range(self.order):
             power = power * inverse
         return power
+
+
+def _middle(larger: FloatArray, smaller: FloatArray) -> float:
+    """The median of their ratio, at least 1."""
+    some = smaller > 0
+    return max(1.0, float(np.median(larger[some] / smaller[some]))) if some.any() else 1.0
 
 
 @dataclass(frozen=True)

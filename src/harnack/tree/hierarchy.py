@@ -53,19 +53,29 @@ class Hierarchy:
         """Nodes of all levels."""
         return sum(self.counts)
 
-    def preorder(self) -> tuple[tuple[IntArray, ...], tuple[int, ...]]:
-        """Number of each node in depth-first order, level by level; and subtree sizes of levels.
+    def links(self) -> tuple[tuple[IntArray, ...], tuple[IntArray, ...], tuple[IntArray, ...]]:
+        """Number of each node, of its first child, and of the node that follows its subtree when
+        all are visited depth first (`node_count` for the last); each level by level, leaves first.
 
-        A subtree is a run of numbers: the node that follows it is `number + size`.
+        Children of a node are numbered one after the other, then the children of the first of
+        them, and so on, so that a walk reads siblings, which it mostly visits all, side by side.
+        The first child of a leaf is 0, which is none: the root has that number.
         """
-        sizes = [1]
+        below = [0]  # nodes below one of each level
         for arity in self.arities:
-            sizes.append(1 + arity * sizes[-1])
-        number = [np.zeros(1, np.int64)]
-        for arity, size in zip(reversed(self.arities), reversed(sizes[:-1]), strict=True):
-            first = number[0][:, None] + 1
-            number.insert(0, (first + size * np.arange(arity)).reshape(-1))
-        return tuple(number), tuple(sizes)
+            below.append(arity * (1 + below[-1]))
+        number, after = [np.zeros(1, np.int64)], [np.array([self.node_count], np.int64)]
+        first = [np.ones(1, np.int64)]
+        for level, arity in reversed(list(enumerate(self.arities))):
+            place = np.arange(arity)
+            child = first[0][:, None] + place
+            following = np.where(place < arity - 1, child + 1, after[0][:, None])
+            start = first[0][:, None] + arity + place * below[level]
+            number.insert(0, child.reshape(-1))
+            after.insert(0, following.reshape(-1))
+            first.insert(0, start.reshape(-1))
+        first[0] = np.zeros_like(first[0])
+        return tuple(number), tuple(first), tuple(after)
 
     def gather(self, values: FloatArray, empty: float = 0.0) -> FloatArray:
         """Values of primitives (n, ...) in slots: (leaves, leaf_size, ...), `empty` elsewhere."""

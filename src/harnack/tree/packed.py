@@ -23,23 +23,32 @@ _MOST_NODES = 2**24
 
 @dataclass(frozen=True)
 class PackedTree:
-    """Nodes in depth-first order, with links; primitives leaf by leaf.
+    """Nodes with links, siblings side by side (`Hierarchy.links`); primitives leaf by leaf.
 
-    The first packet of a node holds six numbers of its owner's, the node that follows its
-    subtree, and the number of its leaf (-1 for an inner node); then the owner's other packets.
+    The head of a node holds six numbers of its owner's, the node that follows its subtree, and
+    the number of its leaf or, for an inner node, minus that of its first child. The owner's other
+    packets lie elsewhere: a walk reads many heads in a row, and few of those.
     """
 
     backend: Backend
-    nodes: Real
-    node_packets: int
+    heads: Real
+    payloads: Real
+    payload_packets: int
     node_count: Any
     primitives: Real
     primitive_packets: int
     leaf_size: int
 
-    def node(self, i: Any, packet: int, active: Mask = True) -> list[Real]:
-        """Eight numbers of node i."""
-        return self._packet(self.nodes, i * self.node_packets + packet, active)
+    def head(self, i: Any) -> list[Real]:
+        """The eight numbers of node i that a walk needs."""
+        return self._packet(self.heads, i, True)
+
+    def payload(self, i: Any, active: Mask) -> list[Real]:
+        """The other numbers of node i."""
+        row: list[Real] = []
+        for k in range(self.payload_packets):
+            row += self._packet(self.payloads, i * self.payload_packets + k, active)
+        return row
 
     def primitive(self, leaf: Any, slot: Any, active: Mask) -> list[Real]:
         """All numbers of a primitive."""
@@ -65,19 +74,23 @@ def pack(
     """
     if tree.node_count >= _MOST_NODES:
         raise ValueError(f"a tree of {tree.node_count} nodes is too large: cut the input in parts")
-    numbers, sizes = tree.preorder()
     extra = levels[0].shape[1] - _HEAD
-    packets = 1 - (-extra // PACKET)
-    table = np.zeros((tree.node_count, PACKET * packets), _number(backend))
-    for depth, (number, size, values) in enumerate(zip(numbers, sizes, levels, strict=True)):
-        table[number, :_HEAD] = values[:, :_HEAD]
-        table[number, _HEAD] = number + size
-        table[number, _HEAD + 1] = np.arange(len(number)) if depth == 0 else -1
-        table[number, PACKET : PACKET + extra] = values[:, _HEAD:]
+    packets = -(-extra // PACKET)
+    heads = np.zeros((tree.node_count, PACKET), _number(backend))
+    payloads = np.zeros((tree.node_count, extra), _number(backend))
+    links = tree.links()
+    for number, first, after, values in zip(*links, levels, strict=True):
+        heads[number, :_HEAD] = values[:, :_HEAD]
+        heads[number, _HEAD] = after
+        heads[number, _HEAD + 1] = -first
+        payloads[number] = values[:, _HEAD:]
+    leaves = links[0][0]
+    heads[leaves, _HEAD + 1] = np.arange(len(leaves))
     width = primitives.shape[2]
     return PackedTree(
         backend,
-        _upload(backend, table),
+        _upload(backend, heads),
+        _upload(backend, payloads) if extra else backend.Float(0),
         packets,
         dr.opaque(backend.UInt32, tree.node_count),
         _upload(backend, primitives.reshape(-1, width)),

@@ -22,7 +22,7 @@ State: TypeAlias = "tuple[Any, ...]"
 class Node:
     """A node on a walk; all lanes may be at different ones.
 
-    head: the six numbers of the first packet. leaf: number of its leaf, if it is_leaf.
+    head: its owner's six numbers that every visit reads. leaf: number of its leaf, if it is_leaf.
     """
 
     tree: PackedTree
@@ -33,10 +33,7 @@ class Node:
 
     def payload(self, active: Mask) -> list[Real]:
         """The other numbers, fetched where active."""
-        row: list[Real] = []
-        for k in range(1, self.tree.node_packets):
-            row += self.tree.node(self.index, k, active)
-        return row
+        return self.tree.payload(self.index, active)
 
 
 Visit: TypeAlias = "Callable[[Node, State], tuple[Mask, State]]"
@@ -52,11 +49,11 @@ def walk(tree: PackedTree, visit: Visit, state: State, active: Mask = True) -> S
     index, mask = tree.backend.UInt32, tree.backend.Bool
 
     def body(i: Any, *state: Any) -> State:
-        head = tree.node(i, 0)
-        is_leaf = head[7] >= 0
-        node = Node(tree, i, tuple(head[:6]), index(dr.select(is_leaf, head[7], 0)), is_leaf)
+        head = tree.head(i)
+        is_leaf, number = head[7] >= 0, index(dr.abs(head[7]))
+        node = Node(tree, i, tuple(head[:6]), number, is_leaf)
         descend, state = visit(node, state)
-        i = dr.select(descend & ~is_leaf, i + 1, index(head[6]))
+        i = dr.select(descend & ~is_leaf, number, index(head[6]))
         return i, *state
 
     def more(i: Any, *_: Any) -> Mask:
