@@ -27,6 +27,7 @@ from harnack.fields import (
     cosine,
     sine,
 )
+from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.geometry import shapes
 from harnack.geometry.mesh_shapes import bumpy_sphere, icosphere, remove_faces
 from harnack.testing import BrokenPromiseError, Scaled, check_field
@@ -202,10 +203,19 @@ def test_approximate_and_jumping_fields_keep_their_promises(name: str) -> None:
     check_field(APPROXIMATE[name], count=60, directions=4)
 
 
-def samples(field: Field, x: np.ndarray) -> tuple[Sample, Any]:
-    """A sample in double precision and a function that makes its numbers arrays (n,) or (n, 3)."""
+def samples(field: Field, x: np.ndarray, fine: Any = True) -> tuple[Sample, Any]:
+    """A sample in double precision and a function that makes its numbers arrays (n,) or (n, 3).
+
+    fine: where to look closely, as `Field.at_detail` takes it.
+    """
     backend = choose_backend("double")
-    sample = field.prepare(backend).evaluate(to_vector3(backend, x))
+    p, seen = to_vector3(backend, x), field.prepare(backend)
+    if field.has_sheets:
+        up = backend.Array3f(0, 0, 1)
+        nowhere = Crossing(0.0, backend.UInt32(NO_SHEET), backend.Float(0), up)
+        seen = seen.between(p, up, nowhere, nowhere, backend.Float(0))
+    assert seen.has_detail
+    sample = seen.at_detail(backend.Bool(fine)).evaluate(p)
 
     def on_host(one: Any) -> np.ndarray:
         array = to_numpy(one) if dr.is_array_v(type(one)) else np.asarray(one)
@@ -247,11 +257,14 @@ def spread(n: int, seed: int = 2) -> np.ndarray:
     return x
 
 
+@pytest.mark.parametrize("fine", [True, False])
 @pytest.mark.parametrize("accuracy", [2.0, 3.0, 4.0])
-def test_what_a_tree_of_dipoles_leaves_out_is_within_its_bounds(accuracy: float) -> None:
+def test_what_a_tree_of_dipoles_leaves_out_is_within_its_bounds(
+    accuracy: float, fine: bool
+) -> None:
     points, normals, areas = _CLOUD
     x, exact = spread(400), dipole_sum(points, areas[:, None] * normals)
-    sample, on_host = samples(hk.DipolePotential(*_CLOUD, accuracy=accuracy), x)
+    sample, on_host = samples(hk.DipolePotential(*_CLOUD, accuracy=accuracy), x, fine)
     value, gradient = exact(x)
     off = np.abs(on_host(sample.value) - value)
     slant = np.linalg.norm(on_host(sample.gradient) - gradient, axis=1)
@@ -261,15 +274,16 @@ def test_what_a_tree_of_dipoles_leaves_out_is_within_its_bounds(accuracy: float)
     check_promises(sample, on_host, x, lambda x, d: exact(x + d)[0] - value)
 
 
+@pytest.mark.parametrize("fine", [True, False])
 @pytest.mark.parametrize("accuracy", [2.0, 3.0, 4.0])
 @pytest.mark.parametrize("order", [0, 1, 2])
 def test_what_a_tree_of_triangles_leaves_out_is_within_its_bounds(
-    order: int, accuracy: float
+    order: int, accuracy: float, fine: bool
 ) -> None:
     vertices, faces = _DAMAGED
     x, exact = spread(400), winding_sum(vertices[faces])
     field = hk.WindingNumber(vertices, faces, method="tree", order=order, accuracy=accuracy)
-    sample, on_host = samples(field, x)
+    sample, on_host = samples(field, x, fine)
     value, gradient = exact(x), np.zeros_like(x)
     # Biot and Savart for all three edges of every triangle, each with an integral of its own.
     for k in range(3):
@@ -290,6 +304,17 @@ def test_what_a_tree_of_triangles_leaves_out_is_within_its_bounds(
         return (np.unwrap(w, axis=0, period=1.0) - w[0])[-1]
 
     check_promises(sample, on_host, x, lift)
+
+
+@pytest.mark.parametrize("field", ["dipoles, accuracy 4", "mesh by tree, accuracy 4"])
+def test_lanes_are_looked_at_as_closely_as_each_asks(field: str) -> None:
+    x = spread(400)
+    mask = np.random.default_rng(0).random(len(x)) < 0.5
+    close, rough, mixed = (samples(APPROXIMATE[field], x, how)[0] for how in (True, False, mask))
+    for name in ("value", "error", "gradient_error"):
+        a, b, c = (to_numpy(getattr(one, name)) for one in (close, rough, mixed))
+        np.testing.assert_array_equal(c, np.where(mask, a, b))
+        assert name == "value" or (b > 2 * a).mean() > 0.5
 
 
 @pytest.mark.slow

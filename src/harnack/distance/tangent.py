@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import drjit as dr
 
+from harnack.backend.basis import across
+
 if TYPE_CHECKING:
     from harnack.backend import Real, Vec3
 
@@ -24,15 +26,10 @@ class TangentPlane:
 
     @classmethod
     def of(cls, gradient: Vec3) -> TangentPlane:
-        """The plane at right angles to a gradient (Duff et al. 2017, "Building an Orthonormal
-        Basis, Revisited"); NaN where that is zero."""
+        """The plane at right angles to a gradient; NaN where that is zero."""
         steepness = dr.norm(gradient)
         n = gradient / steepness
-        sign = dr.select(n.z >= 0, 1.0, -1.0)
-        a = -1 / (sign + n.z)
-        b = n.x * n.y * a
-        u = type(n)(dr.fma(sign * n.x * n.x, a, 1), sign * b, -sign * n.x)
-        v = type(n)(b, dr.fma(n.y * n.y, a, sign), -n.y)
+        u, v = across(n)
         return cls(steepness, n, u, v)
 
     def restricted(self, rows: tuple[Vec3, Vec3, Vec3]) -> tuple[Real, Real, Real]:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 import numpy as np
 
+from harnack.backend.basis import across
 from harnack.backend.extrema import fmax, fmin
 from harnack.tree.hierarchy import FloatArray, Hierarchy, IntArray
 from harnack.tree.packed import PackedTree, pack
@@ -75,14 +76,10 @@ class Frame:
 
     @classmethod
     def along(cls, backend: Backend, o: Vec3, d: Vec3) -> Frame:
-        """A frame of rays, |d| = 1 (Duff et al. 2017)."""
+        """A frame of rays, |d| = 1."""
         vector = backend.Array3f
         o, d = vector(o), vector(d)
-        sign = dr.select(d.z >= 0, backend.Float(1), -1)
-        a = -1 / (sign + d.z)
-        b = d.x * d.y * a
-        u = vector(dr.fma(sign * d.x, d.x * a, 1), sign * b, -sign * d.x)
-        v = vector(b, dr.fma(d.y, d.y * a, sign), -d.y)
+        u, v = across(d)
         return cls(o, u, v, d)
 
     def across(self, p: Vec3) -> tuple[Real, Real]:
