@@ -115,8 +115,7 @@ class FarClusters:
 
         def visit(node: Node, state: Sums) -> tuple[Mask, Sums]:
             error, value, *rest = state
-            r, length, far = self._far(node, x, True)
-            inverse = dr.select(far, dr.rcp(length), 0)
+            r, _, inverse, far = self._far(node, x, True)
             c = node.payload(far)
             terms = far_terms(c, r, inverse, derivatives)
             error = dr.fma(c[15], self._decay(inverse), error)
@@ -141,13 +140,12 @@ class FarClusters:
 
         def visit(node: Node, state: Sums) -> tuple[Mask, Sums]:
             value, g, error, slope_error, clear, s4, s5, *rest = state
-            r, length, far = self._far(node, x, fine)
+            r, square, inverse, far = self._far(node, x, fine)
             c = node.payload(far)
-            inverse = dr.select(far, dr.rcp(length), 0)
             terms = far_terms(c, r, inverse, 1)
+            apart = dr.fma(node.head[3], -1 / self.rough, square * inverse)
             decay, square = self._decay(inverse), inverse * inverse
             fourth = dr.fma(node.head[5], square, node.head[4]) * (square * square)
-            apart = dr.fma(node.head[3], -1 / self.rough, length)
             state = (
                 value + dr.select(far, terms.value, 0),
                 g + dr.select(far, terms.gradient, 0),
@@ -166,12 +164,14 @@ class FarClusters:
         value, g, error, slope_error = *sums[:2], looser * sums[2], looser * self.steeper * sums[3]
         return Nearby(self.backend, value, g, error, slope_error, *sums[4:7]), sums[7:]
 
-    def _far(self, node: Node, x: Vec3, fine: Mask) -> tuple[Vec3, Real, Mask]:
-        """x from the node's centre, its length, and whether that is enough."""
+    def _far(self, node: Node, x: Vec3, fine: Mask) -> tuple[Vec3, Real, Real, Mask]:
+        """x from the node's centre, the square of its length, one over that (0 where it is not
+        enough), and whether it is enough."""
         r = x - self.backend.Array3f(*node.head[:3])
-        length = dr.norm(r)
+        square = dr.squared_norm(r)
         closer = dr.select(fine, self.backend.Float(self.accuracy / self.rough), 1)
-        return r, length, length > node.head[3] * closer
+        far = square > dr.square(node.head[3] * closer)
+        return r, square, dr.select(far, dr.rsqrt(square), 0), far
 
     def _decay(self, inverse: Real) -> Real:
         """r^-(order + 3), as the first term left out."""
