@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import Voronoi
 
+import harnack as hk
 from harnack.geometry import cloud_normals, clouds
 from harnack.geometry.cloud_normals import estimate_normals
 from harnack.geometry.clouds import CloudError, estimate_areas, validate_cloud
@@ -300,3 +301,45 @@ def test_signs_are_carried_along_any_tree():
         edge /= np.linalg.norm(edge)
         mirrored = normals[k - 1] - 2.0 * (normals[k - 1] @ edge) * edge
         assert np.sign(mirrored @ normals[k]) == sign[k] * sign[k - 1]
+
+
+# --- moved ----------------------------------------------------------------------------------
+
+
+def moved_cloud(n=3000, seed=0):
+    rng = np.random.default_rng(seed)
+    u = rng.normal(size=(n, 3))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    return u, np.full(n, 4 * np.pi / n)
+
+
+@pytest.mark.parametrize("motion", ["none", "small", "turned", "shuffled"])
+def test_a_moved_cloud_is_the_cloud_that_is_there(motion, monkeypatch):
+    """Also where the tree no longer fits: its bounds are of where the points are now."""
+    u, areas = moved_cloud()
+    field = hk.DipolePotential(u, u, areas)
+    field.value(u[:5] * 1.5)
+    x = {
+        "none": u,
+        "small": u * (1 + 0.05 * np.sin(3 * u[:, :1])),
+        "turned": u[:, [1, 2, 0]],
+        "shuffled": u[np.random.default_rng(1).permutation(len(u))],
+    }[motion]
+    monkeypatch.setattr("harnack.fields.dipole_tree.build_hierarchy", None)  # no sort again
+    moved = field.moved(x, x, areas)
+    points = np.random.default_rng(2).uniform(-1.5, 1.5, (800, 3))
+    z = x - points[:, None]
+    r = np.linalg.norm(z, axis=2)
+    exact = (areas * (x * z).sum(axis=2) / r**3).sum(axis=1)
+    slope = np.linalg.norm(moved.gradient(points), axis=1)  # times the rounding of the point
+    bound = moved.error_bound(points) + 2e-7 * slope + 1e-6 * np.abs(exact)
+    assert (np.abs(moved.value(points) - exact) <= bound).all()
+    hits = hk.trace(moved, points[:50] * 3, -points[:50], t_max=20.0)
+    inside = np.linalg.norm(points[:50] * 3, axis=1) > 1.3
+    assert hits.hit[inside].all()
+
+
+def test_a_moved_cloud_keeps_its_number_of_points():
+    u, areas = moved_cloud(100)
+    with pytest.raises(CloudError, match="99 of them, where 100 were before"):
+        hk.DipolePotential(u, u, areas).moved(u[1:], u[1:], areas[1:])

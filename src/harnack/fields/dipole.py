@@ -104,7 +104,6 @@ class DipolePotential(BatchedField):
     def values_at(self, x: Vec3, derivatives: int) -> Values:
         on = self._batch(backend_of(x))
         value, *rest, error = on.tree.at(on.unit(x), derivatives)
-        error = error + on.tree.rounding
         gradient = rest[0] / self._size if derivatives >= 1 else None
         if derivatives < 2:
             return Values(value, error, gradient)

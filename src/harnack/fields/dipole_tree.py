@@ -57,10 +57,12 @@ class DipoleTree:
         return cls(FarClusters.of(backend, tree, levels, rows, accuracy), rounding)
 
     def at(self, x: Vec3, derivatives: int) -> tuple[Any, ...]:
-        """Value, gradient and Hessian's parts (as asked for), and the truncation bound, last."""
+        """Value, gradient and Hessian's parts (as asked for), and a bound of the value's error:
+        of truncation and of rounding (see `sample`), last."""
+        vector, real = self.clusters.backend.Array3f, self.clusters.backend.Float
 
         def add(row: list[Real], active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
-            value, *rest = state
+            value, *rest, rounded = state
             one, slope, bend = _dipole(row, x, derivatives)
             value = value + dr.select(active, one, 0)
             if derivatives >= 1:
@@ -68,12 +70,14 @@ class DipoleTree:
             if derivatives == 2:
                 pairs = zip(rest[1:], bend, strict=True)
                 rest[1:] = [old + dr.select(active, new, 0) for old, new in pairs]
-            return value, *rest
+            near = dr.norm(vector(*row[:3]) - x)
+            return value, *rest, rounded + dr.select(active, _rounded(row[6], near), 0)
 
         def leaf(node: Node, near: Mask, sums: tuple[Any, ...]) -> tuple[Any, ...]:
             return for_each(node, near, add, sums)
 
-        return self.clusters.at(x, derivatives, leaf)
+        *sums, rounded, error = self.clusters.at(x, derivatives, leaf, (real(0),))
+        return *sums, dr.fma(self.clusters.backend.epsilon, rounded, error + self.rounding)
 
     def sample(self, x: Vec3, fine: Mask) -> Sample:
         """Value, gradient and certificate at x: see `far_clusters.Nearby.sample`.
@@ -98,7 +102,7 @@ class DipoleTree:
                 dr.select(active, fmin(near, clear), clear),
                 dr.fma(cube, inverse, s4),
                 dr.fma(cube * inverse, inverse, s5),
-                dr.fma(cube, dr.fma(4, near, 2), rounded),
+                rounded + dr.select(active, _rounded(row[6], near), 0),
                 dr.select(active & (near <= clear), vector(*row[3:6]), nearest),
             )
 
@@ -113,6 +117,11 @@ class DipoleTree:
         normal = dr.select(beside, -nearest / weight, dr.normalize(found.gradient))
         rounded = dr.select(dr.isfinite(rounded), epsilon * rounded, 0)
         return found.sample(1.0, self.rounding + rounded, normal)
+
+
+def _rounded(area: Real, near: Real) -> Real:
+    """What rounding may do to a dipole's value at this distance, over epsilon."""
+    return area * dr.fma(4, near, 2) / (near * near * near)
 
 
 def _dipole(row: list[Real], x: Vec3, derivatives: int) -> tuple[Real, Vec3, list[Real]]:

@@ -104,8 +104,9 @@ class FarClusters:
         packed = pack(backend, tree, nodes, primitives)
         return cls(backend, packed, accuracy, rough, order, looser, steeper * (1 + 1e-6))
 
-    def at(self, x: Vec3, derivatives: int, add_leaf: AddLeaf) -> tuple[Any, ...]:
-        """Value, gradient and Hessian's parts (as asked for), and the truncation bound, last.
+    def at(self, x: Vec3, derivatives: int, add_leaf: AddLeaf, own: Sums = ()) -> tuple[Any, ...]:
+        """Value, gradient and Hessian's parts (as asked for), the caller's own sums, and the
+        truncation bound, last.
 
         add_leaf(node, mask, sums): the sums with the contents of a leaf added where the mask is.
         """
@@ -123,11 +124,11 @@ class FarClusters:
             if derivatives >= 1:
                 rest[0] = rest[0] + dr.select(far, terms.gradient, 0)
             if derivatives == 2 and terms.hessian is not None:
-                pairs = zip(rest[1:], terms.hessian.parts(), strict=True)
-                rest[1:] = [old + dr.select(far, new, 0) for old, new in pairs]
+                pairs = zip(rest[1:7], terms.hessian.parts(), strict=True)
+                rest[1:7] = [old + dr.select(far, new, 0) for old, new in pairs]
             return ~far, (error, *add_leaf(node, ~far & node.is_leaf, (value, *rest)))
 
-        error, *rest = walk(self.tree, visit, (real(0), real(0), *sums))
+        error, *rest = walk(self.tree, visit, (real(0), real(0), *sums, *own))
         return *rest, error
 
     def near(self, x: Vec3, fine: Mask, add_leaf: AddLeaf, own: Sums = ()) -> tuple[Nearby, Sums]:
