@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -475,3 +476,77 @@ def test_rays_beside_an_edge_of_a_mesh_by_tree() -> None:
     assert exact.hit.all()
     assert tree.hit.all()
     np.testing.assert_allclose(tree.t, exact.t, atol=1e-5)
+
+
+@pytest.mark.parametrize("precision", ["single", "double"])
+def test_overlapping_sheets_by_tree(precision: Any) -> None:
+    """Two boxes with flush tops: at both sheets at once rounding told the sides of one only."""
+    corners = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
+    quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    faces = np.array([[q[i] for i in part] for q in quads for part in ((0, 1, 2), (0, 2, 3))])
+    vertices = np.concatenate(
+        [corners - [0.5, 0.5, 0.7], corners * [1.25, 1.25, 1.5] - [0.5625, 0.5, 1.2]]
+    )
+    faces = np.concatenate([faces, faces + 8])
+    rng = np.random.default_rng(0)
+    o = np.column_stack([rng.uniform(-0.4, 0.4, (1000, 2)), np.full(1000, 2.0)])
+    d = np.array([[0.1, 0.07, -1.0]])
+    for method in ("exact", "tree"):
+        field = hk.WindingNumber(vertices, faces, method=method)  # type: ignore[arg-type]
+        hits = hk.trace(field, o, d, precision=precision)
+        assert hits.hit.all()
+        np.testing.assert_allclose(hits.position[:, 2], 0.3, atol=1e-4)
+
+
+@pytest.mark.parametrize("precision", ["single", "double"])
+def test_repeated_points(precision: Any) -> None:
+    """Leaves of copies of one point have no size; their bounds were 0/0, and rays passed."""
+    rng = np.random.default_rng(3)
+    points = unit(rng.normal(size=(500, 3)))
+    areas = np.full(500, 4 * np.pi / 500)
+    copies = np.repeat(points[:20], 15, axis=0)
+    areas[:20] /= 16
+    points, areas = (
+        np.concatenate([points, copies]),
+        np.concatenate([areas, np.repeat(areas[:20], 15)]),
+    )
+    points = np.round(points * 1024) / 1024  # of which means are exact
+    field = hk.DipolePotential(points, points, areas)
+    assert np.isfinite(field.error_bound([[0.1, 0.2, 0.3], [2.0, 0.0, 0.0]])).all()
+    o = 3 * unit(rng.normal(size=(500, 3)))
+    hits = hk.trace(field, o, -o + 0.3 * rng.uniform(-1, 1, o.shape), precision=precision)
+    assert hits.hit.all()
+    alone = hk.trace(
+        hk.DipolePotential([[0.0, 0, 0]], [[0.0, 0, 1]], [1.0]),
+        [[0.05, 0.02, 3.0], [0.0, 0.0, -3.0]], [[0.0, 0, -1], [0.0, 0, 1]], precision=precision,
+    )  # fmt: skip
+    assert (alone.status != hk.Status.OUT_OF_STEPS).all()
+
+
+def test_what_is_not_known_is_not_free() -> None:
+    """A field whose error is NaN proves nothing."""
+
+    class Unknown(hk.Field):
+        def evaluate(self, p: Any) -> hk.Sample:
+            error = p.x * math.nan
+            return hk.Sample(p.z, type(p)(0, 0, 1), (hk.Lipschitz(1.0),), error)
+
+    hits = hk.trace(Unknown(), [[0.1, 0, 1]], [[0.0, 0, -1]], t_max=3.0)
+    assert hits.status[0] == hk.Status.OUT_OF_STEPS
+
+
+@pytest.mark.parametrize("height", [1.0, 1e-2, 1e-4])
+def test_rounding_of_slivers_is_in_the_bound(height: float) -> None:
+    vertices = np.array([[-1.0, 0, 0], [1, 0, 0], [0.1, height, 0]])
+    field = hk.WindingNumber(vertices, [[0, 1, 2]], method="tree")
+    rng = np.random.default_rng(0)
+    share = rng.dirichlet(np.ones(3), 20_000)
+    x = share @ vertices + height * rng.normal(size=(20_000, 3)) * 10 ** rng.uniform(
+        -2, 0, (20_000, 1)
+    )
+    x = x.astype(np.float32).astype(np.float64)
+    truth = field.value(x, precision="double")
+    off = np.abs(field.value(x) - truth)
+    off = np.minimum(off, np.abs(off - 1))  # the sides of points on the triangle
+    slope = np.linalg.norm(field.gradient(x, precision="double"), axis=1)
+    assert (off <= field.error_bound(x) + 4e-7 * slope).all()

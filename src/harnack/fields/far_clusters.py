@@ -119,7 +119,7 @@ class FarClusters:
             r, _, inverse, far = self._far(node, x, True)
             c = node.payload(far)
             terms = far_terms(c, r, inverse, derivatives)
-            error = dr.fma(c[15], self._decay(inverse), error)
+            error = dr.fma(c[15], self._decay(inverse), error) + self._rounded(node, inverse)
             value = value + dr.select(far, terms.value, 0)
             if derivatives >= 1:
                 rest[0] = rest[0] + dr.select(far, terms.gradient, 0)
@@ -150,7 +150,7 @@ class FarClusters:
             state = (
                 value + dr.select(far, terms.value, 0),
                 g + dr.select(far, terms.gradient, 0),
-                dr.fma(c[15], decay, error),
+                dr.fma(c[15], decay, error) + self._rounded(node, inverse),
                 dr.fma(c[15], decay * inverse, slope_error),
                 dr.select(far, fmin(apart, clear), clear),
                 s4 + fourth,
@@ -173,6 +173,13 @@ class FarClusters:
         closer = dr.select(fine, self.backend.Float(self.accuracy / self.rough), 1)
         far = square > dr.square(node.head[3] * closer)
         return r, square, dr.select(far, dr.rsqrt(square), 0), far
+
+    def _rounded(self, node: Node, inverse: Real) -> Real:
+        """What rounding adds to the error: coordinates rounded by epsilon each move a dipole a at
+        rho by at most 2 epsilon a/rho^3 in value, the roundings of its term by 4 epsilon a/rho^2.
+        """
+        square = inverse * inverse
+        return self.backend.epsilon * node.head[4] * dr.fma(2 * inverse, square, 4 * square)
 
     def _decay(self, inverse: Real) -> Real:
         """r^-(order + 3), as the first term left out."""

@@ -249,7 +249,7 @@ def truncation(level: Level, nearest: FloatArray, order: int = 2) -> tuple[Float
     = q^5 (42 - 70q + 30q^2)/(1-q)^3. Each term times r^(k+1) (r^(k+2)) falls or stays as r
     grows, so the value at `nearest` serves. A little is added, for single precision to take away.
     """
-    r = np.maximum(nearest, 1e-300)
+    r = np.maximum(nearest, 1e-50)  # of which powers can be taken
     q = np.minimum(level.radius / r, 0.99)
     k = order + 2
     rest = level.spread * level.radius**3 / r ** (6 - k)

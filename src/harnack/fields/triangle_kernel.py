@@ -15,6 +15,8 @@ from harnack.tree.triangles import EDGES, PARITY, corners_of
 if TYPE_CHECKING:
     from harnack.backend import Real, Vec3
 
+# How much of a factor's terms must cancel to count by itself.
+_CANCELS = 16.0
 _PAIRS = ((0, 1, 1.0), (1, 2, 1.0), (0, 2, -1.0))
 
 
@@ -43,6 +45,19 @@ class NearTriangle:
         )
         # (b - a) x (c - a) does not cancel where all three are far away and close together.
         return re, self.parity * dr.dot(a, dr.cross(b - a, c - a))
+
+    def unsure(self, re: Real, im: Real, epsilon: float) -> Real:
+        """What rounding of the factor may do to the winding number.
+
+        Its terms are la lb lc and la |b-a||c-a| at most. Beside two nearly parallel edges they
+        cancel, and so its argument may turn by their rounding over its length, by pi at most.
+        Where little cancels, what there is belongs to the rounding of a sum.
+        """
+        (a, b, c), (la, lb, lc) = self.corners, self.lengths
+        terms = la * dr.fma(lb, lc, dr.norm(b - a) * dr.norm(c - a))
+        cancelled = terms / (dr.abs(re) + dr.abs(im))
+        turned = dr.select(cancelled < 0.0625 / epsilon, 8 * epsilon * cancelled, 0.5)
+        return dr.select(cancelled <= _CANCELS, 0, turned)
 
     def gradient(self) -> Vec3:
         """Of the solid angle: Biot and Savart's field of the three edges (paper, Eq. 11)."""

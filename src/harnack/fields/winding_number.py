@@ -260,7 +260,9 @@ class _Stretch(Field):
 
     def evaluate(self, p: Vec3) -> Sample:
         on = self._on
+        b = self._behind
+        behind = Crossing(b.t / on.size, b.sheet, b.jump, b.normal)
         sample = on.winding.on_stretch(
-            self._frame, on.unit(p), self._behind, self._ahead, self._offset, self._fine
+            self._frame, on.unit(p), behind, self._ahead, self._offset, self._fine
         )
         return on.scaled(sample)

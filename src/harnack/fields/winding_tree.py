@@ -21,7 +21,7 @@ from harnack.fields.far_clusters import FarClusters
 from harnack.fields.triangle_kernel import NearTriangle
 from harnack.fields.winding_mesh import rounding_of_sum
 from harnack.tree import Node, for_each
-from harnack.tree.triangles import EDGES, INDEX, NO_TRIANGLE, in_slots
+from harnack.tree.triangles import EDGES, INDEX, crossing, in_slots
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -67,10 +67,12 @@ class TreeWinding:
         def leaf(node: Node, near: Mask, sums: tuple[Any, ...]) -> tuple[Any, ...]:
             return self._near(node, near, x, derivatives, sums)
 
-        value, *rest, error = self.clusters.at(x, derivatives, leaf)
+        zero = self.backend.Float(0)
+        value, *rest, unsure, error = self.clusters.at(x, derivatives, leaf, (zero,))
         gradient = _SHARE * rest[0] if derivatives >= 1 else self.backend.Array3f(0)
         hessian = SymmetricSum(*(_SHARE * part for part in rest[1:])) if derivatives == 2 else None
-        return _SHARE * value, gradient, hessian, _SHARE * error
+        error = dr.fma(_SHARE, error, unsure)
+        return _SHARE * value, gradient, hessian, error
 
     def _near(
         self, node: Node, near: Mask, x: Vec3, derivatives: int, state: tuple[Any, ...]
@@ -79,14 +81,16 @@ class TreeWinding:
         real = self.backend.Float
 
         def add(row: list[Real], active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
-            zr, zi, turns, *rest = state
+            zr, zi, turns, *rest, unsure = state
             triangle = NearTriangle.of(row, x)
-            zr, zi, turns = times(zr, zi, turns, *triangle.factor())
+            re, im = triangle.factor()
+            unsure = unsure + dr.select(active, triangle.unsure(re, im, self.backend.epsilon), 0)
+            zr, zi, turns = times(zr, zi, turns, re, im)
             if derivatives >= 1:
                 rest[0] = rest[0] + dr.select(active, triangle.gradient(), 0)
             if derivatives == 2:
                 rest[1:] = triangle.add_hessian(SymmetricSum(*rest[1:]), active).parts()
-            return zr, zi, turns, *rest
+            return zr, zi, turns, *rest, unsure
 
         value, *rest = state
         zr, zi, turns, *rest = for_each(node, near, add, (real(1), real(0), real(0), *rest))
@@ -116,20 +120,23 @@ class TreeWinding:
         1 + q/(1-b) <= 1 + q rise/4 on [0, b]. So an edge adds to the remainder what
         s4 += 2e/3 and s5 += e/(2d) do.
 
-        The two triangles at the ends of the stretch are told which side of them x is on.
+        A triangle that the ray passes is told which side of it x is on: behind those passed up to
+        the start of the stretch, before all others. Its own sign is rounded where x lies on it, as
+        it does on several at once where sheets overlap.
         """
-        del frame, turns
+        del ahead, turns
 
         def leaf(node: Node, near: Mask, sums: tuple[Any, ...]) -> tuple[Any, ...]:
-            return self._near_certified(node, near, x, behind, ahead, fine, sums)
+            return self._near_certified(node, near, x, frame, behind, fine, sums)
 
-        found, (beside,) = self.clusters.near(x, fine, leaf, (self.backend.Float(dr.inf),))
+        real, epsilon = self.backend.Float, self.backend.epsilon
+        found, (beside, unsure) = self.clusters.near(x, fine, leaf, (real(dr.inf), real(0)))
         # Beside an edge, open or not, a triangle turns by pi within the rounding of its place.
-        turned = 2 * self.backend.epsilon * dr.rsqrt(beside)
-        return found.sample(_SHARE, self.rounding + turned)
+        turned = fmin(2 * epsilon * dr.rsqrt(beside), real(1))
+        return found.sample(_SHARE, self.rounding + turned + unsure)
 
     def _near_certified(
-        self, node: Node, near: Mask, x: Vec3, behind: Crossing, ahead: Crossing,
+        self, node: Node, near: Mask, x: Vec3, frame: Frame, behind: Crossing,
         fine: Mask, state: tuple[Any, ...],
     ) -> tuple[Any, ...]:  # fmt: skip
         real, index = self.backend.Float, self.backend.UInt32
@@ -138,14 +145,15 @@ class TreeWinding:
         closed = dr.square(0.5 * (reach - 1))
 
         def add(row: list[Real], active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
-            zr, zi, turns, g, clear, s4, s5, beside = state
+            zr, zi, turns, g, clear, s4, s5, beside, unsure = state
             triangle = NearTriangle.of(row, x)
             re, im = triangle.factor()
-            number = dr.select(row[INDEX] >= 0, index(row[INDEX]), NO_TRIANGLE - 1)
+            unsure = unsure + dr.select(active, triangle.unsure(re, im, self.backend.epsilon), 0)
+            t, turn = crossing(row, frame)
+            passed = (t < behind.t) | ((t == behind.t) & (index(row[INDEX]) <= behind.sheet))
             # Not zero, as on a plane that coordinates hit exactly: zero has no side.
-            side = fmax(dr.abs(im), 1e-30)
-            im = dr.select(number == ahead.sheet, -dr.mulsign(side, ahead.jump), im)
-            im = dr.select(number == behind.sheet, dr.mulsign(side, behind.jump), im)
+            told = dr.mulsign(fmax(dr.abs(im), 1e-30), dr.select(passed, -turn, turn))
+            im = dr.select(turn != 0, told, im)
             zr, zi, turns = times(zr, zi, turns, re, im)
             g = g + dr.select(active, triangle.gradient(), 0)
             distances = triangle.squared_distances()
@@ -157,11 +165,11 @@ class TreeWinding:
                 e = dr.select(open_, edge_variation(near2, inverse)[1], 0)
                 s4 = dr.fma(2 / 3, e, s4)
                 s5 = dr.fma(0.5 * dr.rsqrt(near2), e, s5)
-            return zr, zi, turns, g, clear, s4, s5, beside
+            return zr, zi, turns, g, clear, s4, s5, beside, unsure
 
-        value, g, error, slope_error, clear, s4, s5, beside = state
-        begin = (real(1), real(0), real(0), g, clear, s4, s5, beside)
-        zr, zi, turns, g, clear, s4, s5, beside = for_each(node, near, add, begin)
+        value, g, error, slope_error, clear, s4, s5, beside, unsure = state
+        begin = (real(1), real(0), real(0), g, clear, s4, s5, beside, unsure)
+        zr, zi, turns, g, clear, s4, s5, beside, unsure = for_each(node, near, add, begin)
         angle = 2 * dr.fma(2 * dr.pi, turns, dr.atan2(zi, zr))
         value = value + dr.select(near, angle, 0)
-        return value, g, error, slope_error, clear, s4, s5, beside
+        return value, g, error, slope_error, clear, s4, s5, beside, unsure

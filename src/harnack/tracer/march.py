@@ -148,7 +148,7 @@ class PreparedLevelSet:
                 accepted |= _covers(bound, certificates, -slope, doubt, step - reach)
             within = self.tolerance.in_value(steepness, t)
             vague = ~fine & self._is_vague(sample.value, blur, within, beyond) & field.has_detail
-            accepted &= ~vague
+            accepted &= ~vague & dr.isfinite(blur)  # what is not known is not free
             fine = vague | (fine & ~(accepted & (fmin(*gaps) > _PLAIN * blur)))
             hit, met = accepted & (fmin(*gaps) <= fmax(within, 2 * blur)), None
             if beyond is not None:
