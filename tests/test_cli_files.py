@@ -256,3 +256,13 @@ def test_a_closed_mesh_has_no_boundary_to_draw(run, tmp_path):
         code, _, said = run(write_mesh(tmp_path / f"a.{kind}"), "--boundary")
         assert code == 1
         assert "closed surface, which has no boundary" in said
+
+
+def test_where_a_picture_goes_is_checked_before_the_file_is_read(tmp_path, capsys) -> None:
+    missing = tmp_path / "mesh.obj"
+    for name, message in (("q.jpg", ".png or .exr"), ("nowhere/q.png", "create the folder")):
+        assert main(["render", str(missing), "-o", str(tmp_path / name)]) == 1
+        assert message in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["render", str(missing), "--azimuth", "inf"])
+    assert "finite number of degrees" in capsys.readouterr().err

@@ -19,6 +19,7 @@ from harnack.gallery import SCENES, Scene
 from harnack.geometry.surfaces import SURFACE_FILES
 from harnack.opening import UP_AXES, open_surface
 from harnack.rendering import MATERIALS, SHOW_MODES, Camera, render
+from harnack.rendering.images import check_picture_path
 
 _DEMO_SIZE = (480, 360)
 
@@ -35,6 +36,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, TypeError, OSError, RuntimeError) as error:
         errors.print(f"[bold red]error:[/] {error}", highlight=False, soft_wrap=True)
         return 1
+
+
+def _angle(text: str) -> float:
+    angle = float(text)
+    if not math.isfinite(angle):
+        raise argparse.ArgumentTypeError(f"an angle is a finite number of degrees, not {text}")
+    return angle
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -79,7 +87,7 @@ def _add_render(commands: Any) -> None:
     )  # fmt: skip
     for name, what in (("azimuth", "is turned"), ("elevation", "looks down")):
         one.add_argument(
-            f"--{name}", type=float, metavar="DEG", help=f"how far the camera {what}, in degrees"
+            f"--{name}", type=_angle, metavar="DEG", help=f"how far the camera {what}, in degrees"
         )
     file = one.add_argument_group("surface files")
     file.add_argument(
@@ -155,7 +163,7 @@ def _quality(options: Any) -> dict[str, Any]:
 
 def _render(options: Any) -> int:
     source = Path(options.scene)
-    target = Path(options.output or f"{source.stem}.png")
+    target = check_picture_path(options.output or f"{source.stem}.png")
     settings = _quality(options)
     if options.show is not None:
         settings["show"] = options.show
