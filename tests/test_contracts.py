@@ -151,7 +151,7 @@ def bounds_for(field: Field) -> list[Bound]:
         "Charges": (Classic, Slope),
         "Azimuth": (Classic, Slope),
         "Plane": (LipschitzStep, CurvatureStep),
-        "DipolePotential": (Classic, Slope),
+        "DipolePotential": (Classic, Slope, CurvatureStep),
         "ScreenedWindingNumber": (CurvatureStep,),
     }.get(type(field).__name__, (Classic, Slope, LipschitzStep, CurvatureStep))
     return [bound for bound in BOUNDS if isinstance(bound, kinds)]
@@ -272,6 +272,26 @@ def test_what_a_tree_of_dipoles_leaves_out_is_within_its_bounds(
     assert (slant <= on_host(sample.gradient_error) + 1e-12).all()
     assert off.max() > 1e-6  # there is something to bound
     check_promises(sample, on_host, x, lambda x, d: exact(x + d)[0] - value)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_one_dipole_attains_its_curvature_promises(scale: float) -> None:
+    """Straight ahead, at the end of each reach: f leaves its tangent by all that is allowed, so
+    that a promise smaller by a thousandth, or one that reaches farther by that, would break."""
+    field = hk.DipolePotential([[0.0, 0, 0]], [[0.0, 0, 1]], [scale**2])
+    x = scale * np.array([[0.0, 0.0, h] for h in (-0.3, -1.0, -7.0)])
+    sample, on_host = samples(field, x)
+    value, slope = on_host(sample.value), on_host(sample.gradient)[:, 2]
+    np.testing.assert_allclose(value, (scale / x[:, 2]) ** 2, rtol=1e-12)
+    seen = 0
+    for known in sample.known:
+        if isinstance(known, Curvature):
+            t = on_host(known.radius)
+            left = (scale / (x[:, 2] + t)) ** 2 - value - slope * t
+            share = left / (0.5 * on_host(known.constant) * t * t)
+            assert ((share <= 1) & (share >= 1 - 2e-4)).all()
+            seen += 1
+    assert seen == 3
 
 
 @pytest.mark.parametrize("fine", [True, False])
