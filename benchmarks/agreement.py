@@ -22,6 +22,7 @@ from harnack.geometry.mesh_shapes import (
 )
 from harnack.testing.direct_sums import winding_sum
 from harnack.testing.jump_oracle import first_side_changes, judge
+from harnack.testing.mesh_rays import mesh_rays
 
 from .plain_hits import PlainHits
 
@@ -137,7 +138,8 @@ def along_rays(
 ) -> Iterator[RayRow]:
     """First hits by both methods. Raises AssertionError if the oracle is not the direct sum."""
     vertices, faces = mesh
-    o, d = rays(mesh, RAYS, seed)
+    low, high = vertices.min(axis=0) - 0.05, vertices.max(axis=0) + 0.05
+    o, d = mesh_rays(vertices, faces, RAYS, seed, low, high)
     oracle = WindingNumber(vertices, faces, method="exact")
     edges = oracle.mesh.vertices[oracle.mesh.singular]
 
@@ -186,28 +188,6 @@ def _explained(
         there = x + aside * d
         near |= np.abs(exact(there) - level) <= 2 * traced.error_bound(there) + TOLERANCE
     return near
-
-
-def rays(mesh: MeshArrays, n: int, seed: int) -> tuple[FloatArray, FloatArray]:
-    """From outside and inside, past vertices and edges of the mesh, and anywhere."""
-    vertices, faces = mesh
-    rng = np.random.default_rng(seed)
-    o = 2.6 * _unit(rng.normal(size=(n, 3)))
-    o[: n // 4] = rng.uniform(-1.1, 1.1, (n // 4, 3))
-    low, high = vertices.min(axis=0) - 0.05, vertices.max(axis=0) + 0.05
-    target = rng.uniform(low, high, (n, 3))
-    m = n // 2
-    face = vertices[faces[rng.integers(len(faces), size=m)]]
-    weights = rng.dirichlet(np.ones(3), m)
-    weights[: m // 4] = [1, 0, 0]
-    weights[m // 4 : m // 2] = [0.5, 0.5, 0]
-    aside = 10 ** rng.uniform(-4, -2, (m, 1)) * _unit(rng.normal(size=(m, 3)))
-    target[n - m :] = np.einsum("nv,nvk->nk", weights, face) + aside
-    return _rounded(o), _unit(_rounded(target) - _rounded(o))
-
-
-def _unit(v: FloatArray) -> FloatArray:
-    return v / np.linalg.norm(v, axis=-1, keepdims=True)
 
 
 def _rounded(v: FloatArray) -> FloatArray:

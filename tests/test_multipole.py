@@ -397,7 +397,7 @@ def test_sums_over_dipoles_are_bounded(accuracy: float) -> None:
     for seed in range(30):
         y, normal = cluster(seed)
         level = level_of(y, normal)
-        columns = node_columns(level, 5.0, 2, accuracy)[0]
+        columns = node_columns(level, 2, accuracy, np.zeros(1))[0]
         np.testing.assert_array_equal(columns[:3], level.centre[0])
         assert columns[3] == pytest.approx(accuracy * level.radius[0])
         x = viewpoints(level, 1 / accuracy, seed)

@@ -11,7 +11,7 @@ import pytest
 from harnack.backend import choose_backend, to_numpy
 from harnack.geometry.mesh_shapes import bumpy_sphere, torus_mesh
 from harnack.tree import NO_PRIMITIVE, Hierarchy, build_hierarchy, for_each, pack, walk
-from harnack.tree.triangles import Frame, TriangleRays, Upwards, triangle_records
+from harnack.tree.triangles import Frame, TriangleRays, triangle_records
 
 SIZES = [1, 2, 3, 7, 8, 9, 15, 16, 17, 33, 63, 100, 257, 1000]
 NO_TRIANGLE = 0xFFFFFFFF
@@ -233,8 +233,9 @@ def test_turns_ahead_tell_inside_from_outside(precision: Any, shape: str) -> Non
     d[::50] = np.eye(3)[rng.integers(3, size=len(d[::50]))]
     turns = to_numpy(rays.turns_ahead(frame_of(backend, o, d), 0, backend.Bool(True)))
     np.testing.assert_array_equal(turns, inside)
-    up = to_numpy(rays.turns_ahead(Upwards(backend.Array3f(o.T)), 0))
-    np.testing.assert_array_equal(up, inside)
+    for way in (1, -1):  # turns are about the axis upwards
+        turns = to_numpy(rays.turns_along(backend.Array3f(o.T), backend.Float(way)))
+        np.testing.assert_array_equal(way * turns, inside)
 
 
 @pytest.mark.parametrize("precision", ["single", "double"])
@@ -261,8 +262,9 @@ def test_rays_exactly_through_vertices_and_edges(precision: Any) -> None:
         inside = np.abs(o).sum(axis=1) < 1
         turns = to_numpy(rays.turns_ahead(frame_of(backend, o, d), 0, backend.Bool(True)))
         np.testing.assert_array_equal(turns, inside)
-        up = to_numpy(rays.turns_ahead(Upwards(backend.Array3f(o.T)), 0))
-        np.testing.assert_array_equal(up, inside)
+        for way in (1, -1):
+            turns = to_numpy(rays.turns_along(backend.Array3f(o.T), backend.Float(way)))
+            np.testing.assert_array_equal(way * turns, inside)
 
 
 def brute_crossings(o: np.ndarray, d: np.ndarray, triangles: np.ndarray) -> Any:

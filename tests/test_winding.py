@@ -28,6 +28,7 @@ from harnack.geometry.mesh_shapes import (
     torus_mesh,
 )
 from harnack.testing.jump_oracle import first_side_changes, judge
+from harnack.testing.mesh_rays import mesh_rays
 
 FOUR_PI = 4 * math.pi
 METHODS = ["exact", "tree"]
@@ -503,20 +504,7 @@ KINDS = ["holes", "flips", "duplicates", "self-intersections", "soup", "all of i
 
 
 def rays(mesh: Mesh, n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """From outside and inside, past vertices and edges of the mesh, and anywhere."""
-    vertices, faces = mesh
-    rng = np.random.default_rng(seed)
-    o = 2.6 * unit(rng.normal(size=(n, 3)))
-    o[: n // 4] = rng.uniform(-1.2, 1.2, (n // 4, 3))
-    target = rng.uniform(-1.2, 1.2, (n, 3))
-    m = n // 2
-    face = vertices[faces[rng.integers(len(faces), size=m)]]
-    weights = rng.dirichlet(np.ones(3), m)
-    weights[: m // 4] = [1, 0, 0]
-    weights[m // 4 : m // 2] = [0.5, 0.5, 0]
-    aside = 10 ** rng.uniform(-4, -2, (m, 1)) * unit(rng.normal(size=(m, 3)))
-    target[n - m :] = np.einsum("nv,nvk->nk", weights, face) + aside
-    return rounded(o), unit(rounded(target) - rounded(o))
+    return mesh_rays(*mesh, n, seed, -1.2, 1.2)
 
 
 def check_first_hits(mesh: Mesh, method: Any, n: int, seed: int, precision: Any) -> None:

@@ -7,7 +7,6 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
@@ -16,10 +15,11 @@ from harnack.fields.batch import BatchedField, Values
 from harnack.fields.dipole_tree import DipoleTree, hierarchy_of
 from harnack.fields.edge_hessian import SymmetricSum
 from harnack.fields.field import Field, Sample, lengthened
+from harnack.fields.unit_coordinates import UnitCoordinates, placed
 from harnack.geometry import Box, CloudError, estimate_areas, estimate_normals, validate_cloud
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.backend import Backend, Mask, Vec3
     from harnack.geometry import Volume
     from harnack.tree import Hierarchy
 
@@ -123,11 +123,10 @@ class DipolePotential(BatchedField):
         if self._hierarchy is None:
             self._hierarchy = hierarchy_of(unit)
         tree = DipoleTree.of(backend, self._hierarchy, unit, moments, accuracy)
-        centre = backend.Array3f(*(dr.opaque(backend.Float, float(c)) for c in self._centre))
-        return _OnDevice(tree, centre, dr.opaque(backend.Float, self._size))
+        return _OnDevice(*placed(backend, self._centre, self._size), tree)
 
     def prepare(self, backend: Backend) -> DipolePotential:
-        if self._device is not None and self._device.tree.clusters.backend is backend:
+        if self._device is not None and self._device.backend is backend:
             return self
         device = self._upload(backend, self.accuracy or _TRACED)
         prepared = copy.copy(self)
@@ -163,15 +162,10 @@ class DipolePotential(BatchedField):
 
 
 @dataclass(frozen=True)
-class _OnDevice:
-    """A potential on a backend, in unit coordinates."""
+class _OnDevice(UnitCoordinates):
+    """A potential on a backend."""
 
     tree: DipoleTree
-    centre: Vec3
-    size: Real
-
-    def unit(self, p: Vec3) -> Vec3:
-        return (self.tree.clusters.backend.Array3f(p) - self.centre) / self.size
 
     def sample(self, p: Vec3, fine: Mask) -> Sample:
         return lengthened(self.tree.sample(self.unit(p), fine), self.size)

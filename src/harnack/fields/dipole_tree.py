@@ -10,7 +10,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend.extrema import fmin
-from harnack.fields.far_clusters import FarClusters
+from harnack.fields.far_clusters import FarClusters, rounding_of_dipole
 from harnack.fields.multipole import all_levels
 from harnack.tree import NO_PRIMITIVE, Node, build_hierarchy, for_each
 
@@ -58,20 +58,20 @@ class DipoleTree:
 
     def at(self, x: Vec3, derivatives: int) -> tuple[Any, ...]:
         """Value, gradient and Hessian's parts (as asked for), and a bound of the value's error:
-        of truncation and of rounding (see `sample`), last."""
-        vector, real = self.clusters.backend.Array3f, self.clusters.backend.Float
+        of truncation and of rounding, last."""
+        real = self.clusters.backend.Float
 
         def add(row: list[Real], active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
             value, *rest, rounded = state
-            one, slope, bend = _dipole(row, x, derivatives)
+            inverse, one, slope, bend = _dipole(row, x, derivatives)
             value = value + dr.select(active, one, 0)
             if derivatives >= 1:
                 rest[0] = rest[0] + dr.select(active, slope, 0)
             if derivatives == 2:
                 pairs = zip(rest[1:], bend, strict=True)
                 rest[1:] = [old + dr.select(active, new, 0) for old, new in pairs]
-            near = dr.norm(vector(*row[:3]) - x)
-            return value, *rest, rounded + dr.select(active, _rounded(row[6], near), 0)
+            more = dr.select(active, rounding_of_dipole(row[6], inverse), 0)
+            return value, *rest, rounded + more
 
         def leaf(node: Node, near: Mask, sums: tuple[Any, ...]) -> tuple[Any, ...]:
             return for_each(node, near, add, sums)
@@ -80,19 +80,14 @@ class DipoleTree:
         return *sums, dr.fma(self.clusters.backend.epsilon, rounded, error + self.rounding)
 
     def sample(self, x: Vec3, fine: Mask) -> Sample:
-        """Value, gradient and certificate at x: see `far_clusters.Nearby.sample`.
-
-        Rounding. Coordinates rounded by epsilon each move a dipole a at rho by at most
-        2 epsilon a/rho^3 in value; the four roundings of its term, by 4 epsilon a/rho^2.
-        """
+        """Value, gradient and certificate at x: see `far_clusters.Nearby.sample`."""
         vector, real = self.clusters.backend.Array3f, self.clusters.backend.Float
         epsilon = self.clusters.backend.epsilon
 
         def add(row: list[Real], active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
             value, g, error, slope_error, clear, s4, s5, rounded, nearest = state
-            one, slope, _ = _dipole(row, x, 1)
-            near = dr.norm(vector(*row[:3]) - x)
-            inverse = dr.rcp(near)
+            inverse, one, slope, _ = _dipole(row, x, 1)
+            near = dr.rcp(inverse)
             cube = dr.select(active, row[6] * (inverse * inverse * inverse), 0)
             return (
                 value + dr.select(active, one, 0),
@@ -102,7 +97,7 @@ class DipoleTree:
                 dr.select(active, fmin(near, clear), clear),
                 dr.fma(cube, inverse, s4),
                 dr.fma(cube * inverse, inverse, s5),
-                rounded + dr.select(active, _rounded(row[6], near), 0),
+                rounded + dr.select(active, rounding_of_dipole(row[6], inverse), 0),
                 dr.select(active & (near <= clear), vector(*row[3:6]), nearest),
             )
 
@@ -119,13 +114,9 @@ class DipoleTree:
         return found.sample(1.0, self.rounding + rounded, normal)
 
 
-def _rounded(area: Real, near: Real) -> Real:
-    """What rounding may do to a dipole's value at this distance, over epsilon."""
-    return area * dr.fma(4, near, 2) / (near * near * near)
-
-
-def _dipole(row: list[Real], x: Vec3, derivatives: int) -> tuple[Real, Vec3, list[Real]]:
-    """One dipole's value, gradient (paper, Eq. 12 and 15) and Hessian (xx, yy, zz, xy, xz, yz).
+def _dipole(row: list[Real], x: Vec3, derivatives: int) -> tuple[Real, Real, Vec3, list[Real]]:
+    """One over the distance to a dipole, its value, gradient (paper, Eq. 12 and 15) and Hessian
+    (xx, yy, zz, xy, xz, yz).
 
     With z = y - x and u = 1/|z|: f = m.z u^3, grad f = 3 (m.z) u^5 z - m u^3, and
     Hess f = 15 (m.z) u^7 z z^T - 3 u^5 (m z^T + z m^T + (m.z) I).
@@ -137,14 +128,14 @@ def _dipole(row: list[Real], x: Vec3, derivatives: int) -> tuple[Real, Vec3, lis
     along = dr.dot(m, z)
     value = along * u * u2
     if derivatives == 0:
-        return value, vector(0), []
+        return u, value, vector(0), []
     gradient = (u * u2) * dr.fma(vector(3 * along * u2), z, -m)
     if derivatives == 1:
-        return value, gradient, []
+        return u, value, gradient, []
     five = 3 * u * u2 * u2
     pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
     hessian = [
         five * (5 * along * u2 * z[i] * z[j] - m[i] * z[j] - z[i] * m[j] - (along if i == j else 0))
         for i, j in pairs
     ]
-    return value, gradient, hessian
+    return u, value, gradient, hessian

@@ -111,9 +111,8 @@ def lifted_sums(
     winding, sizes = (real(1), real(0), real(0)), (real(dr.inf), real(0), real(0))
     start = (backend.UInt32(0), winding, sizes, *sums)
     _, (zr, zi, turns), (d2, s1, s2), *rest = dr.while_loop(start, more, body, label="lift")
-    angle = 2 * dr.fma(2 * dr.pi, turns, dr.atan2(zi, zr))
     return LiftedSums(
-        angle,
+        whole_angle(zr, zi, turns),
         rest[0] if derivatives >= 1 else vector(0),
         SymmetricSum(*rest[1:]) if derivatives == 2 else SymmetricSum.zero(real),
         dr.sqrt(d2),
@@ -190,3 +189,8 @@ def times(zr: Real, zi: Real, turns: Real, re: Real, im: Real) -> tuple[Real, Re
         dr.select(some, pi * scale, zi),
         turns + over - under,
     )
+
+
+def whole_angle(zr: Real, zi: Real, turns: Real) -> Real:
+    """The solid angle of a product of factors that `times` made."""
+    return 2 * dr.fma(2 * dr.pi, turns, dr.atan2(zi, zr))

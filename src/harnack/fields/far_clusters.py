@@ -37,11 +37,11 @@ Sums: TypeAlias = "tuple[Any, ...]"
 AddLeaf: TypeAlias = "Callable[[Node, Mask, Sums], Sums]"
 
 
-def node_columns(level: Level, accuracy: float, order: int, rough: float) -> FloatArray:
+def node_columns(level: Level, order: int, rough: float, error: FloatArray) -> FloatArray:
     """Numbers of nodes as the walks below read them.
 
-    centre, accepting distance, area, K | 15 coefficients, value error E. A node may be taken as a
-    whole beyond `rough` times its radius R, E holds beyond `accuracy` times R, and
+    centre, accepting distance, area, K | 15 coefficients, value error E (k,), as given. A node may
+    be taken as a whole beyond `rough` times its radius R, where
 
         sum a/rho^p <= (area + K/r^2)/r^p, p = 4 and 5,
 
@@ -50,12 +50,11 @@ def node_columns(level: Level, accuracy: float, order: int, rough: float) -> Flo
     remainder on the way towards x; psi/q^2 grows with q and with p, so that p = 5 and q = 1/rough
     serve: K = psi/q^2 sum a |d|^2.
     """
-    value = truncation(level, accuracy * level.radius, order)[0]
     q = 1 / rough
     wide = level.spread * ((1 - q) ** -5 - 1 - 5 * q) / q**2
     head = np.stack([rough * level.radius, level.area, wide], axis=1)
     return np.concatenate(
-        [level.centre, head, cartesian(level.moments, order), value[:, None]], axis=1
+        [level.centre, head, cartesian(level.moments, order), error[:, None]], axis=1
     )
 
 
@@ -91,16 +90,18 @@ class FarClusters:
         the rough one needs over `looser`, the middle of the ratio of both.
         """
         rough = min(accuracy, _ROUGH)
-        nodes = [node_columns(level, accuracy, order, rough) for level in levels]
-        bounds = [truncation(level, accuracy * level.radius, order) for level in levels]
+        close = [truncation(level, accuracy * level.radius, order) for level in levels]
         roughly = [truncation(level, rough * level.radius, order) for level in levels]
-        looser = _middle(roughly[0][0], bounds[0][0])
+        looser = _middle(roughly[0][0], close[0][0])
+        nodes: list[FloatArray] = []
         steeper = 0.0
-        for columns, (value, slope), close in zip(nodes, roughly, bounds, strict=True):
-            columns[:, -1] = np.maximum(columns[:, -1], value / looser)
-            least = np.maximum(close[1], slope / looser)
-            some = columns[:, -1] > 0
-            steeper = max(steeper, float((least[some] / columns[some, -1]).max(initial=0.0)))
+        for level, *bounds in zip(levels, close, roughly, strict=True):
+            error, slope = (
+                np.maximum(one, other / looser) for one, other in zip(*bounds, strict=True)
+            )
+            some = error > 0
+            steeper = max(steeper, float((slope[some] / error[some]).max(initial=0.0)))
+            nodes.append(node_columns(level, order, rough, error))
         packed = pack(backend, tree, nodes, primitives)
         return cls(backend, packed, accuracy, rough, order, looser, steeper * (1 + 1e-6))
 
@@ -175,11 +176,7 @@ class FarClusters:
         return r, square, dr.select(far, dr.rsqrt(square), 0), far
 
     def _rounded(self, node: Node, inverse: Real) -> Real:
-        """What rounding adds to the error: coordinates rounded by epsilon each move a dipole a at
-        rho by at most 2 epsilon a/rho^3 in value, the roundings of its term by 4 epsilon a/rho^2.
-        """
-        square = inverse * inverse
-        return self.backend.epsilon * node.head[4] * dr.fma(2 * inverse, square, 4 * square)
+        return self.backend.epsilon * rounding_of_dipole(node.head[4], inverse)
 
     def _decay(self, inverse: Real) -> Real:
         """r^-(order + 3), as the first term left out."""
@@ -187,6 +184,16 @@ class FarClusters:
         for _ in range(self.order):
             power = power * inverse
         return power
+
+
+def rounding_of_dipole(area: Real, inverse: Real) -> Real:
+    """What rounding may do to the value of a dipole at distance rho = 1/inverse, over epsilon.
+
+    Coordinates rounded by epsilon each move it by at most 2 epsilon area/rho^3; the four roundings
+    of its term, by 4 epsilon area/rho^2.
+    """
+    square = inverse * inverse
+    return area * dr.fma(2 * inverse, square, 4 * square)
 
 
 def _middle(larger: FloatArray, smaller: FloatArray) -> float:

@@ -18,6 +18,7 @@ from harnack.fields.edge_hessian import SymmetricSum
 from harnack.fields.field import Curvature, Sample
 from harnack.fields.screened_kernel import mean_at_dipoles, promises
 from harnack.fields.screened_tree import PlainSum, TreeSum, dipole_rows
+from harnack.fields.unit_coordinates import UnitCoordinates, placed
 from harnack.geometry import Box
 from harnack.geometry.clouds import estimate_areas, validate_cloud
 from harnack.geometry.meshes import validate_mesh
@@ -170,15 +171,14 @@ class ScreenedWindingNumber(BatchedField):
         return Values(sample.value, sample.error + rounding, sample.gradient, hessian)
 
     def prepare(self, backend: Backend) -> ScreenedWindingNumber:
-        if self._device is not None and self._device.sum.backend is backend:
+        if self._device is not None and self._device.backend is backend:
             return self
         prepared = copy.copy(self)
         if self.method == "sum":
             dipoles = PlainSum.of(backend, self._rows, self._kappa)
         else:
             dipoles = TreeSum.of(backend, self._rows, self._kappa, self.accuracy)
-        centre = backend.Array3f(*(dr.opaque(backend.Float, float(c)) for c in self._centre))
-        prepared._device = _OnDevice(dipoles, centre, dr.opaque(backend.Float, self._size))
+        prepared._device = _OnDevice(*placed(backend, self._centre, self._size), dipoles)
         return prepared
 
     def evaluate(self, p: Vec3) -> Sample:
@@ -186,13 +186,13 @@ class ScreenedWindingNumber(BatchedField):
             return self.prepare(backend_of(p)).evaluate(p)
         on = self._on
         sums = on.sum.sums(on.unit(p))
-        epsilon = on.sum.backend.epsilon
+        epsilon = on.backend.epsilon
         # Terms rounded each and added with random signs; positions, rounded once.
         rounding = epsilon * (12 + math.sqrt(len(self._rows)))
         error = dr.fma(rounding, sums.moved, dr.fma(6 * epsilon, sums.steep, sums.error))
         # On a dipole itself, to rounding, all levels meet: a gradient that says so.
         apart = (sums.nearest > (32 * epsilon) ** 2) & dr.isfinite(sums.value)
-        steep = on.sum.backend.Array3f(0, 0, 1 / (32 * epsilon))
+        steep = on.backend.Array3f(0, 0, 1 / (32 * epsilon))
         value = dr.select(apart, sums.value, 0)
         gradient = dr.select(apart, sums.gradient, steep)
         known = promises(sums, value, gradient, on.sum.kappa, on.size, epsilon)
@@ -299,15 +299,10 @@ class ScreenedWindingNumber(BatchedField):
 
 
 @dataclass(frozen=True)
-class _OnDevice:
-    """The dipoles in unit coordinates, and the way there from the world."""
+class _OnDevice(UnitCoordinates):
+    """The dipoles on a backend."""
 
     sum: PlainSum | TreeSum
-    centre: Vec3
-    size: Real
-
-    def unit(self, p: Vec3) -> Vec3:
-        return (self.sum.backend.Array3f(p) - self.centre) / self.size
 
 
 def _point(row: FloatArray) -> tuple[float, float, float]:

@@ -18,6 +18,7 @@ from harnack.fields.edge_hessian import hessian_over_edges
 from harnack.fields.edge_nearest import Segments, closest_on_segments, uncancelled_edges
 from harnack.fields.edge_sums import EdgeBuffer, EdgeSums, sum_over_edges, upload
 from harnack.fields.field import Field, HarmonicBall, Sample
+from harnack.fields.unit_coordinates import UnitCoordinates, placed
 from harnack.geometry import ConvexHull, is_convex_position, total_length, validate_loops
 
 if TYPE_CHECKING:
@@ -94,15 +95,15 @@ class SolidAngle(Field):
         return "edges" if asked == "edges" else "range"
 
     def prepare(self, backend: Backend) -> SolidAngle:
-        if self._device is not None and self._device.edges.backend is backend:
+        if self._device is not None and self._device.backend is backend:
             return self
         prepared = copy.copy(self)
         # Centred and scaled to unit size: products of eight lengths stay far from overflow.
         unit = tuple((loop - self._centre) / self._size for loop in self.loops)
-        centre = backend.Array3f(*(dr.opaque(backend.Float, float(c)) for c in self._centre))
-        size = dr.opaque(backend.Float, self._size)
         magnitude = float(np.abs(np.concatenate(self.loops)).max() / self._size)
-        prepared._device = _OnDevice(upload(backend, unit), centre, size, magnitude)
+        prepared._device = _OnDevice(
+            *placed(backend, self._centre, self._size), upload(backend, unit), magnitude
+        )
         return prepared
 
     def evaluate(self, p: Vec3) -> Sample:
@@ -111,7 +112,7 @@ class SolidAngle(Field):
         on = self._device
         sums = sum_over_edges(on.edges, on.unit(p), variation=self.certificate == "edges")
         # Coordinates of size `magnitude` (in units of the curve) carry its rounding.
-        epsilon = on.edges.backend.epsilon
+        epsilon = on.backend.epsilon
         rounding = 4 * epsilon * (1 + on.magnitude)
         distance = sums.distance * (1 - _ROUNDING) - rounding
         if self.certificate == "edges":
@@ -121,7 +122,7 @@ class SolidAngle(Field):
         # On the curve itself, to rounding, every level meets and no gradient exists: give one of
         # the size it has there, so that the point counts as close to any level.
         apart = (sums.distance > rounding) & dr.isfinite(sums.angle)
-        steep = on.edges.backend.Array3f(0, 0, 2 / rounding)
+        steep = on.backend.Array3f(0, 0, 2 / rounding)
         gradient = dr.select(apart, sums.gradient, steep) / on.size
         # Each of n factors turns the product by a few roundings, of random sign.
         error = epsilon * (8 + 2 * math.sqrt(sum(len(loop) for loop in self.loops)))
@@ -150,7 +151,7 @@ class SolidAngle(Field):
         start, end = ((q - self._centre) / self._size for q in uncancelled_edges(self.loops))
         if not len(start):
             return None
-        nearest = closest_on_segments(Segments.upload(on.edges.backend, start, end), on.unit(p))
+        nearest = closest_on_segments(Segments.upload(on.backend, start, end), on.unit(p))
         return nearest * on.size + on.centre
 
     def parameters(self) -> tuple[Any, ...]:
@@ -200,16 +201,11 @@ class SolidAngle(Field):
 
 
 @dataclass(frozen=True)
-class _OnDevice:
-    """The edges in unit coordinates, and the way there from the world."""
+class _OnDevice(UnitCoordinates):
+    """The edges on a backend, and how large their coordinates are, in units of the curve."""
 
     edges: EdgeBuffer
-    centre: Vec3
-    size: Real
     magnitude: float
-
-    def unit(self, p: Vec3) -> Vec3:
-        return (self.edges.backend.Array3f(p) - self.centre) / self.size
 
 
 def _is_drjit(value: Any) -> bool:

@@ -16,8 +16,7 @@ from harnack.fields.edge_lift import LiftedEdges, LiftedSums, lifted_sums
 from harnack.fields.edge_trails import EdgeTrails
 from harnack.fields.field import HarmonicBall, Lipschitz, Sample
 from harnack.fields.winding_mesh import rounding_of_sum
-from harnack.tree.triangles import Frame, TriangleRays, Upwards, crossing
-from harnack.tree.walk import Node, State, for_each, walk
+from harnack.tree.triangles import Frame, TriangleRays
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -63,7 +62,7 @@ class ExactWinding:
         # Away from the middle of the mesh, where less of it lies ahead. Mirrored, it winds the
         # other way.
         way = dr.select(x.z >= 0, self.backend.Float(1), -1)
-        turns = _turns_along(self.rays, x, way)
+        turns = self.rays.turns_along(x, way)
         if self.trails is None or self.edges is None:
             return dr.select(way > 0, turns, 0 - turns)  # no zero with a sign
         dr.eval(x, way, turns)
@@ -77,7 +76,7 @@ class ExactWinding:
 
     def at(self, x: Vec3, derivatives: int) -> tuple[Real, Vec3, SymmetricSum | None, Real]:
         """w, gradient, Hessian (as asked for) and a bound of the truncation error, which is 0."""
-        turns = self.rays.turns_ahead(Upwards(x), 0)
+        turns = self.rays.turns_along(x, self.backend.Float(1))
         if self.edges is None:
             return turns, self.backend.Array3f(0), None, self.backend.Float(0)
         sums = lifted_sums(self.edges, lambda p: p - x, derivatives=derivatives, variation=False)
@@ -91,14 +90,14 @@ class ExactWinding:
         return self.rays.turns_ahead(frame, t, active)
 
     def on_stretch(
-        self, frame: Frame, x: Vec3, behind: Crossing, ahead: Crossing, turns: Real, fine: Mask
+        self, frame: Frame, x: Vec3, behind: Crossing, turns: Real, fine: Mask
     ) -> Sample:
         """w continued along a stretch of a ray.
 
         The certificate is that of `SolidAngle` ("edges"), for the sum of solid angles is the
         lift of the boundary's.
         """
-        del behind, ahead, fine
+        del behind, fine
         real = self.backend.Float
         if self.edges is None:
             return Sample(real(turns), self.backend.Array3f(0), (Lipschitz(0.0),), 0.0)
@@ -130,28 +129,3 @@ class ExactWinding:
     def _gradient(self, frame: Frame, sums: LiftedSums, share: float) -> Vec3:
         g = share * sums.gradient
         return g.x * frame.u + g.y * frame.v + g.z * frame.d
-
-
-def _turns_along(rays: TriangleRays, x: Vec3, way: Real) -> Real:
-    """The sum of turns of all crossings of rays from x up (way 1) or down (-1) the z axis.
-
-    Turns are those about the axis upwards, either way.
-    """
-    tree, real = rays.tree, rays.tree.backend.Float
-    up, height = way > 0, way * x.z
-    pad = 4 * tree.backend.epsilon * (1 + dr.max(dr.abs(x)))
-    low_x, high_x, low_y, high_y = x.x - pad, x.x + pad, x.y - pad, x.y + pad
-
-    def visit(node: Node, state: State) -> tuple[Mask, State]:
-        x0, y0, z0, x1, y1, z1 = node.head
-        open_ = (
-            (high_x >= x0) & (low_x <= x1) & (high_y >= y0) & (low_y <= y1)
-            & (height - pad <= dr.select(up, z1, -z0))
-        )  # fmt: skip
-        return open_, for_each(node, open_ & node.is_leaf, add, state)
-
-    def add(row: list[Real], active: Mask, state: State) -> State:
-        t, turn = crossing(row, Upwards(x))
-        return (state[0] + dr.select(active & (way * t > 0), turn, 0),)
-
-    return walk(tree, visit, (real(0),))[0]

@@ -7,7 +7,6 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
@@ -15,7 +14,8 @@ from harnack.backend import backend_of
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.edge_hessian import SymmetricSum
 from harnack.fields.field import Field, Sample, lengthened
-from harnack.fields.sheets import Crossing
+from harnack.fields.sheets import NO_SHEET, Crossing
+from harnack.fields.unit_coordinates import UnitCoordinates, placed
 from harnack.fields.winding_exact import ExactWinding
 from harnack.fields.winding_mesh import WindingMesh
 from harnack.fields.winding_tree import TreeWinding
@@ -127,11 +127,10 @@ class WindingNumber(BatchedField):
             winding = ExactWinding.of(backend, mesh, rays)
         else:
             winding = TreeWinding.of(backend, mesh, accuracy, self.order)
-        centre = backend.Array3f(*(dr.opaque(backend.Float, float(c)) for c in mesh.centre))
-        return _OnDevice(winding, rays, centre, dr.opaque(backend.Float, mesh.size))
+        return _OnDevice(*placed(backend, mesh.centre, mesh.size), winding, rays)
 
     def prepare(self, backend: Backend) -> WindingNumber:
-        if self._device is not None and self._device.winding.backend is backend:
+        if self._device is not None and self._device.backend is backend:
             return self
         prepared = copy.copy(self)
         prepared._device = self._upload(backend, self.accuracy or _TRACED)
@@ -141,17 +140,17 @@ class WindingNumber(BatchedField):
         """w as it is, jumps and all, with what is known of it as a lift."""
         on = self._on(p)
         # A ray from p of length zero: everything lies ahead, nothing has been passed.
-        up = on.winding.backend.Array3f(0, 0, 1)
-        frame = Frame.along(on.winding.backend, on.unit(p), up)
+        up = on.backend.Array3f(0, 0, 1)
+        frame = Frame.along(on.backend, on.unit(p), up)
         turns = on.winding.start(frame, 0, True)
-        nowhere = Crossing(0.0, on.no_sheet, on.winding.backend.Float(0), up)
-        return on.scaled(on.winding.on_stretch(frame, frame.o, nowhere, nowhere, turns, True))
+        nowhere = Crossing(0.0, on.backend.UInt32(NO_SHEET), 0.0, up)
+        return lengthened(on.winding.on_stretch(frame, frame.o, nowhere, turns, True), on.size)
 
     def next_crossing(
         self, o: Vec3, d: Vec3, after: Crossing, t_max: Real, active: Mask
     ) -> Crossing:
         on = self._on(o)
-        frame = Frame.along(on.winding.backend, on.unit(o), d)
+        frame = Frame.along(on.backend, on.unit(o), d)
         behind = (after.t / on.size, after.sheet)
         t, sheet, turn, normal = on.rays.next(frame, behind, t_max / on.size, active)
         # w is larger on the side that the normal does not point to.
@@ -159,13 +158,15 @@ class WindingNumber(BatchedField):
 
     def offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
         on = self._on(o)
-        frame = Frame.along(on.winding.backend, on.unit(o), d)
+        frame = Frame.along(on.backend, on.unit(o), d)
         return on.winding.start(frame, t_min / on.size, active)
 
     def between(self, o: Vec3, d: Vec3, behind: Crossing, ahead: Crossing, offset: Real) -> Field:
+        del ahead
         on = self._on(o)
-        frame = Frame.along(on.winding.backend, on.unit(o), d)
-        return _Stretch(on, frame, behind, ahead, offset)
+        frame = Frame.along(on.backend, on.unit(o), d)
+        start = Crossing(behind.t / on.size, behind.sheet, behind.jump, behind.normal)
+        return _Stretch(on, frame, start, offset)
 
     def distance_to_sheets(self, p: Vec3) -> Real:
         on = self._on(p)
@@ -217,52 +218,36 @@ class WindingNumber(BatchedField):
 
 
 @dataclass(frozen=True)
-class _OnDevice:
-    """A winding number on a backend, in unit coordinates."""
+class _OnDevice(UnitCoordinates):
+    """A winding number on a backend."""
 
     winding: ExactWinding | TreeWinding
     rays: TriangleRays
-    centre: Vec3
-    size: Real
-
-    @property
-    def no_sheet(self) -> Any:
-        return self.winding.backend.UInt32(0xFFFFFFFF)
-
-    def unit(self, p: Vec3) -> Vec3:
-        return (self.winding.backend.Array3f(p) - self.centre) / self.size
 
     def scaled_hessian(self, hessian: SymmetricSum | None) -> SymmetricSum:
         """A Hessian, None for zero, in the coordinates of the mesh as given."""
         if hessian is None:
-            return SymmetricSum.zero(self.winding.backend.Float)
+            return SymmetricSum.zero(self.backend.Float)
         share = 1 / (self.size * self.size)
         return SymmetricSum(*(part * share for part in hessian.parts()))
 
-    def scaled(self, sample: Sample) -> Sample:
-        """A sample in the coordinates of the mesh as given."""
-        return lengthened(sample, self.size)
-
 
 class _Stretch(Field):
-    """A winding number as seen on a stretch of rays."""
+    """A winding number as seen on a stretch of rays; behind: where it starts, in unit lengths."""
 
     def __init__(
-        self, on: _OnDevice, frame: Frame, behind: Crossing, ahead: Crossing, offset: Real,
-        fine: Mask = True,
-    ) -> None:  # fmt: skip
+        self, on: _OnDevice, frame: Frame, behind: Crossing, offset: Real, fine: Mask = True
+    ) -> None:
         self.has_detail = isinstance(on.winding, TreeWinding)
         self._on, self._frame, self._fine = on, frame, fine
-        self._behind, self._ahead, self._offset = behind, ahead, offset
+        self._behind, self._offset = behind, offset
 
     def at_detail(self, fine: Mask) -> Field:
-        return _Stretch(self._on, self._frame, self._behind, self._ahead, self._offset, fine)
+        return _Stretch(self._on, self._frame, self._behind, self._offset, fine)
 
     def evaluate(self, p: Vec3) -> Sample:
         on = self._on
-        b = self._behind
-        behind = Crossing(b.t / on.size, b.sheet, b.jump, b.normal)
         sample = on.winding.on_stretch(
-            self._frame, on.unit(p), behind, self._ahead, self._offset, self._fine
+            self._frame, on.unit(p), self._behind, self._offset, self._fine
         )
-        return on.scaled(sample)
+        return lengthened(sample, on.size)

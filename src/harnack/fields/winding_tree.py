@@ -16,7 +16,7 @@ import numpy as np
 from harnack.backend.extrema import fmax, fmin
 from harnack.fields.edge_field import edge_variation
 from harnack.fields.edge_hessian import SymmetricSum
-from harnack.fields.edge_lift import times
+from harnack.fields.edge_lift import times, whole_angle
 from harnack.fields.far_clusters import FarClusters
 from harnack.fields.triangle_kernel import NearTriangle
 from harnack.fields.winding_mesh import rounding_of_sum
@@ -56,11 +56,6 @@ class TreeWinding:
         """The one it lies on."""
         return self.clusters.backend
 
-    @property
-    def order(self) -> int:
-        """Of the moments of far nodes."""
-        return self.clusters.order
-
     def at(self, x: Vec3, derivatives: int) -> tuple[Real, Vec3, SymmetricSum | None, Real]:
         """w, gradient, Hessian (as asked for) and the bound of the truncation error of w."""
 
@@ -94,8 +89,7 @@ class TreeWinding:
 
         value, *rest = state
         zr, zi, turns, *rest = for_each(node, near, add, (real(1), real(0), real(0), *rest))
-        angle = 2 * dr.fma(2 * dr.pi, turns, dr.atan2(zi, zr))
-        return value + dr.select(near, angle, 0), *rest
+        return value + dr.select(near, whole_angle(zr, zi, turns), 0), *rest
 
     def start(self, frame: Frame, t: Real, active: Mask) -> Real:
         """No crossings are counted: every sum is the whole of w."""
@@ -103,9 +97,8 @@ class TreeWinding:
         return self.backend.Float(0)
 
     def on_stretch(
-        self, frame: Frame, x: Vec3, behind: Crossing, ahead: Crossing, turns: Real,
-        fine: Mask,
-    ) -> Sample:  # fmt: skip
+        self, frame: Frame, x: Vec3, behind: Crossing, turns: Real, fine: Mask
+    ) -> Sample:
         """w on a stretch of a ray, with a certificate.
 
         Certificate. Far dipoles: see `far_clusters.Nearby.sample`. By Stokes the near triangles'
@@ -124,7 +117,7 @@ class TreeWinding:
         the start of the stretch, before all others. Its own sign is rounded where x lies on it, as
         it does on several at once where sheets overlap.
         """
-        del ahead, turns
+        del turns
 
         def leaf(node: Node, near: Mask, sums: tuple[Any, ...]) -> tuple[Any, ...]:
             return self._near_certified(node, near, x, frame, behind, fine, sums)
@@ -170,6 +163,5 @@ class TreeWinding:
         value, g, error, slope_error, clear, s4, s5, beside, unsure = state
         begin = (real(1), real(0), real(0), g, clear, s4, s5, beside, unsure)
         zr, zi, turns, g, clear, s4, s5, beside, unsure = for_each(node, near, add, begin)
-        angle = 2 * dr.fma(2 * dr.pi, turns, dr.atan2(zi, zr))
-        value = value + dr.select(near, angle, 0)
+        value = value + dr.select(near, whole_angle(zr, zi, turns), 0)
         return value, g, error, slope_error, clear, s4, s5, beside, unsure

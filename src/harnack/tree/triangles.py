@@ -93,7 +93,7 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Upwards:
+class _Upwards:
     """The frame of rays from points o along the z axis, for which there is nothing to compute."""
 
     o: Vec3
@@ -168,10 +168,9 @@ class TriangleRays:
         best, number, turn, normal = walk(self.tree, visit, start, active)
         return best, number, turn, normal * dr.rsqrt(fmax(dr.squared_norm(normal), real(1e-37)))
 
-    def turns_ahead(self, frame: Frame | Upwards, t_min: Real, active: Mask = True) -> Real:
+    def turns_ahead(self, frame: Frame, t_min: Real, active: Mask = True) -> Real:
         """The sum of turns of all crossings with t > t_min."""
-        real = self.tree.backend.Float
-        inside = self._boxes(frame) if isinstance(frame, Frame) else self._columns(frame)
+        real, inside = self.tree.backend.Float, self._boxes(frame)
 
         def visit(node: Node, state: State) -> tuple[Mask, State]:
             open_ = inside(node, real(t_min), real(dr.inf))
@@ -182,6 +181,30 @@ class TriangleRays:
             return (state[0] + dr.select(active & (t > t_min), turn, 0),)
 
         return walk(self.tree, visit, (real(0),), active)[0]
+
+    def turns_along(self, x: Vec3, way: Real) -> Real:
+        """The sum of turns of all crossings of rays from x up (way 1) or down (-1) the z axis.
+
+        Turns are those about the axis upwards, either way. To tell boxes apart costs less here.
+        """
+        real = self.tree.backend.Float
+        up, height = way > 0, way * x.z
+        pad = 4 * self.tree.backend.epsilon * (1 + dr.max(dr.abs(x)))
+        low_x, high_x, low_y, high_y = x.x - pad, x.x + pad, x.y - pad, x.y + pad
+
+        def visit(node: Node, state: State) -> tuple[Mask, State]:
+            x0, y0, z0, x1, y1, z1 = node.head
+            open_ = (
+                (high_x >= x0) & (low_x <= x1) & (high_y >= y0) & (low_y <= y1)
+                & (height - pad <= dr.select(up, z1, -z0))
+            )  # fmt: skip
+            return open_, for_each(node, open_ & node.is_leaf, add, state)
+
+        def add(row: list[Real], active: Mask, state: State) -> State:
+            t, turn = crossing(row, _Upwards(x))
+            return (state[0] + dr.select(active & (way * t > 0), turn, 0),)
+
+        return walk(self.tree, visit, (real(0),))[0]
 
     def _boxes(self, frame: Frame) -> Any:
         """A test whether rays meet a node's box between two t; it errs towards yes only."""
@@ -205,21 +228,6 @@ class TriangleRays:
 
         return inside
 
-    def _columns(self, frame: Upwards) -> Any:
-        backend, o = self.tree.backend, frame.o
-        size = fmax(fmax(dr.abs(o.x), dr.abs(o.y)), dr.abs(o.z))
-        pad = 4 * backend.epsilon * (1 + size)
-
-        def inside(node: Node, t_min: Real, t_max: Real) -> Mask:
-            del t_min, t_max
-            x0, y0, _, x1, y1, z1 = node.head
-            return (
-                (o.x >= x0 - pad) & (o.x <= x1 + pad)
-                & (o.y >= y0 - pad) & (o.y <= y1 + pad) & (o.z <= z1 + pad)
-            )  # fmt: skip
-
-        return inside
-
 
 def corners_of(row: list[Real], vector: Any) -> tuple[Vec3, Vec3, Vec3]:
     """The corners of a record."""
@@ -232,7 +240,7 @@ def normal_of(row: list[Real], vector: Any) -> Vec3:
     return row[PARITY] * dr.cross(q - p, r - p)
 
 
-def crossing(row: list[Real], frame: Frame | Upwards) -> tuple[Real, Real]:
+def crossing(row: list[Real], frame: Frame | _Upwards) -> tuple[Real, Real]:
     """t and turn of a ray with the triangle of a record; the turn is 0 where it passes by.
 
     In the plane across the ray, the turn is the winding number of the triangle about the ray:

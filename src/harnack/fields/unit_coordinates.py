@@ -1,0 +1,31 @@
+"""Data on a backend, in coordinates in which they have a size of about one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import drjit as dr
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Real, Vec3
+    from harnack.tree.hierarchy import FloatArray
+
+
+@dataclass(frozen=True)
+class UnitCoordinates:
+    """The way to coordinates centre + size times these; what lies there, subclasses say."""
+
+    backend: Backend
+    centre: Vec3
+    size: Real
+
+    def unit(self, p: Vec3) -> Vec3:
+        """A point in these coordinates."""
+        return (self.backend.Array3f(p) - self.centre) / self.size
+
+
+def placed(backend: Backend, centre: FloatArray, size: float) -> tuple[Backend, Vec3, Real]:
+    """What `UnitCoordinates` consist of; neither becomes part of a kernel's code."""
+    opaque = (dr.opaque(backend.Float, float(c)) for c in centre)
+    return backend, backend.Array3f(*opaque), dr.opaque(backend.Float, size)
