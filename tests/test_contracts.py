@@ -277,8 +277,12 @@ def test_what_a_tree_of_dipoles_leaves_out_is_within_its_bounds(
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
 def test_one_dipole_attains_its_curvature_promises(scale: float) -> None:
     """Straight ahead, at the end of each reach: f leaves its tangent by all that is allowed, so
-    that a promise smaller by a thousandth, or one that reaches farther by that, would break."""
-    field = hk.DipolePotential([[0.0, 0, 0]], [[0.0, 0, 1]], [scale**2])
+    that a promise smaller by a thousandth, or one that reaches farther by that, would break.
+
+    Two others, of next to no area, keep it from being looked at as a node of its own."""
+    points, areas = np.zeros((3, 3)), np.array([1, 1e-14, 1e-14])
+    points[1:, 0] = 20 * scale, -20 * scale
+    field = hk.DipolePotential(points, [[0.0, 0, 1]] * 3, scale**2 * areas)
     x = scale * np.array([[0.0, 0.0, h] for h in (-0.3, -1.0, -7.0)])
     sample, on_host = samples(field, x)
     value, slope = on_host(sample.value), on_host(sample.gradient)[:, 2]

@@ -75,7 +75,7 @@ class DipolePotential(BatchedField):
         if areas is None:
             self.areas = estimate_areas(self.points, self.normals)
         self.accuracy = accuracy
-        low, high = self.points.min(axis=0), self.points.max(axis=0)
+        self._box = low, high = self.points.min(axis=0), self.points.max(axis=0)
         self._centre = 0.5 * (low + high)
         extent = max(0.5 * float((high - low).max()), math.sqrt(float(self.areas.sum())) / 4)
         self._size = 2.0 ** math.ceil(math.log2(extent))
@@ -154,7 +154,8 @@ class DipolePotential(BatchedField):
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """A box around the points: at distance rho from all of them |f| <= (sum of areas)/rho^2."""
         reach = 1.0001 * math.sqrt(float(self.areas.sum()) / min(abs(level) for level in levels))
-        return Box(self.points.min(axis=0) - reach, self.points.max(axis=0) + reach)
+        low, high = self._box
+        return Box(low - reach, high + reach)
 
     def describe(self) -> dict[str, Any]:
         said = ("estimated" if one else "given" for one in self.estimated)

@@ -17,8 +17,10 @@ import numpy as np
 from harnack.backend.extrema import fmin
 from harnack.fields.edge_hessian import SymmetricSum
 from harnack.fields.field import Curvature, HarmonicBall, Sample
-from harnack.fields.multipole import Level, cartesian, truncation
+from harnack.fields.moments import KNOWN
+from harnack.fields.multipole import Level, cartesian
 from harnack.fields.multipole_kernel import far_terms
+from harnack.fields.truncation import sup_norm, truncation
 from harnack.tree import Node, PackedTree, pack, walk
 
 if TYPE_CHECKING:
@@ -28,7 +30,9 @@ if TYPE_CHECKING:
 # A rough look takes nodes as a whole beyond this many times their radius.
 _ROUGH = 2.5
 # Parts of the free distance out to which curvatures are stated: the shorter, the smaller.
-_REACHES = (0.15, 0.35, 0.6)
+_REACHES = (0.2, 0.4, 0.6)
+# The part of the way to the dipoles of far nodes out to which they are stated.
+_WAY = 0.65
 _ROUNDING = 2e-5
 # The free distance, in units of the whole, where nothing bounds it.
 _FAR = 1e4
@@ -40,22 +44,40 @@ AddLeaf: TypeAlias = "Callable[[Node, Mask, Sums], Sums]"
 def node_columns(level: Level, order: int, rough: float, error: FloatArray) -> FloatArray:
     """Numbers of nodes as the walks below read them.
 
-    centre, accepting distance, area, K | 15 coefficients, value error E (k,), as given. A node may
-    be taken as a whole beyond `rough` times its radius R, where
+    centre, accepting distance, A, K | 15 coefficients, value error E (k,), as given. A node may be
+    taken as a whole beyond `rough` times its radius R. From there on a step by t = q r, q <= Q =
+    `longest_part(rough)`, moves its field off the linear by at most
 
-        sum a/rho^p <= (area + K/r^2)/r^p, p = 4 and 5,
+        (A + K/r^2) t^2/r^4 Phi_1(q),   Phi_l(q) = ((1-q)^-(l+1) - 1 - (l+1)q)/q^2.
 
-    for its dipoles a at distances rho: about the centre the first moment vanishes, so
-    sum a rho^-p <= r^-p (area + sum a psi(|d|/r)) with psi(q) = (1-q)^-p - 1 - p q, Taylor's
-    remainder on the way towards x; psi/q^2 grows with q and with p, so that p = 5 and q = 1/rough
-    serve: K = psi/q^2 sum a |d|^2.
+    The term l, a harmonic function of degree -(l+1), is at most B_l/r^(l+1), and its k-th
+    derivative along a line (l+k)!/l! B_l/r^(l+1+k) (`truncation.truncation`, k times). So Taylor's
+    remainder is at most B_l Phi_l(q) t^2/r^(l+3). In Phi_l/Phi_1 the ratio of coefficients,
+    (l+k)!/(l! (k+1)!), grows with k, so that the quotient grows with q: W_l = Phi_l(Q)/Phi_1(Q)
+    serves. With r >= r0 = rough R: A = B_1 + W_2 B_2/r0 and K = sum_{l>=3} W_l B_l/r0^(l-3), for l
+    >= 6 of B_l <= l R^(l-5) sum a |d|^4, with Phi_l(Q) < (1-Q)^-(l+1)/Q^2.
     """
-    q = 1 / rough
-    wide = level.spread * ((1 - q) ** -5 - 1 - 5 * q) / q**2
-    head = np.stack([rough * level.radius, level.area, wide], axis=1)
+    r0, q = np.maximum(rough * level.radius, 1e-50), longest_part(rough)
+    ratio = [((1 - q) ** -(n + 1) - 1 - (n + 1) * q) / (q * q * _phi(q)) for n in range(KNOWN + 1)]
+    terms = [ratio[n] * sup_norm(level.moments, n) for n in range(1, KNOWN + 1)]
+    near = terms[0] + terms[1] / r0
+    x = 1 / (rough * (1 - q))
+    rest = x * (6 - 5 * x) / (1 - x) ** 2 / ((1 - q) ** 6 * q * q * _phi(q))
+    wide = rest * level.fourth / r0**2 + sum(term / r0**n for n, term in enumerate(terms[2:]))
+    head = np.stack([rough * level.radius, near, wide], axis=1)
     return np.concatenate(
         [level.centre, head, cartesian(level.moments, order), error[:, None]], axis=1
     )
+
+
+def longest_part(rough: float) -> float:
+    """Of the distance of a far node's centre: the longest step that certificates cover."""
+    return _WAY * (1 - 1 / rough)
+
+
+def _phi(q: float) -> float:
+    """Phi_1 of `node_columns`: convex, and 3 at 0."""
+    return (3 - 2 * q) / (1 - q) ** 2
 
 
 @dataclass(frozen=True)
@@ -139,15 +161,16 @@ class FarClusters:
         add_leaf: as for `at`, of the sums of `Nearby` in their order and then the own ones.
         """
         real, vector = self.backend.Float, self.backend.Array3f
+        centred = longest_part(self.rough) / _REACHES[-1]
 
         def visit(node: Node, state: Sums) -> tuple[Mask, Sums]:
             value, g, error, slope_error, clear, s4, s5, *rest = state
             r, square, inverse, far = self._far(node, x, fine)
             c = node.payload(far)
             terms = far_terms(c, r, inverse, 1)
-            apart = dr.fma(node.head[3], -1 / self.rough, square * inverse)
+            apart = centred * (square * inverse)
             decay, square = self._decay(inverse), inverse * inverse
-            fourth = dr.fma(node.head[5], square, node.head[4]) * (square * square)
+            fourth = self._size(node, inverse) * (square * square)
             state = (
                 value + dr.select(far, terms.value, 0),
                 g + dr.select(far, terms.gradient, 0),
@@ -176,7 +199,11 @@ class FarClusters:
         return r, square, dr.select(far, dr.rsqrt(square), 0), far
 
     def _rounded(self, node: Node, inverse: Real) -> Real:
-        return self.backend.epsilon * rounding_of_dipole(node.head[4], inverse)
+        return self.backend.epsilon * rounding_of_dipole(self._size(node, inverse), inverse)
+
+    def _size(self, node: Node, inverse: Real) -> Real:
+        """A + K/r^2 of `node_columns`: that many dipoles in its centre would do as much."""
+        return dr.fma(node.head[5], inverse * inverse, node.head[4])
 
     def _decay(self, inverse: Real) -> Real:
         """r^-(order + 3), as the first term left out."""
@@ -206,8 +233,10 @@ def _middle(larger: FloatArray, smaller: FloatArray) -> float:
 class Nearby:
     """What sums over a tree tell about f near x.
 
-    error, slope_error: what was left out of value and gradient. clear: a distance from x within
-    which f is harmonic. s4, s5: bounds of sum a/rho^4 and sum a/rho^5 over dipoles a at rho.
+    error, slope_error: what was left out of value and gradient. clear: the distance of the nearest
+    dipole, or if it is less, the part of that to the nearest far node's centre of which the longest
+    reach is `longest_part`. s4, s5: sums of a/rho^4 and a/rho^5 over dipoles a at rho and, with
+    A + K/r^2 for a, over far nodes at r.
     """
 
     backend: Backend
@@ -226,10 +255,12 @@ class Nearby:
         (k+1)! a/rho^(k+2) (it is a mixed derivative of a/rho, whose tensor is symmetric and takes
         its largest value on equal vectors), so that Taylor's remainder after the linear term is at
         most a ((rho-t)^-2 - rho^-2 - 2t rho^-3) = a t^2 rho^-4 phi(t/rho), phi(q) =
-        (3-2q)/(1-q)^2. phi is convex: on [0, b] it lies below 3 + rise q, rise = (phi(b)-3)/b =
-        (4-3b)/(1-b)^2. With t <= r = b clear and rho >= clear,
+        (3-2q)/(1-q)^2. That of a far node is at most that of a dipole of area A + K/r^2 in its
+        centre, for t/r <= `longest_part` (`node_columns`). phi is convex: on [0, b] it lies below
+        3 + rise q, rise = (phi(b)-3)/b = (4-3b)/(1-b)^2. With t <= r = b clear,
         |f(y) - f(x) - g.(y-x)| <= t^2 (3 s4 + rise r s5).
-        A ball of that radius bounds f by |g| r more, and holds harmonic f.
+        A ball of that radius bounds f by |g| r more, and holds harmonic f: dipoles of far nodes
+        are farther away than 1 - 1/rough times the centre, and `longest_part` is less.
         """
         epsilon, g = self.backend.epsilon, share * self.gradient
         distance = self.clear * (1 - _ROUNDING) - 8 * epsilon

@@ -1,4 +1,4 @@
-"""Moments of dipoles about the nodes of a tree, and what leaving terms out may cost.
+"""Moments of dipoles about the nodes of a tree.
 
 `moments` says what they are. All in double precision: sums over dipoles and over children in
 Dr.Jit, on many threads and without temporaries, the rest, of one row a node, in NumPy.
@@ -9,7 +9,6 @@ Dr.Jit, on many threads and without temporaries, the rest, of one row a node, in
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -30,8 +29,8 @@ FloatArray = npt.NDArray[np.float64]
 Moments = dict[tuple[int, int], npt.NDArray[np.complex128]]
 # Degree, order, and 0 for the real or 1 for the imaginary part.
 _PARTS = tuple((l, m, part) for l, m in KEYS for part in range(2 if m else 1))
-# A bound that is rounded to single precision a few times, down each time, is one still.
-_ROOM = 1 + 2.0**-20
+# Numbers of `_powers`.
+_POWERS = 10
 
 
 @dataclass(frozen=True)
@@ -40,14 +39,18 @@ class Level:
 
     centre: (k, 3) about which the moments are taken: the mean of the dipoles by area.
     radius: (k,) of a ball around it that holds all the dipoles.
-    area, spread: (k,) sums of a_i = |a_i n_i| and of a_i |d_i|^2.
+    area: (k,) sum of a_i = |a_i n_i|.
+    second, third, fourth: (k, 3, 3), (k, 3) and (k,) sums of a_i d_i d_i^T, of a_i |d_i|^2 d_i and
+        of a_i |d_i|^4.
     moments: M_lm, (k,) each, for 1 <= l <= 5 and m >= 0.
     """
 
     centre: FloatArray
     radius: FloatArray
     area: FloatArray
-    spread: FloatArray
+    second: FloatArray
+    third: FloatArray
+    fourth: FloatArray
     moments: Moments
 
 
@@ -149,24 +152,36 @@ def _leaves(
             area, weighted = area + size, weighted + size * sum(w * p for w, p in one.points)
         return fmin(low, of.low), fmax(high, of.high), area, weighted
 
-    def summed(of: _Primitive, spread: Real, *parts: Real) -> tuple[Any, ...]:
+    def summed(of: _Primitive, *parts: Real) -> tuple[Any, ...]:
         for one in of.dipoles:
             away = [(weight, point - centre) for weight, point in one.points]
-            spread = spread + dr.norm(one.normal) * sum(w * dr.squared_norm(d) for w, d in away)
-            more = _flat(_spread_out(one.normal, away))
+            more = _powers(dr.norm(one.normal), away) + _flat(_spread_out(one.normal, away))
             parts = tuple(a + b for a, b in zip(parts, more, strict=True))
-        return spread, *parts
+        return parts
 
     nothing = (vector(dr.inf), vector(-dr.inf), real(0), vector(0))
     low, high, area, weighted = visit(measured, nothing)
     # The mean of positions by area, or the box's middle where there is no area.
     centre = dr.select(area > 0, weighted / dr.select(area > 0, area, 1), 0.5 * (low + high))
-    spread, *parts = visit(summed, (real(0),) * (1 + len(_PARTS)))
-    dr.eval(low, high, area, centre, spread, *parts)
+    sums = visit(summed, (real(0),) * (_POWERS + len(_PARTS)))
+    powers, parts = sums[:_POWERS], sums[_POWERS:]
+    dr.eval(low, high, area, centre, *sums)
     boxes = to_numpy(low), to_numpy(high)
-    at, moments = to_numpy(centre), _moments_of(parts)
-    level = Level(at, _reach(at, *boxes), to_numpy(area), to_numpy(spread), moments)
-    return level, list(parts), *boxes
+    at, (xx, yy, zz, xy, xz, yz, *third, fourth) = to_numpy(centre), map(to_numpy, powers)
+    second = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
+    sizes = to_numpy(area), second, np.stack(third, axis=1), fourth
+    return Level(at, _reach(at, *boxes), *sizes, _moments_of(parts)), list(parts), *boxes
+
+
+def _powers(area: Real, points: Sequence[tuple[float, Vec3]]) -> list[Real]:
+    """A dipole's part of `second` (xx, yy, zz, xy, xz, yz), `third` and `fourth`."""
+    total: list[Real] = [area * 0] * _POWERS
+    for weight, d in points:
+        square, share = dr.squared_norm(d), weight * area
+        pairs = (d.x * d.x, d.y * d.y, d.z * d.z, d.x * d.y, d.x * d.z, d.y * d.z)
+        powers = (*pairs, *(square * d), square * square)
+        total = [dr.fma(share, one, old) for one, old in zip(powers, total, strict=True)]
+    return total
 
 
 def _spread_out(normal: Vec3, points: Sequence[tuple[float, Vec3]]) -> Pairs:
@@ -211,54 +226,27 @@ def _parents(
     first = arity * dr.arange(backend.UInt32, count)
     sums = [sum(dr.gather(backend.Float, one, first + k) for k in range(arity)) for one in found]
     dr.eval(*sums)
-    # About its own mean a child has no first moment, so that the squares add up.
-    wider = below.spread + below.area * (shift * shift).sum(axis=1)
-    spread = wider.reshape(-1, arity).sum(axis=1)
-    return Level(centre, _reach(centre, low, high), area, spread, _moments_of(sums)), sums
+    second, third, fourth = (
+        one.reshape(count, arity, *one.shape[1:]).sum(axis=1) for one in _moved(below, shift)
+    )
+    reach, moments = _reach(centre, low, high), _moments_of(sums)
+    return Level(centre, reach, area, second, third, fourth, moments), sums
+
+
+def _moved(level: Level, s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Second, third and fourth about centre - s: what they are of d + s. About its own centre a
+    node has no first moment."""
+    a, square = level.area[:, None], (s * s).sum(axis=1)
+    trace, bent = np.einsum("kii->k", level.second), np.einsum("kij,kj->ki", level.second, s)
+    second = level.second + a[:, None] * s[:, :, None] * s[:, None]
+    third = level.third + trace[:, None] * s + 2 * bent + a * square[:, None] * s
+    fourth = level.fourth + 2 * trace * square + level.area * square * square
+    return second, third, fourth + 4 * ((level.third + bent) * s).sum(axis=1)
 
 
 def _reach(centre: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
     """Distance from the centre to the farthest corner of the box."""
     return np.linalg.norm(np.maximum(high - centre, centre - low), axis=1)
-
-
-def sup_norm(moments: Moments, l: int) -> FloatArray:
-    """A bound of |term l| r^(l+1) over all directions.
-
-    For unit x, y the addition theorem gives sum_m |I_lm(x)|^2 / ((l+m)!(l-m)!) = P_l(1) = 1, so
-    by Cauchy and Schwarz |sum_m conj(M_lm) I_lm|^2 <= sum_m (l+m)! (l-m)! |M_lm|^2.
-    """
-    total = 0.0
-    for m in range(l + 1):
-        weight = math.factorial(l + m) * math.factorial(l - m) * (1 if m == 0 else 2)
-        total = total + weight * np.abs(moments[l, m]) ** 2
-    return np.sqrt(np.asarray(total))
-
-
-def truncation(level: Level, nearest: FloatArray, order: int = 2) -> tuple[FloatArray, FloatArray]:
-    """(E, G): seen from r >= nearest, what the terms l >= order + 2 =: k add to f is at most
-    E/r^(k+1) in value and G/r^(k+2) in gradient.
-
-    A dipole of area a at d gives the term l at most a l |d|^(l-1)/r^(l+1): on the sphere
-    rho^l P_l is a trigonometric polynomial of degree l along each great circle, so by Bernstein's
-    and Szego's inequality its gradient is at most l rho^(l-1). Terms up to 5 are known exactly and
-    bounded by `sup_norm`; for the rest |d|^(l-1) <= R^(l-3) |d|^2 and
-    sum_{l>=6} l q^(l-1) = q^5 (6 - 5q)/(1-q)^2 with q = R/r. A harmonic function of degree
-    -(l+1) has, by the same inequality, a gradient of at most l+1 times its largest value on the
-    sphere through the point; the rest is then sum_{l>=6} l (l+1) q^(l-1)
-    = q^5 (42 - 70q + 30q^2)/(1-q)^3. Each term times r^(k+1) (r^(k+2)) falls or stays as r
-    grows, so the value at `nearest` serves. A little is added, for single precision to take away.
-    """
-    r = np.maximum(nearest, 1e-50)  # of which powers can be taken
-    q = np.minimum(level.radius / r, 0.99)
-    k = order + 2
-    rest = level.spread * level.radius**3 / r ** (6 - k)
-    value = rest * (6 - 5 * q) / (1 - q) ** 2
-    slope = rest * (42 - 70 * q + 30 * q * q) / (1 - q) ** 3
-    for l in range(k, KNOWN + 1):
-        term = sup_norm(level.moments, l) / r ** (l - k)
-        value, slope = value + term, slope + (l + 1) * term
-    return _ROOM * value, _ROOM * slope
 
 
 def cartesian(moments: Moments, order: int = 2) -> FloatArray:

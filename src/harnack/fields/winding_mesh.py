@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -172,24 +172,33 @@ class WindingMesh:
             flags[near, k] = keys.take(np.searchsorted(keys, edges), mode="clip") == edges
         return flags
 
-    @property
+    @functools.cached_property
+    def box(self) -> tuple[Any, Any]:
+        """Lowest and highest coordinates of the triangles."""
+        return _box(self.vertices, self.faces)
+
+    @functools.cached_property
     def area(self) -> float:
         """Of all triangles."""
         p, q, r = np.moveaxis(self.corners, 1, 0)
         cross = np.linalg.norm(np.cross(q - p, r - p), axis=1)
         return float(0.5 * cross.sum() * self.size**2)
 
-    @property
+    @functools.cached_property
     def boundary_length(self) -> float:
         """Of all singular edges."""
         ends = self.vertices[self.singular]
         return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum())
 
 
-def _centre_and_size(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, float]:
+def _box(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, FloatArray]:
     used = np.zeros(len(vertices), np.bool_)
     used[faces] = True
-    low, high = vertices[used].min(axis=0), vertices[used].max(axis=0)
+    return vertices[used].min(axis=0), vertices[used].max(axis=0)
+
+
+def _centre_and_size(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, float]:
+    low, high = _box(vertices, faces)
     size = 2.0 ** np.ceil(np.log2(0.5 * float((high - low).max())))
     return 0.5 * (low + high), float(size)
 

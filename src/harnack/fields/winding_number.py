@@ -191,8 +191,7 @@ class WindingNumber(BatchedField):
         on the sphere: see `SolidAngle.extent`).
         """
         mesh = self.mesh
-        low = mesh.vertices[mesh.triangles].min(axis=(0, 1))
-        high = mesh.vertices[mesh.triangles].max(axis=(0, 1))
+        low, high = mesh.box
         slack = 1e-4 * float((high - low).max())
         nearest = min(abs(level) for level in levels)
         wide = math.sqrt(mesh.area / (4 * math.pi * max(nearest, 1e-12)))
