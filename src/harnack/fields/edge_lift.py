@@ -129,7 +129,7 @@ def _with_edge(
     direction, inverse = row[3], row[7]
     a, b = place(vector(row[0], row[1], row[2])), place(vector(row[4], row[5], row[6]))
     la, lb = dr.norm(a), dr.norm(b)
-    re, im = _factor(a, b, la, lb)
+    re, im = edge_factor(a, b, la, lb)
     im = direction * im
     zr, zi, turns = winding
     winding = times(zr, zi, turns, re, im)
@@ -149,7 +149,7 @@ def _with_edge(
     return winding, sizes, *sums
 
 
-def _factor(a: Vec3, b: Vec3, la: Real, lb: Real) -> tuple[Real, Real]:
+def edge_factor(a: Vec3, b: Vec3, la: Real, lb: Real) -> tuple[Real, Real]:
     """F_e of the edge from a to b.
 
     A ray exactly through an edge or a vertex is decided as `tree.triangles.crossing` does: as if

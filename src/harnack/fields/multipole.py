@@ -134,7 +134,7 @@ def _leaves(
     index, real, vector = backend.UInt32, backend.Float, backend.Array3f
     filled = tree.slots != NO_PRIMITIVE
     slots = index(np.where(filled, tree.slots, 0).astype(np.uint32).ravel())
-    first = dr.arange(index, len(filled)) * tree.leaf_size
+    first = dr.arange(index, len(filled)) * dr.opaque(index, tree.leaf_size)
     end = first + index(filled.sum(axis=1).astype(np.uint32))
 
     def visit(body: Callable[..., tuple[Any, ...]], state: tuple[Any, ...]) -> tuple[Any, ...]:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
+from harnack.fields.edge_chains import EdgeChains
 from harnack.fields.edge_lift import LiftedEdges, LiftedSums, lifted_sums
 from harnack.fields.edge_trails import EdgeTrails
 from harnack.fields.field import HarmonicBall, Lipschitz, Sample
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 
 # The ball reaches half-way to the nearest edge, as for `SolidAngle`; sums of float32 terms.
 _REACH, _ROUNDING = 0.5, 2e-5
+# So many edges are summed one by one along rays.
+_FEW = 64
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,7 @@ class ExactWinding:
     rays: TriangleRays
     edges: LiftedEdges | None
     trails: EdgeTrails | None
+    chains: EdgeChains | None
     edge_count: int
 
     @classmethod
@@ -43,10 +47,13 @@ class ExactWinding:
         """Everything uploaded."""
         count = len(mesh.singular)
         if not count:
-            return cls(backend, rays, None, None, 0)
+            return cls(backend, rays, None, None, None, 0)
         edges = LiftedEdges.upload(backend, mesh.unit_vertices, mesh.singular)
         trails = EdgeTrails.upload(backend, mesh.unit_vertices, mesh.singular)
-        return cls(backend, rays, edges, trails, count)
+        if count <= _FEW:
+            return cls(backend, rays, edges, trails, None, count)
+        chains = EdgeChains.upload(backend, mesh.unit_vertices, mesh.singular)
+        return cls(backend, rays, edges, trails, chains, count)
 
     @property
     def rounding(self) -> float:
@@ -97,23 +104,30 @@ class ExactWinding:
         The certificate is that of `SolidAngle` ("edges"), for the sum of solid angles is the
         lift of the boundary's.
         """
-        del behind, fine
+        del behind
         real = self.backend.Float
         if self.edges is None:
             return Sample(real(turns), self.backend.Array3f(0), (Lipschitz(0.0),), 0.0)
-        sums = lifted_sums(self.edges, self._seen_along(frame, x), derivatives=1, variation=True)
         share = 1 / (4 * math.pi)
+        if self.chains is not None:
+            sums = self.chains.sums(frame, x, fine)
+            gradient, error, doubt = share * sums.gradient, sums.error, share * sums.slope_error
+        else:
+            sums = lifted_sums(
+                self.edges, self._seen_along(frame, x), derivatives=1, variation=True
+            )
+            gradient, error, doubt = self._gradient(frame, sums, share), real(0), 0.0
         value = dr.fma(share, sums.angle, turns)
         epsilon = self.backend.epsilon
         distance = sums.distance * (1 - _ROUNDING) - 8 * epsilon
         r = _REACH * distance
         variation = 2 * r * (sums.first + r / (1 - _REACH) * sums.second) * (1 + _ROUNDING)
         ball = HarmonicBall(r, value - share * variation, value + share * variation)
-        gradient = self._gradient(frame, sums, share)
         # On an edge itself, to rounding, all values meet: a gradient that says so.
         apart = (sums.distance > 8 * epsilon) & dr.isfinite(dr.squared_norm(gradient))
         steep = self.backend.Array3f(0, 0, share / (4 * epsilon))
-        return Sample(value, dr.select(apart, gradient, steep), (ball,), self.rounding)
+        gradient, error = dr.select(apart, gradient, steep), dr.fma(share, error, self.rounding)
+        return Sample(value, gradient, (ball,), error, doubt)
 
     def _seen_along(self, frame: Frame, x: Vec3) -> Any:
         """Across the ray vertices are seen from its origin, so that `side` decides for all points

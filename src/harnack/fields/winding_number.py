@@ -237,7 +237,7 @@ class _Stretch(Field):
     def __init__(
         self, on: _OnDevice, frame: Frame, behind: Crossing, offset: Real, fine: Mask = True
     ) -> None:
-        self.has_detail = isinstance(on.winding, TreeWinding)
+        self.has_detail = isinstance(on.winding, TreeWinding) or on.winding.chains is not None
         self._on, self._frame, self._fine = on, frame, fine
         self._behind, self._offset = behind, offset
 
