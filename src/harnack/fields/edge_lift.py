@@ -15,7 +15,6 @@ whole ray off the edges, and the jumps of w are those of the triangles passed.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
@@ -23,10 +22,8 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import aligned
-from harnack.backend.extrema import fmin
-from harnack.fields.edge_field import edge_field, edge_variation
+from harnack.fields.edge_field import edge_field
 from harnack.fields.edge_hessian import SymmetricSum, edge_rates
-from harnack.tree.nearest import squared_distance_to_segment
 from harnack.tree.triangles import side
 
 if TYPE_CHECKING:
@@ -70,26 +67,16 @@ class LiftedEdges:
 
 @dataclass(frozen=True)
 class LiftedSums:
-    """Sums over all edges at x, as far as they were asked for, in the coordinates of the frame.
-
-    angle: sum of Omega_e; gradient, hessian: its derivatives; distance: to the nearest edge;
-    first, second: sums of a/(d sqrt(d^2+a^2)) and of the same over d, as in `edge_sums`.
-    """
+    """Sum over all edges of Omega_e and its derivatives, as far as they were asked for."""
 
     angle: Real
     gradient: Vec3
     hessian: SymmetricSum
-    distance: Real
-    first: Real
-    second: Real
 
 
-def lifted_sums(
-    edges: LiftedEdges, place: Callable[[Vec3], Vec3], *, derivatives: int, variation: bool
-) -> LiftedSums:
-    """All sums in one loop over the edges.
+def lifted_sums(edges: LiftedEdges, x: Vec3, derivatives: int) -> LiftedSums:
+    """All sums at points x in one loop over the edges, for the direction d = z.
 
-    place: gives a vertex as (u, v, z) seen from x: across the direction, and along it.
     derivatives: 0 for the angle alone, 1 with the gradient, 2 with the Hessian.
 
     The angles are added up as a product of factors and a count of how often it goes round. s_a
@@ -101,56 +88,43 @@ def lifted_sums(
     def body(i: Any, *state: Any) -> Any:
         for j in range(_CHUNK):
             row = dr.gather(backend.ArrayXf, edges.buffer, i * _CHUNK + j, shape=(8, 1))
-            state = _with_edge(vector, row, place, derivatives, variation, *state)
+            state = _with_edge(row, x, derivatives, *state)
         return i + 1, *state
 
     def more(i: Any, *_: Any) -> Mask:
         return i < edges.trips
 
     sums = (vector(0), *SymmetricSum.zero(real).parts())[: (0, 1, 7)[derivatives]]
-    winding, sizes = (real(1), real(0), real(0)), (real(dr.inf), real(0), real(0))
-    start = (backend.UInt32(0), winding, sizes, *sums)
-    _, (zr, zi, turns), (d2, s1, s2), *rest = dr.while_loop(start, more, body, label="lift")
+    start = (backend.UInt32(0), (real(1), real(0), real(0)), *sums)
+    _, product, *rest = dr.while_loop(start, more, body, label="lift")
     return LiftedSums(
-        whole_angle(zr, zi, turns),
+        whole_angle(*product),
         rest[0] if derivatives >= 1 else vector(0),
         SymmetricSum(*rest[1:]) if derivatives == 2 else SymmetricSum.zero(real),
-        dr.sqrt(d2),
-        s1,
-        s2,
     )
 
 
 def _with_edge(
-    vector: Any, row: Any, place: Callable[[Vec3], Vec3], derivatives: int, variation: bool,
-    winding: Any, sizes: Any, *sums: Any,
-) -> Any:  # fmt: skip
+    row: Any, x: Vec3, derivatives: int, product: tuple[Real, Real, Real], *sums: Any
+) -> Any:
     """The sums with the edge of a record added."""
-    direction, inverse = row[3], row[7]
-    a, b = place(vector(row[0], row[1], row[2])), place(vector(row[4], row[5], row[6]))
+    vector, direction = cast("Any", type(x)), row[3]
+    a, b = vector(row[0], row[1], row[2]) - x, vector(row[4], row[5], row[6]) - x
     la, lb = dr.norm(a), dr.norm(b)
     re, im = edge_factor(a, b, la, lb)
-    im = direction * im
-    zr, zi, turns = winding
-    winding = times(zr, zi, turns, re, im)
-    if derivatives >= 1:
-        c, weight = edge_field(a, b, la, lb)
-        g = dr.fma(vector(direction * weight), c, sums[0])
-        rest = sums[1:]
-        if derivatives == 2:
-            u, v = edge_rates(a, b - a, inverse)
-            rest = SymmetricSum(*rest).plus(direction * u, v).parts()
-        sums = (g, *rest)
-    if variation:
-        d2, s1, s2 = sizes
-        square = squared_distance_to_segment(a, b - a, inverse)
-        first, second = edge_variation(square, inverse)
-        sizes = fmin(square, d2), s1 + first, s2 + second
-    return winding, sizes, *sums
+    product = times(*product, re, direction * im)
+    if derivatives == 0:
+        return (product,)
+    c, weight = edge_field(a, b, la, lb)
+    g = dr.fma(vector(direction * weight), c, sums[0])
+    if derivatives == 1:
+        return product, g
+    u, v = edge_rates(a, b - a, row[7])
+    return product, g, *SymmetricSum(*sums[1:]).plus(direction * u, v).parts()
 
 
 def edge_factor(a: Vec3, b: Vec3, la: Real, lb: Real) -> tuple[Real, Real]:
-    """F_e of the edge from a to b.
+    """F_e of the edge from a to b, seen as (u, v, z): across the direction, and along it.
 
     A ray exactly through an edge or a vertex is decided as `tree.triangles.crossing` does: as if
     it passed at v, and then u, infinitely little below zero.

@@ -42,11 +42,19 @@ AddLeaf: TypeAlias = "Callable[[Node, Mask, Sums], Sums]"
 
 
 def node_columns(level: Level, order: int, rough: float, error: FloatArray) -> FloatArray:
-    """Numbers of nodes as the walks below read them.
+    """Numbers of nodes as the walks below read them, that may be taken as a whole beyond `rough`
+    times their radius: centre, accepting distance, A and K of `bend_columns` | 15 coefficients,
+    value error E (k,), as given."""
+    head = [rough * level.radius, *bend_columns(level, rough)]
+    parts = (level.centre, *head, cartesian(level.moments, order), error)
+    return np.column_stack(parts)
 
-    centre, accepting distance, A, K | 15 coefficients, value error E (k,), as given. A node may be
-    taken as a whole beyond `rough` times its radius R. From there on a step by t = q r, q <= Q =
-    `longest_part(rough)`, moves its field off the linear by at most
+
+def bend_columns(level: Level, rough: float) -> tuple[FloatArray, FloatArray]:
+    """A and K (k,) of nodes that are seen from beyond r0 = `rough` times their radius R.
+
+    From there on a step by t = q r, q <= Q = `longest_part(rough)`, moves a node's field off the
+    linear by at most
 
         (A + K/r^2) t^2/r^4 Phi_1(q),   Phi_l(q) = ((1-q)^-(l+1) - 1 - (l+1)q)/q^2.
 
@@ -54,25 +62,26 @@ def node_columns(level: Level, order: int, rough: float, error: FloatArray) -> F
     derivative along a line (l+k)!/l! B_l/r^(l+1+k) (`truncation.truncation`, k times). So Taylor's
     remainder is at most B_l Phi_l(q) t^2/r^(l+3). In Phi_l/Phi_1 the ratio of coefficients,
     (l+k)!/(l! (k+1)!), grows with k, so that the quotient grows with q: W_l = Phi_l(Q)/Phi_1(Q)
-    serves. With r >= r0 = rough R: A = B_1 + W_2 B_2/r0 and K = sum_{l>=3} W_l B_l/r0^(l-3), for l
-    >= 6 of B_l <= l R^(l-5) sum a |d|^4, with Phi_l(Q) < (1-Q)^-(l+1)/Q^2.
+    serves. With r >= r0: A = B_1 + W_2 B_2/r0 and K = sum_{l>=3} W_l B_l/r0^(l-3), for l >= 6 of
+    B_l <= l R^(l-5) sum a |d|^4, with Phi_l(Q) < (1-Q)^-(l+1)/Q^2.
     """
     r0, q = np.maximum(rough * level.radius, 1e-50), longest_part(rough)
     ratio = [((1 - q) ** -(n + 1) - 1 - (n + 1) * q) / (q * q * _phi(q)) for n in range(KNOWN + 1)]
     terms = [ratio[n] * sup_norm(level.moments, n) for n in range(1, KNOWN + 1)]
-    near = terms[0] + terms[1] / r0
     x = 1 / (rough * (1 - q))
     rest = x * (6 - 5 * x) / (1 - x) ** 2 / ((1 - q) ** 6 * q * q * _phi(q))
     wide = rest * level.fourth / r0**2 + sum(term / r0**n for n, term in enumerate(terms[2:]))
-    head = np.stack([rough * level.radius, near, wide], axis=1)
-    return np.concatenate(
-        [level.centre, head, cartesian(level.moments, order), error[:, None]], axis=1
-    )
+    return terms[0] + terms[1] / r0, wide
 
 
 def longest_part(rough: float) -> float:
     """Of the distance of a far node's centre: the longest step that certificates cover."""
     return _WAY * (1 - 1 / rough)
+
+
+def free_part(rough: float) -> float:
+    """Of the distance of a far node's centre: what is counted as free of dipoles."""
+    return longest_part(rough) / _REACHES[-1]
 
 
 def _phi(q: float) -> float:
@@ -161,14 +170,14 @@ class FarClusters:
         add_leaf: as for `at`, of the sums of `Nearby` in their order and then the own ones.
         """
         real, vector = self.backend.Float, self.backend.Array3f
-        centred = longest_part(self.rough) / _REACHES[-1]
+        free = free_part(self.rough)
 
         def visit(node: Node, state: Sums) -> tuple[Mask, Sums]:
             value, g, error, slope_error, clear, s4, s5, *rest = state
             r, square, inverse, far = self._far(node, x, fine)
             c = node.payload(far)
             terms = far_terms(c, r, inverse, 1)
-            apart = centred * (square * inverse)
+            apart = free * (square * inverse)
             decay, square = self._decay(inverse), inverse * inverse
             fourth = self._size(node, inverse) * (square * square)
             state = (
@@ -234,9 +243,8 @@ class Nearby:
     """What sums over a tree tell about f near x.
 
     error, slope_error: what was left out of value and gradient. clear: the distance of the nearest
-    dipole, or if it is less, the part of that to the nearest far node's centre of which the longest
-    reach is `longest_part`. s4, s5: sums of a/rho^4 and a/rho^5 over dipoles a at rho and, with
-    A + K/r^2 for a, over far nodes at r.
+    dipole, or `free_part` of that to the nearest far node's centre if that is less. s4, s5: sums of
+    a/rho^4 and a/rho^5 over dipoles a at rho and, with A + K/r^2 for a, over far nodes at r.
     """
 
     backend: Backend

@@ -1,21 +1,23 @@
 """Winding numbers without truncation: crossings of one ray, and the boundary edges.
 
-See `edge_lift` for the formula. The cost is that of one ray through a tree of boxes plus one pass
-over the edges at which the triangles do not cancel, however many triangles there are.
+See `edge_lift` for the formula. At points the cost is that of one ray through a tree of boxes plus
+one pass over the edges at which the triangles do not cancel, however many triangles there are.
+Along rays a tree of chains of these edges takes less than all of them (`edge_chains`).
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 
 from harnack.fields.edge_chains import EdgeChains
-from harnack.fields.edge_lift import LiftedEdges, LiftedSums, lifted_sums
+from harnack.fields.edge_lift import LiftedEdges, lifted_sums
 from harnack.fields.edge_trails import EdgeTrails
-from harnack.fields.field import HarmonicBall, Lipschitz, Sample
+from harnack.fields.field import Lipschitz, Sample
 from harnack.fields.winding_mesh import rounding_of_sum
 from harnack.tree.triangles import Frame, TriangleRays
 
@@ -24,11 +26,6 @@ if TYPE_CHECKING:
     from harnack.fields.edge_hessian import SymmetricSum
     from harnack.fields.sheets import Crossing
     from harnack.fields.winding_mesh import WindingMesh
-
-# The ball reaches half-way to the nearest edge, as for `SolidAngle`; sums of float32 terms.
-_REACH, _ROUNDING = 0.5, 2e-5
-# So many edges are summed one by one along rays.
-_FEW = 64
 
 
 @dataclass(frozen=True)
@@ -43,17 +40,26 @@ class ExactWinding:
     edge_count: int
 
     @classmethod
-    def of(cls, backend: Backend, mesh: WindingMesh, rays: TriangleRays) -> ExactWinding:
-        """Everything uploaded."""
-        count = len(mesh.singular)
-        if not count:
+    def of(
+        cls, backend: Backend, mesh: WindingMesh, rays: TriangleRays, traced: bool
+    ) -> ExactWinding:
+        """Everything uploaded; traced: for `on_stretch` as well."""
+        if not len(mesh.singular):
             return cls(backend, rays, None, None, None, 0)
-        edges = LiftedEdges.upload(backend, mesh.unit_vertices, mesh.singular)
-        trails = EdgeTrails.upload(backend, mesh.unit_vertices, mesh.singular)
-        if count <= _FEW:
-            return cls(backend, rays, edges, trails, None, count)
-        chains = EdgeChains.upload(backend, mesh.unit_vertices, mesh.singular)
-        return cls(backend, rays, edges, trails, chains, count)
+        vertices, edges = mesh.unit_vertices, mesh.singular
+        return cls(
+            backend,
+            rays,
+            LiftedEdges.upload(backend, vertices, edges),
+            EdgeTrails.upload(backend, vertices, edges),
+            EdgeChains.upload(backend, vertices, edges) if traced else None,
+            len(edges),
+        )
+
+    @property
+    def has_detail(self) -> bool:
+        """Whether rough looks cost less."""
+        return self.chains is not None
 
     @property
     def rounding(self) -> float:
@@ -86,7 +92,7 @@ class ExactWinding:
         turns = self.rays.turns_along(x, self.backend.Float(1))
         if self.edges is None:
             return turns, self.backend.Array3f(0), None, self.backend.Float(0)
-        sums = lifted_sums(self.edges, lambda p: p - x, derivatives=derivatives, variation=False)
+        sums = lifted_sums(self.edges, x, derivatives)
         share = 1 / (4 * math.pi)
         hessian = type(sums.hessian)(*(share * part for part in sums.hessian.parts()))
         value = dr.fma(share, sums.angle, turns)
@@ -99,47 +105,13 @@ class ExactWinding:
     def on_stretch(
         self, frame: Frame, x: Vec3, behind: Crossing, turns: Real, fine: Mask
     ) -> Sample:
-        """w continued along a stretch of a ray.
-
-        The certificate is that of `SolidAngle` ("edges"), for the sum of solid angles is the
-        lift of the boundary's.
-        """
+        """w continued along a stretch of a ray, certified as `far_clusters.Nearby.sample` says."""
         del behind
-        real = self.backend.Float
         if self.edges is None:
-            return Sample(real(turns), self.backend.Array3f(0), (Lipschitz(0.0),), 0.0)
-        share = 1 / (4 * math.pi)
-        if self.chains is not None:
-            sums = self.chains.sums(frame, x, fine)
-            gradient, error, doubt = share * sums.gradient, sums.error, share * sums.slope_error
-        else:
-            sums = lifted_sums(
-                self.edges, self._seen_along(frame, x), derivatives=1, variation=True
-            )
-            gradient, error, doubt = self._gradient(frame, sums, share), real(0), 0.0
-        value = dr.fma(share, sums.angle, turns)
-        epsilon = self.backend.epsilon
-        distance = sums.distance * (1 - _ROUNDING) - 8 * epsilon
-        r = _REACH * distance
-        variation = 2 * r * (sums.first + r / (1 - _REACH) * sums.second) * (1 + _ROUNDING)
-        ball = HarmonicBall(r, value - share * variation, value + share * variation)
-        # On an edge itself, to rounding, all values meet: a gradient that says so.
-        apart = (sums.distance > 8 * epsilon) & dr.isfinite(dr.squared_norm(gradient))
-        steep = self.backend.Array3f(0, 0, share / (4 * epsilon))
-        gradient, error = dr.select(apart, gradient, steep), dr.fma(share, error, self.rounding)
-        return Sample(value, gradient, (ball,), error, doubt)
-
-    def _seen_along(self, frame: Frame, x: Vec3) -> Any:
-        """Across the ray vertices are seen from its origin, so that `side` decides for all points
-        of the ray alike, and as for triangles; along it, from x."""
-        vector = self.backend.Array3f
-
-        def place(p: Vec3) -> Vec3:
-            u, v = frame.across(p)
-            return vector(u, v, dr.dot(p - x, frame.d))
-
-        return place
-
-    def _gradient(self, frame: Frame, sums: LiftedSums, share: float) -> Vec3:
-        g = share * sums.gradient
-        return g.x * frame.u + g.y * frame.v + g.z * frame.d
+            nothing = self.backend.Array3f(0)
+            return Sample(self.backend.Float(turns), nothing, (Lipschitz(0.0),), 0.0)
+        if self.chains is None:
+            raise RuntimeError("uploaded for points and not for rays")
+        found = self.chains.near(frame, x, fine)
+        found = dataclasses.replace(found, value=dr.fma(4 * math.pi, turns, found.value))
+        return found.sample(1 / (4 * math.pi), self.rounding)

@@ -117,14 +117,14 @@ class WindingNumber(BatchedField):
     def _batch(self, backend: Backend) -> _OnDevice:
         """The evaluator for points, which is made once a backend."""
         if backend not in self._batches:
-            self._batches[backend] = self._upload(backend, self.accuracy or 2.0)
+            self._batches[backend] = self._upload(backend, self.accuracy or 2.0, traced=False)
         return self._batches[backend]
 
-    def _upload(self, backend: Backend, accuracy: float) -> _OnDevice:
+    def _upload(self, backend: Backend, accuracy: float, traced: bool) -> _OnDevice:
         mesh = self.mesh
         rays = TriangleRays.of(backend, mesh.ray_tree, mesh.ray_records)
         if self.method == "exact":
-            winding = ExactWinding.of(backend, mesh, rays)
+            winding = ExactWinding.of(backend, mesh, rays, traced)
         else:
             winding = TreeWinding.of(backend, mesh, accuracy, self.order)
         return _OnDevice(*placed(backend, mesh.centre, mesh.size), winding, rays)
@@ -133,7 +133,7 @@ class WindingNumber(BatchedField):
         if self._device is not None and self._device.backend is backend:
             return self
         prepared = copy.copy(self)
-        prepared._device = self._upload(backend, self.accuracy or _TRACED)
+        prepared._device = self._upload(backend, self.accuracy or _TRACED, traced=True)
         return prepared
 
     def evaluate(self, p: Vec3) -> Sample:
@@ -237,7 +237,7 @@ class _Stretch(Field):
     def __init__(
         self, on: _OnDevice, frame: Frame, behind: Crossing, offset: Real, fine: Mask = True
     ) -> None:
-        self.has_detail = isinstance(on.winding, TreeWinding) or on.winding.chains is not None
+        self.has_detail = on.winding.has_detail
         self._on, self._frame, self._fine = on, frame, fine
         self._behind, self._offset = behind, offset
 

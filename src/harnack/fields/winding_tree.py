@@ -52,6 +52,11 @@ class TreeWinding:
         return cls(FarClusters.of(backend, mesh.tree, levels, slots, accuracy, order), rounding)
 
     @property
+    def has_detail(self) -> bool:
+        """Whether rough looks cost less."""
+        return True
+
+    @property
     def backend(self) -> Backend:
         """The one it lies on."""
         return self.clusters.backend
@@ -157,7 +162,7 @@ class TreeWinding:
                 clear = dr.select(open_, fmin(dr.sqrt(near2), clear), clear)
                 e = dr.select(open_, edge_variation(near2, inverse)[1], 0)
                 s4 = dr.fma(2 / 3, e, s4)
-                s5 = dr.fma(0.5 * dr.rsqrt(near2), e, s5)
+                s5 = dr.fma(0.5 * dr.rsqrt(fmax(near2, 1e-37)), e, s5)
             return zr, zi, turns, g, clear, s4, s5, beside, unsure
 
         value, g, error, slope_error, clear, s4, s5, beside, unsure = state
