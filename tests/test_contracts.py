@@ -213,7 +213,8 @@ def samples(field: Field, x: np.ndarray, fine: Any = True) -> tuple[Sample, Any]
     if field.has_sheets:
         up = backend.Array3f(0, 0, 1)
         nowhere = Crossing(0.0, backend.UInt32(NO_SHEET), backend.Float(0), up)
-        seen = seen.between(p, up, nowhere, nowhere, backend.Float(0))
+        ahead = seen.offset(p, up, backend.Float(0), backend.Bool(True))
+        seen = seen.between(p, up, nowhere, nowhere, ahead)
     assert seen.has_detail
     sample = seen.at_detail(backend.Bool(fine)).evaluate(p)
 
@@ -320,6 +321,26 @@ def test_what_a_tree_of_triangles_leaves_out_is_within_its_bounds(
     assert (off <= on_host(sample.error)).all()
     assert (slant <= on_host(sample.gradient_error) + 1e-9).all()
     assert off.max() > 1e-6
+
+    def lift(x: np.ndarray, d: np.ndarray) -> np.ndarray:
+        """How far w moves with its jumps, which are whole numbers, taken out on the way."""
+        way = np.linspace(0, 1, 65)[:, None, None] * d + x
+        w = exact(way.reshape(-1, 3)).reshape(65, -1)
+        return (np.unwrap(w, axis=0, period=1.0) - w[0])[-1]
+
+    check_promises(sample, on_host, x, lift)
+
+
+@pytest.mark.parametrize("fine", [True, False])
+def test_what_chains_of_edges_leave_out_is_within_its_bounds(fine: bool) -> None:
+    vertices, faces = bumpy_sphere(3)
+    faces = faces[vertices[faces].mean(axis=1)[:, 2] > 0.1]
+    x, exact = spread(300), winding_sum(vertices[faces])
+    sample, on_host = samples(hk.WindingNumber(vertices, faces, method="exact"), x, fine)
+    value = exact(x)
+    off = np.abs(on_host(sample.value) - value)
+    assert (off <= on_host(sample.error) + 1e-12).all()
+    assert (off.max() > 1e-6) != fine
 
     def lift(x: np.ndarray, d: np.ndarray) -> np.ndarray:
         """How far w moves with its jumps, which are whole numbers, taken out on the way."""

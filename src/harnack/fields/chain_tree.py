@@ -52,24 +52,30 @@ def chain_leaves(vertices: FloatArray, trails: list[IntArray]) -> ChainLeaves:
     """Trails of vertices, each ending where it begins, laid out; neighbours next to each other."""
     middles = np.array([vertices[trail].mean(axis=0) for trail in trails])
     near = build_hierarchy(middles, leaf_size=1).slots.ravel()
-    counts = np.array([len(trail) - 1 for trail in trails])
-    spans: IntArray = 2 ** np.ceil(np.log2(-(-counts // _LEAF_SIZE))).astype(np.int64)
-    some = near[near != NO_PRIMITIVE]
-    order: list[int] = some[np.argsort(-spans[some], kind="stable")].tolist()
+    counts = [len(trail) - 1 for trail in trails]
+    spans = [1 << (-(-count // _LEAF_SIZE) - 1).bit_length() for count in counts]
+    some = [int(k) for k in near if k != NO_PRIMITIVE]
+    order = sorted(some, key=spans.__getitem__, reverse=True)
     ends: list[IntArray] = [np.zeros(1, np.int64)]
     start = 0
-    for count, span in zip(counts[order].tolist(), spans[order].tolist(), strict=True):
-        ends.append(start + np.arange(1, span + 1) * count // span)
-        start += count
-    used = int(spans.sum())
+    for k in order:
+        ends.append(_shares(start, counts[k], spans[k])[1:])
+        start += counts[k]
+    used = sum(spans)
     ends.append(np.full(2 ** (used - 1).bit_length() - used, start))
-    laid = [trails[k] for k in order]
+    edges = [np.column_stack([trails[k][:-1], trails[k][1:]]) for k in order]
+    laid = [counts[k] for k in order]
     return ChainLeaves(
-        np.concatenate([np.column_stack([trail[:-1], trail[1:]]) for trail in laid]),
-        np.repeat([int(trail[0]) for trail in laid], counts[order]),
-        np.repeat(spans[order], counts[order]),
+        np.concatenate(edges),
+        np.repeat([int(trails[k][0]) for k in order], laid),
+        np.repeat([spans[k] for k in order], laid),
         np.concatenate(ends),
     )
+
+
+def _shares(start: int, count: int, parts: int) -> IntArray:
+    """(parts + 1,) where each of so many parts of `count` numbers begins, and the last one ends."""
+    return start + np.arange(parts + 1, dtype=np.int64) * count // parts
 
 
 def ranges(start: IntArray, end: IntArray, width: int) -> IntArray:

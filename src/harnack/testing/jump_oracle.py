@@ -122,6 +122,9 @@ def judge(
 ) -> Verdict:
     """Compares hits t (n,), inf for misses, with the changes of sides of an exact function.
 
+    A hit next to a jump that cuts the level off just before it is reached counts as right, as
+    `tracer.stretches` says: where the function would reach it within `reach` if it went on.
+
     reach: how far a hit may be from the surface; a few tolerances of the trace.
     edges: (k, 2, 3) segments at which the function is singular. Around them its gradient grows
         without limit, so that any value is within tolerance of any level: hits within `reach` of
@@ -148,6 +151,7 @@ def judge(
     early = np.flatnonzero(t < truth - reach)
     x = origins[early] + t[early, None] * directions[early]
     near = is_near_surface(value, x, level=level, reach=reach)
+    near |= _continues(value, x, directions[early], level, reach)
     if edges is not None:
         near |= _distance(x, edges) <= reach
     early = early[~near]
@@ -158,6 +162,16 @@ def _is_above(value: Value, o: FloatArray, d: FloatArray, t: FloatArray, level: 
     """For t (n, m) on rays (n, 3)."""
     x = o[:, None] + t[..., None] * d[:, None]
     return value(x.reshape(-1, 3)).reshape(t.shape) > level
+
+
+def _continues(value: Value, x: FloatArray, d: FloatArray, level: float, reach: float) -> BoolArray:
+    """Whether f at x (n, 3) is nearer to the level than it moves on a step of `reach`, ahead or
+    back, whichever is less: on one of the two there is no jump."""
+    if not len(x):
+        return np.zeros(0, np.bool_)
+    here = value(x)
+    moved = [np.abs(value(x + step * d) - here) for step in (reach, -reach)]
+    return np.abs(here - level) <= np.minimum(*moved)
 
 
 def _across(d: FloatArray) -> tuple[FloatArray, FloatArray]:
