@@ -62,7 +62,7 @@ def chain_leaves(vertices: FloatArray, trails: list[IntArray]) -> ChainLeaves:
         ends.append(_shares(start, counts[k], spans[k])[1:])
         start += counts[k]
     used = sum(spans)
-    ends.append(np.full(2 ** (used - 1).bit_length() - used, start))
+    ends.append(np.full((1 << (used - 1).bit_length()) - used, start))
     edges = [np.column_stack([trails[k][:-1], trails[k][1:]]) for k in order]
     laid = [counts[k] for k in order]
     return ChainLeaves(
