@@ -45,8 +45,9 @@ class WindingNumber(BatchedField):
     spans its holes. Faces are counter-clockwise seen from outside.
 
     vertices: (n, 3). faces: (m, 3) indices into them.
-    method: "exact" (`edge_lift`: no truncation, cost by boundary edges), "tree" (`winding_tree`),
-        or "auto": exact up to 2048 boundary edges.
+    method: "exact" (`edge_lift`: no truncation, cost by boundary edges; along rays `edge_chains`,
+        no more truncation than rounding), "tree" (`winding_tree`), or "auto": exact up to 2048
+        boundary edges.
     accuracy: of the tree: a cluster of triangles is taken as a whole beyond `accuracy` times its
         radius; more is slower and sharper. At least 1.5; by default 2 for values at points and 4
         for tracing. order: of the tree: 0 (dipoles), 1 or 2 (octupoles).
