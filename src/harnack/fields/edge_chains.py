@@ -58,7 +58,8 @@ class EdgeChains:
         ball around its chain.
         """
         real, vector = self.backend.Float, self.backend.Array3f
-        pad = 16 * self.backend.epsilon * (1 + dr.max(dr.abs(frame.o)))
+        unit = self.backend.epsilon * (1 + dr.max(dr.abs(frame.o)))
+        pad = 16 * unit
 
         def visit(node: Node, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
             product, value, g, error, slope_error, clear, s4, s5 = state
@@ -85,12 +86,12 @@ class EdgeChains:
                 dr.fma(fourth, inverse, s5),
             )
             chord = vector(*c[19:22]), vector(*c[22:25])
-            state = _with_edge(frame, x, chord, (real(1), c[25]), far & (c[25] > 0), state)
+            state = _with_edge(frame, x, chord, (real(1), c[25], unit), far & (c[25] > 0), state)
             return ~far, for_each(node, ~far & node.is_leaf, add, state)
 
         def add(row: list[Real], active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
             ends, way = (vector(*row[:3]), vector(*row[4:7])), row[3]
-            return _with_edge(frame, x, ends, (way, row[INVERSE]), active & (way != 0), state)
+            return _with_edge(frame, x, ends, (way, row[INVERSE], unit), active & (way != 0), state)
 
         one, zero = (real(1), real(0), real(0)), real(0)
         start = (one, zero, vector(0), zero, zero, real(dr.inf), zero, zero)
@@ -99,12 +100,16 @@ class EdgeChains:
 
 
 def _with_edge(
-    frame: Frame, x: Vec3, ends: tuple[Vec3, Vec3], more: tuple[Real, Real], active: Mask,
+    frame: Frame, x: Vec3, ends: tuple[Vec3, Vec3], more: tuple[Real, ...], active: Mask,
     state: tuple[Any, ...],
 ) -> tuple[Any, ...]:  # fmt: skip
-    """The sums with the edge between `ends` added; more: 1 or -1 for its way, and 1/length^2."""
+    """The sums with the edge between `ends` added.
+
+    more: 1 or -1 for its way; 1/length^2; and how far rounding moves a coordinate, by which an
+    edge's angle changes the more the steeper it is, whatever the others do.
+    """
     product, value, g, error, slope_error, clear, s4, s5 = state
-    vector, (p, q), (way, inverse) = cast("Any", type(x)), ends, more
+    vector, (p, q), (way, inverse, unit) = cast("Any", type(x)), ends, more
     a, b = p - x, q - x
     la, lb = dr.norm(a), dr.norm(b)
     seen_a = vector(*frame.across(p), dr.dot(a, frame.d))
@@ -114,14 +119,15 @@ def _with_edge(
     re, im = dr.select(active, re, 1), dr.select(active, way * im, 0)
     product = times(zr, zi, turns, re, im)
     c, weight = edge_field(a, b, la, lb)
+    slope = dr.select(active, (way * weight) * c, 0)
     square = squared_distance_to_segment(a, b - a, inverse)
     e = dr.select(active, edge_variation(square, inverse)[1], 0)
     closer = dr.rsqrt(fmax(square, 1e-37))
     return (
         product,
         value,
-        g + dr.select(active, (way * weight) * c, 0),
-        error,
+        g + slope,
+        dr.fma(4 * unit, dr.norm(slope), error),
         slope_error,
         dr.select(active, fmin(dr.sqrt(square), clear), clear),
         dr.fma(2 / 3, e, s4),
