@@ -188,7 +188,7 @@ def plot(path: Path, points: list[AtPoints], rays: list[AlongRays]) -> None:
             y = [getattr(row, quantity) for row in some]
             axis.plot([row.elements for row in some], y, "o-", label=series)
         axis.set(xscale="log", xlabel="triangles or points", ylabel=label)
-        axis.legend()
+        axis.legend(loc="center right")
     # Clouds take tens of times as long as meshes: only a logarithm shows both.
     axes[1].set_yscale("log")
     axes[0].set_ylim(bottom=0)

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from harnack.backend import choose_backend, to_numpy
 from harnack.fields import moments
-from harnack.fields.far_clusters import longest_part, node_columns
+from harnack.fields.far_clusters import node_columns
 from harnack.fields.multipole import (
     Level,
     all_levels,
@@ -27,6 +27,7 @@ from harnack.fields.multipole import (
     triangle_rule,
 )
 from harnack.fields.multipole_kernel import far_terms
+from harnack.fields.nearby import longest_part
 from harnack.fields.truncation import sup_norm, truncation
 from harnack.tree import Hierarchy, build_hierarchy
 

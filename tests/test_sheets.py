@@ -483,6 +483,18 @@ def test_the_oracle_sees_hits_that_are_late_early_or_not_there() -> None:
         first_side_changes(exact, o, d, 0.0, math.inf, level=0.5)
 
 
+@pytest.mark.parametrize(("short", "early"), [(0.5, 0), (2.0, 1)])
+def test_a_level_that_a_jump_cuts_off_is_within_reach_or_not(short: float, early: int) -> None:
+    """f = x falls by ten at x = 1, `short` reaches before the level: nowhere is there a surface."""
+
+    def value(x: np.ndarray) -> np.ndarray:
+        return x[:, 0] - 10 * (x[:, 0] > 1)
+
+    o, d, t = np.zeros((1, 3)), np.array([[1.0, 0, 0]]), np.array([1 - 1e-9])
+    verdict = judge(t, value, o, d, 0.0, 3.0, level=1 + short * REACH, reach=REACH)
+    assert len(verdict.early) == early
+
+
 # --- steps that are exact -------------------------------------------------------------------
 
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harnack.fields.far_clusters import bend_columns
 from harnack.fields.multipole import cartesian, triangle_levels
+from harnack.fields.nearby import bend_columns
 from harnack.fields.truncation import truncation
 from harnack.tree import NO_PRIMITIVE, Hierarchy, build_hierarchy
 from harnack.tree.hierarchy import FloatArray, IntArray
@@ -20,8 +20,6 @@ from harnack.tree.hierarchy import FloatArray, IntArray
 RATIO = 2.5
 # And where what it leaves out is at most so much: in a rough look, and over epsilon in a close one.
 _ROUGH, _CLOSE = 1e-2, 1.0
-# Column of an edge: 1/length^2.
-INVERSE = 7
 # Edges of a leaf at most.
 _LEAF_SIZE = 4
 # Where nodes without edges are, far from everything, in units of about the mesh's size.
@@ -44,7 +42,7 @@ class ChainLeaves:
     def hierarchy(self) -> Hierarchy:
         """The tree over the leaves, a power of two."""
         depth = (len(self.ends) - 2).bit_length()
-        slots = ranges(self.ends[:-1], self.ends[1:], _LEAF_SIZE)
+        slots = _ranges(self.ends[:-1], self.ends[1:], _LEAF_SIZE)
         return Hierarchy(slots, (4,) * (depth // 2) + (2,) * (depth % 2))
 
 
@@ -78,21 +76,10 @@ def _shares(start: int, count: int, parts: int) -> IntArray:
     return start + np.arange(parts + 1, dtype=np.int64) * count // parts
 
 
-def ranges(start: IntArray, end: IntArray, width: int) -> IntArray:
+def _ranges(start: IntArray, end: IntArray, width: int) -> IntArray:
     """(n, width): start, start + 1, .. up to end, then NO_PRIMITIVE."""
     index = start[:, None] + np.arange(width)
     return np.where(index < end[:, None], index, NO_PRIMITIVE)
-
-
-def edge_records(leaves: ChainLeaves, tree: Hierarchy, vertices: FloatArray) -> FloatArray:
-    """Edges in slots (leaves, leaf_size, 8): lower end, direction, higher end, `INVERSE`.
-
-    The ends are ordered by vertex index, as those of triangles are; a slot without an edge has no
-    direction."""
-    start, end = leaves.edges.T
-    low, high = vertices[np.minimum(start, end)], vertices[np.maximum(start, end)]
-    inverse = 1 / np.maximum(((high - low) ** 2).sum(axis=1), 1e-300)
-    return tree.gather(np.column_stack([low, np.where(start < end, 1.0, -1.0), high, inverse]))
 
 
 def chain_columns(
@@ -111,7 +98,7 @@ def chain_columns(
     whole = leaves.span <= size
     fan = np.where(whole, leaves.first, np.repeat(leaves.edges[begin, 0], end - begin))
     corners = vertices[np.column_stack([fan, leaves.edges])]
-    slots = ranges(begin, end, int((end - begin).max()))
+    slots = _ranges(begin, end, int((end - begin).max()))
     level = triangle_levels(Hierarchy(slots, ()), corners)[0]
     error, slope = truncation(level, RATIO * level.radius)
     accept = [

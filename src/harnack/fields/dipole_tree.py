@@ -10,8 +10,9 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend.extrema import fmin
-from harnack.fields.far_clusters import FarClusters, rounding_of_dipole
+from harnack.fields.far_clusters import FarClusters
 from harnack.fields.multipole import all_levels
+from harnack.fields.nearby import rounding_of_dipole
 from harnack.tree import NO_PRIMITIVE, Node, build_hierarchy, for_each
 
 if TYPE_CHECKING:
@@ -80,7 +81,7 @@ class DipoleTree:
         return *sums, dr.fma(self.clusters.backend.epsilon, rounded, error + self.rounding)
 
     def sample(self, x: Vec3, fine: Mask) -> Sample:
-        """Value, gradient and certificate at x: see `far_clusters.Nearby.sample`."""
+        """Value, gradient and certificate at x: see `nearby.Nearby.sample`."""
         vector, real = self.clusters.backend.Array3f, self.clusters.backend.Float
         epsilon = self.clusters.backend.epsilon
 

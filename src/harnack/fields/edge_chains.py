@@ -20,12 +20,12 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 
 from harnack.backend.extrema import fmax, fmin
-from harnack.fields.chain_tree import INVERSE, RATIO, chain_columns, chain_leaves, edge_records
+from harnack.fields.chain_tree import RATIO, chain_columns, chain_leaves
 from harnack.fields.edge_field import edge_field, edge_variation
-from harnack.fields.edge_lift import edge_factor, times, whole_angle
+from harnack.fields.edge_lift import edge_factor, edge_records, times, whole_angle
 from harnack.fields.edge_trails import closed_trails
-from harnack.fields.far_clusters import Nearby, free_part, rounding_of_dipole
 from harnack.fields.multipole_kernel import far_terms
+from harnack.fields.nearby import Nearby, free_part, with_far_node
 from harnack.tree import Node, PackedTree, for_each, pack, walk
 from harnack.tree.nearest import squared_distance_to_segment
 
@@ -48,7 +48,8 @@ class EdgeChains:
         leaves = chain_leaves(vertices, closed_trails(edges))
         tree = leaves.hierarchy()
         levels = [chain_columns(leaves, nodes, vertices, backend.epsilon) for nodes in tree.counts]
-        return cls(backend, pack(backend, tree, levels, edge_records(leaves, tree, vertices)))
+        records = tree.gather(edge_records(vertices, leaves.edges))
+        return cls(backend, pack(backend, tree, levels, records))
 
     def near(self, frame: Frame, x: Vec3, fine: Mask) -> Nearby:
         """The sum of Omega_e at points x of rays, and what a certificate needs.
@@ -62,36 +63,28 @@ class EdgeChains:
         pad = 16 * unit
 
         def visit(node: Node, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
-            product, value, g, error, slope_error, clear, s4, s5 = state
             centre, radius = vector(*node.head[:3]), node.head[3] + pad
             r = x - centre
             square, (u, v) = dr.squared_norm(r), frame.across(centre)
             missed = (dr.fma(u, u, v * v) > radius * radius) | (dr.dot(r, frame.d) > radius)
             far = missed & (square > dr.square(dr.select(fine, node.head[5], node.head[4])))
             inverse = dr.select(far, dr.rsqrt(square), 0)
-            c = node.payload(far)
-            terms = far_terms(c, r, inverse, 1)
-            size, power = dr.fma(c[18], inverse * inverse, c[17]), dr.square(inverse * inverse)
-            fourth, decay = size * power, power * inverse
-            rounded = self.backend.epsilon * rounding_of_dipole(size, inverse)
-            clear = dr.select(far, fmin(free_part(RATIO) * square * inverse, clear), clear)
-            state = (
-                product,
-                value + dr.select(far, terms.value, 0),
-                g + dr.select(far, terms.gradient, 0),
-                dr.fma(c[15], decay, error) + rounded,
-                dr.fma(c[16], decay * inverse, slope_error),
-                clear,
-                s4 + fourth,
-                dr.fma(fourth, inverse, s5),
-            )
+            c, decay = node.payload(far), dr.square(inverse * inverse) * inverse
+            sums = with_far_node(
+                state[1:], far_terms(c, r, inverse, 1), far, inverse,
+                dr.fma(c[18], inverse * inverse, c[17]),
+                (c[15] * decay, c[16] * decay * inverse),
+                free_part(RATIO) * (square * inverse), self.backend.epsilon,
+            )  # fmt: skip
+            state = (state[0], *sums)
             chord = vector(*c[19:22]), vector(*c[22:25])
             state = _with_edge(frame, x, chord, (real(1), c[25], unit), far & (c[25] > 0), state)
             return ~far, for_each(node, ~far & node.is_leaf, add, state)
 
         def add(row: list[Real], active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
             ends, way = (vector(*row[:3]), vector(*row[4:7])), row[3]
-            return _with_edge(frame, x, ends, (way, row[INVERSE], unit), active & (way != 0), state)
+            # A slot without an edge has no direction.
+            return _with_edge(frame, x, ends, (way, row[7], unit), active & (way != 0), state)
 
         one, zero = (real(1), real(0), real(0)), real(0)
         start = (one, zero, vector(0), zero, zero, real(dr.inf), zero, zero)

@@ -38,12 +38,7 @@ _TINY = 1e-36
 
 @dataclass(frozen=True)
 class LiftedEdges:
-    """Directed edges on the device, one packet each: lower end, direction, higher end, 1/length^2.
-
-    The ends are ordered by vertex index, as those of triangles are (`tree.triangles`), so that
-    `side` gives the same bits here and there; direction is 1 if the edge runs from lower to
-    higher, -1 if it runs back.
-    """
+    """Directed edges on the device, one packet each: see `edge_records`."""
 
     backend: Backend
     buffer: Any
@@ -52,10 +47,7 @@ class LiftedEdges:
     @classmethod
     def upload(cls, backend: Backend, vertices: FloatArray, edges: IntArray) -> LiftedEdges:
         """Edges (k, 2) between vertices (n, 3); weights are repetitions."""
-        low, high = vertices[edges.min(axis=1)], vertices[edges.max(axis=1)]
-        direction = np.where(edges[:, 0] < edges[:, 1], 1.0, -1.0)[:, None]
-        square = ((high - low) ** 2).sum(axis=1, keepdims=True)
-        table = np.concatenate([low, direction, high, 1 / np.maximum(square, 1e-300)], axis=1)
+        table = edge_records(vertices, edges)
         padding = np.tile(table[:1], (-len(table) % _CHUNK, 1))
         padding[:, 4:7], padding[:, 3] = padding[:, :3], 0.0
         values = np.concatenate([table, padding]).ravel()
@@ -63,6 +55,19 @@ class LiftedEdges:
         return cls(
             backend, aligned(backend, cast), dr.opaque(backend.UInt32, -(-len(edges) // _CHUNK))
         )
+
+
+def edge_records(vertices: FloatArray, edges: IntArray) -> FloatArray:
+    """(k, 8) for directed edges (k, 2): lower end, direction, higher end, 1/length^2.
+
+    The ends are ordered by vertex index, as those of triangles are (`tree.triangles`), so that
+    `side` gives the same bits here and there; direction is 1 if the edge runs from lower to
+    higher, -1 if it runs back.
+    """
+    low, high = vertices[edges.min(axis=1)], vertices[edges.max(axis=1)]
+    direction = np.where(edges[:, 0] < edges[:, 1], 1.0, -1.0)
+    square = ((high - low) ** 2).sum(axis=1)
+    return np.column_stack([low, direction, high, 1 / np.maximum(square, 1e-300)])
 
 
 @dataclass(frozen=True)

@@ -105,7 +105,7 @@ class ExactWinding:
     def on_stretch(
         self, frame: Frame, x: Vec3, behind: Crossing, turns: Real, fine: Mask
     ) -> Sample:
-        """w continued along a stretch of a ray, certified as `far_clusters.Nearby.sample` says."""
+        """w continued along a stretch of a ray, certified as `nearby.Nearby.sample` says."""
         del behind
         if self.edges is None:
             nothing = self.backend.Array3f(0)

@@ -106,7 +106,7 @@ class TreeWinding:
     ) -> Sample:
         """w on a stretch of a ray, with a certificate.
 
-        Certificate. Far dipoles: see `far_clusters.Nearby.sample`. By Stokes the near triangles'
+        Certificate. Far dipoles: see `nearby.Nearby.sample`. By Stokes the near triangles'
         field is that of the boundary of their union. An edge of length L that is not singular and
         nearer than (accuracy - 1) L/2 is not part of it: a far node with a triangle at it has
         radius R >= L/2 and is farther than accuracy R, hence the edge farther than

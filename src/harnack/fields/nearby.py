@@ -1,0 +1,160 @@
+"""What sums over a tree of dipoles tell about a field near a point: how far nodes bend, and how all
+that was summed becomes a certificate."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend.extrema import fmin
+from harnack.fields.field import Curvature, HarmonicBall, Sample
+from harnack.fields.moments import KNOWN
+from harnack.fields.multipole import Level
+from harnack.fields.multipole_kernel import Terms
+from harnack.fields.truncation import sup_norm
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.tree.hierarchy import FloatArray
+
+# Parts of the free distance out to which curvatures are stated: the shorter, the smaller.
+_REACHES = (0.2, 0.4, 0.6)
+# The part of the way to the dipoles of far nodes out to which they are stated.
+_WAY = 0.65
+_ROUNDING = 2e-5
+
+Sums: TypeAlias = "tuple[Any, ...]"
+
+
+def bend_columns(level: Level, rough: float) -> tuple[FloatArray, FloatArray]:
+    """A and K (k,) of nodes that are seen from beyond r0 = `rough` times their radius R.
+
+    From there on a step by t = q r, q <= Q = `longest_part(rough)`, moves a node's field off the
+    linear by at most
+
+        (A + K/r^2) t^2/r^4 Phi_1(q),   Phi_l(q) = ((1-q)^-(l+1) - 1 - (l+1)q)/q^2.
+
+    The term l, a harmonic function of degree -(l+1), is at most B_l/r^(l+1), and its k-th
+    derivative along a line (l+k)!/l! B_l/r^(l+1+k) (`truncation.truncation`, k times). So Taylor's
+    remainder is at most B_l Phi_l(q) t^2/r^(l+3). In Phi_l/Phi_1 the ratio of coefficients,
+    (l+k)!/(l! (k+1)!), grows with k, so that the quotient grows with q: W_l = Phi_l(Q)/Phi_1(Q)
+    serves. With r >= r0: A = B_1 + W_2 B_2/r0 and K = sum_{l>=3} W_l B_l/r0^(l-3), for l >= 6 of
+    B_l <= l R^(l-5) sum a |d|^4, with Phi_l(Q) < (1-Q)^-(l+1)/Q^2.
+    """
+    r0, q = np.maximum(rough * level.radius, 1e-50), longest_part(rough)
+    ratio = [((1 - q) ** -(n + 1) - 1 - (n + 1) * q) / (q * q * _phi(q)) for n in range(KNOWN + 1)]
+    terms = [ratio[n] * sup_norm(level.moments, n) for n in range(1, KNOWN + 1)]
+    x = 1 / (rough * (1 - q))
+    rest = x * (6 - 5 * x) / (1 - x) ** 2 / ((1 - q) ** 6 * q * q * _phi(q))
+    wide = rest * level.fourth / r0**2 + sum(term / r0**n for n, term in enumerate(terms[2:]))
+    return terms[0] + terms[1] / r0, wide
+
+
+def longest_part(rough: float) -> float:
+    """Of the distance of a far node's centre: the longest step that certificates cover."""
+    return _WAY * (1 - 1 / rough)
+
+
+def free_part(rough: float) -> float:
+    """Of the distance of a far node's centre: what is counted as free of dipoles."""
+    return longest_part(rough) / _REACHES[-1]
+
+
+def _phi(q: float) -> float:
+    """Phi_1 of `bend_columns`: convex, and 3 at 0."""
+    return (3 - 2 * q) / (1 - q) ** 2
+
+
+def with_far_node(
+    sums: Sums, terms: Terms, far: Mask, inverse: Real, size: Real, left_out: tuple[Real, Real],
+    free: Real, epsilon: float,
+) -> Sums:  # fmt: skip
+    """The sums of `Nearby`, in its order, with a node's added where it is far, 1/inverse away.
+
+    size: A + K/r^2 of `bend_columns`; left_out: of value and gradient; free: as far as the node
+    counts as free of dipoles. Elsewhere terms and inverse are 0.
+    """
+    value, g, error, slope_error, clear, s4, s5 = sums
+    fourth = size * dr.square(inverse * inverse)
+    return (
+        value + dr.select(far, terms.value, 0),
+        g + dr.select(far, terms.gradient, 0),
+        dr.fma(epsilon, rounding_of_dipole(size, inverse), error + left_out[0]),
+        slope_error + left_out[1],
+        dr.select(far, fmin(free, clear), clear),
+        s4 + fourth,
+        dr.fma(fourth, inverse, s5),
+    )
+
+
+def rounding_of_dipole(area: Real, inverse: Real) -> Real:
+    """What rounding may do to the value of a dipole at distance rho = 1/inverse, over epsilon.
+
+    Coordinates rounded by epsilon each move it by at most 2 epsilon area/rho^3; the four roundings
+    of its term, by 4 epsilon area/rho^2.
+    """
+    square = inverse * inverse
+    return area * dr.fma(2 * inverse, square, 4 * square)
+
+
+@dataclass(frozen=True)
+class Nearby:
+    """What sums over a tree tell about f near x.
+
+    error, slope_error: what was left out of value and gradient. clear: the distance of the nearest
+    dipole, or `free_part` of that to the nearest far node's centre if that is less. s4, s5: sums of
+    a/rho^4 and a/rho^5 over dipoles a at rho and, with A + K/r^2 for a, over far nodes at r.
+    """
+
+    backend: Backend
+    value: Real
+    gradient: Vec3
+    error: Real
+    slope_error: Real
+    clear: Real
+    s4: Real
+    s5: Real
+
+    def sample(self, share: float, rounding: Real, normal: Vec3 | None = None) -> Sample:
+        """`share` times f, with what is known of it.
+
+        Certificate. Along a line the k-th derivative of a dipole a at rho is at most
+        (k+1)! a/rho^(k+2) (it is a mixed derivative of a/rho, whose tensor is symmetric and takes
+        its largest value on equal vectors), so that Taylor's remainder after the linear term is at
+        most a ((rho-t)^-2 - rho^-2 - 2t rho^-3) = a t^2 rho^-4 phi(t/rho), phi(q) =
+        (3-2q)/(1-q)^2. That of a far node is at most that of a dipole of area A + K/r^2 in its
+        centre, for t/r <= `longest_part` (`bend_columns`). phi is convex: on [0, b] it lies below
+        3 + rise q, rise = (phi(b)-3)/b = (4-3b)/(1-b)^2. With t <= r = b clear,
+        |f(y) - f(x) - g.(y-x)| <= t^2 (3 s4 + rise r s5).
+        A ball of that radius bounds f by |g| r more, and holds harmonic f: dipoles of far nodes
+        are farther away than 1 - 1/rough times the centre, and `longest_part` is less.
+        """
+        epsilon, g = self.backend.epsilon, share * self.gradient
+        distance = self.clear * (1 - _ROUNDING) - 8 * epsilon
+        bends = [self._bend(share, b, b * distance) for b in _REACHES]
+        slope, widest = dr.norm(g) + share * self.slope_error, bends[-1]
+        r = widest.radius
+        variation = (1 + _ROUNDING) * r * dr.fma(0.5 * r, widest.constant, slope)
+        value = share * self.value
+        ball = HarmonicBall(r, value - variation, value + variation)
+        # On a singular point itself all values meet: a gradient that says so.
+        apart = (self.clear > 16 * epsilon) & dr.isfinite(value) & dr.isfinite(dr.squared_norm(g))
+        steep = self.backend.Array3f(0, 0, share * 4 * math.pi / (8 * epsilon))
+        return Sample(
+            dr.select(apart, value, 0),
+            dr.select(apart, g, steep),
+            (*bends, ball),
+            share * self.error + rounding,
+            dr.select(apart, share * self.slope_error, 0),
+            normal,
+        )
+
+    def _bend(self, share: float, b: float, r: Real) -> Curvature:
+        """What is known out to r = b times the free distance."""
+        rise = (4 - 3 * b) / (1 - b) ** 2
+        third = 3 * self.s4
+        return Curvature((2 + 2 * _ROUNDING) * share * dr.fma(r * rise, self.s5, third), r)
