@@ -203,10 +203,10 @@ def test_approximate_and_jumping_fields_keep_their_promises(name: str) -> None:
     check_field(APPROXIMATE[name], count=60, directions=4)
 
 
-def samples(field: Field, x: np.ndarray, fine: Any = True) -> tuple[Sample, Any]:
+def samples(field: Field, x: np.ndarray, fine: float = 1.0) -> tuple[Sample, Any]:
     """A sample in double precision and a function that makes its numbers arrays (n,) or (n, 3).
 
-    fine: where to look closely, as `Field.at_detail` takes it.
+    fine: the detail, as `Field.at_detail` takes it.
     """
     backend = choose_backend("double")
     p, seen = to_vector3(backend, x), field.prepare(backend)
@@ -216,7 +216,7 @@ def samples(field: Field, x: np.ndarray, fine: Any = True) -> tuple[Sample, Any]
         ahead = seen.offset(p, up, backend.Float(0), backend.Bool(True))
         seen = seen.between(p, up, nowhere, nowhere, ahead)
     assert seen.has_detail
-    sample = seen.at_detail(backend.Bool(fine)).evaluate(p)
+    sample = seen.at_detail(backend.Float(fine)).evaluate(p)
 
     def on_host(one: Any) -> np.ndarray:
         array = to_numpy(one) if dr.is_array_v(type(one)) else np.asarray(one)

@@ -102,7 +102,7 @@ def sums_along(backend: Backend, mesh: WindingMesh, n: int, fine: bool) -> Any:
     frame = Frame.along(backend, to_vector3(backend, o), to_vector3(backend, d))
     x = dr.fma(backend.Array3f(backend.Float(t)), frame.d, frame.o)
     chains = EdgeChains.upload(backend, mesh.unit_vertices, mesh.singular)
-    found = chains.near(frame, x, backend.Bool(fine))
+    found = chains.near(frame, x, backend.Float(fine))
     # All edges, one ray's axes at a time: as many meshes as there are rays would be, so turn x.
     ends = mesh.unit_vertices[mesh.singular] - (o + t[:, None] * d)[:, None, None]
     axes = np.stack([to_numpy(one) for one in (frame.u, frame.v, frame.d)], axis=1)
@@ -154,7 +154,7 @@ def test_along_the_z_axis_chains_decide_as_single_edges_do(kind: str) -> None:
         p, up = to_vector3(backend, x), backend.Array3f(0, 0, 1)
         frame = Frame(p, backend.Array3f(1, 0, 0), backend.Array3f(0, 1, 0), up)
         chains = EdgeChains.upload(backend, mesh.unit_vertices, mesh.singular)
-        found = to_numpy(chains.near(frame, p, backend.Bool(True)).value)
+        found = to_numpy(chains.near(frame, p, backend.Float(1)).value)
         edges = LiftedEdges.upload(backend, mesh.unit_vertices, mesh.singular)
         angle = to_numpy(lifted_sums(edges, p, 0).angle)
         assert np.abs(found - angle).max() < (3e-3 if precision == "single" else 1e-9)

@@ -29,13 +29,32 @@ _BITS = 5
 
 @dataclass(frozen=True)
 class Values:
-    """What a field is at points: value, a bound of its error and, as far as they were asked for,
-    gradient and Hessian; in the field's own units."""
+    """What a field is at points: value and, as far as they were asked for, gradient and Hessian,
+    in the field's own units, with bounds of their errors by truncation and rounding.
+
+    error: of the value. gradient_error: of the gradient, as a length. hessian_error: of second
+    derivatives along lines, which is the spectral norm of the Hessian's error.
+    """
 
     value: Real
     error: Real
     gradient: Vec3 | None = None
     hessian: SymmetricSum | None = None
+    gradient_error: Real = 0.0
+    hessian_error: Real = 0.0
+
+    def rescaled(self, size: Real) -> Values:
+        """Those of x -> f(x / size), at the points that move there."""
+        gradient, hessian, share = self.gradient, self.hessian, 1 / size
+        square = share * share
+        return Values(
+            self.value,
+            self.error,
+            None if gradient is None else gradient * share,
+            None if hessian is None else type(hessian)(*(square * one for one in hessian.parts())),
+            self.gradient_error * share,
+            self.hessian_error * square,
+        )
 
 
 class BatchedField(Field):
@@ -45,11 +64,12 @@ class BatchedField(Field):
     """
 
     @abc.abstractmethod
-    def values_at(self, x: Vec3, derivatives: int) -> Values:
+    def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> Values:
         """Everything at points x, a Dr.Jit 3-vector of any backend and precision.
 
         derivatives: 0 for the value alone, 1 with the gradient, 2 with the Hessian. Not called
-        while a loop is recorded, unless derivatives is 2.
+        while a loop is recorded, unless derivatives is 2. closer: what is far is approximated only
+        beyond so many times the usual distance, at least 1; infinity approximates nothing.
         """
 
     def value(self, points: Any, *, precision: Precision = "single") -> FloatArray:
@@ -79,11 +99,25 @@ class BatchedField(Field):
         return np.moveaxis(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), 2, 0)
 
     def error_bound(self, points: Any, *, precision: Precision = "single") -> FloatArray:
-        """How far `value` may be from the field at most: truncation, proved, and rounding.
+        """How far `value` may be from the field at most, at points (n, 3): (n,).
 
-        Rounding of the points themselves comes on top.
+        Truncation, proved, and rounding. Rounding of the points themselves, which in single
+        precision are rounded on the way in, comes on top.
         """
         return self._at(points, precision, 0, lambda at: (at.error,))[0]
+
+    def gradient_error_bound(self, points: Any, *, precision: Precision = "single") -> FloatArray:
+        """How far `gradient` may be from the field's at most, as a length, at points (n, 3): (n,).
+
+        As for `error_bound`.
+        """
+        return self._at(points, precision, 1, lambda at: (at.gradient_error,))[0]
+
+    def hessian_error_bound(self, points: Any, *, precision: Precision = "single") -> FloatArray:
+        """How far `hessian` may be from the field's at most, in the spectral norm, at points
+        (n, 3): (n,). As for `error_bound`.
+        """
+        return self._at(points, precision, 2, lambda at: (at.hessian_error,))[0]
 
     def _at(
         self,

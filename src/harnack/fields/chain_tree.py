@@ -100,7 +100,7 @@ def chain_columns(
     corners = vertices[np.column_stack([fan, leaves.edges])]
     slots = _ranges(begin, end, int((end - begin).max()))
     level = triangle_levels(Hierarchy(slots, ()), corners)[0]
-    error, slope = truncation(level, RATIO * level.radius)
+    error, slope, _ = truncation(level, RATIO * level.radius)
     accept = [
         np.maximum(RATIO * level.radius, (error / allowed) ** 0.2)
         for allowed in (_ROUGH, _CLOSE * epsilon)

@@ -13,13 +13,12 @@ import numpy.typing as npt
 from harnack.backend import backend_of
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.dipole_tree import DipoleTree, hierarchy_of
-from harnack.fields.edge_hessian import SymmetricSum
 from harnack.fields.field import Field, Sample, lengthened
-from harnack.fields.unit_coordinates import UnitCoordinates, placed
+from harnack.fields.unit_coordinates import UnitCoordinates, placed, single
 from harnack.geometry import Box, CloudError, estimate_areas, estimate_normals, validate_cloud
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Mask, Vec3
+    from harnack.backend import Backend, Real, Vec3
     from harnack.geometry import Volume
     from harnack.tree import Hierarchy
 
@@ -76,7 +75,7 @@ class DipolePotential(BatchedField):
             self.areas = estimate_areas(self.points, self.normals)
         self.accuracy = accuracy
         self._box = low, high = self.points.min(axis=0), self.points.max(axis=0)
-        self._centre = 0.5 * (low + high)
+        self._centre = single(0.5 * (low + high))
         extent = max(0.5 * float((high - low).max()), math.sqrt(float(self.areas.sum())) / 4)
         self._size = 2.0 ** math.ceil(math.log2(extent))
         self._hierarchy: Hierarchy | None = None
@@ -101,14 +100,9 @@ class DipolePotential(BatchedField):
         field._hierarchy = self._hierarchy
         return field
 
-    def values_at(self, x: Vec3, derivatives: int) -> Values:
+    def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> Values:
         on = self._batch(backend_of(x))
-        value, *rest, error = on.tree.at(on.unit(x), derivatives)
-        gradient = rest[0] / self._size if derivatives >= 1 else None
-        if derivatives < 2:
-            return Values(value, error, gradient)
-        hessian = SymmetricSum(*(part / self._size**2 for part in rest[1:]))
-        return Values(value, error, gradient, hessian)
+        return on.tree.at(on.unit(x), derivatives, closer).rescaled(on.size)
 
     def _batch(self, backend: Backend) -> _OnDevice:
         """The evaluator for points, which is made once a backend."""
@@ -131,18 +125,19 @@ class DipolePotential(BatchedField):
         device = self._upload(backend, self.accuracy or _TRACED)
         prepared = copy.copy(self)
         prepared._device = device
+        prepared.coarsest_detail = device.tree.clusters.coarsest
         return prepared
 
     def evaluate(self, p: Vec3) -> Sample:
         on = self._device
         if on is None:
             return self.prepare(backend_of(p)).evaluate(p)
-        return on.sample(p, True)
+        return on.sample(p, on.backend.Float(1))
 
-    def at_detail(self, fine: Mask) -> Field:
+    def at_detail(self, detail: Real) -> Field:
         if self._device is None:
             raise RuntimeError("prepare(backend) comes before at_detail")
-        return _AtDetail(self._device, fine)
+        return _AtDetail(self._device, detail)
 
     def check_levels(self, levels: tuple[float, ...]) -> None:
         for level in levels:
@@ -168,15 +163,15 @@ class _OnDevice(UnitCoordinates):
 
     tree: DipoleTree
 
-    def sample(self, p: Vec3, fine: Mask) -> Sample:
-        return lengthened(self.tree.sample(self.unit(p), fine), self.size)
+    def sample(self, p: Vec3, detail: Real) -> Sample:
+        return lengthened(self.tree.sample(self.unit(p), detail), self.size)
 
 
 class _AtDetail(Field):
-    """A potential that is looked at closely on some lanes only."""
+    """A potential that is evaluated more or less closely in each lane."""
 
-    def __init__(self, on: _OnDevice, fine: Mask) -> None:
-        self._on, self._fine = on, fine
+    def __init__(self, on: _OnDevice, detail: Real) -> None:
+        self._on, self._detail = on, detail
 
     def evaluate(self, p: Vec3) -> Sample:
-        return self._on.sample(p, self._fine)
+        return self._on.sample(p, self._detail)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
@@ -10,13 +11,15 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend.extrema import fmin
-from harnack.fields.far_clusters import FarClusters
+from harnack.fields.edge_hessian import SymmetricSum
+from harnack.fields.far_clusters import Errors, FarClusters
 from harnack.fields.multipole import all_levels
 from harnack.fields.nearby import rounding_of_dipole
 from harnack.tree import NO_PRIMITIVE, Node, build_hierarchy, for_each
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.fields.batch import Values
     from harnack.fields.field import Sample
     from harnack.tree import Hierarchy
     from harnack.tree.hierarchy import FloatArray
@@ -57,13 +60,12 @@ class DipoleTree:
         rounding = backend.epsilon * (16 + math.sqrt(len(points)) / 8) * max(1.0, area)
         return cls(FarClusters.of(backend, tree, levels, rows, accuracy), rounding)
 
-    def at(self, x: Vec3, derivatives: int) -> tuple[Any, ...]:
-        """Value, gradient and Hessian's parts (as asked for), and a bound of the value's error:
-        of truncation and of rounding, last."""
-        real = self.clusters.backend.Float
+    def at(self, x: Vec3, derivatives: int, closer: Real) -> Values:
+        """Value and derivatives (as asked for) at x, `closer` as for `FarClusters.at`."""
+        count, epsilon = len(dataclasses.fields(Errors)), self.clusters.backend.epsilon
 
         def add(row: list[Real], active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
-            value, *rest, rounded = state
+            errors, (value, *rest) = Errors(*state[:count]), state[count:]
             inverse, one, slope, bend = _dipole(row, x, derivatives)
             value = value + dr.select(active, one, 0)
             if derivatives >= 1:
@@ -72,47 +74,63 @@ class DipoleTree:
                 pairs = zip(rest[1:], bend, strict=True)
                 rest[1:] = [old + dr.select(active, new, 0) for old, new in pairs]
             more = dr.select(active, rounding_of_dipole(row[6], inverse), 0)
-            return value, *rest, rounded + more
+            fourth = dr.select(active, row[6] * dr.square(inverse * inverse), 0)
+            errors = dataclasses.replace(
+                errors,
+                rounding=dr.fma(epsilon, more, errors.rounding),
+                s4=errors.s4 + fourth,
+                s5=dr.fma(fourth, inverse, errors.s5),
+            )
+            return *errors.parts(), value, *rest
 
-        def leaf(node: Node, near: Mask, sums: tuple[Any, ...]) -> tuple[Any, ...]:
-            return for_each(node, near, add, sums)
+        def leaf(node: Node, near: Mask, errors: Errors, sums: Any) -> tuple[Errors, Any]:
+            state = for_each(node, near, add, (*errors.parts(), *sums))
+            return Errors(*state[:count]), state[count:]
 
-        *sums, rounded, error = self.clusters.at(x, derivatives, leaf, (real(0),))
-        return *sums, dr.fma(self.clusters.backend.epsilon, rounded, error + self.rounding)
+        errors, (value, *rest) = self.clusters.at(x, derivatives, leaf, closer)
+        gradient = rest[0] if derivatives >= 1 else None
+        hessian = SymmetricSum(*rest[1:7]) if derivatives == 2 else None
+        unit = self._unit(x)
+        return errors.values(1.0, unit, self.rounding, value, gradient, hessian)
 
-    def sample(self, x: Vec3, fine: Mask) -> Sample:
+    def _unit(self, x: Vec3) -> Real:
+        """What rounding may do to a coordinate of x or of a point."""
+        return self.clusters.backend.epsilon * (1 + dr.max(dr.abs(x)))
+
+    def sample(self, x: Vec3, detail: Real) -> Sample:
         """Value, gradient and certificate at x: see `nearby.Nearby.sample`."""
-        vector, real = self.clusters.backend.Array3f, self.clusters.backend.Float
-        epsilon = self.clusters.backend.epsilon
+        vector, epsilon = self.clusters.backend.Array3f, self.clusters.backend.epsilon
 
         def add(row: list[Real], active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
-            value, g, error, slope_error, clear, s4, s5, rounded, nearest = state
+            value, g, truncation, slope_truncation, rounding, clear, s4, s5, nearest = state
             inverse, one, slope, _ = _dipole(row, x, 1)
             near = dr.rcp(inverse)
             cube = dr.select(active, row[6] * (inverse * inverse * inverse), 0)
+            rounded = dr.select(active, rounding_of_dipole(row[6], inverse), 0)
+            # On a point itself nothing is known, and `Nearby.sample` says so.
+            rounded = dr.select(dr.isfinite(rounded), rounded, 0)
             return (
                 value + dr.select(active, one, 0),
                 g + dr.select(active, slope, 0),
-                error,
-                slope_error,
+                truncation,
+                slope_truncation,
+                dr.fma(epsilon, rounded, rounding),
                 dr.select(active, fmin(near, clear), clear),
                 dr.fma(cube, inverse, s4),
                 dr.fma(cube * inverse, inverse, s5),
-                rounded + dr.select(active, rounding_of_dipole(row[6], inverse), 0),
                 dr.select(active & (near <= clear), vector(*row[3:6]), nearest),
             )
 
         def leaf(node: Node, near: Mask, sums: tuple[Any, ...]) -> tuple[Any, ...]:
             return for_each(node, near, add, sums)
 
-        found, (rounded, nearest) = self.clusters.near(x, fine, leaf, (real(0), vector(0)))
+        found, (nearest,) = self.clusters.near(x, detail, leaf, (vector(0),))
         # Where one point's own field drowns the others', the surface has that point's normal; f
         # is larger on the other side.
         weight = dr.norm(nearest)
         beside = (found.clear * found.clear < _BESIDE * weight) & (weight > 0)
         normal = dr.select(beside, -nearest / weight, dr.normalize(found.gradient))
-        rounded = dr.select(dr.isfinite(rounded), epsilon * rounded, 0)
-        return found.sample(1.0, self.rounding + rounded, normal)
+        return found.sample(1.0, self._unit(x), self.rounding, normal)
 
 
 def _dipole(row: list[Real], x: Vec3, derivatives: int) -> tuple[Real, Real, Vec3, list[Real]]:

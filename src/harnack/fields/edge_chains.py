@@ -21,8 +21,14 @@ import drjit as dr
 
 from harnack.backend.extrema import fmax, fmin
 from harnack.fields.chain_tree import RATIO, chain_columns, chain_leaves
-from harnack.fields.edge_field import edge_field, edge_variation
-from harnack.fields.edge_lift import edge_factor, edge_records, times, whole_angle
+from harnack.fields.edge_field import edge_field
+from harnack.fields.edge_lift import (
+    LiftedProduct,
+    edge_factor,
+    edge_records,
+    epsilon_at,
+    with_edge,
+)
 from harnack.fields.edge_trails import closed_trails
 from harnack.fields.multipole_kernel import far_terms
 from harnack.fields.nearby import Nearby, free_part, with_far_node
@@ -51,23 +57,24 @@ class EdgeChains:
         records = tree.gather(edge_records(vertices, leaves.edges))
         return cls(backend, pack(backend, tree, levels, records))
 
-    def near(self, frame: Frame, x: Vec3, fine: Mask) -> Nearby:
+    def near(self, frame: Frame, x: Vec3, detail: Real) -> Nearby:
         """The sum of Omega_e at points x of rays, and what a certificate needs.
 
-        fine: where to look closely, leaving out no more than rounding does. Edges add to the
-        remainder what `TreeWinding.on_stretch` says, and chords as edges: none is nearer than the
-        ball around its chain.
+        detail: `Field.at_detail`; 1 leaves out no more than rounding does. Edges add to the
+        remainder what `edge_lift.with_edge` says, and so do chords: none is nearer than the ball
+        around its chain.
         """
         real, vector = self.backend.Float, self.backend.Array3f
-        unit = self.backend.epsilon * (1 + dr.max(dr.abs(frame.o)))
-        pad = 16 * unit
+        unit = fmax(epsilon_at(frame.o), epsilon_at(x))
+        pad, close = 16 * unit, fmax(real(detail), real(1))
 
         def visit(node: Node, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
             centre, radius = vector(*node.head[:3]), node.head[3] + pad
             r = x - centre
             square, (u, v) = dr.squared_norm(r), frame.across(centre)
             missed = (dr.fma(u, u, v * v) > radius * radius) | (dr.dot(r, frame.d) > radius)
-            far = missed & (square > dr.square(dr.select(fine, node.head[5], node.head[4])))
+            accepting = dr.select(detail < 1, node.head[4], node.head[5] * close)
+            far = missed & (square > dr.square(accepting))
             inverse = dr.select(far, dr.rsqrt(square), 0)
             c, decay = node.payload(far), dr.square(inverse * inverse) * inverse
             sums = with_far_node(
@@ -86,10 +93,10 @@ class EdgeChains:
             # A slot without an edge has no direction.
             return _with_edge(frame, x, ends, (way, row[7], unit), active & (way != 0), state)
 
-        one, zero = (real(1), real(0), real(0)), real(0)
-        start = (one, zero, vector(0), zero, zero, real(dr.inf), zero, zero)
+        one, zero = LiftedProduct.one(real).parts(), real(0)
+        start = (one, zero, vector(0), zero, zero, zero, real(dr.inf), zero, zero)
         product, value, *rest = walk(self.tree, visit, start)
-        return Nearby(self.backend, value + whole_angle(*product), *rest)
+        return Nearby(self.backend, value + LiftedProduct(*product).angle(), *rest)
 
 
 def _with_edge(
@@ -98,31 +105,20 @@ def _with_edge(
 ) -> tuple[Any, ...]:  # fmt: skip
     """The sums with the edge between `ends` added.
 
-    more: 1 or -1 for its way; 1/length^2; and how far rounding moves a coordinate, by which an
-    edge's angle changes the more the steeper it is, whatever the others do.
+    more: 1 or -1 for its way; 1/length^2; and how far rounding moves a coordinate.
     """
-    product, value, g, error, slope_error, clear, s4, s5 = state
+    product, value, g, truncation, slope_truncation, rounding, clear, s4, s5 = state
     vector, (p, q), (way, inverse, unit) = cast("Any", type(x)), ends, more
     a, b = p - x, q - x
     la, lb = dr.norm(a), dr.norm(b)
     seen_a = vector(*frame.across(p), dr.dot(a, frame.d))
     seen_b = vector(*frame.across(q), dr.dot(b, frame.d))
     re, im = edge_factor(seen_a, seen_b, la, lb)
-    zr, zi, turns = product
     re, im = dr.select(active, re, 1), dr.select(active, way * im, 0)
-    product = times(zr, zi, turns, re, im)
+    product = LiftedProduct(*product).times(re, im).parts()
     c, weight = edge_field(a, b, la, lb)
     slope = dr.select(active, (way * weight) * c, 0)
     square = squared_distance_to_segment(a, b - a, inverse)
-    e = dr.select(active, edge_variation(square, inverse)[1], 0)
-    closer = dr.rsqrt(fmax(square, 1e-37))
-    return (
-        product,
-        value,
-        g + slope,
-        dr.fma(4 * unit, dr.norm(slope), error),
-        slope_error,
-        dr.select(active, fmin(dr.sqrt(square), clear), clear),
-        dr.fma(2 / 3, e, s4),
-        dr.fma(0.5 * closer, e, s5),
-    )
+    rounding, s4, s5 = with_edge((rounding, s4, s5), square, inverse, unit, active)
+    clear = dr.select(active, fmin(dr.sqrt(square), clear), clear)
+    return product, value, g + slope, truncation, slope_truncation, rounding, clear, s4, s5

@@ -22,8 +22,10 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import aligned
-from harnack.fields.edge_field import edge_field
+from harnack.backend.extrema import fmax, fmin
+from harnack.fields.edge_field import edge_field, edge_variation
 from harnack.fields.edge_hessian import SymmetricSum, edge_rates
+from harnack.tree.nearest import squared_distance_to_segment
 from harnack.tree.triangles import side
 
 if TYPE_CHECKING:
@@ -72,15 +74,24 @@ def edge_records(vertices: FloatArray, edges: IntArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class LiftedSums:
-    """Sum over all edges of Omega_e and its derivatives, as far as they were asked for."""
+    """Sum over all edges of Omega_e and its derivatives, as far as they were asked for.
+
+    rounding, s4, s5: what bounds their rounding, in units in the last place of a coordinate; see
+    `rounding_of_edge` and `nearby.Nearby`.
+    """
 
     angle: Real
     gradient: Vec3
     hessian: SymmetricSum
+    rounding: Real
+    s4: Real
+    s5: Real
 
 
 def lifted_sums(edges: LiftedEdges, x: Vec3, derivatives: int) -> LiftedSums:
     """All sums at points x in one loop over the edges, for the direction d = z.
+
+    What of the result nobody uses is not computed.
 
     derivatives: 0 for the angle alone, 1 with the gradient, 2 with the Hessian.
 
@@ -100,32 +111,76 @@ def lifted_sums(edges: LiftedEdges, x: Vec3, derivatives: int) -> LiftedSums:
         return i < edges.trips
 
     sums = (vector(0), *SymmetricSum.zero(real).parts())[: (0, 1, 7)[derivatives]]
-    start = (backend.UInt32(0), (real(1), real(0), real(0)), *sums)
-    _, product, *rest = dr.while_loop(start, more, body, label="lift")
+    product, bounds = LiftedProduct.one(real).parts(), (real(0), real(0), real(0))
+    start = (backend.UInt32(0), product, bounds, *sums)
+    _, product, bounds, *rest = dr.while_loop(start, more, body, label="lift")
     return LiftedSums(
-        whole_angle(*product),
+        LiftedProduct(*product).angle(),
         rest[0] if derivatives >= 1 else vector(0),
         SymmetricSum(*rest[1:]) if derivatives == 2 else SymmetricSum.zero(real),
+        *bounds,
     )
 
 
 def _with_edge(
-    row: Any, x: Vec3, derivatives: int, product: tuple[Real, Real, Real], *sums: Any
-) -> Any:
+    row: Any, x: Vec3, derivatives: int, product: tuple[Real, Real, Real],
+    bounds: tuple[Real, Real, Real], *sums: Any,
+) -> Any:  # fmt: skip
     """The sums with the edge of a record added."""
     vector, direction = cast("Any", type(x)), row[3]
     a, b = vector(row[0], row[1], row[2]) - x, vector(row[4], row[5], row[6]) - x
     la, lb = dr.norm(a), dr.norm(b)
     re, im = edge_factor(a, b, la, lb)
-    product = times(*product, re, direction * im)
+    product = LiftedProduct(*product).times(re, direction * im).parts()
+    square = squared_distance_to_segment(a, b - a, row[7])
+    bounds = with_edge(bounds, square, row[7], epsilon_at(x), direction != 0)
     if derivatives == 0:
-        return (product,)
+        return product, bounds
     c, weight = edge_field(a, b, la, lb)
     g = dr.fma(vector(direction * weight), c, sums[0])
     if derivatives == 1:
-        return product, g
+        return product, bounds, g
     u, v = edge_rates(a, b - a, row[7])
-    return product, g, *SymmetricSum(*sums[1:]).plus(direction * u, v).parts()
+    return product, bounds, g, *SymmetricSum(*sums[1:]).plus(direction * u, v).parts()
+
+
+def epsilon_at(x: Vec3) -> Real:
+    """What rounding may do to a coordinate of x, or of a vertex of size about one."""
+    return float(dr.epsilon(x)) * (1 + dr.max(dr.abs(x)))
+
+
+def rounding_of_edge(first: Real, unit: Real) -> Real:
+    """What rounding may do to the solid angle of an edge.
+
+    first: of `edge_variation`. unit: the rounding of a coordinate, `epsilon_at`. The ends of the
+    edge and x move by a few units, and the angle by that times Biot and Savart's field, which is at
+    most 2 first; the roundings of the factor F_e are as if its ends had moved, for those of its
+    terms are |F_e| times a few over the cosine of half the angle that the edge is seen at, and the
+    same bits of an end serve both edges there. It is less than 4 pi in any case.
+    """
+    return fmin(8 * unit * first, 4 * dr.pi)
+
+
+def with_edge(
+    bounds: tuple[Real, Real, Real], square: Real, inverse: Real, unit: Real, active: Mask
+) -> tuple[Real, Real, Real]:
+    """Sums of `rounding_of_edge` and of what an edge adds to s4 and s5 of `nearby.Nearby`.
+
+    square, inverse: as for `edge_variation`. Along a line the k-th
+    derivative of an edge's field is at most the integral of k!/rho^(k+1) over it (Biot and
+    Savart), so that Taylor's remainder after the linear term is at most that of
+    t^2/(rho^3 (1-t/rho)). With a = L/2 and distance d an edge has int rho^-3 <=
+    2a/(d^2 sqrt(d^2+a^2)) =: 2e, int rho^-4 <= 2e/d; and 1/(1-q) <= 1 + q/(1-b) <= 1 + q rise/4
+    on [0, b] (`Nearby.sample`). So an edge adds to the remainder what s4 += 2e/3 and
+    s5 += e/(2d) do.
+    """
+    rounding, s4, s5 = bounds
+    first, e = (dr.select(active, one, 0) for one in edge_variation(square, inverse))
+    return (
+        rounding + rounding_of_edge(first, unit),
+        dr.fma(2 / 3, e, s4),
+        dr.fma(0.5 * dr.rsqrt(fmax(square, 1e-37)), e, s5),
+    )
 
 
 def edge_factor(a: Vec3, b: Vec3, la: Real, lb: Real) -> tuple[Real, Real]:
@@ -149,27 +204,44 @@ def _s(a: Vec3, length: Real) -> Real:
     return dr.select(a.z > 0, across / (length + a.z), length - a.z)
 
 
-def times(zr: Real, zi: Real, turns: Real, re: Real, im: Real) -> tuple[Real, Real, Real]:
-    """The product z (re + i im), of length about one, and how often it has gone round.
+@dataclass(frozen=True)
+class LiftedProduct:
+    """A product re + i im of factors, of length about one, and how often it has gone round."""
 
-    Arguments lie in (-pi, pi]; that of the product is their sum if they have different signs;
-    otherwise the sum has left the interval exactly if its imaginary part has the other sign.
-    """
-    pr, pi = dr.fma(zr, re, -(zi * im)), dr.fma(zr, im, zi * re)
-    scale = dr.rcp(dr.abs(pr) + dr.abs(pi))
-    one = type(zr)(1)
-    # One of them is then longer than pi/2; to ask for it keeps an underflow from counting.
-    left = (zr < 0) | (re < 0)
-    over = dr.select((zi >= 0) & (im >= 0) & (pi < 0) & left, one, 0)
-    under = dr.select((zi < 0) & (im < 0) & (pi >= 0) & left, one, 0)
-    some = dr.isfinite(scale)
-    return (
-        dr.select(some, pr * scale, zr),
-        dr.select(some, pi * scale, zi),
-        turns + over - under,
-    )
+    re: Real
+    im: Real
+    turns: Real
 
+    @classmethod
+    def one(cls, real: Any) -> LiftedProduct:
+        """Of no factors; real: the type of its numbers."""
+        return cls(real(1), real(0), real(0))
 
-def whole_angle(zr: Real, zi: Real, turns: Real) -> Real:
-    """The solid angle of a product of factors that `times` made."""
-    return 2 * dr.fma(2 * dr.pi, turns, dr.atan2(zi, zr))
+    def parts(self) -> tuple[Real, Real, Real]:
+        """In the order of the constructor, as loops want them."""
+        return self.re, self.im, self.turns
+
+    def times(self, re: Real, im: Real) -> LiftedProduct:
+        """With one factor more.
+
+        Arguments lie in (-pi, pi]; that of the product is their sum if they have different signs;
+        otherwise the sum has left the interval exactly if its imaginary part has the other sign.
+        """
+        pr = dr.fma(self.re, re, -(self.im * im))
+        pi = dr.fma(self.re, im, self.im * re)
+        scale = dr.rcp(dr.abs(pr) + dr.abs(pi))
+        one = type(pr)(1)
+        # One of them is then longer than pi/2; to ask for it keeps an underflow from counting.
+        left = (self.re < 0) | (re < 0)
+        over = dr.select((self.im >= 0) & (im >= 0) & (pi < 0) & left, one, 0)
+        under = dr.select((self.im < 0) & (im < 0) & (pi >= 0) & left, one, 0)
+        some = dr.isfinite(scale)
+        return LiftedProduct(
+            dr.select(some, pr * scale, self.re),
+            dr.select(some, pi * scale, self.im),
+            self.turns + over - under,
+        )
+
+    def angle(self) -> Real:
+        """The solid angle: twice the sum of arguments."""
+        return 2 * dr.fma(2 * dr.pi, self.turns, dr.atan2(self.im, self.re))

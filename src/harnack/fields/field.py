@@ -59,9 +59,11 @@ class Sample:
     error: how far rounding may have moved `value` from f at the point given, beyond eight units
         in its last place (and beyond |gradient| times the rounding of the point itself, which
         the tracer accounts for), or an approximation has. Steps are shortened by it.
-    gradient_error: how far an approximation may have moved `gradient`, as a length.
+    gradient_error: how far rounding and an approximation may have moved `gradient`, as a length;
+        0 where that is only the rounding of a few operations.
     normal: (3,) unit, what to shade with where the gradient is no guide (beside a singular point
         of the surface); None for the gradient's own direction. No step looks at it.
+    truncation: the part of `error` that a closer evaluation makes smaller (`Field.at_detail`).
     """
 
     value: Real
@@ -70,6 +72,7 @@ class Sample:
     error: Real = 0.0
     gradient_error: Real = 0.0
     normal: Vec3 | None = None
+    truncation: Real = 0.0
 
 
 def lengthened(sample: Sample, size: Real) -> Sample:
@@ -83,7 +86,9 @@ def lengthened(sample: Sample, size: Real) -> Sample:
         else:
             known.append(Curvature(one.constant / (size * size), one.radius * size))
     gradient, doubt = sample.gradient / size, sample.gradient_error / size
-    return Sample(sample.value, gradient, tuple(known), sample.error, doubt, sample.normal)
+    return Sample(
+        sample.value, gradient, tuple(known), sample.error, doubt, sample.normal, sample.truncation
+    )
 
 
 class Field(abc.ABC):
@@ -110,7 +115,10 @@ class Field(abc.ABC):
     `between` are needed, and what `evaluate` promises is about f with the jumps taken out."""
 
     has_detail: bool = False
-    """Whether a rougher look at f costs less; then `at_detail` is needed."""
+    """Whether f can be evaluated more coarsely and more closely; then `at_detail` is needed."""
+
+    coarsest_detail: float = 1.0
+    """What detail 0 amounts to, as a detail in (0, 1]: see `at_detail`."""
 
     @abc.abstractmethod
     def evaluate(self, p: Vec3) -> Sample:
@@ -175,13 +183,15 @@ class Field(abc.ABC):
         """What a person would want to know about the choices this field made by itself."""
         return {}
 
-    def at_detail(self, fine: Mask) -> Field:
-        """This field, evaluated as closely as ever on lanes that are fine, roughly on others.
+    def at_detail(self, detail: Real) -> Field:
+        """This field, evaluated so closely in each lane: 0 as coarsely as the field allows, 1 as
+        `evaluate` does, more than 1 more closely.
 
-        A rough sample is as true as any: it states a larger `error`. The tracer looks closely
+        `Sample.truncation` falls about as detail^-3 and is 0 for a detail that is large enough.
+        A coarse sample is as true as any: it states a larger `error`. The tracer asks for detail
         where that error matters.
         """
-        del fine
+        del detail
         return self
 
     # Of fields with sheets only. All may be called while a loop is being recorded, for rays

@@ -26,6 +26,8 @@ _REACHES = (0.2, 0.4, 0.6)
 # The part of the way to the dipoles of far nodes out to which they are stated.
 _WAY = 0.65
 _ROUNDING = 2e-5
+# What rounding does to gradients and second derivatives: see `far_clusters.Errors`.
+SLOPE_ROUNDINGS, SECOND_ROUNDINGS = 16.0, 64.0
 
 Sums: TypeAlias = "tuple[Any, ...]"
 
@@ -78,13 +80,14 @@ def with_far_node(
     size: A + K/r^2 of `bend_columns`; left_out: of value and gradient; free: as far as the node
     counts as free of dipoles. Elsewhere terms and inverse are 0.
     """
-    value, g, error, slope_error, clear, s4, s5 = sums
+    value, g, truncation, slope_truncation, rounding, clear, s4, s5 = sums
     fourth = size * dr.square(inverse * inverse)
     return (
         value + dr.select(far, terms.value, 0),
         g + dr.select(far, terms.gradient, 0),
-        dr.fma(epsilon, rounding_of_dipole(size, inverse), error + left_out[0]),
-        slope_error + left_out[1],
+        truncation + left_out[0],
+        slope_truncation + left_out[1],
+        dr.fma(epsilon, rounding_of_dipole(size, inverse), rounding),
         dr.select(far, fmin(free, clear), clear),
         s4 + fourth,
         dr.fma(fourth, inverse, s5),
@@ -105,22 +108,28 @@ def rounding_of_dipole(area: Real, inverse: Real) -> Real:
 class Nearby:
     """What sums over a tree tell about f near x.
 
-    error, slope_error: what was left out of value and gradient. clear: the distance of the nearest
-    dipole, or `free_part` of that to the nearest far node's centre if that is less. s4, s5: sums of
-    a/rho^4 and a/rho^5 over dipoles a at rho and, with A + K/r^2 for a, over far nodes at r.
+    truncation, slope_truncation: bounds of what was left out of value and gradient. rounding: of
+    the value. clear: the distance of the nearest dipole, or `free_part` of that to the nearest far
+    node's centre if that is less. s4, s5: sums of a/rho^4 and a/rho^5 over dipoles a at rho and,
+    with A + K/r^2 for a, over far nodes at r.
     """
 
     backend: Backend
     value: Real
     gradient: Vec3
-    error: Real
-    slope_error: Real
+    truncation: Real
+    slope_truncation: Real
+    rounding: Real
     clear: Real
     s4: Real
     s5: Real
 
-    def sample(self, share: float, rounding: Real, normal: Vec3 | None = None) -> Sample:
+    def sample(
+        self, share: float, unit: Real, rounding: Real, normal: Vec3 | None = None
+    ) -> Sample:
         """`share` times f, with what is known of it.
+
+        unit: the rounding of a coordinate. rounding: what there is of it in the value besides.
 
         Certificate. Along a line the k-th derivative of a dipole a at rho is at most
         (k+1)! a/rho^(k+2) (it is a mixed derivative of a/rho, whose tensor is symmetric and takes
@@ -134,9 +143,10 @@ class Nearby:
         are farther away than 1 - 1/rough times the centre, and `longest_part` is less.
         """
         epsilon, g = self.backend.epsilon, share * self.gradient
+        slope_error = share * dr.fma(SLOPE_ROUNDINGS * unit, self.s4, self.slope_truncation)
         distance = self.clear * (1 - _ROUNDING) - 8 * epsilon
         bends = [self._bend(share, b, b * distance) for b in _REACHES]
-        slope, widest = dr.norm(g) + share * self.slope_error, bends[-1]
+        slope, widest = dr.norm(g) + slope_error, bends[-1]
         r = widest.radius
         variation = (1 + _ROUNDING) * r * dr.fma(0.5 * r, widest.constant, slope)
         value = share * self.value
@@ -148,9 +158,10 @@ class Nearby:
             dr.select(apart, value, 0),
             dr.select(apart, g, steep),
             (*bends, ball),
-            share * self.error + rounding,
-            dr.select(apart, share * self.slope_error, 0),
+            dr.fma(share, self.truncation + self.rounding, rounding),
+            dr.select(apart, slope_error, 0),
             normal,
+            share * self.truncation,
         )
 
     def _bend(self, share: float, b: float, r: Real) -> Curvature:

@@ -1,88 +1,92 @@
-"""What one triangle adds to the winding number near it: value, gradient, Hessian, certificate."""
+"""Triangles near a point: what the edges of their union add to the winding number.
+
+By Stokes' theorem the field of a set of triangles is that of the boundary of their union, so only
+edges at which they do not cancel are summed up. `edge_lift` says how crossings and edges together
+make the winding number: both are decided by the same bits, so that nothing is rounded beside an
+edge that two triangles share.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
-from harnack.fields.edge_field import edge_field
+from harnack.fields.edge_field import edge_field, edge_variation
 from harnack.fields.edge_hessian import SymmetricSum, edge_rates
+from harnack.fields.edge_lift import LiftedProduct, edge_factor
 from harnack.tree.nearest import squared_distance_to_segment
-from harnack.tree.triangles import EDGES, PARITY, corners_of
+from harnack.tree.triangles import EDGES, INDEX, PARITY, Frame, Upwards, corners_of
 
 if TYPE_CHECKING:
-    from harnack.backend import Real, Vec3
+    from harnack.backend import Mask, Real, Vec3
 
-# How much of a factor's terms must cancel to count by itself.
-_CANCELS = 16.0
-_PAIRS = ((0, 1, 1.0), (1, 2, 1.0), (0, 2, -1.0))
+# The first column of a record behind those of `tree.triangles`: 1 where an edge is singular.
+SINGULAR = EDGES + 3
+# The corners that edges join, and whether they run as the triangle does.
+_EDGES = ((0, 1, 1.0), (1, 2, 1.0), (0, 2, -1.0))
 
 
 @dataclass(frozen=True)
-class NearTriangle:
-    """A triangle of a record, seen from x: corners less x, and their lengths."""
+class NearEdge:
+    """An edge of a triangle, seen from x.
 
-    corners: tuple[Vec3, Vec3, Vec3]
-    lengths: tuple[Real, Real, Real]
-    parity: Real
-    inverse: tuple[Real, Real, Real]
+    a, b: its ends less x. lengths: |a| and |b|. seen: a and b across the frame's rays and along
+    them. way: 1 or -1, as the triangle runs from a to b or back. inverse: 1/length^2, or 0 for no
+    edge. square: that of its distance from x. is_singular: whether the mesh ends there.
+    """
 
-    @classmethod
-    def of(cls, row: list[Real], x: Vec3) -> NearTriangle:
-        """From the numbers of a record (`tree.triangles`)."""
-        p, q, r = corners_of(row, type(x))
-        corners = (p - x, q - x, r - x)
-        lengths = (dr.norm(corners[0]), dr.norm(corners[1]), dr.norm(corners[2]))
-        return cls(corners, lengths, row[PARITY], (row[EDGES], row[EDGES + 1], row[EDGES + 2]))
+    a: Vec3
+    b: Vec3
+    lengths: tuple[Real, Real]
+    seen: tuple[Vec3, Vec3]
+    way: Real
+    inverse: Real
+    square: Real
+    is_singular: Mask
 
-    def factor(self) -> tuple[Real, Real]:
-        """re + i im, its argument half the solid angle (van Oosterom and Strackee 1983)."""
-        (a, b, c), (la, lb, lc) = self.corners, self.lengths
-        re = dr.fma(
-            la * lb, lc, dr.fma(dr.dot(a, b), lc, dr.fma(dr.dot(b, c), la, dr.dot(c, a) * lb))
-        )
-        # (b - a) x (c - a) does not cancel where all three are far away and close together.
-        return re, self.parity * dr.dot(a, dr.cross(b - a, c - a))
+    def is_open(self, reach: Real) -> Mask:
+        """Whether the edge may be part of the boundary of the triangles near x.
 
-    def unsure(self, re: Real, im: Real, epsilon: float) -> Real:
-        """What rounding of the factor may do to the winding number.
-
-        Its terms are la lb lc and la |b-a||c-a| at most. Beside two nearly parallel edges they
-        cancel, and so its argument may turn by their rounding over its length, by pi at most.
-        Where little cancels, what there is belongs to the rounding of a sum.
+        It is not if it is nearer than (reach - 1)/2 times its length L and not singular: a far
+        node with a triangle at it has radius R >= L/2 and is farther than reach R, hence the edge
+        farther than (reach - 1) R. So all triangles at it are near, and they cancel there.
         """
-        (a, b, c), (la, lb, lc) = self.corners, self.lengths
-        terms = la * dr.fma(lb, lc, dr.norm(b - a) * dr.norm(c - a))
-        cancelled = terms / (dr.abs(re) + dr.abs(im))
-        turned = dr.select(cancelled < 0.0625 / epsilon, 8 * epsilon * cancelled, 0.5)
-        return dr.select(cancelled <= _CANCELS, 0, turned)
+        closed = ~self.is_singular & (self.square * self.inverse < dr.square(0.5 * (reach - 1)))
+        return (self.inverse > 0) & ~closed
+
+    def times(self, product: LiftedProduct, active: Mask) -> LiftedProduct:
+        """The product with this edge's factor, where active."""
+        re, im = edge_factor(*self.seen, *self.lengths)
+        return product.times(dr.select(active, re, 1), dr.select(active, self.way * im, 0))
 
     def gradient(self) -> Vec3:
-        """Of the solid angle: Biot and Savart's field of the three edges (paper, Eq. 11)."""
-        vector = cast("Any", type(self.corners[0]))
-        total = vector(0)
-        for i, j, sign in _PAIRS:
-            a, b, la, lb = self.corners[i], self.corners[j], self.lengths[i], self.lengths[j]
-            c, weight = edge_field(a, b, la, lb)
-            total = dr.fma(vector(sign * weight), c, total)
-        return self.parity * total
+        """Of its solid angle: Biot and Savart's field (paper, Eq. 11)."""
+        c, weight = edge_field(self.a, self.b, *self.lengths)
+        return (self.way * weight) * c
 
-    def add_hessian(self, total: SymmetricSum, active: Any) -> SymmetricSum:
-        """The Hessian of the solid angle added to a sum, where active."""
-        sign = dr.select(active, self.parity, 0)
-        for (i, j, turn), inverse in zip(_PAIRS, self.inverse, strict=True):
-            c, rate = edge_rates(self.corners[i], self.corners[j] - self.corners[i], inverse)
-            total = total.plus(dr.select(active, sign * turn * c, 0), dr.select(active, rate, 0))
-        return total
+    def add_hessian(self, total: SymmetricSum, active: Mask) -> SymmetricSum:
+        """Its part of the Hessian of the solid angle added, where active."""
+        c, rate = edge_rates(self.a, self.b - self.a, self.inverse)
+        return total.plus(dr.select(active, self.way * c, 0), dr.select(active, rate, 0))
 
-    def squared_distances(self) -> tuple[Real, Real, Real]:
-        """To the three edges, in the order of the record's inverse lengths."""
-        first, second, third = (
-            squared_distance_to_segment(
-                self.corners[i], self.corners[j] - self.corners[i], self.inverse[k]
-            )
-            for k, (i, j, _) in enumerate(_PAIRS)
-        )
-        return first, second, third
+    def variation(self) -> tuple[Real, Real]:
+        """`edge_field.edge_variation`."""
+        return edge_variation(self.square, self.inverse)
+
+
+def edges_of(row: list[Real], x: Vec3, frame: Frame | Upwards) -> Iterator[NearEdge]:
+    """The edges of the triangle of a record, seen from x; there are none in an empty slot."""
+    vector: Any = type(x)
+    ends = corners_of(row, vector)
+    corners = [p - x for p in ends]
+    lengths = [dr.norm(a) for a in corners]
+    seen = [vector(*frame.across(p), frame.component(a)) for p, a in zip(ends, corners, strict=True)]
+    for k, (i, j, sign) in enumerate(_EDGES):
+        a, b, inverse = corners[i], corners[j], dr.select(row[INDEX] >= 0, row[EDGES + k], 0)
+        yield NearEdge(
+            a, b, (lengths[i], lengths[j]), (seen[i], seen[j]), sign * row[PARITY], inverse,
+            squared_distance_to_segment(a, b - a, inverse), row[SINGULAR + k] > 0,
+        )  # fmt: skip

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import drjit as dr
+import numpy as np
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
@@ -23,6 +24,14 @@ class UnitCoordinates:
     def unit(self, p: Vec3) -> Vec3:
         """A point in these coordinates."""
         return (self.backend.Array3f(p) - self.centre) / self.size
+
+
+def single(centre: FloatArray) -> FloatArray:
+    """The nearest centre that single precision holds exactly: to subtract it from points nearby
+    then rounds nothing, however far the origin is."""
+    with np.errstate(over="ignore"):
+        rounded = centre.astype(np.float32).astype(np.float64)
+    return np.where(np.isfinite(rounded), rounded, centre)
 
 
 def placed(backend: Backend, centre: FloatArray, size: float) -> tuple[Backend, Vec3, Real]:

@@ -14,18 +14,24 @@ from typing import TYPE_CHECKING
 
 import drjit as dr
 
+from harnack.backend.extrema import fmax
+from harnack.fields.batch import Values
 from harnack.fields.edge_chains import EdgeChains
-from harnack.fields.edge_lift import LiftedEdges, lifted_sums
+from harnack.fields.edge_hessian import SymmetricSum
+from harnack.fields.edge_lift import LiftedEdges, epsilon_at, lifted_sums
 from harnack.fields.edge_trails import EdgeTrails
 from harnack.fields.field import Lipschitz, Sample
+from harnack.fields.nearby import SECOND_ROUNDINGS, SLOPE_ROUNDINGS
 from harnack.fields.winding_mesh import rounding_of_sum
 from harnack.tree.triangles import Frame, TriangleRays
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.fields.edge_hessian import SymmetricSum
     from harnack.fields.sheets import Crossing
     from harnack.fields.winding_mesh import WindingMesh
+
+
+_SHARE = 1 / (4 * math.pi)
 
 
 @dataclass(frozen=True)
@@ -58,8 +64,13 @@ class ExactWinding:
 
     @property
     def has_detail(self) -> bool:
-        """Whether rough looks cost less."""
+        """Whether coarse samples cost less."""
         return self.chains is not None
+
+    @property
+    def coarsest_detail(self) -> float:
+        """`Field.coarsest_detail`: of chains, by how much less is left out in a close sample."""
+        return 0.5
 
     @property
     def rounding(self) -> float:
@@ -84,26 +95,32 @@ class ExactWinding:
         dr.eval(value, doubt)
         again = dr.compress(doubt)
         if len(again):
-            dr.scatter(value, self.at(dr.gather(type(x), x, again), 0)[0], again)
+            dr.scatter(value, self.at(dr.gather(type(x), x, again), 0).value, again)
         return value
 
-    def at(self, x: Vec3, derivatives: int) -> tuple[Real, Vec3, SymmetricSum | None, Real]:
-        """w, gradient, Hessian (as asked for) and a bound of the truncation error, which is 0."""
-        turns = self.rays.turns_along(x, self.backend.Float(1))
+    def at(self, x: Vec3, derivatives: int) -> Values:
+        """w, gradient and Hessian (as asked for) at points."""
+        real = self.backend.Float
+        turns = self.rays.turns_along(x, real(1))
         if self.edges is None:
-            return turns, self.backend.Array3f(0), None, self.backend.Float(0)
-        sums = lifted_sums(self.edges, x, derivatives)
-        share = 1 / (4 * math.pi)
-        hessian = type(sums.hessian)(*(share * part for part in sums.hessian.parts()))
-        value = dr.fma(share, sums.angle, turns)
-        return value, share * sums.gradient, hessian, self.backend.Float(0)
+            nothing = self.backend.Array3f(0), SymmetricSum.zero(real)
+            return Values(turns, real(self.rounding), *nothing, real(0), real(0))
+        sums, share, unit = lifted_sums(self.edges, x, derivatives), _SHARE, epsilon_at(x)
+        return Values(
+            dr.fma(share, sums.angle, turns),
+            dr.fma(share, sums.rounding, self.rounding),
+            share * sums.gradient,
+            SymmetricSum(*(share * part for part in sums.hessian.parts())),
+            share * SLOPE_ROUNDINGS * unit * sums.s4,
+            share * SECOND_ROUNDINGS * unit * sums.s5,
+        )
 
     def start(self, frame: Frame, t: Real, active: Mask) -> Real:
         """The part of w that counts crossings, for t at the start of a ray."""
         return self.rays.turns_ahead(frame, t, active)
 
     def on_stretch(
-        self, frame: Frame, x: Vec3, behind: Crossing, turns: Real, fine: Mask
+        self, frame: Frame, x: Vec3, behind: Crossing, turns: Real, detail: Real
     ) -> Sample:
         """w continued along a stretch of a ray, certified as `nearby.Nearby.sample` says."""
         del behind
@@ -112,6 +129,7 @@ class ExactWinding:
             return Sample(self.backend.Float(turns), nothing, (Lipschitz(0.0),), 0.0)
         if self.chains is None:
             raise RuntimeError("uploaded for points and not for rays")
-        found = self.chains.near(frame, x, fine)
+        found = self.chains.near(frame, x, detail)
         found = dataclasses.replace(found, value=dr.fma(4 * math.pi, turns, found.value))
-        return found.sample(1 / (4 * math.pi), self.rounding)
+        unit = fmax(epsilon_at(frame.o), epsilon_at(x))
+        return found.sample(_SHARE, unit, self.rounding)

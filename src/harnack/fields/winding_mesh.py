@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.fields.multipole import Level, triangle_levels
+from harnack.fields.unit_coordinates import single
 from harnack.geometry import MeshError, validate_mesh
 from harnack.geometry.singular import net_faces, singular_edges, weld_vertices
 from harnack.tree import Hierarchy, build_hierarchy
@@ -200,7 +201,7 @@ def _box(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, FloatArray]
 def _centre_and_size(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, float]:
     low, high = _box(vertices, faces)
     size = 2.0 ** np.ceil(np.log2(0.5 * float((high - low).max())))
-    return 0.5 * (low + high), float(size)
+    return single(0.5 * (low + high)), float(size)
 
 
 def rounding_of_sum(backend: Backend, terms: int) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -12,7 +13,7 @@ import numpy.typing as npt
 
 from harnack.backend import backend_of
 from harnack.fields.batch import BatchedField, Values
-from harnack.fields.edge_hessian import SymmetricSum
+from harnack.fields.edge_lift import epsilon_at
 from harnack.fields.field import Field, Sample, lengthened
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.fields.unit_coordinates import UnitCoordinates, placed
@@ -20,7 +21,7 @@ from harnack.fields.winding_exact import ExactWinding
 from harnack.fields.winding_mesh import WindingMesh
 from harnack.fields.winding_tree import TreeWinding
 from harnack.geometry import Box
-from harnack.tree.nearest import distance_to_triangles
+from harnack.tree.nearest import distance_to_triangles, jumps_within
 from harnack.tree.triangles import Frame, TriangleRays
 
 if TYPE_CHECKING:
@@ -32,8 +33,10 @@ FloatArray = npt.NDArray[np.float64]
 
 # One boundary edge costs about a nanosecond, a tree two to three microseconds.
 _MOST_EDGES = 2048
-# What a trace needs: its hits are as sharp as the bound of the truncation error.
+# A coarse sample and the next closer one, of a trace, by experiment.
 _TRACED = 4.0
+# Roundings of a coordinate within which a point may be on either side of a triangle.
+_ON_TRIANGLE = 8.0
 
 
 class WindingNumber(BatchedField):
@@ -105,15 +108,18 @@ class WindingNumber(BatchedField):
         """The face, as given, of each sheet."""
         return self.mesh.source
 
-    def values_at(self, x: Vec3, derivatives: int) -> Values:
+    def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> Values:
         on = self._batch(backend_of(x))
         winding, x = on.winding, on.unit(x)
-        if isinstance(winding, ExactWinding) and derivatives == 0:
-            return Values(winding.values(x), winding.backend.Float(winding.rounding))
-        value, gradient, hessian, error = winding.at(x, derivatives)
-        if derivatives == 2:
-            hessian = on.scaled_hessian(hessian)
-        return Values(value, error + winding.rounding, gradient / on.size, hessian)
+        if isinstance(winding, TreeWinding):
+            values = winding.at(x, derivatives, closer)
+        else:
+            values = winding.at(x, derivatives)
+            if derivatives == 0:
+                values = dataclasses.replace(values, value=winding.values(x))
+        # The side of a triangle that x is on, to rounding, is not known.
+        on_triangle = jumps_within(on.rays, x, _ON_TRIANGLE * epsilon_at(x))
+        return dataclasses.replace(values, error=values.error + on_triangle).rescaled(on.size)
 
     def _batch(self, backend: Backend) -> _OnDevice:
         """The evaluator for points, which is made once a backend."""
@@ -145,7 +151,8 @@ class WindingNumber(BatchedField):
         frame = Frame.along(on.backend, on.unit(p), up)
         turns = on.winding.start(frame, 0, True)
         nowhere = Crossing(0.0, on.backend.UInt32(NO_SHEET), 0.0, up)
-        return lengthened(on.winding.on_stretch(frame, frame.o, nowhere, turns, True), on.size)
+        sample = on.winding.on_stretch(frame, frame.o, nowhere, turns, on.backend.Float(1))
+        return lengthened(sample, on.size)
 
     def next_crossing(
         self, o: Vec3, d: Vec3, after: Crossing, t_max: Real, active: Mask
@@ -224,30 +231,24 @@ class _OnDevice(UnitCoordinates):
     winding: ExactWinding | TreeWinding
     rays: TriangleRays
 
-    def scaled_hessian(self, hessian: SymmetricSum | None) -> SymmetricSum:
-        """A Hessian, None for zero, in the coordinates of the mesh as given."""
-        if hessian is None:
-            return SymmetricSum.zero(self.backend.Float)
-        share = 1 / (self.size * self.size)
-        return SymmetricSum(*(part * share for part in hessian.parts()))
-
 
 class _Stretch(Field):
     """A winding number as seen on a stretch of rays; behind: where it starts, in unit lengths."""
 
     def __init__(
-        self, on: _OnDevice, frame: Frame, behind: Crossing, offset: Real, fine: Mask = True
+        self, on: _OnDevice, frame: Frame, behind: Crossing, offset: Real, detail: Real = 1.0
     ) -> None:
         self.has_detail = on.winding.has_detail
-        self._on, self._frame, self._fine = on, frame, fine
+        self.coarsest_detail = on.winding.coarsest_detail
+        self._on, self._frame, self._detail = on, frame, on.backend.Float(detail)
         self._behind, self._offset = behind, offset
 
-    def at_detail(self, fine: Mask) -> Field:
-        return _Stretch(self._on, self._frame, self._behind, self._offset, fine)
+    def at_detail(self, detail: Real) -> Field:
+        return _Stretch(self._on, self._frame, self._behind, self._offset, detail)
 
     def evaluate(self, p: Vec3) -> Sample:
         on = self._on
         sample = on.winding.on_stretch(
-            self._frame, on.unit(p), self._behind, self._offset, self._fine
+            self._frame, on.unit(p), self._behind, self._offset, self._detail
         )
         return lengthened(sample, on.size)

@@ -6,6 +6,7 @@ Hessians from the same moments, a bound of what the truncation costs, and certif
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -14,25 +15,23 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend.extrema import fmax, fmin
-from harnack.fields.edge_field import edge_variation
 from harnack.fields.edge_hessian import SymmetricSum
-from harnack.fields.edge_lift import times, whole_angle
-from harnack.fields.far_clusters import FarClusters
-from harnack.fields.triangle_kernel import NearTriangle
+from harnack.fields.edge_lift import LiftedProduct, epsilon_at, with_edge
+from harnack.fields.far_clusters import Errors, FarClusters
+from harnack.fields.triangle_kernel import edges_of
 from harnack.fields.winding_mesh import rounding_of_sum
 from harnack.tree import Node, for_each
-from harnack.tree.triangles import EDGES, INDEX, crossing, in_slots
+from harnack.tree.triangles import INDEX, Upwards, crossing, in_slots
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.fields.batch import Values
     from harnack.fields.field import Sample
     from harnack.fields.sheets import Crossing
     from harnack.fields.winding_mesh import WindingMesh
     from harnack.tree.triangles import Frame
 
 _SHARE = 1 / (4 * math.pi)
-# Columns of a record behind those of `tree.triangles`: 1 where an edge is singular.
-_SINGULAR = EDGES + 3
 
 
 @dataclass(frozen=True)
@@ -61,40 +60,47 @@ class TreeWinding:
         """The one it lies on."""
         return self.clusters.backend
 
-    def at(self, x: Vec3, derivatives: int) -> tuple[Real, Vec3, SymmetricSum | None, Real]:
-        """w, gradient, Hessian (as asked for) and the bound of the truncation error of w."""
+    @property
+    def coarsest_detail(self) -> float:
+        """`Field.coarsest_detail`."""
+        return self.clusters.coarsest
 
-        def leaf(node: Node, near: Mask, sums: tuple[Any, ...]) -> tuple[Any, ...]:
-            return self._near(node, near, x, derivatives, sums)
+    def at(self, x: Vec3, derivatives: int, closer: Real) -> Values:
+        """w, gradient and Hessian (as asked for) at points, `closer` as for `FarClusters.at`.
 
-        zero = self.backend.Float(0)
-        value, *rest, unsure, error = self.clusters.at(x, derivatives, leaf, (zero,))
-        gradient = _SHARE * rest[0] if derivatives >= 1 else self.backend.Array3f(0)
-        hessian = SymmetricSum(*(_SHARE * part for part in rest[1:])) if derivatives == 2 else None
-        error = dr.fma(_SHARE, error, unsure)
-        return _SHARE * value, gradient, hessian, error
-
-    def _near(
-        self, node: Node, near: Mask, x: Vec3, derivatives: int, state: tuple[Any, ...]
-    ) -> tuple[Any, ...]:
-        """The sums with the triangles of a leaf added, with one arctangent for all of them."""
-        real = self.backend.Float
+        Near triangles: the crossings of the rays from x along z, and their open edges.
+        """
+        real, epsilon = self.backend.Float, epsilon_at(x)
+        frame, reach = Upwards(x), self.clusters.accuracy * fmax(real(closer), real(1))
+        count = len(dataclasses.fields(Errors))
 
         def add(row: list[Real], active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
-            zr, zi, turns, *rest, unsure = state
-            triangle = NearTriangle.of(row, x)
-            re, im = triangle.factor()
-            unsure = unsure + dr.select(active, triangle.unsure(re, im, self.backend.epsilon), 0)
-            zr, zi, turns = times(zr, zi, turns, re, im)
-            if derivatives >= 1:
-                rest[0] = rest[0] + dr.select(active, triangle.gradient(), 0)
-            if derivatives == 2:
-                rest[1:] = triangle.add_hessian(SymmetricSum(*rest[1:]), active).parts()
-            return zr, zi, turns, *rest, unsure
+            errors, (value, *rest) = Errors(*state[:count]), state[count:]
+            product = LiftedProduct(*rest[-3:])
+            t, turn = crossing(row, frame)
+            value = value + dr.select(active & (t > 0), 4 * math.pi * turn, 0)
+            bounds = errors.rounding, errors.s4, errors.s5
+            for edge in edges_of(row, x, frame):
+                open_ = active & edge.is_open(reach)
+                product = edge.times(product, open_)
+                bounds = with_edge(bounds, edge.square, edge.inverse, epsilon, open_)
+                if derivatives >= 1:
+                    rest[0] = rest[0] + dr.select(open_, edge.gradient(), 0)
+                if derivatives == 2:
+                    rest[1:7] = edge.add_hessian(SymmetricSum(*rest[1:7]), open_).parts()
+            errors = dataclasses.replace(errors, rounding=bounds[0], s4=bounds[1], s5=bounds[2])
+            return *errors.parts(), value, *rest[:-3], *product.parts()
 
-        value, *rest = state
-        zr, zi, turns, *rest = for_each(node, near, add, (real(1), real(0), real(0), *rest))
-        return value + dr.select(near, whole_angle(zr, zi, turns), 0), *rest
+        def leaf(node: Node, near: Mask, errors: Errors, sums: Any) -> tuple[Errors, Any]:
+            state = for_each(node, near, add, (*errors.parts(), *sums))
+            return Errors(*state[:count]), state[count:]
+
+        one = LiftedProduct.one(real).parts()
+        errors, (value, *rest) = self.clusters.at(x, derivatives, leaf, closer, one)
+        value = value + LiftedProduct(*rest[-3:]).angle()
+        gradient = rest[0] if derivatives >= 1 else None
+        hessian = SymmetricSum(*rest[1:7]) if derivatives == 2 else None
+        return errors.values(_SHARE, epsilon, self.rounding, value, gradient, hessian)
 
     def start(self, frame: Frame, t: Real, active: Mask) -> Real:
         """No crossings are counted: every sum is the whole of w."""
@@ -102,71 +108,44 @@ class TreeWinding:
         return self.backend.Float(0)
 
     def on_stretch(
-        self, frame: Frame, x: Vec3, behind: Crossing, turns: Real, fine: Mask
+        self, frame: Frame, x: Vec3, behind: Crossing, turns: Real, detail: Real
     ) -> Sample:
         """w on a stretch of a ray, with a certificate.
 
-        Certificate. Far dipoles: see `nearby.Nearby.sample`. By Stokes the near triangles'
-        field is that of the boundary of their union. An edge of length L that is not singular and
-        nearer than (accuracy - 1) L/2 is not part of it: a far node with a triangle at it has
-        radius R >= L/2 and is farther than accuracy R, hence the edge farther than
-        (accuracy - 1) R. All other edges count as *open*, and f is harmonic as far as the nearest
-        of them. Along a line the k-th derivative of an edge's field is at most the integral of
-        k!/rho^(k+1) over it (Biot and Savart), so that Taylor's remainder after the linear term is
-        at most that of t^2/(rho^3 (1-t/rho)). With a = L/2 and distance d an edge has
-        int rho^-3 <= 2a/(d^2 sqrt(d^2+a^2)) =: 2e, int rho^-4 <= 2e/d; and 1/(1-q) <=
-        1 + q/(1-b) <= 1 + q rise/4 on [0, b]. So an edge adds to the remainder what
-        s4 += 2e/3 and s5 += e/(2d) do.
+        Near triangles: their crossings ahead of x along the ray, and their open edges
+        (`NearEdge.is_open`). Crossings passed up to the start of the stretch are behind x, all
+        others ahead, as the tracer has it: the sign of a triangle that x is on, to rounding, is
+        not asked for.
 
-        A triangle that the ray passes is told which side of it x is on: behind those passed up to
-        the start of the stretch, before all others. Its own sign is rounded where x lies on it, as
-        it does on several at once where sheets overlap.
+        Certificate. Far dipoles: see `nearby.Nearby.sample`. The near triangles' field is that of
+        their open edges, and f is harmonic as far as the nearest of them; what they add to the
+        remainder, says `edge_lift.with_edge`.
         """
         del turns
-
-        def leaf(node: Node, near: Mask, sums: tuple[Any, ...]) -> tuple[Any, ...]:
-            return self._near_certified(node, near, x, frame, behind, fine, sums)
-
-        real, epsilon = self.backend.Float, self.backend.epsilon
-        found, (beside, unsure) = self.clusters.near(x, fine, leaf, (real(dr.inf), real(0)))
-        # Beside an edge, open or not, a triangle turns by pi within the rounding of its place.
-        turned = fmin(2 * epsilon * dr.rsqrt(beside), real(1))
-        return found.sample(_SHARE, self.rounding + turned + unsure)
-
-    def _near_certified(
-        self, node: Node, near: Mask, x: Vec3, frame: Frame, behind: Crossing,
-        fine: Mask, state: tuple[Any, ...],
-    ) -> tuple[Any, ...]:  # fmt: skip
         real, index = self.backend.Float, self.backend.UInt32
-        # Edges nearer than this many half lengths have both their triangles among the near ones.
-        reach = dr.select(fine, real(self.clusters.accuracy), self.clusters.rough)
-        closed = dr.square(0.5 * (reach - 1))
+        epsilon, reach = fmax(epsilon_at(frame.o), epsilon_at(x)), self.clusters.ratio(detail)
 
         def add(row: list[Real], active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
-            zr, zi, turns, g, clear, s4, s5, beside, unsure = state
-            triangle = NearTriangle.of(row, x)
-            re, im = triangle.factor()
-            unsure = unsure + dr.select(active, triangle.unsure(re, im, self.backend.epsilon), 0)
+            value, g, truncation, slope_truncation, rounding, clear, s4, s5, *product = state
             t, turn = crossing(row, frame)
-            passed = (t < behind.t) | ((t == behind.t) & (index(row[INDEX]) <= behind.sheet))
-            # Not zero, as on a plane that coordinates hit exactly: zero has no side.
-            told = dr.mulsign(fmax(dr.abs(im), 1e-30), dr.select(passed, -turn, turn))
-            im = dr.select(turn != 0, told, im)
-            zr, zi, turns = times(zr, zi, turns, re, im)
-            g = g + dr.select(active, triangle.gradient(), 0)
-            distances = triangle.squared_distances()
-            for k, (near2, inverse) in enumerate(zip(distances, triangle.inverse, strict=True)):
-                beside = dr.select(active & (inverse > 0), fmin(near2, beside), beside)
-                open_ = (row[_SINGULAR + k] > 0) | (near2 * inverse >= closed)
-                open_ &= active & (inverse > 0)
-                clear = dr.select(open_, fmin(dr.sqrt(near2), clear), clear)
-                e = dr.select(open_, edge_variation(near2, inverse)[1], 0)
-                s4 = dr.fma(2 / 3, e, s4)
-                s5 = dr.fma(0.5 * dr.rsqrt(fmax(near2, 1e-37)), e, s5)
-            return zr, zi, turns, g, clear, s4, s5, beside, unsure
+            passed = t < behind.t
+            passed |= (t == behind.t) & (index(fmax(row[INDEX], real(0))) <= behind.sheet)
+            value = value + dr.select(active & ~passed, 4 * math.pi * turn, 0)
+            product, bounds = LiftedProduct(*product), (rounding, s4, s5)
+            for edge in edges_of(row, x, frame):
+                open_ = active & edge.is_open(reach)
+                product = edge.times(product, open_)
+                bounds = with_edge(bounds, edge.square, edge.inverse, epsilon, open_)
+                g = g + dr.select(open_, edge.gradient(), 0)
+                clear = dr.select(open_, fmin(dr.sqrt(edge.square), clear), clear)
+            rounding, s4, s5 = bounds
+            sums = value, g, truncation, slope_truncation, rounding, clear, s4, s5
+            return *sums, *product.parts()
 
-        value, g, error, slope_error, clear, s4, s5, beside, unsure = state
-        begin = (real(1), real(0), real(0), g, clear, s4, s5, beside, unsure)
-        zr, zi, turns, g, clear, s4, s5, beside, unsure = for_each(node, near, add, begin)
-        value = value + dr.select(near, whole_angle(zr, zi, turns), 0)
-        return value, g, error, slope_error, clear, s4, s5, beside, unsure
+        def leaf(node: Node, near: Mask, sums: tuple[Any, ...]) -> tuple[Any, ...]:
+            return for_each(node, near, add, sums)
+
+        one = LiftedProduct.one(real).parts()
+        found, product = self.clusters.near(x, detail, leaf, one)
+        found = dataclasses.replace(found, value=found.value + LiftedProduct(*product).angle())
+        return found.sample(_SHARE, epsilon, self.rounding)

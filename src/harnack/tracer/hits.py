@@ -36,6 +36,10 @@ class Hits:
     status: (n,) a `Status`.
     sheet: (n,) index of the sheet, such as a triangle, that was hit; -1 where none was: misses,
         hits of a smooth level set, and all rays of fields that have no sheets.
+    uncertainty: (n,) a length: how much farther than the tolerance the surface may be from
+        `position`, to first order, since rounding leaves f uncertain (error/|grad f|). Hits of
+        smooth level sets only: 0 elsewhere; inf where f is known to be uncertain and its gradient
+        is zero.
     """
 
     t: Any
@@ -45,6 +49,7 @@ class Hits:
     evaluations: Any
     status: Any
     sheet: Any
+    uncertainty: Any
 
     @property
     def hit(self) -> Any:
@@ -154,11 +159,14 @@ def _trace(
         sheet = dr.full(backend.Int32, -1, dr.width(end.status))
         if prepared.field.has_sheets:
             sheet = dr.reinterpret_array(backend.Int32, end.sheet)  # NO_SHEET becomes -1
+        smooth = hit & ~end.on_sheet
+        uncertainty = dr.select(smooth, end.error / length, 0)
     t = end.t
     if differentiable and wants_derivatives(prepared, o, d):
         t, normal = attach(prepared, o, d, end, normal)
     position = dr.select(dr.isfinite(t), dr.fma(backend.Array3f(t), d, o), dr.nan)
-    hits = Hits(t, position, normal, end.value, end.evaluations, end.status, sheet)
+    outcome = end.value, end.evaluations, end.status, sheet, uncertainty
+    hits = Hits(t, position, normal, *outcome)
     dr.eval(*vars(hits).values())
     return hits
 
@@ -166,7 +174,8 @@ def _trace(
 def _no_hits(backend: Backend, *, as_numpy: bool) -> Hits:
     number, vector = dr.zeros(backend.Float, 0), dr.zeros(backend.Array3f, 0)
     count = dr.zeros(backend.UInt32, 0)
-    hits = Hits(number, vector, vector, number, count, count, dr.zeros(backend.Int32, 0))
+    sheet = dr.zeros(backend.Int32, 0)
+    hits = Hits(number, vector, vector, number, count, count, sheet, number)
     return _as_numpy(hits, 0) if as_numpy else hits
 
 
@@ -183,4 +192,5 @@ def _as_numpy(hits: Hits, n: int) -> Hits:
         flat(hits.evaluations).astype(np.int64),
         flat(hits.status).astype(np.int64),
         flat(hits.sheet).astype(np.int64),
+        flat(hits.uncertainty),
     )

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
-from harnack.backend.extrema import fmax, fmin
+from harnack.backend.extrema import clamp, fmax, fmin
 from harnack.certify import Levels, certify
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.tracer.stretches import STATUS, State, Walk, loop, meet
@@ -25,9 +25,17 @@ if TYPE_CHECKING:
     from harnack.geometry import Volume
 
 
-# A rough look is too rough if a level is nearer than this many times its error, and will do again
-# from where one is farther than this many times the error of a close look.
-_VAGUE, _PLAIN = 2.0, 20.0
+# A sample is repeated more closely where a level is nearer in value than this many times its error,
+# until the error is this part of that distance, or truncation this part of what a hit may be off.
+_REFINE_BELOW, _OF_GAP, _OF_HIT = 2.0, 0.25, 0.25
+# The next sample may be so coarse that its truncation is this part of the distance to a level.
+_COARSEN = 0.2
+# Trials stop short of where the slope alone would take f to a level by this factor.
+_AIM = 0.99
+# A repeated sample is closer by these factors at least and at most.
+_CLOSER = 1.25, 16.0
+# Truncation falls like this power of detail; beyond the largest detail there is none.
+_POWER, _MOST_DETAIL = 3.0, 1e6
 
 
 @dataclass(frozen=True)
@@ -36,12 +44,14 @@ class Trace:
 
     A ray that hits a sheet (see `harnack.fields.sheets`) has its index in `sheet`, NO_SHEET
     elsewhere; its t is that of the crossing, `value` is f just before it, and `gradient` is the
-    sheet's unit normal, to the side of larger f.
+    sheet's unit normal, to the side of larger f. error: how far rounding, and truncation if it
+    could not be made smaller, may have moved `value` from f at t.
     """
 
     t: Real
     value: Real
     gradient: Vec3
+    error: Real
     evaluations: Any
     status: Any
     sheet: Any
@@ -83,9 +93,9 @@ class PreparedLevelSet:
     def first_hit(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask = True) -> Trace:
         """The first hit of rays o + t d, |d| = 1, for t_min <= t <= t_max. Inactive rays miss."""
         state, sheet = self._march(o, d, t_min, t_max, active)
-        t, _, _, f, g, evaluations, _, status, _ = state
+        t, _, _, f, g, error, evaluations, _, status, _ = state
         missed = status == int(Status.MISS)
-        return Trace(dr.select(missed, dr.inf, t), f, g, evaluations, status, sheet)
+        return Trace(dr.select(missed, dr.inf, t), f, g, error, evaluations, status, sheet)
 
     def _march(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask) -> tuple[State, Any]:
         """The end state of rays, and the index of the sheet that each hit."""
@@ -94,8 +104,8 @@ class PreparedLevelSet:
         start, end = self.clip(o, d, real(t_min), real(t_max))
         running = self.backend.Bool(active) & (start < end)
         state: State = (
-            real(start), real(0), real(0), real(0), vector(0), count(0),
-            self.backend.Bool(False), count(int(Status.MISS)), running,
+            real(start), real(0), real(0), real(0), vector(0), real(0), count(0),
+            real(0), count(int(Status.MISS)), running,
         )  # fmt: skip
         if not self.field.has_sheets:
             return self._advance(self.field, o, d, end, state), count(NO_SHEET)
@@ -117,7 +127,10 @@ class PreparedLevelSet:
         reach, or the bound at the trial point looking back covers step - reach; then all up to it
         is free. Otherwise the ray goes back to base + reach, which needs no such test. A ray ends
         as a miss when base + reach passes its end, as a hit only at an accepted point. A point is
-        not accepted on a look that is too rough (`_is_vague`), but looked at again.
+        not accepted on a sample that is too coarse (`_finer`), but sampled again.
+
+        A hit is a point where f is within the tolerance of a level *after* the truncation error of
+        f is taken off; where rounding leaves f less certain than that, within twice what it leaves.
 
         In rounded arithmetic a surface could slip through between the two looks, so both see
         it nearer by the rounding of value and position together (`_blur`).
@@ -130,34 +143,44 @@ class PreparedLevelSet:
         size = fmax(fmax(dr.abs(o.x), dr.abs(o.y)), dr.abs(o.z))
 
         def body(
-            base: Real, step: Real, reach: Real, f: Real, g: Vec3, n: Any, fine: Mask, status: Any,
-            active: Mask,
+            base: Real, step: Real, reach: Real, f: Real, g: Vec3, error: Real, n: Any,
+            detail: Real, status: Any, active: Mask,
         ) -> State:  # fmt: skip
             t = base + step
             if ahead is not None:  # the crossing exactly
                 t = dr.select(step >= end - base, end, t)
             beyond = None if ahead is None else (ahead, t == end)
-            seen = field.at_detail(fine) if field.has_detail else field
+            seen = field.at_detail(detail) if field.has_detail else field
             sample = seen.evaluate(dr.fma(vector(t), d, o))
             gaps, steepness = self.levels.gaps(sample.value), dr.norm(sample.gradient)
             blur = self._blur(sample, steepness, size + t)
-            certificates = self._certify(sample, gaps, blur)
+            certificates, ahead_gaps = self._certify(sample, gaps, blur), gaps
             slope, doubt = dr.dot(sample.gradient, d), sample.gradient_error
             accepted = step <= reach
             if self.overstep > 1:
                 accepted |= _covers(bound, certificates, -slope, doubt, step - reach)
-            within = self.tolerance.in_value(steepness, t)
-            vague = ~fine & self._is_vague(sample.value, blur, within, beyond) & field.has_detail
-            accepted &= ~vague & dr.isfinite(blur)  # what is not known is not free
-            fine = vague | (fine & ~(accepted & (fmin(*gaps) > _PLAIN * blur)))
-            hit, met = accepted & (fmin(*gaps) <= fmax(within, 2 * blur)), None
+            within = self.tolerance.in_value(fmax(steepness - doubt, real(0)), t)
+            truncation, again = sample.truncation, None
+            if field.has_detail:
+                gap = self._deciding_gap(sample.value, beyond)
+                closer, again = _finer(
+                    fmax(detail, field.coarsest_detail), gap, blur, truncation, within
+                )
+                accepted &= ~again
+            accepted &= dr.isfinite(blur)  # what is not known is not free
+            if again is not None:
+                coarser = _coarser(detail, fmin(*gaps), truncation, field.coarsest_detail)
+                detail = dr.select(again, closer, dr.select(accepted, coarser, detail))
+            hit, met = accepted & (fmin(*gaps) <= fmax(within - truncation, 2 * blur)), None
             if beyond is not None:
                 met = meet(beyond[0], accepted & beyond[1], sample.value, blur, self.levels)
-                certificates = self._certify(sample, met.gaps, blur)
+                certificates, ahead_gaps = self._certify(sample, met.gaps, blur), met.gaps
             forward = fmax(_step(bound, certificates, slope, doubt), real(0))
-            step = dr.select(accepted, self.overstep * forward, dr.select(vague, step, reach))
+            back = reach if again is None else dr.select(again, step, reach)
+            step = dr.select(accepted, self._trial(forward, slope, ahead_gaps), back)
             reach, base = dr.select(accepted, forward, reach), dr.select(accepted, t, base)
             f, g = dr.select(accepted, sample.value, f), dr.select(accepted, sample.gradient, g)
+            error = dr.select(accepted, blur, error)
             n, free = n + 1, base + reach >= end
             if met is not None:
                 free = dr.select(met.awaited, met.passed, free)
@@ -165,26 +188,33 @@ class PreparedLevelSet:
             if met is not None:
                 status, g = met.mark(status, g)
             active = active & ~(hit | free | (n >= self.max_steps))
-            return base, fmin(step, end - base), reach, f, g, n, fine, status, active
+            step = fmin(step, end - base)
+            return base, step, reach, f, g, error, n, detail, status, active
 
         return loop(state, body, "harnack")
+
+    def _trial(self, forward: Real, slope: Real, gaps: Real) -> Real:
+        """How far to try, where `forward` is proved: longer, but not past where the slope alone
+        would take f to a level. Whatever is tried must still be proved, looking back."""
+        down, up = gaps
+        rate = dr.abs(slope)
+        crossing = dr.select(rate > 0, dr.select(slope > 0, up, down) / rate, dr.inf)
+        return fmin(self.overstep * forward, fmax(_AIM * crossing, forward))
 
     def _status(self, hit: Mask, free: Mask) -> Any:
         """Of a ray that goes no farther."""
         ended = dr.select(free, int(Status.MISS), int(Status.OUT_OF_STEPS))
         return self.backend.UInt32(dr.select(hit, int(Status.HIT), ended))
 
-    def _is_vague(
-        self, value: Real, blur: Real, within: Real, beyond: tuple[Crossing, Mask] | None
-    ) -> Mask:
-        """Whether a rough look is too rough: it shortens the step by much, or may be all that
-        makes a hit. beyond: the crossing at the end of the stretch, and whether this is there."""
+    def _deciding_gap(self, value: Real, beyond: tuple[Crossing, Mask] | None) -> Real:
+        """The distance in value to the nearest level, of f or of what f is behind the crossing at
+        the end of the stretch. beyond: that crossing, and whether this is there."""
         gap = fmin(*self.levels.gaps(value))
         if beyond is not None:
             ahead, there = beyond
             behind = self.levels.gaps(value + ahead.jump)
             gap = dr.select(there & (ahead.sheet != NO_SHEET), fmin(gap, fmin(*behind)), gap)
-        return (gap < _VAGUE * blur) & (2 * blur > within)
+        return gap
 
     def _certify(
         self, sample: Sample, gaps: tuple[Real, Real], blur: Real
@@ -198,6 +228,29 @@ class PreparedLevelSet:
         epsilon = self.backend.epsilon
         position = 4 * epsilon * size
         return dr.fma(steepness, position, dr.fma(8 * epsilon, dr.abs(sample.value), sample.error))
+
+
+def _finer(
+    detail: Real, gap: Real, blur: Real, truncation: Real, within: Real
+) -> tuple[Real, Mask]:
+    """The detail to sample a point at again, and whether the sample at this one is too coarse.
+
+    It is where its error shortens the step by much or decides about a hit, unless truncation is a
+    small part of it: of what a hit may be off (`within`) or of rounding, which no detail helps.
+    """
+    floor = fmax(within, blur - truncation)
+    again = (gap < _REFINE_BELOW * blur) & (truncation > 1.6 * _OF_HIT * floor)
+    again &= detail < _MOST_DETAIL
+    wanted = fmax(_OF_GAP * gap, _OF_HIT * floor)
+    closer = clamp(dr.power(truncation / wanted, 1 / _POWER), *_CLOSER)
+    return fmin(fmax(detail * closer, 1), _MOST_DETAIL), again
+
+
+def _coarser(detail: Real, gap: Real, truncation: Real, coarsest: float) -> Real:
+    """The detail for the next sample, no finer than that of this one, with its truncation and a gap
+    to the next level: 0 for as coarse as can be, or at least 1."""
+    wanted = detail * dr.power(truncation / (_COARSEN * gap), 1 / _POWER)
+    return dr.select(wanted > coarsest, fmin(fmax(wanted, 1), detail), 0)
 
 
 def _step(bound: Longest, certificates: tuple[Certificate, ...], slope: Real, doubt: Real) -> Real:

@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from harnack.certify import Levels
     from harnack.fields.field import Field
 
-# base, step, reach, value, gradient, evaluations, fine, status, active: see
+# base, step, reach, value, gradient, error, evaluations, detail, status, active: see
 # `PreparedLevelSet._advance`.
 State: TypeAlias = "tuple[Any, ...]"
-REACH, EVALUATIONS, STATUS, ACTIVE = 2, 5, 7, 8
+REACH, EVALUATIONS, STATUS, ACTIVE = 2, 6, 8, 9
 
 ON_SHEET = max(Status) + 1
 """Status of a ray that hit a sheet, until `Walk` turns it into a plain HIT."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 
 from harnack.backend.extrema import clamp, fmax, fmin
-from harnack.tree.triangles import EDGES, TriangleRays, corners_of
+from harnack.tree.triangles import EDGES, INDEX, PARITY, TriangleRays, corners_of
 from harnack.tree.walk import Node, State, for_each, walk
 
 if TYPE_CHECKING:
@@ -58,3 +58,22 @@ def squared_distance_to_segment(a: Vec3, e: Vec3, inverse: Real) -> Real:
     real, vector = cast("Any", type(inverse)), cast("Any", type(a))
     share = clamp(-dr.dot(a, e) * inverse, real(0), real(1))
     return dr.squared_norm(dr.fma(vector(share), e, a))
+
+
+def jumps_within(rays: TriangleRays, x: Vec3, distance: Real) -> Real:
+    """The sum of what the winding number jumps by across triangles that are so near to x."""
+    tree = rays.tree
+    real, vector = tree.backend.Float, tree.backend.Array3f
+    x, reach = vector(x), real(distance) * real(distance)
+
+    def visit(node: Node, state: State) -> tuple[Mask, State]:
+        low, high = vector(*node.head[:3]), vector(*node.head[3:])
+        outside = dr.select(x < low, low - x, dr.select(x > high, x - high, 0))
+        close = dr.squared_norm(outside) <= 4 * reach
+        return close, for_each(node, close & node.is_leaf, add, state)
+
+    def add(row: list[Real], active: Mask, state: State) -> State:
+        within = active & (row[INDEX] >= 0) & (squared_distance(row, x) <= reach)
+        return (state[0] + dr.select(within, dr.abs(row[PARITY]), 0),)
+
+    return walk(tree, visit, (real(0),))[0]

@@ -8,19 +8,22 @@ edge is decided alike, to the last bit, and no ray slips through between them or
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import drjit as dr
 import numpy as np
 
 from harnack.backend.basis import across
-from harnack.backend.extrema import fmax, fmin
+from harnack.backend.extrema import clamp, fmax, fmin
 from harnack.tree.hierarchy import FloatArray, Hierarchy, IntArray
 from harnack.tree.packed import PackedTree, pack
 from harnack.tree.walk import Node, State, for_each, walk
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
+
+    # A point across a ray (u, v) and along it.
+    Seen: TypeAlias = tuple[Real, Real, Real]
 
 # Columns of a record; 0 to 8 are the corners.
 PARITY, INDEX, EDGES = 9, 10, 11
@@ -91,9 +94,13 @@ class Frame:
         """Where p is along the rays."""
         return dr.dot(p - self.o, self.d)
 
+    def component(self, a: Vec3) -> Real:
+        """How far a vector reaches along the rays."""
+        return dr.dot(a, self.d)
+
 
 @dataclass(frozen=True)
-class _Upwards:
+class Upwards:
     """The frame of rays from points o along the z axis, for which there is nothing to compute."""
 
     o: Vec3
@@ -105,6 +112,10 @@ class _Upwards:
     def depth(self, p: Vec3) -> Real:
         """As `Frame.depth`."""
         return p.z - self.o.z
+
+    def component(self, a: Vec3) -> Real:
+        """As `Frame.component`."""
+        return a.z
 
 
 def side(a: tuple[Real, Real], b: tuple[Real, Real]) -> Real:
@@ -201,7 +212,7 @@ class TriangleRays:
             return open_, for_each(node, open_ & node.is_leaf, add, state)
 
         def add(row: list[Real], active: Mask, state: State) -> State:
-            t, turn = crossing(row, _Upwards(x))
+            t, turn = crossing(row, Upwards(x))
             return (state[0] + dr.select(active & (way * t > 0), turn, 0),)
 
         return walk(self.tree, visit, (real(0),))[0]
@@ -240,7 +251,7 @@ def normal_of(row: list[Real], vector: Any) -> Vec3:
     return row[PARITY] * dr.cross(q - p, r - p)
 
 
-def crossing(row: list[Real], frame: Frame | _Upwards) -> tuple[Real, Real]:
+def crossing(row: list[Real], frame: Frame | Upwards) -> tuple[Real, Real]:
     """t and turn of a ray with the triangle of a record; the turn is 0 where it passes by.
 
     In the plane across the ray, the turn is the winding number of the triangle about the ray:
@@ -249,6 +260,9 @@ def crossing(row: list[Real], frame: Frame | _Upwards) -> tuple[Real, Real]:
     `side`. Both are the same for all triangles around a vertex or an edge, so that what one of
     them counts its neighbour discounts: the sum over a closed surface is right whatever the
     rounding did, and rays through edges and vertices need no special case.
+
+    t is where a point of the triangle lies that is next to the ray to a few roundings of
+    coordinates, however thin the triangle is (`_depth`).
     """
     vector = cast("Any", type(frame.o))
     p, q, r = corners_of(row, vector)
@@ -265,10 +279,41 @@ def crossing(row: list[Real], frame: Frame | _Upwards) -> tuple[Real, Real]:
     turn = row[PARITY] * (
         upwards(up_a, up_b, ab) + upwards(up_b, up_c, bc) - upwards(up_a, up_c, ac)
     )
-    za, zb, zc = frame.depth(p), frame.depth(q), frame.depth(r)
-    total = bc - ac + ab
-    t = dr.fma(bc, za, dr.fma(-ac, zb, ab * zc)) / total
-    low, high = fmin(za, fmin(zb, zc)), fmax(za, fmax(zb, zc))
-    # Of a triangle seen edge on, any point will do that lies in it.
-    t = dr.select(dr.isfinite(t), fmin(fmax(t, low), high), low)
-    return t, turn
+    a, b, c = (*a, frame.depth(p)), (*b, frame.depth(q)), (*c, frame.depth(r))
+    return _depth((a, b, c), (ab, bc, ac)), turn
+
+
+def _depth(corners: tuple[Seen, Seen, Seen], sides: tuple[Real, Real, Real]) -> Real:
+    """How far along a ray a triangle lies that it passes through, seen as (u, v, depth) each.
+
+    The weight of a corner is an area over that of the triangle, which is all rounding where that is
+    thin. So the weight w of the corner off the longest edge is cut to [0, 1], and the place s along
+    that edge is then chosen for w: the ray is at s + w s', with s' the place of that corner, and
+    places along the longest edge are well known. A wrong w moves the point across that edge only,
+    by no more than the rounding of an area over the edge's length.
+    """
+    (a, b, c), (ab, bc, ac) = corners, sides
+    squares = _square(a, b), _square(b, c), _square(a, c)
+    is_first = (squares[0] >= squares[1]) & (squares[0] >= squares[2])
+    is_last = squares[2] > squares[1]
+
+    def of_longest(first: Real, second: Real, last: Real) -> Real:
+        return dr.select(is_first, first, dr.select(is_last, last, second))
+
+    start, end, apex = (
+        tuple(of_longest(*some) for some in zip(*choice, strict=True))
+        for choice in ((a, b, a), (b, c, c), (c, a, b))
+    )
+    e = end[0] - start[0], end[1] - start[1]
+    share = dr.rcp(of_longest(*squares))
+    here = -dr.fma(start[0], e[0], start[1] * e[1]) * share
+    aside = dr.fma(apex[0] - start[0], e[0], (apex[1] - start[1]) * e[1]) * share
+    zero = type(ab)(0)
+    w = clamp(of_longest(ab, bc, -ac) / (bc - ac + ab), zero, 1)
+    s = clamp(dr.fma(-w, aside, here), zero, 1 - w)
+    return dr.fma(s, end[2] - start[2], dr.fma(w, apex[2] - start[2], start[2]))
+
+
+def _square(a: Seen, b: Seen) -> Real:
+    u, v = b[0] - a[0], b[1] - a[1]
+    return dr.fma(u, u, v * v)
