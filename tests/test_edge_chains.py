@@ -135,8 +135,9 @@ def test_sums_along_rays_are_those_over_all_edges(kind: str, fine: bool) -> None
     off = np.where(aimed, np.abs(np.remainder(off + 1, 4 * np.pi) - 1), off)
     slant = np.linalg.norm(to_numpy(found.gradient) - gradient, axis=1)
     steep = np.linalg.norm(gradient, axis=1)
-    assert (off <= to_numpy(found.error) + 1e-10).all()
-    assert (slant <= to_numpy(found.slope_error) + 1e-9 * (1 + steep)).all()
+    bound = to_numpy(found.truncation + found.rounding)
+    assert (off <= bound + 1e-10).all()
+    assert (slant <= to_numpy(found.slope_truncation) + 1e-9 * (1 + steep)).all()
     assert (off.max() > 1e-5) != fine  # a rough look leaves something out
 
 

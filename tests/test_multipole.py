@@ -351,7 +351,7 @@ def test_truncation_is_bounded(order: int, accuracy: float) -> None:
         y, normal = cluster(seed, 2 if seed % 5 == 4 else 12)
         level = level_of(y, normal)
         nearest = accuracy * level.radius
-        e, g = (bound[0] for bound in truncation(level, nearest, order))
+        e, g, _ = (bound[0] for bound in truncation(level, nearest, order))
         x = viewpoints(level, 1 / accuracy, seed)
         r = np.linalg.norm(x - level.centre[0], axis=1)
         value, gradient = terms(level, x, order, 1)
@@ -374,8 +374,10 @@ def test_bounds_are_not_rounded_below_their_series(order: int, accuracy: float) 
         powers = [(l, l * (level.radius[0] / r) ** (l - 5) / r**4) for l in range(6, 200)]
         parts = [(l, level.fourth[0] * term * r**k / r) for l, term in powers]
         parts += [(l, sup_norm(level.moments, l)[0] / r ** (l - k)) for l in range(k, 6)]
-        e, g = truncation(level, np.array([r]), order)
+        e, g, h = truncation(level, np.array([r]), order)
         value, slope = sum(one for _, one in parts), sum((l + 1) * one for l, one in parts)
+        second = sum((l + 1) * (l + 2) * one for l, one in parts)
+        assert second <= np.float32(h[0]) <= second * (1 + 2e-6)
         assert value <= np.float32(e[0]) <= value * (1 + 2e-6)
         assert slope <= np.float32(g[0]) <= slope * (1 + 2e-6)
 

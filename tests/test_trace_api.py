@@ -49,7 +49,7 @@ def test_shapes_and_types_of_numpy_output() -> None:
     shapes_of = {name: array.shape for name, array in vars(hits).items()}
     assert shapes_of == {
         "t": (7,), "position": (7, 3), "normal": (7, 3), "value": (7,),
-        "evaluations": (7,), "status": (7,), "sheet": (7,),
+        "evaluations": (7,), "status": (7,), "sheet": (7,), "uncertainty": (7,),
     }  # fmt: skip
     assert all(type(array) is np.ndarray for array in vars(hits).values())
     assert hits.t.dtype == hits.position.dtype == hits.value.dtype == np.float32

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from harnack.backend import backend_of
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.dipole_tree import DipoleTree, hierarchy_of
-from harnack.fields.field import Field, Sample, lengthened
+from harnack.fields.field import AtDetail, Field, Sample, lengthened
 from harnack.fields.unit_coordinates import UnitCoordinates, placed, single
 from harnack.geometry import Box, CloudError, estimate_areas, estimate_normals, validate_cloud
 
@@ -137,7 +137,8 @@ class DipolePotential(BatchedField):
     def at_detail(self, detail: Real) -> Field:
         if self._device is None:
             raise RuntimeError("prepare(backend) comes before at_detail")
-        return _AtDetail(self._device, detail)
+        on = self._device
+        return AtDetail(lambda p: on.sample(p, detail))
 
     def check_levels(self, levels: tuple[float, ...]) -> None:
         for level in levels:
@@ -165,13 +166,3 @@ class _OnDevice(UnitCoordinates):
 
     def sample(self, p: Vec3, detail: Real) -> Sample:
         return lengthened(self.tree.sample(self.unit(p), detail), self.size)
-
-
-class _AtDetail(Field):
-    """A potential that is evaluated more or less closely in each lane."""
-
-    def __init__(self, on: _OnDevice, detail: Real) -> None:
-        self._on, self._detail = on, detail
-
-    def evaluate(self, p: Vec3) -> Sample:
-        return self._on.sample(p, self._detail)

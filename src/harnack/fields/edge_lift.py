@@ -158,7 +158,7 @@ def rounding_of_edge(first: Real, unit: Real) -> Real:
     terms are |F_e| times a few over the cosine of half the angle that the edge is seen at, and the
     same bits of an end serve both edges there. It is less than 4 pi in any case.
     """
-    return fmin(8 * unit * first, 4 * dr.pi)
+    return fmin(4 * unit * first, 4 * dr.pi)
 
 
 def with_edge(
@@ -172,14 +172,16 @@ def with_edge(
     t^2/(rho^3 (1-t/rho)). With a = L/2 and distance d an edge has int rho^-3 <=
     2a/(d^2 sqrt(d^2+a^2)) =: 2e, int rho^-4 <= 2e/d; and 1/(1-q) <= 1 + q/(1-b) <= 1 + q rise/4
     on [0, b] (`Nearby.sample`). So an edge adds to the remainder what s4 += 2e/3 and
-    s5 += e/(2d) do.
+    s5 += e/(2d) do. d is less by what rounding may have done to it.
     """
     rounding, s4, s5 = bounds
-    first, e = (dr.select(active, one, 0) for one in edge_variation(square, inverse))
+    distance = fmax(dr.sqrt(square) - 2 * unit, 0)
+    first, e = edge_variation(distance * distance, inverse)
+    first, e, closer = (dr.select(active, one, 0) for one in (first, e, dr.rcp(distance)))
     return (
         rounding + rounding_of_edge(first, unit),
         dr.fma(2 / 3, e, s4),
-        dr.fma(0.5 * dr.rsqrt(fmax(square, 1e-37)), e, s5),
+        dr.fma(0.5 * closer, e, s5),
     )
 
 

@@ -8,6 +8,7 @@ the tracer takes rests on it. `harnack.testing.check_field` tests a field agains
 from __future__ import annotations
 
 import abc
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -241,3 +242,13 @@ class Field(abc.ABC):
         """Distance from p to the nearest sheet; inf where there is none."""
         del p
         return float("inf")
+
+
+class AtDetail(Field):
+    """What `Field.at_detail` returns: another way to evaluate a field, at one detail."""
+
+    def __init__(self, evaluate: Callable[[Vec3], Sample]) -> None:
+        self._evaluate = evaluate
+
+    def evaluate(self, p: Vec3) -> Sample:
+        return self._evaluate(p)

@@ -27,7 +27,7 @@ _REACHES = (0.2, 0.4, 0.6)
 _WAY = 0.65
 _ROUNDING = 2e-5
 # What rounding does to gradients and second derivatives: see `far_clusters.Errors`.
-SLOPE_ROUNDINGS, SECOND_ROUNDINGS = 16.0, 64.0
+SLOPE_ROUNDINGS, SECOND_ROUNDINGS = 10.0, 40.0
 
 Sums: TypeAlias = "tuple[Any, ...]"
 
@@ -142,9 +142,9 @@ class Nearby:
         A ball of that radius bounds f by |g| r more, and holds harmonic f: dipoles of far nodes
         are farther away than 1 - 1/rough times the centre, and `longest_part` is less.
         """
-        epsilon, g = self.backend.epsilon, share * self.gradient
+        g = share * self.gradient
         slope_error = share * dr.fma(SLOPE_ROUNDINGS * unit, self.s4, self.slope_truncation)
-        distance = self.clear * (1 - _ROUNDING) - 8 * epsilon
+        distance = self.clear * (1 - _ROUNDING) - 4 * unit
         bends = [self._bend(share, b, b * distance) for b in _REACHES]
         slope, widest = dr.norm(g) + slope_error, bends[-1]
         r = widest.radius
@@ -152,8 +152,8 @@ class Nearby:
         value = share * self.value
         ball = HarmonicBall(r, value - variation, value + variation)
         # On a singular point itself all values meet: a gradient that says so.
-        apart = (self.clear > 16 * epsilon) & dr.isfinite(value) & dr.isfinite(dr.squared_norm(g))
-        steep = self.backend.Array3f(0, 0, share * 4 * math.pi / (8 * epsilon))
+        apart = (self.clear > 8 * unit) & dr.isfinite(value) & dr.isfinite(dr.squared_norm(g))
+        steep = self.backend.Array3f(0, 0, share * math.pi / unit)
         return Sample(
             dr.select(apart, value, 0),
             dr.select(apart, g, steep),

@@ -14,11 +14,12 @@ import numpy.typing as npt
 
 from harnack.backend import backend_of, choose_backend, to_numpy, to_vector3
 from harnack.fields.batch import BatchedField, Values
-from harnack.fields.edge_hessian import SymmetricSum
-from harnack.fields.field import Curvature, Sample
-from harnack.fields.screened_kernel import mean_at_dipoles, promises
+from harnack.fields.edge_lift import epsilon_at
+from harnack.fields.field import AtDetail, Curvature, Field, Sample
+from harnack.fields.nearby import SECOND_ROUNDINGS, SLOPE_ROUNDINGS
+from harnack.fields.screened_kernel import ScreenedSums, mean_at_dipoles, promises
 from harnack.fields.screened_tree import PlainSum, TreeSum, dipole_rows
-from harnack.fields.unit_coordinates import UnitCoordinates, placed
+from harnack.fields.unit_coordinates import UnitCoordinates, placed, single
 from harnack.geometry import Box
 from harnack.geometry.clouds import estimate_areas, validate_cloud
 from harnack.geometry.meshes import validate_mesh
@@ -107,9 +108,10 @@ class ScreenedWindingNumber(BatchedField):
         self.method: Literal["sum", "tree"] = (
             ("sum" if few else "tree") if method == "auto" else method
         )
+        self.has_detail = self.method == "tree"
         low, high = self.points.min(axis=0), self.points.max(axis=0)
         extent = max(0.5 * float((high - low).max()), math.sqrt(float(self.areas.max())))
-        self._centre = 0.5 * (low + high)
+        self._centre = single(0.5 * (low + high))
         # A power of two, so that lengths are scaled without rounding.
         self._size = 2.0 ** math.ceil(math.log2(extent))
         share = self.areas[:, None] / (4 * math.pi * self._size**2)
@@ -159,16 +161,32 @@ class ScreenedWindingNumber(BatchedField):
             corners.mean(axis=1), normals, areas, length=length, method=method, accuracy=accuracy
         )
 
-    def values_at(self, x: Vec3, derivatives: int) -> Values:
+    def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> Values:
         backend = backend_of(x)
         if backend not in self._batches:
             self._batches[backend] = self.prepare(backend)
-        prepared = self._batches[backend]
-        sample = prepared.evaluate(x)
-        rounding = 8 * backend.epsilon * dr.abs(sample.value)
+        on = self._batches[backend]._on
+        x = on.unit(x)
+        sums, unit = on.sum.sums(x, closer), epsilon_at(x)
         # The trace of the Hessian is w/l^2; it grows without limit at the points.
-        hessian = prepared._hessian(x) if derivatives == 2 else None
-        return Values(sample.value, sample.error + rounding, sample.gradient, hessian)
+        hessian = on.sum.hessian(x, closer) if derivatives == 2 else None
+        rounding = self._rounding(backend, sums) + 8 * backend.epsilon * dr.abs(sums.value)
+        # Fourth derivatives of the kernel: Q_4(t) <= (1 + t/4) Q_3(t).
+        fourth = dr.fma(0.25 * on.sum.kappa, sums.bent, sums.more_bent)
+        return Values(
+            sums.value,
+            sums.error + rounding,
+            sums.gradient,
+            hessian,
+            dr.fma(SLOPE_ROUNDINGS * unit, sums.bent, sums.gradient_error),
+            dr.fma(SECOND_ROUNDINGS * unit, fourth, sums.hessian_error),
+        ).rescaled(on.size)
+
+    def _rounding(self, backend: Backend, sums: ScreenedSums) -> Real:
+        """Of the value: of terms, each rounded and added with random signs, and of positions."""
+        epsilon = backend.epsilon
+        rounding = epsilon * (12 + math.sqrt(len(self._rows)))
+        return dr.fma(rounding, sums.moved, 6 * epsilon * sums.steep)
 
     def prepare(self, backend: Backend) -> ScreenedWindingNumber:
         if self._device is not None and self._device.backend is backend:
@@ -184,12 +202,17 @@ class ScreenedWindingNumber(BatchedField):
     def evaluate(self, p: Vec3) -> Sample:
         if self._device is None:
             return self.prepare(backend_of(p)).evaluate(p)
+        return self._sample(p, 1.0)
+
+    def at_detail(self, detail: Real) -> Field:
+        return AtDetail(lambda p: self._sample(p, detail))
+
+    def _sample(self, p: Vec3, detail: Real) -> Sample:
         on = self._on
-        sums = on.sum.sums(on.unit(p))
-        epsilon = on.backend.epsilon
-        # Terms rounded each and added with random signs; positions, rounded once.
-        rounding = epsilon * (12 + math.sqrt(len(self._rows)))
-        error = dr.fma(rounding, sums.moved, dr.fma(6 * epsilon, sums.steep, sums.error))
+        x = on.unit(p)
+        sums, epsilon = on.sum.sums(x, detail), on.backend.epsilon
+        error = sums.error + self._rounding(on.backend, sums)
+        slope_error = dr.fma(SLOPE_ROUNDINGS * epsilon_at(x), sums.bent, sums.gradient_error)
         # On a dipole itself, to rounding, all levels meet: a gradient that says so.
         apart = (sums.nearest > (32 * epsilon) ** 2) & dr.isfinite(sums.value)
         steep = on.backend.Array3f(0, 0, 1 / (32 * epsilon))
@@ -201,7 +224,8 @@ class ScreenedWindingNumber(BatchedField):
             gradient / on.size,
             known,
             dr.select(apart, error, 0),
-            dr.select(apart, sums.gradient_error / on.size, 0),
+            dr.select(apart, slope_error / on.size, 0),
+            truncation=dr.select(apart, sums.error, 0),
         )
 
     @property
@@ -209,11 +233,6 @@ class ScreenedWindingNumber(BatchedField):
         if self._device is None:
             raise RuntimeError("prepare(backend) comes first")
         return self._device
-
-    def _hessian(self, p: Vec3) -> SymmetricSum:
-        on = self._on
-        share = 1 / (on.size * on.size)
-        return SymmetricSum(*(part * share for part in on.sum.hessian(on.unit(p)).parts()))
 
     def differentiable_value(self, p: Vec3) -> Real:
         """w to first order about p: its value and, in reverse and forward mode, its gradient."""

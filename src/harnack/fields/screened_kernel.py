@@ -84,7 +84,8 @@ class ScreenedSums:
     value, gradient: of w. nearest: the square of the least d_i.
     moved: sum w Q_2/d^2, at least the sum of |terms|. steep: sum w Q_2/d^3; steeper: over d^4.
     bent: sum w Q_3/d^4; more_bent: over d^5.
-    error, gradient_error: bounds of what clusters taken as a whole have done to w.
+    error, gradient_error, hessian_error: bounds of what clusters taken as a whole have done to w,
+    its gradient and its second derivatives along lines.
     Clusters add the bound of their sums.
     """
 
@@ -98,11 +99,12 @@ class ScreenedSums:
     more_bent: Real
     error: Real
     gradient_error: Real
+    hessian_error: Real
 
     @classmethod
     def zero(cls, backend: Backend) -> ScreenedSums:
         """Of no dipoles."""
-        rest = (backend.Float(0) for _ in range(7))
+        rest = (backend.Float(0) for _ in range(8))
         return cls(backend.Float(0), backend.Array3f(0), backend.Float(dr.inf), *rest)
 
     def parts(self) -> tuple[Any, ...]:
@@ -125,6 +127,7 @@ class ScreenedSums:
             dr.fma(bent, tail.inverse, self.more_bent),
             self.error + source.error,
             self.gradient_error + source.gradient_error,
+            self.hessian_error + source.hessian_error,
         )
 
 
@@ -198,7 +201,7 @@ class Source:
     """A dipole or a cluster seen from x, and how fast it changes.
 
     weight: of all its dipoles, which are no nearer than `tail` is for, `squared` its square.
-    error, gradient_error: of a cluster.
+    error, gradient_error, hessian_error: of a cluster.
     """
 
     terms: Terms
@@ -207,6 +210,7 @@ class Source:
     tail: Tail
     error: Real = 0.0
     gradient_error: Real = 0.0
+    hessian_error: Real = 0.0
 
 
 def seen_dipole(row: Sequence[Real], x: Vec3, kappa: Real, derivatives: int) -> Source:

@@ -17,7 +17,11 @@ left of the integral is the rest of the Taylor series of 1/(r - .)^2: with q = |
 for kappa = 0 attained by a dipole on the line to x that points along it. (4-3q)/(1-q)^2 grows with
 q, so R/r serves for all. For the gradient, likewise from 2/(r - .)^3,
 
-    Q_5 |m| |d|^3 (20 - 30q + 12q^2)/((1-q)^3 r^6).
+    Q_5 |m| |d|^3 (20 - 30q + 12q^2)/((1-q)^3 r^6),
+
+and for second derivatives from 6/(r - .)^4,
+
+    Q_6 |m| |d|^3 (120 - 270q + 216q^2 - 60q^3)/((1-q)^4 r^7).
 """
 
 from __future__ import annotations
@@ -31,7 +35,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import aligned
-from harnack.backend.extrema import fmin
+from harnack.backend.extrema import fmax, fmin
 from harnack.fields.edge_hessian import SymmetricSum
 from harnack.fields.screened_kernel import (
     LONGEST,
@@ -87,12 +91,14 @@ class PlainSum:
         count = dr.opaque(backend.UInt32, trips)
         return cls(backend, dr.opaque(backend.Float, kappa), aligned(backend, values), count)
 
-    def sums(self, x: Vec3) -> ScreenedSums:
-        """Value, gradient and bounds at x."""
+    def sums(self, x: Vec3, closer: Real) -> ScreenedSums:
+        """Value, gradient and bounds at x. No sum could be closer."""
+        del closer
         return ScreenedSums(*self._loop(x, 1, _with_sums, ScreenedSums.zero(self.backend).parts()))
 
-    def hessian(self, x: Vec3) -> SymmetricSum:
+    def hessian(self, x: Vec3, closer: Real) -> SymmetricSum:
         """Second derivatives at x."""
+        del closer
         zero = SymmetricSum.zero(self.backend.Float).parts()
         return SymmetricSum(*self._loop(x, 2, _with_hessian, zero))
 
@@ -140,16 +146,22 @@ class TreeSum:
             backend, dr.opaque(backend.Float, kappa), pack(backend, hierarchy, levels, slots)
         )
 
-    def sums(self, x: Vec3) -> ScreenedSums:
-        """Value, gradient and bounds at x."""
-        return ScreenedSums(*self._walk(x, 1, _with_sums, ScreenedSums.zero(self.backend).parts()))
+    def sums(self, x: Vec3, closer: Real) -> ScreenedSums:
+        """Value, gradient and bounds at x; clusters are taken as a whole from `closer` times the
+        `accepting_distance` on."""
+        zero = ScreenedSums.zero(self.backend).parts()
+        return ScreenedSums(*self._walk(x, 1, closer, _with_sums, zero))
 
-    def hessian(self, x: Vec3) -> SymmetricSum:
+    def hessian(self, x: Vec3, closer: Real) -> SymmetricSum:
         """Second derivatives at x."""
         zero = SymmetricSum.zero(self.backend.Float).parts()
-        return SymmetricSum(*self._walk(x, 2, _with_hessian, zero))
+        return SymmetricSum(*self._walk(x, 2, closer, _with_hessian, zero))
 
-    def _walk(self, x: Vec3, derivatives: int, add: Any, start: tuple[Any, ...]) -> Any:
+    def _walk(
+        self, x: Vec3, derivatives: int, closer: Real, add: Any, start: tuple[Any, ...]
+    ) -> Any:
+        closer = fmax(self.backend.Float(closer), self.backend.Float(1))
+
         def near(row: list[Real], active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
             del active
             return add(seen_dipole(row, x, self.kappa, derivatives), state)
@@ -157,7 +169,7 @@ class TreeSum:
         def visit(node: Node, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
             z = self.backend.Array3f(*node.head[:3]) - x
             length = dr.norm(z)
-            far = length > node.head[3]
+            far = length > node.head[3] * closer
             cluster = seen_cluster(node.head, node.payload(far), z, length, self.kappa, derivatives)
             both = zip(add(cluster, state), state, strict=True)
             state = tuple(dr.select(far, a, b) for a, b in both)
@@ -187,7 +199,10 @@ def seen_cluster(
     common = c[23] * inverse * inverse * inverse * share * share
     error = common * fourth * dr.fma(-3, q, 4)
     slope = common * share * fifth * dr.fma(q, dr.fma(12, q, -30), 20)
-    return Source(terms, weight, nearest * nearest, tail, error, slope)
+    sixth = dr.fma(decay * t4 * t * t, 1 / 720, fifth)
+    rest = dr.fma(q, dr.fma(q, dr.fma(-60, q, 216), -270), 120)
+    second = common * share * share * sixth * rest
+    return Source(terms, weight, nearest * nearest, tail, error, slope, second)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 
@@ -79,11 +79,12 @@ class NearEdge:
 
 def edges_of(row: list[Real], x: Vec3, frame: Frame | Upwards) -> Iterator[NearEdge]:
     """The edges of the triangle of a record, seen from x; there are none in an empty slot."""
-    vector: Any = type(x)
+    vector = cast("Any", type(x))
     ends = corners_of(row, vector)
     corners = [p - x for p in ends]
     lengths = [dr.norm(a) for a in corners]
-    seen = [vector(*frame.across(p), frame.component(a)) for p, a in zip(ends, corners, strict=True)]
+    pairs = zip(ends, corners, strict=True)
+    seen = [vector(*frame.across(p), frame.component(a)) for p, a in pairs]
     for k, (i, j, sign) in enumerate(_EDGES):
         a, b, inverse = corners[i], corners[j], dr.select(row[INDEX] >= 0, row[EDGES + k], 0)
         yield NearEdge(

@@ -36,10 +36,9 @@ class Hits:
     status: (n,) a `Status`.
     sheet: (n,) index of the sheet, such as a triangle, that was hit; -1 where none was: misses,
         hits of a smooth level set, and all rays of fields that have no sheets.
-    uncertainty: (n,) a length: how much farther than the tolerance the surface may be from
-        `position`, to first order, since rounding leaves f uncertain (error/|grad f|). Hits of
-        smooth level sets only: 0 elsewhere; inf where f is known to be uncertain and its gradient
-        is zero.
+    uncertainty: (n,) a length: at a hit of a smooth level set, |f - level| is proved to be at most
+        (tolerance + uncertainty) |grad f|. It is 0 unless rounding leaves f less certain than the
+        tolerance asks; 0 for all other rays.
     """
 
     t: Any
@@ -160,7 +159,7 @@ def _trace(
         if prepared.field.has_sheets:
             sheet = dr.reinterpret_array(backend.Int32, end.sheet)  # NO_SHEET becomes -1
         smooth = hit & ~end.on_sheet
-        uncertainty = dr.select(smooth, end.error / length, 0)
+        uncertainty = dr.select(smooth, end.excess / length, 0)
     t = end.t
     if differentiable and wants_derivatives(prepared, o, d):
         t, normal = attach(prepared, o, d, end, normal)

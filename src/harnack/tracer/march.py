@@ -26,8 +26,10 @@ if TYPE_CHECKING:
 
 
 # A sample is repeated more closely where a level is nearer in value than this many times its error,
-# until the error is this part of that distance, or truncation this part of what a hit may be off.
-_REFINE_BELOW, _OF_GAP, _OF_HIT = 2.0, 0.25, 0.25
+# to make truncation this part of that distance, or of what truncation may be (`_finer`).
+_REFINE_BELOW, _OF_GAP, _OF_ALLOWED = 2.0, 0.25, 0.6
+# Of the tolerance, less so many roundings, and of rounding: what truncation may be at a hit.
+_OF_TOLERANCE, _LESS, _OF_ROUNDING = 0.4, 0.55, 0.6
 # The next sample may be so coarse that its truncation is this part of the distance to a level.
 _COARSEN = 0.2
 # Trials stop short of where the slope alone would take f to a level by this factor.
@@ -44,14 +46,14 @@ class Trace:
 
     A ray that hits a sheet (see `harnack.fields.sheets`) has its index in `sheet`, NO_SHEET
     elsewhere; its t is that of the crossing, `value` is f just before it, and `gradient` is the
-    sheet's unit normal, to the side of larger f. error: how far rounding, and truncation if it
-    could not be made smaller, may have moved `value` from f at t.
+    sheet's unit normal, to the side of larger f. excess: by how much f at t may be farther from
+    the level than the tolerance allows.
     """
 
     t: Real
     value: Real
     gradient: Vec3
-    error: Real
+    excess: Real
     evaluations: Any
     status: Any
     sheet: Any
@@ -93,9 +95,9 @@ class PreparedLevelSet:
     def first_hit(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask = True) -> Trace:
         """The first hit of rays o + t d, |d| = 1, for t_min <= t <= t_max. Inactive rays miss."""
         state, sheet = self._march(o, d, t_min, t_max, active)
-        t, _, _, f, g, error, evaluations, _, status, _ = state
+        t, _, _, f, g, excess, evaluations, _, status, _ = state
         missed = status == int(Status.MISS)
-        return Trace(dr.select(missed, dr.inf, t), f, g, error, evaluations, status, sheet)
+        return Trace(dr.select(missed, dr.inf, t), f, g, excess, evaluations, status, sheet)
 
     def _march(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask) -> tuple[State, Any]:
         """The end state of rays, and the index of the sheet that each hit."""
@@ -143,7 +145,7 @@ class PreparedLevelSet:
         size = fmax(fmax(dr.abs(o.x), dr.abs(o.y)), dr.abs(o.z))
 
         def body(
-            base: Real, step: Real, reach: Real, f: Real, g: Vec3, error: Real, n: Any,
+            base: Real, step: Real, reach: Real, f: Real, g: Vec3, excess: Real, n: Any,
             detail: Real, status: Any, active: Mask,
         ) -> State:  # fmt: skip
             t = base + step
@@ -160,27 +162,26 @@ class PreparedLevelSet:
             if self.overstep > 1:
                 accepted |= _covers(bound, certificates, -slope, doubt, step - reach)
             within = self.tolerance.in_value(fmax(steepness - doubt, real(0)), t)
-            truncation, again = sample.truncation, None
+            truncation, gap = sample.truncation, fmin(*gaps)
+            again, closer, coarser = self.backend.Bool(False), detail, detail
             if field.has_detail:
-                gap = self._deciding_gap(sample.value, beyond)
-                closer, again = _finer(
-                    fmax(detail, field.coarsest_detail), gap, blur, truncation, within
-                )
-                accepted &= ~again
-            accepted &= dr.isfinite(blur)  # what is not known is not free
-            if again is not None:
-                coarser = _coarser(detail, fmin(*gaps), truncation, field.coarsest_detail)
-                detail = dr.select(again, closer, dr.select(accepted, coarser, detail))
-            hit, met = accepted & (fmin(*gaps) <= fmax(within - truncation, 2 * blur)), None
+                deciding = self._deciding_gap(sample.value, beyond)
+                now = fmax(detail, field.coarsest_detail)
+                closer, again = _finer(now, deciding, blur, truncation, within)
+                coarser = _coarser(now, gap, truncation, field.coarsest_detail)
+            accepted &= ~again & dr.isfinite(blur)  # what is not known is not free
+            detail = dr.select(again, closer, dr.select(accepted, coarser, detail))
+            near = fmax(within - truncation, 2 * (blur - truncation))
+            hit, met = accepted & (gap <= near), None
             if beyond is not None:
                 met = meet(beyond[0], accepted & beyond[1], sample.value, blur, self.levels)
                 certificates, ahead_gaps = self._certify(sample, met.gaps, blur), met.gaps
             forward = fmax(_step(bound, certificates, slope, doubt), real(0))
-            back = reach if again is None else dr.select(again, step, reach)
-            step = dr.select(accepted, self._trial(forward, slope, ahead_gaps), back)
+            trial = self._trial(forward, slope, ahead_gaps)
+            step = dr.select(accepted, trial, dr.select(again, step, reach))
             reach, base = dr.select(accepted, forward, reach), dr.select(accepted, t, base)
             f, g = dr.select(accepted, sample.value, f), dr.select(accepted, sample.gradient, g)
-            error = dr.select(accepted, blur, error)
+            excess = dr.select(accepted, fmax(gap + blur - within, real(0)), excess)
             n, free = n + 1, base + reach >= end
             if met is not None:
                 free = dr.select(met.awaited, met.passed, free)
@@ -189,11 +190,11 @@ class PreparedLevelSet:
                 status, g = met.mark(status, g)
             active = active & ~(hit | free | (n >= self.max_steps))
             step = fmin(step, end - base)
-            return base, step, reach, f, g, error, n, detail, status, active
+            return base, step, reach, f, g, excess, n, detail, status, active
 
         return loop(state, body, "harnack")
 
-    def _trial(self, forward: Real, slope: Real, gaps: Real) -> Real:
+    def _trial(self, forward: Real, slope: Real, gaps: tuple[Real, Real]) -> Real:
         """How far to try, where `forward` is proved: longer, but not past where the slope alone
         would take f to a level. Whatever is tried must still be proved, looking back."""
         down, up = gaps
@@ -236,12 +237,14 @@ def _finer(
     """The detail to sample a point at again, and whether the sample at this one is too coarse.
 
     It is where its error shortens the step by much or decides about a hit, unless truncation is a
-    small part of it: of what a hit may be off (`within`) or of rounding, which no detail helps.
+    small part of it: of what a hit may be off, `within`, or of rounding, which no detail helps. What
+    is allowed leaves the march a way to a hit: its steps end where a level is as near as `blur`, and
+    1.25 times that is less than what makes a hit, within - truncation or twice rounding.
     """
-    floor = fmax(within, blur - truncation)
-    again = (gap < _REFINE_BELOW * blur) & (truncation > 1.6 * _OF_HIT * floor)
-    again &= detail < _MOST_DETAIL
-    wanted = fmax(_OF_GAP * gap, _OF_HIT * floor)
+    rounding = blur - truncation
+    allowed = fmax(_OF_TOLERANCE * within - _LESS * rounding, _OF_ROUNDING * rounding)
+    again = (gap < _REFINE_BELOW * blur) & (truncation > allowed) & (detail < _MOST_DETAIL)
+    wanted = fmax(_OF_GAP * gap, _OF_ALLOWED * allowed)
     closer = clamp(dr.power(truncation / wanted, 1 / _POWER), *_CLOSER)
     return fmin(fmax(detail * closer, 1), _MOST_DETAIL), again
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from harnack.certify import Levels
     from harnack.fields.field import Field
 
-# base, step, reach, value, gradient, error, evaluations, detail, status, active: see
+# base, step, reach, value, gradient, excess, evaluations, detail, status, active: see
 # `PreparedLevelSet._advance`.
 State: TypeAlias = "tuple[Any, ...]"
 REACH, EVALUATIONS, STATUS, ACTIVE = 2, 6, 8, 9
