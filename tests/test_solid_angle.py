@@ -261,3 +261,27 @@ def test_convex_position_is_found_out() -> None:
     with pytest.raises(ValueError, match="unknown certificate"):
         hk.SolidAngle(CURVES["trefoil"], certificate="best")  # type: ignore[arg-type]
     assert len(validate_loops(CURVES["link"])) == 2
+
+
+def aimed_at(loops: list[np.ndarray], n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rays from around curves towards places near them."""
+    rng = np.random.default_rng(8)
+    points = np.concatenate(loops)
+    centre, size = points.mean(axis=0), np.ptp(points, axis=0).max()
+    o = centre + 2 * size * unit(rng.normal(size=(n, 3)))
+    return o, unit(centre + 0.6 * size * rng.uniform(-1, 1, (n, 3)) - o)
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_a_tiny_edge_hides_no_hits(precision: str) -> None:
+    """A ring run through twice: its 2 pi level lies far outside of its flat hull."""
+    ring = np.tile(shapes.regular_polygon(20), (2, 1))
+    ring -= ring[0]
+    o, d = aimed_at([ring], 1200)
+    plain = hk.trace(hk.SolidAngle(ring), o, d, precision=precision)
+    field = hk.SolidAngle(np.insert(ring, 1, [1e-30, 0, 0], axis=0))
+    assert field.describe()["certificate"] == "edges"
+    tiny = hk.trace(field, o, d, precision=precision)
+    assert plain.hit.sum() > 400
+    assert (plain.status == tiny.status).all()
+    np.testing.assert_allclose(plain.t[plain.hit], tiny.t[plain.hit], atol=1e-3)

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from harnack.backend import aligned
 from harnack.backend.extrema import clamp
+from harnack.fields.edge_sums import inverse_squares
 from harnack.geometry.singular import weld_vertices
 
 if TYPE_CHECKING:
@@ -50,12 +51,14 @@ class Segments:
 
     @classmethod
     def upload(cls, backend: Backend, start: FloatArray, end: FloatArray) -> Segments:
-        """Segments (k, 3) to (k, 3), k >= 1, none of length zero."""
-        inverse = 1 / ((end - start) ** 2).sum(axis=1, keepdims=True)
-        records = np.concatenate([start, inverse, end, np.zeros_like(inverse)], axis=1).ravel()
-        single = backend.precision == "single"
-        values = records.astype(np.float32) if single else records
-        return cls(backend, aligned(backend, values), dr.opaque(backend.UInt32, len(start)))
+        """Segments (k, 3) to (k, 3), k >= 1, of a size of about one. One whose ends are the same
+        in the backend's precision is a point."""
+        cast = np.float64 if backend.precision == "double" else np.float32
+        start, end = start.astype(cast), end.astype(cast)
+        inverse = inverse_squares(end.astype(np.float64) - start)[:, None].astype(cast)
+        records = np.concatenate([start, inverse, end, np.zeros_like(inverse)], axis=1)
+        count = dr.opaque(backend.UInt32, len(start))
+        return cls(backend, aligned(backend, records.ravel()), count)
 
 
 def closest_on_segments(segments: Segments, x: Vec3) -> Vec3:
