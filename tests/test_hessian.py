@@ -13,8 +13,8 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.fields.edge_nearest import uncancelled_edges
 from harnack.geometry import shapes
+from harnack.geometry.net_loops import uncancelled_edges
 from harnack.testing import BrokenPromiseError, check_field
 
 MANY_TERMS = hk.EigenfunctionSum(

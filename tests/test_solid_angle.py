@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 
+import drjit as dr
 import numpy as np
 import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.geometry import shapes, validate_loops
+from harnack.geometry.net_loops import net_loops
 from harnack.testing.oracle import CurveOracle, first_crossings, gap_to_levels
 
 FOUR_PI = 4 * math.pi
@@ -285,3 +287,132 @@ def test_a_tiny_edge_hides_no_hits(precision: str) -> None:
     assert plain.hit.sum() > 400
     assert (plain.status == tiny.status).all()
     np.testing.assert_allclose(plain.t[plain.hit], tiny.t[plain.hit], atol=1e-3)
+
+
+# --- edges run both ways ----------------------------------------------------------------------
+
+CORNERS = np.array([[-1.0, -1, 0], [1, -1, 0.2], [1, 1, 0.1], [-1, 1, -0.3]])
+# Two triangles with a common edge that both run, in opposite directions; and the same as one loop.
+HALVES = [CORNERS[[0, 1, 2]], CORNERS[[2, 3, 0]]]
+KEYHOLE = np.array([[-2.0, -2, 0], [2, -2, 0], [2, 2, 0.5], [-2, 2, 0], [-2, -2, 0], [-1, -1, 0.1],
+                    [-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0.1]])  # fmt: skip
+CANCELLING: dict[str, tuple[list[np.ndarray], list[np.ndarray], np.ndarray]] = {
+    "halves": (HALVES, [CORNERS], CORNERS[[0, 2]]),
+    "keyhole": ([KEYHOLE], [KEYHOLE[:4], KEYHOLE[5:9]], KEYHOLE[4:6]),
+}
+
+
+def rays_beside(edge: np.ndarray, n: int, seed: int = 9) -> tuple[np.ndarray, np.ndarray]:
+    """Rays that pass the inner part of an edge at 1e-9 to 1e-2, some of them along it."""
+    rng = np.random.default_rng(seed)
+    (a, b), e = edge, unit(edge[1] - edge[0])
+    place = a + rng.uniform(0.2, 0.8, (n, 1)) * (b - a)
+    across = unit(np.cross(e, rng.normal(size=(n, 3))))
+    place += 10 ** rng.uniform(-9, -2, (n, 1)) * across
+    d = unit(rng.normal(size=(n, 3)))
+    d[: n // 4] = e + 1e-4 * rng.normal(size=(n // 4, 3)) * rng.integers(0, 2, (n // 4, 1))
+    return place - rng.uniform(0, 4, (n, 1)) * unit(d), unit(d)
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("name", CANCELLING)
+def test_edges_run_both_ways_are_not_there(name: str, precision: str) -> None:
+    loops, net, edge = CANCELLING[name]
+    o, d = rays_beside(edge, 4000)
+    field, other = hk.SolidAngle(loops), hk.SolidAngle(net)
+    assert field.convex_position == other.convex_position
+    found = hk.trace(field, o, d, precision=precision)
+    expected = hk.trace(other, o, d, precision=precision)
+    assert (expected.status != int(hk.Status.OUT_OF_STEPS)).all()
+    assert (found.status != int(hk.Status.OUT_OF_STEPS)).all()
+    assert (found.hit != expected.hit).sum() <= 4  # graze within the tolerance
+    both = found.hit & expected.hit
+    assert np.quantile(np.abs(found.t[both] - expected.t[both]), 0.99) < 1e-3
+    # And by an oracle of its own: the field is near the level where it hits.
+    look = CurveOracle(net)(found.position[found.hit].astype(float))
+    gap = gap_to_levels(look.value, [2 * math.pi], FOUR_PI)
+    assert (gap <= 3e-4 * look.steepness).all()
+    backend = choose_backend(precision)  # type: ignore[arg-type]
+    p = to_vector3(backend, o[:50])
+    for one, two in ((field.evaluate(p).gradient, other.evaluate(p).gradient),
+                     (field.hessian(p)[0], other.hessian(p)[0]),
+                     (field.closest_on_boundary(p), other.closest_on_boundary(p))):  # fmt: skip
+        np.testing.assert_allclose(to_numpy(one), to_numpy(two), rtol=1e-3, atol=1e-4)
+
+
+def test_parts_that_cancel_are_left_out() -> None:
+    square = shapes.regular_polygon(4)
+    assert hk.SolidAngle(HALVES).describe()["cancelled edges"] == 2
+    assert hk.SolidAngle(square).describe()["cancelled edges"] == 0
+    # What is run twice the same way counts twice.
+    assert hk.SolidAngle([square, square]).describe()["cancelled edges"] == 0
+    (net,) = net_loops((square, square, square[::-1].copy()))
+    assert sorted(map(tuple, net)) == sorted(map(tuple, square))
+    kept = (square, square)
+    assert net_loops(kept) is kept
+    # A spike is run out and back.
+    spike = np.insert(square, 1, [[3.0, 0, 0], square[0]], axis=0)
+    assert len(net_loops((spike,))[0]) == 4
+
+
+NOTHING: dict[str, list[np.ndarray]] = {
+    "forth and back": [HALVES[0], HALVES[0][::-1]],
+    "spikes": [np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 0], [0, 1, 0]])],
+}
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("certificate", ["auto", "edges", "paper"])
+@pytest.mark.parametrize("name", NOTHING)
+def test_a_curve_that_cancels_as_a_whole_has_no_surface(
+    name: str, certificate: str, precision: str
+) -> None:
+    field = hk.SolidAngle(NOTHING[name], certificate=certificate)  # type: ignore[arg-type]
+    o, d = aimed_at(NOTHING[name], 300)
+    o[:3], d[:3] = [0, 0, 0], np.eye(3)  # on the curve
+    for level in (2 * math.pi, 0.5):
+        for bound in (None, "classic", "slope"):
+            end = hk.trace(field, o, d, level=level, precision=precision, bound=bound)
+            assert (end.status == int(hk.Status.MISS)).all()
+    far = hk.trace(Unbounded(NOTHING[name]), o, d, precision=precision)
+    assert (far.status == int(hk.Status.MISS)).all()
+    backend = choose_backend(precision)  # type: ignore[arg-type]
+    p = to_vector3(backend, o)
+    assert (to_numpy(field.evaluate(p).value) == 0).all()
+    assert (to_numpy(field.evaluate(p).gradient) == 0).all()
+    assert all((to_numpy(row) == 0).all() for row in field.hessian(p))
+    assert (to_numpy(field.differentiable_value(p)) == 0).all()
+    assert field.closest_on_boundary(p) is None
+    assert field.describe()["cancelled edges"] == sum(map(len, NOTHING[name]))
+    for level in (0.0, FOUR_PI, -2 * FOUR_PI):
+        with pytest.raises(ValueError, match="cancel"):
+            hk.trace(field, o, d, level=level)
+
+
+def test_vertices_can_be_differentiated_by_where_edges_cancel() -> None:
+    """Against finite differences, for a loop whose bridge is run there and back."""
+    backend = choose_backend("double")
+    o, d = aimed_at([KEYHOLE], 200)
+
+    def hits(vertices: np.ndarray, *, differentiate: bool) -> tuple[np.ndarray, np.ndarray]:
+        v = to_vector3(backend, vertices)
+        if differentiate:
+            dr.enable_grad(v)
+            dr.set_grad(v, to_vector3(backend, move))
+        end = hk.trace(
+            hk.SolidAngle(v), to_vector3(backend, o), to_vector3(backend, d), tolerance=1e-9
+        )
+        rate = to_numpy(dr.forward_to(end.t)) if differentiate else np.zeros(len(o))
+        return to_numpy(dr.detach(end.t)), rate
+
+    move = np.random.default_rng(1).normal(size=KEYHOLE.shape)
+    t, rate = hits(KEYHOLE, differentiate=True)
+    h = 1e-5
+    ahead, _ = hits(KEYHOLE + h * move, differentiate=False)  # the bridge opens
+    behind, _ = hits(KEYHOLE - h * move, differentiate=False)
+    t, ahead, behind = (np.nan_to_num(ends, posinf=1e9) for ends in (t, ahead, behind))
+    same = (t < 1e8) & (np.abs(ahead - t) < 1e-2) & (np.abs(behind - t) < 1e-2)
+    assert same.sum() > 40
+    off = np.abs(rate - (ahead - behind) / (2 * h))[same]
+    assert np.median(off) < 1e-5
+    assert np.quantile(off, 0.9) < 1e-2

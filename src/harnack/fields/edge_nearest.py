@@ -12,33 +12,13 @@ import numpy.typing as npt
 from harnack.backend import aligned
 from harnack.backend.extrema import clamp
 from harnack.fields.edge_sums import inverse_squares
-from harnack.geometry.singular import weld_vertices
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Vec3
 
-__all__ = ["Segments", "closest_on_segments", "uncancelled_edges"]
+__all__ = ["Segments", "closest_on_segments"]
 
 FloatArray = npt.NDArray[np.float64]
-
-
-def uncancelled_edges(loops: tuple[FloatArray, ...]) -> tuple[FloatArray, FloatArray]:
-    """Starts and ends (k, 3) of the edges of closed loops that are not run back elsewhere.
-
-    Around an edge that is run n times net, the solid angle changes by 4 pi n: unless n = 0 it
-    takes every value modulo 4 pi next to each of its points, so that every level set ends there.
-    Edges are compared as wholes: of two that overlap in part and run opposite ways, both stay.
-    """
-    start = np.concatenate(loops)
-    end = np.concatenate([np.roll(loop, -1, axis=0) for loop in loops])
-    index = weld_vertices(np.concatenate([start, end])).reshape(2, -1)
-    low, high = index.min(axis=0), index.max(axis=0)
-    pairs, first, which = np.unique(
-        np.column_stack([low, high]), axis=0, return_index=True, return_inverse=True
-    )
-    net = np.bincount(which.ravel(), np.where(index[0] == low, 1, -1), len(pairs))
-    kept = first[net != 0]
-    return start[kept], end[kept]
 
 
 @dataclass(frozen=True)

@@ -27,10 +27,10 @@ def is_convex_position(loops: tuple[FloatArray, ...]) -> bool:
 
     True means: one loop; no edge is shorter than 1e-9 (all lengths relative to the curve's
     size: one that short may be nothing but rounding, and has no direction to be trusted); edges
-    that share no vertex are at least 1e-9 apart, none folds back; and either all vertices lie within 1e-12 of
-    one plane (then P is on the boundary of its flat hull, a degenerate convex set), or every
-    edge has a plane through it that no vertex exceeds by more than 1e-12. False means: no proof
-    found, as for more than 2048 vertices; it says nothing about the curve.
+    that share no vertex are at least 1e-9 apart, none folds back; and either all vertices lie
+    within 1e-12 of one plane (then P is on the boundary of its flat hull, a degenerate convex
+    set), or every edge has a plane through it that no vertex exceeds by more than 1e-12. False
+    means: no proof found, as for more than 2048 vertices; it says nothing about the curve.
 
     Stability. Where no vertex exceeds the plane of an edge, that edge lies on the boundary of
     the hull H, and nothing is left to say. Otherwise let each point move along the normal of its
