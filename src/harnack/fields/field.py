@@ -175,6 +175,15 @@ class Field(abc.ABC):
         """What a person would want to know about the choices this field made by itself."""
         return {}
 
+    def along(self, d: Vec3) -> Field:
+        """This field for rays in unit directions d: its samples may promise more there.
+
+        What a sample of the field returned promises need hold only at points p + s d of the line
+        through p, for both signs of s. Called while no loop is being recorded, or within one.
+        """
+        del d
+        return self
+
     def at_detail(self, fine: Mask) -> Field:
         """This field, evaluated as closely as ever on lanes that are fine, roughly on others.
 

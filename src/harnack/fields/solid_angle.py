@@ -16,8 +16,9 @@ from harnack.fields.edge_angles import differentiable_angle
 from harnack.fields.edge_extent import tight_extent
 from harnack.fields.edge_hessian import hessian_over_edges
 from harnack.fields.edge_nearest import Segments, closest_on_segments
+from harnack.fields.edge_passing import Line, rates_along
 from harnack.fields.edge_sums import EdgeBuffer, EdgeSums, sum_over_edges, upload
-from harnack.fields.field import Field, HarmonicBall, Sample
+from harnack.fields.field import Field, HarmonicBall, Lipschitz, Sample
 from harnack.fields.unit_coordinates import UnitCoordinates, placed
 from harnack.geometry import ConvexHull, is_convex_position, total_length, validate_loops
 from harnack.geometry.net_loops import net_loops, uncancelled_edges
@@ -33,6 +34,9 @@ _PERIOD = 4 * math.pi
 # The ball of the edge certificate is this fraction of the distance to the curve (by experiment:
 # 0.5 to 0.65 need the fewest evaluations, 0.8 more).
 _REACH = 0.5
+# Nearer to the curve than this part of its size, and with a slope below this part of the
+# gradient, a ray may run along the curve and asks what is known there.
+_BESIDE, _FLAT = 0.005, 0.25
 # Levels as near as this to a multiple of 4 pi count as one.
 _NARROW = 1e-9 * _PERIOD
 # Sums of float32 terms; a variation is lengthened and a distance shortened by this much.
@@ -83,11 +87,13 @@ class SolidAngle(Field):
         self.vertices: Vec3 | None = vertices
         self._net: Loops = net_loops(self.loops)
         self.convex_position = is_convex_position(self._net)
+        self._asked = certificate
         self.certificate = self._choose(certificate)
         points = np.concatenate(self._net or self.loops)
         self._centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
         self._size = float(np.linalg.norm(points - self._centre, axis=1).max())
         self._device: _OnDevice | None = None
+        self._direction: Vec3 | None = None
         self._extents: dict[tuple[float, ...], Volume | None] = {}
 
     def _choose(self, asked: CertificateName) -> Literal["edges", "range"]:
@@ -139,7 +145,29 @@ class SolidAngle(Field):
         gradient = dr.select(met, steep, sums.gradient) / on.size
         # Each of n factors turns the product by a few roundings, of random sign.
         error = epsilon * (8 + 2 * math.sqrt(sum(len(loop) for loop in self._net)))
-        return Sample(dr.select(met, 0, sums.angle), gradient, (ball,), error)
+        known = (ball, *self._along_edges(on, x, sums))
+        return Sample(dr.select(met, 0, sums.angle), gradient, known, error)
+
+    def along(self, d: Vec3) -> SolidAngle:
+        if not self._net or self._asked == "paper":
+            return self
+        seen = copy.copy(self)
+        seen._direction = d
+        return seen
+
+    def _along_edges(self, on: _OnDevice, x: Vec3, sums: EdgeSums) -> tuple[Lipschitz, ...]:
+        """What is known along the direction of `along`, if there is one, near the curve: how fast
+        f moves for some lengths between the distance to the curve and its size."""
+        if self._direction is None or on.edges is None:
+            return ()
+        line = Line(x, on.backend.Array3f(self._direction), self._rounding(on))
+        slope, steepness = dr.dot(sums.gradient, line.v), dr.norm(sums.gradient)
+        active = (sums.distance < _BESIDE) & (dr.abs(slope) < _FLAT * steepness)
+        root = dr.sqrt(sums.distance)
+        lengths = (root * dr.sqrt(root), root, dr.sqrt(root))
+        rates = rates_along(on.edges, line, lengths, active)
+        pairs = zip(rates, lengths, strict=True)
+        return tuple(Lipschitz(rate / on.size, length * on.size) for rate, length in pairs)
 
     @staticmethod
     def _rounding(on: _OnDevice) -> float:

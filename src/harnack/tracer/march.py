@@ -98,7 +98,7 @@ class PreparedLevelSet:
             self.backend.Bool(False), count(int(Status.MISS)), running,
         )  # fmt: skip
         if not self.field.has_sheets:
-            return self._advance(self.field, o, d, end, state), count(NO_SHEET)
+            return self._advance(self.field.along(d), o, d, end, state), count(NO_SHEET)
 
         def march(field: Field, stop: Real, ahead: Crossing, state: State) -> State:
             return self._advance(field, o, d, stop, state, ahead)
