@@ -416,3 +416,138 @@ def test_vertices_can_be_differentiated_by_where_edges_cancel() -> None:
     off = np.abs(rate - (ahead - behind) / (2 * h))[same]
     assert np.median(off) < 1e-5
     assert np.quantile(off, 0.9) < 1e-2
+
+
+# --- rays along the curve ---------------------------------------------------------------------
+
+
+def lines_beside(
+    loops: list[np.ndarray], n: int, seed: int = 10
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points 1e-5 to 4e-3 beside edges; directions along their edge, for half of them about; and
+    the distances."""
+    rng = np.random.default_rng(seed)
+    a = np.concatenate(loops)
+    e = np.concatenate([np.roll(loop, -1, axis=0) for loop in loops]) - a
+    k = rng.integers(len(a), size=n)
+    away = 10 ** rng.uniform(-5, -2.4, (n, 1))
+    x = a[k] + rng.uniform(0, 1, (n, 1)) * e[k]
+    x += away * unit(np.cross(e[k], rng.normal(size=(n, 3))))
+    d = unit(e[k]) * rng.choice([-1, 1], (n, 1))
+    d[: n // 2] += 10 ** rng.uniform(-6, -1, (n // 2, 1)) * rng.normal(size=(n // 2, 3))
+    return x, unit(d), away[:, 0]
+
+
+def moves_along(
+    loops: list[np.ndarray], x: np.ndarray, d: np.ndarray, length: np.ndarray
+) -> np.ndarray:
+    """The largest |f(x + s d) - f(x)|/s of the lift over 0 < s < length, by the oracle."""
+    oracle, s, worst = CurveOracle(loops), np.zeros(len(x)), np.zeros(len(x))
+    look = oracle(x)
+    value, start, alive = look.value, look.value, np.arange(len(x))
+    lift, smooth = value.copy(), look.smooth
+    while len(alive):
+        s[alive] = np.minimum(s[alive] + 0.3 * smooth, length[alive])
+        look = oracle(x[alive] + s[alive, None] * d[alive])
+        move = np.remainder(look.value - lift[alive] + 2 * math.pi, FOUR_PI) - 2 * math.pi
+        lift[alive] += move
+        worst[alive] = np.maximum(worst[alive], np.abs(lift - start)[alive] / s[alive])
+        going = s[alive] < length[alive]
+        alive, smooth = alive[going], look.smooth[going]
+    return worst
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("name", ["triangle", "wavy", "holes", "coil", "spiky", "link"])
+def test_what_is_promised_along_a_line_holds(name: str, precision: str) -> None:
+    loops, backend = CURVES[name], choose_backend(precision)  # type: ignore[arg-type]
+    x, d, away = lines_beside(loops, 60)
+    if precision == "single":
+        x, d = (v.astype(np.float32).astype(float) for v in (x, d))
+        x, d = x[away > 1e-4], unit(d[away > 1e-4])
+    field = hk.SolidAngle(loops).along(to_vector3(backend, d))
+    _, *promises = field.evaluate(to_vector3(backend, x)).known
+    gain = 0.0
+    assert len(promises) == 3
+    for promise in promises:
+        rate, length = to_numpy(promise.constant), to_numpy(promise.radius)
+        # Others say nothing that a step could use, and would take the oracle long.
+        useful = (rate * length < 20) & (length < 1e3 * CurveOracle(loops)(x).smooth)
+        assert useful.any() or promise is not promises[0]
+        for sign in (-1, 1):
+            worst = moves_along(loops, x[useful], sign * d[useful], length[useful])
+            assert (worst <= rate[useful] * (1 + 1e-6) + 1e-6).all()
+            gain = max(gain, float((worst / rate[useful]).max()))
+    assert gain > 0.6  # half the rate would not do
+
+
+def rays_along(loops: list[np.ndarray], away: float, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rays at this distance from an edge and parallel to it."""
+    rng = np.random.default_rng(11)
+    a = np.concatenate(loops)
+    e = np.concatenate([np.roll(loop, -1, axis=0) for loop in loops]) - a
+    k, side = rng.integers(len(a), size=n), rng.choice([-1, 1], (n, 1))
+    place = a[k] + rng.uniform(0, 1, (n, 1)) * e[k]
+    place += away * unit(np.cross(e[k], rng.normal(size=(n, 3))))
+    d = side * unit(e[k])
+    return place - rng.uniform(0, 2.5, (n, 1)) * d, d
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("name", ["triangle", "wavy", "holes", "coil", "spiky", "trefoil"])
+def test_hostile_rays_end(name: str, precision: str) -> None:
+    """Rays along edges, at vertices, and at places on edges: nearly none runs out of steps."""
+    loops = CURVES[name]
+    rng = np.random.default_rng(12)
+    a = np.concatenate(loops)
+    o = 3 * unit(rng.normal(size=(300, 3)))
+    rays = [(o, unit(a[rng.integers(len(a), size=300)] - o))]
+    rays += [rays_along(loops, away, 300) for away in (0, 1e-8, 1e-6, 1e-4, 1e-3)]
+    ends = [hk.trace(hk.SolidAngle(loops), *pair, precision=precision) for pair in rays]
+    lost = [(end.status == int(hk.Status.OUT_OF_STEPS)).sum() for end in ends]
+    assert sum(lost[:-1]) == 0, lost
+    assert lost[-1] <= 9  # some of these graze a flat sheet
+    # Aimed at the curve, within the tolerance of which every level is.
+    assert all(end.hit.all() for end in ends[:4])
+
+
+@pytest.mark.parametrize(
+    ("name", "away"),
+    [("wavy", 1e-3), ("triangle", 2e-3), ("spiky", 2e-3), ("coil", 1e-3),
+     pytest.param("triangle", 1e-4, marks=pytest.mark.slow),
+     pytest.param("holes", 3e-4, marks=pytest.mark.slow)],
+)  # fmt: skip
+def test_no_hit_is_missed_along_the_curve(name: str, away: float) -> None:
+    """Against dense sampling: the tolerance is small, so that rays do not end at once."""
+    loops = CURVES[name]
+    o, d = rays_along(loops, away, 40)
+    d[::2] = unit(d[::2] + 0.02 * np.random.default_rng(14).normal(size=(20, 3)))
+    end = hk.trace(hk.SolidAngle(loops), o, d, t_max=4.0, tolerance=1e-7, precision="double")
+    found = first_crossings(
+        CurveOracle(loops), o, d, 0.0, 4.0,
+        levels=[2 * math.pi], period=FOUR_PI, depth=1e-6, spacing=0.2, finest=1e-5,
+    )  # fmt: skip
+    assert np.isfinite(found.beyond).any()
+    proved = np.where(end.status == int(hk.Status.MISS), 4.0, end.t)
+    assert (proved <= found.beyond + 1e-6).all()
+    look = CurveOracle(loops)(end.position[end.hit])
+    gap = gap_to_levels(look.value, [2 * math.pi], FOUR_PI)
+    assert (gap <= 2e-7 * look.steepness).all()
+
+
+@pytest.mark.parametrize("name", ["trefoil", "wavy", "link"])
+def test_curves_far_from_the_origin_can_be_traced(name: str) -> None:
+    """At 2e4 times their size single precision tells places 1e-3 apart."""
+    rng = np.random.default_rng(13)
+    shift = 2e4 * unit(rng.normal(size=3))
+    loops = [loop + shift for loop in CURVES[name]]
+    o, d = aimed_at(loops, 1600)
+    one, two = (hk.trace(hk.SolidAngle(loops), o, d, precision=p) for p in PRECISIONS)  # type: ignore[arg-type]
+    assert (two.status != int(hk.Status.OUT_OF_STEPS)).all()
+    # Hits are as near the surface as rounding lets anyone know, and no surface is passed.
+    look = CurveOracle(loops)(two.position[two.hit].astype(float))
+    gap = gap_to_levels(look.value, [2 * math.pi], FOUR_PI)
+    assert (gap <= 0.03 * look.steepness).all()
+    both = one.hit & two.hit
+    assert (two.t[both] - one.t[both] < 0.02).all()
+    assert (one.hit & ~two.hit).sum() < 8  # within as much of the surface's border

@@ -34,11 +34,11 @@ class Segments:
         """Segments (k, 3) to (k, 3), k >= 1, of a size of about one. One whose ends are the same
         in the backend's precision is a point."""
         cast = np.float64 if backend.precision == "double" else np.float32
-        start, end = start.astype(cast), end.astype(cast)
-        inverse = inverse_squares(end.astype(np.float64) - start)[:, None].astype(cast)
+        start, end = (q.astype(cast).astype(np.float64) for q in (start, end))
+        inverse = inverse_squares(end - start)[:, None]
         records = np.concatenate([start, inverse, end, np.zeros_like(inverse)], axis=1)
         count = dr.opaque(backend.UInt32, len(start))
-        return cls(backend, aligned(backend, records.ravel()), count)
+        return cls(backend, aligned(backend, records.ravel().astype(cast)), count)
 
 
 def closest_on_segments(segments: Segments, x: Vec3) -> Vec3:

@@ -157,7 +157,10 @@ class SolidAngle(Field):
 
     def _along_edges(self, on: _OnDevice, x: Vec3, sums: EdgeSums) -> tuple[Lipschitz, ...]:
         """What is known along the direction of `along`, if there is one, near the curve: how fast
-        f moves for some lengths between the distance to the curve and its size."""
+        f moves, for lengths that lead from the distance to the curve to its size (`rates_along`).
+
+        Beside a straight edge the longest will do, and the others near its ends.
+        """
         if self._direction is None or on.edges is None:
             return ()
         line = Line(x, on.backend.Array3f(self._direction), self._rounding(on))
@@ -166,8 +169,9 @@ class SolidAngle(Field):
         root = dr.sqrt(sums.distance)
         lengths = (root * dr.sqrt(root), root, dr.sqrt(root))
         rates = rates_along(on.edges, line, lengths, active)
+        scale = (1 + _ROUNDING) / on.size
         pairs = zip(rates, lengths, strict=True)
-        return tuple(Lipschitz(rate / on.size, length * on.size) for rate, length in pairs)
+        return tuple(Lipschitz(rate * scale, length * on.size) for rate, length in pairs)
 
     @staticmethod
     def _rounding(on: _OnDevice) -> float:
