@@ -49,7 +49,19 @@ class Curvature:
     radius: Real = float("inf")
 
 
-Knowledge = HarmonicBall | Lipschitz | Curvature
+@dataclass(frozen=True)
+class LineLipschitz:
+    """|f(p + s d) - f(p)| <= constant |s| for |s| < radius, with the direction d of `Field.along`.
+
+    It adds to other promises, on which alone a ray must be able to get on: it may be infinite at
+    most places.
+    """
+
+    constant: Real
+    radius: Real
+
+
+Knowledge = HarmonicBall | Lipschitz | LineLipschitz | Curvature
 
 
 @dataclass(frozen=True)
@@ -78,8 +90,8 @@ def lengthened(sample: Sample, size: Real) -> Sample:
     for one in sample.known:
         if isinstance(one, HarmonicBall):
             known.append(HarmonicBall(one.radius * size, one.lower, one.upper, one.dimension))
-        elif isinstance(one, Lipschitz):
-            known.append(Lipschitz(one.constant / size, one.radius * size))
+        elif isinstance(one, Lipschitz | LineLipschitz):
+            known.append(type(one)(one.constant / size, one.radius * size))
         else:
             known.append(Curvature(one.constant / (size * size), one.radius * size))
     gradient, doubt = sample.gradient / size, sample.gradient_error / size

@@ -18,7 +18,7 @@ from harnack.fields.edge_hessian import hessian_over_edges
 from harnack.fields.edge_nearest import Segments, closest_on_segments
 from harnack.fields.edge_passing import Line, rates_along
 from harnack.fields.edge_sums import EdgeBuffer, EdgeSums, sum_over_edges, upload
-from harnack.fields.field import Field, HarmonicBall, Lipschitz, Sample
+from harnack.fields.field import Field, HarmonicBall, LineLipschitz, Sample
 from harnack.fields.unit_coordinates import UnitCoordinates, placed
 from harnack.geometry import ConvexHull, is_convex_position, total_length, validate_loops
 from harnack.geometry.net_loops import net_loops, uncancelled_edges
@@ -141,7 +141,7 @@ class SolidAngle(Field):
         # exists: give one so steep that the point counts as close to any level. A value that is
         # not a number anywhere else stays one, and the tracer refuses it.
         met = sums.distance <= 2 * rounding
-        steep = on.backend.Array3f(0, 0, _PERIOD / rounding)
+        steep = on.backend.Array3f(0, 0, 4 * _PERIOD / rounding)
         gradient = dr.select(met, steep, sums.gradient) / on.size
         # Each of n factors turns the product by a few roundings, of random sign.
         error = epsilon * (8 + 2 * math.sqrt(sum(len(loop) for loop in self._net)))
@@ -155,7 +155,7 @@ class SolidAngle(Field):
         seen._direction = d
         return seen
 
-    def _along_edges(self, on: _OnDevice, x: Vec3, sums: EdgeSums) -> tuple[Lipschitz, ...]:
+    def _along_edges(self, on: _OnDevice, x: Vec3, sums: EdgeSums) -> tuple[LineLipschitz, ...]:
         """What is known along the direction of `along`, if there is one, near the curve: how fast
         f moves, for lengths that lead from the distance to the curve to its size (`rates_along`).
 
@@ -171,7 +171,7 @@ class SolidAngle(Field):
         rates = rates_along(on.edges, line, lengths, active)
         scale = (1 + _ROUNDING) / on.size
         pairs = zip(rates, lengths, strict=True)
-        return tuple(Lipschitz(rate * scale, length * on.size) for rate, length in pairs)
+        return tuple(LineLipschitz(rate * scale, length * on.size) for rate, length in pairs)
 
     @staticmethod
     def _rounding(on: _OnDevice) -> float:
