@@ -468,7 +468,7 @@ def test_what_is_promised_along_a_line_holds(name: str, precision: str) -> None:
     field = hk.SolidAngle(loops).along(to_vector3(backend, d))
     _, *promises = field.evaluate(to_vector3(backend, x)).known
     gain = 0.0
-    assert len(promises) == 3
+    assert len(promises) == 4
     for promise in promises:
         rate, length = to_numpy(promise.constant), to_numpy(promise.radius)
         # Others say nothing that a step could use, and would take the oracle long.
@@ -494,21 +494,24 @@ def rays_along(loops: list[np.ndarray], away: float, n: int) -> tuple[np.ndarray
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
-@pytest.mark.parametrize("name", ["triangle", "wavy", "holes", "coil", "spiky", "trefoil"])
-def test_hostile_rays_end(name: str, precision: str) -> None:
-    """Rays along edges, at vertices, and at places on edges: nearly none runs out of steps."""
+@pytest.mark.parametrize("tolerance", [1e-4, 1e-7])
+@pytest.mark.parametrize("name", ["triangle", "wavy", "holes", "coil", "spiky"])
+def test_hostile_rays_end(name: str, tolerance: float, precision: str) -> None:
+    """Rays along edges, along flat parts of the surface, and at vertices."""
     loops = CURVES[name]
     rng = np.random.default_rng(12)
     a = np.concatenate(loops)
-    o = 3 * unit(rng.normal(size=(300, 3)))
-    rays = [(o, unit(a[rng.integers(len(a), size=300)] - o))]
-    rays += [rays_along(loops, away, 300) for away in (0, 1e-8, 1e-6, 1e-4, 1e-3)]
-    ends = [hk.trace(hk.SolidAngle(loops), *pair, precision=precision) for pair in rays]
-    lost = [(end.status == int(hk.Status.OUT_OF_STEPS)).sum() for end in ends]
-    assert sum(lost[:-1]) == 0, lost
-    assert lost[-1] <= 9  # some of these graze a flat sheet
+    o = 3 * unit(rng.normal(size=(200, 3)))
+    rays = [(o, unit(a[rng.integers(len(a), size=200)] - o))]
+    rays += [rays_along(loops, away, 200) for away in (0, 1e-8, 1e-6, 1e-4, 1e-3)]
+    ends = [
+        hk.trace(hk.SolidAngle(loops), *pair, tolerance=tolerance, precision=precision)
+        for pair in rays
+    ]
+    for end in ends:
+        assert (end.status != int(hk.Status.OUT_OF_STEPS)).all()
     # Aimed at the curve, within the tolerance of which every level is.
-    assert all(end.hit.all() for end in ends[:4])
+    assert all(end.hit.all() for end in ends[: 4 if tolerance == 1e-4 else 1])
 
 
 @pytest.mark.parametrize(

@@ -35,8 +35,9 @@ _PERIOD = 4 * math.pi
 # 0.5 to 0.65 need the fewest evaluations, 0.8 more).
 _REACH = 0.5
 # Nearer to the curve than this part of its size, and with a slope below this part of the
-# gradient, a ray may run along the curve and asks what is known there.
-_BESIDE, _FLAT = 0.005, 0.25
+# gradient, a ray may run along the curve and asks what is known along its line; elsewhere only
+# with a slope so small that it may run along a flat part of the surface.
+_BESIDE, _FLAT, _GRAZING = 0.005, 0.25, 1e-3
 # Levels as near as this to a multiple of 4 pi count as one.
 _NARROW = 1e-9 * _PERIOD
 # Sums of float32 terms; a variation is lengthened and a distance shortened by this much.
@@ -156,18 +157,20 @@ class SolidAngle(Field):
         return seen
 
     def _along_edges(self, on: _OnDevice, x: Vec3, sums: EdgeSums) -> tuple[LineLipschitz, ...]:
-        """What is known along the direction of `along`, if there is one, near the curve: how fast
-        f moves, for lengths that lead from the distance to the curve to its size (`rates_along`).
+        """What is known along the direction of `along`, if there is one: how fast f moves, for
+        lengths that lead from half the distance to the curve to its size (`rates_along`).
 
-        Beside a straight edge the longest will do, and the others near its ends.
+        Beside a straight edge the longest will do, and others near its ends; along a flat part of
+        the surface, bounded by a plane curve, the shortest.
         """
         if self._direction is None or on.edges is None:
             return ()
         line = Line(x, on.backend.Array3f(self._direction), self._rounding(on))
         slope, steepness = dr.dot(sums.gradient, line.v), dr.norm(sums.gradient)
-        active = (sums.distance < _BESIDE) & (dr.abs(slope) < _FLAT * steepness)
+        flat = dr.select(sums.distance < _BESIDE, _FLAT, _GRAZING) * steepness
+        active = dr.abs(slope) < flat
         root = dr.sqrt(sums.distance)
-        lengths = (root * dr.sqrt(root), root, dr.sqrt(root))
+        lengths = (0.5 * sums.distance, root * dr.sqrt(root), root, dr.sqrt(root))
         rates = rates_along(on.edges, line, lengths, active)
         scale = (1 + _ROUNDING) / on.size
         pairs = zip(rates, lengths, strict=True)
