@@ -307,6 +307,31 @@ def test_numbers_at_the_edge(precision: str) -> None:
                 assert step(unknown, 0.5) == 0
 
 
+@pytest.mark.parametrize("precision", ["single", "double"])
+def test_what_is_not_a_number_proves_no_step(precision: str) -> None:
+    real = choose_backend(precision).Float  # type: ignore[arg-type]
+    one, gap, nan = real(1), real(0.1), real(math.nan)
+    unknown = [
+        (LipschitzStep(), LipschitzCertificate(nan, one, gap, gap)),
+        (LipschitzStep(), LipschitzCertificate(one, nan, gap, gap)),
+        (LipschitzStep(), LipschitzCertificate(one, one, nan, gap)),
+        (LipschitzStep(), LipschitzCertificate(one, one, gap, nan)),
+        (CurvatureStep(), CurvatureCertificate(nan, one, gap, gap)),
+        (CurvatureStep(), CurvatureCertificate(one, nan, gap, gap)),
+        (CurvatureStep(), CurvatureCertificate(one, one, nan, gap)),
+        (CurvatureStep(), CurvatureCertificate(one, one, gap, nan)),
+    ]
+    for bound, certificate in unknown:
+        length = to_numpy(bound.step(certificate, real(0.5)) * one)  # type: ignore[arg-type]
+        assert not length[0] > 0, certificate
+        covers = bound.covers(certificate, real(0.5), real(0.5))  # type: ignore[arg-type]
+        assert not to_numpy(covers & (one > 0))[0], certificate
+    slope = CurvatureStep().step(CurvatureCertificate(one, one, gap, gap), nan)
+    assert not to_numpy(slope)[0] > 0
+    constant = CurvatureStep().step(CurvatureCertificate(real(0), one, gap, gap), real(0))
+    assert to_numpy(constant)[0] == pytest.approx(1, abs=1e-5)
+
+
 def test_a_promise_without_room_does_not_prove_f_constant() -> None:
     """By rounding a value may lie on or beyond the end of its range."""
     for precision, ulp in (("single", 6e-8), ("double", 1.2e-16)):

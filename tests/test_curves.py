@@ -212,6 +212,28 @@ def test_a_dent_of_rounding_size_is_forgiven_and_a_larger_one_is_not():
     assert not is_convex(curve + np.outer(np.arange(13) == 2, 1e-10 * inward))
 
 
+def with_tiny_edge(curve: np.ndarray, length: float) -> np.ndarray:
+    """The curve moved so that it starts at 0, with a vertex `length` after the first."""
+    return np.insert(curve - curve[0], 1, [length, 0, 0], axis=0)
+
+
+@pytest.mark.parametrize("length", [1e-90, 1e-30, 1e-17, 1e-12])
+def test_an_edge_too_short_for_a_direction_proves_nothing(length: float) -> None:
+    """In the coordinates of the tests it has length zero, and NaN for a direction."""
+    ring = shapes.regular_polygon(20)
+    for curve in (np.tile(ring, (2, 1)), ring, flat_figure_eight(), shapes.wavy_polygon(12)):
+        with np.errstate(all="raise", under="ignore"):
+            assert not is_convex(with_tiny_edge(curve, length))
+
+
+def test_segments_of_length_zero_have_a_clearance() -> None:
+    point, other = np.zeros((1, 3)), np.array([[3.0, 4.0, 0.0]])
+    with np.errstate(all="raise"):
+        assert segment_clearance_lower(point, point, other, other) == pytest.approx(5.0)
+        assert segment_clearance_lower(point, other, other, other) == 0.0
+        assert segment_clearance_lower(other, other, point, -other) == pytest.approx(5.0)
+
+
 def edge_depth(x: np.ndarray) -> np.ndarray:
     """How deep below the hull's surface the middle of each edge lies, by Qhull."""
     planes = scipy.spatial.ConvexHull(x).equations

@@ -13,8 +13,8 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.fields.edge_nearest import uncancelled_edges
 from harnack.geometry import shapes
+from harnack.geometry.net_loops import uncancelled_edges
 from harnack.testing import BrokenPromiseError, check_field
 
 MANY_TERMS = hk.EigenfunctionSum(
@@ -300,3 +300,25 @@ def test_a_curve_that_cancels_as_a_whole_has_none() -> None:
     backend = choose_backend("double")
     assert field.closest_on_boundary(to_vector3(backend, [[0.0, 0.0, 1.0]])) is None
     assert hk.Gyroid().closest_on_boundary(to_vector3(backend, [[0.0, 0.0, 1.0]])) is None
+
+
+@pytest.mark.parametrize("precision", ["single", "double"])
+@pytest.mark.parametrize("length", [1e-90, 1e-40, 1e-25, 1e-18, 1e-12])
+def test_tiny_edges_leave_all_numbers_finite(length: float, precision: str) -> None:
+    """At the centre of the curve, where single precision tells their ends apart."""
+    square = [[0.0, 0, 0], [1, 1, 0.2], [-1, 1, 0], [-1, -1, -0.2], [1, -1, 0]]
+    tiny = [square[0], [length, 0, 0], *square[1:]]
+    backend = choose_backend(precision)  # type: ignore[arg-type]
+    # Beside the tiny edge and at right angles to it, among others.
+    x = [[0.0, 0.3, 0.1], [0, 0, 0.5], [0.3, 0.4, -0.2], [0, -0.1, 0], [3, 3, 3]]
+    p = to_vector3(backend, x)
+    field, other = (hk.SolidAngle(one, certificate="edges") for one in (tiny, square))
+    for rows, expected in zip(field.hessian(p), other.hessian(p), strict=True):
+        np.testing.assert_allclose(to_numpy(rows), to_numpy(expected), rtol=2e-3, atol=1e-4)
+    sample, plain = field.evaluate(p), other.evaluate(p)
+    np.testing.assert_allclose(to_numpy(sample.value), to_numpy(plain.value), atol=1e-5)
+    np.testing.assert_allclose(
+        to_numpy(sample.known[0].radius), to_numpy(plain.known[0].radius), rtol=1e-3, atol=1e-6
+    )
+    nearest = to_numpy(field.closest_on_boundary(p))
+    np.testing.assert_allclose(nearest, to_numpy(other.closest_on_boundary(p)), atol=1e-6)

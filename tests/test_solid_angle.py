@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 
+import drjit as dr
 import numpy as np
 import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.geometry import shapes, validate_loops
+from harnack.geometry.net_loops import net_loops
 from harnack.testing.oracle import CurveOracle, first_crossings, gap_to_levels
 
 FOUR_PI = 4 * math.pi
@@ -261,3 +263,294 @@ def test_convex_position_is_found_out() -> None:
     with pytest.raises(ValueError, match="unknown certificate"):
         hk.SolidAngle(CURVES["trefoil"], certificate="best")  # type: ignore[arg-type]
     assert len(validate_loops(CURVES["link"])) == 2
+
+
+def aimed_at(loops: list[np.ndarray], n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rays from around curves towards places near them."""
+    rng = np.random.default_rng(8)
+    points = np.concatenate(loops)
+    centre, size = points.mean(axis=0), np.ptp(points, axis=0).max()
+    o = centre + 2 * size * unit(rng.normal(size=(n, 3)))
+    return o, unit(centre + 0.6 * size * rng.uniform(-1, 1, (n, 3)) - o)
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_a_tiny_edge_hides_no_hits(precision: str) -> None:
+    """A ring run through twice: its 2 pi level lies far outside of its flat hull."""
+    ring = np.tile(shapes.regular_polygon(20), (2, 1))
+    ring -= ring[0]
+    o, d = aimed_at([ring], 1200)
+    plain = hk.trace(hk.SolidAngle(ring), o, d, precision=precision)
+    field = hk.SolidAngle(np.insert(ring, 1, [1e-30, 0, 0], axis=0))
+    assert field.describe()["certificate"] == "edges"
+    tiny = hk.trace(field, o, d, precision=precision)
+    assert plain.hit.sum() > 400
+    assert (plain.status == tiny.status).all()
+    np.testing.assert_allclose(plain.t[plain.hit], tiny.t[plain.hit], atol=1e-3)
+
+
+# --- edges run both ways ----------------------------------------------------------------------
+
+CORNERS = np.array([[-1.0, -1, 0], [1, -1, 0.2], [1, 1, 0.1], [-1, 1, -0.3]])
+# Two triangles with a common edge that both run, in opposite directions; and the same as one loop.
+HALVES = [CORNERS[[0, 1, 2]], CORNERS[[2, 3, 0]]]
+KEYHOLE = np.array([[-2.0, -2, 0], [2, -2, 0], [2, 2, 0.5], [-2, 2, 0], [-2, -2, 0], [-1, -1, 0.1],
+                    [-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0.1]])  # fmt: skip
+CANCELLING: dict[str, tuple[list[np.ndarray], list[np.ndarray], np.ndarray]] = {
+    "halves": (HALVES, [CORNERS], CORNERS[[0, 2]]),
+    "keyhole": ([KEYHOLE], [KEYHOLE[:4], KEYHOLE[5:9]], KEYHOLE[4:6]),
+}
+
+
+def rays_beside(edge: np.ndarray, n: int, seed: int = 9) -> tuple[np.ndarray, np.ndarray]:
+    """Rays that pass the inner part of an edge at 1e-9 to 1e-2, some of them along it."""
+    rng = np.random.default_rng(seed)
+    (a, b), e = edge, unit(edge[1] - edge[0])
+    place = a + rng.uniform(0.2, 0.8, (n, 1)) * (b - a)
+    across = unit(np.cross(e, rng.normal(size=(n, 3))))
+    place += 10 ** rng.uniform(-9, -2, (n, 1)) * across
+    d = unit(rng.normal(size=(n, 3)))
+    d[: n // 4] = e + 1e-4 * rng.normal(size=(n // 4, 3)) * rng.integers(0, 2, (n // 4, 1))
+    return place - rng.uniform(0, 4, (n, 1)) * unit(d), unit(d)
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("name", CANCELLING)
+def test_edges_run_both_ways_are_not_there(name: str, precision: str) -> None:
+    loops, net, edge = CANCELLING[name]
+    o, d = rays_beside(edge, 4000)
+    field, other = hk.SolidAngle(loops), hk.SolidAngle(net)
+    assert field.convex_position == other.convex_position
+    found = hk.trace(field, o, d, precision=precision)
+    expected = hk.trace(other, o, d, precision=precision)
+    assert (expected.status != int(hk.Status.OUT_OF_STEPS)).all()
+    assert (found.status != int(hk.Status.OUT_OF_STEPS)).all()
+    assert (found.hit != expected.hit).sum() <= 4  # graze within the tolerance
+    both = found.hit & expected.hit
+    assert np.quantile(np.abs(found.t[both] - expected.t[both]), 0.99) < 1e-3
+    # And by an oracle of its own: the field is near the level where it hits.
+    look = CurveOracle(net)(found.position[found.hit].astype(float))
+    gap = gap_to_levels(look.value, [2 * math.pi], FOUR_PI)
+    assert (gap <= 3e-4 * look.steepness).all()
+    backend = choose_backend(precision)  # type: ignore[arg-type]
+    p = to_vector3(backend, o[:50])
+    for one, two in ((field.evaluate(p).gradient, other.evaluate(p).gradient),
+                     (field.hessian(p)[0], other.hessian(p)[0]),
+                     (field.closest_on_boundary(p), other.closest_on_boundary(p))):  # fmt: skip
+        np.testing.assert_allclose(to_numpy(one), to_numpy(two), rtol=1e-3, atol=1e-4)
+
+
+def test_parts_that_cancel_are_left_out() -> None:
+    square = shapes.regular_polygon(4)
+    assert hk.SolidAngle(HALVES).describe()["cancelled edges"] == 2
+    assert hk.SolidAngle(square).describe()["cancelled edges"] == 0
+    # What is run twice the same way counts twice.
+    assert hk.SolidAngle([square, square]).describe()["cancelled edges"] == 0
+    (net,) = net_loops((square, square, square[::-1].copy()))
+    assert sorted(map(tuple, net)) == sorted(map(tuple, square))
+    kept = (square, square)
+    assert net_loops(kept) is kept
+    # A spike is run out and back.
+    spike = np.insert(square, 1, [[3.0, 0, 0], square[0]], axis=0)
+    assert len(net_loops((spike,))[0]) == 4
+
+
+NOTHING: dict[str, list[np.ndarray]] = {
+    "forth and back": [HALVES[0], HALVES[0][::-1]],
+    "spikes": [np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 0], [0, 1, 0]])],
+}
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("certificate", ["auto", "edges", "paper"])
+@pytest.mark.parametrize("name", NOTHING)
+def test_a_curve_that_cancels_as_a_whole_has_no_surface(
+    name: str, certificate: str, precision: str
+) -> None:
+    field = hk.SolidAngle(NOTHING[name], certificate=certificate)  # type: ignore[arg-type]
+    o, d = aimed_at(NOTHING[name], 300)
+    o[:3], d[:3] = [0, 0, 0], np.eye(3)  # on the curve
+    for level in (2 * math.pi, 0.5):
+        for bound in (None, "classic", "slope"):
+            end = hk.trace(field, o, d, level=level, precision=precision, bound=bound)
+            assert (end.status == int(hk.Status.MISS)).all()
+    far = hk.trace(Unbounded(NOTHING[name]), o, d, precision=precision)
+    assert (far.status == int(hk.Status.MISS)).all()
+    backend = choose_backend(precision)  # type: ignore[arg-type]
+    p = to_vector3(backend, o)
+    assert (to_numpy(field.evaluate(p).value) == 0).all()
+    assert (to_numpy(field.evaluate(p).gradient) == 0).all()
+    assert all((to_numpy(row) == 0).all() for row in field.hessian(p))
+    assert (to_numpy(field.differentiable_value(p)) == 0).all()
+    assert field.closest_on_boundary(p) is None
+    assert field.describe()["cancelled edges"] == sum(map(len, NOTHING[name]))
+    for level in (0.0, FOUR_PI, -2 * FOUR_PI):
+        with pytest.raises(ValueError, match="cancel"):
+            hk.trace(field, o, d, level=level)
+
+
+def test_vertices_can_be_differentiated_by_where_edges_cancel() -> None:
+    """Against finite differences, for a loop whose bridge is run there and back."""
+    backend = choose_backend("double")
+    o, d = aimed_at([KEYHOLE], 200)
+
+    def hits(vertices: np.ndarray, *, differentiate: bool) -> tuple[np.ndarray, np.ndarray]:
+        v = to_vector3(backend, vertices)
+        if differentiate:
+            dr.enable_grad(v)
+            dr.set_grad(v, to_vector3(backend, move))
+        end = hk.trace(
+            hk.SolidAngle(v), to_vector3(backend, o), to_vector3(backend, d), tolerance=1e-9
+        )
+        rate = to_numpy(dr.forward_to(end.t)) if differentiate else np.zeros(len(o))
+        return to_numpy(dr.detach(end.t)), rate
+
+    move = np.random.default_rng(1).normal(size=KEYHOLE.shape)
+    t, rate = hits(KEYHOLE, differentiate=True)
+    h = 1e-5
+    ahead, _ = hits(KEYHOLE + h * move, differentiate=False)  # the bridge opens
+    behind, _ = hits(KEYHOLE - h * move, differentiate=False)
+    t, ahead, behind = (np.nan_to_num(ends, posinf=1e9) for ends in (t, ahead, behind))
+    same = (t < 1e8) & (np.abs(ahead - t) < 1e-2) & (np.abs(behind - t) < 1e-2)
+    assert same.sum() > 40
+    off = np.abs(rate - (ahead - behind) / (2 * h))[same]
+    assert np.median(off) < 1e-5
+    assert np.quantile(off, 0.9) < 1e-2
+
+
+# --- rays along the curve ---------------------------------------------------------------------
+
+
+def lines_beside(
+    loops: list[np.ndarray], n: int, seed: int = 10
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points 1e-5 to 4e-3 beside edges; directions along their edge, for half of them about; and
+    the distances."""
+    rng = np.random.default_rng(seed)
+    a = np.concatenate(loops)
+    e = np.concatenate([np.roll(loop, -1, axis=0) for loop in loops]) - a
+    k = rng.integers(len(a), size=n)
+    away = 10 ** rng.uniform(-5, -2.4, (n, 1))
+    x = a[k] + rng.uniform(0, 1, (n, 1)) * e[k]
+    x += away * unit(np.cross(e[k], rng.normal(size=(n, 3))))
+    d = unit(e[k]) * rng.choice([-1, 1], (n, 1))
+    d[: n // 2] += 10 ** rng.uniform(-6, -1, (n // 2, 1)) * rng.normal(size=(n // 2, 3))
+    return x, unit(d), away[:, 0]
+
+
+def moves_along(
+    loops: list[np.ndarray], x: np.ndarray, d: np.ndarray, length: np.ndarray
+) -> np.ndarray:
+    """The largest |f(x + s d) - f(x)|/s of the lift over 0 < s < length, by the oracle."""
+    oracle, s, worst = CurveOracle(loops), np.zeros(len(x)), np.zeros(len(x))
+    look = oracle(x)
+    value, start, alive = look.value, look.value, np.arange(len(x))
+    lift, smooth = value.copy(), look.smooth
+    while len(alive):
+        s[alive] = np.minimum(s[alive] + 0.3 * smooth, length[alive])
+        look = oracle(x[alive] + s[alive, None] * d[alive])
+        move = np.remainder(look.value - lift[alive] + 2 * math.pi, FOUR_PI) - 2 * math.pi
+        lift[alive] += move
+        worst[alive] = np.maximum(worst[alive], np.abs(lift - start)[alive] / s[alive])
+        going = s[alive] < length[alive]
+        alive, smooth = alive[going], look.smooth[going]
+    return worst
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("name", ["triangle", "wavy", "holes", "coil", "spiky", "link"])
+def test_what_is_promised_along_a_line_holds(name: str, precision: str) -> None:
+    loops, backend = CURVES[name], choose_backend(precision)  # type: ignore[arg-type]
+    x, d, away = lines_beside(loops, 60)
+    if precision == "single":
+        x, d = (v.astype(np.float32).astype(float) for v in (x, d))
+        x, d = x[away > 1e-4], unit(d[away > 1e-4])
+    field = hk.SolidAngle(loops).along(to_vector3(backend, d))
+    _, *promises = field.evaluate(to_vector3(backend, x)).known
+    gain = 0.0
+    assert len(promises) == 4
+    for promise in promises:
+        rate, length = to_numpy(promise.constant), to_numpy(promise.radius)
+        # Others say nothing that a step could use, and would take the oracle long.
+        useful = (rate * length < 20) & (length < 1e3 * CurveOracle(loops)(x).smooth)
+        assert useful.any() or promise is not promises[0]
+        for sign in (-1, 1):
+            worst = moves_along(loops, x[useful], sign * d[useful], length[useful])
+            assert (worst <= rate[useful] * (1 + 1e-6) + 1e-6).all()
+            gain = max(gain, float((worst / rate[useful]).max()))
+    assert gain > 0.6  # half the rate would not do
+
+
+def rays_along(loops: list[np.ndarray], away: float, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rays at this distance from an edge and parallel to it."""
+    rng = np.random.default_rng(11)
+    a = np.concatenate(loops)
+    e = np.concatenate([np.roll(loop, -1, axis=0) for loop in loops]) - a
+    k, side = rng.integers(len(a), size=n), rng.choice([-1, 1], (n, 1))
+    place = a[k] + rng.uniform(0, 1, (n, 1)) * e[k]
+    place += away * unit(np.cross(e[k], rng.normal(size=(n, 3))))
+    d = side * unit(e[k])
+    return place - rng.uniform(0, 2.5, (n, 1)) * d, d
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("tolerance", [1e-4, 1e-7])
+@pytest.mark.parametrize("name", ["triangle", "wavy", "holes", "coil", "spiky"])
+def test_hostile_rays_end(name: str, tolerance: float, precision: str) -> None:
+    """Rays along edges, along flat parts of the surface, and at vertices."""
+    loops = CURVES[name]
+    rng = np.random.default_rng(12)
+    a = np.concatenate(loops)
+    o = 3 * unit(rng.normal(size=(200, 3)))
+    rays = [(o, unit(a[rng.integers(len(a), size=200)] - o))]
+    rays += [rays_along(loops, away, 200) for away in (0, 1e-8, 1e-6, 1e-4, 1e-3)]
+    ends = [
+        hk.trace(hk.SolidAngle(loops), *pair, tolerance=tolerance, precision=precision)
+        for pair in rays
+    ]
+    for end in ends:
+        assert (end.status != int(hk.Status.OUT_OF_STEPS)).all()
+    # Aimed at the curve, within the tolerance of which every level is.
+    assert all(end.hit.all() for end in ends[: 4 if tolerance == 1e-4 else 1])
+
+
+@pytest.mark.parametrize(
+    ("name", "away"),
+    [("wavy", 1e-3), ("triangle", 2e-3), ("spiky", 2e-3), ("coil", 1e-3),
+     pytest.param("triangle", 1e-4, marks=pytest.mark.slow),
+     pytest.param("holes", 3e-4, marks=pytest.mark.slow)],
+)  # fmt: skip
+def test_no_hit_is_missed_along_the_curve(name: str, away: float) -> None:
+    """Against dense sampling: the tolerance is small, so that rays do not end at once."""
+    loops = CURVES[name]
+    o, d = rays_along(loops, away, 40)
+    d[::2] = unit(d[::2] + 0.02 * np.random.default_rng(14).normal(size=(20, 3)))
+    end = hk.trace(hk.SolidAngle(loops), o, d, t_max=4.0, tolerance=1e-7, precision="double")
+    found = first_crossings(
+        CurveOracle(loops), o, d, 0.0, 4.0,
+        levels=[2 * math.pi], period=FOUR_PI, depth=1e-6, spacing=0.2, finest=1e-5,
+    )  # fmt: skip
+    assert np.isfinite(found.beyond).any()
+    proved = np.where(end.status == int(hk.Status.MISS), 4.0, end.t)
+    assert (proved <= found.beyond + 1e-6).all()
+    look = CurveOracle(loops)(end.position[end.hit])
+    gap = gap_to_levels(look.value, [2 * math.pi], FOUR_PI)
+    assert (gap <= 2e-7 * look.steepness).all()
+
+
+@pytest.mark.parametrize("name", ["trefoil", "wavy", "link"])
+def test_curves_far_from_the_origin_can_be_traced(name: str) -> None:
+    """At 2e4 times their size single precision tells places 1e-3 apart."""
+    rng = np.random.default_rng(13)
+    shift = 2e4 * unit(rng.normal(size=3))
+    loops = [loop + shift for loop in CURVES[name]]
+    o, d = aimed_at(loops, 1600)
+    one, two = (hk.trace(hk.SolidAngle(loops), o, d, precision=p) for p in PRECISIONS)  # type: ignore[arg-type]
+    assert (two.status != int(hk.Status.OUT_OF_STEPS)).all()
+    # Hits are as near the surface as rounding lets anyone know, and no surface is passed.
+    look = CurveOracle(loops)(two.position[two.hit].astype(float))
+    gap = gap_to_levels(look.value, [2 * math.pi], FOUR_PI)
+    assert (gap <= 0.03 * look.steepness).all()
+    both = one.hit & two.hit
+    assert (two.t[both] - one.t[both] < 0.02).all()
+    assert (one.hit & ~two.hit).sum() < 8  # within as much of the surface's border

@@ -38,7 +38,10 @@ class CurvatureStep(Bound):
         assert isinstance(certificate, CurvatureCertificate)
         c = certificate
         up, down = _root(c.gap_up, slope, c.constant), _root(c.gap_down, -slope, c.constant)
-        return fmin(fmin(up, down), c.radius) * _ROUND_DOWN
+        # What is not known proves nothing: `fmin` alone would keep the other argument. A NaN in a
+        # gap, the slope or the constant makes a root NaN; the two are compared for that.
+        known = (up >= 0) & (down >= 0) & (c.constant >= 0) & (c.radius > 0)
+        return dr.select(known, fmin(fmin(up, down), c.radius), 0) * _ROUND_DOWN
 
     def covers(self, certificate: Certificate, slope: Real, length: Real) -> Mask:
         assert isinstance(certificate, CurvatureCertificate)
@@ -53,4 +56,6 @@ def _root(gap: Real, rate: Real, curvature: Real) -> Real:
     gap = dr.select(none, 0, gap)
     root = dr.sqrt(dr.fma(rate, rate, 2 * curvature * gap))
     first = dr.select(rate > 0, 2 * gap / (rate + root), (root - rate) / curvature)
-    return dr.select(none, dr.inf, first)
+    # f is constant to second order: 0/0 above.
+    never = none | ((curvature == 0) & (rate == 0) & (gap > 0))
+    return dr.select(never, dr.inf, first)

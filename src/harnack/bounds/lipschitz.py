@@ -33,7 +33,11 @@ class LipschitzStep(Bound):
         gap = fmin(certificate.gap_down, certificate.gap_up)
         # A constant of zero proves everything, unless f is on a level already.
         free = dr.select(gap > 0, gap / certificate.constant, 0)
-        return fmin(free, certificate.radius) * _ROUND_DOWN
+        # `fmin` gives its second argument where one is NaN: of two numbers that one is not known
+        # the other must not prove a step.
+        known = (certificate.constant >= 0) & (certificate.radius > 0)
+        known &= (certificate.gap_down >= 0) & (certificate.gap_up >= 0)
+        return dr.select(known, fmin(free, certificate.radius), 0) * _ROUND_DOWN
 
     def covers(self, certificate: Certificate, slope: Real, length: Real) -> Mask:
         return length <= self.step(certificate, slope)

@@ -33,7 +33,7 @@ class Longest:
                     break
         if any(bound.sufficient for bound, _ in chosen):
             chosen = [pair for pair in chosen if pair[0].sufficient]
-        if not chosen:
+        if all(getattr(certificate, "is_supplement", False) for _, certificate in chosen):
             names = ", ".join(type(b).__name__ for b in self.bounds)
             kinds = ", ".join(type(c).__name__ for c in certificates) or "none"
             raise ValueError(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from harnack.fields.dipole import DipolePotential
-from harnack.fields.field import Curvature, Field, HarmonicBall, Lipschitz, Sample
+from harnack.fields.field import Curvature, Field, HarmonicBall, LineLipschitz, Lipschitz, Sample
 from harnack.fields.periodic import EigenfunctionSum, Gyroid, SchwarzD, SchwarzP
 from harnack.fields.polynomial import HarmonicPolynomial, SphericalHarmonic
 from harnack.fields.screened import ScreenedWindingNumber
@@ -22,6 +22,7 @@ __all__ = [
     "Gyroid",
     "HarmonicBall",
     "HarmonicPolynomial",
+    "LineLipschitz",
     "Lipschitz",
     "PlaneWave",
     "Product",

@@ -24,7 +24,7 @@ def differentiable_angle(backend: Backend, loops: tuple[Any, ...], x: Vec3) -> R
     Memory grows with points times vertices. The formula is that of `sum_over_edges`, with one
     angle an edge instead of a product: an angle may jump by 4 pi, its derivative does not.
     """
-    total = backend.Float(0)
+    total = dr.zeros(backend.Float, dr.width(x))
     for loop in loops:
         vertices = loop if dr.is_array_v(type(loop)) else to_vector3(backend, np.asarray(loop))
         total = total + _loop_angle(backend, vertices, backend.Array3f(x))

@@ -11,33 +11,14 @@ import numpy.typing as npt
 
 from harnack.backend import aligned
 from harnack.backend.extrema import clamp
-from harnack.geometry.singular import weld_vertices
+from harnack.fields.edge_sums import inverse_squares
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Vec3
 
-__all__ = ["Segments", "closest_on_segments", "uncancelled_edges"]
+__all__ = ["Segments", "closest_on_segments"]
 
 FloatArray = npt.NDArray[np.float64]
-
-
-def uncancelled_edges(loops: tuple[FloatArray, ...]) -> tuple[FloatArray, FloatArray]:
-    """Starts and ends (k, 3) of the edges of closed loops that are not run back elsewhere.
-
-    Around an edge that is run n times net, the solid angle changes by 4 pi n: unless n = 0 it
-    takes every value modulo 4 pi next to each of its points, so that every level set ends there.
-    Edges are compared as wholes: of two that overlap in part and run opposite ways, both stay.
-    """
-    start = np.concatenate(loops)
-    end = np.concatenate([np.roll(loop, -1, axis=0) for loop in loops])
-    index = weld_vertices(np.concatenate([start, end])).reshape(2, -1)
-    low, high = index.min(axis=0), index.max(axis=0)
-    pairs, first, which = np.unique(
-        np.column_stack([low, high]), axis=0, return_index=True, return_inverse=True
-    )
-    net = np.bincount(which.ravel(), np.where(index[0] == low, 1, -1), len(pairs))
-    kept = first[net != 0]
-    return start[kept], end[kept]
 
 
 @dataclass(frozen=True)
@@ -50,12 +31,14 @@ class Segments:
 
     @classmethod
     def upload(cls, backend: Backend, start: FloatArray, end: FloatArray) -> Segments:
-        """Segments (k, 3) to (k, 3), k >= 1, none of length zero."""
-        inverse = 1 / ((end - start) ** 2).sum(axis=1, keepdims=True)
-        records = np.concatenate([start, inverse, end, np.zeros_like(inverse)], axis=1).ravel()
-        single = backend.precision == "single"
-        values = records.astype(np.float32) if single else records
-        return cls(backend, aligned(backend, values), dr.opaque(backend.UInt32, len(start)))
+        """Segments (k, 3) to (k, 3), k >= 1, of a size of about one. One whose ends are the same
+        in the backend's precision is a point."""
+        cast = np.float64 if backend.precision == "double" else np.float32
+        start, end = (q.astype(cast).astype(np.float64) for q in (start, end))
+        inverse = inverse_squares(end - start)[:, None]
+        records = np.concatenate([start, inverse, end, np.zeros_like(inverse)], axis=1)
+        count = dr.opaque(backend.UInt32, len(start))
+        return cls(backend, aligned(backend, records.ravel().astype(cast)), count)
 
 
 def closest_on_segments(segments: Segments, x: Vec3) -> Vec3:

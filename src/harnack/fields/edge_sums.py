@@ -23,8 +23,9 @@ if TYPE_CHECKING:
 # Two complex numbers, as four reals.
 Spinor: TypeAlias = "tuple[Real, Real, Real, Real]"
 
-# A degenerate padding edge has this for 1/length^2: no angle, no gradient, no variation.
-_PADDING = 1e30
+# The largest 1/length^2 of a record, within the range of float32. Edges that have no length, for
+# padding or by rounding, have it too: no angle, no gradient, hardly any variation.
+_SHARPEST = 1e30
 # Often, and without squares: beside a vertex or far away, the product of a few factors leaves the
 # range of float32.
 _RENORMALISE_EVERY = 2
@@ -71,21 +72,29 @@ def chunk_for(loops: tuple[npt.NDArray[np.float64], ...]) -> int:
 def upload(backend: Backend, loops: tuple[npt.NDArray[np.float64], ...]) -> EdgeBuffer:
     """Records of the edges of closed loops, each of shape (n, 3)."""
     chunk = chunk_for(loops)
-    records = np.concatenate([_records(loop, chunk) for loop in loops])
+    cast = np.float64 if backend.precision == "double" else np.float32
+    rounded = (loop.astype(cast).astype(np.float64) for loop in loops)
+    records = np.concatenate([_records(loop, chunk) for loop in rounded])
     trips = dr.opaque(backend.UInt32, len(records))
-    return EdgeBuffer(backend, aligned(backend, _cast(backend, records.ravel())), trips, chunk)
+    return EdgeBuffer(backend, aligned(backend, records.ravel().astype(cast)), trips, chunk)
 
 
-def _cast(backend: Backend, values: npt.NDArray[np.float64]) -> npt.NDArray[Any]:
-    return values if backend.precision == "double" else values.astype(np.float32)
+def inverse_squares(edges: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """1/length^2 of edges (k, 3), (k,), or the largest number that records hold, if less.
+
+    Too small a number makes no distance too long: the foot of the perpendicular ends nearer to
+    the edge's start than it should by less than the edge's length, at most 1e-15, far below the
+    rounding of distances. Nor a variation too small: 1/sqrt(d^2 (1 + 4 d^2/length^2)) grows.
+    """
+    squared = (edges * edges).sum(axis=1)
+    return 1 / np.maximum(squared, 1 / _SHARPEST)
 
 
 def _records(loop: npt.NDArray[np.float64], chunk: int) -> npt.NDArray[np.float64]:
     trips = -(-len(loop) // chunk)
     stays = np.repeat(loop[:1], trips * chunk + 1 - len(loop), axis=0)
     path = np.concatenate([loop, stays])  # back to the start, then degenerate edges
-    squared = ((path[1:] - path[:-1]) ** 2).sum(axis=1)
-    inverse = np.where(squared > 0, 1 / np.where(squared > 0, squared, 1), _PADDING)
+    inverse = inverse_squares(path[1:] - path[:-1])
     rows = np.concatenate([path, np.append(inverse, 0.0)[:, None]], axis=1)
     index = np.arange(trips)[:, None] * chunk + np.arange(chunk + 1)[None, :]
     flat = rows[index].reshape(trips, -1)

@@ -50,7 +50,19 @@ class Curvature:
     radius: Real = float("inf")
 
 
-Knowledge = HarmonicBall | Lipschitz | Curvature
+@dataclass(frozen=True)
+class LineLipschitz:
+    """|f(p + s d) - f(p)| <= constant |s| for |s| < radius, with the direction d of `Field.along`.
+
+    It adds to other promises, on which alone a ray must be able to get on: it may be infinite at
+    most places.
+    """
+
+    constant: Real
+    radius: Real
+
+
+Knowledge = HarmonicBall | Lipschitz | LineLipschitz | Curvature
 
 
 @dataclass(frozen=True)
@@ -82,8 +94,8 @@ def lengthened(sample: Sample, size: Real) -> Sample:
     for one in sample.known:
         if isinstance(one, HarmonicBall):
             known.append(HarmonicBall(one.radius * size, one.lower, one.upper, one.dimension))
-        elif isinstance(one, Lipschitz):
-            known.append(Lipschitz(one.constant / size, one.radius * size))
+        elif isinstance(one, Lipschitz | LineLipschitz):
+            known.append(type(one)(one.constant / size, one.radius * size))
         else:
             known.append(Curvature(one.constant / (size * size), one.radius * size))
     gradient, doubt = sample.gradient / size, sample.gradient_error / size
@@ -183,6 +195,15 @@ class Field(abc.ABC):
     def describe(self) -> dict[str, Any]:
         """What a person would want to know about the choices this field made by itself."""
         return {}
+
+    def along(self, d: Vec3) -> Field:
+        """This field for rays in unit directions d: its samples may promise more there.
+
+        What a sample of the field returned promises need hold only at points p + s d of the line
+        through p, for both signs of s. Called while no loop is being recorded, or within one.
+        """
+        del d
+        return self
 
     def at_detail(self, detail: Real) -> Field:
         """This field, evaluated so closely in each lane: 0 as coarsely as the field allows, 1 as

@@ -15,11 +15,13 @@ from harnack.backend import backend_of, to_numpy
 from harnack.fields.edge_angles import differentiable_angle
 from harnack.fields.edge_extent import tight_extent
 from harnack.fields.edge_hessian import hessian_over_edges
-from harnack.fields.edge_nearest import Segments, closest_on_segments, uncancelled_edges
+from harnack.fields.edge_nearest import Segments, closest_on_segments
+from harnack.fields.edge_passing import Line, rates_along
 from harnack.fields.edge_sums import EdgeBuffer, EdgeSums, sum_over_edges, upload
-from harnack.fields.field import Field, HarmonicBall, Sample
+from harnack.fields.field import Field, HarmonicBall, LineLipschitz, Sample
 from harnack.fields.unit_coordinates import UnitCoordinates, placed
 from harnack.geometry import ConvexHull, is_convex_position, total_length, validate_loops
+from harnack.geometry.net_loops import net_loops, uncancelled_edges
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
@@ -32,6 +34,12 @@ _PERIOD = 4 * math.pi
 # The ball of the edge certificate is this fraction of the distance to the curve (by experiment:
 # 0.5 to 0.65 need the fewest evaluations, 0.8 more).
 _REACH = 0.5
+# Nearer to the curve than this part of its size, and with a slope below this part of the
+# gradient, a ray may run along the curve and asks what is known along its line; elsewhere only
+# with a slope so small that it may run along a flat part of the surface.
+_BESIDE, _FLAT, _GRAZING = 0.005, 0.25, 1e-3
+# Levels as near as this to a multiple of 4 pi count as one.
+_NARROW = 1e-9 * _PERIOD
 # Sums of float32 terms; a variation is lengthened and a distance shortened by this much.
 _ROUNDING = 2e-5
 
@@ -42,6 +50,10 @@ class SolidAngle(Field):
     loops: one (n, 3) array-like of vertices, n >= 3, or a list of them. Every loop is closed by
     itself. Orientation matters: a hole runs against its outer loop. A Dr.Jit 3-vector of n lanes
     is one loop whose vertices hits can be differentiated by.
+
+    Edges that are run there and back, by one loop or by two neighbours, are taken out before
+    anything is computed (`net_loops`): f does not see them. If none is left, f is 0 everywhere,
+    every ray a proved miss, and levels that are multiples of 4 pi are refused.
 
     certificate: how the lift is bounded near a point. "auto" takes "convex" where its hypothesis
     is checked to hold, else "edges".
@@ -74,12 +86,15 @@ class SolidAngle(Field):
         vertices = loops if _is_drjit(loops) else None
         self.loops: Loops = validate_loops(to_numpy(loops) if vertices is not None else loops)
         self.vertices: Vec3 | None = vertices
-        self.convex_position = is_convex_position(self.loops)
+        self._net: Loops = net_loops(self.loops)
+        self.convex_position = is_convex_position(self._net)
+        self._asked = certificate
         self.certificate = self._choose(certificate)
-        points = np.concatenate(self.loops)
+        points = np.concatenate(self._net or self.loops)
         self._centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
         self._size = float(np.linalg.norm(points - self._centre, axis=1).max())
         self._device: _OnDevice | None = None
+        self._direction: Vec3 | None = None
         self._extents: dict[tuple[float, ...], Volume | None] = {}
 
     def _choose(self, asked: CertificateName) -> Literal["edges", "range"]:
@@ -98,35 +113,92 @@ class SolidAngle(Field):
         if self._device is not None and self._device.backend is backend:
             return self
         prepared = copy.copy(self)
-        # Centred and scaled to unit size: products of eight lengths stay far from overflow.
-        unit = tuple((loop - self._centre) / self._size for loop in self.loops)
-        magnitude = float(np.abs(np.concatenate(self.loops)).max() / self._size)
-        prepared._device = _OnDevice(
-            *placed(backend, self._centre, self._size), upload(backend, unit), magnitude
-        )
+        # Centred and scaled to unit size: products of eight lengths stay far from overflow. The
+        # centre is a number of the backend, so that near the curve it is subtracted exactly.
+        cast = np.float64 if backend.precision == "double" else np.float32
+        centre = self._centre.astype(cast).astype(np.float64)
+        unit = tuple((loop - centre) / self._size for loop in self._net)
+        edges = upload(backend, unit) if unit else None
+        magnitude = float(np.abs(np.concatenate(self._net or self.loops)).max() / self._size)
+        prepared._device = _OnDevice(*placed(backend, centre, self._size), edges, magnitude)
         return prepared
 
     def evaluate(self, p: Vec3) -> Sample:
         if self._device is None:
             return self.prepare(backend_of(p)).evaluate(p)
         on = self._device
-        sums = sum_over_edges(on.edges, on.unit(p), variation=self.certificate == "edges")
-        # Coordinates of size `magnitude` (in units of the curve) carry its rounding.
+        if on.edges is None:
+            return self._constant(p)
+        x = on.unit(p)
+        sums = sum_over_edges(on.edges, x, variation=self.certificate == "edges")
         epsilon = on.backend.epsilon
-        rounding = 4 * epsilon * (1 + on.magnitude)
+        rounding = self._rounding(on)
         distance = sums.distance * (1 - _ROUNDING) - rounding
         if self.certificate == "edges":
             ball = self._edge_ball(sums, distance)
         else:
             ball = HarmonicBall(distance * on.size, -1.5 * _PERIOD, 1.5 * _PERIOD)
-        # On the curve itself, to rounding, every level meets and no gradient exists: give one of
-        # the size it has there, so that the point counts as close to any level.
-        apart = (sums.distance > rounding) & dr.isfinite(sums.angle)
-        steep = on.backend.Array3f(0, 0, 2 / rounding)
-        gradient = dr.select(apart, sums.gradient, steep) / on.size
+        # On the curve itself, to rounding, every level meets (`uncancelled_edges`) and no gradient
+        # exists: give one so steep that the point counts as close to any level. A value that is
+        # not a number anywhere else stays one, and the tracer refuses it.
+        met = sums.distance <= 2 * rounding
+        steep = on.backend.Array3f(0, 0, 4 * _PERIOD / rounding)
+        gradient = dr.select(met, steep, sums.gradient) / on.size
         # Each of n factors turns the product by a few roundings, of random sign.
-        error = epsilon * (8 + 2 * math.sqrt(sum(len(loop) for loop in self.loops)))
-        return Sample(dr.select(apart, sums.angle, 0), gradient, (ball,), error)
+        error = epsilon * (8 + 2 * math.sqrt(sum(len(loop) for loop in self._net)))
+        if self.certificate == "edges":
+            # Ends of edges, rounded, move each edge's angle by that times its field, which is at
+            # most twice `first`: where edges nearly cancel, the gradient does not show it.
+            error = dr.fma(4 * epsilon, sums.first, error)
+        known = (ball, *self._along_edges(on, x, sums))
+        return Sample(dr.select(met, 0, sums.angle), gradient, known, error)
+
+    def along(self, d: Vec3) -> SolidAngle:
+        if not self._net or self._asked == "paper":
+            return self
+        seen = copy.copy(self)
+        seen._direction = d
+        return seen
+
+    def _along_edges(self, on: _OnDevice, x: Vec3, sums: EdgeSums) -> tuple[LineLipschitz, ...]:
+        """What is known along the direction of `along`, if there is one: how fast f moves, for
+        lengths that lead from half the distance to the curve to its size (`rates_along`).
+
+        Beside a straight edge the longest will do, and others near its ends; along a flat part of
+        the surface, bounded by a plane curve, the shortest.
+        """
+        if self._direction is None or on.edges is None:
+            return ()
+        line = Line(x, on.backend.Array3f(self._direction), self._rounding(on))
+        slope, steepness = dr.dot(sums.gradient, line.v), dr.norm(sums.gradient)
+        flat = dr.select(sums.distance < _BESIDE, _FLAT, _GRAZING) * steepness
+        active = dr.abs(slope) < flat
+        root = dr.sqrt(sums.distance)
+        lengths = (0.5 * sums.distance, root * dr.sqrt(root), root, dr.sqrt(root))
+        rates = rates_along(on.edges, line, lengths, active)
+        scale = (1 + _ROUNDING) / on.size
+        pairs = zip(rates, lengths, strict=True)
+        return tuple(LineLipschitz(rate * scale, length * on.size) for rate, length in pairs)
+
+    @staticmethod
+    def _rounding(on: _OnDevice) -> float:
+        """How far a point may be from where it was meant to be, in units of the curve.
+
+        Near the curve p - centre is exact, division and the curve's own coordinates have a few
+        roundings of size 1, and p itself was rounded once, at the curve's distance from 0.
+        """
+        return on.backend.epsilon * (6 + 2 * on.magnitude)
+
+    def _constant(self, p: Vec3) -> Sample:
+        """The sample of f = 0, for a curve of which nothing is left: it is true on any ball. The
+        range has a width, as bounds divide by it; no level lies in it (`check_levels`)."""
+        assert self._device is not None
+        on = self._device
+        x = on.unit(p)
+        radius = 1e6 * (1 + dr.norm(x)) * on.size
+        zero = dr.zeros(on.backend.Float, dr.width(p))
+        ball = HarmonicBall(radius, zero - _NARROW, zero + _NARROW)
+        return Sample(zero, on.backend.Array3f(zero), (ball,))
 
     def _edge_ball(self, sums: EdgeSums, distance: Real) -> HarmonicBall:
         assert self._device is not None
@@ -139,18 +211,22 @@ class SolidAngle(Field):
         if self._device is None:
             return self.prepare(backend_of(p)).hessian(p)
         on = self._device
+        if on.edges is None:
+            zero = dr.zeros(on.backend.Array3f, dr.width(p))
+            return zero, zero, zero
         x, y, z = hessian_over_edges(on.edges, on.unit(p))
         share = 1 / (on.size * on.size)
         return x * share, y * share, z * share
 
     def closest_on_boundary(self, p: Vec3) -> Vec3 | None:
         """The closest point of the curve, edges that cancel left out (`uncancelled_edges`)."""
+        if not self._net:
+            return None
         if self._device is None:
             return self.prepare(backend_of(p)).closest_on_boundary(p)
         on = self._device
-        start, end = ((q - self._centre) / self._size for q in uncancelled_edges(self.loops))
-        if not len(start):
-            return None
+        centre = to_numpy(on.centre).reshape(3).astype(np.float64)
+        start, end = ((q - centre) / self._size for q in uncancelled_edges(self._net))
         nearest = closest_on_segments(Segments.upload(on.backend, start, end), on.unit(p))
         return nearest * on.size + on.centre
 
@@ -159,8 +235,18 @@ class SolidAngle(Field):
 
     def differentiable_value(self, p: Vec3) -> Real:
         backend = backend_of(p)
-        loops = (self.vertices,) if self.vertices is not None else self.loops
+        # Vertices that can be moved one by one are all there: moved, edges cancel no longer.
+        loops = (self.vertices,) if self.vertices is not None else self._net
         return differentiable_angle(backend, loops, p)
+
+    def check_levels(self, levels: tuple[float, ...]) -> None:
+        for level in levels:
+            if not self._net and abs(math.remainder(float(level), _PERIOD)) < _NARROW:
+                raise ValueError(
+                    f"level {level:g}: all edges of this curve cancel each other, so that its "
+                    "solid angle is 0 everywhere modulo 4 pi, and no surface is where it takes "
+                    "that value: check the loops' orientations"
+                )
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """Where the level sets must lie.
@@ -179,22 +265,25 @@ class SolidAngle(Field):
         return self._extents[levels]
 
     def _extent(self, levels: tuple[float, ...]) -> Volume | None:
-        points = np.concatenate(self.loops)
+        points = np.concatenate(self._net or self.loops)
         away = [abs(math.remainder(float(level), _PERIOD)) for level in levels]
         nearest = min(away)
-        if nearest < 1e-9 * _PERIOD:
+        if nearest < _NARROW:
             return None
+        if not self._net:
+            return ConvexHull.of(points)  # holds what there is: nothing
         if self.convex_position and nearest > 2 * math.pi * (1 - 1e-9):
             return ConvexHull.of(points).padded(1e-4 * self._size)
-        reach = 1.0001 * total_length(self.loops) / math.sqrt(nearest * (_PERIOD - nearest))
+        reach = 1.0001 * total_length(self._net) / math.sqrt(nearest * (_PERIOD - nearest))
         return tight_extent(
-            self.loops, points.min(axis=0) - reach, points.max(axis=0) + reach, levels
+            self._net, points.min(axis=0) - reach, points.max(axis=0) + reach, levels
         )
 
     def describe(self) -> dict[str, Any]:
         return {
             "loops": len(self.loops),
             "vertices": sum(len(loop) for loop in self.loops),
+            "cancelled edges": sum(map(len, self.loops)) - sum(map(len, self._net)),
             "convex position": self.convex_position,
             "certificate": self.certificate,
         }
@@ -202,9 +291,10 @@ class SolidAngle(Field):
 
 @dataclass(frozen=True)
 class _OnDevice(UnitCoordinates):
-    """The edges on a backend, and how large their coordinates are, in units of the curve."""
+    """The edges on a backend, None if there are none, and how large their coordinates are, in
+    units of the curve."""
 
-    edges: EdgeBuffer
+    edges: EdgeBuffer | None
     magnitude: float
 
 

@@ -25,11 +25,12 @@ MIN_ANGLE = 1e-6  # so do edges that fold back at a smaller angle (radians)
 def is_convex_position(loops: tuple[FloatArray, ...]) -> bool:
     """Whether it is proved that the theorems apply to these (validated) loops.
 
-    True means: one loop; edges that share no vertex are at least 1e-9 apart (all lengths
-    relative to the curve's size), none folds back; and either all vertices lie within 1e-12 of
-    one plane (then P is on the boundary of its flat hull, a degenerate convex set), or every
-    edge has a plane through it that no vertex exceeds by more than 1e-12. False means: no proof
-    found, as for more than 2048 vertices; it says nothing about the curve.
+    True means: one loop; no edge is shorter than 1e-9 (all lengths relative to the curve's
+    size: one that short may be nothing but rounding, and has no direction to be trusted); edges
+    that share no vertex are at least 1e-9 apart, none folds back; and either all vertices lie
+    within 1e-12 of one plane (then P is on the boundary of its flat hull, a degenerate convex
+    set), or every edge has a plane through it that no vertex exceeds by more than 1e-12. False
+    means: no proof found, as for more than 2048 vertices; it says nothing about the curve.
 
     Stability. Where no vertex exceeds the plane of an edge, that edge lies on the boundary of
     the hull H, and nothing is left to say. Otherwise let each point move along the normal of its
@@ -49,7 +50,14 @@ def is_convex_position(loops: tuple[FloatArray, ...]) -> bool:
     if not 0.0 < size < np.inf:
         return False
     x = (loops[0] - 0.5 * (lower + upper)) / size
+    # All comparisons of this module are written so that NaN refuses.
+    if not _edge_lengths(x).min() >= MIN_SEPARATION:
+        return False
     return (_is_flat(x) or _lies_on_hull(x)) and _is_simple(x)
+
+
+def _edge_lengths(x: FloatArray) -> FloatArray:
+    return np.linalg.norm(np.roll(x, -1, axis=0) - x, axis=1)
 
 
 def _is_flat(x: FloatArray) -> bool:
@@ -66,7 +74,7 @@ def _lies_on_hull(x: FloatArray) -> bool:
     for begin in range(0, count, rows):
         part = np.arange(begin, min(begin + rows, count))
         normals[part], excess, is_strict[part] = _supporting_planes(x, part)
-        if excess.max() > TOLERANCE:
+        if not excess.max() <= TOLERANCE:
             return False
     following = np.roll(normals, -1, axis=0)
     is_exact = is_strict & np.roll(is_strict, -1)
@@ -124,9 +132,9 @@ def _is_simple(x: FloatArray) -> bool:
     """Whether edges without a common vertex are MIN_SEPARATION apart, and none folds back."""
     count = len(x)
     ends = np.roll(x, -1, axis=0)
-    direction = (ends - x) / np.linalg.norm(ends - x, axis=1, keepdims=True)
+    direction = (ends - x) / _edge_lengths(x)[:, None]
     turned = direction + np.roll(direction, -1, axis=0)
-    if np.linalg.norm(turned, axis=1).min() < MIN_ANGLE:
+    if not np.linalg.norm(turned, axis=1).min() >= MIN_ANGLE:
         return False
     low, high = np.minimum(x, ends) - MIN_SEPARATION, np.maximum(x, ends)
     near = np.triu(np.ones((count, count), dtype=np.bool_), k=2)
@@ -137,7 +145,8 @@ def _is_simple(x: FloatArray) -> bool:
     first, second = np.nonzero(near)
     for begin in range(0, len(first), 100_000):
         i, j = first[begin : begin + 100_000], second[begin : begin + 100_000]
-        if segment_clearance_lower(x[i], ends[i], x[j], ends[j]).min() < MIN_SEPARATION:
+        clearance = segment_clearance_lower(x[i], ends[i], x[j], ends[j])
+        if not clearance.min() >= MIN_SEPARATION:
             return False
     return True
 
@@ -158,6 +167,8 @@ def segment_clearance_lower(
     safe = np.where(determinant > 0.0, determinant, 1.0)
     s = np.where(determinant > 0.0, np.clip((b * f - c * e) / safe, 0.0, 1.0), 0.0)
     t = np.zeros_like(s)
+    # Of a segment of length zero every share is the same point.
+    a, e = np.where(a > 0.0, a, 1.0), np.where(e > 0.0, e, 1.0)
     for _ in range(3):
         t = np.clip((b * s + f) / e, 0.0, 1.0)
         s = np.clip((b * t - c) / a, 0.0, 1.0)

@@ -39,7 +39,14 @@ from harnack.geometry.chains import join
 from harnack.geometry.convex_volume import FloatArray
 from harnack.geometry.meshes import IntArray
 
-__all__ = ["NetFaces", "net_faces", "singular_edges", "singular_loops", "weld_vertices"]
+__all__ = [
+    "NetFaces",
+    "net_edges",
+    "net_faces",
+    "singular_edges",
+    "singular_loops",
+    "weld_vertices",
+]
 
 # 2^64 over the golden ratio, made odd: the multiplier of Fibonacci hashing (Knuth, TAOCP 6.4).
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
@@ -109,11 +116,24 @@ def singular_edges(faces: IntArray, multiplicity: npt.ArrayLike = 1) -> tuple[In
     if not len(faces):
         return np.zeros((0, 2), dtype=np.int64), np.zeros(0, dtype=np.int64)
     weight = np.broadcast_to(np.asarray(multiplicity, dtype=np.int64), (len(faces),))
-    ends = np.roll(faces, -1, axis=1)
-    low, high = np.minimum(faces, ends).ravel(), np.maximum(faces, ends).ravel()
-    signed = (np.where(faces < ends, 1, -1) * weight[:, None]).ravel()
-    count = int(faces.max()) + 1
-    keys = low * count + high  # below 2^63, since validate_mesh admits at most 10^8 vertices
+    return net_edges(faces.ravel(), np.roll(faces, -1, axis=1).ravel(), np.repeat(weight, 3))
+
+
+def net_edges(
+    begin: IntArray, end: IntArray, weight: npt.ArrayLike = 1
+) -> tuple[IntArray, IntArray]:
+    """Directed edges (k, 2) that are left, and their weights (k,) > 0, of edges begin -> end (m,).
+
+    An edge counts `weight` times, (m,) or one integer of any sign for all, and against the same
+    edge run the other way; one from a vertex to itself does not count. The order is by the lower,
+    then the higher index.
+    """
+    if not len(begin):
+        return np.zeros((0, 2), dtype=np.int64), np.zeros(0, dtype=np.int64)
+    low, high = np.minimum(begin, end), np.maximum(begin, end)
+    signed = np.where(begin < end, 1, -1) * np.asarray(weight, dtype=np.int64)
+    count = int(high.max()) + 1
+    keys = low * count + high  # below 2^63: there are at most 10^8 vertices
     order = np.argsort(keys, kind="stable")
     keys = keys[order]
     starts = np.flatnonzero(np.append(True, keys[1:] != keys[:-1]))

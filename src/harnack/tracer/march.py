@@ -110,7 +110,7 @@ class PreparedLevelSet:
             real(0), count(int(Status.MISS)), running,
         )  # fmt: skip
         if not self.field.has_sheets:
-            return self._advance(self.field, o, d, end, state), count(NO_SHEET)
+            return self._advance(self.field.along(d), o, d, end, state), count(NO_SHEET)
 
         def march(field: Field, stop: Real, ahead: Crossing, state: State) -> State:
             return self._advance(field, o, d, stop, state, ahead)
