@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -261,3 +262,15 @@ def test_convex_position_is_found_out() -> None:
     with pytest.raises(ValueError, match="unknown certificate"):
         hk.SolidAngle(CURVES["trefoil"], certificate="best")  # type: ignore[arg-type]
     assert len(validate_loops(CURVES["link"])) == 2
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e30, 9e99])
+@pytest.mark.parametrize("level", [1.0, 2 * math.pi, 3.0])
+def test_extents_at_any_scale_are_found_without_warnings(scale: float, level: float) -> None:
+    x = shapes.wavy_polygon(12)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found, plain = (hk.SolidAngle(s * x).extent((level,)) for s in (scale, 1.0))
+    assert found is not None
+    assert plain is not None
+    np.testing.assert_allclose(np.array(found.bounds()) / scale, plain.bounds(), rtol=1e-6)

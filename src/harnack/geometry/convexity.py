@@ -20,6 +20,7 @@ TOLERANCE = 1e-12  # a vertex may lie this far off a supporting plane
 ROUNDING = 1e-14  # bound of the rounding errors of a height above a plane
 MIN_SEPARATION = 1e-9  # edges nearer than this count as touching
 MIN_ANGLE = 1e-6  # so do edges that fold back at a smaller angle (radians)
+_SHORTEST = 1e-100  # of edges: squares of shorter ones vanish, and nothing can be told of them
 
 
 def is_convex_position(loops: tuple[FloatArray, ...]) -> bool:
@@ -29,7 +30,7 @@ def is_convex_position(loops: tuple[FloatArray, ...]) -> bool:
     relative to the curve's size), none folds back; and either all vertices lie within 1e-12 of
     one plane (then P is on the boundary of its flat hull, a degenerate convex set), or every
     edge has a plane through it that no vertex exceeds by more than 1e-12. False means: no proof
-    found, as for more than 2048 vertices; it says nothing about the curve.
+    found, as for more than 2048 vertices or an edge below 1e-100; it says nothing about the curve.
 
     Stability. Where no vertex exceeds the plane of an edge, that edge lies on the boundary of
     the hull H, and nothing is left to say. Otherwise let each point move along the normal of its
@@ -49,6 +50,9 @@ def is_convex_position(loops: tuple[FloatArray, ...]) -> bool:
     if not 0.0 < size < np.inf:
         return False
     x = (loops[0] - 0.5 * (lower + upper)) / size
+    shortest = float(np.abs(np.roll(x, -1, axis=0) - x).max(axis=1).min())
+    if not shortest >= _SHORTEST:
+        return False
     return (_is_flat(x) or _lies_on_hull(x)) and _is_simple(x)
 
 
@@ -66,7 +70,7 @@ def _lies_on_hull(x: FloatArray) -> bool:
     for begin in range(0, count, rows):
         part = np.arange(begin, min(begin + rows, count))
         normals[part], excess, is_strict[part] = _supporting_planes(x, part)
-        if excess.max() > TOLERANCE:
+        if not excess.max() <= TOLERANCE:
             return False
     following = np.roll(normals, -1, axis=0)
     is_exact = is_strict & np.roll(is_strict, -1)
@@ -126,7 +130,7 @@ def _is_simple(x: FloatArray) -> bool:
     ends = np.roll(x, -1, axis=0)
     direction = (ends - x) / np.linalg.norm(ends - x, axis=1, keepdims=True)
     turned = direction + np.roll(direction, -1, axis=0)
-    if np.linalg.norm(turned, axis=1).min() < MIN_ANGLE:
+    if not np.linalg.norm(turned, axis=1).min() >= MIN_ANGLE:
         return False
     low, high = np.minimum(x, ends) - MIN_SEPARATION, np.maximum(x, ends)
     near = np.triu(np.ones((count, count), dtype=np.bool_), k=2)
@@ -137,7 +141,7 @@ def _is_simple(x: FloatArray) -> bool:
     first, second = np.nonzero(near)
     for begin in range(0, len(first), 100_000):
         i, j = first[begin : begin + 100_000], second[begin : begin + 100_000]
-        if segment_clearance_lower(x[i], ends[i], x[j], ends[j]).min() < MIN_SEPARATION:
+        if not segment_clearance_lower(x[i], ends[i], x[j], ends[j]).min() >= MIN_SEPARATION:
             return False
     return True
 
