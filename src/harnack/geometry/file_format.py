@@ -24,7 +24,9 @@ class Place:
     where: str = ""
 
     def __str__(self) -> str:
-        return f"{self.path}, {self.where}" if self.where else str(self.path)
+        # A name may hold line ends and other characters that a terminal would obey.
+        name = "".join(c if c.isprintable() else repr(c)[1:-1] for c in str(self.path))
+        return f"{name}, {self.where}" if self.where else name
 
     def error(self, message: str) -> FileFormatError:
         """An error about this place."""
@@ -62,6 +64,8 @@ def read_bytes(path: Path) -> bytes:
     place = Place(path)
     try:
         if not path.exists():
+            if path.is_symlink():
+                raise place.error("this is a link that leads to no file")
             raise place.error("there is no such file")
         if path.is_dir():
             raise place.error("this is a directory, not a file")
