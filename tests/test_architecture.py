@@ -12,6 +12,7 @@ FILES = sorted(SOURCE.rglob("*.py"))
 
 # Each room imports from itself and from the rooms before it.
 ROOMS = (
+    "choices",
     "backend",
     "geometry",
     "tree",

@@ -461,3 +461,9 @@ def test_doctor_survives_a_kernel_that_ends_its_process(monkeypatch: pytest.Monk
         assert not finding.ok
         assert "Cannot select" in finding.detail
         assert "DRJIT_LIBLLVM_PATH" in finding.advice
+
+
+def test_numbers_of_a_field_that_single_precision_cannot_hold_are_refused() -> None:
+    backend = hb.choose_backend("single")
+    with pytest.raises(ValueError, match="too large for single precision"):
+        hb.aligned(backend, np.array([1.0, 1e39]))

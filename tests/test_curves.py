@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 import scipy.spatial
@@ -379,3 +381,17 @@ def test_random_shapes_repeat_with_their_generator():
 def test_impossible_shapes_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+@pytest.mark.parametrize(
+    "loop",
+    [
+        [[0, 0, 0], [1e99, 0, 0], [0, 1e-99, 0]],
+        # Edges 0 and 2 share no vertex and are 1e-198 of the size apart.
+        [[0, 0, 0], [1e99, 0, 0], [0, 1e99, 0], [0, 1e-99, 0]],
+    ],
+)
+def test_what_rounds_to_no_number_is_no_proof_of_convex_position(loop) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert not is_convex_position(validate_loops(loop))

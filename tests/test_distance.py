@@ -828,3 +828,12 @@ def test_several_levels() -> None:
     x = [[0.5, 0.0, 0.0], [0.0, 1.7, 0.0]]
     found = signed_distance(Bare(), x, level=[1.0, 2.0])
     assert found == pytest.approx([-0.5, -0.3])
+
+
+@pytest.mark.parametrize("far", [1e160, 1e300])
+def test_distances_from_very_far_away_come_without_warnings_of_numpy(far: float) -> None:
+    field = hk.SolidAngle(shapes.wavy_polygon(12))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message="overflow|divide|invalid")
+        found = signed_distance(field, [[far, 0, 0]], method="newton", precision="double")
+    assert np.isnan(found) | (np.abs(found) >= 0.99 * far)

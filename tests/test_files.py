@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 import os
 import struct
@@ -12,7 +13,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from harnack.geometry import chains, file_format, shapes
-from harnack.geometry.files import FileFormatError, read_loops, write_atomically
+from harnack.geometry.files import FileFormatError, check_writable, read_loops, write_atomically
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 CORNERS = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
@@ -415,3 +416,74 @@ def test_places_that_cannot_be_written_are_refused_before_the_work(tmp_path):
         pytest.fail("the block must not run")
     with pytest.raises(FileNotFoundError), write_atomically(tmp_path / "a.png"):
         pass  # writes nothing
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs a disk that is always full")
+def test_a_full_disk_is_said_and_nothing_is_left(tmp_path):
+    target = tmp_path / "a.png"
+    target.write_text("old")
+
+    def fill():
+        with write_atomically(target) as partial, open("/dev/full", "wb", buffering=0) as full:
+            partial.write_text("half")
+            full.write(b"more")
+
+    with pytest.raises(OSError, match=r"cannot write .*a\.png: the disk is full; free") as caught:
+        fill()
+    assert caught.value.errno == errno.ENOSPC
+    assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
+    assert target.read_text() == "old"
+
+
+@pytest.mark.parametrize(
+    ("number", "advice"),
+    [
+        (errno.ENOSPC, "the disk is full; free some space"),
+        (errno.EDQUOT, "your share of the disk is used up"),
+        (errno.EACCES, "you may not write in its folder"),
+        (errno.EROFS, "its disk can only be read"),
+        (errno.EIO, "Input/output error; name a file elsewhere"),
+    ],
+)
+def test_what_the_system_refuses_is_said_before_the_work(tmp_path, monkeypatch, number, advice):
+    def refused(*_, **__):
+        raise OSError(number, os.strerror(number), str(tmp_path))
+
+    monkeypatch.setattr("harnack.geometry.files.tempfile.TemporaryFile", refused)
+    with pytest.raises(OSError, match=f"cannot write .*a.png: {advice}") as caught:
+        check_writable(tmp_path / "a.png")
+    assert caught.value.errno == number
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_errors_about_other_files_are_passed_on(tmp_path):
+    with (
+        pytest.raises(FileNotFoundError, match="other"),
+        write_atomically(tmp_path / "a.png"),
+    ):
+        (tmp_path / "other").read_bytes()
+
+
+def test_devices_and_pipes_are_not_replaced(tmp_path):
+    os.mkfifo(tmp_path / "pipe.png")
+    (tmp_path / "null.png").symlink_to("/dev/null")
+    for name in ("pipe.png", "null.png"):
+        with (
+            pytest.raises(OSError, match="it is a device or a pipe, name an ordinary file"),
+            write_atomically(tmp_path / name),
+        ):
+            raise AssertionError("the block must not begin")
+    assert not os.path.isfile("/dev/null")
+
+
+def test_a_link_that_leads_nowhere_is_said(tmp_path):
+    (tmp_path / "a.obj").symlink_to("nowhere.obj")
+    (tmp_path / "b.obj").symlink_to("b.obj")
+    for name in ("a.obj", "b.obj"):
+        with pytest.raises(FileFormatError, match="this is a link that leads to no file"):
+            read_loops(tmp_path / name)
+
+
+def test_names_in_messages_are_printable(tmp_path):
+    with pytest.raises(FileFormatError, match=r"a\\x1b\[31m\\n.obj: there is no such file$"):
+        read_loops(tmp_path / "a\x1b[31m\n.obj")

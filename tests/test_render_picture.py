@@ -308,3 +308,18 @@ def test_other_variants_draw_the_same_picture(variant: str) -> None:
     if variant == "llvm_ad_mono":
         ours, reference = ours[:1], reference @ np.array([[0.2126], [0.7152], [0.0722]])
     np.testing.assert_allclose(ours, reference, rtol=0.05)
+
+
+def test_views_look_alike_in_bands(monkeypatch: pytest.MonkeyPatch) -> None:
+    for show in ("normal", "depth", "evaluations", "status"):
+        whole = draw(show=show)
+        monkeypatch.setattr("harnack.rendering.views._RAYS_A_BAND", 7)
+        np.testing.assert_array_equal(draw(show=show), whole)
+        monkeypatch.undo()
+
+
+def test_tone_mapping_of_many_rows_is_that_of_each() -> None:
+    radiance = np.random.default_rng(0).uniform(0, 3, (150, 2, 3)).astype(np.float32)
+    whole = tone_mapped(radiance)
+    rows = [tone_mapped(radiance[k : k + 1]) for k in range(len(radiance))]
+    np.testing.assert_array_equal(whole, np.concatenate(rows))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import drjit as dr
 import numpy as np
@@ -554,3 +555,15 @@ def test_curves_far_from_the_origin_can_be_traced(name: str) -> None:
     both = one.hit & two.hit
     assert (two.t[both] - one.t[both] < 0.02).all()
     assert (one.hit & ~two.hit).sum() < 8  # within as much of the surface's border
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e30, 9e99])
+@pytest.mark.parametrize("level", [1.0, 2 * math.pi, 3.0])
+def test_extents_at_any_scale_are_found_without_warnings(scale: float, level: float) -> None:
+    x = shapes.wavy_polygon(12)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found, plain = (hk.SolidAngle(s * x).extent((level,)) for s in (scale, 1.0))
+    assert found is not None
+    assert plain is not None
+    np.testing.assert_allclose(np.array(found.bounds()) / scale, plain.bounds(), rtol=1e-6)

@@ -536,3 +536,25 @@ def test_a_damaged_file_is_read_or_refused_but_nothing_else(save, seed, edits, c
         data = data[:position] + bytes_ + data[position + len(bytes_) :]
     with contextlib.suppress(FileFormatError):
         assert read_surface(save(name, data[:cut]), as_).said
+
+
+EMPTY_FACES = (
+    b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
+    b"property float z\nelement face 30000000\nproperty list uchar int vertex_indices\nend_header\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("a.ply", EMPTY_FACES + b"\0" * 30_000_012),
+        ("a.obj", b"v 0 0 0\nf 1 1 1\nf 1 1 1 1\n" + b"x\n" * 1000),
+    ],
+)
+def test_files_of_many_irregular_elements_take_neither_all_memory_nor_minutes(
+    save, monkeypatch, name, content
+):
+    if name == "a.obj":
+        monkeypatch.setattr("harnack.geometry.file_format.MAX_ELEMENTS", 500)
+    with pytest.raises(FileFormatError, match=r"elements are too many .* let the program"):
+        read_surface(save(name, content))

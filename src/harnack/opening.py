@@ -75,12 +75,16 @@ def open_surface(
     """
     path = Path(path)
     if boundary and as_ not in (None, "loops"):
-        raise ValueError(f"--boundary takes faces as curves, which contradicts --as {as_}")
+        raise ValueError(f'boundary=True takes faces as curves, which contradicts as_="{as_}"')
+    if normals not in (None, "estimate"):
+        raise ValueError(f'normals must be "estimate" or None, not {normals!r}')
+    if up not in (None, *_UPRIGHT):
+        raise ValueError(f"up must be one of {', '.join(UP_AXES)} or None, not {up!r}")
     surface = _read(path, as_, boundary)
     if normals is not None and not isinstance(surface, Cloud):
         raise ValueError(
             f"{path}: normals are estimated for point clouds, and this is something else: "
-            f"{surface.said}; leave --normals out, or take its points with --as dipole"
+            f'{surface.said}; leave out normals="estimate", or take its points with as_="dipole"'
         )
     is_curve = isinstance(surface, Loops)
     axis, why = (up, "as asked") if up is not None else _usual_up(path, is_curve=is_curve)
@@ -99,7 +103,7 @@ def _usual_up(path: Path, *, is_curve: bool) -> tuple[Axis, str]:
         return "y", "the standard of the format"
     if kind in _Y_UP_BY_HABIT and not is_curve:
         return "y", "as in most .obj files"
-    return "z", "for want of a standard (--up turns it)"
+    return "z", "for want of a standard (up= turns it)"
 
 
 def _read(path: Path, as_: ReadAs | None, boundary: bool) -> Mesh | Cloud | Loops:
@@ -122,6 +126,6 @@ def _field(surface: Mesh | Cloud | Loops, normals: str | None, rotation: FloatAr
     if surface.normals is None:
         raise ValueError(
             f"{surface.said}. Its normals are missing, which say where outside is: add them to "
-            "the file, or let them be estimated with --normals estimate"
+            'the file, or let them be estimated with normals="estimate"'
         )
     return DipolePotential(points, surface.normals @ rotation.T, surface.areas)

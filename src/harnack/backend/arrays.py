@@ -252,7 +252,7 @@ def aligned(backend: Backend, values: npt.NDArray[Any]) -> Real:
         raise ValueError(f"expected a one-dimensional array, got shape {values.shape}")
     if values.size == 0:
         return dr.zeros(backend.Float, 0)
-    mapped = backend.Float(np.array(values, order="C"))
+    mapped = backend.Float(np.array(_cast(backend, values, "an array"), order="C"))
     lane = dr.arange(backend.UInt32, values.size) ^ dr.opaque(backend.UInt32, 0)
     copy = dr.gather(backend.Float, mapped, lane)
     dr.eval(copy)

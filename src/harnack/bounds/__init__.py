@@ -9,6 +9,7 @@ from harnack.bounds.curvature import CurvatureStep
 from harnack.bounds.lipschitz import LipschitzStep
 from harnack.bounds.longest import Longest
 from harnack.bounds.slope import Slope
+from harnack.choices import did_you_mean
 
 __all__ = [
     "Bound",
@@ -43,5 +44,8 @@ def choose_bound(bound: str | Bound | Longest | None = None) -> Longest:
         return Longest((bound,))
     name = "curvature" if bound is None else bound
     if name not in _NAMED:
-        raise ValueError(f"unknown bound {bound!r}; choose one of {', '.join(sorted(_NAMED))}")
+        raise ValueError(
+            f"unknown bound {bound!r}; choose one of {', '.join(sorted(_NAMED))}"
+            f"{did_you_mean(bound, _NAMED)}"
+        )
     return Longest(_NAMED[name])

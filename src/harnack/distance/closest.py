@@ -31,6 +31,12 @@ _ASLANT = 10.0
 _SHORT = 10.0
 
 
+def _length(vectors: FloatArray) -> FloatArray:
+    """Lengths (n,) of vectors (n, 3), whose squares may overflow."""
+    x, y, z = vectors.T
+    return np.hypot(np.hypot(x, y), z)
+
+
 @dataclass(frozen=True)
 class Closest:
     """points: (n, 3), rounded to the precision in use. feet: (n, 3) the closest points found, NaN
@@ -43,11 +49,11 @@ class Closest:
     @property
     def distance(self) -> FloatArray:
         """(n,) |point - foot|."""
-        return np.linalg.norm(self.points - self.feet, axis=1)
+        return _length(self.points - self.feet)
 
     def or_nearer(self, feet: FloatArray) -> Closest:
         """Itself, or where they are nearer, other feet; NaN is never nearer."""
-        other = np.linalg.norm(self.points - feet, axis=1)
+        other = _length(self.points - feet)
         nearer = (other < self.distance) | (np.isnan(self.distance) & ~np.isnan(other))
         return Closest(self.points, np.where(nearer[:, None], feet, self.feet), self.above)
 
@@ -120,10 +126,11 @@ def _ways(away: FloatArray) -> tuple[FloatArray, ...]:
     """Vectors (n, 3) and four at right angles to each of them, of the same length."""
     away = np.where(np.isfinite(away).all(axis=1, keepdims=True), away, 0.0)
     flattest = np.eye(3)[np.abs(away).argmin(axis=1)]
-    u = np.cross(away, flattest)
-    length = np.linalg.norm(away, axis=1, keepdims=True)
-    u *= length / np.maximum(np.linalg.norm(u, axis=1, keepdims=True), 1e-300)
-    v = np.cross(away / np.maximum(length, 1e-300), u)
+    length = _length(away)[:, None]
+    unit = away / np.maximum(length, 1e-300)
+    u = np.cross(unit, flattest)
+    u *= length / np.maximum(_length(u)[:, None], 1e-300)
+    v = np.cross(unit, u)
     return away, u, -u, v, -v
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from harnack.backend import choose_backend
 from harnack.certify import Levels
+from harnack.choices import did_you_mean
 from harnack.distance.batches import FloatArray, in_batches
 from harnack.distance.closest import Closest, find_closest, find_on_sheets
 from harnack.distance.estimates import first_order, second_order
@@ -65,7 +66,8 @@ def signed_distance(
     """
     if method not in get_args(Method):
         known = ", ".join(f'"{one}"' for one in get_args(Method))
-        raise ValueError(f"unknown method {method!r}; choose one of {known}")
+        hint = did_you_mean(method, get_args(Method))
+        raise ValueError(f"unknown method {method!r}; choose one of {known}{hint}")
     backend = choose_backend(precision)
     surface = _surface(field, level)
     levels = _levels(backend, surface)

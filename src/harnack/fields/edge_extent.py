@@ -65,8 +65,11 @@ def _empty(
     length = np.linalg.norm(e, axis=1)
     foot = np.clip(-(a * e).sum(axis=2) / (length * length), 0, 1)
     distance = np.linalg.norm(a + foot[..., None] * e, axis=2)
-    clear = distance.min(axis=1) > h * 1.001
-    apart = np.maximum(distance - h, 1e-300)
+    near = ~(distance > h * 1.001)
+    clear = ~near.any(axis=1)
+    # Where an edge is near, the cell is kept whatever its variation: any distance will do.
+    distance: FloatArray = np.where(near, 2.0 * h + length, distance)
+    apart = distance - h
     half = 0.5 * length
     variation = 2 * (np.arcsinh(half / apart) - np.arcsinh(half / distance)).sum(axis=1)
     variation = variation * (1 + 1e-9) + 1e-9

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import backend_of, to_numpy
+from harnack.choices import did_you_mean
 from harnack.fields.edge_angles import differentiable_angle
 from harnack.fields.edge_extent import tight_extent
 from harnack.fields.edge_hessian import hessian_over_edges
@@ -106,7 +107,11 @@ class SolidAngle(Field):
                 'of its convex hull, and this is not one; use certificate="auto"'
             )
         if asked not in ("edges", "convex", "paper"):
-            raise ValueError(f"unknown certificate {asked!r}; use auto, edges, convex or paper")
+            names = ("auto", "edges", "convex", "paper")
+            raise ValueError(
+                f"unknown certificate {asked!r}; use auto, edges, convex or paper"
+                f"{did_you_mean(asked, names)}"
+            )
         return "edges" if asked == "edges" else "range"
 
     def prepare(self, backend: Backend) -> SolidAngle:

@@ -10,6 +10,8 @@ from harnack.geometry.convex_volume import FloatArray
 
 MAX_BYTES = 1 << 28
 MAX_LINE = 1 << 24
+# Of files that are read element by element, which takes some 200 bytes and 3 microseconds each.
+MAX_ELEMENTS = 10_000_000
 
 
 class FileFormatError(ValueError):
@@ -24,7 +26,9 @@ class Place:
     where: str = ""
 
     def __str__(self) -> str:
-        return f"{self.path}, {self.where}" if self.where else str(self.path)
+        # A name may hold line ends and other characters that a terminal would obey.
+        name = "".join(c if c.isprintable() else repr(c)[1:-1] for c in str(self.path))
+        return f"{name}, {self.where}" if self.where else name
 
     def error(self, message: str) -> FileFormatError:
         """An error about this place."""
@@ -62,6 +66,8 @@ def read_bytes(path: Path) -> bytes:
     place = Place(path)
     try:
         if not path.exists():
+            if path.is_symlink():
+                raise place.error("this is a link that leads to no file")
             raise place.error("there is no such file")
         if path.is_dir():
             raise place.error("this is a directory, not a file")
@@ -78,6 +84,15 @@ def read_bytes(path: Path) -> bytes:
     if not data.strip():
         raise place.error("the file is empty")
     return data
+
+
+def check_element_count(place: Place, count: int) -> None:
+    """Raise FileFormatError for more than MAX_ELEMENTS vertices, faces and lines."""
+    if count > MAX_ELEMENTS:
+        raise place.error(
+            f"{count:,} elements are too many in a file whose faces differ in size: at most "
+            f"{MAX_ELEMENTS:,} are read; let the program that made it triangulate them"
+        )
 
 
 def text_lines(path: Path, data: bytes, *, first: int = 1) -> list[bytes]:

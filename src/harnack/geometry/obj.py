@@ -13,6 +13,7 @@ from harnack.geometry.file_format import (
     Place,
     as_integer,
     as_number,
+    check_element_count,
     excerpt,
     text_lines,
 )
@@ -29,12 +30,15 @@ def read_obj(path: Path, data: bytes) -> Contents:
     """
     vertices: list[tuple[float, float, float]] = []
     elements: dict[bytes, list[Element]] = {b"f": [], b"l": []}
+    count = 0
     for number, line in _statements(text_lines(path, data)):
         words = line.split(b"#", 1)[0].split()
         if not words:
             continue
         keyword, rest = words[0], words[1:]
         place = Place(path, f"line {number}")
+        count += 1
+        check_element_count(place, count)
         if keyword == b"v":
             vertices.append(_vertex(rest, place))
         elif keyword in elements:

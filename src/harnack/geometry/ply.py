@@ -11,7 +11,14 @@ from typing import Any
 import numpy as np
 
 from harnack.geometry.convex_volume import FloatArray
-from harnack.geometry.file_format import Contents, Element, Place, excerpt, text_lines
+from harnack.geometry.file_format import (
+    Contents,
+    Element,
+    Place,
+    check_element_count,
+    excerpt,
+    text_lines,
+)
 
 # PLY name of a type -> its code in `struct`
 _CODES = {
@@ -61,6 +68,7 @@ def read_ply(path: Path, data: bytes) -> Contents:
         FileFormatError: a malformed header, fewer data than it declares, an index out of range.
     """
     header = read_header(path, data)
+    check_element_count(Place(path), _promised(header, len(data)))
     body = data[header.size :]
     rows = _binary_rows(path, body, header) if header.byte_order else _text_rows(path, body, header)
     vertices: list[tuple[float, float, float]] = []
@@ -79,6 +87,11 @@ def read_ply(path: Path, data: bytes) -> Contents:
     points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
     _check(path, points, elements)
     return Contents(path, points, tuple(elements["face"]), tuple(elements["edge"]))
+
+
+def _promised(header: Header, size: int) -> int:
+    """How many rows a header declares, of those that a file of this size has room for."""
+    return sum(min(section.count, size) for section in header.sections)
 
 
 def _indices(name: str, row: Row, place: Place) -> tuple[int, ...]:

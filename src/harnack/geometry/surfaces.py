@@ -10,6 +10,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
+from harnack.choices import did_you_mean
 from harnack.geometry.clouds import CloudError, checked_normals, checked_points
 from harnack.geometry.convex_volume import FloatArray
 from harnack.geometry.curves import CurveError, validate_loops
@@ -87,7 +88,10 @@ def read_surface(path: str | os.PathLike[str], as_: ReadAs | None = None) -> Mes
     path = Path(path)
     kind = path.suffix.lower()
     if as_ not in (None, "winding", "dipole", "loops"):
-        raise ValueError(f'as_ must be "winding", "dipole", "loops" or None, not {as_!r}')
+        raise ValueError(
+            f'as_ must be "winding", "dipole", "loops" or None, not {as_!r}'
+            + did_you_mean(as_, ("winding", "dipole", "loops"))
+        )
     if kind not in SURFACE_FILES:
         raise FileFormatError(f"{path}: surfaces are read from {', '.join(SURFACE_FILES)} files")
     # Wild numbers overflow on the way to the check that refuses them.

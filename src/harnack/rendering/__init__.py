@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from harnack.rendering.arguments import SHOW_MODES
 from harnack.rendering.carrier import shape
+from harnack.rendering.extent import UnboundedSurfaceError
 from harnack.rendering.materials import MATERIALS, Material
-from harnack.rendering.picture import SHOW_MODES, render
+from harnack.rendering.picture import render
 from harnack.rendering.plugins import register, register_surfaces
 from harnack.rendering.studio import Camera
 
@@ -13,6 +15,7 @@ __all__ = [
     "SHOW_MODES",
     "Camera",
     "Material",
+    "UnboundedSurfaceError",
     "register",
     "register_surfaces",
     "render",

@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from harnack.rendering.extent import box_of
 from harnack.rendering.placement import PlacedSurface, Placement
+from harnack.rendering.scene_files import load_dictionary
 from harnack.rendering.variant import load_mitsuba, mitsuba_backend
 from harnack.tracer import LevelSet, level_set
 
@@ -86,7 +88,9 @@ def as_bsdf(mi: Any, bsdf: Any) -> Any:
     """A BSDF object, from one, its dictionary, or None."""
     if bsdf is None:
         bsdf = {"type": "twosided", "nested": {"type": "diffuse"}}
-    made: Any = mi.load_dict({**bsdf}, parallel=False) if isinstance(bsdf, Mapping) else bsdf
+    made: Any = bsdf
+    if isinstance(bsdf, Mapping):
+        made = load_dictionary(mi, cast("Mapping[str, Any]", bsdf))
     if not isinstance(made, mi.BSDF):
         raise TypeError(f"bsdf must be a BSDF or its dictionary, not {type(made).__name__}")
     return made
@@ -108,18 +112,13 @@ def _carrier_class(variant: str) -> Any:
         """A mesh that no ray meets, with the surface that it stands for."""
 
         def __init__(self, props: Any, surface: LevelSet, placement: Placement) -> None:
-            volume = surface.volume
-            if volume is None or not np.isfinite(np.array(volume.bounds())).all():
-                raise ValueError(
-                    "the surface reaches to infinity: give it a clip, "
-                    "such as clip=harnack.Ball((0, 0, 0), 1)"
-                )
+            ends = box_of(surface)
             mi.Mesh.__init__(self, PLUGIN, 2, 2, props=props)
             self.surface = surface
             self.placement = placement
             self.placed = PlacedSurface.of(surface, placement, mitsuba_backend(mi))
             params = mi.traverse(self)
-            corners = np.concatenate(placement.world_bounds(volume))
+            corners = np.concatenate(placement.world_bounds(ends))
             params["vertex_positions"] = mi.Float(corners.astype(np.float32))
             params["faces"] = mi.UInt32([0, 0, 0, 1, 1, 1])
             params.update()

@@ -24,14 +24,14 @@ def exr_bytes(image: npt.NDArray[np.floating[Any]]) -> bytes:
     Source: "The OpenEXR File Layout", openexr.com, and the ZIP coding of the reference library.
     """
     names = {2: ("Y",), 3: ("R", "G", "B")}[image.ndim]
-    planes = image.astype("<f4").reshape(*image.shape[:2], len(names))
-    height, width, _ = planes.shape
+    height, width = image.shape[:2]
     order = sorted(range(len(names)), key=lambda k: names[k])
-    lines = np.ascontiguousarray(planes[:, :, order].transpose(0, 2, 1)).reshape(height, -1)
     header = _header([names[k] for k in order], width, height)
-    starts = range(0, height, _LINES_A_BLOCK)
-    blocks = [_compressed(lines[y : y + _LINES_A_BLOCK].tobytes()) for y in starts]
-    chunks = [struct.pack("<ii", y, len(b)) + b for y, b in zip(starts, blocks, strict=True)]
+    chunks: list[bytes] = []
+    for y in range(0, height, _LINES_A_BLOCK):  # one at a time: pictures may be large
+        planes = image[y : y + _LINES_A_BLOCK].astype("<f4").reshape(-1, width, len(names))
+        block = _compressed(planes[:, :, order].transpose(0, 2, 1).tobytes())
+        chunks.append(struct.pack("<ii", y, len(block)) + block)
     sizes = [len(chunk) for chunk in chunks]
     first = len(header) + 8 * len(chunks)
     offsets = first + np.concatenate([[0], np.cumsum(sizes[:-1])])

@@ -13,6 +13,7 @@ import numpy as np
 
 from harnack.backend import to_float, to_numpy, to_vector3
 from harnack.geometry.convex_volume import FloatArray
+from harnack.rendering.extent import box_of
 from harnack.rendering.placement import PlacedSurface, Placement
 from harnack.tracer import Tolerance
 
@@ -22,26 +23,29 @@ if TYPE_CHECKING:
 
 # Rays a side of the grid on each of the six faces of the box.
 _GRID = 48
+# Squares of lengths, divided by tolerances, stay far from the ends of single precision.
+_SMALLEST, _LARGEST = 1e-15, 1e16
 
 
 def visible_points(surface: LevelSet, backend: Backend) -> FloatArray:
     """Points (n, 3) of the surface, as seen from the six sides of the box it lies in.
 
     Raises:
-        ValueError: it has no bounds; nothing is found of it.
+        ValueError: it has no bounds, or a size that single precision cannot draw; nothing is
+            found of it.
     """
-    volume = surface.volume
-    ends = None if volume is None else np.array(volume.bounds())
-    if ends is None or not np.isfinite(ends).all():
+    ends = box_of(surface)
+    if 0.0 < (ends[1] - ends[0]).max() < _SMALLEST or np.abs(ends).max() > _LARGEST:
         raise ValueError(
-            "the surface reaches to infinity: give it a clip, "
-            "such as clip=harnack.Ball((0, 0, 0), 1)"
+            f"the surface lies in a box from {_point(ends[0])} to {_point(ends[1])}: pictures are "
+            f"computed in single precision, for sizes from {_SMALLEST:g} and coordinates up to "
+            f"{_LARGEST:g}; choose units nearer to 1"
         )
     points = _probe(surface, backend, *ends)
     if len(points) == 0:
         raise ValueError(
             "nothing is to be seen of this surface: no ray of a grid on the sides of its box "
-            f"{ends[0].round(3).tolist()} to {ends[1].round(3).tolist()} meets it; "
+            f"{_point(ends[0])} to {_point(ends[1])} meets it; "
             "try another level or clip"
         )
     # Once more, as closely as the surface fills.
@@ -50,6 +54,10 @@ def visible_points(surface: LevelSet, backend: Backend) -> FloatArray:
     upper = np.minimum(points.max(axis=0) + margin, ends[1])
     closer = _probe(surface, backend, lower, upper)
     return np.concatenate([points, closer])
+
+
+def _point(corner: FloatArray) -> str:
+    return "(" + ", ".join(f"{c:.4g}" for c in corner) + ")"
 
 
 def _probe(surface: LevelSet, backend: Backend, lower: FloatArray, upper: FloatArray) -> FloatArray:

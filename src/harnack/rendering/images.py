@@ -4,37 +4,50 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 
-from harnack.geometry.files import write_atomically
+from harnack.geometry.files import check_writable, write_atomically
 from harnack.rendering.exr import exr_bytes
 
 FloatImage = npt.NDArray[np.float32]
 
 # Radiances up to here are shown as they are; brighter ones approach white smoothly.
 _SHOULDER = 0.8
+_ROWS_AT_ONCE = 64
 
 
-def check_picture_path(path: str | os.PathLike[str]) -> Path:
+def check_picture_path(path: Any) -> Path:
     """The path of a picture to write.
 
     Raises:
+        TypeError: it is no path.
         ValueError: its extension is neither .png nor .exr.
-        FileNotFoundError: its folder does not exist.
+        OSError: no file can be created there, as `write_atomically` says.
     """
-    path = Path(path)
+    if not isinstance(path, str | os.PathLike):
+        raise TypeError(f"path must name a picture to write, such as 'a.png', not {path!r}")
+    if path == "":
+        raise ValueError("the name of the picture to write is empty: give one, such as a.png")
+    path = Path(cast("str | os.PathLike[str]", path))
     if path.suffix.lower() not in (".png", ".exr"):
         raise ValueError(f"{path}: pictures are written as .png or .exr")
-    if not path.resolve().parent.is_dir():
-        raise FileNotFoundError(f"cannot write {path}: create the folder {path.parent} first")
+    check_writable(path)
     return path
 
 
 def tone_mapped(radiance: FloatImage) -> npt.NDArray[np.uint8]:
     """Linear sRGB radiance as 8-bit sRGB: a smooth shoulder, then the transfer function."""
+    shown = np.empty(radiance.shape, dtype=np.uint8)
+    for start in range(0, len(radiance), _ROWS_AT_ONCE):  # float64 is many times the picture
+        rows = slice(start, start + _ROWS_AT_ONCE)
+        shown[rows] = _tone_mapped(radiance[rows])
+    return shown
+
+
+def _tone_mapped(radiance: FloatImage) -> npt.NDArray[np.uint8]:
     x = np.clip(np.nan_to_num(radiance, nan=0.0, posinf=1e6), 0.0, None).astype(np.float64)
     room = 1.0 - _SHOULDER
     x = np.where(x <= _SHOULDER, x, 1.0 - room * np.exp(-(x - _SHOULDER) / room))
@@ -52,4 +65,7 @@ def write_image(mi: Any, path: Path, image: npt.NDArray[Any]) -> None:
         if path.suffix.lower() == ".exr":
             partial.write_bytes(exr_bytes(image))
         else:
-            mi.Bitmap(np.ascontiguousarray(image)).write(str(partial))
+            # Through memory: Mitsuba's own files do not say why they cannot be written.
+            packed = mi.MemoryStream()
+            mi.Bitmap(np.ascontiguousarray(image)).write(packed, mi.Bitmap.FileFormat.PNG)
+            partial.write_bytes(packed.raw_buffer())

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from harnack.choices import did_you_mean
 from harnack.geometry.convex_volume import FloatArray
 
 # Radiances of the environment, linear sRGB: at the horizon, overhead, and of a soft strip of
@@ -30,7 +31,10 @@ def ground(mi: Any, backdrop: str) -> dict[str, Any]:
         ValueError: unknown backdrop.
     """
     if backdrop not in _BACKDROPS:
-        raise ValueError(f"backdrop must be one of {', '.join(_BACKDROPS)}, not {backdrop!r}")
+        raise ValueError(
+            f"backdrop must be one of {', '.join(_BACKDROPS)}, not {backdrop!r}"
+            f"{did_you_mean(backdrop, _BACKDROPS)}"
+        )
     floor = mi.ScalarTransform4f().translate([0, 0, FLOOR]).scale(100)
     colour = {"type": "rgb", "value": list(_BACKDROPS[backdrop])}
     return {

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
+
+from harnack.choices import did_you_mean
 
 Dictionary = dict[str, Any]
 Colour = tuple[float, float, float]
@@ -81,10 +83,11 @@ MATERIALS: Mapping[str, Material] = {
 """Materials by name."""
 
 
-def material_of(wanted: str | Material | Mapping[str, Any] | None) -> Material:
+def material_of(wanted: Any) -> Material:
     """A material from its name, or from a BSDF dictionary used as it stands.
 
     Raises:
+        TypeError: it is none of these.
         ValueError: there is no material of that name.
     """
     if wanted is None:
@@ -92,7 +95,15 @@ def material_of(wanted: str | Material | Mapping[str, Any] | None) -> Material:
     if isinstance(wanted, Material):
         return wanted
     if isinstance(wanted, Mapping):
-        return Material(dict(wanted), two_sided=False)
+        return Material(dict(cast("Mapping[str, Any]", wanted)), two_sided=False)
+    if not isinstance(wanted, str):
+        raise TypeError(
+            f"a material is a name, a Material or a BSDF dictionary, not {wanted!r}; there are "
+            f"{', '.join(MATERIALS)}"
+        )
     if wanted not in MATERIALS:
-        raise ValueError(f"unknown material {wanted!r}; there are {', '.join(MATERIALS)}")
+        raise ValueError(
+            f"unknown material {wanted!r}; there are {', '.join(MATERIALS)}"
+            f"{did_you_mean(wanted, MATERIALS)}"
+        )
     return MATERIALS[wanted]

@@ -6,7 +6,7 @@ import os
 import warnings
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -20,21 +20,31 @@ from rich.progress import (
 )
 
 from harnack.fields import Field
+from harnack.rendering.arguments import (
+    Request,
+    check_memory,
+    check_settings,
+    check_spp,
+    checked_request,
+    refuse_studio_settings,
+)
 from harnack.rendering.exposure import expose
 from harnack.rendering.images import check_picture_path, tone_mapped, write_image
 from harnack.rendering.integrator import PathTracer
 from harnack.rendering.materials import Material, material_of
 from harnack.rendering.plugins import register
+from harnack.rendering.scene_files import load_dictionary, load_scene_file
 from harnack.rendering.shaded import shaded
 from harnack.rendering.studio import Camera, Exhibit, stratified, studio
 from harnack.rendering.views import VIEWS, look
 from harnack.tracer import LevelSet, level_set
 
 ShowMode = Literal["color", "shaded", "normal", "evaluations", "status", "depth"]
-SHOW_MODES: tuple[str, ...] = ("color", "shaded", *VIEWS)
 # Modes with ground and lights, and what they send out.
 _LIT = {"color": "light paths", "shaded": "rays"}
 _EDGE_SPP = 9
+_OF_STUDIO = ("material", "camera", "backdrop")
+_OWN = ("show", "size", "spp", *_OF_STUDIO, "max_depth", "seed", "progress")
 Image = npt.NDArray[Any]
 Advance = Callable[[float], None]
 MaterialLike = str | Material | Mapping[str, Any]
@@ -86,53 +96,52 @@ def render(
 
     A ray that runs out of steps is drawn magenta, and a warning says how many there were.
 
-    Raises ValueError before anything is drawn for an unknown file type, mode or material,
-    settings that make no surface, or a surface without bounds.
+    Raises ValueError or TypeError before anything is drawn for an unknown setting, file type,
+    mode or material, settings that make no surface, a surface without bounds, or a picture that
+    does not fit into memory; OSError where the picture cannot be written.
     """
     target = None if path is None else check_picture_path(path)
-    _check(show, size, spp)
+    asked = checked_request(
+        show=show, size=size, spp=spp, max_depth=max_depth, seed=seed, camera=camera
+    )
     mi = register()
     in_studio = isinstance(what, Field | LevelSet | list | tuple)
     if in_studio:
-        made = studio(
-            mi, _exhibits(what, material, settings), size=size or (800, 600),
-            camera=camera or Camera(), backdrop=backdrop or "light", bare=show not in _LIT,
-        )  # fmt: skip
-        scene, unit = mi.load_dict(made.scene, parallel=False), made.unit
+        scene, unit = _staged(mi, what, asked, material, backdrop or "light", settings)
     else:
-        _refuse({"material": material, "camera": camera, "backdrop": backdrop, **settings})
-        scene, unit = _loaded(mi, what, size), 1.0
+        of_studio = dict(zip(_OF_STUDIO, (material, camera, backdrop), strict=True))
+        refuse_studio_settings({**of_studio, **settings})
+        scene, unit = _loaded(mi, what, asked.size), 1.0
+        check_memory(asked.show, *map(int, scene.sensors()[0].film().crop_size()))
     if show in VIEWS:
         view = look(mi, scene, scene.sensors()[0], unit)
         image, drawn = VIEWS[show].numbers(view), VIEWS[show].picture(view)
     else:
         with _bar(progress) as advance:
             if show == "shaded":
-                image, lost = _shaded(mi, scene, spp, in_studio, advance)
+                image, lost = _shaded(mi, scene, asked.spp, in_studio, advance)
             else:
-                image, lost = _radiance(mi, scene, spp, in_studio, max_depth, seed, advance)
+                image, lost = _radiance(mi, scene, asked, in_studio, advance)
         _warn_of(lost, _LIT[show])
         drawn = tone_mapped(image)
     if target is not None:
         exact = target.suffix.lower() == ".exr"
-        write_image(mi, target, image.astype(np.float32) if exact else drawn)
+        write_image(mi, target, image.astype(np.float32, copy=False) if exact else drawn)
     return image
 
 
-def _check(show: str, size: tuple[int, int] | None, spp: int | None) -> None:
-    if show not in SHOW_MODES:
-        raise ValueError(f"show must be one of {', '.join(SHOW_MODES)}, not {show!r}")
-    if size is not None and (len(size) != 2 or min(size) < 1):
-        raise ValueError(f"size must be (width, height) in pixels, not {size}")
-    if spp is not None and spp < 1:
-        raise ValueError(f"spp must be at least 1, not {spp}")
-
-
-def _refuse(given: Mapping[str, Any]) -> None:
-    """Settings of the studio make no sense for a scene that has everything already."""
-    wrong = [name for name, value in given.items() if value is not None]
-    if wrong:
-        raise ValueError(f"{', '.join(wrong)}: a Mitsuba scene is drawn as it is")
+def _staged(
+    mi: Any, what: Any, asked: Request, material: Any, backdrop: str, settings: Mapping[str, Any]
+) -> tuple[Any, float]:
+    """The scene of fields and level sets in the studio, and the length in it of their unit."""
+    check_settings(settings, _OWN)
+    size = asked.size or (800, 600)
+    check_memory(asked.show, *size)
+    made = studio(
+        mi, _exhibits(what, material, settings), size=size, camera=asked.camera,
+        backdrop=backdrop, bare=asked.show not in _LIT,
+    )  # fmt: skip
+    return mi.load_dict(made.scene, parallel=False), made.unit
 
 
 def _exhibits(what: Any, materials: Any, settings: Mapping[str, Any]) -> list[Exhibit]:
@@ -145,9 +154,8 @@ def _exhibits(what: Any, materials: Any, settings: Mapping[str, Any]) -> list[Ex
     listed: bool = isinstance(materials, list | tuple)
     names: list[Any] = [*materials] if listed else [materials] * len(given)
     if len(names) != len(given):
-        raise ValueError(
-            f"give one material or {len(given)}, one for each surface, not {len(names)}"
-        )
+        several = f" or {len(given)}, one for each surface" if len(given) > 1 else ""
+        raise ValueError(f"give one material{several}, not {len(names)}")
     fitted = "tolerance" not in settings
     return [
         Exhibit(_surface(one, settings), material_of(name), fitted and isinstance(one, Field))
@@ -175,9 +183,9 @@ def _loaded(mi: Any, what: Any, size: tuple[int, int] | None) -> Any:
             raise ValueError("size: a loaded scene has its own; set film.size of its sensor")
         scene = what
     elif isinstance(what, Mapping):
-        scene = mi.load_dict({**what}, parallel=False)
+        scene = load_dictionary(mi, cast("Mapping[str, Any]", what))
     elif isinstance(what, str | os.PathLike):
-        scene = mi.load_file(os.fspath(what), parallel=False)
+        scene = load_scene_file(mi, cast("str | os.PathLike[str]", what))
     else:
         raise TypeError(
             "draw a field, a LevelSet, a list of them, or a Mitsuba scene, its dictionary or the "
@@ -207,19 +215,15 @@ def _warn_of(lost: int, what: str) -> None:
 
 
 def _radiance(
-    mi: Any,
-    scene: Any,
-    spp: int | None,
-    in_studio: bool,
-    max_depth: int | None,
-    seed: int,
-    advance: Advance,
+    mi: Any, scene: Any, asked: Request, in_studio: bool, advance: Advance
 ) -> tuple[Image, int]:
     sensor = scene.sensors()[0]
-    tracer = _tracer(mi, scene, max_depth)
-    spp = spp or int(sensor.sampler().sample_count())
+    tracer = _tracer(mi, scene, asked.max_depth)
+    spp = asked.spp or check_spp(
+        int(sensor.sampler().sample_count()), source=", which the scene's sampler asks for"
+    )
     spp = stratified(spp) if in_studio else spp
-    return expose(mi, scene, sensor, tracer, spp=spp, seed=seed, advance=advance)
+    return expose(mi, scene, sensor, tracer, spp=spp, seed=asked.seed, advance=advance)
 
 
 def _shaded(

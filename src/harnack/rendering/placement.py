@@ -16,7 +16,6 @@ from harnack.rendering.solid import Solid
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.geometry import Volume
     from harnack.tracer import LevelSet, PreparedLevelSet
 
 
@@ -71,11 +70,9 @@ class Placement:
         turned: FloatArray = np.matmul(local, np.transpose(self.rotation))
         return self.scale * turned + self.translation
 
-    def world_bounds(self, volume: Volume) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corner, (3,) each, of a box in the world that holds a volume's."""
-        lower, upper = volume.bounds()
-        ends = [[float(a), float(b)] for a, b in zip(lower, upper, strict=True)]
-        corners = self.apply(list(itertools.product(*ends)))
+    def world_bounds(self, ends: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper corner, (3,) each, of a box in the world that holds a box (2, 3)."""
+        corners = self.apply(list(itertools.product(*ends.T.tolist())))
         return corners.min(axis=0), corners.max(axis=0)
 
 

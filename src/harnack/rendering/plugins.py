@@ -20,6 +20,7 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from harnack.choices import did_you_mean
 from harnack.fields import Gyroid, SchwarzD, SchwarzP, SolidAngle, SphericalHarmonic
 from harnack.geometry import Ball, Box, Intersection, read_loops
 from harnack.rendering import carrier, integrator
@@ -85,8 +86,9 @@ def _field(props: Any) -> Field:
         return _PERIODIC[name](props.get("cell", 2 * math.pi), domain=_clip(props))
     if name == "spherical_harmonic":
         return SphericalHarmonic(props["l"], props["m"])
+    known = (*_PERIODIC, "spherical_harmonic")
     raise ValueError(
-        f"unknown field {name!r}: there are {', '.join(_PERIODIC)}, spherical_harmonic"
+        f"unknown field {name!r}; there are {', '.join(known)}{did_you_mean(name, known)}"
     )
 
 

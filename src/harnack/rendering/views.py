@@ -17,12 +17,14 @@ from harnack.backend import to_numpy
 from harnack.rendering.colormap import viridis
 from harnack.rendering.images import as_bytes
 from harnack.rendering.integrator import LOST_COLOUR
-from harnack.rendering.pixels import film_places
+from harnack.rendering.pixels import bands, film_places
 from harnack.rendering.world import World
 from harnack.tracer import Status
 
 FloatArray = npt.NDArray[np.floating[Any]]
 
+# Ctrl-C works between bands.
+_RAYS_A_BAND = 2**20
 _BACKGROUND = (0.10, 0.10, 0.11)
 _STATUS_COLOURS = {
     Status.MISS: _BACKGROUND,
@@ -51,28 +53,37 @@ class View:
 def look(mi: Any, scene: Any, sensor: Any, unit: float = 1.0) -> View:
     """What a sensor sees first. unit: of depths, in lengths of the scene."""
     width, height = (int(n) for n in sensor.film().crop_size())
-    ray = _middle_rays(mi, sensor, width, height)
-    _, first = World.of(mi, scene).intersect(ray, dr.zeros(mi.SurfaceInteraction3f), mi.Bool(True))
+    world = World.of(mi, scene)
+    parts = [
+        _look_at_band(mi, world, sensor, start, stop)
+        for start, stop in bands(width * height, _RAYS_A_BAND)
+    ]
+    depth, normal, evaluations, status = (
+        np.concatenate(column).reshape(height, width, *column[0].shape[1:])
+        for column in zip(*parts, strict=True)
+    )
+    return View(depth / unit, normal, evaluations, status)
+
+
+def _look_at_band(mi: Any, world: World, sensor: Any, start: int, stop: int) -> tuple[Any, ...]:
+    """Depth, normal, evaluations and status of pixels `start` to `stop`, counted by rows."""
+    size = tuple(int(n) for n in sensor.film().crop_size())
+    index = dr.arange(mi.UInt32, stop - start) + dr.opaque(mi.UInt32, start)
+    place = film_places(mi, index, mi.Vector2f(0.5), (size[0], size[1]))
+    ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, place, mi.Point2f(0.5))
+    none = dr.zeros(mi.SurfaceInteraction3f)
+    _, first = world.intersect(mi.Ray3f(ray), none, mi.Bool(True))
     dr.eval(first)
 
-    def image(values: Any) -> Any:
+    def numbers(values: Any) -> Any:
         flat = to_numpy(values)
-        return np.broadcast_to(flat, (width * height, *flat.shape[1:])).reshape(
-            height, width, *flat.shape[1:]
-        )
+        return np.broadcast_to(flat, (stop - start, *flat.shape[1:]))
 
-    status = np.where(image(first.met), int(Status.HIT), int(Status.MISS))
-    status = np.where(image(first.lost), int(Status.OUT_OF_STEPS), status)
-    normal = np.where(image(first.met)[..., None], image(first.normal), 0)
-    evaluations = image(first.evaluations).astype(np.int64)
-    return View(image(first.t) / unit, normal, evaluations, status)
-
-
-def _middle_rays(mi: Any, sensor: Any, width: int, height: int) -> Any:
-    index = dr.arange(mi.UInt32, width * height)
-    place = film_places(mi, index, mi.Vector2f(0.5), (width, height))
-    ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, place, mi.Point2f(0.5))
-    return mi.Ray3f(ray)
+    met, lost = numbers(first.met), numbers(first.lost)
+    status = np.where(met, int(Status.HIT), int(Status.MISS))
+    status = np.where(lost, int(Status.OUT_OF_STEPS), status)
+    normal = np.where(met[:, None], numbers(first.normal), 0)
+    return numbers(first.t), normal, numbers(first.evaluations).astype(np.int64), status
 
 
 def normal_picture(view: View) -> npt.NDArray[np.uint8]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -44,18 +45,22 @@ class LevelSet:
     solid: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        if self.max_steps < 1:
+        if operator.index(self.max_steps) < 1:
             raise ValueError(f"max_steps must be at least 1, not {self.max_steps}")
-        if not 1 <= self.overstep < 2:
+        if not 1 <= _as_number(self.overstep, "overstep must be a number in [1, 2)") < 2:
             raise ValueError(f"overstep must lie in [1, 2), not {self.overstep}")
         if self.field.has_sheets and self.field.period is not None:
             raise ValueError("a field with sheets must be real-valued: its period must be None")
 
     @property
+    def numbers(self) -> tuple[float, ...]:
+        """The levels as Python numbers."""
+        return tuple(_number(level) for level in self.levels)
+
+    @property
     def volume(self) -> Volume | None:
         """What rays are clipped to: domain, proved extent and clip together; None for all space."""
-        numbers = tuple(_number(level) for level in self.levels)
-        parts = [self.field.domain, self.field.extent(numbers), self.clip]
+        parts = [self.field.domain, self.field.extent(self.numbers), self.clip]
         kept = list(dict.fromkeys(part for part in parts if part is not None))
         if not kept:
             return None
@@ -98,7 +103,7 @@ def level_set(
     if solid is not None:
         if level is not None:
             raise ValueError("give either level or solid: the ends of a solid are its levels")
-        low, high = solid
+        low, high = _ends(solid)
         if not low < high or not (math.isfinite(low) or math.isfinite(high)):
             raise ValueError(f"solid must be (low, high) with low < high, one finite, not {solid}")
         if field.period is not None:
@@ -109,23 +114,47 @@ def level_set(
                 "high may end at a sheet, with no level there; draw its level set without solid"
             )
         level = [end for end in (low, high) if math.isfinite(end)]
+    if clip is not None and not callable(getattr(clip, "bounds", None)):
+        raise TypeError(
+            "clip must be a volume, such as harnack.Ball((0, 0, 0), 1) or harnack.Box(lower, "
+            f"upper), not {clip!r}"
+        )
     asked = _as_levels(field.default_level if level is None else level)
     for one in asked:
         if not math.isfinite(_number(one)):
             raise ValueError(f"level must be finite, not {_number(one)}")
     field.check_levels(tuple(_number(one) for one in asked))
-    tolerance = tolerance if isinstance(tolerance, Tolerance) else Tolerance(float(tolerance))
+    if not isinstance(tolerance, Tolerance):
+        tolerance = Tolerance(_as_number(tolerance, "tolerance must be a length or a Tolerance"))
     overstep = field.overstep if overstep is None else overstep
     return LevelSet(field, asked, clip, tolerance, max_steps, choose_bound(bound), overstep, solid)
 
 
 def _as_levels(level: Any) -> tuple[Any, ...]:
-    if isinstance(level, Sequence):
+    if isinstance(level, Sequence) and not isinstance(level, str):
         if not level:
             raise ValueError("level: give at least one")
         return tuple(level)  # type: ignore[arg-type]
     return (level,)
 
 
+def _ends(solid: Any) -> tuple[float, float]:
+    wrong = "solid must be (low, high), two numbers"
+    try:
+        low, high = solid
+    except (TypeError, ValueError):
+        raise TypeError(f"{wrong}, not {solid!r}") from None
+    return _as_number(low, wrong), _as_number(high, wrong)
+
+
+def _as_number(number: Any, wrong: str) -> float:
+    try:
+        return float("nothing" if isinstance(number, str) else number)
+    except (TypeError, ValueError):
+        raise TypeError(f"{wrong}, not {number!r}") from None
+
+
 def _number(level: Any) -> float:
-    return float(dr.detach(level)[0]) if dr.is_array_v(type(level)) else float(level)
+    if dr.is_array_v(type(level)):
+        return float(dr.detach(level)[0])
+    return _as_number(level, "level must be a number, or several, such as 0.5 or 2 * math.pi")

@@ -1,0 +1,30 @@
+"""The command line: arguments to calls to files."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from harnack.cli.arguments import parse, parse_level, parse_size
+from harnack.cli.commands import COMMANDS
+from harnack.cli.interrupts import interrupts_noticed
+from harnack.cli.messages import error_line
+
+__all__ = ["main", "parse_level", "parse_size"]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; 0 on success, 1 for what went wrong, 2 for wrong usage, 130 for Ctrl-C."""
+    with interrupts_noticed() as interrupts:
+        try:
+            options = parse(arguments)
+            return COMMANDS[options.command](options)
+        except KeyboardInterrupt:
+            interrupts.asked = True
+        except (ValueError, TypeError, OSError, RuntimeError, MemoryError) as error:
+            # A Ctrl-C within a plug-in reaches us as an error of Mitsuba or Dr.Jit.
+            if not interrupts.asked:
+                print(error_line(error), file=sys.stderr)
+                return 1
+        print("stopped; nothing was written for the picture in progress", file=sys.stderr)
+        return 130

@@ -1,0 +1,202 @@
+"""What can be written behind `harnack`, and what is said of what cannot."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NoReturn
+
+from harnack._version import __version__
+from harnack.choices import did_you_mean
+from harnack.cli.messages import printable
+from harnack.geometry.surfaces import SURFACE_FILES
+from harnack.opening import UP_AXES
+from harnack.rendering import MATERIALS, SHOW_MODES
+from harnack.rendering.arguments import MAX_SIDE, MAX_SPP
+
+# Of what was typed, this much is repeated in messages.
+_SHOWN = 60
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line, and which option an unknown one may have meant."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{printable(f'{self.prog}: error: {message}')} (see {self.prog} --help)\n")
+
+    def options(self) -> list[str]:
+        """All options, as they are written."""
+        return [name for action in self._actions for name in action.option_strings]
+
+
+def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
+    """The arguments of a command, by default of this process; `command` is its name.
+
+    Ends the process with exit code 2 for wrong usage.
+    """
+    whole, commands = _parsers()
+    found, rest = whole.parse_known_args(arguments)
+    if rest:
+        command: _Parser = commands[found.command]
+        known = command.options()
+        if rest[0] in known:  # behind "--"
+            command.error(f"{_shown(rest[0])} is an option: write it before --")
+        what = "there is no option" if rest[0].startswith("-") else "there is no use for"
+        command.error(f"{what} {_shown(rest[0])}{did_you_mean(rest[0], known)}")
+    return found
+
+
+def _parsers() -> tuple[_Parser, dict[str, _Parser]]:
+    """The parser of the whole line, and those of what follows each command."""
+    whole = _Parser(
+        prog="harnack", description="Guaranteed ray tracing of harmonic and other surfaces."
+    )
+    whole.add_argument("--version", action="version", version=f"harnack {__version__}")
+    commands = whole.add_subparsers(required=True, metavar="COMMAND", dest="command")
+    _add_render(commands)
+    many = commands.add_parser("gallery", help="draw or list the named scenes")
+    many.add_argument("names", nargs="*", metavar="NAME", help="scenes to draw (all)")
+    many.add_argument("--list", action="store_true", help="list them and draw nothing")
+    many.add_argument("--demo", action="store_true", help="only those of `make demo`, small")
+    many.add_argument("-o", "--output", metavar="FOLDER", default="out", help="folder (out)")
+    _add_quality(many)
+    commands.add_parser("doctor", help="say what is installed, what works, what is missing")
+    return whole, commands.choices
+
+
+def _add_render(commands: Any) -> None:
+    one = commands.add_parser(
+        "render", help="draw one picture",
+        description="Draw a gallery scene, the surface of a file, or a Mitsuba scene (.xml). "
+        f"Surface files are {', '.join(SURFACE_FILES)}: meshes with any defects, point clouds, "
+        "and curves; what a file was taken for is printed.",
+    )  # fmt: skip
+    one.add_argument(
+        "scene", metavar="SCENE", help="a name from `harnack gallery --list`, or a file"
+    )
+    one.add_argument("-o", "--output", metavar="FILE", help="picture, .png or .exr (SCENE.png)")
+    one.add_argument(
+        "--level", type=parse_level,
+        help="level to draw (1/2 for meshes, 2pi for curves); pi is understood: 2pi, pi/2",
+    )  # fmt: skip
+    _add_choice(one, "--material", sorted(MATERIALS), "what it is made of")
+    _add_choice(
+        one, "--show", SHOW_MODES,
+        "what to draw: color follows light paths, shaded lights first hits by a formula, "
+        "without noise (shaded for meshes and clouds, else color)",
+    )  # fmt: skip
+    for name, what in (("azimuth", "is turned"), ("elevation", "looks down")):
+        one.add_argument(
+            f"--{name}", type=_angle, metavar="DEG", help=f"how far the camera {what}, in degrees"
+        )
+    file = one.add_argument_group("surface files")
+    _add_choice(
+        file, "--as", ("winding", "dipole", "loops"),
+        "take the file as a mesh, as points with normals (of a mesh: the centers of its "
+        "faces) or as curves (of a mesh: its boundary), whatever it looks like",
+        dest="as_",
+    )  # fmt: skip
+    file.add_argument(
+        "--boundary", action="store_true", help="take the boundary of a file's faces as the curves"
+    )
+    _add_choice(file, "--normals", ("estimate",), "estimate the normals of a point cloud")
+    _add_choice(
+        file, "--up", UP_AXES,
+        "the file's axis that points up (y for .glb, .gltf and surfaces in .obj, else z)",
+    )  # fmt: skip
+    _add_quality(one)
+
+
+def _add_quality(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--size", type=parse_size, metavar="WxH", help="pixels (800x600)")
+    parser.add_argument(
+        "--spp", type=_samples, metavar="N",
+        help="samples a pixel (64; 9 at edges of shaded pictures)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--seed", type=_seed, metavar="N", default=0, help="another seed, other noise (0)"
+    )
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def _add_choice(parser: Any, option: str, names: Iterable[str], help: str, **settings: Any) -> None:
+    known = tuple(names)
+    shown = "{" + ",".join(known) + "}"
+    parser.add_argument(option, type=_one_of(known), metavar=shown, help=help, **settings)
+
+
+def _one_of(known: Sequence[str]) -> Callable[[str], str]:
+    def chosen(text: str) -> str:
+        if text not in known:
+            raise argparse.ArgumentTypeError(
+                f"{_shown(text)} is none of {', '.join(known)}{did_you_mean(text, known)}"
+            )
+        return text
+
+    return chosen
+
+
+def _angle(text: str) -> float:
+    try:
+        angle = float(text)
+    except ValueError:
+        angle = math.nan
+    if not math.isfinite(angle):
+        raise argparse.ArgumentTypeError(
+            f"an angle is a finite number of degrees, not {_shown(text)}"
+        )
+    return angle
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """ "800x600" as (800, 600)."""
+    match = re.fullmatch(r"([0-9]{1,9})[xX]([0-9]{1,9})", text)
+    if not match:
+        raise argparse.ArgumentTypeError(f"{_shown(text)} is no size; write it as 800x600")
+    width, height = int(match[1]), int(match[2])
+    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
+        raise argparse.ArgumentTypeError(f"{text}: each side must be 1 to {MAX_SIDE} pixels")
+    return width, height
+
+
+def parse_level(text: str) -> float:
+    """A finite number, or a multiple of pi such as "2pi", "1.5*pi", "-pi/2"."""
+    match = re.fullmatch(
+        r"([+-]?[\d.]*(?:e[+-]?\d+)?)\s*\*?\s*(pi)?\s*(?:/\s*([\d.]+))?", text.strip()
+    )
+    try:
+        if not match:
+            raise ValueError
+        head, has_pi, below = match.groups()
+        if head in ("", "+", "-"):
+            if not has_pi:
+                raise ValueError
+            head += "1"
+        level = float(head) * (math.pi if has_pi else 1.0) / float(below or 1.0)
+        if not math.isfinite(level):
+            raise ValueError
+        return level
+    except (ValueError, ZeroDivisionError):
+        raise argparse.ArgumentTypeError(
+            f"{_shown(text)} is no level; write 0.5, 2pi or pi/3"
+        ) from None
+
+
+def _samples(text: str) -> int:
+    number = int(text) if re.fullmatch(r"[0-9]{1,9}", text) else 0
+    if not 1 <= number <= MAX_SPP:
+        raise argparse.ArgumentTypeError(f"{_shown(text)} must be a number from 1 to {MAX_SPP}")
+    return number
+
+
+def _seed(text: str) -> int:
+    if not re.fullmatch(r"[+-]?[0-9]{1,18}", text):
+        raise argparse.ArgumentTypeError(f"{_shown(text)} must be an integer of at most 18 digits")
+    return int(text)
+
+
+def _shown(text: str) -> str:
+    """What was typed, in quotes, its beginning if it is long."""
+    return repr(text if len(text) <= _SHOWN else text[:_SHOWN] + "...")

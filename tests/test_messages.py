@@ -1,0 +1,248 @@
+"""What users read when something they asked for is not there."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import harnack as hk
+from harnack.choices import did_you_mean
+from harnack.cli import main
+from harnack.cli.messages import error_line, level_text, printable
+from harnack.geometry import shapes
+from harnack.opening import open_surface
+from harnack.rendering import MATERIALS, UnboundedSurfaceError
+
+POLYGON = hk.SolidAngle(shapes.wavy_polygon(12))
+SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0.3\nv 0 1 0\nf 1 2 3 4\n"
+SMALL = ["--size", "8x8", "--show", "normal", "--quiet"]
+
+
+def draw(**settings: Any) -> Any:
+    return hk.render(POLYGON, **{"size": (8, 8), "spp": 1, "progress": False, **settings})
+
+
+# --- in Python -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("settings", "complaint"),
+    [
+        ({"camera": (3, 3, 3)}, r"Camera, not a tuple .*Camera\(azimuth=45, elevation=35.26\)"),
+        ({"camera": "top"}, r"camera must be a harnack.rendering.Camera.*Camera\(azimuth=-50"),
+        ({"background": "dark"}, r"no setting 'background'.*; did you mean \"backdrop\"\?$"),
+        ({"levle": 3.0}, r"no setting 'levle'; there are show, .*; did you mean \"level\"\?$"),
+        ({"colour": "red"}, r"no setting 'colour'; there are .* material, .* solid$"),
+        ({"clip": (0, 0, 0)}, r"clip must be a volume, such as harnack.Ball"),
+        ({"level": "2pi"}, r"level must be a number, .* not '2pi'"),
+        ({"level": [1.0, "a"]}, r"level must be a number, .* not 'a'"),
+        ({"solid": 3}, r"solid must be \(low, high\), two numbers, not 3"),
+        ({"tolerance": "x"}, r"tolerance must be a length or a Tolerance, not 'x'"),
+        ({"material": 5}, r"a material is a name, .* not 5; there are two-tone"),
+        ({"size": 5}, r"size must be \(width, height\) in pixels, .* not 5"),
+        ({"size": (3.5, 2)}, r"size must be .* not \(3.5, 2\)"),
+        ({"size": "800x600"}, r"size must be .* not '800x600'"),
+        ({"spp": 2.5}, "spp must be an integer, not 2.5"),
+        ({"seed": None}, "seed must be an integer, not None"),
+        ({"max_depth": "x"}, "max_depth must be an integer, not 'x'"),
+        ({"path": 3}, "path must name a picture"),
+    ],
+)
+def test_a_wrong_kind_of_argument_is_named(settings: dict[str, Any], complaint: str) -> None:
+    with pytest.raises(TypeError, match=complaint):
+        draw(**settings)
+
+
+@pytest.mark.parametrize(
+    ("settings", "complaint"),
+    [
+        ({"material": "goldd"}, r"unknown material 'goldd'; .*; did you mean \"gold\"\?$"),
+        ({"show": "normals"}, r"show must be one of .*; did you mean \"normal\"\?$"),
+        ({"backdrop": "drak"}, r"backdrop must be one of .*; did you mean \"dark\"\?$"),
+        ({"bound": "Slop"}, r"unknown bound 'Slop'.*; did you mean \"slope\"\?$"),
+        ({"size": (10**6, 10**6)}, "each side must be 1 to 16384"),
+        ({"spp": 10**12}, "spp must be at least 1 and at most 1000000"),
+        ({"max_depth": 10**12}, "max_depth must be at most 2147483647"),
+        ({"material": ["gold", "clay"]}, "give one material, not 2"),
+        ({"path": ""}, "name of the picture to write is empty"),
+    ],
+)
+def test_a_wrong_value_is_named(settings: dict[str, Any], complaint: str) -> None:
+    with pytest.raises(ValueError, match=complaint):
+        draw(**settings)
+
+
+def test_a_picture_larger_than_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("harnack.rendering.arguments._memory", lambda: 1e9)
+    with pytest.raises(ValueError, match=r"needs about 75 GB of memory, .* has 1: choose a sm"):
+        draw(size=(16384, 16384), show="shaded")
+
+
+def test_methods_and_certificates_that_there_are_not() -> None:
+    with pytest.raises(ValueError, match=r'unknown method .*; did you mean "newton"\?'):
+        hk.signed_distance(POLYGON, [[0, 0, 3]], method="newtn")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match=r'unknown certificate .*; did you mean "convex"\?'):
+        hk.SolidAngle(shapes.wavy_polygon(12), certificate="convx")  # pyright: ignore[reportArgumentType]
+
+
+def test_messages_of_the_library_name_arguments_of_python(tmp_path: Path) -> None:
+    mesh, cloud = tmp_path / "a.obj", tmp_path / "a.xyz"
+    mesh.write_text(SQUARE)
+    cloud.write_text("0 0 0\n1 0 0\n0 1 0\n0 0 1\n")
+    for path, settings, complaint in (
+        (mesh, {"normals": "estimate"}, 'leave out normals="estimate", or .* as_="dipole"'),
+        (mesh, {"boundary": True, "as_": "dipole"}, 'boundary=True .* contradicts as_="dipole"'),
+        (cloud, {}, 'let them be estimated with normals="estimate"'),
+        (mesh, {"as_": "dipoles"}, r'as_ must be .*; did you mean "dipole"\?'),
+        (mesh, {"up": "w"}, "up must be one of x, y, z"),
+        (mesh, {"normals": "guess"}, 'normals must be "estimate" or None'),
+    ):
+        with pytest.raises(ValueError, match=complaint) as caught:
+            open_surface(path, **settings)
+        assert "--" not in str(caught.value)
+
+
+@pytest.mark.parametrize("level", [0.0, 4 * math.pi, -8 * math.pi, 1e-300])
+def test_a_level_without_bounds_names_one_that_has_them(level: float) -> None:
+    with pytest.raises(
+        UnboundedSurfaceError, match=r"clip=harnack.Ball.*or choose .* 6.28319"
+    ) as e:
+        draw(level=level)
+    assert "multiples of its period" in str(e.value)
+    assert e.value.usual == 2 * math.pi
+    assert draw(level=level, clip=hk.Ball((0, 0, 0), 1), show="normal").shape == (8, 8, 3)
+
+
+@pytest.mark.parametrize("scale", [1e-99, 1e-25, 1e20, 1e25, 1e39, 9e99])
+def test_what_single_precision_cannot_draw_is_refused_and_not_drawn_empty(scale: float) -> None:
+    x = np.random.default_rng(0).normal(size=(60, 3))
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    for field in (hk.DipolePotential(x * scale, x), hk.SolidAngle(shapes.wavy_polygon(12) * scale)):
+        with pytest.raises(ValueError, match="choose units nearer to 1"):
+            hk.render(field, show="normal", size=(8, 8))
+
+
+# --- on the command line ---------------------------------------------------------------------
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str]:
+    try:
+        code = main(arguments)
+    except SystemExit as end:
+        code = int(end.code or 0)
+    return code, capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "complaint"),
+    [
+        (["render", "trefoyl"], 1, r"'trefoyl' is no scene: .*; did you mean \"trefoil\"\?"),
+        (["gallery", "Trefoyl"], 1, r"no scene is named .*; did you mean \"trefoil\"\?"),
+        (["render", "polygon", "--material", "goldd"], 2, r"--material: 'goldd' .* \"gold\"\?"),
+        (["render", "polygon", "--show", "normals"], 2, r"--show: 'normals' .* \"normal\"\?"),
+        (["render", "a.obj", "--as", "dipol"], 2, r"--as: 'dipol' is none of .* \"dipole\"\?"),
+        (["render", "polygon", "--elevaton", "3"], 2, r"no option '--elevaton'; .*--elevation"),
+        (["render", "polygon", "--level", "4pi"], 1,
+         r"level 12.5664 reaches to infinity.*; choose another --level, such as 2pi$"),
+        (["render", "polygon", "--level", "1e999"], 2, "'1e999' is no level"),
+        (["render", "polygon", "--azimuth", "abc"], 2, "finite number of degrees, not 'abc'"),
+        (["render", "polygon", "--size", "0x0"], 2, "each side must be 1 to 16384"),
+        (["render", "polygon", "--size", "100000x100000"], 2, "each side must be 1 to 16384"),
+        (["render", "polygon", "--size", "1" * 5000 + "x1"], 2, r"111\.\.\.' is no size"),
+        (["render", "polygon", "--spp", "0"], 2, "must be a number from 1 to 1000000"),
+        (["render", "polygon", "--spp", "-1"], 2, "must be a number from 1 to 1000000"),
+        (["render", "polygon", "--spp", "²"], 2, "'²' must be a number from 1 to 1000000"),
+        (["render", "polygon", "--seed", "9" * 5000], 2, "integer of at most 18 digits"),
+        (["render", "polygon", "-o", ""], 1, "-o is empty"),
+        (["render", "polygon", "-o", "folder.png"], 1, "it is a directory, name a file in it"),
+        (["render", "polygon", "-o", "pipe.png"], 1, "it is a device or a pipe"),
+        (["render", "polygon", "-o", "/proc/a.png"], 1, "cannot write /proc/a.png: "),
+        (["render", "polygon", "-o", "y" * 300 + ".png"], 1, "its name is too long"),
+        (["render", "polygon", "-o", "a\0.png"], 1, r"'a\\x00.png' is no name of a file"),
+        (["gallery", "polygon", "-o", "file"], 1, "folder file: a file of that name is there"),
+        (["gallery", "polygon", "-o", "/proc/x"], 1, "cannot make the folder /proc/x: "),
+        (["render", "[/x]y.obj"], 1, r"^error: \[/x\]y.obj: there is no such file$"),
+        (["render", "[red]y.obj"], 1, r"^error: \[red\]y.obj: there is no such file$"),
+        (["render", "\x1b[31m.obj"], 1, r"^error: \\x1b\[31m.obj: there is no such file$"),
+        (["render", "a\nb.obj"], 1, r"^error: a\\nb.obj: there is no such file$"),
+        (["render", "a\0.obj", "-o", "a.png"], 1, r"^error: a\\x00.obj: "),
+        (["render", "circle.obj"], 1, "a link that leads to no file"),
+        (["render", "."], 1, r"^error: '.' is no scene"),
+        (["render", ""], 1, r"^error: '' is no scene"),
+    ],
+)  # fmt: skip
+def test_every_complaint_is_one_line(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    code: int,
+    complaint: str,
+) -> None:
+    import os
+
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder.png").mkdir()
+    (tmp_path / "file").write_text("old")
+    (tmp_path / "circle.obj").symlink_to("circle.obj")
+    os.mkfifo(tmp_path / "pipe.png")
+    before = sorted(tmp_path.iterdir())
+    if arguments[0] == "render" and "--show" not in arguments:
+        arguments = [*arguments[:2], "--show", "normal", *arguments[2:]]
+    found, said = run(capsys, *arguments, "--quiet")
+    assert re.search(complaint, said.rstrip("\n")), said
+    assert (found, said.count("\n")) == (code, 1)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize("name", ["a b.obj", "\xfc.obj", "[red].obj", "[bold] b.obj", "-a.obj"])
+def test_files_of_any_name_are_drawn(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    name: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path(name).write_text(SQUARE)
+    code = main(["render", *SMALL, f"-o{name}.png", "--", name])
+    said = capsys.readouterr().out
+    assert code == 0
+    assert said.startswith(f"{name}: 2 triangles")
+    assert said.endswith(f"wrote {name}.png\n")
+
+
+def test_the_longest_name_that_the_disk_allows_is_written(tmp_path: Path) -> None:
+    target = tmp_path / ("y" * 251 + ".png")
+    assert main(["render", "polygon", *SMALL, "-o", str(target)]) == 0
+    assert [path.name for path in tmp_path.iterdir()] == [target.name]
+
+
+# --- their parts -----------------------------------------------------------------------------
+
+
+def test_names_that_begin_alike_are_preferred() -> None:
+    assert did_you_mean("background", ["bound", "backdrop"]) == '; did you mean "backdrop"?'
+    assert did_you_mean("GOLD", MATERIALS) == '; did you mean "gold"?'
+    assert did_you_mean("zzz", MATERIALS) == ""
+    assert did_you_mean(3, MATERIALS) == ""
+    assert did_you_mean("gold", []) == ""
+
+
+def test_lines_are_printable() -> None:
+    assert printable("a\x1b[31m\r\u202eb") == r"a\x1b[31m\r\u202eb"
+    assert error_line(RuntimeError("two\n  lines")) == "error: two lines"
+    assert "choose a smaller --size" in error_line(MemoryError("of 11 TiB"))
+    assert error_line(ValueError('up= turns as_="loops"')) == "error: --up turns --as loops"
+
+
+@pytest.mark.parametrize(
+    ("level", "text"),
+    [(2 * math.pi, "2pi"), (math.pi, "pi"), (-math.pi / 2, "-0.5pi"), (0.5, "0.5"), (0.0, "0")],
+)
+def test_levels_are_written_as_they_are_typed(level: float, text: str) -> None:
+    assert level_text(level) == text
