@@ -30,12 +30,18 @@ _BITS = 5
 @dataclass(frozen=True)
 class Values:
     """What a field is at points: value, a bound of its error and, as far as they were asked for,
-    gradient and Hessian; in the field's own units."""
+    gradient and Hessian; in the field's own units.
+
+    gradient_error: a bound of the length of the gradient's error. hessian_error: of the spectral
+    norm of the Hessian's error.
+    """
 
     value: Real
     error: Real
     gradient: Vec3 | None = None
     hessian: SymmetricSum | None = None
+    gradient_error: Real = 0.0
+    hessian_error: Real = 0.0
 
 
 class BatchedField(Field):
@@ -45,11 +51,13 @@ class BatchedField(Field):
     """
 
     @abc.abstractmethod
-    def values_at(self, x: Vec3, derivatives: int) -> Values:
+    def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> Values:
         """Everything at points x, a Dr.Jit 3-vector of any backend and precision.
 
         derivatives: 0 for the value alone, 1 with the gradient, 2 with the Hessian. Not called
         while a loop is recorded, unless derivatives is 2.
+        closer: clusters are taken as a whole only beyond this many times the usual distance;
+            infinity sums all terms one by one.
         """
 
     def value(self, points: Any, *, precision: Precision = "single") -> FloatArray:

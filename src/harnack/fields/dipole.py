@@ -19,7 +19,7 @@ from harnack.fields.unit_coordinates import UnitCoordinates, placed
 from harnack.geometry import Box, CloudError, estimate_areas, estimate_normals, validate_cloud
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Mask, Vec3
+    from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.geometry import Volume
     from harnack.tree import Hierarchy
 
@@ -101,7 +101,8 @@ class DipolePotential(BatchedField):
         field._hierarchy = self._hierarchy
         return field
 
-    def values_at(self, x: Vec3, derivatives: int) -> Values:
+    def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> Values:
+        del closer
         on = self._batch(backend_of(x))
         value, *rest, error = on.tree.at(on.unit(x), derivatives)
         gradient = rest[0] / self._size if derivatives >= 1 else None

@@ -159,7 +159,8 @@ class ScreenedWindingNumber(BatchedField):
             corners.mean(axis=1), normals, areas, length=length, method=method, accuracy=accuracy
         )
 
-    def values_at(self, x: Vec3, derivatives: int) -> Values:
+    def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> Values:
+        del closer
         backend = backend_of(x)
         if backend not in self._batches:
             self._batches[backend] = self.prepare(backend)

@@ -105,7 +105,8 @@ class WindingNumber(BatchedField):
         """The face, as given, of each sheet."""
         return self.mesh.source
 
-    def values_at(self, x: Vec3, derivatives: int) -> Values:
+    def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> Values:
+        del closer
         on = self._batch(backend_of(x))
         winding, x = on.winding, on.unit(x)
         if isinstance(winding, ExactWinding) and derivatives == 0:
