@@ -11,7 +11,7 @@ import abc
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from harnack.fields.sheets import NO_SHEET, Crossing
+from harnack.fields.sheets import NO_SHEET, Crossing, NearestSheet
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -228,6 +228,19 @@ class Field(abc.ABC):
         return self
 
     def distance_to_sheets(self, p: Vec3) -> Real:
-        """Distance from p to the nearest sheet; inf where there is none."""
+        """The distance from p to the nearest sheet, rounded down: lower bounds of distances rest on
+        it. inf where there is none."""
         del p
         return float("inf")
+
+    def nearest_sheet(
+        self, p: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
+    ) -> NearestSheet | None:
+        """The first sheet behind `after` = (squared distance, index), nearer than `limit`.
+
+        Sheets are ordered by the squared distance from p, then by index; from (-1, NO_SHEET) on,
+        all come up, each once. limit: a squared distance. The default, None, says nothing:
+        distances then look for the nearest sheet alone, by how `distance_to_sheets` falls.
+        """
+        del p, after, limit, active
+        return None
