@@ -236,11 +236,11 @@ class Field(abc.ABC):
     def nearest_sheet(
         self, p: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
     ) -> NearestSheet | None:
-        """The first sheet behind `after` = (squared distance, index), nearer than `limit`.
+        """The first sheet behind `after` = (order, index), nearer than the distance `limit`.
 
-        Sheets are ordered by the squared distance from p, then by index; from (-1, NO_SHEET) on,
-        all come up, each once. limit: a squared distance. The default, None, says nothing:
-        distances then look for the nearest sheet alone, by how `distance_to_sheets` falls.
+        Sheets are ordered by their distance from p, in whatever measure `NearestSheet.order` gives,
+        then by index; from (-1, NO_SHEET) on, all come up, each once. The default, None, says
+        nothing: distances then look for the nearest sheet alone, by how `distance_to_sheets` falls.
         """
         del p, after, limit, active
         return None

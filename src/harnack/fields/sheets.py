@@ -44,7 +44,8 @@ class Crossing:
 class NearestSheet:
     """The nearest sheet to points x, of those that were asked about (`Field.nearest_sheet`).
 
-    square: squared distance; inf where there is no sheet.
+    order: by this and then by index sheets are ordered; it grows with the distance. inf where
+        there is no sheet.
     sheet: index of the sheet, a Dr.Jit UInt32; NO_SHEET where there is none.
     offset: (3,) from x to the nearest point of the sheet.
     normal: (3,) unit, of the sheet there, to either side; any direction where it has none.
@@ -52,7 +53,7 @@ class NearestSheet:
         the sheet there, whatever rounding does. False on a sheet's rim.
     """
 
-    square: Real
+    order: Real
     sheet: Any
     offset: Vec3
     normal: Vec3

@@ -179,16 +179,12 @@ class WindingNumber(BatchedField):
         self, p: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
     ) -> NearestSheet:
         on = self._on(p)
-        area = on.size * on.size  # a power of two: nothing is rounded, and the order stays
-        behind = (after[0] / area, after[1])
-        found = nearest_triangle(on.rays, on.unit(p), behind, limit / area, active)
+        found = nearest_triangle(on.rays, on.unit(p), after, dr.square(limit / on.size), active)
         length = dr.norm(found.normal)
         up = on.backend.Array3f(0, 0, 1)
         normal = dr.select(length > 0, found.normal / length, up)
         is_inner = found.is_inner & (length > 0)
-        return NearestSheet(
-            found.square * area, found.number, found.offset * on.size, normal, is_inner
-        )
+        return NearestSheet(found.square, found.number, found.offset * on.size, normal, is_inner)
 
     def _on(self, p: Vec3) -> _OnDevice:
         if self._device is None:
