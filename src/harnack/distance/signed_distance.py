@@ -71,7 +71,7 @@ def signed_distance(
     levels = _levels(backend, surface)
     if method == "newton":
         found = find_closest(backend, surface, levels, points)
-        _warn_of_nan("signed_distance", found)
+        _warn("signed_distance", found)
         return np.copysign(found.distance, found.above)
     prepared = field.prepare(backend)
     compute = _COMPUTE[method]
@@ -105,7 +105,7 @@ def closest_points(
     backend = choose_backend(precision)
     surface = _surface(field, level)
     found = find_closest(backend, surface, _levels(backend, surface), points)
-    _warn_of_nan("closest_points", found)
+    _warn("closest_points", found)
     return found.feet
 
 
@@ -126,12 +126,23 @@ def _levels(backend: Backend, surface: LevelSet) -> Levels:
     return Levels(values, surface.field.period)
 
 
-def _warn_of_nan(name: str, found: Closest) -> None:
+def _warn(name: str, found: Closest) -> None:
+    """Of points without an answer, and of answers that a promise of the field contradicts."""
+    n = len(found.feet)
     lost = int(np.isnan(found.feet[:, 0]).sum())
     if lost:
         warnings.warn(
-            f"{name}: no closest point was found for {lost} of {len(found.feet)} points (NaN): no "
-            "descent from there ends on the surface, and no ray that was tried meets it",
+            f"{name}: no closest point was found for {lost} of {n} points (NaN): no descent from "
+            "there ends on the surface, and no ray that was tried meets it",
+            RuntimeWarning,
+            stacklevel=3,
+        )
+    refused = int(found.is_refused.sum())
+    if refused:
+        warnings.warn(
+            f"{name}: for {refused} of {n} points, points of the surface were found within the "
+            "radius that the field's own promises prove to be free of it, and left out: the "
+            "promises in `Sample.known` do not hold (harnack.testing.check_field tests them)",
             RuntimeWarning,
             stacklevel=3,
         )
