@@ -29,6 +29,9 @@ BoolArray = npt.NDArray[np.bool_]
 
 # Further descents start this share of the distance found from the point.
 _ASIDE = 0.5
+# Sheets that are looked at for each point, in the order of their distance: at first, and where none
+# of these is the surface, up to the best that rays find.
+_FEW, _MANY = 16, 1024
 # In epsilons, of coordinates: what rounding may do to a distance.
 _ROUNDING = 64.0
 
@@ -75,9 +78,7 @@ class _Candidates:
         short = distance < found.lower
         if short.any():
             off = np.zeros(len(feet))
-            (off[short],) = in_batches(
-                self.backend, lambda y: (self.descent.noise(y),), feet[short]
-            )
+            (off[short],) = in_batches(self.backend, self._noise, feet[short])
             size = np.abs(found.points).max(axis=1) + found.lower
             slack = 4 * off + _ROUNDING * self.backend.epsilon * size
             short &= distance < found.lower - slack
@@ -90,15 +91,19 @@ class _Candidates:
             is_refused=found.is_refused | short,
         )
 
+    def _noise(self, y: Vec3) -> tuple[Real]:
+        return (self.descent.noise(y),)
+
 
 def find_closest(backend: Backend, surface: LevelSet, levels: Levels, points: Any) -> Closest:
     """The closest of these: the end of the descent from the point, and of five more that start
     half its length from the point, away from its end and to the four sides; the closest point of
-    the curve that the surface ends in; the closest point of the sheets, if the surface is there.
+    the curve that the surface ends in; the closest of the sheets that is the surface.
 
     Where that is none, the end of the descent from the nearest point that rays find
-    (`nearest_seen`). Where sheets are nearer than all of that and not known to be the surface,
-    rays beside the best direction look for what is nearer (`close_in`).
+    (`nearest_seen`). Where a sheet is nearer than all of that, and none of the surface where it is
+    nearest, rays beside the best direction look for what is nearer (`close_in`), and more sheets
+    are looked at, as far as that.
 
     No point is taken that is nearer than the lower bound that the field's promises prove.
     """
@@ -117,26 +122,20 @@ def find_closest(backend: Backend, surface: LevelSet, levels: Levels, points: An
         above = -levels.to_nearest(sample.value)
         foot, end = descend(p, p)
         boundary = prepared.closest_on_boundary(p)
-        nowhere = backend.Array3f(dr.nan)
         return (
             p,
             dr.select(above == 0, p, foot),
             end,
-            nowhere if boundary is None else boundary,
+            backend.Array3f(dr.nan) if boundary is None else boundary,
             above,
             _lower(backend, prepared, levels, p, sample),
         )
 
     x, feet, ends, boundary, above, lower = in_batches(backend, look, points)
-    found = Closest(
-        x,
-        np.full_like(x, np.nan),
-        above,
-        np.where(np.isnan(_within(field, x)[:, 0]), 0.0, lower),
-        np.zeros(len(x), np.bool_),
-    )
-    found = candidates.consider(found, _within(field, feet))
-    found = candidates.consider(found, _within(field, boundary))
+    lower = np.where(np.isnan(_within(field, x)[:, 0]), 0.0, lower)
+    found = Closest(x, np.full_like(x, np.nan), above, lower, np.zeros(len(x), np.bool_))
+    for part in (feet, boundary):
+        found = candidates.consider(found, _within(field, part))
     to_sheet = np.full(len(x), np.inf)
     if field.has_sheets:
         on_sheet, along, to_sheet = _on_sheets(backend, surface, x, found.feet)
@@ -148,7 +147,7 @@ def find_closest(backend: Backend, surface: LevelSet, levels: Levels, points: An
     for part in np.split(_within(field, feet), len(starts)):
         found = candidates.consider(found, part)
     found = _with_seen(backend, surface, candidates, found)
-    return _closed_in(backend, surface, candidates, found, to_sheet)
+    return _past_sheets(backend, surface, candidates, found, to_sheet)
 
 
 def _lower(backend: Backend, field: Field, levels: Levels, p: Vec3, sample: Sample) -> Real:
@@ -215,12 +214,12 @@ def find_on_sheets(backend: Backend, surface: LevelSet, points: FloatArray) -> F
 
 
 def _on_sheets(
-    backend: Backend, surface: LevelSet, points: FloatArray, feet: FloatArray
+    backend: Backend, surface: LevelSet, points: FloatArray, feet: FloatArray, most: int = _FEW
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Points of the surface (n, 3) on sheets, and (n, 3) on the straight way to the nearest sheet
     and on, nearer than `feet` (n, 3), NaN elsewhere; the distance (n,) of the nearest sheet."""
     prepared = surface.prepare(backend)
-    search = SheetSearch(prepared, _scale(surface, points))
+    search = SheetSearch(prepared, _scale(surface, points), most)
 
     def look(p: Vec3, foot: Vec3) -> tuple[Real | Vec3, ...]:
         distance = dr.norm(foot - p)
@@ -232,22 +231,25 @@ def _on_sheets(
     return on_sheet, along, to_sheet
 
 
-def _closed_in(
+def _past_sheets(
     backend: Backend, surface: LevelSet, candidates: _Candidates, found: Closest,
     to_sheet: FloatArray,
 ) -> Closest:  # fmt: skip
     """With nearer feet for points that have a sheet nearer than their foot: that sheet may be the
-    surface at another place than at its nearest point."""
+    surface at another place than at its nearest point, and so may others behind it."""
     rounding = 2 * _ROUNDING * backend.epsilon * _scale(surface, found.points)
     rows = np.flatnonzero(found.distance > to_sheet * (1 + 1e-9) + rounding)
     if not rows.size:
         return found
-    prepared = surface.prepare(backend)
+    prepared, x = surface.prepare(backend), found.points[rows]
+
+    def look(p: Vec3, foot: Vec3) -> tuple[Vec3]:
+        return (close_in(prepared, p, foot),)
+
     feet = np.full_like(found.feet, np.nan)
-    (feet[rows],) = in_batches(
-        backend, lambda p, foot: (close_in(prepared, p, foot),), found.points[rows],
-        found.feet[rows],
-    )  # fmt: skip
+    (feet[rows],) = in_batches(backend, look, x, found.feet[rows])
+    found = candidates.consider(found, feet)
+    feet[rows], _, _ = _on_sheets(backend, surface, x, found.feet[rows], _MANY)
     return candidates.consider(found, feet)
 
 

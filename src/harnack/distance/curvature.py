@@ -16,6 +16,8 @@ from harnack.distance.tangent import TangentPlane
 from harnack.fields.batch import BatchedField
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from harnack.backend import Backend, Precision, Real, Vec3
     from harnack.fields.field import Field
 
@@ -92,11 +94,19 @@ def curvature(field: Field, points: Any, *, precision: Precision = "double") -> 
     return _refined(backend, field, by_tree, points)
 
 
-def _refined(backend: Backend, field: BatchedField, by_tree: Any, points: Any) -> Curvatures:
+def _refined(
+    backend: Backend,
+    field: BatchedField,
+    by_tree: Callable[[Vec3, Real], tuple[Real | Vec3, ...]],
+    points: Any,
+) -> Curvatures:
     """The curvatures by a tree that is looked at more closely where the error is too large."""
 
-    def at(closer: float) -> Any:
-        return lambda p: by_tree(p, dr.opaque(backend.Float, closer))
+    def at(closer: float) -> Callable[[Vec3], tuple[Real | Vec3, ...]]:
+        def compute(p: Vec3) -> tuple[Real | Vec3, ...]:
+            return by_tree(p, dr.opaque(backend.Float, closer))
+
+        return compute
 
     *found, is_truncated = in_batches(backend, at(_CLOSER[0]), points)
     x = np.asarray(points, np.float64)
@@ -136,8 +146,8 @@ class _Derivatives:
     hessian_error: Real
 
     def bent(self) -> tuple[Real | Vec3, ...]:
-        """Mean, Gaussian curvature and normal, the two errors, and 0 where the field states no errors,
-        else 1.
+        """Mean, Gaussian curvature and normal, the two errors, and 0 where the field states that
+        its derivatives are exact, else 1.
 
         Bounds. Let g, A be the derivatives at hand, G = |g|, T = tr M and D = det M of the matrix
         M = (u, v)^T A (u, v), so that mean H = T/(2G) and Gaussian K = D/G^2. Let g', A' be the
@@ -145,16 +155,16 @@ class _Derivatives:
         G' >= G - c, and n' is at an angle t <= pi/2 to n with sin t <= c/G =: s. Let S be at least
         the range of A's eigenvalues: sqrt(2) |A - (tr A/3) 1|_F, as (a-b)^2 <= 2 (a^2 + b^2).
 
-        - T = tr A - n.An. nn^T - n'n'^T has the eigenvalues sin t, -sin t, 0, with unit eigenvectors
-          p, q: |n.An - n'.An'| = sin t |p.Ap - q.Aq| <= s S. And |tr((1 - n'n'^T)(A - A'))| <= 2 h, as
-          that projection has two eigenvalues 1. So |T - T'| <= s S + 2 h, and with |1/G' - 1/G| <=
-          c/(G (G - c)): |H - H'| <= ((s S + 2 h)/2 + |H| c)/(G - c).
+        - T = tr A - n.An. nn^T - n'n'^T has the eigenvalues sin t, -sin t and 0, the first two with
+          unit eigenvectors p, q: |n.An - n'.An'| = sin t |p.Ap - q.Aq| <= s S. The projection
+          1 - n'n'^T has two eigenvalues 1: |tr((1 - n'n'^T)(A - A'))| <= 2 h. So |T - T'| <= s S +
+          2 h, and as |1/G' - 1/G| <= c/(G (G - c)), |H - H'| <= ((s S + 2 h)/2 + |H| c)/(G - c).
         - Let the rotation R by the angle t take n to n'. M' is that of R^T A' R in the same frame
           (its determinant does not depend on the frame). With m the middle of A's range,
           |A - R^T A R| = |(R - 1)(A - m) - (A - m)(R - 1)| <= 2 |R - 1| S/2, |R - 1| = 2 sin(t/2) =
-          sin t sqrt(2/(1 + cos t)) <= s sqrt(2/(1 + sqrt(1 - s^2))) =: r. So E = M' - M has the norm
-          e <= r S + h at most, and det(M + E) = det M + tr(adj(M) E) + det E differs from det M by
-          at most e (|a| + |b|) + e^2, a and b the eigenvalues of M, |a| + |b| = max(|T|, |a - b|).
+          sin t sqrt(2/(1 + cos t)) <= s sqrt(2/(1 + sqrt(1 - s^2))) =: r. So E = M' - M is at most
+          e := r S + h, and det(M + E) = det M + tr(adj(M) E) + det E differs from det M by at most
+          e (|a| + |b|) + e^2, a and b the eigenvalues of M, |a| + |b| = max(|T|, |a - b|).
           With 1/G'^2 - 1/G^2 <= c (2G - c)/(G^2 (G - c)^2):
           |K - K'| <= (e (|a| + |b|) + e^2 + |K| c (2G - c))/(G - c)^2.
 

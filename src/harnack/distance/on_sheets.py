@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 
 __all__ = ["SheetSearch"]
 
-# Sheets of a point that are looked at, in the order of their distance. Behind them only rays look.
-_SHEETS = 24
 # Half the length of a ray through a point of a sheet, in epsilons of coordinates.
 _SHORT = 32.0
 # A regular tetrahedron about the origin, turned so that none of its edges lies in a plane that
@@ -47,10 +45,12 @@ class SheetSearch:
     """The search for the closest point of a prepared surface that lies on a sheet.
 
     scale: at least the coordinates that the field computes with, for what rounding does.
+    most: sheets that are looked at for each point.
     """
 
     surface: PreparedLevelSet
     scale: float
+    most: int
 
     def closest(self, x: Vec3, limit: Real) -> tuple[Vec3, Vec3]:
         """A point of the surface on a sheet, nearer to x than `limit` (NaN where none is found),
@@ -69,6 +69,7 @@ class SheetSearch:
         backend = self.surface.backend
         real, index, vector = backend.Float, backend.UInt32, backend.Array3f
         following = self._following(x)
+        most = dr.opaque(index, self.most)
         short = _SHORT * backend.epsilon * fmax(real(self.scale), dr.max(dr.abs(x)))
         limit = real(limit)
         nothing = NearestSheet(
@@ -90,7 +91,7 @@ class SheetSearch:
             foot = dr.select(met, at, foot)
             n = n + dr.select(fresh, index(1), 0)
             last_probe = near.is_inner | (probe == len(_EDGES))
-            active &= ~met & ~(last_probe & (n >= _SHEETS))
+            active &= ~met & ~(last_probe & (n >= most))
             probe = dr.select(last_probe, index(0), probe + 1)
             return *_parts(near), probe, foot, nearest, n, active
 

@@ -48,9 +48,11 @@ def signed_distance(
             field's `hessian`.
         "newton": to a point of the surface found by search, the closest in its neighbourhood
             (`closest_points`). Exact to rounding if it is the closest of all, else too long in
-            size: an upper bound. NaN, with a RuntimeWarning that counts them, where no surface is
-            found at all, as where there is none.
-            The slowest by far: some hundred evaluations.
+            size: an upper bound, and never below what "lower" proves but for rounding. NaN, with a
+            RuntimeWarning that counts them, where no surface is found at all, as where there is
+            none, or only within a radius that the field promises to be free.
+            The slowest by far: some hundred evaluations, and as many rays for points beside sheets
+            that are not the surface.
         "lower": never longer in size than the true distance, with proof: no level lies in the
             ball of that radius about the point, not even outside the field's domain. Of first
             order too: the nearer the surface, the smaller the share that it falls short by.
@@ -94,7 +96,9 @@ def closest_points(
     """The closest points (n, 3) of a level set to `points` (n, 3) that a search finds.
 
     Each lies on the surface to rounding, and no point of the surface in its neighbourhood is
-    nearer; one elsewhere may be, though several descents are tried (`find_closest`). The curve in
+    nearer; one elsewhere may be, though several descents are tried (`find_closest`). Of sheets,
+    such as the triangles of a mesh, the nearest that is the surface is found, and where a nearer
+    one is not, rays look for what may be nearer, such as a crease in which two meet. The curve in
     which the level sets of a field end counts as part of them, such as the vertices and edges of
     a solid angle. Where every descent ends at a critical or singular point of f, or outside the
     field's domain, the nearest point of the surface that some rays find is taken, and from there
