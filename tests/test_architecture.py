@@ -28,8 +28,6 @@ ROOMS = (
     "cli",
 )
 FREE = ("__init__", "__main__", "testing")  # at the top: may import from any room
-LONGEST_FILE = 320
-LONGEST_FUNCTION = 45
 
 
 def room_of(parts: tuple[str, ...]) -> str:
@@ -72,23 +70,10 @@ def misplaced_imports(path: Path, source: str) -> list[str]:
     return wrong
 
 
-def code_lines(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
-    """Lines of a function without its docstring, where the proofs are."""
-    length = (function.end_lineno or function.lineno) - function.lineno + 1
-    if ast.get_docstring(function) is not None:
-        docstring = function.body[0]
-        length -= (docstring.end_lineno or docstring.lineno) - docstring.lineno + 1
-    return length
-
-
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(SOURCE)))
-def test_file_imports_from_earlier_rooms_and_stays_short(path: Path) -> None:
+def test_file_imports_from_earlier_rooms(path: Path) -> None:
     source = path.read_text(encoding="utf-8")
     assert misplaced_imports(path.relative_to(SOURCE), source) == []
-    assert len(source.splitlines()) <= LONGEST_FILE
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            assert code_lines(node) <= LONGEST_FUNCTION, f"{node.name} is too long"
 
 
 def test_modules_have_names_that_say_something() -> None:
@@ -102,12 +87,6 @@ def test_package_imports_backend_before_anything_that_may_load_drjit() -> None:
     harmless = {("_version",)}
     rooms = [module for module in imported_modules(tree, ("harnack",)) if module not in harmless]
     assert rooms[0][0] == "backend"
-
-
-def test_docstrings_do_not_count_as_code() -> None:
-    (function,) = ast.parse('def f():\n    """One.\n\n    Two.\n    """\n    return 1\n').body
-    assert isinstance(function, ast.FunctionDef)
-    assert code_lines(function) == 2
 
 
 @pytest.mark.parametrize(

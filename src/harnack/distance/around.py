@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from harnack.backend import Backend
     from harnack.tracer import LevelSet
 
-__all__ = ["nearest_seen"]
+__all__ = ["nearest_seen", "surface_box"]
 
 _RAYS = 32
 _ACROSS = 2048
@@ -37,7 +37,7 @@ def nearest_seen(backend: Backend, surface: LevelSet, points: FloatArray) -> Flo
     2048 rays across the volume; NaN if those miss as well.
     """
     parts = [np.zeros((0, 3))]
-    bounds = _bounds(surface)
+    bounds = surface_box(surface)
     for start in range(0, len(points), _AT_ONCE):
         x = points[start : start + _AT_ONCE]
         o = np.repeat(x, _RAYS, axis=0)
@@ -60,7 +60,7 @@ def nearest_seen(backend: Backend, surface: LevelSet, points: FloatArray) -> Flo
     return near
 
 
-def _bounds(surface: LevelSet) -> tuple[FloatArray, FloatArray] | None:
+def surface_box(surface: LevelSet) -> tuple[FloatArray, FloatArray] | None:
     """Corners of a finite box that holds the surface, if one is known."""
     if surface.volume is None:
         return None

@@ -10,25 +10,30 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from harnack.distance.around import nearest_seen
+from harnack.distance.around import nearest_seen, surface_box
 from harnack.distance.batches import FloatArray, in_batches
+from harnack.distance.closing_in import close_in, nearer_along
+from harnack.distance.lower_bound import distance_below
+from harnack.distance.on_sheets import SheetSearch
 from harnack.distance.projection import Descent
-from harnack.tracer import trace
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
     from harnack.certify import Levels
-    from harnack.fields.field import Field
+    from harnack.fields.field import Field, Sample
     from harnack.tracer import LevelSet
 
 __all__ = ["Closest", "find_closest", "find_on_sheets"]
 
+BoolArray = npt.NDArray[np.bool_]
+
 # Further descents start this share of the distance found from the point.
 _ASIDE = 0.5
-# In square roots of epsilon: how far, relative to the distance, rays pass an edge that others may
-# have slipped past, and how long, relative to coordinates, rays through points on a sheet are.
-_ASLANT = 10.0
-_SHORT = 10.0
+# Sheets that are looked at for each point, in the order of their distance: at first, and where none
+# of these is the surface, up to the best that rays find.
+_FEW, _MANY = 16, 1024
+# In epsilons, of coordinates: what rounding may do to a distance.
+_ROUNDING = 64.0
 
 
 def _length(vectors: FloatArray) -> FloatArray:
@@ -39,69 +44,127 @@ def _length(vectors: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Closest:
-    """points: (n, 3), rounded to the precision in use. feet: (n, 3) the closest points found, NaN
-    where none was. above: (n,) f - level, of the level nearest in value."""
+    """The closest points found so far.
+
+    points: (n, 3), rounded to the precision in use.
+    feet: (n, 3) the closest points of the surface found, NaN where none was.
+    above: (n,) f - level, of the level nearest in value.
+    lower: (n,) proved lower bounds of the distance; 0 where nothing is proved.
+    is_refused: (n,) whether a point was found that is nearer than `lower` allows.
+    """
 
     points: FloatArray
     feet: FloatArray
     above: FloatArray
+    lower: FloatArray
+    is_refused: BoolArray
 
     @property
     def distance(self) -> FloatArray:
         """(n,) |point - foot|."""
         return _length(self.points - self.feet)
 
-    def or_nearer(self, feet: FloatArray) -> Closest:
-        """Itself, or where they are nearer, other feet; NaN is never nearer."""
-        other = _length(self.points - feet)
-        nearer = (other < self.distance) | (np.isnan(self.distance) & ~np.isnan(other))
-        return Closest(self.points, np.where(nearer[:, None], feet, self.feet), self.above)
+
+@dataclass(frozen=True)
+class _Candidates:
+    """How points that a search finds are compared with what is proved."""
+
+    backend: Backend
+    field: Field
+    descent: Descent
+
+    def consider(self, found: Closest, feet: FloatArray) -> Closest:
+        """With other feet (n, 3) where these are nearer; NaN is never nearer.
+
+        A foot lies on the surface up to what rounding and approximation have done to the level
+        there (`Descent.noise`). One that is nearer by more than that than the lower bound allows is
+        no point of the surface, or the field does not keep a promise: it is refused, and counted.
+        """
+        distance = _length(found.points - feet)
+        short = distance < found.lower
+        if short.any():
+            off = np.zeros(len(feet))
+            (off[short],) = in_batches(self.backend, self._noise, feet[short])
+            size = np.abs(found.points).max(axis=1) + found.lower
+            slack = 4 * off + _ROUNDING * self.backend.epsilon * size
+            short &= distance < found.lower - slack
+            feet = np.where(short[:, None], np.nan, feet)
+            distance = np.where(short, np.nan, distance)
+        nearer = (distance < found.distance) | (np.isnan(found.distance) & ~np.isnan(distance))
+        return dataclasses.replace(
+            found,
+            feet=np.where(nearer[:, None], feet, found.feet),
+            is_refused=found.is_refused | short,
+        )
+
+    def _noise(self, y: Vec3) -> tuple[Real]:
+        return (self.descent.noise(y),)
 
 
 def find_closest(backend: Backend, surface: LevelSet, levels: Levels, points: Any) -> Closest:
     """The closest of these: the end of the descent from the point, and of five more that start
     half its length from the point, away from its end and to the four sides; the closest point of
-    the curve that the surface ends in; the closest point of the sheets, if the surface is there.
+    the curve that the surface ends in; the closest of the sheets that is the surface.
 
     Where that is none, the end of the descent from the nearest point that rays find
-    (`nearest_seen`).
+    (`nearest_seen`). Where a sheet is nearer than all of that, and none of the surface where it is
+    nearest, rays beside the best direction look for what is nearer (`close_in`), and more sheets
+    are looked at, as far as that.
+
+    No point is taken that is nearer than the lower bound that the field's promises prove.
     """
     field = surface.field
     prepared = field.prepare(backend)
     surface = dataclasses.replace(surface, field=prepared)  # uploaded once
     descent = Descent.of(backend, prepared, levels)
+    candidates = _Candidates(backend, field, descent)
 
     def descend(p: Vec3, start: Vec3) -> tuple[Real | Vec3, ...]:
         foot, found, _ = descent.closest(p, start)
         return dr.select(found, foot, dr.nan), foot
 
     def look(p: Vec3) -> tuple[Real | Vec3, ...]:
-        above = -levels.to_nearest(prepared.evaluate(p).value)
+        sample = prepared.evaluate(p)
+        above = -levels.to_nearest(sample.value)
         foot, end = descend(p, p)
         boundary = prepared.closest_on_boundary(p)
-        nowhere = backend.Array3f(dr.nan)
         return (
             p,
             dr.select(above == 0, p, foot),
             end,
-            nowhere if boundary is None else boundary,
+            backend.Array3f(dr.nan) if boundary is None else boundary,
             above,
+            _lower(backend, prepared, levels, p, sample),
         )
 
-    x, feet, ends, boundary, above = in_batches(backend, look, points)
-    found = Closest(x, _within(field, feet), above).or_nearer(_within(field, boundary))
+    x, feet, ends, boundary, above, lower = in_batches(backend, look, points)
+    lower = np.where(np.isnan(_within(field, x)[:, 0]), 0.0, lower)
+    found = Closest(x, np.full_like(x, np.nan), above, lower, np.zeros(len(x), np.bool_))
+    for part in (feet, boundary):
+        found = candidates.consider(found, _within(field, part))
+    to_sheet = np.full(len(x), np.inf)
     if field.has_sheets:
-        found = found.or_nearer(find_on_sheets(backend, surface, x))
+        on_sheet, along, to_sheet = _on_sheets(backend, surface, x, found.feet)
+        found = candidates.consider(candidates.consider(found, on_sheet), along)
     ways = _ways(x - np.where(np.isnan(found.feet), ends, found.feet))
     starts = [_usable(field, x + _ASIDE * way, x) for way in ways]
     several = np.concatenate([x] * len(starts))
     feet, _ = in_batches(backend, descend, several, np.concatenate(starts))
     for part in np.split(_within(field, feet), len(starts)):
-        found = found.or_nearer(part)
-    return _with_seen(backend, surface, descent, found)
+        found = candidates.consider(found, part)
+    found = _with_seen(backend, surface, candidates, found)
+    return _past_sheets(backend, surface, candidates, found, to_sheet)
 
 
-def _with_seen(backend: Backend, surface: LevelSet, descent: Descent, found: Closest) -> Closest:
+def _lower(backend: Backend, field: Field, levels: Levels, p: Vec3, sample: Sample) -> Real:
+    if not sample.known:
+        return backend.Float(0)
+    return distance_below(backend, field, levels, p, sample)
+
+
+def _with_seen(
+    backend: Backend, surface: LevelSet, candidates: _Candidates, found: Closest
+) -> Closest:
     """With feet for points that have none: from the nearest point that is seen, down to where the
     descent ends. That is a point of the surface even where it is no minimum."""
     lost = np.flatnonzero(np.isnan(found.feet[:, 0]))
@@ -109,7 +172,7 @@ def _with_seen(backend: Backend, surface: LevelSet, descent: Descent, found: Clo
         return found
 
     def descend(p: Vec3, start: Vec3) -> tuple[Real | Vec3, ...]:
-        foot, _, on_level = descent.closest(p, start)
+        foot, _, on_level = candidates.descent.closest(p, start)
         return (dr.select(on_level, foot, start),)
 
     x = found.points[lost]
@@ -119,7 +182,7 @@ def _with_seen(backend: Backend, surface: LevelSet, descent: Descent, found: Clo
     (feet[lost[some]],) = in_batches(backend, descend, x[some], seen[some])
     # The way down may leave the domain; what is seen lies within.
     feet[lost] = np.where(np.isnan(_within(surface.field, feet[lost])), seen, feet[lost])
-    return found.or_nearer(feet)
+    return candidates.consider(found, feet)
 
 
 def _ways(away: FloatArray) -> tuple[FloatArray, ...]:
@@ -148,55 +211,59 @@ def _usable(field: Field, points: FloatArray, others: FloatArray) -> FloatArray:
 
 
 def find_on_sheets(backend: Backend, surface: LevelSet, points: FloatArray) -> FloatArray:
-    """Where straight lines (n, 3) to the nearest sheets first meet the surface; NaN: nowhere.
-
-    The line is a ray to be traced, up to and with the sheet. Its direction is that in which the
-    distance to the sheets falls, by central differences: off by epsilon^(2/3), it is longer by a
-    share epsilon^(4/3). Where it meets nothing it may have slipped past an edge in which a sheet
-    and a smooth part of the surface meet: four more pass it on either side. From a point on a sheet
-    there is no direction: short rays through it along the axes tell what it is on.
-    """
-    prepared = surface.field.prepare(backend)
-
-    def look(p: Vec3) -> tuple[Real | Vec3, ...]:
-        distance = prepared.distance_to_sheets(p)
-        h = backend.epsilon ** (1 / 3) * distance
-        rate: list[Real] = []
-        for axis in range(3):
-            move = backend.Array3f(*(h if k == axis else 0 for k in range(3)))
-            ahead, back = (prepared.distance_to_sheets(q) for q in (p + move, p - move))
-            rate.append((back - ahead) / (2 * h))
-        return distance, backend.Array3f(*rate)
-
-    distance, direction = in_batches(backend, look, points)
-    root = backend.epsilon**0.5
-    scale = max(float(np.abs(points).max(initial=0.0)), 1e-30)
-    short = np.full(len(points), _SHORT * root * scale)
-    on_sheet = distance <= 1e-3 * short
-    usable = np.isfinite(distance) & (np.linalg.norm(direction, axis=1) > 0.1) & ~on_sheet
-    feet = np.full_like(points, np.nan)
-    reach = distance * (1 + 1e-6 + 200 * backend.epsilon)
-    _trace_into(feet, backend, surface, usable, points, direction, reach)
-    for aside in _ways(direction)[1:]:
-        missed = usable & np.isnan(feet[:, 0])
-        _trace_into(
-            feet, backend, surface, missed, points, direction + _ASLANT * root * aside, reach
-        )
-    for axis in np.eye(3):
-        start = points - short[:, None] * axis
-        _trace_into(feet, backend, surface, on_sheet, start, axis + 0 * points, 2 * short)
-    return feet
+    """The closest points (n, 3) to `points` (n, 3) of the surface that lie on a sheet, or between
+    the point and the nearest sheet; NaN: none was found."""
+    surface = dataclasses.replace(surface, field=surface.field.prepare(backend))
+    on_sheet, along, _ = _on_sheets(backend, surface, points, np.full_like(points, np.nan))
+    distances = (np.linalg.norm(points - feet, axis=1) for feet in (on_sheet, along))
+    nearer = np.less(*distances) | np.isnan(along[:, 0])
+    return np.where(nearer[:, None], on_sheet, along)
 
 
-def _trace_into(
-    feet: FloatArray, backend: Backend, surface: LevelSet, rows: npt.NDArray[np.bool_],
-    origins: FloatArray, directions: FloatArray, t_max: FloatArray,
-) -> None:  # fmt: skip
-    """Puts the first hits of some of the rays into `feet`."""
-    index = np.flatnonzero(rows)
-    if not index.size:
-        return
-    hits = trace(
-        surface, origins[index], directions[index], t_max=t_max[index], precision=backend.precision
-    )
-    feet[index[hits.hit]] = hits.position[hits.hit]
+def _on_sheets(
+    backend: Backend, surface: LevelSet, points: FloatArray, feet: FloatArray, most: int = _FEW
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Points of the surface (n, 3) on sheets, and (n, 3) on the straight way to the nearest sheet
+    and on, nearer than `feet` (n, 3), NaN elsewhere; the distance (n,) of the nearest sheet."""
+    prepared = surface.prepare(backend)
+    search = SheetSearch(prepared, _scale(surface, points), most)
+
+    def look(p: Vec3, foot: Vec3) -> tuple[Real | Vec3, ...]:
+        distance = dr.norm(foot - p)
+        limit = dr.select(dr.isnan(distance), dr.inf, distance)
+        on_sheet, way = search.closest(p, limit)
+        return on_sheet, nearer_along(prepared, p, way, limit), dr.norm(way)
+
+    on_sheet, along, to_sheet = in_batches(backend, look, points, feet)
+    return on_sheet, along, to_sheet
+
+
+def _past_sheets(
+    backend: Backend, surface: LevelSet, candidates: _Candidates, found: Closest,
+    to_sheet: FloatArray,
+) -> Closest:  # fmt: skip
+    """With nearer feet for points that have a sheet nearer than their foot: that sheet may be the
+    surface at another place than at its nearest point, and so may others behind it."""
+    rounding = 2 * _ROUNDING * backend.epsilon * _scale(surface, found.points)
+    rows = np.flatnonzero(found.distance > to_sheet * (1 + 1e-9) + rounding)
+    if not rows.size:
+        return found
+    prepared, x = surface.prepare(backend), found.points[rows]
+
+    def look(p: Vec3, foot: Vec3) -> tuple[Vec3]:
+        return (close_in(prepared, p, foot),)
+
+    feet = np.full_like(found.feet, np.nan)
+    (feet[rows],) = in_batches(backend, look, x, found.feet[rows])
+    found = candidates.consider(found, feet)
+    feet[rows], _, _ = _on_sheets(backend, surface, x, found.feet[rows], _MANY)
+    return candidates.consider(found, feet)
+
+
+def _scale(surface: LevelSet, points: FloatArray) -> float:
+    """At least the size of coordinates at and on the way to the surface."""
+    box = surface_box(surface)
+    sizes = [float(np.abs(points).max(initial=0.0))]
+    if box is not None:
+        sizes += [float(np.abs(corner).max()) for corner in box]
+    return max(*sizes, 1e-30)

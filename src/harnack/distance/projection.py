@@ -119,6 +119,10 @@ class Descent:
         y, _, _, _, _, found, _, _ = dr.while_loop(state, more, body, label="along the level")
         return y, found, on_level
 
+    def noise(self, y: Vec3) -> Real:
+        """How far rounding and approximation may have moved the level at y, as a length."""
+        return self._look(y)[1].noise
+
     def _look(self, y: Vec3) -> tuple[Real, _Place]:
         """f - level at y, and the place."""
         sample, real = self.field.evaluate(y), self.backend.Float

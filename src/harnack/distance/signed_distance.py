@@ -49,9 +49,11 @@ def signed_distance(
             field's `hessian`.
         "newton": to a point of the surface found by search, the closest in its neighbourhood
             (`closest_points`). Exact to rounding if it is the closest of all, else too long in
-            size: an upper bound. NaN, with a RuntimeWarning that counts them, where no surface is
-            found at all, as where there is none.
-            The slowest by far: some hundred evaluations.
+            size: an upper bound, and never below what "lower" proves but for rounding. NaN, with a
+            RuntimeWarning that counts them, where no surface is found at all, as where there is
+            none, or only within a radius that the field promises to be free.
+            The slowest by far: some hundred evaluations, and as many rays for points beside sheets
+            that are not the surface.
         "lower": never longer in size than the true distance, with proof: no level lies in the
             ball of that radius about the point, not even outside the field's domain. Of first
             order too: the nearer the surface, the smaller the share that it falls short by.
@@ -73,7 +75,7 @@ def signed_distance(
     levels = _levels(backend, surface)
     if method == "newton":
         found = find_closest(backend, surface, levels, points)
-        _warn_of_nan("signed_distance", found)
+        _warn("signed_distance", found)
         return np.copysign(found.distance, found.above)
     prepared = field.prepare(backend)
     compute = _COMPUTE[method]
@@ -96,7 +98,9 @@ def closest_points(
     """The closest points (n, 3) of a level set to `points` (n, 3) that a search finds.
 
     Each lies on the surface to rounding, and no point of the surface in its neighbourhood is
-    nearer; one elsewhere may be, though several descents are tried (`find_closest`). The curve in
+    nearer; one elsewhere may be, though several descents are tried (`find_closest`). Of sheets,
+    such as the triangles of a mesh, the nearest that is the surface is found, and where a nearer
+    one is not, rays look for what may be nearer, such as a crease in which two meet. The curve in
     which the level sets of a field end counts as part of them, such as the vertices and edges of
     a solid angle. Where every descent ends at a critical or singular point of f, or outside the
     field's domain, the nearest point of the surface that some rays find is taken, and from there
@@ -107,7 +111,7 @@ def closest_points(
     backend = choose_backend(precision)
     surface = _surface(field, level)
     found = find_closest(backend, surface, _levels(backend, surface), points)
-    _warn_of_nan("closest_points", found)
+    _warn("closest_points", found)
     return found.feet
 
 
@@ -128,12 +132,23 @@ def _levels(backend: Backend, surface: LevelSet) -> Levels:
     return Levels(values, surface.field.period)
 
 
-def _warn_of_nan(name: str, found: Closest) -> None:
+def _warn(name: str, found: Closest) -> None:
+    """Of points without an answer, and of answers that a promise of the field contradicts."""
+    n = len(found.feet)
     lost = int(np.isnan(found.feet[:, 0]).sum())
     if lost:
         warnings.warn(
-            f"{name}: no closest point was found for {lost} of {len(found.feet)} points (NaN): no "
-            "descent from there ends on the surface, and no ray that was tried meets it",
+            f"{name}: no closest point was found for {lost} of {n} points (NaN): no descent from "
+            "there ends on the surface, and no ray that was tried meets it",
+            RuntimeWarning,
+            stacklevel=3,
+        )
+    refused = int(found.is_refused.sum())
+    if refused:
+        warnings.warn(
+            f"{name}: for {refused} of {n} points, points of the surface were found within the "
+            "radius that the field's own promises prove to be free of it, and left out: the "
+            "promises in `Sample.known` do not hold (harnack.testing.check_field tests them)",
             RuntimeWarning,
             stacklevel=3,
         )

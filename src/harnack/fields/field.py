@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from harnack.fields.sheets import NO_SHEET, Crossing
+from harnack.fields.sheets import NO_SHEET, Crossing, NearestSheet
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -260,9 +260,22 @@ class Field(abc.ABC):
         return self
 
     def distance_to_sheets(self, p: Vec3) -> Real:
-        """Distance from p to the nearest sheet; inf where there is none."""
+        """The distance from p to the nearest sheet, rounded down: lower bounds of distances rest on
+        it. inf where there is none."""
         del p
         return float("inf")
+
+    def nearest_sheet(
+        self, p: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
+    ) -> NearestSheet | None:
+        """The first sheet behind `after` = (order, index), nearer than the distance `limit`.
+
+        Sheets are ordered by their distance from p, in whatever measure `NearestSheet.order` gives,
+        then by index; from (-1, NO_SHEET) on, all come up, each once. The default, None, says
+        nothing: distances then look for the nearest sheet alone, by how `distance_to_sheets` falls.
+        """
+        del p, after, limit, active
+        return None
 
 
 class AtDetail(Field):

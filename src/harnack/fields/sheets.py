@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from harnack.backend import Real, Vec3
+    from harnack.backend import Mask, Real, Vec3
 
 NO_SHEET = 0xFFFFFFFF
 """The index of no sheet, larger than that of any."""
@@ -38,3 +38,23 @@ class Crossing:
     sheet: Any
     jump: Real
     normal: Vec3
+
+
+@dataclass(frozen=True)
+class NearestSheet:
+    """The nearest sheet to points x, of those that were asked about (`Field.nearest_sheet`).
+
+    order: by this and then by index sheets are ordered; it grows with the distance. inf where
+        there is no sheet.
+    sheet: index of the sheet, a Dr.Jit UInt32; NO_SHEET where there is none.
+    offset: (3,) from x to the nearest point of the sheet.
+    normal: (3,) unit, of the sheet there, to either side; any direction where it has none.
+    is_inner: whether that point lies inside the sheet: a line through it along the normal crosses
+        the sheet there, whatever rounding does. False on a sheet's rim.
+    """
+
+    order: Real
+    sheet: Any
+    offset: Vec3
+    normal: Vec3
+    is_inner: Mask

@@ -8,6 +8,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
+import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
@@ -15,13 +16,13 @@ from harnack.backend import backend_of
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.edge_lift import epsilon_at
 from harnack.fields.field import Field, Sample, lengthened
-from harnack.fields.sheets import NO_SHEET, Crossing
+from harnack.fields.sheets import NO_SHEET, Crossing, NearestSheet
 from harnack.fields.unit_coordinates import UnitCoordinates, placed
 from harnack.fields.winding_exact import ExactWinding
 from harnack.fields.winding_mesh import WindingMesh
 from harnack.fields.winding_tree import TreeWinding
 from harnack.geometry import Box
-from harnack.tree.nearest import distance_to_triangles, jumps_within
+from harnack.tree.nearest import distance_to_triangles, jumps_within, nearest_triangle
 from harnack.tree.triangles import Frame, TriangleRays
 
 if TYPE_CHECKING:
@@ -179,6 +180,17 @@ class WindingNumber(BatchedField):
     def distance_to_sheets(self, p: Vec3) -> Real:
         on = self._on(p)
         return distance_to_triangles(on.rays, on.unit(p)) * on.size
+
+    def nearest_sheet(
+        self, p: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
+    ) -> NearestSheet:
+        on = self._on(p)
+        found = nearest_triangle(on.rays, on.unit(p), after, dr.square(limit / on.size), active)
+        length = dr.norm(found.normal)
+        up = on.backend.Array3f(0, 0, 1)
+        normal = dr.select(length > 0, found.normal / length, up)
+        is_inner = found.is_inner & (length > 0)
+        return NearestSheet(found.square, found.number, found.offset * on.size, normal, is_inner)
 
     def _on(self, p: Vec3) -> _OnDevice:
         if self._device is None:

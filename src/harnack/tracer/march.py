@@ -237,9 +237,9 @@ def _finer(
     """The detail to sample a point at again, and whether the sample at this one is too coarse.
 
     It is where its error shortens the step by much or decides about a hit, unless truncation is a
-    small part of it: of what a hit may be off, `within`, or of rounding, which no detail helps. What
-    is allowed leaves the march a way to a hit: its steps end where a level is as near as `blur`, and
-    1.25 times that is less than what makes a hit, within - truncation or twice rounding.
+    small part of it: of what a hit may be off, `within`, or of rounding, which no detail helps.
+    What is allowed leaves the march a way to a hit: its steps end where a level is as near as
+    `blur`, and 1.25 times that is less than what makes a hit, within - truncation or twice rounding.
     """
     rounding = blur - truncation
     allowed = fmax(_OF_TOLERANCE * within - _LESS * rounding, _OF_ROUNDING * rounding)

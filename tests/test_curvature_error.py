@@ -1,0 +1,191 @@
+"""How far curvatures may be off: proved bounds, against derivatives that are off by as much."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+
+import harnack as hk
+from harnack.backend import choose_backend, to_numpy, to_vector3
+from harnack.distance.curvature import _Derivatives
+from harnack.fields.batch import BatchedField, Values
+from harnack.fields.edge_hessian import SymmetricSum
+
+PRECISIONS = ("double", "single")
+
+
+def unit(v: np.ndarray) -> np.ndarray:
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def true_curvatures(g: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and Gaussian, of gradients (n, 3) and Hessians (n, 3, 3), with no tangent frame."""
+    length = np.linalg.norm(g, axis=1)
+    n = g / length[:, None]
+    across = np.eye(3) - n[:, :, None] * n[:, None]
+    shape = across @ a @ across / length[:, None, None]
+    trace = np.trace(shape, axis1=1, axis2=2)
+    return trace / 2, (trace**2 - np.einsum("nij,nji->n", shape, shape)) / 2
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_no_derivatives_within_the_errors_bend_otherwise(precision: Any) -> None:
+    """Random gradients and Hessians, moved by random vectors and matrices of the sizes stated and
+    by those that turn the normal the most, towards eigenvectors: never outside, and nearly there.
+    """
+    rng = np.random.default_rng(0)
+    n, backend = 200_000, choose_backend(precision)
+    kind = np.float32 if precision == "single" else np.float64
+    frame = np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]
+    bends = rng.normal(size=(n, 3)) * 10 ** rng.uniform(-2, 2, (n, 1))
+    bends *= rng.random((n, 3)) > 0.2
+    bends[::3] -= bends[::3].mean(axis=1, keepdims=True)  # as harmonic functions have it
+    a = np.einsum("nij,nj,nkj->nik", frame, bends, frame)
+    a = (0.5 * (a + a.swapaxes(1, 2))).astype(kind).astype(np.float64)
+    way = rng.normal(size=(n, 3))
+    near = rng.random(n) < 0.3
+    aside = 10 ** rng.uniform(-3, 0, (n, 1)) * frame[:, :, 1]
+    way[near] = (frame[:, :, 0] + aside + 1e-3 * way)[near]
+    g = (unit(way) * 10 ** rng.uniform(-3, 3, (n, 1))).astype(kind).astype(np.float64)
+    length = np.linalg.norm(g, axis=1)
+    off_g = length * 0.999 * 10 ** rng.uniform(-8, 0, n) * rng.integers(0, 2, n)
+    size = np.linalg.norm(a, 2, axis=(1, 2))
+    off_a = size * 10 ** rng.uniform(-8, 1, n) * rng.integers(0, 2, n)
+
+    normal, sine = unit(g), off_g / length
+    across = np.where(near[:, None], frame[:, :, 1], rng.normal(size=(n, 3)))
+    across = unit(across - (across * normal).sum(axis=1, keepdims=True) * normal)
+    steepest = np.sqrt(1 - sine**2)[:, None] * across - sine[:, None] * normal
+    moved = np.where(rng.random((n, 1)) < 0.5, steepest, unit(rng.normal(size=(n, 3))))
+    turned = np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]
+    parts = rng.uniform(-1, 1, (n, 3))
+    parts /= np.abs(parts).max(axis=1, keepdims=True)
+    alike = rng.random(n) < 0.3
+    parts[alike] = rng.choice([-1, 1], alike.sum())[:, None]
+    change = np.einsum("nij,nj,nkj->nik", turned, parts, turned)
+    truth = true_curvatures(g + off_g[:, None] * moved, a + off_a[:, None, None] * change)
+
+    def real(values: np.ndarray) -> Any:
+        return backend.Float((values * (1 + 1e-6)).astype(kind))
+
+    rows: Any = tuple(to_vector3(backend, row) for row in a.swapaxes(0, 1))
+    found = _Derivatives(backend, to_vector3(backend, g), rows, real(off_g), real(off_a)).bent()
+    mean, gaussian, _, mean_error, gaussian_error, truncated = (
+        to_numpy(one).astype(np.float64) for one in found
+    )
+    assert (truncated == ((off_g > 0) | (off_a > 0))).all()
+    for computed, error, exact in zip(
+        (mean, gaussian), (mean_error, gaussian_error), truth, strict=True
+    ):
+        off = np.abs(computed - exact)
+        assert (off <= error).all()
+        assert (off >= 0.99 * error)[error > 1e-3 * np.abs(computed)].any()
+
+
+def test_where_the_gradient_is_not_known() -> None:
+    """An error as large as the gradient leaves nothing to say; nor does one that is no number."""
+    backend = choose_backend("double")
+    gradient = backend.Array3f(0, 0, 1)
+    rows: Any = tuple(backend.Array3f(one) for one in np.eye(3).tolist())
+    for error in (1.0, 2.0, math.inf, math.nan):
+        found = _Derivatives(backend, gradient, rows, backend.Float(error), 0.0).bent()
+        parts = [to_numpy(one) for one in found]
+        assert all(np.isnan(one).all() for one in parts[:3]), error
+        assert all(np.isinf(one).all() for one in parts[3:5])
+        assert parts[5].all()
+    for error in (math.inf, math.nan):
+        found = _Derivatives(backend, gradient, rows, 0.0, backend.Float(error)).bent()
+        assert all(np.isinf(to_numpy(one)).all() for one in found[3:5])
+
+
+class Truncated(BatchedField):
+    """1/|p| - 1, with derivatives said to be off by `gradient` and `hessian` times closer^-2, but
+    no less than `left`, however closely one looks; they are off by `share` of that."""
+
+    domain = hk.Ball(radius=4.0)
+
+    def __init__(
+        self, gradient: float, hessian: float, left: float = 0.0, share: float = 1.0
+    ) -> None:
+        self.errors, self.left, self.share = (gradient, hessian), left, share
+        self.asked: list[tuple[int, float]] = []
+
+    def evaluate(self, p: Any) -> hk.Sample:
+        r = dr.norm(p)
+        return hk.Sample(1 / r - 1, -p / (r * r * r), (hk.HarmonicBall(r, -1.0, math.inf),))
+
+    def values_at(self, x: Any, derivatives: int, closer: Any = 1.0) -> Values:
+        dr.eval(x, closer)
+        self.asked.append((dr.width(x), float(to_numpy(closer)[0])))
+        r = dr.norm(x)
+        g, third = -x / r**3, 1 / r**3
+        near = dr.square(1 / closer)
+        off_g, off_a = (dr.maximum(one * near, self.left) for one in self.errors)
+        ways = (dr.sin(40 * x.x), dr.cos(30 * x.y), dr.sin(50 * x.z + 1))
+        way = dr.normalize(type(x)(*ways))
+        wrong = SymmetricSum(*(self.share * off_a * (way[i] * way[j]) for i, j in INDICES))
+        p = (x.x, x.y, x.z)
+        right = [3 * p[i] * p[j] / r**5 - (third if i == j else 0) for i, j in INDICES]
+        total = SymmetricSum(*(a + b for a, b in zip(right, wrong.parts(), strict=True)))
+        return Values(
+            1 / r - 1, dr.zeros(type(r)), g + self.share * off_g * way, total, off_g, off_a
+        )
+
+
+INDICES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
+
+def test_errors_are_stated_and_hold() -> None:
+    x = unit(np.random.default_rng(0).normal(size=(500, 3)))
+    x *= np.random.default_rng(1).uniform(0.3, 2, (500, 1))
+    r = np.linalg.norm(x, axis=1)
+    field = Truncated(1e-2, 1e-2, left=1e-4)
+    found = hk.curvature(field, x)
+    assert (np.abs(found.mean + 1 / r) <= found.mean_error).all()
+    assert (np.abs(found.gaussian - 1 / r**2) <= found.gaussian_error).all()
+    assert (np.abs(found.mean + 1 / r) > 1e-7).mean() > 0.5  # it has errors to state
+
+
+def test_sums_are_looked_at_as_closely_as_needed() -> None:
+    """Points whose error is small enough are left alone, the others seen closer, up to one by
+    one."""
+    x = np.concatenate([np.full((3, 3), 0.2), np.full((2, 3), 2.0)])
+    field = Truncated(1e-3, 1e-3)
+    found = hk.curvature(field, x)
+    r = np.linalg.norm(x, axis=1)
+    assert (found.mean_error <= 1e-3 / r * 1.01).all()
+    counts = [count for count, _ in field.asked]
+    assert field.asked[0] == (5, 1.0)
+    assert counts == sorted(counts, reverse=True)
+    assert counts[1] == 2  # those far away, where the field is flat
+    everything = Truncated(1e3, 1e3)
+    found = hk.curvature(everything, x)
+    assert everything.asked[-1] == (5, math.inf)
+    assert np.abs(found.mean * r + 1).max() < 1e-12
+    assert (found.mean_error < 1e-12 / r).all()
+
+
+def test_what_stays_uncertain_is_said_or_refused() -> None:
+    x = np.array([[0.5, 0.0, 0.0], [2.0, 0.0, 0.0]])  # gradients 4 and 1/4
+    found = hk.curvature(Truncated(1.0, 1.0, left=0.5, share=0.1), x)
+    assert np.isnan(found.mean).tolist() == [False, True]
+    assert np.isnan(found.gaussian).tolist() == [False, True]
+    assert np.isnan(found.normal).all(axis=1).tolist() == [False, True]
+    assert np.isinf(found.mean_error).tolist() == [False, True]
+    assert abs(found.mean[0] + 2) <= found.mean_error[0]
+    assert found.mean_error[0] > 0.1
+
+
+def test_exact_fields_have_rounding_alone() -> None:
+    x = np.random.default_rng(2).uniform(-1, 1, (200, 3))
+    for precision in PRECISIONS:
+        found = hk.curvature(hk.Gyroid(), x, precision=precision)
+        epsilon = choose_backend(precision).epsilon
+        sample = np.abs(found.mean) + np.sqrt(np.abs(found.gaussian)) + 10
+        assert (found.mean_error < 1e3 * epsilon * sample**2).mean() > 0.9
+        assert np.isfinite(found.gaussian_error).all()
+        assert hk.curvature(hk.Gyroid(), x[:0], precision=precision).mean_error.shape == (0,)
