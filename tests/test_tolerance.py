@@ -1,0 +1,181 @@
+"""Hits of approximate sums meet the tolerance, and say where rounding does not let them.
+
+Every hit is held against sums over all elements in double precision, which share nothing with the
+trees that were traced.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import harnack as hk
+from harnack.geometry.mesh_shapes import icosphere
+from harnack.geometry.singular import singular_edges
+from harnack.testing.direct_sums import dipole_sum, winding_sum
+
+PRECISIONS = ("single", "double")
+
+
+def noisy_sphere(n: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Points near the unit sphere and normals that point away from its centre."""
+    rng = np.random.default_rng(seed)
+    normals = rng.normal(size=(n, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    return normals * (1 + 0.01 * rng.normal(size=(n, 1))), normals
+
+
+def rays_around(n: int, seed: int = 2) -> tuple[np.ndarray, np.ndarray]:
+    """Rays from the sphere of radius 3 towards places in and around the unit sphere."""
+    rng = np.random.default_rng(seed)
+    o = rng.normal(size=(n, 3))
+    o *= 3 / np.linalg.norm(o, axis=1)[:, None]
+    return o, 0.6 * rng.normal(size=(n, 3)) - o
+
+
+def screened_sum(field: hk.ScreenedWindingNumber) -> Any:
+    """Value and gradient of a screened winding number at points, dipole by dipole."""
+    y, a, m, length = field.points, field.areas, field.normals, field.length
+
+    def at(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        values, gradients = [], []
+        for some in np.array_split(x, max(1, len(x) // 200)):
+            z = y[None] - some[:, None]
+            rho = np.linalg.norm(z, axis=2)
+            t, along = rho / length, (z * m).sum(axis=2)
+            first = a * (1 + t) * np.exp(-t) / (4 * np.pi * rho**3)
+            second = a * (3 + 3 * t + t * t) * np.exp(-t) / (4 * np.pi * rho**5)
+            values.append((first * along).sum(axis=1))
+            slope = (second * along)[..., None] * z - first[..., None] * m
+            gradients.append(slope.sum(axis=1))
+        return np.concatenate(values), np.concatenate(gradients)
+
+    return at
+
+
+def edge_fields(vertices: np.ndarray, faces: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """The gradient of the winding number, edge by edge (paper, Eq. 11)."""
+    edges, weights = singular_edges(faces)
+    total = np.zeros_like(x)
+    for (i, j), weight in zip(edges, weights, strict=True):
+        a, b = vertices[i] - x, vertices[j] - x
+        la, lb = np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1)
+        c = np.cross(a, b - a)
+        bracket = (1 / la + 1 / lb) / (la * lb + (a * b).sum(axis=1))
+        total += weight * bracket[:, None] * c
+    return total / (4 * np.pi)
+
+
+def excess(
+    hits: hk.Hits, off: np.ndarray, steepness: np.ndarray, rows: np.ndarray, tolerance: float
+) -> np.ndarray:
+    """How far hits are from the level, over what they may be: the tolerance and what they say."""
+    return off / (steepness * (1.05 * tolerance + hits.uncertainty[rows]))
+
+
+def check_cloud(
+    field: Any, truth: Any, level: float, tolerance: float, precision: Any, n: int
+) -> hk.Hits:
+    o, d = rays_around(n)
+    hits = hk.trace(field, o, d, level=level, tolerance=tolerance, precision=precision)
+    assert not (hits.status == hk.Status.OUT_OF_STEPS).any()
+    rows = np.flatnonzero(hits.hit)
+    assert len(rows) > 0.5 * n
+    value, gradient = truth(hits.position[rows])
+    steepness = np.linalg.norm(gradient, axis=1)
+    # The position, rounded to single precision, moves f by as much.
+    rounded = (4e-7 if precision == "single" else 1e-15) * steepness * 3
+    off = np.maximum(np.abs(value - level) - rounded, 0)
+    assert excess(hits, off, steepness, rows, tolerance).max() <= 1
+    if precision == "double":
+        assert np.median(hits.uncertainty[rows]) == 0
+    return hits
+
+
+@pytest.mark.parametrize("level", [2 * np.pi, 1.0])
+@pytest.mark.parametrize("accuracy", [None, 2.0])
+def test_hits_of_clouds_meet_the_tolerance(level: float, accuracy: float | None) -> None:
+    """They were up to 98 (43,000 with accuracy 2) tolerances off."""
+    points, normals = noisy_sphere(2000)
+    field = hk.DipolePotential(points, normals, accuracy=accuracy)
+    truth = dipole_sum(field.points, field.areas[:, None] * field.normals)
+    check_cloud(field, truth, level, 1e-4, "double", 500)
+
+
+def test_hits_of_screened_clouds_meet_the_tolerance() -> None:
+    """They were up to 268 tolerances off."""
+    field = hk.ScreenedWindingNumber(*noisy_sphere(1500), length=2.0, method="tree")
+    check_cloud(field, screened_sum(field), 0.1, 1e-4, "double", 300)
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_smooth_hits_of_damaged_meshes_meet_the_tolerance(precision: Any) -> None:
+    """They were up to 31 tolerances off."""
+    vertices, faces = icosphere(4)
+    faces = faces[np.random.default_rng(0).uniform(size=len(faces)) > 0.25]
+    field = hk.WindingNumber(vertices, faces, method="tree")
+    rng = np.random.default_rng(3)
+    o = 3 * rng.normal(size=(600, 3))
+    target = vertices[rng.integers(len(vertices), size=600)] * rng.uniform(0.5, 1.1, (600, 1))
+    hits = hk.trace(field, o, target - o, precision=precision)
+    rows = np.flatnonzero(hits.hit & (hits.sheet < 0))
+    assert len(rows) > 60
+    x = hits.position[rows]
+    steepness = np.linalg.norm(edge_fields(vertices, faces, x), axis=1)
+    off = np.abs(winding_sum(vertices[faces])(x) - 0.5)
+    if precision == "single":
+        off = np.maximum(off - 4e-7 * 6 * steepness, 0)
+    assert excess(hits, off, steepness, rows, 1e-4).max() <= 1
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_edges_between_triangles_are_no_surface(precision: Any) -> None:
+    """Rays through edges and vertices of an outer ball, across which w goes from 0 to 1, towards
+    the level 1.5 on an inner one: 88 % of the hits by tree were on the outer ball."""
+    vertices, faces = icosphere(3)
+    both = np.concatenate([vertices, 0.5 * vertices]), np.concatenate([faces, faces + len(vertices)])
+    rng = np.random.default_rng(3)
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
+    chosen = vertices[edges[rng.integers(len(edges), size=1500)]]
+    share = rng.uniform(size=(1500, 1)) * (rng.uniform(size=(1500, 1)) < 0.7)
+    o = 3 * rng.normal(size=(1500, 3))
+    target = chosen[:, 0] + share * (chosen[:, 1] - chosen[:, 0])
+    found = []
+    for method in ("exact", "tree"):
+        field = hk.WindingNumber(*both, method=method)
+        hits = hk.trace(field, o, target - o, level=1.5, precision=precision)
+        assert not (hits.status == hk.Status.OUT_OF_STEPS).any()
+        assert (hits.sheet[hits.hit] >= 0).all()
+        face = field.faces_of_sheets[hits.sheet[hits.hit]]
+        assert (face >= len(faces)).all()
+        found.append(hits.t)
+    np.testing.assert_array_equal(np.isfinite(found[0]), np.isfinite(found[1]))
+
+
+def test_tight_tolerances_in_single_precision_state_their_rounding() -> None:
+    """What cannot be met is not hidden: hits say by how much they may be farther off."""
+    points, normals = noisy_sphere(500)
+    field = hk.DipolePotential(points, normals)
+    truth = dipole_sum(field.points, field.areas[:, None] * field.normals)
+    hits = check_cloud(field, truth, 2 * np.pi, 1e-8, "single", 300)
+    stated = hits.uncertainty[hits.hit]
+    assert (stated > 0).all()
+    assert np.median(stated) < 1e-4
+    assert (hits.uncertainty[~hits.hit] == 0).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("tolerance", [1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7])
+def test_many_hits_meet_the_tolerance(tolerance: float, precision: Any) -> None:
+    for n, accuracy, level in ((300, None, 2 * np.pi), (3000, None, 1.0), (1000, 1.5, 0.3)):
+        points, normals = noisy_sphere(n, seed=n)
+        field = hk.DipolePotential(points, normals, accuracy=accuracy)
+        truth = dipole_sum(field.points, field.areas[:, None] * field.normals)
+        check_cloud(field, truth, level, tolerance, precision, 3000)
+    for length in (0.2, 3.0):
+        field = hk.ScreenedWindingNumber(*noisy_sphere(800), length=length, method="tree")
+        level = field.default_level
+        check_cloud(field, screened_sum(field), level, tolerance, precision, 1000)
