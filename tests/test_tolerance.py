@@ -135,7 +135,10 @@ def test_edges_between_triangles_are_no_surface(precision: Any) -> None:
     """Rays through edges and vertices of an outer ball, across which w goes from 0 to 1, towards
     the level 1.5 on an inner one: 88 % of the hits by tree were on the outer ball."""
     vertices, faces = icosphere(3)
-    both = np.concatenate([vertices, 0.5 * vertices]), np.concatenate([faces, faces + len(vertices)])
+    both = (
+        np.concatenate([vertices, 0.5 * vertices]),
+        np.concatenate([faces, faces + len(vertices)]),
+    )
     rng = np.random.default_rng(3)
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
     chosen = vertices[edges[rng.integers(len(edges), size=1500)]]

@@ -12,6 +12,7 @@ import numpy as np
 
 from harnack.backend.extrema import fmin
 from harnack.fields.edge_hessian import SymmetricSum
+from harnack.fields.edge_lift import epsilon_at
 from harnack.fields.far_clusters import Errors, FarClusters
 from harnack.fields.multipole import all_levels
 from harnack.fields.nearby import rounding_of_dipole
@@ -62,24 +63,26 @@ class DipoleTree:
 
     def at(self, x: Vec3, derivatives: int, closer: Real) -> Values:
         """Value and derivatives (as asked for) at x, `closer` as for `FarClusters.at`."""
-        count, epsilon = len(dataclasses.fields(Errors)), self.clusters.backend.epsilon
+        count, unit = len(dataclasses.fields(Errors)), epsilon_at(x)
 
         def add(row: list[Real], active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
             errors, (value, *rest) = Errors(*state[:count]), state[count:]
             inverse, one, slope, bend = _dipole(row, x, derivatives)
-            value = value + dr.select(active, one, 0)
+            closer, rounded = self._rounded(row, inverse, unit)
+            # On a point itself, to rounding, nothing is known: its error is infinite.
+            active_here = active & dr.isfinite(inverse)
+            value = value + dr.select(active_here, one, 0)
             if derivatives >= 1:
-                rest[0] = rest[0] + dr.select(active, slope, 0)
+                rest[0] = rest[0] + dr.select(active_here, slope, 0)
             if derivatives == 2:
                 pairs = zip(rest[1:], bend, strict=True)
-                rest[1:] = [old + dr.select(active, new, 0) for old, new in pairs]
-            more = dr.select(active, rounding_of_dipole(row[6], inverse), 0)
-            fourth = dr.select(active, row[6] * dr.square(inverse * inverse), 0)
+                rest[1:] = [old + dr.select(active_here, new, 0) for old, new in pairs]
+            fourth = row[6] * dr.square(closer * closer)
             errors = dataclasses.replace(
                 errors,
-                rounding=dr.fma(epsilon, more, errors.rounding),
-                s4=errors.s4 + fourth,
-                s5=dr.fma(fourth, inverse, errors.s5),
+                rounding=errors.rounding + dr.select(active, rounded, 0),
+                s4=errors.s4 + dr.select(active, fourth, 0),
+                s5=errors.s5 + dr.select(active, fourth * closer, 0),
             )
             return *errors.parts(), value, *rest
 
@@ -90,31 +93,35 @@ class DipoleTree:
         errors, (value, *rest) = self.clusters.at(x, derivatives, leaf, closer)
         gradient = rest[0] if derivatives >= 1 else None
         hessian = SymmetricSum(*rest[1:7]) if derivatives == 2 else None
-        unit = self._unit(x)
         return errors.values(1.0, unit, self.rounding, value, gradient, hessian)
 
-    def _unit(self, x: Vec3) -> Real:
-        """What rounding may do to a coordinate of x or of a point."""
-        return self.clusters.backend.epsilon * (1 + dr.max(dr.abs(x)))
+    def _rounded(self, row: list[Real], inverse: Real, unit: Real) -> tuple[Real, Real]:
+        """One over the distance to a dipole, less what rounding may have done to it, and what
+        rounding may do to its value. Both are 0 for padding, infinite on the dipole itself."""
+        near = dr.rcp(inverse) - 2 * unit
+        closer = dr.select(near > 0, dr.rcp(near), dr.inf)
+        rounded = rounding_of_dipole(row[6], closer, unit)
+        some = row[6] > 0
+        return dr.select(some, closer, 0), dr.select(some, rounded, 0)
 
     def sample(self, x: Vec3, detail: Real) -> Sample:
         """Value, gradient and certificate at x: see `nearby.Nearby.sample`."""
-        vector, epsilon = self.clusters.backend.Array3f, self.clusters.backend.epsilon
+        vector, unit = self.clusters.backend.Array3f, epsilon_at(x)
 
         def add(row: list[Real], active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
             value, g, truncation, slope_truncation, rounding, clear, s4, s5, nearest = state
             inverse, one, slope, _ = _dipole(row, x, 1)
             near = dr.rcp(inverse)
             cube = dr.select(active, row[6] * (inverse * inverse * inverse), 0)
-            rounded = dr.select(active, rounding_of_dipole(row[6], inverse), 0)
+            _, rounded = self._rounded(row, inverse, unit)
             # On a point itself nothing is known, and `Nearby.sample` says so.
-            rounded = dr.select(dr.isfinite(rounded), rounded, 0)
+            rounded = dr.select(active & dr.isfinite(rounded), rounded, 0)
             return (
                 value + dr.select(active, one, 0),
                 g + dr.select(active, slope, 0),
                 truncation,
                 slope_truncation,
-                dr.fma(epsilon, rounded, rounding),
+                rounding + rounded,
                 dr.select(active, fmin(near, clear), clear),
                 dr.fma(cube, inverse, s4),
                 dr.fma(cube * inverse, inverse, s5),
@@ -130,7 +137,7 @@ class DipoleTree:
         weight = dr.norm(nearest)
         beside = (found.clear * found.clear < _BESIDE * weight) & (weight > 0)
         normal = dr.select(beside, -nearest / weight, dr.normalize(found.gradient))
-        return found.sample(1.0, self._unit(x), self.rounding, normal)
+        return found.sample(1.0, unit, self.rounding, normal)
 
 
 def _dipole(row: list[Real], x: Vec3, derivatives: int) -> tuple[Real, Real, Vec3, list[Real]]:

@@ -81,7 +81,7 @@ class EdgeChains:
                 state[1:], far_terms(c, r, inverse, 1), far, inverse,
                 dr.fma(c[18], inverse * inverse, c[17]),
                 (c[15] * decay, c[16] * decay * inverse),
-                free_part(RATIO) * (square * inverse), self.backend.epsilon,
+                free_part(RATIO) * (square * inverse), unit,
             )  # fmt: skip
             state = (state[0], *sums)
             chord = vector(*c[19:22]), vector(*c[22:25])

@@ -16,6 +16,7 @@ import numpy as np
 from harnack.backend.extrema import fmax
 from harnack.fields.batch import Values
 from harnack.fields.edge_hessian import SymmetricSum
+from harnack.fields.edge_lift import epsilon_at
 from harnack.fields.multipole import Level, cartesian
 from harnack.fields.multipole_kernel import far_terms
 from harnack.fields.nearby import (
@@ -155,7 +156,7 @@ class FarClusters:
         real, vector = self.backend.Float, self.backend.Array3f
         zero = SymmetricSum.zero(real).parts()
         sums: Sums = (vector(0), *zero)[: (0, 1, 7)[derivatives]]
-        count = len(dataclasses.fields(Errors))
+        count, unit = len(dataclasses.fields(Errors)), epsilon_at(x)
         closer = fmax(real(closer), real(1)) * (self.accuracy / self.rough)
 
         def visit(node: Node, state: Sums) -> tuple[Mask, Sums]:
@@ -175,7 +176,7 @@ class FarClusters:
                 errors.value + left_out,
                 dr.fma(left_out, inverse, errors.slope),
                 dr.fma(left_out, inverse * inverse, errors.second),
-                errors.rounding + self.backend.epsilon * rounding_of_dipole(size, inverse),
+                errors.rounding + rounding_of_dipole(size, inverse, unit),
                 dr.fma(size, fourth, errors.s4),
                 dr.fma(size, fourth * inverse, errors.s5),
             )
@@ -207,6 +208,7 @@ class FarClusters:
         """
         real, vector = self.backend.Float, self.backend.Array3f
         free, closer = free_part(self.rough), self.ratio(detail) / self.rough
+        unit = epsilon_at(x)
 
         def visit(node: Node, state: Sums) -> tuple[Mask, Sums]:
             r, square, inverse, far = self._far(node, x, closer)
@@ -214,7 +216,7 @@ class FarClusters:
             left_out = c[15] * self._decay(inverse)
             sums = with_far_node(
                 state[:8], far_terms(c, r, inverse, 1), far, inverse, self._size(node, inverse),
-                (left_out, left_out * inverse), free * (square * inverse), self.backend.epsilon,
+                (left_out, left_out * inverse), free * (square * inverse), unit,
             )  # fmt: skip
             state = (*sums, *state[8:])
             return ~far, add_leaf(node, ~far & node.is_leaf, state)

@@ -73,12 +73,13 @@ def _phi(q: float) -> float:
 
 def with_far_node(
     sums: Sums, terms: Terms, far: Mask, inverse: Real, size: Real, left_out: tuple[Real, Real],
-    free: Real, epsilon: float,
+    free: Real, unit: Real,
 ) -> Sums:  # fmt: skip
     """The sums of `Nearby`, in its order, with a node's added where it is far, 1/inverse away.
 
     size: A + K/r^2 of `bend_columns`; left_out: of value and gradient; free: as far as the node
-    counts as free of dipoles. Elsewhere terms and inverse are 0.
+    counts as free of dipoles; unit: the rounding of a coordinate. Elsewhere terms and inverse are
+    0.
     """
     value, g, truncation, slope_truncation, rounding, clear, s4, s5 = sums
     fourth = size * dr.square(inverse * inverse)
@@ -87,21 +88,22 @@ def with_far_node(
         g + dr.select(far, terms.gradient, 0),
         truncation + left_out[0],
         slope_truncation + left_out[1],
-        dr.fma(epsilon, rounding_of_dipole(size, inverse), rounding),
+        rounding + rounding_of_dipole(size, inverse, unit),
         dr.select(far, fmin(free, clear), clear),
         s4 + fourth,
         dr.fma(fourth, inverse, s5),
     )
 
 
-def rounding_of_dipole(area: Real, inverse: Real) -> Real:
-    """What rounding may do to the value of a dipole at distance rho = 1/inverse, over epsilon.
+def rounding_of_dipole(area: Real, inverse: Real, unit: Real) -> Real:
+    """What rounding may do to the value of a dipole at distance rho = 1/inverse.
 
-    Coordinates rounded by epsilon each move it by at most 2 epsilon area/rho^3; the four roundings
-    of its term, by 4 epsilon area/rho^2.
+    unit: the rounding of a coordinate, at least epsilon: it moves the value by at most
+    2 unit area/rho^3, twice in the difference of two coordinates; the four roundings of its term
+    do so by 4 epsilon area/rho^2.
     """
     square = inverse * inverse
-    return area * dr.fma(2 * inverse, square, 4 * square)
+    return (unit * area) * dr.fma(4 * inverse, square, 4 * square)
 
 
 @dataclass(frozen=True)

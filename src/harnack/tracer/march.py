@@ -239,7 +239,8 @@ def _finer(
     It is where its error shortens the step by much or decides about a hit, unless truncation is a
     small part of it: of what a hit may be off, `within`, or of rounding, which no detail helps.
     What is allowed leaves the march a way to a hit: its steps end where a level is as near as
-    `blur`, and 1.25 times that is less than what makes a hit, within - truncation or twice rounding.
+    `blur`, and 1.25 times that is less than what makes a hit, within - truncation or twice the
+    rounding.
     """
     rounding = blur - truncation
     allowed = fmax(_OF_TOLERANCE * within - _LESS * rounding, _OF_ROUNDING * rounding)
