@@ -16,10 +16,11 @@ from .convergence import plot
 from .growth import growth
 from .rays import RULES, WIDTH, Row, machine, measure, published
 from .scenes import others, polygons
+from .versions import beside
 from .winding import throughput
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
-SECTIONS = ("rays", "convergence", "winding", "agreement")
+SECTIONS = ("rays", "convergence", "winding", "agreement", "versions")
 
 
 def main() -> None:
@@ -30,6 +31,7 @@ def main() -> None:
     parser.add_argument("--only", choices=SECTIONS, help="rewrite one section of the page")
     parser.add_argument("--bunny", type=Path, help="a surface file, for the winding numbers")
     parser.add_argument("--meshes", type=Path, help="a folder of surface files, for agreement")
+    parser.add_argument("--before", type=Path, help="a checkout of an earlier version, to compare")
     arguments = parser.parse_args()
     names = [arguments.only] if arguments.only else list(SECTIONS)
     if arguments.no_convergence and "convergence" in names:
@@ -38,10 +40,15 @@ def main() -> None:
         if arguments.only == "agreement":
             parser.error("agreement needs a folder of surface files: --meshes FOLDER")
         names = [name for name in names if name != "agreement"]
+    if arguments.before is None:
+        if arguments.only == "versions":
+            parser.error("versions needs a checkout of an earlier version: --before FOLDER")
+        names = [name for name in names if name != "versions"]
     write: dict[str, Callable[[], str]] = {
         "rays": _rays,
         "convergence": lambda: _convergence(arguments.out.with_name("convergence.png")),
         "agreement": lambda: agreement(arguments.meshes),
+        "versions": lambda: beside(arguments.before),
         "winding": lambda: _winding(arguments.bunny, arguments.out.with_name("growth.png")),
     }
     if arguments.only and not arguments.out.exists():
