@@ -44,17 +44,20 @@ class Values:
     hessian_error: Real = 0.0
 
     def rescaled(self, size: Real) -> Values:
-        """Those of x -> f(x / size), at the points that move there."""
+        """Those of x -> f(x / size), at the points that move there. Where a number has overflowed
+        its error is infinite."""
         gradient, hessian, share = self.gradient, self.hessian, 1 / size
-        square = share * share
-        return Values(
-            self.value,
-            self.error,
-            None if gradient is None else gradient * share,
-            None if hessian is None else type(hessian)(*(square * one for one in hessian.parts())),
-            self.gradient_error * share,
-            self.hessian_error * square,
-        )
+        gradient_error, hessian_error = self.gradient_error, self.hessian_error
+        if gradient is not None:
+            gradient = gradient * share
+            known = dr.isfinite(gradient.x) & dr.isfinite(gradient.y) & dr.isfinite(gradient.z)
+            gradient_error = dr.select(known, gradient_error * share, dr.inf)
+        if hessian is not None:
+            hessian = type(hessian)(*(share * share * one for one in hessian.parts()))
+            known = dr.isfinite(sum(hessian.parts()))
+            hessian_error = dr.select(known, hessian_error * (share * share), dr.inf)
+        error = dr.select(dr.isfinite(self.value), self.error, dr.inf)
+        return Values(self.value, error, gradient, hessian, gradient_error, hessian_error)
 
 
 class BatchedField(Field):

@@ -158,10 +158,12 @@ def _dipole(row: list[Real], x: Vec3, derivatives: int) -> tuple[Real, Real, Vec
     gradient = (u * u2) * dr.fma(vector(3 * along * u2), z, -m)
     if derivatives == 1:
         return u, value, gradient, []
-    five = 3 * u * u2 * u2
+    # By the unit vector n = u z, so that powers of u do not overflow sooner than the result.
+    n, four = u * z, 3 * (u2 * u2)
+    along = dr.dot(m, n)
     pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
     hessian = [
-        five * (5 * along * u2 * z[i] * z[j] - m[i] * z[j] - z[i] * m[j] - (along if i == j else 0))
+        four * (5 * along * n[i] * n[j] - m[i] * n[j] - n[i] * m[j] - (along if i == j else 0))
         for i, j in pairs
     ]
     return u, value, gradient, hessian

@@ -140,7 +140,9 @@ def _with_edge(
     g = dr.fma(vector(direction * weight), c, sums[0])
     if derivatives == 1:
         return product, bounds, g
-    u, v = edge_rates(a, b - a, row[7])
+    # The edge itself and not b - a, which far away is mostly rounding.
+    e = vector(row[4] - row[0], row[5] - row[1], row[6] - row[2])
+    u, v = edge_rates(a, e, row[7])
     return product, bounds, g, *SymmetricSum(*sums[1:]).plus(direction * u, v).parts()
 
 

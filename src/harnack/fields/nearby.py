@@ -27,7 +27,7 @@ _REACHES = (0.2, 0.4, 0.6)
 _WAY = 0.65
 _ROUNDING = 2e-5
 # What rounding does to gradients and second derivatives: see `far_clusters.Errors`.
-SLOPE_ROUNDINGS, SECOND_ROUNDINGS = 10.0, 40.0
+SLOPE_ROUNDINGS, SECOND_ROUNDINGS = 16.0, 320.0
 
 Sums: TypeAlias = "tuple[Any, ...]"
 

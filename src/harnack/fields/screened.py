@@ -173,13 +173,17 @@ class ScreenedWindingNumber(BatchedField):
         rounding = self._rounding(backend, sums) + 8 * backend.epsilon * dr.abs(sums.value)
         # Fourth derivatives of the kernel: Q_4(t) <= (1 + t/4) Q_3(t).
         fourth = dr.fma(0.25 * on.sum.kappa, sums.bent, sums.more_bent)
+        # Exponentials are held at exp(-80) = 2e-35 (`screened_kernel.LONGEST`), times at most
+        # Q_3(80) exp(80) = 9e4.
+        share = dr.rsqrt(sums.nearest)
+        held = 2e-30 * float(self._rows[:, 6].sum()) * share * share
         return Values(
             sums.value,
-            sums.error + rounding,
+            sums.error + rounding + held,
             sums.gradient,
             hessian,
-            dr.fma(SLOPE_ROUNDINGS * unit, sums.bent, sums.gradient_error),
-            dr.fma(SECOND_ROUNDINGS * unit, fourth, sums.hessian_error),
+            dr.fma(SLOPE_ROUNDINGS * unit, sums.bent, sums.gradient_error) + 2 * held * share,
+            dr.fma(SECOND_ROUNDINGS * unit, fourth, sums.hessian_error) + 6 * held * share * share,
         ).rescaled(on.size)
 
     def _rounding(self, backend: Backend, sums: ScreenedSums) -> Real:

@@ -33,13 +33,15 @@ _EDGES = ((0, 1, 1.0), (1, 2, 1.0), (0, 2, -1.0))
 class NearEdge:
     """An edge of a triangle, seen from x.
 
-    a, b: its ends less x. lengths: |a| and |b|. seen: a and b across the frame's rays and along
-    them. way: 1 or -1, as the triangle runs from a to b or back. inverse: 1/length^2, or 0 for no
-    edge. square: that of its distance from x. is_singular: whether the mesh ends there.
+    a, b: its ends less x. e: from a to b, without the rounding of x. lengths: |a| and |b|. seen: a
+    and b across the frame's rays and along them. way: 1 or -1, as the triangle runs from a to b or
+    back. inverse: 1/length^2, or 0 for no edge. square: that of its distance from x. is_singular:
+    whether the mesh ends there.
     """
 
     a: Vec3
     b: Vec3
+    e: Vec3
     lengths: tuple[Real, Real]
     seen: tuple[Vec3, Vec3]
     way: Real
@@ -69,7 +71,7 @@ class NearEdge:
 
     def add_hessian(self, total: SymmetricSum, active: Mask) -> SymmetricSum:
         """Its part of the Hessian of the solid angle added, where active."""
-        c, rate = edge_rates(self.a, self.b - self.a, self.inverse)
+        c, rate = edge_rates(self.a, self.e, self.inverse)
         return total.plus(dr.select(active, self.way * c, 0), dr.select(active, rate, 0))
 
     def variation(self) -> tuple[Real, Real]:
@@ -88,6 +90,7 @@ def edges_of(row: list[Real], x: Vec3, frame: Frame | Upwards) -> Iterator[NearE
     for k, (i, j, sign) in enumerate(_EDGES):
         a, b, inverse = corners[i], corners[j], dr.select(row[INDEX] >= 0, row[EDGES + k], 0)
         yield NearEdge(
-            a, b, (lengths[i], lengths[j]), (seen[i], seen[j]), sign * row[PARITY], inverse,
-            squared_distance_to_segment(a, b - a, inverse), row[SINGULAR + k] > 0,
+            a, b, ends[j] - ends[i], (lengths[i], lengths[j]), (seen[i], seen[j]),
+            sign * row[PARITY], inverse, squared_distance_to_segment(a, b - a, inverse),
+            row[SINGULAR + k] > 0,
         )  # fmt: skip
