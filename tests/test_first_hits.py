@@ -227,21 +227,32 @@ COIL_DIRECTIONS = np.array(
 )
 
 
+def rays_down_a_coil(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """From the axis above and below towards the middle."""
+    rng = np.random.default_rng(0)
+    o = rng.uniform(-0.3, 0.3, (n, 3))
+    o[:, 2] = rng.uniform(0.1, 1.2, n) * rng.choice([-1, 1], n)
+    d = rng.uniform(-0.2, 0.2, (n, 3))
+    d[:, 2] = -np.sign(o[:, 2])
+    return o, d / np.linalg.norm(d, axis=1)[:, None]
+
+
 def test_the_assumed_range_misses_hits_of_a_coil_and_ours_does_not() -> None:
-    """With c = -4 pi, which the paper assumes for every curve."""
-    assumed = compare(
-        COIL, COIL_ORIGINS, COIL_DIRECTIONS, 2 * math.pi, certificate="paper", bound="caps"
-    )
+    """With c = -4 pi, which the paper assumes for every curve. Which rays it misses depends on the
+    points that are tried."""
+    o, d = rays_down_a_coil(200)
+    o, d = np.concatenate([COIL_ORIGINS, o]), np.concatenate([COIL_DIRECTIONS, d])
+    assumed = compare(COIL, o, d, 2 * math.pi, certificate="paper", bound="caps")
     failures: list[str] = []
-    ours = compare(COIL, COIL_ORIGINS, COIL_DIRECTIONS, 2 * math.pi, failures=failures)
-    assert assumed.missed == 4
+    ours = compare(COIL, o, d, 2 * math.pi, failures=failures)
+    assert assumed.missed > 80
     assert failures == []
-    assert ours.hits == 4
+    assert ours.hits == 204
 
 
-@pytest.mark.parametrize(("certificate", "missed"), [("paper", 3), ("auto", 0)])
+@pytest.mark.parametrize("certificate", ["paper", "auto"])
 def test_the_published_method_misses_hits_of_a_coil_of_eight_turns(
-    certificate: str, missed: int
+    certificate: str,
 ) -> None:
     """Five turns are too few for c = -4 pi with the classic step: at the centre of a coil of k
     turns the solid angle falls by 2 pi k per radius, and Harnack's inequality with u >= 4 pi
@@ -261,8 +272,10 @@ def test_the_published_method_misses_hits_of_a_coil_of_eight_turns(
             [-0.036494021723557465, -0.06719187154778263, -0.9970724340670274],
         ]
     )
+    more = rays_down_a_coil(200)
+    o, d = np.concatenate([o, more[0]]), np.concatenate([d, more[1]])
     tally = compare(coil, o, d, 2 * math.pi, certificate=certificate, bound="classic")
-    assert tally.missed == missed
+    assert tally.missed > 10 if certificate == "paper" else tally.missed == 0
 
 
 def test_the_lift_of_a_coil_leaves_the_assumed_range() -> None:

@@ -110,24 +110,29 @@ def test_hits_of_screened_clouds_meet_the_tolerance() -> None:
     check_cloud(field, screened_sum(field), 0.1, 1e-4, "double", 300)
 
 
-@pytest.mark.parametrize("precision", PRECISIONS)
-def test_smooth_hits_of_damaged_meshes_meet_the_tolerance(precision: Any) -> None:
-    """They were up to 31 tolerances off."""
+def check_mesh(tolerance: float, precision: Any, n: int, **settings: Any) -> None:
     vertices, faces = icosphere(4)
     faces = faces[np.random.default_rng(0).uniform(size=len(faces)) > 0.25]
-    field = hk.WindingNumber(vertices, faces, method="tree")
+    field = hk.WindingNumber(vertices, faces, method="tree", **settings)
     rng = np.random.default_rng(3)
-    o = 3 * rng.normal(size=(600, 3))
-    target = vertices[rng.integers(len(vertices), size=600)] * rng.uniform(0.5, 1.1, (600, 1))
-    hits = hk.trace(field, o, target - o, precision=precision)
+    o = 3 * rng.normal(size=(n, 3))
+    target = vertices[rng.integers(len(vertices), size=n)] * rng.uniform(0.5, 1.1, (n, 1))
+    hits = hk.trace(field, o, target - o, tolerance=tolerance, precision=precision)
+    assert (hits.status == hk.Status.OUT_OF_STEPS).sum() <= 1e-4 * n
     rows = np.flatnonzero(hits.hit & (hits.sheet < 0))
-    assert len(rows) > 60
+    assert len(rows) > 0.1 * n
     x = hits.position[rows]
     steepness = np.linalg.norm(edge_fields(vertices, faces, x), axis=1)
     off = np.abs(winding_sum(vertices[faces])(x) - 0.5)
     if precision == "single":
         off = np.maximum(off - 4e-7 * 6 * steepness, 0)
-    assert excess(hits, off, steepness, rows, 1e-4).max() <= 1
+    assert excess(hits, off, steepness, rows, tolerance).max() <= 1
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_smooth_hits_of_damaged_meshes_meet_the_tolerance(precision: Any) -> None:
+    """They were up to 31 tolerances off."""
+    check_mesh(1e-4, precision, 600)
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
@@ -182,3 +187,11 @@ def test_many_hits_meet_the_tolerance(tolerance: float, precision: Any) -> None:
         field = hk.ScreenedWindingNumber(*noisy_sphere(800), length=length, method="tree")
         level = field.default_level
         check_cloud(field, screened_sum(field), level, tolerance, precision, 1000)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("tolerance", [1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7])
+def test_many_smooth_hits_of_meshes_meet_the_tolerance(tolerance: float, precision: Any) -> None:
+    check_mesh(tolerance, precision, 4000)
+    check_mesh(tolerance, precision, 2000, accuracy=1.5, order=0)

@@ -37,8 +37,8 @@ class DipolePotential(BatchedField):
         oriented along a spanning tree (`geometry.estimate_normals`). areas: (n,), or None to
         estimate them from neighbours (Barill et al. 2018, Sec. 3.1).
     accuracy: a cluster of points is taken as a whole beyond `accuracy` times its radius; by
-        default 2 for values at points and 4 for tracing, where hits are as sharp as the proved
-        bound of what that leaves out. At least 1.5.
+        default 2 for values at points and 4 for tracing, which takes more where the tolerance asks
+        for it. At least 1.5.
 
     `moved` gives the field of points that have moved.
 

@@ -154,13 +154,14 @@ def epsilon_at(x: Vec3) -> Real:
 def rounding_of_edge(first: Real, unit: Real) -> Real:
     """What rounding may do to the solid angle of an edge.
 
-    first: of `edge_variation`. unit: the rounding of a coordinate, `epsilon_at`. The ends of the
-    edge and x move by a few units, and the angle by that times Biot and Savart's field, which is at
-    most 2 first; the roundings of the factor F_e are as if its ends had moved, for those of its
+    first: of `edge_variation`. unit: the rounding of a coordinate, `epsilon_at`, which is twice
+    what correct rounding does. The ends of the edge, x and their differences are off by half a
+    unit together, and the angle by that times Biot and Savart's field, which is at most 2 first;
+    the roundings of the factor F_e are as if its ends had moved by another half, for those of its
     terms are |F_e| times a few over the cosine of half the angle that the edge is seen at, and the
     same bits of an end serve both edges there. It is less than 4 pi in any case.
     """
-    return fmin(4 * unit * first, 4 * dr.pi)
+    return fmin(2 * unit * first, 4 * dr.pi)
 
 
 def with_edge(

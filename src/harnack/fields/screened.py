@@ -62,7 +62,7 @@ class ScreenedWindingNumber(BatchedField):
     method: "sum" (all dipoles), "tree" (far ones in clusters), "auto".
     accuracy: of the tree: a cluster of radius R is taken as a whole where the screening leaves its
         error as small as that of an unscreened one at distance accuracy * R. The error is bounded
-        and part of every promise: more is slower, and lets hits be sharper.
+        and part of every promise. Tracing takes more where the tolerance asks for it.
 
     Promises (`promises` has the formulas), for d_i the distances from x, d the least of them:
 

@@ -54,7 +54,8 @@ class WindingNumber(BatchedField):
         boundary edges.
     accuracy: of the tree: a cluster of triangles is taken as a whole beyond `accuracy` times its
         radius; more is slower and sharper. At least 1.5; by default 2 for values at points and 4
-        for tracing. order: of the tree: 0 (dipoles), 1 or 2 (octupoles).
+        for tracing, which takes more where the tolerance asks for it. order: of the tree: 0
+        (dipoles), 1 or 2 (octupoles).
 
     Hits on triangles have `Hits.sheet`; `faces_of_sheets` gives the face of each. `moved` gives the
     field for the same faces when vertices have moved.
