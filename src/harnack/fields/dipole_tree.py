@@ -113,15 +113,14 @@ class DipoleTree:
             inverse, one, slope, _ = _dipole(row, x, 1)
             near = dr.rcp(inverse)
             cube = dr.select(active, row[6] * (inverse * inverse * inverse), 0)
-            _, rounded = self._rounded(row, inverse, unit)
-            # On a point itself nothing is known, and `Nearby.sample` says so.
-            rounded = dr.select(active & dr.isfinite(rounded), rounded, 0)
+            # On a point itself, to 16 roundings, nothing is known, and `Nearby.sample` says so.
+            rounded = rounding_of_dipole(row[6], fmin(inverse, dr.rcp(8 * unit)), unit)
             return (
                 value + dr.select(active, one, 0),
                 g + dr.select(active, slope, 0),
                 truncation,
                 slope_truncation,
-                rounding + rounded,
+                rounding + dr.select(active, rounded, 0),
                 dr.select(active, fmin(near, clear), clear),
                 dr.fma(cube, inverse, s4),
                 dr.fma(cube * inverse, inverse, s5),

@@ -153,9 +153,10 @@ class Nearby:
         variation = (1 + _ROUNDING) * r * dr.fma(0.5 * r, widest.constant, slope)
         value = share * self.value
         ball = HarmonicBall(r, value - variation, value + variation)
-        # On a singular point itself all values meet: a gradient that says so.
-        apart = (self.clear > 8 * unit) & dr.isfinite(value) & dr.isfinite(dr.squared_norm(g))
-        steep = self.backend.Array3f(0, 0, share * math.pi / unit)
+        # On a singular point itself all values meet: a gradient so steep that it is as near to any
+        # level as can be.
+        apart = (self.clear > 16 * unit) & dr.isfinite(value) & dr.isfinite(dr.squared_norm(g))
+        steep = self.backend.Array3f(0, 0, share * 1e4 * math.pi / unit)
         return Sample(
             dr.select(apart, value, 0),
             dr.select(apart, g, steep),

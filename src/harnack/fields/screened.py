@@ -165,32 +165,40 @@ class ScreenedWindingNumber(BatchedField):
         backend = backend_of(x)
         if backend not in self._batches:
             self._batches[backend] = self.prepare(backend)
-        on = self._batches[backend]._on
+        prepared = self._batches[backend]
+        on = prepared._on
         x = on.unit(x)
-        sums, unit = on.sum.sums(x, closer), epsilon_at(x)
+        sums = on.sum.sums(x, closer)
         # The trace of the Hessian is w/l^2; it grows without limit at the points.
         hessian = on.sum.hessian(x, closer) if derivatives == 2 else None
-        rounding = self._rounding(backend, sums) + 8 * backend.epsilon * dr.abs(sums.value)
-        # Fourth derivatives of the kernel: Q_4(t) <= (1 + t/4) Q_3(t).
-        fourth = dr.fma(0.25 * on.sum.kappa, sums.bent, sums.more_bent)
-        # Exponentials are held at exp(-80) = 2e-35 (`screened_kernel.LONGEST`), times at most
-        # Q_3(80) exp(80) = 9e4.
-        share = dr.rsqrt(sums.nearest)
-        held = 2e-30 * float(self._rows[:, 6].sum()) * share * share
+        rounding, slope, second = prepared._rounding(backend, sums, epsilon_at(x))
         return Values(
             sums.value,
-            sums.error + rounding + held,
+            sums.error + rounding + 8 * backend.epsilon * dr.abs(sums.value),
             sums.gradient,
             hessian,
-            dr.fma(SLOPE_ROUNDINGS * unit, sums.bent, sums.gradient_error) + 2 * held * share,
-            dr.fma(SECOND_ROUNDINGS * unit, fourth, sums.hessian_error) + 6 * held * share * share,
+            sums.gradient_error + slope,
+            sums.hessian_error + second,
         ).rescaled(on.size)
 
-    def _rounding(self, backend: Backend, sums: ScreenedSums) -> Real:
-        """Of the value: of terms, each rounded and added with random signs, and of positions."""
-        epsilon = backend.epsilon
-        rounding = epsilon * (12 + math.sqrt(len(self._rows)))
-        return dr.fma(rounding, sums.moved, 6 * epsilon * sums.steep)
+    def _rounding(
+        self, backend: Backend, sums: ScreenedSums, unit: Real
+    ) -> tuple[Real, Real, Real]:
+        """Of value, gradient and second derivatives: of terms, each rounded and added with random
+        signs, and of positions, a coordinate of which is off by `unit`.
+
+        Fourth derivatives of the kernel have Q_4(t) <= (1 + t/4) Q_3(t). Exponentials are held at
+        exp(-80) = 2e-35 (`screened_kernel.LONGEST`), times at most Q_3(80) exp(80) = 9e4.
+        """
+        epsilon, share = backend.epsilon, dr.rsqrt(sums.nearest)
+        terms = epsilon * (12 + math.sqrt(len(self._rows)))
+        held = 2e-30 * float(self._rows[:, 6].sum()) * share * share
+        fourth = dr.fma(0.25 * self._on.sum.kappa, sums.bent, sums.more_bent)
+        return (
+            dr.fma(terms, sums.moved, 6 * epsilon * sums.steep) + held,
+            dr.fma(SLOPE_ROUNDINGS * unit, sums.bent, 2 * held * share),
+            dr.fma(SECOND_ROUNDINGS * unit, fourth, 6 * held * share * share),
+        )
 
     def prepare(self, backend: Backend) -> ScreenedWindingNumber:
         if self._device is not None and self._device.backend is backend:
@@ -215,8 +223,8 @@ class ScreenedWindingNumber(BatchedField):
         on = self._on
         x = on.unit(p)
         sums, epsilon = on.sum.sums(x, detail), on.backend.epsilon
-        error = sums.error + self._rounding(on.backend, sums)
-        slope_error = dr.fma(SLOPE_ROUNDINGS * epsilon_at(x), sums.bent, sums.gradient_error)
+        rounding, slope, _ = self._rounding(on.backend, sums, epsilon_at(x))
+        error, slope_error = sums.error + rounding, sums.gradient_error + slope
         # On a dipole itself, to rounding, all levels meet: a gradient that says so.
         apart = (sums.nearest > (32 * epsilon) ** 2) & dr.isfinite(sums.value)
         steep = on.backend.Array3f(0, 0, 1 / (32 * epsilon))

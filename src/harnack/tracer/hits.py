@@ -159,7 +159,7 @@ def _trace(
         if prepared.field.has_sheets:
             sheet = dr.reinterpret_array(backend.Int32, end.sheet)  # NO_SHEET becomes -1
         smooth = hit & ~end.on_sheet
-        uncertainty = dr.select(smooth, end.excess / length, 0)
+        uncertainty = dr.select(smooth & (end.excess > 0), end.excess / length, 0)
     t = end.t
     if differentiable and wants_derivatives(prepared, o, d):
         t, normal = attach(prepared, o, d, end, normal)

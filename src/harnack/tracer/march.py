@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 # A sample is repeated more closely where a level is nearer in value than this many times its error,
 # to make truncation this part of that distance, or of what truncation may be (`_finer`).
-_REFINE_BELOW, _OF_GAP, _OF_ALLOWED = 2.0, 0.25, 0.6
+_REFINE_BELOW, _OF_GAP, _OF_ALLOWED = 2.0, 0.25, 0.85
 # Of the tolerance, less so many roundings, and of rounding: what truncation may be at a hit.
 _OF_TOLERANCE, _LESS, _OF_ROUNDING = 0.4, 0.55, 0.6
 # The next sample may be so coarse that its truncation is this part of the distance to a level.
@@ -37,7 +37,7 @@ _AIM = 0.99
 # A repeated sample is closer by these factors at least and at most.
 _CLOSER = 1.25, 16.0
 # Truncation falls like this power of detail; beyond the largest detail there is none.
-_POWER, _MOST_DETAIL = 3.0, 1e6
+_POWER, _MOST_DETAIL = 3.2, 1e6
 
 
 @dataclass(frozen=True)
@@ -171,8 +171,9 @@ class PreparedLevelSet:
                 coarser = _coarser(now, gap, truncation, field.coarsest_detail)
             accepted &= ~again & dr.isfinite(blur)  # what is not known is not free
             detail = dr.select(again, closer, dr.select(accepted, coarser, detail))
-            near = fmax(within - truncation, 2 * (blur - truncation))
-            hit, met = accepted & (gap <= near), None
+            # Where not even the gradient is known, rounding makes no hits.
+            rounded = dr.select(doubt <= steepness, 2 * (blur - truncation), 0)
+            hit, met = accepted & (gap <= fmax(within - truncation, rounded)), None
             if beyond is not None:
                 met = meet(beyond[0], accepted & beyond[1], sample.value, blur, self.levels)
                 certificates, ahead_gaps = self._certify(sample, met.gaps, blur), met.gaps
