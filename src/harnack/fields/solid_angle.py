@@ -154,7 +154,7 @@ class SolidAngle(Field):
         if self.certificate == "edges":
             # Ends of edges, rounded, move each edge's angle by that times its field, which is at
             # most twice `first`: where edges nearly cancel, the gradient does not show it.
-            error = error + 4 * epsilon * sums.first
+            error = error + dr.select(met, 0, 4 * epsilon * sums.first)
         known = (ball, *self._along_edges(on, x, sums))
         return Sample(dr.select(met, 0, sums.angle), gradient, known, error)
 
