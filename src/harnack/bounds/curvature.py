@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import drjit as dr
 
-from harnack.backend.extrema import fmin
+from harnack.backend.extrema import fmax, fmin
 from harnack.bounds.bound import Bound
 from harnack.certify import Certificate, CurvatureCertificate
 
@@ -38,10 +38,8 @@ class CurvatureStep(Bound):
         assert isinstance(certificate, CurvatureCertificate)
         c = certificate
         up, down = _root(c.gap_up, slope, c.constant), _root(c.gap_down, -slope, c.constant)
-        # What is not known proves nothing: `fmin` alone would keep the other argument. A NaN in a
-        # gap, the slope or the constant makes a root NaN; the two are compared for that.
-        known = (up >= 0) & (down >= 0) & (c.constant >= 0) & (c.radius > 0)
-        return dr.select(known, fmin(fmin(up, down), c.radius), 0) * _ROUND_DOWN
+        known = (up >= 0) & (down >= 0) & (c.constant >= 0) & (c.radius > 0)  # and not NaN
+        return fmax(dr.select(known, fmin(fmin(up, down), c.radius), 0) * _ROUND_DOWN, 0)
 
     def covers(self, certificate: Certificate, slope: Real, length: Real) -> Mask:
         assert isinstance(certificate, CurvatureCertificate)
@@ -52,10 +50,13 @@ class CurvatureStep(Bound):
 
 
 def _root(gap: Real, rate: Real, curvature: Real) -> Real:
+    """The positive root, in a form whose squares neither overflow nor vanish: close to a zero of
+    high order rate, curvature and gap are all far below the root of the smallest number."""
     none = gap >= _LARGEST_GAP
     gap = dr.select(none, 0, gap)
-    root = dr.sqrt(dr.fma(rate, rate, 2 * curvature * gap))
-    first = dr.select(rate > 0, 2 * gap / (rate + root), (root - rate) / curvature)
-    # f is constant to second order: 0/0 above.
-    never = none | ((curvature == 0) & (rate == 0) & (gap > 0))
-    return dr.select(never, dr.inf, first)
+    steep, bent = dr.abs(rate), dr.sqrt(curvature) * dr.sqrt(2 * gap)
+    long = dr.select(steep > bent, steep, bent)
+    share = dr.select(long > 0, dr.select(steep > bent, bent, steep) / long, 0)
+    root = long * dr.sqrt(dr.fma(share, share, 1))
+    falling = dr.select(curvature == 0, dr.select(gap > 0, dr.inf, 0), (root - rate) / curvature)
+    return dr.select(none, dr.inf, dr.select(rate > 0, 2 * gap / (rate + root), falling))

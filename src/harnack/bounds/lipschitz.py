@@ -30,14 +30,12 @@ class LipschitzStep(Bound):
 
     def step(self, certificate: Certificate, slope: Real) -> Real:
         assert isinstance(certificate, LipschitzCertificate)
-        gap = fmin(certificate.gap_down, certificate.gap_up)
-        # A constant of zero proves everything, unless f is on a level already.
-        free = dr.select(gap > 0, gap / certificate.constant, 0)
-        # `fmin` gives its second argument where one is NaN: of two numbers that one is not known
-        # the other must not prove a step.
-        known = (certificate.constant >= 0) & (certificate.radius > 0)
-        known &= (certificate.gap_down >= 0) & (certificate.gap_up >= 0)
-        return dr.select(known, fmin(free, certificate.radius), 0) * _ROUND_DOWN
+        c = certificate
+        gap = fmin(c.gap_down, c.gap_up)
+        # A constant of zero proves everything, unless f is on a level already; what is not a
+        # number proves nothing.
+        known = (c.gap_down > 0) & (c.gap_up > 0) & (c.constant >= 0) & (c.radius >= 0)
+        return dr.select(known, fmin(gap / c.constant, c.radius), 0) * _ROUND_DOWN
 
     def covers(self, certificate: Certificate, slope: Real, length: Real) -> Mask:
         return length <= self.step(certificate, slope)

@@ -6,11 +6,35 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from harnack.backend.extrema import fmax
+from harnack.bounds.bound import Bound
+from harnack.bounds.caps import Caps
+from harnack.bounds.classic import Classic
+from harnack.bounds.curvature import CurvatureStep
+from harnack.bounds.lipschitz import LipschitzStep
+from harnack.bounds.slope import Slope
+from harnack.certify import (
+    BallCertificate,
+    Certificate,
+    CurvatureCertificate,
+    LipschitzCertificate,
+)
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real
-    from harnack.bounds.bound import Bound
-    from harnack.certify import Certificate
+
+# What users call proofs and promises, from the sharpest proof to the plainest.
+_NAMES: dict[str, Bound] = {
+    "curvature": CurvatureStep(),
+    "caps": Caps(),
+    "slope": Slope(),
+    "classic": Classic(),
+    "lipschitz": LipschitzStep(),
+}
+_PROMISES: dict[type[Certificate], str] = {
+    BallCertificate: "HarmonicBall",
+    CurvatureCertificate: "Curvature",
+    LipschitzCertificate: "Lipschitz",
+}
 
 
 @dataclass(frozen=True)
@@ -34,13 +58,29 @@ class Longest:
         if any(bound.sufficient for bound, _ in chosen):
             chosen = [pair for pair in chosen if pair[0].sufficient]
         if all(getattr(certificate, "is_supplement", False) for _, certificate in chosen):
-            names = ", ".join(type(b).__name__ for b in self.bounds)
-            kinds = ", ".join(type(c).__name__ for c in certificates) or "none"
-            raise ValueError(
-                f"no bound applies: the field gives certificates of kind {kinds}, and the bounds "
-                f"asked for ({names}) accept none of them; leave bound=None to choose by itself"
-            )
+            raise ValueError(self._useless(certificates))
         return chosen
+
+    def _useless(self, certificates: tuple[Certificate, ...]) -> str:
+        """Why no bound applies, and which would."""
+        asked = ", ".join(type(bound).__name__ for bound in self.bounds)
+        if not certificates:
+            return (
+                f"the bounds asked for ({asked}) need a promise and the field makes none: "
+                "Sample.known is empty, return a HarmonicBall, Curvature or Lipschitz in it"
+            )
+        kinds = sorted({type(one) for one in certificates}, key=lambda kind: kind.__name__)
+        promises = " and ".join(f"{_PROMISES[kind]} ({kind.__name__})" for kind in kinds)
+        usable = [
+            f'"{name}"'
+            for name, bound in _NAMES.items()
+            if any(bound.accepts(one) for one in certificates)
+        ]
+        return (
+            f"no bound applies: the field promises {promises}, which the bounds asked for "
+            f"({asked}) cannot use; choose {' or '.join(usable)}, or leave bound=None for the "
+            "sharpest there is"
+        )
 
     def step(self, certificates: tuple[Certificate, ...], slope: Real) -> Real:
         """The longest proved step along a direction in which f has this slope."""

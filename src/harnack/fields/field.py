@@ -8,9 +8,12 @@ the tracer takes rests on it. `harnack.testing.check_field` tests a field agains
 from __future__ import annotations
 
 import abc
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, cast
+
+import drjit as dr
 
 from harnack.fields.sheets import NO_SHEET, Crossing, NearestSheet
 
@@ -36,7 +39,10 @@ class HarmonicBall:
 
 @dataclass(frozen=True)
 class Lipschitz:
-    """|f(y) - f(p)| <= constant * |y - p| for every y with |y - p| < radius (default: all y)."""
+    """|f(y) - f(p)| <= constant * |y - p| for every y with |y - p| < radius (default: all y).
+
+    Of a field with a domain: for every such y in it.
+    """
 
     constant: Real
     radius: Real = float("inf")
@@ -44,7 +50,10 @@ class Lipschitz:
 
 @dataclass(frozen=True)
 class Curvature:
-    """|f(y) - f(p) - grad f(p).(y-p)| <= constant |y-p|^2/2 for every y with |y-p| < radius."""
+    """|f(y) - f(p) - grad f(p).(y-p)| <= constant |y-p|^2/2 for every y with |y-p| < radius.
+
+    Of a field with a domain: for every such y in it.
+    """
 
     constant: Real
     radius: Real = float("inf")
@@ -70,8 +79,9 @@ class Sample:
     """One evaluation at a point p: value f(p), gradient (3,), and what is known near p.
 
     error: how far rounding may have moved `value` from f at the point given, beyond eight units
-        in its last place (and beyond |gradient| times the rounding of the point itself, which
-        the tracer accounts for), or an approximation has. Steps are shortened by it.
+        in its last place or eight times the smallest normal number (and beyond |gradient| times
+        the rounding of the point itself, which the tracer accounts for), or an approximation has.
+        Steps are shortened by it.
     gradient_error: how far rounding and an approximation may have moved `gradient`, as a length;
         0 where that is only the rounding of a few operations.
     normal: (3,) unit, what to shade with where the gradient is no guide (beside a singular point
@@ -104,6 +114,39 @@ def lengthened(sample: Sample, size: Real) -> Sample:
     )
 
 
+_HOW = (
+    "return harnack.Sample(value, gradient, known), with a Dr.Jit number, a Dr.Jit 3-vector and a "
+    "tuple of promises, such as (harnack.Lipschitz(1.0),) if |grad f| <= 1"
+)
+
+
+def _checked(evaluate: Callable[[Any, Vec3], Sample]) -> Callable[[Any, Vec3], Sample]:
+    """The same method, which raises TypeError if it returns anything but a proper `Sample`."""
+
+    @functools.wraps(evaluate)
+    def checked(self: Any, p: Vec3) -> Sample:
+        sample: Any = evaluate(self, p)
+        name = f"{type(self).__name__}.evaluate"
+        if not isinstance(sample, Sample):
+            raise TypeError(f"{name} returned {_named(sample)}, not a Sample: {_HOW}")
+        known: Any = sample.known
+        if not isinstance(known, tuple):
+            raise TypeError(f"{name}: Sample.known is {_named(known)}, not a tuple: {_HOW}")
+        for one in cast("tuple[Any, ...]", known):
+            if not isinstance(one, HarmonicBall | Lipschitz | LineLipschitz | Curvature):
+                raise TypeError(f"{name}: Sample.known holds {_named(one)}, no promise: {_HOW}")
+        gradient: Any = sample.gradient
+        if not dr.is_array_v(type(gradient)) or dr.size_v(type(gradient)) != 3:
+            raise TypeError(f"{name}: Sample.gradient is {_named(gradient)}, no 3-vector: {_HOW}")
+        return sample
+
+    return checked
+
+
+def _named(value: Any) -> str:
+    return "nothing" if value is None else f"an object of type {type(value).__name__}"
+
+
 class Field(abc.ABC):
     """A scalar function on R^3 whose level sets can be traced with a proof.
 
@@ -121,7 +164,8 @@ class Field(abc.ABC):
 
     domain: Volume | None = None
     """Where the field may be evaluated and is drawn; None for all of space. Rays are clipped to
-    it, and what a sample promises need only hold for p in it."""
+    it, and what a sample promises need only hold for p in it. As it is convex, a ray from p stays
+    in it as far as it is looked at; `Lipschitz` and `Curvature` need not hold beyond."""
 
     has_sheets: bool = False
     """Whether f jumps across sheets (see `harnack.fields.sheets`). Then `next_crossing` and
@@ -132,6 +176,13 @@ class Field(abc.ABC):
 
     coarsest_detail: float = 1.0
     """What detail 0 amounts to, as a detail in (0, 1]: see `at_detail`."""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Has what `evaluate` returns checked, wherever it is called first."""
+        super().__init_subclass__(**kwargs)
+        if "evaluate" in vars(cls):
+            checked = _checked(cls.evaluate)
+            cls.evaluate = checked  # pyright: ignore[reportAttributeAccessIssue]
 
     @abc.abstractmethod
     def evaluate(self, p: Vec3) -> Sample:

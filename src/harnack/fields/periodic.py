@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
-from harnack.backend.extrema import fmin
+from harnack.backend.extrema import fmax, fmin
 from harnack.fields.extension import ExtensionRange
 from harnack.fields.field import Curvature, Field, Lipschitz, Sample
+from harnack.fields.wave_rounding import WaveRounding
 from harnack.fields.waves import (
     PlaneWave,
     Product,
@@ -42,6 +43,8 @@ __all__ = [
 
 # Constants are moved up by this much for the roundings of float32.
 _ROUNDING = 1e-5
+# And the bound of the Hessian by this much for the rounding of the gradient.
+_SLOPE_SHARE = 1e-5
 
 
 class EigenfunctionSum(Field):
@@ -57,6 +60,16 @@ class EigenfunctionSum(Field):
     is harmonic in R^4 and equals f at w = 0: see `ExtensionRange` for what it is bounded by. The
     Lipschitz constant is local, |grad f(p)| + H r / 2 on the ball of radius r (Taylor), where
     `curvature` H bounds the Hessian, and never above `steepness`.
+
+    The rounding of the value is bounded at the point (`WaveRounding`). That of the gradient, E, is
+    part of it. `Curvature` is promised as (1 + h) H, h = `_SLOPE_SHARE`, and for all t
+
+        E t <= E^2/(2 h H) + h H t^2/2   (2 a b <= a^2 + b^2):
+
+    the larger H and E^2/(2 h H) cover what Taylor's formula says with a rounded gradient. On the
+    harmonic ball of radius R it is E R, of which `bounds.solve.rounding` pays for 16 u of the mean
+    4 (f - lower)/R that the slope is measured by, f - lower being about H R^2/2 or more; only what
+    that leaves is added.
     """
 
     overstep = 1.0
@@ -67,6 +80,9 @@ class EigenfunctionSum(Field):
         longest = 2 * math.pi / min(self.waves.wavenumbers)
         self.domain = Ball(radius=longest) if domain is None else domain
         self._extension = ExtensionRange.best(self.waves)
+        self._rounding = WaveRounding.of(self.terms)
+        radius = self._extension.radius
+        self._slack = 32 * min(0.5 * self.curvature * radius**2, self.steepness * radius)
 
     def _bounds(self) -> WaveBounds:
         return WaveBounds.of(self.terms)
@@ -90,16 +106,19 @@ class EigenfunctionSum(Field):
     def evaluate(self, p: Vec3) -> Sample:
         value, components = evaluate_terms(self.terms, p)
         gradient = type(p)(*components)
-        slope = dr.norm(gradient)
+        epsilon = float(dr.epsilon(type(value)))
+        error, slope_error = self._rounding.errors(p, gradient)
+        slope = dr.norm(gradient) + slope_error
         reach = 0.9 * self.steepness / self.curvature  # the best by experiment, gyroid and P
         local = (slope + 0.5 * self.curvature * reach) * (1 + _ROUNDING)
         lipschitz = Lipschitz(fmin(local, self.steepness * (1 + _ROUNDING)), reach)
         known = (
             self._extension.ball(value, slope),
             lipschitz,
-            Curvature(self.curvature * (1 + _ROUNDING)),
+            Curvature(self.curvature * (1 + _ROUNDING + _SLOPE_SHARE)),
         )
-        error = 8 * dr.epsilon(type(value)) * self.waves.largest_value
+        error += slope_error * (slope_error * (0.5 / (_SLOPE_SHARE * self.curvature)))
+        error += fmax(slope_error * self._extension.radius - self._slack * epsilon, 0)
         return Sample(value, gradient, known, error)
 
     def differentiable_value(self, p: Vec3) -> Real:

@@ -4,14 +4,22 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
 
-from harnack.backend.extrema import fmax
-from harnack.fields.field import Curvature, Field, HarmonicBall, Sample
+from harnack.fields.axial_bounds import order_on_axis
+from harnack.fields.field import (
+    Curvature,
+    Field,
+    HarmonicBall,
+    Knowledge,
+    Lipschitz,
+    Sample,
+)
+from harnack.fields.harmonic_promises import HarmonicPromises
 from harnack.fields.solid_harmonics import (
     LARGEST_DEGREE,
     Weights,
@@ -29,32 +37,19 @@ if TYPE_CHECKING:
 
 __all__ = ["HarmonicPolynomial", "SphericalHarmonic"]
 
-# Promised ends are moved out by this much of their distance for the roundings of float32.
-_ROUNDING = 1e-5
-# Radii of harmonic balls tried, in units of the ball about the domain.
-# Radii of the balls on which the Hessian is bounded (by experiment: two of unlike size).
-_REACHES = ((0.25, 0.05), (1.0, 0.1))
-_RADII = np.geomspace(0.1, 8.0, 200)
-
 
 class _SolidHarmonics(Field):
-    """A sum of solid harmonics of p/size, for |p| <= size or a little beyond.
+    """A sum of solid harmonics of p/size, for |p| <= size; see `HarmonicPromises`."""
 
-    The promise at p is for a ball about p, of a radius R that depends on |p|. It lies in the
-    ball of radius |p| + R about the origin, where `BallRange` bounds the polynomial. The paper
-    takes the fixed ball |y| <= 1.25 size; near level 0 a step loses to the second-order term of
-    the bound, proportional to (range on |y| <= |p|+R)/R^2, so R is chosen to make that least:
-    2|p|/(l-2) for a single degree l > 2. With the slope bound Y_(8,4) took 19 evaluations a ray,
-    with the fixed ball 30 (27 at best, for 1.15); Y_(12,5) took 24 and 61 (50).
-    """
-
-    def __init__(self, weights: Weights, known: BallRange, size: float, domain: Volume) -> None:
+    def __init__(
+        self, weights: Weights, known: BallRange, size: float, domain: Volume, axis: int = 2
+    ) -> None:
+        """axis: of p, that is z of the solid harmonics; x and y follow it cyclically."""
         self.domain = domain
+        self._axis = axis
         self._weights = weights
         self._size = size
-        self._inner, self._outer = _best_radius(known, 0.0), _best_radius(known, 1.0)
-        largest = 1.01 * max(self._inner, 1.0 + self._outer)
-        self._known = known.with_spheres(weights, largest)
+        self._promises = HarmonicPromises.of(weights, known, is_divided=size != 1.0)
         self.value_range = known.with_spheres(weights, 1.0).on_ball(1.0)
 
     @property
@@ -63,36 +58,34 @@ class _SolidHarmonics(Field):
         return max(degree for degree, _ in self._weights)
 
     def evaluate(self, p: Vec3) -> Sample:
-        s = p / self._size
+        s, size = self._local(p), self._size
         value, gradient = evaluate(self._weights, s.x, s.y, s.z)
-        distance = dr.norm(s)
-        radius = self._radius(distance)
-        lower, upper = self._known.at(distance + radius)
-        margin = _ROUNDING * (upper - lower)
-        ball = HarmonicBall(radius * self._size, lower - margin, upper + margin)
-        known = (ball, *(self._curvature(distance, *reach) for reach in _REACHES))
-        error = 8 * dr.epsilon(type(value)) * fmax(upper, -lower)
-        return Sample(value, type(p)(*gradient) / self._size, known, error)
+        rho, r = dr.norm(type(s)(s.x, s.y, 0)), dr.norm(s)
+        ball, lipschitz = self._promises.ball(rho, r), self._promises.lipschitz(rho, r)
+        curvatures = self._promises.curvatures(rho, r)
+        known: list[Knowledge] = [
+            HarmonicBall(ball.radius * size, ball.lower, ball.upper),
+            *(Curvature(one.constant / size**2, one.radius * size) for one in curvatures),
+        ]
+        if lipschitz is not None:
+            known.append(Lipschitz(lipschitz.constant / size, lipschitz.radius * size))
+        error = self._promises.error(rho, r, curvatures[0])
+        slope = type(p)(*_turned(gradient, -self._axis - 1)) / size
+        return Sample(value, slope, tuple(known), error)
+
+    def _local(self, p: Vec3) -> Vec3:
+        return type(p)(*_turned((p.x, p.y, p.z), self._axis + 1)) / self._size
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         """Rows of the Hessian, free of trace to rounding."""
-        s, share = p / self._size, 1 / self._size**2
+        s, share, k = self._local(p), 1 / self._size**2, -self._axis - 1
         xx, yy, zz, xy, xz, yz = (share * one for one in hessian(self._weights, s.x, s.y, s.z))
-        return type(p)(xx, xy, xz), type(p)(xy, yy, yz), type(p)(xz, yz, zz)
-
-    def _curvature(self, distance: Real, share: float, least: float) -> Curvature:
-        """The Hessian's bound on a ball of radius share |p|/(l-2), at least `least` sizes."""
-        radius = fmax(share / max(self.degree - 2, 0.5) * distance, least)
-        constant = self._known.curvature(distance + radius) * (1 + _ROUNDING)
-        return Curvature(constant / self._size**2, radius * self._size)
-
-    def _radius(self, distance: Real) -> Real:
-        if self._inner < self._outer:
-            return fmax(self._outer * distance, self._inner)
-        return fmax(dr.fma(distance, self._outer - self._inner, self._inner), self._outer)
+        rows = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
+        x, y, z = _turned([type(p)(*_turned(row, k)) for row in rows], k)
+        return x, y, z
 
     def differentiable_value(self, p: Vec3) -> Real:
-        s = p / self._size
+        s = self._local(p)
         return evaluate(self._weights, s.x, s.y, s.z)[0]
 
     def check_levels(self, levels: tuple[float, ...]) -> None:
@@ -161,8 +154,19 @@ class HarmonicPolynomial(_SolidHarmonics):
         domain = Ball() if domain is None else domain
         size = _enclosing_radius(domain)
         scaled = {powers: c * size ** sum(powers) for powers, c in self.coefficients.items()}
-        weights = from_monomials(scaled)
-        super().__init__(weights, BallRange.of(weights), size, domain)
+        # The z axis of the solid harmonics is the one along which it vanishes to the highest order.
+        along = [
+            from_monomials({_turned(k, axis + 1): c for k, c in scaled.items()})
+            for axis in range(3)
+        ]
+        axis = max((2, 0, 1), key=lambda axis: order_on_axis(along[axis]))
+        weights = along[axis]
+        super().__init__(weights, BallRange.of(weights), size, domain, axis)
+
+
+def _turned(three: Sequence[Any], n: int) -> tuple[Any, Any, Any]:
+    """Three things moved n places to the front, cyclically: (x, y, z) becomes (y, z, x) for 1."""
+    return three[n % 3], three[(n + 1) % 3], three[(n + 2) % 3]
 
 
 def _checked(
@@ -209,9 +213,3 @@ def _enclosing_radius(domain: Volume) -> float:
     if not np.isfinite(corners).all():
         raise ValueError("a harmonic polynomial needs a bounded domain, such as a Ball or a Box")
     return float(np.linalg.norm(corners))
-
-
-def _best_radius(known: BallRange, distance: float) -> float:
-    """The radius R that makes (range on |y| <= distance + R)/R^2 least."""
-    lower, upper = known.by_degree(distance + _RADII)
-    return float(_RADII[np.argmin((upper - lower) / _RADII**2)])

@@ -121,6 +121,28 @@ def hessian(weights: Weights, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any, An
     return total[0], total[1], total[2], total[3], total[4], total[5]
 
 
+def unit_hessian(l: int, m: int, rho: Any, z: Any, b: float, drop: int) -> Any:  # noqa: E741
+    """The Hessian, (n, 3, 3), of r^l Y_lm / rho^drop for m >= 0 where rho^drop counts as constant.
+
+    At n points of azimuth b on the unit sphere, rho and z (n,); m >= 2 + drop or drop = 0.
+    """
+
+    def power(n: int) -> Any:
+        return rho ** max(n - drop, 0)
+
+    x, y = rho * math.cos(b), rho * math.sin(b)
+    basis = (
+        power(m) * math.cos(m * b),
+        m * power(m - 1) * math.cos((m - 1) * b),
+        -m * power(m - 1) * math.sin((m - 1) * b),
+        m * (m - 1) * power(m - 2) * math.cos((m - 2) * b),
+        -m * (m - 1) * power(m - 2) * math.sin((m - 2) * b),
+    )
+    sums = _second_column([(l, 1.0)], m, Legendre(z, 1.0))
+    xx, yy, zz, xy, xz, yz = (one + 0.0 * z for one in _second_rates(sums, basis, x, y))
+    return np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=-1).reshape(-1, 3, 3)
+
+
 def _second_rates(sums: Sequence[Any], basis: Sequence[Any], x: Any, y: Any) -> tuple[Any, ...]:
     """The six derivatives from sums over l (`_second_column`) and B, B_x, B_y, B_xx, B_xy."""
     at_m, at_next, at_second, rate, rate_next, rate_twice = sums

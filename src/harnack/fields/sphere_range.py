@@ -143,6 +143,14 @@ class BallRange:
             total = total * s + degree * (degree - 1) * most.get(degree, 0.0)
         return total
 
+    def steepness(self, s: Real) -> Real:
+        """A bound of the gradient on |y| <= s, |grad f_l| <= l M |y|^(l-1): see `curvature`."""
+        total = 0.0 * s
+        most = {degree: max(-low, high) for degree, low, high in self.ends}
+        for degree in range(max(most, default=0), 0, -1):
+            total = total * s + degree * most.get(degree, 0.0)
+        return total
+
     def at(self, s: Real) -> tuple[Real, Real]:
         """Lower and upper bound on |y| <= s, a Dr.Jit array, from everything known."""
         lower, upper = self.by_degree(s)

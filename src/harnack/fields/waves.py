@@ -12,9 +12,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import drjit as dr
 import numpy as np
 import numpy.typing as npt
+
+from harnack.backend.sines import sincos
 
 if TYPE_CHECKING:
     from harnack.backend import Real, Vec3
@@ -109,7 +110,7 @@ class _FactorRates:
         """The factor and its derivative along the axis."""
         key = (axis, factor.frequency, factor.phase)
         if key not in self._known:
-            self._known[key] = dr.sincos(_angle(factor.frequency * self._p[axis], factor.phase))
+            self._known[key] = sincos(_angle(factor.frequency * self._p[axis], factor.phase))
         s, c = self._known[key]
         return (c, -factor.frequency * s) if factor.is_cosine else (s, factor.frequency * c)
 
@@ -122,7 +123,7 @@ def evaluate_terms(terms: Sequence[Term], p: Vec3) -> tuple[Real, list[Real]]:
         if isinstance(term, PlaneWave):
             k = term.wave_vector
             angle = _angle(k[0] * p[0] + k[1] * p[1] + k[2] * p[2], term.phase)
-            s, c = dr.sincos(angle)
+            s, c = sincos(angle)
             value += term.amplitude * c
             for axis in range(3):
                 if k[axis] != 0:
@@ -148,7 +149,7 @@ def hessian_of_terms(terms: Sequence[Term], p: Vec3) -> list[list[Real]]:
         if isinstance(term, PlaneWave):
             k = term.wave_vector
             angle = _angle(k[0] * p[0] + k[1] * p[1] + k[2] * p[2], term.phase)
-            wave = term.amplitude * dr.cos(angle)
+            wave = term.amplitude * sincos(angle)[1]
             for i, j in upper:
                 if k[i] * k[j] != 0:
                     upper[i, j] -= k[i] * k[j] * wave

@@ -32,8 +32,8 @@ def check_field(
 ) -> None:
     """Test what a field promises by sampling it in double precision.
 
-    points: (n, 3) where to look; by default `count` random ones in its domain or, if it has
-        none, around its default surface.
+    points: (n, 3) where to look, those outside the field's domain left out; by default `count`
+        random ones in its domain or, if it has none, around its default surface.
     levels: whose `extent` to test; by default the default level.
     directions: how many ways to walk from each point within each promise.
 
@@ -41,22 +41,33 @@ def check_field(
     the gradient is that of the value; f is harmonic where a ball of dimension 2 or 3 says so;
     `differentiable_value` is the value; `hessian`, where there is one, is symmetric, the
     derivative of the gradient and, of a harmonic f, without trace; the lift of f keeps each
-    promise (`HarmonicBall`, `Lipschitz`, `Curvature`) on the way to random points of its ball;
+    promise (`HarmonicBall`, `Lipschitz`, `Curvature`) on the way to random points of its ball, or
+    for the last two to where that leaves the domain;
     some step is possible at most points; no level set leaves its `extent`. Jumps across sheets
     are taken out on the way, and values may move between neighbouring points by `Sample.error`
     besides, as they do where a tree takes other clusters as wholes.
 
     Raises:
         BrokenPromiseError: naming the promise and the point where it is broken.
+        ValueError: none of the points given lies in the field's domain.
+        TypeError: `evaluate` returns something else than a `Sample`.
     """
     generator = np.random.default_rng(rng)
     if points is None:
         points = random_points(field, generator, count)
+    elif field.domain is not None:
+        inside = field.domain.contains_points(np.asarray(points, dtype=np.float64))
+        if not inside.any():
+            raise ValueError(
+                f"points: all {len(points)} lie outside the domain {field.domain} of the field, "
+                "where it promises nothing; give points inside"
+            )
+        points = np.asarray(points, dtype=np.float64)[inside]
     levels = (field.default_level,) if levels is None else tuple(levels)
     look = look_at(field, points)
     _check_numbers(field, points, look)
     check_derivatives(field, points, look)
-    _check_rounding(field, points, look)
+    _check_rounding(field, points)
     _check_differentiable_value(field, points, look)
     for known in look.known:
         _check_promise(field, points, look, known, generator, directions)
@@ -91,21 +102,26 @@ def _check_numbers(field: Field, points: FloatArray, look: Look) -> None:
         )
 
 
-def _check_rounding(field: Field, points: FloatArray, look: Look) -> None:
+def _check_rounding(field: Field, points: FloatArray) -> None:
     """In single precision the value is off by `error`, eight units in its last place, and what
     the rounding of the point does."""
     single = points.astype(np.float32).astype(np.float64)
+    if field.domain is not None:
+        single = single[field.domain.contains_points(single)]
+    if not len(single):
+        return
     exact, rounded = look_at(field, single), look_at(field, single, "single")
     off = rounded.value - exact.value
     if field.period is not None:
         off -= field.period * np.round(off / field.period)
     unit = 2.0**-24
     length = np.linalg.norm(exact.gradient, axis=1)
-    size = np.abs(points).max(axis=1)
+    size = np.abs(single).max(axis=1)
     allowed = rounded.error + exact.error + 8 * unit * (np.abs(exact.value) + length * size)
-    singular = np.min([one.radius for one in look.known], axis=0) < 1e-4 * np.ptp(points)
+    allowed += 8 * 2.0**-126  # numbers below the smallest normal one are lost
+    singular = np.min([one.radius for one in exact.known], axis=0) < 1e-4 * np.ptp(points)
     good = (np.abs(off) <= allowed) | singular
-    require(good, "Sample.error: in single precision the value is off by more", points, off)
+    require(good, "Sample.error: in single precision the value is off by more", single, off)
 
 
 def _check_differentiable_value(field: Field, points: FloatArray, look: Look) -> None:
@@ -127,7 +143,10 @@ def _check_promise(
     rng: np.random.Generator,
     directions: int,
 ) -> None:
-    """Walk from each point to the border of the promise, or across the points' size."""
+    """Walk from each point to the border of the promise, or across the points' size.
+
+    A harmonic ball is one wherever it lies; the others are only asked for in the domain.
+    """
     name = type(known).__name__
     reach = np.minimum(known.radius, 2 * float(np.ptp(points, axis=0).max()) + 1e-300)
     # Denser towards the border, where singularities may lie.
@@ -140,6 +159,8 @@ def _check_promise(
         ways = (steepest, -steepest, random_directions(rng, len(points)))
         d = ways[min(k, 2)]
         t = reach[:, None] * share
+        if not isinstance(known, HarmonicBall):
+            t = np.minimum(reach, _way_out(field, points, d))[:, None] * share
         walk = movements(field, points, d, t)
         moved = walk.moved
         rounding = 1e-9 * (np.abs(look.value)[:, None] + (field.period or 0) + np.abs(moved))
@@ -158,6 +179,17 @@ def _check_promise(
         there = points + t[rows, worst, None] * d
         message = f"{name}: f leaves what is promised here by more than rounding"
         require(excess.max(axis=1) <= 0, message, points, excess.max(axis=1), there)
+
+
+def _way_out(field: Field, points: FloatArray, d: FloatArray) -> FloatArray:
+    """Lengths (n,) within the domain, which is convex, of rays from points in it."""
+    if field.domain is None:
+        return np.full(len(points), np.inf)
+    backend = choose_backend("double")
+    o, way = to_vector3(backend, points, "points"), to_vector3(backend, d, "d")
+    ends = field.domain.prepare(backend).clip(o, way, backend.Float(0), backend.Float(np.inf))
+    end = np.broadcast_to(to_numpy(ends[1]), (len(points),))
+    return np.maximum(end * (1 - 1e-9) - 1e-12 * np.abs(points).max(axis=1), 0)
 
 
 def _beyond_ball(
@@ -186,8 +218,12 @@ def _check_extent(field: Field, level: float, rng: np.random.Generator, count: i
     if not np.isfinite(half).all():
         return
     start = middle + rng.uniform(-2.5, 2.5, (count, 3)) * half
-    d = random_directions(rng, count)
-    t = np.linspace(0, 3 * float(half.max()), 160) * np.ones((count, 1))
+    if field.domain is not None:
+        start = np.concatenate([start, random_points(field, rng, count)])
+        start = start[field.domain.contains_points(start)]
+    d = random_directions(rng, len(start))
+    length = np.minimum(3 * float(half.max()), _way_out(field, start, d))
+    t = np.linspace(0, 1, 160) * length[:, None]
     walk = movements(field, start, d, t)
     above = look_at(field, start).value[:, None] + walk.moved + walk.jumped - level
     # To first order, farther from the level than a thousandth of the extent: no grazing.
@@ -207,8 +243,6 @@ def _check_extent(field: Field, level: float, rng: np.random.Generator, count: i
         offset = there[some, first - 1]
     at = start[row] + high[:, None] * d[row]
     inside = volume.contains_points(at)
-    if field.domain is not None:
-        inside |= ~field.domain.contains_points(at)
     require(inside, f"extent: the surface of level {level:g} leaves {volume} here", at)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.fields.sheets import NO_SHEET, Crossing
-from harnack.testing.poisson import FloatArray
+from harnack.testing.poisson import BoolArray, FloatArray
 
 if TYPE_CHECKING:
     from harnack.backend import Precision
@@ -37,6 +37,22 @@ class Look:
     error: FloatArray
     gradient_error: FloatArray
     known: tuple[Knowledge, ...]
+
+    def at(self, rows: BoolArray) -> Look:
+        """The same at some of the points."""
+        known: list[Knowledge] = []
+        for one in self.known:
+            numbers: dict[str, Any] = {
+                key: value[rows] for key, value in vars(one).items() if key != "dimension"
+            }
+            known.append(dataclasses.replace(one, **numbers))
+        return Look(
+            self.value[rows],
+            self.gradient[rows],
+            self.error[rows],
+            self.gradient_error[rows],
+            tuple(known),
+        )
 
 
 def look_at(field: Field, points: FloatArray, precision: Precision = "double") -> Look:

@@ -1,0 +1,202 @@
+"""Fields of users: right ones pass `check_field`, wrong ones get help where they are first used."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+
+import harnack as hk
+from harnack.fields import Curvature, Field, HarmonicBall, Lipschitz, Sample
+from harnack.geometry import shapes
+from harnack.testing import BrokenPromiseError, check_field
+
+RAY = (np.array([[0.0, 0.0, 3.0]]), np.array([[0.0, 0.0, -1.0]]))
+
+
+class Bell(Field):
+    """exp(-|p|^2/width^2): smooth on one scale and all but constant on larger ones."""
+
+    default_level = 0.5
+
+    def __init__(
+        self, known: Callable[[float], tuple[Any, ...]], width: float, radius: float | None
+    ) -> None:
+        self.known, self.width = known(width), width
+        self.domain = None if radius is None else hk.Ball(radius=radius)
+
+    def evaluate(self, p: Any) -> Sample:
+        f = dr.exp(-dr.squared_norm(p) / self.width**2)
+        return Sample(f, self.slope(p, -2 / self.width**2 * f * p), self.known)
+
+    def slope(self, p: Any, exact: Any) -> Any:
+        del p
+        return exact
+
+
+def steep(width: float) -> tuple[Any, ...]:
+    return (Lipschitz(0.8578 / width),)
+
+
+def bent(width: float) -> tuple[Any, ...]:
+    return (Curvature(2.001 / width**2),)
+
+
+@pytest.mark.parametrize("known", [steep, bent, lambda w: (*bent(w), *steep(w))])
+@pytest.mark.parametrize("radius", [None, 2.0, 6.0, 20.0])
+@pytest.mark.parametrize("width", [0.5, 1.0])
+def test_a_right_gradient_is_called_right(known: Any, radius: float | None, width: float) -> None:
+    """Differences over a share of the domain were off by 6e-11 to 4e-6 and the gradient blamed;
+    in single precision numbers of 1e-39 vanish."""
+    for seed in range(3):
+        check_field(Bell(known, width, radius), rng=seed, count=100, directions=2)
+
+
+@pytest.mark.parametrize("radius", [None, 2.0, 6.0, 20.0])
+@pytest.mark.parametrize(("known", "off"), [(bent, 1e-5), (steep, 1e-3)])
+def test_a_wrong_gradient_is_still_seen(known: Any, radius: float | None, off: float) -> None:
+    """Also of a field that only promises a Lipschitz constant, where nothing was seen before."""
+
+    class Off(Bell):
+        def slope(self, p: Any, exact: Any) -> Any:
+            return exact * (1 + off)
+
+    with pytest.raises(BrokenPromiseError, match="gradient is not that of the value"):
+        check_field(Off(known, 1.0, radius), count=200, directions=1)
+
+
+def test_kinks_are_allowed_where_only_a_lipschitz_constant_is_promised() -> None:
+    class Corner(Field):
+        """max(x, y), whose gradient jumps."""
+
+        domain = hk.Ball(radius=1.5)
+
+        def evaluate(self, p: Any) -> Sample:
+            first = p.x > p.y
+            one = dr.select(first, type(p)(1, 0, 0), type(p)(0, 1, 0))
+            return Sample(dr.select(first, p.x, p.y), one, (Lipschitz(1.0),))
+
+    check_field(Corner(), np.random.default_rng(0).normal(size=(400, 3)) * [1e-3, 1e-3, 0.3])
+    check_field(Corner(), count=400)
+
+
+class Logarithm(Field):
+    """log x, only there where x >= 1/100, and only there so flat."""
+
+    domain = hk.Box((0.01, -1, -1), (2, 1, 1))
+
+    def evaluate(self, p: Any) -> Sample:
+        return Sample(dr.log(p.x), type(p)(1 / p.x, 0, 0), (Lipschitz(100.0), Curvature(1e4)))
+
+
+class Square(Field):
+    """|p|^2 with the Lipschitz constant that it has in its domain."""
+
+    domain = hk.Ball(radius=2.0)
+    default_level = 1.0
+
+    def evaluate(self, p: Any) -> Sample:
+        inside = dr.squared_norm(p) <= 4.0 * (1 + 1e-6)
+        return Sample(dr.select(inside, dr.squared_norm(p), dr.nan), 2 * p, (Lipschitz(4.0),))
+
+
+@pytest.mark.parametrize("field", [Logarithm(), Square()])
+def test_nothing_is_asked_outside_the_domain(field: Field) -> None:
+    assert field.domain is not None
+    check_field(field, count=300)
+    lower, upper = field.domain.bounds()
+    points = np.random.default_rng(0).uniform(lower - 1, upper + 1, (300, 3))
+    check_field(field, points)
+    with pytest.raises(ValueError, match="all 5 lie outside the domain"):
+        check_field(field, np.full((5, 3), 9.0))
+
+
+def test_a_promise_that_fails_within_the_domain_is_seen() -> None:
+    class Flatter(Square):
+        def evaluate(self, p: Any) -> Sample:
+            sample = super().evaluate(p)
+            return Sample(sample.value, sample.gradient, (Lipschitz(3.9),))
+
+    with pytest.raises(BrokenPromiseError, match="Lipschitz: f leaves"):
+        check_field(Flatter(), count=400)
+
+
+def test_a_surface_outside_its_extent_is_seen_within_a_domain() -> None:
+    class Elsewhere(Square):
+        def extent(self, levels: tuple[float, ...]) -> Any:
+            return hk.Ball(radius=0.9)
+
+    with pytest.raises(BrokenPromiseError, match="extent: the surface"):
+        check_field(Elsewhere(), count=100)
+
+
+def number(p: Any) -> Any:
+    return dr.norm(p) - 1
+
+
+WRONG: dict[str, tuple[Callable[[Any], Any], str]] = {
+    "a number": (number, r"Own.evaluate returned an object of type Float\d*, not a Sample"),
+    "a pair": (lambda p: (number(p), p), "returned an object of type tuple, not a Sample"),
+    "nothing": (lambda p: None, "returned nothing, not a Sample"),
+    "a bare promise": (
+        lambda p: Sample(number(p), p, Lipschitz(1.0)),  # type: ignore[arg-type]
+        "Sample.known is an object of type Lipschitz, not a tuple",
+    ),
+    "numbers for promises": (
+        lambda p: Sample(number(p), p, (1.0,)),  # type: ignore[arg-type]
+        "Sample.known holds an object of type float, no promise",
+    ),
+    "a number for a gradient": (
+        lambda p: Sample(number(p), number(p), (Lipschitz(1.0),)),
+        r"Sample.gradient is an object of type Float\d*, no 3-vector",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+@pytest.mark.parametrize("use", ["check_field", "trace", "signed_distance", "render"])
+def test_what_evaluate_must_return_is_said_at_first_use(name: str, use: str) -> None:
+    returned, message = WRONG[name]
+
+    class Own(Field):
+        domain = hk.Ball(radius=2.0)
+
+        def evaluate(self, p: Any) -> Sample:
+            return returned(p)
+
+    uses: dict[str, Callable[[], object]] = {
+        "check_field": lambda: check_field(Own()),
+        "trace": lambda: hk.trace(Own(), *RAY),
+        "signed_distance": lambda: hk.signed_distance(Own(), RAY[0]),
+        "render": lambda: hk.render(Own(), size=(8, 8), spp=1, progress=False),
+    }
+    with pytest.raises(TypeError, match=message) as raised:
+        uses[use]()
+    assert "return harnack.Sample(value, gradient, known)" in str(raised.value)
+
+
+def test_bounds_that_do_not_apply_name_those_that_do() -> None:
+    field = hk.SolidAngle(shapes.wavy_polygon(20))
+    with pytest.raises(ValueError, match='choose "caps" or "slope" or "classic", or leave'):
+        hk.trace(field, *RAY, bound="lipschitz")
+    with pytest.raises(
+        ValueError, match=r"promises Curvature .* cannot use; choose \"curvature\", or leave"
+    ):
+        hk.trace(Bell(bent, 1.0, 2.0), *RAY, bound="caps")
+    with pytest.raises(ValueError, match=r"Sample\.known is empty"):
+        hk.trace(Bell(lambda w: (), 1.0, 2.0), *RAY)
+
+    class Charge(Field):
+        domain = hk.Ball(radius=3.0)
+        default_level = 1.0
+
+        def evaluate(self, p: Any) -> Sample:
+            r = dr.norm(p)
+            return Sample(1 / r, -p / (r * r * r), (HarmonicBall(r, 0.0, float("inf")),))
+
+    with pytest.raises(ValueError, match='choose "slope" or "classic", or leave bound=None'):
+        hk.trace(Charge(), *RAY, bound="lipschitz")
+    assert hk.trace(Charge(), *RAY).hit.all()
