@@ -229,7 +229,13 @@ class PreparedLevelSet:
         """What rounding may have done to f at a point whose coordinates are at most `size`."""
         epsilon = self.backend.epsilon
         position = 4 * epsilon * size
-        return dr.fma(steepness, position, dr.fma(8 * epsilon, dr.abs(sample.value), sample.error))
+        # What is below the smallest normal number is lost.
+        value = 8 * fmax(epsilon * dr.abs(sample.value), self.backend.Float(self._smallest))
+        return dr.fma(steepness, position, value + sample.error)
+
+    @property
+    def _smallest(self) -> float:
+        return float(dr.smallest(self.backend.Float))
 
 
 def _finer(
