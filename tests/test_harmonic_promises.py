@@ -10,6 +10,7 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
+from harnack.backend.lengths import length
 from harnack.bounds import Caps, Classic, CurvatureStep, LipschitzStep, Slope
 from harnack.certify import CurvatureCertificate, LipschitzCertificate
 from harnack.fields.axial_bounds import (
@@ -307,3 +308,43 @@ def test_a_function_without_slope_or_curvature_moves_nowhere() -> None:
     assert to_numpy(CurvatureStep().step(flat, real(0.0)))[0] == pytest.approx(3.0)
     on_level = CurvatureCertificate(real(0.0), real(3.0), real(1.0), real(0.0))
     assert to_numpy(CurvatureStep().step(on_level, real(0.0)))[0] == 0
+
+
+@pytest.mark.parametrize("precision", ["single", "double"])
+def test_lengths_of_very_short_and_long_vectors(precision: Any) -> None:
+    backend = choose_backend(precision)
+    tiny, huge = (1e-32, 1e38) if precision == "single" else (1e-302, 1e308)
+    rng = np.random.default_rng(8)
+    v = rng.normal(size=(3000, 3)) * 10 ** rng.uniform(-4, 0, (3000, 3))
+    v /= np.linalg.norm(v, axis=1, keepdims=True)
+    sizes = 10 ** rng.uniform(np.log10(tiny), np.log10(huge), 3000)
+    found = to_numpy(length(to_vector3(backend, v * sizes[:, None])))
+    np.testing.assert_allclose(found, sizes, rtol=1e-6 if precision == "single" else 1e-14)
+    assert to_numpy(length(backend.Array3f(0.0, 0.0, 0.0)))[0] == 0
+    for k in range(3):
+        one = [1.0, 1.0, 1.0]
+        one[k] = float("nan")
+        assert np.isnan(to_numpy(length(backend.Array3f(*one)))[0])
+
+
+@pytest.mark.parametrize("precision", ["single", "double"])
+def test_distances_near_a_zero_of_high_order(precision: Any) -> None:
+    """Squares of gradients below 1e-19 vanish in single precision: a proved lower bound was 21
+    times the distance, since all slopes seemed to be zero."""
+    field = hk.SphericalHarmonic(12, 12)
+    rng = np.random.default_rng(0)
+    rho, angle = 10 ** rng.uniform(-2.4, -1, 2000), rng.uniform(0, 2 * np.pi, 2000)
+    p = np.stack([rho * np.cos(angle), rho * np.sin(angle), 0 * rho], axis=1)
+    p = p.astype(np.float32).astype(np.float64)
+    # The surface is 24 half planes through the z axis, at odd multiples of pi/24.
+    off = np.abs((np.arctan2(p[:, 1], p[:, 0]) - np.pi / 24) % (np.pi / 12))
+    true = np.hypot(p[:, 0], p[:, 1]) * np.sin(np.minimum(off, np.pi / 12 - off))
+
+    def distance(method: Any) -> np.ndarray:
+        return np.abs(hk.signed_distance(field, p, method=method, precision=precision))
+
+    assert (distance("lower") <= true).all()
+    assert np.median(distance("lower") / true) > 0.5
+    # |f|/|grad f| = rho |cos 12 phi|/12.
+    first = rho * np.abs(np.cos(12 * np.arctan2(p[:, 1], p[:, 0]))) / 12
+    np.testing.assert_allclose(distance("first"), first, atol=1e-7)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import drjit as dr
 
 from harnack.backend.extrema import fmax
+from harnack.backend.lengths import length
 from harnack.distance.tangent import apply
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ def first_order(above: Real, gradient: Vec3) -> Real:
 
     Where the gradient is zero it is infinite with the sign of above; zero on the level itself.
     """
-    return dr.select(above == 0, 0, above / dr.norm(gradient))
+    return dr.select(above == 0, 0, above / length(gradient))
 
 
 def second_order(above: Real, gradient: Vec3, rows: tuple[Vec3, Vec3, Vec3]) -> Real:
@@ -48,7 +49,7 @@ def second_order(above: Real, gradient: Vec3, rows: tuple[Vec3, Vec3, Vec3]) -> 
     Taylor's formula says nothing, its denominator is held at 1/2: the sign is always that of
     above, and the size at most 2 |d1|.
     """
-    steepness = dr.norm(gradient)
+    steepness = length(gradient)
     n = gradient / steepness
     first = first_order(above, gradient)
     bend = dr.dot(n, apply(rows, n)) / steepness

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import drjit as dr
 
 from harnack.backend.extrema import fmax, fmin
+from harnack.backend.lengths import length
 from harnack.bounds import Bound, Caps, CurvatureStep, LipschitzStep, Slope
 from harnack.certify import Certificate, Levels, certify
 
@@ -49,7 +50,7 @@ def distance_below(backend: Backend, field: Field, levels: Levels, p: Vec3, samp
     jumps taken out, which is f up to the nearest sheet.
     """
     down, up = levels.gaps(sample.value)
-    steepness = dr.norm(sample.gradient) + sample.gradient_error
+    steepness = length(sample.gradient) + sample.gradient_error
     size = fmax(fmax(dr.abs(p.x), dr.abs(p.y)), dr.abs(p.z))
     epsilon = backend.epsilon
     blur = dr.fma(8 * epsilon, dr.abs(sample.value), sample.error) + steepness * 4 * epsilon * size
@@ -68,8 +69,8 @@ def _longest(certificates: tuple[Certificate, ...], slope: Real) -> Real:
     for certificate in certificates:
         bound = next((bound for bound in _BOUNDS if bound.accepts(certificate)), None)
         if bound is not None:
-            length = fmax(bound.step(certificate, slope), 0)  # not a number: proves nothing
-            best = length if best is None else fmax(best, length)
+            free = fmax(bound.step(certificate, slope), 0)  # not a number: proves nothing
+            best = free if best is None else fmax(best, free)
     if best is None:
         raise ValueError(
             "the field says nothing that a bound could use (Sample.known is empty): "

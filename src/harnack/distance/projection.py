@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
+from harnack.backend import lengths
 from harnack.backend.extrema import clamp, fmax, fmin
 from harnack.distance.tangent import Eigen, TangentPlane
 
@@ -127,7 +128,7 @@ class Descent:
         """f - level at y, and the place."""
         sample, real = self.field.evaluate(y), self.backend.Float
         size = fmax(fmax(dr.abs(y.x), dr.abs(y.y)), dr.abs(y.z))
-        epsilon, steepness = self.backend.epsilon, dr.norm(sample.gradient)
+        epsilon, steepness = self.backend.epsilon, lengths.length(sample.gradient)
         blur = dr.fma(8 * epsilon, dr.abs(sample.value), sample.error)
         noise = dr.fma(4 * epsilon, size, blur / steepness)
         reach = real(0)
@@ -147,13 +148,13 @@ class Descent:
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
 
         def is_close(above: Real, place: _Place) -> Mask:
-            return dr.abs(above) <= 2 * dr.norm(place.gradient) * place.noise
+            return dr.abs(above) <= 2 * lengths.length(place.gradient) * place.noise
 
         def body(
             above: Real, y: Vec3, g: Vec3, noise: Real, reach: Real,
             share: Real, close: Mask, n: Any, active: Mask,
         ) -> tuple[Any, ...]:  # fmt: skip
-            here, steepness = _Place(y, g, noise, reach), dr.norm(g)
+            here, steepness = _Place(y, g, noise, reach), lengths.length(g)
             length = share * clamp(-above / steepness, -reach, reach)
             above2, there = self._look(dr.fma(vector(length / steepness), g, y))
             better = active & (dr.abs(above2) < dr.abs(above))

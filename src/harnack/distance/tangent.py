@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import drjit as dr
 
 from harnack.backend.basis import across
+from harnack.backend.lengths import length
 
 if TYPE_CHECKING:
     from harnack.backend import Real, Vec3
@@ -27,7 +28,7 @@ class TangentPlane:
     @classmethod
     def of(cls, gradient: Vec3) -> TangentPlane:
         """The plane at right angles to a gradient; NaN where that is zero."""
-        steepness = dr.norm(gradient)
+        steepness = length(gradient)
         n = gradient / steepness
         u, v = across(n)
         return cls(steepness, n, u, v)
