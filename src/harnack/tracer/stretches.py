@@ -82,7 +82,7 @@ class Walk:
         """One stretch: to the next crossing or the end of the ray, or to a hit."""
         count = self.backend.UInt32
         behind, state = Crossing(*outer[:4]), outer[4:]
-        ahead = self._next(behind, state[ACTIVE])
+        ahead, last = self._together(self._next(behind, self.end, state[ACTIVE]), state[ACTIVE])
         stops = ahead.sheet != NO_SHEET
         stop = dr.select(stops, ahead.t, self.end)
         base, _, reach = state[:3]
@@ -97,14 +97,62 @@ class Walk:
         spent = passed & (state[EVALUATIONS] >= self.max_steps)
         status = dr.select(spent, count(int(Status.OUT_OF_STEPS)), status)
         offset = dr.select(passed, offset + ahead.jump, offset)
-        crossing = (ahead.t, ahead.sheet, ahead.jump, ahead.normal)
+        # A sheet that was hit is the one to be named; one that was passed, the last of all there.
+        sheet = dr.select(passed, last, ahead.sheet)
+        crossing = (ahead.t, sheet, ahead.jump, ahead.normal)
         return (offset, *crossing, *state[:STATUS], status, passed & ~spent)
 
-    def _next(self, behind: Crossing, active: Mask) -> Crossing:
+    def _together(self, first: Crossing, active: Mask) -> tuple[Crossing, Any]:
+        """All crossings at the t of the first as one, and the index of the last of them.
+
+        A ray through an edge or a vertex crosses several sheets at once, in no order of theirs:
+        what they do to f there is the sum of their jumps, and between them there is nothing. The
+        sheet named is the first one that jumps as all of them together do.
+        """
+        real, count = self.backend.Float, self.backend.UInt32
+
+        def more(*state: Any) -> Mask:
+            return state[-1]
+
+        def body(
+            jump: Real, last: Any, up: Any, down: Any, n_up: Vec3, n_down: Vec3, go: Mask
+        ) -> tuple[Any, ...]:
+            after = Crossing(first.t, last, 0.0, first.normal)
+            one = self._next(after, first.t, go)
+            found = go & (one.sheet != NO_SHEET) & (one.t == first.t)
+            is_up, is_down = found & (one.jump > 0), found & (one.jump < 0)
+            new_up, new_down = is_up & (up == NO_SHEET), is_down & (down == NO_SHEET)
+            return (
+                jump + dr.select(found, one.jump, 0),
+                dr.select(found, one.sheet, last),
+                dr.select(new_up, one.sheet, up),
+                dr.select(new_down, one.sheet, down),
+                dr.select(new_up, one.normal, n_up),
+                dr.select(new_down, one.normal, n_down),
+                found,
+            )
+
+        some = self.backend.Bool(active) & (first.sheet != NO_SHEET)
+        none = count(NO_SHEET)
+        start = (
+            first.jump,
+            first.sheet,
+            dr.select(first.jump > 0, first.sheet, none),
+            dr.select(first.jump < 0, first.sheet, none),
+            first.normal,
+            first.normal,
+            some,
+        )
+        jump, last, up, down, n_up, n_down, _ = dr.while_loop(start, more, body, label="together")
+        sheet = dr.select(jump > 0, up, dr.select(jump < 0, down, first.sheet))
+        normal = dr.select(jump > 0, n_up, dr.select(jump < 0, n_down, first.normal))
+        return Crossing(first.t, sheet, real(jump), normal), last
+
+    def _next(self, behind: Crossing, end: Real, active: Mask) -> Crossing:
         """The field's answer as arrays of this backend; none if it lies beyond the end."""
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
-        ahead = self.field.next_crossing(self.o, self.d, behind, self.end, active)
-        there = real(ahead.t) <= self.end
+        ahead = self.field.next_crossing(self.o, self.d, behind, end, active)
+        there = real(ahead.t) <= end
         there &= count(ahead.sheet) != NO_SHEET
         return Crossing(
             dr.select(there, real(ahead.t), dr.inf),
@@ -144,8 +192,8 @@ def meet(ahead: Crossing, there: Mask, value: Real, blur: Real, levels: Levels) 
     up to `blur`, and a level within blur of either counts as between: such a sheet is the surface
     or just fails to be, and its points are no farther than rounding from the level. To decide the
     other way could lose a surface, for the march has proved that the level is not met *before*
-    the sheet, which rounding may contradict by as much. Sheets are looked at one by one: two
-    that undo each other's jump at the same t are two sheets with a gap in between.
+    the sheet, which rounding may contradict by as much. Sheets at the same t count as one, with the
+    sum of their jumps (`Walk._together`).
     """
     awaited = ahead.sheet != NO_SHEET
     passed = awaited & there

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 # Columns of a record; 0 to 8 are the corners.
 PARITY, INDEX, EDGES = 9, 10, 11
+# Roundings of a coordinate by which a ray passes an edge and counts as passing through it.
+_CLOSE = 4.0
 # Triangles are numbered in floats; single precision counts no further.
 MOST_TRIANGLES = 2**24
 NO_TRIANGLE = 0xFFFFFFFF
@@ -280,17 +282,22 @@ def crossing(row: list[Real], frame: Frame | Upwards) -> tuple[Real, Real]:
         upwards(up_a, up_b, ab) + upwards(up_b, up_c, bc) - upwards(up_a, up_c, ac)
     )
     a, b, c = (*a, frame.depth(p)), (*b, frame.depth(q)), (*c, frame.depth(r))
-    return _depth((a, b, c), (ab, bc, ac)), turn
+    close = _CLOSE * float(dr.epsilon(frame.o)) * (1 + dr.max(dr.abs(frame.o)))
+    return _depth((a, b, c), (ab, bc, ac), close), turn
 
 
-def _depth(corners: tuple[Seen, Seen, Seen], sides: tuple[Real, Real, Real]) -> Real:
+def _depth(corners: tuple[Seen, Seen, Seen], sides: tuple[Real, Real, Real], close: Real) -> Real:
     """How far along a ray a triangle lies that it passes through, seen as (u, v, depth) each.
 
     The weight of a corner is an area over that of the triangle, which is all rounding where that is
-    thin. So the weight w of the corner off the longest edge is cut to [0, 1], and the place s along
-    that edge is then chosen for w: the ray is at s + w s', with s' the place of that corner, and
-    places along the longest edge are well known. A wrong w moves the point across that edge only,
-    by no more than the rounding of an area over the edge's length.
+    thin. So the weight w of the corner off the longest edge is cut to what the ray's place along
+    that edge allows, and the place s of the point on the edge is then chosen for w: the ray is at
+    s + w s', with s' the place of that corner, 0 <= s <= 1 - w, and places along the longest edge
+    are well known. A wrong w moves the point across that edge only, by no more than the rounding of
+    an area over the edge's length.
+
+    A ray that is as close as `close` to an edge or a vertex passes all triangles there at the depth
+    of that edge or vertex, the same bits for all: what they do to w there, they do at once.
     """
     (a, b, c), (ab, bc, ac) = corners, sides
     squares = _square(a, b), _square(b, c), _square(a, c)
@@ -309,9 +316,22 @@ def _depth(corners: tuple[Seen, Seen, Seen], sides: tuple[Real, Real, Real]) -> 
     here = -dr.fma(start[0], e[0], start[1] * e[1]) * share
     aside = dr.fma(apex[0] - start[0], e[0], (apex[1] - start[1]) * e[1]) * share
     zero = type(ab)(0)
-    w = clamp(of_longest(ab, bc, -ac) / (bc - ac + ab), zero, 1)
+    here, aside = clamp(here, zero, 1), clamp(aside, zero, 1)
+    most = fmin((1 - here) / (1 - aside), fmin(here / aside, type(ab)(1)))
+    w = clamp(of_longest(ab, bc, -ac) / (bc - ac + ab), zero, most)
     s = clamp(dr.fma(-w, aside, here), zero, 1 - w)
-    return dr.fma(s, end[2] - start[2], dr.fma(w, apex[2] - start[2], start[2]))
+    t = dr.fma(s, end[2] - start[2], dr.fma(w, apex[2] - start[2], start[2]))
+    near = close * close
+    for (one, other), side_, square in zip(
+        ((a, b), (b, c), (a, c)), (ab, bc, ac), squares, strict=True
+    ):
+        share = -dr.fma(one[0], other[0] - one[0], one[1] * (other[1] - one[1])) / square
+        at = dr.fma(clamp(share, zero, 1), other[2] - one[2], one[2])
+        beside = (side_ * side_ <= near * square) & (share > 0) & (share < 1)
+        t = dr.select(beside, at, t)
+    for u, v, depth in corners:
+        t = dr.select(dr.fma(u, u, v * v) <= 4 * near, depth, t)
+    return t
 
 
 def _square(a: Seen, b: Seen) -> Real:
