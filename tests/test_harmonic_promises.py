@@ -203,8 +203,7 @@ def rays(kind: str, n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return o, (to - o) / np.linalg.norm(to - o, axis=1, keepdims=True)
 
 
-# In single precision the tracer squares gradients that are too small for it.
-PRECISIONS = ["double", pytest.param("single", marks=pytest.mark.xfail)]
+PRECISIONS = ["double", "single"]
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)

@@ -114,7 +114,7 @@ def find_closest(backend: Backend, surface: LevelSet, levels: Levels, points: An
     No point is taken that is nearer than the lower bound that the field's promises prove.
     """
     field = surface.field
-    prepared = field.prepare(backend)
+    prepared = field.prepare(backend).without_truncation(backend)
     surface = dataclasses.replace(surface, field=prepared)  # uploaded once
     descent = Descent.of(backend, prepared, levels)
     candidates = _Candidates(backend, field, descent)

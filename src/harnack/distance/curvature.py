@@ -79,7 +79,8 @@ def curvature(field: Field, points: Any, *, precision: Precision = "double") -> 
         def directly(p: Vec3) -> tuple[Real | Vec3, ...]:
             sample = prepared.evaluate(p)
             rows = prepared.hessian(p)
-            return _Derivatives(backend, sample.gradient, rows, sample.gradient_error, 0).bent()
+            errors = prepared.derivative_errors(p, sample)
+            return _Derivatives(backend, sample.gradient, rows, *errors).bent()
 
         *found, _ = in_batches(backend, directly, points)
         return Curvatures(*found)

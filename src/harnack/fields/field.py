@@ -8,6 +8,7 @@ the tracer takes rests on it. `harnack.testing.check_field` tests a field agains
 from __future__ import annotations
 
 import abc
+import copy
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -113,6 +114,9 @@ def lengthened(sample: Sample, size: Real) -> Sample:
         sample.value, gradient, tuple(known), sample.error, doubt, sample.normal, sample.truncation
     )
 
+
+# A detail at which nothing is left out.
+_EVERYTHING = 1e9
 
 _HOW = (
     "return harnack.Sample(value, gradient, known), with a Dr.Jit number, a Dr.Jit 3-vector and a "
@@ -266,6 +270,20 @@ class Field(abc.ABC):
         """
         del detail
         return self
+
+    def without_truncation(self, backend: Backend) -> Field:
+        """This field, prepared for the backend, with nothing left out when it is evaluated."""
+        if not self.has_detail:
+            return self
+        closely = copy.copy(self)
+        closely.evaluate = self.at_detail(backend.Float(_EVERYTHING)).evaluate
+        return closely
+
+    def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
+        """Bounds of the errors of the gradient, as a length, and of `hessian`, in the spectral
+        norm, at the point p of a sample: what the sample states, and nothing for the Hessian."""
+        del p
+        return sample.gradient_error, 0.0
 
     # Of fields with sheets only. All may be called while a loop is being recorded, for rays
     # o + t d with |d| = 1; answers for lanes that are not active are not looked at.

@@ -16,10 +16,12 @@ from harnack.choices import did_you_mean
 from harnack.fields.edge_angles import differentiable_angle
 from harnack.fields.edge_extent import tight_extent
 from harnack.fields.edge_hessian import hessian_over_edges
+from harnack.fields.edge_lift import epsilon_at
 from harnack.fields.edge_nearest import Segments, closest_on_segments
 from harnack.fields.edge_passing import Line, rates_along
 from harnack.fields.edge_sums import EdgeBuffer, EdgeSums, sum_over_edges, upload
 from harnack.fields.field import Field, HarmonicBall, LineLipschitz, Sample
+from harnack.fields.nearby import SECOND_ROUNDINGS, SLOPE_ROUNDINGS
 from harnack.fields.unit_coordinates import UnitCoordinates, placed
 from harnack.geometry import ConvexHull, is_convex_position, total_length, validate_loops
 from harnack.geometry.net_loops import net_loops, uncancelled_edges
@@ -222,6 +224,23 @@ class SolidAngle(Field):
         x, y, z = hessian_over_edges(on.edges, on.unit(p))
         share = 1 / (on.size * on.size)
         return x * share, y * share, z * share
+
+    def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
+        """Rounding of positions, as for sums over boundary edges (`far_clusters.Errors`), with
+        distances less by what it may have done to them. Without bound at the curve."""
+        del sample
+        if self._device is None:
+            return self.prepare(backend_of(p)).derivative_errors(p, self.evaluate(p))
+        on = self._device
+        if on.edges is None:
+            return 0.0, 0.0
+        x = on.unit(p)
+        sums, unit = sum_over_edges(on.edges, x, variation=True), epsilon_at(x)
+        distance = sums.distance - 4 * unit
+        share = dr.select(distance > 0, dr.square(dr.square(sums.distance / distance)), dr.inf)
+        slope = (SLOPE_ROUNDINGS * 2 / 3) * unit * sums.second * share / on.size
+        second = 0.5 * SECOND_ROUNDINGS * unit * sums.second / sums.distance * share
+        return slope, second / (on.size * on.size)
 
     def closest_on_boundary(self, p: Vec3) -> Vec3 | None:
         """The closest point of the curve, edges that cancel left out (`uncancelled_edges`)."""

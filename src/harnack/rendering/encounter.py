@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 
 from harnack.backend import Mask, Real, Vec3  # at run time: Dr.Jit reads Encounter's annotations
+from harnack.backend.lengths import length as norm
 from harnack.tracer import Status
 
 if TYPE_CHECKING:
@@ -76,7 +77,7 @@ def meet_surface(
     t = dr.maximum(dr.select(met, trace.t, 0) + step, 0)
     p = dr.fma(vector(t), d, o)
     sample = prepared.sample(p)
-    length = dr.norm(sample.gradient)
+    length = norm(sample.gradient)
     normal = dr.select(length > 0, sample.gradient / length, -d)
     shading = normal if sample.normal is None else sample.normal
     uncertainty = _uncertainty(prepared, sample.gradient, t, sample.value, sample.error)
@@ -134,7 +135,7 @@ def _uncertainty(
     That is the tolerance, or what rounding of f (`Sample.error`) amounts to if that is more; the
     rounding of positions is far below what Mitsuba's rays keep off surfaces anyway.
     """
-    steepness = dr.norm(gradient)
+    steepness = norm(gradient)
     t = dr.select(dr.isfinite(t), t, 0)
     rounding = 2 * (error + 8 * prepared.backend.epsilon * dr.abs(f))
     close = dr.maximum(prepared.tolerance.in_value(steepness, t), rounding)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
+from harnack.backend.lengths import length as norm
 from harnack.certify import Levels
 from harnack.tracer.tolerance import Status
 
@@ -73,7 +74,7 @@ def attach(
         x = dr.fma(backend.Array3f(at), along, here)
         sample = prepared.sample(x)
         slope = dr.dot(sample.gradient, along)
-        length = dr.norm(sample.gradient)
+        length = norm(sample.gradient)
         normal = dr.select(hit & (length > 0), sample.gradient / length, normal)
         dr.eval(at, x, slope, normal)
     value = prepared.field.differentiable_value(dr.fma(backend.Array3f(at), d, o))

@@ -10,6 +10,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import backend_of, choose_backend, to_float, to_numpy, to_vector3
+from harnack.backend.lengths import length as norm
 from harnack.tracer.derivatives import attach, wants_derivatives
 from harnack.tracer.surface import LevelSet, level_set
 from harnack.tracer.tolerance import Status, Tolerance
@@ -153,7 +154,7 @@ def _trace(
     with dr.suspend_grad():
         end = prepared.first_hit(dr.detach(o), dr.detach(d), dr.detach(near), dr.detach(far))
         hit = end.status == int(Status.HIT)
-        length = dr.norm(end.gradient)
+        length = norm(end.gradient)
         normal = dr.select(hit & (length > 0), end.gradient / length, 0)
         sheet = dr.full(backend.Int32, -1, dr.width(end.status))
         if prepared.field.has_sheets:

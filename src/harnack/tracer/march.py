@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 
 from harnack.backend.extrema import clamp, fmax, fmin
+from harnack.backend.lengths import length
 from harnack.certify import Levels, certify
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.tracer.stretches import STATUS, State, Walk, loop, meet
@@ -154,7 +155,7 @@ class PreparedLevelSet:
             beyond = None if ahead is None else (ahead, t == end)
             seen = field.at_detail(detail) if field.has_detail else field
             sample = seen.evaluate(dr.fma(vector(t), d, o))
-            gaps, steepness = self.levels.gaps(sample.value), dr.norm(sample.gradient)
+            gaps, steepness = self.levels.gaps(sample.value), length(sample.gradient)
             blur = self._blur(sample, steepness, size + t)
             certificates, ahead_gaps = self._certify(sample, gaps, blur), gaps
             slope, doubt = dr.dot(sample.gradient, d), sample.gradient_error

@@ -1,0 +1,143 @@
+"""Cases that attacks on the guarantees found, kept as they were."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import harnack as hk
+from harnack.geometry.mesh_shapes import icosphere
+from harnack.testing.direct_sums import dipole_sum
+
+PRECISIONS = ("single", "double")
+
+
+def single(x: np.ndarray) -> np.ndarray:
+    return x.astype(np.float32).astype(np.float64)
+
+
+def grazing(
+    vertices: np.ndarray, faces: np.ndarray, kind: str, n: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rays past vertices or edges of a mesh that mostly do not enter it."""
+    rng = np.random.default_rng(0)
+    chosen = vertices[faces[rng.integers(len(faces), size=n)]]
+    share = rng.uniform(size=(n, 1)) if kind == "edges" else 0
+    target = chosen[:, 0] + share * (chosen[:, 1] - chosen[:, 0])
+    if kind == "axis":
+        d = np.eye(3)[rng.integers(3, size=n)] * rng.choice([-1.0, 1.0], (n, 1))
+    else:
+        d = np.cross(target, rng.normal(size=(n, 3)))
+        d /= np.linalg.norm(d, axis=1)[:, None]
+        d += 0.15 * rng.normal(size=(n, 3)) * rng.uniform(size=(n, 1))
+    d /= np.linalg.norm(d, axis=1)[:, None]
+    return target - 1.2 * d, d, target
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("method", ["exact", "tree"])
+@pytest.mark.parametrize("kind", ["axis", "random", "edges"])
+def test_vertices_of_inner_sheets_are_no_surface(kind: str, method: Any, precision: Any) -> None:
+    """A ball in a ball, both outwards: w is 2 and 1, and the level 1/2 is on neither's inside. Rays
+    that graze vertices of the inner ball crossed its triangles one by one, some of them out before
+    in: 3 % were hits."""
+    vertices, faces = icosphere(2)
+    vertices = single(vertices)
+    both = np.concatenate([3 * vertices, vertices]), np.concatenate([faces, faces + len(vertices)])
+    o, d, target = grazing(vertices, faces, kind, 3000)
+    some = (np.linalg.norm(o, axis=1) > 1.01) & (np.linalg.norm(o, axis=1) < 2.5)
+    o, target = o[some], target[some]
+    o = single(o) if precision == "single" else o
+    field = hk.WindingNumber(*both, method=method)
+    hits = hk.trace(field, o, target - o, t_max=1.6, precision=precision)
+    assert (hits.status == hk.Status.MISS).all(), d[some][hits.hit][:1]
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_hits_of_triangles_seen_edge_on_lie_on_them(precision: Any) -> None:
+    """In the plane of a face, to rounding: hits were up to 0.03 from the triangle they named."""
+    vertices, faces = icosphere(1)
+    vertices = single(vertices)
+    rng = np.random.default_rng(1)
+    n = 4000
+    triangles = vertices[faces[rng.integers(len(faces), size=n)]]
+    weights = rng.dirichlet([1, 1, 1], size=n)
+    edges = triangles[:, 1:] - triangles[:, :1]
+    d = np.einsum("nk,nki->ni", rng.normal(size=(n, 2)), edges)
+    d /= np.linalg.norm(d, axis=1)[:, None]
+    o = single(np.einsum("nk,nki->ni", weights, triangles) - 3 * d)
+    o = np.concatenate([o, [[0.96367258, 1.42124164, -2.16641927]]])
+    d = np.concatenate([single(d), [[-0.15844034, -0.27559111, 0.94812775]]])
+    field = hk.WindingNumber(vertices, faces)
+    hits = hk.trace(field, o, d, tolerance=1e-5, precision=precision)
+    rows = np.flatnonzero(hits.hit & (hits.sheet >= 0))
+    assert len(rows) > 1000
+    a, b, c = np.moveaxis(vertices[faces[field.faces_of_sheets[hits.sheet[rows]]]], 1, 0)
+    x, normal = hits.position[rows], np.cross(b - a, c - a)
+    normal /= np.linalg.norm(normal, axis=1)[:, None]
+    assert np.abs(((x - a) * normal).sum(axis=1)).max() < 1e-5
+    for p, q in ((a, b), (b, c), (c, a)):
+        inward = np.cross(normal, q - p)
+        inward /= np.linalg.norm(inward, axis=1)[:, None]
+        assert ((x - p) * inward).sum(axis=1).min() > -1e-5
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_what_is_lost_in_rounding_is_no_hit(precision: Any) -> None:
+    """Far from a screened cloud the level 0 is nowhere, and w is nothing but held exponentials:
+    hits stated an uncertainty of 0 or NaN."""
+    rng = np.random.default_rng(5)
+    normals = rng.normal(size=(100, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    field = hk.ScreenedWindingNumber(normals, normals, length=0.05, method="sum")
+    o = rng.normal(size=(100, 3))
+    o *= 8 / np.linalg.norm(o, axis=1)[:, None]
+    d = np.cross(o, rng.normal(size=(100, 3)))
+    hits = hk.trace(field, o, d, level=0, t_max=10, precision=precision)
+    assert not hits.hit.any()
+    assert np.isfinite(hits.uncertainty).all()
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_rays_that_start_at_vertices_of_curves_hit_them(precision: Any) -> None:
+    """They ran out of steps at once, where the sum of an edge's field is infinite."""
+    angle = 2 * np.pi * np.arange(8) / 8
+    ring = single(np.column_stack([np.cos(angle), np.sin(angle), 0 * angle]))
+    loops = [ring, single(0.6 * ring[::-1]), single(0.3 * ring)]
+    o = np.concatenate(loops)
+    hits = hk.trace(hk.SolidAngle(loops), o, np.roll(o, 3, axis=0) - o, precision=precision)
+    assert hits.hit.all()
+    assert hits.t.max() < 1e-4
+
+
+def test_closest_points_of_clouds_are_on_the_surface_whatever_the_accuracy() -> None:
+    """They were on that of the approximate sum: up to a fifth of the size off."""
+    rng = np.random.default_rng(3)
+    normals = rng.normal(size=(400, 3))
+    normals = single(normals / np.linalg.norm(normals, axis=1)[:, None])
+    field = hk.DipolePotential(normals, normals, np.full(400, np.pi / 100), accuracy=1.5)
+    x = 0.8 * rng.normal(size=(12, 3))
+    feet = hk.closest_points(field, x)
+    value, gradient = dipole_sum(normals, field.areas[:, None] * field.normals)(feet)
+    apart = np.linalg.norm(feet[:, None] - normals, axis=2).min(axis=1) > 1e-6
+    off = np.abs(value - 2 * np.pi) / np.linalg.norm(gradient, axis=1)
+    assert off[apart].max() < 1e-9
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_curvatures_beside_curves_state_their_error(precision: Any) -> None:
+    """Mean curvatures were off by up to 1e5 times what was stated."""
+    loop = single(hk.geometry.shapes.wavy_polygon(12))
+    rng = np.random.default_rng(0)
+    middle = 0.5 * (loop + np.roll(loop, -1, axis=0))
+    x = single(middle + 1e-5 * rng.normal(size=middle.shape))
+    found = hk.curvature(hk.SolidAngle(loop), x, precision=precision)
+    # In double precision errors are far smaller, and serve as the truth of single precision.
+    exact = hk.curvature(hk.SolidAngle(loop), x, precision="double")
+    off = np.abs(found.mean - exact.mean)
+    assert ((off <= found.mean_error + exact.mean_error) | np.isnan(found.mean)).all()
+    assert (
+        found.mean_error[np.isfinite(found.mean)] > (1 if precision == "single" else 1e-9)
+    ).all()
