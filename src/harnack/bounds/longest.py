@@ -57,13 +57,14 @@ class Longest:
                     break
         if any(bound.sufficient for bound, _ in chosen):
             chosen = [pair for pair in chosen if pair[0].sufficient]
-        if all(getattr(certificate, "is_supplement", False) for _, certificate in chosen):
+        if all(_is_supplement(certificate) for _, certificate in chosen):
             raise ValueError(self._useless(certificates))
         return chosen
 
     def _useless(self, certificates: tuple[Certificate, ...]) -> str:
         """Why no bound applies, and which would."""
         asked = ", ".join(type(bound).__name__ for bound in self.bounds)
+        certificates = tuple(one for one in certificates if not _is_supplement(one))
         if not certificates:
             return (
                 f"the bounds asked for ({asked}) need a promise and the field makes none: "
@@ -97,3 +98,8 @@ class Longest:
             proved = bound.covers(certificate, slope, length)
             free = proved if free is None else free | proved
         return free
+
+
+def _is_supplement(certificate: Certificate) -> bool:
+    """Whether it only adds to others: see `LipschitzCertificate`."""
+    return isinstance(certificate, LipschitzCertificate) and certificate.is_supplement

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 
-from harnack.fields.edge_field import edge_field, edge_variation
+from harnack.fields.edge_field import edge_field
 from harnack.fields.edge_hessian import SymmetricSum, edge_rates
 from harnack.fields.edge_lift import LiftedProduct, edge_factor
 from harnack.tree.nearest import squared_distance_to_segment
@@ -73,10 +73,6 @@ class NearEdge:
         """Its part of the Hessian of the solid angle added, where active."""
         c, rate = edge_rates(self.a, self.e, self.inverse)
         return total.plus(dr.select(active, self.way * c, 0), dr.select(active, rate, 0))
-
-    def variation(self) -> tuple[Real, Real]:
-        """`edge_field.edge_variation`."""
-        return edge_variation(self.square, self.inverse)
 
 
 def edges_of(row: list[Real], x: Vec3, frame: Frame | Upwards) -> Iterator[NearEdge]:
