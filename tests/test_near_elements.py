@@ -112,7 +112,8 @@ def check_mesh(kind: str, method: Any, precision: Any, n: int) -> None:
     some = np.isfinite(truth).all(axis=1)  # all but points on edges
     off = np.linalg.norm(slope - truth, axis=1)[some]
     bound = field.gradient_error_bound(x, precision=precision)[some]
-    assert (off <= bound).all(), (x[some][np.argmax(off / bound)], (off / bound).max())
+    # What overflows says so: its bound is infinite.
+    assert ((off <= bound) | np.isinf(bound)).all(), (x[some], off, bound)
     # They say something: but for points on the mesh to rounding.
     size = np.linalg.norm(truth[some], axis=1)
     assert np.median(bound / size) < (1e-3 if method == "exact" else 0.5)

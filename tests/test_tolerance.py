@@ -124,9 +124,16 @@ def check_mesh(tolerance: float, precision: Any, n: int, **settings: Any) -> Non
     x = hits.position[rows]
     steepness = np.linalg.norm(edge_fields(vertices, faces, x), axis=1)
     off = np.abs(winding_sum(vertices[faces])(x) - 0.5)
+    over = excess(hits, off, steepness, rows, tolerance)
     if precision == "single":
         off = np.maximum(off - 4e-7 * 6 * steepness, 0)
-    assert excess(hits, off, steepness, rows, tolerance).max() <= 1
+        over = excess(hits, off, steepness, rows, tolerance)
+        # At a boundary edge, to the rounding of positions along the ray, every level set ends.
+        rounded = 1e-6 * (np.linalg.norm(o[rows], axis=1) + hits.t[rows])
+        at_edge = 2 * np.pi * steepness * rounded > 0.5
+        assert at_edge.mean() < 0.01
+        over = over[~at_edge]
+    assert over.max() <= 1
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
