@@ -141,3 +141,68 @@ def test_curvatures_beside_curves_state_their_error(precision: Any) -> None:
     assert (
         found.mean_error[np.isfinite(found.mean)] > (1 if precision == "single" else 1e-9)
     ).all()
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_directions_may_have_any_length(precision: Any) -> None:
+    """Those whose squares overflow were proved misses, and short ones pointed elsewhere."""
+    o, d = np.array([[0.1, 0.2, 3.0]]), np.array([[0.0, 0.01, -1.0]])
+    fields: tuple[hk.Field, ...] = (
+        hk.WindingNumber(*icosphere(1)),
+        hk.SolidAngle(hk.geometry.shapes.wavy_polygon(12)),
+    )
+    powers = (-35, -19, -17, 17, 19, 30, 37) if precision == "single" else (-300, -161, 153, 300)
+    for field in fields:
+        hit = hk.trace(field, o, d, precision=precision)
+        for power in powers:
+            same = hk.trace(field, o, d * 10.0**power, precision=precision)
+            assert same.hit.all()
+            np.testing.assert_allclose(same.t, hit.t, rtol=1e-6)
+
+
+@pytest.mark.parametrize("method", ["exact", "tree"])
+def test_rays_on_the_line_of_a_boundary_edge_see_the_right_value(method: Any) -> None:
+    """Exactly on it the edge's factor was as short as what stood for its imaginary part: f along
+    the ray was off by a constant, up to 0.25, and first hits were missed."""
+    vertices, faces = icosphere(1)
+    vertices, faces = single(vertices), faces[np.arange(len(faces)) % 3 > 0]
+    o = [[0.7013015747070312, 0, -1.051462173461914]]
+    d = [[0.14934921264648438, 0, 0.525731086730957]]
+    field = hk.WindingNumber(vertices, faces, method=method)
+    hit = hk.trace(field, o, d, level=0.02, tolerance=1e-5, precision="double")
+    np.testing.assert_allclose(hit.t, 0.029064, atol=1.1e-5)
+    np.testing.assert_allclose(hit.value, field.value(hit.position, precision="double"), atol=1e-6)
+
+
+@pytest.mark.parametrize("method", ["exact", "tree"])
+def test_rays_along_boundary_edges_miss_no_hit(method: Any) -> None:
+    """Of a mesh with whole numbers for coordinates, so that rays are on the very lines: 27,000
+    tolerances off before. Hits are within tolerance of a level, and no level is before them."""
+    rng, n = np.random.default_rng(5), 150
+    vertices, faces = icosphere(1)
+    vertices, faces = np.round(8 * vertices), faces[np.arange(len(faces)) % 3 > 0]
+    corners = vertices[faces[rng.integers(len(faces), size=n)]]
+    start, end = corners[:, 0], corners[:, 1]
+    d = end - start
+    o = start - d * rng.choice([0.125, 0.25, 0.5, 1, 2], (n, 1))
+    field = hk.WindingNumber(vertices, faces, method=method)
+    hits = hk.trace(field, o, d, level=0.02, tolerance=1e-5, precision="double")
+    assert (hits.status != int(hk.Status.OUT_OF_STEPS)).all()
+    exact = hk.WindingNumber(vertices, faces, method="exact")
+    smooth = hits.hit & (hits.sheet < 0)
+    w, gradient = exact.value_and_gradient(hits.position[smooth], precision="double")
+    steep = np.linalg.norm(gradient, axis=1)
+    # On a singular edge itself all values meet.
+    off = np.where(np.isfinite(steep), np.abs(np.remainder(w - 0.02 + 0.5, 1) - 0.5) / steep, 0)
+    assert smooth.sum() > 100
+    assert off.max() < 1.05e-5
+    d /= np.linalg.norm(d, axis=1)[:, None]
+    share = np.linspace(0, 1, 402)[1:-1]
+    x = o[:, None] + (np.minimum(hits.t, 60)[:, None] * share)[:, :, None] * d[:, None]
+    x = x.reshape(-1, 3)
+    around = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+    w = np.stack([exact.value(x + 1e-7 * step, precision="double") for step in around])
+    above, regular = w[0] > 0.02, np.ptp(w, axis=0) < 1e-3  # not on a triangle
+    first = np.repeat(above.reshape(n, -1)[:, 0], 400)
+    assert (above == first)[regular].all()
+    assert regular.mean() > 0.6

@@ -56,7 +56,7 @@ class Longest:
                     chosen.append((bound, certificate))
                     break
         if any(bound.sufficient for bound, _ in chosen):
-            chosen = [pair for pair in chosen if pair[0].sufficient]
+            chosen = [pair for pair in chosen if pair[0].sufficient or _is_supplement(pair[1])]
         if all(_is_supplement(certificate) for _, certificate in chosen):
             raise ValueError(self._useless(certificates))
         return chosen

@@ -14,8 +14,10 @@ their number costs only where the ray passes the boundary closely.
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import drjit as dr
 
@@ -29,16 +31,21 @@ from harnack.fields.edge_lift import (
     epsilon_at,
     with_edge,
 )
+from harnack.fields.edge_passing import with_edge as with_edge_passing
 from harnack.fields.edge_trails import closed_trails
 from harnack.fields.multipole_kernel import far_terms
-from harnack.fields.nearby import Nearby, free_part, with_far_node
+from harnack.fields.nearby import Nearby, Sums, free_part, with_far_node
 from harnack.tree import Node, PackedTree, for_each, pack, walk
 from harnack.tree.nearest import squared_distance_to_segment
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.fields.edge_passing import Line
     from harnack.tree.hierarchy import FloatArray, IntArray
     from harnack.tree.triangles import Frame
+
+# An edge's ends, 1 or -1 for its way and 1/length^2, and where it counts, added to sums.
+AddEdge: TypeAlias = "Callable[[tuple[Vec3, Vec3], Real, Real, Mask, Sums], Sums]"
 
 
 @dataclass(frozen=True)
@@ -64,11 +71,45 @@ class EdgeChains:
         remainder what `edge_lift.with_edge` says, and so do chords: none is nearer than the ball
         around its chain.
         """
+        unit = fmax(epsilon_at(frame.o), epsilon_at(x))
+
+        def add(
+            ends: tuple[Vec3, Vec3], way: Real, inverse: Real, active: Mask, state: Sums
+        ) -> Sums:
+            return _with_edge(frame, x, ends, (way, inverse, unit), active, state)
+
+        one = LiftedProduct.one(self.backend.Float).parts()
+        found, product = self._walk(frame, x, detail, add, one)
+        return dataclasses.replace(found, value=found.value + LiftedProduct(*product).angle())
+
+    def rates(
+        self, frame: Frame, line: Line, lengths: tuple[Real, ...], active: Mask
+    ) -> tuple[Real, ...]:
+        """The constants of `edge_passing` for the sum of Omega_e along the rays from points x."""
+
+        def add(
+            ends: tuple[Vec3, Vec3], way: Real, inverse: Real, active: Mask, state: Sums
+        ) -> Sums:
+            del way
+            p, q = ends
+            with_it = with_edge_passing(line, (p - line.x, q - p), inverse, lengths, state[8:])
+            pairs = zip(with_it, state[8:], strict=True)
+            return *state[:8], *(dr.select(active, new, old) for new, old in pairs)
+
+        start = tuple(self.backend.Float(0) for _ in lengths)
+        far, near = self._walk(frame, line.x, 0, add, start, active)
+        return far.with_rates(line, lengths, near, active)
+
+    def _walk(
+        self, frame: Frame, x: Vec3, detail: Real, add: AddEdge, own: Sums, active: Mask = True
+    ) -> tuple[Nearby, Sums]:
+        """The sums over far nodes without their chords, and all edges and chords added to them and
+        to the caller's own by `add`, where it is told to."""
         real, vector = self.backend.Float, self.backend.Array3f
         unit = fmax(epsilon_at(frame.o), epsilon_at(x))
         pad, close = 16 * unit, fmax(real(detail), real(1))
 
-        def visit(node: Node, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
+        def visit(node: Node, state: Sums) -> tuple[Mask, Sums]:
             centre, radius = vector(*node.head[:3]), node.head[3] + pad
             r = x - centre
             square, (u, v) = dr.squared_norm(r), frame.across(centre)
@@ -78,25 +119,24 @@ class EdgeChains:
             inverse = dr.select(far, dr.rsqrt(square), 0)
             c, decay = node.payload(far), dr.square(inverse * inverse) * inverse
             sums = with_far_node(
-                state[1:], far_terms(c, r, inverse, 1), far, inverse,
+                state[:8], far_terms(c, r, inverse, 1), far, inverse,
                 dr.fma(c[18], inverse * inverse, c[17]),
                 (c[15] * decay, c[16] * decay * inverse),
                 free_part(RATIO) * (square * inverse), unit,
             )  # fmt: skip
-            state = (state[0], *sums)
             chord = vector(*c[19:22]), vector(*c[22:25])
-            state = _with_edge(frame, x, chord, (real(1), c[25], unit), far & (c[25] > 0), state)
-            return ~far, for_each(node, ~far & node.is_leaf, add, state)
+            state = add(chord, real(1), c[25], far & (c[25] > 0), (*sums, *state[8:]))
+            return ~far, for_each(node, ~far & node.is_leaf, edge, state)
 
-        def add(row: list[Real], active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
+        def edge(row: list[Real], active: Mask, state: Sums) -> Sums:
             ends, way = (vector(*row[:3]), vector(*row[4:7])), row[3]
             # A slot without an edge has no direction.
-            return _with_edge(frame, x, ends, (way, row[7], unit), active & (way != 0), state)
+            return add(ends, way, row[7], active & (way != 0), state)
 
-        one, zero = LiftedProduct.one(real).parts(), real(0)
-        start = (one, zero, vector(0), zero, zero, zero, real(dr.inf), zero, zero)
-        product, value, *rest = walk(self.tree, visit, start)
-        return Nearby(self.backend, value + LiftedProduct(*product).angle(), *rest)
+        zero = real(0)
+        start = (zero, vector(0), zero, zero, zero, real(dr.inf), zero, zero, *own)
+        sums = walk(self.tree, visit, start, active)
+        return Nearby(self.backend, *sums[:8]), sums[8:]
 
 
 def _with_edge(
@@ -107,7 +147,7 @@ def _with_edge(
 
     more: 1 or -1 for its way; 1/length^2; and how far rounding moves a coordinate.
     """
-    product, value, g, truncation, slope_truncation, rounding, clear, s4, s5 = state
+    value, g, truncation, slope_truncation, rounding, clear, s4, s5, *product = state
     vector, (p, q), (way, inverse, unit) = cast("Any", type(x)), ends, more
     a, b = p - x, q - x
     la, lb = dr.norm(a), dr.norm(b)
@@ -121,4 +161,5 @@ def _with_edge(
     square = squared_distance_to_segment(a, b - a, inverse)
     rounding, s4, s5 = with_edge((rounding, s4, s5), square, inverse, unit, active)
     clear = dr.select(active, fmin(dr.sqrt(square), clear), clear)
-    return product, value, g + slope, truncation, slope_truncation, rounding, clear, s4, s5
+    sums = value, g + slope, truncation, slope_truncation, rounding, clear, s4, s5
+    return *sums, *product

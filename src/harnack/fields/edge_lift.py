@@ -26,7 +26,7 @@ from harnack.backend.extrema import fmax, fmin
 from harnack.fields.edge_field import edge_field, edge_variation
 from harnack.fields.edge_hessian import SymmetricSum, edge_rates
 from harnack.tree.nearest import squared_distance_to_segment
-from harnack.tree.triangles import side
+from harnack.tree.triangles import Upwards, side
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -128,9 +128,11 @@ def _with_edge(
 ) -> Any:  # fmt: skip
     """The sums with the edge of a record added."""
     vector, direction = cast("Any", type(x)), row[3]
-    a, b = vector(row[0], row[1], row[2]) - x, vector(row[4], row[5], row[6]) - x
+    p, q = vector(row[0], row[1], row[2]), vector(row[4], row[5], row[6])
+    a, b, frame = p - x, q - x, Upwards(x)
     la, lb = dr.norm(a), dr.norm(b)
-    re, im = edge_factor(a, b, la, lb)
+    seen = vector(*frame.across(p), a.z), vector(*frame.across(q), b.z)
+    re, im = edge_factor(*seen, la, lb)
     product = LiftedProduct(*product).times(re, direction * im).parts()
     square = squared_distance_to_segment(a, b - a, row[7])
     bounds = with_edge(bounds, square, row[7], epsilon_at(x), direction != 0)
@@ -199,9 +201,12 @@ def edge_factor(a: Vec3, b: Vec3, la: Real, lb: Real) -> tuple[Real, Real]:
     ax, bx = dr.select(in_line[0], real(-1e-18), a.x), dr.select(in_line[1], real(-1e-18), b.x)
     im = -side((ax, a.y), (bx, b.y))
     re = dr.fma(_s(a, la), _s(b, lb), dr.fma(ax, bx, a.y * b.y))
-    re = dr.select(in_line[0] & in_line[1], 1, re)
     tie = dr.select(a.y == b.y, ax - bx, b.y - a.y)
-    return re, dr.select(im == 0, dr.mulsign(real(_TINY), tie), im)
+    # Of a real factor the sign counts alone. Left as small as it may be, it would be no longer than
+    # what stands for its imaginary part.
+    straight = im == 0
+    re = dr.select(straight, dr.select((re < 0) & ~(in_line[0] & in_line[1]), real(-1), 1), re)
+    return re, dr.select(straight, dr.mulsign(real(_TINY), tie), im)
 
 
 def _s(a: Vec3, length: Real) -> Real:
@@ -231,13 +236,15 @@ class LiftedProduct:
 
         Arguments lie in (-pi, pi]; that of the product is their sum if they have different signs;
         otherwise the sum has left the interval exactly if its imaginary part has the other sign.
+        That of two factors of -pi/2 has: it is -pi, which is pi and a turn less.
         """
         pr = dr.fma(self.re, re, -(self.im * im))
         pi = dr.fma(self.re, im, self.im * re)
         scale = dr.rcp(dr.abs(pr) + dr.abs(pi))
         one = type(pr)(1)
-        # One of them is then longer than pi/2; to ask for it keeps an underflow from counting.
-        left = (self.re < 0) | (re < 0)
+        pi = dr.select(pi == 0, 0, pi)  # no zero with a sign, which would be -pi
+        # One of them is then no shorter than pi/2; to ask for it keeps an underflow from counting.
+        left = (self.re <= 0) | (re <= 0)
         over = dr.select((self.im >= 0) & (im >= 0) & (pi < 0) & left, one, 0)
         under = dr.select((self.im < 0) & (im < 0) & (pi >= 0) & left, one, 0)
         some = dr.isfinite(scale)

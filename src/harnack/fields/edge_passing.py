@@ -15,26 +15,42 @@ distance of the edge from the points of a stretch of the line from below, and |e
 for a point of the edge at length l from the nearest one is at least sqrt(rho^2 + l^2) away, and
 the integral over an interval of l of length 2h is largest if it is centred. Walking from x by at
 most T, rho falls no faster than one walks, and nowhere below the distance rho' of the edge from the
-whole line. So for |s| <= T
+whole line, nor below the distance rho" of the stretch from the line through the edge (a ray may
+meet that one at a small angle, far ahead). So for |s| <= T
 
     |f(x + s v) - f(x)| <= |s| K,   K = sum_e |c| / (rho^2 sqrt(rho^2 + h^2)),
-                                    rho = max(d_e - T, rho').
+                                    rho = max(d_e - T, rho', rho").
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import drjit as dr
 
 from harnack.backend.extrema import clamp, fmax
+from harnack.fields.field import LineLipschitz
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
     from harnack.fields.edge_sums import EdgeBuffer
 
-__all__ = ["Line", "rates_along"]
+__all__ = ["Line", "known_along", "rates_along", "with_edge"]
+
+# Nearer to the curve than this part of its size, and with a slope below this part of the
+# gradient, a ray may run along the curve and asks what is known along its line; elsewhere only
+# with a slope so small that it may run along a flat part of the surface.
+_BESIDE, _FLAT, _GRAZING = 0.005, 0.25, 1e-3
+# Of the distance to the curve, the powers that are the lengths asked about: from half of it to the
+# size of the curve.
+_LENGTHS = 6
+# Sums of rounded terms; a rate is made larger by this much.
+_ROUNDING = 2e-5
+
+# The rates for lengths, on lanes that are active.
+Rates: TypeAlias = "Callable[[tuple[Real, ...], Mask], tuple[Real, ...]]"
 
 
 @dataclass(frozen=True)
@@ -44,6 +60,29 @@ class Line:
     x: Vec3
     v: Vec3
     rounding: Real
+
+    @property
+    def slack(self) -> Real:
+        """Beyond the rounding of the points, that of differences p - x, which are as long as x."""
+        return dr.fma(8 * float(dr.epsilon(self.x)), dr.norm(self.x), self.rounding)
+
+
+def known_along(
+    line: Line, gradient: Vec3, distance: Real, rates: Rates
+) -> tuple[LineLipschitz, ...]:
+    """How fast f moves along lines through points so far from the curve, for lengths that lead from
+    half that distance to the curve's size; only on lanes where it may be worth its cost.
+
+    Beside a straight edge the longest will do, and others near its ends; along a flat part of the
+    surface, bounded by a plane curve, the shortest.
+    """
+    slope, steepness = dr.dot(gradient, line.v), dr.norm(gradient)
+    flat = dr.select(distance < _BESIDE, _FLAT, _GRAZING) * steepness
+    first = 0.5 * fmax(distance, type(distance)(1e-30))
+    lengths = tuple(dr.power(first, 1 - k / _LENGTHS) for k in range(_LENGTHS))
+    found = rates(lengths, dr.abs(slope) < flat)
+    pairs = zip(found, lengths, strict=True)
+    return tuple(LineLipschitz(rate * (1 + _ROUNDING), length) for rate, length in pairs)
 
 
 def rates_along(
@@ -57,8 +96,6 @@ def rates_along(
     real, vector = edges.backend.Float, edges.backend.Array3f
     wide, index = edges.backend.ArrayXf, edges.backend.UInt32
     trips = dr.select(active, edges.trips, 0)
-    # Beyond the rounding of the points, that of differences a, which are as long as x.
-    slack = dr.fma(8 * edges.backend.epsilon, dr.norm(line.x), line.rounding)
 
     def body(i: Any, *rates: Real) -> Any:
         row: list[Real] = []
@@ -68,7 +105,8 @@ def rates_along(
         p = vector(row[0], row[1], row[2])
         for j in range(edges.chunk):
             q = vector(row[4 * j + 4], row[4 * j + 5], row[4 * j + 6])
-            rates = _with_edge(line, slack, p - line.x, q - p, row[4 * j + 3], lengths, rates)
+            ends = p - line.x, q - p
+            rates = with_edge(line, ends, row[4 * j + 3], lengths, rates)
             p = q
         return i + 1, *rates
 
@@ -80,28 +118,35 @@ def rates_along(
     return tuple(dr.select(active, rate, dr.inf) for rate in rates)
 
 
-def _with_edge(
-    line: Line, slack: Real, a: Vec3, e: Vec3, inverse: Real,
-    lengths: tuple[Real, ...], rates: tuple[Real, ...],
+def with_edge(
+    line: Line, edge: tuple[Vec3, Vec3], inverse: Real, lengths: tuple[Real, ...],
+    rates: tuple[Real, ...],
 ) -> tuple[Real, ...]:  # fmt: skip
-    """The rates with an edge e from a, 1/|e|^2 = inverse, added.
+    """The rates with an edge added: `edge` is where it starts, less x, and e; 1/|e|^2 = inverse.
 
     m = a x v and n = e x v are a and e as seen along the line, turned by a right angle. Distances
     on the line's plane are taken from them, and c = v . m x n, so that it is small where both are,
     whatever the lengths of a and e: its error is at most 8 epsilon |m| |e| and slack |n|.
     """
+    (a, e), slack = edge, line.slack
     epsilon = float(dr.epsilon(type(inverse)))
     m, n = dr.cross(a, line.v), dr.cross(e, line.v)
     c = dr.abs(dr.dot(line.v, dr.cross(m, n)))
     quarter = 0.25 * dr.rcp(inverse)  # h^2
     c += 16 * epsilon * dr.norm(m) * dr.sqrt(quarter) + 2 * slack * dr.norm(n)
-    foot = clamp(-dr.dot(m, n) / dr.squared_norm(n), 0, 1)
+    square = dr.squared_norm(n)
+    foot = dr.select(square > 0, clamp(-dr.dot(m, n) / square, 0, 1), 0)
     passing = dr.norm(dr.fma(type(a)(foot), n, m)) - slack
     foot = clamp(-dr.dot(a, e) * inverse, 0, 1)
     distance = dr.norm(dr.fma(type(a)(foot), e, a)) - slack
+    # (a - s v) x e = area + s n, of length |e| times the distance from the line through the edge.
+    area, per_length = dr.cross(a, e), dr.sqrt(inverse)
+    nearest = dr.select(square > 0, -dr.dot(area, n) / square, 0)
     grown: list[Real] = []
     for length, rate in zip(lengths, rates, strict=True):
-        rho = fmax(distance - length, passing)
+        s = clamp(nearest, -length, length)
+        through = dr.norm(dr.fma(type(a)(s), n, area)) * per_length - slack
+        rho = fmax(fmax(distance - length, passing), through)
         square = rho * rho
         term = c * dr.rcp(square) * dr.rsqrt(square + quarter)
         # Not where the edge may be met: nothing is known then.

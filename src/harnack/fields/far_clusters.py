@@ -200,7 +200,9 @@ class FarClusters:
         """How many times their radius nodes must be away to be taken as a whole."""
         return fmax(self.accuracy * detail, self.backend.Float(self.rough))
 
-    def near(self, x: Vec3, detail: Real, add_leaf: AddLeaf, own: Sums = ()) -> tuple[Nearby, Sums]:
+    def near(
+        self, x: Vec3, detail: Real, add_leaf: AddLeaf, own: Sums = (), active: Mask = True
+    ) -> tuple[Nearby, Sums]:
         """All sums that a certificate at x needs, and those of the caller's own.
 
         detail: `Field.at_detail`. add_leaf: as for `at`, of the sums of `Nearby` in their order and
@@ -223,7 +225,7 @@ class FarClusters:
 
         zero = real(0)
         start = (zero, vector(0), zero, zero, zero, real(_FAR), zero, zero, *own)
-        value, g, truncation, slope, *rest = walk(self.tree, visit, start)
+        value, g, truncation, slope, *rest = walk(self.tree, visit, start, active)
         looser = dr.select(detail < 1, real(self.looser), 1)
         left_out = looser * truncation, looser * self.steeper * slope
         return Nearby(self.backend, value, g, *left_out, *rest[:4]), tuple(rest[4:])

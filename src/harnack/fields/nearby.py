@@ -11,7 +11,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend.extrema import fmin
-from harnack.fields.field import Curvature, HarmonicBall, Sample
+from harnack.fields.field import Curvature, HarmonicBall, LineLipschitz, Sample
 from harnack.fields.moments import KNOWN
 from harnack.fields.multipole import Level
 from harnack.fields.multipole_kernel import Terms
@@ -19,6 +19,7 @@ from harnack.fields.truncation import sup_norm
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.fields.edge_passing import Line
     from harnack.tree.hierarchy import FloatArray
 
 # Parts of the free distance out to which curvatures are stated: the shorter, the smaller.
@@ -127,11 +128,17 @@ class Nearby:
     s5: Real
 
     def sample(
-        self, share: float, unit: Real, rounding: Real, normal: Vec3 | None = None
+        self,
+        share: float,
+        unit: Real,
+        rounding: Real,
+        normal: Vec3 | None = None,
+        along: tuple[LineLipschitz, ...] = (),
     ) -> Sample:
         """`share` times f, with what is known of it.
 
         unit: the rounding of a coordinate. rounding: what there is of it in the value besides.
+        along: what is known of f along a line besides.
 
         Certificate. Along a line the k-th derivative of a dipole a at rho is at most
         (k+1)! a/rho^(k+2) (it is a mixed derivative of a/rho, whose tensor is symmetric and takes
@@ -160,15 +167,40 @@ class Nearby:
         return Sample(
             dr.select(apart, value, 0),
             dr.select(apart, g, steep),
-            (*bends, ball),
+            (*bends, ball, *(LineLipschitz(share * one.constant, one.radius) for one in along)),
             dr.fma(share, self.truncation + self.rounding, rounding),
             dr.select(apart, slope_error, 0),
             normal,
             share * self.truncation,
         )
 
+    def with_rates(
+        self, line: Line, lengths: tuple[Real, ...], rates: tuple[Real, ...], active: Mask
+    ) -> tuple[Real, ...]:
+        """The rates K of `edge_passing` for some edges, with those of all that is summed up here.
+
+        f moves by at most |s| |g . v| + s^2 (3 s4 + rise r s5) for |s| <= r (`sample`), if g is
+        known up to its truncation and rounding. Infinite for lengths above r.
+        """
+        unit = line.slack
+        slope = dr.abs(dr.dot(self.gradient, line.v)) + self.slope_truncation
+        slope = dr.fma(SLOPE_ROUNDINGS * unit, self.s4, slope)
+        b = _REACHES[-1]
+        r = b * (self.clear * (1 - _ROUNDING) - 4 * unit)
+        bend = dr.fma(dr.select(self.s5 > 0, r, 0) * _rise(b), self.s5, 3 * self.s4)
+        pairs = zip(lengths, rates, strict=True)
+        found = (
+            dr.select(active & (length <= r), rate + dr.fma(length, bend, slope), dr.inf)
+            for length, rate in pairs
+        )
+        return tuple(found)
+
     def _bend(self, share: float, b: float, r: Real) -> Curvature:
         """What is known out to r = b times the free distance."""
-        rise = (4 - 3 * b) / (1 - b) ** 2
         third = 3 * self.s4
-        return Curvature((2 + 2 * _ROUNDING) * share * dr.fma(r * rise, self.s5, third), r)
+        return Curvature((2 + 2 * _ROUNDING) * share * dr.fma(r * _rise(b), self.s5, third), r)
+
+
+def _rise(b: float) -> float:
+    """The slope of the chord of phi over [0, b]: see `Nearby.sample`."""
+    return (4 - 3 * b) / (1 - b) ** 2

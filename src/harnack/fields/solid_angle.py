@@ -18,7 +18,7 @@ from harnack.fields.edge_extent import tight_extent
 from harnack.fields.edge_hessian import hessian_over_edges
 from harnack.fields.edge_lift import epsilon_at
 from harnack.fields.edge_nearest import Segments, closest_on_segments
-from harnack.fields.edge_passing import Line, rates_along
+from harnack.fields.edge_passing import Line, known_along, rates_along
 from harnack.fields.edge_sums import EdgeBuffer, EdgeSums, sum_over_edges, upload
 from harnack.fields.field import Field, HarmonicBall, LineLipschitz, Sample
 from harnack.fields.nearby import SECOND_ROUNDINGS, SLOPE_ROUNDINGS
@@ -27,7 +27,7 @@ from harnack.geometry import ConvexHull, is_convex_position, total_length, valid
 from harnack.geometry.net_loops import net_loops, uncancelled_edges
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Real, Vec3
+    from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.geometry import Volume
 
 Loops = tuple[npt.NDArray[np.float64], ...]
@@ -37,10 +37,6 @@ _PERIOD = 4 * math.pi
 # The ball of the edge certificate is this fraction of the distance to the curve (by experiment:
 # 0.5 to 0.65 need the fewest evaluations, 0.8 more).
 _REACH = 0.5
-# Nearer to the curve than this part of its size, and with a slope below this part of the
-# gradient, a ray may run along the curve and asks what is known along its line; elsewhere only
-# with a slope so small that it may run along a flat part of the surface.
-_BESIDE, _FLAT, _GRAZING = 0.005, 0.25, 1e-3
 # Levels as near as this to a multiple of 4 pi count as one.
 _NARROW = 1e-9 * _PERIOD
 # Sums of float32 terms; a variation is lengthened and a distance shortened by this much.
@@ -168,24 +164,18 @@ class SolidAngle(Field):
         return seen
 
     def _along_edges(self, on: _OnDevice, x: Vec3, sums: EdgeSums) -> tuple[LineLipschitz, ...]:
-        """What is known along the direction of `along`, if there is one: how fast f moves, for
-        lengths that lead from half the distance to the curve to its size (`rates_along`).
-
-        Beside a straight edge the longest will do, and others near its ends; along a flat part of
-        the surface, bounded by a plane curve, the shortest.
-        """
-        if self._direction is None or on.edges is None:
+        """What is known along the direction of `along`, if there is one."""
+        edges = on.edges
+        if self._direction is None or edges is None:
             return ()
         line = Line(x, on.backend.Array3f(self._direction), self._rounding(on))
-        slope, steepness = dr.dot(sums.gradient, line.v), dr.norm(sums.gradient)
-        flat = dr.select(sums.distance < _BESIDE, _FLAT, _GRAZING) * steepness
-        active = dr.abs(slope) < flat
-        root = dr.sqrt(sums.distance)
-        lengths = (0.5 * sums.distance, root * dr.sqrt(root), root, dr.sqrt(root))
-        rates = rates_along(on.edges, line, lengths, active)
-        scale = (1 + _ROUNDING) / on.size
-        pairs = zip(rates, lengths, strict=True)
-        return tuple(LineLipschitz(rate * scale, length * on.size) for rate, length in pairs)
+
+        def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
+            return rates_along(edges, line, lengths, active)
+
+        known = known_along(line, sums.gradient, sums.distance, rates)
+        size = on.size
+        return tuple(LineLipschitz(one.constant / size, one.radius * size) for one in known)
 
     @staticmethod
     def _rounding(on: _OnDevice) -> float:

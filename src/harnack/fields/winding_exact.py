@@ -19,6 +19,7 @@ from harnack.fields.batch import Values
 from harnack.fields.edge_chains import EdgeChains
 from harnack.fields.edge_hessian import SymmetricSum
 from harnack.fields.edge_lift import LiftedEdges, epsilon_at, lifted_sums
+from harnack.fields.edge_passing import Line, known_along
 from harnack.fields.edge_trails import EdgeTrails
 from harnack.fields.field import Lipschitz, Sample
 from harnack.fields.nearby import SECOND_ROUNDINGS, SLOPE_ROUNDINGS
@@ -132,4 +133,10 @@ class ExactWinding:
         found = self.chains.near(frame, x, detail)
         found = dataclasses.replace(found, value=dr.fma(4 * math.pi, turns, found.value))
         unit = fmax(epsilon_at(frame.o), epsilon_at(x))
-        return found.sample(_SHARE, unit, self.rounding)
+        line, chains = Line(x, frame.d, 8 * unit), self.chains
+
+        def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
+            return chains.rates(frame, line, lengths, active)
+
+        known = known_along(line, found.gradient, found.clear, rates)
+        return found.sample(_SHARE, unit, self.rounding, along=known)

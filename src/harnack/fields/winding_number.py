@@ -15,7 +15,7 @@ import numpy.typing as npt
 from harnack.backend import backend_of
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.edge_lift import epsilon_at
-from harnack.fields.field import Field, Sample, lengthened
+from harnack.fields.field import Field, LineLipschitz, Sample, lengthened
 from harnack.fields.sheets import NO_SHEET, Crossing, NearestSheet
 from harnack.fields.unit_coordinates import UnitCoordinates, placed
 from harnack.fields.winding_exact import ExactWinding
@@ -154,7 +154,8 @@ class WindingNumber(BatchedField):
         turns = on.winding.start(frame, 0, True)
         nowhere = Crossing(0.0, on.backend.UInt32(NO_SHEET), 0.0, up)
         sample = on.winding.on_stretch(frame, frame.o, nowhere, turns, on.backend.Float(1))
-        return lengthened(sample, on.size)
+        known = tuple(one for one in sample.known if not isinstance(one, LineLipschitz))
+        return lengthened(dataclasses.replace(sample, known=known), on.size)
 
     def next_crossing(
         self, o: Vec3, d: Vec3, after: Crossing, t_max: Real, active: Mask

@@ -17,6 +17,8 @@ import numpy as np
 from harnack.backend.extrema import fmax, fmin
 from harnack.fields.edge_hessian import SymmetricSum
 from harnack.fields.edge_lift import LiftedProduct, epsilon_at, with_edge
+from harnack.fields.edge_passing import Line, known_along
+from harnack.fields.edge_passing import with_edge as with_edge_passing
 from harnack.fields.far_clusters import Errors, FarClusters
 from harnack.fields.triangle_kernel import edges_of
 from harnack.fields.winding_mesh import rounding_of_sum
@@ -26,6 +28,7 @@ from harnack.tree.triangles import INDEX, Upwards, crossing, in_slots
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.fields.batch import Values
+    from harnack.fields.edge_passing import Rates
     from harnack.fields.field import Sample
     from harnack.fields.sheets import Crossing
     from harnack.fields.winding_mesh import WindingMesh
@@ -148,4 +151,28 @@ class TreeWinding:
         one = LiftedProduct.one(real).parts()
         found, product = self.clusters.near(x, detail, leaf, one)
         found = dataclasses.replace(found, value=found.value + LiftedProduct(*product).angle())
-        return found.sample(_SHARE, epsilon, self.rounding)
+        line = Line(x, frame.d, 8 * epsilon)
+        known = known_along(line, found.gradient, found.clear, self._rates(line))
+        return found.sample(_SHARE, epsilon, self.rounding, along=known)
+
+    def _rates(self, line: Line) -> Rates:
+        """The rates of `edge_passing` for 4 pi w on stretches of lines."""
+        reach = self.clusters.rough
+
+        def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
+            def add(row: list[Real], active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
+                old = state[8:]
+                for edge in edges_of(row, line.x, Upwards(line.x)):
+                    open_ = active & edge.is_open(reach)
+                    new = with_edge_passing(line, (edge.a, edge.e), edge.inverse, lengths, old)
+                    old = tuple(dr.select(open_, a, b) for a, b in zip(new, old, strict=True))
+                return *state[:8], *old
+
+            def leaf(node: Node, near: Mask, sums: tuple[Any, ...]) -> tuple[Any, ...]:
+                return for_each(node, near, add, sums)
+
+            start = tuple(self.backend.Float(0) for _ in lengths)
+            far, near = self.clusters.near(line.x, 0, leaf, start, active)
+            return far.with_rates(line, lengths, near, active)
+
+        return rates

@@ -10,6 +10,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import backend_of, choose_backend, to_float, to_numpy, to_vector3
+from harnack.backend.lengths import largest_component, unit
 from harnack.backend.lengths import length as norm
 from harnack.tracer.derivatives import attach, wants_derivatives
 from harnack.tracer.surface import LevelSet, level_set
@@ -123,16 +124,20 @@ def _rays(
     for name, length in lengths.items():
         if length not in (1, n):
             raise ValueError(f"{name} has {length} entries, the others have {n}; give 1 or {n}")
-    length = dr.norm(d)
-    if n and not dr.is_array_v(type(directions)):
-        _check_numpy_rays(to_numpy(length), to_numpy(near), to_numpy(far))
-    return o, d / length, near, far
+    if not n:
+        return o, d, near, far
+    if not dr.is_array_v(type(directions)):
+        _check_numpy_rays(to_numpy(largest_component(d)), to_numpy(near), to_numpy(far))
+    return o, unit(d), near, far
 
 
-def _check_numpy_rays(length: Any, near: Any, far: Any) -> None:
-    zero = np.flatnonzero(~(length > 0))
+def _check_numpy_rays(largest: Any, near: Any, far: Any) -> None:
+    zero = np.flatnonzero(~(largest >= np.finfo(largest.dtype).smallest_normal))
     if zero.size:
-        raise ValueError(f"directions: entry {zero[0]} has length zero; a ray needs a direction")
+        raise ValueError(
+            f"directions: entry {zero[0]} has length zero, or is shorter than the smallest number "
+            "that this precision holds; a ray needs a direction"
+        )
     if (near < 0).any():
         raise ValueError("t_min must be >= 0: rays run forwards")
     empty = np.flatnonzero(~(near <= far))

@@ -35,6 +35,8 @@ _OF_TOLERANCE, _LESS, _OF_ROUNDING = 0.4, 0.55, 0.6
 _COARSEN = 0.2
 # Trials stop short of where the slope alone would take f to a level by this factor.
 _AIM = 0.99
+# Of the size of coordinates, how far from the surface rounding may leave a point that is a hit.
+_CLEAR = 1 / 16
 # A repeated sample is closer by these factors at least and at most.
 _CLOSER = 1.25, 16.0
 # Truncation falls like this power of detail; beyond the largest detail there is none.
@@ -175,6 +177,8 @@ class PreparedLevelSet:
             # Where not even the gradient is known, rounding makes no hits.
             rounded = dr.select(doubt <= steepness, 2 * (blur - truncation), 0)
             hit, met = accepted & (gap <= fmax(within - truncation, rounded)), None
+            # Nor is a point one of which rounding hardly says where the surface is.
+            hit &= gap + blur - within <= _CLEAR * steepness * (size + t)
             if beyond is not None:
                 met = meet(beyond[0], accepted & beyond[1], sample.value, blur, self.levels)
                 certificates, ahead_gaps = self._certify(sample, met.gaps, blur), met.gaps

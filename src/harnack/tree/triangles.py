@@ -90,7 +90,7 @@ class Frame:
     def across(self, p: Vec3) -> tuple[Real, Real]:
         """Where p is in the plane that the rays are normal to."""
         a = p - self.o
-        return dr.dot(a, self.u), dr.dot(a, self.v)
+        return _plain(dr.dot(a, self.u)), _plain(dr.dot(a, self.v))
 
     def depth(self, p: Vec3) -> Real:
         """Where p is along the rays."""
@@ -109,7 +109,7 @@ class Upwards:
 
     def across(self, p: Vec3) -> tuple[Real, Real]:
         """As `Frame.across`."""
-        return p.x - self.o.x, p.y - self.o.y
+        return _plain(p.x - self.o.x), _plain(p.y - self.o.y)
 
     def depth(self, p: Vec3) -> Real:
         """As `Frame.depth`."""
@@ -118,6 +118,12 @@ class Upwards:
     def component(self, a: Vec3) -> Real:
         """As `Frame.component`."""
         return a.z
+
+
+def _plain(u: Real) -> Real:
+    """A coordinate across a ray, zero if products of two such could vanish: far below rounding."""
+    is_double = dr.type_v(type(u)) == dr.VarType.Float64
+    return dr.select(dr.abs(u) < (1e-140 if is_double else 1e-16), 0, u)
 
 
 def side(a: tuple[Real, Real], b: tuple[Real, Real]) -> Real:
