@@ -206,3 +206,52 @@ def test_rays_along_boundary_edges_miss_no_hit(method: Any) -> None:
     first = np.repeat(above.reshape(n, -1)[:, 0], 400)
     assert (above == first)[regular].all()
     assert regular.mean() > 0.6
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("method", ["exact", "tree"])
+def test_sheets_in_one_plane_that_cancel_are_no_surface(method: Any, precision: Any) -> None:
+    """A triangle on a larger one that faces the other way: a fifth of the rays hit, in whatever
+    order rounding put the two crossings."""
+    rng, n = np.random.default_rng(0), 1000
+    large, small = [[-2, -2, 0], [2, -2, 0], [0, 2, 0]], [[-1, -1, 0], [0, 1, 0], [1, -1, 0]]
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    o = rng.normal(size=(n, 3)) * [1, 1, 0] + [0, 0, 3]
+    target = np.column_stack([rng.uniform(-0.4, 0.4, n), rng.uniform(-0.8, 0, n), np.zeros(n)])
+    for axes in (np.eye(3), turn):
+        vertices = single(np.array([*large, *small]) @ axes)
+        field = hk.WindingNumber(vertices, [[0, 1, 2], [3, 4, 5]], method=method)
+        hits = hk.trace(field, o @ axes, (target - o) @ axes, level=0.3, precision=precision)
+        assert not (hits.sheet >= 0).any()
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_walls_thicker_than_rounding_are_hit(precision: Any) -> None:
+    """Two sheets that cancel, a hundred roundings apart, are a wall."""
+    rng, n = np.random.default_rng(0), 500
+    thick = 1e-5 if precision == "single" else 1e-13
+    near = np.array([[-2, -2, thick], [2, -2, thick], [0, 2, thick]])
+    vertices = np.concatenate([near, near * [1, 1, 0]])
+    field = hk.WindingNumber(vertices, [[0, 1, 2], [3, 5, 4]])
+    o = rng.normal(size=(n, 3)) * [1, 1, 0] + [0, 0, 3]
+    target = np.column_stack([rng.uniform(-0.4, 0.4, n), rng.uniform(-0.8, 0, n), np.zeros(n)])
+    hits = hk.trace(field, o, target - o, precision=precision)
+    assert (hits.sheet == 0).all()
+
+
+def test_hits_on_dipoles_say_how_far_off_they_are() -> None:
+    """Points that rounding takes for a dipole were hits three tolerances from it, without a word:
+    all levels meet there, but nowhere else."""
+    rng, n = np.random.default_rng(3), 20
+    points = rng.normal(size=(n, 3))
+    points = single(points / np.linalg.norm(points, axis=1)[:, None])
+    areas = single(np.pi / 5 * 10 ** rng.uniform(-8, 2, n))
+    chosen, o = rng.integers(n, size=400), single(rng.normal(size=(400, 3)))
+    field = hk.ScreenedWindingNumber(points, points, areas, length=5.0, method="sum")
+    hits = hk.trace(field, o, points[chosen] - o, level=-0.1, tolerance=1e-5, precision="single")
+    value, gradient = field.value_and_gradient(hits.position[hits.hit], precision="double")
+    off = np.abs(value + 0.1) / np.linalg.norm(gradient, axis=1)
+    apart = np.linalg.norm(hits.position[hits.hit][:, None] - points, axis=2).min(axis=1)
+    stated = 1.05e-5 + hits.uncertainty[hits.hit] + 2e-6
+    assert (np.minimum(off, apart) <= stated).all()
+    assert (hits.uncertainty[hits.hit] > 1e-5).sum() > 50

@@ -161,17 +161,19 @@ class Nearby:
         value = share * self.value
         ball = HarmonicBall(r, value - variation, value + variation)
         # On a singular point itself all values meet: a gradient so steep that it is as near to any
-        # level as can be.
-        apart = (self.clear > 16 * unit) & dr.isfinite(value) & dr.isfinite(dr.squared_norm(g))
-        steep = self.backend.Array3f(0, 0, share * 1e4 * math.pi / unit)
+        # level as can be, and an error that says how far away such a level is.
+        reach, most = 16 * unit, share * 1.6e5 * math.pi
+        apart = (self.clear > reach) & dr.isfinite(value) & dr.isfinite(dr.squared_norm(g))
+        steep = self.backend.Array3f(0, 0, most / reach)
+        error = dr.fma(share, self.truncation + self.rounding, rounding)
         return Sample(
             dr.select(apart, value, 0),
             dr.select(apart, g, steep),
             (*bends, ball, *(LineLipschitz(share * one.constant, one.radius) for one in along)),
-            dr.fma(share, self.truncation + self.rounding, rounding),
+            dr.select(apart, error, most),
             dr.select(apart, slope_error, 0),
             normal,
-            share * self.truncation,
+            dr.select(apart, share * self.truncation, 0),
         )
 
     def with_rates(

@@ -36,6 +36,9 @@ _MOST_SUMMED = 2000
 # Cells of the extent that are split at most, and how often.
 _MOST_CELLS, _FINEST = 4096, 5
 _SMALLEST_LEVEL = 1e-20
+# Nearer to a dipole than so many roundings w is not known, and any level up to the second number
+# may be there.
+_ON_DIPOLE, _ANY_LEVEL = 32, 1e5
 
 
 class ScreenedWindingNumber(BatchedField):
@@ -225,9 +228,10 @@ class ScreenedWindingNumber(BatchedField):
         sums, epsilon = on.sum.sums(x, detail), on.backend.epsilon
         rounding, slope, _ = self._rounding(on.backend, sums, epsilon_at(x))
         error, slope_error = sums.error + rounding, sums.gradient_error + slope
-        # On a dipole itself, to rounding, all levels meet: a gradient that says so.
-        apart = (sums.nearest > (32 * epsilon) ** 2) & dr.isfinite(sums.value)
-        steep = on.backend.Array3f(0, 0, 1 / (32 * epsilon))
+        # On a dipole itself, to rounding, all levels meet: a gradient that says so, and an error
+        # that says how far away they may be.
+        apart = (sums.nearest > (_ON_DIPOLE * epsilon) ** 2) & dr.isfinite(sums.value)
+        steep = on.backend.Array3f(0, 0, _ANY_LEVEL / (_ON_DIPOLE * epsilon))
         value = dr.select(apart, sums.value, 0)
         gradient = dr.select(apart, sums.gradient, steep)
         known = promises(sums, value, gradient, on.sum.kappa, on.size, epsilon)
@@ -235,7 +239,7 @@ class ScreenedWindingNumber(BatchedField):
             value,
             gradient / on.size,
             known,
-            dr.select(apart, error, 0),
+            dr.select(apart, error, _ANY_LEVEL),
             dr.select(apart, slope_error / on.size, 0),
             truncation=dr.select(apart, sums.error, 0),
         )

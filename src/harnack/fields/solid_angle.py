@@ -153,6 +153,7 @@ class SolidAngle(Field):
             # Ends of edges, rounded, move each edge's angle by that times its field, which is at
             # most twice `first`: where edges nearly cancel, the gradient does not show it.
             error = error + dr.select(met, 0, 4 * epsilon * sums.first)
+        error = dr.select(met, 8 * _PERIOD, error)  # that gradient times 2 rounding
         known = (ball, *self._along_edges(on, x, sums))
         return Sample(dr.select(met, 0, sums.angle), gradient, known, error)
 

@@ -30,6 +30,11 @@ if TYPE_CHECKING:
 State: TypeAlias = "tuple[Any, ...]"
 REACH, EVALUATIONS, STATUS, ACTIVE = 2, 6, 8, 9
 
+# Sheets are at the same place if they are no farther apart than so many roundings of coordinates,
+# and the cosine of the angle between them is larger than the second; of rays that graze them, as if
+# the third were the sine of the angle to them.
+_SAME, _PARALLEL, _STEEP = 2.0, 0.999, 1 / 64
+
 ON_SHEET = max(Status) + 1
 """Status of a ray that hit a sheet, until `Walk` turns it into a plain HIT."""
 
@@ -98,32 +103,40 @@ class Walk:
         status = dr.select(spent, count(int(Status.OUT_OF_STEPS)), status)
         offset = dr.select(passed, offset + ahead.jump, offset)
         # A sheet that was hit is the one to be named; one that was passed, the last of all there.
-        sheet = dr.select(passed, last, ahead.sheet)
-        crossing = (ahead.t, sheet, ahead.jump, ahead.normal)
+        t, sheet = dr.select(passed, last.t, ahead.t), dr.select(passed, last.sheet, ahead.sheet)
+        crossing = (t, sheet, ahead.jump, ahead.normal)
         return (offset, *crossing, *state[:STATUS], status, passed & ~spent)
 
-    def _together(self, first: Crossing, active: Mask) -> tuple[Crossing, Any]:
-        """All crossings at the t of the first as one, and the index of the last of them.
+    def _together(self, first: Crossing, active: Mask) -> tuple[Crossing, Crossing]:
+        """All crossings at the t of the first as one, and the last of them.
 
         A ray through an edge or a vertex crosses several sheets at once, in no order of theirs:
-        what they do to f there is the sum of their jumps, and between them there is nothing. The
-        sheet named is the first one that jumps as all of them together do.
+        what they do to f there is the sum of their jumps, and between them there is nothing. So do
+        rays through sheets in one plane: those that lie closer behind each other than coordinates
+        are rounded are at the same t, for their order is that of rounding. The sheet named is the
+        first one that jumps as all of them together do.
         """
         real, count = self.backend.Float, self.backend.UInt32
+        size = fmax(fmax(dr.abs(self.o.x), dr.abs(self.o.y)), dr.abs(self.o.z))
+        close = _SAME * self.backend.epsilon * (size + first.t)
+        steep = fmax(dr.abs(dr.dot(first.normal, self.d)), real(_STEEP))
+        furthest = fmax(fmin(first.t + close / steep, self.end), first.t)
 
         def more(*state: Any) -> Mask:
             return state[-1]
 
         def body(
-            jump: Real, last: Any, up: Any, down: Any, n_up: Vec3, n_down: Vec3, go: Mask
+            jump: Real, t: Real, last: Any, up: Any, down: Any, n_up: Vec3, n_down: Vec3, go: Mask
         ) -> tuple[Any, ...]:
-            after = Crossing(first.t, last, 0.0, first.normal)
-            one = self._next(after, first.t, go)
-            found = go & (one.sheet != NO_SHEET) & (one.t == first.t)
+            one = self._next(Crossing(t, last, 0.0, first.normal), furthest, go)
+            # Sheets at an angle to each other are at the same t or apart.
+            level = dr.abs(dr.dot(one.normal, first.normal)) > _PARALLEL
+            found = go & (one.sheet != NO_SHEET) & ((one.t == first.t) | level)
             is_up, is_down = found & (one.jump > 0), found & (one.jump < 0)
             new_up, new_down = is_up & (up == NO_SHEET), is_down & (down == NO_SHEET)
             return (
                 jump + dr.select(found, one.jump, 0),
+                dr.select(found, one.t, t),
                 dr.select(found, one.sheet, last),
                 dr.select(new_up, one.sheet, up),
                 dr.select(new_down, one.sheet, down),
@@ -136,6 +149,7 @@ class Walk:
         none = count(NO_SHEET)
         start = (
             first.jump,
+            first.t,
             first.sheet,
             dr.select(first.jump > 0, first.sheet, none),
             dr.select(first.jump < 0, first.sheet, none),
@@ -143,10 +157,13 @@ class Walk:
             first.normal,
             some,
         )
-        jump, last, up, down, n_up, n_down, _ = dr.while_loop(start, more, body, label="together")
+        jump, t, last, up, down, n_up, n_down, _ = dr.while_loop(
+            start, more, body, label="together"
+        )
         sheet = dr.select(jump > 0, up, dr.select(jump < 0, down, first.sheet))
         normal = dr.select(jump > 0, n_up, dr.select(jump < 0, n_down, first.normal))
-        return Crossing(first.t, sheet, real(jump), normal), last
+        behind = Crossing(t, last, first.jump, first.normal)
+        return Crossing(first.t, sheet, real(jump), normal), behind
 
     def _next(self, behind: Crossing, end: Real, active: Mask) -> Crossing:
         """The field's answer as arrays of this backend; none if it lies beyond the end."""
