@@ -255,3 +255,69 @@ def test_hits_on_dipoles_say_how_far_off_they_are() -> None:
     stated = 1.05e-5 + hits.uncertainty[hits.hit] + 2e-6
     assert (np.minimum(off, apart) <= stated).all()
     assert (hits.uncertainty[hits.hit] > 1e-5).sum() > 50
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("method", ["exact", "tree"])
+def test_far_away_derivatives_keep_their_bounds(method: Any, precision: Any) -> None:
+    """Gradients by tree exceeded them from 80 sizes on, and Hessians in single precision where
+    powers of the distance underflow. Far away the field of a triangle is that of a dipole."""
+    triangle = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    field = hk.WindingNumber(triangle, [[0, 1, 2]], method=method)
+    rng, normal = np.random.default_rng(0), np.array([0, 0, 0.5])
+    for distance in (3e5, 1e7, 1e9):
+        x = single(distance * rng.normal(size=(50, 3)))
+        r = x - triangle.mean(axis=0)
+        rho = np.linalg.norm(r, axis=1)[:, None]
+        u, share = r / rho, 1 / (4 * np.pi * rho**3)
+        along = (u * normal).sum(axis=1)[:, None]
+        gradient = share * (3 * along * u - normal)
+        # Of the next order, which for a triangle about its centre is the octupole.
+        left_out = 10 * share / rho**2
+        off = np.linalg.norm(
+            np.abs(field.gradient(x, precision=precision)) - np.abs(gradient), axis=1
+        )
+        bound = field.gradient_error_bound(x, precision=precision)
+        assert (off <= bound + left_out[:, 0]).all()
+        both = u[:, :, None] * normal + u[:, None, :] * normal[:, None]
+        outer = u[:, :, None] * u[:, None, :]
+        bend = both + along[:, :, None] * (np.eye(3) - 5 * outer)
+        bend *= 3 * (share / rho)[:, :, None]
+        off = np.abs(np.abs(field.hessian(x, precision=precision)) - np.abs(bend)).max(axis=(1, 2))
+        bound = field.hessian_error_bound(x, precision=precision)
+        assert (off <= bound + left_out[:, 0] / rho[:, 0]).all()
+
+
+def test_curvatures_where_rounding_meets_a_shifted_curve_are_unknown() -> None:
+    """In single precision, 2,000 sizes from the origin, points that count as on the curve had the
+    curvature of a made-up gradient, with an error of nothing."""
+    rng = np.random.default_rng(0)
+    loop = single(rng.normal(size=(6, 3)) + 2000 * np.array([0.6, -0.7, 0.4]))
+    share = rng.random((25, 1))
+    k = rng.integers(6, size=25)
+    x = single(loop[k] * (1 - share) + loop[(k + 1) % 6] * share + 1e-4 * rng.normal(size=(25, 3)))
+    found = hk.curvature(hk.SolidAngle(loop), x, precision="single")
+    exact = hk.curvature(hk.SolidAngle(loop), x, precision="double")
+    known = np.isfinite(found.mean)
+    assert (~known).sum() > 5
+    off = np.abs(found.mean - exact.mean)[known]
+    assert (off <= (found.mean_error + exact.mean_error)[known]).all()
+
+
+def test_distances_from_absurdly_far_away() -> None:
+    """The newton distance to a cloud was 0 from 1e20 sizes on; from 1e160 an IndexError."""
+    vertices, faces = icosphere(2)
+    x = np.array([[0.3, -0.5, 0.8]])
+    open_mesh = hk.WindingNumber(vertices, faces[vertices[faces].mean(axis=1)[:, 2] < 0.6])
+    for field in (open_mesh, hk.DipolePotential(vertices, vertices)):
+        for method in ("lower", "newton"):
+            far = hk.signed_distance(field, 1e20 * x, method=method)  # type: ignore[arg-type]
+            assert -1e20 < far[0] < -1e19
+            with pytest.raises(ValueError, match=r"coordinates up to .* are too large"):
+                hk.signed_distance(field, 1e160 * x, method=method)  # type: ignore[arg-type]
+
+
+def test_a_curve_too_large_for_its_precision_says_so() -> None:
+    field = hk.SolidAngle([[0, 0, 0], [1e39, 0, 0], [0, 1, 0]])
+    with pytest.raises(ValueError, match="too large for single precision"):
+        hk.trace(field, [[0.1, 0.1, 1.0]], [[0, 0, -1.0]], precision="single")

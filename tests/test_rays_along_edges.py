@@ -12,6 +12,8 @@ import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.fields import LineLipschitz
 from harnack.fields.sheets import NO_SHEET, Crossing
+from harnack.geometry.mesh_shapes import icosphere
+from harnack.geometry.shapes import wavy_polygon
 
 Mesh = tuple[np.ndarray, np.ndarray]
 
@@ -96,3 +98,60 @@ def test_rays_in_the_planes_of_slivers_end(thinness: float, method: str, precisi
     t = np.linspace(0, 10, 4000)[:, None]
     for k in missed:
         assert (exact.value(o[k] + t * unit(d[[k]]), precision="double") < 0.5).all()
+
+
+def ends_of_edges(mesh: Mesh, n: int, seed: int = 3) -> tuple[np.ndarray, np.ndarray]:
+    """Both ends (n, 3) of edges of its faces, in either order."""
+    rng = np.random.default_rng(seed)
+    k, i = rng.integers(len(mesh[1]), size=n), rng.integers(3, size=n)
+    corners, step = mesh[0][mesh[1][k]], rng.choice([1, 2], n)
+    return corners[np.arange(n), i], corners[np.arange(n), (i + step) % 3]
+
+
+@pytest.mark.parametrize("precision", ["single", "double"])
+@pytest.mark.parametrize("kind", ["curve", "exact", "tree"])
+def test_rays_that_pass_edges_at_small_angles_end(kind: str, precision: str) -> None:
+    """At tilts of 1e-3 to 1e-5 up to 99 % ran out of steps, which were as short as the distance."""
+    rng, n = np.random.default_rng(4), 300
+    vertices, faces = icosphere(1)
+    mesh = vertices, faces[np.arange(len(faces)) % 3 > 0]
+    field: hk.Field
+    if kind == "curve":
+        loop = wavy_polygon(12)
+        k = rng.integers(12, size=n)
+        a, b = loop[k], loop[(k + 1) % 12]
+        field = hk.SolidAngle(loop)
+    else:
+        a, b = ends_of_edges(mesh, n)
+        field = hk.WindingNumber(*mesh, method=kind)  # type: ignore[arg-type]
+    length = np.linalg.norm(b - a, axis=1)[:, None]
+    at = a + rng.random((n, 1)) * (b - a)
+    for tilt in (1e-2, 1e-3, 1e-4, 1e-6, 1e-9):
+        d = b - a + tilt * length * rng.normal(size=(n, 3))
+        for tolerance in (1e-4, 1e-6):
+            end = hk.trace(field, at - 2 * d, d, tolerance=tolerance, precision=precision)  # type: ignore[arg-type]
+            assert (end.status != int(hk.Status.OUT_OF_STEPS)).all()
+
+
+@pytest.mark.parametrize("precision", ["single", "double"])
+@pytest.mark.parametrize("method", ["exact", "tree"])
+def test_rays_along_cracks_of_t_junctions_end(method: str, precision: str) -> None:
+    """Faces cut in four with rounded midpoints leave cracks as wide as rounding, along which up to
+    half of the rays ran out of steps at low levels: nothing was left of the gradient there."""
+    vertices, faces = icosphere(1)
+    corners = vertices[faces]
+    middle = 0.5 * (corners + np.roll(corners, -1, axis=1))
+    split = np.arange(len(faces)) % 4 == 0
+    parts = [corners[~split], middle[split]]
+    for k in range(3):
+        parts.append(np.stack([corners[split, k], middle[split, k], middle[split, k - 1]], axis=1))
+    soup = np.concatenate(parts).reshape(-1, 3)
+    # Welds what has the same bits, as far as it goes.
+    soup, index = np.unique(soup.astype(np.float32).astype(float), axis=0, return_inverse=True)
+    mesh = soup, index.reshape(-1, 3)
+    field = hk.WindingNumber(*mesh, method=method)  # type: ignore[arg-type]
+    a, b = ends_of_edges(mesh, 400)
+    for level in (0.01, 0.05):
+        for target in (b - a, a - 3 * b):
+            end = hk.trace(field, a - 1.5 * target, target, level=level, precision=precision)  # type: ignore[arg-type]
+            assert (end.status != int(hk.Status.OUT_OF_STEPS)).mean() > 0.99

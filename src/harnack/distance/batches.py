@@ -20,6 +20,8 @@ FloatArray = npt.NDArray[np.float64]
 
 # Bounds memory, and the time until an interrupt is noticed.
 _AT_ONCE = 1 << 18
+# Squares of longer coordinates overflow.
+_LARGEST = 1e100
 
 
 def in_batches(
@@ -32,6 +34,7 @@ def in_batches(
 
     Raises TypeError or ValueError for points that are not an (n, 3) array of finite numbers.
     """
+    _check_size(points)
     whole = [to_vector3(backend, points, "points"), *(_upload(backend, one) for one in others)]
     n = dr.width(whole[0])
     parts: list[tuple[FloatArray, ...]] = []
@@ -46,6 +49,15 @@ def in_batches(
             dr.eval(*results)
         parts.append(tuple(_spread(to_numpy(one), dr.width(lanes)) for one in results))
     return tuple(np.concatenate(column)[:n] for column in zip(*parts, strict=True))
+
+
+def _check_size(points: Any) -> None:
+    given = None if dr.is_array_v(type(points)) else np.asarray(points)
+    if given is None or not given.size or given.dtype.kind not in "fiu":
+        return
+    size = float(np.abs(given).max())
+    if _LARGEST < size < np.inf:
+        raise ValueError(f"points: coordinates up to {size:g} are too large: at most {_LARGEST:g}")
 
 
 def _upload(backend: Backend, vectors: FloatArray) -> Vec3:

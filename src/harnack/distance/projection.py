@@ -28,6 +28,9 @@ _STEPS_ALONG = 60
 _LEAST_SHARE = 1e-7  # of a step: shorter ones are given up
 _LEAST_BEND = 0.05  # of the distance's second derivatives: steps are no longer than 20 gradients
 _INDEFINITE = -1e-3
+# Of the size of coordinates or of the ball on which f is smooth: how far from the level rounding
+# may leave a point that is on it.
+_CLEAR = 1 / 16
 # No minimum is looked for within this share of the distance from where f is singular; what the
 # boundary of the surface is longer by is half its square.
 _RIM = 1e-5
@@ -148,7 +151,11 @@ class Descent:
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
 
         def is_close(above: Real, place: _Place) -> Mask:
-            return dr.abs(above) <= 2 * lengths.length(place.gradient) * place.noise
+            # Not where rounding hardly says where the level is.
+            y = place.y
+            size = fmax(fmax(dr.abs(y.x), dr.abs(y.y)), dr.abs(y.z))
+            known = place.noise <= _CLEAR * fmax(size, place.reach)
+            return known & (dr.abs(above) <= 2 * lengths.length(place.gradient) * place.noise)
 
         def body(
             above: Real, y: Vec3, g: Vec3, noise: Real, reach: Real,

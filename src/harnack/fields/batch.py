@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
@@ -42,6 +43,21 @@ class Values:
     hessian: SymmetricSum | None = None
     gradient_error: Real = 0.0
     hessian_error: Real = 0.0
+
+    def far_away(self, x: Vec3, terms: int) -> Values:
+        """With what underflow does to so many terms in their bounds, seen from x in unit lengths.
+
+        Terms of derivatives are products of what falls like |x|^-5 and grows like |x|^2; a number
+        below the smallest normal one is lost on the way, more than sums of |x|^-4 and |x|^-5 say.
+        """
+        smallest = float(dr.smallest(type(x.x)))
+        lost = 4 * smallest * terms * (1 + dr.squared_norm(x))
+        return dataclasses.replace(
+            self,
+            error=self.error + lost,
+            gradient_error=self.gradient_error + lost,
+            hessian_error=self.hessian_error + lost,
+        )
 
     def rescaled(self, size: Real) -> Values:
         """Those of x -> f(x / size), at the points that move there. Where a number has overflowed

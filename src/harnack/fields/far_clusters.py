@@ -38,7 +38,9 @@ if TYPE_CHECKING:
 
 # A rough look takes nodes as a whole beyond this many times their radius.
 _ROUGH = 2.5
-# The free distance, in units of the whole, where nothing bounds it.
+# Roundings of a far node's gradient itself.
+_OUTSIDE = 64.0
+# The free distance, in units of coordinates, where nothing bounds it.
 _FAR = 1e4
 
 AddLeaf: TypeAlias = "Callable[[Node, Mask, Sums], Sums]"
@@ -72,14 +74,18 @@ class Errors:
     ) -> Values:  # fmt: skip
         """`share` times a sum and its derivatives, with bounds of their errors.
 
-        unit: the rounding of a coordinate. rounding: what there is of it in the value besides.
+        unit: the rounding of a coordinate, at least epsilon. rounding: what there is of it in the
+        value besides. Far outside the whole, where distances are as long as coordinates, the
+        powers of a distance in a gradient, and the sums of moments, have roundings of their own.
         """
+        outside = fmax(unit - 2 * float(dr.epsilon(value)), 0)
+        rounded = SLOPE_ROUNDINGS * unit + _OUTSIDE * outside
         return Values(
             share * value,
             dr.fma(share, self.value + self.rounding, rounding),
             None if gradient is None else share * gradient,
             None if hessian is None else SymmetricSum(*(share * part for part in hessian.parts())),
-            share * dr.fma(SLOPE_ROUNDINGS * unit, self.s4, self.slope),
+            share * dr.fma(rounded, self.s4, self.slope),
             share * dr.fma(SECOND_ROUNDINGS * unit, self.s5, self.second),
         )
 
@@ -224,7 +230,8 @@ class FarClusters:
             return ~far, add_leaf(node, ~far & node.is_leaf, state)
 
         zero = real(0)
-        start = (zero, vector(0), zero, zero, zero, real(_FAR), zero, zero, *own)
+        far_off = _FAR * (1 + dr.max(dr.abs(x)))
+        start = (zero, vector(0), zero, zero, zero, real(far_off), zero, zero, *own)
         value, g, truncation, slope, *rest = walk(self.tree, visit, start, active)
         looser = dr.select(detail < 1, real(self.looser), 1)
         left_out = looser * truncation, looser * self.steeper * slope

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import drjit as dr
 import numpy as np
 
-from harnack.backend.extrema import fmin
+from harnack.backend.extrema import fmax, fmin
 from harnack.fields.field import Curvature, HarmonicBall, LineLipschitz, Sample
 from harnack.fields.moments import KNOWN
 from harnack.fields.multipole import Level
@@ -27,6 +27,8 @@ _REACHES = (0.2, 0.4, 0.6)
 # The part of the way to the dipoles of far nodes out to which they are stated.
 _WAY = 0.65
 _ROUNDING = 2e-5
+# Roundings of a coordinate within which a singular point is near.
+_BESIDE = 256.0
 # What rounding does to gradients and second derivatives: see `far_clusters.Errors`.
 SLOPE_ROUNDINGS, SECOND_ROUNDINGS = 16.0, 320.0
 
@@ -161,9 +163,12 @@ class Nearby:
         value = share * self.value
         ball = HarmonicBall(r, value - variation, value + variation)
         # On a singular point itself all values meet: a gradient so steep that it is as near to any
-        # level as can be, and an error that says how far away such a level is.
+        # level as can be, and an error that says how far away such a level is. So it is beside one,
+        # where rounding leaves nothing of the gradient.
         reach, most = 16 * unit, share * 1.6e5 * math.pi
         apart = (self.clear > reach) & dr.isfinite(value) & dr.isfinite(dr.squared_norm(g))
+        lost = ~(slope_error <= dr.norm(g)) & (self.clear <= _BESIDE * unit)
+        apart, reach = apart & ~lost, fmax(self.clear, reach)
         steep = self.backend.Array3f(0, 0, most / reach)
         error = dr.fma(share, self.truncation + self.rounding, rounding)
         return Sample(

@@ -175,14 +175,15 @@ class ScreenedWindingNumber(BatchedField):
         # The trace of the Hessian is w/l^2; it grows without limit at the points.
         hessian = on.sum.hessian(x, closer) if derivatives == 2 else None
         rounding, slope, second = prepared._rounding(backend, sums, epsilon_at(x))
-        return Values(
+        values = Values(
             sums.value,
             sums.error + rounding + 8 * backend.epsilon * dr.abs(sums.value),
             sums.gradient,
             hessian,
             sums.gradient_error + slope,
             sums.hessian_error + second,
-        ).rescaled(on.size)
+        )
+        return values.far_away(x, 64).rescaled(on.size)
 
     def _rounding(
         self, backend: Backend, sums: ScreenedSums, unit: Real

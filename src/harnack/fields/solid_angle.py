@@ -119,6 +119,13 @@ class SolidAngle(Field):
         # Centred and scaled to unit size: products of eight lengths stay far from overflow. The
         # centre is a number of the backend, so that near the curve it is subtracted exactly.
         cast = np.float64 if backend.precision == "double" else np.float32
+        if (size := float(np.abs(self._centre).max()) + self._size) > 0.1 * float(
+            np.finfo(cast).max
+        ):
+            raise ValueError(
+                f"coordinates up to {size:g} are too large for {backend.precision} precision: "
+                "choose units nearer to 1"
+            )
         centre = self._centre.astype(cast).astype(np.float64)
         unit = tuple((loop - centre) / self._size for loop in self._net)
         edges = upload(backend, unit) if unit else None
@@ -228,7 +235,8 @@ class SolidAngle(Field):
         x = on.unit(p)
         sums, unit = sum_over_edges(on.edges, x, variation=True), epsilon_at(x)
         distance = sums.distance - 4 * unit
-        share = dr.select(distance > 0, dr.square(dr.square(sums.distance / distance)), dr.inf)
+        known = (distance > 0) & (sums.distance > 2 * self._rounding(on))  # see `evaluate`
+        share = dr.select(known, dr.square(dr.square(sums.distance / distance)), dr.inf)
         slope = (SLOPE_ROUNDINGS * 2 / 3) * unit * sums.second * share / on.size
         second = 0.5 * SECOND_ROUNDINGS * unit * sums.second / sums.distance * share
         return slope, second / (on.size * on.size)

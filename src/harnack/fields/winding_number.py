@@ -121,7 +121,8 @@ class WindingNumber(BatchedField):
                 values = dataclasses.replace(values, value=winding.values(x))
         # The side of a triangle that x is on, to rounding, is not known.
         on_triangle = jumps_within(on.rays, x, _ON_TRIANGLE * epsilon_at(x))
-        return dataclasses.replace(values, error=values.error + on_triangle).rescaled(on.size)
+        values = dataclasses.replace(values, error=values.error + on_triangle)
+        return values.far_away(x, 64 + len(self.mesh.singular)).rescaled(on.size)
 
     def _batch(self, backend: Backend) -> _OnDevice:
         """The evaluator for points, which is made once a backend."""
