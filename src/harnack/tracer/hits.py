@@ -28,7 +28,7 @@ class Hits:
     """The ends of n rays, as NumPy arrays or, if the rays were Dr.Jit arrays, as Dr.Jit arrays.
 
     t: (n,) ray parameter of the hit, inf for a miss; for a ray that ran out of steps, how far
-        it is proved free.
+        it is proved free. A hit is within tolerance of the first root, mostly before it.
     position: (n, 3) point at t, NaN for a miss.
     normal: (n, 3) unit normal grad f/|grad f|, or of the sheet that was hit, to its side of
         larger f; zero where there is no hit.
