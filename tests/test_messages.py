@@ -15,6 +15,7 @@ from harnack.choices import did_you_mean
 from harnack.cli import main
 from harnack.cli.messages import error_line, level_text, printable
 from harnack.geometry import shapes
+from harnack.geometry.mesh_shapes import icosphere
 from harnack.opening import open_surface
 from harnack.rendering import MATERIALS, UnboundedSurfaceError
 
@@ -246,3 +247,16 @@ def test_lines_are_printable() -> None:
 )
 def test_levels_are_written_as_they_are_typed(level: float, text: str) -> None:
     assert level_text(level) == text
+
+
+def test_points_too_large_for_single_precision_say_so() -> None:
+    """They overflowed with a warning of NumPy, and their values were not numbers."""
+    field = hk.WindingNumber(*icosphere(1))
+    with pytest.raises(ValueError, match="too large for single precision"):
+        field.value([[1e39, 0.0, 0.0]])
+
+
+@pytest.mark.parametrize("method", ["exakt", "trees"])
+def test_a_mistyped_method_has_a_did_you_mean(method: str) -> None:
+    with pytest.raises(ValueError, match="did you mean"):
+        hk.WindingNumber(*icosphere(1), method=method)  # type: ignore[arg-type]

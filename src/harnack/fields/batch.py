@@ -178,11 +178,10 @@ def at_points(
         raise ValueError(f"points has NaN or infinite values: entry {bad[0]}")
     if not len(given):
         return tuple(one[:0] for one in at_points(np.zeros((1, 3)), kernel, precision))
-    number = np.float64 if precision == "double" else np.float32
     parts: list[tuple[npt.NDArray[Any], ...]] = []
     for start in range(0, len(given), _AT_ONCE):
         some = given[start : start + _AT_ONCE]
-        x = backend.Array3f(*(backend.Float(some[:, k].astype(number)) for k in range(3)))
+        x = to_vector3(backend, some, "points")
         order = morton_order(backend, x)
         results = kernel(backend, dr.gather(backend.Array3f, x, order))
         places = [_back_in_place(one, order, len(some)) for one in results]

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import backend_of, choose_backend, to_numpy, to_vector3
+from harnack.choices import did_you_mean
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.edge_lift import epsilon_at
 from harnack.fields.field import AtDetail, Curvature, Field, Sample
@@ -100,7 +101,8 @@ class ScreenedWindingNumber(BatchedField):
         if not (math.isfinite(length) and length > 0):
             raise ValueError(f"length must be positive and finite, not {length!r}")
         if method not in ("auto", "sum", "tree"):
-            raise ValueError(f'method is "auto", "sum" or "tree", not {method!r}')
+            hint = did_you_mean(method, ("auto", "sum", "tree"))
+            raise ValueError(f'method is "auto", "sum" or "tree", not {method!r}{hint}')
         if not 2 <= accuracy <= 100:
             raise ValueError(f"accuracy must lie between 2 and 100, not {accuracy!r}")
         if areas is None:

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import backend_of
+from harnack.choices import did_you_mean
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.edge_lift import epsilon_at
 from harnack.fields.field import Field, LineLipschitz, Sample, lengthened
@@ -77,7 +78,8 @@ class WindingNumber(BatchedField):
         order: int = 2,
     ) -> None:
         if method not in ("auto", "exact", "tree"):
-            raise ValueError(f'method is "auto", "exact" or "tree", not {method!r}')
+            hint = did_you_mean(method, ("auto", "exact", "tree"))
+            raise ValueError(f'method is "auto", "exact" or "tree", not {method!r}{hint}')
         if accuracy is not None and not 1.5 <= accuracy <= 100:
             raise ValueError(f"accuracy must lie between 1.5 and 100, not {accuracy}")
         if order not in (0, 1, 2):
