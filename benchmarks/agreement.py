@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 import harnack as hk
-from harnack.fields.winding_number import WindingNumber
-from harnack.geometry import read_surface
+from harnack.fields.meshes.winding_number import WindingNumber
+from harnack.files import read_surface
 from harnack.geometry.mesh_shapes import (
     MeshArrays,
     duplicate_faces,

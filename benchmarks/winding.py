@@ -14,8 +14,8 @@ import numpy.typing as npt
 
 from harnack.backend import choose_backend, to_vector3
 from harnack.fields.batch import morton_order
-from harnack.fields.winding_number import WindingNumber
-from harnack.geometry import read_surface
+from harnack.fields.meshes.winding_number import WindingNumber
+from harnack.files import read_surface
 from harnack.geometry.mesh_shapes import MeshArrays, bumpy_sphere, remove_faces
 
 from .rays import machine

@@ -15,6 +15,7 @@ ROOMS = (
     "choices",
     "backend",
     "geometry",
+    "files",
     "tree",
     "fields",
     "certify",
@@ -27,6 +28,23 @@ ROOMS = (
     "view",
     "cli",
 )
+# Within `fields`: the interface, what families share, and the families.
+FIELD_ROOMS = (
+    "sheets",
+    "field",
+    "symmetric",
+    "unit_coordinates",
+    "batch",
+    "edges",
+    "multipoles",
+    "curves",
+    "meshes",
+    "clouds",
+    "polynomials",
+    "waves",
+)
+FAMILIES = ("curves", "meshes", "clouds", "polynomials", "waves")
+MOST_FILES = 14
 FREE = ("__init__", "__main__", "testing")  # at the top: may import from any room
 
 
@@ -74,6 +92,23 @@ def misplaced_imports(path: Path, source: str) -> list[str]:
 def test_file_imports_from_earlier_rooms(path: Path) -> None:
     source = path.read_text(encoding="utf-8")
     assert misplaced_imports(path.relative_to(SOURCE), source) == []
+
+
+def test_families_of_fields_do_not_know_each_other() -> None:
+    wrong: list[str] = []
+    for path in sorted((SOURCE / "fields").rglob("*.py")):
+        parts = path.relative_to(SOURCE / "fields").with_suffix("").parts
+        if parts == ("__init__",):
+            continue
+        room = parts[0]
+        for module in imported_modules(ast.parse(path.read_text(encoding="utf-8")), ("harnack",)):
+            if module[:1] != ("fields",) or len(module) < 2:
+                continue
+            target = module[1]
+            later = FIELD_ROOMS.index(target) > FIELD_ROOMS.index(room)
+            if later or (target in FAMILIES and target != room):
+                wrong.append(f"{path.name} imports harnack.{'.'.join(module)}")
+    assert wrong == []
 
 
 def test_modules_have_names_that_say_something() -> None:

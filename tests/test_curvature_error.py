@@ -13,7 +13,7 @@ import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.distance.curvature import _Derivatives
 from harnack.fields.batch import BatchedField, Values
-from harnack.fields.edge_hessian import SymmetricSum
+from harnack.fields.symmetric import SymmetricSum
 
 PRECISIONS = ("double", "single")
 

@@ -31,8 +31,13 @@ from harnack.fields import (
     sine,
 )
 from harnack.fields.field import Curvature
-from harnack.fields.solid_harmonics import evaluate, from_monomials
-from harnack.fields.sphere_range import BallRange, proved_range, range_of_harmonic, unit_sphere
+from harnack.fields.polynomials.solid_harmonics import evaluate, from_monomials
+from harnack.fields.polynomials.sphere_range import (
+    BallRange,
+    proved_range,
+    range_of_harmonic,
+    unit_sphere,
+)
 from harnack.geometry import Ball, Box, HalfSpace
 
 DOUBLE = choose_backend("double")

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
+from harnack.files.loops import FileFormatError, check_writable, read_loops, write_atomically
 from harnack.geometry import chains, file_format, shapes
-from harnack.geometry.files import FileFormatError, check_writable, read_loops, write_atomically
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 CORNERS = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
@@ -449,7 +449,7 @@ def test_what_the_system_refuses_is_said_before_the_work(tmp_path, monkeypatch, 
     def refused(*_, **__):
         raise OSError(number, os.strerror(number), str(tmp_path))
 
-    monkeypatch.setattr("harnack.geometry.files.tempfile.TemporaryFile", refused)
+    monkeypatch.setattr("harnack.files.loops.tempfile.TemporaryFile", refused)
     with pytest.raises(OSError, match=f"cannot write .*a.png: {advice}") as caught:
         check_writable(tmp_path / "a.png")
     assert caught.value.errno == number

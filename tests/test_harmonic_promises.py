@@ -13,16 +13,16 @@ from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.backend.lengths import length
 from harnack.bounds import Caps, Classic, CurvatureStep, LipschitzStep, Slope
 from harnack.certify import CurvatureCertificate, LipschitzCertificate
-from harnack.fields.axial_bounds import (
+from harnack.fields.field import Curvature, HarmonicBall, Lipschitz
+from harnack.fields.polynomials.axial_bounds import (
     AxialBound,
     gradient_bound,
     hessian_bound,
     order_on_axis,
     value_bound,
 )
-from harnack.fields.field import Curvature, HarmonicBall, Lipschitz
-from harnack.fields.harmonic_rounding import HarmonicRounding
-from harnack.fields.solid_harmonics import Weights, evaluate, hessian
+from harnack.fields.polynomials.harmonic_rounding import HarmonicRounding
+from harnack.fields.polynomials.solid_harmonics import Weights, evaluate, hessian
 from harnack.testing.step_contracts import check_steps
 from harnack.testing.walks import look_at
 

@@ -18,17 +18,17 @@ from hypothesis import strategies as st
 
 from harnack.backend import choose_backend, to_numpy
 from harnack.fields import moments
-from harnack.fields.far_clusters import node_columns
-from harnack.fields.multipole import (
+from harnack.fields.multipoles.far_clusters import node_columns
+from harnack.fields.multipoles.multipole import (
     Level,
     all_levels,
     cartesian,
     triangle_levels,
     triangle_rule,
 )
-from harnack.fields.multipole_kernel import far_terms
-from harnack.fields.nearby import longest_part
-from harnack.fields.truncation import sup_norm, truncation
+from harnack.fields.multipoles.multipole_kernel import far_terms
+from harnack.fields.multipoles.nearby import longest_part
+from harnack.fields.multipoles.truncation import sup_norm, truncation
 from harnack.tree import Hierarchy, build_hierarchy
 
 ORDERS = [0, 1, 2]

@@ -10,8 +10,8 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.fields.multipole import all_levels
-from harnack.fields.truncation import truncation
+from harnack.fields.multipoles.multipole import all_levels
+from harnack.fields.multipoles.truncation import truncation
 from harnack.geometry.mesh_shapes import icosphere
 from harnack.geometry.singular import singular_edges
 from harnack.testing.direct_sums import dipole_sum, winding_sum

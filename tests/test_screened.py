@@ -12,10 +12,9 @@ from scipy.special import eval_legendre, spherical_in, spherical_kn
 
 import harnack as hk
 from harnack.backend import choose_backend, to_float, to_numpy, to_vector3
-from harnack.fields.field import Curvature, HarmonicBall
-from harnack.fields.screened import ScreenedWindingNumber
-from harnack.fields.screened_kernel import seen_dipole, thetas
-from harnack.fields.screened_tree import (
+from harnack.fields.clouds.screened import ScreenedWindingNumber
+from harnack.fields.clouds.screened_kernel import seen_dipole, thetas
+from harnack.fields.clouds.screened_tree import (
     Clusters,
     accepting_distance,
     clusters,
@@ -23,6 +22,7 @@ from harnack.fields.screened_tree import (
     dipole_rows,
     seen_cluster,
 )
+from harnack.fields.field import Curvature, HarmonicBall
 from harnack.geometry import mesh_shapes
 from harnack.geometry.clouds import CloudError
 from harnack.geometry.meshes import MeshError

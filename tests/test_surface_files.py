@@ -14,14 +14,14 @@ import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from harnack.files.file_format import FileFormatError
+from harnack.files.obj import read_obj
+from harnack.files.surface_parts import parts_of_contents, triangles
+from harnack.files.surfaces import Cloud, Loops, Mesh, read_surface
 from harnack.geometry import gltf, obj_surface, ply_surface
-from harnack.geometry.file_format import FileFormatError
 from harnack.geometry.mesh_shapes import icosphere, remove_faces, torus_mesh
-from harnack.geometry.obj import read_obj
 from harnack.geometry.polygons import triangulate
 from harnack.geometry.singular import singular_edges, weld_vertices
-from harnack.geometry.surface_parts import parts_of_contents, triangles
-from harnack.geometry.surfaces import Cloud, Loops, Mesh, read_surface
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 FORMATS = ("obj", "stl", "stl_ascii", "off", "ply", "ply_ascii", "glb")
@@ -555,6 +555,6 @@ def test_files_of_many_irregular_elements_take_neither_all_memory_nor_minutes(
     save, monkeypatch, name, content
 ):
     if name == "a.obj":
-        monkeypatch.setattr("harnack.geometry.file_format.MAX_ELEMENTS", 500)
+        monkeypatch.setattr("harnack.files.file_format.MAX_ELEMENTS", 500)
     with pytest.raises(FileFormatError, match=r"elements are too many .* let the program"):
         read_surface(save(name, content))

@@ -7,7 +7,7 @@ hits = hk.trace(hk.SolidAngle(vertices), origins, directions)
 from __future__ import annotations
 
 # First of all imports: it decides which LLVM Dr.Jit loads, which happens on `import drjit`.
-from harnack import backend, geometry, rendering, testing
+from harnack import backend, files, geometry, rendering, testing
 from harnack._version import __version__
 from harnack.bounds import Bound, Caps, Classic, CurvatureStep, LipschitzStep, Longest, Slope
 from harnack.distance import Curvatures, closest_points, curvature, signed_distance
@@ -76,6 +76,7 @@ __all__ = [
     "closest_points",
     "cosine",
     "curvature",
+    "files",
     "geometry",
     "level_set",
     "render",

@@ -10,16 +10,9 @@ from typing import Literal
 import numpy as np
 
 from harnack.fields import DipolePotential, Field, SolidAngle, WindingNumber
-from harnack.geometry import (
-    Cloud,
-    FileFormatError,
-    Loops,
-    Mesh,
-    read_loops,
-    read_surface,
-)
+from harnack.files import Cloud, FileFormatError, Loops, Mesh, read_loops, read_surface
+from harnack.files.surfaces import ReadAs
 from harnack.geometry.convex_volume import FloatArray
-from harnack.geometry.surfaces import ReadAs
 
 __all__ = ["UP_AXES", "Axis", "OpenedSurface", "open_surface"]
 

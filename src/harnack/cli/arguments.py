@@ -11,7 +11,7 @@ from typing import Any, NoReturn
 from harnack._version import __version__
 from harnack.choices import did_you_mean
 from harnack.cli.messages import printable
-from harnack.geometry.surfaces import SURFACE_FILES
+from harnack.files.surfaces import SURFACE_FILES
 from harnack.opening import UP_AXES
 from harnack.rendering import MATERIALS, SHOW_MODES
 from harnack.rendering.arguments import MAX_SIDE, MAX_SPP

@@ -13,8 +13,8 @@ from rich.console import Console
 from harnack.backend import doctor
 from harnack.choices import did_you_mean
 from harnack.cli.messages import in_options, printable
+from harnack.files.surfaces import SURFACE_FILES
 from harnack.gallery import SCENES, Scene
-from harnack.geometry.surfaces import SURFACE_FILES
 from harnack.opening import open_surface
 from harnack.rendering import Camera, render
 from harnack.rendering.images import check_picture_path

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from harnack.fields.dipole import DipolePotential
+from harnack.fields.clouds.dipole import DipolePotential
+from harnack.fields.clouds.screened import ScreenedWindingNumber
+from harnack.fields.curves.solid_angle import SolidAngle
 from harnack.fields.field import Curvature, Field, HarmonicBall, LineLipschitz, Lipschitz, Sample
-from harnack.fields.periodic import EigenfunctionSum, Gyroid, SchwarzD, SchwarzP
-from harnack.fields.polynomial import HarmonicPolynomial, SphericalHarmonic
-from harnack.fields.screened import ScreenedWindingNumber
+from harnack.fields.meshes.winding_number import WindingNumber
+from harnack.fields.polynomials.polynomial import HarmonicPolynomial, SphericalHarmonic
 from harnack.fields.sheets import NO_SHEET, Crossing
-from harnack.fields.solid_angle import SolidAngle
-from harnack.fields.waves import PlaneWave, Product, cosine, sine
-from harnack.fields.winding_number import WindingNumber
+from harnack.fields.waves.periodic import EigenfunctionSum, Gyroid, SchwarzD, SchwarzP
+from harnack.fields.waves.waves import PlaneWave, Product, cosine, sine
 
 __all__ = [
     "NO_SHEET",

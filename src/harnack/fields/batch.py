@@ -17,7 +17,7 @@ from harnack.fields.field import Field
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Precision, Real, Vec3
-    from harnack.fields.edge_hessian import SymmetricSum
+    from harnack.fields.symmetric import SymmetricSum
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -38,3 +38,8 @@ def placed(backend: Backend, centre: FloatArray, size: float) -> tuple[Backend, 
     """What `UnitCoordinates` consist of; neither becomes part of a kernel's code."""
     opaque = (dr.opaque(backend.Float, float(c)) for c in centre)
     return backend, backend.Array3f(*opaque), dr.opaque(backend.Float, size)
+
+
+def epsilon_at(x: Vec3) -> Real:
+    """What rounding may do to a coordinate of x, or of a vertex of size about one."""
+    return float(dr.epsilon(x)) * (1 + dr.max(dr.abs(x)))

@@ -1,4 +1,4 @@
-"""Curves, clipping volumes, triangles, welding, boundary edges, file reading. No queries."""
+"""Curves, clipping volumes, triangles, welding, boundary edges. No files, no queries."""
 
 from __future__ import annotations
 
@@ -13,28 +13,22 @@ from harnack.geometry.curves import (
     total_length,
     validate_loops,
 )
-from harnack.geometry.files import FileFormatError, read_loops, write_atomically
 from harnack.geometry.meshes import (
     MeshError,
     validate_mesh,
     without_zero_area_faces,
     zero_area_faces,
 )
-from harnack.geometry.surfaces import Cloud, Loops, Mesh, read_surface
 from harnack.geometry.volumes import Ball, Box, ConvexHull, HalfSpace, Intersection, Volume
 
 __all__ = [
     "Ball",
     "Box",
-    "Cloud",
     "CloudError",
     "ConvexHull",
     "CurveError",
-    "FileFormatError",
     "HalfSpace",
     "Intersection",
-    "Loops",
-    "Mesh",
     "MeshError",
     "Volume",
     "bounding_box",
@@ -43,14 +37,11 @@ __all__ = [
     "estimate_normals",
     "is_convex_position",
     "mesh_shapes",
-    "read_loops",
-    "read_surface",
     "shapes",
     "total_length",
     "validate_cloud",
     "validate_loops",
     "validate_mesh",
     "without_zero_area_faces",
-    "write_atomically",
     "zero_area_faces",
 ]

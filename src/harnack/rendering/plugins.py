@@ -22,7 +22,8 @@ from typing import TYPE_CHECKING, Any
 
 from harnack.choices import did_you_mean
 from harnack.fields import Gyroid, SchwarzD, SchwarzP, SolidAngle, SphericalHarmonic
-from harnack.geometry import Ball, Box, Intersection, read_loops
+from harnack.files import read_loops
+from harnack.geometry import Ball, Box, Intersection
 from harnack.rendering import carrier, integrator
 from harnack.rendering.variant import load_mitsuba
 from harnack.tracer import LevelSet, level_set

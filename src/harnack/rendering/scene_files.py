@@ -13,8 +13,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from harnack.geometry.file_format import MAX_BYTES, Place, read_bytes
-from harnack.geometry.surfaces import SURFACE_FILES
+from harnack.files.file_format import MAX_BYTES, Place, read_bytes
+from harnack.files.surfaces import SURFACE_FILES
 
 _BYTE_ORDER_MARKS = {
     codecs.BOM_UTF8: "utf-8", codecs.BOM_UTF32_LE: "utf-32", codecs.BOM_UTF32_BE: "utf-32",

@@ -1,0 +1,1 @@
+"""The solid angle of closed curves."""

@@ -1,0 +1,324 @@
+"""The solid angle of closed curves: nonplanar polygons, holes, knots, links, coils."""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import drjit as dr
+import numpy as np
+import numpy.typing as npt
+
+from harnack.backend import backend_of, to_numpy
+from harnack.choices import did_you_mean
+from harnack.fields.curves.edge_angles import differentiable_angle
+from harnack.fields.curves.edge_extent import tight_extent
+from harnack.fields.curves.edge_nearest import Segments, closest_on_segments
+from harnack.fields.edges.edge_hessian import hessian_over_edges
+from harnack.fields.edges.edge_passing import Line, known_along, rates_along
+from harnack.fields.edges.edge_sums import EdgeBuffer, EdgeSums, sum_over_edges, upload
+from harnack.fields.field import Field, HarmonicBall, LineLipschitz, Sample
+from harnack.fields.multipoles.nearby import SECOND_ROUNDINGS, SLOPE_ROUNDINGS
+from harnack.fields.unit_coordinates import UnitCoordinates, epsilon_at, placed
+from harnack.geometry import ConvexHull, is_convex_position, total_length, validate_loops
+from harnack.geometry.net_loops import net_loops, uncancelled_edges
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.geometry import Volume
+
+Loops = tuple[npt.NDArray[np.float64], ...]
+CertificateName = Literal["auto", "edges", "convex", "paper"]
+
+_PERIOD = 4 * math.pi
+# The ball of the edge certificate is this fraction of the distance to the curve (by experiment:
+# 0.5 to 0.65 need the fewest evaluations, 0.8 more).
+_REACH = 0.5
+# Levels as near as this to a multiple of 4 pi count as one.
+_NARROW = 1e-9 * _PERIOD
+# Sums of float32 terms; a variation is lengthened and a distance shortened by this much.
+_ROUNDING = 2e-5
+
+
+class SolidAngle(Field):
+    """The signed solid angle of closed curves, in steradians, with period 4 pi (paper, Eq. 10).
+
+    loops: one (n, 3) array-like of vertices, n >= 3, or a list of them. Every loop is closed by
+    itself. Orientation matters: a hole runs against its outer loop. A Dr.Jit 3-vector of n lanes
+    is one loop whose vertices hits can be differentiated by.
+
+    Edges that are run there and back, by one loop or by two neighbours, are taken out before
+    anything is computed (`net_loops`): f does not see them. If none is left, f is 0 everywhere,
+    every ray a proved miss, and levels that are multiples of 4 pi are refused.
+
+    certificate: how the lift is bounded near a point. "auto" takes "convex" where its hypothesis
+    is checked to hold, else "edges".
+
+    - "edges" holds for **every** curve. Let d_e be the distance from x to edge e of length 2a_e
+      and r = d/2, d = min d_e. At distance rho an edge's Biot-Savart field is at most
+      2a/(rho sqrt(rho^2+a^2)): the value for the foot at mid-edge, the worst place, as the field
+      is an integral of rho/(rho^2+s^2)^(3/2) that concentrates there. Walking from x, rho falls
+      no faster than the distance walked, so the lift moves on B(x, r) by at most
+      S = sum_e integral_0^r 2a/((d_e-s) sqrt((d_e-s)^2+a^2)) ds, and pulling d_e-s = (1-t) d_e
+      out of the root (which only grows the term) gives with r/d_e <= 1/2
+
+          S <= sum_e 2a/sqrt(d_e^2+a^2) (r/d_e)/(1-r/d_e)
+            <= 2 r sum_e a/(d_e sqrt(..)) + 4 r^2 sum_e a/(d_e^2 sqrt(..)).
+
+    - "convex": on B(x, d) the lift stays in (-6 pi, 6 pi) if the curve is one loop without
+      self-intersections on the boundary of a convex set: a segment crosses the 2 pi level, where
+      the principal value in (-2 pi, 2 pi) jumps by 4 pi, at most once net (paper, Theorem C.1).
+    - "paper" assumes that range for any curve, as the paper does. It is false for coils and
+      links and exists for comparisons: hits can be missed.
+
+    Raises CurveError for loops that are not closed curves, ValueError for "convex" where the
+    hypothesis fails.
+    """
+
+    period: ClassVar[float | None] = _PERIOD
+    default_level: float = 2 * math.pi
+
+    def __init__(self, loops: Any, *, certificate: CertificateName = "auto") -> None:
+        vertices = loops if _is_drjit(loops) else None
+        self.loops: Loops = validate_loops(to_numpy(loops) if vertices is not None else loops)
+        self.vertices: Vec3 | None = vertices
+        self._net: Loops = net_loops(self.loops)
+        self.convex_position = is_convex_position(self._net)
+        self._asked = certificate
+        self.certificate = self._choose(certificate)
+        points = np.concatenate(self._net or self.loops)
+        self._centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
+        self._size = float(np.linalg.norm(points - self._centre, axis=1).max())
+        self._device: _OnDevice | None = None
+        self._direction: Vec3 | None = None
+        self._extents: dict[tuple[float, ...], Volume | None] = {}
+
+    def _choose(self, asked: CertificateName) -> Literal["edges", "range"]:
+        if asked == "auto":
+            return "range" if self.convex_position else "edges"
+        if asked == "convex" and not self.convex_position:
+            raise ValueError(
+                'certificate="convex" needs one loop without self-intersections on the boundary '
+                'of its convex hull, and this is not one; use certificate="auto"'
+            )
+        if asked not in ("edges", "convex", "paper"):
+            names = ("auto", "edges", "convex", "paper")
+            raise ValueError(
+                f"unknown certificate {asked!r}; use auto, edges, convex or paper"
+                f"{did_you_mean(asked, names)}"
+            )
+        return "edges" if asked == "edges" else "range"
+
+    def prepare(self, backend: Backend) -> SolidAngle:
+        if self._device is not None and self._device.backend is backend:
+            return self
+        prepared = copy.copy(self)
+        # Centred and scaled to unit size: products of eight lengths stay far from overflow. The
+        # centre is a number of the backend, so that near the curve it is subtracted exactly.
+        cast = np.float64 if backend.precision == "double" else np.float32
+        if (size := float(np.abs(self._centre).max()) + self._size) > 0.1 * float(
+            np.finfo(cast).max
+        ):
+            raise ValueError(
+                f"coordinates up to {size:g} are too large for {backend.precision} precision: "
+                "choose units nearer to 1"
+            )
+        centre = self._centre.astype(cast).astype(np.float64)
+        unit = tuple((loop - centre) / self._size for loop in self._net)
+        edges = upload(backend, unit) if unit else None
+        magnitude = float(np.abs(np.concatenate(self._net or self.loops)).max() / self._size)
+        prepared._device = _OnDevice(*placed(backend, centre, self._size), edges, magnitude)
+        return prepared
+
+    def evaluate(self, p: Vec3) -> Sample:
+        if self._device is None:
+            return self.prepare(backend_of(p)).evaluate(p)
+        on = self._device
+        if on.edges is None:
+            return self._constant(p)
+        x = on.unit(p)
+        sums = sum_over_edges(on.edges, x, variation=self.certificate == "edges")
+        epsilon = on.backend.epsilon
+        rounding = self._rounding(on)
+        distance = sums.distance * (1 - _ROUNDING) - rounding
+        if self.certificate == "edges":
+            ball = self._edge_ball(sums, distance)
+        else:
+            ball = HarmonicBall(distance * on.size, -1.5 * _PERIOD, 1.5 * _PERIOD)
+        # On the curve itself, to rounding, every level meets (`uncancelled_edges`) and no gradient
+        # exists: give one so steep that the point counts as close to any level. A value that is
+        # not a number anywhere else stays one, and the tracer refuses it.
+        met = sums.distance <= 2 * rounding
+        steep = on.backend.Array3f(0, 0, 4 * _PERIOD / rounding)
+        gradient = dr.select(met, steep, sums.gradient) / on.size
+        # Each of n factors turns the product by a few roundings, of random sign.
+        error = epsilon * (8 + 2 * math.sqrt(sum(len(loop) for loop in self._net)))
+        if self.certificate == "edges":
+            # Ends of edges, rounded, move each edge's angle by that times its field, which is at
+            # most twice `first`: where edges nearly cancel, the gradient does not show it.
+            error = error + dr.select(met, 0, 4 * epsilon * sums.first)
+        error = dr.select(met, 8 * _PERIOD, error)  # that gradient times 2 rounding
+        known = (ball, *self._along_edges(on, x, sums))
+        return Sample(dr.select(met, 0, sums.angle), gradient, known, error)
+
+    def along(self, d: Vec3) -> SolidAngle:
+        if not self._net or self._asked == "paper":
+            return self
+        seen = copy.copy(self)
+        seen._direction = d
+        return seen
+
+    def _along_edges(self, on: _OnDevice, x: Vec3, sums: EdgeSums) -> tuple[LineLipschitz, ...]:
+        """What is known along the direction of `along`, if there is one."""
+        edges = on.edges
+        if self._direction is None or edges is None:
+            return ()
+        line = Line(x, on.backend.Array3f(self._direction), self._rounding(on))
+
+        def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
+            return rates_along(edges, line, lengths, active)
+
+        known = known_along(line, sums.gradient, sums.distance, rates)
+        size = on.size
+        return tuple(LineLipschitz(one.constant / size, one.radius * size) for one in known)
+
+    @staticmethod
+    def _rounding(on: _OnDevice) -> float:
+        """How far a point may be from where it was meant to be, in units of the curve.
+
+        Near the curve p - centre is exact, division and the curve's own coordinates have a few
+        roundings of size 1, and p itself was rounded once, at the curve's distance from 0.
+        """
+        return on.backend.epsilon * (6 + 2 * on.magnitude)
+
+    def _constant(self, p: Vec3) -> Sample:
+        """The sample of f = 0, for a curve of which nothing is left: it is true on any ball. The
+        range has a width, as bounds divide by it; no level lies in it (`check_levels`)."""
+        assert self._device is not None
+        on = self._device
+        x = on.unit(p)
+        radius = 1e6 * (1 + dr.norm(x)) * on.size
+        zero = dr.zeros(on.backend.Float, dr.width(p))
+        ball = HarmonicBall(radius, zero - _NARROW, zero + _NARROW)
+        return Sample(zero, on.backend.Array3f(zero), (ball,))
+
+    def _edge_ball(self, sums: EdgeSums, distance: Real) -> HarmonicBall:
+        assert self._device is not None
+        r = _REACH * distance
+        variation = 2 * r * (sums.first + r / (1 - _REACH) * sums.second) * (1 + _ROUNDING)
+        return HarmonicBall(r * self._device.size, sums.angle - variation, sums.angle + variation)
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        """Rows of the Hessian, free of trace to rounding. It grows without limit at the curve."""
+        if self._device is None:
+            return self.prepare(backend_of(p)).hessian(p)
+        on = self._device
+        if on.edges is None:
+            zero = dr.zeros(on.backend.Array3f, dr.width(p))
+            return zero, zero, zero
+        x, y, z = hessian_over_edges(on.edges, on.unit(p))
+        share = 1 / (on.size * on.size)
+        return x * share, y * share, z * share
+
+    def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
+        """Rounding of positions, as for sums over boundary edges (`far_clusters.Errors`), with
+        distances less by what it may have done to them. Without bound at the curve."""
+        del sample
+        if self._device is None:
+            return self.prepare(backend_of(p)).derivative_errors(p, self.evaluate(p))
+        on = self._device
+        if on.edges is None:
+            return 0.0, 0.0
+        x = on.unit(p)
+        sums, unit = sum_over_edges(on.edges, x, variation=True), epsilon_at(x)
+        distance = sums.distance - 4 * unit
+        known = (distance > 0) & (sums.distance > 2 * self._rounding(on))  # see `evaluate`
+        share = dr.select(known, dr.square(dr.square(sums.distance / distance)), dr.inf)
+        slope = (SLOPE_ROUNDINGS * 2 / 3) * unit * sums.second * share / on.size
+        second = 0.5 * SECOND_ROUNDINGS * unit * sums.second / sums.distance * share
+        return slope, second / (on.size * on.size)
+
+    def closest_on_boundary(self, p: Vec3) -> Vec3 | None:
+        """The closest point of the curve, edges that cancel left out (`uncancelled_edges`)."""
+        if not self._net:
+            return None
+        if self._device is None:
+            return self.prepare(backend_of(p)).closest_on_boundary(p)
+        on = self._device
+        centre = to_numpy(on.centre).reshape(3).astype(np.float64)
+        start, end = ((q - centre) / self._size for q in uncancelled_edges(self._net))
+        nearest = closest_on_segments(Segments.upload(on.backend, start, end), on.unit(p))
+        return nearest * on.size + on.centre
+
+    def parameters(self) -> tuple[Any, ...]:
+        return () if self.vertices is None else (self.vertices,)
+
+    def differentiable_value(self, p: Vec3) -> Real:
+        backend = backend_of(p)
+        # Vertices that can be moved one by one are all there: moved, edges cancel no longer.
+        loops = (self.vertices,) if self.vertices is not None else self._net
+        return differentiable_angle(backend, loops, p)
+
+    def check_levels(self, levels: tuple[float, ...]) -> None:
+        for level in levels:
+            if not self._net and abs(math.remainder(float(level), _PERIOD)) < _NARROW:
+                raise ValueError(
+                    f"level {level:g}: all edges of this curve cancel each other, so that its "
+                    "solid angle is 0 everywhere modulo 4 pi, and no surface is where it takes "
+                    "that value: check the loops' orientations"
+                )
+
+    def extent(self, levels: tuple[float, ...]) -> Volume | None:
+        """Where the level sets must lie.
+
+        The 2 pi level of a curve in convex position lies in its convex hull (paper, Theorem B.1).
+        For any curves of total length L: seen from x at distance rho from all of them, a loop
+        has angular length at most L_i/rho =: t_i; a closed spherical curve of length t < 2 pi,
+        cut into simple loops, bounds |area| <= 2 pi - sqrt(4 pi^2 - t^2) =: phi(t) (isoperimetry
+        on the sphere; phi is convex with phi(0) = 0, so the pieces add up to at most phi of the
+        whole). So |Omega| < l wherever L/rho < sqrt(l (4 pi - l)): a level at distance l from
+        the multiples of 4 pi lies within rho = L/sqrt(l (4 pi - l)) of the curves. Cells of that
+        box that are proved to hold no level are then cut away (`tight_extent`).
+        """
+        if levels not in self._extents:
+            self._extents[levels] = self._extent(levels)
+        return self._extents[levels]
+
+    def _extent(self, levels: tuple[float, ...]) -> Volume | None:
+        points = np.concatenate(self._net or self.loops)
+        away = [abs(math.remainder(float(level), _PERIOD)) for level in levels]
+        nearest = min(away)
+        if nearest < _NARROW:
+            return None
+        if not self._net:
+            return ConvexHull.of(points)  # holds what there is: nothing
+        if self.convex_position and nearest > 2 * math.pi * (1 - 1e-9):
+            return ConvexHull.of(points).padded(1e-4 * self._size)
+        reach = 1.0001 * total_length(self._net) / math.sqrt(nearest * (_PERIOD - nearest))
+        return tight_extent(
+            self._net, points.min(axis=0) - reach, points.max(axis=0) + reach, levels
+        )
+
+    def describe(self) -> dict[str, Any]:
+        return {
+            "loops": len(self.loops),
+            "vertices": sum(len(loop) for loop in self.loops),
+            "cancelled edges": sum(map(len, self.loops)) - sum(map(len, self._net)),
+            "convex position": self.convex_position,
+            "certificate": self.certificate,
+        }
+
+
+@dataclass(frozen=True)
+class _OnDevice(UnitCoordinates):
+    """The edges on a backend, None if there are none, and how large their coordinates are, in
+    units of the curve."""
+
+    edges: EdgeBuffer | None
+    magnitude: float
+
+
+def _is_drjit(value: Any) -> bool:
+    return dr.is_array_v(type(value))

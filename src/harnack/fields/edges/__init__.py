@@ -1,0 +1,1 @@
+"""The solid angle of an edge: value, derivatives, and bounds of how they vary."""

@@ -1,0 +1,1 @@
+"""The winding number of triangle meshes, exact or by a tree."""

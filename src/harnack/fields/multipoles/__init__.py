@@ -1,0 +1,1 @@
+"""Far sums of dipoles as multipoles, with bounds of what they leave out."""

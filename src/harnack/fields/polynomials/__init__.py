@@ -1,0 +1,1 @@
+"""Harmonic polynomials and what is known of them near a point."""

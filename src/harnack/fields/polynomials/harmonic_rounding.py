@@ -1,0 +1,193 @@
+"""How far rounding moves `solid_harmonics.evaluate` at a point, from its distances rho and r.
+
+Everything here is to first order in u, the unit roundoff (eps/2 of the precision in use): each
+operation is right up to a factor 1 + d, |d| <= u, so errors of factors add up. What is of second
+order is below 1e-4 of it in single precision and covered by `_SECOND_ORDER`. With z = r c:
+
+- r^2 = x^2 + y^2 + z^2 is off by 3u of itself.
+- q_l = A z q_(l-1) - B r^2 q_(l-2), A and B the rounded coefficients of the recurrence: a step
+  commits up to g_l = 4u |A z q_(l-1)| + 7u |B r^2 q_(l-2)| and passes on what earlier steps did by
+  the same recurrence, so the error of q_l is at most the sum over k of |G_lk| g_k, where G_lk is
+  the recurrence begun with G_kk = 1 and 0 before. In units of u r^(l-m) it is a function of c
+  alone, whose largest value is found by sampling: `growth`.
+- (x + iy)^m: a product of complex numbers is off by at most 2 sqrt(2) u of its size (each component
+  by 2u (|x c| + |y s|) or 2u (|x s| + |y c|), and 4 |x c y s| <= rho^2 |w|^2), the first by
+  nothing: 2 sqrt(2) (m-1) u rho^m.
+- A term of the sum: 3u for its weight and two products; then u for each further term of its order
+  and for each further order.
+- A point divided by the size of the domain: 3u of each coordinate, that is 3u (rho |f_rho| +
+  |z f_z|).
+
+Numbers too small for the exponent are lost altogether: the smallest normal number for each
+operation, times what the recurrence makes of it.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from harnack.backend.extrema import fmin
+from harnack.fields.polynomials.axial_bounds import (
+    AxialBound,
+    amplitudes,
+    largest_gradient,
+    largest_hessian,
+)
+from harnack.fields.polynomials.solid_harmonics import (
+    Legendre,
+    Weights,
+    normalisation,
+    odd_factorial,
+)
+
+if TYPE_CHECKING:
+    from harnack.backend import Real
+
+FloatArray: TypeAlias = npt.NDArray[np.float64]
+
+# Sums of products of sizes of polynomials in cos(a), of degree 24 at most, are sampled this
+# finely in a; between samples each factor moves by 24 pi/2/_SAMPLES of its largest size at most
+# (Bernstein), which together with what is of second order in u is covered by the factor.
+_SAMPLES = 4000
+_SECOND_ORDER = 1.03
+
+
+@dataclass(frozen=True)
+class HarmonicRounding:
+    """Rounding of value and gradient of a sum, in units of u, at a point of the unit ball.
+
+    Of each the smaller of two bounds counts: one that is sharp near the axis, in powers of rho and
+    r, and one in powers of r alone (the largest of c rho^m on the sphere, and not the largest c).
+    lost: what numbers too small for the exponent add to the value, in smallest normal numbers.
+    """
+
+    value_bounds: tuple[AxialBound, AxialBound]
+    gradient_bounds: tuple[AxialBound, AxialBound]
+    lost: float
+
+    @classmethod
+    def of(cls, weights: Weights, *, is_divided: bool) -> HarmonicRounding:
+        """is_divided: whether points are divided by a size other than 1 before."""
+        tables: list[dict[tuple[int, int], float]] = [{}, {}, {}, {}]
+        orders = len({m for _, m in weights})
+        lost = 1.0
+        for (l, m), amplitude in amplitudes(weights).items():  # noqa: E741
+            # One amplitude stands for two columns: cos(m b) and sin(m b), at right angles.
+            terms = max(sum(order == k for _, order in weights) for k in (m, -m))
+            sums = (terms - 1) + (orders - 1)
+            size = amplitude * _size(l, m)
+            near, anywhere = _of_value(l, m, sums, is_divided)
+            steep_near, steep_anywhere = _of_gradient(l, m, sums, is_divided) if l else (0.0, 0.0)
+            power = max(m - 1, 0)
+            for table, i, degree, constant in (
+                (tables[0], m, l, near),
+                (tables[1], 0, l, anywhere),
+                (tables[2], power, l - 1, steep_near),
+                (tables[3], 0, l - 1, steep_anywhere),
+            ):
+                if degree >= i:
+                    table[i, degree - i] = table.get((i, degree - i), 0.0) + size * constant
+            lost += 2.0 + size * _lost(l, m)
+        a, b, c, d = (AxialBound.of(table) for table in tables)
+        return cls((a, b), (c, d), lost)
+
+    def value(self, rho: Real, r: Real) -> Real:
+        """Of the value, in units of u."""
+        near, anywhere = self.value_bounds
+        return fmin(near(rho, r), anywhere(rho, r))
+
+    def gradient(self, rho: Real, r: Real) -> Real:
+        """Of the gradient, a length, in units of u."""
+        near, anywhere = self.gradient_bounds
+        return fmin(near(rho, r), anywhere(rho, r))
+
+
+def _grid() -> tuple[FloatArray, FloatArray]:
+    a = np.linspace(0.0, math.pi, _SAMPLES + 1)
+    return np.cos(a), np.sin(a)
+
+
+@functools.cache
+def _recurrence(l: int, m: int) -> tuple[FloatArray, FloatArray, float]:  # noqa: E741
+    """|Q|, its error in units of u, and the sum of |G_lk| times coefficients, on the grid of c."""
+    c, _ = _grid()
+    q = Legendre(c, 1.0)
+    zero, one = 0.0 * c, 0.0 * c + 1.0
+    if l < m:
+        return zero, zero, 0.0
+    error, spread = zero.copy(), 0.0
+    for k in range(m + 1, l + 1):
+        a, b = (2 * k - 1) / (k - m), (k + m - 1) / (k - m)
+        committed = 4 * np.abs(a * c * q(k - 1, m))
+        if k > m + 1:
+            committed = committed + 7 * np.abs(b * q(k - 2, m))
+        before, now = zero, one
+        for j in range(k + 1, l + 1):
+            step = (2 * j - 1) / (j - m) * c * now - (j + m - 1) / (j - m) * before
+            before, now = now, step
+        error = error + np.abs(now) * committed
+        spread += float(np.abs(now).max()) * (a + b + 2.0)
+    return np.abs(q(l, m) + zero), error, spread
+
+
+def _size(l: int, m: int) -> float:  # noqa: E741
+    return normalisation(l, m) * odd_factorial(m)
+
+
+def _product(m: int) -> float:
+    """The error of (x + iy)^m in units of u of its size."""
+    return 2 * math.sqrt(2) * max(m - 1, 0)
+
+
+def _of_value(l: int, m: int, sums: int, is_divided: bool) -> tuple[float, float]:  # noqa: E741
+    """In units of u rho^m r^(l-m), and of u r^l."""
+    q, error, _ = _recurrence(l, m)
+    c, s = _grid()
+    total = error + (3 + sums + _product(m)) * q
+    if is_divided:
+        at_next, below = _recurrence(l - 1, m + 1)[0], _recurrence(l - 1, m)[0]
+        total = total + 3 * (m * q + (2 * m + 1) * s * s * at_next + np.abs(c) * (l + m) * below)
+    return _largest(total), _largest(total * s**m)
+
+
+def _of_gradient(l: int, m: int, sums: int, is_divided: bool) -> tuple[float, float]:  # noqa: E741
+    """Of (gx, gy, gz) in units of u rho^(m-1) r^(l-m) (m = 0: u r^(l-1)), and of u r^(l-1).
+
+    As `evaluate` sums it up: 4u for weights, coefficients and products in each part, 2u for the two
+    terms of gx and gy, then the sums. The point divided by the size: 3u (rho |H| + |z grad f_z|),
+    f_z = (l+m) Q_(l-1)^m B being of degree l-1 and order m; and 3u for the gradient divided by it.
+    """
+    _, s = _grid()
+    each = 4 + 2 + 2 * sums + _product(m) + (3 if is_divided else 0)
+    q, q_error, _ = _recurrence(l, m)
+    at_next, next_error, _ = _recurrence(l - 1, m + 1)
+    below, below_error, _ = _recurrence(l - 1, m)
+    power = s if m > 0 else 0.0 * s + 1.0
+    outward = s * power * (2 * m + 1) * (next_error + each * at_next)
+    around = m * (q_error + each * q)
+    up = power * (l + m) * (below_error + each * below)
+    total = np.hypot(outward + around, up)
+    near, anywhere = _largest(total), _largest(total * s ** max(m - 1, 0))
+    if is_divided:
+        # On the sphere |H| <= l (l-1) M and |grad f_z| <= (l-1) l M: see `BallRange.curvature`.
+        rest = 3 * largest_hessian(l, m) / _size(l, m)
+        if l > m:
+            rest += 3 * (l + m) * largest_gradient(l - 1, m) / _size(l - 1, m)
+        near += rest
+        anywhere += min(rest, 6 * l * (l - 1) * _largest(q * s**m))
+    return near, anywhere
+
+
+def _largest(sampled: FloatArray) -> float:
+    return float(sampled.max()) * _SECOND_ORDER
+
+
+def _lost(l: int, m: int) -> float:  # noqa: E741
+    q, _, spread = _recurrence(l, m)
+    return spread + (2 * m + 2) * float(q.max()) + 2

@@ -1,0 +1,1 @@
+"""Sums of waves, such as gyroids."""

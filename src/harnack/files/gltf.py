@@ -1,0 +1,205 @@
+"""Reading .glb and .gltf scenes through trimesh, after their promises were checked.
+
+A glTF file is a JSON header and buffers of bytes. The header says what to read where, and a
+hostile one can ask for more memory than there is; so it is compared with the bytes first.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import warnings
+from io import BytesIO
+from pathlib import Path
+from typing import Any, cast
+from urllib.parse import unquote
+
+import numpy as np
+
+from harnack.files.file_format import MAX_BYTES, FileFormatError, Place, read_bytes
+from harnack.files.surface_parts import Parts, Polygons
+from harnack.geometry.convex_volume import FloatArray
+from harnack.geometry.meshes import IntArray
+
+_COMPONENT_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
+_COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+_DEEPEST = 1000
+# Extensions under which vertices and indices are stored as always.
+_HARMLESS = ("KHR_materials", "KHR_texture", "KHR_lights", "EXT_texture", "KHR_xmp")
+
+
+def read_gltf(path: Path, data: bytes) -> Parts:
+    """All triangles of a scene, placed by its nodes; if it has none, its points.
+
+    Raises:
+        FileFormatError: truncated, malformed, asking for more data than it holds, compressed, a
+            referenced file that is missing, neither triangles nor points.
+    """
+    import trimesh  # here, since it takes half a second
+
+    place = Place(path)
+    header = _header(place, data)
+    try:
+        files = _buffer_files(path, header)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            _check(place, header, len(data) + sum(map(len, files.values())))
+            scene: Any = trimesh.load(
+                BytesIO(data),
+                file_type=path.suffix.lower()[1:],
+                resolver=files,
+                force="scene",
+                process=False,
+                skip_materials=True,
+            )
+            return _parts(place, scene)
+    except FileFormatError:
+        raise
+    except Exception as error:  # whatever trimesh stumbles over
+        reason = str(error).strip().splitlines()[:1] or [type(error).__name__]
+        raise place.error(f"it is no sound glTF file ({reason[0][:120]})") from None
+
+
+def _header(place: Place, data: bytes) -> dict[str, Any]:
+    text = data
+    if place.path.suffix.lower() == ".glb":
+        if len(data) < 20 or data[:4] != b"glTF":
+            raise place.error("this is no .glb file: it does not begin with 'glTF'")
+        version, length, size = (int.from_bytes(data[k : k + 4], "little") for k in (4, 8, 12))
+        if version != 2:
+            raise place.error(f"version {version} of glTF is not read, only 2")
+        if length > len(data) or size > len(data) - 20:
+            raise place.error(
+                f"its header promises {max(length, size + 20):,} bytes, but the file has "
+                f"{len(data):,}: it is truncated"
+            )
+        text = data[20 : 20 + size]
+    try:
+        header: Any = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise place.error(f"its header is no JSON ({str(error)[:80]})") from None
+    if not isinstance(header, dict):
+        raise place.error("its header is no JSON object")
+    return cast("dict[str, Any]", header)
+
+
+def _buffer_files(path: Path, header: dict[str, Any]) -> dict[str, bytes]:
+    """The contents of the files beside it that a scene keeps its buffers in."""
+    files: dict[str, bytes] = {}
+    for buffer in header.get("buffers", []):
+        uri: Any = buffer.get("uri")
+        if uri is None or uri.startswith("data:") or uri in files:
+            continue
+        name = Path(unquote(uri))
+        if name.is_absolute() or ".." in name.parts or ":" in uri:
+            raise Place(path).error(f"its buffer {uri[:80]!r} is not a file beside it")
+        files[uri] = read_bytes(path.parent / name)
+        if sum(map(len, files.values())) > MAX_BYTES:
+            raise Place(path).error(f"its buffers are too large: at most {MAX_BYTES:,} bytes")
+    return files
+
+
+def _check(place: Place, header: dict[str, Any], size: int) -> None:
+    """Compares what the header asks for with what there is. A malformed header raises anything."""
+    for name in header.get("extensionsRequired", []):
+        if not str(name).startswith(_HARMLESS):
+            raise place.error(f"it needs the extension {name}, which is not read: save it without")
+    views, accessors = header.get("bufferViews", []), header.get("accessors", [])
+    asked = 0
+    for view in views:
+        if _count(view, "byteLength") + _count(view, "byteOffset", 0) > size:
+            raise place.error("a buffer view lies outside the file: it is truncated")
+        asked += view["byteLength"]
+    for accessor in accessors:
+        item = _COMPONENT_BYTES[accessor["componentType"]] * _COMPONENTS[accessor["type"]]
+        asked += _count(accessor, "count") * item
+        _count(accessor, "byteOffset", 0)
+    if asked > 8 * max(size, 1 << 16):
+        raise place.error(
+            f"its header asks for {asked:,} bytes of data, many times those of the file ({size:,})"
+        )
+    _check_nodes(place, header, _drawn(place, header, accessors))
+
+
+def _drawn(place: Place, header: dict[str, Any], accessors: list[Any]) -> list[int]:
+    """How many corners each mesh draws."""
+    drawn: list[int] = []
+    for mesh in header.get("meshes", []):
+        total = 0
+        for primitive in mesh["primitives"]:
+            used = [primitive["attributes"]["POSITION"]]
+            used += [primitive["indices"]] if "indices" in primitive else []
+            for index in used:
+                accessor = accessors[index]
+                if "bufferView" not in accessor or "sparse" in accessor:
+                    raise place.error("compressed or sparse vertices are not read: save it plainly")
+            total += accessors[used[-1]]["count"]
+        drawn.append(total)
+    return drawn
+
+
+def _check_nodes(place: Place, header: dict[str, Any], drawn: list[int]) -> None:
+    """Nodes form trees of modest depth, and do not together draw one mesh a million times."""
+    nodes: list[Any] = header.get("nodes", [])
+    children = {k: node.get("children", []) for k, node in enumerate(nodes)}
+    below = [child for found in children.values() for child in found]
+    roots = [root for scene in header.get("scenes", []) for root in set(scene.get("nodes", []))]
+    if len(below) != len(set(below)) or set(below) & set(roots):
+        raise place.error("a node of its scene hangs below two others")
+    level, depth = set(roots), 0
+    while level:
+        level, depth = {child for node in level for child in children[node]}, depth + 1
+        if depth > _DEEPEST:
+            raise place.error(f"its scene is nested more than {_DEEPEST} nodes deep")
+    used: list[int] = [node["mesh"] for node in nodes if "mesh" in node]
+    total = sum(drawn[mesh] for mesh in used)
+    if total > MAX_BYTES:
+        raise place.error(f"its scene draws {total:,} corners: at most {MAX_BYTES:,} are read")
+
+
+def _count(item: dict[str, Any], key: str, default: int | None = None) -> int:
+    value = item.get(key, default)
+    if not isinstance(value, int) or isinstance(value, bool) or value < 0:
+        raise ValueError(f"{key} is {value!r}")
+    return value
+
+
+def _parts(place: Place, scene: Any) -> Parts:
+    """The scene's triangles in one frame, or its points if there are none."""
+    vertices: list[FloatArray] = []
+    faces: list[IntArray] = []
+    points: list[FloatArray] = []
+    count = 0
+    for node in scene.graph.nodes_geometry:
+        world_from_node, name = scene.graph[node]
+        geometry = scene.geometry[name]
+        placed = _placed(place, np.asarray(geometry.vertices), np.asarray(world_from_node))
+        if not hasattr(geometry, "faces"):
+            # Lines have entities; what is left are points.
+            points += [] if hasattr(geometry, "entities") else [placed]
+            continue
+        corners = np.asarray(geometry.faces, dtype=np.int64)
+        if corners.size and (corners.min() < 0 or corners.max() >= len(placed)):
+            raise place.error(
+                f"vertex {corners.max()} of mesh {name[:40]!r} is out of range: it has "
+                f"{len(placed):,} vertices"
+            )
+        if np.linalg.det(world_from_node[:3, :3]) < 0.0:  # a mirror image, inside out
+            corners = corners[:, ::-1]
+        vertices.append(placed)
+        faces.append(corners + count)
+        count += len(placed)
+    if sum(map(len, faces)):
+        triangles = np.concatenate(faces)
+        numbers = np.arange(len(triangles), dtype=np.int64)
+        return Parts(np.concatenate(vertices), None, (Polygons(numbers, triangles),))
+    if points:
+        return Parts(np.concatenate(points))
+    raise place.error("its scene has neither triangles nor points")
+
+
+def _placed(place: Place, vertices: FloatArray, world_from_node: FloatArray) -> FloatArray:
+    x = vertices.astype(np.float64) @ world_from_node[:3, :3].T + world_from_node[:3, 3]
+    if not math.isfinite(float(np.abs(x).max(initial=0.0))):
+        raise place.error("coordinates must be finite")
+    return x

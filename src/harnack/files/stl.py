@@ -1,0 +1,79 @@
+"""Reading .stl files, binary and ascii."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from harnack.files.file_format import Place, excerpt
+from harnack.files.surface_parts import Parts, Polygons
+from harnack.files.text_tables import Lines, content_lines, read_numbers
+from harnack.geometry.convex_volume import FloatArray
+from harnack.geometry.singular import weld_vertices
+
+_HEADER = 84
+_FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+_KEYWORDS = (b"solid", b"facet", b"outer", b"vertex", b"endloop", b"endfacet", b"endsolid")
+
+
+def read_stl(path: Path, data: bytes) -> Parts:
+    """The triangles of an .stl file, corners at the same position made one vertex.
+
+    Raises:
+        FileFormatError: truncated, malformed, a coordinate that is not finite, no triangles.
+    """
+    corners = _binary(path, data) if _is_binary(data) else _text(path, data)
+    if not len(corners):
+        raise Place(path).error("it holds no triangles")
+    bad = np.flatnonzero(~np.isfinite(corners).all(axis=1))
+    if bad.size:
+        raise Place(path, f"triangle {bad[0] // 3}").error("coordinates must be finite")
+    distinct, index = np.unique(weld_vertices(corners), return_inverse=True)
+    faces = index.reshape(-1, 3).astype(np.int64)
+    return Parts(corners[distinct], None, (Polygons(np.arange(len(faces), dtype=np.int64), faces),))
+
+
+def _is_binary(data: bytes) -> bool:
+    """Many binary files begin with "solid" as well, so their length decides first."""
+    if len(data) >= _HEADER and len(data) == _HEADER + _count(data) * _FACET.itemsize:
+        return True
+    return data.lstrip()[:5].lower() != b"solid" or b"\0" in data
+
+
+def _count(data: bytes) -> int:
+    return int.from_bytes(data[_HEADER - 4 : _HEADER], "little")
+
+
+def _binary(path: Path, data: bytes) -> FloatArray:
+    if len(data) < _HEADER:
+        raise Place(path).error(
+            f"{len(data)} bytes are too few for an .stl file: it begins with 'solid' or with a "
+            f"header of {_HEADER} bytes"
+        )
+    count, held = _count(data), (len(data) - _HEADER) // _FACET.itemsize
+    if count > held:
+        raise Place(path).error(
+            f"its header promises {count:,} triangles, but there is room for {held:,}: the file is "
+            "truncated, or no .stl file"
+        )
+    facets = np.frombuffer(data, _FACET, count, _HEADER)
+    return facets["corners"].reshape(-1, 3).astype(np.float64)
+
+
+def _text(path: Path, data: bytes) -> FloatArray:
+    lines = content_lines(path, data)
+    words = [line.split(None, 1)[0].lower() for line in lines.text]
+    for k, word in enumerate(words):
+        if word not in _KEYWORDS:
+            raise lines.place(k).error(f"{excerpt(word)} is no .stl statement")
+    if words[-1] != b"endsolid":
+        raise lines.place(len(words) - 1).error("the file ends before 'endsolid': it is truncated")
+    at = [k for k, word in enumerate(words) if word == b"vertex"]
+    facets = words.count(b"facet")
+    if len(at) != 3 * facets:
+        raise Place(path).error(f"{len(at):,} vertices in {facets:,} facets: each needs three")
+    if not at:
+        return np.zeros((0, 3))
+    rows = [lines.text[k][len(b"vertex") :] for k in at]
+    return read_numbers(Lines(path, rows, [lines.numbers[k] for k in at]), 3)

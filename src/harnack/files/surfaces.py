@@ -1,0 +1,218 @@
+"""Reading surfaces from files: meshes, point clouds and curves, and saying which it was."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from harnack.choices import did_you_mean
+from harnack.files.file_format import FileFormatError, Place, read_bytes
+from harnack.files.gltf import read_gltf
+from harnack.files.loops import read_loops
+from harnack.files.obj_surface import read_obj_surface
+from harnack.files.off import read_off
+from harnack.files.ply_surface import read_ply_surface
+from harnack.files.stl import read_stl
+from harnack.files.surface_parts import Parts, triangles
+from harnack.files.xyz_text import read_xyz
+from harnack.geometry.clouds import CloudError, checked_normals, checked_points
+from harnack.geometry.convex_volume import FloatArray
+from harnack.geometry.curves import CurveError, validate_loops
+from harnack.geometry.meshes import IntArray, MeshError, without_zero_area_faces
+from harnack.geometry.singular import net_faces, singular_edges, singular_loops, weld_vertices
+
+__all__ = ["SURFACE_FILES", "Cloud", "Loops", "Mesh", "ReadAs", "read_surface"]
+
+ReadAs: TypeAlias = Literal["winding", "dipole", "loops"]
+
+_READERS: dict[str, Callable[[Path, bytes], Parts]] = {
+    ".obj": read_obj_surface, ".ply": read_ply_surface, ".stl": read_stl, ".off": read_off,
+    ".glb": read_gltf, ".gltf": read_gltf, ".xyz": read_xyz,
+}  # fmt: skip
+_LOOP_FILES = (".obj", ".ply", ".loops")
+SURFACE_FILES = (*_READERS, ".loops")
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles from a file, as `validate_mesh` returns them. said: what was found, and why."""
+
+    vertices: FloatArray
+    faces: IntArray
+    said: str
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """Points (n, 3) from a file, with unit normals (n, 3) and areas (n,) where it has them.
+
+    said: what was found, and why it counts as a point cloud.
+    """
+
+    points: FloatArray
+    normals: FloatArray | None
+    areas: FloatArray | None
+    said: str
+
+
+@dataclass(frozen=True, eq=False)
+class Loops:
+    """Closed curves from a file, (n, 3) each. said: what was found, and why they are curves."""
+
+    loops: tuple[FloatArray, ...]
+    said: str
+
+
+def read_surface(path: str | os.PathLike[str], as_: ReadAs | None = None) -> Mesh | Cloud | Loops:
+    """What a surface file (.obj, .ply, .stl, .off, .glb, .gltf, .xyz, .loops) describes.
+
+    Faces make a mesh, except polygons of an .obj or .ply file of which some have more than four
+    corners and none share an edge: these are curves, as are polylines without faces. Points alone
+    make a cloud, with normals from nx ny nz (.ply), from as many `vn` as `v` (.obj) or from columns
+    4 to 6 (.xyz). Polygons are cut into triangles, the nodes of a scene put in their places, and
+    faces of zero area left out.
+
+    as_: "winding": the faces, as a mesh. "dipole": the points; of a mesh the centers of its
+    triangles, with their normals and areas. "loops": what `read_loops` finds; of a mesh its
+    boundary, the singular edges joined. None decides as above.
+
+    Raises:
+        FileFormatError: unreadable, malformed, truncated or hostile; of another format; nothing in
+            it that can be taken as asked.
+    """
+    path = Path(path)
+    kind = path.suffix.lower()
+    if as_ not in (None, "winding", "dipole", "loops"):
+        raise ValueError(
+            f'as_ must be "winding", "dipole", "loops" or None, not {as_!r}'
+            + did_you_mean(as_, ("winding", "dipole", "loops"))
+        )
+    if kind not in SURFACE_FILES:
+        raise FileFormatError(f"{path}: surfaces are read from {', '.join(SURFACE_FILES)} files")
+    # Wild numbers overflow on the way to the check that refuses them.
+    with np.errstate(over="ignore", invalid="ignore"):
+        return _read(path, kind, as_)
+
+
+def _read(path: Path, kind: str, as_: ReadAs | None) -> Mesh | Cloud | Loops:
+    if kind == ".loops":
+        _refuse(path, as_, ("loops",), "curves")
+        return _loops(path, "curves, since the file lists nothing else")
+    parts = _READERS[kind](path, read_bytes(path))
+    try:
+        if parts.polygons:
+            return _of_faces(path, parts, as_)
+        if parts.has_lines:
+            _refuse(path, as_, ("loops",), "polylines")
+            return _loops(path, "polylines without faces: curves")
+        if as_ == "loops" and kind == ".ply":
+            return _loops(path, "points joined in their order, as asked: a curve")
+        _refuse(path, as_, ("dipole",), "points")
+        return _cloud(parts)
+    except (MeshError, CloudError) as error:
+        raise Place(path).error(str(error)) from error
+
+
+def _refuse(path: Path, as_: ReadAs | None, possible: tuple[str, ...], held: str) -> None:
+    """Raises unless what was asked for can be made of what the file holds."""
+    needs = {"winding": "faces", "dipole": "points or faces", "loops": "polylines or faces"}
+    if as_ is not None and as_ not in possible:
+        raise Place(path).error(
+            f'it holds {held} only: it cannot be taken as "{as_}", which needs {needs[as_]}'
+        )
+
+
+def _of_faces(path: Path, parts: Parts, as_: ReadAs | None) -> Mesh | Cloud | Loops:
+    can_be_loops = path.suffix.lower() in _LOOP_FILES
+    if as_ == "loops" and parts.has_lines and can_be_loops:
+        return _loops(path, "polylines and faces, taken as curves as asked")
+    if as_ in (None, "loops") and can_be_loops and _are_curves(parts):
+        return _loops(path, "polygons of which no two share an edge: curves")
+    mesh = _mesh(parts)
+    if as_ == "dipole":
+        return _centers(mesh)
+    if as_ == "loops":
+        return _boundary(path, mesh)
+    return mesh
+
+
+def _are_curves(parts: Parts) -> bool:
+    """Whether some polygon has more than four corners, and no two share an edge."""
+    if max(group.corners.shape[1] for group in parts.polygons) <= 4:
+        return False
+    same = weld_vertices(parts.vertices)
+    ends = [same[group.corners] for group in parts.polygons]
+    begin = np.concatenate([corners.ravel() for corners in ends])
+    end = np.concatenate([np.roll(corners, -1, axis=1).ravel() for corners in ends])
+    keys = np.minimum(begin, end) * len(same) + np.maximum(begin, end)
+    return len(np.unique(keys)) == len(keys)
+
+
+def _mesh(parts: Parts) -> Mesh:
+    found = triangles(parts)
+    vertices, faces = without_zero_area_faces(parts.vertices, found)
+    net = net_faces(weld_vertices(vertices)[faces])
+    if not len(net.faces):
+        raise MeshError(f"its {len(faces):,} faces cancel each other: there is no surface")
+    edges, _ = singular_edges(net.faces, net.multiplicity)
+    count = f"{len(faces):,} triangles"
+    if len(edges) == 0:
+        said = f"{count} without singular edges: a closed mesh"
+        middle = vertices.mean(axis=0)
+        if np.linalg.det(vertices[faces] - middle).sum() < 0.0:
+            said += ", whose faces look inward (the winding number inside is negative)"
+    elif len(edges) >= len(faces):
+        said = f"{count}, {len(edges):,} singular edges: a triangle soup"
+    else:
+        said = f"{count}, {len(edges):,} singular edges: a mesh with holes or faces turned round"
+    if len(found) > len(faces):
+        said += f"; {len(found) - len(faces):,} of zero area left out"
+    if len(faces) > len(net.faces):
+        said += f"; {len(faces) - len(net.faces):,} are added to or cancelled by others"
+    if parts.has_lines:
+        said += "; polylines not used"
+    return Mesh(vertices, faces, said)
+
+
+def _centers(mesh: Mesh) -> Cloud:
+    corners = mesh.vertices[mesh.faces]
+    normal = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(normal, axis=1)
+    said = f"{len(area):,} triangles, each taken as a point with its normal and area, as asked"
+    return Cloud(corners.mean(axis=1), normal / area[:, None], area, said)
+
+
+def _boundary(path: Path, mesh: Mesh) -> Loops:
+    edges, weights = singular_edges(weld_vertices(mesh.vertices)[mesh.faces])
+    if not len(edges):
+        raise Place(path).error(
+            'its faces form a closed surface, which has no boundary: it cannot be taken as "loops"'
+        )
+    try:
+        joined = singular_loops(edges, weights)
+        loops = validate_loops([mesh.vertices[loop] for loop in joined])
+    except CurveError as error:
+        raise Place(path).error(str(error)) from error
+    noun = "loop" if len(loops) == 1 else "loops"
+    said = f"{len(loops):,} {noun} of {sum(weights):,} edges: the boundary of the faces, as asked"
+    return Loops(loops, said)
+
+
+def _cloud(parts: Parts) -> Cloud:
+    points = checked_points(parts.vertices)
+    count = f"{len(points):,} points"
+    if parts.normals is None:
+        return Cloud(points, None, None, f"{count} without faces or normals: a point cloud")
+    normals = checked_normals(parts.normals, len(points))
+    return Cloud(points, normals, None, f"{count} with normals, no faces: a point cloud")
+
+
+def _loops(path: Path, why: str) -> Loops:
+    loops = tuple(read_loops(path))
+    noun = "loop" if len(loops) == 1 else "loops"
+    return Loops(loops, f"{len(loops):,} {noun} of {sum(map(len, loops)):,} vertices: {why}")
