@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import backend_of, choose_backend, to_numpy, to_vector3
+from harnack.backend.extrema import fmax
 from harnack.fields.field import Field
 
 if TYPE_CHECKING:
@@ -23,6 +24,9 @@ FloatArray = npt.NDArray[np.float64]
 
 # Points in one kernel: enough to keep a GPU busy, few enough to keep memory small.
 _AT_ONCE = 1 << 20
+# Of the total weight of dipoles: the rounding of their moments, which are summed up in double
+# precision.
+_MOMENTS = 32 * 2.0**-53
 # Cells along an axis, as a power of two; three of them make a key of 15 bits, which NumPy sorts
 # by radix.
 _BITS = 5
@@ -44,19 +48,23 @@ class Values:
     gradient_error: Real = 0.0
     hessian_error: Real = 0.0
 
-    def far_away(self, x: Vec3, terms: int) -> Values:
-        """With what underflow does to so many terms in their bounds, seen from x in unit lengths.
+    def far_away(self, x: Vec3, terms: int, weight: float) -> Values:
+        """With what far points lose in addition in their bounds, x in unit lengths.
 
-        Terms of derivatives are products of what falls like |x|^-5 and grows like |x|^2; a number
-        below the smallest normal one is lost on the way, more than sums of |x|^-4 and |x|^-5 say.
+        Terms of derivatives, of which there are so many, are products of what falls like |x|^-5 and
+        grows like |x|^2: a number below the smallest normal one is lost on the way. And where
+        dipoles nearly cancel, sums of their moments have the rounding of all their weight, not of
+        what is left of it.
         """
         smallest = float(dr.smallest(type(x.x)))
         lost = 4 * smallest * terms * (1 + dr.squared_norm(x))
+        inverse = dr.rcp(fmax(dr.norm(x), type(x.x)(4)))
+        moved = _MOMENTS * weight * dr.square(inverse)
         return dataclasses.replace(
             self,
-            error=self.error + lost,
-            gradient_error=self.gradient_error + lost,
-            hessian_error=self.hessian_error + lost,
+            error=self.error + lost + moved,
+            gradient_error=self.gradient_error + lost + 4 * moved * inverse,
+            hessian_error=self.hessian_error + lost + 24 * moved * dr.square(inverse),
         )
 
     def rescaled(self, size: Real) -> Values:

@@ -103,7 +103,8 @@ class DipolePotential(BatchedField):
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> Values:
         on = self._batch(backend_of(x))
         x = on.unit(x)
-        return on.tree.at(x, derivatives, closer).far_away(x, 64).rescaled(on.size)
+        weight = float(self.areas.sum()) / self._size**2
+        return on.tree.at(x, derivatives, closer).far_away(x, 64, weight).rescaled(on.size)
 
     def _batch(self, backend: Backend) -> _OnDevice:
         """The evaluator for points, which is made once a backend."""

@@ -184,7 +184,8 @@ class ScreenedWindingNumber(BatchedField):
             sums.gradient_error + slope,
             sums.hessian_error + second,
         )
-        return values.far_away(x, 64).rescaled(on.size)
+        weight = float(self.areas.sum()) / (4 * math.pi * self._size**2)
+        return values.far_away(x, 64, weight).rescaled(on.size)
 
     def _rounding(
         self, backend: Backend, sums: ScreenedSums, unit: Real

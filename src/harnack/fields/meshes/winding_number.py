@@ -123,7 +123,8 @@ class WindingNumber(BatchedField):
         # The side of a triangle that x is on, to rounding, is not known.
         on_triangle = jumps_within(on.rays, x, _ON_TRIANGLE * epsilon_at(x))
         values = dataclasses.replace(values, error=values.error + on_triangle)
-        return values.far_away(x, 64 + len(self.mesh.singular)).rescaled(on.size)
+        weight = self.mesh.area / (4 * math.pi * self.mesh.size**2)
+        return values.far_away(x, 64 + len(self.mesh.singular), weight).rescaled(on.size)
 
     def _batch(self, backend: Backend) -> _OnDevice:
         """The evaluator for points, which is made once a backend."""
