@@ -16,7 +16,7 @@ from harnack.backend.lengths import length
 from harnack.certify import Levels, certify
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.tracer.stretches import STATUS, State, Walk, loop, meet
-from harnack.tracer.tolerance import Status, Tolerance
+from harnack.tracer.tolerance import PreparedTolerance, Status
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -76,7 +76,7 @@ class PreparedLevelSet:
     levels: Levels
     volume: Volume | None
     bound: Longest
-    tolerance: Tolerance
+    tolerance: PreparedTolerance
     max_steps: int
     overstep: float
 
@@ -136,6 +136,8 @@ class PreparedLevelSet:
 
         A hit is a point where f is within the tolerance of a level *after* the truncation error of
         f is taken off; where rounding leaves f less certain than that, within twice what it leaves.
+        A trial point at which the level is nearer than the error of f may lie behind the root, by
+        less than the tolerance: it is a hit (`_finer`), so nothing is passed there.
 
         In rounded arithmetic a surface could slip through between the two looks, so both see
         it nearer by the rounding of value and position together (`_blur`).

@@ -79,7 +79,7 @@ class LevelSet:
             Levels(levels, self.field.period),
             None if volume is None else volume.prepare(backend),
             self.bound,
-            self.tolerance,
+            self.tolerance.prepare(backend),
             self.max_steps,
             self.overstep,
         )

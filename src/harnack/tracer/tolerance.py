@@ -12,7 +12,7 @@ import drjit as dr
 from harnack.backend.extrema import fmax
 
 if TYPE_CHECKING:
-    from harnack.backend import Real
+    from harnack.backend import Backend, Real
 
 
 class Status(enum.IntEnum):
@@ -51,8 +51,20 @@ class Tolerance:
         if self.distance == 0 and self.value == 0 and self.per_length == 0:
             raise ValueError("tolerance must be positive: a level set is never met exactly")
 
+    def prepare(self, backend: Backend) -> PreparedTolerance:
+        """The same as numbers of a backend, which no kernel is compiled anew for."""
+        numbers = (self.distance, self.per_length, self.value)
+        return PreparedTolerance(*(dr.opaque(backend.Float, number) for number in numbers))
+
+
+@dataclass(frozen=True)
+class PreparedTolerance:
+    """A `Tolerance` on a backend."""
+
+    distance: Real
+    per_length: Real
+    value: Real
+
     def in_value(self, steepness: Real, t: Real) -> Real:
         """How far in value a level may be from f to be a hit, where |grad f| = steepness."""
-        length = dr.fma(t, self.per_length, self.distance) if self.per_length else self.distance
-        close = steepness * length
-        return fmax(close, type(close)(self.value)) if self.value > 0 else close
+        return fmax(steepness * dr.fma(t, self.per_length, self.distance), self.value)

@@ -129,7 +129,14 @@ class SolidAngle(Field):
         unit = tuple((loop - centre) / self._size for loop in self._net)
         edges = upload(backend, unit) if unit else None
         magnitude = float(np.abs(np.concatenate(self._net or self.loops)).max() / self._size)
-        prepared._device = _OnDevice(*placed(backend, centre, self._size), edges, magnitude)
+        # Each of n factors turns the product by a few roundings, of random sign.
+        turned = 8 + 2 * math.sqrt(sum(len(loop) for loop in self._net))
+        roundings = (6 + 2 * magnitude, turned)
+        prepared._device = _OnDevice(
+            *placed(backend, centre, self._size),
+            edges,
+            *(dr.opaque(backend.Float, backend.epsilon * one) for one in roundings),
+        )
         return prepared
 
     def evaluate(self, p: Vec3) -> Sample:
@@ -141,7 +148,7 @@ class SolidAngle(Field):
         x = on.unit(p)
         sums = sum_over_edges(on.edges, x, variation=self.certificate == "edges")
         epsilon = on.backend.epsilon
-        rounding = self._rounding(on)
+        rounding = on.rounding
         distance = sums.distance * (1 - _ROUNDING) - rounding
         if self.certificate == "edges":
             ball = self._edge_ball(sums, distance)
@@ -153,8 +160,7 @@ class SolidAngle(Field):
         met = sums.distance <= 2 * rounding
         steep = on.backend.Array3f(0, 0, 4 * _PERIOD / rounding)
         gradient = dr.select(met, steep, sums.gradient) / on.size
-        # Each of n factors turns the product by a few roundings, of random sign.
-        error = epsilon * (8 + 2 * math.sqrt(sum(len(loop) for loop in self._net)))
+        error = on.value_rounding
         if self.certificate == "edges":
             # Ends of edges, rounded, move each edge's angle by that times its field, which is at
             # most twice `first`: where edges nearly cancel, the gradient does not show it.
@@ -175,7 +181,7 @@ class SolidAngle(Field):
         edges = on.edges
         if self._direction is None or edges is None:
             return ()
-        line = Line(x, on.backend.Array3f(self._direction), self._rounding(on))
+        line = Line(x, on.backend.Array3f(self._direction), on.rounding)
 
         def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
             return rates_along(edges, line, lengths, active)
@@ -183,15 +189,6 @@ class SolidAngle(Field):
         known = known_along(line, sums.gradient, sums.distance, rates)
         size = on.size
         return tuple(LineLipschitz(one.constant / size, one.radius * size) for one in known)
-
-    @staticmethod
-    def _rounding(on: _OnDevice) -> float:
-        """How far a point may be from where it was meant to be, in units of the curve.
-
-        Near the curve p - centre is exact, division and the curve's own coordinates have a few
-        roundings of size 1, and p itself was rounded once, at the curve's distance from 0.
-        """
-        return on.backend.epsilon * (6 + 2 * on.magnitude)
 
     def _constant(self, p: Vec3) -> Sample:
         """The sample of f = 0, for a curve of which nothing is left: it is true on any ball. The
@@ -234,7 +231,7 @@ class SolidAngle(Field):
         x = on.unit(p)
         sums, unit = sum_over_edges(on.edges, x, variation=True), epsilon_at(x)
         distance = sums.distance - 4 * unit
-        known = (distance > 0) & (sums.distance > 2 * self._rounding(on))  # see `evaluate`
+        known = (distance > 0) & (sums.distance > 2 * on.rounding)  # see `evaluate`
         share = dr.select(known, dr.square(dr.square(sums.distance / distance)), dr.inf)
         slope = (SLOPE_ROUNDINGS * 2 / 3) * unit * sums.second * share / on.size
         second = 0.5 * SECOND_ROUNDINGS * unit * sums.second / sums.distance * share
@@ -313,11 +310,17 @@ class SolidAngle(Field):
 
 @dataclass(frozen=True)
 class _OnDevice(UnitCoordinates):
-    """The edges on a backend, None if there are none, and how large their coordinates are, in
-    units of the curve."""
+    """The edges on a backend, None if there are none.
+
+    rounding: how far a point may be from where it was meant to be, in units of the curve. Near the
+        curve p - centre is exact, division and the curve's own coordinates have a few roundings of
+        size 1, and p itself was rounded once, at the curve's distance from 0.
+    value_rounding: what rounding may do to a product of so many factors.
+    """
 
     edges: EdgeBuffer | None
-    magnitude: float
+    rounding: Real
+    value_rounding: Real
 
 
 def _is_drjit(value: Any) -> bool:

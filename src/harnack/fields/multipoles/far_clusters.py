@@ -113,9 +113,9 @@ class FarClusters:
     accuracy: float
     rough: float
     order: int
-    looser: float
-    steeper: float
-    bent: float
+    looser: Real
+    steeper: Real
+    bent: Real
 
     @classmethod
     def of(
@@ -147,8 +147,9 @@ class FarClusters:
             bent = max(bent, float((second[some] / error[some]).max(initial=0.0)))
             nodes.append(node_columns(level, order, rough, error))
         packed = pack(backend, tree, nodes, primitives)
-        ratios = steeper * (1 + 1e-6), bent * (1 + 1e-6)
-        return cls(backend, packed, accuracy, rough, order, looser, *ratios)
+        ratios = looser, steeper * (1 + 1e-6), bent * (1 + 1e-6)
+        on_device = (dr.opaque(backend.Float, ratio) for ratio in ratios)
+        return cls(backend, packed, accuracy, rough, order, *on_device)
 
     def at(
         self, x: Vec3, derivatives: int, add_leaf: AddToErrors, closer: Real, own: Sums = ()
@@ -233,7 +234,7 @@ class FarClusters:
         far_off = _FAR * (1 + dr.max(dr.abs(x)))
         start = (zero, vector(0), zero, zero, zero, real(far_off), zero, zero, *own)
         value, g, truncation, slope, *rest = walk(self.tree, visit, start, active)
-        looser = dr.select(detail < 1, real(self.looser), 1)
+        looser = dr.select(detail < 1, self.looser, 1)
         left_out = looser * truncation, looser * self.steeper * slope
         return Nearby(self.backend, value, g, *left_out, *rest[:4]), tuple(rest[4:])
 
