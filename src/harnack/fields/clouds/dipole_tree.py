@@ -40,7 +40,7 @@ class DipoleTree:
     """sum_i m_i.(y_i - x)/|y_i - x|^3 on a backend; a record holds y_i, m_i and |m_i|."""
 
     clusters: FarClusters
-    rounding: float
+    rounding: Real
 
     @classmethod
     def of(
@@ -59,7 +59,8 @@ class DipoleTree:
         # Rounded terms, most of them of the size of their share of the whole, random in sign.
         area = float(weight.sum())
         rounding = backend.epsilon * (16 + math.sqrt(len(points)) / 8) * max(1.0, area)
-        return cls(FarClusters.of(backend, tree, levels, rows, accuracy), rounding)
+        clusters = FarClusters.of(backend, tree, levels, rows, accuracy)
+        return cls(clusters, dr.opaque(backend.Float, rounding))
 
     def at(self, x: Vec3, derivatives: int, closer: Real) -> Values:
         """Value and derivatives (as asked for) at x, `closer` as for `FarClusters.at`."""

@@ -38,14 +38,17 @@ _SHARE = 1 / (4 * math.pi)
 
 @dataclass(frozen=True)
 class ExactWinding:
-    """w of a mesh on a backend, in units in which the mesh has a size of about one."""
+    """w of a mesh on a backend, in units in which the mesh has a size of about one.
+
+    rounding: what rounding may add to w.
+    """
 
     backend: Backend
     rays: TriangleRays
     edges: LiftedEdges | None
     trails: EdgeTrails | None
     chains: EdgeChains | None
-    edge_count: int
+    rounding: Real
 
     @classmethod
     def of(
@@ -53,7 +56,7 @@ class ExactWinding:
     ) -> ExactWinding:
         """Everything uploaded; traced: for `on_stretch` as well."""
         if not len(mesh.singular):
-            return cls(backend, rays, None, None, None, 0)
+            return cls(backend, rays, None, None, None, rounding_of_sum(backend, 0))
         vertices, edges = mesh.unit_vertices, mesh.singular
         return cls(
             backend,
@@ -61,7 +64,7 @@ class ExactWinding:
             LiftedEdges.upload(backend, vertices, edges),
             EdgeTrails.upload(backend, vertices, edges),
             EdgeChains.upload(backend, vertices, edges) if traced else None,
-            len(edges),
+            rounding_of_sum(backend, len(edges)),
         )
 
     @property
@@ -73,11 +76,6 @@ class ExactWinding:
     def coarsest_detail(self) -> float:
         """`Field.coarsest_detail`: of chains, by how much less is left out in a close sample."""
         return 0.5
-
-    @property
-    def rounding(self) -> float:
-        """What rounding may add to w."""
-        return rounding_of_sum(self.backend, self.edge_count)
 
     def values(self, x: Vec3) -> Real:
         """w at points, not while a loop is recorded: as `at`, for a third of the work.

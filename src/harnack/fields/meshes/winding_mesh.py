@@ -8,6 +8,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
@@ -20,7 +21,7 @@ from harnack.tree.hierarchy import FloatArray, IntArray
 from harnack.tree.triangles import MOST_TRIANGLES, PARITY, triangle_records
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend
+    from harnack.backend import Backend, Real
 
 # Triangles of a leaf at most, and children of a node: by experiment.
 _LEAF_SIZE, _ARITY = 8, 4
@@ -204,9 +205,9 @@ def _centre_and_size(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray,
     return single(0.5 * (low + high)), float(size)
 
 
-def rounding_of_sum(backend: Backend, terms: int) -> float:
+def rounding_of_sum(backend: Backend, terms: int) -> Real:
     """How far rounding may move w, a sum of so many terms, each rounded a few times.
 
     Errors are random in sign, so that they add up as the root of their number.
     """
-    return backend.epsilon * (16 + math.sqrt(terms))
+    return dr.opaque(backend.Float, backend.epsilon * (16 + math.sqrt(terms)))

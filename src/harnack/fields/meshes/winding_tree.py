@@ -43,7 +43,7 @@ class TreeWinding:
     """w of a mesh on a backend, in units in which the mesh has a size of about one."""
 
     clusters: FarClusters
-    rounding: float
+    rounding: Real
 
     @classmethod
     def of(cls, backend: Backend, mesh: WindingMesh, accuracy: float, order: int) -> TreeWinding:
