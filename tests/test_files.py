@@ -12,8 +12,9 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
+from harnack.files import file_format
 from harnack.files.loops import FileFormatError, check_writable, read_loops, write_atomically
-from harnack.geometry import chains, file_format, shapes
+from harnack.geometry import chains, shapes
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 CORNERS = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]

@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from harnack.backend import choose_backend, to_numpy
-from harnack.fields import moments
+from harnack.fields.multipoles import moments
 from harnack.fields.multipoles.far_clusters import node_columns
 from harnack.fields.multipoles.multipole import (
     Level,

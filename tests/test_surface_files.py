@@ -14,11 +14,11 @@ import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from harnack.files import gltf, obj_surface, ply_surface
 from harnack.files.file_format import FileFormatError
 from harnack.files.obj import read_obj
 from harnack.files.surface_parts import parts_of_contents, triangles
 from harnack.files.surfaces import Cloud, Loops, Mesh, read_surface
-from harnack.geometry import gltf, obj_surface, ply_surface
 from harnack.geometry.mesh_shapes import icosphere, remove_faces, torus_mesh
 from harnack.geometry.polygons import triangulate
 from harnack.geometry.singular import singular_edges, weld_vertices
