@@ -12,8 +12,7 @@ import numpy.typing as npt
 
 import harnack as hk
 from harnack.backend import choose_backend, to_vector3
-from harnack.fields.clouds.dipole import DipolePotential
-from harnack.fields.meshes.winding_number import WindingNumber
+from harnack.fields import DipolePotential, WindingNumber
 from harnack.geometry.mesh_shapes import bumpy_sphere, remove_faces
 
 from .scenes import EYE, camera

@@ -13,9 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import choose_backend, to_vector3
+from harnack.fields import WindingNumber
 from harnack.fields.batch import morton_order
-from harnack.fields.meshes.winding_number import WindingNumber
-from harnack.files import read_surface
 from harnack.geometry.mesh_shapes import MeshArrays, bumpy_sphere, remove_faces
 
 from .rays import machine
@@ -123,6 +122,9 @@ def throughput(surface: Path | None = None) -> str:
         ("bumpy sphere, closed", closed, cube, "exact"),
     ]
     if surface is not None:
+        # Here: `versions` runs this file with earlier versions of the package.
+        from harnack.files import read_surface
+
         read: Any = read_surface(surface, "winding")
         mesh = np.asarray(read.vertices, np.float64), np.asarray(read.faces, np.int64)
         groups += [(surface.stem, mesh, query_points(mesh[0]), m) for m in ("exact", "tree")]

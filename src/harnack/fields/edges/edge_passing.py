@@ -42,7 +42,7 @@ __all__ = ["Line", "known_along", "rates_along", "with_edge"]
 # Nearer to the curve than this part of its size, and with a slope below this part of the
 # gradient, a ray may run along the curve and asks what is known along its line; elsewhere only
 # with a slope so small that it may run along a flat part of the surface.
-_BESIDE, _FLAT, _GRAZING = 0.005, 0.25, 1e-3
+_BESIDE, _FLAT, _GRAZING = 0.001, 0.25, 1e-3
 # Of the distance to the curve, the powers that are the lengths asked about: from half of it to the
 # size of the curve.
 _LENGTHS = 6
