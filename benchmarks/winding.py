@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from harnack.backend import choose_backend, to_vector3
 from harnack.fields import WindingNumber
-from harnack.fields.batch import morton_order
+from harnack.fields.points import morton_order
 from harnack.geometry.mesh_shapes import MeshArrays, bumpy_sphere, remove_faces
 
 from .rays import machine

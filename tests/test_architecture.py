@@ -31,6 +31,7 @@ ROOMS = (
 # Within `fields`: the interface, what families share, and the families.
 FIELD_ROOMS = (
     "sheets",
+    "points",
     "field",
     "symmetric",
     "unit_coordinates",

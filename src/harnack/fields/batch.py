@@ -6,30 +6,22 @@ import abc
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
-import numpy as np
-import numpy.typing as npt
 
-from harnack.backend import backend_of, choose_backend, to_numpy, to_vector3
+from harnack.backend import backend_of
 from harnack.backend.extrema import fmax
 from harnack.fields.field import Field
+from harnack.fields.points import FloatArray, at_points
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Precision, Real, Vec3
     from harnack.fields.symmetric import SymmetricSum
 
-FloatArray = npt.NDArray[np.float64]
-
-# Points in one kernel: enough to keep a GPU busy, few enough to keep memory small.
-_AT_ONCE = 1 << 20
 # Of the total weight of dipoles: the rounding of their moments, which are summed up in double
 # precision.
 _MOMENTS = 32 * 2.0**-53
-# Cells along an axis, as a power of two; three of them make a key of 15 bits, which NumPy sorts
-# by radix.
-_BITS = 5
 
 
 @dataclass(frozen=True)
@@ -99,12 +91,24 @@ class BatchedField(Field):
         beyond so many times the usual distance, at least 1; infinity approximates nothing.
         """
 
-    def value(self, points: Any, *, precision: Precision = "single") -> FloatArray:
-        """The values at points (n, 3): (n,)."""
+    def differentiable_value(self, p: Vec3) -> Real:
+        """f to first order about p: its value and, in reverse and forward mode, its gradient."""
+        with dr.suspend_grad():
+            at = self.values_at(dr.detach(p), 1)
+        return at.value + dr.dot(at.gradient, p - dr.detach(p))
+
+    def value(self, points: Any, *, precision: Precision = "single") -> Any:
+        if dr.is_array_v(type(points)):
+            if dr.grad_enabled(points):
+                return self.differentiable_value(points)
+            return self.values_at(points, 0).value
         return self._at(points, precision, 0, lambda at: (at.value,))[0]
 
-    def gradient(self, points: Any, *, precision: Precision = "single") -> FloatArray:
-        """The gradients at points (n, 3): (n, 3)."""
+    def gradient(self, points: Any, *, precision: Precision = "single") -> Any:
+        if dr.is_array_v(type(points)):
+            if dr.grad_enabled(points):
+                return super().gradient(points)
+            return self.values_at(points, 1).gradient
         return self._at(points, precision, 1, lambda at: (at.gradient,))[0]
 
     def value_and_gradient(
@@ -114,16 +118,8 @@ class BatchedField(Field):
         value, gradient = self._at(points, precision, 1, lambda at: (at.value, at.gradient))
         return value, gradient
 
-    def hessian(self, p: Any, *, precision: Precision = "single") -> Any:
-        """The second derivatives at p (n, 3): (n, 3, 3), symmetric.
-
-        Given a Dr.Jit 3-vector, three rows, as `Field.hessian` describes.
-        """
-        if dr.is_array_v(type(p)):
-            return _hessian(self.values_at(p, 2)).rows(backend_of(p).Array3f)
-        rows = self._at(p, precision, 2, lambda at: _hessian(at).parts())
-        xx, yy, zz, xy, xz, yz = rows
-        return np.moveaxis(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), 2, 0)
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        return _hessian(self.values_at(p, 2)).rows(backend_of(p).Array3f)
 
     def error_bound(self, points: Any, *, precision: Precision = "single") -> FloatArray:
         """How far `value` may be from the field at most, at points (n, 3): (n,).
@@ -164,66 +160,3 @@ def _hessian(values: Values) -> SymmetricSum:
     if values.hessian is None:
         raise RuntimeError("values_at(x, 2) gave no Hessian")
     return values.hessian
-
-
-def at_points(
-    points: Any,
-    kernel: Callable[[Backend, Vec3], tuple[Any, ...]],
-    precision: Precision,
-) -> tuple[npt.NDArray[Any], ...]:
-    """The arrays that `kernel` gives at points (n, 3), in their order.
-
-    The points are visited cell by cell along a Morton curve, so that neighbouring lanes walk a
-    tree together, which halves the time. Raises ValueError for other shapes, NaN or infinity.
-    """
-    backend = choose_backend(precision)
-    given = np.asarray(points)
-    to_vector3(backend, given[:1] if given.ndim == 2 else given, "points")  # shape, early
-    if given.dtype.kind not in "fiu":
-        raise TypeError(f"points must hold real numbers, not {given.dtype}")
-    if not np.isfinite(given).all():
-        bad = np.flatnonzero(~np.isfinite(given).all(axis=1))
-        raise ValueError(f"points has NaN or infinite values: entry {bad[0]}")
-    if not len(given):
-        return tuple(one[:0] for one in at_points(np.zeros((1, 3)), kernel, precision))
-    parts: list[tuple[npt.NDArray[Any], ...]] = []
-    for start in range(0, len(given), _AT_ONCE):
-        some = given[start : start + _AT_ONCE]
-        x = to_vector3(backend, some, "points")
-        order = morton_order(backend, x)
-        results = kernel(backend, dr.gather(backend.Array3f, x, order))
-        places = [_back_in_place(one, order, len(some)) for one in results]
-        dr.eval(*places)
-        parts.append(tuple(to_numpy(one) for one in places))
-    if len(parts) == 1:
-        return parts[0]
-    return tuple(np.concatenate(pieces) for pieces in zip(*parts, strict=True))
-
-
-def _back_in_place(values: Any, order: Any, n: int) -> Any:
-    """Values of the points in the order visited, in the order given."""
-    kind = cast("Any", type(values))
-    if dr.depth_v(kind) == 1:
-        out = dr.zeros(kind, n)
-        dr.scatter(out, values, order)
-        return out
-    return kind([_back_in_place(one, order, n) for one in values])
-
-
-def morton_order(backend: Backend, x: Vec3) -> Any:
-    """An order that visits points cell by cell, cells along a Morton curve (a Dr.Jit UInt32)."""
-    index, vector = backend.UInt32, backend.Array3f
-    n = dr.width(x)
-    if n < 2:
-        return dr.arange(index, n)
-    low = vector(*(dr.min(one) for one in x))
-    sides = [dr.max(x[k]) - low[k] for k in range(3)]
-    size = dr.maximum(dr.maximum(sides[0], sides[1]), sides[2])
-    scale = (2**_BITS - 1e-3) / dr.maximum(size, 1e-30)
-    key = index(0)
-    for axis in range(3):
-        cell = index((x[axis] - low[axis]) * scale)
-        for bit in range(_BITS):
-            key |= (cell & (1 << bit)) << (2 * bit + axis)
-    keys = to_numpy(key).astype(np.uint16)
-    return index(np.argsort(keys, kind="stable").astype(np.uint32))

@@ -15,11 +15,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import drjit as dr
+import numpy as np
+import numpy.typing as npt
 
+from harnack.fields.points import at_points
 from harnack.fields.sheets import NO_SHEET, Crossing, NearestSheet
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.backend import Backend, Mask, Precision, Real, Vec3
     from harnack.geometry import Volume
 
 
@@ -124,6 +127,22 @@ _HOW = (
 )
 
 
+def _of_points(hessian: Callable[[Any, Vec3], Any]) -> Callable[..., Any]:
+    """The same method, which also takes NumPy points and gives NumPy matrices."""
+
+    @functools.wraps(hessian)
+    def general(self: Any, p: Any, *, precision: Precision = "single") -> Any:
+        if dr.is_array_v(type(p)):
+            return hessian(self, p)
+
+        def kernel(backend: Backend, x: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+            return self.prepare(backend).hessian(x)
+
+        return np.stack(at_points(p, kernel, precision), axis=-2)
+
+    return general
+
+
 def _checked(evaluate: Callable[[Any, Vec3], Sample]) -> Callable[[Any, Vec3], Sample]:
     """The same method, which raises TypeError if it returns anything but a proper `Sample`."""
 
@@ -182,11 +201,14 @@ class Field(abc.ABC):
     """What detail 0 amounts to, as a detail in (0, 1]: see `at_detail`."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Has what `evaluate` returns checked, wherever it is called first."""
+        """Has what `evaluate` returns checked, and `hessian` take NumPy arrays too."""
         super().__init_subclass__(**kwargs)
         if "evaluate" in vars(cls):
             checked = _checked(cls.evaluate)
             cls.evaluate = checked  # pyright: ignore[reportAttributeAccessIssue]
+        if "hessian" in vars(cls):
+            general = _of_points(cls.hessian)
+            cls.hessian = general  # pyright: ignore[reportAttributeAccessIssue]
 
     @abc.abstractmethod
     def evaluate(self, p: Vec3) -> Sample:
@@ -228,10 +250,50 @@ class Field(abc.ABC):
         """
         return self.evaluate(p).value
 
+    def value(self, points: Any, *, precision: Precision = "single") -> Any:
+        """f at points (n, 3): (n,); at a single point (3,): a number.
+
+        A Dr.Jit 3-vector gives a Dr.Jit array, with derivatives with respect to whatever has them
+        enabled: the points and the field's parameters. Of an angle-valued field up to its period.
+
+        Raises TypeError or ValueError for other shapes, NaN or infinity.
+        """
+        if dr.is_array_v(type(points)):
+            if any(dr.grad_enabled(one) for one in (points, *self.parameters())):
+                return self.differentiable_value(points)
+            return self.evaluate(points).value
+        return self._samples_at(points, precision, lambda sample: sample.value)
+
+    def gradient(self, points: Any, *, precision: Precision = "single") -> Any:
+        """The gradients of f at points (n, 3): (n, 3); at a single point (3,): (3,).
+
+        A Dr.Jit 3-vector gives a Dr.Jit 3-vector, with derivatives with respect to the points if
+        they have them enabled and the field defines `hessian`. Raises as `value`.
+        """
+        if not dr.is_array_v(type(points)):
+            return self._samples_at(points, precision, lambda sample: sample.gradient)
+        if not dr.grad_enabled(points):
+            return self.evaluate(points).gradient
+        with dr.suspend_grad():
+            p = dr.detach(points)
+            gradient, rows = self.evaluate(p).gradient, self.hessian(p)
+        moved = points - p
+        return gradient + type(points)(*(dr.dot(row, moved) for row in rows))
+
+    def _samples_at(
+        self, points: Any, precision: Precision, wanted: Callable[[Sample], Any]
+    ) -> npt.NDArray[Any]:
+        def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
+            return (wanted(self.prepare(backend).evaluate(x)),)
+
+        return at_points(points, kernel, precision)[0]
+
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         """Rows of the symmetric matrix of second derivatives at p, in f per length squared.
 
-        Curvatures and second-order distances ask for it; tracing needs none.
+        Curvatures and second-order distances ask for it; tracing needs none. Fields define it for
+        Dr.Jit 3-vectors; called with points (n, 3) or (3,), and `precision`, as for `value`, it
+        then gives (n, 3, 3) or (3, 3).
         """
         del p
         raise NotImplementedError(

@@ -253,12 +253,6 @@ class ScreenedWindingNumber(BatchedField):
             raise RuntimeError("prepare(backend) comes first")
         return self._device
 
-    def differentiable_value(self, p: Vec3) -> Real:
-        """w to first order about p: its value and, in reverse and forward mode, its gradient."""
-        with dr.suspend_grad():
-            sample = self.evaluate(dr.detach(p))
-        return sample.value + dr.dot(sample.gradient, p - dr.detach(p))
-
     def check_levels(self, levels: tuple[float, ...]) -> None:
         """ValueError for a level lost in rounding. Any other is taken next to every dipole."""
         for level in levels:
