@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import scipy.spatial
 
 from harnack.distance.batches import FloatArray
 from harnack.tracer import trace
@@ -55,6 +54,8 @@ def nearest_seen(backend: Backend, surface: LevelSet, points: FloatArray) -> Flo
         hits = trace(surface, o, target - o, precision=backend.precision)
         if hits.hit.any():
             found = hits.position[hits.hit]
+            import scipy.spatial  # here: half a second that few need
+
             tree: Any = scipy.spatial.KDTree(found)
             near[missed] = found[tree.query(points[missed])[1]]
     return near

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import scipy.sparse
 
 from harnack.geometry.clouds import (
     CloudError,
@@ -112,6 +111,8 @@ def _spanning_forest(
     x: FloatArray, normals: FloatArray, nearest: npt.NDArray[np.int32]
 ) -> tuple[IntArray, IntArray]:
     """For each point its piece (n,), from 0, and its parent (n,); a root is its own parent."""
+    import scipy.sparse  # here: half a second that few need
+
     sparse: Any = scipy.sparse
     n, k = nearest.shape
     weight = np.empty((n, k))

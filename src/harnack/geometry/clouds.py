@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import scipy.spatial
 
 from harnack.geometry.convex_volume import FloatArray
 from harnack.geometry.meshes import IntArray
@@ -192,6 +191,8 @@ def point_tree(points: FloatArray) -> Any:
     """
     if len(points) < 2:
         raise CloudError("all points are at one position: a surface needs points beside each other")
+    import scipy.spatial  # here: half a second that few need
+
     spatial: Any = scipy.spatial
     return spatial.cKDTree(points)
 

@@ -10,7 +10,6 @@ from typing import Any
 import drjit as dr
 import numpy as np
 import numpy.typing as npt
-import scipy.spatial
 
 from harnack.backend import Backend, Real, Vec3, backend_of
 from harnack.geometry.convex_volume import FloatArray, as_points, checked_distance, rounding
@@ -118,6 +117,8 @@ def _hull_normals(x: FloatArray) -> tuple[FloatArray, bool]:
 
 def _facet_normals(x: FloatArray) -> FloatArray | None:
     """Facet normals by Qhull, which merges coplanar facets; None where it finds x degenerate."""
+    import scipy.spatial  # here: half a second that few need
+
     qhull: Any = scipy.spatial
     try:
         equations: FloatArray = qhull.ConvexHull(x).equations

@@ -79,8 +79,10 @@ def known_along(
     slope, steepness = dr.dot(gradient, line.v), dr.norm(gradient)
     flat = dr.select(distance < _BESIDE, _FLAT, _GRAZING) * steepness
     first = 0.5 * fmax(distance, type(distance)(1e-30))
-    lengths = tuple(dr.power(first, 1 - k / _LENGTHS) for k in range(_LENGTHS))
-    found = rates(lengths, dr.abs(slope) < flat)
+    longer, lengths = dr.power(first, -1 / _LENGTHS), [first]
+    for _ in range(_LENGTHS - 1):
+        lengths.append(lengths[-1] * longer)
+    found = rates(tuple(lengths), dr.abs(slope) < flat)
     pairs = zip(found, lengths, strict=True)
     return tuple(LineLipschitz(rate * (1 + _ROUNDING), length) for rate, length in pairs)
 
