@@ -14,7 +14,6 @@ import numpy.typing as npt
 
 from harnack.backend import choose_backend, to_vector3
 from harnack.fields import WindingNumber
-from harnack.fields.points import morton_order
 from harnack.geometry.mesh_shapes import MeshArrays, bumpy_sphere, remove_faces
 
 from .rays import machine
@@ -142,6 +141,8 @@ def throughput(surface: Path | None = None) -> str:
         "| median error | largest error |",
         "|---|---:|---|---:|---:|---:|---:|---:|---:|",
     ]
+    # Here, for the same reason.
+
     for name, mesh, points, method in groups:
         rows = compare(mesh, points, method)
         for row in rows:
