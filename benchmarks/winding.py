@@ -141,7 +141,6 @@ def throughput(surface: Path | None = None) -> str:
         "| median error | largest error |",
         "|---|---:|---|---:|---:|---:|---:|---:|---:|",
     ]
-    # Here, for the same reason.
 
     for name, mesh, points, method in groups:
         rows = compare(mesh, points, method)
@@ -152,6 +151,9 @@ def throughput(surface: Path | None = None) -> str:
 
 
 def _sorting(points: FloatArray) -> float:
+    # Here: `versions` runs this file with earlier versions of the package.
+    from harnack.fields.points import morton_order
+
     backend = choose_backend("single")
     x = to_vector3(backend, points.astype(np.float32))
 
