@@ -32,7 +32,8 @@ def in_batches(
     others: more vectors of the same shape that `compute` is given, one a lane; their values are
         not looked at.
 
-    Raises TypeError or ValueError for points that are not an (n, 3) array of finite numbers.
+    Raises TypeError or ValueError for points that are not an (n, 3) array of finite numbers of at
+    most 1e100.
     """
     _check_size(points)
     whole = [to_vector3(backend, points, "points"), *(_upload(backend, one) for one in others)]

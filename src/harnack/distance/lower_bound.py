@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import drjit as dr
 
 from harnack.backend.extrema import fmax, fmin
-from harnack.backend.lengths import length
+from harnack.backend.lengths import largest_component, length
 from harnack.bounds import Bound, Caps, CurvatureStep, LipschitzStep, Slope
 from harnack.certify import Certificate, Levels, certify
 
@@ -51,7 +51,7 @@ def distance_below(backend: Backend, field: Field, levels: Levels, p: Vec3, samp
     """
     down, up = levels.gaps(sample.value)
     steepness = length(sample.gradient) + sample.gradient_error
-    size = fmax(fmax(dr.abs(p.x), dr.abs(p.y)), dr.abs(p.z))
+    size = largest_component(p)
     epsilon = backend.epsilon
     blur = dr.fma(8 * epsilon, dr.abs(sample.value), sample.error) + steepness * 4 * epsilon * size
     down, up = fmax(down - blur, 0), fmax(up - blur, 0)

@@ -130,7 +130,7 @@ class Descent:
     def _look(self, y: Vec3) -> tuple[Real, _Place]:
         """f - level at y, and the place."""
         sample, real = self.field.evaluate(y), self.backend.Float
-        size = fmax(fmax(dr.abs(y.x), dr.abs(y.y)), dr.abs(y.z))
+        size = lengths.largest_component(y)
         epsilon, steepness = self.backend.epsilon, lengths.length(sample.gradient)
         blur = dr.fma(8 * epsilon, dr.abs(sample.value), sample.error)
         noise = dr.fma(4 * epsilon, size, blur / steepness)
@@ -153,7 +153,7 @@ class Descent:
         def is_close(above: Real, place: _Place) -> Mask:
             # Not where rounding hardly says where the level is.
             y = place.y
-            size = fmax(fmax(dr.abs(y.x), dr.abs(y.y)), dr.abs(y.z))
+            size = lengths.largest_component(y)
             known = place.noise <= _CLEAR * fmax(size, place.reach)
             return known & (dr.abs(above) <= 2 * lengths.length(place.gradient) * place.noise)
 

@@ -41,12 +41,13 @@ class Values:
     hessian_error: Real = 0.0
 
     def far_away(self, x: Vec3, terms: int, weight: float) -> Values:
-        """With what far points lose in addition in their bounds, x in unit lengths.
+        """The same values with error bounds that hold at points far away too.
 
-        Terms of derivatives, of which there are so many, are products of what falls like |x|^-5 and
-        grows like |x|^2: a number below the smallest normal one is lost on the way. And where
-        dipoles nearly cancel, sums of their moments have the rounding of all their weight, not of
-        what is left of it.
+        x: the points, in unit lengths. terms: how many terms were summed up. weight: of all dipoles
+        together. Two errors count there alone. A term of a derivative is a product of a factor that
+        falls like |x|^-5 and one that grows like |x|^2, and the first may underflow. And where
+        dipoles nearly cancel, their summed moments are rounded in proportion to the weight of all
+        of them, not to the small sum.
         """
         smallest = float(dr.smallest(type(x.x)))
         lost = 4 * smallest * terms * (1 + dr.squared_norm(x))

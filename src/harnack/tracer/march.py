@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 
 from harnack.backend.extrema import clamp, fmax, fmin
-from harnack.backend.lengths import length
+from harnack.backend.lengths import largest_component, length
 from harnack.certify import Levels, certify
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.tracer.stretches import STATUS, State, Walk, loop, meet
@@ -147,7 +147,7 @@ class PreparedLevelSet:
         miss, with the step that the value behind the sheet allows from there.
         """
         real, vector, bound = self.backend.Float, self.backend.Array3f, self.bound
-        size = fmax(fmax(dr.abs(o.x), dr.abs(o.y)), dr.abs(o.z))
+        size = largest_component(o)
 
         def body(
             base: Real, step: Real, reach: Real, f: Real, g: Vec3, excess: Real, n: Any,

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 import drjit as dr
 
 from harnack.backend.extrema import fmax, fmin
+from harnack.backend.lengths import largest_component
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.tracer.tolerance import Status
 
@@ -117,7 +118,7 @@ class Walk:
         first one that jumps as all of them together do.
         """
         real, count = self.backend.Float, self.backend.UInt32
-        size = fmax(fmax(dr.abs(self.o.x), dr.abs(self.o.y)), dr.abs(self.o.z))
+        size = largest_component(self.o)
         close = _SAME * self.backend.epsilon * (size + first.t)
         steep = fmax(dr.abs(dr.dot(first.normal, self.d)), real(_STEEP))
         furthest = fmax(fmin(first.t + close / steep, self.end), first.t)

@@ -15,6 +15,7 @@ import numpy as np
 
 from harnack.backend.basis import across
 from harnack.backend.extrema import clamp, fmax, fmin
+from harnack.backend.lengths import largest_component
 from harnack.tree.hierarchy import FloatArray, Hierarchy, IntArray
 from harnack.tree.packed import PackedTree, pack
 from harnack.tree.walk import Node, State, for_each, walk
@@ -121,7 +122,10 @@ class Upwards:
 
 
 def _plain(u: Real) -> Real:
-    """A coordinate across a ray, zero if products of two such could vanish: far below rounding."""
+    """A coordinate across a ray, with 0 for one so small that a product of two could underflow.
+
+    Such a coordinate is far smaller than the rounding error of a vertex.
+    """
     is_double = dr.type_v(type(u)) == dr.VarType.Float64
     return dr.select(dr.abs(u) < (1e-140 if is_double else 1e-16), 0, u)
 
@@ -234,7 +238,7 @@ class TriangleRays:
         steep = dr.select(dr.abs(d) < 1e-18, dr.select(d < 0, vector(-1e-18), vector(1e-18)), d)
         inverse = dr.rcp(steep)
         o = frame.o
-        size = fmax(fmax(dr.abs(o.x), dr.abs(o.y)), dr.abs(o.z))
+        size = largest_component(o)
         pad = 16 * backend.epsilon * (1 + size)
 
         def inside(node: Node, t_min: Real, t_max: Real) -> Mask:

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
     from harnack.fields.edges.edge_sums import EdgeBuffer
 
-__all__ = ["Line", "known_along", "rates_along", "with_edge"]
+__all__ = ["Line", "known_along", "rates_along", "with_edge_rates"]
 
 # Nearer to the curve than this part of its size, and with a slope below this part of the
 # gradient, a ray may run along the curve and asks what is known along its line; elsewhere only
@@ -108,7 +108,7 @@ def rates_along(
         for j in range(edges.chunk):
             q = vector(row[4 * j + 4], row[4 * j + 5], row[4 * j + 6])
             ends = p - line.x, q - p
-            rates = with_edge(line, ends, row[4 * j + 3], lengths, rates)
+            rates = with_edge_rates(line, ends, row[4 * j + 3], lengths, rates)
             p = q
         return i + 1, *rates
 
@@ -120,7 +120,7 @@ def rates_along(
     return tuple(dr.select(active, rate, dr.inf) for rate in rates)
 
 
-def with_edge(
+def with_edge_rates(
     line: Line, edge: tuple[Vec3, Vec3], inverse: Real, lengths: tuple[Real, ...],
     rates: tuple[Real, ...],
 ) -> tuple[Real, ...]:  # fmt: skip

@@ -24,7 +24,7 @@ import drjit as dr
 from harnack.backend.extrema import fmax, fmin
 from harnack.fields.edges.edge_field import edge_field
 from harnack.fields.edges.edge_lift import LiftedProduct, edge_factor, edge_records, with_edge
-from harnack.fields.edges.edge_passing import with_edge as with_edge_passing
+from harnack.fields.edges.edge_passing import with_edge_rates
 from harnack.fields.meshes.chain_tree import RATIO, chain_columns, chain_leaves
 from harnack.fields.meshes.edge_trails import closed_trails
 from harnack.fields.multipoles.multipole_kernel import far_terms
@@ -87,7 +87,7 @@ class EdgeChains:
         ) -> Sums:
             del way
             p, q = ends
-            with_it = with_edge_passing(line, (p - line.x, q - p), inverse, lengths, state[8:])
+            with_it = with_edge_rates(line, (p - line.x, q - p), inverse, lengths, state[8:])
             pairs = zip(with_it, state[8:], strict=True)
             return *state[:8], *(dr.select(active, new, old) for new, old in pairs)
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from harnack.backend import aligned
 from harnack.backend.extrema import fmax, fmin
+from harnack.backend.lengths import largest_component
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -160,7 +161,7 @@ class EdgeTrails:
         dr.eval(*turns, *doubts)
         order = dr.arange(index, n)
         some = dr.gather(real, dr.concat(doubts), order) <= 0
-        far = fmax(fmax(dr.abs(x.x), dr.abs(x.y)), dr.abs(x.z)) > _FAR
+        far = largest_component(x) > _FAR
         return dr.gather(real, dr.concat(turns), order), some | far
 
     def _over_records(self, points: list[Point]) -> tuple[list[_Product], list[Real]]:

@@ -16,8 +16,7 @@ import numpy as np
 
 from harnack.backend.extrema import fmax, fmin
 from harnack.fields.edges.edge_lift import LiftedProduct, with_edge
-from harnack.fields.edges.edge_passing import Line, known_along
-from harnack.fields.edges.edge_passing import with_edge as with_edge_passing
+from harnack.fields.edges.edge_passing import Line, known_along, with_edge_rates
 from harnack.fields.meshes.triangle_kernel import edges_of
 from harnack.fields.meshes.winding_mesh import rounding_of_sum
 from harnack.fields.multipoles.far_clusters import Errors, FarClusters
@@ -165,7 +164,7 @@ class TreeWinding:
                 old = state[8:]
                 for edge in edges_of(row, line.x, Upwards(line.x)):
                     open_ = active & edge.is_open(reach)
-                    new = with_edge_passing(line, (edge.a, edge.e), edge.inverse, lengths, old)
+                    new = with_edge_rates(line, (edge.a, edge.e), edge.inverse, lengths, old)
                     old = tuple(dr.select(open_, a, b) for a, b in zip(new, old, strict=True))
                 return *state[:8], *old
 
