@@ -16,12 +16,12 @@ from scipy.spatial import cKDTree
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.bounds import Bound, Caps, Classic, CurvatureStep, LipschitzStep, Slope
-from harnack.certify import BallCertificate, Certificate, CurvatureCertificate, LipschitzCertificate
 from harnack.distance import batches, closest_points, curvature, signed_distance
 from harnack.distance.estimates import second_order
+from harnack.enclosures import Caps, Classic, Cone, Enclosure, Slope, Taylor
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.geometry import shapes
+from harnack.testing.cases import BallCase, Case, CurvatureCase, LipschitzCase
 from harnack.testing.exact import exact_step
 from harnack.testing.walks import look_at, movements
 
@@ -603,23 +603,23 @@ def test_the_lower_bound_is_of_first_order() -> None:
         assert np.median(found) > 0.99, name
 
 
-def certificates(rng: np.random.Generator, n: int) -> list[tuple[Bound, Certificate, np.ndarray]]:
+def cases(rng: np.random.Generator, n: int) -> list[tuple[type[Enclosure], Case, np.ndarray]]:
     """Random ones of each kind, the bounds for them, and how large slopes may be."""
     radius, below, above = (10 ** rng.uniform(-2, 1, n) for _ in range(3))
     down, up = (share * 10 ** rng.uniform(-2, 1, n) for share in (below, above))
-    result: list[tuple[Bound, Certificate, np.ndarray]] = []
+    result: list[tuple[type[Enclosure], Case, np.ndarray]] = []
     for dimension in (2, 3, 4):
         for ends in ((below, above), (below, None), (None, above)):
-            ball = BallCertificate(radius, *ends, down, up, dimension)
+            ball = BallCase(radius, *ends, down, up, dimension)
             least = np.minimum(*(np.full(n, np.inf) if end is None else end for end in ends))
             steepest = dimension * least / radius
             if None not in [None if end is None else 0 for end in ends] and dimension == 3:
                 share = below / (below + above)
-                result.append((Caps(), ball, 3 * (below + above) / radius * share * (1 - share)))
-            result += [(Slope(), ball, steepest), (Classic(), ball, steepest)]
+                result.append((Caps, ball, 3 * (below + above) / radius * share * (1 - share)))
+            result += [(Slope, ball, steepest), (Classic, ball, steepest)]
     constant, slopes = 10 ** rng.uniform(-2, 2, n), 10 ** rng.uniform(-2, 1, n)
-    result.append((LipschitzStep(), LipschitzCertificate(constant, radius, down, up), constant))
-    result.append((CurvatureStep(), CurvatureCertificate(constant, radius, down, up), slopes))
+    result.append((Cone, LipschitzCase(constant, radius, down, up), constant))
+    result.append((Taylor, CurvatureCase(constant, radius, down, up), slopes))
     return result
 
 
@@ -629,17 +629,17 @@ def test_the_steepest_directions_have_the_shortest_steps() -> None:
     rng = np.random.default_rng(8)
     n = 50
     kinds = set()
-    for bound, certificate, steepest in certificates(rng, n):
+    for bound, case, steepest in cases(rng, n):
         steep = steepest * rng.uniform(0, 1, n)
-        ends = np.minimum(*(exact_step(bound, certificate, s * steep) for s in (1, -1)))
+        ends = np.minimum(*(exact_step(bound, case, s * steep) for s in (1, -1)))
         for _ in range(4):
-            any_way = exact_step(bound, certificate, steep * rng.uniform(-1, 1, n))
+            any_way = exact_step(bound, case, steep * rng.uniform(-1, 1, n))
             assert (ends <= any_way * (1 + 1e-12)).all(), bound
         # The comparison would notice slopes of no influence or of the wrong sign.
-        if not isinstance(bound, Classic | LipschitzStep):
-            assert (exact_step(bound, certificate, steep) > ends * 1.01).mean() > 0.05
-        kinds.add(type(bound))
-    assert kinds == {Caps, Slope, Classic, LipschitzStep, CurvatureStep}
+        if bound not in (Classic, Cone):
+            assert (exact_step(bound, case, steep) > ends * 1.01).mean() > 0.05
+        kinds.add(bound)
+    assert kinds == {Caps, Slope, Classic, Cone, Taylor}
 
 
 def true_distance(field: hk.Field, x: np.ndarray, rays: int) -> np.ndarray:

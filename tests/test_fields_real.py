@@ -313,7 +313,7 @@ def violation(field: Field, n_points: int, n_samples: int, seed: int = 0) -> flo
     p = points_in(field, n_points, seed)
     sample = field.evaluate(to_vector3(DOUBLE, p))
     f = to_numpy(sample.value) + np.zeros(len(p))
-    balls = [k for k in sample.known if isinstance(k, HarmonicBall)]
+    balls = [k for k in sample.promises if isinstance(k, HarmonicBall)]
     assert balls
     worst = -np.inf
     for ball in balls:
@@ -350,7 +350,7 @@ def test_single_precision_promises_no_more(name: str) -> None:
     field = FIELDS[name]
     p = points_in(field, 3000).astype(np.float32).astype(float)
     exact, rounded = (
-        ends(field.evaluate(to_vector3(backend, p)).known[0], len(p))
+        ends(field.evaluate(to_vector3(backend, p)).weaker[0], len(p))
         for backend in (DOUBLE, SINGLE)
     )
     margin = 0.45e-5 * (exact[2] - exact[1])
@@ -381,7 +381,7 @@ def test_lipschitz_constants_keep_their_promise(name: str) -> None:
     p = points_in(field, 200)
     sample = field.evaluate(to_vector3(DOUBLE, p))
     f = to_numpy(sample.value)
-    known = [k for k in sample.known if isinstance(k, Lipschitz)]
+    known = [k for k in sample.promises if isinstance(k, Lipschitz)]
     assert known
     for promise in known:
         constant = to_numpy(promise.constant) + np.zeros(len(p))
@@ -552,7 +552,7 @@ def test_a_constant_moves_the_range_only() -> None:
     moved = EigenfunctionSum([Product(1.0, sine(2), sine(2)), Product(5.0)])
     assert moved.value_range == pytest.approx((4.0, 6.0))
     p = points_in(plain, 50)
-    a, b = (f.evaluate(to_vector3(DOUBLE, p)).known[0] for f in (plain, moved))
+    a, b = (f.evaluate(to_vector3(DOUBLE, p)).weaker[0] for f in (plain, moved))
     for x, y, shift in zip(ends(a, len(p)), ends(b, len(p)), (0, 5, 5), strict=True):
         np.testing.assert_allclose(x + shift, y, atol=1e-12)
 
@@ -642,5 +642,5 @@ def test_domains() -> None:
 def test_promises_at_the_origin_are_finite() -> None:
     for field in (*POLYNOMIALS.values(), Gyroid()):
         sample = field.evaluate(to_vector3(SINGLE, np.zeros((1, 3))))
-        for number in (sample.value, sample.gradient, *ends(sample.known[0], 1)):
+        for number in (sample.value, sample.gradient, *ends(sample.weaker[0], 1)):
             assert np.isfinite(to_numpy(number) if dr.is_array_v(type(number)) else number).all()

@@ -11,8 +11,7 @@ import pytest
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.backend.lengths import length
-from harnack.bounds import Caps, Classic, CurvatureStep, LipschitzStep, Slope
-from harnack.certify import CurvatureCertificate, LipschitzCertificate
+from harnack.enclosures import Caps, Classic, Cone, Slope, Taylor
 from harnack.fields.field import Curvature, HarmonicBall, Lipschitz
 from harnack.fields.polynomials.axial_bounds import (
     AxialBound,
@@ -23,6 +22,7 @@ from harnack.fields.polynomials.axial_bounds import (
 )
 from harnack.fields.polynomials.harmonic_rounding import HarmonicRounding
 from harnack.fields.polynomials.solid_harmonics import Weights, evaluate, hessian
+from harnack.testing.cases import CurvatureCase, LipschitzCase
 from harnack.testing.step_contracts import check_steps
 from harnack.testing.walks import look_at
 
@@ -259,7 +259,7 @@ def test_single_precision_hits_are_as_close_as_documented(l: int, m: int) -> Non
     assert (off <= 2.1 * (8 * UNIT * size + error) + 1.05e-6).all()
 
 
-@pytest.mark.parametrize("bound", [Classic(), Slope(), Caps(), LipschitzStep(), CurvatureStep()])
+@pytest.mark.parametrize("bound", [Classic, Slope, Caps, Cone, Taylor])
 def test_no_level_lies_within_a_step_near_the_zeros(bound: Any) -> None:
     assert check_steps(POLYNOMIALS["(12, -6)"], bound, count=150) > 0
 
@@ -274,8 +274,7 @@ def test_steps_do_not_depend_on_the_unit_of_the_value(precision: Any) -> None:
 
     def step(unit: float) -> np.ndarray:
         one, *rest = (backend.Float(unit * v) for v in (slope, h, up, down))
-        certificate = CurvatureCertificate(rest[0], np.inf, rest[2], rest[1])
-        return to_numpy(CurvatureStep().step(certificate, one))
+        return to_numpy(CurvatureCase(rest[0], np.inf, rest[2], rest[1]).step(Taylor, one))
 
     expected = step(1.0)
     assert (expected > 0).all()
@@ -294,19 +293,17 @@ def test_promises_that_are_no_numbers_prove_nothing(precision: Any) -> None:
     ):
         for slope in (-1.0, 0.0, 1.0):
             numbers = (real(constant), real(radius), real(1.0), real(up))
-            curved, steep = CurvatureCertificate(*numbers), LipschitzCertificate(*numbers)
-            assert to_numpy(CurvatureStep().step(curved, real(slope)))[0] == 0
-            assert not to_numpy(CurvatureStep().covers(curved, real(slope), real(0.5)))[0]
-            assert to_numpy(LipschitzStep().step(steep, real(slope)))[0] == 0
-            assert not to_numpy(LipschitzStep().covers(steep, real(slope), real(0.5)))[0]
+            for case, kind in ((CurvatureCase(*numbers), Taylor), (LipschitzCase(*numbers), Cone)):
+                assert to_numpy(case.step(kind, real(slope)))[0] == 0
+                assert not to_numpy(case.covers(kind, real(slope), real(0.5)))[0]
 
 
 def test_a_function_without_slope_or_curvature_moves_nowhere() -> None:
     real = DOUBLE.Float
-    flat = CurvatureCertificate(real(0.0), real(3.0), real(1.0), real(1.0))
-    assert to_numpy(CurvatureStep().step(flat, real(0.0)))[0] == pytest.approx(3.0)
-    on_level = CurvatureCertificate(real(0.0), real(3.0), real(1.0), real(0.0))
-    assert to_numpy(CurvatureStep().step(on_level, real(0.0)))[0] == 0
+    flat = CurvatureCase(real(0.0), real(3.0), real(1.0), real(1.0))
+    assert to_numpy(flat.step(Taylor, real(0.0)))[0] == pytest.approx(3.0)
+    on_level = CurvatureCase(real(0.0), real(3.0), real(1.0), real(0.0))
+    assert to_numpy(on_level.step(Taylor, real(0.0)))[0] == 0
 
 
 @pytest.mark.parametrize("precision", ["single", "double"])

@@ -182,7 +182,7 @@ def test_bounds_that_do_not_apply_name_those_that_do() -> None:
     field = hk.SolidAngle(shapes.wavy_polygon(20))
     with pytest.raises(ValueError, match='choose "caps" or "slope" or "classic", or leave'):
         hk.trace(field, *RAY, bound="lipschitz")
-    with pytest.raises(ValueError, match=r"promises Curvature .*choose \"curvature\", or leave"):
+    with pytest.raises(ValueError, match=r"promises Curvature, .*choose \"curvature\", or leave"):
         hk.trace(Bell(bent, 1.0, 2.0), *RAY, bound="caps")
     with pytest.raises(ValueError, match=r"Sample\.known is empty"):
         hk.trace(Bell(lambda w: (), 1.0, 2.0), *RAY)

@@ -23,14 +23,25 @@ from harnack.backend import (
     to_numpy,
 )  # fmt: skip
 from harnack.backend.extrema import clamp, fmax, fmin
-from harnack.bounds import Caps, CurvatureStep, Longest, Slope
-from harnack.certify import BallCertificate, CurvatureCertificate, Levels
+from harnack.enclosures import (
+    Caps,
+    Curvature,
+    Enclosure,
+    Levels,
+    Slope,
+    Slopes,
+    Taylor,
+    choose_proofs,
+)
+from harnack.fields import Field, Sample
+from harnack.fields.look import Path as RayPath
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.rendering.encounter import meet_surface
+from harnack.testing import scaled
+from harnack.testing.cases import BallCase, Case, CurvatureCase
 from harnack.testing.exact import exact_step, on_host
 from harnack.testing.jump_oracle import first_side_changes, judge
-from harnack.tracer import march
-from harnack.tracer.stretches import meet
+from harnack.tracer.sheet_comparison import compare_with_sheet
 
 FOUR_PI = 4 * math.pi
 
@@ -612,8 +623,8 @@ def test_gradients_known_up_to_an_error(bound: Any, overstep: float, direction: 
 # --- steps with slopes known up to an error ------------------------------------------------------
 
 
-def doubtful(rows: int, seed: int) -> list[tuple[Any, Any, Any, Any]]:
-    """(bound, certificate, slope, doubt) of all kinds; slopes so large that they matter."""
+def uncertain(rows: int, seed: int) -> list[tuple[type[Enclosure], Case, Any, Any]]:
+    """(proof, case, slope, error) of all kinds; slopes so large that they matter."""
     rng, real = np.random.default_rng(seed), choose_backend("double").Float
 
     def around_one() -> np.ndarray:
@@ -622,69 +633,78 @@ def doubtful(rows: int, seed: int) -> list[tuple[Any, Any, Any, Any]]:
     radius, below, above, down, up = (around_one() for _ in range(5))
     down, up = down * np.minimum(below, above), up * np.minimum(below, above)
     slope = 2 * rng.uniform(-1, 1, rows) * np.minimum(below, above) / radius
-    doubt = around_one() * 0.2 * np.abs(slope)
-    ball = BallCertificate(
+    error = around_one() * 0.2 * np.abs(slope)
+    ball = BallCase(
         *map(real, (radius, below, above, np.minimum(down, below), np.minimum(up, above))), 3
     )
-    curved = CurvatureCertificate(*map(real, (around_one(), radius, down, up)))
+    curved = CurvatureCase(*map(real, (around_one(), radius, down, up)))
     return [
-        (bound, certificate, real(slope), real(doubt))
-        for bound, certificate in ((Slope(), ball), (Caps(), ball), (CurvatureStep(), curved))
+        (kind, case, real(slope), real(error))
+        for kind, case in ((Slope, ball), (Caps, ball), (Taylor, curved))
     ]
 
 
-def check_doubtful_steps(step: Any, covers: Any) -> None:
-    """Steps are as long as the extremal functions of the worst slope allow, and no longer."""
-    for bound, certificate, slope, doubt in doubtful(2000, 0):
-        host, middle, off = on_host(certificate, 2000), to_numpy(slope), to_numpy(doubt)
-        exact = np.minimum(*(exact_step(bound, host, middle + s * off) for s in (1, -1)))
-        alone = exact_step(bound, host, middle)
-        some = Longest((bound,))
-        found = to_numpy(step(some, (certificate,), slope, doubt))
+def check_uncertain_steps(factor: float = 1.0, covers: float = 1.0) -> None:
+    """Steps are as long as the extremal functions of the worst slope allow, and no longer.
+
+    factor, covers: what the proofs are made wrong by.
+    """
+    for kind, case, slope, error in uncertain(2000, 0):
+        host, middle, off = on_host(case, 2000), to_numpy(slope), to_numpy(error)
+        exact = np.minimum(*(exact_step(kind, host, middle + s * off) for s in (1, -1)))
+        alone = exact_step(kind, host, middle)
+        wrong = scaled(kind, factor, covers=covers)
+        found = to_numpy(case.step(wrong, slope, error))
         ratio = found / exact
-        assert ratio.max() <= 1 + 1e-12, bound
-        assert ratio.min() > 0.99, bound
-        assert np.median(ratio) > 1 - 1e-4, bound
+        assert ratio.max() <= 1 + 1e-12, kind
+        assert ratio.min() > 0.99, kind
+        assert np.median(ratio) > 1 - 1e-4, kind
         assert (alone > 1.01 * exact).mean() > 0.3  # the error does shorten them
         free = [
-            to_numpy(covers(some, (certificate,), slope, doubt, type(slope)(share * exact)))
+            to_numpy(case.covers(wrong, slope, type(slope)(share * exact), error))
             for share in (0.999, 1.0001)
         ]
         inside = exact < 0.999 * host.radius
-        assert free[0].all(), bound
-        assert not free[1][inside].any(), bound
+        assert free[0].all(), kind
+        assert not free[1][inside].any(), kind
 
 
 def test_steps_are_those_of_the_worst_slope() -> None:
-    check_doubtful_steps(march._step, march._covers)
+    check_uncertain_steps()
 
 
 @pytest.mark.parametrize("factor", [1.001, 1.00001])
 def test_steps_too_long_for_the_worst_slope_are_seen(factor: float) -> None:
-    def longer(*given: Any) -> Any:
-        return factor * march._step(*given)
-
-    def further(*given: Any) -> Any:
-        *others, length = given
-        return march._covers(*others, length / 1.001)
-
     with pytest.raises(AssertionError):
-        check_doubtful_steps(longer, march._covers)
+        check_uncertain_steps(factor)
     with pytest.raises(AssertionError):
-        check_doubtful_steps(march._step, further)
+        check_uncertain_steps(covers=1.001)
 
 
-def test_steps_that_ignore_the_error_of_the_slope_are_seen() -> None:
-    def step(some: Any, certificates: Any, slope: Any, doubt: Any) -> Any:
-        return march._step(some, certificates, slope, 0 * doubt)
-
-    def covers(some: Any, certificates: Any, slope: Any, doubt: Any, length: Any) -> Any:
-        return march._covers(some, certificates, slope, 0 * doubt, length)
-
+def test_steps_that_ignore_the_error_of_the_slope_are_seen(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(Slopes, "around", classmethod(lambda cls, slope, error: cls(slope, slope)))
     with pytest.raises(AssertionError):
-        check_doubtful_steps(step, march._covers)
-    with pytest.raises(AssertionError):
-        check_doubtful_steps(march._step, covers)
+        check_uncertain_steps()
+
+
+def test_looks_see_the_error_of_the_slope_in_both_directions() -> None:
+    """The slopes of a look are an interval, and that looking back is the same one negated."""
+    backend = choose_backend("double")
+    real = backend.Float
+
+    class Uncertain(Field):
+        def evaluate(self, p: Any) -> Sample:
+            return Sample(p.x, backend.Array3f(1, 0, 0), (Curvature(1.0),), gradient_error=0.25)
+
+    o, d = backend.Array3f(0, 0, 0), backend.Array3f(1, 0, 0)
+    look = Uncertain().look(RayPath(o, d, choose_proofs(None)), real(0), real(1), real(1))
+    (ahead,), (back,) = look.ahead, look.back
+    assert isinstance(ahead, Taylor)
+    assert isinstance(back, Taylor)
+    ends = [ahead.slopes.low, ahead.slopes.high, back.slopes.low, back.slopes.high]
+    assert [float(end[0]) for end in ends] == [0.75, 1.25, -1.25, -0.75]
 
 
 # --- parts of rays --------------------------------------------------------------------------
@@ -852,10 +872,12 @@ def test_a_level_within_rounding_of_a_side_counts_as_between(
     real, vector = backend.Float, backend.Array3f
     for sheet, there in ((3, True), (3, False), (NO_SHEET, True)):
         ahead = Crossing(real(1), backend.UInt32(sheet), real(jump), vector(0, 0, 1))
-        met = meet(ahead, backend.Bool(there), real(before), real(1e-6), Levels((0.5,)))
+        met = compare_with_sheet(
+            ahead, backend.Bool(there), real(before), real(1e-6), Levels((0.5,))
+        )
         reached = there and sheet != NO_SHEET
-        assert met.passed == [reached]
-        assert met.hit == [hit and reached]
+        assert met.at_crossing == [reached]
+        assert met.is_hit == [hit and reached]
 
 
 # --- derivatives ----------------------------------------------------------------------------

@@ -11,6 +11,8 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
+from harnack.enclosures import choose_proofs
+from harnack.fields.look import Path
 from harnack.geometry import shapes, validate_loops
 from harnack.geometry.net_loops import net_loops
 from harnack.testing.oracle import CurveOracle, first_crossings, gap_to_levels
@@ -468,8 +470,9 @@ def test_what_is_promised_along_a_line_holds(name: str, precision: str) -> None:
     if precision == "single":
         x, d = (v.astype(np.float32).astype(float) for v in (x, d))
         x, d = x[away > 1e-4], unit(d[away > 1e-4])
-    field = hk.SolidAngle(loops).along(to_vector3(backend, d))
-    _, *promises = field.evaluate(to_vector3(backend, x)).known
+    path = Path(to_vector3(backend, x), to_vector3(backend, d), choose_proofs(None))
+    start = backend.Float(0)
+    _, *promises = hk.SolidAngle(loops).look(path, start, start, start).sample.known
     gain = 0.0
     assert len(promises) == 6
     for promise in promises:

@@ -666,7 +666,7 @@ def test_lifts_stay_within_their_promise(method: str) -> None:
     x = rng.uniform(-1.4, 1.4, (300, 3))
     backend = choose_backend("double")
     sample = field.prepare(backend).evaluate(to_vector3(backend, x))
-    ball = next(one for one in sample.known if isinstance(one, HarmonicBall))
+    ball = next(one for one in sample.promises if isinstance(one, HarmonicBall))
     value, radius = to_numpy(sample.value), to_numpy(ball.radius)
     room = np.stack([to_numpy(ball.lower) - value, to_numpy(ball.upper) - value])
     slack = 2 * np.broadcast_to(to_numpy(type(sample.value)(sample.error)), value.shape) + 1e-9

@@ -9,17 +9,25 @@ from __future__ import annotations
 # First of all imports: it decides which LLVM Dr.Jit loads, which happens on `import drjit`.
 from harnack import backend, files, geometry, rendering, testing
 from harnack._version import __version__
-from harnack.bounds import Bound, Caps, Classic, CurvatureStep, LipschitzStep, Longest, Slope
 from harnack.distance import Curvatures, closest_points, curvature, signed_distance
-from harnack.fields import (
+from harnack.enclosures import (
+    Caps,
+    Classic,
+    Cone,
     Curvature,
+    Enclosure,
+    HarmonicBall,
+    Lipschitz,
+    Parabola,
+    Slope,
+    Taylor,
+)
+from harnack.fields import (
     DipolePotential,
     EigenfunctionSum,
     Field,
     Gyroid,
-    HarmonicBall,
     HarmonicPolynomial,
-    Lipschitz,
     PlaneWave,
     Product,
     Sample,
@@ -38,16 +46,16 @@ from harnack.tracer import Hits, LevelSet, Status, Tolerance, level_set, trace
 
 __all__ = [
     "Ball",
-    "Bound",
     "Box",
     "Caps",
     "Classic",
+    "Cone",
     "ConvexHull",
     "Curvature",
-    "CurvatureStep",
     "Curvatures",
     "DipolePotential",
     "EigenfunctionSum",
+    "Enclosure",
     "Field",
     "Gyroid",
     "HalfSpace",
@@ -57,8 +65,7 @@ __all__ = [
     "Intersection",
     "LevelSet",
     "Lipschitz",
-    "LipschitzStep",
-    "Longest",
+    "Parabola",
     "PlaneWave",
     "Product",
     "Sample",
@@ -69,6 +76,7 @@ __all__ = [
     "SolidAngle",
     "SphericalHarmonic",
     "Status",
+    "Taylor",
     "Tolerance",
     "WindingNumber",
     "__version__",

@@ -19,7 +19,7 @@ from harnack.distance.projection import Descent
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
-    from harnack.certify import Levels
+    from harnack.enclosures import Levels
     from harnack.fields.field import Field, Sample
     from harnack.tracer import LevelSet
 
@@ -157,7 +157,7 @@ def find_closest(backend: Backend, surface: LevelSet, levels: Levels, points: An
 
 
 def _lower(backend: Backend, field: Field, levels: Levels, p: Vec3, sample: Sample) -> Real:
-    if not sample.known:
+    if not sample.promises:
         return backend.Float(0)
     return distance_below(backend, field, levels, p, sample)
 

@@ -17,7 +17,7 @@ from harnack.tracer import Status
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
-    from harnack.tracer.march import PreparedLevelSet
+    from harnack.tracer.prepared import PreparedLevelSet
 
 __all__ = ["close_in", "nearer_along"]
 

@@ -21,7 +21,7 @@ from harnack.tracer import Status
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.fields.field import Field
-    from harnack.tracer.march import PreparedLevelSet
+    from harnack.tracer.prepared import PreparedLevelSet
 
 __all__ = ["SheetSearch"]
 

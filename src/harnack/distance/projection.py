@@ -18,7 +18,7 @@ from harnack.distance.tangent import Eigen, TangentPlane
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.certify import Levels
+    from harnack.enclosures import Levels
     from harnack.fields.field import Field
 
 __all__ = ["Descent"]
@@ -135,7 +135,7 @@ class Descent:
         blur = dr.fma(8 * epsilon, dr.abs(sample.value), sample.error)
         noise = dr.fma(4 * epsilon, size, blur / steepness)
         reach = real(0)
-        for known in sample.known:
+        for known in sample.promises:
             radius = real(known.radius)
             reach = fmax(reach, dr.select(dr.isfinite(radius), radius, 0))
         reach = dr.select(reach > 0, reach, dr.inf)

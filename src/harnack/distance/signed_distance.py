@@ -10,12 +10,12 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import choose_backend
-from harnack.certify import Levels
 from harnack.choices import did_you_mean
 from harnack.distance.batches import FloatArray, in_batches
 from harnack.distance.closest import Closest, find_closest, find_on_sheets
 from harnack.distance.estimates import first_order, second_order
 from harnack.distance.lower_bound import distance_below
+from harnack.enclosures import Levels
 from harnack.fields.field import Field
 from harnack.tracer import level_set
 

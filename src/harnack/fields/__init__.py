@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from harnack.enclosures import Curvature, HarmonicBall, LineLipschitz, Lipschitz
 from harnack.fields.clouds.dipole import DipolePotential
 from harnack.fields.clouds.screened import ScreenedWindingNumber
 from harnack.fields.curves.solid_angle import SolidAngle
-from harnack.fields.field import Curvature, Field, HarmonicBall, LineLipschitz, Lipschitz, Sample
+from harnack.fields.field import Field, Sample
 from harnack.fields.meshes.winding_number import WindingNumber
 from harnack.fields.polynomials.polynomial import HarmonicPolynomial, SphericalHarmonic
 from harnack.fields.sheets import NO_SHEET, Crossing

@@ -1,8 +1,8 @@
 """What a field is: the one-page interface between functions and the rest of the library.
 
-A field gives, in one evaluation, its value, its gradient and what it knows about itself near
-the point. What it knows is stated in the field's own units and must be *true*: every step that
-the tracer takes rests on it. `harnack.testing.check_field` tests a field against this page.
+A field gives, in one evaluation, its value, its gradient and what it promises near the point
+(`harnack.enclosures.promises`). Promises must be *true*: every step that the tracer takes rests on
+them. `harnack.testing.check_field` tests a field against this page.
 """
 
 from __future__ import annotations
@@ -11,13 +11,14 @@ import abc
 import copy
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
+from harnack.enclosures import Curvature, HarmonicBall, LineLipschitz, Lipschitz
+from harnack.fields.look import Look, Path, Sample, lengthened
 from harnack.fields.points import at_points
 from harnack.fields.sheets import NO_SHEET, Crossing, NearestSheet
 
@@ -26,97 +27,18 @@ if TYPE_CHECKING:
     from harnack.geometry import Volume
 
 
-@dataclass(frozen=True)
-class HarmonicBall:
-    """f extends to a harmonic function on the ball B(p, radius) of R^dimension that stays in range.
-
-    The continuous lift of f that agrees with `Sample.value` at p is harmonic on the open ball and
-    stays within [lower, upper] there. Either end may be infinite, not both. dimension is 2, 3 or
-    4: a function of the plane extended constantly, of space, or a slice of a function of R^4.
-    """
-
-    radius: Real
-    lower: Real
-    upper: Real
-    dimension: int = 3
-
-
-@dataclass(frozen=True)
-class Lipschitz:
-    """|f(y) - f(p)| <= constant * |y - p| for every y with |y - p| < radius (default: all y).
-
-    Of a field with a domain: for every such y in it.
-    """
-
-    constant: Real
-    radius: Real = float("inf")
-
-
-@dataclass(frozen=True)
-class Curvature:
-    """|f(y) - f(p) - grad f(p).(y-p)| <= constant |y-p|^2/2 for every y with |y-p| < radius.
-
-    Of a field with a domain: for every such y in it.
-    """
-
-    constant: Real
-    radius: Real = float("inf")
-
-
-@dataclass(frozen=True)
-class LineLipschitz:
-    """|f(p + s d) - f(p)| <= constant |s| for |s| < radius, with the direction d of `Field.along`.
-
-    It adds to other promises, on which alone a ray must be able to get on: it may be infinite at
-    most places.
-    """
-
-    constant: Real
-    radius: Real
-
-
-Knowledge = HarmonicBall | Lipschitz | LineLipschitz | Curvature
-
-
-@dataclass(frozen=True)
-class Sample:
-    """One evaluation at a point p: value f(p), gradient (3,), and what is known near p.
-
-    error: how far rounding may have moved `value` from f at the point given, beyond eight units
-        in its last place or eight times the smallest normal number (and beyond |gradient| times
-        the rounding of the point itself, which the tracer accounts for), or an approximation has.
-        Steps are shortened by it.
-    gradient_error: how far rounding and an approximation may have moved `gradient`, as a length;
-        0 where that is only the rounding of a few operations.
-    normal: (3,) unit, what to shade with where the gradient is no guide (beside a singular point
-        of the surface); None for the gradient's own direction. No step looks at it.
-    truncation: the part of `error` that a closer evaluation makes smaller (`Field.at_detail`).
-    """
-
-    value: Real
-    gradient: Vec3
-    known: tuple[Knowledge, ...]
-    error: Real = 0.0
-    gradient_error: Real = 0.0
-    normal: Vec3 | None = None
-    truncation: Real = 0.0
-
-
-def lengthened(sample: Sample, size: Real) -> Sample:
-    """The sample of x -> f(x / size), at the place that moves there."""
-    known: list[Knowledge] = []
-    for one in sample.known:
-        if isinstance(one, HarmonicBall):
-            known.append(HarmonicBall(one.radius * size, one.lower, one.upper, one.dimension))
-        elif isinstance(one, Lipschitz | LineLipschitz):
-            known.append(type(one)(one.constant / size, one.radius * size))
-        else:
-            known.append(Curvature(one.constant / (size * size), one.radius * size))
-    gradient, doubt = sample.gradient / size, sample.gradient_error / size
-    return Sample(
-        sample.value, gradient, tuple(known), sample.error, doubt, sample.normal, sample.truncation
-    )
-
+__all__ = [
+    "AtDetail",
+    "Curvature",
+    "Field",
+    "HarmonicBall",
+    "LineLipschitz",
+    "Lipschitz",
+    "Look",
+    "Path",
+    "Sample",
+    "lengthened",
+]
 
 # A detail at which nothing is left out.
 _EVERYTHING = 1e9
@@ -152,12 +74,14 @@ def _checked(evaluate: Callable[[Any, Vec3], Sample]) -> Callable[[Any, Vec3], S
         name = f"{type(self).__name__}.evaluate"
         if not isinstance(sample, Sample):
             raise TypeError(f"{name} returned {_named(sample)}, not a Sample: {_HOW}")
-        known: Any = sample.known
-        if not isinstance(known, tuple):
-            raise TypeError(f"{name}: Sample.known is {_named(known)}, not a tuple: {_HOW}")
-        for one in cast("tuple[Any, ...]", known):
-            if not isinstance(one, HarmonicBall | Lipschitz | LineLipschitz | Curvature):
-                raise TypeError(f"{name}: Sample.known holds {_named(one)}, no promise: {_HOW}")
+        given: Any
+        for place, given in (("known", sample.known), ("weaker", sample.weaker)):
+            if not isinstance(given, tuple):
+                raise TypeError(f"{name}: Sample.{place} is {_named(given)}, not a tuple: {_HOW}")
+            for one in cast("tuple[Any, ...]", given):
+                if not isinstance(one, HarmonicBall | Lipschitz | LineLipschitz | Curvature):
+                    wrong = f"Sample.{place} holds {_named(one)}, no promise"
+                    raise TypeError(f"{name}: {wrong}: {_HOW}")
         gradient: Any = sample.gradient
         if not dr.is_array_v(type(gradient)) or dr.size_v(type(gradient)) != 3:
             raise TypeError(f"{name}: Sample.gradient is {_named(gradient)}, no 3-vector: {_HOW}")
@@ -313,14 +237,15 @@ class Field(abc.ABC):
         """What a person would want to know about the choices this field made by itself."""
         return {}
 
-    def along(self, d: Vec3) -> Field:
-        """This field for rays in unit directions d: its samples may promise more there.
+    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
+        """What is proved about f along a path from its point at t, in both directions.
 
-        What a sample of the field returned promises need hold only at points p + s d of the line
-        through p, for both signs of s. Called while no loop is being recorded, or within one.
+        The default evaluates the field there and reads its promises along the slope. A field that
+        knows more of a direction than of all overrides this. ahead, back: how far an enclosure can
+        be of use; one that is sharper on a shorter length need reach no farther.
         """
-        del d
-        return self
+        del ahead, back
+        return path.look(self.evaluate(path.point(t)))
 
     def at_detail(self, detail: Real) -> Field:
         """This field, evaluated so closely in each lane: 0 as coarsely as the field allows, 1 as

@@ -16,7 +16,7 @@ from harnack.backend.lengths import length as norm
 from harnack.tracer import Status
 
 if TYPE_CHECKING:
-    from harnack.tracer import PreparedLevelSet, Trace
+    from harnack.tracer import MarchResult, PreparedLevelSet
 
 # Polishing moves a hit by at most this many tolerances: along a ray that only grazes the surface
 # there is no crossing to converge to.
@@ -104,7 +104,7 @@ def meet_surface(
 
 
 def _on_sheet(
-    prepared: PreparedLevelSet, o: Vec3, d: Vec3, trace: Trace, encounter: Encounter
+    prepared: PreparedLevelSet, o: Vec3, d: Vec3, trace: MarchResult, encounter: Encounter
 ) -> Encounter:
     """Encounters with sheets: t is exact to rounding, and so is the plane of the normal.
 

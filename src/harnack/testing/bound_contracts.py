@@ -1,7 +1,7 @@
-"""`check_bound`: functions that keep a certificate's promise, and levels put where they go.
+"""`check_bound`: functions that keep a promise, and levels put where they go.
 
-A bound is right if no function that the certificate allows meets a level within its step. The
-functions drawn here include the extremal ones of the proofs in `harnack.bounds`, so a bound
+A proof is right if no function that the promise allows meets a level within its step. The
+functions drawn here include the extremal ones of the proofs in `harnack.enclosures`, so a proof
 that is a thousandth too long is found out.
 """
 
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from harnack.backend import choose_backend, to_numpy
-from harnack.certify import BallCertificate, CurvatureCertificate, LipschitzCertificate
+from harnack.testing.cases import BallCase, Case, CurvatureCase, LipschitzCase
 from harnack.testing.failures import BrokenPromiseError
 from harnack.testing.poisson import (
     AxialFunctions,
@@ -26,8 +26,7 @@ from harnack.testing.poisson import (
 
 if TYPE_CHECKING:
     from harnack.backend import Precision
-    from harnack.bounds import Bound
-    from harnack.certify import Certificate
+    from harnack.enclosures import Enclosure
 
 __all__ = ["Trial", "check_bound", "trials"]
 
@@ -36,27 +35,27 @@ _SAMPLES = 48
 
 @dataclass(frozen=True)
 class Trial:
-    """Functions along rays, (rows,), and certificates at t = 0 whose promise they keep.
+    """Functions along rays, (rows,), and cases at t = 0 whose promise they keep.
 
     movement: f(t) - f(0) for t (rows, m) with 0 <= t < reach, the distance of the promise.
-    slope: f'(0). The gaps of the certificates are such that levels are met.
+    slope: f'(0). The gaps of the cases are such that levels are met.
     """
 
     name: str
-    certificate: Certificate
+    case: Case
     slope: FloatArray
     reach: FloatArray
     movement: Callable[[FloatArray], FloatArray]
 
 
 def check_bound(
-    bound: Bound,
+    kind: type[Enclosure],
     *,
     rng: np.random.Generator | int = 0,
     rows: int = 400,
     precision: Precision = "double",
 ) -> None:
-    """Test a bound against random functions of every kind of certificate that it accepts.
+    """Test a proof against random functions of every kind of promise that it applies to.
 
     rng: a generator or a seed. rows: how many functions of each kind.
 
@@ -65,17 +64,17 @@ def check_bound(
 
     Raises:
         BrokenPromiseError: with the numbers of the first function that shows it.
-        ValueError: it accepts none of the certificates there are.
+        ValueError: it applies to none of the promises there are.
     """
     accepted = 0
     generator = np.random.default_rng(rng)
     for trial in trials(generator, rows):
         on_device, slope = _upload(trial, precision)
-        if bound.accepts(on_device):
+        if on_device.accepts(kind):
             accepted += 1
-            _check_trial(bound, trial, on_device, slope, generator, precision)
+            _check_trial(kind, trial, on_device, slope, generator, precision)
     if not accepted:
-        raise ValueError(f"{bound!r} accepts none of the certificates there are")
+        raise ValueError(f"{kind.__name__} applies to none of the promises there are")
 
 
 def trials(rng: np.random.Generator, rows: int) -> Iterator[Trial]:
@@ -104,7 +103,7 @@ def _positive(rng: np.random.Generator, rows: int, n: int, *, mirrored: bool) ->
     shares /= shares.sum(axis=1, keepdims=True)
     u = AxialFunctions("points", places, shares * mass[:, None], radius, n)
     sign = -1.0 if mirrored else 1.0
-    rooms = (None, mass) if mirrored else (mass, None)
+    ranges = (None, mass) if mirrored else (mass, None)
     return _with_gaps(
         rng,
         f"positive harmonic, n = {n}, {'upper' if mirrored else 'lower'} end known",
@@ -112,7 +111,7 @@ def _positive(rng: np.random.Generator, rows: int, n: int, *, mirrored: bool) ->
         radius,
         sign * u.slope,
         lambda t: sign * u.movement(t),
-        lambda down, up: BallCertificate(radius, *rooms, down, up, n),
+        lambda down, up: BallCase(radius, *ranges, down, up, n),
     )
 
 
@@ -137,7 +136,7 @@ def _bounded(rng: np.random.Generator, rows: int, n: int) -> Trial:
         radius,
         u.slope,
         u.movement,
-        lambda down, up: BallCertificate(radius, below, above, down, up, n),
+        lambda down, up: BallCase(radius, below, above, down, up, n),
     )
 
 
@@ -160,7 +159,7 @@ def _lipschitz(rng: np.random.Generator, rows: int) -> Trial:
         radius,
         slopes[:, 0],
         movement,
-        lambda down, up: LipschitzCertificate(constant, radius, down, up),
+        lambda down, up: LipschitzCase(constant, radius, down, up),
     )
 
 
@@ -185,7 +184,7 @@ def _curved(rng: np.random.Generator, rows: int) -> Trial:
         radius,
         slope,
         movement,
-        lambda down, up: CurvatureCertificate(constant, radius, down, up),
+        lambda down, up: CurvatureCase(constant, radius, down, up),
     )
 
 
@@ -196,7 +195,7 @@ def _with_gaps(
     reach: FloatArray,
     slope: FloatArray,
     movement: Callable[[FloatArray], FloatArray],
-    certificate: Callable[[FloatArray, FloatArray], Certificate],
+    case: Callable[[FloatArray, FloatArray], Case],
 ) -> Trial:
     """Levels where the function is at a random place, and others at random."""
     rows = len(scale)
@@ -209,50 +208,50 @@ def _with_gaps(
     far = rng.random(rows) < 0.5  # else the other level is often met first
     up = np.where(is_met & far & (met < 0), np.inf, up)
     down = np.where(is_met & far & (met > 0), np.inf, down)
-    return Trial(name, certificate(down, up), slope, reach, movement)
+    return Trial(name, case(down, up), slope, reach, movement)
 
 
 def _log_uniform(rng: np.random.Generator, rows: int, low: float, high: float) -> FloatArray:
     return 10 ** rng.uniform(low, high, rows)
 
 
-def _upload(trial: Trial, precision: Precision) -> tuple[Certificate, Any]:
-    """The certificates and slopes as Dr.Jit arrays."""
+def _upload(trial: Trial, precision: Precision) -> tuple[Case, Any]:
+    """The cases and slopes as Dr.Jit arrays."""
     backend = choose_backend(precision)
     fields = {
         key: backend.Float(value) if isinstance(value, np.ndarray) else value
-        for key, value in vars(trial.certificate).items()
+        for key, value in vars(trial.case).items()
     }
-    return type(trial.certificate)(**fields), backend.Float(trial.slope)
+    return type(trial.case)(**fields), backend.Float(trial.slope)
 
 
 def _check_trial(
-    bound: Bound,
+    kind: type[Enclosure],
     trial: Trial,
-    certificate: Certificate,
+    case: Case,
     slope: Any,
     rng: np.random.Generator,
     precision: Precision,
 ) -> None:
     rows = len(trial.slope)
     real = cast("Any", type(slope))
-    step = to_numpy(bound.step(certificate, slope)).astype(np.float64)
+    step = to_numpy(case.step(kind, slope)).astype(np.float64)
     met = _meets(trial, np.minimum(step, trial.reach), precision)
-    _require(trial, ~met, bound, "meets no level within the step {length}", step)
+    _require(trial, ~met, kind, "meets no level within the step {length}", step)
     good = (step >= 0) & (step <= trial.reach * (1 + 1e-6))
-    _require(trial, good, bound, "is known up to {reach}, and the step {length} is a part", step)
+    _require(trial, good, kind, "is known up to {reach}, and the step {length} is a part", step)
     # In single precision both are rounded, each on its safe side.
     shares = [1 - 1e-5 if precision == "double" else 0.98, *rng.uniform(0.01, 0.98, 2)]
     for share in shares:
         length = step * share
-        free = to_numpy(bound.covers(certificate, slope, real(length)))
-        _require(trial, free, bound, "is covered for {length}, within its step", length)
+        free = to_numpy(case.covers(kind, slope, real(length)))
+        _require(trial, free, kind, "is covered for {length}, within its step", length)
     lengths = [step * (1 + 10 ** rng.uniform(-4, 0, rows)), trial.reach * rng.random(rows)]
     for length in lengths:
-        covered = to_numpy(bound.covers(certificate, slope, real(length)))
+        covered = to_numpy(case.covers(kind, slope, real(length)))
         inside = np.minimum(length, trial.reach)
         wrong = covered & (_meets(trial, inside, precision) | (length > trial.reach * (1 + 1e-6)))
-        _require(trial, ~wrong, bound, "meets no level within {length}, which is covered", length)
+        _require(trial, ~wrong, kind, "meets no level within {length}, which is covered", length)
 
 
 def _meets(trial: Trial, length: FloatArray, precision: Precision) -> BoolArray:
@@ -268,7 +267,7 @@ def _meets(trial: Trial, length: FloatArray, precision: Precision) -> BoolArray:
     slack = 0.0
     if precision == "single":
         slack = 2e-6 * _size(trial)[:, None] * growth
-    c = trial.certificate
+    c = trial.case
     over = moved > c.gap_up[:, None] * (1 + tolerance) + slack
     under = -moved > c.gap_down[:, None] * (1 + tolerance) + slack
     return (over | under).any(axis=1)
@@ -276,21 +275,24 @@ def _meets(trial: Trial, length: FloatArray, precision: Precision) -> BoolArray:
 
 def _size(trial: Trial) -> FloatArray:
     size = np.abs(trial.slope) * trial.reach
-    for name in ("room_below", "room_above"):
-        room: FloatArray | None = vars(trial.certificate).get(name)
-        size = size if room is None else size + room
+    for name in ("range_below", "range_above"):
+        most: FloatArray | None = vars(trial.case).get(name)
+        size = size if most is None else size + most
     return size
 
 
-def _require(trial: Trial, good: Any, bound: Bound, promise: str, length: FloatArray) -> None:
+def _require(
+    trial: Trial, good: Any, kind: type[Enclosure], promise: str, length: FloatArray
+) -> None:
     bad = np.flatnonzero(~good)
     if not bad.size:
         return
     row = bad[0]
-    entries: dict[str, Any] = vars(trial.certificate)
+    entries: dict[str, Any] = vars(trial.case)
     numbers = {k: float(x[row]) if np.ndim(x) else x for k, x in entries.items()}
     what = promise.format(reach=float(trial.reach[row]), length=float(length[row]))
     raise BrokenPromiseError(
-        f"{bound!r} does not keep its promise ({trial.name}): f {what}. Wrong in {bad.size} of "
-        f"{len(good)} trials; the first: {numbers}, slope = {float(trial.slope[row])!r}"
+        f"{kind.__name__} does not keep its promise ({trial.name}): f {what}. Wrong in "
+        f"{bad.size} of {len(good)} trials; the first: {numbers}, "
+        f"slope = {float(trial.slope[row])!r}"
     )

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.fields.field import HarmonicBall, Lipschitz
+from harnack.enclosures import HarmonicBall, Lipschitz
 from harnack.testing.failures import BrokenPromiseError, require
 from harnack.testing.poisson import BoolArray, FloatArray
 from harnack.testing.walks import Look, jumps, look_at

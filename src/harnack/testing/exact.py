@@ -2,50 +2,47 @@
 
 Each is the place where an extremal function of the proof reaches a level, so a bound that steps
 further is wrong and one that steps less far gives something away. Nothing here is taken from
-`harnack.bounds` but the classes that say which proof is meant.
+`harnack.enclosures` but the classes that say which proof is meant.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 import numpy as np
 
 from harnack.backend import to_numpy
-from harnack.bounds import Bound, Caps, Classic, CurvatureStep, LipschitzStep, Slope
-from harnack.certify import BallCertificate, CurvatureCertificate, LipschitzCertificate
+from harnack.enclosures import Caps, Classic, Cone, Enclosure, Slope, Taylor
+from harnack.testing.cases import BallCase, Case, CurvatureCase, LipschitzCase
 from harnack.testing.poisson import FloatArray, cap_movement, kernel_movement, poles_movement
-
-if TYPE_CHECKING:
-    from harnack.certify import Certificate
 
 __all__ = ["exact_step", "on_host"]
 
 
-def exact_step(bound: Bound, certificate: Certificate, slope: FloatArray) -> FloatArray:
-    """The longest step (n,) that this proof allows from a certificate of NumPy arrays (n,).
+def exact_step(kind: type[Enclosure], case: Case, slope: FloatArray) -> FloatArray:
+    """The longest step (n,) that this proof allows from a case of NumPy arrays (n,).
 
-    No longer than the radius. Raises TypeError for a bound whose extremal functions are not
+    No longer than the radius. Raises TypeError for a proof whose extremal functions are not
     known here.
     """
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        if isinstance(certificate, LipschitzCertificate) and isinstance(bound, LipschitzStep):
-            gap = np.minimum(certificate.gap_down, certificate.gap_up)
-            return np.minimum(gap / certificate.constant, certificate.radius)
-        if isinstance(certificate, CurvatureCertificate) and isinstance(bound, CurvatureStep):
-            return _parabolas(certificate, slope)
-        if isinstance(certificate, BallCertificate):
-            for kind, fraction in _FRACTIONS.items():
-                if isinstance(bound, kind):
-                    return certificate.radius * fraction(certificate, slope)
-    raise TypeError(f"no exact step is known for {bound!r} and {type(certificate).__name__}")
+        if isinstance(case, LipschitzCase) and issubclass(kind, Cone):
+            gap = np.minimum(case.gap_down, case.gap_up)
+            return np.minimum(gap / case.constant, case.radius)
+        if isinstance(case, CurvatureCase) and issubclass(kind, Taylor):
+            return _parabolas(case, slope)
+        if isinstance(case, BallCase):
+            for ball, fraction in _FRACTIONS.items():
+                if issubclass(kind, ball):
+                    return case.radius * fraction(case, slope)
+    raise TypeError(f"no exact step is known for {kind.__name__} and {type(case).__name__}")
 
 
-def on_host(certificate: Certificate, lanes: int) -> Certificate:
-    """The same certificate with NumPy arrays (lanes,) in the place of numbers and Dr.Jit arrays."""
+def on_host(case: Case, lanes: int) -> Case:
+    """The same case with NumPy arrays (lanes,) in the place of numbers and Dr.Jit arrays."""
 
     def host(value: object) -> FloatArray:
         array = to_numpy(value) if dr.is_array_v(value) else np.asarray(value)
@@ -53,10 +50,10 @@ def on_host(certificate: Certificate, lanes: int) -> Certificate:
 
     fields: dict[str, Any] = {
         key: host(value)
-        for key, value in vars(certificate).items()
+        for key, value in vars(case).items()
         if value is not None and key != "dimension"
     }
-    return dataclasses.replace(certificate, **fields)
+    return dataclasses.replace(case, **fields)
 
 
 def largest_free(movement: Callable[[FloatArray], FloatArray], gap: FloatArray) -> FloatArray:
@@ -69,7 +66,7 @@ def largest_free(movement: Callable[[FloatArray], FloatArray], gap: FloatArray) 
     return low
 
 
-def _parabolas(c: CurvatureCertificate, slope: FloatArray) -> FloatArray:
+def _parabolas(c: CurvatureCase, slope: FloatArray) -> FloatArray:
     """Second derivatives of plus and minus the constant."""
     h = c.constant
     # An infinite radius is replaced by one within which a level is surely met.
@@ -89,17 +86,17 @@ def _parabolas(c: CurvatureCertificate, slope: FloatArray) -> FloatArray:
     return r * np.minimum(largest_free(rise, c.gap_up), largest_free(fall, c.gap_down))
 
 
-def _sides(c: BallCertificate) -> list[tuple[FloatArray, float, FloatArray, FloatArray]]:
+def _sides(c: BallCase) -> list[tuple[FloatArray, float, FloatArray, FloatArray]]:
     """(u, sign, gap away from the end, gap towards it) of the positive functions u at p."""
     sides: list[tuple[FloatArray, float, FloatArray, FloatArray]] = []
-    if c.room_below is not None:
-        sides.append((c.room_below, 1.0, c.gap_up, c.gap_down))
-    if c.room_above is not None:
-        sides.append((c.room_above, -1.0, c.gap_down, c.gap_up))
+    if c.range_below is not None:
+        sides.append((c.range_below, 1.0, c.gap_up, c.gap_down))
+    if c.range_above is not None:
+        sides.append((c.range_above, -1.0, c.gap_down, c.gap_up))
     return sides
 
 
-def _classic(c: BallCertificate, slope: FloatArray) -> FloatArray:
+def _classic(c: BallCase, slope: FloatArray) -> FloatArray:
     """Point masses at the poles."""
     del slope
     best = np.zeros_like(c.radius)
@@ -111,7 +108,7 @@ def _classic(c: BallCertificate, slope: FloatArray) -> FloatArray:
     return best
 
 
-def _slope(c: BallCertificate, slope: FloatArray) -> FloatArray:
+def _slope(c: BallCase, slope: FloatArray) -> FloatArray:
     """Two point masses at the poles; a ring of mass at one latitude."""
     n = c.dimension
     reach = {1.0: np.zeros_like(c.radius), -1.0: np.zeros_like(c.radius)}
@@ -124,15 +121,15 @@ def _slope(c: BallCertificate, slope: FloatArray) -> FloatArray:
     return np.minimum(reach[1.0], reach[-1.0])
 
 
-def _caps(c: BallCertificate, slope: FloatArray) -> FloatArray:
+def _caps(c: BallCase, slope: FloatArray) -> FloatArray:
     """Two caps on the axis, and all but two caps."""
-    assert c.room_below is not None
-    assert c.room_above is not None
-    span = c.room_below + c.room_above
+    assert c.range_below is not None
+    assert c.range_above is not None
+    span = c.range_below + c.range_above
     reach: list[FloatArray] = []
     for below, above, sign, gap in (
-        (c.room_below, c.room_above, 1.0, c.gap_up),
-        (c.room_above, c.room_below, -1.0, c.gap_down),
+        (c.range_below, c.range_above, 1.0, c.gap_up),
+        (c.range_above, c.range_below, -1.0, c.gap_down),
     ):
         p, rest = below / span, above / span
         shift = np.where(rest > 0, sign * c.radius * slope / (3 * span * rest), 0.0)
@@ -158,7 +155,7 @@ def _belt(q: FloatArray, middle: FloatArray, half: FloatArray) -> FloatArray:
     return total
 
 
-_FRACTIONS: dict[type[Bound], Callable[[BallCertificate, FloatArray], FloatArray]] = {
+_FRACTIONS: dict[type[Enclosure], Callable[[BallCase, FloatArray], FloatArray]] = {
     Classic: _classic,
     Slope: _slope,
     Caps: _caps,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.fields.field import Curvature, HarmonicBall, Lipschitz
+from harnack.enclosures import Curvature, HarmonicBall, Lipschitz
 from harnack.testing.derivative_contracts import check_derivatives
 from harnack.testing.failures import BrokenPromiseError, require
 from harnack.testing.poisson import FloatArray
@@ -16,7 +16,8 @@ from harnack.testing.walks import Look, look_at, movements, random_directions, r
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from harnack.fields.field import Field, Knowledge
+    from harnack.enclosures import Promise
+    from harnack.fields.field import Field
 
 __all__ = ["check_field"]
 
@@ -139,7 +140,7 @@ def _check_promise(
     field: Field,
     points: FloatArray,
     look: Look,
-    known: Knowledge,
+    known: Promise,
     rng: np.random.Generator,
     directions: int,
 ) -> None:

@@ -3,7 +3,7 @@
 A positive harmonic function on the unit ball of R^n is a Poisson integral of a positive measure
 on the sphere. Along an axis only the latitude s of its mass counts, s = 1 ahead and s = -1
 behind. Everything is written as a movement, the value at q minus that at the centre, free of
-cancellation at small q, and shares no formula with `harnack.bounds`.
+cancellation at small q, and shares no formula with `harnack.enclosures`.
 """
 
 from __future__ import annotations

@@ -1,31 +1,38 @@
-"""A bound made wrong on purpose: a test suite that accepts it is worth nothing."""
+"""A proof made wrong on purpose: a test suite that accepts it is worth nothing."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from harnack.bounds import Bound
+from harnack.enclosures import Enclosure, Gaps
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real
-    from harnack.certify import Certificate
 
-__all__ = ["Scaled"]
+__all__ = ["scaled", "unscaled"]
 
 
-@dataclass(frozen=True)
-class Scaled(Bound):
-    """`bound` with every step, and every length it covers, multiplied by `factor`."""
+def scaled(kind: type[Enclosure], factor: float, *, covers: float | None = None) -> Any:
+    """The same proof with every step multiplied by `factor`, and every length that it covers by
+    `covers` (None: by the same)."""
+    loose = factor if covers is None else covers
+    base: Any = kind
 
-    bound: Bound
-    factor: float
+    class Scaled(base):
+        original = kind
 
-    def accepts(self, certificate: Certificate) -> bool:
-        return self.bound.accepts(certificate)
+        def step(self, gaps: Gaps) -> Real:
+            inner: Any = super()
+            return factor * inner.step(gaps)
 
-    def step(self, certificate: Certificate, slope: Real) -> Real:
-        return self.factor * self.bound.step(certificate, slope)
+        def covers(self, gaps: Gaps, length: Real) -> Mask:
+            inner: Any = super()
+            return inner.covers(gaps, length / loose)
 
-    def covers(self, certificate: Certificate, slope: Real, length: Real) -> Mask:
-        return self.bound.covers(certificate, slope, length / self.factor)
+    Scaled.__name__ = f"Scaled{kind.__name__}"
+    return Scaled
+
+
+def unscaled(kind: type[Enclosure]) -> type[Enclosure]:
+    """The proof that `scaled` was given; any other as it is."""
+    return getattr(kind, "original", kind)

@@ -1,4 +1,4 @@
-"""`check_steps`: no level within the steps that a bound takes in a field."""
+"""`check_steps`: no level within the steps that a proof takes in a field."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.certify import certify
+from harnack.enclosures import Gaps
+from harnack.testing.cases import Case, case_of
 from harnack.testing.exact import exact_step, on_host
 from harnack.testing.failures import BrokenPromiseError
 from harnack.testing.poisson import FloatArray
-from harnack.testing.scaled import Scaled
+from harnack.testing.scaled import unscaled
 from harnack.testing.walks import look_at, movements, random_directions, random_points
 
 if TYPE_CHECKING:
     from harnack.backend import Precision
-    from harnack.bounds import Bound
-    from harnack.certify import Certificate
+    from harnack.enclosures import Enclosure
     from harnack.fields.field import Field
 
 __all__ = ["check_steps"]
@@ -26,7 +26,7 @@ __all__ = ["check_steps"]
 
 def check_steps(
     field: Field,
-    bound: Bound,
+    kind: type[Enclosure],
     *,
     rng: np.random.Generator | int = 0,
     count: int = 400,
@@ -35,9 +35,9 @@ def check_steps(
     """Take steps from random points in random directions and look for levels within them.
 
     Levels lie at random distances in value, from tiny to large. Checked for each promise of the
-    field that the bound accepts: no level is met within the step, nor within any length that is
+    field that the proof applies to: no level is met within the step, nor within any length that is
     covered (which is what the tracer asks when it looks back); what is stepped is covered; and
-    the step is not longer than the proof of a bound of `harnack.bounds` allows. In single
+    the step is not longer than a proof of `harnack.enclosures` allows. In single
     precision levels are seen nearer by what rounding may have done, as the tracer sees them.
 
     Returns how many kinds of promise there were to test.
@@ -57,12 +57,13 @@ def check_steps(
     slope = dr.dot(sample.gradient, d)
     down, up = _gaps(field, points, generator)
     blur = _blur(sample, points, backend.epsilon)
-    near = [real(np.maximum(gap - blur, 0)) for gap in (down, up)]
-    accepted = [one for one in certify(sample, near[0], near[1]) if bound.accepts(one)]
+    near = Gaps(*(real(np.maximum(gap - blur, 0)) for gap in (down, up)))
+    cases = [case_of(one, sample, near) for one in sample.promises]
+    accepted = [one for one in cases if one.accepts(kind)]
     for one in accepted:
-        step = to_numpy(bound.step(one, slope)).astype(np.float64) * np.ones(count)
-        _check_step(field, bound, one, slope, points, directions, step, (down, up))
-        _check_covers(field, bound, one, slope, points, directions, step, (down, up), generator)
+        step = to_numpy(one.step(kind, slope)).astype(np.float64) * np.ones(count)
+        _check_step(field, kind, one, slope, points, directions, step, (down, up))
+        _check_covers(field, kind, one, slope, points, directions, step, (down, up), generator)
     return len(accepted)
 
 
@@ -86,35 +87,34 @@ def _blur(sample: Any, points: FloatArray, epsilon: float) -> FloatArray:
 
 
 def _check_step(
-    field: Field, bound: Bound, certificate: Certificate, slope: Any, points: FloatArray,
+    field: Field, kind: type[Enclosure], case: Case, slope: Any, points: FloatArray,
     directions: FloatArray, step: FloatArray, gaps: tuple[FloatArray, FloatArray],
 ) -> None:  # fmt: skip
     def require(good: Any, message: str) -> None:
-        _require(good, f"{type(certificate).__name__}: {message}", points, directions, step)
+        _require(good, f"{type(case).__name__}: {message}", points, directions, step)
 
     require(np.isfinite(step) & (step >= 0), "the step is not a number >= 0")
     require(~_meets(field, points, directions, step, gaps), "a level lies within the step")
-    inner = bound.bound if isinstance(bound, Scaled) else bound
     try:
         along = to_numpy(slope).astype(np.float64) * np.ones(len(points))
-        exact = exact_step(inner, on_host(certificate, len(points)), along)
+        exact = exact_step(unscaled(kind), on_host(case, len(points)), along)
     except TypeError:
-        return  # a bound of the user's own
+        return  # a proof of the user's own
     require(step <= exact * (1 + 1e-12), "the step is longer than the proof allows")
 
 
 def _check_covers(
-    field: Field, bound: Bound, certificate: Certificate, slope: Any, points: FloatArray,
+    field: Field, kind: type[Enclosure], case: Case, slope: Any, points: FloatArray,
     directions: FloatArray, step: FloatArray, gaps: tuple[FloatArray, FloatArray],
     rng: np.random.Generator,
 ) -> None:  # fmt: skip
     real = cast("Any", type(slope))
 
     def covered(length: FloatArray) -> Any:
-        return to_numpy(bound.covers(certificate, slope, real(length))) & np.ones(len(step), bool)
+        return to_numpy(case.covers(kind, slope, real(length))) & np.ones(len(step), bool)
 
     def require(good: Any, message: str, length: FloatArray) -> None:
-        _require(good, f"{type(certificate).__name__}: {message}", points, directions, length)
+        _require(good, f"{type(case).__name__}: {message}", points, directions, length)
 
     part = step * rng.uniform(0.1, 0.9, len(step))
     require(covered(part), "a part of the step is not covered", part)

@@ -15,7 +15,8 @@ from harnack.testing.poisson import BoolArray, FloatArray
 
 if TYPE_CHECKING:
     from harnack.backend import Precision
-    from harnack.fields.field import Field, Knowledge, Sample
+    from harnack.enclosures import Promise
+    from harnack.fields.field import Field, Sample
 
 __all__ = [
     "Look",
@@ -36,11 +37,11 @@ class Look:
     gradient: FloatArray
     error: FloatArray
     gradient_error: FloatArray
-    known: tuple[Knowledge, ...]
+    known: tuple[Promise, ...]
 
     def at(self, rows: BoolArray) -> Look:
         """The same at some of the points."""
-        known: list[Knowledge] = []
+        known: list[Promise] = []
         for one in self.known:
             numbers: dict[str, Any] = {
                 key: value[rows] for key, value in vars(one).items() if key != "dimension"
@@ -60,13 +61,13 @@ def look_at(field: Field, points: FloatArray, precision: Precision = "double") -
     n = len(points)
     sample = _sample(field, points, precision)
 
-    def on_host(one: Knowledge) -> Knowledge:
+    def on_host(one: Promise) -> Promise:
         numbers: dict[str, Any] = {
             key: _spread(value, n) for key, value in vars(one).items() if key != "dimension"
         }
         return dataclasses.replace(one, **numbers)
 
-    known = tuple(on_host(one) for one in sample.known)
+    known = tuple(on_host(one) for one in sample.promises)
     return Look(
         _spread(sample.value, n),
         np.broadcast_to(to_numpy(sample.gradient), (n, 3)).astype(np.float64),

@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 from harnack.tracer.hits import Hits, trace
-from harnack.tracer.march import PreparedLevelSet, Trace
+from harnack.tracer.prepared import MarchResult, PreparedLevelSet
 from harnack.tracer.surface import LevelSet, level_set
 from harnack.tracer.tolerance import Status, Tolerance
 
 __all__ = [
-    "Hits", "LevelSet", "PreparedLevelSet", "Status", "Tolerance", "Trace", "level_set", "trace",
-]  # fmt: skip
+    "Hits",
+    "LevelSet",
+    "MarchResult",
+    "PreparedLevelSet",
+    "Status",
+    "Tolerance",
+    "level_set",
+    "trace",
+]

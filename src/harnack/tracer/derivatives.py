@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 
 from harnack.backend.lengths import length as norm
-from harnack.certify import Levels
+from harnack.enclosures import Levels
 from harnack.tracer.tolerance import Status
 
 if TYPE_CHECKING:
     from harnack.backend import Real, Vec3
-    from harnack.tracer.march import PreparedLevelSet, Trace
+    from harnack.tracer.prepared import MarchResult, PreparedLevelSet
 
 # Newton steps from the tolerance to rounding before the derivative is taken.
 _POLISH = 4
@@ -47,7 +47,7 @@ def wants_derivatives(prepared: PreparedLevelSet, o: Vec3, d: Vec3) -> bool:
 
 
 def attach(
-    prepared: PreparedLevelSet, o: Vec3, d: Vec3, end: Trace, normal: Vec3
+    prepared: PreparedLevelSet, o: Vec3, d: Vec3, end: MarchResult, normal: Vec3
 ) -> tuple[Real, Vec3]:
     """t polished to rounding with its derivative attached, and the normal at that point.
 
@@ -85,7 +85,7 @@ def attach(
     return dr.select(hit, moved, t), normal
 
 
-def _on_plane(prepared: PreparedLevelSet, o: Vec3, d: Vec3, end: Trace) -> Real:
+def _on_plane(prepared: PreparedLevelSet, o: Vec3, d: Vec3, end: MarchResult) -> Real:
     """t with the derivative of the intersection with a plane at hits on sheets."""
     with dr.suspend_grad():
         at = dr.select(end.on_sheet, end.t, 0)
@@ -101,8 +101,7 @@ def _change_of_nearest(prepared: PreparedLevelSet, f: Real) -> Real:
     for level in prepared.levels.values:
         with dr.suspend_grad():
             one = Levels((dr.detach(level),), prepared.levels.period)
-            down, up = one.gaps(f)
-            gap = dr.select(up < down, up, down)
+            gap = one.gaps(f).smaller
             closer = gap < nearest
             nearest = dr.select(closer, gap, nearest)
         change = dr.select(closer, level - dr.detach(level), change)

@@ -18,7 +18,7 @@ from harnack.tracer.tolerance import Status, Tolerance
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Precision, Real, Vec3
-    from harnack.bounds import Bound, Longest
+    from harnack.enclosures import Choice
     from harnack.fields.field import Field
     from harnack.geometry import Volume
 
@@ -68,7 +68,7 @@ def trace(
     t_max: Any = math.inf,
     tolerance: float | Tolerance = 1e-4,
     max_steps: int = 2000,
-    bound: str | Bound | Longest | None = None,
+    bound: Choice = None,
     clip: Volume | None = None,
     overstep: float | None = None,
     precision: Precision | None = None,
@@ -84,7 +84,8 @@ def trace(
         field knows how far its surface reaches.
     tolerance: a length, or a `Tolerance`. In single precision not below about 1e-6 of the
         size of the coordinates.
-    bound: None for the sharpest known; "classic" for the published rule, "slope", "caps".
+    bound: which proofs to use: None for all that pay; "classic" for the published rule, "slope",
+        "caps", "curvature", "lipschitz"; or classes of enclosures, such as `harnack.Caps`.
     precision: "single" or "double" for NumPy input; Dr.Jit input keeps its own.
 
     With Dr.Jit input, t, position and normal carry derivatives with respect to whatever had

@@ -1,70 +1,86 @@
 """Rays through fields that jump: from one crossing of a sheet to the next.
 
-Between two crossings the field is continuous, and the marching loop proves that stretch as it
-proves any ray. What is added here is which stretch comes next, and when a sheet is the surface.
+Between two crossings the field is continuous, and the marching loop proves that ray interval as it
+proves any ray. What is added here is which interval comes next.
 
-A smooth hit is a point within tolerance of a level of the function that continues the stretch. Its
+A smooth hit is a point within tolerance of a level of the function that continues the interval. Its
 level set may end at a sheet, so within tolerance of where it does a ray may hit although the sheet
 cuts the level off: mostly near singular edges, where gradients grow without limit.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
 from harnack.backend.extrema import fmax, fmin
 from harnack.backend.lengths import largest_component
+from harnack.backend.loops import while_active
 from harnack.fields.sheets import NO_SHEET, Crossing
+from harnack.tracer.march import March, MarchState
+from harnack.tracer.sheet_comparison import ON_SHEET
 from harnack.tracer.tolerance import Status
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.certify import Levels
     from harnack.fields.field import Field
-
-# base, step, reach, value, gradient, excess, evaluations, detail, status, active: see
-# `PreparedLevelSet._advance`.
-State: TypeAlias = "tuple[Any, ...]"
-REACH, EVALUATIONS, STATUS, ACTIVE = 2, 6, 8, 9
+    from harnack.fields.look import Path
 
 # Sheets are at the same place if they are no farther apart than so many roundings of coordinates,
 # and the cosine of the angle between them is larger than the second; of rays that graze them, as if
 # the third were the sine of the angle to them.
 _SAME, _PARALLEL, _STEEP = 2.0, 0.999, 1 / 64
 
-ON_SHEET = max(Status) + 1
-"""Status of a ray that hit a sheet, until `Walk` turns it into a plain HIT."""
 
+@dataclass(frozen=True)
+class _WalkState:
+    """Where rays are: the field's offset, the crossing last passed, and the state of the march."""
 
-class March(Protocol):
-    """The marching loop, for a field on a stretch that ends at `stop`, at the crossing `ahead` if
-    there is one. A lane that passes its crossing ends as a miss."""
+    offset: Real
+    behind: Crossing
+    march: MarchState
 
-    def __call__(self, field: Field, stop: Real, ahead: Crossing, state: State) -> State: ...
+    @property
+    def active(self) -> Mask:
+        return self.march.active
 
 
 @dataclass(frozen=True)
-class Walk:
-    """Rays through a field with sheets, |d| = 1, and how to march one stretch of them."""
+class _Together:
+    """Crossings at the same place: the sum of their jumps, the last of them, and the first of those
+    that jump up and down."""
 
-    backend: Backend
+    jump: Real
+    t: Real
+    last: Any
+    up: Any
+    down: Any
+    normal_up: Vec3
+    normal_down: Vec3
+    active: Mask
+
+
+@dataclass(frozen=True)
+class SheetTracer:
+    """Rays through a field with sheets, from `start` to `end`, and how to march one interval."""
+
+    march: March
     field: Field
-    o: Vec3
-    d: Vec3
+    path: Path
     start: Real
     end: Real
-    max_steps: int
-    overstep: float
-    march: March
 
-    def run(self, state: State) -> tuple[State, Any]:
+    @property
+    def backend(self) -> Backend:
+        return self.march.backend
+
+    def run(self, state: MarchState) -> tuple[MarchState, Any]:
         """The end state of rays, and the index of the sheet that each hit (NO_SHEET: none).
 
-        Proof that no hit is missed: crossings come in order, so the stretches cover the ray. On
+        Proof that no hit is missed: crossings come in order, so the intervals cover the ray. On
         each of them the field is the continuous one that `march` sees, up to and including its
         last point, where the value behind the sheet is compared with that before it; from there
         it goes on with the step that the value behind the sheet allows. So the part of the ray
@@ -73,40 +89,47 @@ class Walk:
         The walk begins just before `start`, so that a sheet on the very start is looked at.
         """
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
+        o, d = self.path.origin, self.path.direction
         before = real(self.start * (1 - self.backend.epsilon) - 1e-30)
-        offset = real(self.field.offset(self.o, self.d, before, state[ACTIVE]))
-        outer = (offset, before, count(NO_SHEET), real(0), vector(0), *state)
-        outer = loop(outer, self._stretch, "harnack stretches")
-        sheet, state = outer[2], outer[5:]
-        status = state[STATUS]
-        on_sheet = status == ON_SHEET
-        sheet = dr.select(on_sheet, sheet, count(NO_SHEET))
-        status = dr.select(on_sheet, count(int(Status.HIT)), status)
-        return (*state[:STATUS], status, state[ACTIVE]), sheet
+        offset = real(self.field.offset(o, d, before, state.active))
+        start = Crossing(before, count(NO_SHEET), real(0), vector(0))
+        outer = _WalkState(offset, start, state)
+        outer = while_active(outer, self._interval, "harnack intervals")
+        end = outer.march
+        on_sheet = end.status == ON_SHEET
+        status = dr.select(on_sheet, count(int(Status.HIT)), end.status)
+        sheet = dr.select(on_sheet, outer.behind.sheet, count(NO_SHEET))
+        return dataclasses.replace(end, status=status), sheet
 
-    def _stretch(self, offset: Real, *outer: Any) -> tuple[Any, ...]:
-        """One stretch: to the next crossing or the end of the ray, or to a hit."""
+    def _interval(self, outer: _WalkState) -> _WalkState:
+        """One interval: to the next crossing or the end of the ray, or to a hit."""
         count = self.backend.UInt32
-        behind, state = Crossing(*outer[:4]), outer[4:]
-        ahead, last = self._together(self._next(behind, self.end, state[ACTIVE]), state[ACTIVE])
+        o, d = self.path.origin, self.path.direction
+        behind, now = outer.behind, outer.march
+        ahead, last = self._together(self._next(behind, self.end, now.active), now.active)
         stops = ahead.sheet != NO_SHEET
         stop = dr.select(stops, ahead.t, self.end)
-        base, _, reach = state[:3]
         # The last step may already have proved the rest of the ray.
-        active = state[ACTIVE] & (stops | (base + reach < stop))
-        step = fmin(self.overstep * reach, stop - base)
-        state = (base, step, *state[REACH:ACTIVE], active)
-        field = self.field.between(self.o, self.d, behind, ahead, offset)
-        state = self.march(field, stop, ahead, state)
-        status = state[STATUS]
-        passed = active & stops & (status == int(Status.MISS))
-        spent = passed & (state[EVALUATIONS] >= self.max_steps)
-        status = dr.select(spent, count(int(Status.OUT_OF_STEPS)), status)
-        offset = dr.select(passed, offset + ahead.jump, offset)
+        active = now.active & (stops | (now.base + now.reach < stop))
+        step = fmin(self.march.overstep * now.reach, stop - now.base)
+        now = dataclasses.replace(now, step=step, active=active)
+        field = self.field.between(o, d, behind, ahead, outer.offset)
+        now = self.march.advance(field, self.path, stop, now, ahead)
+        passed = active & stops & (now.status == int(Status.MISS))
+        spent = passed & (now.evaluations >= self.march.max_steps)
+        status = dr.select(spent, count(int(Status.OUT_OF_STEPS)), now.status)
         # A sheet that was hit is the one to be named; one that was passed, the last of all there.
-        t, sheet = dr.select(passed, last.t, ahead.t), dr.select(passed, last.sheet, ahead.sheet)
-        crossing = (t, sheet, ahead.jump, ahead.normal)
-        return (offset, *crossing, *state[:STATUS], status, passed & ~spent)
+        crossing = Crossing(
+            dr.select(passed, last.t, ahead.t),
+            dr.select(passed, last.sheet, ahead.sheet),
+            ahead.jump,
+            ahead.normal,
+        )
+        return _WalkState(
+            dr.select(passed, outer.offset + ahead.jump, outer.offset),
+            crossing,
+            dataclasses.replace(now, status=status, active=passed & ~spent),
+        )
 
     def _together(self, first: Crossing, active: Mask) -> tuple[Crossing, Crossing]:
         """All crossings at the t of the first as one, and the last of them.
@@ -118,58 +141,53 @@ class Walk:
         first one that jumps as all of them together do.
         """
         real, count = self.backend.Float, self.backend.UInt32
-        size = largest_component(self.o)
+        size = largest_component(self.path.origin)
         close = _SAME * self.backend.epsilon * (size + first.t)
-        steep = fmax(dr.abs(dr.dot(first.normal, self.d)), real(_STEEP))
+        steep = fmax(dr.abs(dr.dot(first.normal, self.path.direction)), real(_STEEP))
         furthest = fmax(fmin(first.t + close / steep, self.end), first.t)
 
-        def more(*state: Any) -> Mask:
-            return state[-1]
-
-        def body(
-            jump: Real, t: Real, last: Any, up: Any, down: Any, n_up: Vec3, n_down: Vec3, go: Mask
-        ) -> tuple[Any, ...]:
-            one = self._next(Crossing(t, last, 0.0, first.normal), furthest, go)
+        def body(now: _Together) -> _Together:
+            one = self._next(Crossing(now.t, now.last, 0.0, first.normal), furthest, now.active)
             # Sheets at an angle to each other are at the same t or apart.
             level = dr.abs(dr.dot(one.normal, first.normal)) > _PARALLEL
-            found = go & (one.sheet != NO_SHEET) & ((one.t == first.t) | level)
-            is_up, is_down = found & (one.jump > 0), found & (one.jump < 0)
-            new_up, new_down = is_up & (up == NO_SHEET), is_down & (down == NO_SHEET)
-            return (
-                jump + dr.select(found, one.jump, 0),
-                dr.select(found, one.t, t),
-                dr.select(found, one.sheet, last),
-                dr.select(new_up, one.sheet, up),
-                dr.select(new_down, one.sheet, down),
-                dr.select(new_up, one.normal, n_up),
-                dr.select(new_down, one.normal, n_down),
-                found,
+            found = now.active & (one.sheet != NO_SHEET) & ((one.t == first.t) | level)
+            new_up = found & (one.jump > 0) & (now.up == NO_SHEET)
+            new_down = found & (one.jump < 0) & (now.down == NO_SHEET)
+            return _Together(
+                jump=now.jump + dr.select(found, one.jump, 0),
+                t=dr.select(found, one.t, now.t),
+                last=dr.select(found, one.sheet, now.last),
+                up=dr.select(new_up, one.sheet, now.up),
+                down=dr.select(new_down, one.sheet, now.down),
+                normal_up=dr.select(new_up, one.normal, now.normal_up),
+                normal_down=dr.select(new_down, one.normal, now.normal_down),
+                active=found,
             )
 
-        some = self.backend.Bool(active) & (first.sheet != NO_SHEET)
         none = count(NO_SHEET)
-        start = (
-            first.jump,
-            first.t,
-            first.sheet,
-            dr.select(first.jump > 0, first.sheet, none),
-            dr.select(first.jump < 0, first.sheet, none),
-            first.normal,
-            first.normal,
-            some,
+        start = _Together(
+            jump=first.jump,
+            t=first.t,
+            last=first.sheet,
+            up=dr.select(first.jump > 0, first.sheet, none),
+            down=dr.select(first.jump < 0, first.sheet, none),
+            normal_up=first.normal,
+            normal_down=first.normal,
+            active=self.backend.Bool(active) & (first.sheet != NO_SHEET),
         )
-        jump, t, last, up, down, n_up, n_down, _ = dr.while_loop(
-            start, more, body, label="together"
+        all_there = while_active(start, body, "together")
+        up, down = all_there.jump > 0, all_there.jump < 0
+        sheet = dr.select(up, all_there.up, dr.select(down, all_there.down, first.sheet))
+        normal = dr.select(
+            up, all_there.normal_up, dr.select(down, all_there.normal_down, first.normal)
         )
-        sheet = dr.select(jump > 0, up, dr.select(jump < 0, down, first.sheet))
-        normal = dr.select(jump > 0, n_up, dr.select(jump < 0, n_down, first.normal))
-        behind = Crossing(t, last, first.jump, first.normal)
-        return Crossing(first.t, sheet, real(jump), normal), behind
+        behind = Crossing(all_there.t, all_there.last, first.jump, first.normal)
+        return Crossing(first.t, sheet, real(all_there.jump), normal), behind
 
     def _next(self, behind: Crossing, end: Real, active: Mask) -> Crossing:
         """The field's answer as arrays of this backend; none if it lies beyond the end."""
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
-        ahead = self.field.next_crossing(self.o, self.d, behind, end, active)
+        ahead = self.field.next_crossing(self.path.origin, self.path.direction, behind, end, active)
         there = real(ahead.t) <= end
         there &= count(ahead.sheet) != NO_SHEET
         return Crossing(
@@ -178,57 +196,3 @@ class Walk:
             dr.select(there, real(ahead.jump), 0),
             vector(*ahead.normal),
         )
-
-
-@dataclass(frozen=True)
-class Meeting:
-    """What a look at a point of a stretch tells about the crossing at its end.
-
-    awaited: the stretch ends at a crossing.
-    passed: the look was at the crossing, which ends the stretch.
-    hit: the sheet that was passed is the surface.
-    gaps: to the levels below and above, of the value behind the sheet where it was passed.
-    normal: of the sheet.
-    """
-
-    awaited: Mask
-    passed: Mask
-    hit: Mask
-    gaps: tuple[Real, Real]
-    normal: Vec3
-
-    def mark(self, status: Any, gradient: Vec3) -> tuple[Any, Vec3]:
-        """Status and gradient, those of the sheet where it was hit."""
-        marked = type(status)(dr.select(self.hit, ON_SHEET, status))
-        return marked, dr.select(self.hit, self.normal, gradient)
-
-
-def meet(ahead: Crossing, there: Mask, value: Real, blur: Real, levels: Levels) -> Meeting:
-    """Looks that are proved, at the crossing where `there` holds, with the value before it.
-
-    The sheet is the surface if a level lies between the values on its two sides. They are known
-    up to `blur`, and a level within blur of either counts as between: such a sheet is the surface
-    or just fails to be, and its points are no farther than rounding from the level. To decide the
-    other way could lose a surface, for the march has proved that the level is not met *before*
-    the sheet, which rounding may contradict by as much. Sheets at the same t count as one, with the
-    sum of their jumps (`Walk._together`).
-    """
-    awaited = ahead.sheet != NO_SHEET
-    passed = awaited & there
-    behind = value + dr.select(passed, ahead.jump, 0)
-    low, high = fmin(value, behind) - blur, fmax(value, behind) + blur
-    _, up = levels.gaps(low)
-    hit = passed & (up <= high - low)
-    return Meeting(awaited, passed, hit, levels.gaps(behind), ahead.normal)
-
-
-def loop(state: Any, body: Callable[..., Any], label: str) -> Any:
-    """Runs `body` on lanes of the state whose last entry holds."""
-
-    def running(*state: Any) -> Mask:
-        return state[-1]
-
-    try:
-        return dr.while_loop(state, running, body, label=label)
-    except RuntimeError as error:  # Dr.Jit wraps what the body raises
-        raise (error.__cause__ or error) from None

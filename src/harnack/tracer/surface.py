@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
-from harnack.bounds import Bound, Longest, choose_bound
-from harnack.certify import Levels
+from harnack.enclosures import Choice, Levels, Proofs, choose_proofs
 from harnack.geometry import Intersection
-from harnack.tracer.march import PreparedLevelSet
+from harnack.tracer.prepared import PreparedLevelSet
 from harnack.tracer.tolerance import Tolerance
 
 if TYPE_CHECKING:
@@ -40,7 +39,7 @@ class LevelSet:
     clip: Volume | None = None
     tolerance: Tolerance = dataclasses.field(default_factory=Tolerance)
     max_steps: int = 2000
-    bound: Longest = dataclasses.field(default_factory=choose_bound)
+    bound: Proofs = dataclasses.field(default_factory=choose_proofs)
     overstep: float = 1.4
     solid: tuple[float, float] | None = None
 
@@ -92,7 +91,7 @@ def level_set(
     clip: Volume | None = None,
     tolerance: float | Tolerance = 1e-4,
     max_steps: int = 2000,
-    bound: str | Bound | Longest | None = None,
+    bound: Choice = None,
     overstep: float | None = None,
     solid: tuple[float, float] | None = None,
 ) -> LevelSet:
@@ -127,7 +126,7 @@ def level_set(
     if not isinstance(tolerance, Tolerance):
         tolerance = Tolerance(_as_number(tolerance, "tolerance must be a length or a Tolerance"))
     overstep = field.overstep if overstep is None else overstep
-    return LevelSet(field, asked, clip, tolerance, max_steps, choose_bound(bound), overstep, solid)
+    return LevelSet(field, asked, clip, tolerance, max_steps, choose_proofs(bound), overstep, solid)
 
 
 def _as_levels(level: Any) -> tuple[Any, ...]:

@@ -237,7 +237,7 @@ class ScreenedWindingNumber(BatchedField):
         steep = on.backend.Array3f(0, 0, _ANY_LEVEL / (_ON_DIPOLE * epsilon))
         value = dr.select(apart, sums.value, 0)
         gradient = dr.select(apart, sums.gradient, steep)
-        known = promises(sums, value, gradient, on.sum.kappa, on.size, epsilon)
+        known, ball = promises(sums, value, gradient, on.sum.kappa, on.size, epsilon)
         return Sample(
             value,
             gradient / on.size,
@@ -245,6 +245,7 @@ class ScreenedWindingNumber(BatchedField):
             dr.select(apart, error, _ANY_LEVEL),
             dr.select(apart, slope_error / on.size, 0),
             truncation=dr.select(apart, sums.error, 0),
+            weaker=(ball,),
         )
 
     @property

@@ -272,8 +272,9 @@ def _times(matrix: Sequence[Real], z: Vec3) -> Vec3:
 
 def promises(
     sums: ScreenedSums, f: Real, gradient: Vec3, kappa: Real, size: Real, epsilon: float
-) -> tuple[Curvature | HarmonicBall, ...]:
-    """What `ScreenedWindingNumber` proves. f, gradient: at the point, in units of `size`.
+) -> tuple[tuple[Curvature, ...], HarmonicBall]:
+    """What `ScreenedWindingNumber` proves: how it bends, and a ball, which proves shorter steps.
+    f, gradient: at the point, in units of `size`.
 
     Radii stay below 36 lengths, so that exp(kappa r) times sums in which exponentials are held at
     exp(-80) neither overflows nor grows.
@@ -286,7 +287,7 @@ def promises(
         chord = ((3 - 2 * share) / (1 - share) ** 2 - 3) / share
         return 2 * out * dr.exp(kappa * r) * dr.fma(chord * r, sums.more_bent, 3 * sums.bent)
 
-    known: list[Curvature | HarmonicBall] = []
+    known: list[Curvature] = []
     for share in _REACHES:
         r = share * most
         known.append(Curvature(bend(r, share) / (size * size), r * size))
@@ -301,8 +302,7 @@ def promises(
     lower, upper = fmin(ends[0], products[0]), fmax(ends[1], products[1])
     # A negative cosine turns the interval round.
     lower, upper = fmin(lower, products[1]), fmax(upper, products[0])
-    known.append(HarmonicBall(r * size, lower, upper, dimension=4))
-    return tuple(known)
+    return tuple(known), HarmonicBall(r * size, lower, upper, dimension=4)
 
 
 def mean_at_dipoles(rows: FloatArray, kappa: float) -> float:

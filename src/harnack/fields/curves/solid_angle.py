@@ -19,7 +19,7 @@ from harnack.fields.curves.edge_nearest import Segments, closest_on_segments
 from harnack.fields.edges.edge_hessian import hessian_over_edges
 from harnack.fields.edges.edge_passing import Line, known_along, rates_along
 from harnack.fields.edges.edge_sums import EdgeBuffer, EdgeSums, sum_over_edges, upload
-from harnack.fields.field import Field, HarmonicBall, LineLipschitz, Sample
+from harnack.fields.field import Field, HarmonicBall, LineLipschitz, Look, Path, Sample
 from harnack.fields.multipoles.nearby import SECOND_ROUNDINGS, SLOPE_ROUNDINGS
 from harnack.fields.unit_coordinates import UnitCoordinates, epsilon_at, placed
 from harnack.geometry import ConvexHull, is_convex_position, total_length, validate_loops
@@ -86,13 +86,14 @@ class SolidAngle(Field):
         self.vertices: Vec3 | None = vertices
         self._net: Loops = net_loops(self.loops)
         self.convex_position = is_convex_position(self._net)
+        if self.convex_position:
+            self.overstep = 1.6
         self._asked = certificate
         self.certificate = self._choose(certificate)
         points = np.concatenate(self._net or self.loops)
         self._centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
         self._size = float(np.linalg.norm(points - self._centre, axis=1).max())
         self._device: _OnDevice | None = None
-        self._direction: Vec3 | None = None
         self._extents: dict[tuple[float, ...], Volume | None] = {}
 
     def _choose(self, asked: CertificateName) -> Literal["edges", "range"]:
@@ -140,8 +141,19 @@ class SolidAngle(Field):
         return prepared
 
     def evaluate(self, p: Vec3) -> Sample:
+        return self._sample(p, None)
+
+    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
+        """With what edges promise along the ray, which is much beside a long edge along it."""
+        del ahead, back
+        knows_lines = self._net and self._asked != "paper"
+        direction = path.direction if knows_lines else None
+        return path.look(self._sample(path.point(t), direction))
+
+    def _sample(self, p: Vec3, direction: Vec3 | None) -> Sample:
+        """The sample at p; with promises along a unit direction, if one is given."""
         if self._device is None:
-            return self.prepare(backend_of(p)).evaluate(p)
+            return self.prepare(backend_of(p))._sample(p, direction)
         on = self._device
         if on.edges is None:
             return self._constant(p)
@@ -166,29 +178,8 @@ class SolidAngle(Field):
             # most twice `first`: where edges nearly cancel, the gradient does not show it.
             error = error + dr.select(met, 0, 4 * epsilon * sums.first)
         error = dr.select(met, 8 * _PERIOD, error)  # that gradient times 2 rounding
-        known = (ball, *self._along_edges(on, x, sums))
+        known = (ball, *_along_edges(on, x, sums, direction))
         return Sample(dr.select(met, 0, sums.angle), gradient, known, error)
-
-    def along(self, d: Vec3) -> SolidAngle:
-        if not self._net or self._asked == "paper":
-            return self
-        seen = copy.copy(self)
-        seen._direction = d
-        return seen
-
-    def _along_edges(self, on: _OnDevice, x: Vec3, sums: EdgeSums) -> tuple[LineLipschitz, ...]:
-        """What is known along the direction of `along`, if there is one."""
-        edges = on.edges
-        if self._direction is None or edges is None:
-            return ()
-        line = Line(x, on.backend.Array3f(self._direction), on.rounding)
-
-        def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
-            return rates_along(edges, line, lengths, active)
-
-        known = known_along(line, sums.gradient, sums.distance, rates)
-        size = on.size
-        return tuple(LineLipschitz(one.constant / size, one.radius * size) for one in known)
 
     def _constant(self, p: Vec3) -> Sample:
         """The sample of f = 0, for a curve of which nothing is left: it is true on any ball. The
@@ -321,6 +312,22 @@ class _OnDevice(UnitCoordinates):
     edges: EdgeBuffer | None
     rounding: Real
     value_rounding: Real
+
+
+def _along_edges(
+    on: _OnDevice, x: Vec3, sums: EdgeSums, direction: Vec3 | None
+) -> tuple[LineLipschitz, ...]:
+    """What is known at x, in unit coordinates, along a direction, if one is given."""
+    edges = on.edges
+    if direction is None or edges is None:
+        return ()
+    line = Line(x, on.backend.Array3f(direction), on.rounding)
+
+    def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
+        return rates_along(edges, line, lengths, active)
+
+    known = known_along(line, sums.gradient, sums.distance, rates)
+    return tuple(LineLipschitz(one.constant / on.size, one.radius * on.size) for one in known)
 
 
 def _is_drjit(value: Any) -> bool:

@@ -174,11 +174,12 @@ class Nearby:
         return Sample(
             dr.select(apart, value, 0),
             dr.select(apart, g, steep),
-            (*bends, ball, *(LineLipschitz(share * one.constant, one.radius) for one in along)),
+            (*bends, *(LineLipschitz(share * one.constant, one.radius) for one in along)),
             dr.select(apart, error, most),
             dr.select(apart, slope_error, 0),
             normal,
             dr.select(apart, share * self.truncation, 0),
+            (ball,),
         )
 
     def with_rates(

@@ -10,14 +10,8 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import numpy as np
 
-from harnack.fields.field import (
-    Curvature,
-    Field,
-    HarmonicBall,
-    Knowledge,
-    Lipschitz,
-    Sample,
-)
+from harnack.enclosures import Curvature, HarmonicBall, Lipschitz, Promise
+from harnack.fields.field import Field, Sample
 from harnack.fields.polynomials.axial_bounds import order_on_axis
 from harnack.fields.polynomials.harmonic_promises import HarmonicPromises
 from harnack.fields.polynomials.solid_harmonics import (
@@ -41,6 +35,8 @@ __all__ = ["HarmonicPolynomial", "SphericalHarmonic"]
 class _SolidHarmonics(Field):
     """A sum of solid harmonics of p/size, for |p| <= size; see `HarmonicPromises`."""
 
+    overstep = 1.8
+
     def __init__(
         self, weights: Weights, known: BallRange, size: float, domain: Volume, axis: int = 2
     ) -> None:
@@ -63,15 +59,13 @@ class _SolidHarmonics(Field):
         rho, r = dr.norm(type(s)(s.x, s.y, 0)), dr.norm(s)
         ball, lipschitz = self._promises.ball(rho, r), self._promises.lipschitz(rho, r)
         curvatures = self._promises.curvatures(rho, r)
-        known: list[Knowledge] = [
-            HarmonicBall(ball.radius * size, ball.lower, ball.upper),
-            *(Curvature(one.constant / size**2, one.radius * size) for one in curvatures),
-        ]
+        known = tuple(Curvature(one.constant / size**2, one.radius * size) for one in curvatures)
+        weaker: list[Promise] = [HarmonicBall(ball.radius * size, ball.lower, ball.upper)]
         if lipschitz is not None:
-            known.append(Lipschitz(lipschitz.constant / size, lipschitz.radius * size))
+            weaker.append(Lipschitz(lipschitz.constant / size, lipschitz.radius * size))
         error = self._promises.error(rho, r, curvatures[0])
         slope = type(p)(*_turned(gradient, -self._axis - 1)) / size
-        return Sample(value, slope, tuple(known), error)
+        return Sample(value, slope, known, error, weaker=tuple(weaker))
 
     def _local(self, p: Vec3) -> Vec3:
         return type(p)(*_turned((p.x, p.y, p.z), self._axis + 1)) / self._size

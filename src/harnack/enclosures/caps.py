@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import drjit as dr
 
 from harnack.backend.extrema import clamp, fmax, fmin
-from harnack.bounds.bound import Bound
-from harnack.bounds.solve import is_covered, largest_covered, rounding
-from harnack.certify import BallCertificate, Certificate
+from harnack.enclosures.ball import Ball
+from harnack.enclosures.solve import is_covered, largest_covered, rounding
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real
+    from harnack.enclosures.enclosure import Gaps
 
 
 @dataclass(frozen=True)
-class Caps(Bound):
+class Caps(Ball):
     """Bounded on both sides in space: the extremal boundary values are two spherical caps.
 
     Proof. With values in [c, C], f = c + (C-c) g and g the Poisson integral of boundary values
@@ -44,48 +44,46 @@ class Caps(Bound):
     at most those sign changes, in that order, and where it starts negative it turns once.
     """
 
-    rounds: int = 4
+    rounds: ClassVar[int] = 4
+    """Of the solver: see `largest_covered`."""
 
-    def accepts(self, certificate: Certificate) -> bool:
-        return (
-            isinstance(certificate, BallCertificate)
-            and certificate.dimension == 3
-            and certificate.room_below is not None
-            and certificate.room_above is not None
-        )
+    @classmethod
+    def applies(cls, dimension: int, is_bounded_below: bool, is_bounded_above: bool) -> bool:
+        return dimension == 3 and is_bounded_below and is_bounded_above
 
-    def step(self, certificate: Certificate, slope: Real) -> Real:
-        assert isinstance(certificate, BallCertificate)
-        up, down = _enclosures(certificate, slope)
+    def step(self, gaps: Gaps) -> Real:
+        up, down = self._conditions(gaps)
         q = fmin(largest_covered(up, self.rounds), largest_covered(down, self.rounds))
-        return q * certificate.radius
+        return q * self.radius
 
-    def covers(self, certificate: Certificate, slope: Real, length: Real) -> Mask:
-        assert isinstance(certificate, BallCertificate)
-        up, down = _enclosures(certificate, slope)
-        q = length / certificate.radius
+    def covers(self, gaps: Gaps, length: Real) -> Mask:
+        up, down = self._conditions(gaps)
+        q = length / self.radius
         inside = q <= 1
         q = clamp(q, 0, 1)
         return (length <= 0) | (inside & is_covered(up, q) & is_covered(down, q))
 
+    def _conditions(self, gaps: Gaps) -> tuple[_TwoCaps, _TwoCaps]:
+        """What keeps f from the level above, and from the level below."""
+        below, above = self.range_below, self.range_above
+        assert below is not None
+        assert above is not None
+        share = 1 / (below + above)
+        p, rest = below * share, above * share
+        moment = self.radius * share / 3
+        rising, falling = moment * self.slopes.high, -moment * self.slopes.low
+        return (
+            _two_caps(gaps.up, above, p, rest, rising),
+            _two_caps(gaps.down, below, rest, p, falling),
+        )
 
-def _enclosures(c: BallCertificate, slope: Real) -> tuple[_TwoCaps, _TwoCaps]:
-    """What keeps f from the level above, and from the level below."""
-    below, above = c.room_below, c.room_above
-    assert below is not None
-    assert above is not None
-    share = 1 / (below + above)
-    p, rest = below * share, above * share
-    mu = c.radius * slope * share / 3
-    return _two_caps(c.gap_up, above, p, rest, mu), _two_caps(c.gap_down, below, rest, p, -mu)
 
-
-def _two_caps(gap: Real, room: Real, p: Real, rest: Real, mu: Real) -> _TwoCaps:
-    # Without room f is constant: no level is ever reached.
+def _two_caps(gap: Real, most: Real, p: Real, rest: Real, mu: Real) -> _TwoCaps:
+    # Without a range f is constant: no level is ever reached.
     slack = rounding(type(gap)) * p
     shift = dr.select(rest > 0, mu / rest, 0) + slack
     shift = fmax(fmin(shift, p), -p)  # the worst one, p, if the slope is not a number
-    return _TwoCaps(dr.select(gap < room, gap / room, 1), p, rest, shift)
+    return _TwoCaps(dr.select(gap < most, gap / most, 1), p, rest, shift)
 
 
 @dataclass(frozen=True)

@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING
 import drjit as dr
 
 from harnack.backend.extrema import clamp, fmax, fmin
-from harnack.bounds.bound import Bound
-from harnack.certify import BallCertificate, Certificate
+from harnack.enclosures.ball import Ball
 
 if TYPE_CHECKING:
-    from harnack.backend import Mask, Real
+    from harnack.backend import Real
+    from harnack.enclosures.enclosure import Gaps
 
 _ROUND_DOWN = 1.0 - 1e-6
 
 
 @dataclass(frozen=True)
-class Classic(Bound):
+class Classic(Ball):
     """Harnack's inequality for u = f - lower > 0 on B(p, R), in every direction alike.
 
     Proof. u is a Poisson integral of a positive measure of mass u(p), and the kernel
@@ -39,33 +39,17 @@ class Classic(Bound):
     A level at or below `lower` cannot be reached inside the ball: the step is R.
     """
 
-    def accepts(self, certificate: Certificate) -> bool:
-        return isinstance(certificate, BallCertificate) and certificate.room_below is not None
-
-    def step(self, certificate: Certificate, slope: Real) -> Real:
-        assert isinstance(certificate, BallCertificate)
-        return certificate.radius * fraction(certificate)
-
-    def covers(self, certificate: Certificate, slope: Real, length: Real) -> Mask:
-        return length <= self.step(certificate, slope)
-
-
-def fraction(certificate: BallCertificate) -> Real:
-    """The classic step divided by the radius, from whichever sides are bounded."""
-    below = above = None
-    if certificate.room_below is not None:
-        below = _one_sided(
-            certificate.room_below, certificate.gap_up, certificate.gap_down, certificate.dimension
-        )
-    if certificate.room_above is not None:  # upper - f is positive and harmonic: mirror
-        above = _one_sided(
-            certificate.room_above, certificate.gap_down, certificate.gap_up, certificate.dimension
-        )
-    if below is None or above is None:
-        one = below if above is None else above
-        assert one is not None
-        return one
-    return fmax(below, above)
+    def step(self, gaps: Gaps) -> Real:
+        below = above = None
+        if self.range_below is not None:
+            below = _one_sided(self.range_below, gaps.up, gaps.down, self.dimension)
+        if self.range_above is not None:  # upper - f is positive and harmonic: mirror
+            above = _one_sided(self.range_above, gaps.down, gaps.up, self.dimension)
+        if below is None or above is None:
+            one = below if above is None else above
+            assert one is not None
+            return self.radius * one
+        return self.radius * fmax(below, above)
 
 
 def _one_sided(u: Real, gap_away: Real, gap_toward: Real, dimension: int) -> Real:

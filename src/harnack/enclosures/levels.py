@@ -1,4 +1,4 @@
-"""Which levels bracket a value: the question every certificate is asked.
+"""Which levels bracket a value: the question every enclosure is asked.
 
 An angle-valued function is known modulo its period, so its levels form a ladder: every
 asked-for level plus every multiple of the period (paper, Alg. 2, with the reduction that the
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import drjit as dr
 
 from harnack.backend.extrema import clamp, fmin
+from harnack.enclosures.enclosure import Gaps
 
 if TYPE_CHECKING:
     from harnack.backend import Real
@@ -30,8 +31,8 @@ class Levels:
     values: tuple[Real, ...]
     period: float | None = None
 
-    def gaps(self, f: Real) -> tuple[Real, Real]:
-        """Distances (down, up) >= 0 in value from f to the next level below and above.
+    def gaps(self, f: Real) -> Gaps:
+        """Distances in value from f to the next level below and above.
 
         Either is infinite when there is no such level. A value on a level has both a gap of
         zero on one side and, for a ladder, of at most one period on the other.
@@ -48,9 +49,9 @@ class Levels:
                 below_gap = dr.select(above >= 0, above, math.inf)
                 above_gap = dr.select(above <= 0, -above, math.inf)
             down, up = fmin(down, below_gap), fmin(up, above_gap)
-        return down, up
+        return Gaps(down, up)
 
     def to_nearest(self, f: Real) -> Real:
         """level - f for the level nearest to f."""
-        down, up = self.gaps(f)
-        return dr.select(up < down, up, -down)
+        gaps = self.gaps(f)
+        return dr.select(gaps.up < gaps.down, gaps.up, -gaps.down)

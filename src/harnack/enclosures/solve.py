@@ -1,6 +1,6 @@
-"""The largest stretch that an enclosure proves free, found from the safe side.
+"""The largest length that a ball proves free, found from the safe side.
 
-Every enclosure of this room proves that f meets no level at distance q R as long as
+Every ball of this room proves that f meets no level at distance q R as long as
 
     q k(q) <= gap,
 
@@ -27,7 +27,7 @@ PULL_BACK = 1.0 - 2e-6
 _ROUNDINGS = 16.0
 
 
-class Enclosure(Protocol):
+class Condition(Protocol):
     """q k(q) <= gap is proved free, and q k(q) crosses the gap upwards at most once on [0, 1]."""
 
     @property
@@ -47,13 +47,13 @@ def rounding(real: Any) -> float:
     return _ROUNDINGS * float(dr.epsilon(real))
 
 
-def is_covered(enclosure: Enclosure, q: Real) -> Mask:
+def is_covered(condition: Condition, q: Real) -> Mask:
     """Whether all of [0, q] is proved free, for 0 <= q <= 1."""
     slack = rounding(type(q))
-    return q * (enclosure(q) + slack) <= enclosure.gap * PULL_BACK
+    return q * (condition(q) + slack) <= condition.gap * PULL_BACK
 
 
-def largest_covered(enclosure: Enclosure, rounds: int) -> Real:
+def largest_covered(condition: Condition, rounds: int) -> Real:
     """The largest covered q in [0, 1), never beyond it.
 
     Four rounds end within 1e-5 of it for four balls in five, and within a few percent wherever
@@ -66,10 +66,10 @@ def largest_covered(enclosure: Enclosure, rounds: int) -> Real:
     is where the chord from the best covered to the best uncovered point reaches the gap, which
     is covered if q k(q) is convex.
     """
-    real = cast("Any", type(enclosure.gap))
-    gap, slack = enclosure.gap, rounding(real)
+    real = cast("Any", type(condition.gap))
+    gap, slack = condition.gap, rounding(real)
     previous_q = real(0)
-    previous_k, bend = enclosure.start()
+    previous_k, bend = condition.start()
     q = clamp(_root(gap, previous_k, bend), 0, 1)
     safe, below = real(0), -gap  # q k(q) - gap at the ends of the bracket
     unsafe, above = real(1), real(dr.inf)
@@ -79,7 +79,7 @@ def largest_covered(enclosure: Enclosure, rounds: int) -> Real:
             q = fmax(safe, dr.select(dr.isfinite(above), dr.fma(part, unsafe - safe, safe), q))
             q = q * PULL_BACK
         # Candidates aim at twice the slack, so that rounding does not fail them.
-        k = enclosure(q) + 2 * slack
+        k = condition(q) + 2 * slack
         excess = dr.fma(q, k - slack, -gap)
         good: Mask = excess <= 0
         better = good & (q >= safe)

@@ -7,24 +7,24 @@ convex function: a point mass ring at one latitude, and two point masses at the 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import drjit as dr
 
 from harnack.backend.extrema import clamp, fmax, fmin
-from harnack.bounds.bound import Bound
-from harnack.bounds.solve import Enclosure, is_covered, largest_covered, rounding
-from harnack.certify import BallCertificate, Certificate
+from harnack.enclosures.ball import Ball
+from harnack.enclosures.solve import Condition, is_covered, largest_covered, rounding
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real
+    from harnack.enclosures.enclosure import Gaps
 
 # A chord whose gap is this many times u is not reached within the ball, but for 1e-6 of it.
 _NEVER = 1e18
 
 
 @dataclass(frozen=True)
-class Slope(Bound):
+class Slope(Ball):
     """One- or two-sided slope bound in 2, 3 and 4 dimensions.
 
     Proof. A positive harmonic u on B(p, R) is, along a unit direction v and with q = t/R,
@@ -41,54 +41,52 @@ class Slope(Bound):
     slope; the better of the two is kept on each side.
     """
 
-    rounds: int = 4
+    rounds: ClassVar[int] = 4
+    """Of the solver: see `largest_covered`."""
 
-    def accepts(self, certificate: Certificate) -> bool:
-        return isinstance(certificate, BallCertificate)
-
-    def step(self, certificate: Certificate, slope: Real) -> Real:
-        assert isinstance(certificate, BallCertificate)
-        q = type(certificate.gap_up)(1)
-        for alternatives in _enclosures(certificate, slope):
+    def step(self, gaps: Gaps) -> Real:
+        q = type(gaps.up)(1)
+        for alternatives in self._conditions(gaps):
             side = type(q)(0)
-            for enclosure in alternatives:
-                side = fmax(side, largest_covered(enclosure, self.rounds))
+            for condition in alternatives:
+                side = fmax(side, largest_covered(condition, self.rounds))
             q = fmin(q, side)
-        return q * certificate.radius
+        return q * self.radius
 
-    def covers(self, certificate: Certificate, slope: Real, length: Real) -> Mask:
-        assert isinstance(certificate, BallCertificate)
-        q = length / certificate.radius
+    def covers(self, gaps: Gaps, length: Real) -> Mask:
+        q = length / self.radius
         covered = q <= 1
         q = clamp(q, 0, 1)
-        for alternatives in _enclosures(certificate, slope):
+        for alternatives in self._conditions(gaps):
             free = None
-            for enclosure in alternatives:
-                proved = is_covered(enclosure, q)
+            for condition in alternatives:
+                proved = is_covered(condition, q)
                 free = proved if free is None else free | proved
             covered = covered & free
         return (length <= 0) | covered
 
-
-def _enclosures(c: BallCertificate, slope: Real) -> tuple[list[Enclosure], list[Enclosure]]:
-    """What keeps f from the level above, and from the level below."""
-    up: list[Enclosure] = []
-    down: list[Enclosure] = []
-    for u, sign, gap_away, away, gap_toward, toward in (
-        (c.room_below, 1.0, c.gap_up, up, c.gap_down, down),  # u = f - lower
-        (c.room_above, -1.0, c.gap_down, down, c.gap_up, up),  # u = upper - f
-    ):
-        if u is None:
-            continue
-        # u = 0 forces u to vanish identically: no level is ever reached.
-        share = dr.select(u > 0, 1 / u, dr.inf)
-        mean = dr.select(u > 0, sign * c.radius * slope * share / c.dimension, 0)
-        slack = rounding(type(slope))
-        # A slope that is not a number counts as the worst one, in either place.
-        steep, flat = fmax(fmin(mean + slack, 1), -1), clamp(mean - slack, -1, 1)
-        away.append(_Chord.of(fmin(gap_away * share, _NEVER), steep, c.dimension))
-        toward.append(_Jensen(fmin(gap_toward * share, 1), flat, c.dimension))
-    return up, down
+    def _conditions(self, gaps: Gaps) -> tuple[list[Condition], list[Condition]]:
+        """What keeps f from the level above, and from the level below."""
+        up: list[Condition] = []
+        down: list[Condition] = []
+        rising = self.slopes
+        for u, slopes, gap_away, away, gap_toward, toward in (
+            (self.range_below, rising, gaps.up, up, gaps.down, down),  # u = f - lower
+            (self.range_above, rising.negated(), gaps.down, down, gaps.up, up),  # u = upper - f
+        ):
+            if u is None:
+                continue
+            # u = 0 forces u to vanish identically: no level is ever reached.
+            share = dr.select(u > 0, 1 / u, dr.inf)
+            scale = self.radius * share / self.dimension
+            most = dr.select(u > 0, slopes.high * scale, 0)
+            least = dr.select(u > 0, slopes.low * scale, 0)
+            slack = rounding(type(gaps.up))
+            # A slope that is not a number counts as the worst one, in either place.
+            steep, flat = fmax(fmin(most + slack, 1), -1), clamp(least - slack, -1, 1)
+            away.append(_Chord.of(fmin(gap_away * share, _NEVER), steep, self.dimension))
+            toward.append(_Jensen(fmin(gap_toward * share, 1), flat, self.dimension))
+        return up, down
 
 
 @dataclass(frozen=True)

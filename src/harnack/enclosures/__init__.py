@@ -1,0 +1,43 @@
+"""Enclosures: what is proved about f along a path. One proof a file; none knows a field by name."""
+
+from __future__ import annotations
+
+from harnack.enclosures.ball import Ball
+from harnack.enclosures.caps import Caps
+from harnack.enclosures.classic import Classic
+from harnack.enclosures.enclosure import Enclosure, Gaps, Slopes
+from harnack.enclosures.levels import Levels
+from harnack.enclosures.parabola import Cone, Parabola, Taylor
+from harnack.enclosures.promises import (
+    Curvature,
+    HarmonicBall,
+    LineLipschitz,
+    Lipschitz,
+    Promise,
+)
+from harnack.enclosures.proofs import Choice, Proofs, any_covers, choose_proofs, longest_step
+from harnack.enclosures.slope import Slope
+
+__all__ = [
+    "Ball",
+    "Caps",
+    "Choice",
+    "Classic",
+    "Cone",
+    "Curvature",
+    "Enclosure",
+    "Gaps",
+    "HarmonicBall",
+    "Levels",
+    "LineLipschitz",
+    "Lipschitz",
+    "Parabola",
+    "Promise",
+    "Proofs",
+    "Slope",
+    "Slopes",
+    "Taylor",
+    "any_covers",
+    "choose_proofs",
+    "longest_step",
+]

@@ -1,0 +1,67 @@
+"""Enclosures by harmonic balls: what `classic`, `slope` and `caps` prove from."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import drjit as dr
+
+from harnack.backend.extrema import fmax
+from harnack.enclosures.enclosure import Enclosure, Slopes
+from harnack.enclosures.promises import HarmonicBall, Promise
+
+if TYPE_CHECKING:
+    from typing import Self
+
+    from harnack.backend import Real
+
+# Distances carry a few roundings of float32; a radius is shortened by this much.
+_RADIUS_SLACK = 1.0 - 1e-6
+
+
+@dataclass(frozen=True)
+class Ball(Enclosure):
+    """f is harmonic on B(p, radius) of R^dimension and moves there by less than the two ranges.
+
+    range_below = f - lower and range_above = upper - f are how far the promise lets f move, so that
+    bounds never subtract two large numbers. None says that this side is not bounded.
+    """
+
+    radius: Real
+    range_below: Real | None
+    range_above: Real | None
+    dimension: int
+    slopes: Slopes
+
+    @classmethod
+    def of(cls, promise: Promise, value: Real, error: Real, slopes: Slopes) -> Self | None:
+        """The ends of the promise are moved out by the error and eight units in the last place of
+        f: a promise that seems to leave f no range would otherwise prove f constant. A radius that
+        is not a positive number, or a NaN anywhere, proves nothing (radius 0).
+        """
+        if not isinstance(promise, HarmonicBall):
+            return None
+        total_error = dr.fma(8 * float(dr.epsilon(type(value))), dr.abs(value), error)
+        known = promise.radius > 0
+
+        def movement(end: Real, sign: float) -> Real | None:
+            nonlocal known
+            if isinstance(end, float) and math.isinf(end):
+                return None
+            distance = sign * (end - value)
+            known = known & (distance == distance)  # not NaN
+            return fmax(distance, 0) + total_error
+
+        below, above = movement(promise.lower, -1.0), movement(promise.upper, 1.0)
+        if not cls.applies(promise.dimension, below is not None, above is not None):
+            return None
+        radius = dr.select(known, promise.radius * _RADIUS_SLACK, 0)
+        return cls(radius, below, above, promise.dimension, slopes)
+
+    @classmethod
+    def applies(cls, dimension: int, is_bounded_below: bool, is_bounded_above: bool) -> bool:
+        """Whether the proof is one for balls of this dimension, with these ends known."""
+        del dimension
+        return is_bounded_below or is_bounded_above

@@ -1,0 +1,65 @@
+"""Promises: what a field knows about itself near a point, whatever the direction.
+
+A promise is stated in the field's own units and must be *true*: every step that the tracer takes
+rests on it. Enclosures are made of promises, once the slope along a direction is known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeAlias
+
+if TYPE_CHECKING:
+    from harnack.backend import Real
+
+
+@dataclass(frozen=True)
+class HarmonicBall:
+    """f extends to a harmonic function on the ball B(p, radius) of R^dimension that stays in range.
+
+    The continuous lift of f that agrees with `Sample.value` at p is harmonic on the open ball and
+    stays within [lower, upper] there. Either end may be infinite, not both. dimension is 2, 3 or
+    4: a function of the plane extended constantly, of space, or a slice of a function of R^4.
+    """
+
+    radius: Real
+    lower: Real
+    upper: Real
+    dimension: int = 3
+
+
+@dataclass(frozen=True)
+class Lipschitz:
+    """|f(y) - f(p)| <= constant * |y - p| for every y with |y - p| < radius (default: all y).
+
+    Of a field with a domain: for every such y in it.
+    """
+
+    constant: Real
+    radius: Real = float("inf")
+
+
+@dataclass(frozen=True)
+class Curvature:
+    """|f(y) - f(p) - grad f(p).(y-p)| <= constant |y-p|^2/2 for every y with |y-p| < radius.
+
+    Of a field with a domain: for every such y in it.
+    """
+
+    constant: Real
+    radius: Real = float("inf")
+
+
+@dataclass(frozen=True)
+class LineLipschitz:
+    """|f(p + s d) - f(p)| <= constant |s| for |s| < radius, with the direction d of a path.
+
+    It adds to other promises, on which alone a ray must be able to get on: it may be infinite at
+    most places.
+    """
+
+    constant: Real
+    radius: Real
+
+
+Promise: TypeAlias = HarmonicBall | Lipschitz | LineLipschitz | Curvature

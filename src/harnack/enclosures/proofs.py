@@ -1,0 +1,145 @@
+"""Which proofs are used: promises to enclosures, and of several enclosures the longest step."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
+
+from harnack.backend.extrema import fmax
+from harnack.choices import did_you_mean
+from harnack.enclosures.caps import Caps
+from harnack.enclosures.classic import Classic
+from harnack.enclosures.enclosure import Enclosure, Gaps, Slopes
+from harnack.enclosures.parabola import Cone, Taylor
+from harnack.enclosures.promises import LineLipschitz, Promise
+from harnack.enclosures.slope import Slope
+
+if TYPE_CHECKING:
+    from harnack.backend import Mask, Real
+
+_NAMED: dict[str, tuple[type[Enclosure], ...]] = {
+    "curvature": (Taylor, Caps, Slope, Cone),
+    "caps": (Caps, Slope, Cone),
+    "slope": (Slope, Cone),
+    "classic": (Classic, Cone),
+    "lipschitz": (Cone,),
+}
+
+
+@dataclass(frozen=True)
+class Proofs:
+    """Of each promise the first of these enclosures that can be made of it is used.
+
+    kinds: from the sharpest to the plainest: a later one would only repeat a weaker proof from the
+        same promise.
+    uses_weaker: whether promises are used of which the field says that they are weaker than its
+        others (`Sample.weaker`).
+    """
+
+    kinds: tuple[type[Enclosure], ...]
+    uses_weaker: bool = True
+
+    def enclose(
+        self,
+        known: tuple[Promise, ...],
+        weaker: tuple[Promise, ...],
+        value: Real,
+        error: Real,
+        slopes: Slopes,
+    ) -> tuple[Enclosure, ...]:
+        """The enclosures of f along a direction in which it has these slopes.
+
+        known, weaker, value, error: as in `Sample`. Raises ValueError if no proof applies.
+        """
+        promises = known + weaker if self.uses_weaker else known
+        made = [(one, self._enclosure(one, value, error, slopes)) for one in promises]
+        if all(one is None or isinstance(promise, LineLipschitz) for promise, one in made):
+            raise ValueError(self._useless(known + weaker, value, error, slopes))
+        return tuple(one for _, one in made if one is not None)
+
+    def _enclosure(
+        self, promise: Promise, value: Real, error: Real, slopes: Slopes
+    ) -> Enclosure | None:
+        for kind in self.kinds:
+            enclosure = kind.of(promise, value, error, slopes)
+            if enclosure is not None:
+                return enclosure
+        return None
+
+    def _useless(
+        self, promises: tuple[Promise, ...], value: Real, error: Real, slopes: Slopes
+    ) -> str:
+        """Why no proof applies, and which would."""
+        asked = ", ".join(kind.__name__ for kind in self.kinds)
+        promises = tuple(one for one in promises if not isinstance(one, LineLipschitz))
+        if not promises:
+            return (
+                f"the bounds asked for ({asked}) need a promise and the field makes none: "
+                "Sample.known is empty, return a HarmonicBall, Curvature or Lipschitz in it"
+            )
+        made = " and ".join(sorted({type(one).__name__ for one in promises}))
+        usable = [
+            f'"{name}"'
+            for name, (sharpest, *_) in _NAMED.items()
+            if any(sharpest.of(one, value, error, slopes) is not None for one in promises)
+        ]
+        return (
+            f"no bound applies: the field promises {made}, which the bounds asked for "
+            f"({asked}) cannot use; choose {' or '.join(usable)}, or leave bound=None for the "
+            "sharpest there is"
+        )
+
+
+# A bound as users ask for it.
+Choice: TypeAlias = str | type[Enclosure] | Iterable[type[Enclosure]] | Proofs | None
+
+
+def choose_proofs(bound: Choice = None) -> Proofs:
+    """The proofs asked for: a name, an enclosure's class or several, or None for all that pay.
+
+    Names: "classic" (the published rule), "slope", "caps" (caps where both ends are known, the
+    slope bound elsewhere), "lipschitz", and "curvature" (Taylor's formula where second derivatives
+    are bounded, else as "caps"). None is as "curvature", without the promises that a field itself
+    calls weaker than its others.
+
+    Raises ValueError for another name, TypeError for what is no class of enclosures.
+    """
+    if isinstance(bound, Proofs):
+        return bound
+    if bound is None:
+        return Proofs(_NAMED["curvature"], uses_weaker=False)
+    if isinstance(bound, str):
+        if bound not in _NAMED:
+            raise ValueError(
+                f"unknown bound {bound!r}; choose one of {', '.join(sorted(_NAMED))}"
+                f"{did_you_mean(bound, _NAMED)}"
+            )
+        return Proofs(_NAMED[bound])
+    several = cast("Any", bound) if isinstance(bound, Iterable) else (bound,)
+    kinds: tuple[Any, ...] = tuple(several)
+    if not kinds or not all(isinstance(one, type) and issubclass(one, Enclosure) for one in kinds):
+        raise TypeError(
+            "bound must be a name, or classes of enclosures such as harnack.Caps or "
+            f"(harnack.Caps, harnack.Cone), not {bound!r}"
+        )
+    return Proofs(kinds)
+
+
+def longest_step(enclosures: tuple[Enclosure, ...], gaps: Gaps) -> Real:
+    """The longest step that one of the enclosures proves: every one is safe, so their maximum is.
+
+    At least 0, also where an enclosure gives what is not a number.
+    """
+    best: Real = type(gaps.up)(0)
+    for one in enclosures:
+        best = fmax(one.step(gaps), best)
+    return best
+
+
+def any_covers(enclosures: tuple[Enclosure, ...], gaps: Gaps, length: Real) -> Mask:
+    """Whether one of the enclosures proves the length free."""
+    free = length <= 0
+    for one in enclosures:
+        free |= one.covers(gaps, length)
+    return free

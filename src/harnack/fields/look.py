@@ -1,0 +1,117 @@
+"""What a field answers: samples at points, and looks along a path."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import drjit as dr
+
+from harnack.enclosures import (
+    Curvature,
+    Enclosure,
+    HarmonicBall,
+    LineLipschitz,
+    Lipschitz,
+    Promise,
+    Proofs,
+    Slopes,
+)
+
+if TYPE_CHECKING:
+    from harnack.backend import Real, Vec3
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One evaluation at a point p: value f(p), gradient (3,), and what is known near p.
+
+    error: how far rounding may have moved `value` from f at the point given, beyond eight units
+        in its last place or eight times the smallest normal number (and beyond |gradient| times
+        the rounding of the point itself, which the tracer accounts for), or an approximation has.
+        Steps are shortened by it.
+    gradient_error: how far rounding and an approximation may have moved `gradient`, as a length;
+        0 where that is only the rounding of a few operations.
+    normal: (3,) unit, what to shade with where the gradient is no guide (beside a singular point
+        of the surface); None for the gradient's own direction. No step looks at it.
+    truncation: the part of `error` that a closer evaluation makes smaller (`Field.at_detail`).
+    weaker: promises that are as true as `known`, but proved shorter steps wherever that was
+        measured. Only a bound that is asked for by name uses them.
+    """
+
+    value: Real
+    gradient: Vec3
+    known: tuple[Promise, ...]
+    error: Real = 0.0
+    gradient_error: Real = 0.0
+    normal: Vec3 | None = None
+    truncation: Real = 0.0
+    weaker: tuple[Promise, ...] = ()
+
+    @property
+    def promises(self) -> tuple[Promise, ...]:
+        """All promises, the weaker ones last."""
+        return self.known + self.weaker
+
+
+def lengthened(sample: Sample, size: Real) -> Sample:
+    """The sample of x -> f(x / size), at the place that moves there.
+
+    Values stay; radii are multiplied by the size, gradients and Lipschitz constants divided by it,
+    curvatures by its square.
+    """
+
+    def longer(one: Promise) -> Promise:
+        if isinstance(one, HarmonicBall):
+            return HarmonicBall(one.radius * size, one.lower, one.upper, one.dimension)
+        if isinstance(one, Lipschitz | LineLipschitz):
+            return type(one)(one.constant / size, one.radius * size)
+        return Curvature(one.constant / (size * size), one.radius * size)
+
+    return dataclasses.replace(
+        sample,
+        gradient=sample.gradient / size,
+        gradient_error=sample.gradient_error / size,
+        known=tuple(longer(one) for one in sample.known),
+        weaker=tuple(longer(one) for one in sample.weaker),
+    )
+
+
+@dataclass(frozen=True)
+class Look:
+    """A sample at a point of a path, and what is proved along the path in both directions.
+
+    ahead: enclosures of f(path(t+s)) - f(path(t)).
+    back: enclosures of f(path(t-s)) - f(path(t)), from the same evaluation.
+    slope: the derivative of f along the path, known up to `Sample.gradient_error`.
+    """
+
+    sample: Sample
+    ahead: tuple[Enclosure, ...]
+    back: tuple[Enclosure, ...]
+    slope: Real
+
+
+@dataclass(frozen=True)
+class Path:
+    """The rays o + t d, |d| = 1, along which a field is looked at, and the proofs to use."""
+
+    origin: Vec3
+    direction: Vec3
+    proofs: Proofs
+
+    def point(self, t: Real) -> Vec3:
+        """The points at parameters t."""
+        return dr.fma(type(self.origin)(t), self.direction, self.origin)
+
+    def look(self, sample: Sample) -> Look:
+        """What a sample proves along the path: its promises, seen along the slope.
+
+        A slope known up to an error enters as an interval: see `Enclosure`.
+        """
+        slope = dr.dot(sample.gradient, self.direction)
+        slopes = Slopes.around(slope, sample.gradient_error)
+        given = sample.known, sample.weaker, sample.value, sample.error
+        ahead = self.proofs.enclose(*given, slopes)
+        return Look(sample, ahead, self.proofs.enclose(*given, slopes.negated()), slope)
