@@ -31,8 +31,8 @@ from harnack.certify import (
 from harnack.certify.ball import from_ball
 from harnack.fields import HarmonicBall, Lipschitz, Sample
 from harnack.testing import BrokenPromiseError, Scaled, check_bound
-from harnack.testing.exact import exact_step, on_host
 from harnack.testing.poisson import cap_mass, cap_movement, cap_slope, kernel_movement
+from tests.oracles.exact import exact_step, on_host
 
 BOUNDS = (Classic(), Slope(), Caps(), LipschitzStep(), CurvatureStep())
 # Solved to the end: the default number of rounds trades a little length for time.

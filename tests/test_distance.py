@@ -22,8 +22,8 @@ from harnack.distance import batches, closest_points, curvature, signed_distance
 from harnack.distance.estimates import second_order
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.geometry import shapes
-from harnack.testing.exact import exact_step
 from harnack.testing.walks import look_at, movements
+from tests.oracles.exact import exact_step
 
 # --- fields whose surfaces are known ---------------------------------------------------------
 

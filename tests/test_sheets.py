@@ -27,10 +27,10 @@ from harnack.bounds import Caps, CurvatureStep, Longest, Slope
 from harnack.certify import BallCertificate, CurvatureCertificate, Levels
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.rendering.encounter import meet_surface
-from harnack.testing.exact import exact_step, on_host
-from harnack.testing.jump_oracle import first_side_changes, judge
 from harnack.tracer import march
 from harnack.tracer.stretches import meet
+from tests.oracles.exact import exact_step, on_host
+from tests.oracles.jump_oracle import first_side_changes, judge
 
 FOUR_PI = 4 * math.pi
 

@@ -9,11 +9,11 @@ import numpy as np
 
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.certify import certify
-from harnack.testing.exact import exact_step, on_host
 from harnack.testing.failures import BrokenPromiseError
 from harnack.testing.poisson import FloatArray
 from harnack.testing.scaled import Scaled
 from harnack.testing.walks import look_at, movements, random_directions, random_points
+from tests.oracles.exact import exact_step, on_host
 
 if TYPE_CHECKING:
     from harnack.backend import Precision
