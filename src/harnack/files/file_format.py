@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
-from harnack.geometry.convex_volume import FloatArray
+from harnack.backend import FloatArray
 
 MAX_BYTES = 1 << 28
 MAX_LINE = 1 << 24

@@ -10,8 +10,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from harnack.geometry.convex_volume import FloatArray
-from harnack.geometry.meshes import IntArray
+from harnack.backend.numbers import FloatArray, IntArray
 
 __all__ = [
     "bumpy_sphere",

@@ -35,9 +35,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from harnack.backend.numbers import FloatArray, IntArray
 from harnack.geometry.chains import join
-from harnack.geometry.convex_volume import FloatArray
-from harnack.geometry.meshes import IntArray
 
 __all__ = [
     "NetFaces",

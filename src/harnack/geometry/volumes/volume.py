@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-if TYPE_CHECKING:
-    from harnack.backend import Backend, Mask, Real, Vec3
+from harnack.backend.numbers import check_vectors, real_array
 
-FloatArray: TypeAlias = npt.NDArray[np.float64]
-BoolArray: TypeAlias = npt.NDArray[np.bool_]
+if TYPE_CHECKING:
+    from harnack.backend import Backend, BoolArray, FloatArray, Mask, Real, Vec3
+
 Point: TypeAlias = tuple[float, float, float]
 
 
@@ -72,7 +72,7 @@ class Volume(abc.ABC):
 def rounding(backend: Backend) -> float:
     """Relative error allowed for one clipping formula: ten units in the last place.
 
-    The longest chain of roundings in this room (a plane: normal rounded to the backend, three
+    The longest chain of roundings among volumes (a plane: normal rounded to the backend, three
     products, three sums, one division) is nine.
     """
     return 10.0 * float(dr.epsilon(backend.Float))
@@ -116,9 +116,8 @@ def as_points(points: npt.ArrayLike) -> FloatArray:
     """Points as a float64 array (n, 3).
 
     Raises:
-        ValueError: another shape.
+        ValueError: no real numbers, or another shape.
     """
-    array: Any = np.asarray(points, dtype=np.float64)
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise ValueError(f"points must have shape (n, 3), not {array.shape}")
-    return array
+    array = real_array(points, "points")
+    check_vectors(array, "points")
+    return np.asarray(array, dtype=np.float64)
