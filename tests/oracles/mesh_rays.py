@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.oracles.jump_oracle import FloatArray
+from harnack.backend import FloatArray
 
 
 def mesh_rays(

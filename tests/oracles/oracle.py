@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
+
+from harnack.backend import FloatArray
 
 __all__ = [
     "Crossings",
@@ -25,7 +26,6 @@ __all__ = [
     "gap_to_levels",
 ]
 
-FloatArray: TypeAlias = npt.NDArray[np.float64]
 
 # Sizes of temporary arrays, chosen to stay within a core's cache.
 _PAIRS_AT_ONCE = 16_384

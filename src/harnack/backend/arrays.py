@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend.llvm import ensure_llvm
-from harnack.backend.numbers import check_vectors, real_array
+from harnack.backend.numbers import FloatArray, check_vectors, real_array
 
 # Dr.Jit creates its array types at run time, one family a backend and precision, so no static
 # type describes "a Float of whichever backend". These names say what is meant.
@@ -52,6 +52,11 @@ class Backend:
 
     def __repr__(self) -> str:
         return f"Backend({self.name}, {self.precision})"
+
+    @property
+    def dtype(self) -> type[np.float32 | np.float64]:
+        """NumPy's type of numbers of this precision."""
+        return np.float32 if self.precision == "single" else np.float64
 
     @property
     def epsilon(self) -> float:
@@ -166,11 +171,25 @@ def to_vector3(backend: Backend, vectors: Any, name: str = "vectors") -> Vec3:
         if dr.depth_v(type(vectors)) != 2 or dr.size_v(type(vectors)) != 3:
             raise TypeError(f"{name} must be a 3-vector, got {type(vectors).__name__}")
         return backend.Array3f(vectors)
-    values = real_array(vectors, name, type_error=TypeError).astype(np.float64)
+    return upload_vectors(backend, finite_vectors(vectors, name), name)
+
+
+def finite_vectors(vectors: Any, name: str) -> FloatArray:
+    """An array-like of shape (n, 3) as a float64 array, all of it finite.
+
+    Raises:
+        TypeError: not numbers.
+        ValueError: wrong shape; NaN or infinite values. The message starts with `name`.
+    """
+    values = real_array(vectors, name, type_error=TypeError).astype(np.float64, copy=False)
     check_vectors(values, name)
     _check_rows(~np.isfinite(values).all(axis=1), "NaN or infinite", name)
-    cast = _cast(backend, values, name)
-    return backend.Array3f(*(aligned(backend, one) for one in cast.T))
+    return values
+
+
+def upload_vectors(backend: Backend, rows: npt.NDArray[Any], name: str = "vectors") -> Vec3:
+    """An array (n, 3) as backend.Array3f, whatever its values, as `aligned` uploads numbers."""
+    return backend.Array3f(*(aligned(backend, one) for one in _cast(backend, rows, name).T))
 
 
 def to_float(backend: Backend, values: Any, name: str = "values") -> Real:
@@ -188,7 +207,7 @@ def to_float(backend: Backend, values: Any, name: str = "values") -> Real:
         if dr.depth_v(type(values)) != 1:
             raise TypeError(f"{name} must be one number a lane, got {type(values).__name__}")
         return backend.Float(values)
-    numbers = real_array(values, name, type_error=TypeError).astype(np.float64)
+    numbers = real_array(values, name, type_error=TypeError).astype(np.float64, copy=False)
     if numbers.ndim > 1:
         raise ValueError(f"{name} must be a number or have shape (n,), not {numbers.shape}")
     _check_rows(np.isnan(numbers), "NaN", name)
@@ -214,14 +233,14 @@ def _check_rows(is_bad: Any, what: str, name: str) -> None:
         raise ValueError(f"{name} has {what} values: entry {bad[0]}{rest}")
 
 
-def _cast(backend: Backend, values: npt.NDArray[np.float64], name: str) -> npt.NDArray[Any]:
+def _cast(backend: Backend, values: npt.NDArray[Any], name: str) -> npt.NDArray[Any]:
     """Values in the backend's precision; none may overflow on the way."""
-    if backend.precision == "double":
+    if backend.precision == "double" or values.dtype == backend.dtype:
         return values
     with np.errstate(over="ignore"):
         cast = values.astype(np.float32)
-    overflow = np.isinf(cast) & np.isfinite(values)
-    if overflow.any():
+    infinite = np.isinf(cast)
+    if infinite.any() and (overflow := infinite & np.isfinite(values)).any():
         raise ValueError(
             f"{name} has {values[overflow][0]:g}, too large for single precision: "
             'use precision="double" or smaller units'
@@ -239,11 +258,27 @@ def aligned(backend: Backend, values: npt.NDArray[Any]) -> Real:
     """
     if values.ndim != 1:
         raise ValueError(f"expected a one-dimensional array, got shape {values.shape}")
-    if values.size == 0:
+    return aligned_rows(backend, values[:, None], 1)
+
+
+def aligned_rows(backend: Backend, rows: npt.NDArray[Any], packet: int) -> Real:
+    """Rows of numbers (n, c), each filled up with zeros to a multiple of `packet`, as `aligned`.
+
+    The filling is done by Dr.Jit, on many threads and without another copy in NumPy.
+    """
+    if rows.size == 0:
         return dr.zeros(backend.Float, 0)
-    mapped = backend.Float(np.array(_cast(backend, values, "an array"), order="C"))
-    lane = dr.arange(backend.UInt32, values.size) ^ dr.opaque(backend.UInt32, 0)
-    copy = dr.gather(backend.Float, mapped, lane)
+    count, width = rows.shape
+    cast = _cast(backend, rows, "an array")
+    own = cast.copy(order="C") if cast is rows else np.ascontiguousarray(cast)
+    mapped = backend.Float(own.ravel())
+    padded = -(-width // packet) * packet
+    lane = dr.arange(backend.UInt32, count * padded) ^ dr.opaque(backend.UInt32, 0)
+    if padded == width:
+        copy = dr.gather(backend.Float, mapped, lane)
+    else:
+        row, column = lane // padded, lane % padded
+        copy = dr.gather(backend.Float, mapped, row * width + column, column < width)
     dr.eval(copy)
     return copy
 

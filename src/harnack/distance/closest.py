@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
-import numpy.typing as npt
 
+from harnack.backend import BoolArray, FloatArray
 from harnack.distance.around import nearest_seen, surface_box
-from harnack.distance.batches import FloatArray, in_batches
+from harnack.distance.batches import in_batches
 from harnack.distance.closing_in import close_in, nearer_along
 from harnack.distance.lower_bound import distance_below
 from harnack.distance.on_sheets import SheetSearch
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Closest", "find_closest", "find_on_sheets"]
 
-BoolArray = npt.NDArray[np.bool_]
 
 # Further descents start this share of the distance found from the point.
 _ASIDE = 0.5

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import numpy as np
 
-from harnack.backend import choose_backend
+from harnack.backend import FloatArray, choose_backend
 from harnack.backend.extrema import fmax, fmin
-from harnack.distance.batches import FloatArray, in_batches
+from harnack.distance.batches import in_batches
 from harnack.distance.tangent import TangentPlane
 from harnack.fields.batch import BatchedField
 

@@ -19,11 +19,11 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
+from harnack.backend import FloatArray
 from harnack.fields.polynomials.solid_harmonics import (
     Legendre,
     Weights,
@@ -46,7 +46,6 @@ __all__ = [
     "value_bound",
 ]
 
-FloatArray: TypeAlias = npt.NDArray[np.float64]
 
 _ANGLES = 720  # intervals of the polar angle from pole to pole
 _TURNS = 24  # azimuths over half a turn of m b

@@ -27,11 +27,11 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
+from harnack.backend import FloatArray
 from harnack.backend.extrema import fmin
 from harnack.fields.polynomials.axial_bounds import (
     AxialBound,
@@ -49,7 +49,6 @@ from harnack.fields.polynomials.solid_harmonics import (
 if TYPE_CHECKING:
     from harnack.backend import Real
 
-FloatArray: TypeAlias = npt.NDArray[np.float64]
 
 # Sums of products of sizes of polynomials in cos(a), of degree 24 at most, are sampled this
 # finely in a; between samples each factor moves by 24 pi/2/_SAMPLES of its largest size at most
