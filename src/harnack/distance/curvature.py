@@ -176,7 +176,7 @@ class _Derivatives:
         x, y, z = self.rows
         plane = TangentPlane.of(self.gradient)
         uu, vv, uv = plane.restricted(self.rows)
-        share = 1 / plane.steepness
+        share = 1 / plane.gradient_norm
         mean = 0.5 * (uu + vv) * share
         gaussian = (uu * share) * (vv * share) - (uv * share) * (uv * share)
 
@@ -187,15 +187,15 @@ class _Derivatives:
         deviator = dr.sqrt(diagonal + 2 * off)
         size = deviator + math.sqrt(3) * dr.abs(third)
         wide = math.sqrt(2) * deviator + rounding * size
-        c = dr.fma(rounding, plane.steepness, real(self.gradient_error))
+        c = dr.fma(rounding, plane.gradient_norm, real(self.gradient_error))
         h = dr.fma(rounding, size, real(self.hessian_error))
-        left = plane.steepness - c
+        left = plane.gradient_norm - c
         known = (left > 0) & dr.isfinite(mean) & dr.isfinite(gaussian)
         s = fmin(c * share, real(1))
         mean_error = (0.5 * s * wide + h + dr.abs(mean) * c) / left
         e = dr.fma(s * dr.sqrt(2 / (1 + dr.sqrt(1 - s * s))), wide, h)
         both = fmax(dr.abs(uu + vv), dr.sqrt(dr.square(uu - vv) + 4 * uv * uv))
-        moved = e * (both + e) + dr.abs(gaussian) * c * (2 * plane.steepness - c)
+        moved = e * (both + e) + dr.abs(gaussian) * c * (2 * plane.gradient_norm - c)
         gaussian_error = moved / (left * left)
         is_exact = (real(self.gradient_error) <= 0) & (real(self.hessian_error) <= 0)
         return (

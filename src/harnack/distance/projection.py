@@ -131,9 +131,9 @@ class Descent:
         """f - level at y, and the place."""
         sample, real = self.field.evaluate(y), self.backend.Float
         size = lengths.largest_component(y)
-        epsilon, steepness = self.backend.epsilon, lengths.length(sample.gradient)
+        epsilon, gradient_norm = self.backend.epsilon, lengths.length(sample.gradient)
         blur = dr.fma(8 * epsilon, dr.abs(sample.value), sample.error)
-        noise = dr.fma(4 * epsilon, size, blur / steepness)
+        noise = dr.fma(4 * epsilon, size, blur / gradient_norm)
         reach = real(0)
         for known in sample.known:
             radius = real(known.radius)
@@ -161,9 +161,9 @@ class Descent:
             above: Real, y: Vec3, g: Vec3, noise: Real, reach: Real,
             share: Real, close: Mask, n: Any, active: Mask,
         ) -> tuple[Any, ...]:  # fmt: skip
-            here, steepness = _Place(y, g, noise, reach), lengths.length(g)
-            length = share * clamp(-above / steepness, -reach, reach)
-            above2, there = self._look(dr.fma(vector(length / steepness), g, y))
+            here, gradient_norm = _Place(y, g, noise, reach), lengths.length(g)
+            length = share * clamp(-above / gradient_norm, -reach, reach)
+            above2, there = self._look(dr.fma(vector(length / gradient_norm), g, y))
             better = active & (dr.abs(above2) < dr.abs(above))
             share = dr.select(better, fmin(2 * share, 1), 0.25 * share)
             close |= better & is_close(above2, there)
@@ -186,7 +186,7 @@ class Descent:
         r = x - here.y
         distance = dr.norm(r)
         uu, vv, uv = self._second_derivatives(here.y, plane, fmin(here.reach, distance))
-        lift = dr.dot(r, plane.n) / plane.steepness
+        lift = dr.dot(r, plane.n) / plane.gradient_norm
         bend = Eigen.of(dr.fma(lift, uu, 1), dr.fma(lift, vv, 1), lift * uv)  # of B
         tu, tv = dr.dot(r, plane.u), dr.dot(r, plane.v)
         slant = dr.sqrt(dr.fma(tu, tu, tv * tv))

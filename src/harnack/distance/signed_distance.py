@@ -135,11 +135,11 @@ def _levels(backend: Backend, surface: LevelSet) -> Levels:
 def _warn(name: str, found: Closest) -> None:
     """Of points without an answer, and of answers that a promise of the field contradicts."""
     n = len(found.feet)
-    lost = int(np.isnan(found.feet[:, 0]).sum())
-    if lost:
+    unresolved = int(np.isnan(found.feet[:, 0]).sum())
+    if unresolved:
         warnings.warn(
-            f"{name}: no closest point was found for {lost} of {n} points (NaN): no descent from "
-            "there ends on the surface, and no ray that was tried meets it",
+            f"{name}: no closest point was found for {unresolved} of {n} points (NaN): no descent "
+            "from there ends on the surface, and no ray that was tried meets it",
             RuntimeWarning,
             stacklevel=3,
         )
