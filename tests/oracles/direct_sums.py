@@ -13,13 +13,14 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend import FloatArray, aligned, choose_backend, to_numpy
+from harnack.backend import aligned, choose_backend, to_numpy
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
 
 __all__ = ["ValueAndGradient", "dipole_sum", "winding_sum"]
 
+FloatArray: TypeAlias = npt.NDArray[np.float64]
 ValueAndGradient: TypeAlias = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 """Points (n, 3) in, values (n,) and gradients (n, 3) out."""
 

@@ -239,8 +239,8 @@ def _cast(backend: Backend, values: npt.NDArray[Any], name: str) -> npt.NDArray[
         return values
     with np.errstate(over="ignore"):
         cast = values.astype(np.float32)
-    infinite = np.isinf(cast)
-    if infinite.any() and (overflow := infinite & np.isfinite(values)).any():
+    overflow = np.isinf(cast) & np.isfinite(values)
+    if overflow.any():
         raise ValueError(
             f"{name} has {values[overflow][0]:g}, too large for single precision: "
             'use precision="double" or smaller units'
@@ -258,27 +258,11 @@ def aligned(backend: Backend, values: npt.NDArray[Any]) -> Real:
     """
     if values.ndim != 1:
         raise ValueError(f"expected a one-dimensional array, got shape {values.shape}")
-    return aligned_rows(backend, values[:, None], 1)
-
-
-def aligned_rows(backend: Backend, rows: npt.NDArray[Any], packet: int) -> Real:
-    """Rows of numbers (n, c), each filled up with zeros to a multiple of `packet`, as `aligned`.
-
-    The filling is done by Dr.Jit, on many threads and without another copy in NumPy.
-    """
-    if rows.size == 0:
+    if values.size == 0:
         return dr.zeros(backend.Float, 0)
-    count, width = rows.shape
-    cast = _cast(backend, rows, "an array")
-    own = cast.copy(order="C") if cast is rows else np.ascontiguousarray(cast)
-    mapped = backend.Float(own.ravel())
-    padded = -(-width // packet) * packet
-    lane = dr.arange(backend.UInt32, count * padded) ^ dr.opaque(backend.UInt32, 0)
-    if padded == width:
-        copy = dr.gather(backend.Float, mapped, lane)
-    else:
-        row, column = lane // padded, lane % padded
-        copy = dr.gather(backend.Float, mapped, row * width + column, column < width)
+    mapped = backend.Float(np.array(_cast(backend, values, "an array"), order="C"))
+    lane = dr.arange(backend.UInt32, values.size) ^ dr.opaque(backend.UInt32, 0)
+    copy = dr.gather(backend.Float, mapped, lane)
     dr.eval(copy)
     return copy
 

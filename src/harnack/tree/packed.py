@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
+import numpy.typing as npt
 
-from harnack.backend import FloatArray
-from harnack.backend.arrays import aligned_rows
-from harnack.tree.hierarchy import Hierarchy
+from harnack.tree.hierarchy import FloatArray, Hierarchy
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real
@@ -77,8 +76,8 @@ def pack(
         raise ValueError(f"a tree of {tree.node_count} nodes is too large: cut the input in parts")
     extra = levels[0].shape[1] - _HEAD
     packets = -(-extra // PACKET)
-    heads = np.zeros((tree.node_count, PACKET), backend.dtype)
-    payloads = np.zeros((tree.node_count, extra), backend.dtype)
+    heads = np.zeros((tree.node_count, PACKET), _number(backend))
+    payloads = np.zeros((tree.node_count, extra), _number(backend))
     links = tree.links()
     for number, first, after, values in zip(*links, levels, strict=True):
         heads[number, :_HEAD] = values[:, :_HEAD]
@@ -90,11 +89,31 @@ def pack(
     width = primitives.shape[2]
     return PackedTree(
         backend,
-        aligned_rows(backend, heads, PACKET),
-        aligned_rows(backend, payloads, PACKET) if extra else backend.Float(0),
+        _upload(backend, heads),
+        _upload(backend, payloads) if extra else backend.Float(0),
         packets,
         dr.opaque(backend.UInt32, tree.node_count),
-        aligned_rows(backend, primitives.reshape(-1, width), PACKET),
+        _upload(backend, primitives.reshape(-1, width)),
         -(-width // PACKET),
         tree.leaf_size,
     )
+
+
+def _number(backend: Backend) -> type[np.floating[Any]]:
+    return np.float32 if backend.precision == "single" else np.float64
+
+
+def _upload(backend: Backend, table: npt.NDArray[Any]) -> Real:
+    """Rows (n, c), filled up with zeros to whole packets: aligned, as `backend.aligned` has it.
+
+    The filling is done by Dr.Jit, on many threads and without another copy in NumPy.
+    """
+    rows, width = table.shape
+    padded = -(-width // PACKET) * PACKET
+    mapped = backend.Float(np.array(table, _number(backend), order="C").ravel())
+    # Dr.Jit must not see that this may be the array itself, which need not be aligned.
+    lane = dr.arange(backend.UInt32, rows * padded) ^ dr.opaque(backend.UInt32, 0)
+    row, column = lane // padded, lane % padded
+    copy = dr.gather(backend.Float, mapped, row * width + column, column < width)
+    dr.eval(copy)
+    return copy
