@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
-from harnack.backend import FloatArray
+from harnack.geometry.convex_volume import FloatArray
 
 MAX_BYTES = 1 << 28
 MAX_LINE = 1 << 24

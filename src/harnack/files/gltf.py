@@ -16,9 +16,9 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from harnack.backend import FloatArray
 from harnack.files.file_format import MAX_BYTES, FileFormatError, Place, read_bytes
 from harnack.files.surface_parts import Parts, Polygons
+from harnack.geometry.convex_volume import FloatArray
 from harnack.geometry.meshes import IntArray
 
 _COMPONENT_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from harnack.backend import FloatArray
 from harnack.files.file_format import Place, as_number, text_lines
+from harnack.geometry.convex_volume import FloatArray
 
 
 def read_loops_text(path: Path, data: bytes) -> list[tuple[FloatArray, Place]]:

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from harnack.backend import FloatArray
 from harnack.files.obj import read_obj
 from harnack.files.surface_parts import Parts, Polygons, parts_of_contents
 from harnack.files.text_tables import Lines, quick_table, read_numbers
+from harnack.geometry.convex_volume import FloatArray
 
 # Statements that neither add nor change vertices, faces or lines.
 _PASSED_OVER = (b"#", b"vn ", b"vt ", b"g ", b"o ", b"s ", b"usemtl ", b"mtllib ")

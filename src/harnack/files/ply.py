@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from harnack.backend import FloatArray
 from harnack.files.file_format import (
     Contents,
     Element,
@@ -19,6 +18,7 @@ from harnack.files.file_format import (
     excerpt,
     text_lines,
 )
+from harnack.geometry.convex_volume import FloatArray
 
 # PLY name of a type -> its code in `struct`
 _CODES = {

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend import FloatArray
 from harnack.files.ply import Header, Section, read_header, read_ply
 from harnack.files.surface_parts import Parts, Polygons, parts_of_contents
 from harnack.files.text_tables import quick_table
+from harnack.geometry.convex_volume import FloatArray
 from harnack.geometry.meshes import IntArray
 
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from harnack.backend import FloatArray
 from harnack.files.file_format import Place, excerpt
 from harnack.files.surface_parts import Parts, Polygons
 from harnack.files.text_tables import Lines, content_lines, read_numbers
+from harnack.geometry.convex_volume import FloatArray
 from harnack.geometry.singular import weld_vertices
 
 _HEADER = 84

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harnack.backend import FloatArray
 from harnack.files.file_format import Contents
+from harnack.geometry.convex_volume import FloatArray
 from harnack.geometry.meshes import IntArray
 from harnack.geometry.polygons import triangulate
 

@@ -10,7 +10,6 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from harnack.backend import FloatArray
 from harnack.choices import did_you_mean
 from harnack.files.file_format import FileFormatError, Place, read_bytes
 from harnack.files.gltf import read_gltf
@@ -22,6 +21,7 @@ from harnack.files.stl import read_stl
 from harnack.files.surface_parts import Parts, triangles
 from harnack.files.xyz_text import read_xyz
 from harnack.geometry.clouds import CloudError, checked_normals, checked_points
+from harnack.geometry.convex_volume import FloatArray
 from harnack.geometry.curves import CurveError, validate_loops
 from harnack.geometry.meshes import IntArray, MeshError, without_zero_area_faces
 from harnack.geometry.singular import net_faces, singular_edges, singular_loops, weld_vertices

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from harnack.backend import FloatArray
 from harnack.files.file_format import Place, as_integer, as_number, text_lines
+from harnack.geometry.convex_volume import FloatArray
 from harnack.geometry.meshes import IntArray
 
 __all__ = ["Lines", "content_lines", "quick_table", "read_integers", "read_numbers"]

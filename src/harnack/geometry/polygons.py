@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend import BoolArray, FloatArray
+from harnack.geometry.convex_volume import BoolArray, FloatArray
 from harnack.geometry.meshes import IntArray, MeshError
 
 __all__ = ["triangulate"]

@@ -23,8 +23,8 @@ from harnack.tracer import LevelSet, level_set
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-    from harnack.backend import FloatArray
     from harnack.fields.field import Field
+    from harnack.geometry.convex_volume import FloatArray
 
 PLUGIN = "harnack"
 

@@ -9,7 +9,8 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from harnack.backend import FloatArray, to_numpy
+from harnack.backend import to_numpy
+from harnack.geometry.convex_volume import FloatArray
 from harnack.rendering.lighting import FLOOR
 from harnack.rendering.shading import Light
 from harnack.rendering.world import World

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from harnack.backend import FloatArray, to_float, to_numpy, to_vector3
+from harnack.backend import to_float, to_numpy, to_vector3
+from harnack.geometry.convex_volume import FloatArray
 from harnack.rendering.extent import box_of
 from harnack.rendering.placement import PlacedSurface, Placement
 from harnack.tracer import Tolerance

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from harnack.backend import FloatArray
+from harnack.geometry.convex_volume import FloatArray
 from harnack.rendering.studio import stratified
 
 

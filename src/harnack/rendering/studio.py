@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harnack.backend import FloatArray
+from harnack.geometry.convex_volume import FloatArray
 from harnack.rendering.carrier import shape
 from harnack.rendering.framing import visible_points
 from harnack.rendering.lighting import ground, lights
