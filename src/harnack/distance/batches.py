@@ -32,8 +32,9 @@ def in_batches(
     others: more vectors of the same shape that `compute` is given, one a lane; their values are
         not looked at.
 
-    Raises TypeError or ValueError for points that are not an (n, 3) array of finite numbers of at
-    most 1e100.
+    Raises:
+        TypeError, ValueError: points that are not an (n, 3) array of finite numbers of at most
+            1e100.
     """
     _check_size(points)
     with np.errstate(over="ignore"):

@@ -1,4 +1,4 @@
-"""How a level set bends: mean and Gaussian curvature from first and second derivatives."""
+"""Mean and Gaussian curvature of level sets, from first and second derivatives."""
 
 from __future__ import annotations
 
@@ -69,8 +69,9 @@ def curvature(field: Field, points: Any, *, precision: Precision = "double") -> 
     the size of the surface, clusters are taken as a whole only from farther away, up to the sum of
     all terms one by one. What remains is in `mean_error` and `gaussian_error` (`_bounds`).
 
-    Raises NotImplementedError for a field without second derivatives, TypeError or ValueError for
-    points that are not an (n, 3) array of finite numbers.
+    Raises:
+        NotImplementedError: the field has no second derivatives.
+        TypeError, ValueError: points that are not an (n, 3) array of finite numbers.
     """
     backend = choose_backend(precision)
     if not isinstance(field, BatchedField):

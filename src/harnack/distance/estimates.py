@@ -52,6 +52,6 @@ def second_order(above: Real, gradient: Vec3, rows: tuple[Vec3, Vec3, Vec3]) -> 
     gradient_norm = length(gradient)
     n = gradient / gradient_norm
     first = first_order(above, gradient)
-    bend = dr.dot(n, apply(rows, n)) / gradient_norm
-    quotient = first / fmax(1 - 0.5 * bend * first, 0.5)
+    k = dr.dot(n, apply(rows, n)) / gradient_norm
+    quotient = first / fmax(1 - 0.5 * k * first, 0.5)
     return dr.select(dr.isfinite(first) & (first != 0), quotient, first)

@@ -26,7 +26,7 @@ __all__ = ["Descent"]
 _STEPS_TO_LEVEL = 60
 _STEPS_ALONG = 60
 _LEAST_SHARE = 1e-7  # of a step: shorter ones are given up
-_LEAST_BEND = 0.05  # of the distance's second derivatives: steps are no longer than 20 gradients
+_LEAST_EIGENVALUE = 0.05  # of B (`Descent.closest`): steps are no longer than 20 gradients
 _INDEFINITE = -1e-3
 # Of the size of coordinates or of the ball on which f is smooth: how far from the level rounding
 # may leave a point that is on it.
@@ -187,19 +187,19 @@ class Descent:
         distance = dr.norm(r)
         uu, vv, uv = self._second_derivatives(here.y, plane, fmin(here.reach, distance))
         lift = dr.dot(r, plane.n) / plane.gradient_norm
-        bend = Eigen.of(dr.fma(lift, uu, 1), dr.fma(lift, vv, 1), lift * uv)  # of B
+        eigen = Eigen.of(dr.fma(lift, uu, 1), dr.fma(lift, vv, 1), lift * uv)  # of B
         tu, tv = dr.dot(r, plane.u), dr.dot(r, plane.v)
         slant = dr.sqrt(dr.fma(tu, tu, tv * tv))
         level = slant <= dr.fma(4 * self.backend.epsilon**0.5, distance, 8 * here.noise)
-        saddle = level & (bend.least < _INDEFINITE)
-        most, least = bend.coordinates(tu, tv)
-        most = most / fmax(dr.abs(bend.most), _LEAST_BEND)
-        least = least / fmax(dr.abs(bend.least), _LEAST_BEND)
+        saddle = level & (eigen.least < _INDEFINITE)
+        most, least = eigen.coordinates(tu, tv)
+        most = most / fmax(dr.abs(eigen.most), _LEAST_EIGENVALUE)
+        least = least / fmax(dr.abs(eigen.least), _LEAST_EIGENVALUE)
         least = dr.select(saddle, 0.5 * distance, least)
         length = dr.sqrt(dr.fma(most, most, least * least))
         limit = share * dr.select(saddle, length, fmin(here.reach, distance))
         scale = dr.select(length > 0, fmin(limit / length, 1), 0)
-        a, b = bend.combination(scale * most, scale * least)
+        a, b = eigen.combination(scale * most, scale * least)
         vector = self.backend.Array3f
         return dr.fma(vector(a), plane.u, vector(b) * plane.v), level & ~saddle
 

@@ -33,7 +33,10 @@ def at_points(
     only entries.
 
     The points are visited cell by cell along a Morton curve, so that neighbouring lanes walk a
-    tree together, which halves the time. Raises ValueError for other shapes, NaN or infinity.
+    tree together, which halves the time.
+
+    Raises:
+        TypeError, ValueError: points that are no (n, 3) array of finite numbers.
     """
     backend = choose_backend(precision)
 
@@ -61,7 +64,8 @@ def in_batches(
     others: more vectors (n, 3) that `compute` is given, one a lane; their values are not looked at.
     at_once: how many points make a batch.
 
-    Raises TypeError or ValueError for points that are no (n, 3) array of finite numbers.
+    Raises:
+        TypeError, ValueError: points that are no (n, 3) array of finite numbers.
     """
     on_device = dr.is_array_v(cast("Any", type(points)))
     vectors = (

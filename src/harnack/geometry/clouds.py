@@ -163,7 +163,11 @@ def _as_numbers(values: Any, name: str) -> FloatArray:
 
 
 def check_neighbours(neighbours: int) -> None:
-    """Raises CloudError for fewer than 3 neighbours, which say nothing about a surface."""
+    """That there are enough neighbours to show a surface.
+
+    Raises:
+        CloudError: there are fewer than 3.
+    """
     if neighbours < 3:
         raise CloudError(f"at least 3 neighbours are needed, not {neighbours}")
 

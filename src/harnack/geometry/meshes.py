@@ -2,7 +2,7 @@
 
 A mesh is an array (n, 3) of vertices and an array (m, 3) of faces, indices of vertices counted from
 0. The positive side of a face is the one from which its vertices run counter-clockwise. A mesh may
-have holes, cross itself, repeat faces or turn them round; nothing need be joined to anything.
+have holes, cross itself, repeat faces or reverse them; no face need be joined to another.
 """
 
 from __future__ import annotations

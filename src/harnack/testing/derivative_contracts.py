@@ -40,7 +40,10 @@ def check_derivatives(field: Field, points: FloatArray, look: FieldValues) -> No
     """Gradient, Laplacian and Hessian at points (n, 3), where the field was looked at.
 
     Differences are taken within the field's domain; points too close to its border for that are
-    left out. Raises BrokenPromiseError.
+    left out.
+
+    Raises:
+        BrokenPromiseError: naming the point where they do not agree.
     """
     h, fits = _spacing_within(field, points, _spacing(points, look))
     if not fits.any():
