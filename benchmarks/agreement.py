@@ -20,9 +20,9 @@ from harnack.geometry.mesh_shapes import (
     icosphere,
     remove_faces,
 )
-from harnack.testing.direct_sums import winding_sum
-from harnack.testing.jump_oracle import first_side_changes, judge
-from harnack.testing.mesh_rays import mesh_rays
+from tests.oracles.direct_sums import winding_sum
+from tests.oracles.jump_oracle import first_side_changes, judge
+from tests.oracles.mesh_rays import mesh_rays
 
 from .plain_hits import PlainHits
 

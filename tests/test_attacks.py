@@ -9,7 +9,7 @@ import pytest
 
 import harnack as hk
 from harnack.geometry.mesh_shapes import icosphere
-from harnack.testing.direct_sums import dipole_sum
+from tests.oracles.direct_sums import dipole_sum
 
 PRECISIONS = ("single", "double")
 

@@ -27,9 +27,9 @@ from harnack.enclosures import (
 from harnack.fields import Curvature, HarmonicBall, LineLipschitz, Lipschitz
 from harnack.testing import BrokenPromiseError, check_bound, scaled
 from harnack.testing.cases import BallCase, Case, CurvatureCase, LipschitzCase
-from harnack.testing.exact import exact_step, on_host
 from harnack.testing.poisson import cap_mass, cap_movement, cap_slope, kernel_movement
 from harnack.testing.scaled import unscaled
+from tests.oracles.exact import exact_step, on_host
 
 BOUNDS = (Classic, Slope, Caps, Cone, Taylor)
 

@@ -10,8 +10,8 @@ import pytest
 from scipy.spatial import cKDTree
 
 import harnack as hk
-from harnack.testing.direct_sums import dipole_sum
-from harnack.testing.oracle import Crossings, Look, first_crossings
+from tests.oracles.direct_sums import dipole_sum
+from tests.oracles.oracle import Crossings, OracleValues, first_crossings
 
 LEVEL, FAR, TOLERANCE = 2 * math.pi, 4.0, 1e-4
 # What single precision does to a point of a ray, as a length: beyond this a crossing counts.
@@ -61,9 +61,9 @@ def looking(points: np.ndarray, moments: np.ndarray) -> Any:
     """The O(n) sum, smooth over the distance to the nearest point."""
     exact, tree = dipole_sum(points, moments), cKDTree(points)
 
-    def look(x: np.ndarray) -> Look:
+    def look(x: np.ndarray) -> OracleValues:
         value, gradient = exact(x)
-        return Look(value, gradient, tree.query(x)[0])
+        return OracleValues(value, gradient, tree.query(x)[0])
 
     return look
 

@@ -32,8 +32,8 @@ from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.geometry import shapes
 from harnack.geometry.mesh_shapes import bumpy_sphere, icosphere, remove_faces
 from harnack.testing import BrokenPromiseError, check_field, scaled
-from harnack.testing.direct_sums import dipole_sum, winding_sum
-from harnack.testing.step_contracts import check_steps
+from tests.oracles.direct_sums import dipole_sum, winding_sum
+from tests.oracles.step_contracts import check_steps
 
 BOUNDS = (Classic, Slope, Caps, Cone, Taylor)
 
@@ -413,7 +413,7 @@ def test_levels_inside_a_step_are_seen_without_a_reference() -> None:
     """Where the bound is attained in the field, sampling alone finds a step too long."""
 
     class Foreign(Enclosure):
-        """A proof that `harnack.testing.exact` knows nothing about."""
+        """A proof that `tests.oracles.exact` knows nothing about."""
 
         factor = 1.0
 

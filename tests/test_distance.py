@@ -22,8 +22,8 @@ from harnack.enclosures import Caps, Classic, Cone, Enclosure, Slope, Taylor
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.geometry import shapes
 from harnack.testing.cases import BallCase, Case, CurvatureCase, LipschitzCase
-from harnack.testing.exact import exact_step
 from harnack.testing.walks import look_at, movements
+from tests.oracles.exact import exact_step
 
 # --- fields whose surfaces are known ---------------------------------------------------------
 

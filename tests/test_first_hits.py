@@ -16,7 +16,7 @@ import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.geometry import shapes
 from harnack.geometry.mesh_shapes import icosphere
-from harnack.testing.oracle import CurveOracle, Function, Look, first_crossings, gap_to_levels
+from tests.oracles.oracle import CurveOracle, Function, OracleValues, first_crossings, gap_to_levels
 
 FOUR_PI = 4 * math.pi
 TOLERANCE = 1e-4  # of a curve's size
@@ -159,7 +159,7 @@ def is_near_surface(
         return np.zeros(0, bool)
     here = oracle(o + t[:, None] * d)
     gap = gap_to_levels(here.value, [level], FOUR_PI)
-    near = (gap <= reach * here.steepness) | (here.smooth <= reach)
+    near = (gap <= reach * here.gradient_norm) | (here.smooth <= reach)
     doubtful = np.flatnonzero(~near)
     for k in doubtful:
         along = t[k] + np.linspace(-reach, reach, 41)
@@ -372,10 +372,10 @@ REAL: dict[str, tuple[Any, Callable[[np.ndarray], np.ndarray], tuple[float, ...]
 def looking(value: Callable[[np.ndarray], np.ndarray], smooth: float) -> Function:
     """A function with its gradient by differences."""
 
-    def look(p: np.ndarray) -> Look:
+    def look(p: np.ndarray) -> OracleValues:
         h = 1e-5 * smooth * np.eye(3)
         gradient = [(value(p + step) - value(p - step)) / (2e-5 * smooth) for step in h]
-        return Look(value(p), np.stack(gradient, axis=1), np.full(len(p), smooth))
+        return OracleValues(value(p), np.stack(gradient, axis=1), np.full(len(p), smooth))
 
     return look
 
@@ -412,7 +412,7 @@ def test_real_valued_fields(name: str, bound: str | None) -> None:
     sample = field.evaluate(to_vector3(choose_backend("single"), x))
     rounding = 2 * (to_numpy(sample.error + 0 * sample.value) + 1e-6 * np.abs(here.value))
     gap = gap_to_levels(here.value, levels)
-    assert (gap <= SHARE * tolerance * here.steepness + rounding).all()
+    assert (gap <= SHARE * tolerance * here.gradient_norm + rounding).all()
 
 
 # --- meshes by tree ---------------------------------------------------------------------------

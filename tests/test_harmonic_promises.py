@@ -23,8 +23,8 @@ from harnack.fields.polynomials.axial_bounds import (
 from harnack.fields.polynomials.harmonic_rounding import HarmonicRounding
 from harnack.fields.polynomials.solid_harmonics import Weights, evaluate, hessian
 from harnack.testing.cases import CurvatureCase, LipschitzCase
-from harnack.testing.step_contracts import check_steps
 from harnack.testing.walks import look_at
+from tests.oracles.step_contracts import check_steps
 
 SINGLE, DOUBLE = choose_backend("single"), choose_backend("double")
 UNIT = 2.0**-24

@@ -14,9 +14,9 @@ import pytest
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.geometry import mesh_shapes
-from harnack.testing.direct_sums import winding_sum
 from harnack.tree.nearest import NearestPoint
 from harnack.tree.triangles import triangle_records
+from tests.oracles.direct_sums import winding_sum
 
 PRECISIONS = ("double", "single")
 

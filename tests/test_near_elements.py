@@ -14,8 +14,8 @@ from harnack.fields.multipoles.multipole import all_levels
 from harnack.fields.multipoles.truncation import truncation
 from harnack.geometry.mesh_shapes import icosphere
 from harnack.geometry.singular import singular_edges
-from harnack.testing.direct_sums import dipole_sum, winding_sum
 from harnack.tree import build_hierarchy
+from tests.oracles.direct_sums import dipole_sum, winding_sum
 
 PRECISIONS = ("single", "double")
 METHODS = ("exact", "tree")

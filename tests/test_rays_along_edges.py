@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import pytest
-from test_solid_angle import CurveOracle, lines_beside, moves_along, unit
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
@@ -14,6 +13,7 @@ from harnack.fields import LineLipschitz
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.geometry.mesh_shapes import icosphere
 from harnack.geometry.shapes import wavy_polygon
+from tests.test_solid_angle import CurveOracle, lines_beside, moves_along, unit
 
 Mesh = tuple[np.ndarray, np.ndarray]
 

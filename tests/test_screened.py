@@ -27,9 +27,9 @@ from harnack.geometry import mesh_shapes
 from harnack.geometry.clouds import CloudError
 from harnack.geometry.meshes import MeshError
 from harnack.testing import check_field
-from harnack.testing.oracle import Look, first_crossings
 from harnack.testing.walks import look_at, random_directions
 from harnack.tree import build_hierarchy
+from tests.oracles.oracle import OracleValues, first_crossings
 
 DOUBLE = choose_backend("double")
 Cloud = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -468,7 +468,7 @@ def test_mesh_quadrature_is_as_good_as_it_says() -> None:
 
 
 def oracle(field: ScreenedWindingNumber) -> Any:
-    def function(x: np.ndarray) -> Look:
+    def function(x: np.ndarray) -> OracleValues:
         value, gradient = exact(field, x)
         near = np.concatenate(
             [
@@ -476,7 +476,7 @@ def oracle(field: ScreenedWindingNumber) -> Any:
                 for i in range(0, len(x), 200)
             ]
         )
-        return Look(value, gradient, np.minimum(near, 2 * field.length))
+        return OracleValues(value, gradient, np.minimum(near, 2 * field.length))
 
     return function
 
@@ -498,14 +498,14 @@ def compare(field: ScreenedWindingNumber, level: float, seed: int, **options: An
     at = o + np.where(np.isfinite(hits.t), hits.t, 0)[:, None] * d
     here = function(at)
     # As sharp as the bound of what the tree leaves out.
-    blur = 3 * field.error_bound(at) / np.maximum(here.steepness, 1e-30)
+    blur = 3 * field.error_bound(at) / np.maximum(here.gradient_norm, 1e-30)
     truth = first_crossings(
         function, o, d, 0.0, 6.0, levels=[level], depth=tolerance, finest=0.5 * tolerance
     )
     allowed = 5 * tolerance + np.where(hits.hit, blur, 0)
     missed = hits.t > truth.beyond + allowed
     assert not missed.any(), (o[missed], d[missed], hits.t[missed], truth.beyond[missed])
-    away = np.abs(here.value - level) > here.steepness * allowed
+    away = np.abs(here.value - level) > here.gradient_norm * allowed
     early = hits.hit & away & (here.smooth > 5 * tolerance)
     assert not early.any(), (o[early], d[early], hits.t[early], here.value[early])
     assert not (hits.status == hk.Status.OUT_OF_STEPS).any()

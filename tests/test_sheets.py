@@ -39,9 +39,9 @@ from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.rendering.encounter import meet_surface
 from harnack.testing import scaled
 from harnack.testing.cases import BallCase, Case, CurvatureCase
-from harnack.testing.exact import exact_step, on_host
-from harnack.testing.jump_oracle import first_side_changes, judge
 from harnack.tracer.sheet_comparison import compare_with_sheet
+from tests.oracles.exact import exact_step, on_host
+from tests.oracles.jump_oracle import first_side_changes, judge
 
 FOUR_PI = 4 * math.pi
 

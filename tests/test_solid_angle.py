@@ -15,7 +15,7 @@ from harnack.enclosures import choose_proofs
 from harnack.fields.look import Path
 from harnack.geometry import shapes, validate_loops
 from harnack.geometry.net_loops import net_loops
-from harnack.testing.oracle import CurveOracle, first_crossings, gap_to_levels
+from tests.oracles.oracle import CurveOracle, first_crossings, gap_to_levels
 
 FOUR_PI = 4 * math.pi
 CURVES: dict[str, list[np.ndarray]] = {
@@ -81,7 +81,7 @@ def test_values_and_gradients(name: str, precision: str) -> None:
     loops, backend = CURVES[name], choose_backend(precision)  # type: ignore[arg-type]
     x = away_from_curve(loops, all_points(loops), precision)
     sample = hk.SolidAngle(loops).evaluate(to_vector3(backend, x))
-    truth, steep = CurveOracle(loops)(x), CurveOracle(loops)(x).steepness
+    truth, steep = CurveOracle(loops)(x), CurveOracle(loops)(x).gradient_norm
     size = 1 + np.abs(x).max(axis=1)
     off = gap_to_levels(to_numpy(sample.value) - truth.value, [0.0], FOUR_PI)
     # The last term is the rounding of the truth.
@@ -336,7 +336,7 @@ def test_edges_run_both_ways_are_not_there(name: str, precision: str) -> None:
     # And by an oracle of its own: the field is near the level where it hits.
     look = CurveOracle(net)(found.position[found.hit].astype(float))
     gap = gap_to_levels(look.value, [2 * math.pi], FOUR_PI)
-    assert (gap <= 3e-4 * look.steepness).all()
+    assert (gap <= 3e-4 * look.gradient_norm).all()
     backend = choose_backend(precision)  # type: ignore[arg-type]
     p = to_vector3(backend, o[:50])
     for one, two in ((field.evaluate(p).gradient, other.evaluate(p).gradient),
@@ -541,7 +541,7 @@ def test_no_hit_is_missed_along_the_curve(name: str, away: float) -> None:
     assert (proved <= found.beyond + 1e-6).all()
     look = CurveOracle(loops)(end.position[end.hit])
     gap = gap_to_levels(look.value, [2 * math.pi], FOUR_PI)
-    assert (gap <= 2e-7 * look.steepness).all()
+    assert (gap <= 2e-7 * look.gradient_norm).all()
 
 
 @pytest.mark.parametrize("name", ["trefoil", "wavy", "link"])
@@ -556,7 +556,7 @@ def test_curves_far_from_the_origin_can_be_traced(name: str) -> None:
     # Hits are as near the surface as rounding lets anyone know, and no surface is passed.
     look = CurveOracle(loops)(two.position[two.hit].astype(float))
     gap = gap_to_levels(look.value, [2 * math.pi], FOUR_PI)
-    assert (gap <= 0.03 * look.steepness).all()
+    assert (gap <= 0.03 * look.gradient_norm).all()
     both = one.hit & two.hit
     assert (two.t[both] - one.t[both] < 0.02).all()
     assert (one.hit & ~two.hit).sum() < 8  # within as much of the surface's border

@@ -14,7 +14,7 @@ import pytest
 import harnack as hk
 from harnack.geometry.mesh_shapes import icosphere
 from harnack.geometry.singular import singular_edges
-from harnack.testing.direct_sums import dipole_sum, winding_sum
+from tests.oracles.direct_sums import dipole_sum, winding_sum
 
 PRECISIONS = ("single", "double")
 

@@ -27,8 +27,8 @@ from harnack.geometry.mesh_shapes import (
     remove_faces,
     torus_mesh,
 )
-from harnack.testing.jump_oracle import first_side_changes, judge
-from harnack.testing.mesh_rays import mesh_rays
+from tests.oracles.jump_oracle import first_side_changes, judge
+from tests.oracles.mesh_rays import mesh_rays
 
 FOUR_PI = 4 * math.pi
 METHODS = ["exact", "tree"]

@@ -34,11 +34,15 @@ from harnack.backend.arrays import (  # noqa: E402
     to_numpy,
     to_vector3,
 )
+from harnack.backend.numbers import BoolArray, FloatArray, IntArray  # noqa: E402
 
 __all__ = [
     "Backend",
     "BackendName",
+    "BoolArray",
+    "FloatArray",
     "Index",
+    "IntArray",
     "LLVMLibrary",
     "LLVMNotFoundError",
     "Mask",

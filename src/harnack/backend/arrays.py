@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend.llvm import ensure_llvm
+from harnack.backend.numbers import FloatArray, check_vectors, real_array
 
 # Dr.Jit creates its array types at run time, one family a backend and precision, so no static
 # type describes "a Float of whichever backend". These names say what is meant.
@@ -51,6 +52,11 @@ class Backend:
 
     def __repr__(self) -> str:
         return f"Backend({self.name}, {self.precision})"
+
+    @property
+    def dtype(self) -> type[np.float32 | np.float64]:
+        """NumPy's type of numbers of this precision."""
+        return np.float32 if self.precision == "single" else np.float64
 
     @property
     def epsilon(self) -> float:
@@ -165,13 +171,25 @@ def to_vector3(backend: Backend, vectors: Any, name: str = "vectors") -> Vec3:
         if dr.depth_v(type(vectors)) != 2 or dr.size_v(type(vectors)) != 3:
             raise TypeError(f"{name} must be a 3-vector, got {type(vectors).__name__}")
         return backend.Array3f(vectors)
-    values = _numbers(vectors, name)
-    if values.ndim != 2 or values.shape[1] != 3:
-        hint = "; write [[x, y, z]] for a single one" if values.shape == (3,) else ""
-        raise ValueError(f"{name} must have shape (n, 3), not {values.shape}{hint}")
+    return upload_vectors(backend, finite_vectors(vectors, name), name)
+
+
+def finite_vectors(vectors: Any, name: str) -> FloatArray:
+    """An array-like of shape (n, 3) as a float64 array, all of it finite.
+
+    Raises:
+        TypeError: not numbers.
+        ValueError: wrong shape; NaN or infinite values. The message starts with `name`.
+    """
+    values = real_array(vectors, name, type_error=TypeError).astype(np.float64, copy=False)
+    check_vectors(values, name)
     _check_rows(~np.isfinite(values).all(axis=1), "NaN or infinite", name)
-    cast = _cast(backend, values, name)
-    return backend.Array3f(*(aligned(backend, cast[:, k]) for k in range(3)))
+    return values
+
+
+def upload_vectors(backend: Backend, rows: npt.NDArray[Any], name: str = "vectors") -> Vec3:
+    """An array (n, 3) as backend.Array3f, whatever its values, as `aligned` uploads numbers."""
+    return backend.Array3f(*(aligned(backend, one) for one in _cast(backend, rows, name).T))
 
 
 def to_float(backend: Backend, values: Any, name: str = "values") -> Real:
@@ -189,7 +207,7 @@ def to_float(backend: Backend, values: Any, name: str = "values") -> Real:
         if dr.depth_v(type(values)) != 1:
             raise TypeError(f"{name} must be one number a lane, got {type(values).__name__}")
         return backend.Float(values)
-    numbers = _numbers(values, name)
+    numbers = real_array(values, name, type_error=TypeError).astype(np.float64, copy=False)
     if numbers.ndim > 1:
         raise ValueError(f"{name} must be a number or have shape (n,), not {numbers.shape}")
     _check_rows(np.isnan(numbers), "NaN", name)
@@ -208,16 +226,6 @@ def _check_same_backend(backend: Backend, array: Any, name: str) -> None:
         raise TypeError(f"{name} lives on {own.name}, but the computation runs on {backend.name}")
 
 
-def _numbers(values: Any, name: str) -> npt.NDArray[np.float64]:
-    try:
-        array = np.asarray(values)
-    except ValueError:
-        raise ValueError(f"{name} must be a rectangular array of numbers, not ragged") from None
-    if array.dtype.kind not in "fiu":
-        raise TypeError(f"{name} must hold real numbers, not {array.dtype}")
-    return array.astype(np.float64)
-
-
 def _check_rows(is_bad: Any, what: str, name: str) -> None:
     bad = np.flatnonzero(is_bad)
     if bad.size:
@@ -225,9 +233,9 @@ def _check_rows(is_bad: Any, what: str, name: str) -> None:
         raise ValueError(f"{name} has {what} values: entry {bad[0]}{rest}")
 
 
-def _cast(backend: Backend, values: npt.NDArray[np.float64], name: str) -> npt.NDArray[Any]:
+def _cast(backend: Backend, values: npt.NDArray[Any], name: str) -> npt.NDArray[Any]:
     """Values in the backend's precision; none may overflow on the way."""
-    if backend.precision == "double":
+    if backend.precision == "double" or values.dtype == backend.dtype:
         return values
     with np.errstate(over="ignore"):
         cast = values.astype(np.float32)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import drjit as dr
 
@@ -44,18 +44,22 @@ def while_active(state: State, body: Callable[[State], State], label: str) -> St
 
 
 def _leaves(record: Any) -> Iterator[Any]:
-    for value in vars(record).values():
+    for value in _entries(record):
         if dataclasses.is_dataclass(value):
             yield from _leaves(value)
         else:
             yield value
 
 
-def _record(like: State, leaves: Iterator[Any]) -> State:
+def _record(like: Any, leaves: Iterator[Any]) -> Any:
     """The leaves as a record like another one."""
-    given: dict[str, Any] = vars(like)
-    values = [
-        _record(value, leaves) if dataclasses.is_dataclass(value) else next(leaves)
-        for value in given.values()
-    ]
-    return cast("Any", type(like))(*values)
+    values: list[Any] = []
+    for value in _entries(like):
+        nested = dataclasses.is_dataclass(value)
+        values.append(_record(value, leaves) if nested else next(leaves))
+    return type(like)(*values)
+
+
+def _entries(record: Any) -> list[Any]:
+    """The values of a record's fields, in order."""
+    return [getattr(record, field.name) for field in dataclasses.fields(record)]

@@ -32,10 +32,10 @@ def sincos(x: Any) -> tuple[Any, Any]:
     sine = dr.fma(sine * square, rest, rest)
     cosine = dr.fma(cosine * square, square, dr.fma(square, -0.5, 1))
     # quarter modulo 4 is 0, 1, 2, 3 for (s, c), (c, -s), (-s, -c), (-c, s).
-    turn = quarter - 4 * dr.floor(0.25 * quarter)
-    is_odd = (turn == 1) | (turn == 3)
+    quadrant = quarter - 4 * dr.floor(0.25 * quarter)
+    is_odd = (quadrant == 1) | (quadrant == 3)
     s, c = dr.select(is_odd, cosine, sine), dr.select(is_odd, sine, cosine)
-    return dr.select(turn >= 2, -s, s), dr.select((turn == 1) | (turn == 2), -c, c)
+    return dr.select(quadrant >= 2, -s, s), dr.select((quadrant == 1) | (quadrant == 2), -c, c)
 
 
 def _polynomial(coefficients: tuple[float, ...], x: Any) -> Any:

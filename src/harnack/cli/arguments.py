@@ -1,4 +1,4 @@
-"""What can be written behind `harnack`, and what is said of what cannot."""
+"""The arguments of the command `harnack`: how they are read, and the messages about wrong ones."""
 
 from __future__ import annotations
 

@@ -56,7 +56,11 @@ def _render(options: Any) -> int:
 
 
 def _check_source(name: str) -> None:
-    """Raise ValueError for what is neither a scene nor, by its extension, a file to draw."""
+    """That a name is that of a scene or, by its extension, of a file to draw.
+
+    Raises:
+        ValueError: it is neither.
+    """
     if Path(name).suffix.lower() not in (*SURFACE_FILES, ".xml"):
         raise ValueError(
             f"{name!r} is no scene: give a name from `harnack gallery --list`, a surface "

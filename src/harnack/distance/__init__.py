@@ -1,4 +1,4 @@
-"""Distances to level sets, and how level sets bend: at points, not along rays."""
+"""Distances to level sets and their curvatures, at points."""
 
 from __future__ import annotations
 

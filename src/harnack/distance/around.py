@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harnack.distance.batches import FloatArray
+from harnack.backend import FloatArray
 from harnack.tracer import trace
 
 if TYPE_CHECKING:

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
-import numpy.typing as npt
 
+from harnack.backend import BoolArray, FloatArray
+from harnack.backend.basis import across_rows
 from harnack.distance.around import nearest_seen, surface_box
-from harnack.distance.batches import FloatArray, in_batches
+from harnack.distance.batches import in_batches
 from harnack.distance.closing_in import close_in, nearer_along
 from harnack.distance.lower_bound import distance_below
 from harnack.distance.on_sheets import SheetSearch
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Closest", "find_closest", "find_on_sheets"]
 
-BoolArray = npt.NDArray[np.bool_]
 
 # Further descents start this share of the distance found from the point.
 _ASIDE = 0.5
@@ -102,14 +102,18 @@ class _Candidates:
 
 
 def find_closest(backend: Backend, surface: LevelSet, levels: Levels, points: Any) -> Closest:
-    """The closest of these: the end of the descent from the point, and of five more that start
-    half its length from the point, away from its end and to the four sides; the closest point of
-    the curve that the surface ends in; the closest of the sheets that is the surface.
+    """For each of the points the nearest of these candidates:
 
-    Where that is none, the end of the descent from the nearest point that rays find
-    (`nearest_seen`). Where a sheet is nearer than all of that, and none of the surface where it is
-    nearest, rays beside the best direction look for what is nearer (`close_in`), and more sheets
-    are looked at, as far as that.
+    1. the end of the descent from the point;
+    2. the closest point of the curve in which the surface ends;
+    3. the closest point of the nearest sheets that are part of the surface;
+    4. the ends of five more descents, which start at half the best distance so far: opposite the
+       best candidate, and to the four sides.
+
+    If none of them is found, descend from the nearest hit of some rays (`nearest_seen`). If a sheet
+    is nearer than the best candidate but not part of the surface at its nearest point, rays in
+    directions near the best look for what is nearer (`close_in`), and more sheets are tried, up to
+    that distance.
 
     No point is taken that is nearer than the lower bound that the field's promises prove.
     """
@@ -146,8 +150,8 @@ def find_closest(backend: Backend, surface: LevelSet, levels: Levels, points: An
     if field.has_sheets:
         on_sheet, along, to_sheet = _on_sheets(backend, surface, x, found.feet)
         found = candidates.consider(candidates.consider(found, on_sheet), along)
-    ways = _ways(x - np.where(np.isnan(found.feet), ends, found.feet))
-    starts = [_usable(field, x + _ASIDE * way, x) for way in ways]
+    offsets = _probe_offsets(x - np.where(np.isnan(found.feet), ends, found.feet))
+    starts = [_usable(field, x + _ASIDE * offset, x) for offset in offsets]
     several = np.concatenate([x] * len(starts))
     feet, _ = in_batches(backend, descend, several, np.concatenate(starts))
     for part in np.split(_within(field, feet), len(starts)):
@@ -165,35 +169,32 @@ def _lower(backend: Backend, field: Field, levels: Levels, p: Vec3, sample: Samp
 def _with_seen(
     backend: Backend, surface: LevelSet, candidates: _Candidates, found: Closest
 ) -> Closest:
-    """With feet for points that have none: from the nearest point that is seen, down to where the
-    descent ends. That is a point of the surface even where it is no minimum."""
-    lost = np.flatnonzero(np.isnan(found.feet[:, 0]))
-    if not lost.size:
+    """With feet for points that have none: the end of the descent from the nearest ray hit. That is
+    a point of the surface even where it is no minimum of the distance."""
+    unresolved = np.flatnonzero(np.isnan(found.feet[:, 0]))
+    if not unresolved.size:
         return found
 
     def descend(p: Vec3, start: Vec3) -> tuple[Real | Vec3, ...]:
         foot, _, on_level = candidates.descent.closest(p, start)
         return (dr.select(on_level, foot, start),)
 
-    x = found.points[lost]
+    x = found.points[unresolved]
     seen = nearest_seen(backend, surface, x)
     some = ~np.isnan(seen[:, 0])
     feet = np.full_like(found.feet, np.nan)
-    (feet[lost[some]],) = in_batches(backend, descend, x[some], seen[some])
+    (feet[unresolved[some]],) = in_batches(backend, descend, x[some], seen[some])
     # The way down may leave the domain; what is seen lies within.
-    feet[lost] = np.where(np.isnan(_within(surface.field, feet[lost])), seen, feet[lost])
+    ends = feet[unresolved]
+    feet[unresolved] = np.where(np.isnan(_within(surface.field, ends)), seen, ends)
     return candidates.consider(found, feet)
 
 
-def _ways(away: FloatArray) -> tuple[FloatArray, ...]:
+def _probe_offsets(away: FloatArray) -> tuple[FloatArray, ...]:
     """Vectors (n, 3) and four at right angles to each of them, of the same length."""
     away = np.where(np.isfinite(away).all(axis=1, keepdims=True), away, 0.0)
-    flattest = np.eye(3)[np.abs(away).argmin(axis=1)]
     length = _length(away)[:, None]
-    unit = away / np.maximum(length, 1e-300)
-    u = np.cross(unit, flattest)
-    u *= length / np.maximum(_length(u)[:, None], 1e-300)
-    v = np.cross(unit, u)
+    u, v = (length * one for one in across_rows(away / np.maximum(length, 1e-300)))
     return away, u, -u, v, -v
 
 

@@ -1,4 +1,4 @@
-"""Nearer points of a surface by rays from the point itself, in directions beside the best so far.
+"""Nearer points of a surface by rays from the point itself, in directions near the best so far.
 
 What other searches cannot follow, a ray sees: the crease in which two sheets meet, the rim at which
 a smooth part of the surface ends in a sheet, the edge along which a volume cuts it.
@@ -23,9 +23,9 @@ __all__ = ["close_in", "nearer_along"]
 
 _MOST_RAYS = 600
 # Rays of a turn, which all have to fail before the next turn is narrower: those to where planes
-# meet, then those beside the best direction, about 137.5 degrees apart, so that however many there
+# meet, then those near the best direction, about 137.5 degrees apart, so that however many there
 # are they are spread evenly, and no turn repeats the one before.
-_MEETINGS, _BESIDE, _GOLDEN = 4, 8, 2.399963229728653
+_MEETINGS, _TILTED, _GOLDEN = 4, 8, 2.399963229728653
 # Steps are tangents of angles.
 _WIDEST, _CLOSER = 1.0, 0.25
 # Rays that leave in directions all over the sphere before that.
@@ -159,7 +159,7 @@ def close_in(surface: PreparedLevelSet, x: Vec3, foot: Vec3) -> Vec3:
     ) -> tuple[Any, ...]:  # fmt: skip
         planes, around = _Planes.of(parts), n < _AROUND
         meets = ~around & (failed < _MEETINGS)
-        way = dr.select(meets, dr.normalize(planes.meeting(failed)), _beside(d, step, angle))
+        way = dr.select(meets, dr.normalize(planes.meeting(failed)), _tilted(d, step, angle))
         way = dr.select(around, _spiral(vector, real(n)), way)
         usable = active & dr.isfinite(dr.squared_norm(way))
         # Beyond t as well, for planes.
@@ -174,7 +174,7 @@ def close_in(surface: PreparedLevelSet, x: Vec3, foot: Vec3) -> Vec3:
         d, t = dr.select(nearer, way, d), dr.select(nearer, seen.t, t)
         foot = dr.select(nearer, dr.fma(vector(seen.t), way, x), foot)
         failed = dr.select(nearer | around, count(0), failed + 1)
-        spent = failed == _MEETINGS + _BESIDE
+        spent = failed == _MEETINGS + _TILTED
         narrower = dr.select(spent, _CLOSER * step, step)
         step = dr.select(nearer & ~around & ~meets, fmin(2 * step, _WIDEST), narrower)
         angle = dr.select(nearer | meets | around, angle, angle + _GOLDEN)
@@ -192,7 +192,7 @@ def close_in(surface: PreparedLevelSet, x: Vec3, foot: Vec3) -> Vec3:
     return dr.while_loop(start, more, body, label="closing in")[2]
 
 
-def _beside(d: Vec3, step: Real, angle: Real) -> Vec3:
+def _tilted(d: Vec3, step: Real, angle: Real) -> Vec3:
     """The direction at a distance of `step` from d, seen along d at that angle."""
     vector = cast("Any", type(d))
     u, v = across(d)

@@ -1,4 +1,4 @@
-"""How a level set bends: mean and Gaussian curvature from first and second derivatives."""
+"""Mean and Gaussian curvature of level sets, from first and second derivatives."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import numpy as np
 
-from harnack.backend import choose_backend
+from harnack.backend import FloatArray, choose_backend
 from harnack.backend.extrema import fmax, fmin
-from harnack.distance.batches import FloatArray, in_batches
+from harnack.distance.batches import in_batches
 from harnack.distance.tangent import TangentPlane
 from harnack.fields.batch import BatchedField
 
@@ -69,8 +69,9 @@ def curvature(field: Field, points: Any, *, precision: Precision = "double") -> 
     the size of the surface, clusters are taken as a whole only from farther away, up to the sum of
     all terms one by one. What remains is in `mean_error` and `gaussian_error` (`_bounds`).
 
-    Raises NotImplementedError for a field without second derivatives, TypeError or ValueError for
-    points that are not an (n, 3) array of finite numbers.
+    Raises:
+        NotImplementedError: the field has no second derivatives.
+        TypeError, ValueError: points that are not an (n, 3) array of finite numbers.
     """
     backend = choose_backend(precision)
     if not isinstance(field, BatchedField):
@@ -176,7 +177,7 @@ class _Derivatives:
         x, y, z = self.rows
         plane = TangentPlane.of(self.gradient)
         uu, vv, uv = plane.restricted(self.rows)
-        share = 1 / plane.steepness
+        share = 1 / plane.gradient_norm
         mean = 0.5 * (uu + vv) * share
         gaussian = (uu * share) * (vv * share) - (uv * share) * (uv * share)
 
@@ -187,15 +188,15 @@ class _Derivatives:
         deviator = dr.sqrt(diagonal + 2 * off)
         size = deviator + math.sqrt(3) * dr.abs(third)
         wide = math.sqrt(2) * deviator + rounding * size
-        c = dr.fma(rounding, plane.steepness, real(self.gradient_error))
+        c = dr.fma(rounding, plane.gradient_norm, real(self.gradient_error))
         h = dr.fma(rounding, size, real(self.hessian_error))
-        left = plane.steepness - c
+        left = plane.gradient_norm - c
         known = (left > 0) & dr.isfinite(mean) & dr.isfinite(gaussian)
         s = fmin(c * share, real(1))
         mean_error = (0.5 * s * wide + h + dr.abs(mean) * c) / left
         e = dr.fma(s * dr.sqrt(2 / (1 + dr.sqrt(1 - s * s))), wide, h)
         both = fmax(dr.abs(uu + vv), dr.sqrt(dr.square(uu - vv) + 4 * uv * uv))
-        moved = e * (both + e) + dr.abs(gaussian) * c * (2 * plane.steepness - c)
+        moved = e * (both + e) + dr.abs(gaussian) * c * (2 * plane.gradient_norm - c)
         gaussian_error = moved / (left * left)
         is_exact = (real(self.gradient_error) <= 0) & (real(self.hessian_error) <= 0)
         return (

@@ -49,9 +49,9 @@ def second_order(above: Real, gradient: Vec3, rows: tuple[Vec3, Vec3, Vec3]) -> 
     Taylor's formula says nothing, its denominator is held at 1/2: the sign is always that of
     above, and the size at most 2 |d1|.
     """
-    steepness = length(gradient)
-    n = gradient / steepness
+    gradient_norm = length(gradient)
+    n = gradient / gradient_norm
     first = first_order(above, gradient)
-    bend = dr.dot(n, apply(rows, n)) / steepness
-    quotient = first / fmax(1 - 0.5 * bend * first, 0.5)
+    k = dr.dot(n, apply(rows, n)) / gradient_norm
+    quotient = first / fmax(1 - 0.5 * k * first, 0.5)
     return dr.select(dr.isfinite(first) & (first != 0), quotient, first)

@@ -26,7 +26,7 @@ __all__ = ["Descent"]
 _STEPS_TO_LEVEL = 60
 _STEPS_ALONG = 60
 _LEAST_SHARE = 1e-7  # of a step: shorter ones are given up
-_LEAST_BEND = 0.05  # of the distance's second derivatives: steps are no longer than 20 gradients
+_LEAST_EIGENVALUE = 0.05  # of B (`Descent.closest`): steps are no longer than 20 gradients
 _INDEFINITE = -1e-3
 # Of the size of coordinates or of the ball on which f is smooth: how far from the level rounding
 # may leave a point that is on it.
@@ -131,9 +131,9 @@ class Descent:
         """f - level at y, and the place."""
         sample, real = self.field.evaluate(y), self.backend.Float
         size = lengths.largest_component(y)
-        epsilon, steepness = self.backend.epsilon, lengths.length(sample.gradient)
+        epsilon, gradient_norm = self.backend.epsilon, lengths.length(sample.gradient)
         blur = dr.fma(8 * epsilon, dr.abs(sample.value), sample.error)
-        noise = dr.fma(4 * epsilon, size, blur / steepness)
+        noise = dr.fma(4 * epsilon, size, blur / gradient_norm)
         reach = real(0)
         for known in sample.promises:
             radius = real(known.radius)
@@ -161,9 +161,9 @@ class Descent:
             above: Real, y: Vec3, g: Vec3, noise: Real, reach: Real,
             share: Real, close: Mask, n: Any, active: Mask,
         ) -> tuple[Any, ...]:  # fmt: skip
-            here, steepness = _Place(y, g, noise, reach), lengths.length(g)
-            length = share * clamp(-above / steepness, -reach, reach)
-            above2, there = self._look(dr.fma(vector(length / steepness), g, y))
+            here, gradient_norm = _Place(y, g, noise, reach), lengths.length(g)
+            length = share * clamp(-above / gradient_norm, -reach, reach)
+            above2, there = self._look(dr.fma(vector(length / gradient_norm), g, y))
             better = active & (dr.abs(above2) < dr.abs(above))
             share = dr.select(better, fmin(2 * share, 1), 0.25 * share)
             close |= better & is_close(above2, there)
@@ -186,20 +186,20 @@ class Descent:
         r = x - here.y
         distance = dr.norm(r)
         uu, vv, uv = self._second_derivatives(here.y, plane, fmin(here.reach, distance))
-        lift = dr.dot(r, plane.n) / plane.steepness
-        bend = Eigen.of(dr.fma(lift, uu, 1), dr.fma(lift, vv, 1), lift * uv)  # of B
+        lift = dr.dot(r, plane.n) / plane.gradient_norm
+        eigen = Eigen.of(dr.fma(lift, uu, 1), dr.fma(lift, vv, 1), lift * uv)  # of B
         tu, tv = dr.dot(r, plane.u), dr.dot(r, plane.v)
         slant = dr.sqrt(dr.fma(tu, tu, tv * tv))
         level = slant <= dr.fma(4 * self.backend.epsilon**0.5, distance, 8 * here.noise)
-        saddle = level & (bend.least < _INDEFINITE)
-        most, least = bend.coordinates(tu, tv)
-        most = most / fmax(dr.abs(bend.most), _LEAST_BEND)
-        least = least / fmax(dr.abs(bend.least), _LEAST_BEND)
+        saddle = level & (eigen.least < _INDEFINITE)
+        most, least = eigen.coordinates(tu, tv)
+        most = most / fmax(dr.abs(eigen.most), _LEAST_EIGENVALUE)
+        least = least / fmax(dr.abs(eigen.least), _LEAST_EIGENVALUE)
         least = dr.select(saddle, 0.5 * distance, least)
         length = dr.sqrt(dr.fma(most, most, least * least))
         limit = share * dr.select(saddle, length, fmin(here.reach, distance))
         scale = dr.select(length > 0, fmin(limit / length, 1), 0)
-        a, b = bend.combination(scale * most, scale * least)
+        a, b = eigen.combination(scale * most, scale * least)
         vector = self.backend.Array3f
         return dr.fma(vector(a), plane.u, vector(b) * plane.v), level & ~saddle
 

@@ -61,10 +61,11 @@ def signed_distance(
         surface, and the nearest sheet if that is nearer and the surface lies there.
     precision: of the computation; "lower" allows for rounding in both.
 
-    Raises TypeError or ValueError for points that are not an (n, 3) array of finite numbers, an
-    unknown method, a level that no surface has or, with "lower", points outside the field's
-    domain, where it promises nothing; NotImplementedError for "second" with a field that has no
-    second derivatives.
+    Raises:
+        TypeError, ValueError: points that are not an (n, 3) array of finite numbers, an unknown
+            method, a level that no surface has or, with "lower", points outside the field's
+            domain, where it promises nothing.
+        NotImplementedError: "second" with a field that has no second derivatives.
     """
     if method not in get_args(Method):
         known = ", ".join(f'"{one}"' for one in get_args(Method))
@@ -106,7 +107,10 @@ def closest_points(
     field's domain, the nearest point of the surface that some rays find is taken, and from there
     as far down as descent leads: that need not be a minimum, such as where the rim of a surface
     cut by the domain is closest. NaN, with a RuntimeWarning that counts them, where rays find no
-    surface either. Raises as `signed_distance`.
+    surface either.
+
+    Raises:
+        TypeError, ValueError: as `signed_distance`.
     """
     backend = choose_backend(precision)
     surface = _surface(field, level)
@@ -135,11 +139,11 @@ def _levels(backend: Backend, surface: LevelSet) -> Levels:
 def _warn(name: str, found: Closest) -> None:
     """Of points without an answer, and of answers that a promise of the field contradicts."""
     n = len(found.feet)
-    lost = int(np.isnan(found.feet[:, 0]).sum())
-    if lost:
+    unresolved = int(np.isnan(found.feet[:, 0]).sum())
+    if unresolved:
         warnings.warn(
-            f"{name}: no closest point was found for {lost} of {n} points (NaN): no descent from "
-            "there ends on the surface, and no ray that was tried meets it",
+            f"{name}: no closest point was found for {unresolved} of {n} points (NaN): no descent "
+            "from there ends on the surface, and no ray that was tried meets it",
             RuntimeWarning,
             stacklevel=3,
         )

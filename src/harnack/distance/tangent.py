@@ -20,7 +20,7 @@ __all__ = ["Eigen", "TangentPlane", "apply"]
 class TangentPlane:
     """Where grad f is not zero: its length, the unit normal n along it, two unit tangents u, v."""
 
-    steepness: Real
+    gradient_norm: Real
     n: Vec3
     u: Vec3
     v: Vec3
@@ -28,10 +28,10 @@ class TangentPlane:
     @classmethod
     def of(cls, gradient: Vec3) -> TangentPlane:
         """The plane at right angles to a gradient; NaN where that is zero."""
-        steepness = length(gradient)
-        n = gradient / steepness
+        gradient_norm = length(gradient)
+        n = gradient / gradient_norm
         u, v = across(n)
-        return cls(steepness, n, u, v)
+        return cls(gradient_norm, n, u, v)
 
     def restricted(self, rows: tuple[Vec3, Vec3, Vec3]) -> tuple[Real, Real, Real]:
         """u.Au, v.Av and u.Av of a symmetric matrix A given by its rows."""

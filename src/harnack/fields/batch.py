@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
-from harnack.backend import backend_of
+from harnack.backend import FloatArray, backend_of
 from harnack.backend.extrema import fmax
 from harnack.fields.field import Field
-from harnack.fields.points import FloatArray, at_points
+from harnack.fields.points import at_points
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Precision, Real, Vec3

@@ -1,4 +1,4 @@
-"""Kernels at many points: NumPy in, NumPy out."""
+"""Kernels at many points: NumPy in, NumPy out, Dr.Jit between, so many points at a time."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import choose_backend, to_numpy, to_vector3
+from harnack.backend.arrays import finite_vectors, upload_vectors
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Precision, Vec3
 
-FloatArray = npt.NDArray[np.float64]
+__all__ = ["at_points", "in_batches", "morton_order"]
 
 # Points in one kernel: enough to keep a GPU busy, few enough to keep memory small.
 _AT_ONCE = 1 << 20
@@ -32,32 +33,68 @@ def at_points(
     only entries.
 
     The points are visited cell by cell along a Morton curve, so that neighbouring lanes walk a
-    tree together, which halves the time. Raises ValueError for other shapes, NaN or infinity.
+    tree together, which halves the time.
+
+    Raises:
+        TypeError, ValueError: points that are no (n, 3) array of finite numbers.
     """
     backend = choose_backend(precision)
-    given = np.asarray(points)
-    if given.shape == (3,):
-        return tuple(one[0] for one in at_points(given[None], kernel, precision))
-    to_vector3(backend, given[:1] if given.ndim == 2 else given, "points")  # shape, early
-    if given.dtype.kind not in "fiu":
-        raise TypeError(f"points must hold real numbers, not {given.dtype}")
-    if not np.isfinite(given).all():
-        bad = np.flatnonzero(~np.isfinite(given).all(axis=1))
-        raise ValueError(f"points has NaN or infinite values: entry {bad[0]}")
-    if not len(given):
-        return tuple(one[:0] for one in at_points(np.zeros((1, 3)), kernel, precision))
-    parts: list[tuple[npt.NDArray[Any], ...]] = []
-    for start in range(0, len(given), _AT_ONCE):
-        some = given[start : start + _AT_ONCE]
-        x = to_vector3(backend, some, "points")
+
+    def visit(x: Vec3) -> tuple[Any, ...]:
         order = morton_order(backend, x)
         results = kernel(backend, dr.gather(backend.Array3f, x, order))
-        places = [_back_in_place(one, order, len(some)) for one in results]
-        dr.eval(*places)
-        parts.append(tuple(to_numpy(one) for one in places))
+        return tuple(_back_in_place(one, order, dr.width(x)) for one in results)
+
+    given = np.asarray(points)
+    if given.shape == (3,):
+        return tuple(one[0] for one in in_batches(backend, visit, given[None]))
+    return in_batches(backend, visit, given)
+
+
+def in_batches(
+    backend: Backend,
+    compute: Callable[..., tuple[Any, ...]],
+    points: Any,
+    *others: npt.NDArray[Any],
+    at_once: int = _AT_ONCE,
+) -> tuple[npt.NDArray[Any], ...]:
+    """The results of `compute` for points (n, 3), as arrays (n,) or (n, 3) in its precision.
+
+    points: an array-like, or a Dr.Jit 3-vector.
+    others: more vectors (n, 3) that `compute` is given, one a lane; their values are not looked at.
+    at_once: how many points make a batch.
+
+    Raises:
+        TypeError, ValueError: points that are no (n, 3) array of finite numbers.
+    """
+    on_device = dr.is_array_v(cast("Any", type(points)))
+    vectors = (
+        to_vector3(backend, points, "points") if on_device else finite_vectors(points, "points")
+    )
+    n = dr.width(vectors) if on_device else len(vectors)
+    parts: list[tuple[npt.NDArray[Any], ...]] = []
+    # Once for no points at all: it tells shapes, and the errors of `compute`.
+    for start in range(0, max(n, 1), at_once):
+        lanes = min(at_once, n - start)
+        given = (_part(backend, one, start, lanes) for one in (vectors, *others))
+        with dr.suspend_grad():
+            results = compute(*given) if n else compute(*(backend.Array3f(0) for _ in given))
+            dr.eval(*results)
+        parts.append(tuple(_spread(to_numpy(one), max(lanes, 1)) for one in results))
     if len(parts) == 1:
-        return parts[0]
-    return tuple(np.concatenate(pieces) for pieces in zip(*parts, strict=True))
+        return tuple(one[:n] for one in parts[0])
+    return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
+
+
+def _part(backend: Backend, vectors: Any, start: int, lanes: int) -> Vec3:
+    """Vectors `start` to `start + lanes` of a Dr.Jit vector, or of an array of any values."""
+    if dr.is_array_v(cast("Any", type(vectors))):
+        return dr.gather(backend.Array3f, vectors, dr.arange(backend.UInt32, lanes) + start)
+    return upload_vectors(backend, vectors[start : start + lanes], "points")
+
+
+def _spread(values: npt.NDArray[Any], n: int) -> npt.NDArray[Any]:
+    return values if len(values) == n else np.repeat(values, n, axis=0)
 
 
 def _back_in_place(values: Any, order: Any, n: int) -> Any:

@@ -9,8 +9,7 @@ import drjit as dr
 import numpy as np
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Real, Vec3
-    from harnack.tree.hierarchy import FloatArray
+    from harnack.backend import Backend, FloatArray, Real, Vec3
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from harnack.backend import FloatArray
 from harnack.fields import (
     EigenfunctionSum,
     Field,
@@ -38,16 +39,15 @@ def _levels() -> list[LevelSet]:
 
 def _holes() -> list[LevelSet]:
     """A square with three holes, bent like a sheet in the wind so that no plane contains it."""
-    loops: list[Any] = []
-    for loop in shapes.square_with_holes(24):
-        x, y, _ = loop.T
-        loops.append(np.column_stack([x, y, 0.25 * np.sin(2.2 * x) + 0.2 * np.cos(2.0 * y)]))
-    edge = loops[0]
+    edge, *holes = shapes.square_with_holes(24)
     s = np.linspace(0, 1, 10, endpoint=False)[:, None]
     fine = [(1 - s) * a + s * b for a, b in zip(edge, np.roll(edge, -1, axis=0), strict=True)]
-    outer = np.concatenate(fine)
-    outer[:, 2] = 0.25 * np.sin(2.2 * outer[:, 0]) + 0.2 * np.cos(2.0 * outer[:, 1])
-    return _curve([outer, *loops[1:]])
+    return _curve([_bent(loop) for loop in (np.concatenate(fine), *holes)])
+
+
+def _bent(loop: FloatArray) -> FloatArray:
+    x, y, _ = loop.T
+    return np.column_stack([x, y, 0.25 * np.sin(2.2 * x) + 0.2 * np.cos(2.0 * y)])
 
 
 def _periodic(kind: Any, *, solid: tuple[float, float], box: bool = False) -> list[LevelSet]:

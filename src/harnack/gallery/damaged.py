@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
+from harnack.backend import FloatArray
 from harnack.fields import DipolePotential, WindingNumber
 from harnack.gallery.scene import DRAWN, Scene
 from harnack.geometry import mesh_shapes, shapes
-from harnack.geometry.convex_volume import FloatArray
 from harnack.rendering import Camera
 from harnack.tracer import LevelSet, level_set
 

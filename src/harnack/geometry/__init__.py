@@ -1,4 +1,4 @@
-"""Curves, clipping volumes, triangles, welding, boundary edges. No files, no queries."""
+"""Curves, meshes, clouds and volumes: what is accepted, and their measures. No files, no search."""
 
 from __future__ import annotations
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from harnack.backend.numbers import FloatArray, IntArray, vector_text
 from harnack.geometry.clouds import (
     CloudError,
     check_neighbours,
@@ -16,8 +17,6 @@ from harnack.geometry.clouds import (
     nearest_others,
     point_tree,
 )
-from harnack.geometry.convex_volume import FloatArray
-from harnack.geometry.meshes import IntArray
 from harnack.geometry.singular import weld_vertices
 
 __all__ = ["estimate_normals"]
@@ -85,10 +84,10 @@ def _planes(x: FloatArray, neighbours: int) -> tuple[FloatArray, npt.NDArray[np.
     in_parts(fit, len(x))
     if on_line.any():
         first = int(np.flatnonzero(on_line)[0])
-        point = ", ".join(f"{v:g}" for v in x[first])
         raise CloudError(
             f"the {nearest.shape[1]} nearest neighbours of {on_line.sum():,} points lie on a line, "
-            f"first of ({point}): they show no surface; ask for more neighbours, or give normals"
+            f"first of {vector_text(x[first])}: they show no surface; ask for more neighbours, or "
+            "give normals"
         )
     return normals, nearest
 

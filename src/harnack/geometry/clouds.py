@@ -15,8 +15,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from harnack.geometry.convex_volume import FloatArray
-from harnack.geometry.meshes import IntArray
+from harnack.backend.basis import across_rows
+from harnack.backend.numbers import (
+    TRANSPOSE,
+    FloatArray,
+    IntArray,
+    and_more,
+    check_finite,
+    check_size,
+    check_vectors,
+    real_array,
+)
 from harnack.geometry.singular import weld_vertices
 
 __all__ = ["CloudError", "estimate_areas", "validate_cloud"]
@@ -24,6 +33,7 @@ __all__ = ["CloudError", "estimate_areas", "validate_cloud"]
 MAX_POINTS = 100_000_000
 # Points per step: the temporary arrays of one step then stay in the cache of one core.
 _CHUNK = 4096
+_REMOVE = "its components must be finite; remove the point"
 
 
 class CloudError(ValueError):
@@ -53,7 +63,7 @@ def validate_cloud(
     bad = np.flatnonzero(~((a > 0.0) & (a < np.inf)))
     if bad.size:
         raise CloudError(
-            f"the area of point {bad[0]} is {a[bad[0]]:g}{_and_more(bad.size)}: areas must be "
+            f"the area of point {bad[0]} is {a[bad[0]]:g}{and_more(bad.size)}: areas must be "
             "positive and finite; remove points that stand for no area"
         )
     for array in (x, n, a):
@@ -70,10 +80,9 @@ def checked_points(points: Any) -> FloatArray:
     x = _as_numbers(points, "the points")
     if x.size == 0:
         raise CloudError("there are no points: give an array (n, 3)")
-    _check_rows(x, "the points")
-    _check_finite(x, "point")
-    if (size := float(np.abs(x).max())) > 1e100:
-        raise CloudError(f"coordinates up to {size:g} are too large: choose units nearer to 1")
+    check_vectors(x, "the points", CloudError, transposed=TRANSPOSE)
+    check_finite(x, "point {}", CloudError, _REMOVE)
+    check_size(x, CloudError)
     return x
 
 
@@ -89,17 +98,17 @@ def checked_normals(normals: Any, count: int) -> FloatArray:
             "with harnack.geometry.estimate_normals(points) and look at the result"
         )
     n = _as_numbers(normals, "the normals")
-    _check_rows(n, "the normals")
+    check_vectors(n, "the normals", CloudError, transposed=TRANSPOSE)
     if len(n) != count:
         raise CloudError(
             f"there are {count:,} points but {len(n):,} normals: every point needs one normal"
         )
-    _check_finite(n, "normal")
+    check_finite(n, "normal {}", CloudError, _REMOVE)
     longest = np.abs(n).max(axis=1, keepdims=True)
     bad = np.flatnonzero(longest == 0.0)
     if bad.size:
         raise CloudError(
-            f"normal {bad[0]} is zero{_and_more(bad.size)}: remove these points, or estimate all "
+            f"normal {bad[0]} is zero{and_more(bad.size)}: remove these points, or estimate all "
             "normals with harnack.geometry.estimate_normals(points)"
         )
     n = n / longest  # first, so that squares neither overflow nor vanish
@@ -146,39 +155,19 @@ def estimate_areas(
 
 
 def _as_numbers(values: Any, name: str) -> FloatArray:
-    try:
-        array = np.asarray(values)
-    except (ValueError, OverflowError):
-        raise CloudError(f"{name} are ragged: every row needs as many numbers") from None
-    if array.dtype.kind not in "fiu":
-        raise CloudError(f"{name} must be real numbers, not {array.dtype}")
+    ragged = "are ragged: every row needs as many numbers"
+    array = real_array(values, name, CloudError, ragged=ragged, other="must be real numbers")
     if array.size > 3 * MAX_POINTS:
         raise CloudError(f"{name} have shape {array.shape}: at most {MAX_POINTS:,} are accepted")
     return np.array(array, dtype=np.float64, order="C")
 
 
-def _check_rows(array: FloatArray, name: str) -> None:
-    if array.ndim != 2 or array.shape[1] != 3:
-        hint = "; transpose it" if array.ndim == 2 and array.shape[0] == 3 else ""
-        raise CloudError(f"{name} must have shape (n, 3), not {array.shape}{hint}")
-
-
-def _check_finite(array: FloatArray, name: str) -> None:
-    bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
-    if bad.size:
-        row = ", ".join(f"{v:g}" for v in array[bad[0]])
-        raise CloudError(
-            f"{name} {bad[0]} is ({row}){_and_more(bad.size)}: its components must be finite; "
-            "remove the point"
-        )
-
-
-def _and_more(count: int) -> str:
-    return f" (and {count - 1:,} more)" if count > 1 else ""
-
-
 def check_neighbours(neighbours: int) -> None:
-    """Raises CloudError for fewer than 3 neighbours, which say nothing about a surface."""
+    """That there are enough neighbours to show a surface.
+
+    Raises:
+        CloudError: there are fewer than 3.
+    """
     if neighbours < 3:
         raise CloudError(f"at least 3 neighbours are needed, not {neighbours}")
 
@@ -225,7 +214,7 @@ def _cell_areas(offsets: FloatArray, normals: FloatArray, radii: FloatArray) -> 
     offsets: (m, k, 3) from the points to their neighbours. normals: (m, 3). radii: (m,).
     """
     offsets = offsets / radii[:, None, None]
-    u, v = _tangents(normals)
+    u, v = across_rows(normals)
     # The plane that bisects the offset d meets the tangent plane in the line q . y = |d|^2/2.
     q = np.stack([np.einsum("mkj,mj->mk", offsets, axis) for axis in (u, v)])
     b = 0.5 * np.einsum("mkj,mkj->mk", offsets, offsets)
@@ -238,16 +227,6 @@ def _cell_areas(offsets: FloatArray, normals: FloatArray, radii: FloatArray) -> 
             np.concatenate([q[:, rim], -q[:, rim]], axis=2), np.concatenate([b[rim]] * 2, axis=1)
         )
     return areas * radii * radii
-
-
-def _tangents(n: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Two unit vectors each, (m, 3), orthogonal to n (m, 3) and each other (Duff et al. 2017)."""
-    sign = np.copysign(1.0, n[:, 2])
-    a = -1.0 / (sign + n[:, 2])
-    b = n[:, 0] * n[:, 1] * a
-    u = np.column_stack([1.0 + sign * n[:, 0] ** 2 * a, sign * b, -sign * n[:, 0]])
-    v = np.column_stack([b, sign + n[:, 1] ** 2 * a, -n[:, 1]])
-    return u, v
 
 
 def _disc_cut_by_lines(q: FloatArray, b: FloatArray) -> FloatArray:

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from harnack.geometry.convex_volume import BoolArray, FloatArray
+from harnack.backend.basis import across_rows
+from harnack.backend.numbers import BoolArray, FloatArray
 
 MAX_VERTICES = 2048
 """Longer curves are not examined: the tests take quadratic time."""
@@ -94,10 +95,7 @@ def _supporting_planes(
     start = x[part]
     edge = x[(part + 1) % count] - start
     edge /= np.linalg.norm(edge, axis=1, keepdims=True)
-    least = np.eye(3)[np.argmin(np.abs(edge), axis=1)]
-    across = np.cross(edge, least)
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    up = np.cross(edge, across)
+    across, up = across_rows(edge)
     offset = x[None, :, :] - start[:, None, :]
     a: FloatArray = np.einsum("kni,ki->kn", offset, across)
     b: FloatArray = np.einsum("kni,ki->kn", offset, up)

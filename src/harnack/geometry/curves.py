@@ -12,7 +12,15 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from harnack.geometry.convex_volume import FloatArray
+from harnack.backend.numbers import (
+    TRANSPOSE,
+    FloatArray,
+    and_more,
+    check_finite,
+    check_vectors,
+    real_array,
+    vector_text,
+)
 from harnack.geometry.convexity import is_convex_position
 
 __all__ = [
@@ -116,12 +124,7 @@ def _numbered(loops: Any) -> list[tuple[int, Any]]:
 
 def _validate_loop(loop: Any, name: str) -> FloatArray:
     vertices = _as_vertices(loop, name)
-    bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
-    if bad.size:
-        raise NonFiniteVertexError(
-            f"vertex {bad[0]} of {name} is {_point(vertices[bad[0]])}"
-            f"{_and_more(bad.size)}: coordinates must be finite"
-        )
+    check_finite(vertices, f"vertex {{}} of {name}", NonFiniteVertexError)
     if len(vertices) > 1 and (vertices[0] == vertices[-1]).all():
         vertices = vertices[:-1]
     distinct = _count_distinct(vertices)
@@ -134,19 +137,10 @@ def _validate_loop(loop: Any, name: str) -> FloatArray:
 
 
 def _as_vertices(loop: Any, name: str) -> FloatArray:
-    try:
-        array = np.asarray(loop)
-    except ValueError:
-        raise CurveShapeError(f"{name} is ragged: every vertex needs three coordinates") from None
-    if array.dtype.kind not in "fiu":
-        raise CurveShapeError(f"{name} must hold real numbers, not {array.dtype}")
-    if array.ndim != 2 or array.shape[1] != 3:
-        hint = ""
-        if array.ndim == 2 and array.shape[1] == 2:
-            hint = "; append a column of zeros to a planar curve"
-        elif array.ndim == 2 and array.shape[0] == 3:
-            hint = "; transpose it"
-        raise CurveShapeError(f"{name} must have shape (n, 3), not {array.shape}{hint}")
+    ragged = "is ragged: every vertex needs three coordinates"
+    array = real_array(loop, name, CurveShapeError, ragged=ragged)
+    planar = "; append a column of zeros to a planar curve"
+    check_vectors(array, name, CurveShapeError, planar=planar, transposed=TRANSPOSE)
     if len(array) > MAX_VERTICES:
         raise TooManyVerticesError(_too_many(name, len(array)))
     return np.array(array, dtype=np.float64, order="C")
@@ -169,8 +163,8 @@ def _check_edges(vertices: FloatArray, name: str) -> None:
     if same.size:
         first, second = int(same[0]), (int(same[0]) + 1) % len(vertices)
         raise RepeatedVertexError(
-            f"vertices {first} and {second} of {name} are both {_point(vertices[first])}"
-            f"{_and_more(same.size)}: remove one of them"
+            f"vertices {first} and {second} of {name} are both {vector_text(vertices[first])}"
+            f"{and_more(same.size)}: remove one of them"
         )
     size = float(np.abs(vertices).max())
     shortest = float(np.abs(ends - vertices).max(axis=1).min())
@@ -183,14 +177,6 @@ def _check_edges(vertices: FloatArray, name: str) -> None:
 
 def _too_many(name: str, count: int) -> str:
     return f"{name} has {count:,} vertices: at most {MAX_VERTICES:,} are accepted; resample it"
-
-
-def _point(vertex: FloatArray) -> str:
-    return "(" + ", ".join(f"{v:g}" for v in vertex) + ")"
-
-
-def _and_more(count: int) -> str:
-    return f" (and {count - 1} more)" if count > 1 else ""
 
 
 def edges(loops: Loops) -> tuple[FloatArray, FloatArray]:

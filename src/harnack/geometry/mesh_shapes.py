@@ -10,8 +10,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from harnack.geometry.convex_volume import FloatArray
-from harnack.geometry.meshes import IntArray
+from harnack.backend.numbers import FloatArray, IntArray
 
 __all__ = [
     "bumpy_sphere",
@@ -79,7 +78,7 @@ def remove_faces(faces: IntArray, fraction: float, seed: int) -> IntArray:
 
 
 def flip_faces(faces: IntArray, fraction: float, seed: int) -> IntArray:
-    """The faces (m, 3), a random fraction of them turned round: w jumps the wrong way there."""
+    """The faces (m, 3), a random fraction of them reversed: w jumps the opposite way there."""
     flipped = faces.copy()
     chosen = _chosen(faces, fraction, seed)
     flipped[chosen] = faces[chosen][:, [0, 2, 1]]
@@ -89,7 +88,7 @@ def flip_faces(faces: IntArray, fraction: float, seed: int) -> IntArray:
 def duplicate_faces(
     faces: IntArray, fraction: float, seed: int, *, turned: bool = False
 ) -> IntArray:
-    """The faces (m, 3), then a random fraction of them once more; turned: the other way round.
+    """The faces (m, 3), then a random fraction of them once more; turned: reversed.
 
     A duplicate makes w jump by 2 across that face, a turned one by 0: a hole that is not seen.
     """

@@ -2,27 +2,34 @@
 
 A mesh is an array (n, 3) of vertices and an array (m, 3) of faces, indices of vertices counted from
 0. The positive side of a face is the one from which its vertices run counter-clockwise. A mesh may
-have holes, cross itself, repeat faces or turn them round; nothing need be joined to anything.
+have holes, cross itself, repeat faces or reverse them; no face need be joined to another.
 """
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from harnack.geometry.convex_volume import BoolArray, FloatArray
+from harnack.backend.numbers import (
+    TRANSPOSE,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    and_more,
+    check_finite,
+    check_size,
+    check_vectors,
+    vector_text,
+)
 
 __all__ = [
-    "IntArray",
     "MeshError",
     "validate_mesh",
     "without_zero_area_faces",
     "zero_area_faces",
 ]
-
-IntArray: TypeAlias = npt.NDArray[np.int64]
 
 MAX_VERTICES = 100_000_000
 MAX_FACES = 100_000_000
@@ -109,20 +116,13 @@ def _as_vertices(vertices: Any) -> FloatArray:
         raise MeshError("there are no vertices: give an array (n, 3)")
     if array.dtype.kind not in "fiu":
         raise MeshError(f"the vertices must be real numbers, not {array.dtype}")
-    if array.ndim != 2 or array.shape[1] != 3:
-        hint = "; transpose it" if array.ndim == 2 and array.shape[0] == 3 else ""
-        raise MeshError(f"the vertices must have shape (n, 3), not {array.shape}{hint}")
+    check_vectors(array, "the vertices", MeshError, transposed=TRANSPOSE)
     if len(array) > MAX_VERTICES:
         raise MeshError(f"{len(array):,} vertices are too many: at most {MAX_VERTICES:,}")
     x = np.array(array, dtype=np.float64, order="C")
-    bad = np.flatnonzero(~np.isfinite(x).all(axis=1))
-    if bad.size:
-        raise MeshError(
-            f"vertex {bad[0]} is {_point(x[bad[0]])}{_and_more(bad.size)}: coordinates must be "
-            "finite; remove it and the faces that use it"
-        )
-    if (size := float(np.abs(x).max())) > 1e100:
-        raise MeshError(f"coordinates up to {size:g} are too large: choose units nearer to 1")
+    advice = "coordinates must be finite; remove it and the faces that use it"
+    check_finite(x, "vertex {}", MeshError, advice)
+    check_size(x, MeshError)
     return x
 
 
@@ -157,7 +157,7 @@ def _check_range(faces: npt.NDArray[Any], count: int) -> None:
     if index == count and int(faces.min()) == 1:
         hint = "; these indices seem to count from 1: subtract 1"
     raise MeshError(
-        f"face {bad[0]} is {tuple(map(int, first))}{_and_more(bad.size)}, but vertex {index} is "
+        f"face {bad[0]} is {tuple(map(int, first))}{and_more(bad.size)}, but vertex {index} is "
         f"out of range: there are {count:,} vertices, counted from 0{hint}"
     )
 
@@ -193,26 +193,18 @@ def _check_size(longest: FloatArray) -> None:
     small = np.flatnonzero((longest > 0.0) & (longest < 1e-100))
     if small.size:
         raise MeshError(
-            f"the edges of face {small[0]}{_and_more(small.size)} are only "
+            f"the edges of face {small[0]}{and_more(small.size)} are only "
             f"{longest[small[0]]:g} long: choose units nearer to 1, or remove it"
         )
 
 
 def _flat_message(x: FloatArray, faces: IntArray, flat: IntArray) -> str:
     a, b, c = (x[k] for k in faces[flat[0]])
+    corners = ", ".join(vector_text(one) for one in (a, b, c))
     repeated = bool((a == b).all() or (b == c).all() or (c == a).all())
     why = "two of its vertices are equal" if repeated else "its vertices lie on a line"
     count = f"{flat.size:,} of {len(faces):,} faces have" if flat.size > 1 else "one face has"
     return (
-        f"{count} zero area, first face {flat[0]} with vertices {_point(a)}, {_point(b)}, "
-        f"{_point(c)}: {why}; harnack.geometry.without_zero_area_faces(vertices, faces) removes "
-        "such faces"
+        f"{count} zero area, first face {flat[0]} with vertices {corners}: {why}; "
+        "harnack.geometry.without_zero_area_faces(vertices, faces) removes such faces"
     )
-
-
-def _point(vertex: FloatArray) -> str:
-    return "(" + ", ".join(f"{v:g}" for v in vertex) + ")"
-
-
-def _and_more(count: int) -> str:
-    return f" (and {count - 1:,} more)" if count > 1 else ""

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from harnack.geometry.convex_volume import FloatArray
+from harnack.backend.numbers import FloatArray, IntArray
 from harnack.geometry.curves import Loops
-from harnack.geometry.meshes import IntArray
 from harnack.geometry.singular import net_edges, singular_loops, weld_vertices
 
 __all__ = ["net_loops", "uncancelled_edges"]

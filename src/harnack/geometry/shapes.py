@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from harnack.geometry.convex_volume import FloatArray
+from harnack.backend.numbers import FloatArray
 
 Route = Literal["outside", "axis"]
 

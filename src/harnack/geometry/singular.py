@@ -35,9 +35,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from harnack.backend.numbers import FloatArray, IntArray
 from harnack.geometry.chains import join
-from harnack.geometry.convex_volume import FloatArray
-from harnack.geometry.meshes import IntArray
 
 __all__ = [
     "NetFaces",
@@ -78,9 +77,9 @@ def weld_vertices(vertices: FloatArray) -> IntArray:
 
 
 def net_faces(faces: IntArray) -> NetFaces:
-    """The faces (m, 3) with duplicates added up: same vertices +1, same vertices turned round -1.
+    """The faces (m, 3) with duplicates added up: same vertices +1, reversed -1.
 
-    A face that its turned duplicates cancel vanishes, and so does one that uses a vertex twice,
+    A face that its reversed duplicates cancel vanishes, and so does one that uses a vertex twice,
     since it has no area. Whichever corner a face begins with makes no difference. What remains
     runs so that its multiplicity is positive, and keeps the order of the original faces.
     """

@@ -14,7 +14,7 @@ from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.enclosures import HarmonicBall, Lipschitz
 from harnack.testing.failures import BrokenPromiseError, require
 from harnack.testing.poisson import BoolArray, FloatArray
-from harnack.testing.walks import Look, jumps, look_at
+from harnack.testing.walks import FieldValues, jumps, look_at
 
 if TYPE_CHECKING:
     from harnack.fields.field import Field
@@ -36,11 +36,14 @@ _TRIED = (1.0, 0.1, 0.01, 1e-3, 1e-4)
 _SMOOTH = 0.5
 
 
-def check_derivatives(field: Field, points: FloatArray, look: Look) -> None:
+def check_derivatives(field: Field, points: FloatArray, look: FieldValues) -> None:
     """Gradient, Laplacian and Hessian at points (n, 3), where the field was looked at.
 
     Differences are taken within the field's domain; points too close to its border for that are
-    left out. Raises BrokenPromiseError.
+    left out.
+
+    Raises:
+        BrokenPromiseError: naming the point where they do not agree.
     """
     h, fits = _spacing_within(field, points, _spacing(points, look))
     if not fits.any():
@@ -95,7 +98,9 @@ class _Nearby:
     gradient_error: FloatArray
 
 
-def _around(field: Field, points: FloatArray, look: Look, h: FloatArray) -> Iterator[_Nearby]:
+def _around(
+    field: Field, points: FloatArray, look: FieldValues, h: FloatArray
+) -> Iterator[_Nearby]:
     for axis in range(3):
         for node, weight, wide in zip(_NODES, _WEIGHTS, _WIDE_WEIGHTS, strict=True):
             way = np.sign(node) * np.eye(3)[axis] + 0 * points
@@ -129,11 +134,11 @@ def _chosen(trials: list[list[_Nearby]], choice: npt.NDArray[np.intp]) -> list[_
     return [pick(nodes) for nodes in zip(*trials, strict=True)]
 
 
-def _spacing(points: FloatArray, look: Look) -> FloatArray:
+def _spacing(points: FloatArray, look: FieldValues) -> FloatArray:
     return 2e-3 * _scale(points, look)
 
 
-def _scale(points: FloatArray, look: Look) -> FloatArray:
+def _scale(points: FloatArray, look: FieldValues) -> FloatArray:
     """A length (n,) over which the field is smooth: the smallest radius that is promised."""
     size = float(np.ptp(points, axis=0).max()) or 1.0
     radii = [known.radius for known in look.known if isinstance(known, HarmonicBall)]
@@ -145,7 +150,9 @@ def _size(points: FloatArray) -> FloatArray:
     return np.abs(points).max(axis=1)
 
 
-def _check_gradient(field: Field, points: FloatArray, look: Look, nearby: list[_Nearby]) -> None:
+def _check_gradient(
+    field: Field, points: FloatArray, look: FieldValues, nearby: list[_Nearby]
+) -> None:
     """By central differences of the value."""
     tolerance, allowance = _limits(field, points, look, nearby)
     off = np.linalg.norm(_difference(nearby)[0] - look.gradient, axis=1)
@@ -162,7 +169,7 @@ def _difference(nearby: list[_Nearby]) -> tuple[FloatArray, FloatArray]:
 
 
 def _limits(
-    field: Field, points: FloatArray, look: Look, nearby: list[_Nearby]
+    field: Field, points: FloatArray, look: FieldValues, nearby: list[_Nearby]
 ) -> tuple[FloatArray, FloatArray]:
     """How far differences of the value may be from the gradient (n,): what they leave out and
     rounding, and besides what errors of value and gradient allow."""
@@ -189,7 +196,7 @@ def _bend(nearby: list[_Nearby]) -> FloatArray:
     return np.sum([np.abs(one.weight * one.gradient[:, one.axis]) for one in nearby], axis=0)
 
 
-def _check_laplacian(points: FloatArray, look: Look, nearby: list[_Nearby]) -> None:
+def _check_laplacian(points: FloatArray, look: FieldValues, nearby: list[_Nearby]) -> None:
     """By central differences of the gradient."""
     if not _is_harmonic(look):
         return
@@ -204,7 +211,7 @@ def _check_laplacian(points: FloatArray, look: Look, nearby: list[_Nearby]) -> N
     _agree(np.abs(laplacian), tolerance, allowance, message, points)
 
 
-def _is_harmonic(look: Look) -> bool:
+def _is_harmonic(look: FieldValues) -> bool:
     return any(isinstance(one, HarmonicBall) and one.dimension < 4 for one in look.known)
 
 
@@ -217,7 +224,9 @@ def _agree(
         raise BrokenPromiseError(f"{message} at more than half of the {len(points)} points")
 
 
-def _check_hessian(field: Field, points: FloatArray, look: Look, nearby: list[_Nearby]) -> None:
+def _check_hessian(
+    field: Field, points: FloatArray, look: FieldValues, nearby: list[_Nearby]
+) -> None:
     """By central differences of the gradient, of two orders: they tell how far to trust them."""
     backend = choose_backend("double")
     try:

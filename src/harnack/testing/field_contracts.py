@@ -11,7 +11,7 @@ from harnack.enclosures import Curvature, HarmonicBall, Lipschitz
 from harnack.testing.derivative_contracts import check_derivatives
 from harnack.testing.failures import BrokenPromiseError, require
 from harnack.testing.poisson import FloatArray
-from harnack.testing.walks import Look, look_at, movements, random_directions, random_points
+from harnack.testing.walks import FieldValues, look_at, movements, random_directions, random_points
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -76,7 +76,7 @@ def check_field(
         _check_extent(field, level, generator, count)
 
 
-def _check_numbers(field: Field, points: FloatArray, look: Look) -> None:
+def _check_numbers(field: Field, points: FloatArray, look: FieldValues) -> None:
     if field.period is not None and not 0 < field.period < np.inf:
         raise BrokenPromiseError(f"period must be None or a positive number, not {field.period!r}")
     require(np.isfinite(look.value), "the value is not a finite number", points)
@@ -125,7 +125,7 @@ def _check_rounding(field: Field, points: FloatArray) -> None:
     require(good, "Sample.error: in single precision the value is off by more", single, off)
 
 
-def _check_differentiable_value(field: Field, points: FloatArray, look: Look) -> None:
+def _check_differentiable_value(field: Field, points: FloatArray, look: FieldValues) -> None:
     backend = choose_backend("double")
     prepared = field.prepare(backend)
     value = prepared.differentiable_value(to_vector3(backend, points, "points"))
@@ -139,7 +139,7 @@ def _check_differentiable_value(field: Field, points: FloatArray, look: Look) ->
 def _check_promise(
     field: Field,
     points: FloatArray,
-    look: Look,
+    look: FieldValues,
     known: Promise,
     rng: np.random.Generator,
     directions: int,
@@ -152,9 +152,9 @@ def _check_promise(
     reach = np.minimum(known.radius, 2 * float(np.ptp(points, axis=0).max()) + 1e-300)
     # Denser towards the border, where singularities may lie.
     share = 1 - np.linspace(1, 0.03, 80) ** 2
-    steepness = np.linalg.norm(look.gradient, axis=1, keepdims=True)
-    steepest = look.gradient / np.maximum(steepness, 1e-300)
-    steepest[steepness[:, 0] == 0] = (1.0, 0.0, 0.0)
+    gradient_norm = np.linalg.norm(look.gradient, axis=1, keepdims=True)
+    steepest = look.gradient / np.maximum(gradient_norm, 1e-300)
+    steepest[gradient_norm[:, 0] == 0] = (1.0, 0.0, 0.0)
     for k in range(directions):
         # Singularities tend to lie along the gradient.
         ways = (steepest, -steepest, random_directions(rng, len(points)))
@@ -228,7 +228,7 @@ def _check_extent(field: Field, level: float, rng: np.random.Generator, count: i
     walk = movements(field, start, d, t)
     above = look_at(field, start).value[:, None] + walk.moved + walk.jumped - level
     # To first order, farther from the level than a thousandth of the extent: no grazing.
-    clear = _gap(field, above) > 1e-3 * float(half.max()) * walk.steepness + walk.error
+    clear = _gap(field, above) > 1e-3 * float(half.max()) * walk.gradient_norm + walk.error
     crossed = (_cell(field, above[:, 1:]) != _cell(field, above[:, :-1])) & clear[:, 1:]
     row, column = np.nonzero(crossed & clear[:, :-1])
     if not row.size:

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from harnack.fields.field import Field, Sample
 
 __all__ = [
-    "Look",
-    "Walk",
+    "FieldValues",
+    "LiftAlongRays",
     "jumps",
     "look_at",
     "movements",
@@ -30,7 +30,7 @@ __all__ = [
 
 
 @dataclass(frozen=True)
-class Look:
+class FieldValues:
     """A field at n points: value (n,), gradient (n, 3), their errors and promises (n,) each."""
 
     value: FloatArray
@@ -39,7 +39,7 @@ class Look:
     gradient_error: FloatArray
     known: tuple[Promise, ...]
 
-    def at(self, rows: BoolArray) -> Look:
+    def at(self, rows: BoolArray) -> FieldValues:
         """The same at some of the points."""
         known: list[Promise] = []
         for one in self.known:
@@ -47,7 +47,7 @@ class Look:
                 key: value[rows] for key, value in vars(one).items() if key != "dimension"
             }
             known.append(dataclasses.replace(one, **numbers))
-        return Look(
+        return FieldValues(
             self.value[rows],
             self.gradient[rows],
             self.error[rows],
@@ -56,7 +56,7 @@ class Look:
         )
 
 
-def look_at(field: Field, points: FloatArray, precision: Precision = "double") -> Look:
+def look_at(field: Field, points: FloatArray, precision: Precision = "double") -> FieldValues:
     """The field at points (n, 3), all numbers of its promises as float64 arrays (n,)."""
     n = len(points)
     sample = _sample(field, points, precision)
@@ -68,7 +68,7 @@ def look_at(field: Field, points: FloatArray, precision: Precision = "double") -
         return dataclasses.replace(one, **numbers)
 
     known = tuple(on_host(one) for one in sample.promises)
-    return Look(
+    return FieldValues(
         _spread(sample.value, n),
         np.broadcast_to(to_numpy(sample.gradient), (n, 3)).astype(np.float64),
         _spread(sample.error, n),
@@ -78,20 +78,24 @@ def look_at(field: Field, points: FloatArray, precision: Precision = "double") -
 
 
 @dataclass(frozen=True)
-class Walk:
-    """What was met on the way to points of n rays, each array (n, m).
+class LiftAlongRays:
+    """The continuous lift of f at m points along each of n rays, all arrays (n, m).
 
-    moved: how far the continuous lift of f has moved since the first point. jumped: by how much f
-    has jumped besides, across sheets. steepness: |gradient|. error: `Sample.error`.
+    moved: how far the lift has moved since the ray's first point.
+    jumped: by how much f has jumped besides, across sheets.
+    gradient_norm: |grad f| at the points.
+    error: `Sample.error` at the points.
     """
 
     moved: FloatArray
     jumped: FloatArray
-    steepness: FloatArray
+    gradient_norm: FloatArray
     error: FloatArray
 
 
-def movements(field: Field, start: FloatArray, direction: FloatArray, lengths: FloatArray) -> Walk:
+def movements(
+    field: Field, start: FloatArray, direction: FloatArray, lengths: FloatArray
+) -> LiftAlongRays:
     """How far the continuous lift of f moves along rays: f(start + t direction) - f(start).
 
     start, direction: (n, 3), unit directions. lengths: t (n, m), each row rising from 0. A value
@@ -112,7 +116,9 @@ def movements(field: Field, start: FloatArray, direction: FloatArray, lengths: F
         move -= field.period * np.round((move - expected) / field.period)
     total = np.concatenate([np.zeros((n, 1)), np.cumsum(move, axis=1)], axis=1)
     jumped = jumps(field, start, direction, lengths)
-    return Walk(total - jumped, jumped, np.linalg.norm(gradient, axis=2), look.error.reshape(n, m))
+    return LiftAlongRays(
+        total - jumped, jumped, np.linalg.norm(gradient, axis=2), look.error.reshape(n, m)
+    )
 
 
 def jumps(

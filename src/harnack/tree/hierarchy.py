@@ -13,8 +13,7 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
+from harnack.backend import FloatArray, IntArray
 
 NO_PRIMITIVE = -1
 # So many points and their indices stay in the cache.

@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 import drjit as dr
 import numpy as np
 
+from harnack.backend import FloatArray, IntArray
 from harnack.backend.basis import across
 from harnack.backend.extrema import clamp, fmax, fmin
 from harnack.backend.lengths import largest_component
-from harnack.tree.hierarchy import FloatArray, Hierarchy, IntArray
+from harnack.tree.hierarchy import Hierarchy
 from harnack.tree.packed import PackedTree, pack
 from harnack.tree.walk import Node, State, for_each, walk
 

@@ -19,16 +19,15 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
+from harnack.backend import FloatArray
 from harnack.fields.polynomials.solid_harmonics import (
     Legendre,
     Weights,
-    normalisation,
-    odd_factorial,
+    legendre_weight,
     unit_hessian,
 )
 
@@ -46,7 +45,6 @@ __all__ = [
     "value_bound",
 ]
 
-FloatArray: TypeAlias = npt.NDArray[np.float64]
 
 _ANGLES = 720  # intervals of the polar angle from pole to pole
 _TURNS = 24  # azimuths over half a turn of m b
@@ -141,13 +139,14 @@ def amplitudes(weights: Weights) -> dict[tuple[int, int], float]:
     return sizes
 
 
-def _angles() -> tuple[FloatArray, FloatArray]:
-    a = np.linspace(0.0, math.pi, _ANGLES + 1)
+def polar_samples(count: int = _ANGLES) -> tuple[FloatArray, FloatArray]:
+    """cos(a) and sin(a) at count + 1 polar angles, evenly spaced from 0 to pi."""
+    a = np.linspace(0.0, math.pi, count + 1)
     return np.cos(a), np.sin(a)
 
 
 def _proved(sampled: FloatArray, degree: int) -> float:
-    """The largest size of a trigonometric polynomial in a, from its samples at `_angles`.
+    """The largest size of a trigonometric polynomial in a, from its samples at `polar_samples`.
 
     At its maximum A its slope is 0 and its second derivative at most degree^2 A (Bernstein), and a
     sample is within half a spacing, so the samples fall short of A by at most e A.
@@ -156,15 +155,11 @@ def _proved(sampled: FloatArray, degree: int) -> float:
     return float(np.abs(sampled).max()) / (1 - e) * (1 + 1e-12)
 
 
-def _harmonic(l: int, m: int) -> float:  # noqa: E741
-    return normalisation(l, m) * odd_factorial(m)
-
-
 @functools.cache
 def largest_value(l: int, m: int) -> float:  # noqa: E741
     """The largest N |Q(cos a)|."""
-    z, _ = _angles()
-    return _harmonic(l, m) * _proved(np.broadcast_to(Legendre(z, 1.0)(l, m), z.shape), l)
+    z, _ = polar_samples()
+    return legendre_weight(l, m) * _proved(np.broadcast_to(Legendre(z, 1.0)(l, m), z.shape), l)
 
 
 @functools.cache
@@ -177,7 +172,7 @@ def largest_gradient(l: int, m: int) -> float:  # noqa: E741
     """
     if l == 0:
         return 0.0
-    z, rho = _angles()
+    z, rho = polar_samples()
     q = Legendre(z, 1.0)
     at_m, at_next = q(l, m), (2 * m + 1) * q(l - 1, m + 1)
     if m == 0:
@@ -187,7 +182,7 @@ def largest_gradient(l: int, m: int) -> float:  # noqa: E741
         axial, around = rho * ((l + m) * (q(l - 1, m) if l > m else 0.0)), m * at_m
     # The square of a directional derivative is of degree 2 l, and so is their sum.
     steep = np.maximum(radial**2 + axial**2, around**2)
-    return _harmonic(l, m) * math.sqrt(_proved(steep, 2 * l))
+    return legendre_weight(l, m) * math.sqrt(_proved(steep, 2 * l))
 
 
 @functools.cache
@@ -199,7 +194,7 @@ def largest_hessian(l: int, m: int) -> float:  # noqa: E741
     """
     if l < 2:
         return 0.0
-    z, rho = _angles()
+    z, rho = polar_samples()
     worst = 0.0
     for turn in np.pi * np.arange(_TURNS) / _TURNS:
         b = turn / max(m, 1)

@@ -57,7 +57,7 @@ class HarmonicPromises:
     degree, lowest: the largest degree of a term, and the smallest above 0.
     order: to which the sum, less its constant, vanishes along the z axis.
     inner, outer: radii of harmonic balls at r = 0 and r = 1.
-    beside: the share of r below which rho says how large a ball is.
+    axis_share: the share of r below which rho says how large a ball is.
     value, gradient, hessian: bounds near an axis of order 3 or more, None where the order is less.
     rounding: of value and gradient as they are evaluated.
     """
@@ -68,7 +68,7 @@ class HarmonicPromises:
     order: int
     inner: float
     outer: float
-    beside: float
+    axis_share: float
     axial: tuple[AxialBound, AxialBound, AxialBound] | None
     rounding: HarmonicRounding
 
@@ -76,14 +76,14 @@ class HarmonicPromises:
     def of(cls, weights: Weights, known: BallRange, *, is_divided: bool) -> HarmonicPromises:
         """known: the ranges of the degrees. is_divided: points are divided by a size before."""
         inner, outer = _best_radius(known, 0.0), _best_radius(known, 1.0)
-        order, axial, beside = order_on_axis(weights), None, 0.0
+        order, axial, axis_share = order_on_axis(weights), None, 0.0
         if order > 2:
             rest = {key: weight for key, weight in weights.items() if key[0] > 0}
             axial = value_bound(rest), gradient_bound(rest), hessian_bound(rest)
             lower, upper = known.by_degree(1.0)
             most = max(upper - known.constant, known.constant - lower)
-            # Where rho = beside r, both bounds of a single term are the same.
-            beside = (most / float(axial[0](1.0, 1.0))) ** (1 / order)
+            # Where rho = axis_share r, both bounds of a single term are the same.
+            axis_share = (most / float(axial[0](1.0, 1.0))) ** (1 / order)
         return cls(
             known.with_spheres(weights, 1.01 * max(inner, 1.0 + outer)),
             max(degree for degree, _ in weights),
@@ -91,7 +91,7 @@ class HarmonicPromises:
             order,
             inner,
             outer,
-            beside,
+            axis_share,
             axial,
             HarmonicRounding.of(weights, is_divided=is_divided),
         )
@@ -131,7 +131,7 @@ class HarmonicPromises:
         if self.lowest < 3:
             return None
         radius = fmax(r * (_WIDE / (self.degree - 2)), _LEAST)
-        constant = self.known.steepness(r + radius)
+        constant = self.known.gradient(r + radius)
         if self.axial is not None:
             constant = fmin(constant, self.axial[1](rho + radius, r + radius))
         return Lipschitz(dr.fma(constant, 1 + _ROUNDING, self._smallest(r)), radius)
@@ -170,8 +170,8 @@ class HarmonicPromises:
         radius = self.outer * r
         if self.axial is not None:
             order, rest = self.order - 2.0, float(self.degree - self.order)
-            beside = 2 / (order / rho + rest / fmax(r, _ORIGIN))
-            radius = dr.select(rho < self.beside * r, fmin(beside, radius), radius)
+            by_axis = 2 / (order / rho + rest / fmax(r, _ORIGIN))
+            radius = dr.select(rho < self.axis_share * r, fmin(by_axis, radius), radius)
         return fmax(radius, _ORIGIN * self.outer)
 
     def _smallest(self, r: Real) -> float:

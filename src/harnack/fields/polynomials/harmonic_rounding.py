@@ -27,29 +27,28 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
+from harnack.backend import FloatArray
 from harnack.backend.extrema import fmin
 from harnack.fields.polynomials.axial_bounds import (
     AxialBound,
     amplitudes,
     largest_gradient,
     largest_hessian,
+    polar_samples,
 )
 from harnack.fields.polynomials.solid_harmonics import (
     Legendre,
     Weights,
-    normalisation,
-    odd_factorial,
+    legendre_weight,
 )
 
 if TYPE_CHECKING:
     from harnack.backend import Real
 
-FloatArray: TypeAlias = npt.NDArray[np.float64]
 
 # Sums of products of sizes of polynomials in cos(a), of degree 24 at most, are sampled this
 # finely in a; between samples each factor moves by 24 pi/2/_SAMPLES of its largest size at most
@@ -81,7 +80,7 @@ class HarmonicRounding:
             # One amplitude stands for two columns: cos(m b) and sin(m b), at right angles.
             terms = max(sum(order == k for _, order in weights) for k in (m, -m))
             sums = (terms - 1) + (orders - 1)
-            size = amplitude * _size(l, m)
+            size = amplitude * legendre_weight(l, m)
             near, anywhere = _of_value(l, m, sums, is_divided)
             steep_near, steep_anywhere = _of_gradient(l, m, sums, is_divided) if l else (0.0, 0.0)
             power = max(m - 1, 0)
@@ -108,15 +107,10 @@ class HarmonicRounding:
         return fmin(near(rho, r), anywhere(rho, r))
 
 
-def _grid() -> tuple[FloatArray, FloatArray]:
-    a = np.linspace(0.0, math.pi, _SAMPLES + 1)
-    return np.cos(a), np.sin(a)
-
-
 @functools.cache
 def _recurrence(l: int, m: int) -> tuple[FloatArray, FloatArray, float]:  # noqa: E741
     """|Q|, its error in units of u, and the sum of |G_lk| times coefficients, on the grid of c."""
-    c, _ = _grid()
+    c, _ = polar_samples(_SAMPLES)
     q = Legendre(c, 1.0)
     zero, one = 0.0 * c, 0.0 * c + 1.0
     if l < m:
@@ -136,10 +130,6 @@ def _recurrence(l: int, m: int) -> tuple[FloatArray, FloatArray, float]:  # noqa
     return np.abs(q(l, m) + zero), error, spread
 
 
-def _size(l: int, m: int) -> float:  # noqa: E741
-    return normalisation(l, m) * odd_factorial(m)
-
-
 def _product(m: int) -> float:
     """The error of (x + iy)^m in units of u of its size."""
     return 2 * math.sqrt(2) * max(m - 1, 0)
@@ -148,7 +138,7 @@ def _product(m: int) -> float:
 def _of_value(l: int, m: int, sums: int, is_divided: bool) -> tuple[float, float]:  # noqa: E741
     """In units of u rho^m r^(l-m), and of u r^l."""
     q, error, _ = _recurrence(l, m)
-    c, s = _grid()
+    c, s = polar_samples(_SAMPLES)
     total = error + (3 + sums + _product(m)) * q
     if is_divided:
         at_next, below = _recurrence(l - 1, m + 1)[0], _recurrence(l - 1, m)[0]
@@ -163,7 +153,7 @@ def _of_gradient(l: int, m: int, sums: int, is_divided: bool) -> tuple[float, fl
     terms of gx and gy, then the sums. The point divided by the size: 3u (rho |H| + |z grad f_z|),
     f_z = (l+m) Q_(l-1)^m B being of degree l-1 and order m; and 3u for the gradient divided by it.
     """
-    _, s = _grid()
+    _, s = polar_samples(_SAMPLES)
     each = 4 + 2 + 2 * sums + _product(m) + (3 if is_divided else 0)
     q, q_error, _ = _recurrence(l, m)
     at_next, next_error, _ = _recurrence(l - 1, m + 1)
@@ -176,9 +166,9 @@ def _of_gradient(l: int, m: int, sums: int, is_divided: bool) -> tuple[float, fl
     near, anywhere = _largest(total), _largest(total * s ** max(m - 1, 0))
     if is_divided:
         # On the sphere |H| <= l (l-1) M and |grad f_z| <= (l-1) l M: see `BallRange.curvature`.
-        rest = 3 * largest_hessian(l, m) / _size(l, m)
+        rest = 3 * largest_hessian(l, m) / legendre_weight(l, m)
         if l > m:
-            rest += 3 * (l + m) * largest_gradient(l - 1, m) / _size(l - 1, m)
+            rest += 3 * (l + m) * largest_gradient(l - 1, m) / legendre_weight(l - 1, m)
         near += rest
         anywhere += min(rest, 6 * l * (l - 1) * _largest(q * s**m))
     return near, anywhere

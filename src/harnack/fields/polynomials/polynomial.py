@@ -83,7 +83,11 @@ class _SolidHarmonics(Field):
         return evaluate(self._weights, s.x, s.y, s.z)[0]
 
     def check_levels(self, levels: tuple[float, ...]) -> None:
-        """ValueError for a level that is proved to lie outside the range in the domain."""
+        """Refuse levels that no point of the domain can have.
+
+        Raises:
+            ValueError: a level is proved to lie outside the range in the domain.
+        """
         low, high = self.value_range
         for level in levels:
             if not low <= level <= high:
@@ -110,7 +114,9 @@ class SphericalHarmonic(_SolidHarmonics):
     l, m: degree 0 <= l <= 12 and order -l <= m <= l.
     radius: of the ball that it is clipped to, about the origin.
 
-    Raises ValueError (TypeError if not whole numbers) for others.
+    Raises:
+        ValueError: l or m outside these ranges, or a radius that is not positive.
+        TypeError: l or m is no whole number.
     """
 
     def __init__(self, l: int, m: int, *, radius: float = 1.0) -> None:  # noqa: E741
@@ -137,8 +143,9 @@ class HarmonicPolynomial(_SolidHarmonics):
     evaluated as a sum of solid harmonics, which agrees with it in value and z-derivative on the
     plane z = 0, thus everywhere if it is harmonic.
 
-    Raises ValueError for a polynomial that is not harmonic (showing its Laplacian), of a higher
-    degree, with coefficients that are not finite, or for an unbounded domain.
+    Raises:
+        ValueError: the polynomial is not harmonic (the message shows its Laplacian), its degree is
+            above 12, a coefficient is not finite, or the domain is unbounded.
     """
 
     def __init__(
@@ -166,7 +173,11 @@ def _turned(three: Sequence[Any], n: int) -> tuple[Any, Any, Any]:
 def _checked(
     coefficients: Mapping[tuple[int, int, int], float],
 ) -> dict[tuple[int, int, int], float]:
-    """The coefficients that are not zero. ValueError unless they make a harmonic polynomial."""
+    """The coefficients that are not zero.
+
+    Raises:
+        ValueError: they make no harmonic polynomial.
+    """
     checked: dict[tuple[int, int, int], float] = {}
     for powers, value in coefficients.items():
         try:

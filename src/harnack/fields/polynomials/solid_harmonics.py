@@ -33,6 +33,11 @@ def odd_factorial(m: int) -> float:
     return float(math.prod(range(1, 2 * m, 2)))
 
 
+def legendre_weight(l: int, m: int) -> float:  # noqa: E741
+    """N_lm (2m-1)!!, what `Legendre` leaves out of r^l Y_lm, m >= 0."""
+    return normalisation(l, m) * odd_factorial(m)
+
+
 class Legendre:
     """Q_l^m / (2m-1)!! at one point, each computed once.
 
@@ -165,7 +170,7 @@ def _second_column(
     at_m, at_next, rate = _column(column, m, q)
     at_second, rate_next, rate_twice = 0.0, 0.0, 0.0
     for l, weight in column:  # noqa: E741
-        a = weight * normalisation(l, m) * odd_factorial(m)
+        a = weight * legendre_weight(l, m)
         if l > m + 1:
             rate_twice = rate_twice + (a * (l + m) * (l + m - 1)) * q(l - 2, m)
         if l > m + 2:
@@ -179,7 +184,7 @@ def _column(column: Sequence[tuple[int, float]], m: int, q: Legendre) -> tuple[A
     """Sums over l of c_lm N_lm times Q_l^m, Q_(l-1)^(m+1) and (l+m) Q_(l-1)^m."""
     at_m, at_next, rate = 0.0, 0.0, 0.0
     for l, weight in column:  # noqa: E741
-        a = weight * normalisation(l, m) * odd_factorial(m)
+        a = weight * legendre_weight(l, m)
         at_m = at_m + a * q(l, m)
         if l > m:
             rate = rate + (a * (l + m)) * q(l - 1, m)
@@ -232,7 +237,7 @@ def from_monomials(coefficients: Monomials) -> dict[tuple[int, int], float]:
         spectra = [np.fft.rfft(part) / n for part in parts]
         for m in range(l + 1):
             odd = (l - m) % 2
-            size = normalisation(l, m) * odd_factorial(m)
+            size = legendre_weight(l, m)
             size *= (l + m) * q(l - 1, m) if odd else q(l, m)
             harmonic = complex(spectra[odd][m]) * (2 if m else 1) / size
             for order, weight in ((m, harmonic.real), (-m, -harmonic.imag)):

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import drjit as dr
 import numpy as np
-import numpy.typing as npt
 
+from harnack.backend import FloatArray
 from harnack.backend.extrema import fmax, fmin
 from harnack.fields.polynomials.solid_harmonics import Weights, evaluate
 
@@ -26,7 +26,7 @@ _RESOLUTION = 0.1
 _FRACTIONS = (0.25, 0.4, 0.55, 0.7, 0.85, 1.0)
 
 
-def unit_sphere(covering: float) -> npt.NDArray[np.float64]:
+def unit_sphere(covering: float) -> FloatArray:
     """Points (3, n) of the unit sphere such that none of it is further than `covering` away.
 
     Distances are measured along great circles. Rings at equal steps h of latitude, at equal
@@ -37,7 +37,7 @@ def unit_sphere(covering: float) -> npt.NDArray[np.float64]:
     chord = 2 * math.sin(0.5 * min(covering, math.pi))
     rings = math.ceil(math.pi / (1.4 * chord)) + 1
     h = math.pi / rings
-    points: list[npt.NDArray[np.float64]] = []
+    points: list[FloatArray] = []
     for ring in range(rings):
         a = (ring + 0.5) * h
         room = math.sqrt(chord**2 - (h / 2) ** 2)
@@ -71,8 +71,8 @@ def proved_range(low: float, high: float, degree: int, covering: float) -> tuple
 def range_of_harmonic(l: int, m: int) -> tuple[float, float]:  # noqa: E741
     """Proved range of Y_lm on the unit sphere, within 1e-5 of the true one.
 
-    For m = 0 the circle through the poles takes every value, and elsewhere the factor cos(m phi)
-    or sin(m phi) is +-1 in turn, so that the range is symmetric.
+    For m = 0 a circle through the poles takes every value. Elsewhere the factor cos(m phi) or
+    sin(m phi) takes both signs alike, so that the range is symmetric.
     """
     n = 8192
     t = 2 * np.pi * np.arange(n) / n
@@ -137,18 +137,18 @@ class BallRange:
         T'^2 + l^2 T^2 <= l^2 M^2 (Bernstein-Szego). A directional derivative of f_l is again
         homogeneous and harmonic, of degree l-1, so |v.H v| <= l (l-1) M |y|^(l-2).
         """
-        total = 0.0 * s
-        most = {degree: max(-low, high) for degree, low, high in self.ends}
-        for degree in range(max(most, default=0), 1, -1):
-            total = total * s + degree * (degree - 1) * most.get(degree, 0.0)
-        return total
+        return self._derivative(s, 2)
 
-    def steepness(self, s: Real) -> Real:
+    def gradient(self, s: Real) -> Real:
         """A bound of the gradient on |y| <= s, |grad f_l| <= l M |y|^(l-1): see `curvature`."""
+        return self._derivative(s, 1)
+
+    def _derivative(self, s: Real, order: int) -> Real:
+        """The sum over l of l (l-1) .. (l-order+1) M |y|^(l-order), by Horner's rule."""
         total = 0.0 * s
         most = {degree: max(-low, high) for degree, low, high in self.ends}
-        for degree in range(max(most, default=0), 0, -1):
-            total = total * s + degree * most.get(degree, 0.0)
+        for degree in range(max(most, default=0), order - 1, -1):
+            total = total * s + math.perm(degree, order) * most.get(degree, 0.0)
         return total
 
     def at(self, s: Real) -> tuple[Real, Real]:
@@ -166,14 +166,12 @@ class BallRange:
         return max(low for low, _ in bounds), min(high for _, high in bounds)
 
 
-def _points(weights: Weights) -> tuple[npt.NDArray[np.float64], float]:
+def _points(weights: Weights) -> tuple[FloatArray, float]:
     covering = _RESOLUTION / max(1, max(degree for degree, _ in weights))
     return unit_sphere(covering), covering
 
 
-def _values(
-    weights: Weights, points: npt.NDArray[np.float64]
-) -> dict[int, npt.NDArray[np.float64]]:
+def _values(weights: Weights, points: FloatArray) -> dict[int, FloatArray]:
     """The values of each f_l at points of the unit sphere."""
     degrees = sorted({degree for degree, _ in weights})
     return {
@@ -182,9 +180,7 @@ def _values(
     }
 
 
-def sphere_range(
-    values: dict[int, npt.NDArray[np.float64]], s: float, covering: float
-) -> tuple[float, float]:
+def sphere_range(values: dict[int, FloatArray], s: float, covering: float) -> tuple[float, float]:
     """Proved range of the sum of f_l on the sphere of radius s; values: on the unit sphere."""
-    whole: npt.NDArray[np.float64] = np.sum([s**degree * v for degree, v in values.items()], axis=0)
+    whole: FloatArray = np.sum([s**degree * v for degree, v in values.items()], axis=0)
     return proved_range(float(whole.min()), float(whole.max()), max(values), covering)

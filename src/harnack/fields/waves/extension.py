@@ -53,7 +53,7 @@ class ExtensionRange:
     spread: float  # E
     largest: float
     constant: float
-    steepness: float
+    largest_gradient: float
     curvature: float
 
     @classmethod
@@ -89,14 +89,14 @@ class ExtensionRange:
             spread=spread,
             largest=largest,
             constant=waves.constant,
-            steepness=waves.largest_gradient,
+            largest_gradient=waves.largest_gradient,
             curvature=waves.largest_curvature,
         )
 
     def ball(self, f: Real, slope: Real) -> HarmonicBall:
         """The promise at a point with value f and |grad f| = slope."""
         r = self.radius
-        rise = fmin(self.steepness * r, slope * r + 0.5 * self.curvature * r * r)
+        rise = fmin(self.largest_gradient * r, slope * r + 0.5 * self.curvature * r * r)
         out = 1 + _ROUNDING
         real = backend_of(f).Float
         f = f - self.constant
@@ -120,7 +120,7 @@ class ExtensionRange:
     def _below_host(self, slope: float) -> float:
         """The same at f = 0 in Python floats, for choosing the radius."""
         r, alpha, e = self.radius, self.alpha, self.spread
-        rise = min(self.steepness * r, slope * r + 0.5 * self.curvature * r * r)
+        rise = min(self.largest_gradient * r, slope * r + 0.5 * self.curvature * r * r)
         x = np.linspace(0.0, 1.0, 101)
         falling = (1 + alpha * (1 - x * x)) * rise * x + (1 - x * x) * e
         return min(float(falling.max()), self.largest)

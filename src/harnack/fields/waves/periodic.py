@@ -54,8 +54,6 @@ class EigenfunctionSum(Field):
     domain: the volume it is drawn in; by default the ball about the origin whose radius is the
         longest wavelength.
 
-    Raises ValueError for terms that are not finite or a sum that is constant.
-
     Each term is an eigenfunction of the Laplacian, so cosh(kappa w) f with kappa^2 = -eigenvalue
     is harmonic in R^4 and equals f at w = 0: see `ExtensionRange` for what it is bounded by. The
     Lipschitz constant is local, |grad f(p)| + H r / 2 on the ball of radius r (Taylor), where
@@ -70,6 +68,9 @@ class EigenfunctionSum(Field):
     harmonic ball of radius R it is E R, of which `bounds.solve.rounding` pays for 16 u of the mean
     4 (f - lower)/R that the slope is measured by, f - lower being about H R^2/2 or more; only what
     that leaves is added.
+
+    Raises:
+        ValueError: terms that are not finite, or a sum that is constant.
     """
 
     overstep = 1.0
@@ -127,7 +128,11 @@ class EigenfunctionSum(Field):
         return x, y, z
 
     def check_levels(self, levels: tuple[float, ...]) -> None:
-        """ValueError for a level that is proved to lie outside the range of the function."""
+        """Refuse levels that no point can have.
+
+        Raises:
+            ValueError: a level is proved to lie outside the range of the function.
+        """
         least, most = self.value_range
         for level in levels:
             if not least <= level <= most:

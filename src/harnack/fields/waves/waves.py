@@ -81,7 +81,11 @@ Term = Product | PlaneWave
 
 
 def checked_terms(terms: Iterable[Term]) -> tuple[Term, ...]:
-    """The terms as a tuple. ValueError or TypeError names the first one that will not do."""
+    """The terms as a tuple.
+
+    Raises:
+        ValueError, TypeError: there is no term, or one will not do; the message names the first.
+    """
     checked = tuple(terms)
     if not checked:
         raise ValueError("a sum needs at least one term")
@@ -199,7 +203,11 @@ class WaveBounds:
 
     @classmethod
     def of(cls, terms: Iterable[Term]) -> WaveBounds:
-        """The bounds of a sum, equal wave vectors added up first. ValueError for a constant."""
+        """The bounds of a sum, equal wave vectors added up first.
+
+        Raises:
+            ValueError: the sum is constant.
+        """
         waves: dict[tuple[float, ...], complex] = {}
         for term in terms:
             for k, amplitude in _plane_waves(term):

@@ -1,4 +1,4 @@
-"""Clipping volumes: ball, box, half-space, convex hull, and intersections of them."""
+"""Ball, box and half-space, and intersections of volumes."""
 
 from __future__ import annotations
 
@@ -11,11 +11,10 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend import Backend, Mask, Real, Vec3, backend_of
+from harnack.backend import Backend, BoolArray, FloatArray, Mask, Real, Vec3, backend_of
 from harnack.backend.extrema import fmax, fmin
-from harnack.geometry.convex_volume import (
-    BoolArray,
-    FloatArray,
+from harnack.geometry.volumes.polytope import Polytope
+from harnack.geometry.volumes.volume import (
     Point,
     Volume,
     as_points,
@@ -24,10 +23,8 @@ from harnack.geometry.convex_volume import (
     emptied,
     rounding,
 )
-from harnack.geometry.hull import ConvexHull
-from harnack.geometry.polytope import PlaneTable, Polytope
 
-__all__ = ["Ball", "Box", "ConvexHull", "HalfSpace", "Intersection", "Volume"]
+__all__ = ["Ball", "Box", "HalfSpace", "Intersection"]
 
 
 @dataclass(frozen=True)
@@ -109,7 +106,6 @@ class Box(Polytope):
 
     lower: Point
     upper: Point
-    _buffer: PlaneTable | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         lower = checked_point(self.lower, "the lower corner of a box", finite=False)
@@ -127,12 +123,6 @@ class Box(Polytope):
         rows[3:, :3], rows[3:, 3] = -np.eye(3), -np.array(self.lower)
         return rows[np.isfinite(rows[:, 3])]
 
-    def _uploaded(self) -> PlaneTable | None:
-        return self._buffer
-
-    def prepare(self, backend: Backend) -> Box:
-        return replace(self, _buffer=PlaneTable.upload(backend, self.planes()))
-
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         return np.array(self.lower), np.array(self.upper)
 
@@ -149,7 +139,6 @@ class HalfSpace(Polytope):
 
     normal: Point
     offset: float
-    _buffer: PlaneTable | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         normal = np.array(checked_point(self.normal, "the normal of a half-space"))
@@ -165,12 +154,6 @@ class HalfSpace(Polytope):
 
     def planes(self) -> FloatArray:
         return np.array([[*self.normal, self.offset]])
-
-    def _uploaded(self) -> PlaneTable | None:
-        return self._buffer
-
-    def prepare(self, backend: Backend) -> HalfSpace:
-        return replace(self, _buffer=PlaneTable.upload(backend, self.planes()))
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         lower, upper = np.full(3, -np.inf), np.full(3, np.inf)

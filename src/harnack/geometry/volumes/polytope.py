@@ -4,24 +4,26 @@ from __future__ import annotations
 
 import abc
 import sys
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias, TypeVar
 
 import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend import Backend, Mask, Real, Vec3, aligned, backend_of
-from harnack.backend.extrema import fmax, fmin
-from harnack.geometry.convex_volume import (
+from harnack.backend import (
+    Backend,
     BoolArray,
     FloatArray,
-    Volume,
-    as_points,
-    emptied,
-    rounding,
+    Mask,
+    Real,
+    Vec3,
+    aligned,
+    backend_of,
 )
+from harnack.backend.extrema import fmax, fmin
+from harnack.geometry.volumes.volume import Volume, as_points, emptied, rounding
 
 MAX_UNROLLED = 32
 """Up to this many planes the loop is unrolled into the kernel."""
@@ -30,40 +32,50 @@ _CHUNK = 4
 _NO_CONSTRAINT = (0.0, 0.0, 0.0, 1e30)
 
 State = TypeVar("State", bound=tuple[Any, ...])
+Prepared = TypeVar("Prepared", bound="Polytope")
 
 
 @dataclass(frozen=True, eq=False)
-class PlaneTable:
-    """Planes n.x <= h as rows (n, h) of four numbers, in a buffer of the backend.
+class Planes:
+    """Planes n.x <= h as rows (n, h) of four numbers, for a kernel.
 
-    The number of planes is rounded up, or a kernel parameter too (length) if they are many, so
-    that different volumes share a kernel. reach: the largest |h|, another parameter.
+    backend: where the kernel runs.
+    rows: (m, 4) on the host, of which kernels see the numbers where there is no buffer.
+    buffer: the rows on the backend, or None: literal numbers serve volumes that were not prepared.
+    length: the number of rows in the buffer as a kernel parameter.
+    reach: the largest |h|, a kernel parameter too if there is a buffer.
 
     Unrolled, a scalar gather at a literal index costs no more than a literal number (0.4 ns a
     plane and ray in all); a packet gather in a loop makes that 1.1 ns, four planes a trip.
     """
 
     backend: Backend
-    planes: int
+    rows: FloatArray
     buffer: Any
     length: Any
-    reach: Any
+    reach: Real
 
-    @staticmethod
-    def upload(backend: Backend, rows: FloatArray) -> PlaneTable:
-        """The table of rows (m, 4)."""
+    @classmethod
+    def literal(cls, backend: Backend, rows: FloatArray) -> Planes:
+        """The rows (m, 4) as they are."""
+        return cls(backend, rows, None, None, backend.Float(_reach(rows)))
+
+    @classmethod
+    def upload(cls, backend: Backend, rows: FloatArray) -> Planes:
+        """The rows (m, 4) in a buffer; it is filled up to a multiple of eight, if they are more, so
+        that volumes with about as many planes share a kernel."""
         count = len(rows) if len(rows) <= 8 else -(-len(rows) // 8) * 8
-        padding = np.tile(_NO_CONSTRAINT, (count - len(rows), 1))
-        buffer = aligned(backend, np.concatenate([rows, padding]).ravel())
+        filled = np.concatenate([rows, np.tile(_NO_CONSTRAINT, (count - len(rows), 1))])
         length = dr.opaque(backend.UInt32, count)
-        return PlaneTable(backend, count, buffer, length, dr.opaque(backend.Float, _reach(rows)))
+        reach = dr.opaque(backend.Float, _reach(rows))
+        return cls(backend, filled, aligned(backend, filled.ravel()), length, reach)
 
     def fold(self, state: State, step: Callable[[State, Vec3, Real], State]) -> State:
         """state = step(state, n, h) for every plane."""
         index = self.backend.UInt32
-        if self.planes <= MAX_UNROLLED:
-            for k in range(self.planes):
-                x, y, z, h = (self._number(4 * k + i) for i in range(4))
+        if self.buffer is None or len(self.rows) <= MAX_UNROLLED:
+            for k in range(len(self.rows)):
+                x, y, z, h = (self._number(k, i) for i in range(4))
                 state = step(state, self.backend.Array3f(x, y, z), h)
             return state
 
@@ -83,35 +95,12 @@ class PlaneTable:
         )
         return result[1:]
 
-    def _number(self, k: int) -> Real:
-        return dr.gather(self.backend.Float, self.buffer, self.backend.UInt32(k))
+    def _number(self, k: int, i: int) -> Real:
+        if self.buffer is None:
+            return self.backend.Float(float(self.rows[k, i]))
+        return dr.gather(self.backend.Float, self.buffer, self.backend.UInt32(4 * k + i))
 
 
-@dataclass(frozen=True, eq=False)
-class LiteralPlanes:
-    """Planes written into the kernel as numbers: for volumes that were not prepared."""
-
-    backend: Backend
-    rows: FloatArray
-
-    @property
-    def reach(self) -> Real:
-        """The largest |h|."""
-        return self.backend.Float(_reach(self.rows))
-
-    def fold(self, state: State, step: Callable[[State, Vec3, Real], State]) -> State:
-        """state = step(state, n, h) for every plane."""
-        for n, h in self._literals():
-            state = step(state, n, h)
-        return state
-
-    def _literals(self) -> Iterator[tuple[Vec3, Real]]:
-        for row in self.rows:
-            x, y, z, h = (float(v) for v in row)
-            yield self.backend.Array3f(x, y, z), self.backend.Float(h)
-
-
-Planes: TypeAlias = PlaneTable | LiteralPlanes
 Slacks: TypeAlias = tuple[Real, Real]
 
 
@@ -119,6 +108,7 @@ def _reach(rows: FloatArray) -> float:
     return float(np.abs(rows[:, 3]).max(initial=0.0))
 
 
+@dataclass(frozen=True, eq=False)
 class Polytope(Volume):
     """The intersection of the half-spaces n.x <= h, with unit normals n.
 
@@ -129,23 +119,23 @@ class Polytope(Volume):
     t >= |N / D| if N < 0, and no condition if N >= 0.
     """
 
+    _uploaded: Planes | None = field(default=None, repr=False, compare=False, kw_only=True)
+
     @abc.abstractmethod
     def planes(self) -> FloatArray:
         """Rows (nx, ny, nz, h), shape (m, 4), float64, all finite."""
 
-    @abc.abstractmethod
-    def _uploaded(self) -> PlaneTable | None:
-        """The planes on a backend, if `prepare` put them there."""
+    def prepare(self: Prepared, backend: Backend) -> Prepared:
+        return replace(self, _uploaded=Planes.upload(backend, self.planes()))
 
     def _table(self, backend: Backend) -> Planes:
-        table = self._uploaded()
-        if table is not None and table.backend == backend:
-            return table
+        if self._uploaded is not None and self._uploaded.backend == backend:
+            return self._uploaded
         rows = self.planes()
         is_recording = dr.flag(dr.JitFlag.SymbolicScope)  # nothing can be uploaded then
         if len(rows) <= MAX_UNROLLED or is_recording:
-            return LiteralPlanes(backend, rows)
-        return PlaneTable.upload(backend, rows)
+            return Planes.literal(backend, rows)
+        return Planes.upload(backend, rows)
 
     def _slacks(self, table: Planes, o: Vec3, d: Vec3) -> Callable[[Vec3, Real], Slacks]:
         """(n, h) -> bounds of the errors of h - n.o and n.d."""

@@ -15,10 +15,10 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from harnack.backend import BoolArray, FloatArray
+
 __all__ = ["Verdict", "first_side_changes", "is_near_surface", "judge"]
 
-FloatArray: TypeAlias = npt.NDArray[np.float64]
-BoolArray: TypeAlias = npt.NDArray[np.bool_]
 Value: TypeAlias = Callable[[FloatArray], FloatArray]
 """A real function: points (m, 3) in, exact values (m,) out."""
 

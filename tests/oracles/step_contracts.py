@@ -10,11 +10,11 @@ import numpy as np
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.enclosures import Gaps
 from harnack.testing.cases import Case, case_of
-from harnack.testing.exact import exact_step, on_host
 from harnack.testing.failures import BrokenPromiseError
 from harnack.testing.poisson import FloatArray
 from harnack.testing.scaled import unscaled
 from harnack.testing.walks import look_at, movements, random_directions, random_points
+from tests.oracles.exact import exact_step, on_host
 
 if TYPE_CHECKING:
     from harnack.backend import Precision

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend import Backend, Real, Vec3, backend_of
-from harnack.geometry.convex_volume import FloatArray, as_points, checked_distance, rounding
-from harnack.geometry.polytope import Planes, PlaneTable, Polytope, Slacks
+from harnack.backend import FloatArray, Real, Vec3, backend_of
+from harnack.geometry.volumes.polytope import Planes, Polytope, Slacks
+from harnack.geometry.volumes.volume import as_points, checked_distance, rounding
 
 MAX_PLANES = 2048
 """Nearly parallel facets beyond this number are dropped; what is left is a little larger."""
@@ -36,7 +36,6 @@ class ConvexHull(Polytope):
     offsets: FloatArray
     lower: FloatArray
     upper: FloatArray
-    _buffer: PlaneTable | None = field(default=None, repr=False)
 
     @staticmethod
     def of(points: npt.ArrayLike) -> ConvexHull:
@@ -67,17 +66,11 @@ class ConvexHull(Polytope):
     def planes(self) -> FloatArray:
         return np.column_stack([self.normals, self.offsets])
 
-    def _uploaded(self) -> PlaneTable | None:
-        return self._buffer
-
     def _slacks(self, table: Planes, o: Vec3, d: Vec3) -> Callable[[Vec3, Real], Slacks]:
         """As |n| = 1, |n|.|o| <= |o| serves all planes; in a bounded volume that is enough."""
         eps = rounding(backend_of(o))
         room, speed = eps * (dr.norm(o) + table.reach), eps * dr.norm(d)
         return lambda _n, _h: (room, speed)
-
-    def prepare(self, backend: Backend) -> ConvexHull:
-        return replace(self, _buffer=PlaneTable.upload(backend, self.planes()))
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         return np.array(self.lower), np.array(self.upper)

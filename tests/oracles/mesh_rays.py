@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from harnack.testing.jump_oracle import FloatArray
+from harnack.backend import FloatArray
 
 
 def mesh_rays(

@@ -14,11 +14,18 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
-__all__ = ["Crossings", "CurveOracle", "Function", "Look", "first_crossings", "gap_to_levels"]
+from harnack.backend import FloatArray
 
-FloatArray: TypeAlias = npt.NDArray[np.float64]
+__all__ = [
+    "Crossings",
+    "CurveOracle",
+    "Function",
+    "OracleValues",
+    "first_crossings",
+    "gap_to_levels",
+]
+
 
 # Sizes of temporary arrays, chosen to stay within a core's cache.
 _PAIRS_AT_ONCE = 16_384
@@ -29,7 +36,7 @@ _ASIDE = np.array([0.0513, 0.0271, 0.0387])
 
 
 @dataclass(frozen=True)
-class Look:
+class OracleValues:
     """A function at n points: value (n,), gradient (n, 3), and the length over which it is smooth
     (n,), such as the distance to its singularities; samples are a fraction of it apart."""
 
@@ -38,12 +45,12 @@ class Look:
     smooth: FloatArray
 
     @property
-    def steepness(self) -> FloatArray:
+    def gradient_norm(self) -> FloatArray:
         """(n,) |gradient|."""
         return np.linalg.norm(self.gradient, axis=1)
 
 
-Function: TypeAlias = Callable[[FloatArray], Look]
+Function: TypeAlias = Callable[[FloatArray], OracleValues]
 
 
 @dataclass(frozen=True)
@@ -52,17 +59,17 @@ class CurveOracle:
 
     loops: Sequence[FloatArray]
 
-    def __call__(self, x: FloatArray) -> Look:
+    def __call__(self, x: FloatArray) -> OracleValues:
         edges = sum(len(loop) for loop in self.loops)
         at_once = max(1, _PAIRS_AT_ONCE // edges)
         parts = [self._look(x[i : i + at_once]) for i in range(0, max(len(x), 1), at_once)]
-        return Look(
+        return OracleValues(
             np.concatenate([part.value for part in parts]),
             np.concatenate([part.gradient for part in parts]),
             np.concatenate([part.smooth for part in parts]),
         )
 
-    def _look(self, x: FloatArray) -> Look:
+    def _look(self, x: FloatArray) -> OracleValues:
         value, gradient = np.zeros(len(x)), np.zeros_like(x)
         near = np.full(len(x), math.inf)
         for loop in self.loops:
@@ -85,7 +92,7 @@ class CurveOracle:
                 weight = (la + lb) / (la * lb) * inverse
                 gradient += np.stack([(weight * part).sum(axis=1) for part in cross], axis=1)
             near = np.minimum(near, _distance(a, ab - la * la, e))
-        return Look(_wrap(value, 4 * math.pi), gradient, near)
+        return OracleValues(_wrap(value, 4 * math.pi), gradient, near)
 
 
 def _dot(a: Sequence[FloatArray], b: Sequence[FloatArray]) -> FloatArray:
@@ -168,7 +175,7 @@ def first_crossings(
         move = look.value - lift
         lift = lift + (move if period is None else _wrap(move, period))
         same = _cell(lift, levels, period) == first_cell[alive]
-        deep = ~same & (gap_to_levels(lift, levels, period) > depth * look.steepness)
+        deep = ~same & (gap_to_levels(lift, levels, period) > depth * look.gradient_norm)
         last = np.where(same, t_next, last)
         found = alive[deep]
         before[found], beyond[found], start[found] = last[deep], t_next[deep], t[deep]
@@ -196,7 +203,7 @@ def _refined(
         move = look.value - end.value
         lift = end.value + (move if period is None else _wrap(move, period))
         deep = (_cell(lift, levels, period) == end_cell) & (
-            gap_to_levels(lift, levels, period) > depth * look.steepness
+            gap_to_levels(lift, levels, period) > depth * look.gradient_norm
         )
         low, high = np.where(deep, low, middle), np.where(deep, middle, high)
     return high

@@ -1,0 +1,9 @@
+"""Convex parts of space that rays are cut to: their closed formulas, no search."""
+
+from __future__ import annotations
+
+from harnack.geometry.volumes.hull import ConvexHull
+from harnack.geometry.volumes.primitives import Ball, Box, HalfSpace, Intersection
+from harnack.geometry.volumes.volume import Volume
+
+__all__ = ["Ball", "Box", "ConvexHull", "HalfSpace", "Intersection", "Volume"]
