@@ -13,7 +13,9 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from harnack.files import file_format
-from harnack.files.loops import FileFormatError, check_writable, read_loops, write_atomically
+from harnack.files.file_format import FileFormatError
+from harnack.files.loops import read_loops
+from harnack.files.writing import check_writable, write_atomically
 from harnack.geometry import chains, shapes
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
@@ -307,6 +309,14 @@ def test_a_file_above_the_limit_is_not_read(tmp_path):
         read_loops(path)
 
 
+@pytest.mark.parametrize("byte_order", ["", "<", ">"])
+def test_faces_without_corners_have_no_boundary(save, byte_order):
+    faces = ("face", ["list uchar int vertex_indices"], [[[]], [[0, 1, 2]], [[2]]])
+    path = save("a.ply", make_ply(byte_order, [VERTICES, faces]))
+    (rim,) = as_lists(read_loops(path, boundary=True))
+    assert same_cycle(rim, CORNERS[:3])
+
+
 def test_boundary_needs_faces(save):
     with pytest.raises(FileFormatError, match="no faces to take the boundary of"):
         read_loops(save("a.obj", SQUARE + "l 1 2 3 4 1\n"), boundary=True)
@@ -450,7 +460,7 @@ def test_what_the_system_refuses_is_said_before_the_work(tmp_path, monkeypatch, 
     def refused(*_, **__):
         raise OSError(number, os.strerror(number), str(tmp_path))
 
-    monkeypatch.setattr("harnack.files.loops.tempfile.TemporaryFile", refused)
+    monkeypatch.setattr("harnack.files.writing.tempfile.TemporaryFile", refused)
     with pytest.raises(OSError, match=f"cannot write .*a.png: {advice}") as caught:
         check_writable(tmp_path / "a.png")
     assert caught.value.errno == number

@@ -14,10 +14,9 @@ import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from harnack.files import gltf, obj_surface, ply_surface
+from harnack.files import gltf
+from harnack.files import ply as ply_files
 from harnack.files.file_format import FileFormatError
-from harnack.files.obj import read_obj
-from harnack.files.surface_parts import parts_of_contents, triangles
 from harnack.files.surfaces import Cloud, Loops, Mesh, read_surface
 from harnack.geometry.mesh_shapes import icosphere, remove_faces, torus_mesh
 from harnack.geometry.polygons import triangulate
@@ -127,7 +126,7 @@ def test_star_shaped_polygons_in_space_are_cut_without_overlaps(seed, k):
     plane = np.stack([r * np.cos(t), r * np.sin(t), 0.0 * r], axis=2)
     rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     x = (plane @ rotation.T + rng.normal(size=3)).reshape(-1, 3)
-    cut = triangulate(x, np.arange(9 * k).reshape(9, k))
+    cut = triangulate(x, np.arange(9 * k), np.full(9, k))
     assert cut.shape == (9 * (k - 2), 3)
     vectors = area(x, cut).reshape(9, k - 2, 3)
     whole = np.linalg.norm(vectors.sum(axis=1), axis=1)
@@ -144,6 +143,45 @@ def test_a_corner_in_the_middle_of_an_edge_leaves_no_gap(save):
     assert "left out" not in mesh.said
     edges, _ = singular_edges(weld_vertices(mesh.vertices)[mesh.faces])
     assert len(edges) == 7
+
+
+@given(seed=st.integers(0, 2**32 - 1), k=st.integers(3, 12), n=st.integers(3, 12))
+def test_triangles_of_polygons_that_cross_themselves_add_up_to_them(seed, k, n):
+    rng = np.random.default_rng(seed)
+    x = rng.integers(0, 4, size=(n, 3)) * [1.0, 1.0, 0.0]
+    polygon = rng.integers(0, n, size=k)
+    triangles = triangulate(x, polygon, np.array([k]))
+    directed = [(int(a), int(b)) for a, b in zip(polygon, np.roll(polygon, -1), strict=True)]
+    for a, b, c in triangles.tolist():
+        directed += [(b, a), (c, b), (a, c)]
+    for a, b in directed:
+        assert directed.count((a, b)) == directed.count((b, a)) or a == b
+
+
+def test_a_polygon_of_many_corners_with_dents_is_cut():
+    t = 2.0 * np.pi * np.arange(1500) / 1500
+    r = 1.0 + 0.5 * np.sin(37.0 * t)
+    x = np.stack([r * np.cos(t), r * np.sin(t), 0.0 * t], axis=1)
+    cut = area(x, triangulate(x, np.arange(1500), np.array([1500])))
+    whole = 0.5 * np.cross(x, np.roll(x, -1, axis=0)).sum(axis=0)
+    assert len(cut) == 1498
+    np.testing.assert_allclose(np.linalg.norm(cut, axis=1).sum(), whole[2], rtol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_corners_in_the_middle_of_edges_leave_no_triangle_without_area(seed):
+    # An L of which every edge is cut in four, turned in space.
+    corners = np.array(L_SHAPE, dtype=float)
+    s = np.arange(4)[None, :, None] / 4
+    x = (corners[:, None] + s * (np.roll(corners, -1, axis=0) - corners)[:, None]).reshape(-1, 3)
+    x = np.roll(x, seed, axis=0)
+    rotation = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
+    cut = np.linalg.norm(
+        area(x @ rotation, triangulate(x @ rotation, np.arange(24), np.array([24]))), axis=1
+    )
+    assert len(cut) == 22
+    assert cut.min() > 1e-3
+    assert cut.sum() == pytest.approx(3.0)
 
 
 def test_faces_of_different_sizes_keep_their_order(save):
@@ -291,39 +329,32 @@ def test_as_must_be_known(save):
         read_surface(save("a.xyz", XYZ), "mesh")
 
 
-# --- plain files are read quickly, and as the careful readers do -------------------------------
-
-PLAIN_OBJ = [
-    SQUARE + "f 1 2 3\nf 1 3 4\n",
-    "# by hand\r\no thing\r\n" + SQUARE.replace("\n", " # corner\r\n") + "s off\nf 1 2 3 4\r\n",
-    SQUARE + "vt 0 0\nvn 0 0 1\nf 1/1/1 2/1/1 3/1/1\nf 1//1 3//1 4//1 # end",
-    "f 1 2 3\n" + SQUARE,
-]
-
-
-@pytest.mark.parametrize("text", PLAIN_OBJ)
-def test_plain_obj_files_are_read_alike_both_ways(text):
-    quick = obj_surface._read_plain(text.encode().splitlines())
-    assert quick is not None
-    careful = parts_of_contents(read_obj(Path("a.obj"), text.encode()))
-    np.testing.assert_array_equal(quick.vertices, careful.vertices)
-    np.testing.assert_array_equal(triangles(quick), triangles(careful))
+# --- ways to write the same --------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    "text",
+    ("text", "faces"),
     [
-        SQUARE + "f -4 -3 -2\n",
-        SQUARE + "f 1 2 3\nf 1 2 3 4\n",
-        SQUARE + "f 1 2 \\\n3\n",
-        SQUARE + "  f 1 2 3\n",
-        SQUARE + "l 1 2 3 1\nf 1 2 3\n",
-        SQUARE + "f 1 2 3 #\nf\t1 2 3\n",
+        (SQUARE + "f 1 2 3\nf 1 3 4\n", [[0, 1, 2], [0, 2, 3]]),
+        ("# by hand\r\no thing\r\n" + SQUARE.replace("\n", " # corner\r\n")
+         + "s off\nf 1 2 3 4\r\n", [[0, 1, 2], [0, 2, 3]]),
+        (SQUARE + "vt 0 0\nvn 0 0 1\nf 1/1/1 2/1/1 3/1/1\nf 1//1 3//1 4//1 # end",
+         [[0, 1, 2], [0, 2, 3]]),
+        ("f 1 2 3\n" + SQUARE, [[0, 1, 2]]),
+        (SQUARE + "f -4 -3 -2\n", [[0, 1, 2]]),
+        (SQUARE + "f 1 2 3\nf 1 2 3 4\n", [[0, 1, 2], [0, 1, 2], [0, 2, 3]]),
+        (SQUARE + "f 1 2 \\\n3\n", [[0, 1, 2]]),
+        (SQUARE + "  f 1 2 3\n", [[0, 1, 2]]),
+        (SQUARE + "l 1 2 3 1\nf 1 2 3\n", [[0, 1, 2]]),
+        (SQUARE + "f 1 2 3 #\nf\t1 2 3\n", [[0, 1, 2], [0, 1, 2]]),
+        (SQUARE + "f 1.0 2.000e+00 3\n", [[0, 1, 2]]),
+        (SQUARE + "f 1 2 3 \\\n\nf 1 2 3\\", [[0, 1, 2], [0, 1, 2]]),
     ],
-)
-def test_unusual_obj_files_are_left_to_the_careful_reader(save, text):
-    assert obj_surface._read_plain(text.encode().splitlines()) is None
-    assert len(read_surface(save("a.obj", text)).faces) >= 1
+)  # fmt: skip
+def test_ways_to_write_faces_in_obj_files(save, text, faces):
+    mesh = read_surface(save("a.obj", text))
+    assert mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
+    assert mesh.faces.tolist() == faces
 
 
 FACES = "element face 2\nproperty uchar flag\nproperty list uchar int vertex_indices\n"
@@ -337,7 +368,8 @@ def test_ply_faces_are_read_quickly_if_regular(save, monkeypatch):
     assert len(read_surface(save("m.ply", mixed)).faces) == 3
     regular = ply("<", NAMES[:3], rows, (FACES, REGULAR))
     text = ply("", NAMES[:3], rows, (FACES, b"7 3 0 1 2\n7 3 0 2 3\n"))
-    monkeypatch.setattr(ply_surface, "read_ply", None)  # not called
+    # Called before rows are gone through one by one.
+    monkeypatch.setattr(ply_files, "check_element_count", None)
     for data in (regular, text):
         assert read_surface(save("r.ply", data)).faces.tolist() == [[0, 1, 2], [0, 2, 3]]
 
@@ -441,10 +473,12 @@ BAD = [
     ("large.obj", SQUARE + "v 1e200 0 0\nf 1 2 5\n", r"up to 1e\+200 are too large"),
     ("zero.obj", SQUARE.replace("v", "vn 0 0 0\nv"), "normal 0 is zero .and 3 more.*estimate"),
     ("word.obj", SQUARE + "vn 0 0 1\n" * 3 + "vn up\n", "line 8: 1 numbers are too few"),
-    ("dents.obj", "".join(f"v {k % 7} {k % 5} 0\n" for k in range(1500)) + "f " +
-     " ".join(map(str, range(1, 1501))) + "\nf 1 2 3\n", "take too long to triangulate"),
+    ("dents.obj", "".join(f"v {k % 7} {k % 5} 0\n" for k in range(40000)) + "f " +
+     " ".join(map(str, range(1, 40001))) + "\nf 1 2 3\n", "take too long to triangulate"),
     ("many.ply", ply("<", NAMES, ROWS).replace(b"vertex 4", b"vertex 999999999"), "ends before"),
     ("cut.ply", ply("<", NAMES, ROWS)[:-1], "the file ends before the 4 rows"),
+    *[(f"cut{k}.ply", ply("<", NAMES[:3], [row[:3] for row in ROWS], (FACES, REGULAR))[:-k],
+       "the file ends before the 2 rows of element 'face'") for k in (1, 4, 13, 14)],
     ("nan.ply", ply("", NAMES, [*ROWS, ["nan", 0, 0, 0, 0, 1]]), "vertex 4: coordinates must"),
     ("range.ply", ply("<", NAMES[:3], np.array(ROWS)[:, :3], (FACES, REGULAR[:-4] + b"\4\0\0\0")),
      "face 1: vertex 4 is out of range"),

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from harnack.files.loops import FileFormatError, read_loops, write_atomically
+from harnack.files.file_format import FileFormatError
+from harnack.files.loops import read_loops
 from harnack.files.surfaces import Cloud, Loops, Mesh, read_surface
+from harnack.files.writing import write_atomically
 
 __all__ = [
     "Cloud",

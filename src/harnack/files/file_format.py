@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from harnack.geometry.convex_volume import FloatArray
+from harnack.geometry.meshes import IntArray
 
 MAX_BYTES = 1 << 28
-MAX_LINE = 1 << 24
-# Of files that are read element by element, which takes some 200 bytes and 3 microseconds each.
+# Of files that must be gone through element by element, up to some microseconds each.
 MAX_ELEMENTS = 10_000_000
 
 
@@ -35,26 +38,87 @@ class Place:
         return FileFormatError(f"{self}: {message}")
 
 
-@dataclass(frozen=True)
-class Element:
-    """A polygon or polyline: indices of vertices, and where it stands in the file."""
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Where the members of a list stand in a file. numbers: one a member, of lines or the like."""
 
-    indices: tuple[int, ...]
-    place: Place
+    path: Path
+    noun: str
+    numbers: Sequence[int]
+
+    def __getitem__(self, k: int | np.integer[Any]) -> Place:
+        return Place(self.path, f"{self.noun} {self.numbers[int(k)]}")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
+class Polygons:
+    """Polygons or polylines of a file, as indices of vertices.
+
+    corners: those of all of them, one polygon after the other. sizes: (m,), how many each has.
+    places: (m,), where each stands in the file.
+    """
+
+    corners: IntArray
+    sizes: IntArray
+    places: Places
+
+    def __len__(self) -> int:
+        return len(self.sizes)
+
+    def place_of(self, k: int | np.integer[Any]) -> Place:
+        """Where the polygon stands to which corner k of all belongs."""
+        return self.places[int(np.searchsorted(np.cumsum(self.sizes), k, side="right"))]
+
+    def __iter__(self) -> Iterator[tuple[IntArray, Place]]:
+        """The corners of each, and where it stands."""
+        ends = np.cumsum(self.sizes)
+        for k, (begin, end) in enumerate(zip(ends - self.sizes, ends, strict=True)):
+            yield self.corners[begin:end], self.places[k]
+
+
+_NONE = np.zeros(0, dtype=np.int64)
+NO_POLYGONS = Polygons(_NONE, _NONE, Places(Path(), "", ()))
+
+
+@dataclass(frozen=True, eq=False)
 class Contents:
     """The geometry in a file.
 
-    vertices: (n, 3), finite. faces: closed, last vertex joined to first. polylines: as listed,
-    closed only if the last index is the first. All indices lie in [0, n).
+    vertices: (n, 3), finite. normals: (n, 3) or none. faces: closed, last vertex joined to first.
+    polylines: as listed, closed only if the last index is the first. All indices lie in [0, n).
     """
 
     path: Path
     vertices: FloatArray
-    faces: tuple[Element, ...]
-    polylines: tuple[Element, ...]
+    normals: FloatArray | None = None
+    faces: Polygons = NO_POLYGONS
+    polylines: Polygons = NO_POLYGONS
+
+
+def triangle_list(path: Path, corners: IntArray) -> Polygons:
+    """Triangles (m, 3) as polygons."""
+    sizes = np.full(len(corners), 3, dtype=np.int64)
+    return Polygons(corners.ravel(), sizes, Places(path, "triangle", range(len(corners))))
+
+
+def check_finite(coordinates: FloatArray, places: Places) -> None:
+    """Raise FileFormatError for the first row (n, k) with a number that is not finite."""
+    wrong = np.flatnonzero(~np.isfinite(coordinates).all(axis=1))
+    if wrong.size:
+        raise places[wrong[0]].error("coordinates must be finite")
+
+
+def check_indices(polygons: Polygons, count: int, *, first: int = 0) -> None:
+    """Raise FileFormatError for the first index outside of [0, count).
+
+    first: the index that the file gives its first vertex, for messages.
+    """
+    corners = polygons.corners
+    wrong = np.flatnonzero((corners < 0) | (corners >= count))
+    if wrong.size:
+        raise polygons.place_of(wrong[0]).error(
+            f"vertex {corners[wrong[0]] + first} is out of range: the file has {count:,} vertices"
+        )
 
 
 def read_bytes(path: Path) -> bytes:
@@ -95,53 +159,7 @@ def check_element_count(place: Place, count: int) -> None:
         )
 
 
-def text_lines(path: Path, data: bytes, *, first: int = 1) -> list[bytes]:
-    """Lines of a text file, without line ends and byte order mark.
-
-    first: number of the first line, for messages.
-
-    Raises:
-        FileFormatError: it holds binary data, or a line above 16 MiB.
-    """
-    if b"\0" in data:
-        raise Place(path).error("this is binary data, not the text that its extension announces")
-    lines = data.removeprefix(b"\xef\xbb\xbf").splitlines()
-    for number, line in enumerate(lines, first):
-        if len(line) > MAX_LINE:
-            raise Place(path, f"line {number}").error(
-                f"a line of {len(line):,} bytes is too long: at most {MAX_LINE:,} are read"
-            )
-    return lines
-
-
-def as_number(word: bytes, place: Place) -> float:
-    """A finite number.
-
-    Raises:
-        FileFormatError: it is not one.
-    """
-    try:
-        value = float(word)
-    except ValueError:
-        raise place.error(f"{excerpt(word)} is not a number") from None
-    if not math.isfinite(value):
-        raise place.error(f"coordinates must be finite, not {excerpt(word)}")
-    return value
-
-
-def as_integer(word: bytes, place: Place) -> int:
-    """An integer.
-
-    Raises:
-        FileFormatError: it is not one.
-    """
-    try:
-        return int(word)
-    except ValueError:
-        raise place.error(f"{excerpt(word)} is not an integer") from None
-
-
-def excerpt(word: bytes) -> str:
-    """A word from a file, short and printable, in quotes."""
-    shown = word[:32].decode("ascii", "backslashreplace")
-    return repr(shown + ("..." if len(word) > 32 else ""))
+def differ_in_size(polygons: Polygons) -> bool:
+    """Whether polygons have different numbers of corners, or fewer than three."""
+    sizes = polygons.sizes
+    return bool(len(sizes)) and bool((sizes != max(3, int(sizes[0]))).any())

@@ -16,8 +16,14 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from harnack.files.file_format import MAX_BYTES, FileFormatError, Place, read_bytes
-from harnack.files.surface_parts import Parts, Polygons
+from harnack.files.file_format import (
+    MAX_BYTES,
+    Contents,
+    FileFormatError,
+    Place,
+    read_bytes,
+    triangle_list,
+)
 from harnack.geometry.convex_volume import FloatArray
 from harnack.geometry.meshes import IntArray
 
@@ -28,7 +34,7 @@ _DEEPEST = 1000
 _HARMLESS = ("KHR_materials", "KHR_texture", "KHR_lights", "EXT_texture", "KHR_xmp")
 
 
-def read_gltf(path: Path, data: bytes) -> Parts:
+def read_gltf(path: Path, data: bytes) -> Contents:
     """All triangles of a scene, placed by its nodes; if it has none, its points.
 
     Raises:
@@ -52,7 +58,7 @@ def read_gltf(path: Path, data: bytes) -> Parts:
                 process=False,
                 skip_materials=True,
             )
-            return _parts(place, scene)
+            return _contents(place, scene)
     except FileFormatError:
         raise
     except Exception as error:  # whatever trimesh stumbles over
@@ -164,7 +170,7 @@ def _count(item: dict[str, Any], key: str, default: int | None = None) -> int:
     return value
 
 
-def _parts(place: Place, scene: Any) -> Parts:
+def _contents(place: Place, scene: Any) -> Contents:
     """The scene's triangles in one frame, or its points if there are none."""
     vertices: list[FloatArray] = []
     faces: list[IntArray] = []
@@ -190,11 +196,10 @@ def _parts(place: Place, scene: Any) -> Parts:
         faces.append(corners + count)
         count += len(placed)
     if sum(map(len, faces)):
-        triangles = np.concatenate(faces)
-        numbers = np.arange(len(triangles), dtype=np.int64)
-        return Parts(np.concatenate(vertices), None, (Polygons(numbers, triangles),))
+        triangles = triangle_list(place.path, np.concatenate(faces))
+        return Contents(place.path, np.concatenate(vertices), None, triangles)
     if points:
-        return Parts(np.concatenate(points))
+        return Contents(place.path, np.concatenate(points))
     raise place.error("its scene has neither triangles nor points")
 
 

@@ -7,12 +7,18 @@ from pathlib import Path
 
 import numpy as np
 
-from harnack.files.file_format import Contents, Element, Place, as_integer, excerpt
-from harnack.files.surface_parts import Parts, Polygons, parts_of_contents
-from harnack.files.text_tables import Lines, content_lines, quick_table, read_numbers
+from harnack.files.file_format import Contents, Place, Polygons, check_indices
+from harnack.files.text_tables import (
+    Lines,
+    as_integer,
+    content_lines,
+    excerpt,
+    read_integers,
+    read_table,
+)
 
 
-def read_off(path: Path, data: bytes) -> Parts:
+def read_off(path: Path, data: bytes) -> Contents:
     """Vertices and faces of an .off file. Colors, normals and textures are passed over.
 
     Raises:
@@ -27,18 +33,17 @@ def read_off(path: Path, data: bytes) -> Parts:
         )
     if not count:
         raise Place(path).error("it holds no vertices")
-    vertices = read_numbers(lines[:count], 3)
+    vertices = read_table(lines[:count], 3)
     rows = lines[count : count + faces_count]
-    table = quick_table(rows.text)
-    if table is not None and table.shape[1] >= 4:
-        k = int(table[0, 0]) if 3 <= table[0, 0] < table.shape[1] else 0
-        corners = table[:, 1 : k + 1]
-        regular = k and (table[:, 0] == k).all() and (corners == np.rint(corners)).all()
-        if regular and corners.min() >= 0 and corners.max() < count:
-            numbers = np.arange(faces_count, dtype=np.int64)
-            return Parts(vertices, None, (Polygons(numbers, corners.astype(np.int64)),))
-    faces = tuple(_face(rows, k, count) for k in range(faces_count))
-    return parts_of_contents(Contents(path, vertices, faces, ()))
+    sizes = read_integers(rows, 0, 1)
+    wrong = np.flatnonzero((sizes < 1) | (sizes >= rows.counts()))
+    if wrong.size:
+        k = int(wrong[0])
+        word = excerpt(rows.text[k].split()[0])
+        raise rows.places[k].error(f"a face of {word} vertices does not fit on this line")
+    faces = Polygons(read_integers(rows, 1, sizes + 1), sizes, rows.places)
+    check_indices(faces, count)
+    return Contents(path, vertices, None, faces)
 
 
 def _header(path: Path, lines: Lines) -> tuple[int, int, Lines]:
@@ -58,20 +63,8 @@ def _header(path: Path, lines: Lines) -> tuple[int, int, Lines]:
         raise Place(path).error("the file ends before the numbers of vertices and faces")
     words = (rest or lines.text[1]).split()
     if len(words) < 2:
-        raise lines.place(at).error("numbers of vertices and faces are expected here")
-    counts = [as_integer(word, lines.place(at)) for word in words[:2]]
+        raise lines.places[at].error("numbers of vertices and faces are expected here")
+    counts = [as_integer(word, lines.places[at]) for word in words[:2]]
     if min(counts) < 0:
-        raise lines.place(at).error("numbers of vertices and faces cannot be negative")
+        raise lines.places[at].error("numbers of vertices and faces cannot be negative")
     return counts[0], counts[1], lines[at + 1 :]
-
-
-def _face(rows: Lines, k: int, count: int) -> Element:
-    words, place = rows.text[k].split(), rows.place(k)
-    size = as_integer(words[0], place)
-    if not 1 <= size < len(words):
-        raise place.error(f"a face of {excerpt(words[0])} vertices does not fit on this line")
-    indices = tuple(as_integer(word, place) for word in words[1 : size + 1])
-    for index in indices:
-        if not 0 <= index < count:
-            raise place.error(f"vertex {index} is out of range: the file has {count:,} vertices")
-    return Element(indices, place)

@@ -1,4 +1,8 @@
-"""Reading Stanford .ply, ascii and binary: vertices, faces and edges; all else is passed over."""
+"""Reading Stanford .ply, ascii and binary: vertices, faces and edges; all else is passed over.
+
+All rows of an element are read at once, property by property: where a property begins in each row
+follows from the properties before it and the lengths of the lists among them.
+"""
 
 from __future__ import annotations
 
@@ -6,19 +10,25 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
+import numpy.typing as npt
 
 from harnack.files.file_format import (
+    NO_POLYGONS,
     Contents,
-    Element,
+    FileFormatError,
     Place,
+    Places,
+    Polygons,
     check_element_count,
-    excerpt,
-    text_lines,
+    check_finite,
+    check_indices,
+    differ_in_size,
 )
-from harnack.geometry.convex_volume import FloatArray
+from harnack.files.text_tables import Lines, content_lines, excerpt, read_floats
+from harnack.geometry.meshes import IntArray
 
 # PLY name of a type -> its code in `struct`
 _CODES = {
@@ -29,8 +39,6 @@ _CODES = {
 }  # fmt: skip
 _BYTE_ORDERS = {b"ascii": "", b"binary_little_endian": "<", b"binary_big_endian": ">"}
 _MAX_HEADER = 1 << 16
-
-Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -60,64 +68,250 @@ class Header:
     size: int
     lines: int
 
+    def promised(self, size: int) -> int:
+        """How many rows it declares, of those that a file of this size has room for."""
+        return sum(min(section.count, size) for section in self.sections)
+
+
+class Values(Protocol):
+    """The numbers behind the header, by their positions."""
+
+    size: int
+
+    def at(self, where: IntArray, code: str) -> npt.NDArray[Any]:
+        """Those at these positions; anything at positions that lie outside."""
+        ...
+
+    def width(self, code: str) -> int:
+        """How many positions a number takes."""
+        ...
+
+
+class BinaryValues:
+    """Positions are bytes."""
+
+    def __init__(self, body: bytes, byte_order: str) -> None:
+        self.size = len(body)
+        self.padded = body + bytes(8)
+        self.byte_order = byte_order
+
+    def at(self, where: IntArray, code: str) -> npt.NDArray[Any]:
+        kind = np.dtype(self.byte_order + code)
+        every = np.ndarray((self.size + 1,), kind, self.padded, strides=(1,))
+        return every[np.clip(where, 0, self.size)].astype(kind.newbyteorder("="))
+
+    def width(self, code: str) -> int:
+        return struct.calcsize("=" + code)
+
+
+class TextValues:
+    """Positions are words."""
+
+    def __init__(self, rows: Lines) -> None:
+        self._numbers = np.append(read_floats(rows, convert=_any_number), 0.0)
+        self.size = len(self._numbers) - 1
+
+    def at(self, where: IntArray, code: str) -> npt.NDArray[Any]:
+        found = self._numbers[np.clip(where, 0, self.size)]
+        if code in "fd" or (found != np.rint(found)).any():
+            return found
+        return np.clip(found, -(2.0**53), 2.0**53).astype(np.int64)
+
+    def width(self, code: str) -> int:
+        return 1
+
+
+def _any_number(word: bytes, place: Place) -> float:
+    try:
+        return float(word)
+    except ValueError as error:
+        raise place.error(str(error)[:80]) from None
+
+
+@dataclass(frozen=True, eq=False)
+class Column:
+    """A property in all rows. begins: (n,), positions. sizes: (n,) if it is a list, else none."""
+
+    code: str
+    begins: IntArray
+    sizes: IntArray | None
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """All rows of an element: its columns by name, and where each row stands in the file."""
+
+    values: Values
+    columns: dict[str, Column]
+    places: Places
+
+    def has(self, *names: str) -> bool:
+        """Whether there are columns of single numbers by these names."""
+        return all(name in self.columns and self.columns[name].sizes is None for name in names)
+
+    def numbers(self, name: str) -> npt.NDArray[Any]:
+        """A column of single numbers."""
+        column = self._column(name, is_list=False)
+        return self.values.at(column.begins, column.code)
+
+    def lists(self, name: str) -> tuple[npt.NDArray[Any], IntArray]:
+        """A column of lists: the numbers of all, one after the other, and how many each has."""
+        column = self._column(name, is_list=True)
+        sizes = column.begins[:0] if column.sizes is None else column.sizes
+        within = np.arange(int(sizes.sum()), dtype=np.int64)
+        within -= np.repeat(np.cumsum(sizes) - sizes, sizes)
+        where = np.repeat(column.begins, sizes) + within * self.values.width(column.code)
+        return self.values.at(where, column.code), sizes
+
+    def _column(self, name: str, *, is_list: bool) -> Column:
+        if name not in self.columns:
+            raise self.places[0].error(f"this element needs a property {name!r}")
+        column = self.columns[name]
+        if (column.sizes is not None) != is_list:
+            raise self.places[0].error("a list where one number is expected, or the reverse")
+        return column
+
 
 def read_ply(path: Path, data: bytes) -> Contents:
-    """Vertices, faces and edges (as polylines of two vertices) of a .ply file.
+    """Vertices, their normals if all have nx, ny and nz, faces, and edges as polylines of two.
 
     Raises:
         FileFormatError: a malformed header, fewer data than it declares, an index out of range.
     """
-    header = read_header(path, data)
-    check_element_count(Place(path), _promised(header, len(data)))
-    body = data[header.size :]
-    rows = _binary_rows(path, body, header) if header.byte_order else _text_rows(path, body, header)
-    vertices: list[tuple[float, float, float]] = []
-    elements: dict[str, list[Element]] = {"face": [], "edge": []}
-    for section, number, row in rows:
-        place = Place(path, f"{section.name} {number}")
+    header = _header(path, data)
+    tables = (_binary_tables if header.byte_order else _text_tables)(path, data, header)
+    vertices, normals = np.zeros((0, 3)), None
+    if table := tables.get("vertex"):
+        vertices = np.stack([table.numbers(name) for name in "xyz"], axis=1).astype(np.float64)
+        check_finite(vertices, table.places)
+        if table.has("nx", "ny", "nz"):
+            columns = [table.numbers(name) for name in ("nx", "ny", "nz")]
+            normals = np.stack(columns, axis=1).astype(np.float64)
+    faces = edges = NO_POLYGONS
+    if table := tables.get("face"):
+        name = "vertex_index" if "vertex_index" in table.columns else "vertex_indices"
+        faces = _polygons(table, *table.lists(name), len(vertices))
+    if table := tables.get("edge"):
+        ends = np.stack([table.numbers("vertex1"), table.numbers("vertex2")], axis=1)
+        edges = _polygons(table, ends.ravel(), np.full(len(ends), 2), len(vertices))
+    if differ_in_size(faces):
+        check_element_count(Place(path), header.promised(len(data)))
+    return Contents(path, vertices, normals, faces, edges)
+
+
+def _polygons(table: Table, corners: npt.NDArray[Any], sizes: IntArray, count: int) -> Polygons:
+    """Polygons of these corners, which must be indices of so many vertices."""
+    found = Polygons(corners.astype(np.int64), sizes, table.places)
+    if corners.dtype.kind == "f" and corners.size:
+        k = int(np.argmax(corners != np.rint(corners)))
+        raise found.place_of(k).error(f"indices must be integers, not {float(corners[k])}")
+    check_indices(found, count)
+    return found
+
+
+def _columns(
+    section: Section, values: Values, begins: IntArray, places: Places
+) -> tuple[dict[str, Column], IntArray]:
+    """The columns of rows that begin at these positions, and where each row ends."""
+    columns: dict[str, Column] = {}
+    at = begins
+    for p in section.properties:
+        sizes = None
+        if p.length_code is not None:
+            lengths = values.at(at, p.length_code)
+            if lengths.dtype.kind == "f":
+                k = int(np.argmax(lengths != np.rint(lengths)))
+                raise places[k].error(f"the length of a list is no integer, but {lengths[k]}")
+            # What is impossible ends behind everything.
+            sizes = np.where(lengths < 0, values.size + 1, lengths).astype(np.int64)
+            sizes = np.minimum(sizes, values.size + 1)
+            at = at + values.width(p.length_code)
+        columns[p.name] = Column(p.code, at, sizes)
+        at = at + values.width(p.code) * (1 if sizes is None else sizes)
+    return columns, at
+
+
+def _text_tables(path: Path, data: bytes, header: Header) -> dict[str, Table]:
+    lines = content_lines(path, data[header.size :], comment=None, first=header.lines + 1)
+    tables: dict[str, Table] = {}
+    for section in header.sections:
+        if section.count > len(lines):
+            raise _too_short(path, section)
+        if not section.count:
+            continue
+        places = Places(path, section.name, range(section.count))
+        rows, lines = Lines(lines.text[: section.count], places), lines[section.count :]
+        counts, values = rows.counts(), TextValues(rows)
+        columns, ends = _columns(section, values, np.cumsum(counts) - counts, places)
+        wrong = np.flatnonzero(ends != np.cumsum(counts))
+        if wrong.size:
+            how = "few" if ends[wrong[0]] > np.cumsum(counts)[wrong[0]] else "many"
+            raise places[wrong[0]].error(f"{counts[wrong[0]]} numbers are too {how}")
+        tables[section.name] = Table(values, columns, places)
+    return tables
+
+
+def _binary_tables(path: Path, data: bytes, header: Header) -> dict[str, Table]:
+    values = BinaryValues(data[header.size :], header.byte_order)
+    tables: dict[str, Table] = {}
+    begin = 0
+    for section in header.sections:
+        least = sum(values.width(p.length_code or p.code) for p in section.properties)
+        if section.count * least > values.size - begin:
+            raise _too_short(path, section)
+        if not section.count:
+            continue
+        places = Places(path, section.name, range(section.count))
         try:
-            if section.name == "vertex":
-                vertices.append((float(row["x"]), float(row["y"]), float(row["z"])))
-            elif section.name in elements:
-                elements[section.name].append(Element(_indices(section.name, row, place), place))
-        except KeyError as missing:
-            raise place.error(f"this element needs a property {missing}") from None
-        except TypeError:
-            raise place.error("a list where one number is expected, or the reverse") from None
-    points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
-    _check(path, points, elements)
-    return Contents(path, points, tuple(elements["face"]), tuple(elements["edge"]))
+            # Most often the lists of all rows are as long as those of the first, and not empty.
+            stride = next(_row_ends(section, values, begin)) - begin
+            if stride == least and any(p.length_code for p in section.properties):
+                check_element_count(Place(path), header.promised(len(data)))
+            begins = begin + stride * np.arange(section.count, dtype=np.int64)
+            columns, ends = _columns(section, values, begins, places)
+            if (ends != begins + stride).any() or ends[-1] > values.size:
+                check_element_count(Place(path), header.promised(len(data)))
+                ends = np.fromiter(_row_ends(section, values, begin), np.int64, section.count)
+                columns, _ = _columns(section, values, np.append(begin, ends[:-1]), places)
+        except struct.error:
+            raise _too_short(path, section) from None
+        begin = int(ends[-1])
+        tables[section.name] = Table(values, columns, places)
+    return tables
 
 
-def _promised(header: Header, size: int) -> int:
-    """How many rows a header declares, of those that a file of this size has room for."""
-    return sum(min(section.count, size) for section in header.sections)
+def _row_ends(section: Section, values: BinaryValues, begin: int) -> Iterator[int]:
+    """Where each row ends; raises struct.error if that is behind the end of the file."""
+    skipped = 0
+    lists: list[tuple[int, struct.Struct, int]] = []
+    for p in section.properties:
+        if p.length_code is None:
+            skipped += values.width(p.code)
+        else:
+            length = struct.Struct((values.byte_order + p.length_code).encode())
+            lists.append((skipped, length, values.width(p.code)))
+            skipped = 0
+    at = begin
+    for _ in range(section.count):
+        for before, length, width in lists:
+            (count,) = length.unpack_from(values.padded, at + before)
+            if count < 0:
+                raise struct.error
+            at += before + length.size + count * width
+        at += skipped
+        if at > values.size:
+            raise struct.error
+        yield at
 
 
-def _indices(name: str, row: Row, place: Place) -> tuple[int, ...]:
-    if name == "edge":
-        indices: tuple[Any, ...] = (row["vertex1"], row["vertex2"])
-    else:
-        indices = tuple(row["vertex_index" if "vertex_index" in row else "vertex_indices"])
-    for index in indices:
-        if not isinstance(index, int):
-            raise place.error(f"indices must be integers, not {index!r}")
-    return indices
+def _too_short(path: Path, section: Section) -> FileFormatError:
+    return Place(path).error(
+        f"the file ends before the {section.count:,} rows of element {section.name!r} that its "
+        "header declares"
+    )
 
 
-def _check(path: Path, points: FloatArray, elements: dict[str, list[Element]]) -> None:
-    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
-    if bad.size:
-        raise Place(path, f"vertex {bad[0]}").error("coordinates must be finite")
-    for element in (*elements["face"], *elements["edge"]):
-        for index in element.indices:
-            if not 0 <= index < len(points):
-                raise element.place.error(
-                    f"vertex {index} is out of range: the file has {len(points)} vertices"
-                )
-
-
-def read_header(path: Path, data: bytes) -> Header:
+def _header(path: Path, data: bytes) -> Header:
     """What the header of a .ply file declares.
 
     Raises:
@@ -171,89 +365,3 @@ def _property(words: list[bytes], section: Section, place: Place) -> Property:
     if len(codes) == 2 and codes[0] in "fd":
         raise place.error("the length of a list must be an integer")
     return Property(name, codes[-1], codes[0] if len(codes) == 2 else None)
-
-
-def _binary_rows(path: Path, body: bytes, header: Header) -> Iterator[tuple[Section, int, Row]]:
-    offset = 0
-    for section in header.sections:
-        fixed = "".join(p.length_code or p.code for p in section.properties)
-        least = struct.calcsize(header.byte_order + fixed)
-        if section.count * least > len(body) - offset:
-            raise _too_short(path, section)
-        is_simple = not any(p.length_code for p in section.properties)
-        reader = struct.Struct(header.byte_order + fixed)
-        names = [p.name for p in section.properties]
-        for number in range(section.count):
-            if is_simple:
-                row: Row = dict(zip(names, reader.unpack_from(body, offset), strict=True))
-                offset += least
-            else:
-                try:
-                    row, offset = _binary_row(body, offset, header.byte_order, section)
-                except struct.error:
-                    raise _too_short(path, section) from None
-            yield section, number, row
-
-
-def _binary_row(body: bytes, offset: int, order: str, section: Section) -> tuple[Row, int]:
-    row: Row = {}
-    for p in section.properties:
-        if p.length_code is None:
-            (row[p.name],) = struct.unpack_from(order + p.code, body, offset)
-            offset += struct.calcsize(order + p.code)
-            continue
-        (length,) = struct.unpack_from(order + p.length_code, body, offset)
-        offset += struct.calcsize(order + p.length_code)
-        size = length * struct.calcsize(order + p.code)
-        if not 0 <= size <= len(body) - offset:
-            raise struct.error
-        row[p.name] = struct.unpack_from(f"{order}{length}{p.code}", body, offset)
-        offset += size
-    return row, offset
-
-
-def _too_short(path: Path, section: Section) -> Exception:
-    return Place(path).error(
-        f"the file ends before the {section.count:,} rows of element {section.name!r} that its "
-        "header declares"
-    )
-
-
-def _text_rows(path: Path, body: bytes, header: Header) -> Iterator[tuple[Section, int, Row]]:
-    lines = [line for line in text_lines(path, body, first=header.lines + 1) if line.strip()]
-    next_line = 0
-    for section in header.sections:
-        if section.count > len(lines) - next_line:
-            raise _too_short(path, section)
-        for number in range(section.count):
-            place = Place(path, f"{section.name} {number}")
-            yield section, number, _text_row(lines[next_line].split(), section, place)
-            next_line += 1
-
-
-def _text_row(words: list[bytes], section: Section, place: Place) -> Row:
-    row: Row = {}
-    rest = iter(words)
-    try:
-        for p in section.properties:
-            convert = float if p.code in "fd" else int
-            if p.length_code is None:
-                row[p.name] = convert(next(rest))
-            else:
-                length = int(next(rest))
-                row[p.name] = tuple([convert(word) for word in _take(rest, length)])
-    except StopIteration:
-        raise place.error(f"{len(words)} numbers are too few") from None
-    except ValueError as error:
-        raise place.error(str(error)[:80]) from None
-    if any(True for _ in rest):
-        raise place.error(f"{len(words)} numbers are too many")
-    return row
-
-
-def _take(words: Iterator[bytes], count: int) -> list[bytes]:
-    """The next `count` words; StopIteration if there are fewer, or count is negative."""
-    found = [word for _, word in zip(range(count), words, strict=False)]
-    if len(found) != count:
-        raise StopIteration
-    return found

@@ -6,9 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from harnack.files.file_format import Place, excerpt
-from harnack.files.surface_parts import Parts, Polygons
-from harnack.files.text_tables import Lines, content_lines, read_numbers
+from harnack.files.file_format import Contents, Place, Places, check_finite, triangle_list
+from harnack.files.text_tables import content_lines, excerpt, read_table
 from harnack.geometry.convex_volume import FloatArray
 from harnack.geometry.singular import weld_vertices
 
@@ -17,7 +16,7 @@ _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute
 _KEYWORDS = (b"solid", b"facet", b"outer", b"vertex", b"endloop", b"endfacet", b"endsolid")
 
 
-def read_stl(path: Path, data: bytes) -> Parts:
+def read_stl(path: Path, data: bytes) -> Contents:
     """The triangles of an .stl file, corners at the same position made one vertex.
 
     Raises:
@@ -26,12 +25,9 @@ def read_stl(path: Path, data: bytes) -> Parts:
     corners = _binary(path, data) if _is_binary(data) else _text(path, data)
     if not len(corners):
         raise Place(path).error("it holds no triangles")
-    bad = np.flatnonzero(~np.isfinite(corners).all(axis=1))
-    if bad.size:
-        raise Place(path, f"triangle {bad[0] // 3}").error("coordinates must be finite")
+    check_finite(corners.reshape(-1, 9), Places(path, "triangle", range(len(corners) // 3)))
     distinct, index = np.unique(weld_vertices(corners), return_inverse=True)
-    faces = index.reshape(-1, 3).astype(np.int64)
-    return Parts(corners[distinct], None, (Polygons(np.arange(len(faces), dtype=np.int64), faces),))
+    return Contents(path, corners[distinct], None, triangle_list(path, index.reshape(-1, 3)))
 
 
 def _is_binary(data: bytes) -> bool:
@@ -66,14 +62,11 @@ def _text(path: Path, data: bytes) -> FloatArray:
     words = [line.split(None, 1)[0].lower() for line in lines.text]
     for k, word in enumerate(words):
         if word not in _KEYWORDS:
-            raise lines.place(k).error(f"{excerpt(word)} is no .stl statement")
+            raise lines.places[k].error(f"{excerpt(word)} is no .stl statement")
     if words[-1] != b"endsolid":
-        raise lines.place(len(words) - 1).error("the file ends before 'endsolid': it is truncated")
+        raise lines.places[len(words) - 1].error("the file ends before 'endsolid': it is truncated")
     at = [k for k, word in enumerate(words) if word == b"vertex"]
     facets = words.count(b"facet")
     if len(at) != 3 * facets:
         raise Place(path).error(f"{len(at):,} vertices in {facets:,} facets: each needs three")
-    if not at:
-        return np.zeros((0, 3))
-    rows = [lines.text[k][len(b"vertex") :] for k in at]
-    return read_numbers(Lines(path, rows, [lines.numbers[k] for k in at]), 3)
+    return read_table(lines.chosen(at), 3, skip=1)

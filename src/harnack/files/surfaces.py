@@ -11,27 +11,27 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from harnack.choices import did_you_mean
-from harnack.files.file_format import FileFormatError, Place, read_bytes
+from harnack.files.file_format import Contents, FileFormatError, Place, read_bytes
 from harnack.files.gltf import read_gltf
-from harnack.files.loops import read_loops
-from harnack.files.obj_surface import read_obj_surface
+from harnack.files.loops import loops_in, read_loops
+from harnack.files.obj import read_obj
 from harnack.files.off import read_off
-from harnack.files.ply_surface import read_ply_surface
+from harnack.files.plain_text import read_xyz
+from harnack.files.ply import read_ply
 from harnack.files.stl import read_stl
-from harnack.files.surface_parts import Parts, triangles
-from harnack.files.xyz_text import read_xyz
 from harnack.geometry.clouds import CloudError, checked_normals, checked_points
 from harnack.geometry.convex_volume import FloatArray
 from harnack.geometry.curves import CurveError, validate_loops
 from harnack.geometry.meshes import IntArray, MeshError, without_zero_area_faces
+from harnack.geometry.polygons import triangulate
 from harnack.geometry.singular import net_faces, singular_edges, singular_loops, weld_vertices
 
 __all__ = ["SURFACE_FILES", "Cloud", "Loops", "Mesh", "ReadAs", "read_surface"]
 
 ReadAs: TypeAlias = Literal["winding", "dipole", "loops"]
 
-_READERS: dict[str, Callable[[Path, bytes], Parts]] = {
-    ".obj": read_obj_surface, ".ply": read_ply_surface, ".stl": read_stl, ".off": read_off,
+_READERS: dict[str, Callable[[Path, bytes], Contents]] = {
+    ".obj": read_obj, ".ply": read_ply, ".stl": read_stl, ".off": read_off,
     ".glb": read_gltf, ".gltf": read_gltf, ".xyz": read_xyz,
 }  # fmt: skip
 _LOOP_FILES = (".obj", ".ply", ".loops")
@@ -102,18 +102,19 @@ def read_surface(path: str | os.PathLike[str], as_: ReadAs | None = None) -> Mes
 def _read(path: Path, kind: str, as_: ReadAs | None) -> Mesh | Cloud | Loops:
     if kind == ".loops":
         _refuse(path, as_, ("loops",), "curves")
-        return _loops(path, "curves, since the file lists nothing else")
-    parts = _READERS[kind](path, read_bytes(path))
+        return _loops(read_loops(path), "curves, since the file lists nothing else")
+    contents = _READERS[kind](path, read_bytes(path))
     try:
-        if parts.polygons:
-            return _of_faces(path, parts, as_)
-        if parts.has_lines:
+        if (contents.faces.sizes >= 3).any():
+            return _of_faces(contents, as_)
+        if len(contents.polylines):
             _refuse(path, as_, ("loops",), "polylines")
-            return _loops(path, "polylines without faces: curves")
+            return _loops(loops_in(contents), "polylines without faces: curves")
         if as_ == "loops" and kind == ".ply":
-            return _loops(path, "points joined in their order, as asked: a curve")
+            why = "points joined in their order, as asked: a curve"
+            return _loops(loops_in(contents), why)
         _refuse(path, as_, ("dipole",), "points")
-        return _cloud(parts)
+        return _cloud(contents)
     except (MeshError, CloudError) as error:
         raise Place(path).error(str(error)) from error
 
@@ -127,35 +128,39 @@ def _refuse(path: Path, as_: ReadAs | None, possible: tuple[str, ...], held: str
         )
 
 
-def _of_faces(path: Path, parts: Parts, as_: ReadAs | None) -> Mesh | Cloud | Loops:
-    can_be_loops = path.suffix.lower() in _LOOP_FILES
-    if as_ == "loops" and parts.has_lines and can_be_loops:
-        return _loops(path, "polylines and faces, taken as curves as asked")
-    if as_ in (None, "loops") and can_be_loops and _are_curves(parts):
-        return _loops(path, "polygons of which no two share an edge: curves")
-    mesh = _mesh(parts)
+def _of_faces(contents: Contents, as_: ReadAs | None) -> Mesh | Cloud | Loops:
+    can_be_loops = contents.path.suffix.lower() in _LOOP_FILES
+    if as_ == "loops" and len(contents.polylines) and can_be_loops:
+        return _loops(loops_in(contents), "polylines and faces, taken as curves as asked")
+    if as_ in (None, "loops") and can_be_loops and _are_curves(contents):
+        return _loops(loops_in(contents), "polygons of which no two share an edge: curves")
+    mesh = _mesh(contents)
     if as_ == "dipole":
         return _centers(mesh)
     if as_ == "loops":
-        return _boundary(path, mesh)
+        return _boundary(contents.path, mesh)
     return mesh
 
 
-def _are_curves(parts: Parts) -> bool:
+def _are_curves(contents: Contents) -> bool:
     """Whether some polygon has more than four corners, and no two share an edge."""
-    if max(group.corners.shape[1] for group in parts.polygons) <= 4:
+    faces = contents.faces
+    if faces.sizes.max() <= 4:
         return False
-    same = weld_vertices(parts.vertices)
-    ends = [same[group.corners] for group in parts.polygons]
-    begin = np.concatenate([corners.ravel() for corners in ends])
-    end = np.concatenate([np.roll(corners, -1, axis=1).ravel() for corners in ends])
+    same = weld_vertices(contents.vertices)
+    begin = same[faces.corners]
+    ends = np.cumsum(faces.sizes)
+    after = np.arange(1, len(begin) + 1, dtype=np.int64)
+    after[ends[faces.sizes > 0] - 1] = (ends - faces.sizes)[faces.sizes > 0]
+    end = begin[after]
     keys = np.minimum(begin, end) * len(same) + np.maximum(begin, end)
+    keys = keys[np.repeat(faces.sizes, faces.sizes) >= 3]
     return len(np.unique(keys)) == len(keys)
 
 
-def _mesh(parts: Parts) -> Mesh:
-    found = triangles(parts)
-    vertices, faces = without_zero_area_faces(parts.vertices, found)
+def _mesh(contents: Contents) -> Mesh:
+    found = triangulate(contents.vertices, contents.faces.corners, contents.faces.sizes)
+    vertices, faces = without_zero_area_faces(contents.vertices, found)
     net = net_faces(weld_vertices(vertices)[faces])
     if not len(net.faces):
         raise MeshError(f"its {len(faces):,} faces cancel each other: there is no surface")
@@ -174,7 +179,7 @@ def _mesh(parts: Parts) -> Mesh:
         said += f"; {len(found) - len(faces):,} of zero area left out"
     if len(faces) > len(net.faces):
         said += f"; {len(faces) - len(net.faces):,} are added to or cancelled by others"
-    if parts.has_lines:
+    if len(contents.polylines):
         said += "; polylines not used"
     return Mesh(vertices, faces, said)
 
@@ -203,16 +208,15 @@ def _boundary(path: Path, mesh: Mesh) -> Loops:
     return Loops(loops, said)
 
 
-def _cloud(parts: Parts) -> Cloud:
-    points = checked_points(parts.vertices)
+def _cloud(contents: Contents) -> Cloud:
+    points = checked_points(contents.vertices)
     count = f"{len(points):,} points"
-    if parts.normals is None:
+    if contents.normals is None:
         return Cloud(points, None, None, f"{count} without faces or normals: a point cloud")
-    normals = checked_normals(parts.normals, len(points))
+    normals = checked_normals(contents.normals, len(points))
     return Cloud(points, normals, None, f"{count} with normals, no faces: a point cloud")
 
 
-def _loops(path: Path, why: str) -> Loops:
-    loops = tuple(read_loops(path))
+def _loops(loops: list[FloatArray], why: str) -> Loops:
     noun = "loop" if len(loops) == 1 else "loops"
-    return Loops(loops, f"{len(loops):,} {noun} of {sum(map(len, loops)):,} vertices: {why}")
+    return Loops(tuple(loops), f"{len(loops):,} {noun} of {sum(map(len, loops)):,} vertices: {why}")

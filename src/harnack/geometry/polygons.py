@@ -3,48 +3,81 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from harnack.geometry.chains import boundary_edges, join
 from harnack.geometry.convex_volume import BoolArray, FloatArray
 from harnack.geometry.meshes import IntArray, MeshError
 
 __all__ = ["triangulate"]
 
-# Corners cubed, summed over polygons with dents: some ten seconds of work.
-_MOST_WORK = 2_000_000_000
-# Twice the area of a triangle, in a polygon of size about 1, up to which it is no ear.
+# Corners squared, and so many more a polygon, summed over those of which ears are cut: some ten
+# seconds of work at worst.
+_MOST_WORK = 1_000_000_000
+_WORK_A_POLYGON = 500
+# Twice the area of a triangle, in a polygon of size about 1, up to which it counts as flat.
 _FLAT = 1e-12
+# How much an edge with corners in its middle is bent: depth over the square of its length.
+_INWARD = 1e-6
 _CHUNK = 2_000_000
 
 
-def triangulate(vertices: FloatArray, polygons: IntArray) -> IntArray:
-    """Triangles (m (k - 2), 3) of polygons (m, k), k >= 3, polygon by polygon.
+def triangulate(vertices: FloatArray, corners: IntArray, sizes: IntArray) -> IntArray:
+    """Triangles (k, 3) of polygons, in their order.
 
-    vertices: (n, 3). A polygon that need not be quite flat is judged by its shadow along its mean
-    normal. Where the fan around its first corner is not a proper triangulation, because the polygon
-    has dents, ears are cut off one by one (Meisters 1975). Polygons that cross themselves get
-    triangles that overlap; in a winding number these still add up to the polygon.
+    vertices: (n, 3). corners: of all polygons, one after the other. sizes: (m,), how many corners
+    each has; those with fewer than three give no triangles. A polygon that need not be quite flat
+    is judged by its shadow along its mean normal. Where the fans around its first two corners are
+    not proper triangulations, because the polygon has dents, ears are cut off it (Meisters 1975).
+    The edges of the triangles always cancel to those of the polygon: polygons that cross themselves
+    get triangles that overlap, and in a winding number these still add up to the polygon.
 
     Raises:
         MeshError: so many polygons with dents and so many corners that it would take long.
     """
-    m, k = len(polygons), int(polygons.shape[1])
-    steps = np.arange(1, k - 1, dtype=np.int64)
-    fans = np.stack([np.zeros_like(steps), steps, steps + 1], axis=1)
-    pattern = np.broadcast_to(fans, (m, k - 2, 3))
-    if k > 3 and m:
-        bent = np.concatenate(
-            [_has_dents(vertices, part) for part in _parts(polygons, max(1, _CHUNK // k))]
-        )
-        if bent.any():
-            pattern = pattern.copy()
-            pattern[bent] = _cut_ears(vertices, polygons[bent])
-    rows = np.arange(m, dtype=np.int64)[:, None, None]
-    return polygons[rows, pattern].reshape(-1, 3)
+    begins = np.cumsum(sizes) - sizes
+    found = [np.zeros((0, 3), dtype=np.int64)]
+    owners = [np.zeros(0, dtype=np.int64)]
+    work = 0
+    for part in _equal_parts(sizes):
+        k = int(sizes[part[0]])
+        polygons = corners[begins[part][:, None] + np.arange(k)]
+        bent = np.zeros(len(part), dtype=bool)
+        if k > 3:
+            bent = _has_dents(vertices, polygons)
+            # The fan around the second corner is that around the first of the polygon turned on.
+            polygons[bent] = np.roll(polygons[bent], -1, axis=1)
+            bent[bent] = _has_dents(vertices, polygons[bent])
+        work += int(bent.sum()) * (k * k + _WORK_A_POLYGON)
+        if work > _MOST_WORK:
+            raise MeshError(
+                f"{bent.sum():,} polygons with dents and {k:,} corners each take too long to "
+                "triangulate: let the program that made the file triangulate them"
+            )
+        found.append(_fans(polygons[~bent]))
+        owners.append(np.repeat(part[~bent], k - 2))
+        shadows = _shadows(vertices, polygons[bent])
+        for owner, polygon, shadow in zip(part[bent], polygons[bent], shadows, strict=True):
+            found.append(_cut_ears(polygon, shadow))
+            owners.append(np.full(len(found[-1]), owner))
+    return np.concatenate(found)[np.argsort(np.concatenate(owners), kind="stable")]
 
 
-def _parts(polygons: IntArray, size: int) -> list[IntArray]:
-    return [polygons[k : k + size] for k in range(0, len(polygons), size)]
+def _equal_parts(sizes: IntArray) -> list[IntArray]:
+    """Numbers of polygons with equally many corners, three or more, not too many at a time."""
+    order = np.argsort(sizes, kind="stable")
+    order = order[sizes[order] >= 3]
+    distinct, first = np.unique(sizes[order], return_index=True)
+    parts: list[IntArray] = []
+    for size, begin, end in zip(distinct, first, [*first[1:], len(order)], strict=True):
+        step = max(1, _CHUNK // int(size))
+        parts += [order[k : min(k + step, end)] for k in range(begin, end, step)]
+    return parts
+
+
+def _fans(polygons: IntArray) -> IntArray:
+    """Triangles (m (k - 2), 3) of polygons (m, k) around their first corners."""
+    first = np.broadcast_to(polygons[:, :1], polygons[:, 2:].shape)
+    return np.stack([first, polygons[:, 1:-1], polygons[:, 2:]], axis=2).reshape(-1, 3)
 
 
 def _has_dents(vertices: FloatArray, polygons: IntArray) -> BoolArray:
@@ -71,49 +104,38 @@ def _shadows(vertices: FloatArray, polygons: IntArray) -> FloatArray:
     return np.stack([np.einsum("mkj,mj->mk", p, axis) for axis in axes], axis=2)
 
 
-def _cut_ears(vertices: FloatArray, polygons: IntArray) -> IntArray:
-    """Corner numbers (m, k - 2, 3) of the triangles of polygons (m, k) with dents."""
-    m, k = polygons.shape
-    if m * k**3 > _MOST_WORK:
-        raise MeshError(
-            f"{m:,} polygons with dents and {k:,} corners each take too long to triangulate: "
-            "let the program that made the file triangulate them"
-        )
-    parts = _parts(polygons, max(1, _CHUNK // (k * k)))
-    return np.concatenate([_cut_ears_of_part(_shadows(vertices, part)) for part in parts])
+def _cut_ears(polygon: IntArray, shadow: FloatArray) -> IntArray:
+    """Triangles of a polygon (k,) whose shadow (k, 2) has dents."""
+    import mapbox_earcut  # here, since most files do without
+
+    ears = np.zeros((0, 3), dtype=np.int64)
+    if np.isfinite(shadow).all():
+        ends = np.array([len(polygon)], dtype=np.uint32)
+        cut = mapbox_earcut.triangulate_float64(_bent_inward(shadow), ends)
+        ears = polygon[cut.reshape(-1, 3)]
+    if len(ears) == len(polygon) - 2:
+        return ears
+    # The polygon crosses or touches itself, and corners were dropped: fans fill what remains.
+    remaining = join(boundary_edges([polygon.tolist(), *ears[:, ::-1].tolist()]))
+    return np.concatenate([ears, *(_fans(np.array([loop])) for loop in remaining)])
 
 
-def _cut_ears_of_part(shadows: FloatArray) -> IntArray:
-    m, k = len(shadows), int(shadows.shape[1])
-    left = np.tile(np.arange(k, dtype=np.int64), (m, 1))
-    row = np.arange(m, dtype=np.int64)
-    triangles = np.empty((m, k - 2, 3), dtype=np.int64)
-    for cut in range(k - 3):
-        ear = _first_ears(np.take_along_axis(shadows, left[:, :, None], axis=1))
-        count = k - cut
-        around = np.stack([(ear - 1) % count, ear, (ear + 1) % count], axis=1)
-        triangles[:, cut] = left[row[:, None], around]
-        keep = np.arange(count, dtype=np.int64) != ear[:, None]
-        left = left[keep].reshape(m, count - 1)
-    triangles[:, -1] = left
-    return triangles
+def _bent_inward(shadow: FloatArray) -> FloatArray:
+    """The polygon (k, 2), its straight edges with corners in their middle bent by next to nothing.
 
-
-def _first_ears(p: FloatArray) -> npt.NDArray[np.intp]:
-    """Number of the first corner (m,) of each polygon (m, k, 2) that can be cut off.
-
-    Its triangle turns left and holds no other vertex. Where there is none, the polygon crosses
-    itself, and the corner that turns left most is taken.
+    Such a corner is then no ear, which would be a triangle without area.
     """
-    before, after = np.roll(p, 1, axis=1), np.roll(p, -1, axis=1)
-    turn = _cross(p - before, after - p)
-    inside = np.ones((*p.shape[:2], p.shape[1]), dtype=bool)
-    for a, b in ((before, p), (p, after), (after, before)):
-        inside &= _cross((b - a)[:, :, None], p[:, None] - a[:, :, None]) >= 0.0
-        inside &= (p[:, None] != a[:, :, None]).any(axis=3)  # not a corner of the triangle itself
-    is_ear = (turn > _FLAT) & ~inside.any(axis=2)
-    return np.argmax(np.where(is_ear, np.inf, turn), axis=1)
-
-
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    arriving, leaving = shadow - np.roll(shadow, 1, axis=0), np.roll(shadow, -1, axis=0) - shadow
+    turn = arriving[:, 0] * leaving[:, 1] - arriving[:, 1] * leaving[:, 0]
+    is_straight = (np.abs(turn) <= _FLAT) & ((arriving * leaving).sum(axis=1) > 0.0)
+    ends = np.flatnonzero(~is_straight)
+    if len(ends) in (0, len(shadow)):
+        return shadow
+    k = np.arange(len(shadow))
+    begin = shadow[ends[np.searchsorted(ends, k, side="right") - 1]]
+    end = shadow[ends[np.searchsorted(ends, k) % len(ends)]]
+    edge = end - begin
+    length = np.maximum(np.linalg.norm(edge, axis=1), 1e-300)
+    depth = np.linalg.norm(shadow - begin, axis=1) * np.linalg.norm(end - shadow, axis=1)
+    inward = np.stack([-edge[:, 1], edge[:, 0]], axis=1) / length[:, None]
+    return shadow + _INWARD * depth[:, None] * inward

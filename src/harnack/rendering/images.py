@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from harnack.files.loops import check_writable, write_atomically
+from harnack.files.writing import check_writable, write_atomically
 from harnack.rendering.exr import exr_bytes
 
 FloatImage = npt.NDArray[np.float32]
