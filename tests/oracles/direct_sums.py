@@ -13,7 +13,8 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend import aligned, choose_backend, to_numpy
+from harnack.backend import choose_backend, to_numpy
+from harnack.backend.records import Records
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
@@ -58,7 +59,7 @@ def dipole_sum(points: npt.ArrayLike, moments: npt.ArrayLike) -> ValueAndGradien
             vector: Any = backend.Array3f
 
             def add(row: list[Real], sums: tuple[Any, ...]) -> tuple[Any, ...]:
-                z, m = vector(*row[:3]) - x, vector(*row[3:])
+                z, m = vector(*row[:3]) - x, vector(*row[3:6])
                 square = dr.squared_norm(z)
                 cube, along = 1 / (square * dr.sqrt(square)), dr.dot(m, z)
                 return sums[0] + along * cube, sums[1] + cube * (3 * along / square * z - m)
@@ -79,20 +80,7 @@ def _summed(
     start: tuple[Any, ...],
 ) -> tuple[Any, ...]:
     """`add` of every row (k,) of numbers, one after the other, by one loop."""
-    real: Any = backend.Float
-    width = rows.shape[1]
-    table = aligned(backend, np.ascontiguousarray(rows).ravel())
-    count = dr.opaque(backend.UInt32, len(rows))
-
-    def body(i: Any, *sums: Any) -> tuple[Any, ...]:
-        row = [dr.gather(real, table, width * i + k) for k in range(width)]
-        return i + 1, *add(row, sums)
-
-    def more(i: Any, *_: Any) -> Any:
-        return i < count
-
-    state = (backend.UInt32(0), *start)
-    return dr.while_loop(state, more, body, label="direct sum")[1:]
+    return Records.upload(backend, rows).for_each(add, start, "direct sum")
 
 
 def _in_parts(

@@ -34,8 +34,8 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend import aligned
 from harnack.backend.extrema import fmax, fmin
+from harnack.backend.records import Records
 from harnack.fields.clouds.screened_kernel import (
     LONGEST,
     ScreenedSums,
@@ -74,22 +74,20 @@ def dipole_rows(points: FloatArray, moments: FloatArray) -> FloatArray:
 class PlainSum:
     """All dipoles, one by one."""
 
-    backend: Backend
     kappa: Any
-    buffer: Any
-    trips: Any
+    records: Records
 
     @classmethod
     def of(cls, backend: Backend, rows: FloatArray, kappa: float) -> PlainSum:
         """Everything uploaded, padded to whole trips."""
-        trips = -(-len(rows) // _CHUNK)
-        padding = np.zeros((trips * _CHUNK - len(rows), _WIDTH))
-        padding[:, :3] = _NOWHERE
-        values: npt.NDArray[Any] = np.concatenate([rows, padding]).ravel()
-        if backend.precision == "single":
-            values = values.astype(np.float32)
-        count = dr.opaque(backend.UInt32, trips)
-        return cls(backend, dr.opaque(backend.Float, kappa), aligned(backend, values), count)
+        nothing = np.array([_NOWHERE] * 3 + [0.0] * (_WIDTH - 3))
+        records = Records.upload(backend, rows, nothing, _CHUNK)
+        return cls(dr.opaque(backend.Float, kappa), records)
+
+    @property
+    def backend(self) -> Backend:
+        """The one they lie on."""
+        return self.records.backend
 
     def sums(self, x: Vec3, closer: Real) -> ScreenedSums:
         """Value, gradient and bounds at x. No sum could be closer."""
@@ -103,20 +101,10 @@ class PlainSum:
         return SymmetricSum(*self._loop(x, 2, _with_hessian, zero))
 
     def _loop(self, x: Vec3, derivatives: int, add: Any, start: tuple[Any, ...]) -> Any:
-        backend = self.backend
+        def each(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+            return add(seen_dipole(row, x, self.kappa, derivatives), state)
 
-        def body(i: Any, *state: Any) -> Any:
-            for j in range(_CHUNK):
-                place = i * _CHUNK + j
-                row = dr.gather(backend.ArrayXf, self.buffer, place, shape=(_WIDTH, 1))
-                numbers = [row[k] for k in range(_WIDTH)]
-                state = add(seen_dipole(numbers, x, self.kappa, derivatives), state)
-            return i + 1, *state
-
-        def more(i: Any, *_: Any) -> Any:
-            return i < self.trips
-
-        return dr.while_loop((backend.UInt32(0), *start), more, body, label="screened dipoles")[1:]
+        return self.records.for_each(each, start, "screened dipoles")
 
 
 def _with_sums(source: Source, state: tuple[Any, ...]) -> tuple[Any, ...]:

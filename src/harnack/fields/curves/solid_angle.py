@@ -15,10 +15,11 @@ from harnack.backend import backend_of, to_numpy
 from harnack.choices import did_you_mean
 from harnack.fields.curves.edge_angles import differentiable_angle
 from harnack.fields.curves.edge_extent import tight_extent
-from harnack.fields.curves.edge_nearest import Segments, closest_on_segments
+from harnack.fields.curves.edge_nearest import closest_on_segments, segments
 from harnack.fields.edges.edge_hessian import hessian_over_edges
 from harnack.fields.edges.edge_passing import Line, known_along, rates_along
-from harnack.fields.edges.edge_sums import EdgeBuffer, EdgeSums, sum_over_edges, upload
+from harnack.fields.edges.edge_records import LoopEdges
+from harnack.fields.edges.edge_sums import EdgeSums, sum_over_edges
 from harnack.fields.field import Field, HarmonicBall, LineLipschitz, Look, Path, Sample
 from harnack.fields.multipoles.nearby import SECOND_ROUNDINGS, SLOPE_ROUNDINGS
 from harnack.fields.unit_coordinates import UnitCoordinates, epsilon_at, placed
@@ -128,7 +129,7 @@ class SolidAngle(Field):
             )
         centre = self._centre.astype(cast).astype(np.float64)
         unit = tuple((loop - centre) / self._size for loop in self._net)
-        edges = upload(backend, unit) if unit else None
+        edges = LoopEdges.upload(backend, unit) if unit else None
         magnitude = float(np.abs(np.concatenate(self._net or self.loops)).max() / self._size)
         # Each of n factors turns the product by a few roundings, of random sign.
         turned = 8 + 2 * math.sqrt(sum(len(loop) for loop in self._net))
@@ -237,7 +238,7 @@ class SolidAngle(Field):
         on = self._device
         centre = to_numpy(on.centre).reshape(3).astype(np.float64)
         start, end = ((q - centre) / self._size for q in uncancelled_edges(self._net))
-        nearest = closest_on_segments(Segments.upload(on.backend, start, end), on.unit(p))
+        nearest = closest_on_segments(segments(on.backend, start, end), on.unit(p))
         return nearest * on.size + on.centre
 
     def parameters(self) -> tuple[Any, ...]:
@@ -309,7 +310,7 @@ class _OnDevice(UnitCoordinates):
     value_rounding: what rounding may do to a product of so many factors.
     """
 
-    edges: EdgeBuffer | None
+    edges: LoopEdges | None
     rounding: Real
     value_rounding: Real
 

@@ -40,7 +40,7 @@ from harnack.fields.symmetric import SymmetricSum
 
 if TYPE_CHECKING:
     from harnack.backend import Real, Vec3
-    from harnack.fields.edges.edge_sums import EdgeBuffer
+    from harnack.fields.edges.edge_records import LoopEdges
 
 __all__ = ["edge_rates", "hessian_over_edges"]
 
@@ -68,28 +68,12 @@ def edge_rates(a: Vec3, e: Vec3, inverse: Real) -> tuple[Vec3, Vec3]:
     return c, across * h + along * e
 
 
-def hessian_over_edges(edges: EdgeBuffer, x: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+def hessian_over_edges(edges: LoopEdges, x: Vec3) -> tuple[Vec3, Vec3, Vec3]:
     """Rows of the Hessian of the solid angle at x, in one loop over the edges."""
-    real, vector = edges.backend.Float, edges.backend.Array3f
-    wide, index = edges.backend.ArrayXf, edges.backend.UInt32
-    x = vector(x)
+    x = edges.backend.Array3f(x)
 
-    def body(i: Any, *parts: Real) -> Any:
-        row: list[Real] = []
-        for k in range(edges.packets):
-            eight = dr.gather(wide, edges.buffer, i * edges.packets + k, shape=(8, 1))
-            row += [eight[j] for j in range(8)]
-        total = SymmetricSum(*parts)
-        p = vector(row[0], row[1], row[2])
-        for j in range(edges.chunk):
-            q = vector(row[4 * j + 4], row[4 * j + 5], row[4 * j + 6])
-            total = total.plus(*edge_rates(p - x, q - p, row[4 * j + 3]))
-            p = q
-        return i + 1, *total.parts()
+    def add(p: Vec3, q: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
+        return SymmetricSum(*state).plus(*edge_rates(p - x, q - p, inverse)).parts()
 
-    def more(i: Any, *_: Any) -> Any:
-        return i < edges.trips
-
-    start = (index(0), *SymmetricSum.zero(real).parts())
-    _, *parts = dr.while_loop(start, more, body, label="edge hessian")
-    return SymmetricSum(*parts).rows(vector)
+    start = SymmetricSum.zero(edges.backend.Float).parts()
+    return SymmetricSum(*edges.for_each(add, start, "edge hessian")).rows(type(x))

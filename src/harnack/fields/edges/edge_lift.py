@@ -21,10 +21,11 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 import numpy as np
 
-from harnack.backend import aligned
 from harnack.backend.extrema import fmax, fmin
+from harnack.backend.records import Records
 from harnack.fields.edges.edge_field import edge_field, edge_variation
 from harnack.fields.edges.edge_hessian import edge_rates
+from harnack.fields.edges.edge_records import single_edges
 from harnack.fields.symmetric import SymmetricSum
 from harnack.fields.unit_coordinates import epsilon_at
 from harnack.tree.nearest import squared_distance_to_segment
@@ -44,21 +45,14 @@ _TINY = 1e-36
 class LiftedEdges:
     """Directed edges on the device, one packet each: see `edge_records`."""
 
-    backend: Backend
-    buffer: Any
-    trips: Any
+    records: Records
 
     @classmethod
     def upload(cls, backend: Backend, vertices: FloatArray, edges: IntArray) -> LiftedEdges:
         """Edges (k, 2) between vertices (n, 3); weights are repetitions."""
         table = edge_records(vertices, edges)
-        padding = np.tile(table[:1], (-len(table) % _CHUNK, 1))
-        padding[:, 4:7], padding[:, 3] = padding[:, :3], 0.0
-        values = np.concatenate([table, padding]).ravel()
-        cast = values.astype(np.float32) if backend.precision == "single" else values
-        return cls(
-            backend, aligned(backend, cast), dr.opaque(backend.UInt32, -(-len(edges) // _CHUNK))
-        )
+        nothing = np.concatenate([table[0, :3], [0.0], table[0, :3], table[0, 7:]])
+        return cls(Records.upload(backend, table, nothing, _CHUNK))
 
 
 def edge_records(vertices: FloatArray, edges: IntArray) -> FloatArray:
@@ -70,8 +64,7 @@ def edge_records(vertices: FloatArray, edges: IntArray) -> FloatArray:
     """
     low, high = vertices[edges.min(axis=1)], vertices[edges.max(axis=1)]
     direction = np.where(edges[:, 0] < edges[:, 1], 1.0, -1.0)
-    square = ((high - low) ** 2).sum(axis=1)
-    return np.column_stack([low, direction, high, 1 / np.maximum(square, 1e-300)])
+    return single_edges(low, high, direction)
 
 
 @dataclass(frozen=True)
@@ -100,22 +93,14 @@ def lifted_sums(edges: LiftedEdges, x: Vec3, derivatives: int) -> LiftedSums:
     The angles are added up as a product of factors and a count of how often it goes round. s_a
     is taken as |a'|^2/(|a| + a.d) where a.d > 0, so that nothing cancels.
     """
-    backend = edges.backend
-    real, vector = backend.Float, backend.Array3f
+    real, vector = edges.records.backend.Float, edges.records.backend.Array3f
 
-    def body(i: Any, *state: Any) -> Any:
-        for j in range(_CHUNK):
-            row = dr.gather(backend.ArrayXf, edges.buffer, i * _CHUNK + j, shape=(8, 1))
-            state = _with_edge(row, x, derivatives, *state)
-        return i + 1, *state
-
-    def more(i: Any, *_: Any) -> Mask:
-        return i < edges.trips
+    def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+        return _with_edge(row, x, derivatives, *state)
 
     sums = (vector(0), *SymmetricSum.zero(real).parts())[: (0, 1, 7)[derivatives]]
     product, bounds = LiftedProduct.one(real).parts(), (real(0), real(0), real(0))
-    start = (backend.UInt32(0), product, bounds, *sums)
-    _, product, bounds, *rest = dr.while_loop(start, more, body, label="lift")
+    product, bounds, *rest = edges.records.for_each(add, (product, bounds, *sums), "lift")
     return LiftedSums(
         LiftedProduct(*product).angle(),
         rest[0] if derivatives >= 1 else vector(0),

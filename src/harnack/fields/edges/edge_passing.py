@@ -26,7 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import drjit as dr
 
@@ -35,7 +35,7 @@ from harnack.fields.field import LineLipschitz
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
-    from harnack.fields.edges.edge_sums import EdgeBuffer
+    from harnack.fields.edges.edge_records import LoopEdges
 
 __all__ = ["Line", "known_along", "rates_along", "with_edge_rates"]
 
@@ -88,35 +88,19 @@ def known_along(
 
 
 def rates_along(
-    edges: EdgeBuffer, line: Line, lengths: tuple[Real, ...], active: Mask
+    edges: LoopEdges, line: Line, lengths: tuple[Real, ...], active: Mask
 ) -> tuple[Real, ...]:
     """For each length T a constant K of the module's bound on the line for |s| <= T.
 
     Infinite on lanes that are not active, which cost nothing where their neighbours are not
     either, and where the line meets the curve within T, to rounding.
     """
-    real, vector = edges.backend.Float, edges.backend.Array3f
-    wide, index = edges.backend.ArrayXf, edges.backend.UInt32
-    trips = dr.select(active, edges.trips, 0)
 
-    def body(i: Any, *rates: Real) -> Any:
-        row: list[Real] = []
-        for k in range(edges.packets):
-            eight = dr.gather(wide, edges.buffer, i * edges.packets + k, shape=(8, 1))
-            row += [eight[j] for j in range(8)]
-        p = vector(row[0], row[1], row[2])
-        for j in range(edges.chunk):
-            q = vector(row[4 * j + 4], row[4 * j + 5], row[4 * j + 6])
-            ends = p - line.x, q - p
-            rates = with_edge_rates(line, ends, row[4 * j + 3], lengths, rates)
-            p = q
-        return i + 1, *rates
+    def add(p: Vec3, q: Vec3, inverse: Real, rates: tuple[Real, ...]) -> tuple[Real, ...]:
+        return with_edge_rates(line, (p - line.x, q - p), inverse, lengths, rates)
 
-    def more(i: Any, *_: Any) -> Mask:
-        return i < trips
-
-    start = (index(0), *(real(0) for _ in lengths))
-    _, *rates = dr.while_loop(start, more, body, label="edges along")
+    start = tuple(edges.backend.Float(0) for _ in lengths)
+    rates = edges.for_each(add, start, "edges along", active)
     return tuple(dr.select(active, rate, dr.inf) for rate in rates)
 
 

@@ -11,42 +11,21 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import drjit as dr
-import numpy as np
-import numpy.typing as npt
 
-from harnack.backend import aligned
-from harnack.backend.extrema import clamp, fmin
+from harnack.backend.extrema import fmin
+from harnack.fields.edges.edge_field import edge_variation
+from harnack.tree.nearest import squared_distance_to_segment
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Real, Vec3
+    from harnack.backend import Real, Vec3
+    from harnack.fields.edges.edge_records import LoopEdges
 
 # Two complex numbers, as four reals.
 Spinor: TypeAlias = "tuple[Real, Real, Real, Real]"
 
-# The largest 1/length^2 of a record, within the range of float32. Edges that have no length, for
-# padding or by rounding, have it too: no angle, no gradient, hardly any variation.
-_SHARPEST = 1e30
 # Often, and without squares: beside a vertex or far away, the product of a few factors leaves the
 # range of float32.
 _RENORMALISE_EVERY = 2
-
-
-@dataclass(frozen=True)
-class EdgeBuffer:
-    """Edges on the device: `trips` records of `chunk` consecutive edges each.
-
-    A record holds chunk + 1 vertices as (x, y, z, 1/|edge to the next|^2), padded to packets of
-    eight floats. Records do not lean on each other, so several loops need no special case.
-    """
-
-    backend: Backend
-    buffer: Any
-    trips: Any
-    chunk: int
-
-    @property
-    def packets(self) -> int:
-        return -(-4 * (self.chunk + 1) // 8)
 
 
 @dataclass(frozen=True)
@@ -62,46 +41,7 @@ class EdgeSums:
     second: Real
 
 
-def chunk_for(loops: tuple[npt.NDArray[np.float64], ...]) -> int:
-    """Eight edges a trip, or four where eight would be mostly padding."""
-    edges = sum(len(loop) for loop in loops)
-    padded = sum(-(-len(loop) // 8) * 8 for loop in loops)
-    return 8 if padded <= 1.2 * edges else 4
-
-
-def upload(backend: Backend, loops: tuple[npt.NDArray[np.float64], ...]) -> EdgeBuffer:
-    """Records of the edges of closed loops, each of shape (n, 3)."""
-    chunk = chunk_for(loops)
-    cast = np.float64 if backend.precision == "double" else np.float32
-    rounded = (loop.astype(cast).astype(np.float64) for loop in loops)
-    records = np.concatenate([_records(loop, chunk) for loop in rounded])
-    trips = dr.opaque(backend.UInt32, len(records))
-    return EdgeBuffer(backend, aligned(backend, records.ravel().astype(cast)), trips, chunk)
-
-
-def inverse_squares(edges: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """1/length^2 of edges (k, 3), (k,), or the largest number that records hold, if less.
-
-    Too small a number makes no distance too long: the foot of the perpendicular ends nearer to
-    the edge's start than it should by less than the edge's length, at most 1e-15, far below the
-    rounding of distances. Nor a variation too small: 1/sqrt(d^2 (1 + 4 d^2/length^2)) grows.
-    """
-    squared = (edges * edges).sum(axis=1)
-    return 1 / np.maximum(squared, 1 / _SHARPEST)
-
-
-def _records(loop: npt.NDArray[np.float64], chunk: int) -> npt.NDArray[np.float64]:
-    trips = -(-len(loop) // chunk)
-    stays = np.repeat(loop[:1], trips * chunk + 1 - len(loop), axis=0)
-    path = np.concatenate([loop, stays])  # back to the start, then degenerate edges
-    inverse = inverse_squares(path[1:] - path[:-1])
-    rows = np.concatenate([path, np.append(inverse, 0.0)[:, None]], axis=1)
-    index = np.arange(trips)[:, None] * chunk + np.arange(chunk + 1)[None, :]
-    flat = rows[index].reshape(trips, -1)
-    return np.pad(flat, ((0, 0), (0, -flat.shape[1] % 8)))
-
-
-def sum_over_edges(edges: EdgeBuffer, x: Vec3, *, variation: bool) -> EdgeSums:
+def sum_over_edges(edges: LoopEdges, x: Vec3, *, variation: bool) -> EdgeSums:
     """All sums at x in one loop.
 
     Solid angle. For unit spinors chi(a) of the directions a = p_i - x, the product of
@@ -114,46 +54,35 @@ def sum_over_edges(edges: EdgeBuffer, x: Vec3, *, variation: bool) -> EdgeSums:
     Gradient. Biot-Savart: each edge gives (1/|a|+1/|b|)/(|a||b|+a.b) a x b (Eq. 11). The
     bracket cancels beside the edge; |factor|^2 = 2 s_a s_b (|a||b|+a.b) does not.
     """
-    real, vector = edges.backend.Float, edges.backend.Array3f
-    wide, index = edges.backend.ArrayXf, edges.backend.UInt32
-    x = vector(x)
+    real, x = edges.backend.Float, edges.backend.Array3f(x)
 
-    def body(i: Any, zr: Real, zi: Real, g: Vec3, d2: Real, s1: Real, s2: Real) -> Any:
-        row: list[Real] = []
-        for k in range(edges.packets):
-            eight = dr.gather(wide, edges.buffer, i * edges.packets + k, shape=(8, 1))
-            row += [eight[j] for j in range(8)]
-        p = vector(row[0], row[1], row[2])
+    def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+        zr, zi, g, d2, s1, s2 = state
+        p = edges.vertex(row, 0)
         a = p - x
         la, sa, ca = spinor(a)
-        for j in range(edges.chunk):
-            q = vector(row[4 * j + 4], row[4 * j + 5], row[4 * j + 6])
-            inverse = row[4 * j + 3]
+        for k in range(edges.run):
+            q, inverse = edges.vertex(row, k + 1), row[4 * k + 3]
             b = q - x
             lb, sb, cb = spinor(b)
             re, im = inner_product(ca, cb)
             zr, zi = dr.fma(zr, re, -(zi * im)), dr.fma(zr, im, zi * re)
-            if j % _RENORMALISE_EVERY == _RENORMALISE_EVERY - 1:
+            if k % _RENORMALISE_EVERY == _RENORMALISE_EVERY - 1:
                 scale = dr.rcp(dr.abs(zr) + dr.abs(zi))
                 zr, zi = zr * scale, zi * scale
             e = q - p
             weight = (la + lb) * (sa * sb) / (la * lb * dr.fma(re, re, im * im))
-            g = dr.fma(vector(weight), dr.cross(a, e), g)
-            foot = clamp(-dr.dot(a, e) * inverse, real(0), real(1))
-            near = dr.squared_norm(dr.fma(vector(foot), e, a))
-            d2 = fmin(near, d2)
+            g = dr.fma(type(g)(weight), dr.cross(a, e), g)
+            square = squared_distance_to_segment(a, e, inverse)
+            d2 = fmin(square, d2)
             if variation:
-                first = dr.rsqrt(near * dr.fma(near, 4 * inverse, 1))
-                s1 = s1 + first
-                s2 = dr.fma(first, dr.rsqrt(near), s2)
+                first, second = edge_variation(square, inverse)
+                s1, s2 = s1 + first, s2 + second
             p, a, la, sa, ca = q, b, lb, sb, cb
-        return i + 1, zr, zi, g, d2, s1, s2
+        return zr, zi, g, d2, s1, s2
 
-    def more(i: Any, *_: Any) -> Any:
-        return i < edges.trips
-
-    start = (index(0), real(1), real(0), vector(0), real(dr.inf), real(0), real(0))
-    _, zr, zi, g, d2, s1, s2 = dr.while_loop(start, more, body, label="edges")
+    start = (real(1), real(0), type(x)(0), real(dr.inf), real(0), real(0))
+    zr, zi, g, d2, s1, s2 = edges.records.for_each(add, start, "edges")
     return EdgeSums(2 * dr.atan2(zi, zr), 2 * g, dr.sqrt(d2), s1, s2)
 
 

@@ -16,16 +16,16 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 import drjit as dr
 import numpy as np
 
-from harnack.backend import aligned
 from harnack.backend.extrema import fmax, fmin
 from harnack.backend.lengths import largest_component
+from harnack.backend.records import Records
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.tree.hierarchy import FloatArray, IntArray
 
 # Edges of a record: its five vertices and the number of its edges fill two packets of eight.
-_EDGES, _PACKETS = 4, 2
+_EDGES = 4
 # Points of a lane: as many as registers hold, by experiment.
 _POINTS = 3
 # Sides closer to zero than this many rounding errors of their products are not trusted; theirs
@@ -120,9 +120,7 @@ class _Product:
 class EdgeTrails:
     """Directed edges on the device, as records of consecutive edges of closed trails."""
 
-    backend: Backend
-    buffer: Any
-    trips: Any
+    records: Records
 
     @classmethod
     def upload(cls, backend: Backend, vertices: FloatArray, edges: IntArray) -> EdgeTrails:
@@ -135,10 +133,7 @@ class EdgeTrails:
             index = np.minimum(first + np.arange(_EDGES + 1), count)
             filled = np.minimum(count - first, _EDGES)
             rows.append(np.concatenate([vertices[trail[index]].reshape(trips, -1), filled], 1))
-        table = np.concatenate(rows).ravel()
-        values = table.astype(np.float32) if backend.precision == "single" else table
-        trips = dr.opaque(backend.UInt32, sum(len(row) for row in rows))
-        return cls(backend, aligned(backend, values), trips)
+        return cls(Records.upload(backend, np.concatenate(rows)))
 
     def turns(self, x: Vec3, way: Real) -> tuple[Real, Mask]:
         """1/(4 pi) times the sum of Omega_e at points x, and whether to doubt it.
@@ -148,13 +143,13 @@ class EdgeTrails:
         than rounding can tell, where a factor is (beside an edge or a short one), and far away.
         """
         dr.eval(x, way)
-        real, index, n = self.backend.Float, self.backend.UInt32, dr.width(x)
+        backend, n = self.records.backend, dr.width(x)
+        real, index = backend.Float, backend.UInt32
         lanes = -(-n // _POINTS)
         lane = dr.arange(index, lanes)
         places = [dr.minimum(lane + k * lanes, n - 1) for k in range(_POINTS)]
         points = [
-            (dr.gather(self.backend.Array3f, x, place), dr.gather(real, way, place))
-            for place in places
+            (dr.gather(backend.Array3f, x, place), dr.gather(real, way, place)) for place in places
         ]
         products, doubts = self._over_records(points)
         turns = [-one.turns() for one in products]  # of conjugate factors
@@ -166,26 +161,18 @@ class EdgeTrails:
 
     def _over_records(self, points: list[Point]) -> tuple[list[_Product], list[Real]]:
         """For each point the product of all factors, and a number below 0 where it is in doubt."""
-        backend, bits = self.backend, _Bits.of(self.backend)
-        real = backend.Float
+        backend = self.records.backend
+        real, bits = backend.Float, _Bits.of(backend)
         slack = real(-_UNSURE * 0.5 * backend.epsilon)
 
-        def body(i: Any, *state: Any) -> Any:
-            row: list[Real] = []
-            for k in range(_PACKETS):
-                eight = dr.gather(backend.ArrayXf, self.buffer, i * _PACKETS + k, shape=(8, 1))
-                row += [eight[j] for j in range(8)]
+        def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
             # Edges that fill a record up are from a vertex to itself: no doubt about those.
             slacks = [dr.select(row[15] > k, slack, 1) for k in range(_EDGES)]
             pairs = zip(points, state, strict=True)
-            return i + 1, *(_with_record(bits, row, slacks, x, old) for x, old in pairs)
-
-        def more(i: Any, *_: Any) -> Mask:
-            return i < self.trips
+            return tuple(_with_record(bits, row, slacks, x, old) for x, old in pairs)
 
         one = (real(1), real(0), bits.integer(0), real(1))
-        start = (backend.UInt32(0), *(one for _ in points))
-        _, *out = dr.while_loop(start, more, body, label="trails")
+        out = self.records.for_each(add, tuple(one for _ in points), "trails")
         return [_Product(*one[:3]) for one in out], [one[3] for one in out]
 
 
