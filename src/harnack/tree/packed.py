@@ -37,7 +37,7 @@ class PackedTree:
     node_count: Any
     primitives: Real
     primitive_packets: int
-    leaf_size: int
+    leaf_size: Any
 
     def head(self, i: Any) -> list[Real]:
         """The eight numbers of node i that a walk needs."""
@@ -95,7 +95,7 @@ def pack(
         dr.opaque(backend.UInt32, tree.node_count),
         _upload(backend, primitives.reshape(-1, width)),
         -(-width // PACKET),
-        tree.leaf_size,
+        dr.opaque(backend.UInt32, tree.leaf_size),
     )
 
 
