@@ -33,6 +33,7 @@ FIELD_ROOMS = (
     "sheets",
     "points",
     "field",
+    "kept",
     "symmetric",
     "unit_coordinates",
     "batch",

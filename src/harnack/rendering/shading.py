@@ -104,8 +104,9 @@ def of_mended(colour: Any, mended: Any) -> Any:
 
 def _parameter(array: Any, numbers: Sequence[float]) -> Any:
     """Numbers as a vector of the kind of another, which no kernel is compiled anew for."""
-    kind = type(array)
-    return kind(*(dr.opaque(dr.value_t(kind), number) for number in numbers))
+    vector = _like(array, numbers)
+    dr.make_opaque(vector)
+    return vector
 
 
 def _like(array: Any, numbers: Sequence[float]) -> Any:
