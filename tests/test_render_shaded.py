@@ -16,7 +16,7 @@ from harnack.geometry import mesh_shapes, shapes
 from harnack.rendering import Camera, Material, register, render, shape
 from harnack.rendering.floor import Floor
 from harnack.rendering.occlusion import visible_sky
-from harnack.rendering.pixels import grid_offsets
+from harnack.rendering.pixels import grid_offsets, in_tiles
 from harnack.rendering.shading import Light
 from harnack.rendering.world import World
 
@@ -264,3 +264,12 @@ def test_other_variants_draw_much_the_same_or_say_no() -> None:
     refused = in_variant("llvm_ad_spectral")
     assert refused.returncode != 0
     assert "shaded pictures know red, green and blue" in refused.stderr
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 2), (4, 4), (9, 5), (16, 7)])
+def test_tiles_hold_every_pixel_once(size: tuple[int, int]) -> None:
+    order = in_tiles(size)
+    assert sorted(order) == list(range(size[0] * size[1]))
+    if size == (9, 5):  # the first tile, and the first of the narrow one at the right
+        assert order[:16].tolist() == [y * 9 + x for y in range(4) for x in range(4)]
+        assert order[32:36].tolist() == [8, 17, 26, 35]
