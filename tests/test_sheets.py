@@ -26,7 +26,7 @@ from harnack.backend.extrema import clamp, fmax, fmin
 from harnack.bounds import Caps, CurvatureStep, Longest, Slope
 from harnack.certify import BallCertificate, CurvatureCertificate, Levels
 from harnack.fields.sheets import NO_SHEET, Crossing
-from harnack.rendering.encounter import meet_surface
+from harnack.rendering.surfaces.encounter import meet_surface
 from harnack.testing.exact import exact_step, on_host
 from harnack.testing.jump_oracle import first_side_changes, judge
 from harnack.tracer import march

@@ -14,11 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import to_numpy
-from harnack.rendering.colormap import viridis
-from harnack.rendering.images import as_bytes
-from harnack.rendering.integrator import LOST_COLOUR
-from harnack.rendering.pixels import bands, film_places, in_tiles, pixels_of_band
-from harnack.rendering.world import World
+from harnack.rendering.mitsuba.integrator import LOST_COLOUR
+from harnack.rendering.mitsuba.world import World
+from harnack.rendering.pictures.colormap import viridis
+from harnack.rendering.pictures.images import as_bytes
+from harnack.rendering.pictures.pixels import bands, film_places, in_tiles, pixels_of_band
 from harnack.tracer import Status
 
 FloatArray = npt.NDArray[np.floating[Any]]

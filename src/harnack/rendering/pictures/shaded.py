@@ -16,14 +16,20 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import to_numpy
-from harnack.rendering.exposure import as_rgb, mean_of_blocks
-from harnack.rendering.floor import Floor
-from harnack.rendering.images import tone_mapped
-from harnack.rendering.integrator import LOST_COLOUR
-from harnack.rendering.occlusion import visible_sky
-from harnack.rendering.pixels import bands, film_places, grid_offsets, in_tiles, pixels_of_band
-from harnack.rendering.shading import Light, of_mended, of_side, reflectance
-from harnack.rendering.world import World
+from harnack.rendering.mitsuba.integrator import LOST_COLOUR
+from harnack.rendering.mitsuba.world import World
+from harnack.rendering.pictures.exposure import as_rgb, mean_of_blocks
+from harnack.rendering.pictures.floor import Floor
+from harnack.rendering.pictures.images import tone_mapped
+from harnack.rendering.pictures.occlusion import visible_sky
+from harnack.rendering.pictures.pixels import (
+    bands,
+    film_places,
+    grid_offsets,
+    in_tiles,
+    pixels_of_band,
+)
+from harnack.rendering.pictures.shading import Light, of_mended, of_side, reflectance
 
 # Rays of one band.
 _RAYS_A_BAND = 2**17

@@ -10,9 +10,9 @@ from typing import Any
 import drjit as dr
 
 from harnack.backend import Mask, Real  # needed at run time: Dr.Jit reads annotations of _Path
-from harnack.rendering.interaction import connecting_ray, leaving_ray
-from harnack.rendering.variant import load_mitsuba
-from harnack.rendering.world import World
+from harnack.rendering.mitsuba.interaction import connecting_ray, leaving_ray
+from harnack.rendering.mitsuba.variant import load_mitsuba
+from harnack.rendering.mitsuba.world import World
 
 PLUGIN = "harnack_path"
 # What a ray that ran out of steps is drawn in: nothing in nature is this colour.

@@ -12,10 +12,10 @@ import numpy as np
 from harnack.backend import to_numpy
 from harnack.backend.arrays import aligned
 from harnack.geometry.convex_volume import FloatArray
-from harnack.rendering.lighting import FLOOR
-from harnack.rendering.shading import Light
-from harnack.rendering.variant import mitsuba_backend
-from harnack.rendering.world import World
+from harnack.rendering.mitsuba.variant import mitsuba_backend
+from harnack.rendering.mitsuba.world import World
+from harnack.rendering.pictures.shading import Light
+from harnack.rendering.studio.lighting import FLOOR
 
 # Cells a side of a square of half this side, which holds what stands on the stage and its shadow.
 _CELLS = 64

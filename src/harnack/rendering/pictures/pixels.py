@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.geometry.convex_volume import FloatArray
-from harnack.rendering.studio import stratified
+from harnack.rendering.studio.stage import stratified
 
 IntArray = npt.NDArray[np.int64]
 
