@@ -33,6 +33,7 @@ FIELD_ROOMS = (
     "points",
     "look",
     "field",
+    "kept",
     "symmetric",
     "unit_coordinates",
     "batch",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 import harnack as hk
 from harnack.geometry.mesh_shapes import icosphere
+from harnack.rendering import Camera
 
 
 def knot(k: int) -> hk.Field:
@@ -34,6 +36,19 @@ def cloud(k: int) -> hk.Field:
     return hk.DipolePotential((1 + 0.1 * k) * vertices, vertices)
 
 
+def compiled(call: Callable[[], object], size: int | None = None) -> int:
+    """How many kernels, of `size` lanes if given, were not there yet when `call` needed them.
+
+    What a former run has left on disk counts: it was compiled for these very numbers.
+    """
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        call()
+        kernels = dr.kernel_history((dr.KernelType.JIT,))
+    new = (one for one in kernels if not one["cache_hit"] or one["cache_disk"])
+    return sum(size in (None, one["size"]) for one in new)
+
+
 @pytest.mark.parametrize(
     ("make", "level"),
     [(knot, 6.0), (cut_sphere, 0.5), (tree, 0.5), (cloud, 6.0)],
@@ -44,12 +59,62 @@ def test_another_surface_compiles_no_kernel(make: Callable[[int], hk.Field], lev
     def trace(k: int) -> int:
         o = np.tile([3.0 + 0.1 * k, -2.0, 2.0], (300, 1))
         d = 0.4 * rng.normal(size=(300, 3)) - o
-        dr.kernel_history_clear()
-        hk.trace(make(k), o, d, level=level * (1 - 0.01 * k), tolerance=1e-4 * (1 + 0.1 * k))
-        kernels = dr.kernel_history((dr.KernelType.JIT,))
+        settings = {"level": level * (1 - 0.01 * k), "tolerance": 1e-4 * (1 + 0.1 * k)}
         # Of rays: those that pack a tree are small, and come in a few kinds by its size.
-        return sum(not kernel["cache_hit"] and kernel["size"] == 300 for kernel in kernels)
+        return compiled(lambda: hk.trace(make(k), o, d, **settings), size=300)
 
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        trace(0), trace(1)
-        assert [trace(k) for k in range(2, 22)] == [0] * 20
+    trace(0), trace(1)
+    assert [trace(k) for k in range(2, 22)] == [0] * 20
+
+
+def camera(k: int) -> Camera:
+    return Camera(azimuth=-50 + 7.3 * k, elevation=20 + k, fov=20 + k, zoom=1 + 0.05 * k)
+
+
+def drawn(what: Any, k: int, show: str, **settings: Any) -> int:
+    """How many kernels a small picture compiles, of which all is other than in the k before."""
+    settings = {"camera": camera(k), "backdrop": ("light", "dark")[k % 2], "seed": k} | settings
+    small = {"size": (24, 18), "spp": 4, "progress": False}
+    return compiled(lambda: hk.render(what, show=show, **settings, **small))
+
+
+@pytest.mark.parametrize("show", ["color", "shaded"])
+def test_another_picture_compiles_no_kernel(show: str) -> None:
+    def picture(k: int) -> int:
+        settings: dict[str, Any] = {"level": 6 - 0.02 * k, "max_depth": 3 + k}
+        return drawn(knot(k), k, show, tolerance=1e-4 * (1 + 0.1 * k), **settings)
+
+    picture(0), picture(1)
+    assert [picture(k) for k in range(2, 5)] == [0] * 3
+
+
+HARMONIC = hk.SphericalHarmonic(3, 2)
+
+
+def cut(k: int) -> hk.geometry.Volume:
+    box = hk.Box((-1 - 0.1 * k, -1, -1), (1, 2, 0.5 + 0.01 * k))
+    return hk.Intersection([hk.Ball((0.01 * k, 0, 0), 1 + 0.1 * k), box])
+
+
+PICTURES: dict[str, Callable[[int], int]] = {
+    **{
+        show: lambda k, show=show: drawn(knot(k), k, show, level=6 - 0.02 * k)
+        for show in hk.rendering.SHOW_MODES
+    },
+    "clipped": lambda k: drawn(HARMONIC, k, "color", level=0.1 + 0.01 * k, clip=cut(k)),
+    "glass": lambda k: drawn(
+        HARMONIC, k, "color", solid=(-np.inf, 0.1 + 0.01 * k), clip=cut(k), material="glass"
+    ),
+    "wall": lambda k: drawn(HARMONIC, k, "shaded", solid=(-0.1 - 0.01 * k, 0.2), clip=cut(k)),
+    "mesh": lambda k: drawn(cut_sphere(k), k, "shaded"),
+    "tree": lambda k: drawn(tree(k), k, "shaded"),
+    "cloud": lambda k: drawn(cloud(k), k, "shaded", level=6 - 0.06 * k),
+    "two": lambda k: drawn([knot(k), cut_sphere(k)], k, "color"),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PICTURES)
+def test_no_other_picture_compiles_a_kernel(name: str) -> None:
+    PICTURES[name](0), PICTURES[name](1)
+    assert [PICTURES[name](k) for k in range(2, 22)] == [0] * 20

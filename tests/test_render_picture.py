@@ -15,10 +15,10 @@ import pytest
 import harnack as hk
 from harnack.geometry import shapes
 from harnack.rendering import MATERIALS, SHOW_MODES, Camera, Material, picture, register, render
-from harnack.rendering.colormap import viridis
-from harnack.rendering.exr import exr_bytes
-from harnack.rendering.images import tone_mapped
-from harnack.rendering.studio import on_ground
+from harnack.rendering.pictures.colormap import viridis
+from harnack.rendering.pictures.exr import exr_bytes
+from harnack.rendering.pictures.images import tone_mapped
+from harnack.rendering.studio.stage import on_ground
 
 mi = register()
 SMALL: dict[str, Any] = {"size": (40, 30), "progress": False}
@@ -82,7 +82,7 @@ def test_the_same_seed_draws_the_same_picture() -> None:
 
 def test_bands_leave_no_seam(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = draw(spp=64)
-    monkeypatch.setattr("harnack.rendering.exposure._PATHS_A_BAND", 64 * 50)
+    monkeypatch.setattr("harnack.rendering.pictures.exposure._PATHS_A_BAND", 64 * 50)
     bands = draw(spp=64)
     assert not np.array_equal(whole, bands)
     assert np.abs(whole - bands).mean() < 0.02
@@ -313,7 +313,7 @@ def test_other_variants_draw_the_same_picture(variant: str) -> None:
 def test_views_look_alike_in_bands(monkeypatch: pytest.MonkeyPatch) -> None:
     for show in ("normal", "depth", "evaluations", "status"):
         whole = draw(show=show)
-        monkeypatch.setattr("harnack.rendering.views._RAYS_A_BAND", 7)
+        monkeypatch.setattr("harnack.rendering.pictures.views._RAYS_A_BAND", 7)
         np.testing.assert_array_equal(draw(show=show), whole)
         monkeypatch.undo()
 

@@ -14,11 +14,11 @@ import harnack as hk
 from harnack.fields.field import Field, Lipschitz, Sample
 from harnack.geometry import mesh_shapes, shapes
 from harnack.rendering import Camera, Material, register, render, shape
-from harnack.rendering.floor import Floor
-from harnack.rendering.occlusion import visible_sky
-from harnack.rendering.pixels import grid_offsets
-from harnack.rendering.shading import Light
-from harnack.rendering.world import World
+from harnack.rendering.mitsuba.world import World
+from harnack.rendering.pictures.floor import Floor
+from harnack.rendering.pictures.occlusion import visible_sky
+from harnack.rendering.pictures.pixels import grid_offsets, in_tiles
+from harnack.rendering.pictures.shading import Light
 
 mi = register()
 T = mi.ScalarTransform4f
@@ -132,7 +132,7 @@ def draw(what: Any = POLYGON, **settings: Any) -> np.ndarray:
 def test_the_picture_is_always_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = draw()
     np.testing.assert_array_equal(whole, draw(seed=7))
-    monkeypatch.setattr("harnack.rendering.shaded._RAYS_A_BAND", 333)
+    monkeypatch.setattr("harnack.rendering.pictures.shaded._RAYS_A_BAND", 333)
     np.testing.assert_allclose(draw(), whole, atol=1e-5)
 
 
@@ -199,7 +199,7 @@ def positions(bend: float) -> tuple[Any, Any]:
 
 
 def test_a_plane_hides_nothing_and_a_wall_hides_what_is_near(monkeypatch: Any) -> None:
-    monkeypatch.setattr("harnack.rendering.occlusion._REACH", 0.4)
+    monkeypatch.setattr("harnack.rendering.pictures.occlusion._REACH", 0.4)
     flat = np.array(visible_sky(mi, *positions(0.0), mi.Float(1), (41, 41))).reshape(41, 41)
     np.testing.assert_allclose(flat, 1, atol=1e-6)
     bent = np.array(visible_sky(mi, *positions(2.0), mi.Float(1), (41, 41))).reshape(41, 41)
@@ -264,3 +264,12 @@ def test_other_variants_draw_much_the_same_or_say_no() -> None:
     refused = in_variant("llvm_ad_spectral")
     assert refused.returncode != 0
     assert "shaded pictures know red, green and blue" in refused.stderr
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 2), (4, 4), (9, 5), (16, 7)])
+def test_tiles_hold_every_pixel_once(size: tuple[int, int]) -> None:
+    order = in_tiles(size)
+    assert sorted(order) == list(range(size[0] * size[1]))
+    if size == (9, 5):  # the first tile, and the first of the narrow one at the right
+        assert order[:16].tolist() == [y * 9 + x for y in range(4) for x in range(4)]
+        assert order[32:36].tolist() == [8, 17, 26, 35]

@@ -36,7 +36,7 @@ from harnack.enclosures import (
 from harnack.fields import Field, Sample
 from harnack.fields.look import Path as RayPath
 from harnack.fields.sheets import NO_SHEET, Crossing
-from harnack.rendering.encounter import meet_surface
+from harnack.rendering.surfaces.encounter import meet_surface
 from harnack.testing import scaled
 from harnack.testing.cases import BallCase, Case, CurvatureCase
 from harnack.tracer.sheet_comparison import compare_with_sheet

@@ -278,5 +278,9 @@ def to_numpy(array: Any) -> npt.NDArray[Any]:
     kind = _type_of(array)
     if not dr.is_array_v(kind) or dr.depth_v(kind) > 2:
         raise TypeError(f"expected a Dr.Jit array or vector, got {kind.__module__}.{kind.__name__}")
-    lanes_last: Any = dr.detach(array).numpy()
-    return np.array(lanes_last.T, order="C")
+    array = dr.detach(array)
+    if dr.depth_v(kind) == 1:
+        return np.array(array.numpy())
+    # Component by component: Dr.Jit's own conversion of vectors compiles a kernel for every n.
+    dr.eval(array)
+    return np.stack(np.broadcast_arrays(*(component.numpy() for component in array)), axis=-1)

@@ -17,7 +17,7 @@ from harnack.files.surfaces import SURFACE_FILES
 from harnack.gallery import SCENES, Scene
 from harnack.opening import open_surface
 from harnack.rendering import Camera, render
-from harnack.rendering.images import check_picture_path
+from harnack.rendering.pictures.images import check_picture_path
 
 _DEMO_SIZE = (480, 360)
 

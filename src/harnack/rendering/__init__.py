@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from harnack.rendering.arguments import SHOW_MODES
-from harnack.rendering.carrier import shape
-from harnack.rendering.extent import UnboundedSurfaceError
-from harnack.rendering.materials import MATERIALS, Material
+from harnack.rendering.mitsuba.carrier import shape
+from harnack.rendering.mitsuba.plugins import register, register_surfaces
 from harnack.rendering.picture import render
-from harnack.rendering.plugins import register, register_surfaces
-from harnack.rendering.studio import Camera
+from harnack.rendering.studio.materials import MATERIALS, Material
+from harnack.rendering.studio.stage import Camera
+from harnack.rendering.surfaces.extent import UnboundedSurfaceError
 
 __all__ = [
     "MATERIALS",

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from harnack.choices import did_you_mean
-from harnack.rendering.studio import Camera
-from harnack.rendering.views import VIEWS
+from harnack.rendering.pictures.views import VIEWS
+from harnack.rendering.studio.stage import Camera
 from harnack.tracer import level_set
 
 __all__ = [

@@ -28,15 +28,15 @@ from harnack.rendering.arguments import (
     checked_request,
     refuse_studio_settings,
 )
-from harnack.rendering.exposure import expose
-from harnack.rendering.images import check_picture_path, tone_mapped, write_image
-from harnack.rendering.integrator import PathTracer
-from harnack.rendering.materials import Material, material_of
-from harnack.rendering.plugins import register
-from harnack.rendering.scene_files import load_dictionary, load_scene_file
-from harnack.rendering.shaded import shaded
-from harnack.rendering.studio import Camera, Exhibit, stratified, studio
-from harnack.rendering.views import VIEWS, look
+from harnack.rendering.mitsuba.integrator import PathTracer
+from harnack.rendering.mitsuba.plugins import register
+from harnack.rendering.mitsuba.scene_files import load_dictionary, load_scene_file
+from harnack.rendering.pictures.exposure import expose
+from harnack.rendering.pictures.images import check_picture_path, tone_mapped, write_image
+from harnack.rendering.pictures.shaded import shaded
+from harnack.rendering.pictures.views import VIEWS, look
+from harnack.rendering.studio.materials import Material, material_of
+from harnack.rendering.studio.stage import Camera, Exhibit, stratified, studio
 from harnack.tracer import LevelSet, level_set
 
 ShowMode = Literal["color", "shaded", "normal", "evaluations", "status", "depth"]

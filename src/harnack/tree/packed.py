@@ -34,7 +34,7 @@ class PackedTree:
     payloads: Records | None
     node_count: Any
     primitives: Records
-    leaf_size: int
+    leaf_size: Any
 
     def head(self, i: Any) -> list[Real]:
         """The eight numbers of node i that a walk needs."""
@@ -77,5 +77,5 @@ def pack(
         Records.upload(backend, payloads) if extra else None,
         dr.opaque(backend.UInt32, tree.node_count),
         Records.upload(backend, primitives.reshape(-1, primitives.shape[2])),
-        tree.leaf_size,
+        dr.opaque(backend.UInt32, tree.leaf_size),
     )

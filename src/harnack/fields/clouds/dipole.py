@@ -14,6 +14,7 @@ from harnack.backend import backend_of
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.clouds.dipole_tree import DipoleTree, hierarchy_of
 from harnack.fields.field import AtDetail, Field, Sample, lengthened
+from harnack.fields.kept import prepared_once
 from harnack.fields.unit_coordinates import UnitCoordinates, placed, single
 from harnack.geometry import Box, CloudError, estimate_areas, estimate_normals, validate_cloud
 
@@ -121,6 +122,7 @@ class DipolePotential(BatchedField):
         tree = DipoleTree.of(backend, self._hierarchy, unit, moments, accuracy)
         return _OnDevice(*placed(backend, self._centre, self._size), tree)
 
+    @prepared_once
     def prepare(self, backend: Backend) -> DipolePotential:
         if self._device is not None and self._device.backend is backend:
             return self

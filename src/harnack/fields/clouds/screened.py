@@ -18,6 +18,7 @@ from harnack.fields.batch import BatchedField, Values
 from harnack.fields.clouds.screened_kernel import ScreenedSums, mean_at_dipoles, promises
 from harnack.fields.clouds.screened_tree import PlainSum, TreeSum, dipole_rows
 from harnack.fields.field import AtDetail, Curvature, Field, Sample
+from harnack.fields.kept import prepared_once
 from harnack.fields.multipoles.nearby import SECOND_ROUNDINGS, SLOPE_ROUNDINGS
 from harnack.fields.unit_coordinates import UnitCoordinates, epsilon_at, placed, single
 from harnack.geometry import Box
@@ -206,6 +207,7 @@ class ScreenedWindingNumber(BatchedField):
             dr.fma(SECOND_ROUNDINGS * unit, fourth, 6 * held * share * share),
         )
 
+    @prepared_once
     def prepare(self, backend: Backend) -> ScreenedWindingNumber:
         if self._device is not None and self._device.backend is backend:
             return self

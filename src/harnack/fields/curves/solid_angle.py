@@ -21,6 +21,7 @@ from harnack.fields.edges.edge_passing import Line, known_along, rates_along
 from harnack.fields.edges.edge_records import LoopEdges
 from harnack.fields.edges.edge_sums import EdgeSums, sum_over_edges
 from harnack.fields.field import Field, HarmonicBall, LineLipschitz, Look, Path, Sample
+from harnack.fields.kept import prepared_once
 from harnack.fields.multipoles.nearby import SECOND_ROUNDINGS, SLOPE_ROUNDINGS
 from harnack.fields.unit_coordinates import UnitCoordinates, epsilon_at, placed
 from harnack.geometry import ConvexHull, is_convex_position, total_length, validate_loops
@@ -113,6 +114,7 @@ class SolidAngle(Field):
             )
         return "edges" if asked == "edges" else "range"
 
+    @prepared_once
     def prepare(self, backend: Backend) -> SolidAngle:
         if self._device is not None and self._device.backend is backend:
             return self

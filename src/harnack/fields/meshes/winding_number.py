@@ -16,6 +16,7 @@ from harnack.backend import backend_of
 from harnack.choices import did_you_mean
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.field import Field, LineLipschitz, Sample, lengthened
+from harnack.fields.kept import prepared_once
 from harnack.fields.meshes.winding_exact import ExactWinding
 from harnack.fields.meshes.winding_mesh import WindingMesh
 from harnack.fields.meshes.winding_tree import TreeWinding
@@ -141,6 +142,7 @@ class WindingNumber(BatchedField):
             winding = TreeWinding.of(backend, mesh, accuracy, self.order)
         return _OnDevice(*placed(backend, mesh.centre, mesh.size), winding, rays)
 
+    @prepared_once
     def prepare(self, backend: Backend) -> WindingNumber:
         if self._device is not None and self._device.backend is backend:
             return self

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import choose_backend, to_numpy
+from harnack.backend.arrays import aligned
 from harnack.backend.extrema import fmax, fmin
 from harnack.fields.multipoles.moments import KEYS, KNOWN, Pairs, moved, of_dipole, regular
 from harnack.tree import NO_PRIMITIVE, Hierarchy
@@ -134,8 +135,10 @@ def _leaves(
     index, real, vector = backend.UInt32, backend.Float, backend.Array3f
     filled = tree.slots != NO_PRIMITIVE
     slots = index(np.where(filled, tree.slots, 0).astype(np.uint32).ravel())
-    first = dr.arange(index, len(filled)) * dr.opaque(index, tree.leaf_size)
-    end = first + index(filled.sum(axis=1).astype(np.uint32))
+    # An index that Dr.Jit cannot see through: what NumPy may have put unaligned is gathered.
+    leaf = dr.arange(index, len(filled)) ^ dr.opaque(index, 0)
+    first = leaf * dr.opaque(index, tree.leaf_size)
+    end = first + dr.gather(index, index(filled.sum(axis=1).astype(np.uint32)), leaf)
 
     def visit(body: Callable[..., tuple[Any, ...]], state: tuple[Any, ...]) -> tuple[Any, ...]:
         def step(slot: Any, *state: Any) -> tuple[Any, ...]:
@@ -221,7 +224,7 @@ def _parents(
     given: Pairs = dict.fromkeys(KEYS, (0.0, 0.0))
     for (l, m, part), values in zip(_PARTS, parts, strict=True):
         given[l, m] = (given[l, m][0], values) if part else (values, 0.0)
-    found = _flat(moved(given, *(backend.Float(one.copy()) for one in shift.T)))
+    found = _flat(moved(given, *(aligned(backend, one) for one in shift.T)))
     dr.eval(*found)
     first = arity * dr.arange(backend.UInt32, count)
     sums = [sum(dr.gather(backend.Float, one, first + k) for k in range(arity)) for one in found]

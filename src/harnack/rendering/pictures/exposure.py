@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import to_numpy
-from harnack.rendering.integrator import PathTracer
-from harnack.rendering.pixels import bands, film_places
+from harnack.rendering.mitsuba.integrator import PathTracer
+from harnack.rendering.pictures.pixels import bands, film_places
 
 # Paths of one band: about a second or two on a CPU, and Ctrl-C works between bands.
 _PATHS_A_BAND = 2**18

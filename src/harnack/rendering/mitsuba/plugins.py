@@ -24,8 +24,8 @@ from harnack.choices import did_you_mean
 from harnack.fields import Gyroid, SchwarzD, SchwarzP, SolidAngle, SphericalHarmonic
 from harnack.files import read_loops
 from harnack.geometry import Ball, Box, Intersection
-from harnack.rendering import carrier, integrator
-from harnack.rendering.variant import load_mitsuba
+from harnack.rendering.mitsuba import carrier, integrator
+from harnack.rendering.mitsuba.variant import load_mitsuba
 from harnack.tracer import LevelSet, level_set
 
 if TYPE_CHECKING:

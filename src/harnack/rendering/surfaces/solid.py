@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import drjit as dr
 
-from harnack.rendering.encounter import CLEARANCE, Encounter, facing, meet_surface
+from harnack.rendering.surfaces.encounter import CLEARANCE, Encounter, facing, meet_surface
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3

@@ -14,15 +14,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harnack.geometry.convex_volume import FloatArray
-from harnack.rendering.carrier import shape
-from harnack.rendering.framing import visible_points
-from harnack.rendering.lighting import ground, lights
-from harnack.rendering.placement import Placement
-from harnack.rendering.variant import mitsuba_backend
+from harnack.rendering.mitsuba.carrier import shape
+from harnack.rendering.mitsuba.variant import mitsuba_backend
+from harnack.rendering.studio.lighting import ground, lights
+from harnack.rendering.surfaces.framing import visible_points
+from harnack.rendering.surfaces.placement import Placement
 from harnack.tracer import LevelSet, Tolerance
 
 if TYPE_CHECKING:
-    from harnack.rendering.materials import Material
+    from harnack.rendering.studio.materials import Material
 
 
 @dataclass(frozen=True)

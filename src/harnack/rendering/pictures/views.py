@@ -14,11 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import to_numpy
-from harnack.rendering.colormap import viridis
-from harnack.rendering.images import as_bytes
-from harnack.rendering.integrator import LOST_COLOUR
-from harnack.rendering.pixels import bands, film_places
-from harnack.rendering.world import World
+from harnack.rendering.mitsuba.integrator import LOST_COLOUR
+from harnack.rendering.mitsuba.world import World
+from harnack.rendering.pictures.colormap import viridis
+from harnack.rendering.pictures.images import as_bytes
+from harnack.rendering.pictures.pixels import bands, film_places, in_tiles, pixels_of_band
 from harnack.tracer import Status
 
 FloatArray = npt.NDArray[np.floating[Any]]
@@ -54,22 +54,26 @@ def look(mi: Any, scene: Any, sensor: Any, unit: float = 1.0) -> View:
     """What a sensor sees first. unit: of depths, in lengths of the scene."""
     width, height = (int(n) for n in sensor.film().crop_size())
     world = World.of(mi, scene)
+    order = in_tiles((width, height))
     parts = [
-        _look_at_band(mi, world, sensor, start, stop)
+        _look_at(mi, world, sensor, pixels_of_band(mi, mi.UInt32(order), start, stop))
         for start, stop in bands(width * height, _RAYS_A_BAND)
     ]
-    depth, normal, evaluations, status = (
-        np.concatenate(column).reshape(height, width, *column[0].shape[1:])
-        for column in zip(*parts, strict=True)
-    )
+
+    def by_rows(column: tuple[Any, ...]) -> Any:
+        image = np.empty((height, width, *column[0].shape[1:]), column[0].dtype)
+        image.reshape(height * width, *column[0].shape[1:])[order] = np.concatenate(column)
+        return image
+
+    depth, normal, evaluations, status = (by_rows(one) for one in zip(*parts, strict=True))
     return View(depth / unit, normal, evaluations, status)
 
 
-def _look_at_band(mi: Any, world: World, sensor: Any, start: int, stop: int) -> tuple[Any, ...]:
-    """Depth, normal, evaluations and status of pixels `start` to `stop`, counted by rows."""
-    size = tuple(int(n) for n in sensor.film().crop_size())
-    index = dr.arange(mi.UInt32, stop - start) + dr.opaque(mi.UInt32, start)
-    place = film_places(mi, index, mi.Vector2f(0.5), (size[0], size[1]))
+def _look_at(mi: Any, world: World, sensor: Any, pixel: Any) -> tuple[Any, ...]:
+    """Depth, normal, evaluations and status of pixels, counted by rows."""
+    width, height = (int(n) for n in sensor.film().crop_size())
+    count = dr.width(pixel)
+    place = film_places(mi, pixel, mi.Vector2f(0.5), (width, height))
     ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, place, mi.Point2f(0.5))
     none = dr.zeros(mi.SurfaceInteraction3f)
     _, first = world.intersect(mi.Ray3f(ray), none, mi.Bool(True))
@@ -77,7 +81,7 @@ def _look_at_band(mi: Any, world: World, sensor: Any, start: int, stop: int) -> 
 
     def numbers(values: Any) -> Any:
         flat = to_numpy(values)
-        return np.broadcast_to(flat, (stop - start, *flat.shape[1:]))
+        return np.broadcast_to(flat, (count, *flat.shape[1:]))
 
     met, lost = numbers(first.met), numbers(first.lost)
     status = np.where(met, int(Status.HIT), int(Status.MISS))

@@ -8,7 +8,7 @@ import drjit as dr
 
 if TYPE_CHECKING:
     from harnack.backend import Real, Vec3
-    from harnack.rendering.encounter import Encounter
+    from harnack.rendering.surfaces.encounter import Encounter
 
 
 def surface_interaction(mi: Any, met: Encounter, ray: Any, shape: Any) -> Any:

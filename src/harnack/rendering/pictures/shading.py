@@ -65,7 +65,7 @@ class Light:
         of the hemisphere over the normal that nothing near hides, and reached: the part of the
         key light that is not in shadow, in [0, 1].
         """
-        key, up = _like(normal, self.key), _like(normal, self.up)
+        key, up = _parameter(normal, self.key), _parameter(normal, self.up)
         wrapped = dr.clip((dr.dot(normal, key) + _WRAP) / (1 + _WRAP), 0, 1)
         shown = (1 - _KEY_HIDDEN * (1 - visible)) * reached
         share = 0.5 + 0.5 * dr.dot(normal, up)
@@ -100,6 +100,13 @@ def of_mended(colour: Any, mended: Any) -> Any:
     """The colour, tinted where a level set spans what a mesh leaves open."""
     tint = dr.select(colour[0] > 1.6 * colour[2], _like(colour, _TEAL), _like(colour, _AMBER))
     return dr.select(mended, dr.lerp(colour, tint, _MENDED), colour)
+
+
+def _parameter(array: Any, numbers: Sequence[float]) -> Any:
+    """Numbers as a vector of the kind of another, which no kernel is compiled anew for."""
+    vector = _like(array, numbers)
+    dr.make_opaque(vector)
+    return vector
 
 
 def _like(array: Any, numbers: Sequence[float]) -> Any:

@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.geometry.convex_volume import FloatArray
-from harnack.rendering.encounter import Encounter, meet_surface
-from harnack.rendering.solid import Solid
+from harnack.rendering.surfaces.encounter import Encounter, meet_surface
+from harnack.rendering.surfaces.solid import Solid
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3

@@ -16,14 +16,20 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import to_numpy
-from harnack.rendering.exposure import as_rgb, mean_of_blocks
-from harnack.rendering.floor import Floor
-from harnack.rendering.images import tone_mapped
-from harnack.rendering.integrator import LOST_COLOUR
-from harnack.rendering.occlusion import visible_sky
-from harnack.rendering.pixels import bands, film_places, grid_offsets
-from harnack.rendering.shading import Light, of_mended, of_side, reflectance
-from harnack.rendering.world import World
+from harnack.rendering.mitsuba.integrator import LOST_COLOUR
+from harnack.rendering.mitsuba.world import World
+from harnack.rendering.pictures.exposure import as_rgb, mean_of_blocks
+from harnack.rendering.pictures.floor import Floor
+from harnack.rendering.pictures.images import tone_mapped
+from harnack.rendering.pictures.occlusion import visible_sky
+from harnack.rendering.pictures.pixels import (
+    bands,
+    film_places,
+    grid_offsets,
+    in_tiles,
+    pixels_of_band,
+)
+from harnack.rendering.pictures.shading import Light, of_mended, of_side, reflectance
 
 # Rays of one band.
 _RAYS_A_BAND = 2**17
@@ -46,6 +52,13 @@ class _Seen:
     glossy: Any
     met: Any
     lost: Any
+
+    @classmethod
+    def nothing(cls, mi: Any, count: int) -> _Seen:
+        """Room for as many pixels, to scatter to."""
+        vectors, colours, masks = (mi.Vector3f,) * 3, (mi.Color3f,) * 2, (mi.Bool,) * 3
+        kinds = (*vectors, mi.Float, *colours, *masks)
+        return cls(*(dr.zeros(kind, count) for kind in kinds))
 
 
 def shaded(
@@ -73,20 +86,20 @@ def shaded(
         )
     painter = _Painter(mi, World.of(mi, scene), sensor, on_floor=on_floor)
     count = painter.size[0] * painter.size[1]
-    parts: list[_Seen] = []
+    order = in_tiles(painter.size)
+    seen = _Seen.nothing(mi, count)
     for start, stop in bands(count, _RAYS_A_BAND):
-        pixel = dr.arange(mi.UInt32, stop - start) + dr.opaque(mi.UInt32, start)
-        seen = painter.look(pixel, mi.Vector2f(0.5))
+        pixel = pixels_of_band(mi, mi.UInt32(order), start, stop)
+        part = painter.look(pixel, mi.Vector2f(0.5))
+        dr.scatter(seen, part, pixel)
         dr.eval(seen)
         dr.sync_thread()
-        parts.append(seen)
         advance(_FIRST * (stop - start) / count)
-    seen = _joined(parts)
     sky = visible_sky(mi, seen.position, seen.normal, seen.width, painter.size)
     dr.eval(sky)
     image = to_numpy(painter.paint(seen, sky)).reshape(*painter.size[::-1], 3)
     lost = int(dr.count(seen.lost)[0])
-    edges = np.flatnonzero(_edges(image)) if spp > 1 else np.empty(0, dtype=np.int64)
+    edges = order[_edges(image).ravel()[order]] if spp > 1 else order[:0]
     offsets = grid_offsets(spp)
     for start, stop in bands(len(edges), max(1, _RAYS_A_BAND // len(offsets))):
         chosen = edges[start:stop]
@@ -186,22 +199,6 @@ class _Painter:
             nearest = dr.select(nearer, away, nearest)
             found = dr.select(nearer, dr.gather(mi.Float, sky, other), found)
         return found
-
-
-def _joined(parts: list[_Seen]) -> _Seen:
-    """Bands of what was seen as one."""
-    if len(parts) == 1:
-        return parts[0]
-    names = list(vars(parts[0]))
-    return _Seen(*(_concatenated([getattr(part, name) for part in parts]) for name in names))
-
-
-def _concatenated(arrays: list[Any]) -> Any:
-    if dr.depth_v(arrays[0]) == 1:
-        return dr.concat(arrays)
-    return type(arrays[0])(
-        *(dr.concat([array[k] for array in arrays]) for k in range(len(arrays[0])))
-    )
 
 
 def _edges(image: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:

@@ -10,9 +10,9 @@ from typing import Any
 import drjit as dr
 
 from harnack.backend import Mask, Real  # needed at run time: Dr.Jit reads annotations of _Path
-from harnack.rendering.interaction import connecting_ray, leaving_ray
-from harnack.rendering.variant import load_mitsuba
-from harnack.rendering.world import World
+from harnack.rendering.mitsuba.interaction import connecting_ray, leaving_ray
+from harnack.rendering.mitsuba.variant import load_mitsuba
+from harnack.rendering.mitsuba.world import World
 
 PLUGIN = "harnack_path"
 # What a ray that ran out of steps is drawn in: nothing in nature is this colour.
@@ -75,6 +75,10 @@ class PathTracer:
         self.rr_depth = rr_depth
         self.hide_emitters = hide_emitters
         self.clamp = clamp
+        # Kernel parameters: other limits compile nothing.
+        self._deepest = dr.opaque(mi.UInt32, self.max_depth)
+        self._first_gamble = dr.opaque(mi.UInt32, rr_depth)
+        self._brightest = dr.opaque(mi.Float, clamp)
         self.lost_colour = mi.load_dict(
             {"type": "srgb", "color": list(LOST_COLOUR)}, parallel=False
         )
@@ -120,7 +124,7 @@ class PathTracer:
         radiance = path.radiance + self._emitted(world.scene, path, si, path.active & ~lost)
         shown = path.throughput * mi.Spectrum(self.lost_colour.eval(si, lost))
         radiance += dr.select(path.active & lost, shown, 0)
-        active = path.active & si.is_valid() & (path.depth + 1 < self.max_depth)
+        active = path.active & si.is_valid() & (path.depth + 1 < self._deepest)
         bsdf = si.bsdf()
         radiance += self._lit(world, path, si, clearance, bsdf, sampler, active)
 
@@ -134,7 +138,7 @@ class PathTracer:
         active &= brightest > 0
         # Russian roulette, without the factor eta^-2 that radiance takes on in glass.
         keep = dr.minimum(brightest * eta * eta, 0.95)
-        gamble = path.depth + 1 >= self.rr_depth
+        gamble = path.depth + 1 >= self._first_gamble
         active &= ~gamble | (sampler.next_1d(active) < keep)
         throughput = dr.select(gamble, throughput / keep, throughput)
         return _Path(
@@ -168,7 +172,7 @@ class PathTracer:
         """Light, dimmed to at most `clamp` in every channel where it is indirect."""
         if self.clamp == math.inf:
             return light
-        excess = dr.max(light) / self.clamp
+        excess = dr.max(light) / self._brightest
         return dr.select(indirect & (excess > 1), light / excess, light)
 
     def _lit(

@@ -10,10 +10,12 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import to_numpy
+from harnack.backend.arrays import aligned
 from harnack.geometry.convex_volume import FloatArray
-from harnack.rendering.lighting import FLOOR
-from harnack.rendering.shading import Light
-from harnack.rendering.world import World
+from harnack.rendering.mitsuba.variant import mitsuba_backend
+from harnack.rendering.mitsuba.world import World
+from harnack.rendering.pictures.shading import Light
+from harnack.rendering.studio.lighting import FLOOR
 
 # Cells a side of a square of half this side, which holds what stands on the stage and its shadow.
 _CELLS = 64
@@ -42,8 +44,10 @@ class Floor:
         cell = (np.arange(_CELLS) + 0.5) / _CELLS * 2 * _REACH - _REACH
         y, x = np.meshgrid(cell, cell, indexing="ij")
         seen = [_part_seen(world, x, y, to) for to in (_to_key(light.key), _to_sky())]
-        image = np.stack([_blurred(part) for part in seen], axis=-1).astype(np.float32)
-        return cls(mi, mi.Texture2f(mi.TensorXf(image), wrap_mode=dr.WrapMode.Clamp))
+        image = np.stack([_blurred(part) for part in seen], axis=-1)
+        numbers = mi.Float(aligned(mitsuba_backend(mi), image.ravel()))
+        tensor = mi.TensorXf(numbers, image.shape)
+        return cls(mi, mi.Texture2f(tensor, wrap_mode=dr.WrapMode.Clamp))
 
     def at(self, position: Any) -> tuple[Any, Any]:
         """The parts of key light and sky that reach points of the floor; 1 for other points."""

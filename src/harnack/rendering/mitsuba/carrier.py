@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from harnack.rendering.extent import box_of
-from harnack.rendering.placement import PlacedSurface, Placement
-from harnack.rendering.scene_files import load_dictionary
-from harnack.rendering.variant import load_mitsuba, mitsuba_backend
+from harnack.rendering.mitsuba.scene_files import load_dictionary
+from harnack.rendering.mitsuba.variant import load_mitsuba, mitsuba_backend
+from harnack.rendering.surfaces.extent import box_of
+from harnack.rendering.surfaces.placement import PlacedSurface, Placement
 from harnack.tracer import LevelSet, level_set
 
 if TYPE_CHECKING:
@@ -54,7 +54,9 @@ def shape(
     Raises:
         ValueError: the surface has no bounds and no `clip`, or `to_world` is no similarity.
     """
-    from harnack.rendering.plugins import register  # not above: plugins are made of carriers
+    from harnack.rendering.mitsuba.plugins import (
+        register,  # not above: plugins are made of carriers
+    )
 
     mi = register()
     if isinstance(surface, LevelSet):

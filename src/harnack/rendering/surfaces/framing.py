@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from harnack.backend import to_float, to_numpy, to_vector3
+from harnack.fields.kept import KeptWithFields
 from harnack.geometry.convex_volume import FloatArray
-from harnack.rendering.extent import box_of
-from harnack.rendering.placement import PlacedSurface, Placement
+from harnack.rendering.surfaces.extent import box_of
+from harnack.rendering.surfaces.placement import PlacedSurface, Placement
 from harnack.tracer import Tolerance
 
 if TYPE_CHECKING:
@@ -25,10 +26,14 @@ if TYPE_CHECKING:
 _GRID = 48
 # Squares of lengths, divided by tolerances, stay far from the ends of single precision.
 _SMALLEST, _LARGEST = 1e-15, 1e16
+_POINTS: KeptWithFields[FloatArray] = KeptWithFields()
 
 
 def visible_points(surface: LevelSet, backend: Backend) -> FloatArray:
     """Points (n, 3) of the surface, as seen from the six sides of the box it lies in.
+
+    Those of a field that is uploaded once are found once, as long as the settings are the same:
+    when only the camera moves, nothing is traced for it.
 
     Raises:
         ValueError: it has no bounds, or a size that single precision cannot draw; nothing is
@@ -41,6 +46,19 @@ def visible_points(surface: LevelSet, backend: Backend) -> FloatArray:
             f"computed in single precision, for sizes from {_SMALLEST:g} and coordinates up to "
             f"{_LARGEST:g}; choose units nearer to 1"
         )
+    prepared = surface.field.prepare(backend)
+
+    def found() -> FloatArray:
+        return _found(surface, backend, ends)
+
+    if prepared is surface.field:  # it may have changed in place
+        return found()
+    settings = (surface.numbers, surface.clip, surface.solid, surface.max_steps)
+    return _POINTS.get(prepared, (*settings, surface.bound, surface.overstep), found)
+
+
+def _found(surface: LevelSet, backend: Backend, ends: FloatArray) -> FloatArray:
+    """Points on a coarse grid, and on one as close as the surface fills."""
     points = _probe(surface, backend, *ends)
     if len(points) == 0:
         raise ValueError(
@@ -48,7 +66,6 @@ def visible_points(surface: LevelSet, backend: Backend) -> FloatArray:
             f"{_point(ends[0])} to {_point(ends[1])} meets it; "
             "try another level or clip"
         )
-    # Once more, as closely as the surface fills.
     margin = 0.6 * float((ends[1] - ends[0]).max()) / _GRID
     lower = np.maximum(points.min(axis=0) - margin, ends[0])
     upper = np.minimum(points.max(axis=0) + margin, ends[1])

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.files.writing import check_writable, write_atomically
-from harnack.rendering.exr import exr_bytes
+from harnack.rendering.pictures.exr import exr_bytes
 
 FloatImage = npt.NDArray[np.float32]
 

@@ -8,10 +8,10 @@ from typing import Any
 import drjit as dr
 
 from harnack.backend import Mask
-from harnack.rendering.carrier import is_carrier
-from harnack.rendering.encounter import Encounter
-from harnack.rendering.interaction import surface_interaction
-from harnack.rendering.variant import mitsuba_backend
+from harnack.rendering.mitsuba.carrier import is_carrier
+from harnack.rendering.mitsuba.interaction import surface_interaction
+from harnack.rendering.mitsuba.variant import mitsuba_backend
+from harnack.rendering.surfaces.encounter import Encounter
 
 
 @dataclass(frozen=True)

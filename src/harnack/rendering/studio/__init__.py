@@ -1,0 +1,1 @@
+"""A photo studio for surfaces: stage, camera, lights and materials."""

@@ -1,0 +1,93 @@
+"""Fields are uploaded once for each backend, and framed once for all cameras."""
+
+from __future__ import annotations
+
+import gc
+import weakref
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+
+import harnack as hk
+from harnack.backend import choose_backend, to_vector3
+from harnack.geometry.mesh_shapes import icosphere
+from harnack.rendering import Camera
+
+VERTICES, FACES = icosphere(1)
+FIELDS: dict[str, Callable[[], hk.Field]] = {
+    "curve": lambda: hk.SolidAngle([[1, 0, 0], [0, 1, 0], [-1, 0, 0.3], [0, -1, 0]]),
+    "mesh": lambda: hk.WindingNumber(VERTICES, FACES[5:]),
+    "tree": lambda: hk.WindingNumber(VERTICES, FACES[5:], method="tree"),
+    "cloud": lambda: hk.DipolePotential(VERTICES, VERTICES),
+    "screened": lambda: hk.ScreenedWindingNumber(VERTICES, VERTICES, length=1.0),
+}
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_a_field_is_uploaded_once_to_each_backend(name: str) -> None:
+    field = FIELDS[name]()
+    for backend in (choose_backend(), choose_backend("double")):
+        prepared = field.prepare(backend)
+        assert prepared is not field
+        assert prepared.prepare(backend) is prepared
+        assert field.prepare(backend) is prepared
+    assert field.prepare(choose_backend()) is not prepared
+
+
+def test_what_is_kept_goes_with_the_field() -> None:
+    for make in FIELDS.values():
+        field = make()
+        prepared = field.prepare(choose_backend())
+        hk.render(field, show="status", size=(8, 6), progress=False)
+        gone = weakref.ref(field), weakref.ref(prepared)
+        del field, prepared
+        gc.collect()
+        assert [one() for one in gone] == [None, None]
+
+
+def test_a_field_with_an_attribute_set_is_uploaded_again() -> None:
+    class Shifted(hk.SolidAngle):
+        shift = 0.0
+
+        def evaluate(self, p: Any) -> hk.Sample:
+            sample = super().evaluate(p)
+            return hk.Sample(sample.value + self.shift, sample.gradient, sample.known, sample.error)
+
+    field = Shifted([[1, 0, 0], [0, 1, 0], [-1, 0, 0.3], [0, -1, 0]])
+    rays = [[0.0, 0, 3]], [[0.0, 0.1, -1]]
+    before = hk.trace(field, *rays).t
+    field.shift = -0.1
+    assert 0.01 < abs(hk.trace(field, *rays).t - before) < 0.1
+
+
+def test_vertices_with_derivatives_are_uploaded_each_time() -> None:
+    backend = choose_backend()
+    corners = np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0.3], [0, -1, 0]])
+    field = hk.SolidAngle(to_vector3(backend, corners))
+    assert field.prepare(backend) is not field.prepare(backend)
+
+
+def test_a_picture_from_another_side_finds_the_surface_no_more() -> None:
+    def picture(field: hk.Field, **settings: Any) -> tuple[np.ndarray, int]:
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            image = hk.render(
+                field, show="depth", size=(16, 12), camera=Camera(azimuth=20), progress=False,
+                **settings,
+            )  # fmt: skip
+            return image, len(dr.kernel_history((dr.KernelType.JIT,)))
+
+    field = FIELDS["curve"]()
+    hk.render(field, show="depth", size=(16, 12), progress=False)
+    again, few = picture(field)
+    new, many = picture(FIELDS["curve"]())
+    np.testing.assert_array_equal(again, new)
+    assert few < 0.7 * many
+    # With other settings it is found anew.
+    ball = hk.Ball((0.5, 0, 0), 0.6)
+    np.testing.assert_array_equal(
+        picture(field, clip=ball)[0], picture(FIELDS["curve"](), clip=ball)[0]
+    )
