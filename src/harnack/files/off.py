@@ -35,11 +35,9 @@ def read_off(path: Path, data: bytes) -> Contents:
     numbers, counts = read_floats(rows, convert=_number_or_nan)
     begins = np.cumsum(counts) - counts
     sizes = _integers(rows, numbers[begins], np.arange(len(rows)), np.zeros_like(begins))
-    wrong = np.flatnonzero((sizes < 1) | (sizes >= counts))
-    if wrong.size:
-        raise rows.places[wrong[0]].error(
-            f"a face of '{sizes[wrong[0]]}' vertices does not fit on this line"
-        )
+    if (wrong := np.flatnonzero((sizes < 1) | (sizes >= counts))).size:
+        k = wrong[0]
+        raise rows.places[k].error(f"a face of '{sizes[k]}' vertices does not fit on this line")
     owners = np.repeat(np.arange(len(rows)), sizes)
     within = 1 + positions(sizes)
     corners = _integers(rows, numbers[begins[owners] + within], owners, within)

@@ -10,7 +10,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -74,22 +74,8 @@ class Header:
         return sum(min(section.count, size) for section in self.sections)
 
 
-class Values(Protocol):
-    """The numbers behind the header, by their positions."""
-
-    size: int
-
-    def at(self, where: IntArray, code: str) -> npt.NDArray[Any]:
-        """Those at these positions; anything at positions that lie outside."""
-        ...
-
-    def width(self, code: str) -> int:
-        """How many positions a number takes."""
-        ...
-
-
 class BinaryValues:
-    """Positions are bytes of the file."""
+    """The numbers of a file by their positions, which are bytes."""
 
     def __init__(self, data: bytes, byte_order: str) -> None:
         self.size = len(data)
@@ -97,17 +83,19 @@ class BinaryValues:
         self.byte_order = byte_order
 
     def at(self, where: IntArray, code: str) -> npt.NDArray[Any]:
+        """Those at these positions; anything at positions that lie outside."""
         kind = np.dtype(self.byte_order + code)
         last = self.size - kind.itemsize  # the header alone is longer than a number
         every = np.ndarray((last + 1,), kind, self.data, strides=(1,))
         return every[np.clip(where, 0, last)].astype(kind.newbyteorder("="))
 
     def width(self, code: str) -> int:
+        """How many positions a number takes."""
         return struct.calcsize("=" + code)
 
 
 class TextValues:
-    """Positions are words. counts: (n,), how many each row has."""
+    """The numbers of an element by their positions, which are words. counts: (n,) a row."""
 
     def __init__(self, rows: Lines) -> None:
         numbers, self.counts = read_floats(rows, convert=_any_number)
@@ -122,6 +110,9 @@ class TextValues:
 
     def width(self, code: str) -> int:
         return 1
+
+
+Values: TypeAlias = BinaryValues | TextValues
 
 
 def _any_number(word: bytes, place: Place) -> float:
