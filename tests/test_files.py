@@ -58,6 +58,11 @@ def test_obj_ways_to_write_a_square(save, text):
     assert same_cycle(loop, CORNERS)
 
 
+def test_obj_lines_that_continue_and_say_nothing(save):
+    text = "\\\n\\\n\n" + SQUARE + "f 1 2 3 4" + " \\\n" * 100_000 + "\nl 1 2 3 \\\n1"
+    assert [len(loop) for loop in read_loops(save("a.obj", text))] == [4, 3]
+
+
 def test_obj_of_several_loops(save):
     text = SQUARE + "v 0 0 1\nv 1 0 1\nv 0 1 1\n"
     path = save("two.obj", text + "f 1 2 3 4\nl 5 6 7 5\nl 1 2\nl 2 5\nl 5 1\n")

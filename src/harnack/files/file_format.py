@@ -95,6 +95,13 @@ class Contents:
     polylines: Polygons = NO_POLYGONS
 
 
+def positions(sizes: IntArray) -> IntArray:
+    """Positions within lists that stand one after the other: 0 to size - 1 for each of them."""
+    found = np.arange(int(sizes.sum()), dtype=np.int64)
+    found -= np.repeat(np.cumsum(sizes) - sizes, sizes)
+    return found
+
+
 def triangle_list(path: Path, corners: IntArray) -> Polygons:
     """Triangles (m, 3) as polygons."""
     sizes = np.full(len(corners), 3, dtype=np.int64)

@@ -30,53 +30,53 @@ def read_obj(path: Path, data: bytes) -> Contents:
     Raises:
         FileFormatError: a malformed statement, an index out of range.
     """
-    lines = _statements(content_lines(path, data))
-    found: dict[bytes, list[int]] = {b"v": [], b"vn": [], b"f": [], b"l": []}
-    for k, line in enumerate(lines.text):
+    lines = content_lines(path, data)
+    if b"\\" in data:
+        lines = _joined(lines)
+    found: dict[bytes, tuple[list[bytes], list[int]]]
+    found = {keyword: ([], []) for keyword in (b"v", b"vn", b"f", b"l")}
+    for number, line in zip(lines.places.numbers, lines.text, strict=True):
         keyword = line.split(None, 1)[0]
-        if keyword in found:
-            found[keyword].append(k)
+        if listed := found.get(keyword):
+            listed[0].append(line[len(keyword) :])
+            listed[1].append(number)
         elif not keyword.replace(b"_", b"").isalnum():
-            raise lines.places[k].error(f"{excerpt(keyword)} is no .obj statement")
-    rows = lines.chosen(found[b"v"])
-    vertices = read_table(rows, 3, skip=1, few="a vertex needs three coordinates, not {}")
-    faces = _polygons(lines.chosen(found[b"f"]), 3, rows)
-    polylines = _polygons(lines.chosen(found[b"l"]), 2, rows)
+            raise Place(path, f"line {number}").error(f"{excerpt(keyword)} is no .obj statement")
+    rows = {k: Lines(text, Places(path, "line", numbers)) for k, (text, numbers) in found.items()}
+    vertices = read_table(rows[b"v"], 3, few="a vertex needs three coordinates, not {}")
+    faces = _polygons(rows[b"f"], "'f' needs at least 3 vertices", 3, rows[b"v"])
+    polylines = _polygons(rows[b"l"], "'l' needs at least 2 vertices", 2, rows[b"v"])
     if differ_in_size(faces):
         check_element_count(Place(path), len(lines))
     normals = None
-    if not (len(faces) or len(polylines)) and 0 < len(found[b"vn"]) == len(vertices):
-        normals = read_table(lines.chosen(found[b"vn"]), 3, skip=1)
+    if not (len(faces) or len(polylines)) and 0 < len(rows[b"vn"]) == len(vertices):
+        normals = read_table(rows[b"vn"], 3)
     return Contents(path, vertices, normals, faces, polylines)
 
 
-def _statements(lines: Lines) -> Lines:
+def _joined(lines: Lines) -> Lines:
     """A backslash at the end of a line continues it on the next."""
-    if not any(line.endswith(b"\\") for line in lines.text):
-        return lines
-    text: list[bytes] = []
+    pieces: list[list[bytes]] = []
     numbers: list[int] = []
     continued = 0  # the number of the line that continues the last
     for line, number in zip(lines.text, lines.places.numbers, strict=True):
-        if number == continued:
-            text[-1] += b" " + line.removesuffix(b"\\")
-        else:
-            text.append(line.removesuffix(b"\\"))
+        if number != continued:
+            pieces.append([])
             numbers.append(number)
+        pieces[-1].append(line.removesuffix(b"\\"))
         continued = number + 1 if line.endswith(b"\\") else 0
-    return Lines(text, Places(lines.places.path, "line", numbers))
+    joined = [(b" ".join(piece).strip(), k) for piece, k in zip(pieces, numbers, strict=True)]
+    joined = [(line, k) for line, k in joined if line]
+    return Lines([x for x, _ in joined], Places(lines.places.path, "line", [k for _, k in joined]))
 
 
-def _polygons(lines: Lines, least: int, vertices: Lines) -> Polygons:
-    """Faces or polylines, of so many corners at least, counted from 0."""
+def _polygons(lines: Lines, few: str, least: int, vertices: Lines) -> Polygons:
+    """Faces or polylines, counted from 0. few: the error of one with fewer corners than `least`."""
     # Texture and normal indices stand behind slashes.
     text = [re.sub(rb"(?<=\S)/\S*", b"", line) if b"/" in line else line for line in lines.text]
-    corners = read_integers(Lines(text, lines.places), skip=1)
-    sizes = lines.counts() - 1
+    corners, sizes = read_integers(Lines(text, lines.places))
     if (short := np.flatnonzero(sizes < least)).size:
-        k = int(short[0])
-        keyword = excerpt(lines.text[k].split()[0])
-        raise lines.places[k].error(f"{keyword} needs at least {least} vertices")
+        raise lines.places[short[0]].error(few)
     listed = Polygons(corners, sizes, lines.places)
     if (zero := np.flatnonzero(corners == 0)).size:
         raise listed.place_of(zero[0]).error("vertices are counted from 1, there is no vertex 0")

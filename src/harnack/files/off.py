@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 
 import numpy as np
 
-from harnack.files.file_format import Contents, Place, Polygons, check_indices
-from harnack.files.text_tables import (
-    Lines,
-    as_integer,
-    content_lines,
-    excerpt,
-    read_integers,
-    read_table,
-)
+from harnack.files.file_format import Contents, Place, Polygons, check_indices, positions
+from harnack.files.text_tables import Lines, as_integer, content_lines, read_floats, read_table
+from harnack.geometry.convex_volume import FloatArray
+from harnack.geometry.meshes import IntArray
 
 
 def read_off(path: Path, data: bytes) -> Contents:
@@ -35,15 +31,35 @@ def read_off(path: Path, data: bytes) -> Contents:
         raise Place(path).error("it holds no vertices")
     vertices = read_table(lines[:count], 3)
     rows = lines[count : count + faces_count]
-    sizes = read_integers(rows, 0, 1)
-    wrong = np.flatnonzero((sizes < 1) | (sizes >= rows.counts()))
-    if wrong.size:
-        k = int(wrong[0])
-        word = excerpt(rows.text[k].split()[0])
-        raise rows.places[k].error(f"a face of {word} vertices does not fit on this line")
-    faces = Polygons(read_integers(rows, 1, sizes + 1), sizes, rows.places)
+    # Colors may follow the corners: they need be no integers, and not even numbers.
+    numbers, counts = read_floats(rows, convert=_number_or_nan)
+    begins = np.cumsum(counts) - counts
+    sizes = _integers(rows, numbers[begins], np.arange(len(rows)), np.zeros_like(begins))
+    if (wrong := np.flatnonzero((sizes < 1) | (sizes >= counts))).size:
+        k = wrong[0]
+        raise rows.places[k].error(f"a face of '{sizes[k]}' vertices does not fit on this line")
+    owners = np.repeat(np.arange(len(rows)), sizes)
+    within = 1 + positions(sizes)
+    corners = _integers(rows, numbers[begins[owners] + within], owners, within)
+    faces = Polygons(corners, sizes, rows.places)
     check_indices(faces, count)
     return Contents(path, vertices, None, faces)
+
+
+def _number_or_nan(word: bytes, _: Place) -> float:
+    try:
+        return float(word)
+    except ValueError:
+        return math.nan
+
+
+def _integers(rows: Lines, numbers: FloatArray, owners: IntArray, within: IntArray) -> IntArray:
+    """Numbers as integers. owners, within: which word of which row each is."""
+    wrong = np.flatnonzero(~((numbers == np.rint(numbers)) & (np.abs(numbers) < 2.0**53)))
+    if wrong.size:
+        k = int(owners[wrong[0]])
+        as_integer(rows.text[k].split()[int(within[wrong[0]])], rows.places[k])
+    return numbers.astype(np.int64)
 
 
 def _header(path: Path, lines: Lines) -> tuple[int, int, Lines]:

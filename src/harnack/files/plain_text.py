@@ -23,7 +23,7 @@ def read_xyz(path: Path, data: bytes) -> Contents:
     lines = content_lines(path, data)
     if not len(lines):
         raise Place(path).error("it holds no points: write one a line, x y z")
-    counts, numbers = lines.counts(), read_floats(lines)
+    numbers, counts = read_floats(lines)
     columns = int(counts[0])
     ragged = np.flatnonzero(counts != columns)
     if ragged.size:
@@ -55,7 +55,7 @@ def read_loops_text(path: Path, data: bytes) -> list[tuple[FloatArray, Place]]:
     lines = content_lines(path, data)
     if not len(lines):
         raise Place(path).error("there are no loops: write one a line, x y z repeated")
-    counts, numbers = lines.counts(), read_floats(lines)
+    numbers, counts = read_floats(lines)
     wrong = np.flatnonzero(counts % 3)
     if wrong.size:
         raise lines.places[wrong[0]].error(

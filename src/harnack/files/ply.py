@@ -10,7 +10,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +26,7 @@ from harnack.files.file_format import (
     check_finite,
     check_indices,
     differ_in_size,
+    positions,
 )
 from harnack.files.text_tables import Lines, content_lines, excerpt, read_floats
 from harnack.geometry.meshes import IntArray
@@ -73,43 +74,33 @@ class Header:
         return sum(min(section.count, size) for section in self.sections)
 
 
-class Values(Protocol):
-    """The numbers behind the header, by their positions."""
-
-    size: int
-
-    def at(self, where: IntArray, code: str) -> npt.NDArray[Any]:
-        """Those at these positions; anything at positions that lie outside."""
-        ...
-
-    def width(self, code: str) -> int:
-        """How many positions a number takes."""
-        ...
-
-
 class BinaryValues:
-    """Positions are bytes."""
+    """The numbers of a file by their positions, which are bytes."""
 
-    def __init__(self, body: bytes, byte_order: str) -> None:
-        self.size = len(body)
-        self.padded = body + bytes(8)
+    def __init__(self, data: bytes, byte_order: str) -> None:
+        self.size = len(data)
+        self.data = data
         self.byte_order = byte_order
 
     def at(self, where: IntArray, code: str) -> npt.NDArray[Any]:
+        """Those at these positions; anything at positions that lie outside."""
         kind = np.dtype(self.byte_order + code)
-        every = np.ndarray((self.size + 1,), kind, self.padded, strides=(1,))
-        return every[np.clip(where, 0, self.size)].astype(kind.newbyteorder("="))
+        last = self.size - kind.itemsize  # the header alone is longer than a number
+        every = np.ndarray((last + 1,), kind, self.data, strides=(1,))
+        return every[np.clip(where, 0, last)].astype(kind.newbyteorder("="))
 
     def width(self, code: str) -> int:
+        """How many positions a number takes."""
         return struct.calcsize("=" + code)
 
 
 class TextValues:
-    """Positions are words."""
+    """The numbers of an element by their positions, which are words. counts: (n,) a row."""
 
     def __init__(self, rows: Lines) -> None:
-        self._numbers = np.append(read_floats(rows, convert=_any_number), 0.0)
-        self.size = len(self._numbers) - 1
+        numbers, self.counts = read_floats(rows, convert=_any_number)
+        self._numbers = np.append(numbers, 0.0)
+        self.size = len(numbers)
 
     def at(self, where: IntArray, code: str) -> npt.NDArray[Any]:
         found = self._numbers[np.clip(where, 0, self.size)]
@@ -121,6 +112,9 @@ class TextValues:
         return 1
 
 
+Values: TypeAlias = BinaryValues | TextValues
+
+
 def _any_number(word: bytes, place: Place) -> float:
     try:
         return float(word)
@@ -130,10 +124,14 @@ def _any_number(word: bytes, place: Place) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Column:
-    """A property in all rows. begins: (n,), positions. sizes: (n,) if it is a list, else none."""
+    """A property in all rows.
+
+    begins: (n,), positions, and what to add to them. sizes: (n,) if it is a list, else none.
+    """
 
     code: str
     begins: IntArray
+    added: int
     sizes: IntArray | None
 
 
@@ -151,25 +149,27 @@ class Table:
 
     def numbers(self, name: str) -> npt.NDArray[Any]:
         """A column of single numbers."""
-        column = self._column(name, is_list=False)
-        return self.values.at(column.begins, column.code)
+        column = self._column(name)
+        if column.sizes is not None:
+            raise self._is_other_kind()
+        return self.values.at(column.begins + column.added, column.code)
 
     def lists(self, name: str) -> tuple[npt.NDArray[Any], IntArray]:
         """A column of lists: the numbers of all, one after the other, and how many each has."""
-        column = self._column(name, is_list=True)
-        sizes = column.begins[:0] if column.sizes is None else column.sizes
-        within = np.arange(int(sizes.sum()), dtype=np.int64)
-        within -= np.repeat(np.cumsum(sizes) - sizes, sizes)
-        where = np.repeat(column.begins, sizes) + within * self.values.width(column.code)
-        return self.values.at(where, column.code), sizes
+        column = self._column(name)
+        if column.sizes is None:
+            raise self._is_other_kind()
+        where = np.repeat(column.begins + column.added, column.sizes)
+        where += positions(column.sizes) * self.values.width(column.code)
+        return self.values.at(where, column.code), column.sizes
 
-    def _column(self, name: str, *, is_list: bool) -> Column:
+    def _column(self, name: str) -> Column:
         if name not in self.columns:
             raise self.places[0].error(f"this element needs a property {name!r}")
-        column = self.columns[name]
-        if (column.sizes is not None) != is_list:
-            raise self.places[0].error("a list where one number is expected, or the reverse")
-        return column
+        return self.columns[name]
+
+    def _is_other_kind(self) -> FileFormatError:
+        return self.places[0].error("a list where one number is expected, or the reverse")
 
 
 def read_ply(path: Path, data: bytes) -> Contents:
@@ -214,21 +214,23 @@ def _columns(
 ) -> tuple[dict[str, Column], IntArray]:
     """The columns of rows that begin at these positions, and where each row ends."""
     columns: dict[str, Column] = {}
-    at = begins
+    at, added = begins, 0
     for p in section.properties:
-        sizes = None
-        if p.length_code is not None:
-            lengths = values.at(at, p.length_code)
-            if lengths.dtype.kind == "f":
-                k = int(np.argmax(lengths != np.rint(lengths)))
-                raise places[k].error(f"the length of a list is no integer, but {lengths[k]}")
-            # What is impossible ends behind everything.
-            sizes = np.where(lengths < 0, values.size + 1, lengths).astype(np.int64)
-            sizes = np.minimum(sizes, values.size + 1)
-            at = at + values.width(p.length_code)
-        columns[p.name] = Column(p.code, at, sizes)
-        at = at + values.width(p.code) * (1 if sizes is None else sizes)
-    return columns, at
+        if p.length_code is None:
+            columns[p.name] = Column(p.code, at, added, None)
+            added += values.width(p.code)
+            continue
+        lengths = values.at(at + added, p.length_code)
+        if lengths.dtype.kind == "f":
+            k = int(np.argmax(lengths != np.rint(lengths)))
+            raise places[k].error(f"the length of a list is no integer, but {lengths[k]}")
+        # What is impossible ends behind everything.
+        sizes = np.where(lengths < 0, values.size + 1, lengths).astype(np.int64)
+        sizes = np.minimum(sizes, values.size + 1)
+        added += values.width(p.length_code)
+        columns[p.name] = Column(p.code, at, added, sizes)
+        at, added = at + added + values.width(p.code) * sizes, 0
+    return columns, at + added
 
 
 def _text_tables(path: Path, data: bytes, header: Header) -> dict[str, Table]:
@@ -241,7 +243,8 @@ def _text_tables(path: Path, data: bytes, header: Header) -> dict[str, Table]:
             continue
         places = Places(path, section.name, range(section.count))
         rows, lines = Lines(lines.text[: section.count], places), lines[section.count :]
-        counts, values = rows.counts(), TextValues(rows)
+        values = TextValues(rows)
+        counts = values.counts
         columns, ends = _columns(section, values, np.cumsum(counts) - counts, places)
         wrong = np.flatnonzero(ends != np.cumsum(counts))
         if wrong.size:
@@ -252,9 +255,9 @@ def _text_tables(path: Path, data: bytes, header: Header) -> dict[str, Table]:
 
 
 def _binary_tables(path: Path, data: bytes, header: Header) -> dict[str, Table]:
-    values = BinaryValues(data[header.size :], header.byte_order)
+    values = BinaryValues(data, header.byte_order)
     tables: dict[str, Table] = {}
-    begin = 0
+    begin = header.size
     for section in header.sections:
         least = sum(values.width(p.length_code or p.code) for p in section.properties)
         if section.count * least > values.size - begin:
@@ -288,13 +291,13 @@ def _row_ends(section: Section, values: BinaryValues, begin: int) -> Iterator[in
         if p.length_code is None:
             skipped += values.width(p.code)
         else:
-            length = struct.Struct((values.byte_order + p.length_code).encode())
+            length = struct.Struct(values.byte_order + p.length_code)
             lists.append((skipped, length, values.width(p.code)))
             skipped = 0
     at = begin
     for _ in range(section.count):
         for before, length, width in lists:
-            (count,) = length.unpack_from(values.padded, at + before)
+            (count,) = length.unpack_from(values.data, at + before)
             if count < 0:
                 raise struct.error
             at += before + length.size + count * width

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from harnack.files.file_format import Contents, Place, Places, check_finite, triangle_list
-from harnack.files.text_tables import content_lines, excerpt, read_table
+from harnack.files.text_tables import Lines, content_lines, excerpt, read_table
 from harnack.geometry.convex_volume import FloatArray
 from harnack.geometry.singular import weld_vertices
 
@@ -69,4 +69,5 @@ def _text(path: Path, data: bytes) -> FloatArray:
     facets = words.count(b"facet")
     if len(at) != 3 * facets:
         raise Place(path).error(f"{len(at):,} vertices in {facets:,} facets: each needs three")
-    return read_table(lines.chosen(at), 3, skip=1)
+    rows = [lines.text[k][len("vertex") :] for k in at]
+    return read_table(Lines(rows, Places(path, "line", [lines.places.numbers[k] for k in at])), 3)

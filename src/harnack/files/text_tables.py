@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import chain, repeat
+from itertools import chain
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
 from harnack.files.file_format import Place, Places
 from harnack.geometry.convex_volume import FloatArray
@@ -27,6 +30,8 @@ __all__ = [
 
 MAX_LINE = 1 << 24
 
+_Number = TypeVar("_Number", int, float)
+
 
 @dataclass(frozen=True, eq=False)
 class Lines:
@@ -41,22 +46,6 @@ class Lines:
     def __getitem__(self, part: slice) -> Lines:
         places = self.places
         return Lines(self.text[part], Places(places.path, places.noun, places.numbers[part]))
-
-    def chosen(self, which: list[int]) -> Lines:
-        """Some of the lines."""
-        places = self.places
-        numbers = [places.numbers[k] for k in which]
-        return Lines([self.text[k] for k in which], Places(places.path, places.noun, numbers))
-
-    def counts(self) -> IntArray:
-        """How many words each line has."""
-        return np.fromiter((len(line.split()) for line in self.text), np.int64)
-
-    def words(self, skip: int = 0, stop: int | IntArray | None = None) -> Iterator[list[bytes]]:
-        """Words number `skip` and following of each line. stop: the first not to be given."""
-        stops = stop.tolist() if isinstance(stop, np.ndarray) else repeat(stop)
-        for line, end in zip(self.text, stops, strict=False):
-            yield line.split(None, -1 if end is None else end)[skip:end]
 
 
 def content_lines(
@@ -79,10 +68,13 @@ def content_lines(
             f"a line of {longest:,} bytes is too long: at most {MAX_LINE:,} are read"
         )
     if comment is not None and comment in data:
-        lines = [line.split(comment, 1)[0] for line in lines]
+        lines = [line.split(comment, 1)[0] if comment in line else line for line in lines]
     lines = [line.strip() for line in lines]
-    numbers = [number for number, line in enumerate(lines, first) if line]
-    return Lines([line for line in lines if line], Places(path, "line", numbers))
+    numbers: Sequence[int] = range(first, first + len(lines))
+    if not all(lines):
+        numbers = [number for number, line in zip(numbers, lines, strict=True) if line]
+        lines = [line for line in lines if line]
+    return Lines(lines, Places(path, "line", numbers))
 
 
 def as_number(word: bytes, place: Place) -> float:
@@ -131,75 +123,96 @@ def excerpt(word: bytes) -> str:
     return repr(shown + ("..." if len(word) > 32 else ""))
 
 
-def read_integers(lines: Lines, skip: int = 0, stop: int | IntArray | None = None) -> IntArray:
-    """The integers that `Lines.words` gives, those of all lines one after the other.
+def read_table(
+    lines: Lines, columns: int, *, few: str = "{} numbers are too few: {} are expected"
+) -> FloatArray:
+    """The first numbers of each line, all finite: (n, columns). Further words are passed over.
+
+    few: the error of a line with fewer.
 
     Raises:
-        FileFormatError: naming the line of the first that is none.
+        FileFormatError: naming the first line with too few, or with what is no finite number.
     """
-    try:
-        return np.fromiter(map(int, chain.from_iterable(lines.words(skip, stop))), np.int64)
-    except (ValueError, OverflowError):
-        return np.fromiter(_converted(lines, skip, stop, as_integer), np.int64)
+    found = _at_once(lines, range(columns))
+    if found is not None and np.isfinite(found).all():
+        return found
+    numbers: list[float] = []
+    for k, line in enumerate(lines.text):
+        words, place = line.split()[:columns], lines.places[k]
+        if len(words) < columns:
+            raise place.error(few.format(len(words), columns))
+        numbers += [as_number(word, place) for word in words]
+    return np.array(numbers, dtype=np.float64).reshape(-1, columns)
 
 
 def read_floats(
     lines: Lines, *, convert: Callable[[bytes, Place], float] = as_number
-) -> FloatArray:
-    """The numbers of all lines, one after the other.
+) -> tuple[FloatArray, IntArray]:
+    """The numbers of all lines, one after the other, and how many each line has: (n,).
 
     convert: makes numbers of the words where not all are finite numbers, or raises.
 
     Raises:
         FileFormatError: what `convert` raises.
     """
-    found = _floats(lines, 0, None)
-    if found is None:
-        return np.fromiter(_converted(lines, 0, None, convert), np.float64)
-    return found
+    found = _at_once(lines)
+    if found is not None and np.isfinite(found).all():
+        return found.ravel(), _equal(found)
+    return _one_by_one(lines, float, convert)
 
 
-def read_table(
-    lines: Lines,
-    columns: int,
-    *,
-    skip: int = 0,
-    few: str = "{} numbers are too few: {} are expected",
-) -> FloatArray:
-    """A table (n, columns) of finite numbers, one row a line; further words are passed over.
-
-    skip: how many words come before the first number. few: the error of a line with fewer numbers.
+def read_integers(lines: Lines) -> tuple[IntArray, IntArray]:
+    """The integers of all lines, one after the other, and how many each line has: (n,).
 
     Raises:
-        FileFormatError: naming the first line with too few, or with what is no finite number.
+        FileFormatError: naming the line of the first word that is none.
     """
-    found = _floats(lines, skip, skip + columns)
-    if found is None or len(found) != columns * len(lines):
-        for k, words in enumerate(lines.words(skip, skip + columns)):
-            if len(words) < columns:
-                raise lines.places[k].error(few.format(len(words), columns))
-            for word in words:
-                as_number(word, lines.places[k])
-        raise AssertionError("what cannot be read has an error")
-    return found.reshape(-1, columns)
+    found = _at_once(lines)
+    if found is not None and (np.abs(found) < 2.0**53).all() and (found == np.rint(found)).all():
+        return found.astype(np.int64).ravel(), _equal(found)
+    return _one_by_one(lines, int, as_integer)
 
 
-def _floats(lines: Lines, skip: int, stop: int | None) -> FloatArray | None:
-    """The numbers that `Lines.words` gives; None if not all are finite numbers."""
-    try:
-        found = np.fromiter(map(float, chain.from_iterable(lines.words(skip, stop))), np.float64)
-    except ValueError:
+def _at_once(lines: Lines, columns: Sequence[int] | None = None) -> FloatArray | None:
+    """A table of numbers by NumPy, or None where it does not succeed.
+
+    columns: which to read. None: all, if there are as many in each line.
+    """
+    if not len(lines):
         return None
-    return found if np.isfinite(found).all() else None
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            table = np.loadtxt(
+                lines.text, np.float64, comments=None, usecols=columns, ndmin=2, encoding="latin1"
+            )
+    except (ValueError, UserWarning):
+        return None
+    return table if len(table) == len(lines) else None  # it passes over blank lines
 
 
-def _converted(
-    lines: Lines,
-    skip: int,
-    stop: int | IntArray | None,
-    convert: Callable[[bytes, Place], float],
-) -> Iterator[float]:
-    for k, words in enumerate(lines.words(skip, stop)):
-        place = lines.places[k]
-        for word in words:
-            yield convert(word, place)
+def _equal(table: FloatArray) -> IntArray:
+    """How many numbers each row of a table has."""
+    return np.full(len(table), table.shape[1], dtype=np.int64)
+
+
+def _one_by_one(
+    lines: Lines, kind: type[_Number], convert: Callable[[bytes, Place], _Number]
+) -> tuple[npt.NDArray[Any], IntArray]:
+    """The words of lines with different numbers of them, or with what is no number."""
+
+    def converted() -> Iterator[_Number]:
+        for k, line in enumerate(lines.text):
+            place = lines.places[k]
+            for word in line.split():
+                yield convert(word, place)
+
+    counts = np.fromiter((len(line.split()) for line in lines.text), np.int64)
+    try:
+        words = chain.from_iterable(map(bytes.split, lines.text))
+        found = np.fromiter(map(kind, words), np.dtype(kind))
+        if np.isfinite(found).all():
+            return found, counts
+    except (ValueError, OverflowError):
+        pass
+    return np.fromiter(converted(), np.dtype(kind)), counts

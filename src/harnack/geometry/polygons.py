@@ -13,7 +13,7 @@ __all__ = ["triangulate"]
 # Corners squared, and so many more a polygon, summed over those of which ears are cut: some ten
 # seconds of work at worst.
 _MOST_WORK = 1_000_000_000
-_WORK_A_POLYGON = 500
+_WORK_A_POLYGON = 1000
 # Twice the area of a triangle, in a polygon of size about 1, up to which it counts as flat.
 _FLAT = 1e-12
 # How much an edge with corners in its middle is bent: depth over the square of its length.
@@ -34,6 +34,8 @@ def triangulate(vertices: FloatArray, corners: IntArray, sizes: IntArray) -> Int
     Raises:
         MeshError: so many polygons with dents and so many corners that it would take long.
     """
+    if (sizes == 3).all():
+        return corners.reshape(-1, 3)
     begins = np.cumsum(sizes) - sizes
     found = [np.zeros((0, 3), dtype=np.int64)]
     owners = [np.zeros(0, dtype=np.int64)]
@@ -46,7 +48,8 @@ def triangulate(vertices: FloatArray, corners: IntArray, sizes: IntArray) -> Int
             bent = _has_dents(vertices, polygons)
             # The fan around the second corner is that around the first of the polygon turned on.
             polygons[bent] = np.roll(polygons[bent], -1, axis=1)
-            bent[bent] = _has_dents(vertices, polygons[bent])
+            # A quadrilateral can be cut in no other way.
+            bent[bent] = k > 4 and _has_dents(vertices, polygons[bent])
         work += int(bent.sum()) * (k * k + _WORK_A_POLYGON)
         if work > _MOST_WORK:
             raise MeshError(
@@ -81,13 +84,17 @@ def _fans(polygons: IntArray) -> IntArray:
 
 
 def _has_dents(vertices: FloatArray, polygons: IntArray) -> BoolArray:
-    """Whether some triangle of the fan around the first corner is turned over or flat: (m,)."""
+    """Whether some triangle of the fan around the first corner is turned over or flat: (m,).
+
+    Polygons without any area count as without dents.
+    """
     p = vertices[polygons]
     spokes = p[:, 1:] - p[:, :1]
     areas = np.cross(spokes[:, :-1], spokes[:, 1:])
     normal = areas.sum(axis=1)
-    least = _FLAT * np.einsum("mj,mj->m", normal, normal)
-    return (np.einsum("mkj,mj->mk", areas, normal) <= least[:, None]).any(axis=1)
+    square = np.einsum("mj,mj->m", normal, normal)
+    is_turned = np.einsum("mkj,mj->mk", areas, normal) <= _FLAT * square[:, None]
+    return is_turned.any(axis=1) & (square > 0.0)
 
 
 def _shadows(vertices: FloatArray, polygons: IntArray) -> FloatArray:
