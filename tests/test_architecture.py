@@ -36,6 +36,7 @@ FIELD_ROOMS = (
     "symmetric",
     "unit_coordinates",
     "batch",
+    "sums",
     "edges",
     "multipoles",
     "curves",

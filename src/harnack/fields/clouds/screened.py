@@ -18,7 +18,7 @@ from harnack.fields.batch import BatchedField, Values
 from harnack.fields.clouds.screened_kernel import ScreenedSums, mean_at_dipoles, promises
 from harnack.fields.clouds.screened_tree import PlainSum, TreeSum, dipole_rows
 from harnack.fields.field import AtDetail, Curvature, Field, Sample
-from harnack.fields.multipoles.nearby import SECOND_ROUNDINGS, SLOPE_ROUNDINGS
+from harnack.fields.sums import SECOND_ROUNDINGS, SLOPE_ROUNDINGS
 from harnack.fields.unit_coordinates import UnitCoordinates, epsilon_at, placed, single
 from harnack.geometry import Box
 from harnack.geometry.clouds import estimate_areas, validate_cloud

@@ -16,12 +16,11 @@ from harnack.choices import did_you_mean
 from harnack.fields.curves.edge_angles import differentiable_angle
 from harnack.fields.curves.edge_extent import tight_extent
 from harnack.fields.curves.edge_nearest import closest_on_segments, segments
-from harnack.fields.edges.edge_hessian import hessian_over_edges
 from harnack.fields.edges.edge_passing import Line, known_along, rates_along
 from harnack.fields.edges.edge_records import LoopEdges
-from harnack.fields.edges.edge_sums import EdgeSums, sum_over_edges
+from harnack.fields.edges.edge_sums import EdgeSums, hessian_over_edges, sum_over_edges
 from harnack.fields.field import Field, HarmonicBall, LineLipschitz, Sample
-from harnack.fields.multipoles.nearby import SECOND_ROUNDINGS, SLOPE_ROUNDINGS
+from harnack.fields.sums import SECOND_ROUNDINGS, SLOPE_ROUNDINGS
 from harnack.fields.unit_coordinates import UnitCoordinates, epsilon_at, placed
 from harnack.geometry import ConvexHull, is_convex_position, total_length, validate_loops
 from harnack.geometry.net_loops import net_loops, uncancelled_edges
@@ -221,7 +220,7 @@ class SolidAngle(Field):
         return x * share, y * share, z * share
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """Rounding of positions, as for sums over boundary edges (`far_clusters.Errors`), with
+        """Rounding of positions, as for sums over boundary edges (`sums.SLOPE_ROUNDINGS`), with
         distances less by what it may have done to them. Without bound at the curve."""
         del sample
         if self._device is None:
