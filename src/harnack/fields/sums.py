@@ -48,6 +48,17 @@ def remainder_factor(q: float) -> float:
     return (3 - 2 * q) / (1 - q) ** 2
 
 
+def rounding_of_sum(
+    backend: Backend, terms: int, own: float = 16, growth: float = 1.0, size: float = 1.0
+) -> Real:
+    """How far rounding may move a sum of so many terms, each rounded `own` times, of `size`.
+
+    Errors are random in sign, so that they add up as the root of their number; `growth` times it
+    where most terms are small. No part of a kernel's code.
+    """
+    return dr.opaque(backend.Float, backend.epsilon * (own + growth * math.sqrt(terms)) * size)
+
+
 def rounding_of_dipole(area: Real, inverse: Real, unit: Real) -> Real:
     """What rounding may do to the value of a dipole at distance rho = 1/inverse.
 
@@ -204,7 +215,8 @@ class FieldSums:
         g = share * self.gradient
         slope_error = share * dr.fma(SLOPE_ROUNDINGS * unit, self.s4, self.slope_truncation)
         distance = self.free_distance * (1 - _ROUNDING) - 4 * unit
-        bends = [self._bend(share, b, b * distance) for b in _REACHES]
+        scale, radii = (2 + 2 * _ROUNDING) * share, [(b, b * distance) for b in _REACHES]
+        bends = [Curvature(scale * self.remainder(b, r), r) for b, r in radii]
         slope, widest = dr.norm(g) + slope_error, bends[-1]
         r = widest.radius
         variation = (1 + _ROUNDING) * r * dr.fma(0.5 * r, widest.constant, slope)
@@ -243,7 +255,7 @@ class FieldSums:
         slope = dr.fma(SLOPE_ROUNDINGS * unit, self.s4, slope)
         b = _REACHES[-1]
         r = b * (self.free_distance * (1 - _ROUNDING) - 4 * unit)
-        bend = dr.fma(dr.select(self.s5 > 0, r, 0) * _rise(b), self.s5, 3 * self.s4)
+        bend = self.remainder(b, dr.select(self.s5 > 0, r, 0))
         pairs = zip(lengths, rates, strict=True)
         found = (
             dr.select(active & (length <= r), rate + dr.fma(length, bend, slope), dr.inf)
@@ -251,10 +263,9 @@ class FieldSums:
         )
         return tuple(found)
 
-    def _bend(self, share: float, b: float, r: Real) -> Curvature:
-        """What is known out to r = b times the free distance."""
-        third = 3 * self.s4
-        return Curvature((2 + 2 * _ROUNDING) * share * dr.fma(r * _rise(b), self.s5, third), r)
+    def remainder(self, b: float, r: Real) -> Real:
+        """3 s4 + rise r s5 for r = b times the free distance, or less: see `sample`."""
+        return dr.fma(_rise(b) * r, self.s5, 3 * self.s4)
 
 
 def _rise(b: float) -> float:

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
-import numpy as np
 
 from harnack.backend.extrema import fmax
+from harnack.fields.clouds.dipole_records import dipole_rows, in_slots
 from harnack.fields.multipoles.far_clusters import FarClusters
 from harnack.fields.multipoles.multipole import all_levels
-from harnack.fields.sums import FieldSums, Terms, rounding_of_dipole
+from harnack.fields.sums import FieldSums, Terms, rounding_of_dipole, rounding_of_sum
 from harnack.fields.symmetric import SymmetricSum
 from harnack.fields.unit_coordinates import epsilon_at
-from harnack.tree import NO_PRIMITIVE, build_hierarchy
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -25,14 +23,8 @@ if TYPE_CHECKING:
     from harnack.tree import Hierarchy
     from harnack.tree.hierarchy import FloatArray
 
-_LEAF_SIZE, _ARITY = 8, 4
 # Beside a point means within this part (of its area, in squared distance).
 _BESIDE = 0.04
-
-
-def hierarchy_of(points: FloatArray) -> Hierarchy:
-    """Which of the points (n, 3) lie in which leaf."""
-    return build_hierarchy(points, leaf_size=_LEAF_SIZE, arity=_ARITY)
 
 
 @dataclass(frozen=True)
@@ -57,15 +49,12 @@ class DipoleTree:
         tree: `hierarchy_of` these points, or of where they were once.
         """
         levels = all_levels(tree, points[:, None], moments[:, None], points, points)
-        weight = np.linalg.norm(moments, axis=1, keepdims=True)
-        rows = tree.gather(np.concatenate([points, moments, weight], axis=1))
-        empty = tree.slots == NO_PRIMITIVE
-        rows[empty, :3] = np.broadcast_to(rows[:, :1, :3], (*empty.shape, 3))[empty]
+        rows = dipole_rows(points, moments)
         # Rounded terms, most of them of the size of their share of the whole, random in sign.
-        area = float(weight.sum())
-        rounding = backend.epsilon * (16 + math.sqrt(len(points)) / 8) * max(1.0, area)
-        clusters = FarClusters.of(backend, tree, levels, rows, accuracy)
-        return cls(clusters, dr.opaque(backend.Float, rounding))
+        share = max(1.0, float(rows[:, 6].sum()))
+        rounding = rounding_of_sum(backend, len(points), 16, growth=1 / 8, size=share)
+        clusters = FarClusters.of(backend, tree, levels, in_slots(tree, rows), accuracy)
+        return cls(clusters, rounding)
 
     def at(self, x: Vec3, derivatives: int, closer: Real) -> Values:
         """Value and derivatives (as asked for) at x; closer: the detail, at least 1."""

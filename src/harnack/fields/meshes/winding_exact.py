@@ -21,7 +21,7 @@ from harnack.fields.edges.edge_passing import Line, known_along
 from harnack.fields.field import Lipschitz, Sample
 from harnack.fields.meshes.edge_chains import EdgeChains
 from harnack.fields.meshes.edge_trails import EdgeTrails
-from harnack.fields.meshes.winding_mesh import rounding_of_sum
+from harnack.fields.sums import rounding_of_sum
 from harnack.fields.symmetric import SymmetricSum
 from harnack.fields.unit_coordinates import epsilon_at
 from harnack.tree.triangles import Frame, TriangleRays

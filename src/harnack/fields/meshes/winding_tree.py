@@ -17,9 +17,8 @@ from harnack.backend.extrema import fmax
 from harnack.fields.edges.edge_lift import LiftedProduct, LiftedSums
 from harnack.fields.edges.edge_passing import Line, known_along, with_edge_rates
 from harnack.fields.meshes.triangle_kernel import edges_of
-from harnack.fields.meshes.winding_mesh import rounding_of_sum
 from harnack.fields.multipoles.far_clusters import FarClusters
-from harnack.fields.sums import FieldSums, Terms
+from harnack.fields.sums import FieldSums, Terms, rounding_of_sum
 from harnack.fields.unit_coordinates import epsilon_at
 from harnack.tree.triangles import INDEX, Upwards, crossing, in_slots
 
