@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import itertools
 import math
@@ -21,7 +20,13 @@ from harnack.fields.clouds.screened_kernel import mean_at_dipoles, promises
 from harnack.fields.clouds.screened_tree import PlainSum, ScreenedDipoles, TreeSum
 from harnack.fields.field import AtDetail, Curvature, Field, Sample
 from harnack.fields.sums import SECOND_ROUNDINGS, SLOPE_ROUNDINGS, FieldSums
-from harnack.fields.unit_coordinates import UnitCoordinates, epsilon_at, placed, single
+from harnack.fields.unit_coordinates import (
+    UnitCoordinates,
+    UploadedField,
+    epsilon_at,
+    placed,
+    single,
+)
 from harnack.geometry import Box
 from harnack.geometry.clouds import estimate_areas, validate_cloud
 from harnack.geometry.meshes import validate_mesh
@@ -43,7 +48,7 @@ _SMALLEST_LEVEL = 1e-20
 _ON_DIPOLE, _ANY_LEVEL = 32, 1e5
 
 
-class ScreenedWindingNumber(BatchedField):
+class ScreenedWindingNumber(UploadedField["_OnDevice"], BatchedField):
     """w(x) = (1/4 pi) sum_i a_i n_i.(y_i - x) (1 + rho_i/l) exp(-rho_i/l)/rho_i^3, rho_i = |y_i-x|.
 
     Minus the derivative of the Yukawa kernel exp(-rho/l)/rho along n_i at y_i; as l grows, the
@@ -99,6 +104,7 @@ class ScreenedWindingNumber(BatchedField):
         method: MethodName = "auto",
         accuracy: float = 6.0,
     ) -> None:
+        super().__init__()
         if not (math.isfinite(length) and length > 0):
             raise ValueError(f"length must be positive and finite, not {length!r}")
         if method not in ("auto", "sum", "tree"):
@@ -124,8 +130,6 @@ class ScreenedWindingNumber(BatchedField):
         self._rows = dipole_rows((self.points - self._centre) / self._size, share * self.normals)
         self._kappa = self._size / self.length
         self.default_level = mean_at_dipoles(self._rows, self._kappa)
-        self._device: _OnDevice | None = None
-        self._batches: dict[Backend, ScreenedWindingNumber] = {}
         self._extents: dict[tuple[float, ...], Volume | None] = {}
 
     @classmethod
@@ -168,15 +172,11 @@ class ScreenedWindingNumber(BatchedField):
         )
 
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> Values:
-        backend = backend_of(x)
-        if backend not in self._batches:
-            self._batches[backend] = self.prepare(backend)
-        prepared = self._batches[backend]
-        on = prepared._on
+        on = self._batch(backend_of(x))
         x = on.unit(x)
-        sums, epsilon = on.dipoles.sums(x, closer, derivatives).sums, backend.epsilon
+        sums, epsilon = on.dipoles.sums(x, closer, derivatives).sums, on.backend.epsilon
         values = sums.values(1.0, epsilon_at(x), 8 * epsilon * dr.abs(sums.value))
-        held, slope, second = prepared._held(sums, epsilon_at(x))
+        held, slope, second = self._held(on, sums, epsilon_at(x))
         values = dataclasses.replace(
             values,
             error=values.error + held,
@@ -186,7 +186,7 @@ class ScreenedWindingNumber(BatchedField):
         weight = float(self.areas.sum()) / (4 * math.pi * self._size**2)
         return values.far_away(x, 64, weight).rescaled(on.size)
 
-    def _held(self, sums: FieldSums, unit: Real) -> tuple[Real, Real, Real]:
+    def _held(self, on: _OnDevice, sums: FieldSums, unit: Real) -> tuple[Real, Real, Real]:
         """What the screening adds to the rounding of value, gradient and second derivatives.
 
         Exponentials are held at exp(-80) = 2e-35 (`screened_kernel.LONGEST`), times at most
@@ -195,35 +195,35 @@ class ScreenedWindingNumber(BatchedField):
         """
         share = dr.rcp(sums.free_distance)
         held = 2e-30 * float(self._rows[:, 6].sum()) * share * share
-        fourth = 0.25 * self._on.dipoles.kappa * sums.s4
+        fourth = 0.25 * on.dipoles.kappa * sums.s4
         second = dr.fma(SECOND_ROUNDINGS * unit, fourth, 6 * held * share * share)
         return held, 2 * held * share, second
 
-    def prepare(self, backend: Backend) -> ScreenedWindingNumber:
-        if self._device is not None and self._device.backend is backend:
-            return self
-        prepared = copy.copy(self)
+    def _upload(self, backend: Backend, *, traced: bool) -> _OnDevice:
+        del traced
         if self.method == "sum":
             dipoles = PlainSum(backend, self._rows, self._kappa)
         else:
             dipoles = TreeSum(backend, self._rows, self._kappa, self.accuracy)
-        prepared._device = _OnDevice(*placed(backend, self._centre, self._size), dipoles)
-        return prepared
+        return _OnDevice(*placed(backend, self._centre, self._size), dipoles)
+
+    def _batch(self, backend: Backend) -> _OnDevice:
+        if self._device is not None and self._device.backend is backend:
+            return self._device  # values at points take nothing else
+        return super()._batch(backend)
 
     def evaluate(self, p: Vec3) -> Sample:
-        if self._device is None:
-            return self.prepare(backend_of(p)).evaluate(p)
-        return self._sample(p, 1.0)
+        return self._sample(self._on(p), p, 1.0)
 
     def at_detail(self, detail: Real) -> Field:
-        return AtDetail(lambda p: self._sample(p, detail))
+        on = self._prepared()
+        return AtDetail(lambda p: self._sample(on, p, detail))
 
-    def _sample(self, p: Vec3, detail: Real) -> Sample:
-        on = self._on
+    def _sample(self, on: _OnDevice, p: Vec3, detail: Real) -> Sample:
         x = on.unit(p)
         screened, epsilon = on.dipoles.sums(x, detail, 1), on.backend.epsilon
         sums, unit = screened.sums, epsilon_at(x)
-        held, slope, _ = self._held(sums, unit)
+        held, slope, _ = self._held(on, sums, unit)
         error = sums.truncation + sums.rounding + held
         slope_error = sums.slope_truncation + dr.fma(SLOPE_ROUNDINGS * unit, sums.s4, slope)
         # On a dipole itself, to rounding, all levels meet: a gradient that says so, and an error
@@ -241,12 +241,6 @@ class ScreenedWindingNumber(BatchedField):
             dr.select(apart, slope_error / on.size, 0),
             truncation=dr.select(apart, sums.truncation, 0),
         )
-
-    @property
-    def _on(self) -> _OnDevice:
-        if self._device is None:
-            raise RuntimeError("prepare(backend) comes first")
-        return self._device
 
     def check_levels(self, levels: tuple[float, ...]) -> None:
         """ValueError for a level lost in rounding. Any other is taken next to every dipole."""
