@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 _REACHES = (0.2, 0.4, 0.6)
 # The part of the way to the dipoles of far nodes out to which they are stated.
 _WAY = 0.65
-_ROUNDING = 2e-5
+# Sums of rounded terms: bounds are lengthened, and distances shortened, by this part of them.
+SUM_ROUNDING = 2e-5
 # Roundings of a coordinate within which a singular point is near.
 _BESIDE = 256.0
 # Rounding of positions and of terms moves the gradient by at most so many s4, and second
@@ -214,12 +215,12 @@ class FieldSums:
         """
         g = share * self.gradient
         slope_error = share * dr.fma(SLOPE_ROUNDINGS * unit, self.s4, self.slope_truncation)
-        distance = self.free_distance * (1 - _ROUNDING) - 4 * unit
-        scale, radii = (2 + 2 * _ROUNDING) * share, [(b, b * distance) for b in _REACHES]
+        distance = self.free_distance * (1 - SUM_ROUNDING) - 4 * unit
+        scale, radii = (2 + 2 * SUM_ROUNDING) * share, [(b, b * distance) for b in _REACHES]
         bends = [Curvature(scale * self.remainder(b, r), r) for b, r in radii]
         slope, widest = dr.norm(g) + slope_error, bends[-1]
         r = widest.radius
-        variation = (1 + _ROUNDING) * r * dr.fma(0.5 * r, widest.constant, slope)
+        variation = (1 + SUM_ROUNDING) * r * dr.fma(0.5 * r, widest.constant, slope)
         value = share * self.value
         ball = HarmonicBall(r, value - variation, value + variation)
         # On a singular point itself all values meet: a gradient so steep that it is as near to any
@@ -254,7 +255,7 @@ class FieldSums:
         slope = dr.abs(dr.dot(self.gradient, v)) + self.slope_truncation
         slope = dr.fma(SLOPE_ROUNDINGS * unit, self.s4, slope)
         b = _REACHES[-1]
-        r = b * (self.free_distance * (1 - _ROUNDING) - 4 * unit)
+        r = b * (self.free_distance * (1 - SUM_ROUNDING) - 4 * unit)
         bend = self.remainder(b, dr.select(self.s5 > 0, r, 0))
         pairs = zip(lengths, rates, strict=True)
         found = (

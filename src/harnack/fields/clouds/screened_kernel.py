@@ -37,7 +37,7 @@ import numpy.typing as npt
 
 from harnack.backend.extrema import fmax, fmin
 from harnack.fields.field import Curvature, HarmonicBall
-from harnack.fields.sums import FieldSums, Terms
+from harnack.fields.sums import SUM_ROUNDING, FieldSums, Terms
 from harnack.fields.symmetric import SymmetricSum
 
 if TYPE_CHECKING:
@@ -55,7 +55,6 @@ cannot go on: bounds are then too large, and values off by less than 1e-33 area/
 _REACHES = (0.1, 0.25, 0.45)
 # The ball of the harmonic certificate: it shrinks where the kernel falls fast.
 _BALL, _SHRINK = 0.35, 0.1
-_ROUNDING = 2e-5
 # Pairs of points and dipoles looked at for the default level.
 _PAIRS, _MOST_PROBES, _LEAST_PROBES = 8_000_000, 512, 24
 
@@ -279,8 +278,8 @@ def promises(
     Radii stay below 36 lengths, so that exp(kappa r) times sums in which exponentials are held at
     exp(-80) neither overflows nor grows.
     """
-    out, sums = 1 + _ROUNDING, screened.sums
-    nearest = fmax(sums.free_distance * (1 - _ROUNDING) - 8 * epsilon, 0)
+    out, sums = 1 + SUM_ROUNDING, screened.sums
+    nearest = fmax(sums.free_distance * (1 - SUM_ROUNDING) - 8 * epsilon, 0)
     most = fmin(nearest, LONGEST / kappa)
 
     def bend(r: Real, share: float) -> Real:

@@ -20,7 +20,12 @@ from harnack.fields.edges.edge_passing import Line, known_along, rates_along
 from harnack.fields.edges.edge_records import LoopEdges
 from harnack.fields.edges.edge_sums import EdgeSums, hessian_over_edges, sum_over_edges
 from harnack.fields.field import HarmonicBall, LineLipschitz, Sample
-from harnack.fields.sums import SECOND_ROUNDINGS, SLOPE_ROUNDINGS
+from harnack.fields.sums import (
+    SECOND_ROUNDINGS,
+    SLOPE_ROUNDINGS,
+    SUM_ROUNDING,
+    rounding_of_sum,
+)
 from harnack.fields.unit_coordinates import UnitCoordinates, UploadedField, epsilon_at, placed
 from harnack.geometry import ConvexHull, is_convex_position, total_length, validate_loops
 from harnack.geometry.net_loops import net_loops, uncancelled_edges
@@ -38,8 +43,6 @@ _PERIOD = 4 * math.pi
 _REACH = 0.5
 # Levels as near as this to a multiple of 4 pi count as one.
 _NARROW = 1e-9 * _PERIOD
-# Sums of float32 terms; a variation is lengthened and a distance shortened by this much.
-_ROUNDING = 2e-5
 
 
 class SolidAngle(UploadedField["_OnDevice"]):
@@ -127,13 +130,12 @@ class SolidAngle(UploadedField["_OnDevice"]):
         unit = tuple((loop - centre) / self._size for loop in self._net)
         edges = LoopEdges.upload(backend, unit) if unit else None
         magnitude = float(np.abs(np.concatenate(self._net or self.loops)).max() / self._size)
-        # Each of n factors turns the product by a few roundings, of random sign.
-        turned = 8 + 2 * math.sqrt(sum(len(loop) for loop in self._net))
-        roundings = (6 + 2 * magnitude, turned)
+        factors = sum(len(loop) for loop in self._net)
         return _OnDevice(
             *placed(backend, centre, self._size),
             edges,
-            *(dr.opaque(backend.Float, backend.epsilon * one) for one in roundings),
+            dr.opaque(backend.Float, backend.epsilon * (6 + 2 * magnitude)),
+            rounding_of_sum(backend, factors, own=8, growth=2),
         )
 
     def evaluate(self, p: Vec3) -> Sample:
@@ -144,7 +146,7 @@ class SolidAngle(UploadedField["_OnDevice"]):
         sums = sum_over_edges(on.edges, x, variation=self.certificate == "edges")
         epsilon = on.backend.epsilon
         rounding = on.rounding
-        distance = sums.distance * (1 - _ROUNDING) - rounding
+        distance = sums.distance * (1 - SUM_ROUNDING) - rounding
         if self.certificate == "edges":
             ball = self._edge_ball(on, sums, distance)
         else:
@@ -196,7 +198,7 @@ class SolidAngle(UploadedField["_OnDevice"]):
 
     def _edge_ball(self, on: _OnDevice, sums: EdgeSums, distance: Real) -> HarmonicBall:
         r = _REACH * distance
-        variation = 2 * r * (sums.first + r / (1 - _REACH) * sums.second) * (1 + _ROUNDING)
+        variation = 2 * r * (sums.first + r / (1 - _REACH) * sums.second) * (1 + SUM_ROUNDING)
         return HarmonicBall(r * on.size, sums.angle - variation, sums.angle + variation)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:

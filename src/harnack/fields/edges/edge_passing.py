@@ -33,6 +33,7 @@ import drjit as dr
 from harnack.backend.extrema import clamp, fmax
 from harnack.fields.edges.edge import Edge
 from harnack.fields.field import LineLipschitz
+from harnack.fields.sums import SUM_ROUNDING
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
@@ -47,8 +48,6 @@ _BESIDE, _FLAT, _GRAZING = 0.001, 0.25, 1e-3
 # Of the distance to the curve, the powers that are the lengths asked about: from half of it to the
 # size of the curve.
 _LENGTHS = 6
-# Sums of rounded terms; a rate is made larger by this much.
-_ROUNDING = 2e-5
 
 # The rates for lengths, on lanes that are active.
 Rates: TypeAlias = "Callable[[tuple[Real, ...], Mask], tuple[Real, ...]]"
@@ -85,7 +84,7 @@ def known_along(
         lengths.append(lengths[-1] * longer)
     found = rates(tuple(lengths), dr.abs(slope) < flat)
     pairs = zip(found, lengths, strict=True)
-    return tuple(LineLipschitz(rate * (1 + _ROUNDING), length) for rate, length in pairs)
+    return tuple(LineLipschitz(rate * (1 + SUM_ROUNDING), length) for rate, length in pairs)
 
 
 def rates_along(
