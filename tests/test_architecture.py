@@ -37,6 +37,7 @@ FIELD_ROOMS = (
     "symmetric",
     "unit_coordinates",
     "batch",
+    "sums",
     "edges",
     "multipoles",
     "curves",

@@ -27,8 +27,8 @@ from harnack.fields.multipoles.multipole import (
     triangle_rule,
 )
 from harnack.fields.multipoles.multipole_kernel import far_terms
-from harnack.fields.multipoles.nearby import longest_part
 from harnack.fields.multipoles.truncation import sup_norm, truncation
+from harnack.fields.sums import longest_part
 from harnack.tree import Hierarchy, build_hierarchy
 
 ORDERS = [0, 1, 2]

@@ -12,6 +12,7 @@ from scipy.special import eval_legendre, spherical_in, spherical_kn
 
 import harnack as hk
 from harnack.backend import choose_backend, to_float, to_numpy, to_vector3
+from harnack.fields.clouds.dipole_records import dipole_rows
 from harnack.fields.clouds.screened import ScreenedWindingNumber
 from harnack.fields.clouds.screened_kernel import seen_dipole, thetas
 from harnack.fields.clouds.screened_tree import (
@@ -19,7 +20,6 @@ from harnack.fields.clouds.screened_tree import (
     accepting_distance,
     clusters,
     coefficients,
-    dipole_rows,
     seen_cluster,
 )
 from harnack.fields.field import Curvature, HarmonicBall

@@ -1,14 +1,22 @@
-"""Data on a backend, in coordinates in which they have a size of about one."""
+"""Data on a backend, in coordinates in which they have a size of about one, and their fields."""
 
 from __future__ import annotations
 
+import abc
+import copy
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 import drjit as dr
 import numpy as np
 
+from harnack.backend import backend_of
+from harnack.fields.field import Field
+from harnack.fields.kept import prepared_once
+
 if TYPE_CHECKING:
+    from typing import Self
+
     from harnack.backend import Backend, FloatArray, Real, Vec3
 
 
@@ -23,6 +31,47 @@ class UnitCoordinates:
     def unit(self, p: Vec3) -> Vec3:
         """A point in these coordinates."""
         return (self.backend.Array3f(p) - self.centre) / self.size
+
+
+Uploaded = TypeVar("Uploaded", bound=UnitCoordinates)
+
+
+class UploadedField(Field, Generic[Uploaded]):
+    """A field that is evaluated by data on a backend. Subclasses define `_upload`."""
+
+    def __init__(self) -> None:
+        self._device: Uploaded | None = None
+        self._batches: dict[Backend, Uploaded] = {}
+
+    @abc.abstractmethod
+    def _upload(self, backend: Backend, *, traced: bool) -> Uploaded:
+        """The data, for tracing or for values at points."""
+
+    @prepared_once
+    def prepare(self, backend: Backend) -> Self:
+        if self._device is not None and self._device.backend is backend:
+            return self
+        prepared = copy.copy(self)
+        prepared._device = self._upload(backend, traced=True)
+        return prepared
+
+    def _on(self, p: Vec3) -> Uploaded:
+        """The data for tracing, on the backend of p where `prepare` was not called."""
+        if self._device is None:
+            return self._upload(backend_of(p), traced=True)
+        return self._device
+
+    def _prepared(self) -> Uploaded:
+        """The data for tracing; RuntimeError where `prepare` was not called."""
+        if self._device is None:
+            raise RuntimeError("prepare(backend) comes first, before at_detail")
+        return self._device
+
+    def _batch(self, backend: Backend) -> Uploaded:
+        """The data for values at points, which are uploaded once a backend."""
+        if backend not in self._batches:
+            self._batches[backend] = self._upload(backend, traced=False)
+        return self._batches[backend]
 
 
 def single(centre: FloatArray) -> FloatArray:

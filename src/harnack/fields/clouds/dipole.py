@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import backend_of
 from harnack.fields.batch import BatchedField, Values
-from harnack.fields.clouds.dipole_tree import DipoleTree, hierarchy_of
+from harnack.fields.clouds.dipole_records import hierarchy_of
+from harnack.fields.clouds.dipole_tree import DipoleTree
 from harnack.fields.field import AtDetail, Field, Sample, lengthened
-from harnack.fields.kept import prepared_once
-from harnack.fields.unit_coordinates import UnitCoordinates, placed, single
+from harnack.fields.unit_coordinates import UnitCoordinates, UploadedField, placed, single
 from harnack.geometry import Box, CloudError, estimate_areas, estimate_normals, validate_cloud
 
 if TYPE_CHECKING:
@@ -28,7 +27,7 @@ FloatArray = npt.NDArray[np.float64]
 _VALUES, _TRACED = 2.0, 4.0
 
 
-class DipolePotential(BatchedField):
+class DipolePotential(UploadedField["_OnDevice"], BatchedField):
     """f(x) = sum a_i n_i.(p_i - x)/|p_i - x|^3 of oriented points (paper, Eq. 12).
 
     With a_i the areas that the points stand for, f is about 4 pi inside and 0 outside: the
@@ -58,6 +57,7 @@ class DipolePotential(BatchedField):
         *,
         accuracy: float | None = None,
     ) -> None:
+        super().__init__()
         if normals is None:
             raise CloudError(
                 "normals are missing, and without them inside and outside are not known: give "
@@ -80,8 +80,6 @@ class DipolePotential(BatchedField):
         extent = max(0.5 * float((high - low).max()), math.sqrt(float(self.areas.sum())) / 4)
         self._size = 2.0 ** math.ceil(math.log2(extent))
         self._hierarchy: Hierarchy | None = None
-        self._batches: dict[Backend, _OnDevice] = {}
-        self._device: _OnDevice | None = None
 
     def moved(
         self, points: Any, normals: Any | Literal["estimate"] = None, areas: Any = None
@@ -107,13 +105,8 @@ class DipolePotential(BatchedField):
         weight = float(self.areas.sum()) / self._size**2
         return on.tree.at(x, derivatives, closer).far_away(x, 64, weight).rescaled(on.size)
 
-    def _batch(self, backend: Backend) -> _OnDevice:
-        """The evaluator for points, which is made once a backend."""
-        if backend not in self._batches:
-            self._batches[backend] = self._upload(backend, self.accuracy or _VALUES)
-        return self._batches[backend]
-
-    def _upload(self, backend: Backend, accuracy: float) -> _OnDevice:
+    def _upload(self, backend: Backend, *, traced: bool) -> _OnDevice:
+        accuracy = self.accuracy or (_TRACED if traced else _VALUES)
         unit = (self.points - self._centre) / self._size
         # Areas shrink with the square of lengths, and the potential knows no scale.
         moments = (self.areas / self._size**2)[:, None] * self.normals
@@ -122,26 +115,18 @@ class DipolePotential(BatchedField):
         tree = DipoleTree.of(backend, self._hierarchy, unit, moments, accuracy)
         return _OnDevice(*placed(backend, self._centre, self._size), tree)
 
-    @prepared_once
-    def prepare(self, backend: Backend) -> DipolePotential:
-        if self._device is not None and self._device.backend is backend:
-            return self
-        device = self._upload(backend, self.accuracy or _TRACED)
-        prepared = copy.copy(self)
-        prepared._device = device
-        prepared.coarsest_detail = device.tree.clusters.coarsest
+    def prepare(self, backend: Backend) -> Self:
+        prepared = super().prepare(backend)
+        if prepared._device is not None:
+            prepared.coarsest_detail = prepared._device.tree.clusters.coarsest
         return prepared
 
     def evaluate(self, p: Vec3) -> Sample:
-        on = self._device
-        if on is None:
-            return self.prepare(backend_of(p)).evaluate(p)
+        on = self._on(p)
         return on.sample(p, on.backend.Float(1))
 
     def at_detail(self, detail: Real) -> Field:
-        if self._device is None:
-            raise RuntimeError("prepare(backend) comes before at_detail")
-        on = self._device
+        on = self._prepared()
         return AtDetail(lambda p: on.sample(p, detail))
 
     def check_levels(self, levels: tuple[float, ...]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import copy
+import dataclasses
 import itertools
 import math
 from dataclasses import dataclass
@@ -15,12 +15,18 @@ import numpy.typing as npt
 from harnack.backend import backend_of, choose_backend, to_numpy, to_vector3
 from harnack.choices import did_you_mean
 from harnack.fields.batch import BatchedField, Values
-from harnack.fields.clouds.screened_kernel import ScreenedSums, mean_at_dipoles, promises
-from harnack.fields.clouds.screened_tree import PlainSum, TreeSum, dipole_rows
+from harnack.fields.clouds.dipole_records import dipole_rows
+from harnack.fields.clouds.screened_kernel import mean_at_dipoles, promises
+from harnack.fields.clouds.screened_tree import PlainSum, ScreenedDipoles, TreeSum
 from harnack.fields.field import AtDetail, Curvature, Field, Sample
-from harnack.fields.kept import prepared_once
-from harnack.fields.multipoles.nearby import SECOND_ROUNDINGS, SLOPE_ROUNDINGS
-from harnack.fields.unit_coordinates import UnitCoordinates, epsilon_at, placed, single
+from harnack.fields.sums import SECOND_ROUNDINGS, SLOPE_ROUNDINGS, FieldSums
+from harnack.fields.unit_coordinates import (
+    UnitCoordinates,
+    UploadedField,
+    epsilon_at,
+    placed,
+    single,
+)
 from harnack.geometry import Box
 from harnack.geometry.clouds import estimate_areas, validate_cloud
 from harnack.geometry.meshes import validate_mesh
@@ -42,7 +48,7 @@ _SMALLEST_LEVEL = 1e-20
 _ON_DIPOLE, _ANY_LEVEL = 32, 1e5
 
 
-class ScreenedWindingNumber(BatchedField):
+class ScreenedWindingNumber(UploadedField["_OnDevice"], BatchedField):
     """w(x) = (1/4 pi) sum_i a_i n_i.(y_i - x) (1 + rho_i/l) exp(-rho_i/l)/rho_i^3, rho_i = |y_i-x|.
 
     Minus the derivative of the Yukawa kernel exp(-rho/l)/rho along n_i at y_i; as l grows, the
@@ -98,6 +104,7 @@ class ScreenedWindingNumber(BatchedField):
         method: MethodName = "auto",
         accuracy: float = 6.0,
     ) -> None:
+        super().__init__()
         if not (math.isfinite(length) and length > 0):
             raise ValueError(f"length must be positive and finite, not {length!r}")
         if method not in ("auto", "sum", "tree"):
@@ -123,8 +130,6 @@ class ScreenedWindingNumber(BatchedField):
         self._rows = dipole_rows((self.points - self._centre) / self._size, share * self.normals)
         self._kappa = self._size / self.length
         self.default_level = mean_at_dipoles(self._rows, self._kappa)
-        self._device: _OnDevice | None = None
-        self._batches: dict[Backend, ScreenedWindingNumber] = {}
         self._extents: dict[tuple[float, ...], Volume | None] = {}
 
     @classmethod
@@ -167,94 +172,76 @@ class ScreenedWindingNumber(BatchedField):
         )
 
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> Values:
-        backend = backend_of(x)
-        if backend not in self._batches:
-            self._batches[backend] = self.prepare(backend)
-        prepared = self._batches[backend]
-        on = prepared._on
+        on = self._batch(backend_of(x))
         x = on.unit(x)
-        sums = on.sum.sums(x, closer)
-        # The trace of the Hessian is w/l^2; it grows without limit at the points.
-        hessian = on.sum.hessian(x, closer) if derivatives == 2 else None
-        rounding, slope, second = prepared._rounding(backend, sums, epsilon_at(x))
-        values = Values(
-            sums.value,
-            sums.error + rounding + 8 * backend.epsilon * dr.abs(sums.value),
-            sums.gradient,
-            hessian,
-            sums.gradient_error + slope,
-            sums.hessian_error + second,
+        sums, epsilon = on.dipoles.sums(x, closer, derivatives).sums, on.backend.epsilon
+        values = sums.values(1.0, epsilon_at(x), 8 * epsilon * dr.abs(sums.value))
+        held, slope, second = self._held(on, sums, epsilon_at(x))
+        values = dataclasses.replace(
+            values,
+            error=values.error + held,
+            gradient_error=values.gradient_error + slope,
+            hessian_error=values.hessian_error + second,
         )
         weight = float(self.areas.sum()) / (4 * math.pi * self._size**2)
         return values.far_away(x, 64, weight).rescaled(on.size)
 
-    def _rounding(
-        self, backend: Backend, sums: ScreenedSums, unit: Real
-    ) -> tuple[Real, Real, Real]:
-        """Of value, gradient and second derivatives: of terms, each rounded and added with random
-        signs, and of positions, a coordinate of which is off by `unit`.
+    def _held(self, on: _OnDevice, sums: FieldSums, unit: Real) -> tuple[Real, Real, Real]:
+        """What the screening adds to the rounding of value, gradient and second derivatives.
 
-        Fourth derivatives of the kernel have Q_4(t) <= (1 + t/4) Q_3(t). Exponentials are held at
-        exp(-80) = 2e-35 (`screened_kernel.LONGEST`), times at most Q_3(80) exp(80) = 9e4.
+        Exponentials are held at exp(-80) = 2e-35 (`screened_kernel.LONGEST`), times at most
+        Q_3(80) exp(80) = 9e4. Fourth derivatives of the kernel have Q_4(t) <= (1 + t/4) Q_3(t), and
+        a coordinate is off by `unit`.
         """
-        epsilon, share = backend.epsilon, dr.rsqrt(sums.nearest)
-        terms = epsilon * (12 + math.sqrt(len(self._rows)))
+        share = dr.rcp(sums.free_distance)
         held = 2e-30 * float(self._rows[:, 6].sum()) * share * share
-        fourth = dr.fma(0.25 * self._on.sum.kappa, sums.bent, sums.more_bent)
-        return (
-            dr.fma(terms, sums.moved, 6 * epsilon * sums.steep) + held,
-            dr.fma(SLOPE_ROUNDINGS * unit, sums.bent, 2 * held * share),
-            dr.fma(SECOND_ROUNDINGS * unit, fourth, 6 * held * share * share),
-        )
+        fourth = 0.25 * on.dipoles.kappa * sums.s4
+        second = dr.fma(SECOND_ROUNDINGS * unit, fourth, 6 * held * share * share)
+        return held, 2 * held * share, second
 
-    @prepared_once
-    def prepare(self, backend: Backend) -> ScreenedWindingNumber:
-        if self._device is not None and self._device.backend is backend:
-            return self
-        prepared = copy.copy(self)
+    def _upload(self, backend: Backend, *, traced: bool) -> _OnDevice:
+        del traced
         if self.method == "sum":
-            dipoles = PlainSum.of(backend, self._rows, self._kappa)
+            dipoles = PlainSum(backend, self._rows, self._kappa)
         else:
-            dipoles = TreeSum.of(backend, self._rows, self._kappa, self.accuracy)
-        prepared._device = _OnDevice(*placed(backend, self._centre, self._size), dipoles)
-        return prepared
+            dipoles = TreeSum(backend, self._rows, self._kappa, self.accuracy)
+        return _OnDevice(*placed(backend, self._centre, self._size), dipoles)
+
+    def _batch(self, backend: Backend) -> _OnDevice:
+        if self._device is not None and self._device.backend is backend:
+            return self._device  # values at points take nothing else
+        return super()._batch(backend)
 
     def evaluate(self, p: Vec3) -> Sample:
-        if self._device is None:
-            return self.prepare(backend_of(p)).evaluate(p)
-        return self._sample(p, 1.0)
+        return self._sample(self._on(p), p, 1.0)
 
     def at_detail(self, detail: Real) -> Field:
-        return AtDetail(lambda p: self._sample(p, detail))
+        on = self._prepared()
+        return AtDetail(lambda p: self._sample(on, p, detail))
 
-    def _sample(self, p: Vec3, detail: Real) -> Sample:
-        on = self._on
+    def _sample(self, on: _OnDevice, p: Vec3, detail: Real) -> Sample:
         x = on.unit(p)
-        sums, epsilon = on.sum.sums(x, detail), on.backend.epsilon
-        rounding, slope, _ = self._rounding(on.backend, sums, epsilon_at(x))
-        error, slope_error = sums.error + rounding, sums.gradient_error + slope
+        screened, epsilon = on.dipoles.sums(x, detail, 1), on.backend.epsilon
+        sums, unit = screened.sums, epsilon_at(x)
+        held, slope, _ = self._held(on, sums, unit)
+        error = sums.truncation + sums.rounding + held
+        slope_error = sums.slope_truncation + dr.fma(SLOPE_ROUNDINGS * unit, sums.s4, slope)
         # On a dipole itself, to rounding, all levels meet: a gradient that says so, and an error
         # that says how far away they may be.
-        apart = (sums.nearest > (_ON_DIPOLE * epsilon) ** 2) & dr.isfinite(sums.value)
+        apart = (sums.free_distance > _ON_DIPOLE * epsilon) & dr.isfinite(sums.value)
         steep = on.backend.Array3f(0, 0, _ANY_LEVEL / (_ON_DIPOLE * epsilon))
         value = dr.select(apart, sums.value, 0)
         gradient = dr.select(apart, sums.gradient, steep)
-        known, ball = promises(sums, value, gradient, on.sum.kappa, on.size, epsilon)
+        known, ball = promises(screened, value, gradient, on.dipoles.kappa, on.size, epsilon)
         return Sample(
             value,
             gradient / on.size,
             known,
             dr.select(apart, error, _ANY_LEVEL),
             dr.select(apart, slope_error / on.size, 0),
-            truncation=dr.select(apart, sums.error, 0),
+            truncation=dr.select(apart, sums.truncation, 0),
             weaker=(ball,),
         )
-
-    @property
-    def _on(self) -> _OnDevice:
-        if self._device is None:
-            raise RuntimeError("prepare(backend) comes first")
-        return self._device
 
     def check_levels(self, levels: tuple[float, ...]) -> None:
         """ValueError for a level lost in rounding. Any other is taken next to every dipole."""
@@ -337,7 +324,7 @@ class ScreenedWindingNumber(BatchedField):
 class _OnDevice(UnitCoordinates):
     """The dipoles on a backend."""
 
-    sum: PlainSum | TreeSum
+    dipoles: ScreenedDipoles
 
 
 def _point(row: FloatArray) -> tuple[float, float, float]:

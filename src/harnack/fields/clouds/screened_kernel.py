@@ -37,12 +37,13 @@ import numpy.typing as npt
 
 from harnack.backend.extrema import fmax, fmin
 from harnack.fields.field import Curvature, HarmonicBall
+from harnack.fields.sums import SUM_ROUNDING, FieldSums, Terms
 from harnack.fields.symmetric import SymmetricSum
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from harnack.backend import Backend, Real, Vec3
+    from harnack.backend import Backend, Mask, Real, Vec3
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -54,7 +55,6 @@ cannot go on: bounds are then too large, and values off by less than 1e-33 area/
 _REACHES = (0.1, 0.25, 0.45)
 # The ball of the harmonic certificate: it shrinks where the kernel falls fast.
 _BALL, _SHRINK = 0.35, 0.1
-_ROUNDING = 2e-5
 # Pairs of points and dipoles looked at for the default level.
 _PAIRS, _MOST_PROBES, _LEAST_PROBES = 8_000_000, 512, 24
 
@@ -69,66 +69,63 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Terms:
-    """sum_k P_k psi_k at z, with the derivatives in x = y - z that were asked for."""
-
-    value: Real
-    gradient: Vec3
-    hessian: SymmetricSum | None
-
-
-@dataclass(frozen=True)
 class ScreenedSums:
     """Sums over all dipoles, weights w_i = area_i/(4 pi), distances d_i, Q_m at kappa d_i.
 
-    value, gradient: of w. nearest: the square of the least d_i.
-    moved: sum w Q_2/d^2, at least the sum of |terms|. steep: sum w Q_2/d^3; steeper: over d^4.
-    bent: sum w Q_3/d^4; more_bent: over d^5.
-    error, gradient_error, hessian_error: bounds of what clusters taken as a whole have done to w,
-    its gradient and its second derivatives along lines.
-    Clusters add the bound of their sums.
+    sums: value, derivatives and bounds; s4 and s5 are the sums of w Q_3/d^4 and w Q_3/d^5, which
+        for an infinite length are those of `FieldSums`.
+    steep, steeper: sums of w Q_2/d^3 and w Q_2/d^4.
+    Clusters add the bounds of their sums.
     """
 
-    value: Real
-    gradient: Vec3
-    nearest: Real
-    moved: Real
+    sums: FieldSums
     steep: Real
     steeper: Real
-    bent: Real
-    more_bent: Real
-    error: Real
-    gradient_error: Real
-    hessian_error: Real
 
     @classmethod
-    def zero(cls, backend: Backend) -> ScreenedSums:
-        """Of no dipoles."""
-        rest = (backend.Float(0) for _ in range(8))
-        return cls(backend.Float(0), backend.Array3f(0), backend.Float(dr.inf), *rest)
+    def zero(cls, backend: Backend, derivatives: int) -> ScreenedSums:
+        """Of no dipoles; derivatives: as for `FieldSums.zero`."""
+        zero = backend.Float(0)
+        return cls(FieldSums.zero(backend, dr.inf, derivatives), zero, zero)
+
+    @classmethod
+    def of(cls, parts: tuple[Any, ...]) -> ScreenedSums:
+        """From `parts`."""
+        return cls(FieldSums.of(parts[0]), *parts[1:])
 
     def parts(self) -> tuple[Any, ...]:
         """In the order of the constructor, as loops want them."""
-        return tuple(getattr(self, one.name) for one in dataclasses.fields(self))
+        return self.sums.parts(), self.steep, self.steeper
 
-    def plus(self, source: Source) -> ScreenedSums:
-        """With one more dipole or cluster."""
-        tail, terms = source.tail, source.terms
-        steep = source.weight * tail.second * tail.cube
-        bent = source.weight * tail.third * tail.cube * tail.inverse
-        return ScreenedSums(
-            self.value + terms.value,
-            self.gradient + terms.gradient,
-            fmin(source.squared, self.nearest),
-            dr.fma(steep, tail.distance, self.moved),
-            self.steep + steep,
-            dr.fma(steep, tail.inverse, self.steeper),
-            self.bent + bent,
-            dr.fma(bent, tail.inverse, self.more_bent),
-            self.error + source.error,
-            self.gradient_error + source.gradient_error,
-            self.hessian_error + source.hessian_error,
+    def plus(self, source: Source, rounding: Real, active: Mask) -> ScreenedSums:
+        """With one more dipole or cluster, where active.
+
+        rounding: of a sum of so many terms, as part of the sum of their absolute values. That sum
+        is at most the one of w Q_2/d^2; and 6 epsilon w Q_2/d^3 is what positions do.
+        """
+        tail, sums = source.tail, self.sums.plus(source.terms, active)
+        weight = dr.select(active, source.weight, 0)
+        steep = weight * tail.second * tail.cube
+        bent = weight * tail.third * tail.cube * tail.inverse
+        error, slope, second = (
+            dr.select(active, one, 0)
+            for one in (source.error, source.gradient_error, source.hessian_error)
         )
+        nearer, bounds = fmin(tail.distance, sums.free_distance), sums.second_truncation
+        # Dr.Jit's epsilon is half the distance from 1 to the next number, ours is all of it.
+        positions = 6 * 2 * float(dr.epsilon(steep))
+        sums = dataclasses.replace(
+            sums,
+            truncation=sums.truncation + error,
+            slope_truncation=sums.slope_truncation + slope,
+            second_truncation=None if bounds is None else bounds + second,
+            rounding=dr.fma(steep, dr.fma(rounding, tail.distance, positions), sums.rounding),
+            free_distance=dr.select(active, nearer, sums.free_distance),
+            s4=sums.s4 + bent,
+            s5=dr.fma(bent, tail.inverse, sums.s5),
+        )
+        steeper = dr.fma(steep, tail.inverse, self.steeper)
+        return ScreenedSums(sums, self.steep + steep, steeper)
 
 
 @dataclass(frozen=True)
@@ -167,8 +164,8 @@ def combine(
 ) -> Terms:
     """The sum of terms at z, inverse = 1/|z|, t = kappa |z|, decay = exp(-t).
 
-    derivatives: 1 for value and gradient, 2 with the Hessian. Powers of 1/|z| are spread over the
-    factors, so that none overflows.
+    derivatives: 0 for the value, 1 with the gradient, 2 with the Hessian. Powers of 1/|z| are
+    spread over the factors, so that none overflows.
     """
     vector = _type_of(z)
     theta = thetas(t, len(parts) + derivatives)
@@ -177,6 +174,8 @@ def combine(
     gradient, slopes, matrix = vector(0), vector(0), [0.0] * 6
     for k, part in enumerate(parts, start=1):
         value = dr.fma(theta[k], part.value, value)
+        if derivatives == 0:
+            continue
         along = dr.fma(theta[k + 1], part.value, along)
         gradient = dr.fma(vector(theta[k]), part.gradient, gradient)
         if derivatives == 2:
@@ -184,6 +183,8 @@ def combine(
             slopes = dr.fma(vector(theta[k + 1]), part.gradient, slopes)
             if part.hessian is not None:
                 matrix = [dr.fma(theta[k], h, m) for h, m in zip(part.hessian, matrix, strict=True)]
+    if derivatives == 0:
+        return Terms(scale * value)
     along = along * u2
     first = scale * dr.fma(vector(along), z, -gradient)
     if derivatives < 2:
@@ -200,13 +201,12 @@ def combine(
 class Source:
     """A dipole or a cluster seen from x, and how fast it changes.
 
-    weight: of all its dipoles, which are no nearer than `tail` is for, `squared` its square.
+    weight: of all its dipoles, which are no nearer than `tail` is for.
     error, gradient_error, hessian_error: of a cluster.
     """
 
     terms: Terms
     weight: Real
-    squared: Real
     tail: Tail
     error: Real = 0.0
     gradient_error: Real = 0.0
@@ -225,7 +225,7 @@ def seen_dipole(row: Sequence[Real], x: Vec3, kappa: Real, derivatives: int) -> 
     u2 = inverse * inverse
     part = Part(dr.dot(m, z) * u2, m * u2)
     terms = combine([part], z, inverse, t, decay, derivatives)
-    return Source(terms, row[6], squared, Tail.of(distance, inverse, t, decay))
+    return Source(terms, row[6], Tail.of(distance, inverse, t, decay))
 
 
 def cluster_parts(c: Sequence[Real], z: Vec3, inverse: Real) -> list[Part]:
@@ -271,7 +271,7 @@ def _times(matrix: Sequence[Real], z: Vec3) -> Vec3:
 
 
 def promises(
-    sums: ScreenedSums, f: Real, gradient: Vec3, kappa: Real, size: Real, epsilon: float
+    screened: ScreenedSums, f: Real, gradient: Vec3, kappa: Real, size: Real, epsilon: float
 ) -> tuple[tuple[Curvature, ...], HarmonicBall]:
     """What `ScreenedWindingNumber` proves: how it bends, and a ball, which proves shorter steps.
     f, gradient: at the point, in units of `size`.
@@ -279,13 +279,12 @@ def promises(
     Radii stay below 36 lengths, so that exp(kappa r) times sums in which exponentials are held at
     exp(-80) neither overflows nor grows.
     """
-    out = 1 + _ROUNDING
-    nearest = fmax(dr.sqrt(sums.nearest) * (1 - _ROUNDING) - 8 * epsilon, 0)
+    out, sums = 1 + SUM_ROUNDING, screened.sums
+    nearest = fmax(sums.free_distance * (1 - SUM_ROUNDING) - 8 * epsilon, 0)
     most = fmin(nearest, LONGEST / kappa)
 
     def bend(r: Real, share: float) -> Real:
-        chord = ((3 - 2 * share) / (1 - share) ** 2 - 3) / share
-        return 2 * out * dr.exp(kappa * r) * dr.fma(chord * r, sums.more_bent, 3 * sums.bent)
+        return 2 * out * dr.exp(kappa * r) * sums.remainder(share, r)
 
     known: list[Curvature] = []
     for share in _REACHES:
@@ -293,8 +292,8 @@ def promises(
         known.append(Curvature(bend(r, share) / (size * size), r * size))
     r = _BALL * most / dr.fma(_SHRINK * kappa, most, 1)
     chord = (1 / (1 - _BALL) ** 2 - 1 - 2 * _BALL) / _BALL**2
-    moved = out * dr.exp(kappa * r) * r * dr.fma(chord * r, sums.steeper, 2 * sums.steep)
-    slope = dr.norm(gradient) + sums.gradient_error
+    moved = out * dr.exp(kappa * r) * r * dr.fma(chord * r, screened.steeper, 2 * screened.steep)
+    slope = dr.norm(gradient) + sums.slope_truncation
     moved = fmin(moved, out * r * dr.fma(0.5 * r, bend(r, _BALL), slope))
     least = dr.cos(fmin(kappa * r, math.pi))
     ends = (f - moved, f + moved)

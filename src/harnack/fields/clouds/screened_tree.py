@@ -26,6 +26,7 @@ and for second derivatives from 6/(r - .)^4,
 
 from __future__ import annotations
 
+import abc
 import itertools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -36,6 +37,7 @@ import numpy.typing as npt
 
 from harnack.backend.extrema import fmax, fmin
 from harnack.backend.records import Records
+from harnack.fields.clouds.dipole_records import hierarchy_of, in_slots, padding_row
 from harnack.fields.clouds.screened_kernel import (
     LONGEST,
     ScreenedSums,
@@ -45,8 +47,9 @@ from harnack.fields.clouds.screened_kernel import (
     combine,
     seen_dipole,
 )
-from harnack.fields.symmetric import SymmetricSum
-from harnack.tree import Hierarchy, Node, PackedTree, build_hierarchy, for_each, pack, walk
+from harnack.fields.multipoles.cluster_walk import SeenCluster, walk_clusters
+from harnack.fields.sums import rounding_of_sum
+from harnack.tree import Hierarchy, pack
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -55,115 +58,77 @@ if TYPE_CHECKING:
 
 FloatArray = npt.NDArray[np.float64]
 
-# Dipoles of a leaf at most, children of a node, dipoles a trip of the plain sum: by experiment.
-_LEAF_SIZE, _ARITY, _CHUNK = 8, 4, 4
-_WIDTH = 8  # numbers of a dipole
-# Where padding lies: far away, with no moment. (Not so far that powers overflow.)
-_NOWHERE = 1e4
+# Dipoles a trip of the plain sum, by experiment.
+_CHUNK = 4
 # A cluster is never taken as a whole nearer than this many radii.
 _LEAST = 1.5
 
 
-def dipole_rows(points: FloatArray, moments: FloatArray) -> FloatArray:
-    """(n, 8) rows as `seen_dipole` reads them. moments: (n, 3) area times normal over 4 pi."""
-    weight = np.linalg.norm(moments, axis=1, keepdims=True)
-    return np.concatenate([points, moments, weight, np.zeros_like(weight)], axis=1)
+class ScreenedDipoles(abc.ABC):
+    """Dipoles on a backend.
+
+    kappa: one over the length. rounding: of sums of so many terms, as `ScreenedSums.plus` takes it.
+    """
+
+    def __init__(self, backend: Backend, rows: FloatArray, kappa: float) -> None:
+        self.backend = backend
+        self.kappa = dr.opaque(backend.Float, kappa)
+        self.rounding = rounding_of_sum(backend, len(rows), 12)
+
+    @abc.abstractmethod
+    def sums(self, x: Vec3, closer: Real, derivatives: int) -> ScreenedSums:
+        """Value, derivatives and bounds at x; clusters are taken as a whole from `closer` times
+        the `accepting_distance` on. derivatives: as for `FieldSums.zero`."""
+
+    def _with_dipole(
+        self, row: list[Real], x: Vec3, derivatives: int, state: tuple[Any, ...]
+    ) -> tuple[Any, ...]:
+        dipole = seen_dipole(row, x, self.kappa, derivatives)
+        return ScreenedSums.of(state).plus(dipole, self.rounding, True).parts()
 
 
-@dataclass(frozen=True)
-class PlainSum:
-    """All dipoles, one by one."""
+class PlainSum(ScreenedDipoles):
+    """All dipoles, one by one; no sum could be closer."""
 
-    kappa: Any
-    records: Records
+    def __init__(self, backend: Backend, rows: FloatArray, kappa: float) -> None:
+        super().__init__(backend, rows, kappa)
+        self._records = Records.upload(backend, rows, padding_row(rows[0]), _CHUNK)
 
-    @classmethod
-    def of(cls, backend: Backend, rows: FloatArray, kappa: float) -> PlainSum:
-        """Everything uploaded, padded to whole trips."""
-        nothing = np.array([_NOWHERE] * 3 + [0.0] * (_WIDTH - 3))
-        records = Records.upload(backend, rows, nothing, _CHUNK)
-        return cls(dr.opaque(backend.Float, kappa), records)
-
-    @property
-    def backend(self) -> Backend:
-        """The one they lie on."""
-        return self.records.backend
-
-    def sums(self, x: Vec3, closer: Real) -> ScreenedSums:
-        """Value, gradient and bounds at x. No sum could be closer."""
+    def sums(self, x: Vec3, closer: Real, derivatives: int) -> ScreenedSums:
         del closer
-        return ScreenedSums(*self._loop(x, 1, _with_sums, ScreenedSums.zero(self.backend).parts()))
 
-    def hessian(self, x: Vec3, closer: Real) -> SymmetricSum:
-        """Second derivatives at x."""
-        del closer
-        zero = SymmetricSum.zero(self.backend.Float).parts()
-        return SymmetricSum(*self._loop(x, 2, _with_hessian, zero))
+        def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+            return self._with_dipole(row, x, derivatives, state)
 
-    def _loop(self, x: Vec3, derivatives: int, add: Any, start: tuple[Any, ...]) -> Any:
-        def each(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            return add(seen_dipole(row, x, self.kappa, derivatives), state)
-
-        return self.records.for_each(each, start, "screened dipoles")
+        start = ScreenedSums.zero(self.backend, derivatives).parts()
+        return ScreenedSums.of(self._records.for_each(add, start, "screened dipoles"))
 
 
-def _with_sums(source: Source, state: tuple[Any, ...]) -> tuple[Any, ...]:
-    return ScreenedSums(*state).plus(source).parts()
+class TreeSum(ScreenedDipoles):
+    """Near dipoles one by one, far ones in clusters. See `accepting_distance` for the accuracy."""
 
+    def __init__(self, backend: Backend, rows: FloatArray, kappa: float, accuracy: float) -> None:
+        super().__init__(backend, rows, kappa)
+        tree = hierarchy_of(rows[:, :3])
+        levels = [columns(level, kappa, accuracy) for level in clusters(tree, rows)]
+        self._tree = pack(backend, tree, levels, in_slots(tree, rows))
 
-def _with_hessian(source: Source, state: tuple[Any, ...]) -> tuple[Any, ...]:
-    assert source.terms.hessian is not None
-    return tuple(a + b for a, b in zip(state, source.terms.hessian.parts(), strict=True))
-
-
-@dataclass(frozen=True)
-class TreeSum:
-    """Near dipoles one by one, far ones in clusters."""
-
-    backend: Backend
-    kappa: Any
-    tree: PackedTree
-
-    @classmethod
-    def of(cls, backend: Backend, rows: FloatArray, kappa: float, accuracy: float) -> TreeSum:
-        """Everything uploaded. See `accepting_distance` for the accuracy."""
-        hierarchy = build_hierarchy(rows[:, :3], leaf_size=_LEAF_SIZE, arity=_ARITY)
-        levels = [columns(level, kappa, accuracy) for level in clusters(hierarchy, rows)]
-        slots = _in_slots(hierarchy, rows)
-        return cls(
-            backend, dr.opaque(backend.Float, kappa), pack(backend, hierarchy, levels, slots)
-        )
-
-    def sums(self, x: Vec3, closer: Real) -> ScreenedSums:
-        """Value, gradient and bounds at x; clusters are taken as a whole from `closer` times the
-        `accepting_distance` on."""
-        zero = ScreenedSums.zero(self.backend).parts()
-        return ScreenedSums(*self._walk(x, 1, closer, _with_sums, zero))
-
-    def hessian(self, x: Vec3, closer: Real) -> SymmetricSum:
-        """Second derivatives at x."""
-        zero = SymmetricSum.zero(self.backend.Float).parts()
-        return SymmetricSum(*self._walk(x, 2, closer, _with_hessian, zero))
-
-    def _walk(
-        self, x: Vec3, derivatives: int, closer: Real, add: Any, start: tuple[Any, ...]
-    ) -> Any:
+    def sums(self, x: Vec3, closer: Real, derivatives: int) -> ScreenedSums:
         closer = fmax(self.backend.Float(closer), self.backend.Float(1))
 
         def near(row: list[Real], active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
             del active
-            return add(seen_dipole(row, x, self.kappa, derivatives), state)
+            return self._with_dipole(row, x, derivatives, state)
 
-        def visit(node: Node, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
-            z = self.backend.Array3f(*node.head[:3]) - x
-            length = dr.norm(z)
-            far = length > node.head[3] * closer
-            cluster = seen_cluster(node.head, node.payload(far), z, length, self.kappa, derivatives)
-            both = zip(add(cluster, state), state, strict=True)
-            state = tuple(dr.select(far, a, b) for a, b in both)
-            return ~far, for_each(node, ~far & node.is_leaf, near, state)
+        def far(node: SeenCluster, state: tuple[Any, ...]) -> tuple[Any, ...]:
+            length = dr.sqrt(node.square)
+            cluster = seen_cluster(
+                node.head, node.payload, -node.r, length, self.kappa, derivatives
+            )
+            return ScreenedSums.of(state).plus(cluster, self.rounding, node.far).parts()
 
-        return walk(self.tree, visit, start)
+        start = ScreenedSums.zero(self.backend, derivatives).parts()
+        return ScreenedSums.of(walk_clusters(self._tree, x, closer, far, near, start))
 
 
 def seen_cluster(
@@ -190,7 +155,7 @@ def seen_cluster(
     sixth = dr.fma(decay * t4 * t * t, 1 / 720, fifth)
     rest = dr.fma(q, dr.fma(q, dr.fma(-60, q, 216), -270), 120)
     second = common * share * share * sixth * rest
-    return Source(terms, weight, nearest * nearest, tail, error, slope, second)
+    return Source(terms, weight, tail, error, slope, second)
 
 
 @dataclass(frozen=True)
@@ -213,10 +178,10 @@ def clusters(tree: Hierarchy, rows: FloatArray) -> list[Clusters]:
     T1, T2, T3 move from a child's centre to its parent's, d -> d + s: T2 gains sym(T1 s) and T3
     sym(2 T2 s + T1 s s). The rest is taken from the dipoles themselves.
     """
-    slots = _in_slots(tree, rows)
+    slots = in_slots(tree, rows)
     levels: list[Clusters] = []
     for count, arity in zip(tree.counts, (0, *tree.arities), strict=True):
-        p, m, w = np.split(slots.reshape(count, -1, _WIDTH)[..., :7], [3, 6], axis=2)
+        p, m, w = np.split(slots.reshape(count, -1, slots.shape[2])[..., :7], [3, 6], axis=2)
         weight = w.sum(axis=(1, 2))
         centre = (w * p).sum(axis=1) / np.where(weight > 0, weight, 1)[:, None]
         d = p - centre[:, None]
@@ -289,10 +254,3 @@ def accepting_distance(radius: FloatArray, kappa: float, accuracy: float) -> Flo
         good = accuracy * radius * q4**0.2 <= r
         low, high = np.where(good, low, r), np.where(good, r, high)
     return high + 1e-5
-
-
-def _in_slots(tree: Hierarchy, rows: FloatArray) -> FloatArray:
-    """(leaves, leaf_size, 8) rows of dipoles, empty slots far away and without a moment."""
-    slots = np.array(tree.gather(rows), dtype=np.float64)
-    slots[tree.slots < 0, :3] = _NOWHERE
-    return slots

@@ -1,24 +1,33 @@
 """Where the level sets of a solid angle can be: cells proved empty are cut away.
 
-Plain NumPy in double precision: done once for a curve and its levels, before any ray.
+In double precision, and done once for a curve and its levels, before any ray.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
+from typing import TYPE_CHECKING, Any
 
+import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
+from harnack.backend import choose_backend, to_numpy, to_vector3
+from harnack.backend.extrema import fmin
+from harnack.fields.edges.edge import Edge
+from harnack.fields.edges.edge_records import LoopEdges
+from harnack.fields.edges.edge_sums import inner_product, spinor
 from harnack.geometry import ConvexHull
+
+if TYPE_CHECKING:
+    from harnack.backend import Real, Vec3
 
 FloatArray = npt.NDArray[np.float64]
 
 # Work is bounded by cells x edges: the subdivision stops before it costs more than this.
 _MOST_PAIRS = 3_000_000
 _FINEST = 5
-_PAIRS_AT_ONCE = 500_000
 
 
 def tight_extent(
@@ -32,61 +41,49 @@ def tight_extent(
     2a/(rho sqrt(rho^2 + a^2)) along the way (see `SolidAngle`). Cells that are not proved empty
     are split; those left at the end are wrapped in 26 planes.
     """
-    start = np.concatenate(loops)
-    end = np.concatenate([np.roll(loop, -1, axis=0) for loop in loops])
-    corner, size = lower[None], upper - lower
+    corner, size = np.zeros((1, 3)), upper - lower
+    scale, count = float(size.max()), sum(len(loop) for loop in loops)
+    unit = tuple((loop - lower) / scale for loop in loops)
+    edges = LoopEdges.upload(choose_backend("double"), unit)
+    size = size / scale
     for _ in range(_FINEST):
-        if 8 * len(corner) * len(start) > _MOST_PAIRS:
+        if 8 * len(corner) * count > _MOST_PAIRS:
             break
         size = size / 2
         steps = np.array(list(itertools.product((0, 1), repeat=3))) * size
         corner = (corner[:, None] + steps).reshape(-1, 3)
-        corner = corner[~_proved_empty(start, end, corner + size / 2, size, levels)]
+        half_diagonal = 0.5 * float(np.linalg.norm(size))
+        corner = corner[~_proved_empty(edges, corner + size / 2, half_diagonal, levels)]
     if not len(corner):
-        corner, size = lower[None], upper - lower
+        corner, size = np.zeros((1, 3)), (upper - lower) / scale
     slack = 1e-4 * float(np.linalg.norm(upper - lower))
-    return _wrapped(corner + size / 2, size / 2 + slack)
+    return _wrapped(lower + scale * (corner + size / 2), scale * size / 2 + slack)
 
 
 def _proved_empty(
-    start: FloatArray, end: FloatArray, centres: FloatArray, size: FloatArray,
-    levels: tuple[float, ...],
-) -> npt.NDArray[np.bool_]:  # fmt: skip
-    at_once = max(1, _PAIRS_AT_ONCE // len(start))
-    parts = [centres[i : i + at_once] for i in range(0, len(centres), at_once)]
-    half_diagonal = 0.5 * float(np.linalg.norm(size))
-    return np.concatenate([_empty(start, end, x, half_diagonal, levels) for x in parts])
-
-
-def _empty(
-    start: FloatArray, end: FloatArray, x: FloatArray, h: float, levels: tuple[float, ...]
+    edges: LoopEdges, centres: FloatArray, h: float, levels: tuple[float, ...]
 ) -> npt.NDArray[np.bool_]:
-    a, b, e = start - x[:, None], end - x[:, None], end - start
-    length = np.linalg.norm(e, axis=1)
-    foot = np.clip(-(a * e).sum(axis=2) / (length * length), 0, 1)
-    distance = np.linalg.norm(a + foot[..., None] * e, axis=2)
-    near = ~(distance > h * 1.001)
-    clear = ~near.any(axis=1)
-    # Where an edge is near, the cell is kept whatever its variation: any distance will do.
-    distance: FloatArray = np.where(near, 2.0 * h + length, distance)
-    apart = distance - h
-    half = 0.5 * length
-    variation = 2 * (np.arcsinh(half / apart) - np.arcsinh(half / distance)).sum(axis=1)
-    variation = variation * (1 + 1e-9) + 1e-9
-    (a0, a1), (b0, b1) = _spinor(a), _spinor(b)
-    f = 2 * np.angle(a0.conj() * b0 + a1.conj() * b1).sum(axis=1)
-    gap = np.full(len(x), math.inf)
+    """Whether no level lies within h of centres (n, 3); h and centres in the edges' units."""
+    real, x = edges.backend.Float, to_vector3(edges.backend, centres)
+    h_device = dr.opaque(real, h)
+
+    def add(p: Vec3, q: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
+        zr, zi, nearest, variation = state
+        edge = Edge.between(p, q, inverse, x)
+        re, im = inner_product(spinor(edge.a)[2], spinor(edge.b)[2])
+        zr, zi = dr.fma(zr, re, -(zi * im)), dr.fma(zr, im, zi * re)
+        scale = dr.rcp(dr.abs(zr) + dr.abs(zi))
+        distance, half = dr.sqrt(edge.square), 0.5 * dr.rsqrt(inverse)
+        moved = dr.asinh(half / (distance - h_device)) - dr.asinh(half / distance)
+        return zr * scale, zi * scale, fmin(distance, nearest), variation + 2 * moved
+
+    start = (real(1), real(0), real(dr.inf), real(0))
+    zr, zi, nearest, variation = edges.for_each(add, start, "edge extent")
+    f, d, s = (to_numpy(one) for one in (2 * dr.atan2(zi, zr), nearest, variation))
+    gap = np.full(len(f), math.inf)
     for level in levels:
         gap = np.minimum(gap, np.abs(np.remainder(f - level + 2 * np.pi, 4 * np.pi) - 2 * np.pi))
-    return clear & (gap > variation)
-
-
-def _spinor(a: FloatArray) -> tuple[npt.NDArray[np.complex128], npt.NDArray[np.complex128]]:
-    """The unnormalised spinor of directions a (..., 3), as in `edge_sums.spinor`."""
-    s = np.linalg.norm(a, axis=-1) + np.abs(a[..., 2])
-    across = a[..., 0] + 1j * a[..., 1]
-    up = a[..., 2] >= 0
-    return np.where(up, s, across.conj()), np.where(up, across, s)
+    return (d > h * 1.001) & (gap > s * (1 + 1e-9) + 1e-9)
 
 
 def _wrapped(centres: FloatArray, half: FloatArray) -> ConvexHull:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -16,14 +15,17 @@ from harnack.choices import did_you_mean
 from harnack.fields.curves.edge_angles import differentiable_angle
 from harnack.fields.curves.edge_extent import tight_extent
 from harnack.fields.curves.edge_nearest import closest_on_segments, segments
-from harnack.fields.edges.edge_hessian import hessian_over_edges
 from harnack.fields.edges.edge_passing import Line, known_along, rates_along
 from harnack.fields.edges.edge_records import LoopEdges
-from harnack.fields.edges.edge_sums import EdgeSums, sum_over_edges
-from harnack.fields.field import Field, HarmonicBall, LineLipschitz, Look, Path, Sample
-from harnack.fields.kept import prepared_once
-from harnack.fields.multipoles.nearby import SECOND_ROUNDINGS, SLOPE_ROUNDINGS
-from harnack.fields.unit_coordinates import UnitCoordinates, epsilon_at, placed
+from harnack.fields.edges.edge_sums import EdgeSums, hessian_over_edges, sum_over_edges
+from harnack.fields.field import HarmonicBall, LineLipschitz, Look, Path, Sample
+from harnack.fields.sums import (
+    SECOND_ROUNDINGS,
+    SLOPE_ROUNDINGS,
+    SUM_ROUNDING,
+    rounding_of_sum,
+)
+from harnack.fields.unit_coordinates import UnitCoordinates, UploadedField, epsilon_at, placed
 from harnack.geometry import ConvexHull, is_convex_position, total_length, validate_loops
 from harnack.geometry.net_loops import net_loops, uncancelled_edges
 
@@ -40,11 +42,9 @@ _PERIOD = 4 * math.pi
 _REACH = 0.5
 # Levels as near as this to a multiple of 4 pi count as one.
 _NARROW = 1e-9 * _PERIOD
-# Sums of float32 terms; a variation is lengthened and a distance shortened by this much.
-_ROUNDING = 2e-5
 
 
-class SolidAngle(Field):
+class SolidAngle(UploadedField["_OnDevice"]):
     """The signed solid angle of closed curves, in steradians, with period 4 pi (paper, Eq. 10).
 
     loops: one (n, 3) array-like of vertices, n >= 3, or a list of them. Every loop is closed by
@@ -83,6 +83,7 @@ class SolidAngle(Field):
     default_level: float = 2 * math.pi
 
     def __init__(self, loops: Any, *, certificate: CertificateName = "auto") -> None:
+        super().__init__()
         vertices = loops if _is_drjit(loops) else None
         self.loops: Loops = validate_loops(to_numpy(loops) if vertices is not None else loops)
         self.vertices: Vec3 | None = vertices
@@ -95,7 +96,6 @@ class SolidAngle(Field):
         points = np.concatenate(self._net or self.loops)
         self._centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
         self._size = float(np.linalg.norm(points - self._centre, axis=1).max())
-        self._device: _OnDevice | None = None
         self._extents: dict[tuple[float, ...], Volume | None] = {}
 
     def _choose(self, asked: CertificateName) -> Literal["edges", "range"]:
@@ -114,11 +114,8 @@ class SolidAngle(Field):
             )
         return "edges" if asked == "edges" else "range"
 
-    @prepared_once
-    def prepare(self, backend: Backend) -> SolidAngle:
-        if self._device is not None and self._device.backend is backend:
-            return self
-        prepared = copy.copy(self)
+    def _upload(self, backend: Backend, *, traced: bool) -> _OnDevice:
+        del traced
         # Centred and scaled to unit size: products of eight lengths stay far from overflow. The
         # centre is a number of the backend, so that near the curve it is subtracted exactly.
         cast = np.float64 if backend.precision == "double" else np.float32
@@ -133,15 +130,13 @@ class SolidAngle(Field):
         unit = tuple((loop - centre) / self._size for loop in self._net)
         edges = LoopEdges.upload(backend, unit) if unit else None
         magnitude = float(np.abs(np.concatenate(self._net or self.loops)).max() / self._size)
-        # Each of n factors turns the product by a few roundings, of random sign.
-        turned = 8 + 2 * math.sqrt(sum(len(loop) for loop in self._net))
-        roundings = (6 + 2 * magnitude, turned)
-        prepared._device = _OnDevice(
+        factors = sum(len(loop) for loop in self._net)
+        return _OnDevice(
             *placed(backend, centre, self._size),
             edges,
-            *(dr.opaque(backend.Float, backend.epsilon * one) for one in roundings),
+            dr.opaque(backend.Float, backend.epsilon * (6 + 2 * magnitude)),
+            rounding_of_sum(backend, factors, own=8, growth=2),
         )
-        return prepared
 
     def evaluate(self, p: Vec3) -> Sample:
         return self._sample(p, None)
@@ -155,18 +150,16 @@ class SolidAngle(Field):
 
     def _sample(self, p: Vec3, direction: Vec3 | None) -> Sample:
         """The sample at p; with promises along a unit direction, if one is given."""
-        if self._device is None:
-            return self.prepare(backend_of(p))._sample(p, direction)
-        on = self._device
+        on = self._on(p)
         if on.edges is None:
-            return self._constant(p)
+            return self._constant(on, p)
         x = on.unit(p)
         sums = sum_over_edges(on.edges, x, variation=self.certificate == "edges")
         epsilon = on.backend.epsilon
         rounding = on.rounding
-        distance = sums.distance * (1 - _ROUNDING) - rounding
+        distance = sums.distance * (1 - SUM_ROUNDING) - rounding
         if self.certificate == "edges":
-            ball = self._edge_ball(sums, distance)
+            ball = self._edge_ball(on, sums, distance)
         else:
             ball = HarmonicBall(distance * on.size, -1.5 * _PERIOD, 1.5 * _PERIOD)
         # On the curve itself, to rounding, every level meets (`uncancelled_edges`) and no gradient
@@ -184,28 +177,23 @@ class SolidAngle(Field):
         known = (ball, *_along_edges(on, x, sums, direction))
         return Sample(dr.select(met, 0, sums.angle), gradient, known, error)
 
-    def _constant(self, p: Vec3) -> Sample:
+    def _constant(self, on: _OnDevice, p: Vec3) -> Sample:
         """The sample of f = 0, for a curve of which nothing is left: it is true on any ball. The
         range has a width, as bounds divide by it; no level lies in it (`check_levels`)."""
-        assert self._device is not None
-        on = self._device
         x = on.unit(p)
         radius = 1e6 * (1 + dr.norm(x)) * on.size
         zero = dr.zeros(on.backend.Float, dr.width(p))
         ball = HarmonicBall(radius, zero - _NARROW, zero + _NARROW)
         return Sample(zero, on.backend.Array3f(zero), (ball,))
 
-    def _edge_ball(self, sums: EdgeSums, distance: Real) -> HarmonicBall:
-        assert self._device is not None
+    def _edge_ball(self, on: _OnDevice, sums: EdgeSums, distance: Real) -> HarmonicBall:
         r = _REACH * distance
-        variation = 2 * r * (sums.first + r / (1 - _REACH) * sums.second) * (1 + _ROUNDING)
-        return HarmonicBall(r * self._device.size, sums.angle - variation, sums.angle + variation)
+        variation = 2 * r * (sums.first + r / (1 - _REACH) * sums.second) * (1 + SUM_ROUNDING)
+        return HarmonicBall(r * on.size, sums.angle - variation, sums.angle + variation)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         """Rows of the Hessian, free of trace to rounding. It grows without limit at the curve."""
-        if self._device is None:
-            return self.prepare(backend_of(p)).hessian(p)
-        on = self._device
+        on = self._on(p)
         if on.edges is None:
             zero = dr.zeros(on.backend.Array3f, dr.width(p))
             return zero, zero, zero
@@ -214,12 +202,10 @@ class SolidAngle(Field):
         return x * share, y * share, z * share
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """Rounding of positions, as for sums over boundary edges (`far_clusters.Errors`), with
+        """Rounding of positions, as for sums over boundary edges (`sums.SLOPE_ROUNDINGS`), with
         distances less by what it may have done to them. Without bound at the curve."""
         del sample
-        if self._device is None:
-            return self.prepare(backend_of(p)).derivative_errors(p, self.evaluate(p))
-        on = self._device
+        on = self._on(p)
         if on.edges is None:
             return 0.0, 0.0
         x = on.unit(p)
@@ -235,9 +221,7 @@ class SolidAngle(Field):
         """The closest point of the curve, edges that cancel left out (`uncancelled_edges`)."""
         if not self._net:
             return None
-        if self._device is None:
-            return self.prepare(backend_of(p)).closest_on_boundary(p)
-        on = self._device
+        on = self._on(p)
         centre = to_numpy(on.centre).reshape(3).astype(np.float64)
         start, end = ((q - centre) / self._size for q in uncancelled_edges(self._net))
         nearest = closest_on_segments(segments(on.backend, start, end), on.unit(p))

@@ -15,6 +15,7 @@ whole ray off the edges, and the jumps of w are those of the triangles passed.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
@@ -23,17 +24,17 @@ import numpy as np
 
 from harnack.backend.extrema import fmax, fmin
 from harnack.backend.records import Records
-from harnack.fields.edges.edge_field import edge_field, edge_variation
-from harnack.fields.edges.edge_hessian import edge_rates
+from harnack.fields.edges.edge import Edge, edge_variation
 from harnack.fields.edges.edge_records import single_edges
+from harnack.fields.sums import FieldSums, Terms
 from harnack.fields.symmetric import SymmetricSum
 from harnack.fields.unit_coordinates import epsilon_at
-from harnack.tree.nearest import squared_distance_to_segment
 from harnack.tree.triangles import Upwards, side
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.tree.hierarchy import FloatArray, IntArray
+    from harnack.tree.triangles import Frame
 
 # Edges a trip of the loop; those that fill the last one have no length and no direction.
 _CHUNK = 4
@@ -68,113 +69,139 @@ def edge_records(vertices: FloatArray, edges: IntArray) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class LiftedSums:
-    """Sum over all edges of Omega_e and its derivatives, as far as they were asked for.
+class LiftedEdge:
+    """An edge as it is seen from x along rays of one direction.
 
-    rounding, s4, s5: what bounds their rounding, in units in the last place of a coordinate; see
-    `rounding_of_edge` and `nearby.Nearby`.
+    ends: where it begins and ends. frame: of the rays. direction: 1 or -1, as the edge runs from
+    the one to the other or back; it counts so in everything.
     """
 
-    angle: Real
-    gradient: Vec3
-    hessian: SymmetricSum
-    rounding: Real
-    s4: Real
-    s5: Real
+    edge: Edge
+    ends: tuple[Vec3, Vec3]
+    frame: Frame | Upwards
+    direction: Real
+
+    @classmethod
+    def between(
+        cls, p: Vec3, q: Vec3, direction: Real, inverse: Real, frame: Frame | Upwards, x: Vec3
+    ) -> LiftedEdge:
+        """The edge from p to q, inverse = 1/|q-p|^2, seen from x on a ray of the frame."""
+        return cls(Edge.between(p, q, inverse, x), (p, q), frame, direction)
+
+    def factor(self) -> tuple[Real, Real]:
+        """F_e, by its real and imaginary part."""
+        vector, frame, edge = cast("Any", type(self.edge.a)), self.frame, self.edge
+        pairs = zip(self.ends, (edge.a, edge.b), strict=True)
+        a, b = (vector(*frame.across(p), frame.component(a)) for p, a in pairs)
+        re, im = edge_factor(a, b, *edge.lengths)
+        return re, self.direction * im
+
+    def terms(self, derivatives: int, active: Mask) -> Terms:
+        """What it adds to the derivatives of the sum of angles, as far as they are asked for; 0
+        where it is not active."""
+        if derivatives == 0:
+            return Terms(0.0)
+        weight, c = self.edge.field()
+        gradient = dr.select(active, self.direction * weight, 0) * c
+        if derivatives == 1:
+            return Terms(0.0, gradient)
+        c, rate = self.edge.rates()
+        c, rate = dr.select(active, self.direction * c, 0), dr.select(active, rate, 0)
+        return Terms(0.0, gradient, SymmetricSum.zero(type(c.x)).plus(c, rate))
+
+    def bounds(self, unit: Real) -> tuple[Real, Real, Real]:
+        """What rounding may do to Omega_e, and what the edge adds to s4 and s5 of `FieldSums`.
+
+        unit: the rounding of a coordinate, `epsilon_at`, which is twice what correct rounding does.
+
+        Rounding. The ends of the edge, x and their differences are off by half a unit together, and
+        the angle by that times Biot and Savart's field, which is at most twice the first number of
+        `edge_variation`; the roundings of the factor F_e are as if its ends had moved by another
+        half, for those of its terms are |F_e| times a few over the cosine of half the angle that
+        the edge is seen at, and the same bits of an end serve both edges there. It is less than
+        4 pi in any case.
+
+        Variation. Along a line the k-th derivative of an edge's field is at most the integral of
+        k!/rho^(k+1) over it (Biot and Savart), so that Taylor's remainder after the linear term is
+        at most that of t^2/(rho^3 (1-t/rho)). With a = L/2 and distance d an edge has int rho^-3 <=
+        2a/(d^2 sqrt(d^2+a^2)) =: 2e, int rho^-4 <= 2e/d; and 1/(1-q) <= 1 + q/(1-b) <= 1 + q rise/4
+        on [0, b] (`FieldSums.sample`). So an edge adds to the remainder what s4 += 2e/3 and
+        s5 += e/(2d) do. d is less by what rounding may have done to it.
+        """
+        distance = fmax(dr.sqrt(self.edge.square) - 2 * unit, 0)
+        first, e = edge_variation(distance * distance, self.edge.inverse)
+        return fmin(2 * unit * first, 4 * dr.pi), 2 / 3 * e, 0.5 * dr.rcp(distance) * e
+
+
+@dataclass(frozen=True)
+class LiftedSums:
+    """Sums over terms and edges, of which the edges' angles are a product yet."""
+
+    sums: FieldSums
+    product: LiftedProduct
+
+    @classmethod
+    def zero(cls, backend: Backend, derivatives: int) -> LiftedSums:
+        """Of nothing; derivatives: as for `FieldSums.zero`."""
+        return cls(FieldSums.zero(backend, dr.inf, derivatives), LiftedProduct.one(backend.Float))
+
+    @classmethod
+    def of(cls, parts: tuple[Any, ...]) -> LiftedSums:
+        """From `parts`."""
+        return cls(FieldSums.of(parts[0]), LiftedProduct(*parts[1]))
+
+    def parts(self) -> tuple[Any, ...]:
+        """Those of the sums and those of the product, as loops want them."""
+        return self.sums.parts(), self.product.parts()
+
+    def plus(self, edge: LiftedEdge, unit: Real, active: Mask) -> LiftedSums:
+        """With an edge more, where active; unit as for its `bounds`."""
+        (re, im), terms = edge.factor(), edge.terms(self.sums.derivatives, active)
+        sums = self.sums.plus(terms, True)
+        rounding, s4, s5 = (dr.select(active, one, 0) for one in edge.bounds(unit))
+        free = fmin(dr.sqrt(edge.edge.square), sums.free_distance)
+        sums = dataclasses.replace(
+            sums,
+            rounding=sums.rounding + rounding,
+            free_distance=dr.select(active, free, sums.free_distance),
+            s4=sums.s4 + s4,
+            s5=sums.s5 + s5,
+        )
+        factor = dr.select(active, re, 1), dr.select(active, im, 0)
+        return LiftedSums(sums, self.product.times(*factor))
+
+    @property
+    def angle(self) -> Real:
+        """The sum of Omega_e."""
+        return self.product.angle()
+
+    def whole(self) -> FieldSums:
+        """The sums with the edges' angles in their value."""
+        return dataclasses.replace(self.sums, value=self.sums.value + self.angle)
 
 
 def lifted_sums(edges: LiftedEdges, x: Vec3, derivatives: int) -> LiftedSums:
     """All sums at points x in one loop over the edges, for the direction d = z.
 
-    What of the result nobody uses is not computed.
-
-    derivatives: 0 for the angle alone, 1 with the gradient, 2 with the Hessian.
-
-    The angles are added up as a product of factors and a count of how often it goes round. s_a
-    is taken as |a'|^2/(|a| + a.d) where a.d > 0, so that nothing cancels.
+    derivatives: 0 for the angle alone, 1 with the gradient, 2 with the Hessian. What of the result
+    nobody uses is not computed.
     """
-    real, vector = edges.records.backend.Float, edges.records.backend.Array3f
+    backend, unit = edges.records.backend, epsilon_at(x)
+    vector = backend.Array3f
 
     def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-        return _with_edge(row, x, derivatives, *state)
+        p, q = vector(*row[:3]), vector(*row[4:7])
+        edge = LiftedEdge.between(p, q, row[3], row[7], Upwards(x), x)
+        return LiftedSums.of(state).plus(edge, unit, row[3] != 0).parts()
 
-    sums = (vector(0), *SymmetricSum.zero(real).parts())[: (0, 1, 7)[derivatives]]
-    product, bounds = LiftedProduct.one(real).parts(), (real(0), real(0), real(0))
-    product, bounds, *rest = edges.records.for_each(add, (product, bounds, *sums), "lift")
-    return LiftedSums(
-        LiftedProduct(*product).angle(),
-        rest[0] if derivatives >= 1 else vector(0),
-        SymmetricSum(*rest[1:]) if derivatives == 2 else SymmetricSum.zero(real),
-        *bounds,
-    )
-
-
-def _with_edge(
-    row: Any, x: Vec3, derivatives: int, product: tuple[Real, Real, Real],
-    bounds: tuple[Real, Real, Real], *sums: Any,
-) -> Any:  # fmt: skip
-    """The sums with the edge of a record added."""
-    vector, direction = cast("Any", type(x)), row[3]
-    p, q = vector(row[0], row[1], row[2]), vector(row[4], row[5], row[6])
-    a, b, frame = p - x, q - x, Upwards(x)
-    la, lb = dr.norm(a), dr.norm(b)
-    seen = vector(*frame.across(p), a.z), vector(*frame.across(q), b.z)
-    re, im = edge_factor(*seen, la, lb)
-    product = LiftedProduct(*product).times(re, direction * im).parts()
-    square = squared_distance_to_segment(a, b - a, row[7])
-    bounds = with_edge(bounds, square, row[7], epsilon_at(x), direction != 0)
-    if derivatives == 0:
-        return product, bounds
-    c, weight = edge_field(a, b, la, lb)
-    g = dr.fma(vector(direction * weight), c, sums[0])
-    if derivatives == 1:
-        return product, bounds, g
-    # The edge itself and not b - a, which far away is mostly rounding.
-    e = vector(row[4] - row[0], row[5] - row[1], row[6] - row[2])
-    u, v = edge_rates(a, e, row[7])
-    return product, bounds, g, *SymmetricSum(*sums[1:]).plus(direction * u, v).parts()
-
-
-def rounding_of_edge(first: Real, unit: Real) -> Real:
-    """What rounding may do to the solid angle of an edge.
-
-    first: of `edge_variation`. unit: the rounding of a coordinate, `epsilon_at`, which is twice
-    what correct rounding does. The ends of the edge, x and their differences are off by half a
-    unit together, and the angle by that times Biot and Savart's field, which is at most 2 first;
-    the roundings of the factor F_e are as if its ends had moved by another half, for those of its
-    terms are |F_e| times a few over the cosine of half the angle that the edge is seen at, and the
-    same bits of an end serve both edges there. It is less than 4 pi in any case.
-    """
-    return fmin(2 * unit * first, 4 * dr.pi)
-
-
-def with_edge(
-    bounds: tuple[Real, Real, Real], square: Real, inverse: Real, unit: Real, active: Mask
-) -> tuple[Real, Real, Real]:
-    """Sums of `rounding_of_edge` and of what an edge adds to s4 and s5 of `nearby.Nearby`.
-
-    square, inverse: as for `edge_variation`. Along a line the k-th
-    derivative of an edge's field is at most the integral of k!/rho^(k+1) over it (Biot and
-    Savart), so that Taylor's remainder after the linear term is at most that of
-    t^2/(rho^3 (1-t/rho)). With a = L/2 and distance d an edge has int rho^-3 <=
-    2a/(d^2 sqrt(d^2+a^2)) =: 2e, int rho^-4 <= 2e/d; and 1/(1-q) <= 1 + q/(1-b) <= 1 + q rise/4
-    on [0, b] (`Nearby.sample`). So an edge adds to the remainder what s4 += 2e/3 and
-    s5 += e/(2d) do. d is less by what rounding may have done to it.
-    """
-    rounding, s4, s5 = bounds
-    distance = fmax(dr.sqrt(square) - 2 * unit, 0)
-    first, e = edge_variation(distance * distance, inverse)
-    first, e, closer = (dr.select(active, one, 0) for one in (first, e, dr.rcp(distance)))
-    return (
-        rounding + rounding_of_edge(first, unit),
-        dr.fma(2 / 3, e, s4),
-        dr.fma(0.5 * closer, e, s5),
-    )
+    start = LiftedSums.zero(backend, derivatives).parts()
+    return LiftedSums.of(edges.records.for_each(add, start, "lift"))
 
 
 def edge_factor(a: Vec3, b: Vec3, la: Real, lb: Real) -> tuple[Real, Real]:
     """F_e of the edge from a to b, seen as (u, v, z): across the direction, and along it.
 
+    s_a is taken as |a'|^2/(|a| + a.d) where a.d > 0, so that nothing cancels.
     A ray exactly through an edge or a vertex is decided as `tree.triangles.crossing` does: as if
     it passed at v, and then u, infinitely little below zero.
     """

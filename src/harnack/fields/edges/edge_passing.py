@@ -31,7 +31,9 @@ from typing import TYPE_CHECKING, TypeAlias
 import drjit as dr
 
 from harnack.backend.extrema import clamp, fmax
+from harnack.fields.edges.edge import Edge
 from harnack.fields.field import LineLipschitz
+from harnack.fields.sums import SUM_ROUNDING
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
@@ -46,8 +48,6 @@ _BESIDE, _FLAT, _GRAZING = 0.001, 0.25, 1e-3
 # Of the distance to the curve, the powers that are the lengths asked about: from half of it to the
 # size of the curve.
 _LENGTHS = 6
-# Sums of rounded terms; a rate is made larger by this much.
-_ROUNDING = 2e-5
 
 # The rates for lengths, on lanes that are active.
 Rates: TypeAlias = "Callable[[tuple[Real, ...], Mask], tuple[Real, ...]]"
@@ -84,7 +84,7 @@ def known_along(
         lengths.append(lengths[-1] * longer)
     found = rates(tuple(lengths), dr.abs(slope) < flat)
     pairs = zip(found, lengths, strict=True)
-    return tuple(LineLipschitz(rate * (1 + _ROUNDING), length) for rate, length in pairs)
+    return tuple(LineLipschitz(rate * (1 + SUM_ROUNDING), length) for rate, length in pairs)
 
 
 def rates_along(
@@ -97,7 +97,7 @@ def rates_along(
     """
 
     def add(p: Vec3, q: Vec3, inverse: Real, rates: tuple[Real, ...]) -> tuple[Real, ...]:
-        return with_edge_rates(line, (p - line.x, q - p), inverse, lengths, rates)
+        return with_edge_rates(line, Edge.between(p, q, inverse, line.x), lengths, rates)
 
     start = tuple(edges.backend.Float(0) for _ in lengths)
     rates = edges.for_each(add, start, "edges along", active)
@@ -105,16 +105,15 @@ def rates_along(
 
 
 def with_edge_rates(
-    line: Line, edge: tuple[Vec3, Vec3], inverse: Real, lengths: tuple[Real, ...],
-    rates: tuple[Real, ...],
-) -> tuple[Real, ...]:  # fmt: skip
-    """The rates with an edge added: `edge` is where it starts, less x, and e; 1/|e|^2 = inverse.
+    line: Line, edge: Edge, lengths: tuple[Real, ...], rates: tuple[Real, ...]
+) -> tuple[Real, ...]:
+    """The rates with an edge added, seen from the line's x.
 
     m = a x v and n = e x v are a and e as seen along the line, turned by a right angle. Distances
     on the line's plane are taken from them, and c = v . m x n, so that it is small where both are,
     whatever the lengths of a and e: its error is at most 8 epsilon |m| |e| and slack |n|.
     """
-    (a, e), slack = edge, line.slack
+    a, e, inverse, slack = edge.a, edge.e, edge.inverse, line.slack
     epsilon = float(dr.epsilon(type(inverse)))
     m, n = dr.cross(a, line.v), dr.cross(e, line.v)
     c = dr.abs(dr.dot(line.v, dr.cross(m, n)))
@@ -123,8 +122,7 @@ def with_edge_rates(
     square = dr.squared_norm(n)
     foot = dr.select(square > 0, clamp(-dr.dot(m, n) / square, 0, 1), 0)
     passing = dr.norm(dr.fma(type(a)(foot), n, m)) - slack
-    foot = clamp(-dr.dot(a, e) * inverse, 0, 1)
-    distance = dr.norm(dr.fma(type(a)(foot), e, a)) - slack
+    distance = dr.sqrt(edge.square) - slack
     # (a - s v) x e = area + s n, of length |e| times the distance from the line through the edge.
     area, per_length = dr.cross(a, e), dr.sqrt(inverse)
     nearest = dr.select(square > 0, -dr.dot(area, n) / square, 0)

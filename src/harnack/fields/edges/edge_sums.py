@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import drjit as dr
 
 from harnack.backend.extrema import fmin
-from harnack.fields.edges.edge_field import edge_variation
+from harnack.fields.edges.edge import Edge, edge_variation
+from harnack.fields.symmetric import SymmetricSum
 from harnack.tree.nearest import squared_distance_to_segment
 
 if TYPE_CHECKING:
@@ -84,6 +85,17 @@ def sum_over_edges(edges: LoopEdges, x: Vec3, *, variation: bool) -> EdgeSums:
     start = (real(1), real(0), type(x)(0), real(dr.inf), real(0), real(0))
     zr, zi, g, d2, s1, s2 = edges.records.for_each(add, start, "edges")
     return EdgeSums(2 * dr.atan2(zi, zr), 2 * g, dr.sqrt(d2), s1, s2)
+
+
+def hessian_over_edges(edges: LoopEdges, x: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+    """Rows of the Hessian of the solid angle at x, in one loop over the edges."""
+    x = edges.backend.Array3f(x)
+
+    def add(p: Vec3, q: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
+        return SymmetricSum(*state).plus(*Edge.between(p, q, inverse, x).rates()).parts()
+
+    start = SymmetricSum.zero(edges.backend.Float).parts()
+    return SymmetricSum(*edges.for_each(add, start, "edge hessian")).rows(type(x))
 
 
 def inner_product(a: Spinor, b: Spinor) -> tuple[Real, Real]:

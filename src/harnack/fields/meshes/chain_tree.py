@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from harnack.fields.multipoles.multipole import cartesian, triangle_levels
-from harnack.fields.multipoles.nearby import bend_columns
-from harnack.fields.multipoles.truncation import truncation
+from harnack.fields.multipoles.truncation import bend_columns, truncation
 from harnack.tree import NO_PRIMITIVE, Hierarchy, build_hierarchy
 from harnack.tree.hierarchy import FloatArray, IntArray
 

@@ -21,8 +21,7 @@ from harnack.fields.edges.edge_passing import Line, known_along
 from harnack.fields.field import Lipschitz, Sample
 from harnack.fields.meshes.edge_chains import EdgeChains
 from harnack.fields.meshes.edge_trails import EdgeTrails
-from harnack.fields.meshes.winding_mesh import rounding_of_sum
-from harnack.fields.multipoles.nearby import SECOND_ROUNDINGS, SLOPE_ROUNDINGS
+from harnack.fields.sums import rounding_of_sum
 from harnack.fields.symmetric import SymmetricSum
 from harnack.fields.unit_coordinates import epsilon_at
 from harnack.tree.triangles import Frame, TriangleRays
@@ -105,15 +104,9 @@ class ExactWinding:
         if self.edges is None:
             nothing = self.backend.Array3f(0), SymmetricSum.zero(real)
             return Values(turns, real(self.rounding), *nothing, real(0), real(0))
-        sums, share, unit = lifted_sums(self.edges, x, derivatives), _SHARE, epsilon_at(x)
-        return Values(
-            dr.fma(share, sums.angle, turns),
-            dr.fma(share, sums.rounding, self.rounding),
-            share * sums.gradient,
-            SymmetricSum(*(share * part for part in sums.hessian.parts())),
-            share * SLOPE_ROUNDINGS * unit * sums.s4,
-            share * SECOND_ROUNDINGS * unit * sums.s5,
-        )
+        sums, unit = lifted_sums(self.edges, x, derivatives).whole(), epsilon_at(x)
+        sums = dataclasses.replace(sums, value=dr.fma(4 * math.pi, turns, sums.value))
+        return sums.values(_SHARE, unit, self.rounding)
 
     def start(self, frame: Frame, t: Real, active: Mask) -> Real:
         """The part of w that counts crossings, for t at the start of a ray."""
@@ -122,7 +115,7 @@ class ExactWinding:
     def on_stretch(
         self, frame: Frame, x: Vec3, behind: Crossing, turns: Real, detail: Real
     ) -> Sample:
-        """w continued along a stretch of a ray, certified as `nearby.Nearby.sample` says."""
+        """w continued along a stretch of a ray, certified as `FieldSums.sample` says."""
         del behind
         if self.edges is None:
             nothing = self.backend.Array3f(0)
@@ -137,5 +130,5 @@ class ExactWinding:
         def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
             return chains.rates(frame, line, lengths, active)
 
-        known = known_along(line, found.gradient, found.clear, rates)
+        known = known_along(line, found.gradient, found.free_distance, rates)
         return found.sample(_SHARE, unit, self.rounding, along=known)

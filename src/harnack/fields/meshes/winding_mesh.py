@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
@@ -19,9 +17,6 @@ from harnack.geometry.singular import net_faces, singular_edges, weld_vertices
 from harnack.tree import Hierarchy, build_hierarchy
 from harnack.tree.hierarchy import FloatArray, IntArray
 from harnack.tree.triangles import MOST_TRIANGLES, PARITY, triangle_records
-
-if TYPE_CHECKING:
-    from harnack.backend import Backend, Real
 
 # Triangles of a leaf at most, and children of a node: by experiment.
 _LEAF_SIZE, _ARITY = 8, 4
@@ -203,11 +198,3 @@ def _centre_and_size(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray,
     low, high = _box(vertices, faces)
     size = 2.0 ** np.ceil(np.log2(0.5 * float((high - low).max())))
     return single(0.5 * (low + high)), float(size)
-
-
-def rounding_of_sum(backend: Backend, terms: int) -> Real:
-    """How far rounding may move w, a sum of so many terms, each rounded a few times.
-
-    Errors are random in sign, so that they add up as the root of their number.
-    """
-    return dr.opaque(backend.Float, backend.epsilon * (16 + math.sqrt(terms)))

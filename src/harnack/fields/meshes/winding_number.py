@@ -16,12 +16,11 @@ from harnack.backend import backend_of
 from harnack.choices import did_you_mean
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.field import Field, LineLipschitz, Sample, lengthened
-from harnack.fields.kept import prepared_once
 from harnack.fields.meshes.winding_exact import ExactWinding
 from harnack.fields.meshes.winding_mesh import WindingMesh
 from harnack.fields.meshes.winding_tree import TreeWinding
 from harnack.fields.sheets import NO_SHEET, Crossing, NearestSheet
-from harnack.fields.unit_coordinates import UnitCoordinates, epsilon_at, placed
+from harnack.fields.unit_coordinates import UnitCoordinates, UploadedField, epsilon_at, placed
 from harnack.geometry import Box
 from harnack.tree.nearest import distance_to_triangles, jumps_within, nearest_triangle
 from harnack.tree.triangles import Frame, TriangleRays
@@ -35,13 +34,13 @@ FloatArray = npt.NDArray[np.float64]
 
 # One boundary edge costs about a nanosecond, a tree two to three microseconds.
 _MOST_EDGES = 2048
-# A coarse sample and the next closer one, of a trace, by experiment.
-_TRACED = 4.0
+# The accuracy of values at points, and of traces, by experiment.
+_VALUES, _TRACED = 2.0, 4.0
 # Roundings of a coordinate within which a point may be on either side of a triangle.
 _ON_TRIANGLE = 8.0
 
 
-class WindingNumber(BatchedField):
+class WindingNumber(UploadedField["_OnDevice"], BatchedField):
     """w of a triangle mesh: how often it winds around a point (Jacobson et al. 2013).
 
     For a closed mesh 1 inside and 0 outside; for a mesh with holes, cracks, duplicated or flipped
@@ -77,6 +76,7 @@ class WindingNumber(BatchedField):
         accuracy: float | None = None,
         order: int = 2,
     ) -> None:
+        super().__init__()
         if method not in ("auto", "exact", "tree"):
             hint = did_you_mean(method, ("auto", "exact", "tree"))
             raise ValueError(f'method is "auto", "exact" or "tree", not {method!r}{hint}')
@@ -90,8 +90,6 @@ class WindingNumber(BatchedField):
             ("exact" if few else "tree") if method == "auto" else method
         )
         self.accuracy, self.order = accuracy, order
-        self._batches: dict[Backend, _OnDevice] = {}
-        self._device: _OnDevice | None = None
 
     def moved(self, vertices: Any) -> WindingNumber:
         """The winding number of the same faces with their vertices (n, 3) elsewhere, for less work.
@@ -127,13 +125,8 @@ class WindingNumber(BatchedField):
         weight = self.mesh.area / (4 * math.pi * self.mesh.size**2)
         return values.far_away(x, 64 + len(self.mesh.singular), weight).rescaled(on.size)
 
-    def _batch(self, backend: Backend) -> _OnDevice:
-        """The evaluator for points, which is made once a backend."""
-        if backend not in self._batches:
-            self._batches[backend] = self._upload(backend, self.accuracy or 2.0, traced=False)
-        return self._batches[backend]
-
-    def _upload(self, backend: Backend, accuracy: float, traced: bool) -> _OnDevice:
+    def _upload(self, backend: Backend, *, traced: bool) -> _OnDevice:
+        accuracy = self.accuracy or (_TRACED if traced else _VALUES)
         mesh = self.mesh
         rays = TriangleRays.of(backend, mesh.ray_tree, mesh.ray_records)
         if self.method == "exact":
@@ -141,14 +134,6 @@ class WindingNumber(BatchedField):
         else:
             winding = TreeWinding.of(backend, mesh, accuracy, self.order)
         return _OnDevice(*placed(backend, mesh.centre, mesh.size), winding, rays)
-
-    @prepared_once
-    def prepare(self, backend: Backend) -> WindingNumber:
-        if self._device is not None and self._device.backend is backend:
-            return self
-        prepared = copy.copy(self)
-        prepared._device = self._upload(backend, self.accuracy or _TRACED, traced=True)
-        return prepared
 
     def evaluate(self, p: Vec3) -> Sample:
         """w as it is, jumps and all, with what is known of it as a lift."""
@@ -198,11 +183,6 @@ class WindingNumber(BatchedField):
         normal = dr.select(length > 0, found.normal / length, up)
         is_inner = found.is_inner & (length > 0)
         return NearestSheet(found.square, found.number, found.offset * on.size, normal, is_inner)
-
-    def _on(self, p: Vec3) -> _OnDevice:
-        if self._device is None:
-            return self.prepare(backend_of(p))._on(p)
-        return self._device
 
     def check_levels(self, levels: tuple[float, ...]) -> None:
         for level in levels:

@@ -6,26 +6,25 @@ Hessians from the same moments, a bound of what the truncation costs, and certif
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import drjit as dr
 import numpy as np
 
-from harnack.backend.extrema import fmax, fmin
-from harnack.fields.edges.edge_lift import LiftedProduct, with_edge
+from harnack.backend.extrema import fmax
+from harnack.fields.edges.edge_lift import LiftedProduct, LiftedSums
 from harnack.fields.edges.edge_passing import Line, known_along, with_edge_rates
 from harnack.fields.meshes.triangle_kernel import edges_of
-from harnack.fields.meshes.winding_mesh import rounding_of_sum
-from harnack.fields.multipoles.far_clusters import Errors, FarClusters
-from harnack.fields.symmetric import SymmetricSum
+from harnack.fields.multipoles.far_clusters import FarClusters
+from harnack.fields.sums import FieldSums, Terms, rounding_of_sum
 from harnack.fields.unit_coordinates import epsilon_at
-from harnack.tree import Node, for_each
 from harnack.tree.triangles import INDEX, Upwards, crossing, in_slots
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.fields.batch import Values
     from harnack.fields.edges.edge_passing import Rates
@@ -33,6 +32,8 @@ if TYPE_CHECKING:
     from harnack.fields.meshes.winding_mesh import WindingMesh
     from harnack.fields.sheets import Crossing
     from harnack.tree.triangles import Frame
+
+    IsAhead: TypeAlias = Callable[[list[Real], Real], Mask]
 
 _SHARE = 1 / (4 * math.pi)
 
@@ -69,41 +70,43 @@ class TreeWinding:
         return self.clusters.coarsest
 
     def at(self, x: Vec3, derivatives: int, closer: Real) -> Values:
-        """w, gradient and Hessian (as asked for) at points, `closer` as for `FarClusters.at`.
+        """w, gradient and Hessian (as asked for) at points; closer: the detail, at least 1.
 
         Near triangles: the crossings of the rays from x along z, and their open edges.
         """
-        real, epsilon = self.backend.Float, epsilon_at(x)
-        frame, reach = Upwards(x), self.clusters.accuracy * fmax(real(closer), real(1))
-        count = len(dataclasses.fields(Errors))
+        unit, detail = epsilon_at(x), fmax(self.backend.Float(closer), self.backend.Float(1))
 
-        def add(row: list[Real], active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
-            errors, (value, *rest) = Errors(*state[:count]), state[count:]
-            product = LiftedProduct(*rest[-3:])
+        def is_ahead(row: list[Real], t: Real) -> Mask:
+            del row
+            return t > 0
+
+        sums = self._sums(Upwards(x), x, detail, unit, is_ahead, derivatives)
+        return self.clusters.values(sums, _SHARE, unit, self.rounding)
+
+    def _sums(
+        self, frame: Frame | Upwards, x: Vec3, detail: Real, unit: Real, is_ahead: IsAhead,
+        derivatives: int,
+    ) -> FieldSums:  # fmt: skip
+        """4 pi w by far clusters, the crossings of near triangles that are ahead on rays of the
+        frame through x, and the open edges of near triangles (`is_open`).
+
+        is_ahead(row, t): whether a crossing at t with the triangle of a record is.
+        """
+        reach = self.clusters.ratio(detail)
+
+        def add(
+            row: list[Real], active: Mask, sums: FieldSums, own: tuple[Any, ...]
+        ) -> tuple[FieldSums, tuple[Any, ...]]:
             t, turn = crossing(row, frame)
-            value = value + dr.select(active & (t > 0), 4 * math.pi * turn, 0)
-            bounds = errors.rounding, errors.s4, errors.s5
-            for edge in edges_of(row, x, frame):
-                open_ = active & edge.is_open(reach)
-                product = edge.times(product, open_)
-                bounds = with_edge(bounds, edge.square, edge.inverse, epsilon, open_)
-                if derivatives >= 1:
-                    rest[0] = rest[0] + dr.select(open_, edge.gradient(), 0)
-                if derivatives == 2:
-                    rest[1:7] = edge.add_hessian(SymmetricSum(*rest[1:7]), open_).parts()
-            errors = dataclasses.replace(errors, rounding=bounds[0], s4=bounds[1], s5=bounds[2])
-            return *errors.parts(), value, *rest[:-3], *product.parts()
+            crossed = Terms(4 * math.pi * turn)
+            lifted = LiftedSums(sums.plus(crossed, active & is_ahead(row, t)), LiftedProduct(*own))
+            for near in edges_of(row, x, frame):
+                lifted = lifted.plus(near.edge, unit, active & near.is_open(reach))
+            return lifted.sums, lifted.product.parts()
 
-        def leaf(node: Node, near: Mask, errors: Errors, sums: Any) -> tuple[Errors, Any]:
-            state = for_each(node, near, add, (*errors.parts(), *sums))
-            return Errors(*state[:count]), state[count:]
-
-        one = LiftedProduct.one(real).parts()
-        errors, (value, *rest) = self.clusters.at(x, derivatives, leaf, closer, one)
-        value = value + LiftedProduct(*rest[-3:]).angle()
-        gradient = rest[0] if derivatives >= 1 else None
-        hessian = SymmetricSum(*rest[1:7]) if derivatives == 2 else None
-        return errors.values(_SHARE, epsilon, self.rounding, value, gradient, hessian)
+        one = LiftedProduct.one(self.backend.Float).parts()
+        sums, product = self.clusters.sums(x, detail, add, one, derivatives=derivatives)
+        return LiftedSums(sums, LiftedProduct(*product)).whole()
 
     def start(self, frame: Frame, t: Real, active: Mask) -> Real:
         """No crossings are counted: every sum is the whole of w."""
@@ -120,59 +123,38 @@ class TreeWinding:
         others ahead, as the tracer has it: the sign of a triangle that x is on, to rounding, is
         not asked for.
 
-        Certificate. Far dipoles: see `nearby.Nearby.sample`. The near triangles' field is that of
+        Certificate. Far dipoles: see `FieldSums.sample`. The near triangles' field is that of
         their open edges, and f is harmonic as far as the nearest of them; what they add to the
-        remainder, says `edge_lift.with_edge`.
+        remainder, says `LiftedEdge.bounds`.
         """
         del turns
-        real, index = self.backend.Float, self.backend.UInt32
-        epsilon, reach = fmax(epsilon_at(frame.o), epsilon_at(x)), self.clusters.ratio(detail)
+        index, unit = self.backend.UInt32, fmax(epsilon_at(frame.o), epsilon_at(x))
 
-        def add(row: list[Real], active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
-            value, g, truncation, slope_truncation, rounding, clear, s4, s5, *product = state
-            t, turn = crossing(row, frame)
-            passed = t < behind.t
-            passed |= (t == behind.t) & (index(fmax(row[INDEX], real(0))) <= behind.sheet)
-            value = value + dr.select(active & ~passed, 4 * math.pi * turn, 0)
-            product, bounds = LiftedProduct(*product), (rounding, s4, s5)
-            for edge in edges_of(row, x, frame):
-                open_ = active & edge.is_open(reach)
-                product = edge.times(product, open_)
-                bounds = with_edge(bounds, edge.square, edge.inverse, epsilon, open_)
-                g = g + dr.select(open_, edge.gradient(), 0)
-                clear = dr.select(open_, fmin(dr.sqrt(edge.square), clear), clear)
-            rounding, s4, s5 = bounds
-            sums = value, g, truncation, slope_truncation, rounding, clear, s4, s5
-            return *sums, *product.parts()
+        def is_ahead(row: list[Real], t: Real) -> Mask:
+            number = index(fmax(row[INDEX], self.backend.Float(0)))
+            return ~((t < behind.t) | ((t == behind.t) & (number <= behind.sheet)))
 
-        def leaf(node: Node, near: Mask, sums: tuple[Any, ...]) -> tuple[Any, ...]:
-            return for_each(node, near, add, sums)
-
-        one = LiftedProduct.one(real).parts()
-        found, product = self.clusters.near(x, detail, leaf, one)
-        found = dataclasses.replace(found, value=found.value + LiftedProduct(*product).angle())
-        line = Line(x, frame.d, 8 * epsilon)
-        known = known_along(line, found.gradient, found.clear, self._rates(line))
-        return found.sample(_SHARE, epsilon, self.rounding, along=known)
+        found = self._sums(frame, x, detail, unit, is_ahead, 1)
+        line = Line(x, frame.d, 8 * unit)
+        known = known_along(line, found.gradient, found.free_distance, self._rates(line))
+        return found.sample(_SHARE, unit, self.rounding, along=known)
 
     def _rates(self, line: Line) -> Rates:
         """The rates of `edge_passing` for 4 pi w on stretches of lines."""
         reach = self.clusters.rough
 
         def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
-            def add(row: list[Real], active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
-                old = state[8:]
-                for edge in edges_of(row, line.x, Upwards(line.x)):
-                    open_ = active & edge.is_open(reach)
-                    new = with_edge_rates(line, (edge.a, edge.e), edge.inverse, lengths, old)
-                    old = tuple(dr.select(open_, a, b) for a, b in zip(new, old, strict=True))
-                return *state[:8], *old
-
-            def leaf(node: Node, near: Mask, sums: tuple[Any, ...]) -> tuple[Any, ...]:
-                return for_each(node, near, add, sums)
+            def add(
+                row: list[Real], active: Mask, sums: FieldSums, own: tuple[Any, ...]
+            ) -> tuple[FieldSums, tuple[Any, ...]]:
+                for near in edges_of(row, line.x, Upwards(line.x)):
+                    open_ = active & near.is_open(reach)
+                    new = with_edge_rates(line, near.edge.edge, lengths, own)
+                    own = tuple(dr.select(open_, a, b) for a, b in zip(new, own, strict=True))
+                return sums, own
 
             start = tuple(self.backend.Float(0) for _ in lengths)
-            far, near = self.clusters.near(line.x, 0, leaf, start, active)
-            return far.with_rates(line, lengths, near, active)
+            far, near = self.clusters.sums(line.x, 0, add, start, active)
+            return far.with_rates(line.v, line.slack, lengths, near, active)
 
         return rates

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 
+from harnack.fields.sums import Terms
 from harnack.fields.symmetric import SymmetricSum
 
 if TYPE_CHECKING:
@@ -15,17 +15,9 @@ if TYPE_CHECKING:
     from harnack.backend import Real, Vec3
 
 
-@dataclass(frozen=True)
-class Terms:
-    """sum_l P_l(r)/r^(2l+1) for l = 1, 2, 3, and its derivatives, as far as they were asked for."""
-
-    value: Real
-    gradient: Vec3 | None = None
-    hessian: SymmetricSum | None = None
-
-
 def far_terms(c: Sequence[Real], r: Vec3, inverse: Real, derivatives: int) -> Terms:
-    """The terms with coefficients c (as `multipole.cartesian` lays them out) at r, inverse = 1/|r|.
+    """sum_l P_l(r)/r^(2l+1) for l = 1, 2, 3, and its derivatives, with the coefficients c that
+    `multipole.cartesian` lays out; inverse = 1/|r|.
 
     derivatives: 0 for the value, 1 with the gradient, 2 with the Hessian too. With u = 1/|r|,
     G_l = grad P_l (so that l P_l = G_l.r by Euler) and H_l the Hessian of P_l,

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from harnack.fields.multipoles.moments import KNOWN
 from harnack.fields.multipoles.multipole import Level, Moments
+from harnack.fields.sums import longest_part, remainder_factor
 
 FloatArray = npt.NDArray[np.float64]
 # A bound that is rounded to single precision a few times, down each time, is one still.
@@ -65,3 +66,28 @@ def truncation(
             second + (l + 1) * (l + 2) * term,
         )
     return _ROOM * value, _ROOM * slope, _ROOM * second
+
+
+def bend_columns(level: Level, rough: float) -> tuple[FloatArray, FloatArray]:
+    """A and K (k,) of nodes that are seen from beyond r0 = `rough` times their radius R.
+
+    From there on a step by t = q r, q <= Q = `longest_part(rough)`, moves a node's field off the
+    linear by at most
+
+        (A + K/r^2) t^2/r^4 Phi_1(q),   Phi_l(q) = ((1-q)^-(l+1) - 1 - (l+1)q)/q^2.
+
+    The term l, a harmonic function of degree -(l+1), is at most B_l/r^(l+1), and its k-th
+    derivative along a line (l+k)!/l! B_l/r^(l+1+k) (`truncation.truncation`, k times). So Taylor's
+    remainder is at most B_l Phi_l(q) t^2/r^(l+3). In Phi_l/Phi_1 the ratio of coefficients,
+    (l+k)!/(l! (k+1)!), grows with k, so that the quotient grows with q: W_l = Phi_l(Q)/Phi_1(Q)
+    serves. With r >= r0: A = B_1 + W_2 B_2/r0 and K = sum_{l>=3} W_l B_l/r0^(l-3), for l >= 6 of
+    B_l <= l R^(l-5) sum a |d|^4, with Phi_l(Q) < (1-Q)^-(l+1)/Q^2.
+    """
+    r0, q = np.maximum(rough * level.radius, 1e-50), longest_part(rough)
+    first = q * q * remainder_factor(q)
+    ratio = [((1 - q) ** -(n + 1) - 1 - (n + 1) * q) / first for n in range(KNOWN + 1)]
+    terms = [ratio[n] * sup_norm(level.moments, n) for n in range(1, KNOWN + 1)]
+    x = 1 / (rough * (1 - q))
+    rest = x * (6 - 5 * x) / (1 - x) ** 2 / ((1 - q) ** 6 * first)
+    wide = rest * level.fourth / r0**2 + sum(term / r0**n for n, term in enumerate(terms[2:]))
+    return terms[0] + terms[1] / r0, wide

@@ -1,0 +1,275 @@
+"""What sums over edges, dipoles and far nodes of trees tell about a field near a point.
+
+Every family of such fields adds up the same record, `FieldSums`, and makes of it values with error
+bounds, or a sample with a certificate.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+
+from harnack.backend.extrema import fmax, fmin
+from harnack.fields.batch import Values
+from harnack.fields.field import Curvature, HarmonicBall, LineLipschitz, Sample
+from harnack.fields.symmetric import SymmetricSum
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Mask, Real, Vec3
+
+# Parts of the free distance out to which curvatures are stated: the shorter, the smaller.
+_REACHES = (0.2, 0.4, 0.6)
+# The part of the way to the dipoles of far nodes out to which they are stated.
+_WAY = 0.65
+# Sums of rounded terms: bounds are lengthened, and distances shortened, by this part of them.
+SUM_ROUNDING = 2e-5
+# Roundings of a coordinate within which a singular point is near.
+_BESIDE = 256.0
+# Rounding of positions and of terms moves the gradient by at most so many s4, and second
+# derivatives by so many s5, units in the last place of coordinates.
+SLOPE_ROUNDINGS, SECOND_ROUNDINGS = 16.0, 320.0
+
+
+def longest_part(rough: float) -> float:
+    """Of the distance of a far node's centre: the longest step that certificates cover."""
+    return _WAY * (1 - 1 / rough)
+
+
+def free_part(rough: float) -> float:
+    """Of the distance of a far node's centre: what is counted as free of dipoles."""
+    return longest_part(rough) / _REACHES[-1]
+
+
+def remainder_factor(q: float) -> float:
+    """phi of `FieldSums.sample`: convex, and 3 at 0."""
+    return (3 - 2 * q) / (1 - q) ** 2
+
+
+def rounding_of_sum(
+    backend: Backend, terms: int, own: float = 16, growth: float = 1.0, size: float = 1.0
+) -> Real:
+    """How far rounding may move a sum of so many terms, each rounded `own` times, of `size`.
+
+    Errors are random in sign, so that they add up as the root of their number; `growth` times it
+    where most terms are small. No part of a kernel's code.
+    """
+    return dr.opaque(backend.Float, backend.epsilon * (own + growth * math.sqrt(terms)) * size)
+
+
+def rounding_of_dipole(area: Real, inverse: Real, unit: Real) -> Real:
+    """What rounding may do to the value of a dipole at distance rho = 1/inverse.
+
+    unit: the rounding of a coordinate, at least epsilon: it moves the value by at most
+    2 unit area/rho^3, twice in the difference of two coordinates; the four roundings of its term
+    do so by 4 epsilon area/rho^2.
+    """
+    square = inverse * inverse
+    return (unit * area) * dr.fma(4 * inverse, square, 4 * square)
+
+
+@dataclass(frozen=True)
+class Terms:
+    """What one dipole, edge or far node adds to f and its derivatives, as far as those were asked
+    for."""
+
+    value: Real
+    gradient: Vec3 | None = None
+    hessian: SymmetricSum | None = None
+
+
+@dataclass(frozen=True)
+class FieldSums:
+    """Sums of terms of f at points x, and of what bounds them near x.
+
+    value, gradient, hessian: of f, None where they were not asked for.
+    truncation, slope_truncation, second_truncation: bounds of what was left out of value, gradient
+        and second derivatives along lines; the last is None without a Hessian.
+    rounding: bound of what rounding has done to the value.
+    free_distance: of the nearest singular point, a dipole or an edge, or `free_part` of that to the
+        nearest far node's centre if that is less.
+    s4, s5: sums of a/rho^4 and a/rho^5 over dipoles a at rho and, with A + K/r^2 of
+        `truncation.bend_columns` for a, over far nodes at r. Edges: see `LiftedEdge.bounds`.
+    """
+
+    value: Real
+    gradient: Vec3
+    hessian: SymmetricSum | None
+    truncation: Real
+    slope_truncation: Real
+    second_truncation: Real
+    rounding: Real
+    free_distance: Real
+    s4: Real
+    s5: Real
+
+    @classmethod
+    def zero(cls, backend: Backend, free_distance: Real, derivatives: int) -> FieldSums:
+        """Of nothing. free_distance: where nothing bounds it. derivatives: 0 for the value alone, 1
+        with the gradient, 2 with the Hessian."""
+        real, zero = backend.Float, backend.Float(0)
+        gradient = backend.Array3f(0) if derivatives >= 1 else None
+        hessian = SymmetricSum.zero(real) if derivatives == 2 else None
+        second = None if hessian is None else zero
+        bounds = zero, zero, second, zero, real(free_distance), zero, zero
+        return cls(zero, gradient, hessian, *bounds)
+
+    @classmethod
+    def of(cls, parts: tuple[Any, ...]) -> FieldSums:
+        """From `parts`."""
+        value, gradient, hessian, *bounds = parts
+        return cls(value, gradient, None if hessian is None else SymmetricSum(*hessian), *bounds)
+
+    def parts(self) -> tuple[Any, ...]:
+        """In the order of the constructor, as loops want them. (What no trip changes is left out: a
+        loop with such a state is recorded twice.)"""
+        hessian = None if self.hessian is None else self.hessian.parts()
+        bounds = self.truncation, self.slope_truncation, self.second_truncation, self.rounding
+        return self.value, self.gradient, hessian, *bounds, self.free_distance, self.s4, self.s5
+
+    @property
+    def derivatives(self) -> int:
+        """How many were asked for."""
+        return 0 if self.gradient is None else 1 if self.hessian is None else 2
+
+    def plus(self, terms: Terms, active: Mask) -> FieldSums:
+        """With terms more, where active; derivatives that they do not have are 0."""
+        gradient, hessian = self.gradient, self.hessian
+        if gradient is not None and terms.gradient is not None:
+            gradient = gradient + dr.select(active, terms.gradient, 0)
+        if hessian is not None and terms.hessian is not None:
+            pairs = zip(hessian.parts(), terms.hessian.parts(), strict=True)
+            hessian = SymmetricSum(*(old + dr.select(active, new, 0) for old, new in pairs))
+        value = self.value + dr.select(active, terms.value, 0)
+        return dataclasses.replace(self, value=value, gradient=gradient, hessian=hessian)
+
+    def with_far_node(
+        self, terms: Terms, far: Mask, inverse: Real, size: Real, left_out: tuple[Real, Real, Real],
+        free: Real, unit: Real,
+    ) -> FieldSums:  # fmt: skip
+        """With a node of a tree more where it is far, at distance 1/inverse.
+
+        size: A + K/r^2 of `truncation.bend_columns`. left_out: of value, gradient and second
+        derivatives. free: as far as the node counts as free of dipoles. unit: the rounding of a
+        coordinate. left_out and inverse are 0 where it is not far.
+        """
+        fourth, second = size * dr.square(inverse * inverse), self.second_truncation
+        second = None if second is None else second + left_out[2]
+        return dataclasses.replace(
+            self.plus(terms, far),
+            truncation=self.truncation + left_out[0],
+            slope_truncation=self.slope_truncation + left_out[1],
+            second_truncation=second,
+            rounding=self.rounding + rounding_of_dipole(size, inverse, unit),
+            free_distance=dr.select(far, fmin(free, self.free_distance), self.free_distance),
+            s4=self.s4 + fourth,
+            s5=dr.fma(fourth, inverse, self.s5),
+        )
+
+    def values(self, share: float, unit: Real, rounding: Real, outside: float = 0.0) -> Values:
+        """`share` times f and its derivatives, as far as there are, with bounds of their errors.
+
+        unit: the rounding of a coordinate, at least epsilon. rounding: what there is of it in the
+        value besides. outside: roundings of gradients far outside the whole, where distances are
+        as long as coordinates: the powers of a distance, and the sums of moments, have their own.
+        """
+        value, error = share * self.value, dr.fma(share, self.truncation + self.rounding, rounding)
+        if self.gradient is None:
+            return Values(value, error)
+        rounded = SLOPE_ROUNDINGS * unit
+        if outside:
+            rounded = rounded + outside * fmax(unit - 2 * float(dr.epsilon(self.value)), 0)
+        slope = share * dr.fma(rounded, self.s4, self.slope_truncation)
+        if self.hessian is None:
+            return Values(value, error, share * self.gradient, None, slope)
+        hessian = SymmetricSum(*(share * part for part in self.hessian.parts()))
+        second = share * dr.fma(SECOND_ROUNDINGS * unit, self.s5, self.second_truncation)
+        return Values(value, error, share * self.gradient, hessian, slope, second)
+
+    def sample(
+        self,
+        share: float,
+        unit: Real,
+        rounding: Real,
+        normal: Vec3 | None = None,
+        along: tuple[LineLipschitz, ...] = (),
+    ) -> Sample:
+        """`share` times f, with what is known of it.
+
+        unit: the rounding of a coordinate. rounding: what there is of it in the value besides.
+        along: what is known of f along a line besides.
+
+        Certificate. Along a line the k-th derivative of a dipole a at rho is at most
+        (k+1)! a/rho^(k+2) (it is a mixed derivative of a/rho, whose tensor is symmetric and takes
+        its largest value on equal vectors), so that Taylor's remainder after the linear term is at
+        most a ((rho-t)^-2 - rho^-2 - 2t rho^-3) = a t^2 rho^-4 phi(t/rho), phi(q) =
+        (3-2q)/(1-q)^2. That of a far node is at most that of a dipole of area A + K/r^2 in its
+        centre, for t/r <= `longest_part` (`truncation.bend_columns`). phi is convex: on [0, b] it
+        lies below 3 + rise q, rise = (phi(b)-3)/b = (4-3b)/(1-b)^2. With t <= r = b free_distance,
+        |f(y) - f(x) - g.(y-x)| <= t^2 (3 s4 + rise r s5).
+        A ball of that radius bounds f by |g| r more, and holds harmonic f: dipoles of far nodes
+        are farther away than 1 - 1/rough times the centre, and `longest_part` is less.
+        """
+        g = share * self.gradient
+        slope_error = share * dr.fma(SLOPE_ROUNDINGS * unit, self.s4, self.slope_truncation)
+        distance = self.free_distance * (1 - SUM_ROUNDING) - 4 * unit
+        scale, radii = (2 + 2 * SUM_ROUNDING) * share, [(b, b * distance) for b in _REACHES]
+        bends = [Curvature(scale * self.remainder(b, r), r) for b, r in radii]
+        slope, widest = dr.norm(g) + slope_error, bends[-1]
+        r = widest.radius
+        variation = (1 + SUM_ROUNDING) * r * dr.fma(0.5 * r, widest.constant, slope)
+        value = share * self.value
+        ball = HarmonicBall(r, value - variation, value + variation)
+        # On a singular point itself all values meet: a gradient so steep that it is as near to any
+        # level as can be, and an error that says how far away such a level is. So it is beside one,
+        # where rounding leaves nothing of the gradient.
+        reach, most = 16 * unit, share * 1.6e5 * math.pi
+        apart = (self.free_distance > reach) & dr.isfinite(value) & dr.isfinite(dr.squared_norm(g))
+        lost = ~(slope_error <= dr.norm(g)) & (self.free_distance <= _BESIDE * unit)
+        apart, reach = apart & ~lost, fmax(self.free_distance, reach)
+        steep = type(g)(0, 0, most / reach)
+        error = dr.fma(share, self.truncation + self.rounding, rounding)
+        return Sample(
+            dr.select(apart, value, 0),
+            dr.select(apart, g, steep),
+            (*bends, *(LineLipschitz(share * one.constant, one.radius) for one in along)),
+            dr.select(apart, error, most),
+            dr.select(apart, slope_error, 0),
+            normal,
+            dr.select(apart, share * self.truncation, 0),
+            (ball,),
+        )
+
+    def with_rates(
+        self, v: Vec3, unit: Real, lengths: tuple[Real, ...], rates: tuple[Real, ...], active: Mask
+    ) -> tuple[Real, ...]:
+        """The rates K of `edge_passing` for some edges, with those of all that is summed up here.
+
+        f moves by at most |s| |g . v| + s^2 (3 s4 + rise r s5) for |s| <= r (`sample`), if g is
+        known up to its truncation and rounding. Infinite for lengths above r.
+
+        v: directions of the lines; unit: the rounding of their points' coordinates.
+        """
+        slope = dr.abs(dr.dot(self.gradient, v)) + self.slope_truncation
+        slope = dr.fma(SLOPE_ROUNDINGS * unit, self.s4, slope)
+        b = _REACHES[-1]
+        r = b * (self.free_distance * (1 - SUM_ROUNDING) - 4 * unit)
+        bend = self.remainder(b, dr.select(self.s5 > 0, r, 0))
+        pairs = zip(lengths, rates, strict=True)
+        found = (
+            dr.select(active & (length <= r), rate + dr.fma(length, bend, slope), dr.inf)
+            for length, rate in pairs
+        )
+        return tuple(found)
+
+    def remainder(self, b: float, r: Real) -> Real:
+        """3 s4 + rise r s5 for r = b times the free distance, or less: see `sample`."""
+        return dr.fma(_rise(b) * r, self.s5, 3 * self.s4)
+
+
+def _rise(b: float) -> float:
+    """The slope of the chord of phi over [0, b]: see `FieldSums.sample`."""
+    return (4 - 3 * b) / (1 - b) ** 2
