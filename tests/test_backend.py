@@ -18,6 +18,7 @@ from rich.console import Console
 
 import harnack.backend as hb
 from harnack.backend import doctor, llvm
+from harnack.backend.basis import across, across_rows
 
 ELF_WITH_SONAME = b"\x7fELF...\0libc.so.6\0%s\0LLVMCreateMessage\0"
 
@@ -467,3 +468,19 @@ def test_numbers_of_a_field_that_single_precision_cannot_hold_are_refused() -> N
     backend = hb.choose_backend("single")
     with pytest.raises(ValueError, match="too large for single precision"):
         hb.aligned(backend, np.array([1.0, 1e39]))
+
+
+def test_rows_have_frames() -> None:
+    """Both functions for an orthonormal basis agree, at the poles as well."""
+    rng = np.random.default_rng(3)
+    d = np.concatenate([rng.normal(size=(200, 3)), [[0, 0, 1], [0, 0, -1], [1e-9, 0, -1]]])
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    u, v = across_rows(d)
+    frame = np.stack([u, v, d], axis=1)
+    np.testing.assert_allclose(frame @ frame.transpose(0, 2, 1), np.tile(np.eye(3), (203, 1, 1)),
+                               atol=1e-14)  # fmt: skip
+    np.testing.assert_allclose(np.linalg.det(frame), 1.0, atol=1e-14)
+    backend = hb.choose_backend("double")
+    on_backend = across(hb.to_vector3(backend, d))
+    for ours, theirs in zip((u, v), on_backend, strict=True):
+        np.testing.assert_allclose(ours, hb.to_numpy(theirs), atol=1e-15)

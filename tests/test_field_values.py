@@ -10,6 +10,7 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
+from harnack.fields.points import in_batches
 from harnack.geometry.mesh_shapes import icosphere
 from harnack.geometry.shapes import wavy_polygon
 
@@ -64,6 +65,28 @@ def test_single_points_and_no_points(name: str) -> None:
         field.value(np.zeros((2, 2)))
     with pytest.raises(ValueError, match="NaN"):
         field.gradient([[np.nan, 0.0, 0.0]])
+
+
+@pytest.mark.parametrize("n", [0, 1, 7, 8, 20])
+def test_points_in_batches_are_points_one_by_one(n: int) -> None:
+    """Of arrays and of Dr.Jit vectors; what is the same for all points is given to each."""
+    backend = choose_backend("double")
+    rng = np.random.default_rng(n)
+    x, other = rng.normal(size=(n, 3)), rng.normal(size=(n, 3))
+    other[: n // 2] = np.nan  # other vectors are not looked at
+    calls: list[int] = []
+
+    def compute(p: Any, q: Any) -> tuple[Any, ...]:
+        calls.append(dr.width(p))
+        return dr.dot(p, q), p + q, backend.Float(3)
+
+    for points in (x, to_vector3(backend, x)):
+        calls.clear()
+        product, total, three = in_batches(backend, compute, points, other, at_once=7)
+        assert calls == {0: [1], 1: [1], 7: [7], 8: [7, 1], 20: [7, 7, 6]}[n]
+        np.testing.assert_allclose(product, (x * other).sum(axis=1), rtol=1e-13, atol=1e-13)
+        np.testing.assert_allclose(total, x + other)
+        np.testing.assert_array_equal(three, np.full(n, 3.0))
 
 
 @pytest.mark.parametrize("name", FIELDS)

@@ -47,23 +47,23 @@ def nearer_along(surface: PreparedLevelSet, x: Vec3, way: Vec3, limit: Real) -> 
 
 
 @dataclass(frozen=True)
-class _Plane:
+class _TouchingPlane:
     """Points x + r with r.normal = offset, |normal| = 1; normal = 0 where there is no plane."""
 
     normal: Vec3
     offset: Real
 
     @classmethod
-    def where(cls, mask: Mask, one: _Plane, other: _Plane) -> _Plane:
+    def where(cls, mask: Mask, one: _TouchingPlane, other: _TouchingPlane) -> _TouchingPlane:
         """One plane in some lanes, another elsewhere."""
         normal = dr.select(mask, one.normal, other.normal)
         return cls(normal, dr.select(mask, one.offset, other.offset))
 
-    def is_apart(self, other: _Plane) -> Mask:
+    def is_apart(self, other: _TouchingPlane) -> Mask:
         """Whether both are planes, and not nearly parallel."""
         return dr.squared_norm(dr.cross(self.normal, other.normal)) > _APART * _APART
 
-    def meeting(self, other: _Plane) -> Vec3:
+    def meeting(self, other: _TouchingPlane) -> Vec3:
         """The shortest way to where both are; not finite if they are parallel."""
         vector = cast("Any", type(self.normal))
         cosine = dr.dot(self.normal, other.normal)
@@ -72,7 +72,7 @@ class _Plane:
             1 - cosine * cosine
         )
 
-    def corner(self, second: _Plane, third: _Plane) -> Vec3:
+    def corner(self, second: _TouchingPlane, third: _TouchingPlane) -> Vec3:
         """The way to where all three are; not finite if they are parallel to a line."""
         vector = cast("Any", type(self.normal))
         a, b, c = self.normal, second.normal, third.normal
@@ -83,18 +83,18 @@ class _Plane:
 
 
 @dataclass(frozen=True)
-class _Planes:
+class _TouchingPlanes:
     """Three planes that touch the surface: where the best point is, then the two last seen that are
     parallel neither to it nor to one another."""
 
-    first: _Plane
-    second: _Plane
-    third: _Plane
+    first: _TouchingPlane
+    second: _TouchingPlane
+    third: _TouchingPlane
 
     @classmethod
-    def of(cls, parts: tuple[Any, ...]) -> _Planes:
+    def of(cls, parts: tuple[Any, ...]) -> _TouchingPlanes:
         """From `parts`."""
-        return cls(*(_Plane(parts[k], parts[k + 1]) for k in (0, 2, 4)))
+        return cls(*(_TouchingPlane(parts[k], parts[k + 1]) for k in (0, 2, 4)))
 
     def parts(self) -> tuple[Any, ...]:
         """Normals and offsets, as loops want them."""
@@ -104,23 +104,23 @@ class _Planes:
             for part in (plane.normal, plane.offset)
         )
 
-    def with_(self, plane: _Plane, seen: Mask, best: Mask) -> _Planes:
+    def with_(self, plane: _TouchingPlane, seen: Mask, best: Mask) -> _TouchingPlanes:
         """With one more, where `seen`; that of the best point, where `best`."""
         first, second, third = self.first, self.second, self.third
-        parts = _Plane.where
+        parts = _TouchingPlane.where
         stays = first.is_apart(plane)
-        ours = _Planes(
+        ours = _TouchingPlanes(
             plane,
             parts(stays, first, second),
             parts(stays & second.is_apart(plane), second, third),
         )
         is_new = seen & ~best & stays
-        theirs = _Planes(
+        theirs = _TouchingPlanes(
             first,
             parts(is_new, plane, second),
             parts(is_new & second.is_apart(plane), second, third),
         )
-        return _Planes(
+        return _TouchingPlanes(
             parts(best, ours.first, theirs.first),
             parts(best, ours.second, theirs.second),
             parts(best, ours.third, theirs.third),
@@ -157,7 +157,7 @@ def close_in(surface: PreparedLevelSet, x: Vec3, foot: Vec3) -> Vec3:
         d: Vec3, t: Real, foot: Vec3, step: Real, angle: Real, failed: Any, n: Any, active: Mask,
         *parts: Any,
     ) -> tuple[Any, ...]:  # fmt: skip
-        planes, around = _Planes.of(parts), n < _AROUND
+        planes, around = _TouchingPlanes.of(parts), n < _AROUND
         meets = ~around & (failed < _MEETINGS)
         way = dr.select(meets, dr.normalize(planes.meeting(failed)), _tilted(d, step, angle))
         way = dr.select(around, _spiral(vector, real(n)), way)
@@ -169,7 +169,7 @@ def close_in(surface: PreparedLevelSet, x: Vec3, foot: Vec3) -> Vec3:
         nearer = hit & (seen.t < t * (1 - 8 * backend.epsilon))
         normal = dr.normalize(seen.gradient)
         touches = hit & dr.isfinite(dr.squared_norm(normal))
-        touching = _Plane(normal, dr.dot(normal, way) * seen.t)
+        touching = _TouchingPlane(normal, dr.dot(normal, way) * seen.t)
         planes = planes.with_(touching, touches, touches & nearer)
         d, t = dr.select(nearer, way, d), dr.select(nearer, seen.t, t)
         foot = dr.select(nearer, dr.fma(vector(seen.t), way, x), foot)

@@ -76,9 +76,13 @@ def in_batches(
     # Once for no points at all: it tells shapes, and the errors of `compute`.
     for start in range(0, max(n, 1), at_once):
         lanes = min(at_once, n - start)
-        given = (_part(backend, one, start, lanes) for one in (vectors, *others))
         with dr.suspend_grad():
-            results = compute(*given) if n else compute(*(backend.Array3f(0) for _ in given))
+            results = compute(
+                *(
+                    _part(backend, one, start, lanes) if n else backend.Array3f(0)
+                    for one in (vectors, *others)
+                )
+            )
             dr.eval(*results)
         parts.append(tuple(_spread(to_numpy(one), max(lanes, 1)) for one in results))
     if len(parts) == 1:
