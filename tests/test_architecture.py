@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -46,7 +47,9 @@ FIELD_ROOMS = (
     "waves",
 )
 FAMILIES = ("curves", "meshes", "clouds", "polynomials", "waves")
-MOST_FILES = 14
+# Within `rendering`.
+RENDERING_ROOMS = ("surfaces", "mitsuba", "studio", "pictures", "arguments", "picture")
+MOST_FILES = 13
 FREE = ("__init__", "__main__", "testing")  # at the top: may import from any room
 
 
@@ -111,6 +114,49 @@ def test_families_of_fields_do_not_know_each_other() -> None:
             if later or (target in FAMILIES and target != room):
                 wrong.append(f"{path.name} imports harnack.{'.'.join(module)}")
     assert wrong == []
+
+
+def rendering_imports() -> dict[tuple[str, ...], set[tuple[str, ...]]]:
+    """What each file of `rendering` imports from `rendering`, at its top or within a function."""
+    room = SOURCE / "rendering"
+    parts = {path: path.relative_to(room).with_suffix("").parts for path in room.rglob("*.py")}
+    graph: dict[tuple[str, ...], set[tuple[str, ...]]] = {}
+    for path, name in parts.items():
+        if name[-1] == "__init__":
+            continue
+        graph[name] = set()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom):
+                assert node.level == 0, "imports are absolute"
+                stem = tuple((node.module or "").split("."))
+                found = [(*stem, alias.name) for alias in node.names] + [stem]
+            elif isinstance(node, ast.Import):
+                found = [tuple(alias.name.split(".")) for alias in node.names]
+            else:
+                continue
+            inside = (one[2:] for one in found if one[:2] == ("harnack", "rendering"))
+            graph[name] |= {one for one in inside if one in parts.values()}
+    return graph
+
+
+def test_rooms_of_rendering_are_in_order_and_without_circles() -> None:
+    graph = rendering_imports()
+    assert len(graph) > 20
+    TopologicalSorter(graph).prepare()  # raises CycleError
+    order = RENDERING_ROOMS.index
+    wrong = [
+        (name, one)
+        for name, found in graph.items()
+        for one in found
+        if order(one[0]) > order(name[0])
+    ]
+    assert wrong == []
+
+
+def test_rooms_of_rendering_are_small() -> None:
+    folders = [path for path in (SOURCE / "rendering").rglob("*") if any(path.glob("*.py"))]
+    assert {path.name for path in folders} == set(RENDERING_ROOMS) - {"arguments", "picture"}
+    assert all(len(list(path.glob("*.py"))) <= MOST_FILES for path in folders)
 
 
 def test_modules_have_names_that_say_something() -> None:
