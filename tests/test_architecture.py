@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -47,7 +48,9 @@ FIELD_ROOMS = (
     "waves",
 )
 FAMILIES = ("curves", "meshes", "clouds", "polynomials", "waves")
-# Files of one folder, `__init__` left out; those of rooms that wait to be divided are not counted.
+# Within `rendering`.
+RENDERING_ROOMS = ("surfaces", "mitsuba", "studio", "pictures", "arguments", "picture")
+# Files of one folder, `__init__` left out.
 MOST_FILES = 13
 UNDIVIDED = ("files", "rendering")
 FREE = ("__init__", "__main__", "testing")  # at the top: may import from any room
@@ -123,6 +126,43 @@ def test_no_room_is_a_hallway() -> None:
         if path.stem != "__init__" and room not in UNDIVIDED:
             counts[room] = counts.get(room, 0) + 1
     assert {room: count for room, count in counts.items() if count > MOST_FILES} == {}
+
+
+def rendering_imports() -> dict[tuple[str, ...], set[tuple[str, ...]]]:
+    """What each file of `rendering` imports from `rendering`, at its top or within a function."""
+    room = SOURCE / "rendering"
+    parts = {path: path.relative_to(room).with_suffix("").parts for path in room.rglob("*.py")}
+    graph: dict[tuple[str, ...], set[tuple[str, ...]]] = {}
+    for path, name in parts.items():
+        if name[-1] == "__init__":
+            continue
+        graph[name] = set()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom):
+                assert node.level == 0, "imports are absolute"
+                stem = tuple((node.module or "").split("."))
+                found = [(*stem, alias.name) for alias in node.names] + [stem]
+            elif isinstance(node, ast.Import):
+                found = [tuple(alias.name.split(".")) for alias in node.names]
+            else:
+                continue
+            inside = (one[2:] for one in found if one[:2] == ("harnack", "rendering"))
+            graph[name] |= {one for one in inside if one in parts.values()}
+    return graph
+
+
+def test_rooms_of_rendering_are_in_order_and_without_circles() -> None:
+    graph = rendering_imports()
+    assert len(graph) > 20
+    TopologicalSorter(graph).prepare()  # raises CycleError
+    order = RENDERING_ROOMS.index
+    wrong = [
+        (name, one)
+        for name, found in graph.items()
+        for one in found
+        if order(one[0]) > order(name[0])
+    ]
+    assert wrong == []
 
 
 def test_modules_have_names_that_say_something() -> None:

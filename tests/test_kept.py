@@ -14,8 +14,9 @@ import pytest
 import harnack as hk
 from harnack.backend import choose_backend, to_vector3
 from harnack.geometry.mesh_shapes import icosphere
-from harnack.rendering import Camera
+from harnack.rendering import Camera, register
 
+register()
 VERTICES, FACES = icosphere(1)
 FIELDS: dict[str, Callable[[], hk.Field]] = {
     "curve": lambda: hk.SolidAngle([[1, 0, 0], [0, 1, 0], [-1, 0, 0.3], [0, -1, 0]]),

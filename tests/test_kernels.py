@@ -11,7 +11,9 @@ import pytest
 
 import harnack as hk
 from harnack.geometry.mesh_shapes import icosphere
-from harnack.rendering import Camera
+from harnack.rendering import Camera, register
+
+register()
 
 
 def knot(k: int) -> hk.Field:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -408,3 +409,24 @@ def test_xml_shape_with_a_misspelt_property_is_refused() -> None:
     )
     with pytest.raises(RuntimeError, match="levle"):
         mi.load_string(text)
+
+
+def test_integrators_that_cannot_see_our_surfaces_are_named_in_a_warning() -> None:
+    theirs = {"type": "sphere"}
+    path, ours = {"type": "path"}, {"type": "harnack_path"}
+
+    def scene(integrator: dict[str, Any], member: Any) -> Any:
+        members = {"integrator": integrator, "sensor": sensor(size=8), "lamp": lamp()}
+        return mi.load_dict({"type": "scene", "shape": member, **members})
+
+    for stock in (path, {"type": "prb"}):
+        with pytest.warns(UserWarning, match="1 of .*cannot see.*harnack_path"):
+            mi.render(scene(stock, shape(Sphere())), spp=1)
+    with pytest.warns(UserWarning, match="PathIntegrator draws nothing"):
+        mi.render(scene(ours, shape(Sphere())), integrator=mi.load_dict(path), spp=1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mi.render(scene(ours, shape(Sphere())), spp=1)
+        mi.render(scene({"type": "moment", "nested": ours}, shape(Sphere())), spp=1)
+        mi.render(scene(path, theirs), spp=1)
+        render(scene(path, shape(Sphere())), spp=1, progress=False)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from harnack.rendering.arguments import SHOW_MODES
-from harnack.rendering.mitsuba.carrier import shape
 from harnack.rendering.mitsuba.plugins import register, register_surfaces
+from harnack.rendering.mitsuba.shapes import shape
 from harnack.rendering.picture import render
+from harnack.rendering.studio.camera import Camera
 from harnack.rendering.studio.materials import MATERIALS, Material
-from harnack.rendering.studio.stage import Camera
 from harnack.rendering.surfaces.extent import UnboundedSurfaceError
 
 __all__ = [

@@ -13,7 +13,7 @@ from typing import Any
 
 from harnack.choices import did_you_mean
 from harnack.rendering.pictures.views import VIEWS
-from harnack.rendering.studio.stage import Camera
+from harnack.rendering.studio.camera import Camera
 from harnack.tracer import level_set
 
 __all__ = [

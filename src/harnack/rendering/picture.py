@@ -33,10 +33,12 @@ from harnack.rendering.mitsuba.plugins import register
 from harnack.rendering.mitsuba.scene_files import load_dictionary, load_scene_file
 from harnack.rendering.pictures.exposure import expose
 from harnack.rendering.pictures.images import check_picture_path, tone_mapped, write_image
+from harnack.rendering.pictures.pixels import stratified
 from harnack.rendering.pictures.shaded import shaded
 from harnack.rendering.pictures.views import VIEWS, look
+from harnack.rendering.studio.camera import Camera
 from harnack.rendering.studio.materials import Material, material_of
-from harnack.rendering.studio.stage import Camera, Exhibit, stratified, studio
+from harnack.rendering.studio.stage import Exhibit, studio
 from harnack.tracer import LevelSet, level_set
 
 ShowMode = Literal["color", "shaded", "normal", "evaluations", "status", "depth"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +18,8 @@ from harnack.fields.unit_coordinates import UnitCoordinates, UploadedField, plac
 from harnack.geometry import Box, CloudError, estimate_areas, estimate_normals, validate_cloud
 
 if TYPE_CHECKING:
+    from typing import Self
+
     from harnack.backend import Backend, Real, Vec3
     from harnack.geometry import Volume
     from harnack.tree import Hierarchy

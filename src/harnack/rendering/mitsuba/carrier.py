@@ -9,66 +9,19 @@ and traces what they carry.
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harnack.rendering.mitsuba.scene_files import load_dictionary
 from harnack.rendering.mitsuba.variant import load_mitsuba, mitsuba_backend
 from harnack.rendering.surfaces.extent import box_of
 from harnack.rendering.surfaces.placement import PlacedSurface, Placement
-from harnack.tracer import LevelSet, level_set
+from harnack.tracer import LevelSet
 
 if TYPE_CHECKING:
-    import numpy.typing as npt
-
-    from harnack.fields.field import Field
     from harnack.geometry.convex_volume import FloatArray
 
 PLUGIN = "harnack"
-
-
-def shape(
-    surface: Field | LevelSet,
-    *,
-    bsdf: Mapping[str, Any] | Any = None,
-    to_world: npt.ArrayLike | Any = None,
-    **settings: Any,
-) -> Any:
-    """A Mitsuba shape of a field's level set, for a scene dictionary or a scene.
-
-        scene = mitsuba.load_dict({
-            "type": "scene",
-            "integrator": {"type": "harnack_path"},
-            "surface": harnack.rendering.shape(field, bsdf={"type": "roughconductor"}),
-            ...
-        })
-
-    bsdf: dictionary or BSDF object; grey diffuse, seen from both sides, if left out. Open
-        surfaces have two sides: wrap one-sided BSDFs as {"type": "twosided", ...}.
-    to_world: matrix (4, 4) or Mitsuba transform of moves, turns and one scale for all axes.
-    settings: as `harnack.level_set` takes them: level, clip, tolerance, solid, ... Glass needs a
-        `solid`.
-
-    Raises:
-        ValueError: the surface has no bounds and no `clip`, or `to_world` is no similarity.
-    """
-    from harnack.rendering.mitsuba.plugins import (
-        register,  # not above: plugins are made of carriers
-    )
-
-    mi = register()
-    if isinstance(surface, LevelSet):
-        if settings:
-            raise ValueError(f"{', '.join(settings)}: a LevelSet holds its settings already")
-    else:
-        surface = level_set(surface, **settings)
-    props = mi.Properties()
-    props["bsdf"] = as_bsdf(mi, bsdf)
-    if to_world is not None:
-        props["to_world"] = mi.ScalarTransform4f(as_matrix(to_world))
-    return from_properties(mi, props, surface)
 
 
 def from_properties(mi: Any, props: Any, surface: LevelSet) -> Any:
@@ -83,18 +36,6 @@ def from_properties(mi: Any, props: Any, surface: LevelSet) -> Any:
     made = _carrier_class(mi.variant())(props, surface, placement)
     if made.emitter() is not None or made.is_medium_transition():
         raise ValueError("surfaces that are traced can neither emit light nor bound a medium")
-    return made
-
-
-def as_bsdf(mi: Any, bsdf: Any) -> Any:
-    """A BSDF object, from one, its dictionary, or None."""
-    if bsdf is None:
-        bsdf = {"type": "twosided", "nested": {"type": "diffuse"}}
-    made: Any = bsdf
-    if isinstance(bsdf, Mapping):
-        made = load_dictionary(mi, cast("Mapping[str, Any]", bsdf))
-    if not isinstance(made, mi.BSDF):
-        raise TypeError(f"bsdf must be a BSDF or its dictionary, not {type(made).__name__}")
     return made
 
 

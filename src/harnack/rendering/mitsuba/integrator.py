@@ -15,6 +15,7 @@ from harnack.rendering.mitsuba.variant import load_mitsuba
 from harnack.rendering.mitsuba.world import World
 
 PLUGIN = "harnack_path"
+INTEGRATOR = "HarnackPath"
 # What a ray that ran out of steps is drawn in: nothing in nature is this colour.
 LOST_COLOUR = (1.0, 0.0, 1.0)
 
@@ -243,6 +244,6 @@ def integrator_class(variant: str) -> Any:
             return count
 
         def to_string(self) -> str:
-            return f"HarnackPath[max_depth = {self.tracer.max_depth}]"
+            return f"{INTEGRATOR}[max_depth = {self.tracer.max_depth}]"
 
     return HarnackPath

@@ -25,6 +25,7 @@ from harnack.fields import Gyroid, SchwarzD, SchwarzP, SolidAngle, SphericalHarm
 from harnack.files import read_loops
 from harnack.geometry import Ball, Box, Intersection
 from harnack.rendering.mitsuba import carrier, integrator
+from harnack.rendering.mitsuba.stock import watch
 from harnack.rendering.mitsuba.variant import load_mitsuba
 from harnack.tracer import LevelSet, level_set
 
@@ -39,10 +40,12 @@ def register() -> Any:
     """Make `harnack` (shape) and `harnack_path` (integrator) known, and return `mitsuba`.
 
     Needed once in each variant, before a scene that names them is loaded with Mitsuba's own
-    functions; `render` and `shape` do it by themselves.
+    functions; `render` and `shape` do it by themselves. From then on `mitsuba.render` warns of
+    surfaces that another integrator would leave out.
     """
     mi = register_surfaces(carrier.PLUGIN, surface_of)
     mi.register_integrator(integrator.PLUGIN, integrator.integrator_class(mi.variant()))
+    watch(mi)
     return mi
 
 

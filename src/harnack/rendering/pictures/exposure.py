@@ -7,7 +7,6 @@ same seed gives the same picture.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -17,7 +16,7 @@ import numpy.typing as npt
 
 from harnack.backend import to_numpy
 from harnack.rendering.mitsuba.integrator import PathTracer
-from harnack.rendering.pictures.pixels import bands, film_places
+from harnack.rendering.pictures.pixels import bands, film_places, stratified
 
 # Paths of one band: about a second or two on a CPU, and Ctrl-C works between bands.
 _PATHS_A_BAND = 2**18
@@ -44,7 +43,8 @@ def expose(
     """
     width, height = (int(n) for n in sensor.film().crop_size())
     sampler = sensor.sampler().clone()
-    sampler.set_sample_count(_whole_grid(spp) if "Multijitter" in str(sampler) else spp)
+    # Multi-jittering rounds up to a whole grid by itself, but warns of it.
+    sampler.set_sample_count(stratified(spp) if "Multijitter" in str(sampler) else spp)
     spp = int(sampler.sample_count())
     sampler.set_samples_per_wavefront(spp)
     image = np.empty((width * height, 3), dtype=np.float32)
@@ -62,12 +62,6 @@ def expose(
         lost += int(dr.count(got_lost)[0])
         advance((stop - start) / (width * height))
     return image.reshape(height, width, 3), lost
-
-
-def _whole_grid(spp: int) -> int:
-    """The samples of the nearly square grid that multi-jittering rounds up to (and warns of)."""
-    across = max(1, math.isqrt(spp))
-    return across * -(-spp // across)
 
 
 def _mixed(seed: int, band: int) -> int:

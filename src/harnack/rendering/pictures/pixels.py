@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -10,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.geometry.convex_volume import FloatArray
-from harnack.rendering.studio.stage import stratified
 
 IntArray = npt.NDArray[np.int64]
 
@@ -48,6 +48,12 @@ def film_places(mi: Any, pixel: Any, offset: Any, size: tuple[int, int]) -> Any:
     """Places on the film, in [0, 1]^2, of offsets in [0, 1]^2 within pixels counted by rows."""
     place = mi.Vector2f(pixel % size[0], pixel // size[0]) + offset
     return mi.Point2f(place / mi.ScalarVector2f(*size))
+
+
+def stratified(spp: int) -> int:
+    """The samples a pixel, at least `spp`, that can be arranged in a nearly square grid."""
+    rows = max(1, math.isqrt(spp))
+    return rows * -(-spp // rows)
 
 
 def grid_offsets(count: int) -> FloatArray:

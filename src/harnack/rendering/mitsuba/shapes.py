@@ -1,0 +1,66 @@
+"""Surfaces as shapes, for scenes that are put together in Python."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, cast
+
+from harnack.rendering.mitsuba.carrier import as_matrix, from_properties
+from harnack.rendering.mitsuba.plugins import register
+from harnack.rendering.mitsuba.scene_files import load_dictionary
+from harnack.tracer import LevelSet, level_set
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from harnack.fields.field import Field
+
+
+def shape(
+    surface: Field | LevelSet,
+    *,
+    bsdf: Mapping[str, Any] | Any = None,
+    to_world: npt.ArrayLike | Any = None,
+    **settings: Any,
+) -> Any:
+    """A Mitsuba shape of a field's level set, for a scene dictionary or a scene.
+
+        scene = mitsuba.load_dict({
+            "type": "scene",
+            "integrator": {"type": "harnack_path"},
+            "surface": harnack.rendering.shape(field, bsdf={"type": "roughconductor"}),
+            ...
+        })
+
+    bsdf: dictionary or BSDF object; grey diffuse, seen from both sides, if left out. Open
+        surfaces have two sides: wrap one-sided BSDFs as {"type": "twosided", ...}.
+    to_world: matrix (4, 4) or Mitsuba transform of moves, turns and one scale for all axes.
+    settings: as `harnack.level_set` takes them: level, clip, tolerance, solid, ... Glass needs a
+        `solid`.
+
+    Raises:
+        ValueError: the surface has no bounds and no `clip`, or `to_world` is no similarity.
+    """
+    mi = register()
+    if isinstance(surface, LevelSet):
+        if settings:
+            raise ValueError(f"{', '.join(settings)}: a LevelSet holds its settings already")
+    else:
+        surface = level_set(surface, **settings)
+    props = mi.Properties()
+    props["bsdf"] = as_bsdf(mi, bsdf)
+    if to_world is not None:
+        props["to_world"] = mi.ScalarTransform4f(as_matrix(to_world))
+    return from_properties(mi, props, surface)
+
+
+def as_bsdf(mi: Any, bsdf: Any) -> Any:
+    """A BSDF object, from one, its dictionary, or None."""
+    if bsdf is None:
+        bsdf = {"type": "twosided", "nested": {"type": "diffuse"}}
+    made: Any = bsdf
+    if isinstance(bsdf, Mapping):
+        made = load_dictionary(mi, cast("Mapping[str, Any]", bsdf))
+    if not isinstance(made, mi.BSDF):
+        raise TypeError(f"bsdf must be a BSDF or its dictionary, not {type(made).__name__}")
+    return made
