@@ -52,7 +52,6 @@ FAMILIES = ("curves", "meshes", "clouds", "polynomials", "waves")
 RENDERING_ROOMS = ("surfaces", "mitsuba", "studio", "pictures", "arguments", "picture")
 # Files of one folder, `__init__` left out.
 MOST_FILES = 13
-UNDIVIDED = ("files", "rendering")
 FREE = ("__init__", "__main__", "testing")  # at the top: may import from any room
 
 
@@ -123,7 +122,7 @@ def test_no_room_is_a_hallway() -> None:
     counts: dict[str, int] = {}
     for path in FILES:
         room = path.relative_to(SOURCE).parent.as_posix()
-        if path.stem != "__init__" and room not in UNDIVIDED:
+        if path.stem != "__init__":
             counts[room] = counts.get(room, 0) + 1
     assert {room: count for room, count in counts.items() if count > MOST_FILES} == {}
 

@@ -9,10 +9,10 @@ from typing import Literal
 
 import numpy as np
 
+from harnack.backend import FloatArray
 from harnack.fields import DipolePotential, Field, SolidAngle, WindingNumber
 from harnack.files import Cloud, FileFormatError, Loops, Mesh, read_loops, read_surface
 from harnack.files.surfaces import ReadAs
-from harnack.geometry.convex_volume import FloatArray
 
 __all__ = ["UP_AXES", "Axis", "OpenedSurface", "open_surface"]
 

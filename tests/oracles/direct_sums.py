@@ -13,7 +13,7 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend import choose_backend, to_numpy
+from harnack.backend import FloatArray, choose_backend, to_numpy
 from harnack.backend.records import Records
 
 if TYPE_CHECKING:
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
 __all__ = ["ValueAndGradient", "dipole_sum", "winding_sum"]
 
-FloatArray: TypeAlias = npt.NDArray[np.float64]
 ValueAndGradient: TypeAlias = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 """Points (n, 3) in, values (n,) and gradients (n, 3) out."""
 

@@ -13,11 +13,12 @@ from typing import Any
 
 import drjit as dr
 import numpy as np
+import numpy.typing as npt
 
-from harnack.backend import to_numpy
+from harnack.backend import FloatArray, to_numpy
 from harnack.enclosures import Caps, Classic, Cone, Enclosure, Slope, Taylor
 from harnack.testing.cases import BallCase, Case, CurvatureCase, LipschitzCase
-from harnack.testing.poisson import FloatArray, cap_movement, kernel_movement, poles_movement
+from harnack.testing.poisson import cap_movement, kernel_movement
 
 __all__ = ["exact_step", "on_host"]
 
@@ -102,8 +103,8 @@ def _classic(c: BallCase, slope: FloatArray) -> FloatArray:
     best = np.zeros_like(c.radius)
     for u, _, away, toward in _sides(c):
         n = c.dimension
-        up = largest_free(lambda q, n=n, u=u: u * poles_movement(q, 1.0, n), away)
-        down = largest_free(lambda q, n=n, u=u: -u * poles_movement(q, -1.0, n), toward)
+        up = largest_free(lambda q, n=n, u=u: u * _poles_movement(q, 1.0, n), away)
+        down = largest_free(lambda q, n=n, u=u: -u * _poles_movement(q, -1.0, n), toward)
         best = np.maximum(best, np.minimum(up, down))
     return best
 
@@ -114,7 +115,7 @@ def _slope(c: BallCase, slope: FloatArray) -> FloatArray:
     reach = {1.0: np.zeros_like(c.radius), -1.0: np.zeros_like(c.radius)}
     for u, sign, away, toward in _sides(c):
         m = np.where(u > 0, np.clip(sign * c.radius * slope / (n * u), -1, 1), 0.0)
-        chord = largest_free(lambda q, m=m, u=u: u * poles_movement(q, m, n), away)
+        chord = largest_free(lambda q, m=m, u=u: u * _poles_movement(q, m, n), away)
         jensen = largest_free(lambda q, m=m, u=u: -u * kernel_movement(q, m, n), toward)
         reach[sign] = np.maximum(reach[sign], chord)
         reach[-sign] = np.maximum(reach[-sign], jensen)
@@ -144,6 +145,21 @@ def _caps(c: BallCase, slope: FloatArray) -> FloatArray:
 
         reach.append(largest_free(up, gap))
     return np.minimum(reach[0], reach[1])
+
+
+def _poles_movement(q: npt.ArrayLike, mean: npt.ArrayLike, dimension: int) -> FloatArray:
+    """(1+m)/2 P(q, 1) + (1-m)/2 P(q, -1) - 1.
+
+    With P(q, +-1) = exp(S +- D), S = (1-n/2) log(1-q^2) and D = n artanh(q), it is
+    exp(S) (cosh D + m sinh D) - 1.
+    """
+    q, m = np.asarray(q, np.float64), np.asarray(mean, np.float64)
+    log_square, odd = (1 - 0.5 * dimension) * np.log1p(-q * q), dimension * np.arctanh(q)
+    # cosh D + m sinh D - 1 in two ways: the second does not cancel near m = -1.
+    plain = 2 * np.sinh(0.5 * odd) ** 2 + m * np.sinh(odd)
+    near_minus_one = (1 + m) * np.sinh(odd) + np.expm1(-odd)
+    rest = np.where(m < -0.5, near_minus_one, plain)
+    return np.expm1(log_square) + np.exp(log_square) * rest
 
 
 def _belt(q: FloatArray, middle: FloatArray, half: FloatArray) -> FloatArray:

@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 import numpy as np
 
-from harnack.backend import choose_backend, to_numpy, to_vector3
+from harnack.backend import FloatArray, choose_backend, to_numpy, to_vector3
 from harnack.enclosures import Gaps
 from harnack.testing.cases import Case, case_of
 from harnack.testing.failures import BrokenPromiseError
-from harnack.testing.poisson import FloatArray
 from harnack.testing.scaled import unscaled
 from harnack.testing.walks import look_at, movements, random_directions, random_points
 from tests.oracles.exact import exact_step, on_host

@@ -25,11 +25,6 @@ State: TypeAlias = "tuple[Any, ...]"
 EachRecord: TypeAlias = "Callable[[list[Real], State], State]"
 
 
-def number_type(backend: Backend) -> type[np.floating[Any]]:
-    """NumPy's type of a number of the backend's precision."""
-    return np.float32 if backend.precision == "single" else np.float64
-
-
 @dataclass(frozen=True)
 class Records:
     """Rows of a table, each filled up with zeros to whole packets.
@@ -64,7 +59,7 @@ class Records:
             table = np.concatenate([table, np.tile(filling, (missing, 1))])
         rows, width = table.shape
         padded = -(-width // PACKET) * PACKET
-        mapped = backend.Float(np.array(table, number_type(backend), order="C").ravel())
+        mapped = backend.Float(np.array(table, backend.dtype, order="C").ravel())
         # Dr.Jit must not see that this may be the array itself, which need not be aligned.
         lane = dr.arange(backend.UInt32, rows * padded) ^ dr.opaque(backend.UInt32, 0)
         row, column = lane // padded, lane % padded

@@ -15,7 +15,7 @@ from harnack.fields import points as field_points
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
 
-__all__ = ["FloatArray", "in_batches"]
+__all__ = ["in_batches"]
 
 # Bounds memory, and the time until an interrupt is noticed.
 _AT_ONCE = 1 << 18

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import drjit as dr
 import numpy as np
 
-from harnack.backend import choose_backend
+from harnack.backend import FloatArray, choose_backend
 from harnack.choices import did_you_mean
-from harnack.distance.batches import FloatArray, in_batches
+from harnack.distance.batches import in_batches
 from harnack.distance.closest import Closest, find_closest, find_on_sheets
 from harnack.distance.estimates import first_order, second_order
 from harnack.distance.lower_bound import distance_below

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from harnack.geometry.convex_volume import FloatArray
-from harnack.geometry.meshes import IntArray
+from harnack.backend import FloatArray, IntArray
 
 MAX_BYTES = 1 << 28
 # Of files that must be gone through element by element, up to some microseconds each.

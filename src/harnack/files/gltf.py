@@ -16,6 +16,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
+from harnack.backend import FloatArray, IntArray
 from harnack.files.file_format import (
     MAX_BYTES,
     Contents,
@@ -24,8 +25,6 @@ from harnack.files.file_format import (
     read_bytes,
     triangle_list,
 )
-from harnack.geometry.convex_volume import FloatArray
-from harnack.geometry.meshes import IntArray
 
 _COMPONENT_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 _COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}

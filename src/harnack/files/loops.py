@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
+from harnack.backend import FloatArray
 from harnack.files.file_format import Contents, FileFormatError, Place, read_bytes
 from harnack.files.obj import read_obj
 from harnack.files.plain_text import read_loops_text
 from harnack.files.ply import read_ply
 from harnack.geometry.chains import Edge, OpenChainError, boundary_edges, join
-from harnack.geometry.convex_volume import FloatArray
 from harnack.geometry.curves import CurveError, validate_loops
 from harnack.geometry.singular import weld_vertices
 

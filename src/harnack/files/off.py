@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from harnack.backend import FloatArray
 from harnack.files.file_format import Contents, Place, Polygons, check_indices, positions
 from harnack.files.text_tables import Lines, as_integer, content_lines, read_floats, read_table
-from harnack.geometry.convex_volume import FloatArray
 from harnack.geometry.meshes import IntArray
 
 

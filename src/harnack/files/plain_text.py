@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from harnack.backend import FloatArray
 from harnack.files.file_format import Contents, Place
 from harnack.files.text_tables import content_lines, read_floats
-from harnack.geometry.convex_volume import FloatArray
 
 
 def read_xyz(path: Path, data: bytes) -> Contents:

@@ -15,6 +15,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from harnack.backend import IntArray
 from harnack.files.file_format import (
     NO_POLYGONS,
     Contents,
@@ -29,7 +30,6 @@ from harnack.files.file_format import (
     positions,
 )
 from harnack.files.text_tables import Lines, content_lines, excerpt, read_floats
-from harnack.geometry.meshes import IntArray
 
 # PLY name of a type -> its code in `struct`
 _CODES = {

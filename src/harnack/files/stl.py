@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from harnack.backend import FloatArray
 from harnack.files.file_format import Contents, Place, Places, check_finite, triangle_list
 from harnack.files.text_tables import Lines, content_lines, excerpt, read_table
-from harnack.geometry.convex_volume import FloatArray
 from harnack.geometry.singular import weld_vertices
 
 _HEADER = 84

@@ -10,6 +10,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
+from harnack.backend import FloatArray, IntArray
 from harnack.choices import did_you_mean
 from harnack.files.file_format import Contents, FileFormatError, Place, read_bytes
 from harnack.files.gltf import read_gltf
@@ -20,9 +21,8 @@ from harnack.files.plain_text import read_xyz
 from harnack.files.ply import read_ply
 from harnack.files.stl import read_stl
 from harnack.geometry.clouds import CloudError, checked_normals, checked_points
-from harnack.geometry.convex_volume import FloatArray
 from harnack.geometry.curves import CurveError, validate_loops
-from harnack.geometry.meshes import IntArray, MeshError, without_zero_area_faces
+from harnack.geometry.meshes import MeshError, without_zero_area_faces
 from harnack.geometry.polygons import triangulate
 from harnack.geometry.singular import net_faces, singular_edges, singular_loops, weld_vertices
 

@@ -13,9 +13,8 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from harnack.backend import FloatArray, IntArray
 from harnack.files.file_format import Place, Places
-from harnack.geometry.convex_volume import FloatArray
-from harnack.geometry.meshes import IntArray
 
 __all__ = [
     "Lines",

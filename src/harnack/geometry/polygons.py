@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from harnack.backend import BoolArray, FloatArray, IntArray
 from harnack.geometry.chains import boundary_edges, join
-from harnack.geometry.convex_volume import BoolArray, FloatArray
-from harnack.geometry.meshes import IntArray, MeshError
+from harnack.geometry.meshes import MeshError
 
 __all__ = ["triangulate"]
 

@@ -13,16 +13,10 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from harnack.backend import choose_backend, to_numpy
+from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy
 from harnack.testing.cases import BallCase, Case, CurvatureCase, LipschitzCase
 from harnack.testing.failures import BrokenPromiseError
-from harnack.testing.poisson import (
-    AxialFunctions,
-    BoolArray,
-    FloatArray,
-    cap_mass,
-    kernel_movement,
-)
+from harnack.testing.poisson import AxialFunctions, cap_mass, kernel_movement
 
 if TYPE_CHECKING:
     from harnack.backend import Precision

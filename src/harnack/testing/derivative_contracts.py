@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend import choose_backend, to_numpy, to_vector3
+from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy, to_vector3
 from harnack.enclosures import HarmonicBall, Lipschitz
 from harnack.testing.failures import BrokenPromiseError, require
-from harnack.testing.poisson import BoolArray, FloatArray
 from harnack.testing.walks import FieldValues, jumps, look_at
 
 if TYPE_CHECKING:

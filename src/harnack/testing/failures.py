@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from harnack.testing.poisson import BoolArray, FloatArray
+from harnack.backend import BoolArray, FloatArray
 
 __all__ = ["BrokenPromiseError", "require"]
 

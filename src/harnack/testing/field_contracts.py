@@ -6,11 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from harnack.backend import choose_backend, to_numpy, to_vector3
+from harnack.backend import FloatArray, choose_backend, to_numpy, to_vector3
 from harnack.enclosures import Curvature, HarmonicBall, Lipschitz
 from harnack.testing.derivative_contracts import check_derivatives
 from harnack.testing.failures import BrokenPromiseError, require
-from harnack.testing.poisson import FloatArray
 from harnack.testing.walks import FieldValues, look_at, movements, random_directions, random_points
 
 if TYPE_CHECKING:

@@ -10,13 +10,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-FloatArray: TypeAlias = npt.NDArray[np.float64]
-BoolArray: TypeAlias = npt.NDArray[np.bool_]
+from harnack.backend import FloatArray
 
 # Below this |q| the movement of a cap is a power series, whose terms fall like q^l.
 _SERIES_BELOW = 0.25
@@ -29,21 +27,6 @@ def kernel_movement(q: npt.ArrayLike, s: npt.ArrayLike, dimension: int) -> Float
     near = (1 - q) ** 2 + 2 * q * (1 - s)  # accurate where q and s are near 1
     log = np.where(q < 0.5, np.log1p(np.maximum(q * (q - 2 * s), -0.99)), np.log(near))
     return np.expm1(np.log1p(-q * q) - 0.5 * dimension * log)
-
-
-def poles_movement(q: npt.ArrayLike, mean: npt.ArrayLike, dimension: int) -> FloatArray:
-    """(1+m)/2 P(q, 1) + (1-m)/2 P(q, -1) - 1.
-
-    With P(q, +-1) = exp(S +- D), S = (1-n/2) log(1-q^2) and D = n artanh(q), it is
-    exp(S) (cosh D + m sinh D) - 1.
-    """
-    q, m = np.asarray(q, np.float64), np.asarray(mean, np.float64)
-    log_square, odd = (1 - 0.5 * dimension) * np.log1p(-q * q), dimension * np.arctanh(q)
-    # cosh D + m sinh D - 1 in two ways: the second does not cancel near m = -1.
-    plain = 2 * np.sinh(0.5 * odd) ** 2 + m * np.sinh(odd)
-    near_minus_one = (1 + m) * np.sinh(odd) + np.expm1(-odd)
-    rest = np.where(m < -0.5, near_minus_one, plain)
-    return np.expm1(log_square) + np.exp(log_square) * rest
 
 
 def cap_mass(height: npt.ArrayLike, dimension: int) -> FloatArray:

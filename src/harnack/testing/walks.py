@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import numpy as np
 
-from harnack.backend import choose_backend, to_numpy, to_vector3
+from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy, to_vector3
 from harnack.fields.sheets import NO_SHEET, Crossing
-from harnack.testing.poisson import BoolArray, FloatArray
 
 if TYPE_CHECKING:
     from harnack.backend import Precision

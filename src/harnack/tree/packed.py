@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import numpy as np
 
-from harnack.backend.records import PACKET, Records, number_type
-from harnack.tree.hierarchy import FloatArray, Hierarchy
+from harnack.backend import FloatArray
+from harnack.backend.records import PACKET, Records
+from harnack.tree.hierarchy import Hierarchy
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real
@@ -61,8 +62,8 @@ def pack(
     if tree.node_count >= _MOST_NODES:
         raise ValueError(f"a tree of {tree.node_count} nodes is too large: cut the input in parts")
     extra = levels[0].shape[1] - _HEAD
-    heads = np.zeros((tree.node_count, PACKET), number_type(backend))
-    payloads = np.zeros((tree.node_count, extra), number_type(backend))
+    heads = np.zeros((tree.node_count, PACKET), backend.dtype)
+    payloads = np.zeros((tree.node_count, extra), backend.dtype)
     links = tree.links()
     for number, first, after, values in zip(*links, levels, strict=True):
         heads[number, :_HEAD] = values[:, :_HEAD]

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from harnack.backend import backend_of
 from harnack.fields.batch import BatchedField, Values
@@ -24,7 +23,6 @@ if TYPE_CHECKING:
     from harnack.geometry import Volume
     from harnack.tree import Hierarchy
 
-FloatArray = npt.NDArray[np.float64]
 
 _VALUES, _TRACED = 2.0, 4.0
 

@@ -17,11 +17,10 @@ from harnack.fields.symmetric import SymmetricSum
 from harnack.fields.unit_coordinates import epsilon_at
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.backend import Backend, FloatArray, Mask, Real, Vec3
     from harnack.fields.batch import Values
     from harnack.fields.field import Sample
     from harnack.tree import Hierarchy
-    from harnack.tree.hierarchy import FloatArray
 
 # Beside a point means within this part (of its area, in squared distance).
 _BESIDE = 0.04

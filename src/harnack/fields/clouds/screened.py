@@ -12,7 +12,7 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend import backend_of, choose_backend, to_numpy, to_vector3
+from harnack.backend import FloatArray, backend_of, choose_backend, to_numpy, to_vector3
 from harnack.choices import did_you_mean
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.clouds.dipole_records import dipole_rows
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
     from harnack.geometry import Volume
 
-FloatArray = npt.NDArray[np.float64]
 MethodName = Literal["auto", "sum", "tree"]
 
 # Where a tree becomes faster than the plain sum.

@@ -33,8 +33,8 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
-import numpy.typing as npt
 
+from harnack.backend import FloatArray
 from harnack.backend.extrema import fmax, fmin
 from harnack.fields.field import Curvature, HarmonicBall
 from harnack.fields.sums import SUM_ROUNDING, FieldSums, Terms
@@ -45,7 +45,6 @@ if TYPE_CHECKING:
 
     from harnack.backend import Backend, Mask, Real, Vec3
 
-FloatArray = npt.NDArray[np.float64]
 
 LONGEST = 80.0
 """Beyond this many screening lengths exponentials stay at exp(-80) = 2e-35, as single precision

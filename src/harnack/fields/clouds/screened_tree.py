@@ -33,8 +33,8 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
-import numpy.typing as npt
 
+from harnack.backend import FloatArray
 from harnack.backend.extrema import fmax, fmin
 from harnack.backend.records import Records
 from harnack.fields.clouds.dipole_records import hierarchy_of, in_slots, padding_row
@@ -56,7 +56,6 @@ if TYPE_CHECKING:
 
     from harnack.backend import Backend, Mask, Real, Vec3
 
-FloatArray = npt.NDArray[np.float64]
 
 # Dipoles a trip of the plain sum, by experiment.
 _CHUNK = 4

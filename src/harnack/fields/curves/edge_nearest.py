@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
-import numpy.typing as npt
 
+from harnack.backend import FloatArray
 from harnack.backend.extrema import clamp
-from harnack.backend.records import Records, number_type
+from harnack.backend.records import Records
 from harnack.fields.edges.edge_records import single_edges
 
 if TYPE_CHECKING:
@@ -17,13 +17,11 @@ if TYPE_CHECKING:
 
 __all__ = ["closest_on_segments", "segments"]
 
-FloatArray = npt.NDArray[np.float64]
-
 
 def segments(backend: Backend, start: FloatArray, end: FloatArray) -> Records:
     """Segments (k, 3) to (k, 3), k >= 1, of a size of about one. One whose ends are the same in
     the backend's precision is a point."""
-    start, end = (q.astype(number_type(backend)).astype(np.float64) for q in (start, end))
+    start, end = (q.astype(backend.dtype).astype(np.float64) for q in (start, end))
     return Records.upload(backend, single_edges(start, end))
 
 

@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
-from harnack.backend.records import Records, number_type
+from harnack.backend import FloatArray
+from harnack.backend.records import Records
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
 
-FloatArray = npt.NDArray[np.float64]
 # Gives the state with the edge from p to q, of which the third is 1/length^2, taken into account.
 EachEdge: TypeAlias = "Callable[[Vec3, Vec3, Real, tuple[Any, ...]], tuple[Any, ...]]"
 
@@ -57,7 +56,7 @@ class LoopEdges:
     @classmethod
     def upload(cls, backend: Backend, loops: tuple[FloatArray, ...]) -> LoopEdges:
         """The edges of closed loops, each of shape (n, 3)."""
-        run, number = _run_for(loops), number_type(backend)
+        run, number = _run_for(loops), backend.dtype
         rounded = (loop.astype(number).astype(np.float64) for loop in loops)
         table = np.concatenate([_runs(loop, run) for loop in rounded])
         return cls(Records.upload(backend, table), run)

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from harnack.backend import FloatArray, IntArray
 from harnack.fields.multipoles.multipole import cartesian, triangle_levels
 from harnack.fields.multipoles.truncation import bend_columns, truncation
 from harnack.tree import NO_PRIMITIVE, Hierarchy, build_hierarchy
-from harnack.tree.hierarchy import FloatArray, IntArray
 
 # A chain is taken as a whole beyond this many times its radius.
 RATIO = 2.5

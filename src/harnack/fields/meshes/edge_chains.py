@@ -32,9 +32,8 @@ from harnack.tree import Node, PackedTree, for_each, pack, walk
 from harnack.tree.walk import State
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.backend import Backend, FloatArray, IntArray, Mask, Real, Vec3
     from harnack.fields.edges.edge_passing import Line
-    from harnack.tree.hierarchy import FloatArray, IntArray
     from harnack.tree.triangles import Frame
 
 # An edge, and where it counts, added to a state.

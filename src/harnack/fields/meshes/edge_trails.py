@@ -21,8 +21,7 @@ from harnack.backend.lengths import largest_component
 from harnack.backend.records import Records
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.tree.hierarchy import FloatArray, IntArray
+    from harnack.backend import Backend, FloatArray, IntArray, Mask, Real, Vec3
 
 # Edges of a record: its five vertices and the number of its edges fill two packets of eight.
 _EDGES = 4

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from harnack.backend import FloatArray, IntArray
 from harnack.fields.multipoles.multipole import Level, triangle_levels
 from harnack.fields.unit_coordinates import single
 from harnack.geometry import MeshError, validate_mesh
 from harnack.geometry.singular import net_faces, singular_edges, weld_vertices
 from harnack.tree import Hierarchy, build_hierarchy
-from harnack.tree.hierarchy import FloatArray, IntArray
 from harnack.tree.triangles import MOST_TRIANGLES, PARITY, triangle_records
 
 # Triangles of a leaf at most, and children of a node: by experiment.

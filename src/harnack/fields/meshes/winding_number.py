@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from harnack.geometry import Volume
 
 MethodName = Literal["auto", "exact", "tree"]
-FloatArray = npt.NDArray[np.float64]
 
 # One boundary edge costs about a nanosecond, a tree two to three microseconds.
 _MOST_EDGES = 2048

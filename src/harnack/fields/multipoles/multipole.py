@@ -17,7 +17,7 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend import choose_backend, to_numpy
+from harnack.backend import FloatArray, choose_backend, to_numpy
 from harnack.backend.arrays import aligned
 from harnack.backend.extrema import fmax, fmin
 from harnack.fields.multipoles.moments import KEYS, KNOWN, Pairs, moved, of_dipole, regular
@@ -26,7 +26,6 @@ from harnack.tree import NO_PRIMITIVE, Hierarchy
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
 
-FloatArray = npt.NDArray[np.float64]
 Moments = dict[tuple[int, int], npt.NDArray[np.complex128]]
 # Degree, order, and 0 for the real or 1 for the imaginary part.
 _PARTS = tuple((l, m, part) for l, m in KEYS for part in range(2 if m else 1))

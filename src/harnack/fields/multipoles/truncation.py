@@ -8,13 +8,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
+from harnack.backend import FloatArray
 from harnack.fields.multipoles.moments import KNOWN
 from harnack.fields.multipoles.multipole import Level, Moments
 from harnack.fields.sums import longest_part, remainder_factor
 
-FloatArray = npt.NDArray[np.float64]
 # A bound that is rounded to single precision a few times, down each time, is one still.
 _ROOM = 1 + 2.0**-20
 

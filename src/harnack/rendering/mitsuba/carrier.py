@@ -19,7 +19,7 @@ from harnack.rendering.surfaces.placement import PlacedSurface, Placement
 from harnack.tracer import LevelSet
 
 if TYPE_CHECKING:
-    from harnack.geometry.convex_volume import FloatArray
+    from harnack.backend import FloatArray
 
 PLUGIN = "harnack"
 

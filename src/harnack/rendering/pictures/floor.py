@@ -9,9 +9,8 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from harnack.backend import to_numpy
+from harnack.backend import FloatArray, to_numpy
 from harnack.backend.arrays import aligned
-from harnack.geometry.convex_volume import FloatArray
 from harnack.rendering.mitsuba.variant import mitsuba_backend
 from harnack.rendering.mitsuba.world import World
 from harnack.rendering.pictures.shading import Light

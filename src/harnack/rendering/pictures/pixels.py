@@ -10,7 +10,7 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from harnack.geometry.convex_volume import FloatArray
+from harnack.backend import FloatArray
 
 IntArray = npt.NDArray[np.int64]
 

@@ -14,7 +14,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from harnack.geometry.convex_volume import FloatArray
+from harnack.backend import FloatArray
 
 Colour = tuple[float, float, float]
 

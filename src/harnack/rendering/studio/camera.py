@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harnack.geometry.convex_volume import FloatArray
+from harnack.backend import FloatArray
 
 # The part of the picture that the surface fills at zoom 1.
 _FILLED = 0.86

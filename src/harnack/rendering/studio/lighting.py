@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from harnack.backend import FloatArray
 from harnack.choices import did_you_mean
-from harnack.geometry.convex_volume import FloatArray
 
 # Radiances of the environment, linear sRGB: at the horizon, overhead, and of a soft strip of
 # light behind the stage that draws edges and gives metal something to reflect.

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harnack.geometry.convex_volume import FloatArray
+from harnack.backend import FloatArray
 from harnack.rendering.mitsuba.shapes import shape
 from harnack.rendering.mitsuba.variant import mitsuba_backend
 from harnack.rendering.studio.camera import Camera

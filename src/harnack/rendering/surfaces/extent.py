@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from harnack.geometry.convex_volume import FloatArray
+from harnack.backend import FloatArray
 
 if TYPE_CHECKING:
     from harnack.tracer import LevelSet

@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from harnack.backend import to_float, to_numpy, to_vector3
+from harnack.backend import FloatArray, to_float, to_numpy, to_vector3
 from harnack.fields.kept import KeptWithFields
-from harnack.geometry.convex_volume import FloatArray
 from harnack.rendering.surfaces.extent import box_of
 from harnack.rendering.surfaces.placement import PlacedSurface, Placement
 from harnack.tracer import Tolerance
