@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gc
 import weakref
 from collections.abc import Callable
@@ -62,6 +63,29 @@ def test_a_field_with_an_attribute_set_is_uploaded_again() -> None:
     before = hk.trace(field, *rays).t
     field.shift = -0.1
     assert 0.01 < abs(hk.trace(field, *rays).t - before) < 0.1
+
+
+@dataclasses.dataclass
+class Ball(hk.Field):
+    """Anyone's field: a dataclass, which has no hash, and which changes in place."""
+
+    radius: float
+    domain = hk.Ball(radius=2)
+
+    def evaluate(self, p: Any) -> hk.Sample:
+        return hk.Sample(dr.norm(p) - self.radius, p / dr.norm(p), (hk.Lipschitz(1.0),))
+
+    def prepare(self, backend: Any) -> Ball:
+        return Ball(dr.opaque(backend.Float, float(self.radius)))
+
+
+def test_fields_of_anyone_are_drawn_as_they_are_now() -> None:
+    field = Ball(0.5)
+    drawn = {"show": "depth", "size": (9, 9), "progress": False}
+    for radius in (0.5, 1.0, 1.0):
+        field.radius = radius
+        again = hk.render(field, **drawn)
+        np.testing.assert_array_equal(again, hk.render(Ball(radius), **drawn))
 
 
 def test_vertices_with_derivatives_are_uploaded_each_time() -> None:

@@ -6,7 +6,7 @@ import functools
 from collections import defaultdict
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
-from weakref import WeakKeyDictionary
+from weakref import finalize
 
 from harnack.fields.field import Field
 
@@ -24,23 +24,25 @@ class KeptWithFields(Generic[Value]):
     """
 
     def __init__(self) -> None:
-        kept: WeakKeyDictionary[Field, tuple[Any, dict[str, Any], Value]] = WeakKeyDictionary()
-        self._kept = kept
+        # By identity: fields that anyone writes may be equal to others, or have no hash.
+        self._kept: dict[int, tuple[Any, dict[str, Any], Value]] = {}
 
     def get(self, field: Field, key: Any, make: Callable[[], Value]) -> Value:
         """The value of a field under a key, from `make` where another key was asked for last.
 
         It is made anew if an attribute of the field has been set since.
         """
-        if field in self._kept:
-            kept_key, attributes, value = self._kept[field]
+        if id(field) in self._kept:
+            kept_key, attributes, value = self._kept[id(field)]
             now = vars(field)
             same = attributes.keys() == now.keys()
             if same and kept_key == key and all(attributes[name] is now[name] for name in now):
                 return value
         value = make()
         if value is not field:
-            self._kept[field] = key, {**vars(field)}, value
+            if id(field) not in self._kept:
+                finalize(field, self._kept.pop, id(field), None).atexit = False
+            self._kept[id(field)] = key, {**vars(field)}, value
         return value
 
 
