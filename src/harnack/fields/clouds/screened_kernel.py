@@ -103,28 +103,27 @@ class ScreenedSums:
         is at most the one of w Q_2/d^2; and 6 epsilon w Q_2/d^3 is what positions do.
         """
         tail, sums = source.tail, self.sums.plus(source.terms, active)
-        weight = dr.select(active, source.weight, 0)
-        steep = weight * tail.second * tail.cube
-        bent = weight * tail.third * tail.cube * tail.inverse
-        error, slope, second = (
-            dr.select(active, one, 0)
-            for one in (source.error, source.gradient_error, source.hessian_error)
+        steep = source.weight * tail.second * tail.cube
+        bent = source.weight * tail.third * tail.cube * tail.inverse
+        bounds = steep, steep * tail.inverse, bent, bent * tail.inverse
+        errors = source.error, source.gradient_error, source.hessian_error
+        steep, steeper, bent, more_bent, error, slope, second = (
+            dr.select(active, one, 0) for one in (*bounds, *errors)
         )
-        nearer, bounds = fmin(tail.distance, sums.free_distance), sums.second_truncation
+        nearer, old = fmin(tail.distance, sums.free_distance), sums.second_truncation
         # Dr.Jit's epsilon is half the distance from 1 to the next number, ours is all of it.
         positions = 6 * 2 * float(dr.epsilon(steep))
         sums = dataclasses.replace(
             sums,
             truncation=sums.truncation + error,
             slope_truncation=sums.slope_truncation + slope,
-            second_truncation=None if bounds is None else bounds + second,
+            second_truncation=None if old is None else old + second,
             rounding=dr.fma(steep, dr.fma(rounding, tail.distance, positions), sums.rounding),
             free_distance=dr.select(active, nearer, sums.free_distance),
             s4=sums.s4 + bent,
-            s5=dr.fma(bent, tail.inverse, sums.s5),
+            s5=sums.s5 + more_bent,
         )
-        steeper = dr.fma(steep, tail.inverse, self.steeper)
-        return ScreenedSums(sums, self.steep + steep, steeper)
+        return ScreenedSums(sums, self.steep + steep, self.steeper + steeper)
 
 
 @dataclass(frozen=True)
