@@ -15,6 +15,7 @@ import pytest
 from scipy.special import lpmv
 
 from harnack.backend import choose_backend, to_numpy, to_vector3
+from harnack.enclosures import Curvature
 from harnack.fields import (
     EigenfunctionSum,
     Field,
@@ -30,7 +31,6 @@ from harnack.fields import (
     cosine,
     sine,
 )
-from harnack.fields.field import Curvature
 from harnack.fields.polynomials.solid_harmonics import evaluate, from_monomials
 from harnack.fields.polynomials.sphere_range import (
     BallRange,

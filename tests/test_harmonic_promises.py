@@ -11,8 +11,16 @@ import pytest
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.backend.lengths import length
-from harnack.enclosures import Caps, Classic, Cone, Slope, Taylor
-from harnack.fields.field import Curvature, HarmonicBall, Lipschitz
+from harnack.enclosures import (
+    Caps,
+    Classic,
+    Cone,
+    Curvature,
+    HarmonicBall,
+    Lipschitz,
+    Slope,
+    Taylor,
+)
 from harnack.fields.polynomials.axial_bounds import (
     AxialBound,
     gradient_bound,

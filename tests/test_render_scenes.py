@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.fields.field import Field, Lipschitz, Sample
+from harnack.enclosures import Lipschitz
+from harnack.fields.field import Field, Sample
 from harnack.rendering import picture, register, render, shape
 
 mi = register()

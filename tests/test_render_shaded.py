@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.fields.field import Field, Lipschitz, Sample
+from harnack.enclosures import Lipschitz
+from harnack.fields.field import Field, Sample
 from harnack.geometry import mesh_shapes, shapes
 from harnack.rendering import Camera, Material, register, render, shape
 from harnack.rendering.mitsuba.world import World

@@ -12,6 +12,7 @@ from scipy.special import eval_legendre, spherical_in, spherical_kn
 
 import harnack as hk
 from harnack.backend import choose_backend, to_float, to_numpy, to_vector3
+from harnack.enclosures import Curvature, HarmonicBall
 from harnack.fields.clouds.dipole_records import dipole_rows
 from harnack.fields.clouds.screened import ScreenedWindingNumber
 from harnack.fields.clouds.screened_kernel import seen_dipole, thetas
@@ -22,7 +23,6 @@ from harnack.fields.clouds.screened_tree import (
     coefficients,
     seen_cluster,
 )
-from harnack.fields.field import Curvature, HarmonicBall
 from harnack.geometry import mesh_shapes
 from harnack.geometry.clouds import CloudError
 from harnack.geometry.meshes import MeshError

@@ -9,8 +9,8 @@ import pytest
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy
 from harnack.backend.sines import sincos
+from harnack.enclosures import Curvature
 from harnack.fields import PlaneWave, Product, cosine, sine
-from harnack.fields.field import Curvature
 from harnack.testing.walks import look_at
 
 UNIT = 2.0**-24

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.fields.field import HarmonicBall
+from harnack.enclosures import HarmonicBall
 from harnack.fields.meshes.edge_trails import EdgeTrails, closed_trails
 from harnack.fields.meshes.winding_number import WindingNumber
 from harnack.geometry import MeshError

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 
 from harnack.backend.extrema import fmax, fmin
+from harnack.enclosures import Curvature, HarmonicBall, LineLipschitz
 from harnack.fields.batch import Values
-from harnack.fields.field import Curvature, HarmonicBall, LineLipschitz, Sample
+from harnack.fields.field import Sample
 from harnack.fields.symmetric import SymmetricSum
 
 if TYPE_CHECKING:

@@ -14,11 +14,12 @@ import numpy.typing as npt
 
 from harnack.backend import FloatArray, backend_of, choose_backend, to_numpy, to_vector3
 from harnack.choices import did_you_mean
+from harnack.enclosures import Curvature
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.clouds.dipole_records import dipole_rows
 from harnack.fields.clouds.screened_kernel import mean_at_dipoles, promises
 from harnack.fields.clouds.screened_tree import PlainSum, ScreenedDipoles, TreeSum
-from harnack.fields.field import AtDetail, Curvature, Field, Sample
+from harnack.fields.field import AtDetail, Field, Sample
 from harnack.fields.sums import SECOND_ROUNDINGS, SLOPE_ROUNDINGS, FieldSums
 from harnack.fields.unit_coordinates import (
     UnitCoordinates,

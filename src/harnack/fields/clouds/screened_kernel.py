@@ -36,7 +36,7 @@ import numpy as np
 
 from harnack.backend import FloatArray
 from harnack.backend.extrema import fmax, fmin
-from harnack.fields.field import Curvature, HarmonicBall
+from harnack.enclosures import Curvature, HarmonicBall
 from harnack.fields.sums import SUM_ROUNDING, FieldSums, Terms
 from harnack.fields.symmetric import SymmetricSum
 

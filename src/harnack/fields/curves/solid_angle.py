@@ -12,13 +12,14 @@ import numpy.typing as npt
 
 from harnack.backend import backend_of, to_numpy
 from harnack.choices import did_you_mean
+from harnack.enclosures import HarmonicBall, LineLipschitz
 from harnack.fields.curves.edge_angles import differentiable_angle
 from harnack.fields.curves.edge_extent import tight_extent
 from harnack.fields.curves.edge_nearest import closest_on_segments, segments
 from harnack.fields.edges.edge_passing import Line, known_along, rates_along
 from harnack.fields.edges.edge_records import LoopEdges
 from harnack.fields.edges.edge_sums import EdgeSums, hessian_over_edges, sum_over_edges
-from harnack.fields.field import HarmonicBall, LineLipschitz, Look, Path, Sample
+from harnack.fields.field import Look, Path, Sample
 from harnack.fields.sums import (
     SECOND_ROUNDINGS,
     SLOPE_ROUNDINGS,

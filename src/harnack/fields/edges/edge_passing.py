@@ -31,8 +31,8 @@ from typing import TYPE_CHECKING, TypeAlias
 import drjit as dr
 
 from harnack.backend.extrema import clamp, fmax
+from harnack.enclosures import LineLipschitz
 from harnack.fields.edges.edge import Edge
-from harnack.fields.field import LineLipschitz
 from harnack.fields.sums import SUM_ROUNDING
 
 if TYPE_CHECKING:

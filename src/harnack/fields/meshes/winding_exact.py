@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING
 import drjit as dr
 
 from harnack.backend.extrema import fmax
+from harnack.enclosures import Lipschitz
 from harnack.fields.batch import Values
 from harnack.fields.edges.edge_lift import LiftedEdges, lifted_sums
 from harnack.fields.edges.edge_passing import Line, known_along
-from harnack.fields.field import Lipschitz, Sample
+from harnack.fields.field import Sample
 from harnack.fields.meshes.edge_chains import EdgeChains
 from harnack.fields.meshes.edge_trails import EdgeTrails
 from harnack.fields.sums import rounding_of_sum

@@ -14,8 +14,9 @@ import numpy.typing as npt
 
 from harnack.backend import backend_of
 from harnack.choices import did_you_mean
+from harnack.enclosures import LineLipschitz
 from harnack.fields.batch import BatchedField, Values
-from harnack.fields.field import Field, LineLipschitz, Sample, lengthened
+from harnack.fields.field import Field, Sample, lengthened
 from harnack.fields.meshes.winding_exact import ExactWinding
 from harnack.fields.meshes.winding_mesh import WindingMesh
 from harnack.fields.meshes.winding_tree import TreeWinding

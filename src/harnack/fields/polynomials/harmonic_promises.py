@@ -22,7 +22,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend.extrema import fmax, fmin
-from harnack.fields.field import Curvature, HarmonicBall, Lipschitz
+from harnack.enclosures import Curvature, HarmonicBall, Lipschitz
 from harnack.fields.polynomials.axial_bounds import (
     AxialBound,
     gradient_bound,

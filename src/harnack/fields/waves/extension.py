@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from harnack.backend import backend_of
 from harnack.backend.extrema import fmax, fmin
-from harnack.fields.field import HarmonicBall
+from harnack.enclosures import HarmonicBall
 from harnack.fields.waves.waves import WaveBounds
 
 if TYPE_CHECKING:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 
 from harnack.backend.extrema import fmax, fmin
-from harnack.fields.field import Curvature, Field, Lipschitz, Sample
+from harnack.enclosures import Curvature, Lipschitz
+from harnack.fields.field import Field, Sample
 from harnack.fields.waves.extension import ExtensionRange
 from harnack.fields.waves.wave_rounding import WaveRounding
 from harnack.fields.waves.waves import (
