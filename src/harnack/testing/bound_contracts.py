@@ -68,7 +68,10 @@ def check_bound(
             accepted += 1
             _check_trial(kind, trial, on_device, slope, generator, precision)
     if not accepted:
-        raise ValueError(f"{kind.__name__} applies to none of the promises there are")
+        raise ValueError(
+            f"{kind.__name__} applies to none of the promises there are; define its classmethod "
+            "of(promise, value, error, slopes), which returns an enclosure for its kind of promise"
+        )
 
 
 def trials(rng: np.random.Generator, rows: int) -> Iterator[Trial]:
@@ -231,21 +234,27 @@ def _check_trial(
     real = cast("Any", type(slope))
     step = to_numpy(case.step(kind, slope)).astype(np.float64)
     met = _meets(trial, np.minimum(step, trial.reach), precision)
-    _require(trial, ~met, kind, "meets no level within the step {length}", step)
+    _require(trial, ~met, kind, "a level is met within the step {length}", step)
     good = (step >= 0) & (step <= trial.reach * (1 + 1e-6))
-    _require(trial, good, kind, "is known up to {reach}, and the step {length} is a part", step)
+    _require(
+        trial,
+        good,
+        kind,
+        "the step {length} is no length up to {reach}, where the promise ends",
+        step,
+    )
     # In single precision both are rounded, each on its safe side.
     shares = [1 - 1e-5 if precision == "double" else 0.98, *rng.uniform(0.01, 0.98, 2)]
     for share in shares:
         length = step * share
         free = to_numpy(case.covers(kind, slope, real(length)))
-        _require(trial, free, kind, "is covered for {length}, within its step", length)
+        _require(trial, free, kind, "{length} is not covered, but lies within the step", length)
     lengths = [step * (1 + 10 ** rng.uniform(-4, 0, rows)), trial.reach * rng.random(rows)]
     for length in lengths:
         covered = to_numpy(case.covers(kind, slope, real(length)))
         inside = np.minimum(length, trial.reach)
         wrong = covered & (_meets(trial, inside, precision) | (length > trial.reach * (1 + 1e-6)))
-        _require(trial, ~wrong, kind, "meets no level within {length}, which is covered", length)
+        _require(trial, ~wrong, kind, "a level is met within {length}, which is covered", length)
 
 
 def _meets(trial: Trial, length: FloatArray, precision: Precision) -> BoolArray:
@@ -286,7 +295,7 @@ def _require(
     numbers = {k: float(x[row]) if np.ndim(x) else x for k, x in entries.items()}
     what = promise.format(reach=float(trial.reach[row]), length=float(length[row]))
     raise BrokenPromiseError(
-        f"{kind.__name__} does not keep its promise ({trial.name}): f {what}. Wrong in "
+        f"{kind.__name__} does not keep its promise ({trial.name}): {what}. Wrong in "
         f"{bad.size} of {len(good)} trials; the first: {numbers}, "
         f"slope = {float(trial.slope[row])!r}"
     )

@@ -35,6 +35,9 @@ class Tolerance:
         tolerance grow with its footprint.
     value: also a hit where |f - level| <= value, whatever the gradient.
 
+    Beside a pole of f, |f - level|/|grad f| is the distance to the pole and none to the level: rays
+    that pass a point charge within the tolerance are called hits of every level.
+
     Where rounding leaves the distance to the level less certain than this, that uncertainty is
     the tolerance: about 1e-6 of the coordinates' size in single precision, 1e-15 in double.
     """

@@ -1,1 +1,1 @@
-"""Potentials of oriented points."""
+"""Sums over points: potentials of oriented points, with and without screening."""
