@@ -15,10 +15,10 @@ from harnack.enclosures import (
     Cone,
     Enclosure,
     Gaps,
-    Levels,
     Parabola,
     Slope,
     Slopes,
+    TargetLevels,
     Taylor,
     any_covers,
     choose_proofs,
@@ -497,7 +497,7 @@ def test_gaps_to_the_levels_of_a_ladder(precision: str) -> None:
     ladder = np.sort(np.concatenate([np.arange(-5, 6) * period + value for value in values]))
     seen = real(f)
     f = to_numpy(seen).astype(np.float64)
-    gaps = Levels(values, period).gaps(seen)
+    gaps = TargetLevels(values, period).gaps(seen)
     down, up = to_numpy(gaps.down), to_numpy(gaps.up)
     below = np.array([x - ladder[ladder <= x].max() for x in f])
     above = np.array([ladder[ladder >= x].min() - x for x in f])
@@ -514,7 +514,7 @@ def test_gaps_to_the_levels_of_a_ladder(precision: str) -> None:
 
 def test_gaps_without_a_period() -> None:
     real = choose_backend("double").Float
-    gaps = Levels((0.0, 2.0)).gaps(real([-1, 0, 0.5, 2, 3]))
+    gaps = TargetLevels((0.0, 2.0)).gaps(real([-1, 0, 0.5, 2, 3]))
     assert np.array_equal(to_numpy(gaps.down), [np.inf, 0, 0.5, 0, 1])
     assert np.array_equal(to_numpy(gaps.up), [1, 0, 1.5, 0, np.inf])
 

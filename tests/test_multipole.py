@@ -20,7 +20,7 @@ from harnack.backend import choose_backend, to_numpy
 from harnack.fields.multipoles import moments
 from harnack.fields.multipoles.far_clusters import node_columns
 from harnack.fields.multipoles.multipole import (
-    Level,
+    NodeMoments,
     all_levels,
     cartesian,
     triangle_levels,
@@ -115,14 +115,14 @@ def cluster(seed: int, count: int = 12) -> tuple[np.ndarray, np.ndarray]:
     return y, normal
 
 
-def level_of(y: np.ndarray, normal: np.ndarray) -> Level:
+def level_of(y: np.ndarray, normal: np.ndarray) -> NodeMoments:
     """The cluster as one leaf."""
     tree = Hierarchy(np.zeros((1, 1), np.int64), ())
     low, high = y.min(axis=0)[None], y.max(axis=0)[None]
     return all_levels(tree, y[None], normal[None], low, high)[0]
 
 
-def terms(level: Level, x: np.ndarray, order: int, derivatives: int) -> Any:
+def terms(level: NodeMoments, x: np.ndarray, order: int, derivatives: int) -> Any:
     """Value, gradient and Hessian that a node alone gives at x (k, 3)."""
     backend = choose_backend("double")
     c = [dr.opaque(backend.Float, float(v)) for v in cartesian(level.moments, order)[0]]
@@ -335,7 +335,7 @@ def test_sup_norm_bounds_every_term() -> None:
                 assert np.abs(term).max() >= 0.95 * bound
 
 
-def viewpoints(level: Level, q: float, seed: int) -> np.ndarray:
+def viewpoints(level: NodeMoments, q: float, seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     r = level.radius[0] / q * np.where(np.arange(60) < 30, 1.0, rng.uniform(1, 4, 60))
     return level.centre[0] + r[:, None] * unit(rng.normal(size=(60, 3)))
@@ -401,7 +401,12 @@ def test_truncation_is_bounded_for_triangles(order: int) -> None:
 
 
 def bent(
-    level: Level, rough: float, way: np.ndarray, part: float, y: np.ndarray, normal: np.ndarray
+    level: NodeMoments,
+    rough: float,
+    way: np.ndarray,
+    part: float,
+    y: np.ndarray,
+    normal: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """How far f moves off the linear on steps along `way` (60, 3), and the bound of it."""
     columns = node_columns(level, 2, rough, np.zeros(1))[0]

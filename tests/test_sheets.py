@@ -27,9 +27,9 @@ from harnack.enclosures import (
     Caps,
     Curvature,
     Enclosure,
-    Levels,
     Slope,
     Slopes,
+    TargetLevels,
     Taylor,
     choose_proofs,
 )
@@ -873,7 +873,7 @@ def test_a_level_within_rounding_of_a_side_counts_as_between(
     for sheet, there in ((3, True), (3, False), (NO_SHEET, True)):
         ahead = Crossing(real(1), backend.UInt32(sheet), real(jump), vector(0, 0, 1))
         met = compare_with_sheet(
-            ahead, backend.Bool(there), real(before), real(1e-6), Levels((0.5,))
+            ahead, backend.Bool(there), real(before), real(1e-6), TargetLevels((0.5,))
         )
         reached = there and sheet != NO_SHEET
         assert met.at_crossing == [reached]

@@ -11,7 +11,7 @@ import numpy as np
 
 from harnack.backend import FloatArray
 from harnack.fields import DipolePotential, Field, SolidAngle, WindingNumber
-from harnack.files import Cloud, FileFormatError, Loops, Mesh, read_loops, read_surface
+from harnack.files import ClosedCurves, Cloud, FileFormatError, Mesh, read_loops, read_surface
 from harnack.files.surfaces import ReadAs
 
 __all__ = ["UP_AXES", "Axis", "OpenedSurface", "open_surface"]
@@ -79,7 +79,7 @@ def open_surface(
             f"{path}: normals are estimated for point clouds, and this is something else: "
             f'{surface.said}; leave out normals="estimate", or take its points with as_="dipole"'
         )
-    is_curve = isinstance(surface, Loops)
+    is_curve = isinstance(surface, ClosedCurves)
     axis, why = (up, "as asked") if up is not None else _usual_up(path, is_curve=is_curve)
     try:
         field = _field(surface, normals, _UPRIGHT[axis])
@@ -99,19 +99,21 @@ def _usual_up(path: Path, *, is_curve: bool) -> tuple[Axis, str]:
     return "z", "for want of a standard (up= turns it)"
 
 
-def _read(path: Path, as_: ReadAs | None, boundary: bool) -> Mesh | Cloud | Loops:
+def _read(path: Path, as_: ReadAs | None, boundary: bool) -> Mesh | Cloud | ClosedCurves:
     if boundary and path.suffix.lower() in _LOOP_FILES:
         loops = tuple(read_loops(path, boundary=True))
         noun = "loop" if len(loops) == 1 else "loops"
         count = f"{len(loops):,} {noun} of {sum(map(len, loops)):,} vertices"
-        return Loops(loops, f"{count}: the boundary of the faces, as asked")
+        return ClosedCurves(loops, f"{count}: the boundary of the faces, as asked")
     return read_surface(path, "loops" if boundary else as_)
 
 
-def _field(surface: Mesh | Cloud | Loops, normals: str | None, rotation: FloatArray) -> Field:
+def _field(
+    surface: Mesh | Cloud | ClosedCurves, normals: str | None, rotation: FloatArray
+) -> Field:
     if isinstance(surface, Mesh):
         return WindingNumber(surface.vertices @ rotation.T, surface.faces)
-    if isinstance(surface, Loops):
+    if isinstance(surface, ClosedCurves):
         return SolidAngle([loop @ rotation.T for loop in surface.loops])
     points = surface.points @ rotation.T
     if normals == "estimate":

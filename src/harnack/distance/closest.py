@@ -20,7 +20,7 @@ from harnack.distance.projection import Descent
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
-    from harnack.enclosures import Levels
+    from harnack.enclosures import TargetLevels
     from harnack.fields.field import Field, Sample
     from harnack.tracer import LevelSet
 
@@ -101,7 +101,7 @@ class _Candidates:
         return (self.descent.noise(y),)
 
 
-def find_closest(backend: Backend, surface: LevelSet, levels: Levels, points: Any) -> Closest:
+def find_closest(backend: Backend, surface: LevelSet, levels: TargetLevels, points: Any) -> Closest:
     """For each of the points the nearest of these candidates:
 
     1. the end of the descent from the point;
@@ -160,7 +160,7 @@ def find_closest(backend: Backend, surface: LevelSet, levels: Levels, points: An
     return _past_sheets(backend, surface, candidates, found, to_sheet)
 
 
-def _lower(backend: Backend, field: Field, levels: Levels, p: Vec3, sample: Sample) -> Real:
+def _lower(backend: Backend, field: Field, levels: TargetLevels, p: Vec3, sample: Sample) -> Real:
     if not sample.promises:
         return backend.Float(0)
     return distance_below(backend, field, levels, p, sample)

@@ -8,7 +8,7 @@ import drjit as dr
 
 from harnack.backend.extrema import fmax, fmin
 from harnack.backend.lengths import largest_component, length
-from harnack.enclosures import Gaps, Levels, Slopes, choose_proofs, longest_step
+from harnack.enclosures import Gaps, Slopes, TargetLevels, choose_proofs, longest_step
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
@@ -20,7 +20,9 @@ __all__ = ["distance_below"]
 _PROOFS = choose_proofs("curvature")
 
 
-def distance_below(backend: Backend, field: Field, levels: Levels, p: Vec3, sample: Sample) -> Real:
+def distance_below(
+    backend: Backend, field: Field, levels: TargetLevels, p: Vec3, sample: Sample
+) -> Real:
     """A length that the distance from p to the nearest level is proved not to fall short of.
 
     sample: the field at p.

@@ -18,7 +18,7 @@ from harnack.distance.tangent import Eigen, TangentPlane
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.enclosures import Levels
+    from harnack.enclosures import TargetLevels
     from harnack.fields.field import Field
 
 __all__ = ["Descent"]
@@ -62,11 +62,11 @@ class Descent:
 
     backend: Backend
     field: Field
-    levels: Levels
+    levels: TargetLevels
     has_hessian: bool
 
     @classmethod
-    def of(cls, backend: Backend, field: Field, levels: Levels) -> Descent:
+    def of(cls, backend: Backend, field: Field, levels: TargetLevels) -> Descent:
         try:
             field.hessian(backend.Array3f(0))
         except NotImplementedError:

@@ -15,7 +15,7 @@ from harnack.distance.batches import in_batches
 from harnack.distance.closest import Closest, find_closest, find_on_sheets
 from harnack.distance.estimates import first_order, second_order
 from harnack.distance.lower_bound import distance_below
-from harnack.enclosures import Levels
+from harnack.enclosures import TargetLevels
 from harnack.fields.field import Field
 from harnack.tracer import level_set
 
@@ -128,12 +128,12 @@ def _surface(field: Field, level: Any) -> LevelSet:
     return level_set(field, level, tolerance=_CLOSE, overstep=1.0)
 
 
-def _levels(backend: Backend, surface: LevelSet) -> Levels:
+def _levels(backend: Backend, surface: LevelSet) -> TargetLevels:
     values = tuple(
         one if dr.is_array_v(type(one)) else dr.opaque(backend.Float, float(one))
         for one in surface.levels
     )
-    return Levels(values, surface.field.period)
+    return TargetLevels(values, surface.field.period)
 
 
 def _warn(name: str, found: Closest) -> None:
@@ -170,25 +170,25 @@ def _check_domain(field: Field, points: FloatArray) -> None:
         )
 
 
-def _first(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
+def _first(backend: Backend, field: Field, levels: TargetLevels, p: Vec3) -> Real:
     del backend
     sample = field.evaluate(p)
     return first_order(-levels.to_nearest(sample.value), sample.gradient)
 
 
-def _second(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
+def _second(backend: Backend, field: Field, levels: TargetLevels, p: Vec3) -> Real:
     del backend
     sample, rows = field.evaluate(p), field.hessian(p)
     return second_order(-levels.to_nearest(sample.value), sample.gradient, rows)
 
 
-def _lower(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
+def _lower(backend: Backend, field: Field, levels: TargetLevels, p: Vec3) -> Real:
     sample = field.evaluate(p)
     above = -levels.to_nearest(sample.value)
     return dr.copysign(distance_below(backend, field, levels, p, sample), above)
 
 
-_COMPUTE: dict[str, Callable[[Backend, Field, Levels, Vec3], Real]] = {
+_COMPUTE: dict[str, Callable[[Backend, Field, TargetLevels, Vec3], Real]] = {
     "first": _first,
     "second": _second,
     "lower": _lower,

@@ -6,7 +6,7 @@ from harnack.enclosures.ball import Ball
 from harnack.enclosures.caps import Caps
 from harnack.enclosures.classic import Classic
 from harnack.enclosures.enclosure import Enclosure, Gaps, Slopes
-from harnack.enclosures.levels import Levels
+from harnack.enclosures.levels import TargetLevels
 from harnack.enclosures.parabola import Cone, Parabola, Taylor
 from harnack.enclosures.promises import (
     Curvature,
@@ -28,7 +28,6 @@ __all__ = [
     "Enclosure",
     "Gaps",
     "HarmonicBall",
-    "Levels",
     "LineLipschitz",
     "Lipschitz",
     "Parabola",
@@ -36,6 +35,7 @@ __all__ = [
     "Proofs",
     "Slope",
     "Slopes",
+    "TargetLevels",
     "Taylor",
     "any_covers",
     "choose_proofs",

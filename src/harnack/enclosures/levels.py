@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Levels:
+class TargetLevels:
     """A finite set of target levels, repeated with `period` if there is one.
 
     `values` may be Python floats or size-1 Dr.Jit arrays of the backend in use (so that a level

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from harnack.files.file_format import FileFormatError
 from harnack.files.loops import read_loops
-from harnack.files.surfaces import Cloud, Loops, Mesh, read_surface
+from harnack.files.surfaces import ClosedCurves, Cloud, Mesh, read_surface
 from harnack.files.writing import write_atomically
 
 __all__ = [
+    "ClosedCurves",
     "Cloud",
     "FileFormatError",
-    "Loops",
     "Mesh",
     "read_loops",
     "read_surface",

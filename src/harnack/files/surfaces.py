@@ -26,7 +26,7 @@ from harnack.geometry.meshes import MeshError, without_zero_area_faces
 from harnack.geometry.polygons import triangulate
 from harnack.geometry.singular import net_faces, singular_edges, singular_loops, weld_vertices
 
-__all__ = ["SURFACE_FILES", "Cloud", "Loops", "Mesh", "ReadAs", "read_surface"]
+__all__ = ["SURFACE_FILES", "ClosedCurves", "Cloud", "Mesh", "ReadAs", "read_surface"]
 
 ReadAs: TypeAlias = Literal["winding", "dipole", "loops"]
 
@@ -61,14 +61,16 @@ class Cloud:
 
 
 @dataclass(frozen=True, eq=False)
-class Loops:
+class ClosedCurves:
     """Closed curves from a file, (n, 3) each. said: what was found, and why they are curves."""
 
     loops: tuple[FloatArray, ...]
     said: str
 
 
-def read_surface(path: str | os.PathLike[str], as_: ReadAs | None = None) -> Mesh | Cloud | Loops:
+def read_surface(
+    path: str | os.PathLike[str], as_: ReadAs | None = None
+) -> Mesh | Cloud | ClosedCurves:
     """What a surface file (.obj, .ply, .stl, .off, .glb, .gltf, .xyz, .loops) describes.
 
     Faces make a mesh, except polygons of an .obj or .ply file of which some have more than four
@@ -99,7 +101,7 @@ def read_surface(path: str | os.PathLike[str], as_: ReadAs | None = None) -> Mes
         return _read(path, kind, as_)
 
 
-def _read(path: Path, kind: str, as_: ReadAs | None) -> Mesh | Cloud | Loops:
+def _read(path: Path, kind: str, as_: ReadAs | None) -> Mesh | Cloud | ClosedCurves:
     if kind == ".loops":
         _refuse(path, as_, ("loops",), "curves")
         return _loops(read_loops(path), "curves, since the file lists nothing else")
@@ -128,7 +130,7 @@ def _refuse(path: Path, as_: ReadAs | None, possible: tuple[str, ...], held: str
         )
 
 
-def _of_faces(contents: Contents, as_: ReadAs | None) -> Mesh | Cloud | Loops:
+def _of_faces(contents: Contents, as_: ReadAs | None) -> Mesh | Cloud | ClosedCurves:
     can_be_loops = contents.path.suffix.lower() in _LOOP_FILES
     if as_ == "loops" and len(contents.polylines) and can_be_loops:
         return _loops(loops_in(contents), "polylines and faces, taken as curves as asked")
@@ -192,7 +194,7 @@ def _centers(mesh: Mesh) -> Cloud:
     return Cloud(corners.mean(axis=1), normal / area[:, None], area, said)
 
 
-def _boundary(path: Path, mesh: Mesh) -> Loops:
+def _boundary(path: Path, mesh: Mesh) -> ClosedCurves:
     edges, weights = singular_edges(weld_vertices(mesh.vertices)[mesh.faces])
     if not len(edges):
         raise Place(path).error(
@@ -205,7 +207,7 @@ def _boundary(path: Path, mesh: Mesh) -> Loops:
         raise Place(path).error(str(error)) from error
     noun = "loop" if len(loops) == 1 else "loops"
     said = f"{len(loops):,} {noun} of {sum(weights):,} edges: the boundary of the faces, as asked"
-    return Loops(loops, said)
+    return ClosedCurves(loops, said)
 
 
 def _cloud(contents: Contents) -> Cloud:
@@ -217,6 +219,8 @@ def _cloud(contents: Contents) -> Cloud:
     return Cloud(points, normals, None, f"{count} with normals, no faces: a point cloud")
 
 
-def _loops(loops: list[FloatArray], why: str) -> Loops:
+def _loops(loops: list[FloatArray], why: str) -> ClosedCurves:
     noun = "loop" if len(loops) == 1 else "loops"
-    return Loops(tuple(loops), f"{len(loops):,} {noun} of {sum(map(len, loops)):,} vertices: {why}")
+    return ClosedCurves(
+        tuple(loops), f"{len(loops):,} {noun} of {sum(map(len, loops)):,} vertices: {why}"
+    )

@@ -38,7 +38,7 @@ from harnack.rendering.pictures.shaded import shaded
 from harnack.rendering.pictures.views import VIEWS, look
 from harnack.rendering.studio.camera import Camera
 from harnack.rendering.studio.materials import Material, material_of
-from harnack.rendering.studio.stage import Exhibit, studio
+from harnack.rendering.studio.stage import StudioObject, studio
 from harnack.tracer import LevelSet, level_set
 
 ShowMode = Literal["color", "shaded", "normal", "evaluations", "status", "depth"]
@@ -146,7 +146,7 @@ def _staged(
     return mi.load_dict(made.scene, parallel=False), made.unit
 
 
-def _exhibits(what: Any, materials: Any, settings: Mapping[str, Any]) -> list[Exhibit]:
+def _exhibits(what: Any, materials: Any, settings: Mapping[str, Any]) -> list[StudioObject]:
     given: list[Any] = [what] if isinstance(what, Field | LevelSet) else list(what)
     if not given:
         raise ValueError("there is nothing to draw: give at least one field")
@@ -160,7 +160,7 @@ def _exhibits(what: Any, materials: Any, settings: Mapping[str, Any]) -> list[Ex
         raise ValueError(f"give one material{several}, not {len(names)}")
     fitted = "tolerance" not in settings
     return [
-        Exhibit(_surface(one, settings), material_of(name), fitted and isinstance(one, Field))
+        StudioObject(_surface(one, settings), material_of(name), fitted and isinstance(one, Field))
         for one, name in zip(given, names, strict=True)
     ]
 

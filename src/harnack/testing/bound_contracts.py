@@ -236,13 +236,8 @@ def _check_trial(
     met = _meets(trial, np.minimum(step, trial.reach), precision)
     _require(trial, ~met, kind, "a level is met within the step {length}", step)
     good = (step >= 0) & (step <= trial.reach * (1 + 1e-6))
-    _require(
-        trial,
-        good,
-        kind,
-        "the step {length} is no length up to {reach}, where the promise ends",
-        step,
-    )
+    beyond = "the step {length} is no length up to {reach}, where the promise ends"
+    _require(trial, good, kind, beyond, step)
     # In single precision both are rounded, each on its safe side.
     shares = [1 - 1e-5 if precision == "double" else 0.98, *rng.uniform(0.01, 0.98, 2)]
     for share in shares:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 
 from harnack.backend.lengths import length as norm
-from harnack.enclosures import Levels
+from harnack.enclosures import TargetLevels
 from harnack.tracer.tolerance import Status
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ def _change_of_nearest(prepared: PreparedLevelSet, f: Real) -> Real:
     nearest, change = dr.inf, prepared.backend.Float(0)
     for level in prepared.levels.values:
         with dr.suspend_grad():
-            one = Levels((dr.detach(level),), prepared.levels.period)
+            one = TargetLevels((dr.detach(level),), prepared.levels.period)
             gap = one.gaps(f).smaller
             closer = gap < nearest
             nearest = dr.select(closer, gap, nearest)

@@ -21,7 +21,7 @@ from harnack.tracer.tolerance import PreparedTolerance, Status
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.enclosures import Gaps, Levels
+    from harnack.enclosures import Gaps, TargetLevels
     from harnack.fields.field import Field
     from harnack.fields.look import Look, Path, Sample
 
@@ -96,7 +96,7 @@ class March:
     """How to march: towards which levels, until when, and with which over-stepping factor."""
 
     backend: Backend
-    levels: Levels
+    levels: TargetLevels
     tolerance: PreparedTolerance
     max_steps: int
     overstep: float

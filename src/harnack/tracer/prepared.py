@@ -15,7 +15,7 @@ from harnack.tracer.tolerance import PreparedTolerance, Status
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.enclosures import Levels, Proofs
+    from harnack.enclosures import Proofs, TargetLevels
     from harnack.fields.field import Field, Sample
     from harnack.geometry import Volume
 
@@ -50,7 +50,7 @@ class PreparedLevelSet:
 
     backend: Backend
     field: Field
-    levels: Levels
+    levels: TargetLevels
     volume: Volume | None
     proofs: Proofs
     tolerance: PreparedTolerance

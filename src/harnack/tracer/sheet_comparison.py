@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 
 from harnack.backend.extrema import fmax, fmin
-from harnack.enclosures import Gaps, Levels
+from harnack.enclosures import Gaps, TargetLevels
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.tracer.tolerance import Status
 
@@ -43,7 +43,7 @@ class SheetComparison:
 
 
 def compare_with_sheet(
-    ahead: Crossing, there: Mask, value: Real, total_error: Real, levels: Levels
+    ahead: Crossing, there: Mask, value: Real, total_error: Real, levels: TargetLevels
 ) -> SheetComparison:
     """Compare samples that are proved, at the crossing where `there` holds, with the value before
     it.

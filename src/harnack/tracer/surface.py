@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
-from harnack.enclosures import Choice, Levels, Proofs, choose_proofs
+from harnack.enclosures import Choice, Proofs, TargetLevels, choose_proofs
 from harnack.geometry import Intersection
 from harnack.tracer.prepared import PreparedLevelSet
 from harnack.tracer.tolerance import Tolerance
@@ -75,7 +75,7 @@ class LevelSet:
         return PreparedLevelSet(
             backend,
             self.field.prepare(backend),
-            Levels(levels, self.field.period),
+            TargetLevels(levels, self.field.period),
             None if volume is None else volume.prepare(backend),
             self.bound,
             self.tolerance.prepare(backend),

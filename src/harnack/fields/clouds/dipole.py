@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _VALUES, _TRACED = 2.0, 4.0
 
 
-class DipolePotential(UploadedField["_OnDevice"], BatchedField):
+class DipolePotential(UploadedField["_DipoleBuffers"], BatchedField):
     """f(x) = sum a_i n_i.(p_i - x)/|p_i - x|^3 of oriented points (paper, Eq. 12).
 
     With a_i the areas that the points stand for, f is about 4 pi inside and 0 outside: the
@@ -105,7 +105,7 @@ class DipolePotential(UploadedField["_OnDevice"], BatchedField):
         weight = float(self.areas.sum()) / self._size**2
         return on.tree.at(x, derivatives, closer).far_away(x, 64, weight).rescaled(on.size)
 
-    def _upload(self, backend: Backend, *, traced: bool) -> _OnDevice:
+    def _upload(self, backend: Backend, *, traced: bool) -> _DipoleBuffers:
         accuracy = self.accuracy or (_TRACED if traced else _VALUES)
         unit = (self.points - self._centre) / self._size
         # Areas shrink with the square of lengths, and the potential knows no scale.
@@ -113,7 +113,7 @@ class DipolePotential(UploadedField["_OnDevice"], BatchedField):
         if self._hierarchy is None:
             self._hierarchy = hierarchy_of(unit)
         tree = DipoleTree.of(backend, self._hierarchy, unit, moments, accuracy)
-        return _OnDevice(*placed(backend, self._centre, self._size), tree)
+        return _DipoleBuffers(*placed(backend, self._centre, self._size), tree)
 
     def prepare(self, backend: Backend) -> Self:
         prepared = super().prepare(backend)
@@ -148,7 +148,7 @@ class DipolePotential(UploadedField["_OnDevice"], BatchedField):
 
 
 @dataclass(frozen=True)
-class _OnDevice(UnitCoordinates):
+class _DipoleBuffers(UnitCoordinates):
     """A potential on a backend."""
 
     tree: DipoleTree

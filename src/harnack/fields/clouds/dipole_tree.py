@@ -10,7 +10,7 @@ import drjit as dr
 
 from harnack.backend.extrema import fmax
 from harnack.fields.clouds.dipole_records import dipole_rows, in_slots
-from harnack.fields.multipoles.far_clusters import FarClusters
+from harnack.fields.multipoles.far_clusters import Treecode
 from harnack.fields.multipoles.multipole import all_levels
 from harnack.fields.sums import FieldSums, Terms, rounding_of_dipole, rounding_of_sum
 from harnack.fields.symmetric import SymmetricSum
@@ -30,7 +30,7 @@ _BESIDE = 0.04
 class DipoleTree:
     """sum_i m_i.(y_i - x)/|y_i - x|^3 on a backend; a record holds y_i, m_i and |m_i|."""
 
-    clusters: FarClusters
+    clusters: Treecode
     rounding: Real
 
     @property
@@ -52,7 +52,7 @@ class DipoleTree:
         # Rounded terms, most of them of the size of their share of the whole, random in sign.
         share = max(1.0, float(rows[:, 6].sum()))
         rounding = rounding_of_sum(backend, len(points), 16, growth=1 / 8, size=share)
-        clusters = FarClusters.of(backend, tree, levels, in_slots(tree, rows), accuracy)
+        clusters = Treecode.of(backend, tree, levels, in_slots(tree, rows), accuracy)
         return cls(clusters, rounding)
 
     def at(self, x: Vec3, derivatives: int, closer: Real) -> Values:

@@ -18,7 +18,7 @@ from harnack.enclosures import Curvature
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.clouds.dipole_records import dipole_rows
 from harnack.fields.clouds.screened_kernel import mean_at_dipoles, promises
-from harnack.fields.clouds.screened_tree import PlainSum, ScreenedDipoles, TreeSum
+from harnack.fields.clouds.screened_tree import DirectSum, ScreenedDipoles, TreeSum
 from harnack.fields.field import AtDetail, Field, Sample
 from harnack.fields.sums import SECOND_ROUNDINGS, SLOPE_ROUNDINGS, FieldSums
 from harnack.fields.unit_coordinates import (
@@ -48,7 +48,7 @@ _SMALLEST_LEVEL = 1e-20
 _ON_DIPOLE, _ANY_LEVEL = 32, 1e5
 
 
-class ScreenedWindingNumber(UploadedField["_OnDevice"], BatchedField):
+class ScreenedWindingNumber(UploadedField["_ScreenedBuffers"], BatchedField):
     """w(x) = (1/4 pi) sum_i a_i n_i.(y_i - x) (1 + rho_i/l) exp(-rho_i/l)/rho_i^3, rho_i = |y_i-x|.
 
     Minus the derivative of the Yukawa kernel exp(-rho/l)/rho along n_i at y_i; as l grows, the
@@ -186,7 +186,7 @@ class ScreenedWindingNumber(UploadedField["_OnDevice"], BatchedField):
         weight = float(self.areas.sum()) / (4 * math.pi * self._size**2)
         return values.far_away(x, 64, weight).rescaled(on.size)
 
-    def _held(self, on: _OnDevice, sums: FieldSums, unit: Real) -> tuple[Real, Real, Real]:
+    def _held(self, on: _ScreenedBuffers, sums: FieldSums, unit: Real) -> tuple[Real, Real, Real]:
         """What the screening adds to the rounding of value, gradient and second derivatives.
 
         Exponentials are held at exp(-80) = 2e-35 (`screened_kernel.LONGEST`), times at most
@@ -199,15 +199,15 @@ class ScreenedWindingNumber(UploadedField["_OnDevice"], BatchedField):
         second = dr.fma(SECOND_ROUNDINGS * unit, fourth, 6 * held * share * share)
         return held, 2 * held * share, second
 
-    def _upload(self, backend: Backend, *, traced: bool) -> _OnDevice:
+    def _upload(self, backend: Backend, *, traced: bool) -> _ScreenedBuffers:
         del traced
         if self.method == "sum":
-            dipoles = PlainSum(backend, self._rows, self._kappa)
+            dipoles = DirectSum(backend, self._rows, self._kappa)
         else:
             dipoles = TreeSum(backend, self._rows, self._kappa, self.accuracy)
-        return _OnDevice(*placed(backend, self._centre, self._size), dipoles)
+        return _ScreenedBuffers(*placed(backend, self._centre, self._size), dipoles)
 
-    def _batch(self, backend: Backend) -> _OnDevice:
+    def _batch(self, backend: Backend) -> _ScreenedBuffers:
         if self._device is not None and self._device.backend is backend:
             return self._device  # values at points take nothing else
         return super()._batch(backend)
@@ -219,7 +219,7 @@ class ScreenedWindingNumber(UploadedField["_OnDevice"], BatchedField):
         on = self._prepared()
         return AtDetail(lambda p: self._sample(on, p, detail))
 
-    def _sample(self, on: _OnDevice, p: Vec3, detail: Real) -> Sample:
+    def _sample(self, on: _ScreenedBuffers, p: Vec3, detail: Real) -> Sample:
         x = on.unit(p)
         screened, epsilon = on.dipoles.sums(x, detail, 1), on.backend.epsilon
         sums, unit = screened.sums, epsilon_at(x)
@@ -321,7 +321,7 @@ class ScreenedWindingNumber(UploadedField["_OnDevice"], BatchedField):
 
 
 @dataclass(frozen=True)
-class _OnDevice(UnitCoordinates):
+class _ScreenedBuffers(UnitCoordinates):
     """The dipoles on a backend."""
 
     dipoles: ScreenedDipoles

@@ -74,7 +74,7 @@ class ScreenedSums:
     sums: value, derivatives and bounds; s4 and s5 are the sums of w Q_3/d^4 and w Q_3/d^5, which
         for an infinite length are those of `FieldSums`.
     steep, steeper: sums of w Q_2/d^3 and w Q_2/d^4.
-    Clusters add the bounds of their sums.
+    ClusterMoments add the bounds of their sums.
     """
 
     sums: FieldSums

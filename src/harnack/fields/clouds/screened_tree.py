@@ -86,7 +86,7 @@ class ScreenedDipoles(abc.ABC):
         return ScreenedSums.of(state).plus(dipole, self.rounding, True).parts()
 
 
-class PlainSum(ScreenedDipoles):
+class DirectSum(ScreenedDipoles):
     """All dipoles, one by one; no sum could be closer."""
 
     def __init__(self, backend: Backend, rows: FloatArray, kappa: float) -> None:
@@ -158,7 +158,7 @@ def seen_cluster(
 
 
 @dataclass(frozen=True)
-class Clusters:
+class ClusterMoments:
     """The nodes of one level: centre (k, 3), radius, weight, third = sum w |d|^3 (k,) each, and
     T1 (k, 3), T2 (k, 3, 3), T3 (k, 3, 3, 3), symmetric."""
 
@@ -171,14 +171,14 @@ class Clusters:
     t3: FloatArray
 
 
-def clusters(tree: Hierarchy, rows: FloatArray) -> list[Clusters]:
+def clusters(tree: Hierarchy, rows: FloatArray) -> list[ClusterMoments]:
     """Moments of all levels, from the leaves to the root.
 
     T1, T2, T3 move from a child's centre to its parent's, d -> d + s: T2 gains sym(T1 s) and T3
     sym(2 T2 s + T1 s s). The rest is taken from the dipoles themselves.
     """
     slots = in_slots(tree, rows)
-    levels: list[Clusters] = []
+    levels: list[ClusterMoments] = []
     for count, arity in zip(tree.counts, (0, *tree.arities), strict=True):
         p, m, w = np.split(slots.reshape(count, -1, slots.shape[2])[..., :7], [3, 6], axis=2)
         weight = w.sum(axis=(1, 2))
@@ -195,12 +195,12 @@ def clusters(tree: Hierarchy, rows: FloatArray) -> list[Clusters]:
             )
         else:
             moments = _moved(levels[-1], centre, arity)
-        levels.append(Clusters(centre, length.max(axis=1), weight, third, *moments))
+        levels.append(ClusterMoments(centre, length.max(axis=1), weight, third, *moments))
     return levels
 
 
 def _moved(
-    children: Clusters, centre: FloatArray, arity: int
+    children: ClusterMoments, centre: FloatArray, arity: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     s = children.centre - np.repeat(centre, arity, axis=0)
     t1, t2, t3 = children.t1, children.t2, children.t3
@@ -218,7 +218,7 @@ def _symmetric(
     return t1, 0.5 * (t2 + t2.transpose(0, 2, 1)), total / 6
 
 
-def coefficients(level: Clusters) -> FloatArray:
+def coefficients(level: ClusterMoments) -> FloatArray:
     """(k, 23) numbers as `cluster_parts` reads them: T1; tr T2; -T2; -3/2 tr T3; T3/2."""
     t2, t3 = -level.t2, 0.5 * level.t3
     i, j = np.array([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]).T
@@ -231,7 +231,7 @@ def coefficients(level: Clusters) -> FloatArray:
     return np.concatenate([level.t1, trace2, t2[:, i, j], trace3, t3[:, a, b, c]], axis=1)
 
 
-def columns(level: Clusters, kappa: float, accuracy: float) -> FloatArray:
+def columns(level: ClusterMoments, kappa: float, accuracy: float) -> FloatArray:
     """(k, 30): centre, accepting distance, radius, weight | coefficients, third."""
     accept = accepting_distance(level.radius, kappa, accuracy)
     # Rounding of centre and radius must not let a dipole out.

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import drjit as dr
 import numpy as np
-import numpy.typing as npt
 
 from harnack.backend import backend_of, to_numpy
 from harnack.choices import did_you_mean
@@ -28,13 +27,13 @@ from harnack.fields.sums import (
 )
 from harnack.fields.unit_coordinates import UnitCoordinates, UploadedField, epsilon_at, placed
 from harnack.geometry import ConvexHull, is_convex_position, total_length, validate_loops
+from harnack.geometry.curves import Loops
 from harnack.geometry.net_loops import net_loops, uncancelled_edges
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.geometry import Volume
 
-Loops = tuple[npt.NDArray[np.float64], ...]
 CertificateName = Literal["auto", "edges", "convex", "paper"]
 
 _PERIOD = 4 * math.pi
@@ -45,7 +44,7 @@ _REACH = 0.5
 _NARROW = 1e-9 * _PERIOD
 
 
-class SolidAngle(UploadedField["_OnDevice"]):
+class SolidAngle(UploadedField["_CurveBuffers"]):
     """The signed solid angle of closed curves, in steradians, with period 4 pi (paper, Eq. 10).
 
     loops: one (n, 3) array-like of vertices, n >= 3, or a list of them. Every loop is closed by
@@ -115,7 +114,7 @@ class SolidAngle(UploadedField["_OnDevice"]):
             )
         return "edges" if asked == "edges" else "range"
 
-    def _upload(self, backend: Backend, *, traced: bool) -> _OnDevice:
+    def _upload(self, backend: Backend, *, traced: bool) -> _CurveBuffers:
         del traced
         # Centred and scaled to unit size: products of eight lengths stay far from overflow. The
         # centre is a number of the backend, so that near the curve it is subtracted exactly.
@@ -132,7 +131,7 @@ class SolidAngle(UploadedField["_OnDevice"]):
         edges = LoopEdges.upload(backend, unit) if unit else None
         magnitude = float(np.abs(np.concatenate(self._net or self.loops)).max() / self._size)
         factors = sum(len(loop) for loop in self._net)
-        return _OnDevice(
+        return _CurveBuffers(
             *placed(backend, centre, self._size),
             edges,
             dr.opaque(backend.Float, backend.epsilon * (6 + 2 * magnitude)),
@@ -178,7 +177,7 @@ class SolidAngle(UploadedField["_OnDevice"]):
         known = (ball, *_along_edges(on, x, sums, direction))
         return Sample(dr.select(met, 0, sums.angle), gradient, known, error)
 
-    def _constant(self, on: _OnDevice, p: Vec3) -> Sample:
+    def _constant(self, on: _CurveBuffers, p: Vec3) -> Sample:
         """The sample of f = 0, for a curve of which nothing is left: it is true on any ball. The
         range has a width, as bounds divide by it; no level lies in it (`check_levels`)."""
         x = on.unit(p)
@@ -187,7 +186,7 @@ class SolidAngle(UploadedField["_OnDevice"]):
         ball = HarmonicBall(radius, zero - _NARROW, zero + _NARROW)
         return Sample(zero, on.backend.Array3f(zero), (ball,))
 
-    def _edge_ball(self, on: _OnDevice, sums: EdgeSums, distance: Real) -> HarmonicBall:
+    def _edge_ball(self, on: _CurveBuffers, sums: EdgeSums, distance: Real) -> HarmonicBall:
         r = _REACH * distance
         variation = 2 * r * (sums.first + r / (1 - _REACH) * sums.second) * (1 + SUM_ROUNDING)
         return HarmonicBall(r * on.size, sums.angle - variation, sums.angle + variation)
@@ -288,7 +287,7 @@ class SolidAngle(UploadedField["_OnDevice"]):
 
 
 @dataclass(frozen=True)
-class _OnDevice(UnitCoordinates):
+class _CurveBuffers(UnitCoordinates):
     """The edges on a backend, None if there are none.
 
     rounding: how far a point may be from where it was meant to be, in units of the curve. Near the
@@ -303,7 +302,7 @@ class _OnDevice(UnitCoordinates):
 
 
 def _along_edges(
-    on: _OnDevice, x: Vec3, sums: EdgeSums, direction: Vec3 | None
+    on: _CurveBuffers, x: Vec3, sums: EdgeSums, direction: Vec3 | None
 ) -> tuple[LineLipschitz, ...]:
     """What is known at x, in unit coordinates, along a direction, if one is given."""
     edges = on.edges

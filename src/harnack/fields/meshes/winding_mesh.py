@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray, IntArray
-from harnack.fields.multipoles.multipole import Level, triangle_levels
+from harnack.fields.multipoles.multipole import NodeMoments, triangle_levels
 from harnack.fields.unit_coordinates import single
 from harnack.geometry import MeshError, validate_mesh
 from harnack.geometry.singular import net_faces, singular_edges, weld_vertices
@@ -150,7 +150,7 @@ class WindingMesh:
         )
 
     @functools.cached_property
-    def levels(self) -> list[Level]:
+    def levels(self) -> list[NodeMoments]:
         """Moments of the nodes."""
         return triangle_levels(self.tree, self.corners)
 

@@ -40,7 +40,7 @@ _VALUES, _TRACED = 2.0, 4.0
 _ON_TRIANGLE = 8.0
 
 
-class WindingNumber(UploadedField["_OnDevice"], BatchedField):
+class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
     """w of a triangle mesh: how often it winds around a point (Jacobson et al. 2013).
 
     For a closed mesh 1 inside and 0 outside; for a mesh with holes, cracks, duplicated or flipped
@@ -125,7 +125,7 @@ class WindingNumber(UploadedField["_OnDevice"], BatchedField):
         weight = self.mesh.area / (4 * math.pi * self.mesh.size**2)
         return values.far_away(x, 64 + len(self.mesh.singular), weight).rescaled(on.size)
 
-    def _upload(self, backend: Backend, *, traced: bool) -> _OnDevice:
+    def _upload(self, backend: Backend, *, traced: bool) -> _MeshBuffers:
         accuracy = self.accuracy or (_TRACED if traced else _VALUES)
         mesh = self.mesh
         rays = TriangleRays.of(backend, mesh.ray_tree, mesh.ray_records)
@@ -133,7 +133,7 @@ class WindingNumber(UploadedField["_OnDevice"], BatchedField):
             winding = ExactWinding.of(backend, mesh, rays, traced)
         else:
             winding = TreeWinding.of(backend, mesh, accuracy, self.order)
-        return _OnDevice(*placed(backend, mesh.centre, mesh.size), winding, rays)
+        return _MeshBuffers(*placed(backend, mesh.centre, mesh.size), winding, rays)
 
     def evaluate(self, p: Vec3) -> Sample:
         """w as it is, jumps and all, with what is known of it as a lift."""
@@ -224,7 +224,7 @@ class WindingNumber(UploadedField["_OnDevice"], BatchedField):
 
 
 @dataclass(frozen=True)
-class _OnDevice(UnitCoordinates):
+class _MeshBuffers(UnitCoordinates):
     """A winding number on a backend."""
 
     winding: ExactWinding | TreeWinding
@@ -235,7 +235,7 @@ class _Stretch(Field):
     """A winding number as seen on a stretch of rays; behind: where it starts, in unit lengths."""
 
     def __init__(
-        self, on: _OnDevice, frame: Frame, behind: Crossing, offset: Real, detail: Real = 1.0
+        self, on: _MeshBuffers, frame: Frame, behind: Crossing, offset: Real, detail: Real = 1.0
     ) -> None:
         self.has_detail = on.winding.has_detail
         self.coarsest_detail = on.winding.coarsest_detail

@@ -17,7 +17,7 @@ from harnack.backend.extrema import fmax
 from harnack.fields.edges.edge_lift import LiftedProduct, LiftedSums
 from harnack.fields.edges.edge_passing import Line, known_along, with_edge_rates
 from harnack.fields.meshes.triangle_kernel import edges_of
-from harnack.fields.multipoles.far_clusters import FarClusters
+from harnack.fields.multipoles.far_clusters import Treecode
 from harnack.fields.sums import FieldSums, Terms, rounding_of_sum
 from harnack.fields.unit_coordinates import epsilon_at
 from harnack.tree.triangles import INDEX, Upwards, crossing, in_slots
@@ -42,7 +42,7 @@ _SHARE = 1 / (4 * math.pi)
 class TreeWinding:
     """w of a mesh on a backend, in units in which the mesh has a size of about one."""
 
-    clusters: FarClusters
+    clusters: Treecode
     rounding: Real
 
     @classmethod
@@ -52,7 +52,7 @@ class TreeWinding:
         slots = in_slots(mesh.tree, records)
         rounding = rounding_of_sum(backend, len(mesh.triangles))
         levels = list(mesh.levels)
-        return cls(FarClusters.of(backend, mesh.tree, levels, slots, accuracy, order), rounding)
+        return cls(Treecode.of(backend, mesh.tree, levels, slots, accuracy, order), rounding)
 
     @property
     def has_detail(self) -> bool:

@@ -15,7 +15,7 @@ import numpy as np
 
 from harnack.backend.extrema import fmax
 from harnack.fields.multipoles.cluster_walk import SeenCluster, walk_clusters
-from harnack.fields.multipoles.multipole import Level, cartesian
+from harnack.fields.multipoles.multipole import NodeMoments, cartesian
 from harnack.fields.multipoles.multipole_kernel import far_terms
 from harnack.fields.multipoles.truncation import bend_columns, truncation
 from harnack.fields.sums import FieldSums, free_part
@@ -40,7 +40,7 @@ _FAR = 1e4
 AddPrimitive: TypeAlias = "Callable[[list[Real], Mask, FieldSums, Own], tuple[FieldSums, Own]]"
 
 
-def node_columns(level: Level, order: int, rough: float, error: FloatArray) -> FloatArray:
+def node_columns(level: NodeMoments, order: int, rough: float, error: FloatArray) -> FloatArray:
     """Numbers of nodes as the walk below reads them, that may be taken as a whole beyond `rough`
     times their radius: centre, accepting distance, A and K of `bend_columns` | 15 coefficients,
     value error E (k,), as given."""
@@ -50,7 +50,7 @@ def node_columns(level: Level, order: int, rough: float, error: FloatArray) -> F
 
 
 @dataclass(frozen=True)
-class FarClusters:
+class Treecode:
     """The walk over a tree of nodes as `node_columns` lays them out.
 
     looser: the errors of a rough look are at most this many times those stored. steeper, bent:
@@ -72,11 +72,11 @@ class FarClusters:
         cls,
         backend: Backend,
         tree: Hierarchy,
-        levels: list[Level],
+        levels: list[NodeMoments],
         primitives: FloatArray,
         accuracy: float,
         order: int = 2,
-    ) -> FarClusters:
+    ) -> Treecode:
         """Everything uploaded. primitives: records in their slots, as `tree.pack` takes them.
 
         E is stored once for both looks: as large as the closer one needs, and no less than what

@@ -34,7 +34,7 @@ _POWERS = 10
 
 
 @dataclass(frozen=True)
-class Level:
+class NodeMoments:
     """The nodes of one level of the tree.
 
     centre: (k, 3) about which the moments are taken: the mean of the dipoles by area.
@@ -56,7 +56,7 @@ class Level:
 
 def all_levels(
     tree: Hierarchy, points: FloatArray, normals: FloatArray, low: FloatArray, high: FloatArray
-) -> list[Level]:
+) -> list[NodeMoments]:
     """Moments of the nodes of all levels, from the leaves to the root.
 
     points, normals: (n, s, 3) dipoles of each of n primitives; a normal's length is its area.
@@ -75,7 +75,7 @@ def all_levels(
     return _levels(backend, tree, primitive)
 
 
-def triangle_levels(tree: Hierarchy, corners: FloatArray) -> list[Level]:
+def triangle_levels(tree: Hierarchy, corners: FloatArray) -> list[NodeMoments]:
     """Moments of the nodes of all levels, for triangles (n, 3, 3): exact up to rounding."""
     backend = choose_backend("double")
     buffer = backend.Float(corners.ravel())
@@ -113,7 +113,7 @@ def _row(backend: Backend, buffer: Real, i: Any) -> Vec3:
 
 def _levels(
     backend: Backend, tree: Hierarchy, primitive: Callable[[Any], _Primitive]
-) -> list[Level]:
+) -> list[NodeMoments]:
     level, parts, low, high = _leaves(backend, tree, primitive)
     levels = [level]
     for arity in tree.arities:
@@ -126,7 +126,7 @@ def _levels(
 
 def _leaves(
     backend: Backend, tree: Hierarchy, primitive: Callable[[Any], _Primitive]
-) -> tuple[Level, list[Real], FloatArray, FloatArray]:
+) -> tuple[NodeMoments, list[Real], FloatArray, FloatArray]:
     """The leaves, their `_PARTS` on the backend, and boxes around them.
 
     One lane a leaf, which looks at its primitives twice: for the centre, and about it.
@@ -172,7 +172,7 @@ def _leaves(
     at, (xx, yy, zz, xy, xz, yz, *third, fourth) = to_numpy(centre), map(to_numpy, powers)
     second = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
     sizes = to_numpy(area), second, np.stack(third, axis=1), fourth
-    return Level(at, _reach(at, *boxes), *sizes, _moments_of(parts)), list(parts), *boxes
+    return NodeMoments(at, _reach(at, *boxes), *sizes, _moments_of(parts)), list(parts), *boxes
 
 
 def _powers(area: Real, points: Sequence[tuple[float, Vec3]]) -> list[Real]:
@@ -211,8 +211,8 @@ def _moments_of(parts: Sequence[Real]) -> Moments:
 
 
 def _parents(
-    backend: Backend, below: Level, parts: list[Real], low: FloatArray, high: FloatArray
-) -> tuple[Level, list[Real]]:
+    backend: Backend, below: NodeMoments, parts: list[Real], low: FloatArray, high: FloatArray
+) -> tuple[NodeMoments, list[Real]]:
     """The level above, whose boxes are given, and its `_PARTS`."""
     count, arity = len(low), len(below.area) // len(low)
     area = below.area.reshape(-1, arity).sum(axis=1)
@@ -232,10 +232,10 @@ def _parents(
         one.reshape(count, arity, *one.shape[1:]).sum(axis=1) for one in _moved(below, shift)
     )
     reach, moments = _reach(centre, low, high), _moments_of(sums)
-    return Level(centre, reach, area, second, third, fourth, moments), sums
+    return NodeMoments(centre, reach, area, second, third, fourth, moments), sums
 
 
-def _moved(level: Level, s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _moved(level: NodeMoments, s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Second, third and fourth about centre - s: what they are of d + s. About its own centre a
     node has no first moment."""
     a, square = level.area[:, None], (s * s).sum(axis=1)

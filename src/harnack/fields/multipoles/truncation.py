@@ -11,7 +11,7 @@ import numpy as np
 
 from harnack.backend import FloatArray
 from harnack.fields.multipoles.moments import KNOWN
-from harnack.fields.multipoles.multipole import Level, Moments
+from harnack.fields.multipoles.multipole import Moments, NodeMoments
 from harnack.fields.sums import longest_part, remainder_factor
 
 # A bound that is rounded to single precision a few times, down each time, is one still.
@@ -32,7 +32,7 @@ def sup_norm(moments: Moments, l: int) -> FloatArray:
 
 
 def truncation(
-    level: Level, nearest: FloatArray, order: int = 2
+    level: NodeMoments, nearest: FloatArray, order: int = 2
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """(E, G, H): seen from r >= nearest, what the terms l >= order + 2 =: k add to f is at most
     E/r^(k+1) in value, G/r^(k+2) in gradient and H/r^(k+3) in second derivatives along lines.
@@ -67,7 +67,7 @@ def truncation(
     return _ROOM * value, _ROOM * slope, _ROOM * second
 
 
-def bend_columns(level: Level, rough: float) -> tuple[FloatArray, FloatArray]:
+def bend_columns(level: NodeMoments, rough: float) -> tuple[FloatArray, FloatArray]:
     """A and K (k,) of nodes that are seen from beyond r0 = `rough` times their radius R.
 
     From there on a step by t = q r, q <= Q = `longest_part(rough)`, moves a node's field off the

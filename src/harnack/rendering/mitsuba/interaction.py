@@ -8,10 +8,10 @@ import drjit as dr
 
 if TYPE_CHECKING:
     from harnack.backend import Real, Vec3
-    from harnack.rendering.surfaces.encounter import Encounter
+    from harnack.rendering.surfaces.encounter import SurfaceHit
 
 
-def surface_interaction(mi: Any, met: Encounter, ray: Any, shape: Any) -> Any:
+def surface_interaction(mi: Any, met: SurfaceHit, ray: Any, shape: Any) -> Any:
     """The SurfaceInteraction3f of a ray with one of our surfaces, valid where `met.met`.
 
     shape: ShapePtr of the carrier, whose BSDF is asked. Texture coordinates are x and y of the

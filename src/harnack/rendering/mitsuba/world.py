@@ -11,7 +11,7 @@ from harnack.backend import Mask
 from harnack.rendering.mitsuba.carrier import is_carrier
 from harnack.rendering.mitsuba.interaction import surface_interaction
 from harnack.rendering.mitsuba.variant import mitsuba_backend
-from harnack.rendering.surfaces.encounter import Encounter
+from harnack.rendering.surfaces.encounter import SurfaceHit
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class World:
         """Finds the carriers in a scene."""
         return cls(mi, scene, tuple(s for s in scene.shapes() if is_carrier(s)))
 
-    def intersect(self, ray: Any, start: Any, active: Mask) -> tuple[Any, Encounter]:
+    def intersect(self, ray: Any, start: Any, active: Mask) -> tuple[Any, SurfaceHit]:
         """The first thing that rays meet, as interaction and as encounter.
 
         start: the interaction that rays leave, not valid for rays that come from a camera.
@@ -51,9 +51,9 @@ class World:
             limit = dr.select(event, met.t, limit)
         return si, first
 
-    def _of_scene(self, si: Any, active: Mask) -> Encounter:
+    def _of_scene(self, si: Any, active: Mask) -> SurfaceHit:
         mi, vector = self.mi, mitsuba_backend(self.mi).Array3f
-        return Encounter(
+        return SurfaceHit(
             t=si.t,
             met=active & si.is_valid(),
             lost=mi.Bool(False),

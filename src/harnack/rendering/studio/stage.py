@@ -32,7 +32,7 @@ _CLAMP = 2.0
 
 
 @dataclass(frozen=True)
-class Exhibit:
+class StudioObject:
     """A surface on the stage.
 
     fitted: whether to give it a tolerance that suits its size in place of its own.
@@ -53,7 +53,7 @@ class Studio:
 
 def studio(
     mi: Any,
-    exhibits: Sequence[Exhibit],
+    exhibits: Sequence[StudioObject],
     *,
     size: tuple[int, int],
     camera: Camera,

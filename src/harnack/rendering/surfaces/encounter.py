@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
-from harnack.backend import Mask, Real, Vec3  # at run time: Dr.Jit reads Encounter's annotations
+from harnack.backend import Mask, Real, Vec3  # at run time: Dr.Jit reads SurfaceHit's annotations
 from harnack.backend.lengths import length as norm
 from harnack.tracer import Status
 
@@ -28,7 +28,7 @@ _GRAZING = 1e-3
 
 
 @dataclass
-class Encounter:
+class SurfaceHit:
     """What rays meet first. Lanes that meet nothing have met = lost = False and t = inf.
 
     t: ray parameter; of a lost ray, how far it is proved free.
@@ -56,7 +56,7 @@ class Encounter:
 
 def meet_surface(
     prepared: PreparedLevelSet, o: Vec3, d: Vec3, t_max: Real, active: Mask
-) -> Encounter:
+) -> SurfaceHit:
     """Where rays o + t d, |d| = 1, 0 <= t <= t_max, first meet the level set.
 
     One Newton step along the ray, one evaluation there, and one projection along its gradient
@@ -87,7 +87,7 @@ def meet_surface(
         rest = dr.select(dr.abs(rest) * length <= dr.abs(gap), rest, 0)
     # gap > 0: the level is above, so the ray comes from the side of smaller values.
     side = dr.select(gap > 0, prepared.backend.Float(1), -1)
-    encounter = Encounter(
+    encounter = SurfaceHit(
         t=dr.select(met, t, trace.t),
         met=met,
         lost=trace.status == int(Status.OUT_OF_STEPS),
@@ -104,8 +104,8 @@ def meet_surface(
 
 
 def _on_sheet(
-    prepared: PreparedLevelSet, o: Vec3, d: Vec3, trace: MarchResult, encounter: Encounter
-) -> Encounter:
+    prepared: PreparedLevelSet, o: Vec3, d: Vec3, trace: MarchResult, encounter: SurfaceHit
+) -> SurfaceHit:
     """Encounters with sheets: t is exact to rounding, and so is the plane of the normal.
 
     The ray comes from the side of smaller values if it runs along the normal. The next ray keeps

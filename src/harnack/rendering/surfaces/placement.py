@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray
-from harnack.rendering.surfaces.encounter import Encounter, meet_surface
+from harnack.rendering.surfaces.encounter import SurfaceHit, meet_surface
 from harnack.rendering.surfaces.solid import Solid
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ class PlacedSurface:
         scale = dr.opaque(backend.Float, placement.scale)
         return cls(prepared, solid, scale, rows, vector(placement.translation))
 
-    def meet(self, o: Vec3, d: Vec3, t_max: Real, active: Mask, leaves: Real = 0.0) -> Encounter:
+    def meet(self, o: Vec3, d: Vec3, t_max: Real, active: Mask, leaves: Real = 0.0) -> SurfaceHit:
         """Where rays of the world, |d| = 1, first meet it, in coordinates of the world.
 
         leaves: of a ray that starts on this very surface, 1 or -1 for the side of the normal that

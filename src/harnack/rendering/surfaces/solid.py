@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import drjit as dr
 
-from harnack.rendering.surfaces.encounter import CLEARANCE, Encounter, facing, meet_surface
+from harnack.rendering.surfaces.encounter import CLEARANCE, SurfaceHit, facing, meet_surface
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
@@ -42,7 +42,7 @@ class Solid:
         f = self.prepared.sample(p).value
         return (f >= self.low) & (f <= self.high)
 
-    def meet(self, o: Vec3, d: Vec3, t_max: Real, active: Mask, leaves: Real = 0.0) -> Encounter:
+    def meet(self, o: Vec3, d: Vec3, t_max: Real, active: Mask, leaves: Real = 0.0) -> SurfaceHit:
         """Where rays o + t d, |d| = 1, 0 <= t <= t_max, first cross the boundary of the solid.
 
         leaves: of a ray that starts at the boundary, 1 if it goes out of the solid there, -1 if
@@ -87,7 +87,7 @@ class Solid:
         capped = within & ((start > 0) | (end < t_max))
         return capped | self.prepared.occluded(o, d, 0, t_max, active & ~capped)
 
-    def _meet_levels(self, o: Vec3, d: Vec3, t_max: Real, active: Mask) -> Encounter:
+    def _meet_levels(self, o: Vec3, d: Vec3, t_max: Real, active: Mask) -> SurfaceHit:
         """The first level set inside the volume, its normal turned out of the solid."""
         met = meet_surface(self.prepared, o, d, t_max, active)
         at_low = dr.abs(met.value - self.low) < dr.abs(met.value - self.high)
