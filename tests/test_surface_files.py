@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from harnack.files import gltf
 from harnack.files import ply as ply_files
 from harnack.files.file_format import FileFormatError
-from harnack.files.surfaces import Cloud, Loops, Mesh, read_surface
+from harnack.files.surfaces import ClosedCurves, Cloud, Mesh, read_surface
 from harnack.geometry.mesh_shapes import icosphere, remove_faces, torus_mesh
 from harnack.geometry.polygons import triangulate
 from harnack.geometry.singular import singular_edges, weld_vertices
@@ -291,7 +291,7 @@ PENTAGON = SQUARE + "v -1 0.5 0\n"
 )  # fmt: skip
 def test_curves(save, name, content, as_, said):
     loops = read_surface(save(name, content), as_)
-    assert isinstance(loops, Loops)
+    assert isinstance(loops, ClosedCurves)
     assert loops.said.startswith(said)
     assert all(loop.shape[1] == 3 for loop in loops.loops)
 
