@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class LoopState(Protocol):
-    """A frozen dataclass of Dr.Jit arrays, or of such dataclasses."""
+    """A frozen dataclass of Dr.Jit arrays, of such dataclasses, and of None where there is nothing."""
 
     @property
     def active(self) -> Mask:
@@ -47,7 +47,7 @@ def _leaves(record: Any) -> Iterator[Any]:
     for value in _entries(record):
         if dataclasses.is_dataclass(value):
             yield from _leaves(value)
-        else:
+        elif value is not None:
             yield value
 
 
@@ -55,8 +55,10 @@ def _record(like: Any, leaves: Iterator[Any]) -> Any:
     """The leaves as a record like another one."""
     values: list[Any] = []
     for value in _entries(like):
-        nested = dataclasses.is_dataclass(value)
-        values.append(_record(value, leaves) if nested else next(leaves))
+        if dataclasses.is_dataclass(value):
+            values.append(_record(value, leaves))
+        else:
+            values.append(None if value is None else next(leaves))
     return type(like)(*values)
 
 

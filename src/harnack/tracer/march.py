@@ -55,7 +55,8 @@ class MarchState:
     value, gradient: f at base.
     excess: by how much f at base may be farther from a level than the tolerance allows.
     evaluations: so far.
-    detail: of the next sample (`Field.at_detail`).
+    detail: of the next sample (`Field.at_detail`); None for fields that have none. (Dr.Jit records a
+        loop twice in which a state never changes.)
     status: a `Status` once the ray has ended.
     active: whether it goes on.
     """
@@ -68,12 +69,14 @@ class MarchState:
     gradient: Vec3
     excess: Real
     evaluations: Any
-    detail: Real
+    detail: Real | None
     status: Any
     active: Mask
 
     @classmethod
-    def at(cls, backend: Backend, start: Real, end: Real, active: Mask) -> MarchState:
+    def at(
+        cls, backend: Backend, start: Real, end: Real, active: Mask, *, has_detail: bool
+    ) -> MarchState:
         """At the start of rays, before anything was looked at."""
         real, vector, count = backend.Float, backend.Array3f, backend.UInt32
         return cls(
@@ -85,7 +88,7 @@ class MarchState:
             gradient=vector(0),
             excess=real(0),
             evaluations=count(0),
-            detail=real(0),
+            detail=real(0) if has_detail else None,
             status=count(int(Status.MISS)),
             active=backend.Bool(active) & (start < end),
         )
@@ -140,7 +143,8 @@ class March:
             at_end = None if ahead is None else t == end
 
             # Look there.
-            seen = field.at_detail(now.detail) if field.has_detail else field
+            has_detail = field.has_detail and now.detail is not None
+            seen = field.at_detail(now.detail) if has_detail else field
             unproved = now.step - now.reach
             candidate = fmin(now.candidate, end - t)
             look = seen.look(path, t, candidate, fmax(unproved, real(0)))
@@ -156,12 +160,16 @@ class March:
                 fmax(gradient_norm - sample.gradient_error, real(0)), t
             )
             too_coarse, finer, coarser = self.backend.Bool(False), now.detail, now.detail
-            if field.has_detail:
+            if has_detail:
                 deciding = self._deciding_gap(sample.value, ahead, at_end)
                 detail = fmax(now.detail, field.coarsest_detail)
                 finer, too_coarse = _finer(detail, deciding, total_error, sample.truncation, within)
                 coarser = _coarser(detail, gaps.smaller, sample.truncation, field.coarsest_detail)
             accepted &= ~too_coarse & dr.isfinite(total_error)  # what is not known is not free
+            next_detail = now.detail
+            if has_detail:
+                kept = dr.select(accepted, coarser, now.detail)
+                next_detail = dr.select(too_coarse, finer, kept)
 
             # Is it a hit, or a sheet?
             hit = accepted & self._is_hit(
@@ -200,7 +208,7 @@ class March:
                 gradient=gradient,
                 excess=dr.select(accepted, excess, now.excess),
                 evaluations=evaluations,
-                detail=dr.select(too_coarse, finer, dr.select(accepted, coarser, now.detail)),
+                detail=next_detail,
                 status=status,
                 active=now.active & ~(hit | free | (evaluations >= self.max_steps)),
             )

@@ -89,7 +89,8 @@ class PreparedLevelSet:
         backend, real = self.backend, self.backend.Float
         path = Path(backend.Array3f(o), backend.Array3f(d), self.proofs)
         start, end = self.clip(path.origin, path.direction, real(t_min), real(t_max))
-        state = MarchState.at(backend, start, end, active)
+        has_detail = self.field.has_detail or self.field.has_sheets
+        state = MarchState.at(backend, start, end, active, has_detail=has_detail)
         march = March(backend, self.levels, self.tolerance, self.max_steps, self.overstep)
         if self.field.has_sheets:
             return SheetTracer(march, self.field, path, real(start), real(end)).run(state)
