@@ -10,6 +10,7 @@ import pytest
 
 from harnack.backend import choose_backend, to_numpy
 from harnack.enclosures import (
+    Ball,
     Caps,
     Classic,
     Cone,
@@ -416,6 +417,64 @@ def test_parabolas_of_either_sign_step_to_the_first_level(precision: str) -> Non
         assert (covered == expected).all()
 
 
+@pytest.mark.parametrize("precision", ["single", "double"])
+@pytest.mark.parametrize("unit", [1e-165, 1e-23, 1.0, 1e20, 1e32, 1e160])
+def test_parabolas_that_turn_do_not_depend_on_the_unit_of_the_value(
+    unit: float, precision: str
+) -> None:
+    """In single precision a square of 1e-23 vanished, and lengths beyond the level were covered."""
+    if precision == "single" and not 1e-30 < unit < 1e35:
+        pytest.skip("no number of this precision")
+    real = choose_backend(precision).Float  # type: ignore[arg-type]
+    slope, bend = real(unit), real(-10 * unit)
+    turning = Parabola(Slopes(slope, slope), bend, bend, real(math.inf))
+    gaps = Gaps(real(math.inf), real(0.01 * unit))
+    assert to_numpy(turning.step(gaps))[0] == pytest.approx(0.01055728, rel=3e-6)
+    assert to_numpy(turning.covers(gaps, real(0.0105)))[0]
+    assert not to_numpy(turning.covers(gaps, real(0.2)))[0]
+    cone = LipschitzCase(real(unit), real(math.inf), real(math.inf), real(5 * unit))
+    assert to_numpy(cone.step(Cone, slope))[0] == pytest.approx(5, rel=3e-6)
+
+
+@pytest.mark.parametrize("precision", ["single", "double"])
+def test_parabolas_that_graze_a_level_stop_before_it(precision: str) -> None:
+    """Their highest point lies on the level, to rounding: once they were free for ever."""
+    real = choose_backend(precision).Float  # type: ignore[arg-type]
+    for a, c, gap in (
+        (1.5934311151504517, -0.14085014164447784, 9.013205528259277),
+        (1.5, -1.5, 0.75),
+    ):
+        slope, bend, level = real(a), real(c), Gaps(real(math.inf), real(gap))
+        turning = Parabola(Slopes(slope, slope), bend, bend, real(math.inf))
+        assert to_numpy(turning.step(level))[0] <= -a / c
+        assert not to_numpy(turning.covers(level, real(-2 * a / c)))[0]
+
+
+def test_the_classic_step_does_not_depend_on_the_unit_of_the_value() -> None:
+    """A product of two values vanished in single precision: steps were 64 % too long."""
+    real = choose_backend("single").Float
+    slope = real(0)
+    for unit in (1e-35, 1e-31, 1.0, 1e31, 1e36):
+        case = BallCase(real(1), real(unit), None, real(math.inf), real(3 * unit), 3)
+        assert to_numpy(case.step(Classic, slope))[0] == pytest.approx(0.406929, rel=1e-5)
+
+
+def test_balls_of_which_a_number_is_none_prove_nothing() -> None:
+    for precision in ("single", "double"):
+        real = choose_backend(precision).Float  # type: ignore[arg-type]
+        one, nan, slope = real(1), real(math.nan), real(0.2)
+        for numbers in ((nan, None, one, one), (one, nan, one, one), (one, one, nan, one)):
+            case = BallCase(one, *numbers, 3)
+            for bound in (Classic, Slope, Caps):
+                if case.accepts(bound):
+                    assert to_numpy(case.step(bound, slope))[0] == 0
+                    assert not to_numpy(case.covers(bound, slope, 0.5 * one))[0]
+        slopes = Slopes(slope, slope)
+        unknown = Slope.of(HarmonicBall(one, 0 * one, math.inf), 0.5 * one, nan, slopes)
+        assert unknown is not None
+        assert to_numpy(unknown.step(Gaps(one, one)))[0] == 0
+
+
 def test_the_longest_of_all_enclosures_counts() -> None:
     """Promises of every kind: the step is the largest of those that each of them proves."""
     backend = choose_backend("double")
@@ -466,16 +525,20 @@ def test_bounds_are_chosen_by_name() -> None:
     assert choose_proofs(some) is some
     with pytest.raises(ValueError, match=r"unknown bound 'harnak'; choose one of caps, classic"):
         choose_proofs("harnak")
-    for wrong in (3, (), Caps, (Caps, "slope"), int):
-        if wrong is not Caps:
-            with pytest.raises(TypeError, match=r"such as harnack\.Caps"):
-                choose_proofs(wrong)  # type: ignore[arg-type]
+    for wrong in (3, (), (Caps, "slope"), int, Enclosure, Ball):
+        with pytest.raises(TypeError, match=r"such as harnack\.Caps"):
+            choose_proofs(wrong)  # type: ignore[arg-type]
     real = choose_backend("double").Float
     given = (real(0), 0.0, Slopes(real(0.4), real(0.4)))
     with pytest.raises(ValueError, match=r'no bound applies.*Lipschitz, which.*Caps.*"lipschitz"'):
         choose_proofs(Caps).enclose((Lipschitz(1.0),), (), *given)
     with pytest.raises(ValueError, match=r"Sample\.known is empty"):
         choose_proofs(None).enclose((LineLipschitz(1.0, 1.0),), (), *given)
+    endless = HarmonicBall(real(1), -math.inf, math.inf)
+    with pytest.raises(ValueError, match="an end that is not infinite"):
+        choose_proofs(None).enclose((endless,), (), *given)
+    with pytest.raises(ValueError, match=r'choose "lipschitz"$'):
+        choose_proofs(None).enclose((), (Lipschitz(1.0),), *given)
 
 
 def test_check_bound_refuses_a_proof_that_applies_to_nothing() -> None:

@@ -163,3 +163,65 @@ def test_candidates_grow_and_shrink() -> None:
     assert hits.hit[0]
     assert hits.t[0] == pytest.approx(5.0, abs=2e-4)
     assert hits.evaluations[0] < 400
+    endless = Bisecting()
+    endless.domain = None
+    hits = hk.trace(endless, [[-4.0, 0, 0]], [[1.0, 0, 0]], t_max=math.inf)
+    assert hits.t[0] == pytest.approx(5.0, abs=2e-4)
+    assert hits.evaluations[0] < 400
+
+
+@pytest.mark.parametrize("unit", [1e-24, 1e20])
+def test_enclosures_of_values_of_any_size_miss_nothing(unit: float) -> None:
+    """Squares of such slopes vanish or overflow in single precision: 469 hits were passed."""
+
+    class Scaled(TaylorBlobs):
+        default_level = 0.5 * unit
+
+        def look(self, path: RayPath, t: Any, ahead: Any, back: Any) -> Look:
+            look = super().look(path, t, ahead, back)
+            sample = look.sample
+
+            def scaled(one: Parabola) -> Parabola:
+                slopes = Slopes(one.slopes.low * unit, one.slopes.high * unit)
+                bends = one.least_curvature * unit, one.most_curvature * unit
+                return Parabola(slopes, *bends, one.reach)
+
+            seen = Sample(sample.value * unit, sample.gradient * unit, (), sample.error * unit)
+            ahead, back = scaled(look.ahead[-1]), scaled(look.back[-1])
+            return Look(seen, (ahead,), (back,), look.slope * unit)
+
+    o, d = rays(20_000)
+    plain = hk.trace(TaylorBlobs(), o, d, tolerance=1e-5, overstep=1.8)
+    scaled = hk.trace(Scaled(), o, d, tolerance=1e-5, overstep=1.8)
+    assert (plain.hit == scaled.hit).mean() > 0.9998
+
+
+def test_a_level_within_a_large_error_is_not_passed() -> None:
+    """f is off by 0.001 and says so: on which side the level lies is not known."""
+
+    class Off(Field):
+        domain = hk.Box((-5.0,) * 3, (5.0,) * 3)
+
+        def evaluate(self, p: Any) -> Sample:
+            near = dr.abs(p.x) < 0.3
+            value = p.x - dr.select(near, 0.001, 0.0)
+            error = dr.select(near, 0.001001, 0.0)
+            return Sample(value, type(p)(1, 0, 0), (hk.Curvature(1.0),), error)
+
+    hits = hk.trace(Off(), [[2e-4, 0, 0]], [[-1.0, 0, 0]], level=0.0)
+    assert hits.status[0] != int(hk.Status.MISS)
+
+
+@pytest.mark.parametrize("distance", [1e-5, 1e-6, 1e-7])
+def test_rays_beside_the_origin_of_coordinates_reach_the_surface(distance: float) -> None:
+    """The size of coordinates is tiny there, and the rounding of the value is not."""
+    t = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+    rng, n = np.random.default_rng(0), 1000
+    o = distance * np.column_stack([rng.normal(size=(n, 2)), np.ones(n)])
+    d = np.array([0, 0, -1.0]) + 0.3 * rng.normal(size=(n, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    down = d[:, 2] < -0.2
+    circle = hk.SolidAngle(np.column_stack([np.cos(t), np.sin(t), 0 * t]))
+    hits = hk.trace(circle, o[down], d[down], tolerance=1e-6)
+    assert hits.hit.all()
+    assert (hits.evaluations < 50).all()

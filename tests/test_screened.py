@@ -17,7 +17,7 @@ from harnack.fields.clouds.dipole_records import dipole_rows
 from harnack.fields.clouds.screened import ScreenedWindingNumber
 from harnack.fields.clouds.screened_kernel import seen_dipole, thetas
 from harnack.fields.clouds.screened_tree import (
-    Clusters,
+    ClusterMoments,
     accepting_distance,
     clusters,
     coefficients,
@@ -186,7 +186,7 @@ def test_derivatives_are_largest_along_the_line_to_the_pole() -> None:
 # ---------------------------------------------------------------- clusters
 
 
-def seen(level: Clusters, x: np.ndarray, kappa: float) -> tuple[Any, ...]:
+def seen(level: ClusterMoments, x: np.ndarray, kappa: float) -> tuple[Any, ...]:
     """Clusters from x (k, 3): value, gradient, error, gradient_error, sums as NumPy arrays."""
     zeros = np.zeros((len(x), 4))
     head = np.concatenate([zeros, level.radius[:, None], level.weight[:, None]], axis=1)
@@ -206,8 +206,8 @@ def seen(level: Clusters, x: np.ndarray, kappa: float) -> tuple[Any, ...]:
     )
 
 
-def repeated(level: Clusters, views: int) -> Clusters:
-    return Clusters(*(np.repeat(value, views, axis=0) for value in vars(level).values()))
+def repeated(level: ClusterMoments, views: int) -> ClusterMoments:
+    return ClusterMoments(*(np.repeat(value, views, axis=0) for value in vars(level).values()))
 
 
 @pytest.mark.parametrize("kappa", [1e-3, 1.0, 30.0])
@@ -246,7 +246,7 @@ def test_truncation_bound_is_attained() -> None:
     t2 = np.einsum("ki,kj->kij", m, d)
     t3 = np.einsum("kij,kl->kijl", t2, d)
     radius, one = np.array([0.3]), np.ones(1)
-    level = Clusters(np.zeros((1, 3)), radius, one, radius**3, m, t2, t3)
+    level = ClusterMoments(np.zeros((1, 3)), radius, one, radius**3, m, t2, t3)
     x = np.array([[0.0, 0, 0.7]])
     value, gradient, error, slope = seen(level, x, 1e-9)
     f, g = kernel(d - x, m, 1e-9)

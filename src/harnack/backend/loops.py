@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class LoopState(Protocol):
-    """A frozen dataclass of Dr.Jit arrays, of such dataclasses, and of None where there is nothing."""
+    """A frozen dataclass of Dr.Jit arrays, such dataclasses, and None where there is nothing."""
 
     @property
     def active(self) -> Mask:

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 import drjit as dr
 
 from harnack.backend.extrema import fmax
-from harnack.enclosures.enclosure import Enclosure, Slopes
+from harnack.enclosures.enclosure import Enclosure, Gaps, Slopes
 from harnack.enclosures.promises import HarmonicBall, Promise
 
 if TYPE_CHECKING:
     from typing import Self
 
-    from harnack.backend import Real
+    from harnack.backend import Mask, Real
 
 # Distances carry a few roundings of float32; a radius is shortened by this much.
 _RADIUS_SLACK = 1.0 - 1e-6
@@ -59,6 +59,14 @@ class Ball(Enclosure):
             return None
         radius = dr.select(known, promise.radius * _RADIUS_SLACK, 0)
         return cls(radius, below, above, promise.dimension, slopes)
+
+    def is_known(self, gaps: Gaps) -> Mask:
+        """Whether ranges and gaps are numbers, and large enough to divide by."""
+        known = (gaps.down >= 0) & (gaps.up >= 0)
+        for one in (self.range_below, self.range_above):
+            if one is not None:
+                known &= (one == 0) | (dr.isfinite(1 / one) & dr.isfinite(2 * one))
+        return known
 
     @classmethod
     def applies(cls, dimension: int, is_bounded_below: bool, is_bounded_above: bool) -> bool:

@@ -54,12 +54,12 @@ class Caps(Ball):
     def step(self, gaps: Gaps) -> Real:
         up, down = self._conditions(gaps)
         q = fmin(largest_covered(up, self.rounds), largest_covered(down, self.rounds))
-        return q * self.radius
+        return dr.select(self.is_known(gaps), q * self.radius, 0)
 
     def covers(self, gaps: Gaps, length: Real) -> Mask:
         up, down = self._conditions(gaps)
         q = length / self.radius
-        inside = q <= 1
+        inside = (q <= 1) & self.is_known(gaps)
         q = clamp(q, 0, 1)
         return (length <= 0) | (inside & is_covered(up, q) & is_covered(down, q))
 

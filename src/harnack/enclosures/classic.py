@@ -40,6 +40,10 @@ class Classic(Ball):
     """
 
     def step(self, gaps: Gaps) -> Real:
+        return dr.select(self.is_known(gaps), self.radius * self._fraction(gaps), 0)
+
+    def _fraction(self, gaps: Gaps) -> Real:
+        """The step divided by the radius, from whichever sides are bounded."""
         below = above = None
         if self.range_below is not None:
             below = _one_sided(self.range_below, gaps.up, gaps.down, self.dimension)
@@ -48,8 +52,8 @@ class Classic(Ball):
         if below is None or above is None:
             one = below if above is None else above
             assert one is not None
-            return self.radius * one
-        return self.radius * fmax(below, above)
+            return one
+        return fmax(below, above)
 
 
 def _one_sided(u: Real, gap_away: Real, gap_toward: Real, dimension: int) -> Real:
@@ -67,7 +71,8 @@ def _plane(u: Real, v: Real, gap: Real) -> Real:
 
 
 def _space(u: Real, v: Real, gap: Real) -> Real:
-    return 2 * gap / (u + 2 * v + dr.sqrt(u * (u + 8 * v)))
+    # The product of the two roots, as u (u + 8v) may underflow or overflow.
+    return 2 * gap / (u + 2 * v + dr.sqrt(u) * dr.sqrt(u + 8 * v))
 
 
 def _quartic_growing(u: Real, v: Real, gap: Real) -> Real:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from harnack.backend import Mask, Real
 
 _ROUND_DOWN = 1.0 - 1e-6
-_LARGEST_GAP = 1e30  # and beyond: there is no level on this side
+_ROOT_OF_TWO = math.sqrt(2.0)
 
 
 @dataclass(frozen=True)
@@ -93,19 +94,19 @@ def _first_root(gap: Real, slope: Real, curvature: Real) -> Real:
     In a form whose squares neither overflow nor vanish: close to a zero of high order slope,
     curvature and gap are all far below the root of the smallest number.
     """
-    none = gap >= _LARGEST_GAP
+    none = gap == dr.inf  # there is no level on this side
     if isinstance(curvature, float) and curvature == 0.0:
         away = dr.select(slope <= 0, dr.select(gap > 0, dr.inf, 0), dr.nan)
         return dr.select(none, dr.inf, dr.select(slope > 0, gap / slope, away))
-    gap = dr.select(none, 0, gap)
-    steep, bent = dr.abs(slope), dr.sqrt(dr.abs(curvature)) * dr.sqrt(2 * gap)
+    turns = curvature < 0
+    gap = _seen_by_turning(dr.select(none, 0, gap), turns)
+    steep, bent = dr.abs(slope), _steepest_that_turns(gap, curvature)
     longer, shorter = fmax(steep, bent), fmin(steep, bent)
     ratio = dr.select(longer > 0, shorter / longer, 0)
-    turns = curvature < 0
     root = longer * dr.sqrt(dr.fma(dr.select(turns, -ratio, ratio), ratio, 1))
     away = dr.select(slope <= 0, dr.select(gap > 0, dr.inf, 0), dr.nan)
     falling = dr.select(curvature <= 0, away, (root - slope) / curvature)
-    found = dr.select(slope > 0, 2 * gap / (slope + root), falling)
+    found = dr.select(slope > 0, gap / (0.5 * slope + 0.5 * root), falling)
     return dr.select(none | (turns & (steep < bent)), dr.inf, found)
 
 
@@ -118,4 +119,16 @@ def _stays_below(gap: Real, slope: Real, curvature: Real, length: Real) -> Mask:
     if isinstance(curvature, float) and curvature == 0.0:
         return below
     turned = (curvature < 0) & (slope + 2 * bend < 0) & (slope > 0)
-    return dr.select(turned, slope * slope <= -2 * curvature * gap, below)
+    highest = _steepest_that_turns(_seen_by_turning(gap, turned), curvature)
+    return dr.select(turned, slope <= highest, below)
+
+
+def _steepest_that_turns(gap: Real, curvature: Real) -> Real:
+    """sqrt(2 |curvature| gap): a parabola with a smaller slope turns before the gap."""
+    return dr.sqrt(dr.abs(curvature)) * (_ROOT_OF_TWO * dr.sqrt(gap))
+
+
+def _seen_by_turning(gap: Real, turns: Mask) -> Real:
+    """The gap as parabolas see it that may turn just before it: nearer by eight roundings, as there
+    the root of a difference that cancels decides."""
+    return dr.select(turns, gap * (1 - 8 * float(dr.epsilon(type(gap)))), gap)

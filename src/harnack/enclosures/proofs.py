@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
@@ -84,10 +85,15 @@ class Proofs:
             for name, (sharpest, *_) in _NAMED.items()
             if any(sharpest.of(one, value, error, slopes) is not None for one in promises)
         ]
+        if not usable:
+            return (
+                f"no bound applies: the field promises {made}, from which nothing follows; a "
+                "HarmonicBall needs an end that is not infinite"
+            )
+        others = "" if not self.uses_weaker else ", or leave bound=None for the sharpest there is"
         return (
             f"no bound applies: the field promises {made}, which the bounds asked for "
-            f"({asked}) cannot use; choose {' or '.join(usable)}, or leave bound=None for the "
-            "sharpest there is"
+            f"({asked}) cannot use; choose {' or '.join(usable)}{others}"
         )
 
 
@@ -118,12 +124,17 @@ def choose_proofs(bound: Choice = None) -> Proofs:
         return Proofs(_NAMED[bound])
     several = cast("Any", bound) if isinstance(bound, Iterable) else (bound,)
     kinds: tuple[Any, ...] = tuple(several)
-    if not kinds or not all(isinstance(one, type) and issubclass(one, Enclosure) for one in kinds):
+    if not kinds or not all(_is_proof(one) for one in kinds):
         raise TypeError(
             "bound must be a name, or classes of enclosures such as harnack.Caps or "
             f"(harnack.Caps, harnack.Cone), not {bound!r}"
         )
     return Proofs(kinds)
+
+
+def _is_proof(kind: Any) -> bool:
+    """Whether this is a class of enclosures that can be made."""
+    return isinstance(kind, type) and issubclass(kind, Enclosure) and not inspect.isabstract(kind)
 
 
 def longest_step(enclosures: tuple[Enclosure, ...], gaps: Gaps) -> Real:

@@ -51,7 +51,7 @@ class Slope(Ball):
             for condition in alternatives:
                 side = fmax(side, largest_covered(condition, self.rounds))
             q = fmin(q, side)
-        return q * self.radius
+        return dr.select(self.is_known(gaps), q * self.radius, 0)
 
     def covers(self, gaps: Gaps, length: Real) -> Mask:
         q = length / self.radius
@@ -63,7 +63,7 @@ class Slope(Ball):
                 proved = is_covered(condition, q)
                 free = proved if free is None else free | proved
             covered = covered & free
-        return (length <= 0) | covered
+        return (length <= 0) | (covered & self.is_known(gaps))
 
     def _conditions(self, gaps: Gaps) -> tuple[list[Condition], list[Condition]]:
         """What keeps f from the level above, and from the level below."""

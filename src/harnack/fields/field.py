@@ -130,6 +130,8 @@ class Field(abc.ABC):
         if "evaluate" in vars(cls):
             checked = _checked(cls.evaluate)
             cls.evaluate = checked  # pyright: ignore[reportAttributeAccessIssue]
+            if "look" not in vars(cls):  # that of a base would pass it by
+                cls.look = Field.look
         if "hessian" in vars(cls):
             general = _of_points(cls.hessian)
             cls.hessian = general  # pyright: ignore[reportAttributeAccessIssue]

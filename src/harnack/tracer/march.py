@@ -14,7 +14,7 @@ import drjit as dr
 from harnack.backend.extrema import clamp, fmax, fmin
 from harnack.backend.lengths import largest_component, length
 from harnack.backend.loops import while_active
-from harnack.enclosures import any_covers, longest_step
+from harnack.enclosures import LineLipschitz, any_covers, longest_step
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.tracer.sheet_comparison import compare_with_sheet
 from harnack.tracer.tolerance import PreparedTolerance, Status
@@ -33,10 +33,10 @@ _REFINE_BELOW, _OF_GAP, _OF_ALLOWED = 2.0, 0.25, 0.85
 _OF_TOLERANCE, _LESS, _OF_ROUNDING = 0.4, 0.55, 0.6
 # The next sample may be so coarse that its truncation is this part of the distance to a level.
 _COARSEN = 0.2
-# Trials stop short of where f is predicted to reach a level by this factor: by a cubic, or where
+# Trials stop short of where f is predicted to reach a level by this factor: by a parabola, or where
 # there is only a slope.
 _AIM, _AIM_BY_SLOPE = 0.999, 0.99
-# Of the size of coordinates, how far from the surface rounding may leave a point that is a hit.
+# How far from the surface rounding may leave a point that is a hit: see `March._is_near`.
 _LARGEST_UNCERTAINTY = 1 / 16
 # A repeated sample is closer by these factors at least and at most.
 _CLOSER = 1.25, 16.0
@@ -55,8 +55,8 @@ class MarchState:
     value, gradient: f at base.
     excess: by how much f at base may be farther from a level than the tolerance allows.
     evaluations: so far.
-    detail: of the next sample (`Field.at_detail`); None for fields that have none. (Dr.Jit records a
-        loop twice in which a state never changes.)
+    detail: of the next sample (`Field.at_detail`); None for fields that have none (Dr.Jit records
+        a loop twice in which a state never changes).
     status: a `Status` once the ray has ended.
     active: whether it goes on.
     """
@@ -124,7 +124,8 @@ class March:
         A hit is a point where f is within the tolerance of a level *after* the truncation error of
         f is taken off; where rounding leaves f less certain than that, within twice what it leaves.
         A trial point at which the level is nearer than the error of f may lie behind the root, by
-        less than the tolerance: it is a hit (`_finer`), so nothing is passed there.
+        less than the tolerance: it is a hit (`_finer`), so nothing is passed there. Where such a
+        point is none, because its error is large, it is not accepted, and proves no step.
 
         In rounded arithmetic a surface could slip through between the two looks, so both see
         it nearer by the rounding of value and position together (`_total_error`).
@@ -153,12 +154,16 @@ class March:
             total_error = self._total_error(sample, gradient_norm, size + t)
 
             # Is all up to there proved free, and is the sample fine enough to say so?
-            accepted = now.step <= now.reach
-            if self.overstep > 1:
-                accepted |= any_covers(look.back, gaps.less(total_error), unproved)
             within = self.tolerance.in_value(
                 fmax(gradient_norm - sample.gradient_error, real(0)), t
             )
+            is_near = self._is_near(
+                gaps.smaller, within, total_error, sample, gradient_norm, size + t
+            )
+            accepted = now.step <= now.reach
+            if self.overstep > 1:
+                knows_side = is_near | (gaps.smaller > total_error)
+                accepted |= knows_side & any_covers(look.back, gaps.less(total_error), unproved)
             too_coarse, finer, coarser = self.backend.Bool(False), now.detail, now.detail
             if has_detail:
                 deciding = self._deciding_gap(sample.value, ahead, at_end)
@@ -172,9 +177,7 @@ class March:
                 next_detail = dr.select(too_coarse, finer, kept)
 
             # Is it a hit, or a sheet?
-            hit = accepted & self._is_hit(
-                gaps.smaller, within, total_error, sample, gradient_norm, size + t
-            )
+            hit = accepted & is_near
             gaps_ahead, sheet = gaps, None
             if ahead is not None:
                 sheet = compare_with_sheet(
@@ -184,13 +187,15 @@ class March:
 
             # How far to go from there.
             forward = longest_step(look.ahead, gaps_ahead.less(total_error))
+            forward = dr.select(gaps_ahead.smaller > total_error, forward, 0)
             trial = self._trial(forward, look, gaps_ahead, now, path, is_smooth)
             base = dr.select(accepted, t, now.base)
             step = dr.select(accepted, trial, dr.select(too_coarse, now.step, now.reach))
             reach = dr.select(accepted, forward, now.reach)
             excess = fmax(gaps.smaller + total_error - within, real(0))
             # After a step of zero enclosures are asked for a third of the length: bisection.
-            tried = dr.select(forward > 0, 2 * forward, candidate / 3)
+            shorter = dr.select(dr.isfinite(candidate), candidate / 3, 1 + 16 * (size + t))
+            tried = dr.select(forward > 0, 2 * forward, shorter)
             free = base + reach >= end
             if sheet is not None:
                 free = dr.select(sheet.has_crossing, sheet.at_crossing, free)
@@ -215,7 +220,7 @@ class March:
 
         return while_active(state, body, "harnack")
 
-    def _is_hit(
+    def _is_near(
         self,
         gap: Real,
         within: Real,
@@ -224,12 +229,20 @@ class March:
         gradient_norm: Real,
         size: Real,
     ) -> Mask:
-        """Whether a level is near enough in value, `within` by the tolerance: see `advance`."""
+        """Whether a level is near enough in value for a hit, `within` by the tolerance: see
+        `advance`.
+
+        Not where rounding says no more than where the surface is to a sixteenth of the size of the
+        coordinates or, if that is larger, of the radius on which f is known to be smooth.
+        """
         # Where not even the gradient is known, rounding makes no hits.
         knows_gradient = sample.gradient_error <= gradient_norm
         rounded = dr.select(knows_gradient, 2 * (total_error - sample.truncation), 0)
         near = gap <= fmax(within - sample.truncation, rounded)
-        # Nor is a point one of which rounding hardly says where the surface is.
+        for promise in sample.known:
+            radius = promise.radius
+            if not isinstance(promise, LineLipschitz):
+                size = fmax(dr.select(dr.isfinite(radius), radius, 0), size)
         return near & (gap + total_error - within <= _LARGEST_UNCERTAINTY * gradient_norm * size)
 
     def _trial(
@@ -244,29 +257,26 @@ class March:
         slope = look.slope
         rate, gap = dr.abs(slope), dr.select(slope > 0, gaps.up, gaps.down)
         if is_smooth:
-            second, third = self._hermite(look, now, path)
-            second, third = dr.mulsign(second, slope), dr.mulsign(third, slope)
-            target = _AIM * _first_crossing(gap, rate, second, third)
+            bend = dr.mulsign(self._bend(look, now, path), slope)
+            root = dr.fma(rate, rate, 2 * bend * gap)
+            target = _AIM * dr.select(root >= 0, 2 * gap / (rate + dr.sqrt(root)), dr.inf)
         else:
             target = _AIM_BY_SLOPE * dr.select(rate > 0, gap / rate, dr.inf)
         return fmin(self.overstep * forward, fmax(target, forward))
 
-    def _hermite(self, look: Look, now: MarchState, path: Path) -> tuple[Real, Real]:
-        """The coefficients of x^2 and x^3 of the cubic with the values and slopes of f here and at
-        the last accepted point, a length h before; 0 where nothing was accepted before.
+    def _bend(self, look: Look, now: MarchState, path: Path) -> Real:
+        """The second derivative here of the cubic with the values and slopes of f here and at the
+        last accepted point, a length h before; 0 where nothing was accepted before.
 
-        With D the difference quotient and s0, s the slopes: (2s + s0 - 3D)/h and (s + s0 - 2D)/h^2.
+        With D the difference quotient and s0, s the slopes: 2 (2s + s0 - 3D)/h (Hermite).
         """
         h, slope, before = now.step, look.slope, dr.dot(now.gradient, path.direction)
         rise = look.sample.value - now.value
         if self.levels.period is not None:  # the lift that the slopes predict
             turns = dr.round((rise - 0.5 * h * (slope + before)) / self.levels.period)
             rise = dr.fma(turns, -self.levels.period, rise)
-        quotient = rise / h
         known = (now.evaluations > 0) & (h > 0)
-        second = dr.select(known, (2 * slope + before - 3 * quotient) / h, 0)
-        third = dr.select(known, (slope + before - 2 * quotient) / (h * h), 0)
-        return second, third
+        return dr.select(known, 2 * (2 * slope + before - 3 * rise / h) / h, 0)
 
     def _status(self, hit: Mask, free: Mask) -> Any:
         """Of a ray that goes no farther."""
@@ -291,20 +301,6 @@ class March:
         smallest = self.backend.Float(float(dr.smallest(self.backend.Float)))
         value = 8 * fmax(epsilon * dr.abs(sample.value), smallest)
         return dr.fma(gradient_norm, position, value + sample.error)
-
-
-def _first_crossing(gap: Real, slope: Real, second: Real, third: Real) -> Real:
-    """About where slope x + second x^2 + third x^3 first reaches the gap, for slope >= 0: Newton's
-    method from where the parabola does. Infinite where that does not."""
-    root = dr.fma(slope, slope, 4 * second * gap)
-    parabola = 2 * gap / (slope + dr.sqrt(fmax(root, 0)))
-    x = parabola
-    for _ in range(2):
-        rise = x * dr.fma(x, dr.fma(x, third, second), slope)
-        rate = dr.fma(x, dr.fma(3 * x, third, 2 * second), slope)
-        x = dr.select(rate > 0, x - (rise - gap) / rate, x)
-    x = dr.select(x > 0, x, parabola)
-    return dr.select((root >= 0) & dr.isfinite(parabola), x, dr.inf)
 
 
 def _finer(

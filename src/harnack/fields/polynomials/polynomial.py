@@ -35,7 +35,7 @@ __all__ = ["HarmonicPolynomial", "SphericalHarmonic"]
 class _SolidHarmonics(Field):
     """A sum of solid harmonics of p/size, for |p| <= size; see `HarmonicPromises`."""
 
-    overstep = 1.8
+    overstep = 1.6
 
     def __init__(
         self, weights: Weights, known: BallRange, size: float, domain: Volume, axis: int = 2
