@@ -66,6 +66,18 @@ class Cone(Parabola):
         constant = _not_negative(promise.constant)
         return cls(Slopes(-constant, constant), 0.0, 0.0, promise.radius)
 
+    # Both sides at once, as a ray beside an edge asks many cones.
+
+    def step(self, gaps: Gaps) -> Real:
+        length = gaps.smaller / self.slopes.high
+        known = (gaps.down > 0) & (gaps.up > 0) & (self.slopes.high >= 0) & (self.reach > 0)
+        return dr.select(known, fmin(length, self.reach), 0) * _ROUND_DOWN
+
+    def covers(self, gaps: Gaps, length: Real) -> Mask:
+        moved = self.slopes.high * length
+        free = (length <= self.reach) & (moved <= gaps.down) & (moved <= gaps.up)
+        return (length <= 0) | free
+
 
 @dataclass(frozen=True)
 class Taylor(Parabola):
