@@ -28,18 +28,8 @@ def distance_below(
     sample: the field at p.
 
     Proof. An enclosure holds f(p + tv) within [L(t, s), U(t, s)], s the slope along a unit
-    direction v, and steps to where that first meets a level. Both ends rise with s, for each there
-    is:
-
-    - `Cone`: s does not enter.
-    - `Taylor`: f + st -+ H t^2/2.
-    - `Slope`: with m = R s/(n u), U = u [(1+m)/2 P(q, 1) + (1-m)/2 P(q, -1)] rises as P(q, 1) >=
-      P(q, -1), and L = u P(q, m) as P(q, .) does. For upper - f, whose slope is -s, the two
-      change places and signs.
-    - `Caps`: U belongs to boundary values that are 1 on the caps X.v > 1-b and X.v < a-1 of the
-      unit sphere, b = p + mu/(1-p), a = p - mu/(1-p), mu proportional to s. As s grows, weight
-      moves from a-1 to 1-b, which is no smaller as a + b = 2p <= 2, and P(q, .) rises. L is the
-      complement: the same with p -> 1-p, mu -> -mu, negated.
+    direction v, and steps to where that first meets a level. Neither end falls as s grows: that is
+    what every enclosure has to say of itself (`Enclosure`).
 
     All slopes lie in [-G, G], G = |grad f(p)| and its error: one enclosure with that interval of
     slopes holds in every direction. The level above and that below are proofs of their own, and so

@@ -38,6 +38,9 @@ class Caps(Ball):
     The lower bound is the complement: C - (C-c)(...) with p -> 1-p, mu -> -mu. |mu| <= p (1-p)
     holds in exact arithmetic and is enforced.
 
+    Neither end falls as the slope grows: weight then moves from s = a-1 to s = 1-b, which is no
+    smaller as a + b = 2p <= 2, and P(q, .) rises. L is the complement, negated.
+
     The first crossing is unique: (X-s)^(-3/2) with X = (1+q^2)/(2q) is a Laplace transform of
     exp(-tX) exp(ts), hence totally positive in (q, s) on (0, 1) x (-1, 1) (Karlin 1968), hence
     variation diminishing: U - level is the transform of values with signs (+, -, +), so it has

@@ -36,7 +36,8 @@ class Classic(Ball):
         n = 2:  |v-u| / (u+v)         n = 3:  2 |v-u| / (u + 2v + sqrt(u (u + 8v)))
 
     and for n = 4 the cubic is solved by Newton's method from the safe side (`_quartic_growing`).
-    A level at or below `lower` cannot be reached inside the ball: the step is R.
+    A level at or below `lower` cannot be reached inside the ball: the step is R. The slope does not
+    enter.
     """
 
     def step(self, gaps: Gaps) -> Real:

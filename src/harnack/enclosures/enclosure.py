@@ -66,9 +66,10 @@ class Slopes:
 class Enclosure(abc.ABC):
     """A proof that F stays within a range for 0 <= s < reach.
 
-    Both ends of the range must not fall as the slope grows: then the range at the upper end of
-    `Slopes` bounds F from above and that at the lower end bounds it from below, whatever the slope
-    in between is.
+    Neither end of the range may fall as the slope grows, and every proof says why: then the range
+    at the upper end of `Slopes` bounds F from above and that at the lower end bounds it from below,
+    whatever the slope in between is. In particular slopes in [-|grad f|, |grad f|] bound F in every
+    direction.
     """
 
     @classmethod

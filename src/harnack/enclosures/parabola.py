@@ -32,6 +32,7 @@ class Parabola(Enclosure):
     2g/(a + r) where a > 0 and (r - a)/c where a <= 0 < c, with r = sqrt(a^2 + 2 c g); there is none
     where a <= 0 and c <= 0, or where r is not real. For the level below the same holds of -F.
     Exact to second order where the curvatures are, so it converges quadratically at the surface.
+    The upper end rises with the largest slope, the lower one with the least.
     """
 
     slopes: Slopes

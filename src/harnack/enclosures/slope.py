@@ -39,6 +39,9 @@ class Slope(Ball):
     or q^3 - 3q + 2m (n = 4), each decreasing on [0, 1]. So each first crossing is unique, and
     what is free at q is free before it. With upper - f > 0 the same holds for its negative
     slope; the better of the two is kept on each side.
+
+    Neither end falls as the slope grows: the upper one rises with m as P(q, 1) >= P(q, -1), the
+    lower one as P(q, .) does. For upper - f, whose slope is negated, they change places and signs.
     """
 
     rounds: ClassVar[int] = 4
