@@ -200,7 +200,13 @@ def test_fields_keep_their_promises(name: str) -> None:
     check_field(field, count=60, directions=4, levels=(field.default_level, *levels))
 
 
-@pytest.mark.parametrize("name", APPROXIMATE)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow) if name.endswith("accuracy 4") else name
+        for name in APPROXIMATE
+    ],
+)
 def test_approximate_and_jumping_fields_keep_their_promises(name: str) -> None:
     check_field(APPROXIMATE[name], count=60, directions=4)
 
@@ -305,7 +311,7 @@ def test_one_dipole_attains_its_curvature_promises(scale: float) -> None:
 
 @pytest.mark.parametrize("fine", [True, False])
 @pytest.mark.parametrize("accuracy", [2.0, 3.0, 4.0])
-@pytest.mark.parametrize("order", [0, 1, 2])
+@pytest.mark.parametrize("order", [*(pytest.param(k, marks=pytest.mark.slow) for k in (0, 1)), 2])
 def test_what_a_tree_of_triangles_leaves_out_is_within_its_bounds(
     order: int, accuracy: float, fine: bool
 ) -> None:

@@ -540,7 +540,7 @@ def on_sphere(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return points, points, np.full(n, 4 * np.pi / n)
 
 
-@pytest.mark.parametrize("n", [60, 600])
+@pytest.mark.parametrize("n", [60, pytest.param(600, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", ["dipoles", "dipoles by tree", "screened", "barely screened"])
 def test_every_point_has_a_distance_from_a_cloud(kind: str, n: int) -> None:
     """Far from the points f is nearly constant, and its gradient leads nowhere."""

@@ -161,7 +161,10 @@ def test_along_the_z_axis_chains_decide_as_single_edges_do(kind: str) -> None:
         assert np.abs(found - angle).max() < (3e-3 if precision == "single" else 1e-9)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "kind",
+    [kind if kind == "many" else pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS],
+)
 def test_promises_of_chains_hold(kind: str) -> None:
     mesh = cut(kind, 1 if kind == "all" else 2)
     check_field(hk.WindingNumber(*mesh, method="exact"), count=100)

@@ -120,7 +120,7 @@ def beside_faces(
 # --- beside the faces of closed meshes -----------------------------------------------------------
 
 
-@pytest.mark.parametrize("method", ["auto", "tree"])
+@pytest.mark.parametrize("method", ["auto", pytest.param("tree", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("flat", [0.44, 0.01])
 def test_a_billionth_off_a_flat_ball(flat: float, method: Any) -> None:
     """Differences of distances that short are rounding: three of four answers were as long as the
@@ -156,7 +156,7 @@ def test_on_vertices_edges_and_faces(precision: Any) -> None:
         assert np.abs(lower).max() / scale < 64 * choose_backend(precision).epsilon
 
 
-@pytest.mark.parametrize("level", [0.5, 1.5])
+@pytest.mark.parametrize("level", [0.5, pytest.param(1.5, marks=pytest.mark.slow)])
 def test_shells_within_shells(level: float) -> None:
     """Of a ball in a turned-round ball in a doubled torus, only some are the surface; points right
     beside the others are as far from it as any."""

@@ -463,7 +463,13 @@ def moves_along(
 
 
 @pytest.mark.parametrize("precision", [pytest.param("single", marks=pytest.mark.slow), "double"])
-@pytest.mark.parametrize("name", ["triangle", "wavy", "holes", "coil", "spiky", "link"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("wavy", "holes", "link"),
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("triangle", "coil", "spiky")),
+    ],
+)
 def test_what_is_promised_along_a_line_holds(name: str, precision: str) -> None:
     loops, backend = CURVES[name], choose_backend(precision)  # type: ignore[arg-type]
     x, d, away = lines_beside(loops, 40)

@@ -154,7 +154,9 @@ def test_precisions_agree() -> None:
         assert np.quantile(np.abs(single.t[both] - double.t[both]), 0.98) < 2e-4
 
 
-@pytest.mark.parametrize("overstep", [1.0, 1.2, 1.4, 1.9])
+@pytest.mark.parametrize(
+    "overstep", [1.0, *(pytest.param(x, marks=pytest.mark.slow) for x in (1.2, 1.4)), 1.9]
+)
 @pytest.mark.parametrize("bound", BOUNDS)
 def test_different_proofs_give_the_same_hits(bound: str | None, overstep: float) -> None:
     o, d = around(300)
