@@ -67,7 +67,7 @@ class Cone(Parabola):
         constant = _not_negative(promise.constant)
         return cls(Slopes(-constant, constant), 0.0, 0.0, promise.radius)
 
-    # Both sides at once, as a ray beside an edge asks many cones.
+    # Both sides in one formula, for speed: a ray beside an edge asks a dozen cones at each point.
 
     def step(self, gaps: Gaps) -> Real:
         length = gaps.smaller / self.slopes.high
@@ -108,11 +108,8 @@ def _first_root(gap: Real, slope: Real, curvature: Real) -> Real:
     curvature and gap are all far below the root of the smallest number.
     """
     none = gap == dr.inf  # there is no level on this side
-    if isinstance(curvature, float) and curvature == 0.0:
-        away = dr.select(slope <= 0, dr.select(gap > 0, dr.inf, 0), dr.nan)
-        return dr.select(none, dr.inf, dr.select(slope > 0, gap / slope, away))
     turns = curvature < 0
-    gap = _seen_by_turning(dr.select(none, 0, gap), turns)
+    gap = _rounded_down_where(turns, dr.select(none, 0, gap))
     steep, bent = dr.abs(slope), _steepest_that_turns(gap, curvature)
     longer, shorter = fmax(steep, bent), fmin(steep, bent)
     ratio = dr.select(longer > 0, shorter / longer, 0)
@@ -128,12 +125,9 @@ def _stays_below(gap: Real, slope: Real, curvature: Real, length: Real) -> Mask:
 
     The largest value lies at an end, or at the vertex of a parabola that rises and then turns."""
     bend = 0.5 * curvature * length
-    below = (bend + slope) * length <= gap
-    if isinstance(curvature, float) and curvature == 0.0:
-        return below
-    turned = (curvature < 0) & (slope + 2 * bend < 0) & (slope > 0)
-    highest = _steepest_that_turns(_seen_by_turning(gap, turned), curvature)
-    return dr.select(turned, slope <= highest, below)
+    turned = (slope > 0) & (slope + 2 * bend < 0)
+    steepest = _steepest_that_turns(_rounded_down_where(turned, gap), curvature)
+    return dr.select(turned, slope <= steepest, (bend + slope) * length <= gap)
 
 
 def _steepest_that_turns(gap: Real, curvature: Real) -> Real:
@@ -141,7 +135,7 @@ def _steepest_that_turns(gap: Real, curvature: Real) -> Real:
     return dr.sqrt(dr.abs(curvature)) * (_ROOT_OF_TWO * dr.sqrt(gap))
 
 
-def _seen_by_turning(gap: Real, turns: Mask) -> Real:
-    """The gap as parabolas see it that may turn just before it: nearer by eight roundings, as there
-    the root of a difference that cancels decides."""
+def _rounded_down_where(turns: Mask, gap: Real) -> Real:
+    """The gap, smaller by eight roundings where a parabola turns: if it turns close to the level,
+    rounding decides whether a^2 + 2 c g is negative."""
     return dr.select(turns, gap * (1 - 8 * float(dr.epsilon(type(gap)))), gap)

@@ -124,8 +124,9 @@ class March:
         A hit is a point where f is within the tolerance of a level *after* the truncation error of
         f is taken off; where rounding leaves f less certain than that, within twice what it leaves.
         A trial point at which the level is nearer than the error of f may lie behind the root, by
-        less than the tolerance: it is a hit (`_finer`), so nothing is passed there. Where such a
-        point is none, because its error is large, it is not accepted, and proves no step.
+        less than the tolerance: it is a hit (`_finer`), so nothing is passed there. If it is no
+        hit, because the error is large, it is not accepted by looking back, and no step from it is
+        proved: on which side of the point the level lies is not known.
 
         In rounded arithmetic a surface could slip through between the two looks, so both see
         it nearer by the rounding of value and position together (`_total_error`).
@@ -229,11 +230,11 @@ class March:
         gradient_norm: Real,
         size: Real,
     ) -> Mask:
-        """Whether a level is near enough in value for a hit, `within` by the tolerance: see
-        `advance`.
+        """Whether a level is near enough in value for a hit; see `advance`.
 
-        Not where rounding says no more than where the surface is to a sixteenth of the size of the
-        coordinates or, if that is larger, of the radius on which f is known to be smooth.
+        within: how near the tolerance asks it to be. A point is no hit if rounding leaves the
+        distance to the surface uncertain by more than a sixteenth of the size of the coordinates
+        or, if that is larger, of the radius on which f is known to be smooth.
         """
         # Where not even the gradient is known, rounding makes no hits.
         knows_gradient = sample.gradient_error <= gradient_norm

@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
-import numpy.typing as npt
 
-from harnack.backend import choose_backend, to_numpy, to_vector3
+from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy, to_vector3
 from harnack.backend.extrema import fmin
 from harnack.fields.edges.edge import Edge
 from harnack.fields.edges.edge_records import LoopEdges
@@ -22,8 +21,6 @@ from harnack.geometry import ConvexHull
 
 if TYPE_CHECKING:
     from harnack.backend import Real, Vec3
-
-FloatArray = npt.NDArray[np.float64]
 
 # Work is bounded by cells x edges: the subdivision stops before it costs more than this.
 _MOST_PAIRS = 3_000_000
@@ -62,7 +59,7 @@ def tight_extent(
 
 def _proved_empty(
     edges: LoopEdges, centres: FloatArray, h: float, levels: tuple[float, ...]
-) -> npt.NDArray[np.bool_]:
+) -> BoolArray:
     """Whether no level lies within h of centres (n, 3); h and centres in the edges' units."""
     real, x = edges.backend.Float, to_vector3(edges.backend, centres)
     h_device = dr.opaque(real, h)

@@ -8,11 +8,8 @@ from typing import Any
 
 import drjit as dr
 import numpy as np
-import numpy.typing as npt
 
-from harnack.backend import FloatArray
-
-IntArray = npt.NDArray[np.int64]
+from harnack.backend import FloatArray, IntArray
 
 _TILE = 4
 
