@@ -18,6 +18,7 @@ ROOMS = (
     "geometry",
     "files",
     "tree",
+    "arithmetic",
     "enclosures",
     "fields",
     "tracer",
@@ -34,6 +35,7 @@ FIELD_ROOMS = (
     "points",
     "look",
     "field",
+    "formula",
     "kept",
     "symmetric",
     "unit_coordinates",
@@ -46,6 +48,9 @@ FIELD_ROOMS = (
     "clouds",
     "polynomials",
     "waves",
+    "expressions",
+    "solids",
+    "blobs",
 )
 # Families do not know each other. A new one is added above and in docs/architecture.md.
 FAMILIES = FIELD_ROOMS[FIELD_ROOMS.index("multipoles") + 1 :]

@@ -9,6 +9,20 @@ from __future__ import annotations
 # First of all imports: it decides which LLVM Dr.Jit loads, which happens on `import drjit`.
 from harnack import backend, files, geometry, rendering, testing
 from harnack._version import __version__
+from harnack.arithmetic import (
+    acos,
+    asin,
+    atan,
+    cos,
+    cosh,
+    exp,
+    log,
+    sin,
+    sinh,
+    sqrt,
+    tan,
+    tanh,
+)
 from harnack.distance import Curvatures, closest_points, curvature, signed_distance
 from harnack.enclosures import (
     Caps,
@@ -19,6 +33,7 @@ from harnack.enclosures import (
     HarmonicBall,
     Lipschitz,
     Parabola,
+    Pieces,
     Slope,
     Taylor,
 )
@@ -38,6 +53,7 @@ from harnack.fields import (
     SphericalHarmonic,
     WindingNumber,
     cosine,
+    expression,
     sine,
 )
 from harnack.geometry import Ball, Box, ConvexHull, HalfSpace, Intersection
@@ -66,6 +82,7 @@ __all__ = [
     "LevelSet",
     "Lipschitz",
     "Parabola",
+    "Pieces",
     "PlaneWave",
     "Product",
     "Sample",
@@ -80,17 +97,30 @@ __all__ = [
     "Tolerance",
     "WindingNumber",
     "__version__",
+    "acos",
+    "asin",
+    "atan",
     "backend",
     "closest_points",
+    "cos",
+    "cosh",
     "cosine",
     "curvature",
+    "exp",
+    "expression",
     "files",
     "geometry",
     "level_set",
+    "log",
     "render",
     "rendering",
     "signed_distance",
+    "sin",
     "sine",
+    "sinh",
+    "sqrt",
+    "tan",
+    "tanh",
     "testing",
     "trace",
 ]

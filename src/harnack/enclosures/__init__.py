@@ -8,6 +8,7 @@ from harnack.enclosures.classic import Classic
 from harnack.enclosures.enclosure import Enclosure, Gaps, Slopes
 from harnack.enclosures.levels import TargetLevels
 from harnack.enclosures.parabola import Cone, Parabola, Taylor
+from harnack.enclosures.pieces import LinearTaylor, OnePiece, Pieces, QuadraticTaylor, Segment
 from harnack.enclosures.promises import (
     Curvature,
     HarmonicBall,
@@ -16,6 +17,7 @@ from harnack.enclosures.promises import (
     Promise,
 )
 from harnack.enclosures.proofs import Choice, Proofs, any_covers, choose_proofs, longest_step
+from harnack.enclosures.restriction import Piece, Restriction
 from harnack.enclosures.slope import Slope
 
 __all__ = [
@@ -29,10 +31,17 @@ __all__ = [
     "Gaps",
     "HarmonicBall",
     "LineLipschitz",
+    "LinearTaylor",
     "Lipschitz",
+    "OnePiece",
     "Parabola",
+    "Piece",
+    "Pieces",
     "Promise",
     "Proofs",
+    "QuadraticTaylor",
+    "Restriction",
+    "Segment",
     "Slope",
     "Slopes",
     "TargetLevels",

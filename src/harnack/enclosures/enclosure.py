@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import abc
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from harnack.backend.extrema import fmax, fmin
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from harnack.backend import Mask, Real
     from harnack.enclosures.promises import Promise
+    from harnack.enclosures.restriction import Restriction
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,11 @@ class Enclosure(abc.ABC):
     at the upper end of `Slopes` bounds F from above and that at the lower end bounds it from below,
     whatever the slope in between is. In particular slopes in [-|grad f|, |grad f|] bound F in every
     direction.
+
+    growth: how many times the last step an enclosure is asked to reach next, by experiment.
     """
+
+    growth: ClassVar[float] = 2.0
 
     @classmethod
     def of(cls, promise: Promise, value: Real, error: Real, slopes: Slopes) -> Self | None:
@@ -79,6 +84,15 @@ class Enclosure(abc.ABC):
         value: f where it was looked at, known up to `error`. slopes: of f along the path.
         """
         del promise, value, error, slopes
+        return None
+
+    @classmethod
+    def along(cls, function: Restriction, slopes: Slopes, length: Real) -> Self | None:
+        """The enclosure that this proof makes of ranges of f along the path; None if it makes none.
+
+        length: how far it should reach. slopes: of f along the path, where it starts.
+        """
+        del function, slopes, length
         return None
 
     @abc.abstractmethod

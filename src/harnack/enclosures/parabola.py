@@ -41,8 +41,8 @@ class Parabola(Enclosure):
     reach: Real
 
     def step(self, gaps: Gaps) -> Real:
-        up = _first_root(gaps.up, self.slopes.high, self.most_curvature)
-        down = _first_root(gaps.down, -self.slopes.low, -self.least_curvature)
+        up = first_root(gaps.up, self.slopes.high, self.most_curvature)
+        down = first_root(gaps.down, -self.slopes.low, -self.least_curvature)
         known = (up >= 0) & (down >= 0) & (self.reach > 0)  # and not NaN
         return fmax(dr.select(known, fmin(fmin(up, down), self.reach), 0) * _ROUND_DOWN, 0)
 
@@ -101,7 +101,7 @@ def _not_negative(constant: Real) -> Real:
     return dr.select(constant >= 0, constant, dr.nan)
 
 
-def _first_root(gap: Real, slope: Real, curvature: Real) -> Real:
+def first_root(gap: Real, slope: Real, curvature: Real) -> Real:
     """The first s > 0 at which slope s + curvature s^2/2 reaches the gap; infinite if none does.
 
     In a form whose squares neither overflow nor vanish: close to a zero of high order slope,

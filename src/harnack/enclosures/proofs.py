@@ -13,13 +13,19 @@ from harnack.enclosures.caps import Caps
 from harnack.enclosures.classic import Classic
 from harnack.enclosures.enclosure import Enclosure, Gaps, Slopes
 from harnack.enclosures.parabola import Cone, Taylor
+from harnack.enclosures.pieces import LinearTaylor, Pieces, QuadraticTaylor, Segment
 from harnack.enclosures.promises import LineLipschitz, Promise
 from harnack.enclosures.slope import Slope
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real
+    from harnack.enclosures.restriction import Restriction
 
 _NAMED: dict[str, tuple[type[Enclosure], ...]] = {
+    "pieces": (Pieces, Taylor, Caps, Slope, Cone),
+    "quadratic-taylor": (QuadraticTaylor,),
+    "linear-taylor": (LinearTaylor,),
+    "segment": (Segment,),
     "curvature": (Taylor, Caps, Slope, Cone),
     "caps": (Caps, Slope, Cone),
     "slope": (Slope, Cone),
@@ -40,6 +46,20 @@ class Proofs:
 
     kinds: tuple[type[Enclosure], ...]
     uses_weaker: bool = True
+
+    @property
+    def growth(self) -> float:
+        """How many times the last step the next look asks for."""
+        return max(kind.growth for kind in self.kinds)
+
+    def along(self, function: Restriction, slopes: Slopes, length: Real) -> tuple[Enclosure, ...]:
+        """The enclosures of a function whose ranges along the path are known; none if none of the
+        proofs is made of ranges."""
+        for kind in self.kinds:
+            enclosure = kind.along(function, slopes, length)
+            if enclosure is not None:
+                return (enclosure,)
+        return ()
 
     def enclose(
         self,
@@ -106,7 +126,9 @@ def choose_proofs(bound: Choice = None) -> Proofs:
 
     Names: "classic" (the published rule), "slope", "caps" (caps where both ends are known, the
     slope bound elsewhere), "lipschitz", and "curvature" (Taylor's formula where second derivatives
-    are bounded, else as "caps"). None is as "curvature", without the promises that a field itself
+    are bounded, else as "caps"); of fields with a formula, "pieces", and for comparison
+    "quadratic-taylor", "linear-taylor", "segment". None is as "pieces", which is as "curvature" for
+    fields without a formula, and without the promises that a field itself
     calls weaker than its others.
 
     Raises ValueError for another name, TypeError for what is no class of enclosures.
@@ -114,7 +136,7 @@ def choose_proofs(bound: Choice = None) -> Proofs:
     if isinstance(bound, Proofs):
         return bound
     if bound is None:
-        return Proofs(_NAMED["curvature"], uses_weaker=False)
+        return Proofs(_NAMED["pieces"], uses_weaker=False)
     if isinstance(bound, str):
         if bound not in _NAMED:
             raise ValueError(

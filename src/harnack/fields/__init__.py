@@ -6,7 +6,9 @@ from harnack.enclosures import Curvature, HarmonicBall, LineLipschitz, Lipschitz
 from harnack.fields.clouds.dipole import DipolePotential
 from harnack.fields.clouds.screened import ScreenedWindingNumber
 from harnack.fields.curves.solid_angle import SolidAngle
+from harnack.fields.expressions.expression import expression
 from harnack.fields.field import Field, Sample
+from harnack.fields.formula import Formula
 from harnack.fields.meshes.winding_number import WindingNumber
 from harnack.fields.polynomials.polynomial import HarmonicPolynomial, SphericalHarmonic
 from harnack.fields.sheets import NO_SHEET, Crossing
@@ -20,6 +22,7 @@ __all__ = [
     "DipolePotential",
     "EigenfunctionSum",
     "Field",
+    "Formula",
     "Gyroid",
     "HarmonicBall",
     "HarmonicPolynomial",
@@ -35,5 +38,6 @@ __all__ = [
     "SphericalHarmonic",
     "WindingNumber",
     "cosine",
+    "expression",
     "sine",
 ]

@@ -1,0 +1,319 @@
+"""The usual functions: their ranges, and those of their derivatives, on intervals.
+
+One table entry serves every arithmetic: a `Function` tells what it is of plain numbers and where
+it and its first two derivatives stay on an interval. `sin(x)` and its like take numbers of any
+arithmetic, Dr.Jit and NumPy arrays, and Python numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
+
+import drjit as dr
+import numpy as np
+
+from harnack.arithmetic.interval import ONE, Interval, unit_of
+from harnack.backend.extrema import fmax, fmin
+from harnack.backend.sines import sincos
+
+if TYPE_CHECKING:
+    from harnack.backend import Mask, Real
+
+Ranges: TypeAlias = "tuple[Interval, Interval, Interval]"
+
+# Units in the last place that exp, log and their like are off by at most, on every backend.
+_UNITS = 8.0
+
+
+@dataclass(frozen=True)
+class Function:
+    """A function of one number.
+
+    ranges: of it, its derivative and its second derivative on an interval. Where the function is
+        not defined, the ends are no numbers or infinite: nothing is known.
+    plain: the function of Dr.Jit numbers.
+    numpy: the function of NumPy arrays and Python numbers.
+    """
+
+    name: str
+    ranges: Callable[[Interval], Ranges]
+    plain: Callable[[Any], Any]
+    numpy: Callable[[Any], Any]
+
+    def __call__(self, x: Any) -> Any:
+        """The function of a number of any kind."""
+        if hasattr(x, "apply"):
+            return x.apply(self)
+        if dr.is_array_v(type(x)):
+            return self.plain(x)
+        return self.numpy(x)
+
+
+def _rising(f: Callable[[Any], Any], x: Interval) -> Interval:
+    """The range of a function that rises and is right within `_UNITS`."""
+    low = f(x.low)
+    high = low if x.low is x.high else f(x.high)
+    return Interval(low, high).widened(_UNITS * unit_of(x.low), _tiny(x))
+
+
+def _tiny(x: Interval) -> float:
+    return float(dr.smallest(cast("Any", type(x.low))))
+
+
+def _two(x: Interval) -> Interval:
+    return x + x
+
+
+def _exp(x: Interval) -> Ranges:
+    e = _rising(dr.exp, x)
+    e = Interval(fmax(e.low, 0), e.high)
+    return e, e, e
+
+
+def _log(x: Interval) -> Ranges:
+    one = x.reciprocal()
+    positive = x.low > 0
+    one = Interval(dr.select(positive, one.low, 0), dr.select(positive, one.high, dr.inf))
+    return _rising(dr.log, x), one, -one.square()
+
+
+def _sqrt(x: Interval) -> Ranges:
+    low = fmax(x.low, 0)
+    high = low if x.low is x.high else x.high
+    root = _rising(dr.sqrt, Interval(low, high))
+    root = Interval(fmax(root.low, 0), root.high)
+    slope = _half(_positive_reciprocal(root))
+    return root, slope, -_half(slope * _positive_reciprocal(Interval(low, high)))
+
+
+def _half(x: Interval) -> Interval:
+    return x * Interval(0.5, 0.5)
+
+
+def _positive_reciprocal(x: Interval) -> Interval:
+    """1/x of numbers >= 0; infinite above where 0 is one of them."""
+    one = Interval(fmax(x.low, 0), x.high).reciprocal()
+    return Interval(dr.select(x.low > 0, one.low, 1 / x.high * (1 - 4 * unit_of(x.high))), one.high)
+
+
+def _reciprocal(x: Interval) -> Ranges:
+    one = x.reciprocal()
+    slope = -one.square()
+    return one, slope, _two(-slope * one)
+
+
+def _sine(x: Interval) -> Ranges:
+    s, c = _sine_and_cosine(x)
+    return s, c, -s
+
+
+def _cosine(x: Interval) -> Ranges:
+    s, c = _sine_and_cosine(x)
+    return c, -s, -c
+
+
+def _sine_and_cosine(x: Interval) -> tuple[Interval, Interval]:
+    """Ranges of sin and cos.
+
+    Proof. Both are monotone between the multiples of pi/2 at which they are 1 or -1: the range is
+    that of the ends, and of such points inside. Which are inside is asked of an interval widened by
+    the rounding of the question; if one is counted wrongly, it is that near to an end. Beyond 10^6
+    sines are not known to rounding: there the range is [-1, 1].
+    """
+    unit = unit_of(x.low)
+    s0, c0 = sincos(x.low)
+    if x.low is x.high:
+        wide = dr.abs(x.low) > 1e6
+        s, c = (Interval(one, one).widened(4 * unit, 4 * unit) for one in (s0, c0))
+        return _unit_range(s, wide), _unit_range(c, wide)
+    s1, c1 = sincos(x.high)
+    turn = 1 / (2 * math.pi)
+    slack = 8 * unit * (fmax(dr.abs(x.low), dr.abs(x.high)) + 1) * turn
+    low, high = x.low * turn - slack, x.high * turn + slack
+    wide = ~(fmax(dr.abs(x.low), dr.abs(x.high)) <= 1e6) | ~(high - low < 1)
+
+    def passes(phase: float) -> Mask:
+        return dr.floor(high - phase) > dr.floor(low - phase)
+
+    def over(a: Real, b: Real, top: float, bottom: float) -> Interval:
+        plain = Interval(fmin(a, b), fmax(a, b)).widened(4 * unit, 4 * unit)
+        least = dr.select(passes(bottom), -1, plain.low)
+        return _unit_range(Interval(least, dr.select(passes(top), 1, plain.high)), wide)
+
+    return over(s0, s1, 0.25, 0.75), over(c0, c1, 0.0, 0.5)
+
+
+def _unit_range(x: Interval, wide: Mask) -> Interval:
+    return Interval(
+        dr.select(wide, -1, fmax(x.low, -1)),
+        dr.select(wide, 1, fmin(x.high, 1)),
+    )
+
+
+def _tan(x: Interval) -> Ranges:
+    s, c = _sine_and_cosine(x)
+    t = s * c.reciprocal()
+    # Monotone where the cosine has no zero: the ends are the range.
+    ends = [
+        one * two.reciprocal()
+        for one, two in (
+            _sine_and_cosine(Interval(x.low, x.low)), _sine_and_cosine(Interval(x.high, x.high)),
+        )
+    ]  # fmt: skip
+    no_pole = c.smallest > 0
+    t = Interval(dr.select(no_pole, ends[0].low, t.low), dr.select(no_pole, ends[1].high, t.high))
+    slope = ONE + t.square()
+    return t, slope, _two(t * slope)
+
+
+def _tanh(x: Interval) -> Ranges:
+    t = _rising(dr.tanh, x)
+    t = Interval(fmax(t.low, -1), fmin(t.high, 1))
+    slope = ONE - t.square()
+    slope = Interval(fmax(slope.low, 0), slope.high)
+    return t, slope, -_two(t * slope)
+
+
+def _atan(x: Interval) -> Ranges:
+    slope = (ONE + x.square()).reciprocal()
+    most = 3 * math.sqrt(3) / 8 * (1 + 1e-6)  # of |2x/(1+x^2)^2|, at x = 1/sqrt(3)
+    second = -_two(x * slope.square())
+    second = Interval(fmax(second.low, -most), fmin(second.high, most))
+    return _rising(dr.atan, x), slope, second
+
+
+def _asin(x: Interval) -> Ranges:
+    inside = Interval(fmax(x.low, -1), fmin(x.high, 1))
+    slope = _positive_reciprocal(_sqrt(ONE - inside.square())[0])
+    return _rising(dr.asin, inside), slope, inside * slope * slope.square()
+
+
+def _acos(x: Interval) -> Ranges:
+    value, slope, second = _asin(x)
+    quarter = Interval.constant(math.pi / 2, type(x.low))
+    return quarter - value, -slope, -second
+
+
+def _sinh(x: Interval) -> Ranges:
+    return _rising(dr.sinh, x), _cosh_range(x), _rising(dr.sinh, x)
+
+
+def _cosh(x: Interval) -> Ranges:
+    return _cosh_range(x), _rising(dr.sinh, x), _cosh_range(x)
+
+
+def _cosh_range(x: Interval) -> Interval:
+    return _rising(dr.cosh, Interval(x.smallest, x.largest))
+
+
+def _abs(x: Interval) -> Ranges:
+    """|x|: its second derivative is an infinite impulse at 0, upwards."""
+    positive, negative = x.low >= 0, x.high <= 0
+    slope = Interval(dr.select(positive, 1, -1), dr.select(negative, -1, 1))
+    kink = dr.select(positive | negative, 0, dr.inf)
+    return Interval(x.smallest, x.largest), slope, Interval(0.0, kink)
+
+
+def integer_power(x: Interval, n: int) -> Interval:
+    """The range of x^n, n >= 0."""
+    if n == 0:
+        return ONE
+    if n == 1:
+        return x
+    if n % 2 == 0:
+        low, high = x.smallest, x.largest
+        if x.low is x.high:
+            low = high
+    else:
+        low, high = x.low, x.high
+    a = _repeated(low, n)
+    b = a if low is high else _repeated(high, n)
+    # Every product is off by half a unit, in the exact power of a number in between.
+    return Interval(a, b).widened(n * unit_of(x.low), n * _tiny(x))
+
+
+def _repeated(x: Real, n: int) -> Real:
+    result: Real = None
+    while n:
+        if n & 1:
+            result = x if result is None else result * x
+        x = x * x if n > 1 else x
+        n >>= 1
+    return result
+
+
+def power(n: float) -> Function:
+    """x -> x^n. An exponent that is no integer is for x >= 0."""
+    if float(n).is_integer():
+        k = int(n)
+        if k < 0:
+
+            def inverse(x: Interval) -> Ranges:
+                one = x.reciprocal()
+                return (
+                    integer_power(one, -k),
+                    Interval(float(k), float(k)) * integer_power(one, 1 - k),
+                    Interval(float(k * (k - 1)), float(k * (k - 1))) * integer_power(one, 2 - k),
+                )
+
+            return Function(f"power {k}", inverse, lambda x: 1 / _repeated(x, -k), _numpy_power(k))
+
+        def whole(x: Interval) -> Ranges:
+            second = Interval(float(k * (k - 1)), float(k * (k - 1)))
+            return (
+                integer_power(x, k),
+                Interval(float(k), float(k)) * integer_power(x, max(k - 1, 0)),
+                second * integer_power(x, max(k - 2, 0)) if k > 1 else Interval(0.0, 0.0),
+            )
+
+        def of_numbers(x: Any) -> Any:
+            return 0 * x + 1 if k == 0 else _repeated(x, k)
+
+        return Function(f"power {k}", whole, of_numbers, _numpy_power(k))
+
+    def real(x: Interval) -> Ranges:
+        like: Any = type(x.low)
+        slope, second = Interval.constant(n, like), Interval.constant(n * (n - 1), like)
+        return _real_power(x, n), slope * _real_power(x, n - 1), second * _real_power(x, n - 2)
+
+    return Function(f"power {n}", real, lambda x: dr.power(fmax(x, 0), n), _numpy_power(n))
+
+
+def _numpy_power(n: float) -> Callable[[Any], Any]:
+    return lambda x: np.power(x, float(n))
+
+
+def _real_power(x: Interval, n: float) -> Interval:
+    """The range of x^n for x >= 0 and any n: exp2(n log2 x), so off by n log2(x) units and some."""
+
+    def ends(v: Real) -> Interval:
+        v = fmax(v, 0)
+        zero = 0.0 if n > 0 else dr.inf
+        result = dr.select(v > 0, dr.power(fmax(v, _tiny(x)), n), zero)
+        off = unit_of(v) * (_UNITS + 2 * abs(n) * dr.abs(dr.log2(fmax(v, _tiny(x)))))
+        moved = dr.select(dr.isfinite(result), off * dr.abs(result) + _tiny(x), 0)
+        return Interval(result - moved, result + moved)
+
+    first = ends(x.low)
+    last = first if x.low is x.high else ends(x.high)
+    low, high = (first, last) if n > 0 else (last, first)
+    return Interval(fmax(low.low, 0), high.high)
+
+
+exp = Function("exp", _exp, dr.exp, np.exp)
+log = Function("log", _log, dr.log, np.log)
+sqrt = Function("sqrt", _sqrt, dr.sqrt, np.sqrt)
+reciprocal = Function("reciprocal", _reciprocal, lambda x: 1 / x, lambda x: 1 / x)
+sin = Function("sin", _sine, lambda x: sincos(x)[0], np.sin)
+cos = Function("cos", _cosine, lambda x: sincos(x)[1], np.cos)
+tan = Function("tan", _tan, lambda x: sincos(x)[0] / sincos(x)[1], np.tan)
+tanh = Function("tanh", _tanh, dr.tanh, np.tanh)
+atan = Function("atan", _atan, dr.atan, np.arctan)
+asin = Function("asin", _asin, dr.asin, np.arcsin)
+acos = Function("acos", _acos, dr.acos, np.arccos)
+sinh = Function("sinh", _sinh, dr.sinh, np.sinh)
+cosh = Function("cosh", _cosh, dr.cosh, np.cosh)
+absolute = Function("abs", _abs, dr.abs, np.abs)

@@ -1,0 +1,321 @@
+"""Jets: ranges of a function and of its first two derivatives, over a point or a piece of a path.
+
+Interval arithmetic of value, first and second derivatives at once (Moore 1966; the Taylor forms of
+Aydinlilar and Zanni 2023, section 6.1, are made of it). A formula that is given jets as its
+coordinates answers with the jet of its value. So one formula serves for values, gradients and
+Hessians at a point, with proved bounds of rounding, and for the ranges that steps are proved from.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
+
+import drjit as dr
+
+from harnack.arithmetic.functions import (
+    Function,
+    absolute,
+    cos,
+    cosh,
+    exp,
+    log,
+    power,
+    reciprocal,
+    sin,
+    sinh,
+    sqrt,
+    tan,
+    tanh,
+)
+from harnack.arithmetic.interval import ONE, ZERO, Interval
+
+if TYPE_CHECKING:
+    from harnack.backend import Real, Vec3
+
+# NumPy's functions of jets: numpy.sin(x) is sin(x).
+_UFUNCS = {
+    "sin": sin, "cos": cos, "tan": tan, "exp": exp, "log": log, "sqrt": sqrt, "tanh": tanh,
+    "sinh": sinh, "cosh": cosh, "absolute": absolute, "fabs": absolute, "square": power(2),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Jet:
+    """Ranges of a function of n variables on a box of them; mostly n = 1, the length along a path,
+    or n = 3 at a point.
+
+    value: of the function.
+    first: (n,) of the partial derivatives.
+    second: (n (n+1) / 2,) of the second derivatives, rows of the upper triangle; empty if they are
+        not asked for. In the sense of distributions: at a kink, where the first derivative jumps,
+        the range has no upper or no lower end.
+    start: with n = 1, the jet at the start of the piece, from which ranges are narrowed; None where
+        the jet is that of a point.
+    width: the length of the piece.
+    """
+
+    value: Interval
+    first: tuple[Interval, ...]
+    second: tuple[Interval, ...]
+    start: Jet | None = None
+    width: Real = 0.0
+
+    @classmethod
+    def at_point(cls, p: Vec3, *, order: int = 1) -> tuple[Jet, Jet, Jet]:
+        """The coordinates as functions of themselves, at points p: for gradients and Hessians."""
+        second = (ZERO,) * 6 if order > 1 else ()
+        units = [tuple(ONE if i == k else ZERO for i in range(3)) for k in range(3)]
+        x, y, z = (Jet(Interval.exactly(p[k]), units[k], second) for k in range(3))
+        return x, y, z
+
+    @classmethod
+    def along(
+        cls, p: Vec3, direction: Vec3, start: Real, end: Real, *, anchored: bool = True
+    ) -> tuple[Jet, Jet, Jet]:
+        """The coordinates of p + s d as functions of s, start <= s <= end."""
+
+        def coordinate(x: Real, slope: Real) -> Jet:
+            rate = Interval.exactly(slope)
+            here = _moved(x, slope, start)
+            first, second = (rate,), (ZERO,)
+            anchor = Jet(here, first, second) if anchored else None
+            return Jet(here.hull(_moved(x, slope, end)), first, second, anchor, end - start)
+
+        x, y, z = (coordinate(p[k], direction[k]) for k in range(3))
+        return x, y, z
+
+    # Operators.
+
+    def constant(self, x: float) -> Jet:
+        """A constant number as a function of the same variables."""
+        value = Interval.constant(float(x), type(self._kind()))
+        zeros = (ZERO,) * len(self.first), (ZERO,) * len(self.second)
+        start = None if self.start is None else Jet(value, *zeros)
+        return Jet(value, *zeros, start, self.width)
+
+    def _kind(self) -> Any:
+        for jet in (self.value, *self.first):
+            if dr.is_array_v(cast("Any", type(jet.low))):
+                return jet.low
+        return self.width
+
+    def _with(self, other: Any) -> Jet | None:
+        """Another operand as a jet; None where it is none."""
+        if isinstance(other, Jet):
+            return other
+        if dr.is_array_v(cast("Any", type(other))) and dr.depth_v(type(other)) == 1:
+            value = Interval.exactly(other)
+            zeros = (ZERO,) * len(self.first), (ZERO,) * len(self.second)
+            start = None if self.start is None else Jet(value, *zeros)
+            return Jet(value, *zeros, start, self.width)
+        try:
+            return self.constant(float(other))
+        except (TypeError, ValueError):
+            return None
+
+    def __add__(self, other: Any) -> Jet:
+        b = self._with(other)
+        if b is None:
+            return NotImplemented
+        jet = Jet(
+            self.value + b.value,
+            tuple(x + y for x, y in zip(self.first, b.first, strict=True)),
+            tuple(x + y for x, y in zip(self.second, b.second, strict=True)),
+        )
+        return jet if self.start is None else jet._anchored(self.start + b.start, self.width)
+
+    __radd__ = __add__
+
+    def __neg__(self) -> Jet:
+        return dataclasses.replace(
+            self,
+            value=-self.value,
+            first=tuple(-one for one in self.first),
+            second=tuple(-one for one in self.second),
+            start=None if self.start is None else -self.start,
+        )
+
+    def __pos__(self) -> Jet:
+        return self
+
+    def __sub__(self, other: Any) -> Jet:
+        b = self._with(other)
+        return NotImplemented if b is None else self + -b
+
+    def __rsub__(self, other: Any) -> Jet:
+        return -self + other
+
+    def __mul__(self, other: Any) -> Jet:
+        b = self._with(other)
+        if b is None:
+            return NotImplemented
+        x, y = self.value, b.value
+        first = tuple(x * v + y * u for u, v in zip(self.first, b.first, strict=True))
+        second = tuple(
+            x * b.second[k]
+            + (self.first[i] * b.first[j] + self.first[j] * b.first[i])
+            + y * self.second[k]
+            for k, (i, j) in enumerate(self._pairs())
+        )
+        jet = Jet(x * y, first, second)
+        return jet if self.start is None else jet._anchored(self.start * b.start, self.width)
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, other: Any) -> Jet:
+        if isinstance(other, Jet):
+            return self * other.apply(reciprocal)
+        b = self._with(other)
+        if b is None:
+            return NotImplemented
+        if not dr.is_array_v(cast("Any", type(other))) and float(other) == 0.0:
+            raise ZeroDivisionError("a formula divides by the constant 0")
+        return self * b.apply(reciprocal) if not b.value.is_static else self * (1.0 / float(other))
+
+    def __rtruediv__(self, other: Any) -> Jet:
+        return self.apply(reciprocal) * other
+
+    def __pow__(self, exponent: Any) -> Jet:
+        if isinstance(exponent, Jet):
+            return (self.apply(log) * exponent).apply(exp)
+        return self.apply(power(float(exponent)))
+
+    def __rpow__(self, base: Any) -> Jet:
+        b = self._with(base)
+        return NotImplemented if b is None else b**self
+
+    def __abs__(self) -> Jet:
+        return self.apply(absolute)
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **settings: Any) -> Any:
+        """NumPy's functions and operators, of jets."""
+        name = ufunc.__name__
+        if method == "__call__" and not settings:
+            if name in _UFUNCS:
+                return self.apply(_UFUNCS[name])
+            plain = {
+                "add": "__add__", "subtract": "__sub__", "multiply": "__mul__",
+                "true_divide": "__truediv__", "divide": "__truediv__", "power": "__pow__",
+                "maximum": "maximum", "minimum": "minimum",
+            }.get(name)  # fmt: skip
+            if plain is not None:
+                a, b = inputs
+                return getattr(a if isinstance(a, Jet) else self._with(a), plain)(b)
+        raise TypeError(
+            f"numpy.{name} has no proved ranges: write formulas with + - * / **, abs, and "
+            f"harnack.{', '.join(sorted(_UFUNCS))}, maximum, minimum, norm"
+        )
+
+    def __float__(self) -> float:
+        raise TypeError(
+            "a formula cannot use functions of plain numbers, such as math.sin, nor decide by its "
+            "coordinates: use harnack.sin and its like, harnack.maximum and harnack.minimum"
+        )
+
+    __bool__ = __float__  # type: ignore[assignment]
+
+    # Functions.
+
+    def apply(self, function: Function) -> Jet:
+        """A function of this one: f(g)'' = f'' g' g' + f' g''."""
+        x = self._dynamic_value()
+        value, slope, curvature = function.ranges(x)
+        first = tuple(slope * one for one in self.first)
+        second = tuple(
+            curvature * (self.first[i].square() if i == j else self.first[i] * self.first[j])
+            + slope * self.second[k]
+            for k, (i, j) in enumerate(self._pairs())
+        )
+        jet = Jet(value, first, second)
+        return jet if self.start is None else jet._anchored(self.start.apply(function), self.width)
+
+    def maximum(self, other: Any) -> Jet:
+        """The larger of two functions at each place.
+
+        Proof. Where one is larger everywhere, it is the maximum. Elsewhere the derivative is one of
+        the two, the second derivative too, but for the places where they cross: there the first
+        derivative jumps up, which has no upper bound.
+        """
+        b = self._with(other)
+        assert b is not None
+        x, y = self.value, b.value
+        left, right = x.low > y.high, y.low > x.high
+
+        def chosen(u: Interval, v: Interval, *, kink: bool) -> Interval:
+            both = u.hull(v)
+            high = dr.inf if kink else both.high
+            return Interval(
+                dr.select(left, u.low, dr.select(right, v.low, both.low)),
+                dr.select(left, u.high, dr.select(right, v.high, high)),
+            )
+
+        pairs = self._pairs()
+        value = Interval(_max(x.low, y.low), _max(x.high, y.high))
+        first = tuple(chosen(u, v, kink=False) for u, v in zip(self.first, b.first, strict=True))
+        second = tuple(
+            chosen(u, v, kink=i == j)
+            for (i, j), u, v in zip(pairs, self.second, b.second, strict=True)
+        )
+        jet = Jet(value, first, second)
+        if self.start is None:
+            return jet
+        return jet._anchored(self.start.maximum(b.start), self.width)
+
+    def minimum(self, other: Any) -> Jet:
+        """The smaller of two functions at each place."""
+        b = self._with(other)
+        assert b is not None
+        return -((-self).maximum(-b))
+
+    def _dynamic_value(self) -> Interval:
+        """The value as numbers of the backend."""
+        if not self.value.is_static:
+            return self.value
+        kind = cast("Any", type(self._kind()))
+        low = kind(self.value.low)
+        return Interval(low, low if self.value.low == self.value.high else kind(self.value.high))
+
+    def _pairs(self) -> list[tuple[int, int]]:
+        n = len(self.first)
+        return [(i, j) for i in range(n) for j in range(i, n)][: len(self.second)]
+
+    def _anchored(self, start: Jet | None, width: Real) -> Jet:
+        """The same, narrowed by what is known at the start of the piece.
+
+        Proof. f(s) = f(0) + s f'(r) for some r in between, so f stays within f(0) + [0, w] f'; the
+        same holds of f' and f'', also where f' jumps by at most what f'' allows.
+        """
+        if start is None:
+            return self
+        rise = _spanned(self.first[0], width)
+        first = self.first[0]
+        if self.second:
+            turned = start.first[0] + _spanned(self.second[0], width)
+            first = first.meet(turned)
+        value = self.value.meet(start.value + rise)
+        return Jet(value, (first,), self.second, start, width)
+
+
+def _spanned(slope: Interval, width: Real) -> Interval:
+    """s times numbers of an interval, for 0 <= s <= width."""
+    if slope.is_zero:
+        return ZERO
+    moved = slope * Interval(width, width)
+    return Interval(_min(moved.low, 0.0), _max(moved.high, 0.0))
+
+
+def _moved(x: Real, slope: Real, s: Real) -> Interval:
+    """x + slope s."""
+    if isinstance(s, float) and s == 0.0:
+        return Interval.exactly(x)
+    return Interval.exactly(x) + Interval.exactly(slope) * Interval.exactly(s)
+
+
+def _max(a: Real, b: Real) -> Real:
+    return max(a, b) if isinstance(a, float) and isinstance(b, float) else dr.select(a > b, a, b)
+
+
+def _min(a: Real, b: Real) -> Real:
+    return min(a, b) if isinstance(a, float) and isinstance(b, float) else dr.select(a < b, a, b)

@@ -1,0 +1,142 @@
+"""Pieces: the path cut at a few lengths, with ranges of the first two derivatives on each piece."""
+
+from __future__ import annotations
+
+import abc
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import drjit as dr
+
+from harnack.backend.extrema import fmax, fmin
+from harnack.enclosures.enclosure import Enclosure, Gaps, Slopes
+from harnack.enclosures.parabola import first_root
+from harnack.enclosures.restriction import Piece
+
+if TYPE_CHECKING:
+    from typing import Self
+
+    from harnack.backend import Real
+    from harnack.enclosures.restriction import Restriction
+
+_ROUND_DOWN = 1.0 - 1e-6
+
+
+@dataclass(frozen=True)
+class Pieces(Enclosure):
+    """F' and F'' stay within ranges on successive pieces of the path.
+
+    slopes: of F at s = 0.
+
+    Proof of the step. Let F <= A at the start of a piece, with F' <= D there, and F' <= k, F'' <= c
+    on the piece. Then F <= A + min(k s, D s + c s^2/2) on it. The next piece starts with at most
+    the value of that at its end, and with a slope of at most min(D + c w, k), w the length of the
+    piece. The first s at which that reaches the gap is the root of a line or of a parabola. The
+    level below is the same of -F. With exact ranges the bound converges to F with the third power
+    of the length of the pieces, so that one look may cross much of a ray.
+
+    Source: our own; one piece is the linear and the quadratic Taylor form together (Aydinlilar and
+    Zanni 2023, section 6.1).
+    """
+
+    slopes: Slopes
+    parts: tuple[Piece, ...]
+
+    knots: ClassVar[tuple[float, ...]] = (0.125, 0.25, 0.5, 1.0)
+    """Ends of pieces, in parts of the length looked ahead."""
+    growth: ClassVar[float] = 4.0
+    """How many times the last step the next look asks for."""
+
+    @classmethod
+    def along(cls, function: Restriction, slopes: Slopes, length: Real) -> Self | None:
+        ends = [knot * length for knot in cls.knots]
+        return cls(slopes, function.pieces([0.0, *ends]))
+
+    def step(self, gaps: Gaps) -> Real:
+        up = self._reach(gaps.up, 1)
+        down = self._reach(gaps.down, -1)
+        return fmax(fmin(up, down), 0) * _ROUND_DOWN
+
+    def _reach(self, gap: Real, sign: int) -> Real:
+        """The first s at which sign F may reach the gap; the whole length if it cannot."""
+        slope = self.slopes.high if sign > 0 else -self.slopes.low
+        none = gap == dr.inf
+        left = dr.select(none, 0, gap)  # of the gap, at the start of the piece
+        total = type(gap)(0)
+        free = gap >= 0  # and not NaN
+        for part in self.parts:
+            most = part.slopes.high if sign > 0 else -part.slopes.low
+            bend = part.most_curvature if sign > 0 else -part.least_curvature
+            slope, reach, left = self._on_piece(left, slope, most, bend, part.length)
+            reach = dr.select(none, part.length, reach)
+            total = dr.select(free, total + reach, total)
+            free &= reach >= part.length
+        return total
+
+    @classmethod
+    def _on_piece(
+        cls, left: Real, slope: Real, most: Real, bend: Real, length: Real
+    ) -> tuple[Real, Real, Real]:
+        """The slope at the end of a piece, how far it is free, and what is left of the gap."""
+        slope = fmin(slope, most)
+        by_line = dr.select(most > 0, left / most, dr.inf)
+        by_line = dr.select(left > 0, by_line, 0)
+        by_parabola = first_root(left, slope, bend)
+        reach = fmin(length, fmax(by_parabola, by_line))
+        # Rises and falls may cancel: their rounding counts, not that of their sum.
+        unit = 4 * float(dr.epsilon(type(left)))
+        bent, straight = 0.5 * length * length * bend, slope * length
+        by_parabola = (bent + straight) + unit * (dr.abs(bent) + dr.abs(straight))
+        risen = fmin(by_parabola, most * length + unit * dr.abs(most * length))
+        return dr.fma(bend, length, slope), reach, left - risen
+
+
+class OnePiece(Pieces, abc.ABC):
+    """Proofs from ranges on the whole length at once: those of the literature, for comparison."""
+
+    knots = (1.0,)
+    growth = 2.0
+
+
+class QuadraticTaylor(OnePiece):
+    """The slope here and the range of F'' ahead.
+
+    Source: Aydinlilar and Zanni 2023, section 6.1. Proof: that of `Pieces`, without the line.
+    """
+
+    @classmethod
+    def _on_piece(
+        cls, left: Real, slope: Real, most: Real, bend: Real, length: Real
+    ) -> tuple[Real, Real, Real]:
+        del most
+        return super()._on_piece(left, slope, type(left)(dr.inf), bend, length)
+
+
+class LinearTaylor(OnePiece):
+    """The range of F' ahead.
+
+    Source: Aydinlilar and Zanni 2023, section 4.1, with the exact range. Proof: that of `Pieces`,
+    without the parabola.
+    """
+
+    @classmethod
+    def _on_piece(
+        cls, left: Real, slope: Real, most: Real, bend: Real, length: Real
+    ) -> tuple[Real, Real, Real]:
+        del slope, bend
+        return super()._on_piece(left, most, most, type(left)(0), length)
+
+
+class Segment(OnePiece):
+    """The largest |F'| ahead: segment tracing.
+
+    Source: Galin, Guerin, Paris and Peytavie 2020; Aydinlilar and Zanni 2023, equation 10. Proof:
+    |F(s)| <= K s with K the bound of |F'| on the piece.
+    """
+
+    @classmethod
+    def along(cls, function: Restriction, slopes: Slopes, length: Real) -> Self | None:
+        (part,) = function.pieces([0.0, length])
+        most = fmax(part.slopes.high, -part.slopes.low)
+        both = Slopes(-most, most)
+        return cls(both, (Piece(part.length, both, 0.0, 0.0),))

@@ -1,0 +1,39 @@
+"""A function along a path, as far as enclosures ask for it: ranges, and not values at points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from harnack.backend import Real
+    from harnack.enclosures.enclosure import Slopes
+
+
+@dataclass(frozen=True)
+class Piece:
+    """What F' and F'' are on one piece of the path.
+
+    length: of the piece.
+    slopes: the range of F' on it.
+    least_curvature, most_curvature: the range of F''; an end may be infinite, for functions with
+        kinks.
+    """
+
+    length: Real
+    slopes: Slopes
+    least_curvature: Real
+    most_curvature: Real
+
+
+class Restriction(Protocol):
+    """A function along a path, as enclosures ask for it."""
+
+    def pieces(self, knots: Sequence[Real]) -> tuple[Piece, ...]:
+        """Ranges of the derivatives of f(path(t+s)) between each knot and the next.
+
+        knots: lengths s, rising, the first of them 0.
+        """
+        ...

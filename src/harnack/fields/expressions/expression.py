@@ -1,0 +1,63 @@
+"""A user's own formula as a field."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from harnack.fields.formula import Formula
+
+if TYPE_CHECKING:
+    from harnack.geometry import Volume
+
+
+@dataclass(frozen=True, eq=False)
+class Expression(Formula):
+    """f(x, y, z) as a Python function, written with plain operators and `harnack.sin` and its like.
+
+    function: called with three coordinates while a kernel is being recorded; numbers in it are
+        literals of that kernel.
+    domain: the volume it is drawn in; None for all of space.
+    """
+
+    function: Callable[[Any, Any, Any], Any]
+    domain: Volume | None = None
+    default_level: float = field(default=0.0, kw_only=True)
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        return self.function(x, y, z)
+
+    def prepare(self, backend: Any) -> Formula:
+        del backend
+        return self
+
+
+def expression(
+    function: Callable[[Any, Any, Any], Any], *, domain: Volume | None = None, level: float = 0.0
+) -> Expression:
+    """The implicit surface f(x, y, z) = level of a formula of your own.
+
+    function: of three coordinates, written with + - * / **, abs, and the functions `harnack.sin`,
+        `cos`, `tan`, `exp`, `log`, `sqrt`, `tanh`, `atan`, `asin`, `acos`, `sinh`, `cosh`,
+        `maximum`, `minimum`, `norm`; NumPy's of the same names do too.
+    domain: the volume to draw it in, such as `harnack.Ball()`; None for all of space.
+
+        torus = hk.expression(lambda x, y, z: (hk.norm(x, y) - 1) ** 2 + z**2 - 0.1)
+
+    Raises:
+        TypeError: function cannot be called with three coordinates, or uses what has no proved
+            ranges.
+    """
+    if not callable(function):
+        raise TypeError(f"function must be callable with x, y, z, not {function!r}")
+    made = Expression(function, domain, default_level=level)
+    made.formula(*_probe())
+    return made
+
+
+def _probe() -> tuple[Any, Any, Any]:
+    from harnack.arithmetic import Jet
+    from harnack.backend import choose_backend
+
+    return Jet.at_point(choose_backend("double").Array3f(0.1, 0.2, 0.3))

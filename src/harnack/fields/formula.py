@@ -1,0 +1,149 @@
+"""Fields that are given by a formula of the coordinates: everything else follows from it.
+
+A formula is evaluated in two ways. Given jets of the coordinates at a point, it answers with value
+and gradient and how far rounding may have moved them; given jets along a piece of a path, with
+ranges of its derivatives there, from which steps are proved.
+"""
+
+from __future__ import annotations
+
+import abc
+import copy
+import dataclasses
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
+
+import drjit as dr
+
+from harnack.arithmetic import Jet
+from harnack.enclosures import Lipschitz, Piece, Slopes
+from harnack.fields.field import Field
+from harnack.fields.look import Look, Path, Sample
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Real, Vec3
+
+
+class Formula(Field):
+    """A field given by `formula`.
+
+    lipschitz: a proved bound of |grad f| everywhere, for sphere tracing (bound="lipschitz"); None
+        where none is known.
+    """
+
+    overstep = 1.0  # longer steps than proved cost looks: what is proved is long already
+    lipschitz: Real | None = None
+
+    @abc.abstractmethod
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        """f of the coordinates, which may be jets or Dr.Jit numbers: written with + - * / ** and
+        the functions of `harnack.arithmetic`."""
+
+    def evaluate(self, p: Vec3) -> Sample:
+        jet = self._jet(Jet.at_point(p), p.x)
+        zero = 0 * p.x
+        gradient = type(p)(*(zero + one.middle for one in jet.first))
+        doubt = zero
+        for one in jet.first:
+            doubt = doubt + one.radius
+        known = () if self.lipschitz is None else (Lipschitz(zero + self.lipschitz),)
+        value, error = zero + jet.value.middle, zero + jet.value.radius
+        return Sample(value, gradient, known, error, doubt)
+
+    def differentiable_value(self, p: Vec3) -> Real:
+        return 0 * p.x + self.formula(p.x, p.y, p.z)
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        jet = self._jet(Jet.at_point(p, order=2), p.x)
+        xx, xy, xz, yy, yz, zz = (0 * p.x + one.middle for one in jet.second)
+        vector: Any = type(p)
+        return vector(xx, xy, xz), vector(xy, yy, yz), vector(xz, yz, zz)
+
+    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
+        """The sample, and the enclosures that its ranges prove; looking back nothing is proved."""
+        del back
+        p = path.point(t)
+        sample = self.evaluate(p)
+        slope = dr.dot(sample.gradient, path.direction)
+        slopes = Slopes.around(slope, sample.gradient_error)
+        function = self.restricted(p, path.direction)
+        enclosures = path.proofs.along(function, slopes, ahead)
+        if not enclosures:
+            return path.look(sample)
+        return Look(sample, enclosures, (), slope)
+
+    def restricted(self, p: Vec3, direction: Vec3) -> FormulaAlong:
+        """The field along the path from p, as enclosures ask for it."""
+        return FormulaAlong(self, p, direction)
+
+    def prepare(self, backend: Backend) -> Field:
+        """The same formula with its numbers as data of the backend, so that other numbers compile
+        no other kernel."""
+        return prepared_numbers(self, backend)
+
+    def _jet(self, coordinates: tuple[Jet, Jet, Jet], like: Real) -> Jet:
+        return as_jet(self.formula(*coordinates), coordinates[0], type(self).__name__)
+
+
+def as_jet(value: Any, like: Jet, name: str) -> Jet:
+    """What a formula returned, as a jet; a constant is one too.
+
+    Raises:
+        TypeError: it returned anything else.
+    """
+    if isinstance(value, Jet):
+        return value
+    if isinstance(value, int | float):
+        return like.constant(float(value))
+    raise TypeError(
+        f"{name}: the formula returned an object of type {type(value).__name__}, not a number made "
+        "of its coordinates: write it with + - * / ** and functions such as harnack.sin"
+    )
+
+
+@dataclass(frozen=True)
+class FormulaAlong:
+    """A formula along the path p + s d."""
+
+    field: Formula
+    p: Vec3
+    direction: Vec3
+
+    def pieces(self, knots: Sequence[Real]) -> tuple[Piece, ...]:
+        """See `harnack.enclosures.Restriction`."""
+        made: list[Piece] = []
+        for start, end in itertools.pairwise(knots):
+            coordinates = Jet.along(self.p, self.direction, start, end)
+            jet = as_jet(self.field.formula(*coordinates), coordinates[0], type(self).__name__)
+            (slopes,), (curvatures,) = jet.first, jet.second
+            zero = 0 * self.p.x
+            made.append(
+                Piece(
+                    end - start,
+                    Slopes(zero + slopes.low, zero + slopes.high),
+                    zero + curvatures.low,
+                    zero + curvatures.high,
+                )
+            )
+        return tuple(made)
+
+
+def prepared_numbers(field: Any, backend: Backend) -> Any:
+    """A copy of a dataclass whose numbers, and those of its fields, are data of the backend."""
+    other = copy.copy(field)
+    for entry in dataclasses.fields(cast("Any", field)) if dataclasses.is_dataclass(field) else ():
+        value = getattr(field, entry.name)
+        if (prepared := _prepared(value, backend)) is not value:
+            object.__setattr__(other, entry.name, prepared)
+    return other
+
+
+def _prepared(value: Any, backend: Backend) -> Any:
+    if isinstance(value, float):
+        return dr.opaque(backend.Float, value)
+    if isinstance(value, tuple):
+        entries = cast("tuple[Any, ...]", value)
+        return tuple(_prepared(one, backend) for one in entries)
+    return value.prepare(backend) if isinstance(value, Field) else value
