@@ -275,7 +275,7 @@ def power(n: float) -> Function:
         return Function(f"power {k}", whole, of_numbers, _numpy_power(k))
 
     def real(x: Interval) -> Ranges:
-        like: Any = type(x.low)
+        like = cast("Any", type(x.low))
         slope, second = Interval.constant(n, like), Interval.constant(n * (n - 1), like)
         return _real_power(x, n), slope * _real_power(x, n - 1), second * _real_power(x, n - 2)
 

@@ -58,7 +58,7 @@ class Formula(Field):
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         jet = self._jet(Jet.at_point(p, order=2), p.x)
         xx, xy, xz, yy, yz, zz = (0 * p.x + one.middle for one in jet.second)
-        vector: Any = type(p)
+        vector = cast("Any", type(p))
         return vector(xx, xy, xz), vector(xy, yy, yz), vector(xz, yz, zz)
 
     def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:

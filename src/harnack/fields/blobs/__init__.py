@@ -1,0 +1,1 @@
+"""Sums of kernels about points: metaballs, molecules, surfaces through oriented points."""

@@ -1,0 +1,1 @@
+"""Solids: where a function is negative, and how they are put together."""
