@@ -10,6 +10,7 @@ from __future__ import annotations
 from harnack import backend, files, geometry, rendering, testing
 from harnack._version import __version__
 from harnack.arithmetic import (
+    absolute,
     acos,
     asin,
     atan,
@@ -17,6 +18,9 @@ from harnack.arithmetic import (
     cosh,
     exp,
     log,
+    maximum,
+    minimum,
+    norm,
     sin,
     sinh,
     sqrt,
@@ -97,6 +101,7 @@ __all__ = [
     "Tolerance",
     "WindingNumber",
     "__version__",
+    "absolute",
     "acos",
     "asin",
     "atan",
@@ -112,6 +117,9 @@ __all__ = [
     "geometry",
     "level_set",
     "log",
+    "maximum",
+    "minimum",
+    "norm",
     "render",
     "rendering",
     "signed_distance",

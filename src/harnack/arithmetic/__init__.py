@@ -22,6 +22,7 @@ from harnack.arithmetic.functions import (
 )
 from harnack.arithmetic.interval import ONE, ZERO, Interval
 from harnack.arithmetic.jet import Jet
+from harnack.arithmetic.norms import maximum, minimum, norm
 
 __all__ = [
     "ONE",
@@ -37,6 +38,9 @@ __all__ = [
     "cosh",
     "exp",
     "log",
+    "maximum",
+    "minimum",
+    "norm",
     "power",
     "reciprocal",
     "sin",
