@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import drjit as dr
 
@@ -42,15 +42,20 @@ class Pieces(Enclosure):
     slopes: Slopes
     parts: tuple[Piece, ...]
 
-    knots: ClassVar[tuple[float, ...]] = (0.125, 0.25, 0.5, 1.0)
-    """Ends of pieces, in parts of the length looked ahead."""
-    growth: ClassVar[float] = 4.0
-    """How many times the last step the next look asks for."""
-
     @classmethod
     def along(cls, function: Restriction, slopes: Slopes, length: Real) -> Self | None:
-        ends = [knot * length for knot in cls.knots]
-        return cls(slopes, function.pieces([0.0, *ends]))
+        """Each piece is twice as long as the one before it, but for the first two."""
+        count = cls._count(function)
+        knots = [length * 2.0 ** (k + 1 - count) for k in range(count)]
+        return cls(slopes, function.pieces([0.0, *knots]))
+
+    @classmethod
+    def _count(cls, function: Restriction) -> int:
+        return function.piece_count
+
+    @property
+    def growth(self) -> float:
+        return max(2.0, float(len(self.parts)))
 
     def step(self, gaps: Gaps) -> Real:
         if gaps.is_one_sided:
@@ -100,8 +105,10 @@ class Pieces(Enclosure):
 class OnePiece(Pieces, abc.ABC):
     """Proofs from ranges on the whole length at once: those of the literature, for comparison."""
 
-    knots = (1.0,)
-    growth = 2.0
+    @classmethod
+    def _count(cls, function: Restriction) -> int:
+        del function
+        return 1
 
 
 class QuadraticTaylor(OnePiece):

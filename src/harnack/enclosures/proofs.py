@@ -47,11 +47,6 @@ class Proofs:
     kinds: tuple[type[Enclosure], ...]
     uses_weaker: bool = True
 
-    @property
-    def growth(self) -> float:
-        """How many times the last step the next look asks for."""
-        return max(kind.growth for kind in self.kinds)
-
     def along(self, function: Restriction, slopes: Slopes, length: Real) -> tuple[Enclosure, ...]:
         """The enclosures of a function whose ranges along the path are known; none if none of the
         proofs is made of ranges."""

@@ -33,6 +33,7 @@ class Formula(Field):
         where none is known.
     """
 
+    has_creases = True  # it may use abs, maximum and minimum
     overstep = 1.0  # longer steps than proved cost looks: what is proved is long already
     lipschitz: Real | None = None
 
@@ -76,7 +77,7 @@ class Formula(Field):
         enclosures = path.proofs.along(function, slopes, ahead)
         if not enclosures:
             return path.look(sample)
-        return Look(sample, enclosures, (), slope)
+        return Look(sample, enclosures, (), slope, max(one.growth for one in enclosures))
 
     def restricted(self, p: Vec3, direction: Vec3) -> FormulaAlong:
         """The field along the path from p, as enclosures ask for it."""
@@ -114,6 +115,7 @@ class FormulaAlong:
     field: Formula
     p: Vec3
     direction: Vec3
+    piece_count: int = 2
 
     def pieces(self, knots: Sequence[Real]) -> tuple[Piece, ...]:
         """See `harnack.enclosures.Restriction`.
@@ -143,7 +145,11 @@ class FormulaAlong:
         state = (index(0), *([zero] * (4 * count)))
         _, *found = dr.while_loop(state, lambda i, *_: i < count, body, label="pieces")
         return tuple(
-            Piece(ends[k + 1] - ends[k], Slopes(*found[4 * k : 4 * k + 2]), *found[4 * k + 2 : 4 * k + 4])
+            Piece(
+                ends[k + 1] - ends[k],
+                Slopes(*found[4 * k : 4 * k + 2]),
+                *found[4 * k + 2 : 4 * k + 4],
+            )
             for k in range(count)
         )
 

@@ -197,7 +197,7 @@ class March:
             excess = fmax(gaps.smaller + total_error - within, real(0))
             # After a step of zero enclosures are asked for a third of the length: bisection.
             shorter = dr.select(dr.isfinite(candidate), candidate / 3, 1 + 16 * (size + t))
-            tried = dr.select(forward > 0, path.proofs.growth * forward, shorter)
+            tried = dr.select(forward > 0, look.growth * forward, shorter)
             free = base + reach >= end
             if sheet is not None:
                 free = dr.select(sheet.has_crossing, sheet.at_crossing, free)
