@@ -22,7 +22,7 @@ from harnack.fields.field import Field
 from harnack.fields.look import Look, Path, Sample
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Real, Vec3
+    from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.enclosures import Promise
 
 
@@ -141,9 +141,12 @@ class FormulaAlong:
             ]
             return i + 1, *kept
 
+        def more(i: Any, *_: Any) -> Mask:
+            return i < count
+
         index = dr.uint32_array_t(cast("Any", type(zero)))
         state = (index(0), *([zero] * (4 * count)))
-        _, *found = dr.while_loop(state, lambda i, *_: i < count, body, label="pieces")
+        _, *found = dr.while_loop(state, more, body, label="pieces")
         return tuple(
             Piece(
                 ends[k + 1] - ends[k],
