@@ -14,6 +14,7 @@ from harnack.backend import FloatArray, choose_backend
 from harnack.enclosures import Curvature, Lipschitz
 from harnack.fields.field import Field, Sample
 from harnack.geometry import shapes
+from harnack.geometry.mesh_shapes import icosphere
 from harnack.tracer.contact import root_between
 
 PRECISIONS = ("single", "double")
@@ -50,7 +51,7 @@ def rays(n: int, seed: int = 0, distance: float = 2.5) -> tuple[FloatArray, Floa
     return o, d / np.linalg.norm(d, axis=1)[:, None]
 
 
-def alternations(f: FloatArray, level: float, w: float) -> int:
+def alternations(f: FloatArray, level: float, w: float | FloatArray) -> int:
     """How often f, in order, goes from more than w on one side of a level to so much beyond it."""
     side = np.sign(np.where(np.abs(f - level) > w, f - level, 0))
     return int(np.count_nonzero(np.diff(side[side != 0])))
@@ -341,12 +342,105 @@ def test_bad_settings_are_refused() -> None:
             hk.trace(Sphere(), o, d, all_hits=wrong)
     with pytest.raises(TypeError, match="an integer such as 8"):
         hk.trace(Sphere(), o, d, all_hits="all")  # type: ignore[call-overload]
-    vertices, faces = hk.geometry.mesh_shapes.icosphere(0)
+    mesh = hk.WindingNumber(*icosphere(0))
+    with pytest.raises(ValueError, match="all_hits takes one level of a field with sheets"):
+        hk.trace(mesh, o, d, all_hits=2, level=(0.3, 0.6))
+    with pytest.raises(ValueError, match="confirm takes one level of a field with sheets"):
+        hk.level_set(mesh, [0.3, 0.6], confirm=True)
+
+
+def balls() -> tuple[FloatArray, Any]:
+    """A ball with a hollow, and another one that cuts into it."""
+    v, f = icosphere(2)
+    vertices = np.concatenate([v, 0.5 * v + [0.2, 0, 0], 0.4 * v + [1.2, 0, 0]])
+    return vertices, np.concatenate([f, f[:, ::-1] + len(v), f + 2 * len(v)])
+
+
+def changes_of_winding(
+    vertices: FloatArray, faces: Any, o: FloatArray, d: FloatArray
+) -> tuple[FloatArray, Any]:
+    """Where a ray from outside crosses triangles at which the winding number passes 1/2."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    along = normal @ d
+    t = ((a - o) * normal).sum(axis=1) / along
+    p = o + t[:, None] * d
+    inside = np.array(
+        [(np.cross(y - x, p - x) * normal).sum(axis=1) > 0 for x, y in ((a, b), (b, c), (c, a))]
+    ).all(axis=0)
+    crossed = np.flatnonzero(inside & (t > 0))
+    crossed = crossed[np.argsort(t[crossed])]
+    w = np.concatenate([[0], np.cumsum(-np.sign(along[crossed]))])
+    passes = crossed[(w[1:] > 0.5) != (w[:-1] > 0.5)]
+    return t[passes], passes
+
+
+@pytest.mark.parametrize(
+    ("method", "precision"),
+    [
+        ("exact", "single"),
+        ("exact", "double"),
+        ("tree", "single"),
+        pytest.param("tree", "double", marks=pytest.mark.slow),
+    ],
+)
+def test_closed_meshes_are_crossed_at_their_triangles(method: str, precision: Any) -> None:
+    vertices, faces = balls()
+    o, d = rays(200, seed=4, distance=3.0)
+    mesh = hk.WindingNumber(vertices, faces, method=method)
+    found = hk.trace(mesh, o, d, all_hits=10, precision=precision)
+    assert 2 < found.count.mean() < 6
+    for i in range(len(o)):
+        t, triangles = changes_of_winding(vertices, faces, o[i], d[i])
+        n = found.count[i]
+        assert n == len(t)
+        np.testing.assert_allclose(found.t[i, :n], t, atol=2e-5)
+        np.testing.assert_array_equal(found.sheet[i, :n], triangles)
+        np.testing.assert_array_equal(found.side[i, :n], np.resize([1, -1], n))
+    assert (found.sheet[np.isinf(found.t)] == -1).all()
+    assert (found.status == hk.Status.MISS).all()
+    sure = hk.trace(mesh, o, d, confirm=True, precision=precision)
+    np.testing.assert_array_equal(sure.t, found.t[:, 0])
+    np.testing.assert_array_equal(sure.sheet, found.sheet[:, 0])
+
+
+@pytest.mark.parametrize("method", ["exact", pytest.param("tree", marks=pytest.mark.slow)])
+def test_meshes_with_holes_are_crossed_where_the_winding_number_passes(method: str) -> None:
+    vertices, faces = balls()
+    kept = np.random.default_rng(0).random(len(faces)) < 0.8
+    mesh = hk.WindingNumber(vertices, faces[kept], method=method)
+    o, d = rays(30, seed=6, distance=3.0)
+    found = hk.trace(mesh, o, d, all_hits=12, tolerance=1e-4)
+    exact = hk.WindingNumber(vertices, faces[kept])
+    alike = 0
+    for i in range(len(o)):
+        crossed = found.t[i, : found.count[i]]
+        near = crossed[:, None] + 1e-3 * np.linspace(-1, 1, 101) ** 3
+        t = np.unique(np.concatenate([np.linspace(0, 6, 3001), near.ravel()]))
+        w = exact.value(o[i] + t[:, None] * d[i], precision="double")
+        steep = np.linalg.norm(exact.gradient(o[i] + t[:, None] * d[i], precision="double"), axis=1)
+        # Beside an edge that is open gradients are large, and so is the tolerance in value.
+        around = np.lib.stride_tricks.sliding_window_view(np.pad(steep, 20, mode="edge"), 41)
+        least = alternations(w, 0.5, 1e-3 + 1e-4 * around.max(axis=1))
+        most = alternations(w, 0.5, 0.0)
+        assert least <= found.count[i] <= most
+        if found.count[i] == most:
+            alike += 1
+            np.testing.assert_allclose(crossed, t[:-1][np.diff(w > 0.5)], atol=1e-3)
+    assert alike > 25
+    smooth = np.isfinite(found.t) & (found.sheet < 0)
+    assert 5 < smooth.sum() < np.isfinite(found.t).sum() - 10
+    value = exact.value(found.position[smooth].astype(float), precision="double")
+    assert np.quantile(np.abs(value - 0.5), 0.9) < 1e-4
+
+
+def test_a_ray_that_starts_on_a_triangle_leaves_it_uncounted() -> None:
+    vertices, faces = icosphere(1)
     mesh = hk.WindingNumber(vertices, faces)
-    with pytest.raises(ValueError, match="all_hits counts where f passes continuously"):
-        hk.trace(mesh, o, d, all_hits=2)
-    with pytest.raises(ValueError, match="confirm counts where f passes continuously"):
-        hk.level_set(mesh, confirm=True)
+    o = np.einsum("nkd,k->nd", vertices[faces[:40]], [0.3, 0.3, 0.4])
+    for sign, count in ((1.0, 0), (-1.0, 1)):
+        found = hk.trace(mesh, o, sign * o, all_hits=3, precision="double")
+        np.testing.assert_array_equal(found.count, count)
 
 
 def test_the_root_of_a_cubic_is_found_in_its_bracket() -> None:

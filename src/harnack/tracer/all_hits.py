@@ -11,7 +11,6 @@ import numpy as np
 
 from harnack.backend import to_numpy
 from harnack.backend.lengths import length as norm
-from harnack.fields.sheets import NO_SHEET
 from harnack.tracer.crossings import find_crossings
 from harnack.tracer.derivatives import attach, wants_derivatives
 from harnack.tracer.prepared import MarchResult
@@ -35,6 +34,7 @@ class AllHits:
     position: (n, k, 3) point at t, NaN where there is none.
     normal: (n, k, 3) unit normal grad f/|grad f|, to the side of larger f; zero where there is
         none.
+    sheet: (n, k) index of the sheet, such as a triangle, that was crossed; -1 where none was.
     side: (n, k) integers: 1 where f rises through the level along the ray, -1 where it falls
         through it, 0 where there is no crossing.
     count: (n,) how many crossings there are, at most k.
@@ -49,6 +49,7 @@ class AllHits:
     t: Any
     position: Any
     normal: Any
+    sheet: Any
     side: Any
     count: Any
     end: Any
@@ -61,7 +62,7 @@ def check_all_hits(all_hits: Any, surface: LevelSet) -> int:
 
     Raises:
         TypeError: not an integer.
-        ValueError: less than 1; or a field with sheets.
+        ValueError: less than 1; or several levels of a field with sheets.
     """
     try:
         k = operator.index(all_hits)
@@ -104,14 +105,14 @@ def trace_all(
     if differentiable and wants_derivatives(prepared, o, d):
         with dr.suspend_grad():
             status = dr.select(is_found, backend.UInt32(int(Status.HIT)), int(Status.MISS))
-            none, no_sheet = dr.zeros(backend.Float, dr.width(t)), backend.UInt32(NO_SHEET)
-            ends = MarchResult(t, none, found.gradient, none, none, status, no_sheet, found.side)
+            none = dr.zeros(backend.Float, dr.width(t))
+            ends = MarchResult(t, none, found.gradient, none, none, status, found.sheet, found.side)
         t, normal = attach(prepared, o, d, ends, normal)
     position = dr.select(dr.isfinite(t), dr.fma(backend.Array3f(t), d, o), dr.nan)
     side = backend.Int32(found.side)
-    hits = AllHits(
-        t, position, normal, side, found.count, found.end, found.status, found.evaluations
-    )
+    sheet = dr.reinterpret_array(backend.Int32, found.sheet)  # NO_SHEET becomes -1
+    of_rays = found.count, found.end, found.status, found.evaluations
+    hits = AllHits(t, position, normal, sheet, side, *of_rays)
     dr.eval(*vars(hits).values())
     return hits
 
@@ -120,7 +121,7 @@ def no_crossings(backend: Backend) -> AllHits:
     """Of no rays."""
     number, vector = dr.zeros(backend.Float, 0), dr.zeros(backend.Array3f, 0)
     count, side = dr.zeros(backend.UInt32, 0), dr.zeros(backend.Int32, 0)
-    return AllHits(number, vector, vector, side, count, number, count, count)
+    return AllHits(number, vector, vector, side, side, count, number, count, count)
 
 
 def crossings_as_numpy(hits: AllHits, n: int, k: int) -> AllHits:
@@ -137,6 +138,7 @@ def crossings_as_numpy(hits: AllHits, n: int, k: int) -> AllHits:
         each(hits.t),
         each(hits.position),
         each(hits.normal),
+        each(hits.sheet).astype(np.int64),
         each(hits.side).astype(np.int64),
         of_ray(hits.count).astype(np.int64),
         of_ray(hits.end),

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from typing import Any
 
     from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.fields.sheets import Crossing
 
 # The tolerance is at least so many roundings of f, and at most this part of the distance in value
 # between two levels, so that there is no doubt which of them was reached.
@@ -113,16 +114,26 @@ class Hysteresis:
     is_free_before, is_free_after: whether the ray is proved free before the part of it that is
         marched and behind it, by where the surface lies. Then f stays on the side of a level that
         it is on at that end, and that it is more than its error off the level there is enough.
+    start, rounding: where the part begins, and how far off a sheet rounding may have put a ray that
+        starts on it.
     """
 
     levels: TargetLevels
     spacing: Real
     is_free_before: Mask
     is_free_after: Mask
+    start: Real
+    rounding: Real
 
     @classmethod
-    def of(cls, levels: TargetLevels, free_before: Mask, free_after: Mask) -> Hysteresis:
-        """The rule for some levels."""
+    def of(
+        cls,
+        levels: TargetLevels,
+        free: tuple[Mask, Mask],
+        start: Real,
+        rounding: Real,
+    ) -> Hysteresis:
+        """The rule for some levels. free: before and after the part of the ray."""
         period = levels.period
         spacing: Real = dr.inf if period is None else period
         for k, one in enumerate(levels.values):
@@ -132,7 +143,7 @@ class Hysteresis:
                     apart = apart - period * dr.floor(apart / period)
                     apart = fmin(apart, period - apart)
                 spacing = fmin(spacing, dr.select(apart > 0, apart, dr.inf))
-        return cls(levels, spacing, free_before, free_after)
+        return cls(levels, spacing, *free, start, rounding)
 
     def within(self, within: Real) -> Real:
         """How near in value a level must be for contact, where the tolerance asks for `within`."""
@@ -189,6 +200,33 @@ class Hysteresis:
             dr.select(active, is_touching, touching),
             root,
             at_root,
+        ), crosses
+
+    def jump(
+        self, now: Contact, active: Mask, seen: Accepted, ahead: Crossing, d: Vec3
+    ) -> tuple[Contact, Mask]:
+        """The contact behind the sheet `ahead`, and whether the jump of f there crosses the level.
+
+        now: the contact at an accepted point just before the sheet. d: the direction of the ray.
+        Of a field with sheets there is one level. A ray that starts on a sheet is on neither side.
+        """
+        x = -self.levels.to_nearest(seen.value)
+        one = type(x)(1)
+        side = dr.select(now.is_touching, now.side, dr.select(x > 0, one, -1))
+        starts = dr.abs(dr.dot(ahead.normal, d)) * (seen.t - self.start) <= self.rounding
+        side = dr.select(starts, 0, side)
+        behind = x + ahead.jump
+        passes = active & (side * x > 0) & (side * behind <= 0)
+        begins = active & ~now.is_touching & (dr.abs(behind) <= seen.band)
+        is_off = dr.abs(behind) > fmax(_PASSED * seen.band, seen.total_error)
+        crosses = active & is_off & (side * behind < 0)
+        side = dr.select(is_off, dr.select(behind > 0, one, -1), side)
+        at_sheet = passes | begins
+        return Contact(
+            dr.select(active, side, now.side),
+            dr.select(active, dr.abs(behind) <= seen.band, now.is_touching),
+            dr.select(at_sheet, seen.t, now.root),
+            dr.select(at_sheet, ahead.normal, now.gradient),
         ), crosses
 
     def _side(self, now: Contact, seen: Accepted, x: Real) -> Real:

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 
 from harnack.backend.loops import while_active
+from harnack.fields.sheets import NO_SHEET
+from harnack.tracer.stretches import SheetTracer, SheetWalk
 from harnack.tracer.tolerance import Status
 
 if TYPE_CHECKING:
@@ -22,7 +24,8 @@ class CrossingsFound:
     """The first k crossings of n rays, as Dr.Jit arrays.
 
     t: (n k) of crossing j of ray i at i k + j; inf where there are fewer.
-    gradient: (n k, 3) of f there; 0 where there is none.
+    gradient: (n k, 3) of f there, of a sheet its normal; 0 where there is none.
+    sheet: (n k) index of the sheet that was crossed, NO_SHEET for none.
     side: (n k) 1 where f rises through the level along the ray, -1 where it falls, 0 for none.
     count: (n) how many there are, at most k.
     end: (n) how far the ray was followed; inf if it was to its end.
@@ -32,6 +35,7 @@ class CrossingsFound:
 
     t: Real
     gradient: Vec3
+    sheet: Any
     side: Real
     count: Any
     end: Real
@@ -41,14 +45,32 @@ class CrossingsFound:
 
 @dataclass(frozen=True)
 class _Walk:
-    """Where rays are, and how many crossings they have behind them."""
+    """Where rays are, and how many crossings they have behind them.
 
-    march: MarchState
+    sheets: where they are among sheets, whose state of the march is a part of it; None of a field
+        without sheets.
+    """
+
+    march: MarchState | None
+    sheets: SheetWalk | None
     count: Any
 
     @property
     def active(self) -> Mask:
-        return self.march.active
+        return self.now.active
+
+    @property
+    def now(self) -> MarchState:
+        """The state of the march."""
+        state = self.march if self.sheets is None else self.sheets.march
+        assert state is not None
+        return state
+
+    def moved(self, now: MarchState, count: Any) -> _Walk:
+        """The same walk with another state of the march."""
+        if self.sheets is None:
+            return _Walk(now, None, count)
+        return _Walk(None, dataclasses.replace(self.sheets, march=now), count)
 
 
 def find_crossings(
@@ -66,11 +88,18 @@ def find_crossings(
     place = dr.arange(count, n) * k
     # Filled in from within the loop, so they must lie in memory before it is recorded.
     t, side = dr.full(real, dr.inf, n * k), dr.zeros(real, n * k)
-    gradient = dr.zeros(vector, n * k)
-    dr.make_opaque(t, side, gradient)
+    gradient, sheets = dr.zeros(vector, n * k), dr.full(count, NO_SHEET, n * k)
+    dr.make_opaque(t, side, gradient, sheets)
+    tracer = SheetTracer(march, prepared.field, path, start, end)
 
     def one(now: _Walk) -> _Walk:
-        after = march.advance(prepared.field, path, end, now.march)
+        there, sheet = now, None
+        if now.sheets is None:
+            after = march.advance(prepared.field, path, end, now.now)
+        else:
+            walk = tracer.interval(now.sheets)
+            there = _Walk(None, walk, now.count)
+            after, sheet = tracer.end_of(walk)
         contact = after.contact
         assert contact is not None
         found = now.active & (after.status == int(Status.HIT))
@@ -78,14 +107,23 @@ def find_crossings(
         dr.scatter(t, contact.root, slot, found)
         dr.scatter(side, contact.side, slot, found)
         dr.scatter(gradient, contact.gradient, slot, found)
+        if sheet is not None:
+            dr.scatter(sheets, sheet, slot, found)
         crossings = now.count + dr.select(found, count(1), 0)
         more = found & (crossings < k)
-        free = after.base + after.reach >= end
-        status = dr.select(more & free, count(int(Status.MISS)), after.status)
-        march_on = dataclasses.replace(after, status=status, active=more & ~free)
-        return _Walk(march_on, crossings)
+        status = dr.select(more, count(int(Status.MISS)), after.status)
+        if now.sheets is None:
+            more &= after.base + after.reach < end
+        else:
+            more |= after.active
+        return there.moved(dataclasses.replace(after, status=status, active=more), crossings)
 
-    walk = while_active(_Walk(state, dr.zeros(count, n)), one, "harnack crossings")
-    last = walk.march
+    begun = _Walk(state, None, dr.zeros(count, n))
+    if prepared.field.has_sheets:
+        begun = _Walk(None, tracer.begin(state), dr.zeros(count, n))
+    walk = while_active(begun, one, "harnack crossings")
+    last = walk.now
     followed = dr.select(last.status == int(Status.MISS), dr.inf, last.base)
-    return CrossingsFound(t, gradient, side, walk.count, followed, last.evaluations, last.status)
+    return CrossingsFound(
+        t, gradient, sheets, side, walk.count, followed, last.evaluations, last.status
+    )

@@ -6,7 +6,7 @@ gets say how far the ray is free.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -153,7 +153,8 @@ class March:
 
         ahead: of a field with sheets, the crossing at `end`, on lanes where there is one. Those
         lanes look at that point as well. Accepted there, they hit the sheet or have passed it: a
-        miss, with the step that the value behind the sheet allows from there.
+        miss, with the step that the value behind the sheet allows from there. With `hysteresis`
+        `value` is then that behind the sheet.
         """
         real, size = self.backend.Float, largest_component(path.origin)
         is_smooth = ahead is None and not field.has_detail
@@ -186,7 +187,7 @@ class March:
                 gaps.smaller, within, total_error, sample, gradient_norm, size + t
             )
             excess = fmax(gaps.smaller + total_error - within, real(0))
-            true_gaps, band, may_pass = gaps, within, is_near
+            band, may_pass = within, is_near
             if self.hysteresis is not None and now.contact is not None:
                 band = self._band(within, total_error, sample, gradient_norm)
                 gaps = self.hysteresis.gaps(now.contact, sample.value, gaps, band)
@@ -210,24 +211,33 @@ class March:
                 kept = dr.select(accepted, coarser, now.detail)
                 next_detail = dr.select(too_coarse, finer, kept)
 
-            # Is it a hit, a crossing, or a sheet?
-            hit, contact = accepted & is_near, now.contact
-            gaps_ahead, aims, sheet = gaps, gaps, None
-            if self.hysteresis is not None and now.contact is not None:
-                before = now.base, now.value, dr.dot(now.gradient, path.direction), now.gradient
-                there = Accepted(
-                    t, sample.value, sample.gradient, look.slope, before, total_error, is_near,
-                    band, t == end,
-                )  # fmt: skip
-                contact, hit = self.hysteresis.update(now.contact, accepted, there)
-                after = contact, sample.value, true_gaps, band
-                gaps_ahead = self.hysteresis.gaps(*after)
-                aims = self.hysteresis.gaps(*after, AIM)
+            # Is it a hit, or a sheet?
+            hit, gaps_ahead, sheet = accepted & is_near, gaps, None
             if ahead is not None:
                 sheet = compare_with_sheet(
                     ahead, accepted & at_end, sample.value, total_error, self.levels
                 )
-                gaps_ahead = aims = sheet.gaps
+                gaps_ahead = sheet.gaps
+
+            # Or a crossing?
+            aims, contact, value = gaps_ahead, now.contact, sample.value
+            if self.hysteresis is not None and now.contact is not None:
+                before = now.base, now.value, dr.dot(now.gradient, path.direction), now.gradient
+                last = t == end if sheet is None else (t == end) & ~sheet.has_crossing
+                there = Accepted(
+                    t, value, sample.gradient, look.slope, before, total_error, is_near, band, last
+                )
+                contact, hit = self.hysteresis.update(now.contact, accepted, there)
+                if ahead is not None and sheet is not None:
+                    # What was crossed before the sheet comes first: the sheet is looked at again.
+                    passed = sheet.at_crossing & ~hit
+                    contact, jumps = self.hysteresis.jump(
+                        contact, passed, there, ahead, path.direction
+                    )
+                    sheet = replace(sheet, at_crossing=passed, is_hit=jumps)
+                    value = value + dr.select(passed, ahead.jump, 0)
+                after = contact, value, self.levels.gaps(value), band
+                gaps_ahead, aims = self.hysteresis.gaps(*after), self.hysteresis.gaps(*after, AIM)
 
             # How far to go from there.
             forward = longest_step(look.ahead, gaps_ahead.less(total_error))
@@ -255,7 +265,7 @@ class March:
                 step=fmin(step, end - base),
                 reach=reach,
                 candidate=dr.select(accepted, tried, now.candidate),
-                value=dr.select(accepted, sample.value, now.value),
+                value=dr.select(accepted, value, now.value),
                 gradient=gradient,
                 excess=dr.select(accepted, excess, now.excess),
                 evaluations=evaluations,

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 # Rays that look for crossings begin and end outside the proved extent of the surface by this part
 # of the size of coordinates, to be seen on one side of it.
 _AROUND = 1 / 64
+# Rays that start so many roundings off a sheet start on it.
+_ON_SHEET = 8.0
 
 
 @dataclass(frozen=True)
@@ -133,21 +135,20 @@ class PreparedLevelSet:
         The surface may touch the ends of the latter, so that on it f is on one side only. Beyond
         it the ray is free. So a little more of the ray is looked at, if there is more of it.
         """
-        none = self.backend.Bool(False)
+        none, size = self.backend.Bool(False), largest_component(path.origin)
+        rounding = _ON_SHEET * self.backend.epsilon * (size + t_min)
         if self.volume is None:
-            return start, end, Hysteresis.of(self.levels, none, none)
+            return start, end, Hysteresis.of(self.levels, (none, none), start, rounding)
         first, last = t_min, t_max
         if self.region is not None:
             first, last = self.region.clip(path.origin, path.direction, t_min, t_max)
-        around = _AROUND * (largest_component(path.origin) + dr.abs(start))
+        around = _AROUND * (size + dr.abs(start))
         holds = start < end
         before, after = fmax(start - around, first), fmin(end + around, last)
         free_before, free_after = before > first, after < last
-        return (
-            dr.select(holds, before, start),
-            dr.select(holds, after, end),
-            Hysteresis.of(self.levels, holds & free_before, holds & free_after),
-        )
+        start, end = dr.select(holds, before, start), dr.select(holds, after, end)
+        free = holds & free_before, holds & free_after
+        return start, end, Hysteresis.of(self.levels, free, start, rounding)
 
     def _march(
         self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask

@@ -58,15 +58,15 @@ class LevelSet:
             self.check_crossings("confirm")
 
     def check_crossings(self, setting: str) -> None:
-        """Raise ValueError for a field with sheets: where f jumps, crossings are not counted.
+        """Raise ValueError for several levels of a field with sheets: a jump may cross more than
+        one of them at once.
 
         setting: what asks for crossings.
         """
-        if self.field.has_sheets:
+        if self.field.has_sheets and len(self.levels) > 1:
             raise ValueError(
-                f"{setting} counts where f passes continuously through a level, and this "
-                f"{type(self.field).__name__} jumps across sheets: trace its first hits without "
-                f"{setting}"
+                f"{setting} takes one level of a field with sheets, such as this "
+                f"{type(self.field).__name__}, not {len(self.levels)}: trace each level by itself"
             )
 
     @property
