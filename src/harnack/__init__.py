@@ -67,9 +67,10 @@ from harnack.fields import (
 )
 from harnack.geometry import Ball, Box, ConvexHull, HalfSpace, Intersection
 from harnack.rendering import render
-from harnack.tracer import Hits, LevelSet, Status, Tolerance, level_set, trace
+from harnack.tracer import AllHits, Hits, LevelSet, Status, Tolerance, level_set, trace
 
 __all__ = [
+    "AllHits",
     "Ball",
     "Box",
     "Caps",
