@@ -16,7 +16,7 @@ from harnack.enclosures.restriction import Piece
 if TYPE_CHECKING:
     from typing import Self
 
-    from harnack.backend import Real
+    from harnack.backend import Mask, Real
     from harnack.enclosures.restriction import Restriction
 
 _ROUND_DOWN = 1.0 - 1e-6
@@ -53,12 +53,15 @@ class Pieces(Enclosure):
         return cls(slopes, function.pieces([0.0, *ends]))
 
     def step(self, gaps: Gaps) -> Real:
-        up = self._reach(gaps.up, 1)
-        down = self._reach(gaps.down, -1)
-        return fmax(fmin(up, down), 0) * _ROUND_DOWN
+        up, is_free_above = self._reach(gaps.up, 1)
+        down, is_free_below = self._reach(gaps.down, -1)
+        # The end of the last piece is exact: pulled back, it would cost a ray that misses a look.
+        length = fmax(fmin(up, down), 0)
+        return dr.select(is_free_above & is_free_below, length, length * _ROUND_DOWN)
 
-    def _reach(self, gap: Real, sign: int) -> Real:
-        """The first s at which sign F may reach the gap; the whole length if it cannot."""
+    def _reach(self, gap: Real, sign: int) -> tuple[Real, Mask]:
+        """The first s at which sign F may reach the gap, or the whole length if it cannot; and
+        whether it cannot."""
         slope = self.slopes.high if sign > 0 else -self.slopes.low
         none = gap == dr.inf
         left = dr.select(none, 0, gap)  # of the gap, at the start of the piece
@@ -71,7 +74,7 @@ class Pieces(Enclosure):
             reach = dr.select(none, part.length, reach)
             total = dr.select(free, total + reach, total)
             free &= reach >= part.length
-        return total
+        return total, free
 
     @classmethod
     def _on_piece(
@@ -82,7 +85,7 @@ class Pieces(Enclosure):
         by_line = dr.select(most > 0, left / most, dr.inf)
         by_line = dr.select(left > 0, by_line, 0)
         by_parabola = first_root(left, slope, bend)
-        reach = fmin(length, fmax(by_parabola, by_line))
+        reach = fmin(length, fmax(by_parabola, by_line) * _ROUND_DOWN)
         # Rises and falls may cancel: their rounding counts, not that of their sum.
         unit = 4 * float(dr.epsilon(type(left)))
         bent, straight = 0.5 * length * length * bend, slope * length
