@@ -11,7 +11,7 @@ import abc
 import copy
 import dataclasses
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
@@ -128,6 +128,12 @@ class FormulaAlong:
                 )
             )
         return tuple(made)
+
+    def through(self, coordinates: Callable[[Vec3, Vec3], tuple[Any, Any, Any]]) -> Any:
+        """See `harnack.enclosures.Evaluable`."""
+        x, y, z = coordinates(self.p, self.direction)
+        value = self.field.formula(x, y, z)
+        return x.constant(float(value)) if isinstance(value, int | float) else value
 
 
 def prepared_numbers(field: Any, backend: Backend) -> Any:
