@@ -60,12 +60,18 @@ class Pieces(Enclosure):
     def step(self, gaps: Gaps) -> Real:
         if gaps.is_one_sided:
             rises = gaps.down == dr.inf
-            return fmax(self._reach(fmin(gaps.up, gaps.down), rises), 0) * _ROUND_DOWN
-        up, down = self._reach(gaps.up, True), self._reach(gaps.down, False)
-        return fmax(fmin(up, down), 0) * _ROUND_DOWN
+            reach, is_free = self._reach(fmin(gaps.up, gaps.down), rises)
+        else:
+            up, is_free_above = self._reach(gaps.up, True)
+            down, is_free_below = self._reach(gaps.down, False)
+            reach, is_free = fmin(up, down), is_free_above & is_free_below
+        # The end of the last piece is exact: pulled back, it would cost a ray that misses a look.
+        reach = fmax(reach, 0)
+        return dr.select(is_free, reach, reach * _ROUND_DOWN)
 
-    def _reach(self, gap: Real, rises: Mask | bool) -> Real:
-        """The first s at which F, or -F, may reach the gap; the whole length if it cannot."""
+    def _reach(self, gap: Real, rises: Mask | bool) -> tuple[Real, Mask]:
+        """The first s at which F, or -F, may reach the gap, or the whole length if it cannot; and
+        whether it cannot."""
 
         def chosen(upper: Real, lower: Real) -> Real:
             return dr.select(rises, upper, -lower)
@@ -82,18 +88,19 @@ class Pieces(Enclosure):
             reach = dr.select(none, part.length, reach)
             total = dr.select(free, total + reach, total)
             free &= reach >= part.length
-        return total
+        return total, free
 
     @classmethod
     def _on_piece(
         cls, left: Real, slope: Real, most: Real, bend: Real, length: Real
     ) -> tuple[Real, Real, Real]:
         """The slope at the end of a piece, how far it is free, and what is left of the gap."""
-        slope = fmin(slope, most)
-        by_line = dr.select(most > 0, left / most, dr.inf)
+        # What is not a number is not known.
+        slope = dr.select((slope <= most) | (most != most), slope, most)
+        by_line = dr.select(most > 0, left / most, dr.select(most <= 0, dr.inf, 0))
         by_line = dr.select(left > 0, by_line, 0)
         by_parabola = first_root(left, slope, bend)
-        reach = fmin(length, fmax(by_parabola, by_line))
+        reach = fmin(length, fmax(by_parabola, by_line) * _ROUND_DOWN)
         # Rises and falls may cancel: their rounding counts, not that of their sum.
         unit = 4 * float(dr.epsilon(type(left)))
         bent, straight = 0.5 * length * length * bend, slope * length

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
-    from harnack.backend import Real
+    from harnack.backend import Real, Vec3
     from harnack.enclosures.enclosure import Slopes
 
 
@@ -42,4 +42,13 @@ class Restriction(Protocol):
 
         knots: lengths s, rising, the first of them 0.
         """
+        ...
+
+
+@runtime_checkable
+class Evaluable(Protocol):
+    """A restriction that is a formula: any arithmetic can be asked for what it makes of it."""
+
+    def through(self, coordinates: Callable[[Vec3, Vec3], tuple[Any, Any, Any]]) -> Any:
+        """The formula of coordinates made from a point p and the direction d of the path."""
         ...

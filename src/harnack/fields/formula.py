@@ -10,7 +10,7 @@ from __future__ import annotations
 import abc
 import copy
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
@@ -171,6 +171,12 @@ class FormulaAlong:
 
 def _numbers(piece: Piece) -> tuple[Real, Real, Real, Real]:
     return piece.slopes.low, piece.slopes.high, piece.least_curvature, piece.most_curvature
+
+    def through(self, coordinates: Callable[[Vec3, Vec3], tuple[Any, Any, Any]]) -> Any:
+        """See `harnack.enclosures.Evaluable`."""
+        x, y, z = coordinates(self.p, self.direction)
+        value = self.field.formula(x, y, z)
+        return x.constant(float(value)) if isinstance(value, int | float) else value
 
 
 def prepared_numbers(field: Any, backend: Backend) -> Any:
