@@ -160,7 +160,7 @@ class Jet:
         return -self + other
 
     def __mul__(self, other: Any) -> Jet:
-        if other is self:
+        if other is self:  # a square: ranges of products know nothing of that
             return self.apply(power(2))
         b = self._with(other)
         if b is None:

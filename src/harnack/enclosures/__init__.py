@@ -6,6 +6,7 @@ from harnack.enclosures.ball import Ball
 from harnack.enclosures.caps import Caps
 from harnack.enclosures.classic import Classic
 from harnack.enclosures.enclosure import Enclosure, Gaps, Slopes
+from harnack.enclosures.extremum import Greatest, Negated, Part, Stretched
 from harnack.enclosures.levels import TargetLevels
 from harnack.enclosures.parabola import Cone, Parabola, Taylor
 from harnack.enclosures.pieces import LinearTaylor, OnePiece, Pieces, QuadraticTaylor, Segment
@@ -29,12 +30,15 @@ __all__ = [
     "Curvature",
     "Enclosure",
     "Gaps",
+    "Greatest",
     "HarmonicBall",
     "LineLipschitz",
     "LinearTaylor",
     "Lipschitz",
+    "Negated",
     "OnePiece",
     "Parabola",
+    "Part",
     "Piece",
     "Pieces",
     "Promise",
@@ -44,6 +48,7 @@ __all__ = [
     "Segment",
     "Slope",
     "Slopes",
+    "Stretched",
     "TargetLevels",
     "Taylor",
     "any_covers",

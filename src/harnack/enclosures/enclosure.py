@@ -30,10 +30,14 @@ class Gaps:
     """How far f must move, down or up, to reach a level: lengths in value >= 0.
 
     Infinite where there is no level on that side.
+
+    is_one_sided: at most one of the two is finite, on every lane: there is one level alone. Known
+        while a kernel is being recorded, it spares the proof of the other side.
     """
 
     down: Real
     up: Real
+    is_one_sided: bool = False
 
     @property
     def smaller(self) -> Real:
@@ -42,7 +46,12 @@ class Gaps:
 
     def less(self, error: Real) -> Gaps:
         """The gaps that surely remain of a value known up to `error`."""
-        return Gaps(fmax(self.down - error, 0), fmax(self.up - error, 0))
+        down, up = fmax(self.down - error, 0), fmax(self.up - error, 0)
+        return Gaps(down, up, self.is_one_sided)
+
+    def exchanged(self) -> Gaps:
+        """Those of the negative function."""
+        return Gaps(self.up, self.down, self.is_one_sided)
 
 
 @dataclass(frozen=True)

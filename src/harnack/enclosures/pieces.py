@@ -16,7 +16,7 @@ from harnack.enclosures.restriction import Piece
 if TYPE_CHECKING:
     from typing import Self
 
-    from harnack.backend import Real
+    from harnack.backend import Mask, Real
     from harnack.enclosures.restriction import Restriction
 
 _ROUND_DOWN = 1.0 - 1e-6
@@ -53,20 +53,26 @@ class Pieces(Enclosure):
         return cls(slopes, function.pieces([0.0, *ends]))
 
     def step(self, gaps: Gaps) -> Real:
-        up = self._reach(gaps.up, 1)
-        down = self._reach(gaps.down, -1)
+        if gaps.is_one_sided:
+            rises = gaps.down == dr.inf
+            return fmax(self._reach(fmin(gaps.up, gaps.down), rises), 0) * _ROUND_DOWN
+        up, down = self._reach(gaps.up, True), self._reach(gaps.down, False)
         return fmax(fmin(up, down), 0) * _ROUND_DOWN
 
-    def _reach(self, gap: Real, sign: int) -> Real:
-        """The first s at which sign F may reach the gap; the whole length if it cannot."""
-        slope = self.slopes.high if sign > 0 else -self.slopes.low
+    def _reach(self, gap: Real, rises: Mask | bool) -> Real:
+        """The first s at which F, or -F, may reach the gap; the whole length if it cannot."""
+
+        def chosen(upper: Real, lower: Real) -> Real:
+            return dr.select(rises, upper, -lower)
+
+        slope = chosen(self.slopes.high, self.slopes.low)
         none = gap == dr.inf
         left = dr.select(none, 0, gap)  # of the gap, at the start of the piece
         total = type(gap)(0)
         free = gap >= 0  # and not NaN
         for part in self.parts:
-            most = part.slopes.high if sign > 0 else -part.slopes.low
-            bend = part.most_curvature if sign > 0 else -part.least_curvature
+            most = chosen(part.slopes.high, part.slopes.low)
+            bend = chosen(part.most_curvature, part.least_curvature)
             slope, reach, left = self._on_piece(left, slope, most, bend, part.length)
             reach = dr.select(none, part.length, reach)
             total = dr.select(free, total + reach, total)

@@ -114,6 +114,10 @@ class Field(abc.ABC):
     it, and what a sample promises need only hold for p in it. As it is convex, a ray from p stays
     in it as far as it is looked at; `Lipschitz` and `Curvature` need not hold beyond."""
 
+    is_entire: bool = False
+    """Whether f, and what it promises, is right in all of space, so that `domain` is only where it
+    is drawn."""
+
     has_sheets: bool = False
     """Whether f jumps across sheets (see `harnack.fields.sheets`). Then `next_crossing` and
     `between` are needed, and what `evaluate` promises is about f with the jumps taken out."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 import abc
 import copy
 import dataclasses
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
@@ -24,6 +23,7 @@ from harnack.fields.look import Look, Path, Sample
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
+    from harnack.enclosures import Promise
 
 
 class Formula(Field):
@@ -48,9 +48,13 @@ class Formula(Field):
         doubt = zero
         for one in jet.first:
             doubt = doubt + one.radius
-        known = () if self.lipschitz is None else (Lipschitz(zero + self.lipschitz),)
+        known = self.promises(p)
         value, error = zero + jet.value.middle, zero + jet.value.radius
         return Sample(value, gradient, known, error, doubt)
+
+    def promises(self, p: Vec3) -> tuple[Promise, ...]:
+        """What holds in every direction from p: a Lipschitz constant, where one is known."""
+        return () if self.lipschitz is None else (Lipschitz(0 * p.x + self.lipschitz),)
 
     def differentiable_value(self, p: Vec3) -> Real:
         return 0 * p.x + self.formula(p.x, p.y, p.z)
@@ -112,22 +116,52 @@ class FormulaAlong:
     direction: Vec3
 
     def pieces(self, knots: Sequence[Real]) -> tuple[Piece, ...]:
-        """See `harnack.enclosures.Restriction`."""
-        made: list[Piece] = []
-        for start, end in itertools.pairwise(knots):
-            coordinates = Jet.along(self.p, self.direction, start, end)
-            jet = as_jet(self.field.formula(*coordinates), coordinates[0], type(self).__name__)
-            (slopes,), (curvatures,) = jet.first, jet.second
-            zero = 0 * self.p.x
-            made.append(
-                Piece(
-                    end - start,
-                    Slopes(zero + slopes.low, zero + slopes.high),
-                    zero + curvatures.low,
-                    zero + curvatures.high,
-                )
-            )
-        return tuple(made)
+        """See `harnack.enclosures.Restriction`.
+
+        The formula is recorded once, in a loop over the pieces: a kernel that holds it once for
+        each of them takes several times as long to compile, and runs no faster.
+        """
+        zero = 0 * self.p.x
+        ends = [zero + one for one in knots]
+        count = len(ends) - 1
+        if count == 1:
+            return (self._piece(zero, ends[1]),)
+
+        def body(i: Any, *numbers: Any) -> tuple[Any, ...]:
+            start, end = ends[0], ends[1]
+            for k in range(1, count):
+                start, end = dr.select(i == k, ends[k], start), dr.select(i == k, ends[k + 1], end)
+            made = _numbers(self._piece(start, end))
+            kept = [
+                dr.select(i == k, made[j], numbers[len(made) * k + j])
+                for k in range(count)
+                for j in range(len(made))
+            ]
+            return i + 1, *kept
+
+        index = dr.uint32_array_t(cast("Any", type(zero)))
+        state = (index(0), *([zero] * (4 * count)))
+        _, *found = dr.while_loop(state, lambda i, *_: i < count, body, label="pieces")
+        return tuple(
+            Piece(ends[k + 1] - ends[k], Slopes(*found[4 * k : 4 * k + 2]), *found[4 * k + 2 : 4 * k + 4])
+            for k in range(count)
+        )
+
+    def _piece(self, start: Real, end: Real) -> Piece:
+        coordinates = Jet.along(self.p, self.direction, start, end)
+        jet = as_jet(self.field.formula(*coordinates), coordinates[0], type(self.field).__name__)
+        (slopes,), (curvatures,) = jet.first, jet.second
+        zero = 0 * self.p.x
+        return Piece(
+            end - start,
+            Slopes(zero + slopes.low, zero + slopes.high),
+            zero + curvatures.low,
+            zero + curvatures.high,
+        )
+
+
+def _numbers(piece: Piece) -> tuple[Real, Real, Real, Real]:
+    return piece.slopes.low, piece.slopes.high, piece.least_curvature, piece.most_curvature
 
 
 def prepared_numbers(field: Any, backend: Backend) -> Any:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 
+from harnack.backend.extrema import fmax
 from harnack.enclosures import (
     Curvature,
     Enclosure,
@@ -76,6 +77,17 @@ def lengthened(sample: Sample, size: Real) -> Sample:
         known=tuple(longer(one) for one in sample.known),
         weaker=tuple(longer(one) for one in sample.weaker),
     )
+
+
+def value_error(sample: Sample, gradient_norm: Real, size: Real) -> Real:
+    """What rounding and truncation may have done to f at a point whose coordinates are at most
+    `size`, gradient_norm being |gradient|."""
+    kind = cast("Any", type(sample.value))
+    epsilon = 2 * float(dr.epsilon(kind))
+    # What is below the smallest normal number is lost.
+    smallest = kind(float(dr.smallest(kind)))
+    value = 8 * fmax(epsilon * dr.abs(sample.value), smallest)
+    return dr.fma(gradient_norm, 4 * epsilon * size, value + sample.error)
 
 
 @dataclass(frozen=True)

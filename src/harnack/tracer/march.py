@@ -15,6 +15,7 @@ from harnack.backend.extrema import clamp, fmax, fmin
 from harnack.backend.lengths import largest_component, length
 from harnack.backend.loops import while_active
 from harnack.enclosures import LineLipschitz, any_covers, longest_step
+from harnack.fields.look import value_error
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.tracer.sheet_comparison import compare_with_sheet
 from harnack.tracer.tolerance import PreparedTolerance, Status
@@ -129,7 +130,7 @@ class March:
         proved: on which side of the point the level lies is not known.
 
         In rounded arithmetic a surface could slip through between the two looks, so both see
-        it nearer by the rounding of value and position together (`_total_error`).
+        it nearer by the rounding of value and position together (`value_error`).
 
         ahead: of a field with sheets, the crossing at `end`, on lanes where there is one. Those
         lanes look at that point as well. Accepted there, they hit the sheet or have passed it: a
@@ -152,7 +153,7 @@ class March:
             look = seen.look(path, t, candidate, fmax(unproved, real(0)))
             sample, gradient_norm = look.sample, length(look.sample.gradient)
             gaps = self.levels.gaps(sample.value)
-            total_error = self._total_error(sample, gradient_norm, size + t)
+            total_error = value_error(sample, gradient_norm, size + t)
 
             # Is all up to there proved free, and is the sample fine enough to say so?
             within = self.tolerance.in_value(
@@ -292,16 +293,6 @@ class March:
             behind = self.levels.gaps(value + ahead.jump).smaller
             gap = dr.select(at_end & (ahead.sheet != NO_SHEET), fmin(gap, behind), gap)
         return gap
-
-    def _total_error(self, sample: Sample, gradient_norm: Real, size: Real) -> Real:
-        """What rounding and truncation may have done to f at a point whose coordinates are at most
-        `size`."""
-        epsilon = self.backend.epsilon
-        position = 4 * epsilon * size
-        # What is below the smallest normal number is lost.
-        smallest = self.backend.Float(float(dr.smallest(self.backend.Float)))
-        value = 8 * fmax(epsilon * dr.abs(sample.value), smallest)
-        return dr.fma(gradient_norm, position, value + sample.error)
 
 
 def _finer(

@@ -74,6 +74,8 @@ class EigenfunctionSum(Field):
         ValueError: terms that are not finite, or a sum that is constant.
     """
 
+    is_entire = True
+
     def __init__(self, terms: Iterable[Term], *, domain: Volume | None = None) -> None:
         self.terms = checked_terms(terms)
         self.waves = self._bounds()
