@@ -25,7 +25,7 @@ def blend_union(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:
     it, the function is not continuous at g = 0, and there is no constant at all.
     """
     g_a, g_b = (maximum(1.0 - one / radius, 0.0) for one in (a, b))
-    near = radius * (1.0 - norm(g_a, g_b, p=power))
+    near = (1.0 - norm(g_a, g_b, p=power)) * radius
     least = minimum(a, b)
     both = near + maximum(least - radius, 0.0)
     if not isinstance(least, Jet) or not isinstance(both, Jet):

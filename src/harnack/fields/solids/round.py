@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from harnack.arithmetic import maximum, minimum, norm
+from harnack.arithmetic import cos, maximum, minimum, norm, sin
 from harnack.arithmetic.blends import corner
 from harnack.fields.solids.checks import ball_around, box_around, finite, positive, triple
 from harnack.fields.solids.solid import Shape
@@ -47,13 +47,12 @@ class Plane(Shape):
         _set(self, "normal", tuple(v / length for v in normal))
         _set(self, "distance", finite(self.distance, "the distance of a plane"))
 
-
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         a, b, c = self.normal
-        return a * x + b * y + c * z - self.distance
+        return x * a + y * b + z * c - self.distance
 
-    def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        del levels
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        del level, above
         return None
 
 
@@ -77,8 +76,10 @@ class Sphere(Shape):
         a, b, c = self.center
         return norm(x - a, y - b, z - c) - self.radius
 
-    def extent(self, levels: tuple[float, ...]) -> Volume:
-        return ball_around(self.center, self.radius + max(levels))
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        if above:
+            return None
+        return ball_around(self.center, self.radius + level)
 
 
 @dataclass(frozen=True)
@@ -100,11 +101,13 @@ class Ellipsoid(Shape):
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         a, b, c = self.radii
-        return minimum(a, b, c) * (norm(x / a, y / b, z / c) - 1.0)
+        return (norm(x / a, y / b, z / c) - 1.0) * minimum(a, b, c)
 
-    def extent(self, levels: tuple[float, ...]) -> Volume:
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        if above:
+            return None
         a, b, c = self.radii
-        size = 1.0 + max(levels) / min(self.radii)
+        size = 1.0 + level / min(self.radii)
         return box_around((size * a, size * b, size * c))
 
 
@@ -132,10 +135,12 @@ class Cylinder(Shape):
         side = norm(x, y) - self.radius
         return side if self.half_height is None else corner(side, abs(z) - self.half_height)
 
-    def extent(self, levels: tuple[float, ...]) -> Volume | None:
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        if above:
+            return None
         if self.half_height is None:
             return None
-        r, most = self.radius, max(levels)
+        r, most = self.radius, level
         return box_around((r + most, r + most, self.half_height + most))
 
 
@@ -162,12 +167,10 @@ class DoubleCone(Shape):
         _set(self, "angle", angle)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        from harnack.arithmetic import cos, sin
+        return norm(x, y) * cos(self.angle) - abs(z) * sin(self.angle)
 
-        return cos(self.angle) * norm(x, y) - sin(self.angle) * abs(z)
-
-    def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        del levels
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        del level, above
         return None
 
 
@@ -205,8 +208,10 @@ class Capsule(Shape):
         across = norm(*(v - t * a for v, a in zip(q, axis, strict=True)))
         return norm(across, beyond) - self.radius
 
-    def extent(self, levels: tuple[float, ...]) -> Volume:
-        r = self.radius + max(levels)
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        if above:
+            return None
+        r = self.radius + level
         pairs = list(zip(self.start, self.end, strict=True))
         half = [abs(b - a) / 2 + r for a, b in pairs]
         middle = tuple((a + b) / 2 for a, b in pairs)
@@ -233,6 +238,8 @@ class Torus(Shape):
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         return norm(norm(x, y) - self.major, z) - self.minor
 
-    def extent(self, levels: tuple[float, ...]) -> Volume:
-        r = self.minor + max(levels)
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        if above:
+            return None
+        r = self.minor + level
         return box_around((self.major + r, self.major + r, r))

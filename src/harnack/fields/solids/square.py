@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from harnack.arithmetic import minimum, norm
 from harnack.arithmetic.blends import corner
-from harnack.fields.formula import Formula, prepared_numbers
+from harnack.fields.formula import prepared_numbers
 from harnack.fields.solids.checks import box_around, finite, positive, triple
 from harnack.fields.solids.solid import Shape
 
@@ -52,8 +52,10 @@ class Cuboid(Shape):
         )
         return corner(*sides) - self.radius
 
-    def extent(self, levels: tuple[float, ...]) -> Volume:
-        a, b, c = (one + max(levels) for one in self.half_sides)
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        if above:
+            return None
+        a, b, c = (one + level for one in self.half_sides)
         return box_around((a, b, c))
 
 
@@ -121,11 +123,13 @@ class Superellipsoid(_Powered):
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         (p, q), (a, b, c) = self.powers, self.radii
-        return minimum(a, b, c) * (norm(norm(x / a, y / b, p=p), z / c, p=q) - 1.0)
+        return (norm(norm(x / a, y / b, p=p), z / c, p=q) - 1.0) * minimum(a, b, c)
 
-    def extent(self, levels: tuple[float, ...]) -> Volume:
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        if above:
+            return None
         a, b, c = self.radii
-        size = 1.0 + max(levels) / min(self.radii)
+        size = 1.0 + level / min(self.radii)
         return box_around((size * a, size * b, size * c))
 
 
@@ -153,36 +157,8 @@ class Supertorus(_Powered):
         p, q = self.powers
         return norm(norm(x, y, p=p) - self.major, z, p=q) - self.minor
 
-    def extent(self, levels: tuple[float, ...]) -> Volume:
-        r = self.minor + max(levels)
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        if above:
+            return None
+        r = self.minor + level
         return box_around((self.major + r, self.major + r, r))
-
-
-@dataclass(frozen=True)
-class Offset(Shape):
-    """A shape grown by a distance: f - distance (Hart, equation 32); shrunk by a negative one.
-
-    Of a signed distance it is the set of points that near to the solid, with outer edges rounded;
-    of a bound of the distance something smaller. The constant is that of the shape.
-    """
-
-    solid: Formula
-    distance: float
-
-    def __post_init__(self) -> None:
-        if not isinstance(cast("Any", self.solid), Formula):
-            raise TypeError(
-                f"only shapes with a formula are grown, not {type(self.solid).__name__}: trace "
-                "other fields at another level"
-            )
-        _set(self, "distance", finite(self.distance, "the distance of an offset"))
-
-    @property
-    def lipschitz(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.solid.lipschitz
-
-    def formula(self, x: Any, y: Any, z: Any) -> Any:
-        return self.solid.formula(x, y, z) - self.distance
-
-    def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        return self.solid.extent(tuple(one + self.distance for one in levels))
