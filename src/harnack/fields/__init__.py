@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 from harnack.enclosures import Curvature, HarmonicBall, LineLipschitz, Lipschitz
+from harnack.fields.blobs.blobs import BlobError, Blobs
+from harnack.fields.blobs.hrbf import HRBF
+from harnack.fields.blobs.kernels import Compact, Cubic, Gaussian, Kernel, Sextic
+from harnack.fields.blobs.molecule import Molecule
 from harnack.fields.clouds.dipole import DipolePotential
 from harnack.fields.clouds.screened import ScreenedWindingNumber
 from harnack.fields.curves.solid_angle import SolidAngle
@@ -19,24 +23,33 @@ from harnack.fields.waves.periodic import EigenfunctionSum, Gyroid, SchwarzD, Sc
 from harnack.fields.waves.waves import PlaneWave, Product, cosine, sine
 
 __all__ = [
+    "HRBF",
     "NO_SHEET",
+    "BlobError",
+    "Blobs",
+    "Compact",
     "Crossing",
+    "Cubic",
     "Curvature",
     "DipolePotential",
     "EigenfunctionSum",
     "Field",
     "Formula",
+    "Gaussian",
     "Gyroid",
     "HarmonicBall",
     "HarmonicPolynomial",
+    "Kernel",
     "LineLipschitz",
     "Lipschitz",
+    "Molecule",
     "PlaneWave",
     "Product",
     "Sample",
     "SchwarzD",
     "SchwarzP",
     "ScreenedWindingNumber",
+    "Sextic",
     "Shape",
     "Solid",
     "SolidAngle",

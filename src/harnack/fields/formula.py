@@ -156,6 +156,12 @@ class FormulaAlong:
             for k in range(count)
         )
 
+    def through(self, coordinates: Callable[[Vec3, Vec3], tuple[Any, Any, Any]]) -> Any:
+        """See `harnack.enclosures.Evaluable`."""
+        x, y, z = coordinates(self.p, self.direction)
+        value = self.field.formula(x, y, z)
+        return x.constant(float(value)) if isinstance(value, int | float) else value
+
     def _piece(self, start: Real, end: Real) -> Piece:
         coordinates = Jet.along(self.p, self.direction, start, end)
         jet = as_jet(self.field.formula(*coordinates), coordinates[0], type(self.field).__name__)
@@ -171,12 +177,6 @@ class FormulaAlong:
 
 def _numbers(piece: Piece) -> tuple[Real, Real, Real, Real]:
     return piece.slopes.low, piece.slopes.high, piece.least_curvature, piece.most_curvature
-
-    def through(self, coordinates: Callable[[Vec3, Vec3], tuple[Any, Any, Any]]) -> Any:
-        """See `harnack.enclosures.Evaluable`."""
-        x, y, z = coordinates(self.p, self.direction)
-        value = self.field.formula(x, y, z)
-        return x.constant(float(value)) if isinstance(value, int | float) else value
 
 
 def prepared_numbers(field: Any, backend: Backend) -> Any:
