@@ -53,18 +53,24 @@ from harnack.fields import (
     SchwarzD,
     SchwarzP,
     ScreenedWindingNumber,
+    Shape,
+    Solid,
     SolidAngle,
     SphericalHarmonic,
     WindingNumber,
     cosine,
     expression,
+    intersection,
     sine,
+    solid,
+    union,
 )
 from harnack.geometry import Ball, Box, ConvexHull, HalfSpace, Intersection
 from harnack.rendering import render
-from harnack.tracer import Hits, LevelSet, Status, Tolerance, level_set, trace
+from harnack.tracer import AllHits, Hits, LevelSet, Status, Tolerance, level_set, trace
 
 __all__ = [
+    "AllHits",
     "Ball",
     "Box",
     "Caps",
@@ -93,7 +99,9 @@ __all__ = [
     "SchwarzD",
     "SchwarzP",
     "ScreenedWindingNumber",
+    "Shape",
     "Slope",
+    "Solid",
     "SolidAngle",
     "SphericalHarmonic",
     "Status",
@@ -115,6 +123,7 @@ __all__ = [
     "expression",
     "files",
     "geometry",
+    "intersection",
     "level_set",
     "log",
     "maximum",
@@ -126,9 +135,11 @@ __all__ = [
     "sin",
     "sine",
     "sinh",
+    "solid",
     "sqrt",
     "tan",
     "tanh",
     "testing",
     "trace",
+    "union",
 ]

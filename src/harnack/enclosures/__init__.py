@@ -8,6 +8,14 @@ from harnack.enclosures.classic import Classic
 from harnack.enclosures.enclosure import Enclosure, Gaps, Slopes
 from harnack.enclosures.extremum import Greatest, Negated, Part, Stretched
 from harnack.enclosures.levels import TargetLevels
+from harnack.enclosures.literature import (
+    AffineBand,
+    Band,
+    BottomUpLinear,
+    BottomUpQuadratic,
+    IntervalRange,
+    Mixed,
+)
 from harnack.enclosures.parabola import Cone, Parabola, Taylor
 from harnack.enclosures.pieces import LinearTaylor, OnePiece, Pieces, QuadraticTaylor, Segment
 from harnack.enclosures.promises import (
@@ -18,23 +26,30 @@ from harnack.enclosures.promises import (
     Promise,
 )
 from harnack.enclosures.proofs import Choice, Proofs, any_covers, choose_proofs, longest_step
-from harnack.enclosures.restriction import Piece, Restriction
+from harnack.enclosures.restriction import Evaluable, Piece, Restriction
 from harnack.enclosures.slope import Slope
 
 __all__ = [
+    "AffineBand",
     "Ball",
+    "Band",
+    "BottomUpLinear",
+    "BottomUpQuadratic",
     "Caps",
     "Choice",
     "Classic",
     "Cone",
     "Curvature",
     "Enclosure",
+    "Evaluable",
     "Gaps",
     "Greatest",
     "HarmonicBall",
+    "IntervalRange",
     "LineLipschitz",
     "LinearTaylor",
     "Lipschitz",
+    "Mixed",
     "Negated",
     "OnePiece",
     "Parabola",

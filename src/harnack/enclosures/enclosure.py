@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import abc
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 from harnack.backend.extrema import fmax, fmin
 
@@ -80,11 +80,12 @@ class Enclosure(abc.ABC):
     at the upper end of `Slopes` bounds F from above and that at the lower end bounds it from below,
     whatever the slope in between is. In particular slopes in [-|grad f|, |grad f|] bound F in every
     direction.
-
-    growth: how many times the last step an enclosure is asked to reach next, by experiment.
     """
 
-    growth: ClassVar[float] = 2.0
+    @property
+    def growth(self) -> float:
+        """How many times the last step an enclosure should reach next, by experiment."""
+        return 2.0
 
     @classmethod
     def of(cls, promise: Promise, value: Real, error: Real, slopes: Slopes) -> Self | None:

@@ -12,6 +12,9 @@ from harnack.fields.formula import Formula
 from harnack.fields.meshes.winding_number import WindingNumber
 from harnack.fields.polynomials.polynomial import HarmonicPolynomial, SphericalHarmonic
 from harnack.fields.sheets import NO_SHEET, Crossing
+from harnack.fields.solids.combined import intersection, union
+from harnack.fields.solids.region import solid
+from harnack.fields.solids.solid import Shape, Solid
 from harnack.fields.waves.periodic import EigenfunctionSum, Gyroid, SchwarzD, SchwarzP
 from harnack.fields.waves.waves import PlaneWave, Product, cosine, sine
 
@@ -34,10 +37,15 @@ __all__ = [
     "SchwarzD",
     "SchwarzP",
     "ScreenedWindingNumber",
+    "Shape",
+    "Solid",
     "SolidAngle",
     "SphericalHarmonic",
     "WindingNumber",
     "cosine",
     "expression",
+    "intersection",
     "sine",
+    "solid",
+    "union",
 ]

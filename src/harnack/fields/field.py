@@ -122,6 +122,9 @@ class Field(abc.ABC):
     """Whether f jumps across sheets (see `harnack.fields.sheets`). Then `next_crossing` and
     `between` are needed, and what `evaluate` promises is about f with the jumps taken out."""
 
+    has_creases: bool = False
+    """Whether the gradient jumps somewhere, as it does where the surfaces of a union meet."""
+
     has_detail: bool = False
     """Whether f can be evaluated more coarsely and more closely; then `at_detail` is needed."""
 

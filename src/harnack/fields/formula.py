@@ -10,7 +10,7 @@ from __future__ import annotations
 import abc
 import copy
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
@@ -22,7 +22,7 @@ from harnack.fields.field import Field
 from harnack.fields.look import Look, Path, Sample
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Real, Vec3
+    from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.enclosures import Promise
 
 
@@ -33,6 +33,7 @@ class Formula(Field):
         where none is known.
     """
 
+    has_creases = True  # it may use abs, maximum and minimum
     overstep = 1.0  # longer steps than proved cost looks: what is proved is long already
     lipschitz: Real | None = None
 
@@ -76,7 +77,7 @@ class Formula(Field):
         enclosures = path.proofs.along(function, slopes, ahead)
         if not enclosures:
             return path.look(sample)
-        return Look(sample, enclosures, (), slope)
+        return Look(sample, enclosures, (), slope, max(one.growth for one in enclosures))
 
     def restricted(self, p: Vec3, direction: Vec3) -> FormulaAlong:
         """The field along the path from p, as enclosures ask for it."""
@@ -114,6 +115,7 @@ class FormulaAlong:
     field: Formula
     p: Vec3
     direction: Vec3
+    piece_count: int = 2
 
     def pieces(self, knots: Sequence[Real]) -> tuple[Piece, ...]:
         """See `harnack.enclosures.Restriction`.
@@ -139,11 +141,18 @@ class FormulaAlong:
             ]
             return i + 1, *kept
 
+        def more(i: Any, *_: Any) -> Mask:
+            return i < count
+
         index = dr.uint32_array_t(cast("Any", type(zero)))
         state = (index(0), *([zero] * (4 * count)))
-        _, *found = dr.while_loop(state, lambda i, *_: i < count, body, label="pieces")
+        _, *found = dr.while_loop(state, more, body, label="pieces")
         return tuple(
-            Piece(ends[k + 1] - ends[k], Slopes(*found[4 * k : 4 * k + 2]), *found[4 * k + 2 : 4 * k + 4])
+            Piece(
+                ends[k + 1] - ends[k],
+                Slopes(*found[4 * k : 4 * k + 2]),
+                *found[4 * k + 2 : 4 * k + 4],
+            )
             for k in range(count)
         )
 
@@ -162,6 +171,12 @@ class FormulaAlong:
 
 def _numbers(piece: Piece) -> tuple[Real, Real, Real, Real]:
     return piece.slopes.low, piece.slopes.high, piece.least_curvature, piece.most_curvature
+
+    def through(self, coordinates: Callable[[Vec3, Vec3], tuple[Any, Any, Any]]) -> Any:
+        """See `harnack.enclosures.Evaluable`."""
+        x, y, z = coordinates(self.p, self.direction)
+        value = self.field.formula(x, y, z)
+        return x.constant(float(value)) if isinstance(value, int | float) else value
 
 
 def prepared_numbers(field: Any, backend: Backend) -> Any:

@@ -97,12 +97,14 @@ class Look:
     ahead: enclosures of f(path(t+s)) - f(path(t)).
     back: enclosures of f(path(t-s)) - f(path(t)), from the same evaluation.
     slope: the derivative of f along the path, known up to `Sample.gradient_error`.
+    growth: how many times the step from here the next look should be asked to reach.
     """
 
     sample: Sample
     ahead: tuple[Enclosure, ...]
     back: tuple[Enclosure, ...]
     slope: Real
+    growth: float = 2.0
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ gets say how far the ray is free.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -17,6 +17,7 @@ from harnack.backend.loops import while_active
 from harnack.enclosures import LineLipschitz, any_covers, longest_step
 from harnack.fields.look import value_error
 from harnack.fields.sheets import NO_SHEET, Crossing
+from harnack.tracer.contact import AIM, CLOSER, Accepted, Contact, Hysteresis
 from harnack.tracer.sheet_comparison import compare_with_sheet
 from harnack.tracer.tolerance import PreparedTolerance, Status
 
@@ -60,6 +61,7 @@ class MarchState:
         a loop twice in which a state never changes).
     status: a `Status` once the ray has ended.
     active: whether it goes on.
+    contact: what is known of the level reached last; None for rays that end where they reach one.
     """
 
     base: Real
@@ -73,10 +75,18 @@ class MarchState:
     detail: Real | None
     status: Any
     active: Mask
+    contact: Contact | None = None
 
     @classmethod
     def at(
-        cls, backend: Backend, start: Real, end: Real, active: Mask, *, has_detail: bool
+        cls,
+        backend: Backend,
+        start: Real,
+        end: Real,
+        active: Mask,
+        *,
+        has_detail: bool,
+        crosses: bool = False,
     ) -> MarchState:
         """At the start of rays, before anything was looked at."""
         real, vector, count = backend.Float, backend.Array3f, backend.UInt32
@@ -92,18 +102,23 @@ class MarchState:
             detail=real(0) if has_detail else None,
             status=count(int(Status.MISS)),
             active=backend.Bool(active) & (start < end),
+            contact=Contact.none(backend) if crosses else None,
         )
 
 
 @dataclass(frozen=True)
 class March:
-    """How to march: towards which levels, until when, and with which over-stepping factor."""
+    """How to march: towards which levels, until when, and with which over-stepping factor.
+
+    hysteresis: for rays that end where they have crossed a level, and not where they reach one.
+    """
 
     backend: Backend
     levels: TargetLevels
     tolerance: PreparedTolerance
     max_steps: int
     overstep: float
+    hysteresis: Hysteresis | None = None
 
     def advance(
         self,
@@ -132,9 +147,14 @@ class March:
         In rounded arithmetic a surface could slip through between the two looks, so both see
         it nearer by the rounding of value and position together (`value_error`).
 
+        With `hysteresis` a level that is reached is not the end: the ray goes on, towards levels
+        that lie where the hysteresis puts them, and ends as a hit where it has crossed one. It may
+        be made active again there, to go on to the next.
+
         ahead: of a field with sheets, the crossing at `end`, on lanes where there is one. Those
         lanes look at that point as well. Accepted there, they hit the sheet or have passed it: a
-        miss, with the step that the value behind the sheet allows from there.
+        miss, with the step that the value behind the sheet allows from there. With `hysteresis`
+        `value` is then that behind the sheet.
         """
         real, size = self.backend.Float, largest_component(path.origin)
         is_smooth = ahead is None and not field.has_detail
@@ -142,6 +162,8 @@ class March:
         def body(now: MarchState) -> MarchState:
             t = now.base + now.step
             if ahead is not None:  # the crossing exactly
+                t = dr.select(now.step >= end - now.base, end, t)
+            if now.contact is not None:
                 t = dr.select(now.step >= end - now.base, end, t)
             at_end = None if ahead is None else t == end
 
@@ -159,12 +181,23 @@ class March:
             within = self.tolerance.in_value(
                 fmax(gradient_norm - sample.gradient_error, real(0)), t
             )
+            if self.hysteresis is not None:
+                within = self.hysteresis.within(within)
             is_near = self._is_near(
                 gaps.smaller, within, total_error, sample, gradient_norm, size + t
             )
+            excess = fmax(gaps.smaller + total_error - within, real(0))
+            band, may_pass = within, is_near
+            if self.hysteresis is not None and now.contact is not None:
+                band = self._band(within, total_error, sample, gradient_norm)
+                gaps = self.hysteresis.gaps(now.contact, sample.value, gaps, band)
+                within = CLOSER * within
+                may_pass &= ~now.contact.is_touching
+                if self.levels.period is not None:  # the value alone tells its side of a level
+                    may_pass = self.backend.Bool(False)
             accepted = now.step <= now.reach
             if self.overstep > 1:
-                knows_side = is_near | (gaps.smaller > total_error)
+                knows_side = may_pass | (gaps.smaller > total_error)
                 accepted |= knows_side & any_covers(look.back, gaps.less(total_error), unproved)
             too_coarse, finer, coarser = self.backend.Bool(False), now.detail, now.detail
             if has_detail:
@@ -179,26 +212,47 @@ class March:
                 next_detail = dr.select(too_coarse, finer, kept)
 
             # Is it a hit, or a sheet?
-            hit = accepted & is_near
-            gaps_ahead, sheet = gaps, None
+            hit, gaps_ahead, sheet = accepted & is_near, gaps, None
             if ahead is not None:
                 sheet = compare_with_sheet(
                     ahead, accepted & at_end, sample.value, total_error, self.levels
                 )
                 gaps_ahead = sheet.gaps
 
+            # Or a crossing?
+            aims, contact, value = gaps_ahead, now.contact, sample.value
+            if self.hysteresis is not None and now.contact is not None:
+                before = now.base, now.value, dr.dot(now.gradient, path.direction), now.gradient
+                last = t == end if sheet is None else (t == end) & ~sheet.has_crossing
+                there = Accepted(
+                    t, value, sample.gradient, look.slope, before, total_error, is_near, band, last
+                )
+                contact, hit = self.hysteresis.update(now.contact, accepted, there)
+                if ahead is not None and sheet is not None:
+                    # What was crossed before the sheet comes first: the sheet is looked at again.
+                    passed = sheet.at_crossing & ~hit
+                    contact, jumps = self.hysteresis.jump(
+                        contact, passed, there, ahead, path.direction
+                    )
+                    sheet = replace(sheet, at_crossing=passed, is_hit=jumps)
+                    value = value + dr.select(passed, ahead.jump, 0)
+                after = contact, value, self.levels.gaps(value), band
+                gaps_ahead, aims = self.hysteresis.gaps(*after), self.hysteresis.gaps(*after, AIM)
+
             # How far to go from there.
             forward = longest_step(look.ahead, gaps_ahead.less(total_error))
             forward = dr.select(gaps_ahead.smaller > total_error, forward, 0)
-            trial = self._trial(forward, look, gaps_ahead, now, path, is_smooth)
+            trial = self._trial(forward, look, aims, now, path, is_smooth)
             base = dr.select(accepted, t, now.base)
             step = dr.select(accepted, trial, dr.select(too_coarse, now.step, now.reach))
             reach = dr.select(accepted, forward, now.reach)
-            excess = fmax(gaps.smaller + total_error - within, real(0))
             # After a step of zero enclosures are asked for a third of the length: bisection.
             shorter = dr.select(dr.isfinite(candidate), candidate / 3, 1 + 16 * (size + t))
-            tried = dr.select(forward > 0, path.proofs.growth * forward, shorter)
+            tried = dr.select(forward > 0, look.growth * forward, shorter)
             free = base + reach >= end
+            if self.hysteresis is not None and contact is not None:  # a contact may end at the end
+                undecided = contact.is_touching & self.hysteresis.is_free_after
+                free &= ~(accepted & undecided & (t < end))
             if sheet is not None:
                 free = dr.select(sheet.has_crossing, sheet.at_crossing, free)
             evaluations = now.evaluations + 1
@@ -211,13 +265,14 @@ class March:
                 step=fmin(step, end - base),
                 reach=reach,
                 candidate=dr.select(accepted, tried, now.candidate),
-                value=dr.select(accepted, sample.value, now.value),
+                value=dr.select(accepted, value, now.value),
                 gradient=gradient,
                 excess=dr.select(accepted, excess, now.excess),
                 evaluations=evaluations,
                 detail=next_detail,
                 status=status,
                 active=now.active & ~(hit | free | (evaluations >= self.max_steps)),
+                contact=contact,
             )
 
         return while_active(state, body, "harnack")
@@ -246,6 +301,13 @@ class March:
             if not isinstance(promise, LineLipschitz):
                 size = fmax(dr.select(dr.isfinite(radius), radius, 0), size)
         return near & (gap + total_error - within <= _LARGEST_UNCERTAINTY * gradient_norm * size)
+
+    def _band(self, within: Real, total_error: Real, sample: Sample, gradient_norm: Real) -> Real:
+        """The tolerance in value that contacts go by (`Hysteresis.band`)."""
+        assert self.hysteresis is not None
+        knows_gradient = sample.gradient_error <= gradient_norm
+        rounding = dr.select(knows_gradient, total_error - sample.truncation, 0)
+        return self.hysteresis.band(within, rounding)
 
     def _trial(
         self, forward: Real, look: Look, gaps: Gaps, now: MarchState, path: Path, is_smooth: bool

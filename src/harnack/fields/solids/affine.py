@@ -226,7 +226,8 @@ class AffineImage(Solid):
             return tuple(Stretched(one, speed, numbers.factor) for one in enclosures)
 
         slope = look.slope * speed * numbers.factor
-        return Look(sample, stretched(look.ahead), stretched(look.back), slope)
+        ahead_, back_ = stretched(look.ahead), stretched(look.back)
+        return Look(sample, ahead_, back_, slope, look.growth)
 
     def _size(self, p: Vec3, t: Real) -> Real:
         """The size of what the local coordinates of p + t d are summed from."""

@@ -150,7 +150,7 @@ class Combined(Solid):
         slope = dr.dot(sample.gradient, path.direction)
         front = self._enclosures([one.ahead for one in looks], below)
         behind = self._enclosures([one.back for one in looks], below)
-        return Look(sample, front, behind, slope)
+        return Look(sample, front, behind, slope, max(one.growth for one in looks))
 
     def _enclosures(
         self, parts: list[tuple[Enclosure, ...]], below: list[tuple[Real, Real]]
@@ -290,6 +290,7 @@ def negated_look(look: Look) -> Look:
         tuple(Negated(one) for one in look.ahead),
         tuple(Negated(one) for one in look.back),
         -look.slope,
+        look.growth,
     )
 
 

@@ -307,7 +307,7 @@ class Near(_OfField):
             return tuple(Folded(one, offset, self.field.period) for one in enclosures)
 
         slope = dr.mulsign(look.slope, offset)
-        return Look(sample, folded(look.ahead), folded(look.back), slope)
+        return Look(sample, folded(look.ahead), folded(look.back), slope, look.growth)
 
     def _offset(self, value: Real) -> Real:
         """f - level, reduced to half a period on either side."""

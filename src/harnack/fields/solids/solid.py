@@ -30,6 +30,7 @@ class Solid(Field):
     """
 
     overstep = 1.0
+    has_creases = True
     lipschitz: Any = None
 
     def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
