@@ -13,24 +13,47 @@ from harnack.fields.meshes.winding_number import WindingNumber
 from harnack.fields.polynomials.polynomial import HarmonicPolynomial, SphericalHarmonic
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.fields.solids.combined import intersection, union
+from harnack.fields.solids.fractal import Displaced, FractalNoise, Noise
+from harnack.fields.solids.julia import Julia
 from harnack.fields.solids.region import solid
+from harnack.fields.solids.round import (
+    Capsule,
+    Cylinder,
+    DoubleCone,
+    Ellipsoid,
+    Plane,
+    Sphere,
+    Torus,
+)
 from harnack.fields.solids.solid import Shape, Solid
+from harnack.fields.solids.square import Cuboid, Superellipsoid, Supertorus
+from harnack.fields.solids.tube import Tube
 from harnack.fields.waves.periodic import EigenfunctionSum, Gyroid, SchwarzD, SchwarzP
 from harnack.fields.waves.waves import PlaneWave, Product, cosine, sine
 
 __all__ = [
     "NO_SHEET",
+    "Capsule",
     "Crossing",
+    "Cuboid",
     "Curvature",
+    "Cylinder",
     "DipolePotential",
+    "Displaced",
+    "DoubleCone",
     "EigenfunctionSum",
+    "Ellipsoid",
     "Field",
     "Formula",
+    "FractalNoise",
     "Gyroid",
     "HarmonicBall",
     "HarmonicPolynomial",
+    "Julia",
     "LineLipschitz",
     "Lipschitz",
+    "Noise",
+    "Plane",
     "PlaneWave",
     "Product",
     "Sample",
@@ -40,7 +63,12 @@ __all__ = [
     "Shape",
     "Solid",
     "SolidAngle",
+    "Sphere",
     "SphericalHarmonic",
+    "Superellipsoid",
+    "Supertorus",
+    "Torus",
+    "Tube",
     "WindingNumber",
     "cosine",
     "expression",
