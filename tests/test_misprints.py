@@ -109,11 +109,16 @@ def test_equation_38_the_constants_of_a_sum_add_up() -> None:
 
 
 def test_equation_38_no_sum_over_the_points_that_count_here() -> None:
-    """Where no support reaches, the constant of those that count is 0: any step would be allowed,
-    though a support, and the surface, lie ahead."""
-    x, center, radius = 2.0, 0.0, 1.0
-    assert soft(abs(x - center), radius) == 0
-    assert soft(0.0, radius) == 1
+    """Where no support reaches, the constant of those that count is 0 and any step is allowed; the
+    largest rho with rho lambda(rho) <= f, over supports that meet the ball, stops ahead of it."""
+    start, radius, threshold = 2.0, 1.0, 0.3
+    f = threshold - float(soft(start, radius))
+    t = np.linspace(0, start, 20_001)
+    surface = t[np.argmax(threshold - soft(start - t, radius) <= 0)]
+    constant = np.where(t > start - radius, 1.5 / radius, 0.0)  # of supports that meet the ball
+    safe = t[t * constant <= f].max()
+    assert constant[0] == 0.0
+    assert safe < surface
 
 
 def test_equation_39_the_slope_of_the_cubic() -> None:
@@ -184,9 +189,8 @@ def test_equation_51_the_constant_of_a_twist() -> None:
 
 
 def test_equation_53_dimension_of_fractal_noise() -> None:
-    """Amplitudes 2^(-beta i) at frequencies 2^i: differences at lag h grow like h^beta, the Hurst
-    exponent, so D = 3 - beta of a surface; printed is 2 + (3 - beta)/2, which is more by
-    (1 + beta)/2 - 1 + ... = (beta + 1)/2."""
+    """With amplitudes 2^(-beta i) at frequencies 2^i, differences at a lag h grow like h^beta, the
+    Hurst exponent, so that surfaces have D = 3 - beta: 2.5 and not 3.25 here."""
     beta, octaves = 0.5, 14
     rng = np.random.default_rng(1)
     phases = rng.uniform(0, 2 * math.pi, (200, octaves))
@@ -215,3 +219,76 @@ def test_the_usual_estimate_of_julia_sets_is_no_bound() -> None:
         golden = (1 + math.sqrt(5)) / 2  # the rightmost point of the filled set
         if start >= 10:
             assert estimate > start - golden
+
+
+def hit_by(spheres: Any, origin: Any, direction: Any, *, printed: bool) -> float:
+    """Sphere tracing of spheres by Hart's figure 6, as printed, or with the last travel taken off
+    every distance and d_min made infinite before the loop over the objects."""
+    last = t = 0.0
+    known = [0.0] * len(spheres)
+    least = math.inf
+    for _ in range(3000):
+        if not printed:
+            least = math.inf
+        if not printed:
+            known = [one - last for one in known]
+        for k, (*center, radius) in enumerate(spheres):
+            if printed and known[k] - last > least:
+                known[k] -= last
+            elif printed or known[k] <= least:
+                known[k] = math.dist(origin + t * direction, center) - radius
+                least = min(least, known[k])
+            if printed:
+                last = least
+        last = least
+        if least < 1e-6 or t > 20:
+            break
+        t += least
+    return t if least < 1e-6 else math.inf
+
+
+def test_figure_6_of_the_triangle_inequality() -> None:
+    rng = np.random.default_rng(2)
+    wrong = {True: 0, False: 0}
+    for _ in range(150):
+        spheres = np.column_stack([rng.uniform(-2, 2, (6, 3)), rng.uniform(0.1, 0.6, 6)])
+        origin = np.array([0.0, 0.0, -6.0])
+        aim = rng.uniform(-1.5, 1.5, 3) - origin
+        direction = aim / np.linalg.norm(aim)
+        b = (spheres[:, :3] - origin) @ direction
+        gap = spheres[:, 3] ** 2 - (np.sum((spheres[:, :3] - origin) ** 2, axis=1) - b * b)
+        exact = np.where(gap > 1e-3, b - np.sqrt(np.maximum(gap, 0)), np.inf).min()
+        if (np.abs(gap) <= 1e-3).any():
+            continue  # grazes one
+        for printed in wrong:
+            found = hit_by(spheres, origin, direction, printed=printed)
+            wrong[printed] += int(not (found == exact or abs(found - exact) < 1e-3))
+    assert wrong[False] == 0
+    assert wrong[True] > 5
+
+
+def test_algorithm_1_of_forward_inclusion_needs_an_absolute_value() -> None:
+    """f = -1 - t has no root, yet `eval < eps` registers one at every step; |eval| < eps none."""
+    values = -1.0 - np.linspace(0, 5, 50)
+    assert (values < 1e-3).all()
+    assert not (np.abs(values) < 1e-3).any()
+    # Equation 4: the step f/L is negative from the negative side, and goes back.
+    assert values[0] / 1.0 < 0 < abs(values[0]) / 1.0
+
+
+def test_figure_11_of_forward_inclusion_needs_a_square() -> None:
+    """Kernels (1 - d^2/(r sigma)^2) are the same at all scales and 0 at the edge of the support."""
+    for scale in (1.0, 3.0):
+        r, sigma, d = 1.5 * scale, 1.2, 1.5 * 1.2 * scale
+        assert 1 - d**2 / (r**2 * sigma**2) == pytest.approx(0.0)
+        assert abs(1 - d / (r**2 * sigma**2)) > 0.1
+
+
+def test_figure_9_of_forward_inclusion_stretches_no_falling_bounds() -> None:
+    """F = 0 up to s = 1 and 1 - s behind it. The line through its ends on [1, 2] bounds it there;
+    stretched to start at 0 it does not. Raised to max(0, .) it does."""
+    s = np.linspace(0, 2, 201)
+    f = np.where(s < 1, 0.0, 1 - s)
+    stretched = -0.5 * s
+    assert (f > stretched + 1e-12).any()
+    assert (f <= np.maximum(stretched, 0)).all()
