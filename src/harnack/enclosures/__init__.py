@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from harnack.enclosures.ball import Ball
-from harnack.enclosures.caps import Caps
-from harnack.enclosures.classic import Classic
+from harnack.enclosures.balls.ball import Ball
+from harnack.enclosures.balls.caps import Caps
+from harnack.enclosures.balls.classic import Classic
+from harnack.enclosures.balls.slope import Slope
 from harnack.enclosures.enclosure import Enclosure, Gaps, Slopes
 from harnack.enclosures.extremum import Greatest, Negated, Part, Stretched
 from harnack.enclosures.levels import TargetLevels
@@ -27,7 +28,6 @@ from harnack.enclosures.promises import (
 )
 from harnack.enclosures.proofs import Choice, Proofs, any_covers, choose_proofs, longest_step
 from harnack.enclosures.restriction import Evaluable, Piece, Restriction
-from harnack.enclosures.slope import Slope
 
 __all__ = [
     "AffineBand",

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 from harnack.enclosures import Curvature, HarmonicBall, LineLipschitz, Lipschitz
+from harnack.fields.blobs.blobs import BlobError, Blobs
+from harnack.fields.blobs.hrbf import HRBF
+from harnack.fields.blobs.kernels import Compact, Cubic, Gaussian, Kernel, Sextic
+from harnack.fields.blobs.molecule import Molecule
 from harnack.fields.clouds.dipole import DipolePotential
 from harnack.fields.clouds.screened import ScreenedWindingNumber
 from harnack.fields.curves.solid_angle import SolidAngle
@@ -32,9 +36,14 @@ from harnack.fields.waves.periodic import EigenfunctionSum, Gyroid, SchwarzD, Sc
 from harnack.fields.waves.waves import PlaneWave, Product, cosine, sine
 
 __all__ = [
+    "HRBF",
     "NO_SHEET",
+    "BlobError",
+    "Blobs",
     "Capsule",
+    "Compact",
     "Crossing",
+    "Cubic",
     "Cuboid",
     "Curvature",
     "Cylinder",
@@ -46,12 +55,15 @@ __all__ = [
     "Field",
     "Formula",
     "FractalNoise",
+    "Gaussian",
     "Gyroid",
     "HarmonicBall",
     "HarmonicPolynomial",
     "Julia",
+    "Kernel",
     "LineLipschitz",
     "Lipschitz",
+    "Molecule",
     "Noise",
     "Plane",
     "PlaneWave",
@@ -60,6 +72,7 @@ __all__ = [
     "SchwarzD",
     "SchwarzP",
     "ScreenedWindingNumber",
+    "Sextic",
     "Shape",
     "Solid",
     "SolidAngle",

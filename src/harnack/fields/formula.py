@@ -10,6 +10,7 @@ from __future__ import annotations
 import abc
 import copy
 import dataclasses
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
@@ -22,7 +23,7 @@ from harnack.fields.field import Field
 from harnack.fields.look import Look, Path, Sample
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.backend import Backend, Real, Vec3
     from harnack.enclosures import Promise
 
 
@@ -115,46 +116,19 @@ class FormulaAlong:
     field: Formula
     p: Vec3
     direction: Vec3
-    piece_count: int = 2
+    # Ranges of a formula cost as much as its value: one piece takes the least time, four take two
+    # thirds of the looks and twice the time.
+    piece_count: int = 1
 
     def pieces(self, knots: Sequence[Real]) -> tuple[Piece, ...]:
-        """See `harnack.enclosures.Restriction`.
+        """See `harnack.enclosures.Restriction`."""
+        return tuple(self._piece(start, end) for start, end in itertools.pairwise(knots))
 
-        The formula is recorded once, in a loop over the pieces: a kernel that holds it once for
-        each of them takes several times as long to compile, and runs no faster.
-        """
-        zero = 0 * self.p.x
-        ends = [zero + one for one in knots]
-        count = len(ends) - 1
-        if count == 1:
-            return (self._piece(zero, ends[1]),)
-
-        def body(i: Any, *numbers: Any) -> tuple[Any, ...]:
-            start, end = ends[0], ends[1]
-            for k in range(1, count):
-                start, end = dr.select(i == k, ends[k], start), dr.select(i == k, ends[k + 1], end)
-            made = _numbers(self._piece(start, end))
-            kept = [
-                dr.select(i == k, made[j], numbers[len(made) * k + j])
-                for k in range(count)
-                for j in range(len(made))
-            ]
-            return i + 1, *kept
-
-        def more(i: Any, *_: Any) -> Mask:
-            return i < count
-
-        index = dr.uint32_array_t(cast("Any", type(zero)))
-        state = (index(0), *([zero] * (4 * count)))
-        _, *found = dr.while_loop(state, more, body, label="pieces")
-        return tuple(
-            Piece(
-                ends[k + 1] - ends[k],
-                Slopes(*found[4 * k : 4 * k + 2]),
-                *found[4 * k + 2 : 4 * k + 4],
-            )
-            for k in range(count)
-        )
+    def through(self, coordinates: Callable[[Vec3, Vec3], tuple[Any, Any, Any]]) -> Any:
+        """See `harnack.enclosures.Evaluable`."""
+        x, y, z = coordinates(self.p, self.direction)
+        value = self.field.formula(x, y, z)
+        return x.constant(float(value)) if isinstance(value, int | float) else value
 
     def _piece(self, start: Real, end: Real) -> Piece:
         coordinates = Jet.along(self.p, self.direction, start, end)
@@ -167,16 +141,6 @@ class FormulaAlong:
             zero + curvatures.low,
             zero + curvatures.high,
         )
-
-
-def _numbers(piece: Piece) -> tuple[Real, Real, Real, Real]:
-    return piece.slopes.low, piece.slopes.high, piece.least_curvature, piece.most_curvature
-
-    def through(self, coordinates: Callable[[Vec3, Vec3], tuple[Any, Any, Any]]) -> Any:
-        """See `harnack.enclosures.Evaluable`."""
-        x, y, z = coordinates(self.p, self.direction)
-        value = self.field.formula(x, y, z)
-        return x.constant(float(value)) if isinstance(value, int | float) else value
 
 
 def prepared_numbers(field: Any, backend: Backend) -> Any:

@@ -80,6 +80,23 @@ class Solid(Field):
 
         return Complement(self)
 
+    def blended(
+        self, other: Solid, radius: float, *, power: float = 2.0, intersect: bool = False
+    ) -> Solid:
+        """The union with another solid, with a fillet where the surfaces meet (or, with
+        intersect=True, the intersection with a rounded edge).
+
+        radius: how far the fillet reaches along both surfaces, where f is a distance.
+        power: the exponent of the superellipse that the fillet is a part of: 2 for a circle, larger
+            for a sharper corner (Hart 1996, appendix D.3, corrected).
+
+        Raises:
+            ValueError: radius or power out of range. TypeError: a solid without a formula.
+        """
+        from harnack.fields.solids.blended import Blend
+
+        return Blend((self, other), radius, power, not intersect)
+
     def grown(self, distance: float) -> Solid:
         """The points where f <= distance: larger by that length, or smaller if it is negative,
         where f is a distance."""
