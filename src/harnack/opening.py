@@ -3,16 +3,32 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from harnack.backend import FloatArray
-from harnack.fields import DipolePotential, Field, SolidAngle, WindingNumber
-from harnack.files import ClosedCurves, Cloud, FileFormatError, Mesh, read_loops, read_surface
-from harnack.files.surfaces import ReadAs
+from harnack.fields import (
+    Blobs,
+    DipolePotential,
+    Field,
+    Molecule,
+    SolidAngle,
+    WindingNumber,
+)
+from harnack.files import (
+    Atoms,
+    ClosedCurves,
+    Cloud,
+    FileFormatError,
+    Mesh,
+    Metaballs,
+    read_loops,
+    read_surface,
+)
+from harnack.files.surfaces import ReadAs, Surface
 
 __all__ = ["UP_AXES", "Axis", "OpenedSurface", "open_surface"]
 
@@ -55,7 +71,8 @@ def open_surface(
     normals: Literal["estimate"] | None = None,
     up: Axis | None = None,
 ) -> OpenedSurface:
-    """The field of a surface file: meshes wind, clouds are dipoles, curves span solid angles.
+    """The field of a surface file: meshes wind, clouds are dipoles, curves span solid angles,
+    metaballs and atoms are blobs.
 
     as_: "winding", "dipole" or "loops" instead of what `read_surface` decides. boundary: the
     curves that bound the faces. normals: "estimate" finds those of a point cloud, and replaces
@@ -99,7 +116,7 @@ def _usual_up(path: Path, *, is_curve: bool) -> tuple[Axis, str]:
     return "z", "for want of a standard (up= turns it)"
 
 
-def _read(path: Path, as_: ReadAs | None, boundary: bool) -> Mesh | Cloud | ClosedCurves:
+def _read(path: Path, as_: ReadAs | None, boundary: bool) -> Surface:
     if boundary and path.suffix.lower() in _LOOP_FILES:
         loops = tuple(read_loops(path, boundary=True))
         noun = "loop" if len(loops) == 1 else "loops"
@@ -108,13 +125,16 @@ def _read(path: Path, as_: ReadAs | None, boundary: bool) -> Mesh | Cloud | Clos
     return read_surface(path, "loops" if boundary else as_)
 
 
-def _field(
-    surface: Mesh | Cloud | ClosedCurves, normals: str | None, rotation: FloatArray
-) -> Field:
+def _field(surface: Surface, normals: str | None, rotation: FloatArray) -> Field:
     if isinstance(surface, Mesh):
         return WindingNumber(surface.vertices @ rotation.T, surface.faces)
     if isinstance(surface, ClosedCurves):
         return SolidAngle([loop @ rotation.T for loop in surface.loops])
+    if isinstance(surface, Metaballs):
+        centres = surface.centres @ rotation.T
+        return Blobs(centres, surface.radii, surface.weights, groups=surface.groups)
+    if isinstance(surface, Atoms):
+        return Molecule(replace(surface, positions=surface.positions @ rotation.T))
     points = surface.points @ rotation.T
     if normals == "estimate":
         return DipolePotential(points, normals, surface.areas)

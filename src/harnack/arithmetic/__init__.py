@@ -24,6 +24,7 @@ from harnack.arithmetic.functions import (
 )
 from harnack.arithmetic.interval import ONE, ZERO, Interval
 from harnack.arithmetic.jet import Jet
+from harnack.arithmetic.norms import maximum, minimum, norm
 from harnack.arithmetic.parabolas import Parabolas
 
 __all__ = [
@@ -44,6 +45,9 @@ __all__ = [
     "cosh",
     "exp",
     "log",
+    "maximum",
+    "minimum",
+    "norm",
     "power",
     "reciprocal",
     "sin",

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from harnack.enclosures.ball import Ball
-from harnack.enclosures.caps import Caps
-from harnack.enclosures.classic import Classic
+from harnack.enclosures.balls.ball import Ball
+from harnack.enclosures.balls.caps import Caps
+from harnack.enclosures.balls.classic import Classic
+from harnack.enclosures.balls.slope import Slope
 from harnack.enclosures.enclosure import Enclosure, Gaps, Slopes
+from harnack.enclosures.extremum import Greatest, Negated, Part, Stretched
 from harnack.enclosures.levels import TargetLevels
 from harnack.enclosures.literature import (
     AffineBand,
@@ -26,7 +28,6 @@ from harnack.enclosures.promises import (
 )
 from harnack.enclosures.proofs import Choice, Proofs, any_covers, choose_proofs, longest_step
 from harnack.enclosures.restriction import Evaluable, Piece, Restriction
-from harnack.enclosures.slope import Slope
 
 __all__ = [
     "AffineBand",
@@ -42,14 +43,17 @@ __all__ = [
     "Enclosure",
     "Evaluable",
     "Gaps",
+    "Greatest",
     "HarmonicBall",
     "IntervalRange",
     "LineLipschitz",
     "LinearTaylor",
     "Lipschitz",
     "Mixed",
+    "Negated",
     "OnePiece",
     "Parabola",
+    "Part",
     "Piece",
     "Pieces",
     "Promise",
@@ -59,6 +63,7 @@ __all__ = [
     "Segment",
     "Slope",
     "Slopes",
+    "Stretched",
     "TargetLevels",
     "Taylor",
     "any_covers",

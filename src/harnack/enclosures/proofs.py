@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from harnack.backend.extrema import fmax
 from harnack.choices import did_you_mean
-from harnack.enclosures.caps import Caps
-from harnack.enclosures.classic import Classic
+from harnack.enclosures.balls.caps import Caps
+from harnack.enclosures.balls.classic import Classic
+from harnack.enclosures.balls.slope import Slope
 from harnack.enclosures.enclosure import Enclosure, Gaps, Slopes
 from harnack.enclosures.literature import (
     AffineBand,
@@ -22,7 +23,6 @@ from harnack.enclosures.literature import (
 from harnack.enclosures.parabola import Cone, Taylor
 from harnack.enclosures.pieces import LinearTaylor, Pieces, QuadraticTaylor, Segment
 from harnack.enclosures.promises import LineLipschitz, Promise
-from harnack.enclosures.slope import Slope
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real
@@ -58,11 +58,6 @@ class Proofs:
 
     kinds: tuple[type[Enclosure], ...]
     uses_weaker: bool = True
-
-    @property
-    def growth(self) -> float:
-        """How many times the last step the next look asks for."""
-        return max(kind.growth for kind in self.kinds)
 
     def along(self, function: Restriction, slopes: Slopes, length: Real) -> tuple[Enclosure, ...]:
         """The enclosures of a function whose ranges along the path are known; none if none of the

@@ -29,7 +29,13 @@ class Piece:
 
 
 class Restriction(Protocol):
-    """A function along a path, as enclosures ask for it."""
+    """A function along a path, as enclosures ask for it.
+
+    piece_count: how many pieces of the path take the least time, by experiment.
+    """
+
+    @property
+    def piece_count(self) -> int: ...
 
     def pieces(self, knots: Sequence[Real]) -> tuple[Piece, ...]:
         """Ranges of the derivatives of f(path(t+s)) between each knot and the next.

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 from harnack.enclosures import Curvature, HarmonicBall, LineLipschitz, Lipschitz
+from harnack.fields.blobs.blobs import BlobError, Blobs
+from harnack.fields.blobs.hrbf import HRBF
+from harnack.fields.blobs.kernels import Compact, Cubic, Gaussian, Kernel, Sextic
+from harnack.fields.blobs.molecule import Molecule
 from harnack.fields.clouds.dipole import DipolePotential
 from harnack.fields.clouds.screened import ScreenedWindingNumber
 from harnack.fields.curves.solid_angle import SolidAngle
@@ -12,32 +16,77 @@ from harnack.fields.formula import Formula
 from harnack.fields.meshes.winding_number import WindingNumber
 from harnack.fields.polynomials.polynomial import HarmonicPolynomial, SphericalHarmonic
 from harnack.fields.sheets import NO_SHEET, Crossing
+from harnack.fields.solids.combined import intersection, union
+from harnack.fields.solids.fractal import Displaced, FractalNoise, Noise
+from harnack.fields.solids.julia import Julia
+from harnack.fields.solids.region import solid
+from harnack.fields.solids.round import (
+    Capsule,
+    Cylinder,
+    DoubleCone,
+    Ellipsoid,
+    Plane,
+    Sphere,
+    Torus,
+)
+from harnack.fields.solids.solid import Shape, Solid
+from harnack.fields.solids.square import Cuboid, Superellipsoid, Supertorus
+from harnack.fields.solids.tube import Tube
 from harnack.fields.waves.periodic import EigenfunctionSum, Gyroid, SchwarzD, SchwarzP
 from harnack.fields.waves.waves import PlaneWave, Product, cosine, sine
 
 __all__ = [
+    "HRBF",
     "NO_SHEET",
+    "BlobError",
+    "Blobs",
+    "Capsule",
+    "Compact",
     "Crossing",
+    "Cubic",
+    "Cuboid",
     "Curvature",
+    "Cylinder",
     "DipolePotential",
+    "Displaced",
+    "DoubleCone",
     "EigenfunctionSum",
+    "Ellipsoid",
     "Field",
     "Formula",
+    "FractalNoise",
+    "Gaussian",
     "Gyroid",
     "HarmonicBall",
     "HarmonicPolynomial",
+    "Julia",
+    "Kernel",
     "LineLipschitz",
     "Lipschitz",
+    "Molecule",
+    "Noise",
+    "Plane",
     "PlaneWave",
     "Product",
     "Sample",
     "SchwarzD",
     "SchwarzP",
     "ScreenedWindingNumber",
+    "Sextic",
+    "Shape",
+    "Solid",
     "SolidAngle",
+    "Sphere",
     "SphericalHarmonic",
+    "Superellipsoid",
+    "Supertorus",
+    "Torus",
+    "Tube",
     "WindingNumber",
     "cosine",
     "expression",
+    "intersection",
     "sine",
+    "solid",
+    "union",
 ]

@@ -1,18 +1,23 @@
-"""Curves, meshes and clouds from files, and files that are never half written."""
+"""Curves, meshes, clouds, blobs and molecules from files, and files that are never half written."""
 
 from __future__ import annotations
 
 from harnack.files.file_format import FileFormatError
 from harnack.files.loops import read_loops
+from harnack.files.metaballs import Metaballs
+from harnack.files.molecules import Atoms, read_molecule
 from harnack.files.surfaces import ClosedCurves, Cloud, Mesh, read_surface
 from harnack.files.writing import write_atomically
 
 __all__ = [
+    "Atoms",
     "ClosedCurves",
     "Cloud",
     "FileFormatError",
     "Mesh",
+    "Metaballs",
     "read_loops",
+    "read_molecule",
     "read_surface",
     "write_atomically",
 ]

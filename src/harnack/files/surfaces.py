@@ -1,4 +1,4 @@
-"""Reading surfaces from files: meshes, point clouds and curves, and saying which it was."""
+"""Reading surfaces from files: meshes, clouds, curves, blobs; and saying which it was."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from harnack.choices import did_you_mean
 from harnack.files.file_format import Contents, FileFormatError, Place, read_bytes
 from harnack.files.gltf import read_gltf
 from harnack.files.loops import loops_in, read_loops
+from harnack.files.metaballs import Metaballs, read_metaballs
+from harnack.files.molecules import MOLECULE_FILES, Atoms, atoms_in
 from harnack.files.obj import read_obj
 from harnack.files.off import read_off
 from harnack.files.plain_text import read_xyz
@@ -35,7 +37,7 @@ _READERS: dict[str, Callable[[Path, bytes], Contents]] = {
     ".glb": read_gltf, ".gltf": read_gltf, ".xyz": read_xyz,
 }  # fmt: skip
 _LOOP_FILES = (".obj", ".ply", ".loops")
-SURFACE_FILES = (*_READERS, ".loops")
+SURFACE_FILES = (*_READERS, ".loops", ".blobs", *MOLECULE_FILES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,10 +70,12 @@ class ClosedCurves:
     said: str
 
 
-def read_surface(
-    path: str | os.PathLike[str], as_: ReadAs | None = None
-) -> Mesh | Cloud | ClosedCurves:
-    """What a surface file (.obj, .ply, .stl, .off, .glb, .gltf, .xyz, .loops) describes.
+Surface: TypeAlias = Mesh | Cloud | ClosedCurves | Metaballs | Atoms
+
+
+def read_surface(path: str | os.PathLike[str], as_: ReadAs | None = None) -> Surface:
+    """What a surface file describes: .obj, .ply, .stl, .off, .glb, .gltf, .xyz, .loops, .blobs,
+    or a molecule's, .pdb, .ent, .cif, .mmcif.
 
     Faces make a mesh, except polygons of an .obj or .ply file of which some have more than four
     corners and none share an edge: these are curves, as are polylines without faces. Points alone
@@ -101,7 +105,13 @@ def read_surface(
         return _read(path, kind, as_)
 
 
-def _read(path: Path, kind: str, as_: ReadAs | None) -> Mesh | Cloud | ClosedCurves:
+def _read(path: Path, kind: str, as_: ReadAs | None) -> Surface:
+    if kind == ".blobs":
+        _refuse(path, as_, (), "blobs")
+        return read_metaballs(path, read_bytes(path))
+    if kind in MOLECULE_FILES:
+        _refuse(path, as_, (), "atoms")
+        return atoms_in(path, read_bytes(path))
     if kind == ".loops":
         _refuse(path, as_, ("loops",), "curves")
         return _loops(read_loops(path), "curves, since the file lists nothing else")

@@ -172,7 +172,7 @@ def _surface(one: Field | LevelSet, settings: Mapping[str, Any]) -> LevelSet:
         return one
     own: dict[str, Any] = {
         "clip": one.clip, "tolerance": one.tolerance, "max_steps": one.max_steps,
-        "bound": one.bound, "overstep": one.overstep,
+        "bound": one.bound, "overstep": one.overstep, "confirm": one.confirm,
     }  # fmt: skip
     if "level" not in settings and "solid" not in settings:
         own |= {"level": one.levels} if one.solid is None else {"solid": one.solid}

@@ -1,0 +1,384 @@
+"""Blobs: metaballs, soft objects and densities of molecules, as level sets of sums of kernels."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, cast
+
+import drjit as dr
+import numpy as np
+
+from harnack.arithmetic import Jet
+from harnack.backend import FloatArray, IntArray, backend_of
+from harnack.backend.extrema import fmin
+from harnack.backend.numbers import check_finite, check_size, check_vectors, real_array
+from harnack.backend.records import Records
+from harnack.enclosures import Enclosure, Gaps, Lipschitz, Slopes
+from harnack.fields.blobs.grid import CellLists, Grid, uploaded_integers
+from harnack.fields.blobs.jets import blob_term, summed
+from harnack.fields.blobs.kernels import Kernel, choose_kernel
+from harnack.fields.blobs.largest import GroupedList, LargestAlong, largest_at, largest_jet
+from harnack.fields.blobs.sums import (
+    PIECES,
+    BlobValue,
+    ForEach,
+    Knots,
+    hessian_at,
+    over,
+    over_list,
+    sum_along,
+    value_at,
+)
+from harnack.fields.formula import Formula
+from harnack.fields.kept import prepared_once
+from harnack.fields.look import Look, Path, Sample
+from harnack.geometry import Box
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Real, Vec3
+    from harnack.geometry import Volume
+
+# From so many blobs on, a grid is quicker than a sum over all, by experiment.
+_MANY = 64
+# Looks reach beyond what is asked for by more than what steps are rounded down by: then one that is
+# free to the end says so, and no other look is needed there.
+_BEYOND_END = 1 + 4e-6
+
+
+class BlobError(ValueError):
+    """Blobs that cannot be; the message says which and why."""
+
+
+class Blobs(Formula):
+    """f(x) = sum of w_i A k(|x - c_i|^2 / R_i^2): metaballs, whose surface is f = 1.
+
+    A single blob of weight 1 is the ball with its radius; where blobs meet, they flow together.
+    Inside f is larger.
+
+    centres: (n, 3). radii: (n,) or one number, > 0. weights: (n,), or None for 1; negative ones
+        carve.
+    kernel: "compact" (a polynomial of the sixth degree), "gaussian", or the soft objects "cubic"
+        and "sextic"; or one with numbers of one's own, such as `Gaussian(sharpness=2.0)`. Each ends
+        at `Kernel.support` times the radius.
+    groups: (n,) integers: f is then the largest of the sums of each group, so that groups meet in
+        creases; None for one sum.
+
+    A look costs what is near: many blobs are kept in a uniform grid of lists.
+
+    Raises BlobError (a ValueError) for what are no blobs.
+    """
+
+    default_level: float = 1.0
+    period: ClassVar[float | None] = None
+
+    def __init__(
+        self,
+        centres: Any,
+        radii: Any,
+        weights: Any = None,
+        *,
+        kernel: str | Kernel = "compact",
+        groups: Any = None,
+    ) -> None:
+        self.centres, self.radii, self.weights, self.groups = _checked(
+            centres, radii, weights, groups
+        )
+        self.kernel = choose_kernel(kernel)
+        self._on: _BlobData | None = None
+        self._lists: CellLists | None = None
+
+    def __len__(self) -> int:
+        return len(self.centres)
+
+    @property
+    def _supports(self) -> FloatArray:
+        return self.radii * self.kernel.support
+
+    def cell_lists(self) -> CellLists | None:
+        """The lists of blobs near each cell of a grid, made once; None for few blobs."""
+        if self._lists is None and len(self) >= _MANY:
+            self._lists = CellLists.of(self.centres, self._supports)
+        return self._lists
+
+    @prepared_once
+    def prepare(self, backend: Backend) -> Blobs:
+        """The blobs as records of the backend; others compile no other kernel."""
+        prepared = copy.copy(self)
+        prepared._on = _BlobData.upload(backend, self)
+        prepared.kernel = self.kernel.prepare(backend)
+        prepared.lipschitz = dr.opaque(backend.Float, self.largest_gradient())
+        return prepared
+
+    def largest_gradient(self) -> float:
+        """A bound of |grad f|: the largest sum of the largest gradients of blobs that meet."""
+        steep = np.abs(self.weights) * (self.kernel.amplitude * self.kernel.steepness.slope)
+        steep /= self._supports
+        lists = self.cell_lists()
+        if lists is None:
+            return float(steep.sum())
+        ends = np.concatenate([[0.0], np.cumsum(steep[lists.entries])])
+        return float((ends[lists.starts[1:]] - ends[lists.starts[:-1]]).max()) * (1 + 1e-6)
+
+    def extent(self, levels: tuple[float, ...]) -> Volume:
+        """The box around all supports: outside f is 0."""
+        del levels
+        reach = self._supports[:, None] * (1 + 1e-6)
+        return Box((self.centres - reach).min(axis=0), (self.centres + reach).max(axis=0))
+
+    def check_levels(self, levels: tuple[float, ...]) -> None:
+        for level in levels:
+            if level == 0.0:
+                raise ValueError(
+                    "level 0 of blobs is all the space outside of them; a single blob has its "
+                    "radius at level 1, and any other number but 0 gives a surface"
+                )
+
+    def evaluate(self, p: Vec3) -> Sample:
+        on = self._prepared(p)
+        return self._sample(on.value_at(self.kernel, p))
+
+    def _sample(self, found: BlobValue) -> Sample:
+        known = () if self.lipschitz is None else (Lipschitz(0 * found.value + self.lipschitz),)
+        return Sample(found.value, found.gradient, known, found.error, found.gradient_error)
+
+    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
+        """Value and ranges by one loop over the blobs near; looking back nothing is proved.
+
+        In a grid a look reaches to the end of its cell. In an empty one f is 0 until the path comes
+        to the first cell that is not: what follows from there is proved from that cell's list.
+        """
+        del back
+        p, d = path.point(t), path.direction
+        asked = Knots()
+        nothing = Slopes(0.0, 0.0)
+        path.proofs.along(asked, nothing, ahead)
+        if asked.knots is None:
+            return path.look(self.evaluate(p))
+        on = self._prepared(p)
+        ahead = ahead * _BEYOND_END
+        run: Real | None = None
+        there, length = p, fmin(ahead, on.across)
+        if on.grid is not None:
+            run = empty = on.grid.run(p, d, ahead)
+            there = dr.fma(type(p)(empty), d, p)
+            reach = on.grid.cell(there).exit(d)
+            length = fmin(dr.select(empty > 0, reach, fmin(ahead, reach)), on.across)
+        path.proofs.along(asked, nothing, length)
+        enclosures: tuple[Enclosure, ...]
+        if on.groups is None:
+            found = sum_along(
+                self.kernel, on.backend, there, d, asked.knots, on.near(there), signed=on.signed
+            )
+            start = found.start if run is None else _zero_where(run > 0, found.start)
+            slope = dr.dot(start.gradient, d)
+            slopes = Slopes.around(slope, start.gradient_error)
+            enclosures = path.proofs.along(found, slopes, length)
+        else:
+            start = on.value_at(self.kernel, p)
+            slope = dr.dot(start.gradient, d)
+            enclosures = (
+                LargestAlong(
+                    self.kernel, on.grouped(there), path, there, start.value, asked.knots, length,
+                    on.signed,
+                ),
+            )  # fmt: skip
+        if run is not None:
+            enclosures = tuple(_After(run, one) for one in enclosures)
+        return Look(self._sample(start), enclosures, (), slope, PIECES)
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        """f of jets of the coordinates, or of Dr.Jit numbers: a sum over all blobs, near or not."""
+        if not isinstance(x, Jet):
+            return self.differentiable_value(backend_of(x).Array3f(x, y, z))
+        on = self._prepared_for(backend_of(_number_of(x, y, z)))
+        zero = on.backend.Float(0)
+        term = blob_term(self.kernel, (x, y, z))
+        if on.groups is None:
+            return summed(term, x, zero, over(on.records))
+        return largest_jet(term, x, zero, on.grouped(None))
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        """Of the sum, or of the largest sum."""
+        on = self._prepared(p)
+        if on.groups is not None:
+            return super().hessian(p)
+        xx, xy, xz, yy, yz, zz = hessian_at(self.kernel, on.backend, p, on.near(p))
+        vector = on.backend.Array3f
+        return vector(xx, xy, xz), vector(xy, yy, yz), vector(xz, yz, zz)
+
+    def differentiable_value(self, p: Vec3) -> Real:
+        with dr.suspend_grad():
+            at = dr.detach(p)
+            sample = self.evaluate(at)
+        return sample.value + dr.dot(sample.gradient, p - at)
+
+    def _prepared(self, p: Vec3) -> _BlobData:
+        return self._prepared_for(backend_of(p))
+
+    def _prepared_for(self, backend: Backend) -> _BlobData:
+        if self._on is None:
+            return _BlobData.upload(backend, self)
+        return self._on
+
+    def describe(self) -> dict[str, Any]:
+        facts: dict[str, Any] = {"blobs": len(self), "kernel": self.kernel.name}
+        lists = self.cell_lists()
+        if lists is not None:
+            nx, ny, nz = lists.shape
+            facts["grid"] = f"{nx} x {ny} x {nz} cells of {lists.cell:.3g}"
+        return facts
+
+
+@dataclass(frozen=True)
+class _BlobData:
+    """Blobs on a backend.
+
+    groups: of each blob, and how many there are; None where all are one sum.
+    across: longer than any path through all supports.
+    """
+
+    backend: Backend
+    records: Records
+    grid: Grid | None
+    groups: tuple[Any, Any] | None
+    signed: bool
+    across: Real
+
+    @classmethod
+    def upload(cls, backend: Backend, blobs: Blobs) -> _BlobData:
+        """The blobs on a backend."""
+        lists = blobs.cell_lists()
+        groups = None
+        if blobs.groups is not None:
+            count = dr.opaque(backend.UInt32, int(blobs.groups.max()) + 1)
+            groups = uploaded_integers(backend, blobs.groups), count
+        low, high = blobs.extent(()).bounds()
+        return cls(
+            backend,
+            Records.upload(backend, _rows(backend, blobs)),
+            None if lists is None else Grid.upload(backend, lists),
+            groups,
+            bool((blobs.weights < 0).any()),
+            dr.opaque(backend.Float, 2 * float(np.linalg.norm(high - low))),
+        )
+
+    def near(self, p: Vec3) -> ForEach:
+        """The blobs whose supports may hold p: those of its cell."""
+        if self.grid is None:
+            return over(self.records)
+        return over_list(self.records, self.grid.entries, *self.grid.cell(p).entries())
+
+    def grouped(self, p: Vec3 | None) -> GroupedList:
+        """The same by groups; all blobs where p is None."""
+        assert self.groups is not None
+        of, count = self.groups
+        if self.grid is None or p is None:
+            zero = self.backend.UInt32(0)
+            return GroupedList(self.records, of, None, zero, self.records.trips, count)
+        begin, end = self.grid.cell(p).entries()
+        return GroupedList(self.records, of, self.grid.entries, begin, end, count)
+
+    def value_at(self, kernel: Kernel, p: Vec3) -> BlobValue:
+        """The sum, or the largest sum, at points p."""
+        if self.groups is None:
+            return value_at(kernel, self.backend, p, self.near(p))
+        return largest_at(kernel, self.backend, p, self.grouped(p))
+
+
+def _rows(backend: Backend, blobs: Blobs) -> FloatArray:
+    """Records (n, 8): the centre, what of it the precision leaves over, 1/R, and the amplitude."""
+    supports = blobs.radii * blobs.kernel.support
+    amplitude = blobs.weights * blobs.kernel.amplitude
+    with np.errstate(over="ignore"):
+        near = blobs.centres.astype(backend.dtype).astype(np.float64)
+        bend = (np.abs(amplitude) * blobs.kernel.steepness.bend / supports**2).astype(backend.dtype)
+    if not (np.isfinite(bend).all() and np.isfinite(near).all() and (1 / supports < 1e30).all()):
+        worst = int(np.argmin(blobs.radii))
+        raise BlobError(
+            f"blob {worst} has a radius of {blobs.radii[worst]:g}, too small for single precision: "
+            'use precision="double" or larger units'
+        )
+    rest = blobs.centres - near
+    return np.column_stack([near, rest, 1 / supports, amplitude])
+
+
+@dataclass(frozen=True)
+class _After(Enclosure):
+    """F = 0 for 0 <= s <= run, then what another enclosure says of the path from there."""
+
+    run: Real
+    then: Enclosure
+
+    def step(self, gaps: Gaps) -> Real:
+        return self.run + self.then.step(gaps)
+
+
+def _zero_where(mask: Any, found: BlobValue) -> BlobValue:
+    """The sum, 0 where no support is near."""
+    zero = 0 * found.value
+    return BlobValue(
+        dr.select(mask, zero, found.value),
+        dr.select(mask, type(found.gradient)(0), found.gradient),
+        dr.select(mask, zero, found.error),
+        dr.select(mask, zero, found.gradient_error),
+    )
+
+
+def _number_of(*jets: Jet) -> Any:
+    """A number of the backend among those of jets.
+
+    Raises:
+        TypeError: they are all constants.
+    """
+    for jet in jets:
+        for one in (jet.value, *jet.first):
+            for end in (one.low, one.high):
+                if dr.is_array_v(cast("Any", type(end))):
+                    return end
+    raise TypeError("blobs need a point of the backend: the coordinates are constants")
+
+
+def _checked(
+    centres: Any, radii: Any, weights: Any, groups: Any
+) -> tuple[FloatArray, FloatArray, FloatArray, IntArray | None]:
+    """Arrays of what was given.
+
+    Raises:
+        BlobError: wrong shapes, or numbers that no blob can have.
+    """
+    c = real_array(centres, "centres", BlobError).astype(np.float64)
+    check_vectors(c, "centres", BlobError)
+    if not len(c):
+        raise BlobError("centres: there are none; give at least one blob")
+    check_finite(c, "centre {}", BlobError)
+    check_size(c, BlobError)
+    r = _numbers(radii, "radii", len(c))
+    bad = np.flatnonzero(~(r > 0))
+    if bad.size:
+        raise BlobError(f"radius {bad[0]} is {r[bad[0]]:g}: radii must be positive")
+    w = np.ones(len(c)) if weights is None else _numbers(weights, "weights", len(c))
+    if groups is None:
+        return c, r, w, None
+    g = np.asarray(groups)
+    if g.shape != (len(c),) or g.dtype.kind not in "iu":
+        raise BlobError(
+            f"groups must be {len(c)} integers, one for each blob, not {g.dtype} of shape {g.shape}"
+        )
+    order = np.argsort(g, kind="stable")
+    return c[order], r[order], w[order], np.unique(g[order], return_inverse=True)[1]
+
+
+def _numbers(values: Any, name: str, count: int) -> FloatArray:
+    array = real_array(values, name, BlobError).astype(np.float64)
+    if array.ndim == 0:
+        array = np.full(count, float(array))
+    if array.shape != (count,):
+        raise BlobError(
+            f"{name} must be one number, or {count}, one for each centre, not an array of shape "
+            f"{array.shape}"
+        )
+    bad = np.flatnonzero(~np.isfinite(array))
+    if bad.size:
+        raise BlobError(f"{name}: entry {bad[0]} is {array[bad[0]]}, and all must be finite")
+    return array

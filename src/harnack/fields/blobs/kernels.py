@@ -1,0 +1,451 @@
+"""Kernels: how much of a blob is left at a distance from its centre, and along a line.
+
+Lengths are in units of the support: a kernel is a function k(q) of the squared distance q, falling
+from its centre to 0 at q = 1, where it ends with k' = 0. Along a line that passes the centre at the
+distance h, x from the nearest point, it is k(h^2 + x^2): a function of x on the chord |x| <= S,
+S^2 = 1 - h^2. Its derivatives in x all have the same shape, and that is what proofs rest on:
+
+- the first is odd and, for x > 0, falls to one minimum at x = c1, then rises to 0 at S;
+- the second is even and rises from a minimum at 0 to one maximum at c2, then falls until S.
+
+So their ranges on any piece of the line are found among the values at its two ends and three
+numbers of the chord. At S the second derivative of some kernels jumps to 0 (`jumps`).
+"""
+
+from __future__ import annotations
+
+import abc
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import drjit as dr
+import numpy as np
+
+from harnack.arithmetic import Function, Interval
+from harnack.arithmetic.interval import unit_of
+from harnack.backend.extrema import fmax, fmin
+from harnack.choices import did_you_mean
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, FloatArray, Real
+
+
+@dataclass(frozen=True)
+class Chord:
+    """A kernel along a line.
+
+    half: S, half the length of the chord; 0 where the line passes by.
+    turn: c1. steepest: the first derivative at -c1, its largest.
+    bend: c2. most, least: the second derivative at c2 and at 0.
+    """
+
+    half: Real
+    turn: Real
+    steepest: Real
+    bend: Real
+    most: Real
+    least: Real
+
+
+@dataclass(frozen=True)
+class Steepness:
+    """Lipschitz constants of k and of its first two derivatives along a line, with respect to
+    where the line and the point on it are, in units of the support (`slope` also bounds |grad k|):
+    what rounding of these can do. The jump of the second derivative at S is not counted."""
+
+    value: float
+    slope: float
+    bend: float
+
+
+class Kernel(abc.ABC):
+    """A kernel. Amplitudes are chosen so that a single blob of weight 1 has the value 1 at its
+    radius."""
+
+    name: ClassVar[str]
+    jumps: ClassVar[bool] = True
+    """Whether the second derivative along a line jumps where the support ends."""
+
+    @property
+    @abc.abstractmethod
+    def support(self) -> float:
+        """Where a blob ends, in parts of its radius."""
+
+    @property
+    @abc.abstractmethod
+    def steepness(self) -> Steepness:
+        """See `Steepness`."""
+
+    @abc.abstractmethod
+    def height(self, q: FloatArray) -> FloatArray:
+        """k(q), in double precision on the host."""
+
+    @abc.abstractmethod
+    def profile(self, q: Real) -> tuple[Real, Real, Real]:
+        """k, dk/dq, and a number m with which k is right within 16 roundings of m and of dk/dq."""
+
+    @abc.abstractmethod
+    def second(self, q: Real) -> Real:
+        """d2k/dq2."""
+
+    @abc.abstractmethod
+    def chord(self, height: Real, inside: Real) -> Chord:
+        """The kernel along lines with h^2 = `height` <= 1 and S^2 = `inside` = 1 - h^2 >= 0."""
+
+    @abc.abstractmethod
+    def derivatives(self, height: Real, inside: Real, x: Real) -> tuple[Real, Real]:
+        """The first two derivatives along such lines at |x| <= S."""
+
+    @abc.abstractmethod
+    def ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
+        """Ranges of k and of its first two derivatives in q, on an interval of q >= 0."""
+
+    def prepare(self, backend: Backend) -> Kernel:
+        """The same with its numbers as data of the backend."""
+        del backend
+        return self
+
+    @property
+    def amplitude(self) -> float:
+        """1 / k at the radius of a blob."""
+        return 1.0 / float(self.height(np.array([self.support**-2.0]))[0])
+
+    def function(self) -> Function:
+        """The kernel as a function of jets of q."""
+        return Function(self.name, self.ranges, lambda q: self.profile(q)[0], self.height)
+
+
+@dataclass(frozen=True)
+class Compact(Kernel):
+    """(1 - q)^3: polynomial, with a continuous second derivative (Aydinlilar and Zanni 2023, eq. 7
+    with n = 6).
+
+    Along a line w = S^2 - x^2 and f' = -6 x w^2, f'' = 6 w (4 x^2 - w), f''' = 24 x (3w - 2x^2).
+    So f'' = 0 at x^2 = S^2/5 and f''' = 0 at x = 0 and x^2 = 3 S^2/5.
+    """
+
+    support: float = 1.6  # pyright: ignore[reportIncompatibleMethodOverride]
+    name = "compact"
+    jumps = False
+
+    def __post_init__(self) -> None:
+        _check_support(self.support)
+
+    @property
+    def steepness(self) -> Steepness:
+        return Steepness(5.0, 12.0, 90.0)
+
+    def height(self, q: FloatArray) -> FloatArray:
+        return np.maximum(1 - q, 0) ** 3
+
+    def profile(self, q: Real) -> tuple[Real, Real, Real]:
+        w = fmax(1 - q, 0)
+        squared = w * w
+        k = squared * w
+        return k, -3 * squared, k
+
+    def second(self, q: Real) -> Real:
+        return 6 * fmax(1 - q, 0)
+
+    def chord(self, height: Real, inside: Real) -> Chord:
+        half, squared = dr.sqrt(inside), inside * inside
+        turn = math.sqrt(0.2) * half
+        return Chord(
+            half, turn, 3.84 * squared * turn, math.sqrt(0.6) * half, 4.8 * squared, -6 * squared
+        )
+
+    def derivatives(self, height: Real, inside: Real, x: Real) -> tuple[Real, Real]:
+        square = x * x
+        w = inside - square
+        return -6 * x * (w * w), 6 * w * dr.fma(4, square, -w)
+
+    def ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
+        w = _rest(q)
+        unit = unit_of(w.low)
+        return (
+            _rising(w.low * w.low * w.low, w.high * w.high * w.high, 4 * unit),
+            _rising(-3 * w.high * w.high, -3 * w.low * w.low, 4 * unit),
+            _rising(6 * w.low, 6 * w.high, 2 * unit),
+        )
+
+
+@dataclass(frozen=True)
+class Sextic(Kernel):
+    """1 - 22/9 q + 17/9 q^2 - 4/9 q^3 = w^2 (5 + 4w)/9 with w = 1 - q: soft objects (Wyvill,
+    McPheeters and Wyvill 1986; Hart 1996, appendix D).
+
+    Along a line f' = -4/9 x w (5 + 6w), f'' = -4/9 w (5 + 6w) + 8/9 x^2 (5 + 12w) and f''' =
+    4/9 x (15 + 36w - 24x^2), which is 0 at 0 and at x^2 = 1/4 + 3/5 S^2. f'' = 0 is a quadratic
+    equation in x^2, with sum of roots 1/2 + 6/5 S^2 and product S^2 (5 + 6 S^2)/30; the larger root
+    lies outside the chord. Where the maximum of f'' would too, f'' rises until S.
+    """
+
+    support: float = 2.0  # pyright: ignore[reportIncompatibleMethodOverride]
+    name = "sextic"
+
+    def __post_init__(self) -> None:
+        _check_support(self.support)
+
+    @property
+    def steepness(self) -> Steepness:
+        return Steepness(4.0, 10.0, 60.0)
+
+    def height(self, q: FloatArray) -> FloatArray:
+        w = np.maximum(1 - q, 0)
+        return w * w * (5 + 4 * w) / 9
+
+    def profile(self, q: Real) -> tuple[Real, Real, Real]:
+        w = fmax(1 - q, 0)
+        k = w * w * dr.fma(4 / 9, w, 5 / 9)
+        return k, -w * dr.fma(4 / 3, w, 10 / 9), k
+
+    def second(self, q: Real) -> Real:
+        return dr.select(q < 1, dr.fma(8 / 3, 1 - q, 10 / 9), 0)
+
+    def chord(self, height: Real, inside: Real) -> Chord:
+        total = dr.fma(1.2, inside, 0.5)
+        product = inside * dr.fma(0.2, inside, 1 / 6)
+        turn = dr.sqrt(2 * product / (total + dr.sqrt(fmax(total * total - 4 * product, 0))))
+        bend = dr.sqrt(fmin(dr.fma(0.6, inside, 0.25), inside))
+        first, _ = self.derivatives(height, inside, turn)
+        _, most = self.derivatives(height, inside, bend)
+        return Chord(
+            dr.sqrt(inside), turn, -first, bend, most, -inside * dr.fma(8 / 3, inside, 20 / 9)
+        )
+
+    def derivatives(self, height: Real, inside: Real, x: Real) -> tuple[Real, Real]:
+        square = x * x
+        w = inside - square
+        part = w * dr.fma(8 / 3, w, 20 / 9)
+        return -x * part, dr.fma(square, dr.fma(32 / 3, w, 40 / 9), -part)
+
+    def ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
+        w = _rest(q)
+        unit = unit_of(w.low)
+
+        def k(w: Real) -> Real:
+            return w * w * (4 / 9 * w + 5 / 9)
+
+        def slope(w: Real) -> Real:
+            return -w * (4 / 3 * w + 10 / 9)
+
+        bend = _rising(8 / 3 * w.low + 10 / 9, 8 / 3 * w.high + 10 / 9, 4 * unit)
+        return (
+            _rising(k(w.low), k(w.high), 6 * unit),
+            _rising(slope(w.high), slope(w.low), 6 * unit),
+            _ended(bend, q),
+        )
+
+
+@dataclass(frozen=True)
+class Cubic(Kernel):
+    """1 - 3 r^2 + 2 r^3 = (1 - r)^2 (1 + 2r) with r^2 = q: soft objects (Hart 1996, eq. 36).
+
+    Along a line r^2 = h^2 + x^2 and f' = -6 x (1 - r), f'' = -6 (1 - r - x^2/r), f''' =
+    6 x/r (3 - x^2/r^2), so f'' rises until S. f'' = 0 where r + x^2/r = 1: a quadratic equation,
+    x^2 = (1 - 4h^2 + sqrt(1 + 8h^2))/8.
+    """
+
+    support: float = 2.0  # pyright: ignore[reportIncompatibleMethodOverride]
+    name = "cubic"
+
+    def __post_init__(self) -> None:
+        _check_support(self.support)
+
+    @property
+    def steepness(self) -> Steepness:
+        return Steepness(5.0, 12.0, 40.0)
+
+    def height(self, q: FloatArray) -> FloatArray:
+        r = np.sqrt(np.clip(q, 0, 1))
+        return (1 - r) ** 2 * (1 + 2 * r)
+
+    def profile(self, q: Real) -> tuple[Real, Real, Real]:
+        r = dr.sqrt(fmin(q, 1))
+        w = 1 - r
+        k = w * w * dr.fma(2, r, 1)
+        return k, -3 * w, k
+
+    def second(self, q: Real) -> Real:
+        return dr.select(q < 1, 1.5 / dr.sqrt(fmax(q, float(dr.smallest(type(q))))), 0)
+
+    def chord(self, height: Real, inside: Real) -> Chord:
+        half = dr.sqrt(inside)
+        turn = dr.sqrt(fmax(1 + dr.sqrt(dr.fma(8, height, 1)) - 4 * height, 0) * 0.125)
+        turn = fmin(turn, half)
+        first, _ = self.derivatives(height, inside, turn)
+        return Chord(half, turn, -first, half, 6 * inside, 6 * dr.sqrt(height) - 6)
+
+    def derivatives(self, height: Real, inside: Real, x: Real) -> tuple[Real, Real]:
+        square = x * x
+        r = dr.sqrt(fmax(height + square, float(dr.smallest(type(x)))))
+        return -6 * x * (1 - r), 6 * (square / r - (1 - r))
+
+    def ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
+        low, high = dr.sqrt(fmin(fmax(q.low, 0), 1)), dr.sqrt(fmin(q.high, 1))
+        unit = unit_of(low)
+
+        def k(r: Real) -> Real:
+            return (1 - r) * (1 - r) * (1 + 2 * r)
+
+        # Absolute errors: of r half a unit, of 1 - r as much and less.
+        slope = Interval(-3 * (1 - low) - 8 * unit, fmin(-3 * (1 - high) + 8 * unit, 0))
+        value = Interval(fmax(k(high) - 8 * unit, 0), k(low) + 8 * unit)
+        bend = Interval(1.5 / high, dr.select(low > 0, 1.5 / low, dr.inf)).widened(8 * unit)
+        return value, slope, _ended(bend, q)
+
+
+# A polynomial P with y = (1 - u) P(u), e^-y (1 - 2y) = u, within 3e-5 for 0 <= u <= 1.
+_TURN = (
+    0.49997092305737245, -0.3219978627536485, 0.32259825712084994,
+    -0.30315186994209903, 0.18704273421313763, -0.051146934086341474,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Gaussian(Kernel):
+    """exp(z) - 1 - z with z = b (1 - q): a Gaussian, less its tangent in q where the blob ends
+    (Aydinlilar and Zanni 2023, eq. 6, has no end).
+
+    A Gaussian that is only cut off jumps, and no step across the jump could be proved. Less its
+    tangent it ends as smoothly as the other kernels, differs from the Gaussian by a parabola that
+    is small where the tail is, and its ranges are exact.
+
+    sharpness: s of exp(-s d^2/radius^2).
+    tail: what is left of the Gaussian where the blob ends, in parts of what it is at the radius.
+
+    Along a line z = b (S^2 - x^2), y = b x^2 and f' = -2 b x (e^z - 1), f'' =
+    2b (e^z (2y - 1) + 1), f''' = 4 b^2 x e^z (3 - 2y): the maximum of f'' is at y = 3/2, or at S if
+    that is nearer. f'' = 0 where e^-y (1 - 2y) = e^-z at x = 0: a function of one number, taken
+    from a polynomial. Its error e changes the extreme value of f' by the order of e^2.
+    """
+
+    sharpness: float = 1.0
+    tail: float = 1e-3
+    rate: Any = None
+    name = "gaussian"
+
+    def __post_init__(self) -> None:
+        if not 0 < self.sharpness <= 20:
+            raise ValueError(f"sharpness must be in (0, 20], not {self.sharpness!r}")
+        if not 1e-6 <= self.tail <= 0.5:
+            raise ValueError(
+                f"tail must lie between 1e-6 and 0.5, not {self.tail!r}: it is what is left of a "
+                "Gaussian where the blob ends"
+            )
+
+    @property
+    def support(self) -> float:
+        return math.sqrt(1 - math.log(self.tail) / self.sharpness)
+
+    @property
+    def _rate(self) -> Any:
+        return self.sharpness * self.support**2 if self.rate is None else self.rate
+
+    @property
+    def steepness(self) -> Steepness:
+        b = self.sharpness * self.support**2
+        top = math.exp(b)
+        return Steepness(4 * b * top, 8 * b * (1 + math.sqrt(b)) * top, 16 * b * (1 + b) * top)
+
+    def prepare(self, backend: Backend) -> Kernel:
+        return Gaussian(self.sharpness, self.tail, dr.opaque(backend.Float, float(self._rate)))
+
+    def height(self, q: FloatArray) -> FloatArray:
+        z = self.sharpness * self.support**2 * np.maximum(1 - q, 0)
+        return np.expm1(z) - z
+
+    def profile(self, q: Real) -> tuple[Real, Real, Real]:
+        z = self._rate * fmax(1 - q, 0)
+        e = dr.exp(z)
+        return e - 1 - z, -self._rate * (e - 1), dr.select(z > 0, e, 0)
+
+    def second(self, q: Real) -> Real:
+        return dr.select(q < 1, self._rate * self._rate * dr.exp(self._rate * (1 - q)), 0)
+
+    def chord(self, height: Real, inside: Real) -> Chord:
+        b = self._rate
+        z = b * inside
+        top = dr.exp(z)
+        u = 1 / top
+        polynomial: Any = _TURN[-1]
+        for one in reversed(_TURN[:-1]):
+            polynomial = dr.fma(polynomial, u, one)
+        y = fmax((1 - u) * polynomial, 0)
+        turn = dr.sqrt(y / b)
+        late = z < 1.5
+        most = 2 * b * (2 * dr.select(late, z, top * math.exp(-1.5)) + dr.select(late, 0, 1))
+        return Chord(
+            dr.sqrt(inside),
+            turn,
+            2 * b * turn * (dr.exp(z - y) - 1),
+            dr.sqrt(fmin(1.5, z) / b),
+            most,
+            -2 * b * (top - 1),
+        )
+
+    def derivatives(self, height: Real, inside: Real, x: Real) -> tuple[Real, Real]:
+        b = self._rate
+        y = b * (x * x)
+        e = dr.exp(b * inside - y)
+        return -2 * b * x * (e - 1), 2 * b * dr.fma(e, dr.fma(2, y, -1), 1)
+
+    def ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
+        w = _rest(q)
+        b, unit = self._rate, unit_of(w.low)
+        # The product with b is off by half a unit, the exponential by eight.
+        off = 16 * unit
+        z = Interval(b * w.low, b * w.high).widened(2 * unit)
+        low, high = dr.exp(z.low), dr.exp(z.high)
+        value = Interval(fmax(low - 1 - z.low - off * low, 0), high - 1 - z.high + off * high)
+        slope = Interval(-b * (high - 1) - off * b * high, fmin(-b * (low - 1) + off * b * low, 0))
+        bend = Interval(b * b * low, b * b * high).widened(off)
+        return value, slope, _ended(bend, q)
+
+
+KERNELS: dict[str, type[Kernel]] = {
+    "compact": Compact, "gaussian": Gaussian, "cubic": Cubic, "sextic": Sextic,
+}  # fmt: skip
+
+
+def choose_kernel(kernel: str | Kernel) -> Kernel:
+    """A kernel by its name, with its usual numbers, or as it is given.
+
+    Raises ValueError for another name, TypeError for what is neither.
+    """
+    if isinstance(kernel, Kernel):
+        return kernel
+    if not isinstance(kernel, str):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise TypeError(f"kernel must be a name or a kernel such as Compact(1.6), not {kernel!r}")
+    if kernel not in KERNELS:
+        raise ValueError(
+            f"unknown kernel {kernel!r}; choose one of {', '.join(KERNELS)}"
+            f"{did_you_mean(kernel, KERNELS)}"
+        )
+    return KERNELS[kernel]()
+
+
+def _check_support(support: float) -> None:
+    if not 1.0 < support <= 100.0:
+        raise ValueError(
+            f"support must lie between 1 and 100, not {support!r}: it is where a blob ends, in "
+            "parts of its radius"
+        )
+
+
+def _rest(q: Interval) -> Interval:
+    """1 - q where it is not negative."""
+    w = Interval(1.0, 1.0) - q
+    return Interval(fmax(w.low, 0), fmax(w.high, 0))
+
+
+def _rising(low: Real, high: Real, unit: float) -> Interval:
+    return Interval(low, high).widened(unit)
+
+
+def _ended(bend: Interval, q: Interval) -> Interval:
+    """A positive second derivative on an interval, 0 where the support has ended."""
+    return Interval(
+        dr.select(q.high < 1, fmax(bend.low, 0), 0), dr.select(q.low <= 1, bend.high, 0)
+    )

@@ -1,0 +1,278 @@
+"""Sums of blobs: at a point, and along a path with ranges of both derivatives on all its pieces.
+
+One loop over the blobs. Each is seen from the point in units of its own support, so that one set of
+bounds serves blobs of every size.
+
+What rounding does. Let u be the unit roundoff, v the vector from the point to a centre in units of
+the support, t = v.d. Centres are stored as the sum of two numbers, so that v is right within 4u|v|;
+then so are t, the distance h of the line from the centre (as a length), and the places x = s - t,
+within 8u(2 + |t|) where they matter: that is a displacement of the blob beside the path, in which
+also falls that |d| is 1 up to 2u only. A displacement by e changes f' by at most `Steepness.slope`
+times e, and f'' by `Steepness.bend` times e (its jumps at the end of the support are looked for
+within a margin). A sum of n terms adds n u times the sum of their largest absolute values. Both are
+added to the ranges, outwards. The value at the point is right within 8u |dk/dq|, by the rounding of
+q, and (16 + n)u m, with m as in `Kernel.profile`.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import drjit as dr
+
+from harnack.backend.extrema import clamp, fmax, fmin
+from harnack.enclosures import Piece, Slopes
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.backend.records import Records
+    from harnack.fields.blobs.kernels import Chord, Kernel
+
+State: TypeAlias = "tuple[Any, ...]"
+# Gives the state with the record of one blob taken into account.
+EachBlob: TypeAlias = "Callable[[list[Real], State], State]"
+# Runs it over the blobs that matter.
+ForEach: TypeAlias = "Callable[[EachBlob, State], State]"
+
+
+@dataclass(frozen=True)
+class BlobValue:
+    """A sum at points: value and gradient, and how far rounding may have moved them."""
+
+    value: Real
+    gradient: Vec3
+    error: Real
+    gradient_error: Real
+
+
+# Pieces of a path that take the least time: finding what is near costs more than ranges.
+PIECES = 4
+
+
+@dataclass(frozen=True)
+class Along:
+    """A sum along the path from p: what it is there, and ranges on pieces (see `Restriction`)."""
+
+    start: BlobValue
+    parts: tuple[Piece, ...]
+    piece_count: int = PIECES
+
+    def pieces(self, knots: Sequence[Real]) -> tuple[Piece, ...]:
+        """The ranges between the knots that it was made with."""
+        assert len(knots) == len(self.parts) + 1
+        return self.parts
+
+
+class Knots:
+    """A function along a path that is asked in advance which ranges will be wanted."""
+
+    def __init__(self) -> None:
+        self.piece_count = PIECES
+        self.knots: tuple[Real, ...] | None = None
+
+    def pieces(self, knots: Sequence[Real]) -> tuple[Piece, ...]:
+        """Remembers the knots, and says nothing."""
+        self.knots = tuple(knots)
+        ends = itertools.pairwise(knots)
+        return tuple(Piece(b - a, Slopes(0.0, 0.0), 0.0, 0.0) for a, b in ends)
+
+
+def value_at(kernel: Kernel, backend: Backend, p: Vec3, for_each: ForEach) -> BlobValue:
+    """The sum at points p."""
+    real = backend.Float
+
+    def body(row: list[Real], state: State) -> State:
+        inverse, amplitude = row[6], row[7]
+        v = _from(p, row) * inverse
+        return _add_value(kernel, v, inverse, amplitude, state)
+
+    state = for_each(body, tuple(real(0) for _ in range(_VALUE)))
+    return _value(kernel, backend, state)
+
+
+def sum_along(
+    kernel: Kernel,
+    backend: Backend,
+    p: Vec3,
+    d: Vec3,
+    knots: Sequence[Real],
+    for_each: ForEach,
+    *,
+    signed: bool = True,
+) -> Along:
+    """The sum along p + s d. signed: whether amplitudes may be negative."""
+    real = backend.Float
+    count = len(knots) - 1
+    unit = 0.5 * backend.epsilon
+    jumps = kernel.jumps
+
+    def body(row: list[Real], state: State) -> State:
+        start, sums = state[:_VALUE], list(state[_VALUE:])
+        inverse, amplitude = row[6], row[7]
+        v = _from(p, row) * inverse
+        start = _add_value(kernel, v, inverse, amplitude, start)
+
+        along = dr.dot(v, d)
+        beside = v - along * d
+        squared = dr.dot(beside, beside)
+        height = fmin(squared, 1)
+        inside = 1 - height
+        chord = kernel.chord(height, inside)
+        size = 1 + dr.abs(along)
+        margin = (64 * unit) * size
+        places = [dr.fma(knot, inverse, -along) for knot in knots]
+        near = (squared < 1 + margin) & (places[0] < 1 + margin) & (places[-1] > -1 - margin)
+        slope_scale = amplitude * inverse
+        bend_scale = slope_scale * inverse
+
+        a = clamp(places[0], -chord.half, chord.half)
+        first_a, second_a = kernel.derivatives(height, inside, a)
+        for k in range(count):
+            b = clamp(places[k + 1], -chord.half, chord.half)
+            first_b, second_b = kernel.derivatives(height, inside, b)
+            slopes = _slopes(chord, a, b, first_a, first_b)
+            bends = _bends(chord, a, b, second_a, second_b)
+            if jumps:
+                bends = _with_jumps(bends, inside, margin, places[k], places[k + 1])
+            for at, (low, high), scale in ((0, slopes, slope_scale), (2, bends, bend_scale)):
+                if signed:
+                    up = scale > 0
+                    low, high = dr.select(up, low, high), dr.select(up, high, low)
+                sums[4 * k + at] = dr.fma(low, scale, sums[4 * k + at])
+                sums[4 * k + at + 1] = dr.fma(high, scale, sums[4 * k + at + 1])
+            a, first_a, second_a = b, first_b, second_b
+
+        weight = dr.select(near, size + 1, 0)
+        sums[-3] = dr.fma(dr.abs(slope_scale), weight, sums[-3])
+        sums[-2] = dr.fma(dr.abs(bend_scale), weight, sums[-2])
+        sums[-1] = sums[-1] + dr.select(near, real(1), 0)
+        return (*start, *sums)
+
+    state = for_each(body, tuple(real(0) for _ in range(_VALUE + 4 * count + 3)))
+    steepness = kernel.steepness
+    slope_size, bend_size, terms = state[-3:]
+    rounding = unit * (16 + terms)
+    slope_error = rounding * steepness.slope * slope_size
+    bend_error = rounding * steepness.bend * bend_size
+    parts: list[Piece] = []
+    for k, (begin, end) in enumerate(itertools.pairwise(knots)):
+        low, high, least, most = state[_VALUE + 4 * k : _VALUE + 4 * k + 4]
+        slopes = Slopes(low - slope_error, high + slope_error)
+        parts.append(Piece(end - begin, slopes, least - bend_error, most + bend_error))
+    return Along(_value(kernel, backend, state[:_VALUE]), tuple(parts))
+
+
+def hessian_at(kernel: Kernel, backend: Backend, p: Vec3, for_each: ForEach) -> State:
+    """The second derivatives of the sum at points p: rows of the upper triangle."""
+
+    def body(row: list[Real], state: State) -> State:
+        inverse, amplitude = row[6], row[7]
+        v = _from(p, row) * inverse
+        q = dr.dot(v, v)
+        scale = amplitude * inverse * inverse
+        even = 2 * scale * kernel.profile(q)[1]
+        bend = 4 * scale * kernel.second(q)
+        pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+        return tuple(
+            total + dr.select(q < 1, bend * v[i] * v[j] + (even if i == j else 0), 0)
+            for total, (i, j) in zip(state, pairs, strict=True)
+        )
+
+    return for_each(body, tuple(backend.Float(0) for _ in range(6)))
+
+
+# Numbers of the state that belong to the value at the point: the value, the gradient, the sums that
+# errors are made of, and the number of terms.
+_VALUE = 8
+
+
+def _add_value(kernel: Kernel, v: Vec3, inverse: Real, amplitude: Real, state: State) -> State:
+    value, x, y, z, moved, noise, slope_size, terms = state
+    q = dr.dot(v, v)
+    k, slope, scale = kernel.profile(q)
+    steep = amplitude * slope
+    pull = -2 * steep * inverse
+    here = q < 1.001
+    size = dr.abs(amplitude)
+    return (
+        dr.fma(amplitude, k, value),
+        dr.fma(pull, v.x, x),
+        dr.fma(pull, v.y, y),
+        dr.fma(pull, v.z, z),
+        moved + dr.abs(steep),
+        dr.fma(size, scale, noise),
+        slope_size + dr.select(here, size * inverse, 0),
+        terms + dr.select(here, type(q)(1), 0),
+    )
+
+
+def _value(kernel: Kernel, backend: Backend, state: State) -> BlobValue:
+    value, x, y, z, moved, noise, slope_size, terms = state
+    unit = 0.5 * backend.epsilon
+    error = unit * dr.fma(16 + terms, noise, 8 * moved)
+    gradient_error = unit * (32 + terms) * kernel.steepness.slope * slope_size
+    return BlobValue(value, backend.Array3f(x, y, z), error, gradient_error)
+
+
+def _from(p: Vec3, row: list[Real]) -> Vec3:
+    """The vector from p to the centre of a blob."""
+    return type(p)(*((row[k] - p[k]) + row[3 + k] for k in range(3)))
+
+
+def _slopes(chord: Chord, a: Real, b: Real, at_a: Real, at_b: Real) -> tuple[Real, Real]:
+    """The range of the first derivative between a and b."""
+    falls = (a <= chord.turn) & (b >= chord.turn)
+    rises = (a <= -chord.turn) & (b >= -chord.turn)
+    low = dr.select(falls, -chord.steepest, fmin(at_a, at_b))
+    return low, dr.select(rises, chord.steepest, fmax(at_a, at_b))
+
+
+def _bends(chord: Chord, a: Real, b: Real, at_a: Real, at_b: Real) -> tuple[Real, Real]:
+    """The range of the second derivative between a and b."""
+    centre = (a <= 0) & (b >= 0)
+    right = (a <= chord.bend) & (b >= chord.bend)
+    left = (a <= -chord.bend) & (b >= -chord.bend)
+    low = dr.select(centre, chord.least, fmin(at_a, at_b))
+    return low, dr.select(left | right, chord.most, fmax(at_a, at_b))
+
+
+def _with_jumps(
+    bends: tuple[Real, Real], inside: Real, margin: Real, begin: Real, end: Real
+) -> tuple[Real, Real]:
+    """The range with 0 in it where the piece leaves the support, and nothing else where it does not
+    meet it."""
+    low, high = bends
+    nearest = fmax(fmax(begin, -end), 0)
+    meets = nearest * nearest < inside + margin
+    farthest = fmax(dr.abs(begin), dr.abs(end))
+    leaves: Mask = ~(farthest * farthest <= inside - margin)
+    low, high = dr.select(leaves, fmin(low, 0), low), dr.select(leaves, fmax(high, 0), high)
+    return dr.select(meets, low, 0), dr.select(meets, high, 0)
+
+
+def over(records: Records, *, active: Mask = True) -> ForEach:
+    """All records, one after the other."""
+
+    def for_each(body: EachBlob, state: State) -> State:
+        return records.for_each(body, state, "blobs", active)
+
+    return for_each
+
+
+def over_list(records: Records, entries: Any, begin: Any, end: Any) -> ForEach:
+    """The records of a list: `entries` from begin to end."""
+    kind = records.backend.UInt32
+
+    def for_each(body: EachBlob, state: State) -> State:
+        def step(i: Any, *state: Any) -> State:
+            return i + 1, *body(records.row(dr.gather(kind, entries, i)), state)
+
+        def more(i: Any, *_: Any) -> Mask:
+            return i < end
+
+        return dr.while_loop((kind(begin), *state), more, step, label="blobs of a cell")[1:]
+
+    return for_each
