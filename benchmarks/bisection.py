@@ -2,7 +2,8 @@
 
 An interval of the ray is looked at as a whole. Where the enclosure proves it free, the next one
 follows; where not, what it proves free at the front (and, of bands, at the end) is cut off and the
-rest halved. The ends of intervals still to come are on a stack.
+rest halved. The ends of intervals still to come are on a stack, each with how far the ray is free
+behind it.
 """
 
 from __future__ import annotations
@@ -53,29 +54,34 @@ def bisect(
             back = dr.select(dr.isfinite(back) & (back > front), back, length)
         return front, back
 
-    def body(start: Any, top: Any, looks: Any, found: Any, active: Any, stack: Any) -> Any:
-        stop = stack.read(top, active=active)
+    def body(start: Any, top: Any, looks: Any, found: Any, active: Any, ends: Any, on: Any) -> Any:
+        stop = ends.read(top, active=active)
+        resumed = on.read(top, active=active)
         front, back = look(start, stop)
         looks = looks + 1
         free = front >= stop - start
         short = ~free & (stop - start < width)
         found = dr.select(short, start, found)
-        after = dr.select(free, stop, start + front)
+        after = dr.select(free, resumed, start + front)
         last = start + back
         halved = active & ~free & ~short
-        stack.write(last, top, active=halved)
-        stack.write(0.5 * (after + last), dr.minimum(top + 1, _DEPTH - 1), active=halved)
+        middle = 0.5 * (after + last)
+        upper = dr.minimum(top + 1, _DEPTH - 1)
+        ends.write(last, top, active=halved)
+        ends.write(middle, upper, active=halved)
+        on.write(middle, upper, active=halved)
         done = short | (free & (top == 0)) | (looks >= _MOST)
-        top = dr.select(free, top - 1, dr.minimum(top + 1, _DEPTH - 1))
-        return after, dr.select(done, count(0), top), looks, found, active & ~done, stack
+        top = dr.select(free, top - 1, upper)
+        return after, dr.select(done, count(0), top), looks, found, active & ~done, ends, on
 
     core = time.process_time()
     n = dr.width(o)
-    stack = dr.alloc_local(real, _DEPTH)
-    stack.write(real(end), count(0))
+    ends, on = dr.alloc_local(real, _DEPTH), dr.alloc_local(real, _DEPTH)
+    ends.write(real(end), count(0))
+    on.write(real(end), count(0))
     state = (
         dr.zeros(real, n), dr.zeros(count, n), dr.zeros(count, n),
-        dr.full(real, dr.inf, n), dr.full(backend.Bool, True, n), stack,
+        dr.full(real, dr.inf, n), dr.full(backend.Bool, True, n), ends, on,
     )  # fmt: skip
     result = dr.while_loop(state, lambda *now: now[4], body, label="bisection")
     looks, found = result[2], result[3]

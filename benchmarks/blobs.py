@@ -123,7 +123,7 @@ class BlobFormula(Formula):
         return summed(self.records, blob) - self.scene.threshold
 
     def restricted(self, p: Any, direction: Any) -> BlobsAlong:
-        return BlobsAlong(self, p, direction)
+        return BlobsAlong(self, p, direction, piece_count=4)
 
 
 @dataclass(frozen=True)
