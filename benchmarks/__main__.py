@@ -14,13 +14,18 @@ import harnack as hk
 from .agreement import agreement
 from .convergence import plot
 from .growth import growth
+from .hart import hart
+from .inclusion import inclusion
+from .povray import compare_with_povray, has_povray
 from .rays import RULES, WIDTH, Row, machine, measure, published
 from .scenes import others, polygons
 from .versions import beside
 from .winding import throughput
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
-SECTIONS = ("rays", "convergence", "winding", "agreement", "versions")
+SECTIONS = (
+    "rays", "convergence", "winding", "agreement", "versions", "inclusion", "hart", "povray",
+)  # fmt: skip
 
 
 def main() -> None:
@@ -44,11 +49,20 @@ def main() -> None:
         if arguments.only == "versions":
             parser.error("versions needs a checkout of an earlier version: --before FOLDER")
         names = [name for name in names if name != "versions"]
+    if not has_povray():
+        missing = "povray needs the program povray: apt-get install povray (Debian, Ubuntu)"
+        if arguments.only == "povray":
+            parser.error(missing)
+        print(f"skipped: {missing}")
+        names = [name for name in names if name != "povray"]
     write: dict[str, Callable[[], str]] = {
         "rays": _rays,
         "convergence": lambda: _convergence(arguments.out.with_name("convergence.png")),
         "agreement": lambda: agreement(arguments.meshes),
         "versions": lambda: beside(arguments.before),
+        "inclusion": inclusion,
+        "hart": hart,
+        "povray": compare_with_povray,
         "winding": lambda: _winding(arguments.bunny, arguments.out.with_name("growth.png")),
     }
     if arguments.only and not arguments.out.exists():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from harnack.arithmetic.affine import Affine
+from harnack.arithmetic.clipped import ClippedPower, clipped_power
 from harnack.arithmetic.functions import (
     Function,
     absolute,
@@ -22,21 +24,30 @@ from harnack.arithmetic.functions import (
 )
 from harnack.arithmetic.interval import ONE, ZERO, Interval
 from harnack.arithmetic.jet import Jet
+from harnack.arithmetic.norms import maximum, minimum, norm
+from harnack.arithmetic.parabolas import Parabolas
 
 __all__ = [
     "ONE",
     "ZERO",
+    "Affine",
+    "ClippedPower",
     "Function",
     "Interval",
     "Jet",
+    "Parabolas",
     "absolute",
     "acos",
     "asin",
     "atan",
+    "clipped_power",
     "cos",
     "cosh",
     "exp",
     "log",
+    "maximum",
+    "minimum",
+    "norm",
     "power",
     "reciprocal",
     "sin",

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 import drjit as dr
 import numpy as np
 
-from harnack.arithmetic.interval import ONE, Interval, unit_of
+from harnack.arithmetic.interval import ONE, ZERO, Interval, select, unit_of
 from harnack.backend.extrema import fmax, fmin
 from harnack.backend.sines import sincos
 
@@ -32,8 +32,9 @@ _UNITS = 8.0
 class Function:
     """A function of one number.
 
-    ranges: of it, its derivative and its second derivative on an interval. Where the function is
-        not defined, the ends are no numbers or infinite: nothing is known.
+    ranges: of it, its derivative and its second derivative on an interval. Where the interval
+        holds a pole, or a point at which the function is not defined, the derivatives may be any
+        number: f(s) = f(0) + s f'(r) does not hold across such a point.
     plain: the function of Dr.Jit numbers.
     numpy: the function of NumPy arrays and Python numbers.
     """
@@ -67,6 +68,19 @@ def _two(x: Interval) -> Interval:
     return x + x
 
 
+def _where(defined: Mask, ranges: Ranges) -> Ranges:
+    """The ranges, of which the derivatives are known only where the function is defined."""
+    value, *rest = ranges
+    slope, second = (
+        Interval(
+            select(defined, one.low, -dr.inf, value.low),
+            select(defined, one.high, dr.inf, value.low),
+        )
+        for one in rest
+    )
+    return value, slope, second
+
+
 def _exp(x: Interval) -> Ranges:
     e = _rising(dr.exp, x)
     e = Interval(fmax(e.low, 0), e.high)
@@ -75,9 +89,7 @@ def _exp(x: Interval) -> Ranges:
 
 def _log(x: Interval) -> Ranges:
     one = x.reciprocal()
-    positive = x.low > 0
-    one = Interval(dr.select(positive, one.low, 0), dr.select(positive, one.high, dr.inf))
-    return _rising(dr.log, x), one, -one.square()
+    return _where(x.low > 0, (_rising(dr.log, x), one, -one.square()))
 
 
 def _sqrt(x: Interval) -> Ranges:
@@ -86,7 +98,8 @@ def _sqrt(x: Interval) -> Ranges:
     root = _rising(dr.sqrt, Interval(low, high))
     root = Interval(fmax(root.low, 0), root.high)
     slope = _half(_positive_reciprocal(root))
-    return root, slope, -_half(slope * _positive_reciprocal(Interval(low, high)))
+    second = -_half(slope * _positive_reciprocal(Interval(low, high)))
+    return _where(x.low >= 0, (root, slope, second))
 
 
 def _half(x: Interval) -> Interval:
@@ -95,14 +108,14 @@ def _half(x: Interval) -> Interval:
 
 def _positive_reciprocal(x: Interval) -> Interval:
     """1/x of numbers >= 0; infinite above where 0 is one of them."""
-    one = Interval(fmax(x.low, 0), x.high).reciprocal()
-    return Interval(dr.select(x.low > 0, one.low, 1 / x.high * (1 - 4 * unit_of(x.high))), one.high)
+    above = Interval(x.high, x.high).reciprocal()
+    return Interval(fmax(above.low, 0), Interval(fmax(x.low, 0), x.high).reciprocal().high)
 
 
 def _reciprocal(x: Interval) -> Ranges:
     one = x.reciprocal()
     slope = -one.square()
-    return one, slope, _two(-slope * one)
+    return _where((x.low > 0) | (x.high < 0), (one, slope, _two(-slope * one)))
 
 
 def _sine(x: Interval) -> Ranges:
@@ -166,7 +179,7 @@ def _tan(x: Interval) -> Ranges:
     no_pole = c.smallest > 0
     t = Interval(dr.select(no_pole, ends[0].low, t.low), dr.select(no_pole, ends[1].high, t.high))
     slope = ONE + t.square()
-    return t, slope, _two(t * slope)
+    return _where(no_pole, (t, slope, _two(t * slope)))
 
 
 def _tanh(x: Interval) -> Ranges:
@@ -188,7 +201,8 @@ def _atan(x: Interval) -> Ranges:
 def _asin(x: Interval) -> Ranges:
     inside = Interval(fmax(x.low, -1), fmin(x.high, 1))
     slope = _positive_reciprocal(_sqrt(ONE - inside.square())[0])
-    return _rising(dr.asin, inside), slope, inside * slope * slope.square()
+    second = inside * slope * slope.square()
+    return _where((x.low >= -1) & (x.high <= 1), (_rising(dr.asin, inside), slope, second))
 
 
 def _acos(x: Interval) -> Ranges:
@@ -211,10 +225,10 @@ def _cosh_range(x: Interval) -> Interval:
 
 def _abs(x: Interval) -> Ranges:
     """|x|: its second derivative is an infinite impulse at 0, upwards."""
-    positive, negative = x.low >= 0, x.high <= 0
-    slope = Interval(dr.select(positive, 1, -1), dr.select(negative, -1, 1))
-    kink = dr.select(positive | negative, 0, dr.inf)
-    return Interval(x.smallest, x.largest), slope, Interval(0.0, kink)
+    positive, negative = x.low > 0, x.high < 0
+    slope = Interval(select(positive, 1, -1, x.low), select(negative, -1, 1, x.low))
+    kink = select(positive | negative, 0, dr.inf, x.low)
+    return Interval(x.smallest, x.largest), slope, Interval(type(x.low)(0), kink)
 
 
 def integer_power(x: Interval, n: int) -> Interval:
@@ -232,7 +246,8 @@ def integer_power(x: Interval, n: int) -> Interval:
     a = _repeated(low, n)
     b = a if low is high else _repeated(high, n)
     # Every product is off by half a unit, in the exact power of a number in between.
-    return Interval(a, b).widened(n * unit_of(x.low), n * _tiny(x))
+    result = Interval(a, b).widened(n * unit_of(x.low), n * _tiny(x))
+    return Interval(fmax(result.low, 0), result.high) if n % 2 == 0 else result
 
 
 def _repeated(x: Real, n: int) -> Real:
@@ -253,20 +268,20 @@ def power(n: float) -> Function:
 
             def inverse(x: Interval) -> Ranges:
                 one = x.reciprocal()
-                return (
-                    integer_power(one, -k),
-                    Interval(float(k), float(k)) * integer_power(one, 1 - k),
-                    Interval(float(k * (k - 1)), float(k * (k - 1))) * integer_power(one, 2 - k),
-                )
+                slope = Interval.constant(k, type(x.low)) * integer_power(one, 1 - k)
+                second = Interval.constant(k * (k - 1), type(x.low)) * integer_power(one, 2 - k)
+                defined = (x.low > 0) | (x.high < 0)
+                return _where(defined, (integer_power(one, -k), slope, second))
 
             return Function(f"power {k}", inverse, lambda x: 1 / _repeated(x, -k), _numpy_power(k))
 
         def whole(x: Interval) -> Ranges:
-            second = Interval(float(k * (k - 1)), float(k * (k - 1)))
+            like = cast("Any", type(x.low))
+            slope, second = Interval.constant(k, like), Interval.constant(k * (k - 1), like)
             return (
                 integer_power(x, k),
-                Interval(float(k), float(k)) * integer_power(x, max(k - 1, 0)),
-                second * integer_power(x, max(k - 2, 0)) if k > 1 else Interval(0.0, 0.0),
+                slope * integer_power(x, max(k - 1, 0)),
+                second * integer_power(x, max(k - 2, 0)) if k > 1 else ZERO,
             )
 
         def of_numbers(x: Any) -> Any:
@@ -276,8 +291,10 @@ def power(n: float) -> Function:
 
     def real(x: Interval) -> Ranges:
         like = cast("Any", type(x.low))
-        slope, second = Interval.constant(n, like), Interval.constant(n * (n - 1), like)
-        return _real_power(x, n), slope * _real_power(x, n - 1), second * _real_power(x, n - 2)
+        slope = Interval.constant(n, like) * _real_power(x, n - 1)
+        second = Interval.constant(n * (n - 1), like) * _real_power(x, n - 2)
+        defined = x.low >= 0 if n > 0 else x.low > 0
+        return _where(defined, (_real_power(x, n), slope, second))
 
     return Function(f"power {n}", real, lambda x: dr.power(fmax(x, 0), n), _numpy_power(n))
 
@@ -287,20 +304,23 @@ def _numpy_power(n: float) -> Callable[[Any], Any]:
 
 
 def _real_power(x: Interval, n: float) -> Interval:
-    """The range of x^n for x >= 0 and any n: exp2(n log2 x), so off by n log2(x) units and some."""
+    """The range of x^n for x >= 0 and any n: exp2(n log2 x), so off by n log2(x) units and some.
 
-    def ends(v: Real) -> Interval:
-        v = fmax(v, 0)
-        zero = 0.0 if n > 0 else dr.inf
-        result = dr.select(v > 0, dr.power(fmax(v, _tiny(x)), n), zero)
-        off = unit_of(v) * (_UNITS + 2 * abs(n) * dr.abs(dr.log2(fmax(v, _tiny(x)))))
-        moved = dr.select(dr.isfinite(result), off * dr.abs(result) + _tiny(x), 0)
-        return Interval(result - moved, result + moved)
+    What is no normal number counts as the range from 0 to the smallest of those.
+    """
+    least = fmax(x.low, 0)
+    most = fmax(_tiny(x), x.high) if x.high is not x.low else fmax(_tiny(x), least)
 
-    first = ends(x.low)
-    last = first if x.low is x.high else ends(x.high)
-    low, high = (first, last) if n > 0 else (last, first)
-    return Interval(fmax(low.low, 0), high.high)
+    def end(v: Real, sign: int) -> Real:
+        result = dr.power(v, n)
+        off = unit_of(v) * (_UNITS + 2 * abs(n) * dr.abs(dr.log2(v)))
+        return result + sign * (off * result + _tiny(x))
+
+    at_least = fmax(least, _tiny(x))
+    if n > 0:
+        return Interval(dr.select(least >= _tiny(x), fmax(end(at_least, -1), 0), 0), end(most, 1))
+    high = dr.select(least >= _tiny(x), end(at_least, 1), dr.inf)
+    return Interval(fmax(end(most, -1), 0), high)
 
 
 exp = Function("exp", _exp, dr.exp, np.exp)

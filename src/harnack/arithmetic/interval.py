@@ -7,6 +7,7 @@ derivatives, proofs (Moore 1966).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
@@ -28,15 +29,19 @@ class Interval:
     An end that is not a number stands for an infinite one: nothing is known on that side. Python
     floats are constants known while a kernel is recorded; with them, operations are left out.
 
+    is_single: whether Python floats stand for numbers of single precision, so that they must be
+        such numbers themselves: they would be rounded, inwards perhaps, where they meet an array.
+
     Proof of the rounding. An operation of the backend is off by half a unit in the last place, or
     by less than the smallest normal number where the result is no normal number. Each end is moved
     outwards by a whole unit (`_down`, `_up`), which covers its own rounding and that of the move.
-    Python's own floats are in double precision and are rounded to single precision where they meet
-    it; then they count as the interval of the two neighbours (`constant`).
+    A sum that is no normal number is exact, or 0 on a backend that flushes it: it may be off by
+    less than the smallest normal number, which the tracer adds to every value.
     """
 
     low: Real
     high: Real
+    is_single: bool = False
 
     @classmethod
     def exactly(cls, x: Real) -> Interval:
@@ -47,12 +52,7 @@ class Interval:
     def constant(cls, x: float, like: Any) -> Interval:
         """A Python number x, as far as numbers of the type `like` hold it."""
         if dr.is_array_v(like) and dr.type_v(like) == dr.VarType.Float32:
-            single = np.float32(x)
-            if float(single) != x:
-                return cls(
-                    float(np.nextafter(single, np.float32(-np.inf))),
-                    float(np.nextafter(single, np.float32(np.inf))),
-                )
+            return cls(*_single(float(x), float(x)), is_single=True)
         return cls(float(x), float(x))
 
     @property
@@ -82,12 +82,12 @@ class Interval:
     @property
     def largest(self) -> Real:
         """The largest absolute value."""
-        return _larger(_absolute(self.low), _absolute(self.high))
+        return _unknown_or_larger(_absolute(self.low), _absolute(self.high))
 
     @property
     def smallest(self) -> Real:
         """The smallest absolute value."""
-        return _larger(_larger(self.low, 0.0), -self.high)
+        return _larger(-self.high, _larger(self.low, 0.0))
 
     def holds(self, x: Real) -> Mask:
         """Whether x lies in the interval."""
@@ -95,13 +95,17 @@ class Interval:
 
     def hull(self, other: Interval) -> Interval:
         """The smallest interval that holds both."""
-        return Interval(_smaller(self.low, other.low), _larger(self.high, other.high))
+        low = -_unknown_or_larger(-self.low, -other.low)
+        high = _unknown_or_larger(self.high, other.high)
+        return Interval(low, high, self.is_single or other.is_single)
 
     def meet(self, other: Interval) -> Interval:
         """What both hold, of two that are known to hold a common number; an end that is not a
         number gives way."""
         return Interval(
-            _defined_larger(self.low, other.low), _defined_smaller(self.high, other.high)
+            _defined_larger(self.low, other.low),
+            _defined_smaller(self.high, other.high),
+            self.is_single or other.is_single,
         )
 
     def shifted(self, x: Real) -> Interval:
@@ -111,15 +115,15 @@ class Interval:
     def __neg__(self) -> Interval:
         if self.low is self.high:
             low = -self.low
-            return Interval(low, low)
-        return Interval(-self.high, -self.low)
+            return Interval(low, low, self.is_single)
+        return Interval(-self.high, -self.low, self.is_single)
 
     def __add__(self, other: Interval) -> Interval:
         if other.is_zero:
             return self
         if self.is_zero:
             return other
-        return Interval(_down(self.low + other.low), _up(self.high + other.high))
+        return self._outwards(self.low + other.low, self.high + other.high, other)
 
     def __sub__(self, other: Interval) -> Interval:
         return self + -other
@@ -158,28 +162,42 @@ class Interval:
         if a == b == -1.0:
             return -self
         if a < 0.0 < b:
-            most = self.largest * max(-a, b)
-            return Interval(_down(-most), _up(most))
+            most = _lost(self.largest * max(-a, b), 1)
+            return self._outwards(-most, most, constant)
         if b <= 0.0:
-            return -self._times(Interval(-b, -a))
-        if a == b and np.frexp(a)[0] == 0.5:  # exact, but for what underflows
-            return Interval(_lost(self.low * a, -1), _lost(self.high * a, 1))
+            return -self._times(Interval(-b, -a, constant.is_single))
+        if a == b <= 1.0 and np.frexp(a)[0] == 0.5:  # exact, but for what underflows
+            low, high = _lost(self.low * a, -1), _lost(self.high * a, 1)
+            return Interval(low, high, self.is_single or constant.is_single)
         low = self.low * a if a == b else _smaller(self.low * a, self.low * b)
         high = self.high * b if a == b else _larger(self.high * a, self.high * b)
-        return Interval(_down(_lost(low, -1)), _up(_lost(high, 1)))
+        return self._outwards(_lost(low, -1), _lost(high, 1), constant)
 
     def square(self) -> Interval:
         """The squares."""
         low, high = self.smallest, self.largest
         if self.low is self.high:
             low = high
-        return Interval(_larger(_down(_lost(low * low, -1)), 0.0), _up(_lost(high * high, 1)))
+        result = self._outwards(_lost(low * low, -1), _lost(high * high, 1))
+        return Interval(_larger(result.low, 0.0), result.high, self.is_single)
 
     def reciprocal(self) -> Interval:
         """1/x; all numbers where 0 lies in the interval."""
-        has_zero = (self.low <= 0) & (self.high >= 0)
+        if self.is_static:
+            if self.low <= 0.0 <= self.high:
+                return Interval(-math.inf, math.inf, self.is_single)
+            return self._outwards(1 / self.high, 1 / self.low)
+        has_zero = ~((self.low > 0) | (self.high < 0))
         low, high = _down(_lost(1 / self.high, -1)), _up(_lost(1 / self.low, 1))
         return Interval(dr.select(has_zero, -dr.inf, low), dr.select(has_zero, dr.inf, high))
+
+    def _outwards(self, low: Real, high: Real, other: Interval | None = None) -> Interval:
+        """The result of an operation of this and another one, its ends moved outwards."""
+        single = self.is_single or (other is not None and other.is_single)
+        low, high = _down(low), _up(high)
+        if single and isinstance(low, float) and isinstance(high, float):
+            low, high = _single(low, high)
+        return Interval(low, high, single)
 
     def widened(self, relative: float, absolute: float = 0.0) -> Interval:
         """With each end moved outwards by a part of itself and an absolute length, for functions
@@ -200,6 +218,13 @@ def unit_of(x: Real) -> float:
     return float(dr.epsilon(type(x))) * 2 if dr.is_array_v(cast("Any", type(x))) else 2.0**-52
 
 
+def select(condition: Mask, a: Real, b: Real, like: Real) -> Real:
+    """a or b, numbers of the kind of `like`: of two Python numbers Dr.Jit itself makes integers or
+    numbers of single precision."""
+    kind = cast("Any", type(like))
+    return dr.select(condition, kind(a) if dr.is_array_v(kind) else a, b)
+
+
 def _down(x: Real) -> Real:
     """A number below x, by a whole unit in the last place at least."""
     return dr.fma(dr.abs(x), -unit_of(x), x)
@@ -216,6 +241,17 @@ def _lost(x: Real, sign: int) -> Real:
     return x + sign * float(dr.smallest(kind)) if dr.is_array_v(kind) else x
 
 
+def _single(low: float, high: float) -> tuple[float, float]:
+    """The numbers of single precision that hold both between them."""
+    with np.errstate(over="ignore"):
+        a, b = np.float32(low), np.float32(high)
+    if float(a) > low:
+        a = np.nextafter(a, np.float32(-np.inf))
+    if float(b) < high:
+        b = np.nextafter(b, np.float32(np.inf))
+    return float(a), float(b)
+
+
 def _smaller(a: Real, b: Real) -> Real:
     if isinstance(a, float) and isinstance(b, float):
         return min(a, b)
@@ -228,13 +264,20 @@ def _larger(a: Real, b: Real) -> Real:
     return fmax(a, b)
 
 
+def _unknown_or_larger(a: Real, b: Real) -> Real:
+    """The larger; not a number where either is none."""
+    if isinstance(a, float) and isinstance(b, float):
+        return math.nan if a != a or b != b else max(a, b)
+    return dr.select((a > b) | (a != a), a, b)
+
+
 def _defined_smaller(a: Real, b: Real) -> Real:
     """The smaller; a where b is not a number, and b where a is not."""
-    return dr.select((a <= b) | ~(b == b), a, b)
+    return dr.select((a <= b) | (b != b), a, b)
 
 
 def _defined_larger(a: Real, b: Real) -> Real:
-    return dr.select((a >= b) | ~(b == b), a, b)
+    return dr.select((a >= b) | (b != b), a, b)
 
 
 def _absolute(x: Real) -> Real:

@@ -29,10 +29,11 @@ from harnack.arithmetic.functions import (
     tan,
     tanh,
 )
-from harnack.arithmetic.interval import ONE, ZERO, Interval
+from harnack.arithmetic.interval import ONE, ZERO, Interval, select
+from harnack.backend.extrema import fmax, fmin
 
 if TYPE_CHECKING:
-    from harnack.backend import Real, Vec3
+    from harnack.backend import Mask, Real, Vec3
 
 # NumPy's functions of jets: numpy.sin(x) is sin(x).
 _UFUNCS = {
@@ -90,12 +91,26 @@ class Jet:
 
     def constant(self, x: float) -> Jet:
         """A constant number as a function of the same variables."""
-        value = Interval.constant(float(x), type(self._kind()))
+        return self._constant(Interval.constant(float(x), type(self.kind())))
+
+    def of(self, other: Any) -> Jet:
+        """A number of any kind as a function of the same variables.
+
+        Raises:
+            TypeError: it is no number.
+        """
+        b = self._with(other)
+        if b is None:
+            raise TypeError(f"expected a number, not an object of type {type(other).__name__}")
+        return b
+
+    def _constant(self, value: Interval) -> Jet:
         zeros = (ZERO,) * len(self.first), (ZERO,) * len(self.second)
         start = None if self.start is None else Jet(value, *zeros)
         return Jet(value, *zeros, start, self.width)
 
-    def _kind(self) -> Any:
+    def kind(self) -> Any:
+        """A number of the kind in use; a Python number where none is known."""
         for jet in (self.value, *self.first):
             if dr.is_array_v(cast("Any", type(jet.low))):
                 return jet.low
@@ -106,10 +121,7 @@ class Jet:
         if isinstance(other, Jet):
             return other
         if dr.is_array_v(cast("Any", type(other))) and dr.depth_v(type(other)) == 1:
-            value = Interval.exactly(other)
-            zeros = (ZERO,) * len(self.first), (ZERO,) * len(self.second)
-            start = None if self.start is None else Jet(value, *zeros)
-            return Jet(value, *zeros, start, self.width)
+            return self._constant(Interval.exactly(other))
         try:
             return self.constant(float(other))
         except (TypeError, ValueError):
@@ -124,7 +136,7 @@ class Jet:
             tuple(x + y for x, y in zip(self.first, b.first, strict=True)),
             tuple(x + y for x, y in zip(self.second, b.second, strict=True)),
         )
-        return jet if self.start is None else jet._anchored(self.start + b.start, self.width)
+        return jet if self.start is None else jet.anchored(self.start + b.start, self.width)
 
     __radd__ = __add__
 
@@ -148,6 +160,8 @@ class Jet:
         return -self + other
 
     def __mul__(self, other: Any) -> Jet:
+        if other is self:  # a square: ranges of products know nothing of that
+            return self.apply(power(2))
         b = self._with(other)
         if b is None:
             return NotImplemented
@@ -157,10 +171,10 @@ class Jet:
             x * b.second[k]
             + (self.first[i] * b.first[j] + self.first[j] * b.first[i])
             + y * self.second[k]
-            for k, (i, j) in enumerate(self._pairs())
+            for k, (i, j) in enumerate(self.pairs())
         )
         jet = Jet(x * y, first, second)
-        return jet if self.start is None else jet._anchored(self.start * b.start, self.width)
+        return jet if self.start is None else jet.anchored(self.start * b.start, self.width)
 
     __rmul__ = __mul__
 
@@ -170,9 +184,11 @@ class Jet:
         b = self._with(other)
         if b is None:
             return NotImplemented
-        if not dr.is_array_v(cast("Any", type(other))) and float(other) == 0.0:
+        if not b.value.is_static:
+            return self * b.apply(reciprocal)
+        if float(other) == 0.0:
             raise ZeroDivisionError("a formula divides by the constant 0")
-        return self * b.apply(reciprocal) if not b.value.is_static else self * (1.0 / float(other))
+        return self * self._constant(b.value.reciprocal())
 
     def __rtruediv__(self, other: Any) -> Jet:
         return self.apply(reciprocal) * other
@@ -201,7 +217,10 @@ class Jet:
                 "maximum": "maximum", "minimum": "minimum",
             }.get(name)  # fmt: skip
             if plain is not None:
-                a, b = inputs
+                if plain in ("maximum", "minimum"):
+                    a, b = sorted(inputs, key=lambda one: not isinstance(one, Jet))
+                else:
+                    a, b = inputs
                 return getattr(a if isinstance(a, Jet) else self._with(a), plain)(b)
         raise TypeError(
             f"numpy.{name} has no proved ranges: write formulas with + - * / **, abs, and "
@@ -220,16 +239,16 @@ class Jet:
 
     def apply(self, function: Function) -> Jet:
         """A function of this one: f(g)'' = f'' g' g' + f' g''."""
-        x = self._dynamic_value()
+        x = self.dynamic_value()
         value, slope, curvature = function.ranges(x)
         first = tuple(slope * one for one in self.first)
         second = tuple(
             curvature * (self.first[i].square() if i == j else self.first[i] * self.first[j])
             + slope * self.second[k]
-            for k, (i, j) in enumerate(self._pairs())
+            for k, (i, j) in enumerate(self.pairs())
         )
         jet = Jet(value, first, second)
-        return jet if self.start is None else jet._anchored(self.start.apply(function), self.width)
+        return jet if self.start is None else jet.anchored(self.start.apply(function), self.width)
 
     def maximum(self, other: Any) -> Jet:
         """The larger of two functions at each place.
@@ -238,21 +257,22 @@ class Jet:
         the two, the second derivative too, but for the places where they cross: there the first
         derivative jumps up, which has no upper bound.
         """
-        b = self._with(other)
-        assert b is not None
-        x, y = self.value, b.value
+        b = self.of(other)
+        x, y = self.dynamic_value(), b.dynamic_value(self.kind())
         left, right = x.low > y.high, y.low > x.high
 
         def chosen(u: Interval, v: Interval, *, kink: bool) -> Interval:
+            if u.is_static and v.is_static and u == v and not kink:
+                return u
             both = u.hull(v)
             high = dr.inf if kink else both.high
             return Interval(
-                dr.select(left, u.low, dr.select(right, v.low, both.low)),
-                dr.select(left, u.high, dr.select(right, v.high, high)),
+                select(left, u.low, select(right, v.low, both.low, x.low), x.low),
+                select(left, u.high, select(right, v.high, high, x.low), x.low),
             )
 
-        pairs = self._pairs()
-        value = Interval(_max(x.low, y.low), _max(x.high, y.high))
+        pairs = self.pairs()
+        value = Interval(x.meet(y).low, x.hull(y).high)
         first = tuple(chosen(u, v, kink=False) for u, v in zip(self.first, b.first, strict=True))
         second = tuple(
             chosen(u, v, kink=i == j)
@@ -261,27 +281,48 @@ class Jet:
         jet = Jet(value, first, second)
         if self.start is None:
             return jet
-        return jet._anchored(self.start.maximum(b.start), self.width)
+        return jet.anchored(self.start.maximum(b.start), self.width)
 
     def minimum(self, other: Any) -> Jet:
         """The smaller of two functions at each place."""
-        b = self._with(other)
-        assert b is not None
+        b = self.of(other)
         return -((-self).maximum(-b))
 
-    def _dynamic_value(self) -> Interval:
+    def selected(self, condition: Mask, other: Jet) -> Jet:
+        """This one where the condition holds, elsewhere the other; each lane is all of one."""
+        kind = self.kind()
+
+        def chosen(u: Interval, v: Interval) -> Interval:
+            if u.is_static and v.is_static and u == v:
+                return u
+            low = select(condition, u.low, v.low, kind)
+            return Interval(low, select(condition, u.high, v.high, kind))
+
+        start = None
+        if self.start is not None and other.start is not None:
+            start = self.start.selected(condition, other.start)
+        return Jet(
+            chosen(self.value, other.value),
+            tuple(chosen(u, v) for u, v in zip(self.first, other.first, strict=True)),
+            tuple(chosen(u, v) for u, v in zip(self.second, other.second, strict=True)),
+            start,
+            self.width,
+        )
+
+    def dynamic_value(self, like: Any = None) -> Interval:
         """The value as numbers of the backend."""
         if not self.value.is_static:
             return self.value
-        kind = cast("Any", type(self._kind()))
+        kind = cast("Any", type(self.kind() if like is None else like))
         low = kind(self.value.low)
         return Interval(low, low if self.value.low == self.value.high else kind(self.value.high))
 
-    def _pairs(self) -> list[tuple[int, int]]:
+    def pairs(self) -> list[tuple[int, int]]:
+        """Indices of the variables of each second derivative."""
         n = len(self.first)
         return [(i, j) for i in range(n) for j in range(i, n)][: len(self.second)]
 
-    def _anchored(self, start: Jet | None, width: Real) -> Jet:
+    def anchored(self, start: Jet | None, width: Real) -> Jet:
         """The same, narrowed by what is known at the start of the piece.
 
         Proof. f(s) = f(0) + s f'(r) for some r in between, so f stays within f(0) + [0, w] f'; the
@@ -289,21 +330,25 @@ class Jet:
         """
         if start is None:
             return self
-        rise = _spanned(self.first[0], width)
+        rise = spanned(self.first[0], width)
         first = self.first[0]
         if self.second:
-            turned = start.first[0] + _spanned(self.second[0], width)
+            turned = start.first[0] + spanned(self.second[0], width)
             first = first.meet(turned)
         value = self.value.meet(start.value + rise)
         return Jet(value, (first,), self.second, start, width)
 
 
-def _spanned(slope: Interval, width: Real) -> Interval:
-    """s times numbers of an interval, for 0 <= s <= width."""
+def spanned(slope: Interval, width: Real) -> Interval:
+    """s times numbers of an interval, for 0 <= s <= width.
+
+    Where the lower end overflows upwards, or the upper end downwards, it is no number, and 0 is
+    right.
+    """
     if slope.is_zero:
         return ZERO
     moved = slope * Interval(width, width)
-    return Interval(_min(moved.low, 0.0), _max(moved.high, 0.0))
+    return Interval(fmin(moved.low, 0.0), fmax(moved.high, 0.0))
 
 
 def _moved(x: Real, slope: Real, s: Real) -> Interval:
@@ -311,11 +356,3 @@ def _moved(x: Real, slope: Real, s: Real) -> Interval:
     if isinstance(s, float) and s == 0.0:
         return Interval.exactly(x)
     return Interval.exactly(x) + Interval.exactly(slope) * Interval.exactly(s)
-
-
-def _max(a: Real, b: Real) -> Real:
-    return max(a, b) if isinstance(a, float) and isinstance(b, float) else dr.select(a > b, a, b)
-
-
-def _min(a: Real, b: Real) -> Real:
-    return min(a, b) if isinstance(a, float) and isinstance(b, float) else dr.select(a < b, a, b)

@@ -87,6 +87,10 @@ def _add_render(commands: Any) -> None:
         "what to draw: color follows light paths, shaded lights first hits by a formula, "
         "without noise (shaded for meshes and clouds, else color)",
     )  # fmt: skip
+    one.add_argument(
+        "--confirm", action="store_true",
+        help="a ray hits only where the field changes sign, not where it comes near and turns back",
+    )  # fmt: skip
     for name, what in (("azimuth", "is turned"), ("elevation", "looks down")):
         one.add_argument(
             f"--{name}", type=_angle, metavar="DEG", help=f"how far the camera {what}, in degrees"

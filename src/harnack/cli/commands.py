@@ -44,15 +44,22 @@ def _render(options: Any) -> int:
     if options.scene in SCENES or kind == ".xml":
         _refuse_file_options(options)
     if options.scene in SCENES:
-        _draw_scene(SCENES[options.scene], target, options, settings)
+        _draw_scene(SCENES[options.scene], target, options, {**settings, **_of_surfaces(options)})
     elif kind == ".xml":
-        if options.level is not None or options.material is not None:
-            raise ValueError("level and material of a Mitsuba scene are set in its own file")
+        if options.level is not None or options.material is not None or options.confirm:
+            raise ValueError(
+                "level, material and confirm of a Mitsuba scene are set in its own file"
+            )
         render(str(source), target, **settings)
     else:
-        _draw_file(source, target, options, settings)
+        _draw_file(source, target, options, {**settings, **_of_surfaces(options)})
     _say(f"wrote {target}")
     return 0
+
+
+def _of_surfaces(options: Any) -> dict[str, Any]:
+    """Settings of the surfaces drawn that were asked for."""
+    return {"confirm": True} if options.confirm else {}
 
 
 def _check_source(name: str) -> None:

@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
-from harnack.enclosures.ball import Ball
-from harnack.enclosures.caps import Caps
-from harnack.enclosures.classic import Classic
+from harnack.enclosures.balls.ball import Ball
+from harnack.enclosures.balls.caps import Caps
+from harnack.enclosures.balls.classic import Classic
+from harnack.enclosures.balls.slope import Slope
 from harnack.enclosures.enclosure import Enclosure, Gaps, Slopes
+from harnack.enclosures.extremum import Greatest, Negated, Part, Stretched
 from harnack.enclosures.levels import TargetLevels
+from harnack.enclosures.literature import (
+    AffineBand,
+    Band,
+    BottomUpLinear,
+    BottomUpQuadratic,
+    IntervalRange,
+    Mixed,
+)
 from harnack.enclosures.parabola import Cone, Parabola, Taylor
 from harnack.enclosures.pieces import LinearTaylor, OnePiece, Pieces, QuadraticTaylor, Segment
 from harnack.enclosures.promises import (
@@ -17,24 +27,33 @@ from harnack.enclosures.promises import (
     Promise,
 )
 from harnack.enclosures.proofs import Choice, Proofs, any_covers, choose_proofs, longest_step
-from harnack.enclosures.restriction import Piece, Restriction
-from harnack.enclosures.slope import Slope
+from harnack.enclosures.restriction import Evaluable, Piece, Restriction
 
 __all__ = [
+    "AffineBand",
     "Ball",
+    "Band",
+    "BottomUpLinear",
+    "BottomUpQuadratic",
     "Caps",
     "Choice",
     "Classic",
     "Cone",
     "Curvature",
     "Enclosure",
+    "Evaluable",
     "Gaps",
+    "Greatest",
     "HarmonicBall",
+    "IntervalRange",
     "LineLipschitz",
     "LinearTaylor",
     "Lipschitz",
+    "Mixed",
+    "Negated",
     "OnePiece",
     "Parabola",
+    "Part",
     "Piece",
     "Pieces",
     "Promise",
@@ -44,6 +63,7 @@ __all__ = [
     "Segment",
     "Slope",
     "Slopes",
+    "Stretched",
     "TargetLevels",
     "Taylor",
     "any_covers",

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import abc
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 from harnack.backend.extrema import fmax, fmin
 
@@ -30,10 +30,14 @@ class Gaps:
     """How far f must move, down or up, to reach a level: lengths in value >= 0.
 
     Infinite where there is no level on that side.
+
+    is_one_sided: at most one of the two is finite, on every lane: there is one level alone. Known
+        while a kernel is being recorded, it spares the proof of the other side.
     """
 
     down: Real
     up: Real
+    is_one_sided: bool = False
 
     @property
     def smaller(self) -> Real:
@@ -42,7 +46,12 @@ class Gaps:
 
     def less(self, error: Real) -> Gaps:
         """The gaps that surely remain of a value known up to `error`."""
-        return Gaps(fmax(self.down - error, 0), fmax(self.up - error, 0))
+        down, up = fmax(self.down - error, 0), fmax(self.up - error, 0)
+        return Gaps(down, up, self.is_one_sided)
+
+    def exchanged(self) -> Gaps:
+        """Those of the negative function."""
+        return Gaps(self.up, self.down, self.is_one_sided)
 
 
 @dataclass(frozen=True)
@@ -71,11 +80,12 @@ class Enclosure(abc.ABC):
     at the upper end of `Slopes` bounds F from above and that at the lower end bounds it from below,
     whatever the slope in between is. In particular slopes in [-|grad f|, |grad f|] bound F in every
     direction.
-
-    growth: how many times the last step an enclosure is asked to reach next, by experiment.
     """
 
-    growth: ClassVar[float] = 2.0
+    @property
+    def growth(self) -> float:
+        """How many times the last step an enclosure should reach next, by experiment."""
+        return 2.0
 
     @classmethod
     def of(cls, promise: Promise, value: Real, error: Real, slopes: Slopes) -> Self | None:

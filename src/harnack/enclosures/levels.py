@@ -49,7 +49,7 @@ class TargetLevels:
                 below_gap = dr.select(above >= 0, above, math.inf)
                 above_gap = dr.select(above <= 0, -above, math.inf)
             down, up = fmin(down, below_gap), fmin(up, above_gap)
-        return Gaps(down, up)
+        return Gaps(down, up, len(self.values) == 1 and self.period is None)
 
     def to_nearest(self, f: Real) -> Real:
         """level - f for the level nearest to f."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import drjit as dr
 
@@ -16,7 +16,7 @@ from harnack.enclosures.restriction import Piece
 if TYPE_CHECKING:
     from typing import Self
 
-    from harnack.backend import Real
+    from harnack.backend import Mask, Real
     from harnack.enclosures.restriction import Restriction
 
 _ROUND_DOWN = 1.0 - 1e-6
@@ -42,47 +42,65 @@ class Pieces(Enclosure):
     slopes: Slopes
     parts: tuple[Piece, ...]
 
-    knots: ClassVar[tuple[float, ...]] = (0.125, 0.25, 0.5, 1.0)
-    """Ends of pieces, in parts of the length looked ahead."""
-    growth: ClassVar[float] = 4.0
-    """How many times the last step the next look asks for."""
-
     @classmethod
     def along(cls, function: Restriction, slopes: Slopes, length: Real) -> Self | None:
-        ends = [knot * length for knot in cls.knots]
-        return cls(slopes, function.pieces([0.0, *ends]))
+        """Each piece is twice as long as the one before it, but for the first two."""
+        count = cls._count(function)
+        knots = [length * 2.0 ** (k + 1 - count) for k in range(count)]
+        return cls(slopes, function.pieces([0.0, *knots]))
+
+    @classmethod
+    def _count(cls, function: Restriction) -> int:
+        return function.piece_count
+
+    @property
+    def growth(self) -> float:
+        return max(2.0, float(len(self.parts)))
 
     def step(self, gaps: Gaps) -> Real:
-        up = self._reach(gaps.up, 1)
-        down = self._reach(gaps.down, -1)
-        return fmax(fmin(up, down), 0) * _ROUND_DOWN
+        if gaps.is_one_sided:
+            rises = gaps.down == dr.inf
+            reach, is_free = self._reach(fmin(gaps.up, gaps.down), rises)
+        else:
+            up, is_free_above = self._reach(gaps.up, True)
+            down, is_free_below = self._reach(gaps.down, False)
+            reach, is_free = fmin(up, down), is_free_above & is_free_below
+        # The end of the last piece is exact: pulled back, it would cost a ray that misses a look.
+        reach = fmax(reach, 0)
+        return dr.select(is_free, reach, reach * _ROUND_DOWN)
 
-    def _reach(self, gap: Real, sign: int) -> Real:
-        """The first s at which sign F may reach the gap; the whole length if it cannot."""
-        slope = self.slopes.high if sign > 0 else -self.slopes.low
+    def _reach(self, gap: Real, rises: Mask | bool) -> tuple[Real, Mask]:
+        """The first s at which F, or -F, may reach the gap, or the whole length if it cannot; and
+        whether it cannot."""
+
+        def chosen(upper: Real, lower: Real) -> Real:
+            return dr.select(rises, upper, -lower)
+
+        slope = chosen(self.slopes.high, self.slopes.low)
         none = gap == dr.inf
         left = dr.select(none, 0, gap)  # of the gap, at the start of the piece
         total = type(gap)(0)
         free = gap >= 0  # and not NaN
         for part in self.parts:
-            most = part.slopes.high if sign > 0 else -part.slopes.low
-            bend = part.most_curvature if sign > 0 else -part.least_curvature
+            most = chosen(part.slopes.high, part.slopes.low)
+            bend = chosen(part.most_curvature, part.least_curvature)
             slope, reach, left = self._on_piece(left, slope, most, bend, part.length)
             reach = dr.select(none, part.length, reach)
             total = dr.select(free, total + reach, total)
             free &= reach >= part.length
-        return total
+        return total, free
 
     @classmethod
     def _on_piece(
         cls, left: Real, slope: Real, most: Real, bend: Real, length: Real
     ) -> tuple[Real, Real, Real]:
         """The slope at the end of a piece, how far it is free, and what is left of the gap."""
-        slope = fmin(slope, most)
-        by_line = dr.select(most > 0, left / most, dr.inf)
+        # What is not a number is not known.
+        slope = dr.select((slope <= most) | (most != most), slope, most)
+        by_line = dr.select(most > 0, left / most, dr.select(most <= 0, dr.inf, 0))
         by_line = dr.select(left > 0, by_line, 0)
         by_parabola = first_root(left, slope, bend)
-        reach = fmin(length, fmax(by_parabola, by_line))
+        reach = fmin(length, fmax(by_parabola, by_line) * _ROUND_DOWN)
         # Rises and falls may cancel: their rounding counts, not that of their sum.
         unit = 4 * float(dr.epsilon(type(left)))
         bent, straight = 0.5 * length * length * bend, slope * length
@@ -94,8 +112,10 @@ class Pieces(Enclosure):
 class OnePiece(Pieces, abc.ABC):
     """Proofs from ranges on the whole length at once: those of the literature, for comparison."""
 
-    knots = (1.0,)
-    growth = 2.0
+    @classmethod
+    def _count(cls, function: Restriction) -> int:
+        del function
+        return 1
 
 
 class QuadraticTaylor(OnePiece):

@@ -9,13 +9,20 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from harnack.backend.extrema import fmax
 from harnack.choices import did_you_mean
-from harnack.enclosures.caps import Caps
-from harnack.enclosures.classic import Classic
+from harnack.enclosures.balls.caps import Caps
+from harnack.enclosures.balls.classic import Classic
+from harnack.enclosures.balls.slope import Slope
 from harnack.enclosures.enclosure import Enclosure, Gaps, Slopes
+from harnack.enclosures.literature import (
+    AffineBand,
+    BottomUpLinear,
+    BottomUpQuadratic,
+    IntervalRange,
+    Mixed,
+)
 from harnack.enclosures.parabola import Cone, Taylor
 from harnack.enclosures.pieces import LinearTaylor, Pieces, QuadraticTaylor, Segment
 from harnack.enclosures.promises import LineLipschitz, Promise
-from harnack.enclosures.slope import Slope
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real
@@ -26,6 +33,11 @@ _NAMED: dict[str, tuple[type[Enclosure], ...]] = {
     "quadratic-taylor": (QuadraticTaylor,),
     "linear-taylor": (LinearTaylor,),
     "segment": (Segment,),
+    "bottom-up-linear": (BottomUpLinear,),
+    "bottom-up-quadratic": (BottomUpQuadratic,),
+    "mixed": (Mixed,),
+    "affine": (AffineBand,),
+    "interval": (IntervalRange,),
     "curvature": (Taylor, Caps, Slope, Cone),
     "caps": (Caps, Slope, Cone),
     "slope": (Slope, Cone),
@@ -46,11 +58,6 @@ class Proofs:
 
     kinds: tuple[type[Enclosure], ...]
     uses_weaker: bool = True
-
-    @property
-    def growth(self) -> float:
-        """How many times the last step the next look asks for."""
-        return max(kind.growth for kind in self.kinds)
 
     def along(self, function: Restriction, slopes: Slopes, length: Real) -> tuple[Enclosure, ...]:
         """The enclosures of a function whose ranges along the path are known; none if none of the
@@ -127,9 +134,10 @@ def choose_proofs(bound: Choice = None) -> Proofs:
     Names: "classic" (the published rule), "slope", "caps" (caps where both ends are known, the
     slope bound elsewhere), "lipschitz", and "curvature" (Taylor's formula where second derivatives
     are bounded, else as "caps"); of fields with a formula, "pieces", and for comparison
-    "quadratic-taylor", "linear-taylor", "segment". None is as "pieces", which is as "curvature" for
-    fields without a formula, and without the promises that a field itself
-    calls weaker than its others.
+    "quadratic-taylor", "linear-taylor", "segment", and of the formula's own arithmetic
+    "bottom-up-linear", "bottom-up-quadratic", "mixed", "affine", "interval".
+    None is as "pieces", which is as "curvature" for fields without a formula, and without the
+    promises that a field itself calls weaker than its others.
 
     Raises ValueError for another name, TypeError for what is no class of enclosures.
     """

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
-    from harnack.backend import Real
+    from harnack.backend import Real, Vec3
     from harnack.enclosures.enclosure import Slopes
 
 
@@ -29,11 +29,26 @@ class Piece:
 
 
 class Restriction(Protocol):
-    """A function along a path, as enclosures ask for it."""
+    """A function along a path, as enclosures ask for it.
+
+    piece_count: how many pieces of the path take the least time, by experiment.
+    """
+
+    @property
+    def piece_count(self) -> int: ...
 
     def pieces(self, knots: Sequence[Real]) -> tuple[Piece, ...]:
         """Ranges of the derivatives of f(path(t+s)) between each knot and the next.
 
         knots: lengths s, rising, the first of them 0.
         """
+        ...
+
+
+@runtime_checkable
+class Evaluable(Protocol):
+    """A restriction that is a formula: any arithmetic can be asked for what it makes of it."""
+
+    def through(self, coordinates: Callable[[Vec3, Vec3], tuple[Any, Any, Any]]) -> Any:
+        """The formula of coordinates made from a point p and the direction d of the path."""
         ...

@@ -16,6 +16,22 @@ from harnack.fields.formula import Formula
 from harnack.fields.meshes.winding_number import WindingNumber
 from harnack.fields.polynomials.polynomial import HarmonicPolynomial, SphericalHarmonic
 from harnack.fields.sheets import NO_SHEET, Crossing
+from harnack.fields.solids.combined import intersection, union
+from harnack.fields.solids.fractal import Displaced, FractalNoise, Noise
+from harnack.fields.solids.julia import Julia
+from harnack.fields.solids.region import solid
+from harnack.fields.solids.round import (
+    Capsule,
+    Cylinder,
+    DoubleCone,
+    Ellipsoid,
+    Plane,
+    Sphere,
+    Torus,
+)
+from harnack.fields.solids.solid import Shape, Solid
+from harnack.fields.solids.square import Cuboid, Superellipsoid, Supertorus
+from harnack.fields.solids.tube import Tube
 from harnack.fields.waves.periodic import EigenfunctionSum, Gyroid, SchwarzD, SchwarzP
 from harnack.fields.waves.waves import PlaneWave, Product, cosine, sine
 
@@ -24,22 +40,32 @@ __all__ = [
     "NO_SHEET",
     "BlobError",
     "Blobs",
+    "Capsule",
     "Compact",
     "Crossing",
     "Cubic",
+    "Cuboid",
     "Curvature",
+    "Cylinder",
     "DipolePotential",
+    "Displaced",
+    "DoubleCone",
     "EigenfunctionSum",
+    "Ellipsoid",
     "Field",
     "Formula",
+    "FractalNoise",
     "Gaussian",
     "Gyroid",
     "HarmonicBall",
     "HarmonicPolynomial",
+    "Julia",
     "Kernel",
     "LineLipschitz",
     "Lipschitz",
     "Molecule",
+    "Noise",
+    "Plane",
     "PlaneWave",
     "Product",
     "Sample",
@@ -47,10 +73,20 @@ __all__ = [
     "SchwarzP",
     "ScreenedWindingNumber",
     "Sextic",
+    "Shape",
+    "Solid",
     "SolidAngle",
+    "Sphere",
     "SphericalHarmonic",
+    "Superellipsoid",
+    "Supertorus",
+    "Torus",
+    "Tube",
     "WindingNumber",
     "cosine",
     "expression",
+    "intersection",
     "sine",
+    "solid",
+    "union",
 ]

@@ -114,9 +114,16 @@ class Field(abc.ABC):
     it, and what a sample promises need only hold for p in it. As it is convex, a ray from p stays
     in it as far as it is looked at; `Lipschitz` and `Curvature` need not hold beyond."""
 
+    is_entire: bool = False
+    """Whether f, and what it promises, is right in all of space, so that `domain` is only where it
+    is drawn."""
+
     has_sheets: bool = False
     """Whether f jumps across sheets (see `harnack.fields.sheets`). Then `next_crossing` and
     `between` are needed, and what `evaluate` promises is about f with the jumps taken out."""
+
+    has_creases: bool = False
+    """Whether the gradient jumps somewhere, as it does where the surfaces of a union meet."""
 
     has_detail: bool = False
     """Whether f can be evaluated more coarsely and more closely; then `at_detail` is needed."""

@@ -11,7 +11,7 @@ import abc
 import copy
 import dataclasses
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
@@ -24,6 +24,7 @@ from harnack.fields.look import Look, Path, Sample
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
+    from harnack.enclosures import Promise
 
 
 class Formula(Field):
@@ -33,6 +34,7 @@ class Formula(Field):
         where none is known.
     """
 
+    has_creases = True  # it may use abs, maximum and minimum
     overstep = 1.0  # longer steps than proved cost looks: what is proved is long already
     lipschitz: Real | None = None
 
@@ -48,9 +50,13 @@ class Formula(Field):
         doubt = zero
         for one in jet.first:
             doubt = doubt + one.radius
-        known = () if self.lipschitz is None else (Lipschitz(zero + self.lipschitz),)
+        known = self.promises(p)
         value, error = zero + jet.value.middle, zero + jet.value.radius
         return Sample(value, gradient, known, error, doubt)
+
+    def promises(self, p: Vec3) -> tuple[Promise, ...]:
+        """What holds in every direction from p: a Lipschitz constant, where one is known."""
+        return () if self.lipschitz is None else (Lipschitz(0 * p.x + self.lipschitz),)
 
     def differentiable_value(self, p: Vec3) -> Real:
         return 0 * p.x + self.formula(p.x, p.y, p.z)
@@ -72,7 +78,7 @@ class Formula(Field):
         enclosures = path.proofs.along(function, slopes, ahead)
         if not enclosures:
             return path.look(sample)
-        return Look(sample, enclosures, (), slope)
+        return Look(sample, enclosures, (), slope, max(one.growth for one in enclosures))
 
     def restricted(self, p: Vec3, direction: Vec3) -> FormulaAlong:
         """The field along the path from p, as enclosures ask for it."""
@@ -110,24 +116,31 @@ class FormulaAlong:
     field: Formula
     p: Vec3
     direction: Vec3
+    # Ranges of a formula cost as much as its value: one piece takes the least time, four take two
+    # thirds of the looks and twice the time.
+    piece_count: int = 1
 
     def pieces(self, knots: Sequence[Real]) -> tuple[Piece, ...]:
         """See `harnack.enclosures.Restriction`."""
-        made: list[Piece] = []
-        for start, end in itertools.pairwise(knots):
-            coordinates = Jet.along(self.p, self.direction, start, end)
-            jet = as_jet(self.field.formula(*coordinates), coordinates[0], type(self).__name__)
-            (slopes,), (curvatures,) = jet.first, jet.second
-            zero = 0 * self.p.x
-            made.append(
-                Piece(
-                    end - start,
-                    Slopes(zero + slopes.low, zero + slopes.high),
-                    zero + curvatures.low,
-                    zero + curvatures.high,
-                )
-            )
-        return tuple(made)
+        return tuple(self._piece(start, end) for start, end in itertools.pairwise(knots))
+
+    def through(self, coordinates: Callable[[Vec3, Vec3], tuple[Any, Any, Any]]) -> Any:
+        """See `harnack.enclosures.Evaluable`."""
+        x, y, z = coordinates(self.p, self.direction)
+        value = self.field.formula(x, y, z)
+        return x.constant(float(value)) if isinstance(value, int | float) else value
+
+    def _piece(self, start: Real, end: Real) -> Piece:
+        coordinates = Jet.along(self.p, self.direction, start, end)
+        jet = as_jet(self.field.formula(*coordinates), coordinates[0], type(self.field).__name__)
+        (slopes,), (curvatures,) = jet.first, jet.second
+        zero = 0 * self.p.x
+        return Piece(
+            end - start,
+            Slopes(zero + slopes.low, zero + slopes.high),
+            zero + curvatures.low,
+            zero + curvatures.high,
+        )
 
 
 def prepared_numbers(field: Any, backend: Backend) -> Any:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 
+from harnack.backend.extrema import fmax
 from harnack.enclosures import (
     Curvature,
     Enclosure,
@@ -78,6 +79,17 @@ def lengthened(sample: Sample, size: Real) -> Sample:
     )
 
 
+def value_error(sample: Sample, gradient_norm: Real, size: Real) -> Real:
+    """What rounding and truncation may have done to f at a point whose coordinates are at most
+    `size`, gradient_norm being |gradient|."""
+    kind = cast("Any", type(sample.value))
+    epsilon = 2 * float(dr.epsilon(kind))
+    # What is below the smallest normal number is lost.
+    smallest = kind(float(dr.smallest(kind)))
+    value = 8 * fmax(epsilon * dr.abs(sample.value), smallest)
+    return dr.fma(gradient_norm, 4 * epsilon * size, value + sample.error)
+
+
 @dataclass(frozen=True)
 class Look:
     """A sample at a point of a path, and what is proved along the path in both directions.
@@ -85,12 +97,14 @@ class Look:
     ahead: enclosures of f(path(t+s)) - f(path(t)).
     back: enclosures of f(path(t-s)) - f(path(t)), from the same evaluation.
     slope: the derivative of f along the path, known up to `Sample.gradient_error`.
+    growth: how many times the step from here the next look should be asked to reach.
     """
 
     sample: Sample
     ahead: tuple[Enclosure, ...]
     back: tuple[Enclosure, ...]
     slope: Real
+    growth: float = 2.0
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,8 @@ _TRIED = (1.0, 0.1, 0.01, 1e-3, 1e-4)
 # Of a field with an error the differences must agree at this share of the points even without it:
 # between neighbouring points an approximation mostly is a smooth function itself.
 _SMOOTH = 0.5
+# Of a field with creases they must agree at this share.
+_OFF_CREASES = 0.9
 
 
 def check_derivatives(field: Field, points: FloatArray, look: FieldValues) -> None:
@@ -155,7 +157,8 @@ def _check_gradient(
     """By central differences of the value."""
     tolerance, allowance = _limits(field, points, look, nearby)
     off = np.linalg.norm(_difference(nearby)[0] - look.gradient, axis=1)
-    _agree(off, tolerance, allowance, "the gradient is not that of the value", points)
+    message = "the gradient is not that of the value"
+    _agree(off, tolerance, allowance, message, points, has_creases=field.has_creases)
 
 
 def _difference(nearby: list[_Nearby]) -> tuple[FloatArray, FloatArray]:
@@ -215,10 +218,22 @@ def _is_harmonic(look: FieldValues) -> bool:
 
 
 def _agree(
-    off: FloatArray, tolerance: FloatArray, allowance: FloatArray, message: str, points: FloatArray
+    off: FloatArray,
+    tolerance: FloatArray,
+    allowance: FloatArray,
+    message: str,
+    points: FloatArray,
+    *,
+    has_creases: bool = False,
 ) -> None:
-    """Everywhere within both together, at most points within the tolerance alone."""
-    require(off <= tolerance + allowance, message, points, off)
+    """Everywhere within both together, at most points within the tolerance alone.
+
+    has_creases: differences may cross one, at few points.
+    """
+    good = off <= tolerance + allowance
+    if has_creases and good.mean() >= _OFF_CREASES:
+        return
+    require(good, message, points, off)
     if np.mean(off <= tolerance) < _SMOOTH:
         raise BrokenPromiseError(f"{message} at more than half of the {len(points)} points")
 
@@ -253,4 +268,5 @@ def _check_hessian(
     tolerance = 1e-7 * size + 0.1 * np.abs(fine - coarse).max(axis=(1, 2))
     tolerance += 1e-11 * length * (1 + _size(points) / h) / h
     allowance = np.sum([np.abs(one.weight) * one.gradient_error for one in nearby], axis=0)
-    _agree(off, tolerance, allowance, "the Hessian is not the derivative of the gradient", points)
+    message = "the Hessian is not the derivative of the gradient"
+    _agree(off, tolerance, allowance, message, points, has_creases=field.has_creases)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 import drjit as dr
 import numpy as np
@@ -12,6 +12,13 @@ import numpy as np
 from harnack.backend import backend_of, choose_backend, to_float, to_numpy, to_vector3
 from harnack.backend.lengths import largest_component, unit
 from harnack.backend.lengths import length as norm
+from harnack.tracer.all_hits import (
+    AllHits,
+    check_all_hits,
+    crossings_as_numpy,
+    no_crossings,
+    trace_all,
+)
 from harnack.tracer.derivatives import attach, wants_derivatives
 from harnack.tracer.surface import LevelSet, level_set
 from harnack.tracer.tolerance import Status, Tolerance
@@ -28,7 +35,9 @@ class Hits:
     """The ends of n rays, as NumPy arrays or, if the rays were Dr.Jit arrays, as Dr.Jit arrays.
 
     t: (n,) ray parameter of the hit, inf for a miss; for a ray that ran out of steps, how far
-        it is proved free. A hit is within tolerance of the first root, mostly before it.
+        it is proved free. A hit is within tolerance of the first root, mostly before it. One that
+        is confirmed is at a root: between two points that were looked at, with f on different
+        sides of the level, where the cubic through their values and slopes takes the level.
     position: (n, 3) point at t, NaN for a miss.
     normal: (n, 3) unit normal grad f/|grad f|, or of the sheet that was hit, to its side of
         larger f; zero where there is no hit.
@@ -58,6 +67,7 @@ class Hits:
         return self.status == int(Status.HIT)
 
 
+@overload
 def trace(
     field: Field | LevelSet,
     origins: Any,
@@ -72,7 +82,48 @@ def trace(
     clip: Volume | None = None,
     overstep: float | None = None,
     precision: Precision | None = None,
-) -> Hits:
+    confirm: bool = False,
+    all_hits: None = None,
+) -> Hits: ...
+
+
+@overload
+def trace(
+    field: Field | LevelSet,
+    origins: Any,
+    directions: Any,
+    *,
+    level: Any = None,
+    t_min: Any = 0.0,
+    t_max: Any = math.inf,
+    tolerance: float | Tolerance = 1e-4,
+    max_steps: int = 2000,
+    bound: Choice = None,
+    clip: Volume | None = None,
+    overstep: float | None = None,
+    precision: Precision | None = None,
+    confirm: bool = False,
+    all_hits: int,
+) -> AllHits: ...
+
+
+def trace(
+    field: Field | LevelSet,
+    origins: Any,
+    directions: Any,
+    *,
+    level: Any = None,
+    t_min: Any = 0.0,
+    t_max: Any = math.inf,
+    tolerance: float | Tolerance = 1e-4,
+    max_steps: int = 2000,
+    bound: Choice = None,
+    clip: Volume | None = None,
+    overstep: float | None = None,
+    precision: Precision | None = None,
+    confirm: bool = False,
+    all_hits: int | None = None,
+) -> Hits | AllHits:
     """First hits of rays with a level set of a field; no hit is ever missed.
 
     field: what to trace; or a `LevelSet`, which then holds all the settings.
@@ -88,6 +139,15 @@ def trace(
         "caps", "curvature", "lipschitz"; or classes of enclosures, such as `harnack.Caps`.
     precision: "single" or "double" for NumPy input; Dr.Jit input keeps its own.
 
+    confirm: a hit counts only where f really changes sign: a ray that comes within the tolerance
+        of a level and turns back does not hit it. The hit is then at a root. What is guaranteed is
+        that of `all_hits`.
+    all_hits: how many crossings of each ray to return, in order, as an `AllHits`. No crossing is
+        missed whose function swings farther than the tolerance to both sides of the level, and none
+        is counted twice; touching a level without passing to its other side is no crossing, and
+        neither is starting on it. Where levels are closer in value than four tolerances, a quarter
+        of their distance is the tolerance. `max_steps` is for all of the ray.
+
     With Dr.Jit input, t, position and normal carry derivatives with respect to whatever had
     them enabled: rays, level, vertices of the field (implicit differentiation at the hit).
 
@@ -99,15 +159,26 @@ def trace(
         if isinstance(field, LevelSet)
         else level_set(
             field, level, clip=clip, tolerance=tolerance,
-            max_steps=max_steps, bound=bound, overstep=overstep,
+            max_steps=max_steps, bound=bound, overstep=overstep, confirm=confirm,
         )
     )  # fmt: skip
+    k = None if all_hits is None else check_all_hits(all_hits, surface)
     given = [a for a in (origins, directions) if dr.is_array_v(type(a))]
     if given and precision is not None:
         raise ValueError("precision follows Dr.Jit rays; give it only with NumPy ones")
     backend = backend_of(given[0]) if given else choose_backend(precision or "single")
     o, d, near, far = _rays(backend, origins, directions, t_min, t_max)
+    n = max(dr.width(array) for array in (o, d, near, far))
     if min(dr.width(array) for array in (o, d, near, far)) == 0:
+        n = 0
+    if k is not None:
+        all_of_them = no_crossings(backend)
+        if n > 0:
+            all_of_them = trace_all(
+                surface, backend, o, d, near, far, k, differentiable=bool(given)
+            )
+        return all_of_them if given else crossings_as_numpy(all_of_them, n, k)
+    if n == 0:
         return _no_hits(backend, as_numpy=not given)
     hits = _trace(surface, backend, o, d, near, far, differentiable=bool(given))
     return hits if given else _as_numpy(hits, max(dr.width(o), dr.width(d), dr.width(near)))

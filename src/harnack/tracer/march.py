@@ -6,7 +6,7 @@ gets say how far the ray is free.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -15,7 +15,9 @@ from harnack.backend.extrema import clamp, fmax, fmin
 from harnack.backend.lengths import largest_component, length
 from harnack.backend.loops import while_active
 from harnack.enclosures import LineLipschitz, any_covers, longest_step
+from harnack.fields.look import value_error
 from harnack.fields.sheets import NO_SHEET, Crossing
+from harnack.tracer.contact import AIM, CLOSER, Accepted, Contact, Hysteresis
 from harnack.tracer.sheet_comparison import compare_with_sheet
 from harnack.tracer.tolerance import PreparedTolerance, Status
 
@@ -59,6 +61,7 @@ class MarchState:
         a loop twice in which a state never changes).
     status: a `Status` once the ray has ended.
     active: whether it goes on.
+    contact: what is known of the level reached last; None for rays that end where they reach one.
     """
 
     base: Real
@@ -72,10 +75,18 @@ class MarchState:
     detail: Real | None
     status: Any
     active: Mask
+    contact: Contact | None = None
 
     @classmethod
     def at(
-        cls, backend: Backend, start: Real, end: Real, active: Mask, *, has_detail: bool
+        cls,
+        backend: Backend,
+        start: Real,
+        end: Real,
+        active: Mask,
+        *,
+        has_detail: bool,
+        crosses: bool = False,
     ) -> MarchState:
         """At the start of rays, before anything was looked at."""
         real, vector, count = backend.Float, backend.Array3f, backend.UInt32
@@ -91,18 +102,23 @@ class MarchState:
             detail=real(0) if has_detail else None,
             status=count(int(Status.MISS)),
             active=backend.Bool(active) & (start < end),
+            contact=Contact.none(backend) if crosses else None,
         )
 
 
 @dataclass(frozen=True)
 class March:
-    """How to march: towards which levels, until when, and with which over-stepping factor."""
+    """How to march: towards which levels, until when, and with which over-stepping factor.
+
+    hysteresis: for rays that end where they have crossed a level, and not where they reach one.
+    """
 
     backend: Backend
     levels: TargetLevels
     tolerance: PreparedTolerance
     max_steps: int
     overstep: float
+    hysteresis: Hysteresis | None = None
 
     def advance(
         self,
@@ -129,11 +145,16 @@ class March:
         proved: on which side of the point the level lies is not known.
 
         In rounded arithmetic a surface could slip through between the two looks, so both see
-        it nearer by the rounding of value and position together (`_total_error`).
+        it nearer by the rounding of value and position together (`value_error`).
+
+        With `hysteresis` a level that is reached is not the end: the ray goes on, towards levels
+        that lie where the hysteresis puts them, and ends as a hit where it has crossed one. It may
+        be made active again there, to go on to the next.
 
         ahead: of a field with sheets, the crossing at `end`, on lanes where there is one. Those
         lanes look at that point as well. Accepted there, they hit the sheet or have passed it: a
-        miss, with the step that the value behind the sheet allows from there.
+        miss, with the step that the value behind the sheet allows from there. With `hysteresis`
+        `value` is then that behind the sheet.
         """
         real, size = self.backend.Float, largest_component(path.origin)
         is_smooth = ahead is None and not field.has_detail
@@ -141,6 +162,8 @@ class March:
         def body(now: MarchState) -> MarchState:
             t = now.base + now.step
             if ahead is not None:  # the crossing exactly
+                t = dr.select(now.step >= end - now.base, end, t)
+            if now.contact is not None:
                 t = dr.select(now.step >= end - now.base, end, t)
             at_end = None if ahead is None else t == end
 
@@ -152,18 +175,29 @@ class March:
             look = seen.look(path, t, candidate, fmax(unproved, real(0)))
             sample, gradient_norm = look.sample, length(look.sample.gradient)
             gaps = self.levels.gaps(sample.value)
-            total_error = self._total_error(sample, gradient_norm, size + t)
+            total_error = value_error(sample, gradient_norm, size + t)
 
             # Is all up to there proved free, and is the sample fine enough to say so?
             within = self.tolerance.in_value(
                 fmax(gradient_norm - sample.gradient_error, real(0)), t
             )
+            if self.hysteresis is not None:
+                within = self.hysteresis.within(within)
             is_near = self._is_near(
                 gaps.smaller, within, total_error, sample, gradient_norm, size + t
             )
+            excess = fmax(gaps.smaller + total_error - within, real(0))
+            band, may_pass = within, is_near
+            if self.hysteresis is not None and now.contact is not None:
+                band = self._band(within, total_error, sample, gradient_norm)
+                gaps = self.hysteresis.gaps(now.contact, sample.value, gaps, band)
+                within = CLOSER * within
+                may_pass &= ~now.contact.is_touching
+                if self.levels.period is not None:  # the value alone tells its side of a level
+                    may_pass = self.backend.Bool(False)
             accepted = now.step <= now.reach
             if self.overstep > 1:
-                knows_side = is_near | (gaps.smaller > total_error)
+                knows_side = may_pass | (gaps.smaller > total_error)
                 accepted |= knows_side & any_covers(look.back, gaps.less(total_error), unproved)
             too_coarse, finer, coarser = self.backend.Bool(False), now.detail, now.detail
             if has_detail:
@@ -178,26 +212,50 @@ class March:
                 next_detail = dr.select(too_coarse, finer, kept)
 
             # Is it a hit, or a sheet?
-            hit = accepted & is_near
-            gaps_ahead, sheet = gaps, None
+            hit, gaps_ahead, sheet = accepted & is_near, gaps, None
             if ahead is not None:
                 sheet = compare_with_sheet(
                     ahead, accepted & at_end, sample.value, total_error, self.levels
                 )
                 gaps_ahead = sheet.gaps
 
+            # Or a crossing?
+            aims, contact, value = gaps_ahead, now.contact, sample.value
+            if self.hysteresis is not None and now.contact is not None:
+                before = now.base, now.value, dr.dot(now.gradient, path.direction), now.gradient
+                last = t == end if sheet is None else (t == end) & ~sheet.has_crossing
+                there = Accepted(
+                    t, value, sample.gradient, look.slope, before, total_error, is_near, band, last
+                )
+                contact, hit = self.hysteresis.update(now.contact, accepted, there)
+                if ahead is not None and sheet is not None:
+                    # What was crossed before the sheet comes first: the sheet is looked at again.
+                    passed = sheet.at_crossing & ~hit
+                    contact, jumps = self.hysteresis.jump(
+                        contact, passed, there, ahead, path.direction
+                    )
+                    sheet = replace(sheet, at_crossing=passed, is_hit=jumps)
+                    value = value + dr.select(passed, ahead.jump, 0)
+                after = contact, value, self.levels.gaps(value), band
+                gaps_ahead, aims = self.hysteresis.gaps(*after), self.hysteresis.gaps(*after, AIM)
+
             # How far to go from there.
             forward = longest_step(look.ahead, gaps_ahead.less(total_error))
             forward = dr.select(gaps_ahead.smaller > total_error, forward, 0)
-            trial = self._trial(forward, look, gaps_ahead, now, path, is_smooth)
+            trial = self._trial(forward, look, aims, now, path, is_smooth)
             base = dr.select(accepted, t, now.base)
             step = dr.select(accepted, trial, dr.select(too_coarse, now.step, now.reach))
             reach = dr.select(accepted, forward, now.reach)
-            excess = fmax(gaps.smaller + total_error - within, real(0))
             # After a step of zero enclosures are asked for a third of the length: bisection.
             shorter = dr.select(dr.isfinite(candidate), candidate / 3, 1 + 16 * (size + t))
-            tried = dr.select(forward > 0, path.proofs.growth * forward, shorter)
+            tried = dr.select(forward > 0, look.growth * forward, shorter)
+            if now.contact is not None and contact is not None:  # off the surface, all lies ahead
+                leaves = now.contact.is_touching & ~contact.is_touching
+                tried = dr.select(leaves | hit, end - t, tried)
             free = base + reach >= end
+            if self.hysteresis is not None and contact is not None:  # a contact may end at the end
+                undecided = contact.is_touching & self.hysteresis.is_free_after
+                free &= ~(accepted & undecided & (t < end))
             if sheet is not None:
                 free = dr.select(sheet.has_crossing, sheet.at_crossing, free)
             evaluations = now.evaluations + 1
@@ -210,13 +268,14 @@ class March:
                 step=fmin(step, end - base),
                 reach=reach,
                 candidate=dr.select(accepted, tried, now.candidate),
-                value=dr.select(accepted, sample.value, now.value),
+                value=dr.select(accepted, value, now.value),
                 gradient=gradient,
                 excess=dr.select(accepted, excess, now.excess),
                 evaluations=evaluations,
                 detail=next_detail,
                 status=status,
                 active=now.active & ~(hit | free | (evaluations >= self.max_steps)),
+                contact=contact,
             )
 
         return while_active(state, body, "harnack")
@@ -245,6 +304,13 @@ class March:
             if not isinstance(promise, LineLipschitz):
                 size = fmax(dr.select(dr.isfinite(radius), radius, 0), size)
         return near & (gap + total_error - within <= _LARGEST_UNCERTAINTY * gradient_norm * size)
+
+    def _band(self, within: Real, total_error: Real, sample: Sample, gradient_norm: Real) -> Real:
+        """The tolerance in value that contacts go by (`Hysteresis.band`)."""
+        assert self.hysteresis is not None
+        knows_gradient = sample.gradient_error <= gradient_norm
+        rounding = dr.select(knows_gradient, total_error - sample.truncation, 0)
+        return self.hysteresis.band(within, rounding)
 
     def _trial(
         self, forward: Real, look: Look, gaps: Gaps, now: MarchState, path: Path, is_smooth: bool
@@ -292,16 +358,6 @@ class March:
             behind = self.levels.gaps(value + ahead.jump).smaller
             gap = dr.select(at_end & (ahead.sheet != NO_SHEET), fmin(gap, behind), gap)
         return gap
-
-    def _total_error(self, sample: Sample, gradient_norm: Real, size: Real) -> Real:
-        """What rounding and truncation may have done to f at a point whose coordinates are at most
-        `size`."""
-        epsilon = self.backend.epsilon
-        position = 4 * epsilon * size
-        # What is below the smallest normal number is lost.
-        smallest = self.backend.Float(float(dr.smallest(self.backend.Float)))
-        value = 8 * fmax(epsilon * dr.abs(sample.value), smallest)
-        return dr.fma(gradient_norm, position, value + sample.error)
 
 
 def _finer(

@@ -7,8 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
+from harnack.backend.extrema import fmax, fmin
+from harnack.backend.lengths import largest_component
 from harnack.fields.look import Path
 from harnack.fields.sheets import NO_SHEET
+from harnack.tracer.contact import Hysteresis
 from harnack.tracer.march import March, MarchState
 from harnack.tracer.stretches import SheetTracer
 from harnack.tracer.tolerance import PreparedTolerance, Status
@@ -20,6 +23,13 @@ if TYPE_CHECKING:
     from harnack.geometry import Volume
 
 
+# Rays that look for crossings begin and end outside the proved extent of the surface by this part
+# of the size of coordinates, to be seen on one side of it.
+_AROUND = 1 / 64
+# Rays that start so many roundings off a sheet start on it.
+_ON_SHEET = 8.0
+
+
 @dataclass(frozen=True)
 class MarchResult:
     """Ends of rays, as Dr.Jit arrays. t is where the proof of freedom ends (inf for a miss).
@@ -28,6 +38,10 @@ class MarchResult:
     elsewhere; its t is that of the crossing, `value` is f just before it, and `gradient` is the
     sheet's unit normal, to the side of larger f. excess: by how much f at t may be farther from
     the level than the tolerance allows.
+
+    Where hits are confirmed, t and gradient are those of the crossing, f at which is the level;
+    `value` is f a little behind it, and `side` 1 where f rises through the level along the ray, -1
+    where it falls through it. Where they are not, `side` is None.
     """
 
     t: Real
@@ -37,6 +51,7 @@ class MarchResult:
     evaluations: Any
     status: Any
     sheet: Any
+    side: Real | None = None
 
     @property
     def on_sheet(self) -> Mask:
@@ -46,7 +61,11 @@ class MarchResult:
 
 @dataclass(frozen=True)
 class PreparedLevelSet:
-    """A level set on a backend. Its methods can be called while a kernel is being recorded."""
+    """A level set on a backend. Its methods can be called while a kernel is being recorded.
+
+    volume: what holds the surface. region: where the field may be looked at, only for rays that
+        look for crossings; it is all of space, or larger than `volume`. Both None for all of space.
+    """
 
     backend: Backend
     field: Field
@@ -56,6 +75,8 @@ class PreparedLevelSet:
     tolerance: PreparedTolerance
     max_steps: int
     overstep: float
+    confirm: bool = False
+    region: Volume | None = None
 
     def sample(self, p: Vec3) -> Sample:
         """The field at p."""
@@ -77,21 +98,65 @@ class PreparedLevelSet:
     ) -> MarchResult:
         """The first hit of rays o + t d, |d| = 1, for t_min <= t <= t_max. Inactive rays miss."""
         end, sheet = self._march(o, d, t_min, t_max, active)
-        t = dr.select(end.status == int(Status.MISS), dr.inf, end.base)
-        return MarchResult(
-            t, end.value, end.gradient, end.excess, end.evaluations, end.status, sheet
+        t, gradient, excess, side = end.base, end.gradient, end.excess, None
+        if end.contact is not None:
+            crossed = end.status == int(Status.HIT)
+            t = dr.select(crossed, end.contact.root, t)
+            gradient = dr.select(crossed, end.contact.gradient, gradient)
+            excess, side = dr.zeros(type(excess)), end.contact.side
+        t = dr.select(end.status == int(Status.MISS), dr.inf, t)
+        return MarchResult(t, end.value, gradient, excess, end.evaluations, end.status, sheet, side)
+
+    def ready(
+        self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask, *, crosses: bool
+    ) -> tuple[March, Path, Real, Real, MarchState]:
+        """How to march, along which path, from where to where, and the state before it.
+
+        crosses: whether rays end where they have crossed a level, and not where they reach one.
+        """
+        backend, real = self.backend, self.backend.Float
+        path = Path(backend.Array3f(o), backend.Array3f(d), self.proofs)
+        start, end = self.clip(path.origin, path.direction, real(t_min), real(t_max))
+        has_detail = self.field.has_detail or self.field.has_sheets
+        hysteresis = None
+        if crosses:
+            start, end, hysteresis = self._around(path, real(t_min), real(t_max), start, end)
+        state = MarchState.at(backend, start, end, active, has_detail=has_detail, crosses=crosses)
+        march = March(
+            backend, self.levels, self.tolerance, self.max_steps, self.overstep, hysteresis
         )
+        return march, path, real(start), real(end), state
+
+    def _around(
+        self, path: Path, t_min: Real, t_max: Real, start: Real, end: Real
+    ) -> tuple[Real, Real, Hysteresis]:
+        """The part of rays to look at for crossings, given the part that can hold the surface.
+
+        The surface may touch the ends of the latter, so that on it f is on one side only. Beyond
+        it the ray is free. So a little more of the ray is looked at, if there is more of it.
+        """
+        none, size = self.backend.Bool(False), largest_component(path.origin)
+        rounding = _ON_SHEET * self.backend.epsilon * (size + t_min)
+        if self.volume is None:
+            return start, end, Hysteresis.of(self.levels, (none, none), start, rounding)
+        first, last = t_min, t_max
+        if self.region is not None:
+            first, last = self.region.clip(path.origin, path.direction, t_min, t_max)
+        around = _AROUND * (size + dr.abs(start))
+        holds = start < end
+        before, after = fmax(start - around, first), fmin(end + around, last)
+        free_before, free_after = before > first, after < last
+        start, end = dr.select(holds, before, start), dr.select(holds, after, end)
+        free = holds & free_before, holds & free_after
+        return start, end, Hysteresis.of(self.levels, free, start, rounding)
 
     def _march(
         self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask
     ) -> tuple[MarchState, Any]:
         """The end state of rays, and the index of the sheet that each hit."""
-        backend, real = self.backend, self.backend.Float
-        path = Path(backend.Array3f(o), backend.Array3f(d), self.proofs)
-        start, end = self.clip(path.origin, path.direction, real(t_min), real(t_max))
-        has_detail = self.field.has_detail or self.field.has_sheets
-        state = MarchState.at(backend, start, end, active, has_detail=has_detail)
-        march = March(backend, self.levels, self.tolerance, self.max_steps, self.overstep)
+        march, path, start, end, state = self.ready(
+            o, d, t_min, t_max, active, crosses=self.confirm
+        )
         if self.field.has_sheets:
-            return SheetTracer(march, self.field, path, real(start), real(end)).run(state)
-        return march.advance(self.field, path, end, state), backend.UInt32(NO_SHEET)
+            return SheetTracer(march, self.field, path, start, end).run(state)
+        return march.advance(self.field, path, end, state), self.backend.UInt32(NO_SHEET)

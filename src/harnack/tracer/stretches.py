@@ -36,12 +36,16 @@ _SAME, _PARALLEL, _STEEP = 2.0, 0.999, 1 / 64
 
 
 @dataclass(frozen=True)
-class _WalkState:
-    """Where rays are: the field's offset, the crossing last passed, and the state of the march."""
+class SheetWalk:
+    """Where rays are: the field's offset, the crossing last passed, and the state of the march.
+
+    named: index of the sheet that was looked at last, of rays that look for crossings.
+    """
 
     offset: Real
     behind: Crossing
     march: MarchState
+    named: Any | None = None
 
     @property
     def active(self) -> Mask:
@@ -88,20 +92,29 @@ class SheetTracer:
 
         The walk begins just before `start`, so that a sheet on the very start is looked at.
         """
+        outer = while_active(self.begin(state), self.interval, "harnack intervals")
+        return self.end_of(outer)
+
+    def begin(self, state: MarchState) -> SheetWalk:
+        """Rays at their start."""
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
         o, d = self.path.origin, self.path.direction
         before = real(self.start * (1 - self.backend.epsilon) - 1e-30)
         offset = real(self.field.offset(o, d, before, state.active))
         start = Crossing(before, count(NO_SHEET), real(0), vector(0))
-        outer = _WalkState(offset, start, state)
-        outer = while_active(outer, self._interval, "harnack intervals")
-        end = outer.march
+        named = None if state.contact is None else count(NO_SHEET)
+        return SheetWalk(offset, start, state, named)
+
+    def end_of(self, outer: SheetWalk) -> tuple[MarchState, Any]:
+        """The state of rays, and the index of the sheet that each is on, NO_SHEET for none."""
+        count, end = self.backend.UInt32, outer.march
         on_sheet = end.status == ON_SHEET
         status = dr.select(on_sheet, count(int(Status.HIT)), end.status)
-        sheet = dr.select(on_sheet, outer.behind.sheet, count(NO_SHEET))
+        named = outer.behind.sheet if outer.named is None else outer.named
+        sheet = dr.select(on_sheet, named, count(NO_SHEET))
         return dataclasses.replace(end, status=status), sheet
 
-    def _interval(self, outer: _WalkState) -> _WalkState:
+    def interval(self, outer: SheetWalk) -> SheetWalk:
         """One interval: to the next crossing or the end of the ray, or to a hit."""
         count = self.backend.UInt32
         o, d = self.path.origin, self.path.direction
@@ -110,12 +123,18 @@ class SheetTracer:
         stops = ahead.sheet != NO_SHEET
         stop = dr.select(stops, ahead.t, self.end)
         # The last step may already have proved the rest of the ray.
-        active = now.active & (stops | (now.base + now.reach < stop))
+        goes_on = now.base + now.reach < stop
+        if now.contact is not None and self.march.hysteresis is not None:
+            undecided = now.contact.is_touching & self.march.hysteresis.is_free_after
+            goes_on |= undecided & (now.base < stop)
+        active = now.active & (stops | goes_on)
         step = fmin(self.march.overstep * now.reach, stop - now.base)
         now = dataclasses.replace(now, step=step, active=active)
         field = self.field.between(o, d, behind, ahead, outer.offset)
         now = self.march.advance(field, self.path, stop, now, ahead)
         passed = active & stops & (now.status == int(Status.MISS))
+        if now.contact is not None:
+            return self._passed(outer, now, ahead, last, passed, active & stops)
         spent = passed & (now.evaluations >= self.march.max_steps)
         status = dr.select(spent, count(int(Status.OUT_OF_STEPS)), now.status)
         # A sheet that was hit is the one to be named; one that was passed, the last of all there.
@@ -125,10 +144,37 @@ class SheetTracer:
             ahead.jump,
             ahead.normal,
         )
-        return _WalkState(
+        return SheetWalk(
             dr.select(passed, outer.offset + ahead.jump, outer.offset),
             crossing,
             dataclasses.replace(now, status=status, active=passed & ~spent),
+        )
+
+    def _passed(
+        self,
+        outer: SheetWalk,
+        now: MarchState,
+        ahead: Crossing,
+        last: Crossing,
+        passed: Mask,
+        stopped: Mask,
+    ) -> SheetWalk:
+        """The walk of rays that look for crossings: one that has crossed the level on a sheet has
+        passed the sheet, and may be made active again."""
+        spent = passed & (now.evaluations >= self.march.max_steps)
+        status = dr.select(spent, self.backend.UInt32(int(Status.OUT_OF_STEPS)), now.status)
+        through = passed | (stopped & (now.status == ON_SHEET))
+        behind = Crossing(
+            dr.select(through, last.t, outer.behind.t),
+            dr.select(through, last.sheet, outer.behind.sheet),
+            dr.select(through, ahead.jump, outer.behind.jump),
+            dr.select(through, ahead.normal, outer.behind.normal),
+        )
+        return SheetWalk(
+            dr.select(through, outer.offset + ahead.jump, outer.offset),
+            behind,
+            dataclasses.replace(now, status=status, active=passed & ~spent),
+            dr.select(through, ahead.sheet, outer.named),
         )
 
     def _together(self, first: Crossing, active: Mask) -> tuple[Crossing, Crossing]:

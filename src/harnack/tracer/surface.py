@@ -28,6 +28,9 @@ class LevelSet:
 
     levels: None for the field's default, a number, several, or Dr.Jit numbers.
     clip: a volume to cut the surface with, besides the field's own domain.
+    confirm: whether a ray hits only where f really changes sign about the level: where it passes
+        to the other side, by at least half the tolerance. One that comes within the tolerance and
+        turns back (a graze) goes on.
     solid: (low, high) makes it the closed solid {low <= f <= high} cut by its volume, whose
         levels are the finite ends; only renderers look at it.
     overstep: steps are this much longer than proved, and kept if the bound at the far end,
@@ -42,6 +45,7 @@ class LevelSet:
     bound: Proofs = dataclasses.field(default_factory=choose_proofs)
     overstep: float = 1.4
     solid: tuple[float, float] | None = None
+    confirm: bool = False
 
     def __post_init__(self) -> None:
         if operator.index(self.max_steps) < 1:
@@ -50,6 +54,20 @@ class LevelSet:
             raise ValueError(f"overstep must lie in [1, 2), not {self.overstep}")
         if self.field.has_sheets and self.field.period is not None:
             raise ValueError("a field with sheets must be real-valued: its period must be None")
+        if self.confirm:
+            self.check_crossings("confirm")
+
+    def check_crossings(self, setting: str) -> None:
+        """Raise ValueError for several levels of a field with sheets: a jump may cross more than
+        one of them at once.
+
+        setting: what asks for crossings.
+        """
+        if self.field.has_sheets and len(self.levels) > 1:
+            raise ValueError(
+                f"{setting} takes one level of a field with sheets, such as this "
+                f"{type(self.field).__name__}, not {len(self.levels)}: trace each level by itself"
+            )
 
     @property
     def numbers(self) -> tuple[float, ...]:
@@ -59,15 +77,16 @@ class LevelSet:
     @property
     def volume(self) -> Volume | None:
         """What rays are clipped to: domain, proved extent and clip together; None for all space."""
-        parts = [self.field.domain, self.field.extent(self.numbers), self.clip]
-        kept = list(dict.fromkeys(part for part in parts if part is not None))
-        if not kept:
-            return None
-        return kept[0] if len(kept) == 1 else Intersection(tuple(kept))
+        return _common([self.field.domain, self.field.extent(self.numbers), self.clip])
 
-    def prepare(self, backend: Backend) -> PreparedLevelSet:
-        """Everything uploaded to a backend, ready to be traced in a recorded kernel."""
-        volume = self.volume
+    def prepare(self, backend: Backend, *, crosses: bool = False) -> PreparedLevelSet:
+        """Everything uploaded to a backend, ready to be traced in a recorded kernel.
+
+        crosses: whether rays will look for crossings.
+        """
+        volume, region = self.volume, None
+        if crosses or self.confirm:
+            region = _common([self.field.domain, self.clip])
         levels = tuple(
             level if dr.is_array_v(type(level)) else dr.opaque(backend.Float, float(level))
             for level in self.levels
@@ -81,6 +100,8 @@ class LevelSet:
             self.tolerance.prepare(backend),
             self.max_steps,
             self.overstep,
+            self.confirm,
+            None if region is None else region.prepare(backend),
         )
 
 
@@ -94,6 +115,7 @@ def level_set(
     bound: Choice = None,
     overstep: float | None = None,
     solid: tuple[float, float] | None = None,
+    confirm: bool = False,
 ) -> LevelSet:
     """A `LevelSet` from what users write: a level or several, a tolerance, a bound's name.
 
@@ -126,7 +148,17 @@ def level_set(
     if not isinstance(tolerance, Tolerance):
         tolerance = Tolerance(_as_number(tolerance, "tolerance must be a length or a Tolerance"))
     overstep = field.overstep if overstep is None else overstep
-    return LevelSet(field, asked, clip, tolerance, max_steps, choose_proofs(bound), overstep, solid)
+    return LevelSet(
+        field, asked, clip, tolerance, max_steps, choose_proofs(bound), overstep, solid, confirm
+    )
+
+
+def _common(parts: Sequence[Volume | None]) -> Volume | None:
+    """The volume that some have in common; None for all of space."""
+    kept = list(dict.fromkeys(part for part in parts if part is not None))
+    if not kept:
+        return None
+    return kept[0] if len(kept) == 1 else Intersection(tuple(kept))
 
 
 def _as_levels(level: Any) -> tuple[Any, ...]:

@@ -20,6 +20,7 @@ from harnack.fields.blobs.jets import blob_term, summed
 from harnack.fields.blobs.kernels import Kernel, choose_kernel
 from harnack.fields.blobs.largest import GroupedList, LargestAlong, largest_at, largest_jet
 from harnack.fields.blobs.sums import (
+    PIECES,
     BlobValue,
     ForEach,
     Knots,
@@ -184,7 +185,7 @@ class Blobs(Formula):
             )  # fmt: skip
         if run is not None:
             enclosures = tuple(_After(run, one) for one in enclosures)
-        return Look(self._sample(start), enclosures, (), slope)
+        return Look(self._sample(start), enclosures, (), slope, PIECES)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         """f of jets of the coordinates, or of Dr.Jit numbers: a sum over all blobs, near or not."""

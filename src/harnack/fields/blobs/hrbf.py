@@ -18,7 +18,7 @@ from harnack.backend.numbers import check_finite, check_size, check_vectors, rea
 from harnack.backend.records import Records
 from harnack.enclosures import Lipschitz, Piece, Slopes
 from harnack.fields.blobs.jets import summed
-from harnack.fields.blobs.sums import Along, BlobValue, Knots, State, over
+from harnack.fields.blobs.sums import PIECES, Along, BlobValue, Knots, State, over
 from harnack.fields.formula import Formula
 from harnack.fields.kept import prepared_once
 from harnack.fields.look import Look, Path, Sample
@@ -110,7 +110,8 @@ class HRBF(Formula):
         found = self._along(p, d, asked.knots)
         slope = dr.dot(found.start.gradient, d)
         slopes = Slopes.around(slope, found.start.gradient_error)
-        return Look(self._sample(found.start), path.proofs.along(found, slopes, length), (), slope)
+        enclosures = path.proofs.along(found, slopes, length)
+        return Look(self._sample(found.start), enclosures, (), slope, PIECES)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         """f of jets of the coordinates, or of Dr.Jit numbers."""

@@ -48,12 +48,17 @@ class BlobValue:
     gradient_error: Real
 
 
+# Pieces of a path that take the least time: finding what is near costs more than ranges.
+PIECES = 4
+
+
 @dataclass(frozen=True)
 class Along:
     """A sum along the path from p: what it is there, and ranges on pieces (see `Restriction`)."""
 
     start: BlobValue
     parts: tuple[Piece, ...]
+    piece_count: int = PIECES
 
     def pieces(self, knots: Sequence[Real]) -> tuple[Piece, ...]:
         """The ranges between the knots that it was made with."""
@@ -65,6 +70,7 @@ class Knots:
     """A function along a path that is asked in advance which ranges will be wanted."""
 
     def __init__(self) -> None:
+        self.piece_count = PIECES
         self.knots: tuple[Real, ...] | None = None
 
     def pieces(self, knots: Sequence[Real]) -> tuple[Piece, ...]:

@@ -1,18 +1,162 @@
-"""What a solid is: the points where a function is negative."""
+"""What a solid is: the points where a function is not positive, and what can be done with one."""
 
 from __future__ import annotations
+
+import abc
+from typing import TYPE_CHECKING, Any
 
 from harnack.fields.field import Field
 from harnack.fields.formula import Formula
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    import numpy.typing as npt
+
+    from harnack.fields.solids.maps import Map
+    from harnack.geometry import Volume
+
 
 class Solid(Field):
-    """The points where f <= 0, whose boundary is the level 0.
+    """The points where f <= 0; its boundary is the level 0.
+
+    Solids are put together by operators, `a | b` (union), `a & b` (intersection), `a - b`
+    (difference), `~a` (complement), and are moved and bent by methods. What is proved about the
+    parts holds of the whole: every step is proved from enclosures of the parts, never from a
+    distance that the whole does not have.
 
     lipschitz: a proved bound of |grad f| everywhere, so that f/lipschitz is a bound of the distance
         from outside (Hart 1996, definition 3); None where none is known.
     """
 
+    overstep = 1.0
+    has_creases = True
+    lipschitz: Any = None
+
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        """A volume proved to hold all points where f <= level, or f >= level if `above`; None where
+        none is known."""
+        del level, above
+        return self.domain
+
+    def extent(self, levels: tuple[float, ...]) -> Volume | None:
+        return self.hull(max(levels)) or self.hull(min(levels), above=True)
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        """f of coordinates that are jets; see `Formula`.
+
+        Raises:
+            TypeError: f has no formula.
+        """
+        del x, y, z
+        raise TypeError(
+            f"{type(self).__name__} has no formula, so it cannot be blended, twisted or tapered; "
+            "move it by moved, rotated, scaled or transformed, and join it by |, & and -"
+        )
+
+    @abc.abstractmethod
+    def leaves(self, change: Callable[[Solid], Solid]) -> Solid:
+        """The same combination of changed parts: a map of space is one of each part."""
+
+    # Combinations.
+
+    def __or__(self, other: Any) -> Solid:
+        from harnack.fields.solids.combined import union
+
+        return union(self, other) if isinstance(other, Solid) else NotImplemented
+
+    def __and__(self, other: Any) -> Solid:
+        from harnack.fields.solids.combined import intersection
+
+        return intersection(self, other) if isinstance(other, Solid) else NotImplemented
+
+    def __sub__(self, other: Any) -> Solid:
+        from harnack.fields.solids.combined import Complement, intersection
+
+        return intersection(self, Complement(other)) if isinstance(other, Solid) else NotImplemented
+
+    def __invert__(self) -> Solid:
+        from harnack.fields.solids.combined import Complement
+
+        return Complement(self)
+
+    def blended(
+        self, other: Solid, radius: float, *, power: float = 2.0, intersect: bool = False
+    ) -> Solid:
+        """The union with another solid, with a fillet where the surfaces meet (or, with
+        intersect=True, the intersection with a rounded edge).
+
+        radius: how far the fillet reaches along both surfaces, where f is a distance.
+        power: the exponent of the superellipse that the fillet is a part of: 2 for a circle, larger
+            for a sharper corner (Hart 1996, appendix D.3, corrected).
+
+        Raises:
+            ValueError: radius or power out of range. TypeError: a solid without a formula.
+        """
+        from harnack.fields.solids.blended import Blend
+
+        return Blend((self, other), radius, power, not intersect)
+
+    def grown(self, distance: float) -> Solid:
+        """The points where f <= distance: larger by that length, or smaller if it is negative,
+        where f is a distance."""
+        from harnack.fields.solids.combined import Offset
+
+        return Offset(self, float(distance))
+
+    # Maps of space. Those that bend are for solids with a formula.
+
+    def moved(self, offset: Sequence[float]) -> Solid:
+        """The solid, moved by a vector (3,)."""
+        from harnack.fields.solids.affine import Affine
+
+        return self._mapped(Affine.translation(offset))
+
+    def rotated(self, degrees: float, axis: str | Sequence[float] = "z") -> Solid:
+        """The solid, turned by so many degrees about an axis through the origin, anticlockwise as
+        seen from its end. axis: "x", "y", "z" or a vector (3,)."""
+        from harnack.fields.solids.affine import Affine
+
+        return self._mapped(Affine.rotation(degrees, axis))
+
+    def scaled(self, factors: float | Sequence[float]) -> Solid:
+        """The solid, made so many times as large about the origin, along all axes or along each.
+
+        f is measured in the new unit of length if all factors are equal, so that a distance stays
+        one; else it is left as it is."""
+        from harnack.fields.solids.affine import Affine
+
+        return self._mapped(Affine.scaling(factors))
+
+    def transformed(self, matrix: npt.ArrayLike) -> Solid:
+        """The solid under a linear or an affine map: matrix (3, 3), (3, 4) or (4, 4)."""
+        from harnack.fields.solids.affine import Affine
+
+        return self._mapped(Affine.of_matrix(matrix))
+
+    def twisted(self, rate: float, axis: str = "z") -> Solid:
+        """The solid, turned about an axis by so many radians for each unit of length along it."""
+        from harnack.fields.solids.bends import Twist
+
+        return self._mapped(Twist(float(rate), axis))
+
+    def tapered(
+        self, start: tuple[float, float], end: tuple[float, float], axis: str = "z"
+    ) -> Solid:
+        """The solid, its cross sections scaled along an axis.
+
+        start, end: (coordinate along the axis, scale), two places; the scale is linear between
+        them and constant beyond. Scales are positive."""
+        from harnack.fields.solids.bends import Taper
+
+        return self._mapped(Taper(start, end, axis))
+
+    def _mapped(self, change: Map) -> Solid:
+        return self.leaves(change.of)
+
 
 class Shape(Formula, Solid):
     """A solid given by a formula of the coordinates."""
+
+    def leaves(self, change: Callable[[Solid], Solid]) -> Solid:
+        return change(self)

@@ -66,13 +66,15 @@ class EigenfunctionSum(Field):
         E t <= E^2/(2 h H) + h H t^2/2   (2 a b <= a^2 + b^2):
 
     the larger H and E^2/(2 h H) cover what Taylor's formula says with a rounded gradient. On the
-    harmonic ball of radius R it is E R, of which `enclosures.solve.rounding` pays for 16 u of the
+    harmonic ball of radius R it is E R, of which `balls.solve.rounding` pays for 16 u of the
     mean 4 (f - lower)/R that the slope is measured by, f - lower being about H R^2/2 or more; only
     what that leaves is added.
 
     Raises:
         ValueError: terms that are not finite, or a sum that is constant.
     """
+
+    is_entire = True
 
     def __init__(self, terms: Iterable[Term], *, domain: Volume | None = None) -> None:
         self.terms = checked_terms(terms)

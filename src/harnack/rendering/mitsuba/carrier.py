@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from harnack.rendering.mitsuba.clear import tint_of
 from harnack.rendering.mitsuba.variant import load_mitsuba, mitsuba_backend
 from harnack.rendering.surfaces.extent import box_of
 from harnack.rendering.surfaces.placement import PlacedSurface, Placement
@@ -24,16 +25,23 @@ if TYPE_CHECKING:
 PLUGIN = "harnack"
 
 
-def from_properties(mi: Any, props: Any, surface: LevelSet) -> Any:
+def from_properties(mi: Any, props: Any, surface: LevelSet, tint: Any = None) -> Any:
     """The shape of a surface with the `to_world` and the BSDF that a plug-in's properties hold.
+
+    tint: of a solid, what is left of light after one unit of length in it, in the world.
 
     Raises:
         ValueError: as `shape`; or the properties hold an emitter or a medium.
     """
+    if tint is not None and surface.solid is None:
+        raise ValueError(
+            "tint is of a solid, which light goes through: give solid=(low, high), for instance "
+            "solid=(-math.inf, level)"
+        )
     placement = Placement.identity()
     if "to_world" in props:
         placement = Placement.of(as_matrix(props["to_world"]))
-    made = _carrier_class(mi.variant())(props, surface, placement)
+    made = _carrier_class(mi.variant())(props, surface, placement, tint)
     if made.emitter() is not None or made.is_medium_transition():
         raise ValueError("surfaces that are traced can neither emit light nor bound a medium")
     return made
@@ -54,11 +62,12 @@ def _carrier_class(variant: str) -> Any:
     class Carrier(mi.Mesh):
         """A mesh that no ray meets, with the surface that it stands for."""
 
-        def __init__(self, props: Any, surface: LevelSet, placement: Placement) -> None:
+        def __init__(self, props: Any, surface: LevelSet, placement: Placement, tint: Any) -> None:
             ends = box_of(surface)
             mi.Mesh.__init__(self, PLUGIN, 2, 2, props=props)
             self.surface = surface
             self.placement = placement
+            self.tint = tint_of(mi, tint)
             self.placed = PlacedSurface.of(surface, placement, mitsuba_backend(mi))
             params = mi.traverse(self)
             corners = np.concatenate(placement.world_bounds(ends))

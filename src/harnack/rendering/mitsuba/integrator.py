@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 
 from harnack.backend import Mask, Real  # needed at run time: Dr.Jit reads annotations of _Path
+from harnack.rendering.mitsuba.clear import transmittance
 from harnack.rendering.mitsuba.interaction import connecting_ray, leaving_ray
 from harnack.rendering.mitsuba.variant import load_mitsuba
 from harnack.rendering.mitsuba.world import World
@@ -122,6 +123,8 @@ class PathTracer:
         mi = self.mi
         si, met = world.intersect(path.ray, path.previous, path.active)
         clearance, lost = met.clearance, met.lost
+        left = transmittance(mi, world.carriers, path.previous, si, path.ray.d)
+        path = replace(path, throughput=path.throughput * left)
         radiance = path.radiance + self._emitted(world.scene, path, si, path.active & ~lost)
         shown = path.throughput * mi.Spectrum(self.lost_colour.eval(si, lost))
         radiance += dr.select(path.active & lost, shown, 0)

@@ -8,6 +8,7 @@
     <float name="clip_radius" value="1"/>          a ball about clip_center, and/or a box from
     <point name="clip_lower" x="-1" y="0" z="0"/>  clip_lower to clip_upper
     <float name="tolerance" value="1e-4"/>         and the integer max_steps
+    <boolean name="confirm" value="true"/>         hits only where the field changes sign
     <transform name="to_world"> ... </transform>   moves, turns and one scale for all axes
     <bsdf type="..."/>
 </shape>
@@ -72,7 +73,7 @@ def surface_of(props: Any) -> LevelSet:
     settings: dict[str, Any] = {"clip": _clip(props)}
     if "low" in props or "high" in props:
         settings["solid"] = (props.get("low", -math.inf), props.get("high", math.inf))
-    for name in ("level", "tolerance", "max_steps"):
+    for name in ("level", "tolerance", "max_steps", "confirm"):
         if name in props:
             settings[name] = props[name]
     return level_set(_field(props), **settings)

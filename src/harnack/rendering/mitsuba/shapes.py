@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
 from harnack.rendering.mitsuba.carrier import as_matrix, from_properties
@@ -21,6 +21,7 @@ def shape(
     *,
     bsdf: Mapping[str, Any] | Any = None,
     to_world: npt.ArrayLike | Any = None,
+    tint: Sequence[float] | None = None,
     **settings: Any,
 ) -> Any:
     """A Mitsuba shape of a field's level set, for a scene dictionary or a scene.
@@ -35,6 +36,8 @@ def shape(
     bsdf: dictionary or BSDF object; grey diffuse, seen from both sides, if left out. Open
         surfaces have two sides: wrap one-sided BSDFs as {"type": "twosided", ...}.
     to_world: matrix (4, 4) or Mitsuba transform of moves, turns and one scale for all axes.
+    tint: of a solid of glass, what is left of red, green and blue light after one unit of length
+        in it, in the world: (1, 1, 1) for clear (Beer and Lambert).
     settings: as `harnack.level_set` takes them: level, clip, tolerance, solid, ... Glass needs a
         `solid`.
 
@@ -51,7 +54,7 @@ def shape(
     props["bsdf"] = as_bsdf(mi, bsdf)
     if to_world is not None:
         props["to_world"] = mi.ScalarTransform4f(as_matrix(to_world))
-    return from_properties(mi, props, surface)
+    return from_properties(mi, props, surface, tint)
 
 
 def as_bsdf(mi: Any, bsdf: Any) -> Any:

@@ -30,6 +30,7 @@ from harnack.rendering.pictures.pixels import (
     pixels_of_band,
 )
 from harnack.rendering.pictures.shading import Light, of_mended, of_side, reflectance
+from harnack.rendering.pictures.through import Through
 
 # Rays of one band.
 _RAYS_A_BAND = 2**17
@@ -41,7 +42,11 @@ _FIRST = 0.6
 
 @dataclass
 class _Seen:
-    """What rays meet first. light: shone by an emitter or the environment, or magenta for lost."""
+    """What rays meet first, or first behind clear matter.
+
+    light: shone by an emitter or the environment and reflected by clear matter, or magenta for
+        lost. through: what clear matter leaves of the light from what is met.
+    """
 
     position: Any
     normal: Any
@@ -49,6 +54,7 @@ class _Seen:
     width: Any
     colour: Any
     light: Any
+    through: Any
     glossy: Any
     met: Any
     lost: Any
@@ -56,7 +62,7 @@ class _Seen:
     @classmethod
     def nothing(cls, mi: Any, count: int) -> _Seen:
         """Room for as many pixels, to scatter to."""
-        vectors, colours, masks = (mi.Vector3f,) * 3, (mi.Color3f,) * 2, (mi.Bool,) * 3
+        vectors, colours, masks = (mi.Vector3f,) * 3, (mi.Color3f,) * 3, (mi.Bool,) * 3
         kinds = (*vectors, mi.Float, *colours, *masks)
         return cls(*(dr.zeros(kind, count) for kind in kinds))
 
@@ -119,6 +125,7 @@ class _Painter:
         self.size = (width, height)
         matrix = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
         self.light = Light.of(matrix)
+        self.through = Through(world, self.light)
         self.floor = Floor.of(world, self.light) if on_floor else None
 
     def look(self, pixel: Any, offset: Any) -> _Seen:
@@ -128,8 +135,8 @@ class _Painter:
         ray, weight = self.sensor.sample_ray_differential(
             self.sensor.shutter_open(), 0.5, place, mi.Point2f(0.5)
         )
-        plain = mi.Ray3f(ray)
-        si, first = self.world.intersect(plain, dr.zeros(mi.SurfaceInteraction3f), mi.Bool(True))
+        sight = self.through.look(mi.Ray3f(ray))
+        si, first = sight.si, sight.first
         lost = first.lost | dr.zeros(mi.Bool, dr.width(pixel))
         met = first.met & ~lost
         inside, open_surface = si.wi.z > 0, self._is_open(si)
@@ -138,14 +145,17 @@ class _Painter:
         colour, other = reflectance(colour), reflectance(other)
         colour = of_mended(of_side(colour, other, inside & open_surface), first.mended)
         shone = si.emitter(scene).eval(si, ~lost) * weight
-        light = dr.select(lost, mi.Color3f(LOST_COLOUR), as_rgb(mi, shone, ray.wavelengths))
-        normal = mi.Vector3f(dr.mulsign(mi.Vector3f(si.n), -dr.dot(si.n, ray.d)))
-        t = dr.select(met, first.t, 0)
+        light = as_rgb(mi, sight.throughput * shone + weight * sight.gathered, ray.wavelengths)
+        light = dr.select(lost, mi.Color3f(LOST_COLOUR), light)
+        through = as_rgb(mi, sight.throughput, ray.wavelengths)
+        d = sight.ray.d
+        normal = mi.Vector3f(dr.mulsign(mi.Vector3f(si.n), -dr.dot(si.n, d)))
+        t = dr.select(met, sight.travelled + first.t, 0)
         width = dr.norm(ray.o_x + t * ray.d_x - ray.o - t * ray.d)
         flags = si.bsdf().flags()
         glossy = mi.has_flag(flags, mi.BSDFFlags.Glossy) | mi.has_flag(flags, mi.BSDFFlags.Delta)
         position = dr.select(met, mi.Vector3f(si.p), dr.nan)
-        return _Seen(position, normal, -ray.d, width, colour, light, glossy, met, lost)
+        return _Seen(position, normal, -d, width, colour, light, through, glossy, met, lost)
 
     def _reflectance(self, si: Any, side: int) -> Any:
         """Of the side that is seen (1) or the other (-1), seen straight on."""
@@ -169,7 +179,7 @@ class _Painter:
             key, above = self.floor.at(seen.position)
             sky = dr.minimum(sky, above)
         lit = self.light.on(seen.colour, seen.normal, seen.eye, seen.glossy, sky, key)
-        return dr.select(seen.met, lit, 0) + seen.light
+        return dr.select(seen.met, seen.through * lit, 0) + seen.light
 
     def refine(
         self, chosen: Any, offsets: Any, position: Any, sky: Any

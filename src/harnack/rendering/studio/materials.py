@@ -40,12 +40,21 @@ class Material:
     two_sided: whether open surfaces are to be seen from both sides. A BSDF that takes care of
         that itself does not want it.
     transparent: light passes through it, so that only a solid can be made of it.
+    tint: what it leaves of red, green and blue light that passes through one unit of length on the
+        stage, where half the diagonal of all that stands there is 1; None for all.
     """
 
     front: Dictionary
     back: Dictionary | None = None
     two_sided: bool = True
     transparent: bool = False
+    tint: Colour | None = None
+
+    def __post_init__(self) -> None:
+        if self.tint is not None and not self.transparent:
+            raise ValueError(
+                "tint is of a material that light passes through: give transparent=True too"
+            )
 
     def bsdf(self, *, solid: bool) -> Dictionary:
         """The BSDF's dictionary for a solid or an open surface.
@@ -66,6 +75,12 @@ class Material:
         return nested if self.back is None else {**nested, "back": self.back}
 
 
+def _tinted(tint: Colour, index: float = 1.5) -> Material:
+    """Glass that takes some of the light away."""
+    glass: Dictionary = {"type": "dielectric", "int_ior": index, "ext_ior": 1.0}
+    return Material(glass, transparent=True, tint=tint)
+
+
 MATERIALS: Mapping[str, Material] = {
     "two-tone": Material(_glazed((0.80, 0.255, 0.11), 0.22), _glazed((0.07, 0.25, 0.40), 0.22)),
     "eggshell": Material(_glazed((0.66, 0.13, 0.06), 0.3), _glazed((0.80, 0.74, 0.64), 0.3)),
@@ -79,6 +94,9 @@ MATERIALS: Mapping[str, Material] = {
     "frosted": Material(
         {"type": "roughdielectric", "int_ior": 1.5, "ext_ior": 1.0, "alpha": 0.12}, transparent=True
     ),
+    "amber": _tinted((0.86, 0.42, 0.06)),
+    "cobalt": _tinted((0.10, 0.24, 0.72)),
+    "jelly": _tinted((0.80, 0.12, 0.16), 1.35),
 }
 """Materials by name."""
 

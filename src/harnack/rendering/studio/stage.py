@@ -77,7 +77,9 @@ def studio(
         if one.fitted:
             surface = replace(surface, tolerance=Tolerance(_TOLERANCE / placement.scale))
         bsdf = one.material.bsdf(solid=surface.solid is not None)
-        scene[f"surface{k}"] = shape(surface, bsdf=bsdf, to_world=placement.matrix)
+        scene[f"surface{k}"] = shape(
+            surface, bsdf=bsdf, to_world=placement.matrix, tint=one.material.tint
+        )
     if not bare:
         scene |= {**ground(mi, backdrop), **lights(mi, camera.azimuth)}
     return Studio(scene, placement.scale)

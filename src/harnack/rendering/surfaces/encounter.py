@@ -64,6 +64,8 @@ def meet_surface(
     the ray comes from; a normal that says otherwise (the step went past the point where a
     grazing ray is nearest) is turned to that side.
 
+    A confirmed hit is at a root already, and its side is known.
+
     A hit on a sheet of a field that jumps is where it is, and faces the side of larger values.
     """
     vector = prepared.backend.Array3f
@@ -74,6 +76,10 @@ def meet_surface(
     slope = dr.dot(trace.gradient, d)
     reach = _POLISH * _uncertainty(prepared, trace.gradient, trace.t, trace.value)
     step = dr.select(smooth & (slope != 0), dr.clip(gap / slope, -reach, reach), 0)
+    # gap > 0: the level is above, so the ray comes from the side of smaller values.
+    side = dr.select(gap > 0, prepared.backend.Float(1), -1)
+    if trace.side is not None:  # confirmed hits are at a root
+        step, side = dr.zeros(type(step)), trace.side
     t = dr.maximum(dr.select(met, trace.t, 0) + step, 0)
     p = dr.fma(vector(t), d, o)
     sample = prepared.sample(p)
@@ -85,8 +91,6 @@ def meet_surface(
     rest = dr.select(length > 0, dr.clip(rest, -reach, reach), 0)
     if prepared.field.has_sheets:  # behind one, the value says nothing about this surface
         rest = dr.select(dr.abs(rest) * length <= dr.abs(gap), rest, 0)
-    # gap > 0: the level is above, so the ray comes from the side of smaller values.
-    side = dr.select(gap > 0, prepared.backend.Float(1), -1)
     encounter = SurfaceHit(
         t=dr.select(met, t, trace.t),
         met=met,

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, ClassVar
 import drjit as dr
 
 from harnack.backend.extrema import clamp, fmax, fmin
-from harnack.enclosures.ball import Ball
-from harnack.enclosures.solve import is_covered, largest_covered, rounding
+from harnack.enclosures.balls.ball import Ball
+from harnack.enclosures.balls.solve import is_covered, largest_covered, rounding
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import drjit as dr
 
 from harnack.backend.extrema import clamp, fmax, fmin
-from harnack.enclosures.ball import Ball
+from harnack.enclosures.balls.ball import Ball
 
 if TYPE_CHECKING:
     from harnack.backend import Real

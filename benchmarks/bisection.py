@@ -1,0 +1,90 @@
+"""Bisection of rays with interval pruning, the baseline of the published tables.
+
+An interval of the ray is looked at as a whole. Where the enclosure proves it free, the next one
+follows; where not, what it proves free at the front (and, of bands, at the end) is cut off and the
+rest halved. The ends of intervals still to come are on a stack, each with how far the ray is free
+behind it.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import drjit as dr
+
+from harnack.backend.arrays import Backend
+from harnack.enclosures import Band, Enclosure, Slopes, TargetLevels
+
+_DEPTH, _MOST = 48, 2000
+
+
+def bisect(
+    backend: Backend, field: Any, kind: type[Enclosure], rays: tuple[Any, Any, Any], width: float
+) -> tuple[Any, Any, float]:
+    """Where rays hit f = 0 (infinite where they do not), looks, and core seconds.
+
+    rays: origins, unit directions and lengths. width: an interval this short that is not proved
+        free is a hit.
+    """
+    o, d, end = rays
+    prepared = field.prepare(backend)
+    levels = TargetLevels((dr.opaque(backend.Float, 0.0),))
+    real, count = backend.Float, backend.UInt32
+
+    def look(start: Any, stop: Any) -> tuple[Any, Any]:
+        """Where the interval is free from its start on, and from where to its end."""
+        p = dr.fma(backend.Array3f(start), d, o)
+        sample = prepared.evaluate(p)
+        length = stop - start
+        slope = dr.dot(sample.gradient, d)
+        made: Any = kind.along(prepared.restricted(p, d), Slopes(slope, slope), length)
+        gaps = levels.gaps(sample.value).less(sample.error)
+        front = made.step(gaps)
+        back = length
+        if isinstance(made, Band):
+            # Lines that fall into the gap at the end: from where on they are inside.
+            up = (gaps.up - made.offsets.high) / made.slopes.high
+            down = -(gaps.down + made.offsets.low) / made.slopes.low
+            above = (made.offsets.high >= gaps.up) & (made.slopes.high < 0) & (up < length)
+            below = (-made.offsets.low >= gaps.down) & (made.slopes.low > 0) & (down < length)
+            upper = dr.select(above, up, dr.select(gaps.up == dr.inf, 0, length))
+            lower = dr.select(below, down, dr.select(gaps.down == dr.inf, 0, length))
+            back = dr.clip(dr.maximum(upper, lower) * (1 + 1e-6), 0, length)
+            back = dr.select(dr.isfinite(back) & (back > front), back, length)
+        return front, back
+
+    def body(start: Any, top: Any, looks: Any, found: Any, active: Any, ends: Any, on: Any) -> Any:
+        stop = ends.read(top, active=active)
+        resumed = on.read(top, active=active)
+        front, back = look(start, stop)
+        looks = looks + 1
+        free = front >= stop - start
+        short = ~free & (stop - start < width)
+        found = dr.select(short, start, found)
+        after = dr.select(free, resumed, start + front)
+        last = start + back
+        halved = active & ~free & ~short
+        middle = 0.5 * (after + last)
+        upper = dr.minimum(top + 1, _DEPTH - 1)
+        ends.write(last, top, active=halved)
+        ends.write(middle, upper, active=halved)
+        on.write(middle, upper, active=halved)
+        done = short | (free & (top == 0)) | (looks >= _MOST)
+        top = dr.select(free, top - 1, upper)
+        return after, dr.select(done, count(0), top), looks, found, active & ~done, ends, on
+
+    core = time.process_time()
+    n = dr.width(o)
+    ends, on = dr.alloc_local(real, _DEPTH), dr.alloc_local(real, _DEPTH)
+    ends.write(real(end), count(0))
+    on.write(real(end), count(0))
+    state = (
+        dr.zeros(real, n), dr.zeros(count, n), dr.zeros(count, n),
+        dr.full(real, dr.inf, n), dr.full(backend.Bool, True, n), ends, on,
+    )  # fmt: skip
+    result = dr.while_loop(state, lambda *now: now[4], body, label="bisection")
+    looks, found = result[2], result[3]
+    dr.eval(looks, found)
+    dr.sync_thread()
+    return found, looks, time.process_time() - core

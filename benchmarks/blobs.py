@@ -1,0 +1,254 @@
+"""Compact blobs as a formula of records: what the published methods are compared on.
+
+f = sum of a max(1 - |p - c|^2/R^2, 0)^3 - T over the blobs. The formula itself goes through every
+arithmetic; ranges of derivatives in closed form, and those published for segment tracing, are given
+besides. `Scene` and its rays are those that the published tables were repeated with before.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from harnack.arithmetic import clipped_power
+from harnack.backend.extrema import clamp, fmax, fmin
+from harnack.backend.records import Records
+from harnack.enclosures import Piece, Slopes
+from harnack.fields.formula import Formula, FormulaAlong
+
+# Rounding of a blob's derivatives, in units of their largest absolute values.
+_ROUNDINGS = 64.0
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Random blobs of compact support and their threshold.
+
+    centres: (n, 3). reaches: (n,) R, where a blob ends. heights: (n,). threshold: T.
+    """
+
+    centres: np.ndarray
+    reaches: np.ndarray
+    heights: np.ndarray
+    threshold: float
+
+    @classmethod
+    def random(
+        cls, count: int, size: float, radii: tuple[float, float], width: float, seed: int
+    ) -> Scene:
+        """Blobs of random radii r in a cube of half the edge `size`; each alone would be a ball of
+        radius r, and ends at width r."""
+        generator = np.random.default_rng(seed)
+        centres = generator.uniform(-size, size, (count, 3))
+        radius = generator.uniform(*radii, count)
+        height = np.full(count, 1.0 / (1 - 1 / width**2) ** 3)
+        return cls(centres, width * radius, height, 1.0)
+
+    @property
+    def box(self) -> tuple[np.ndarray, np.ndarray]:
+        reach = self.reaches[:, None]
+        return (self.centres - reach).min(0), (self.centres + reach).max(0)
+
+    def rays(self, count: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Origins, unit directions and lengths of rays between random points of the box's faces."""
+        generator = np.random.default_rng(seed)
+        low, high = self.box
+        size = high - low
+        areas = np.array([size[1] * size[2], size[0] * size[2], size[0] * size[1]])
+
+        def points() -> np.ndarray:
+            axis = generator.choice(3, count, p=areas / areas.sum())
+            side = generator.integers(0, 2, count)
+            p = low + generator.random((count, 3)) * size
+            p[np.arange(count), axis] = np.where(side, high[axis], low[axis])
+            return p
+
+        a, b = points(), points()
+        length = np.linalg.norm(b - a, axis=1)
+        kept = length > 1e-6
+        return a[kept], ((b - a) / length[:, None])[kept], length[kept]
+
+    def values(self, points: np.ndarray) -> np.ndarray:
+        """f in double precision, at points (n, 3)."""
+        total = np.full(len(points), -self.threshold)
+        for c, reach, height in zip(self.centres, self.reaches, self.heights, strict=True):
+            w = 1 - ((points - c) ** 2).sum(1) / reach**2
+            total += height * np.maximum(w, 0) ** 3
+        return total
+
+    def first_inside(self, rays: tuple[np.ndarray, ...], samples: int) -> np.ndarray:
+        """Where f is first seen to be positive, at so many points of each ray; else infinity."""
+        o, d, length = rays
+        found = np.full(len(o), np.inf)
+        for k in range(samples + 1):
+            t = length * k / samples
+            inside = self.values(o + t[:, None] * d) >= 0
+            found = np.where(inside & np.isinf(found), t, found)
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class BlobFormula(Formula):
+    """The field of a `Scene`.
+
+    exact: whether ranges of the first derivative are exact, for each blob; else products of the
+        ranges of the kernel's and the distance's derivative, as in segment tracing (Galin et al.
+        2020; Aydinlilar and Zanni 2023, equation 21).
+    """
+
+    scene: Scene
+    exact: bool = True
+    records: Records | None = None
+
+    def prepare(self, backend: Any) -> BlobFormula:
+        scene = self.scene
+        table = np.column_stack([scene.centres, scene.reaches**-2.0, scene.heights])
+        return dataclasses.replace(self, records=Records.upload(backend, table))
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        assert self.records is not None, "call prepare"
+        kernel = clipped_power(3)
+
+        def blob(row: list[Any]) -> Any:
+            u, v, w = x - row[0], y - row[1], z - row[2]
+            return kernel(1.0 - (u * u + v * v + w * w) * row[3]) * row[4]
+
+        return summed(self.records, blob) - self.scene.threshold
+
+    def restricted(self, p: Any, direction: Any) -> BlobsAlong:
+        return BlobsAlong(self, p, direction, piece_count=4)
+
+
+@dataclass(frozen=True)
+class BlobsAlong(FormulaAlong):
+    """Blobs along a path, with ranges of derivatives in closed form."""
+
+    def pieces(self, knots: Sequence[Any]) -> tuple[Piece, ...]:
+        """With x = s - s0 along the path and S half the chord, the derivative of
+        a (w0 - x^2/R^2)^3 has its extrema at x^2 = S^2/5, the second at 0 and x^2 = 3 S^2/5."""
+        field: Any = self.field
+        count = len(knots) - 1
+        zero = 0 * self.p.x
+
+        def body(row: list[Any], state: tuple[Any, ...]) -> tuple[Any, ...]:
+            centre, rate, height = row[:3], row[3], row[4]
+            v = [centre[k] - self.p[k] for k in range(3)]
+            middle = sum((v[k] * self.direction[k] for k in range(1, 3)), v[0] * self.direction[0])
+            aside = [v[k] - middle * self.direction[k] for k in range(3)]
+            away = aside[0] * aside[0] + aside[1] * aside[1] + aside[2] * aside[2]
+            top = 1 - away * rate
+            half = dr.sqrt(fmax(top, 0) / rate)
+            unit = _ROUNDINGS * float(dr.epsilon(type(top)))
+            there = half > 0
+            slack = dr.select(there, unit * 6 * height * dr.sqrt(rate), 0)
+            bent = dr.select(there, unit * 30 * height * rate, 0)
+
+            def first(x: Any) -> Any:
+                w = fmax(top - rate * x * x, 0)
+                return -6 * height * rate * x * w * w
+
+            def second(x: Any) -> Any:
+                w = fmax(top - rate * x * x, 0)
+                return 6 * height * rate * w * (4 * rate * x * x - w)
+
+            new: list[Any] = []
+            for k, (start, end) in enumerate(itertools.pairwise(knots)):
+                x, y = start - middle, end - middle
+                if field.exact:
+                    near = math.sqrt(0.2) * half
+                    low, high = _extrema(first, x, y, half, (near, -near))
+                else:
+                    low, high = _product(away, rate, height, x, y)
+                far = math.sqrt(0.6) * half
+                least, most = _extrema(second, x, y, half, (far, -far, 0 * far))
+                old = state[4 * k : 4 * k + 4]
+                new += [
+                    old[0] + (low - slack), old[1] + (high + slack),
+                    old[2] + (least - bent), old[3] + (most + bent),
+                ]  # fmt: skip
+            return tuple(new)
+
+        state = field.records.for_each(body, (zero,) * (4 * count), "blobs along")
+        return tuple(
+            Piece(end - start, Slopes(*state[4 * k : 4 * k + 2]), *state[4 * k + 2 : 4 * k + 4])
+            for k, (start, end) in enumerate(itertools.pairwise(knots))
+        )
+
+
+def _extrema(
+    function: Callable[[Any], Any], x: Any, y: Any, half: Any, places: tuple[Any, ...]
+) -> tuple[Any, Any]:
+    """Least and largest value on [x, y] of a function that is 0 outside [-half, half] and has no
+    extrema but at the places."""
+    a, b = clamp(x, -half, half), clamp(y, -half, half)
+    low = high = function(a)
+    for place in (b, *(clamp(one, a, b) for one in places)):
+        value = function(place)
+        low, high = fmin(low, value), fmax(high, value)
+    return low, high
+
+
+def _product(away: Any, rate: Any, height: Any, x: Any, y: Any) -> tuple[Any, Any]:
+    """The range of k'(d) times the range of d', with d the distance from the centre."""
+    first, last = dr.sqrt(away + x * x), dr.sqrt(away + y * y)
+    ratios = [one / fmax(d, 1e-20) for one, d in ((x, first), (y, last))]
+    nearest = dr.select((x < 0) & (y > 0), dr.sqrt(away), fmin(first, last))
+    farthest = fmax(first, last)
+
+    def kernel(d: Any) -> Any:
+        w = fmax(1 - rate * d * d, 0)
+        return -6 * height * rate * d * w * w
+
+    steepest = clamp(dr.sqrt(0.2 / rate), nearest, farthest)
+    ends = kernel(nearest), kernel(farthest)
+    low, high = fmin(fmin(*ends), kernel(steepest)), fmax(*ends)
+    products = [k * ratio for k in (low, high) for ratio in ratios]
+    least = most = products[0]
+    for one in products[1:]:
+        least, most = fmin(least, one), fmax(most, one)
+    return least, most
+
+
+def summed(records: Records, term: Callable[[list[Any]], Any]) -> Any:
+    """The sum of `term` of every record, in numbers of any arithmetic, in one recorded loop."""
+    start = term(records.row(records.backend.UInt32(0)))
+    zero = records.backend.Float(0)
+
+    def body(i: Any, *state: Any) -> tuple[Any, ...]:
+        total = _rebuilt(start, iter(state)) + term(records.row(i))
+        return i + 1, *(zero + one for one in _numbers(total))
+
+    first = (records.backend.UInt32(1), *(zero + one for one in _numbers(start)))
+    state = dr.while_loop(first, lambda i, *_: i < records.trips, body, label="blobs")
+    return _rebuilt(start, iter(state[1:]))
+
+
+def _numbers(x: Any) -> Iterator[Any]:
+    """The numbers of the backend, and Python floats, of a number of any arithmetic."""
+    if dataclasses.is_dataclass(x):
+        for entry in dataclasses.fields(x):
+            yield from _numbers(getattr(x, entry.name))
+    elif isinstance(x, tuple):
+        for one in x:
+            yield from _numbers(one)
+    elif x is not None and not isinstance(x, int):
+        yield x
+
+
+def _rebuilt(like: Any, numbers: Iterator[Any]) -> Any:
+    if dataclasses.is_dataclass(like):
+        values = {
+            entry.name: _rebuilt(getattr(like, entry.name), numbers)
+            for entry in dataclasses.fields(like)
+        }
+        return type(like)(**values)
+    if isinstance(like, tuple):
+        return tuple(_rebuilt(one, numbers) for one in like)
+    return like if like is None or isinstance(like, int) else next(numbers)

@@ -1,0 +1,162 @@
+"""Revised affine arithmetic along a path: a line and an error that is constant.
+
+A function of 0 <= s <= h is c + l e + r, with e = 2s/h - 1 and |r| <= error. Sums keep what is
+linear in s, products and functions put the rest into the error. Unlike `Parabolas` it is not exact
+at s = 0, so a ray is cut into smaller parts where it proves nothing.
+
+Source: Vu, Sam-Haroud and Faltings 2009; Fryazinov, Pasko and Comninos 2010.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
+
+import drjit as dr
+
+from harnack.arithmetic.interval import Interval, unit_of
+from harnack.arithmetic.operators import Operators
+from harnack.backend.extrema import fmax, fmin
+
+if TYPE_CHECKING:
+    from harnack.arithmetic.functions import Function
+    from harnack.backend import Real, Vec3
+
+_ROUNDINGS = 16.0
+
+
+@dataclass(frozen=True)
+class Affine(Operators):
+    """centre + slope e + r for -1 <= e <= 1, with |r| <= error.
+
+    centre, slope, error: numbers of the backend.
+    """
+
+    centre: Real
+    slope: Real
+    error: Real
+
+    @classmethod
+    def along(cls, p: Vec3, direction: Vec3, length: Real) -> tuple[Affine, Affine, Affine]:
+        """The coordinates of p + s d for 0 <= s <= length."""
+
+        def coordinate(x: Real, rate: Real) -> Affine:
+            half = 0.5 * length * rate
+            return cls(x + half, half, _slack(dr.abs(x) + dr.abs(half)))
+
+        x, y, z = (coordinate(p[k], direction[k]) for k in range(3))
+        return x, y, z
+
+    @property
+    def range(self) -> Interval:
+        """Where the function stays."""
+        room = dr.abs(self.slope) + self.error
+        slack = _slack(dr.abs(self.centre) + room)
+        return Interval(self.centre - room - slack, self.centre + room + slack)
+
+    def constant(self, x: float | Real) -> Affine:
+        kind = cast("Any", type(self.centre))
+        value = kind(x)
+        exact = not isinstance(x, int | float) or (float(x).is_integer() and abs(x) < 2**20)
+        error = 0 * value if exact else _slack(dr.abs(value))
+        return Affine(value, 0 * self.centre, error)
+
+    def __neg__(self) -> Affine:
+        return Affine(-self.centre, -self.slope, self.error)
+
+    def sum(self, other: Any) -> Affine:
+        centre, slope = self.centre + other.centre, self.slope + other.slope
+        return Affine(
+            centre, slope, self.error + other.error + _slack(dr.abs(centre) + dr.abs(slope))
+        )
+
+    def product(self, other: Any) -> Affine:
+        """Proof. Of (c + l e + r)(d + m e + q), e^2 lies in [0, 1], so l m e^2 within l m/2 of
+        l m/2; everything else that is not linear in e is an error."""
+        c, l, r = self.centre, self.slope, self.error  # noqa: E741
+        d, m, q = other.centre, other.slope, other.error
+        both = 0.5 * l * m
+        error = (dr.abs(c) + dr.abs(l)) * q + (dr.abs(d) + dr.abs(m)) * r + r * q + dr.abs(both)
+        size = (dr.abs(c) + dr.abs(l) + r) * (dr.abs(d) + dr.abs(m) + q)
+        return Affine(c * d + both, c * m + d * l, error + _slack(size))
+
+    def apply(self, function: Function) -> Affine:
+        """phi(f), by the best of three: its chord, its mean slope, its range.
+
+        Proof. On a range [x, y] of width w, phi lies above its chord by -phi''(z) (t - x)(y - t)/2
+        for some z, so by at most -min phi'' w^2/8 and at least -max phi'' w^2/8, or 0. With D the
+        range of phi', it is within (D+ - D-)/2 |t - m| of phi(m) + (D+ + D-)/2 (t - m), m half way.
+        And it stays within its range.
+        """
+        x = self.range
+        value, slopes, curvature = function.ranges(x)
+        width = x.high - x.low
+        unit = unit_of(width)
+        ends = [function.ranges(Interval(one, one))[0] for one in (x.low, x.high)]
+        rise = dr.select(width > 0, (ends[1].middle - ends[0].middle) / width, 0)
+        rise = dr.select(dr.isfinite(rise), rise, 0)
+        eighth = 0.125 * width * width
+        over, under = fmax(-curvature.low * eighth, 0), fmin(-curvature.high * eighth, 0)
+        size = dr.abs(ends[0].middle) + dr.abs(ends[1].middle)
+        chord = (
+            0.5 * (ends[0].middle + ends[1].middle) + 0.5 * (over + under),
+            rise,
+            0.5 * (over - under) + ends[0].radius + ends[1].radius + _slack(size),
+        )
+        middle = 0.5 * x.low + 0.5 * x.high
+        there = function.ranges(Interval(middle, middle))[0]
+        mean = (
+            there.middle,
+            slopes.middle,
+            (slopes.radius * width * 0.5 + there.radius) * (1 + 8 * unit)
+            + _slack(dr.abs(there.middle) + dr.abs(slopes.middle) * width),
+        )
+        flat = (value.middle, 0 * width, value.radius + _slack(dr.abs(value.middle)))
+        best = _better(_better(chord, mean), flat)
+        centre, rate, error = best
+        moved = rate * (self.centre - middle)
+        slack = _slack(
+            dr.abs(centre) + dr.abs(rate) * (dr.abs(self.centre) + dr.abs(self.slope) + self.error)
+        )
+        return Affine(centre + moved, rate * self.slope, error + dr.abs(rate) * self.error + slack)
+
+    def larger(self, other: Any) -> Affine:
+        """max(f, g) = g + max(f - g, 0); the one that is surely larger where there is one."""
+        difference = self.sum(-other)
+        x = difference.range
+        one, two = x.low >= 0, x.high <= 0
+        # max(t, 0) on [x, y], x < 0 < y: its chord has slope y/(y - x) and lies above by at most
+        # -x y/(y - x), at 0.
+        rate = x.high / (x.high - x.low)
+        above = -x.low * rate
+        centre = rate * (difference.centre - x.low) - 0.5 * above
+        size = dr.abs(rate) * (dr.abs(difference.centre) + dr.abs(x.low) + dr.abs(x.high))
+        part = Affine(
+            centre, rate * difference.slope, rate * difference.error + 0.5 * above + _slack(size)
+        )
+        both = other.sum(part)
+        return Affine(
+            *(
+                dr.select(one, u, dr.select(two, v, w))
+                for u, v, w in zip(_entries(self), _entries(other), _entries(both), strict=True)
+            )
+        )
+
+
+def _entries(x: Affine) -> tuple[Real, Real, Real]:
+    return x.centre, x.slope, x.error
+
+
+def _better(one: tuple[Real, Real, Real], two: tuple[Real, Real, Real]) -> tuple[Real, Real, Real]:
+    """The one with the smaller error; what is no number gives way."""
+    known = dr.isfinite(one[0]) & dr.isfinite(one[1]) & dr.isfinite(one[2])
+    other = dr.isfinite(two[0]) & dr.isfinite(two[1]) & dr.isfinite(two[2])
+    first = known & ((one[2] <= two[2]) | ~other)
+    x, y, z = (dr.select(first, u, v) for u, v in zip(one, two, strict=True))
+    return x, y, z
+
+
+def _slack(size: Real) -> Real:
+    """What rounding and underflow may have done to a sum of numbers of this size together."""
+    smallest = float(dr.smallest(cast("Any", type(size))))
+    return dr.fma(size, _ROUNDINGS * unit_of(size), _ROUNDINGS * smallest)

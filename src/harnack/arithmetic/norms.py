@@ -1,0 +1,231 @@
+"""Functions of several numbers: the larger, the smaller, and norms (Hart 1996, appendix B).
+
+They take jets, Dr.Jit and NumPy arrays and Python numbers, also mixed.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from typing import TYPE_CHECKING, Any, cast
+
+import drjit as dr
+import numpy as np
+
+from harnack.arithmetic.functions import absolute, power, reciprocal, sqrt
+from harnack.arithmetic.interval import ONE, Interval
+from harnack.arithmetic.jet import Jet, spanned
+from harnack.backend.extrema import fmax, fmin
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+def maximum(*values: Any) -> Any:
+    """The largest of two or more numbers of any kind."""
+    return _folded("maximum", values)
+
+
+def minimum(*values: Any) -> Any:
+    """The smallest of two or more numbers of any kind."""
+    return _folded("minimum", values)
+
+
+def _folded(name: str, values: tuple[Any, ...]) -> Any:
+    if len(values) < 2:
+        raise TypeError(f"{name} compares two numbers or more, and {len(values)} was given")
+    if any(isinstance(one, Jet) for one in values):
+        # Jets first, so that one of them takes each of the others.
+        ordered = sorted(values, key=lambda one: not isinstance(one, Jet))
+        return functools.reduce(lambda a, b: getattr(a, name)(b), ordered)
+    of_arrays, of_others = _PAIRS[name]
+
+    def plain(a: Any, b: Any) -> Any:
+        is_array = any(dr.is_array_v(cast("Any", type(one))) for one in (a, b))
+        return of_arrays(a, b) if is_array else of_others(a, b)
+
+    return functools.reduce(plain, values)
+
+
+_PAIRS: dict[str, tuple[Callable[[Any, Any], Any], Callable[[Any, Any], Any]]] = {
+    "maximum": (fmax, np.maximum),
+    "minimum": (fmin, np.minimum),
+}
+
+
+def norm(*values: Any, p: float = 2.0) -> Any:
+    """The p-norm (|x|^p + |y|^p + ...)^(1/p), with p = 2 the Euclidean length.
+
+    p: at least 1, `math.inf` for the largest absolute value.
+
+    Proof of the ranges. With N the norm and u_i = |x_i|/N <= 1, N' is the sum of
+    sign(x_i) u_i^(p-1) x_i', at most the p-norm of the x_i' (Hoelder's and Minkowski's
+    inequalities), and N'' = (p-1)/N (sum_i u_i^(p-2) x_i'^2 - N'^2) + sum_i sign(x_i) u_i^(p-1)
+    x_i''. Its first part is not negative, for N is convex; where N = 0 it has a kink upwards,
+    which has no upper bound. For p = 2 the first part is sum_(i<j) w_ij^2 / N^3 with w_ij = x_i
+    x_j' - x_j x_i' (Lagrange's identity), and w_ij' = x_i x_j'' - x_j x_i'' is 0 along straight
+    lines: the range of w_ij is narrowed from the start of the piece.
+
+    Raises:
+        TypeError: no numbers given.
+        ValueError: p is below 1, for which this is no norm and has no bounded derivative.
+    """
+    if not values:
+        raise TypeError("norm needs a number or more")
+    if not p >= 1.0:
+        raise ValueError(f"the p of a norm must be at least 1, not {p!r}")
+    if len(values) == 1 or math.isinf(p):
+        sizes = [absolute(one) for one in values]
+        return sizes[0] if len(sizes) == 1 else maximum(*sizes)
+    if p == 1.0:
+        return functools.reduce(lambda a, b: a + b, [absolute(one) for one in values])
+    jets = [one for one in values if isinstance(one, Jet)]
+    if not jets:
+        return _plain_norm(values, p)
+    given = [one if isinstance(one, Jet) else jets[0].of(one) for one in values]
+    return _norm(given, p)
+
+
+def _plain_norm(values: tuple[Any, ...], p: float) -> Any:
+    """Of arrays and numbers, without a slope that is not finite at 0."""
+    if not any(dr.is_array_v(cast("Any", type(one))) for one in values):
+        sizes = np.array(np.broadcast_arrays(*(np.abs(one) for one in values)))
+        most = sizes.max(axis=0)
+        scale = np.where(most > 0, most, 1.0)
+        return scale * np.sum((sizes / scale) ** p, axis=0) ** (1 / p) * (most > 0)
+    if p == 2.0:
+        total = functools.reduce(lambda a, b: a + b, [one * one for one in values])
+        positive = total > 0
+        return dr.select(positive, dr.sqrt(dr.select(positive, total, 1)), 0)
+    most = functools.reduce(lambda a, b: fmax(a, b), [dr.abs(one) for one in values])
+    positive = most > 0
+    scale = dr.select(positive, dr.detach(most), 1)
+    parts = [dr.abs(one) / scale for one in values]
+    total = functools.reduce(lambda a, b: a + b, [_plain_power(one, p) for one in parts])
+    return dr.select(positive, scale * dr.power(dr.select(positive, total, 1), 1 / p), 0)
+
+
+def _plain_power(x: Any, p: float) -> Any:
+    return dr.select(x > 0, dr.power(dr.select(x > 0, x, 1), p), 0)
+
+
+def _norm(xs: list[Jet], p: float) -> Jet:
+    like = next((one.value.low for one in xs if not one.value.is_static), None)
+    like = xs[0].kind() if like is None else like
+    values = [_dynamic(one.value, like) for one in xs]
+    length = _length(values, p)
+    over = _one_over(length)
+    unit = [_clipped(one * over, ONE) for one in values]
+    pulls = unit if p == 2.0 else [_signed_power(one, p - 1) for one in unit]
+    count = range(len(xs))
+    first = tuple(
+        _clipped(
+            _total([pulls[k] * xs[k].first[i] for k in count]),
+            _length([_dynamic(one.first[i], like) for one in xs], p),
+        )
+        for i in range(len(xs[0].first))
+    )
+    second: list[Interval] = []
+    for k, (i, j) in enumerate(xs[0].pairs()):
+        if p == 2.0:
+            bent = _turning(xs, values, over, i, j)
+        else:
+            bent = -(first[i] * first[j])
+            for one, u in zip(xs, unit, strict=True):
+                by = power(p - 2).ranges(Interval(u.smallest, u.largest))[0]
+                bent = bent + by * _product(one.first[i], one.first[j])
+            bent = bent * over * Interval.constant(p - 1, type(like))
+        if i == j:
+            bent = Interval(fmax(bent.low, 0), bent.high)
+        second.append(bent + _total([u * x.second[k] for u, x in zip(pulls, xs, strict=True)]))
+    jet = Jet(length, first, tuple(second))
+    starts = [one.start for one in xs]
+    if any(one is None for one in starts):
+        return jet
+    return jet.anchored(_norm(cast("list[Jet]", starts), p), xs[0].width)
+
+
+def _turning(xs: list[Jet], values: list[Interval], over: Interval, i: int, j: int) -> Interval:
+    """sum_(k<l) w_kl,i w_kl,j / N^3."""
+    parts: list[Interval] = []
+    for k, m in itertools.combinations(range(len(xs)), 2):
+        a = _across(xs, values, k, m, i) * over
+        parts.append(a.square() if i == j else a * (_across(xs, values, k, m, j) * over))
+    return _total(parts) * over
+
+
+def _across(xs: list[Jet], values: list[Interval], k: int, m: int, i: int) -> Interval:
+    """w_km = x_k x_m' - x_m x_k'."""
+    across = values[k] * xs[m].first[i] - values[m] * xs[k].first[i]
+    a, b = xs[k].start, xs[m].start
+    if a is None or b is None:
+        return across
+    at_start = a.value * b.first[i] - b.value * a.first[i]
+    rate = values[k] * xs[m].second[i] - values[m] * xs[k].second[i]
+    return across.meet(at_start + spanned(rate, xs[k].width))
+
+
+def _length(values: list[Interval], p: float) -> Interval:
+    """The range of the norm of independent numbers."""
+    smallest, largest = [one.smallest for one in values], [one.largest for one in values]
+    low = _length_of(smallest, p).low
+    most = functools.reduce(fmax, smallest)  # rounding and underflow cannot make it shorter
+    return Interval(fmax(low, most), _length_of(largest, p).high)
+
+
+def _length_of(sizes: list[Any], p: float) -> Interval:
+    """The norm of numbers >= 0."""
+    if p == 2.0:
+        return sqrt.ranges(_total([Interval.exactly(one).square() for one in sizes]))[0]
+    most = functools.reduce(lambda a, b: dr.select((a > b) | (a != a), a, b), sizes)
+    tiny = float(dr.smallest(cast("Any", type(most))))
+    # Divided by the largest, so that no power overflows.
+    over = Interval.exactly(fmax(tiny, most)).reciprocal()
+    root, raised = power(1 / p).ranges, power(p).ranges
+    parts = [raised(Interval.exactly(one) * over)[0] for one in sizes]
+    total = root(_total(parts))[0] * Interval.exactly(most)
+    return Interval(dr.select(most > tiny, total.low, 0), fmax(total.high, 0) + len(sizes) * tiny)
+
+
+def _signed_power(x: Interval, q: float) -> Interval:
+    """sign(x) |x|^q, q > 0, which rises."""
+
+    def of(v: Any) -> Interval:
+        size = power(q).ranges(Interval.exactly(dr.abs(v)))[0]
+        return Interval(
+            dr.select(v >= 0, size.low, -size.high), dr.select(v >= 0, size.high, -size.low)
+        )
+
+    low = of(x.low)
+    return low if x.low is x.high else Interval(low.low, of(x.high).high)
+
+
+def _one_over(length: Interval) -> Interval:
+    """1/N of N >= 0; no upper end where N may be 0."""
+    over = reciprocal.ranges(length)[0]
+    least = Interval.exactly(length.high).reciprocal()
+    return Interval(fmax(least.low, 0), over.high)
+
+
+def _clipped(x: Interval, most: Interval) -> Interval:
+    """What of x is no larger than `most`."""
+    bound = most.high
+    return Interval(fmax(x.low, -bound), fmin(x.high, bound))
+
+
+def _product(a: Interval, b: Interval) -> Interval:
+    return a.square() if a is b else a * b
+
+
+def _total(parts: list[Interval]) -> Interval:
+    return functools.reduce(lambda a, b: a + b, parts)
+
+
+def _dynamic(x: Interval, like: Any) -> Interval:
+    """An interval of numbers of the backend."""
+    if not x.is_static:
+        return x
+    kind = cast("Any", type(like))
+    low = kind(x.low)
+    return Interval(low, low if x.low == x.high else kind(x.high))

@@ -1,0 +1,173 @@
+"""The operators of numbers of any arithmetic, from sums, products and functions of one number."""
+
+from __future__ import annotations
+
+import abc
+from typing import TYPE_CHECKING, Any, cast
+
+import drjit as dr
+
+from harnack.arithmetic.functions import (
+    absolute,
+    cos,
+    cosh,
+    exp,
+    log,
+    power,
+    reciprocal,
+    sin,
+    sinh,
+    sqrt,
+    tan,
+    tanh,
+)
+
+if TYPE_CHECKING:
+    from typing import Self
+
+    from harnack.arithmetic.functions import Function
+    from harnack.backend import Real
+
+# NumPy's functions of such numbers: numpy.sin(x) is sin(x).
+_UFUNCS = {
+    "sin": sin, "cos": cos, "tan": tan, "exp": exp, "log": log, "sqrt": sqrt, "tanh": tanh,
+    "sinh": sinh, "cosh": cosh, "absolute": absolute, "fabs": absolute, "square": power(2),
+}  # fmt: skip
+_OPERATORS = {
+    "add": "__add__", "subtract": "__sub__", "multiply": "__mul__", "true_divide": "__truediv__",
+    "divide": "__truediv__", "power": "__pow__", "maximum": "maximum", "minimum": "minimum",
+}  # fmt: skip
+
+
+class Operators(abc.ABC):
+    """What `+ - * / **`, abs, NumPy's functions, maximum and minimum are, for numbers that know
+    sums, products, functions of one number, and the larger of two.
+
+    Formulas are written once, as for `Jet`, and evaluated with any such number.
+    """
+
+    @abc.abstractmethod
+    def constant(self, x: float | Real) -> Self:
+        """A number known while a kernel is recorded, or one of the backend, as a constant of the
+        same arithmetic."""
+
+    @abc.abstractmethod
+    def sum(self, other: Any) -> Self: ...
+
+    @abc.abstractmethod
+    def product(self, other: Any) -> Self: ...
+
+    @abc.abstractmethod
+    def __neg__(self) -> Self: ...
+
+    @abc.abstractmethod
+    def apply(self, function: Function) -> Self:
+        """A function of this number."""
+
+    @abc.abstractmethod
+    def larger(self, other: Any) -> Self: ...
+
+    def _operand(self, other: Any) -> Self | None:
+        """Another operand as a number of this arithmetic; None where it is none."""
+        if isinstance(other, type(self)):
+            return other
+        if dr.is_array_v(cast("Any", type(other))):
+            return self.constant(other) if dr.depth_v(type(other)) == 1 else None
+        try:
+            return self.constant(float(other))
+        except (TypeError, ValueError):
+            return None
+
+    def __add__(self, other: Any) -> Any:
+        b = self._operand(other)
+        return NotImplemented if b is None else self.sum(b)
+
+    __radd__ = __add__
+
+    def __pos__(self) -> Self:
+        return self
+
+    def __sub__(self, other: Any) -> Any:
+        b = self._operand(other)
+        return NotImplemented if b is None else self.sum(-b)
+
+    def __rsub__(self, other: Any) -> Self:
+        return -self + other
+
+    def __mul__(self, other: Any) -> Any:
+        b = self._operand(other)
+        return NotImplemented if b is None else self.product(b)
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, other: Any) -> Any:
+        if isinstance(other, int | float):
+            if other == 0:
+                raise ZeroDivisionError("a formula divides by the constant 0")
+            return self * (1.0 / other)
+        b = self._operand(other)
+        return NotImplemented if b is None else self.product(b.apply(reciprocal))
+
+    def __rtruediv__(self, other: Any) -> Self:
+        return self.apply(reciprocal) * other
+
+    def __pow__(self, exponent: Any) -> Self:
+        if isinstance(exponent, type(self)):
+            return (self.apply(log) * exponent).apply(exp)
+        n = float(exponent)
+        if not n.is_integer():
+            return self.apply(power(n))
+        return self._repeated(int(n)) if n >= 0 else self._repeated(int(-n)).apply(reciprocal)
+
+    def _repeated(self, n: int) -> Self:
+        """x^n by products, n >= 0."""
+        if n == 0:
+            return self.constant(1.0)
+        if n == 1:
+            return self
+        half = self._repeated(n // 2)
+        square = half.product(half)
+        return square.product(self) if n % 2 else square
+
+    def __rpow__(self, base: Any) -> Any:
+        b = self._operand(base)
+        return NotImplemented if b is None else b**self
+
+    def __abs__(self) -> Self:
+        return self.apply(absolute)
+
+    def maximum(self, other: Any) -> Self:
+        """The larger of two functions at each place."""
+        b = self._operand(other)
+        assert b is not None
+        return self.larger(b)
+
+    def minimum(self, other: Any) -> Self:
+        """The smaller of two functions at each place."""
+        b = self._operand(other)
+        assert b is not None
+        return -((-self).larger(-b))
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **settings: Any) -> Any:
+        """NumPy's functions and operators, of these numbers."""
+        name = ufunc.__name__
+        if method == "__call__" and not settings:
+            if name in _UFUNCS:
+                return self.apply(_UFUNCS[name])
+            if name in _OPERATORS:
+                a, b = inputs
+                first = a if isinstance(a, Operators) else self._operand(a)
+                return getattr(first, _OPERATORS[name])(b)
+        raise TypeError(
+            f"numpy.{name} has no proved ranges: write formulas with + - * / **, abs, and "
+            f"harnack.{', '.join(sorted(_UFUNCS))}, maximum, minimum, norm"
+        )
+
+    def __float__(self) -> float:
+        raise TypeError(
+            "a formula cannot use functions of plain numbers, such as math.sin, nor decide by its "
+            "coordinates: use harnack.sin and its like, harnack.maximum and harnack.minimum"
+        )
+
+    def __bool__(self) -> bool:
+        raise TypeError("a formula cannot decide by its coordinates: use harnack.maximum")

@@ -1,0 +1,598 @@
+"""Parabolas through a function's value: the bottom-up linear and quadratic arithmetic of a path.
+
+A number is a function f of the length s along a path, 0 <= s <= h, known by its value at 0 and by
+
+    a- s + b- s^2  <=  f(s) - f(0)  <=  a+ s + b+ s^2.
+
+Sums, products, functions and maxima of such numbers are such numbers again, so that a formula given
+the coordinates as such numbers proves its own parabolas (Aydinlilar and Zanni 2023, sections 5.2
+and 6.2, appendices B and C). Two things are better than published: functions by chords through the
+value itself, which need no validity interval, and both that and Taylor's formula where one is the
+tighter.
+
+Rounding. Coefficients are computed in rounded arithmetic; each result is moved outwards by
+`_ROUNDINGS` units in the last place of the sum of the absolute values of everything added up in
+it, which is more than the number of operations done.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
+
+import drjit as dr
+
+from harnack.arithmetic.clipped import ClippedPower
+from harnack.arithmetic.interval import Interval, unit_of
+from harnack.arithmetic.operators import Operators
+from harnack.backend.extrema import clamp, fmax, fmin
+
+if TYPE_CHECKING:
+    from harnack.arithmetic.functions import Function
+    from harnack.backend import Real, Vec3
+
+# a s + b s^2, as (a, b).
+Quadratic: TypeAlias = "tuple[Real, Real]"
+
+_ROUNDINGS = 32.0
+# Of the length: where two proofs are compared to choose the tighter.
+_COMPARED_AT = 0.6
+
+
+@dataclass(frozen=True)
+class Parabolas(Operators):
+    """A function along a path between two parabolas through its value at the start.
+
+    value: at s = 0.
+    lower, upper: (a, b) of the parabolas a s + b s^2 around f(s) - f(0).
+    length: h; the bounds hold for 0 <= s <= h.
+    degree: 1 if the bounds are kept straight: bottom-up linear arithmetic; else 2.
+    polynomial: the degree of f, at most 2, if it is a polynomial: then the two parabolas differ by
+        rounding alone. None for other functions.
+    """
+
+    value: Interval
+    lower: Quadratic
+    upper: Quadratic
+    length: Real
+    degree: int = 2
+    polynomial: int | None = None
+
+    @classmethod
+    def along(
+        cls, p: Vec3, direction: Vec3, length: Real, *, degree: int = 2
+    ) -> tuple[Parabolas, Parabolas, Parabolas]:
+        """The coordinates of p + s d for 0 <= s <= length."""
+
+        def coordinate(x: Real, slope: Real) -> Parabolas:
+            line = slope, 0.0
+            return cls(Interval.exactly(x), line, line, length, degree, 1)
+
+        x, y, z = (coordinate(p[k], direction[k]) for k in range(3))
+        return x, y, z
+
+    @property
+    def bounds(self) -> tuple[Quadratic, Quadratic]:
+        """The parabolas below and above, straight if the degree is 1."""
+        if self.degree == 2:
+            return self.lower, self.upper
+        return _straight(self.lower, self.upper, self.length)
+
+    def constant(self, x: float | Real) -> Parabolas:
+        if isinstance(x, int | float):
+            value = Interval.constant(float(x), cast("Any", type(self.length)))
+        else:
+            value = Interval.exactly(x)
+        return self._made(value, (0.0, 0.0), (0.0, 0.0), 0)
+
+    def _made(
+        self, value: Interval, lower: Quadratic, upper: Quadratic, polynomial: int | None = None
+    ) -> Parabolas:
+        made = Parabolas(value, lower, upper, self.length, self.degree, polynomial)
+        if polynomial is None and self.degree == 1:
+            lower, upper = made.bounds
+            return dataclasses.replace(made, lower=lower, upper=upper)
+        return made
+
+    def __neg__(self) -> Parabolas:
+        (a, b), (c, d) = self.lower, self.upper
+        return dataclasses.replace(self, value=-self.value, lower=(-c, -d), upper=(-a, -b))
+
+    def sum(self, other: Any) -> Parabolas:
+        value = self.value + other.value
+        lower = _added(self.lower, other.lower, -1)
+        upper = _added(self.upper, other.upper, 1)
+        if self.polynomial is None or other.polynomial is None:
+            return self._made(value, lower, upper)
+        return self._made(value, lower, upper, max(self.polynomial, other.polynomial))
+
+    # Products.
+
+    def product(self, other: Any) -> Parabolas:
+        """f g - f(0) g(0) = f(0) G + g(0) F + F G.
+
+        Proof. F and G lie between two parabolas each, and F G is linear in each of them: f g lies
+        between the least and the largest of the products of one bound of f with one of g. Each of
+        those is a quartic. Straight bounds: f(0) c + g(0) a + a c s is the slope of a chord, which
+        is between its values at both ends. Parabolas: the derivative of the quartic is a cubic,
+        which `_lines_around` puts between two lines; their integrals are parabolas.
+        """
+        if other.polynomial == 0:
+            return self._scaled(other.value)
+        if self.polynomial == 0:
+            return other._scaled(self.value)
+        value = self.value * other.value
+        if self is other:
+            value = self.value.square()
+        both = None
+        if self.polynomial is not None and other.polynomial is not None:
+            both = self.polynomial + other.polynomial
+        if both == 2:
+            lower, upper = self._product_of_lines(other)
+            return self._made(value, lower, upper, 2)
+        if self.degree == 1:
+            return self._made(value, *self._straight_product(other))
+        return self._made(value, *self._curved_product(other))
+
+    def _scaled(self, factor: Interval) -> Parabolas:
+        """The product with a constant.
+
+        Proof. k f for k = m + e, |e| <= r: m f has the bounds of f times m, swapped if m < 0, and
+        |e f| <= r max(|lower|, |upper|), coefficient by coefficient.
+        """
+        value = self.value * factor
+        middle, radius = factor.middle, factor.radius
+        if factor.is_zero:
+            return self._made(value, (0.0, 0.0), (0.0, 0.0), 0)
+        low, high = self.lower, self.upper
+        moved = [(middle * one[0], middle * one[1]) for one in (low, high)]
+        falls = middle < 0
+        lower = tuple(dr.select(falls, v, u) for u, v in zip(*moved, strict=True))
+        upper = tuple(dr.select(falls, u, v) for u, v in zip(*moved, strict=True))
+        sizes = [fmax(dr.abs(u), dr.abs(v)) for u, v in zip(low, high, strict=True)]
+        slack = [
+            0.0 if _is_zero(low[k]) and _is_zero(high[k])
+            else radius * sizes[k] + _slack(dr.abs(middle) * sizes[k])
+            for k in range(2)
+        ]  # fmt: skip
+        return self._made(
+            value,
+            (lower[0] - slack[0], lower[1] - slack[1]),
+            (upper[0] + slack[0], upper[1] + slack[1]),
+            self.polynomial,
+        )
+
+    def _product_of_lines(self, other: Parabolas) -> tuple[Quadratic, Quadratic]:
+        """Of two polynomials of degree 1: exact, up to rounding."""
+        a, ra = _middle(self.lower[0], self.upper[0])
+        c, rc = _middle(other.lower[0], other.upper[0])
+        v, rv, w, rw = *_ends(self.value), *_ends(other.value)
+        linear = v * c + w * a
+        slack = _slack(dr.abs(v * c) + dr.abs(w * a))
+        slack += rv * dr.abs(c) + rw * dr.abs(a) + (dr.abs(v) + rv) * rc + (dr.abs(w) + rw) * ra
+        bent = a * c
+        loose = _slack(dr.abs(bent)) + dr.abs(a) * rc + dr.abs(c) * ra + ra * rc
+        return (linear - slack, bent - loose), (linear + slack, bent + loose)
+
+    def _straight_product(self, other: Parabolas) -> tuple[Quadratic, Quadratic]:
+        h = self.length
+        v, rv, w, rw = *_ends(self.value), *_ends(other.value)
+        lows: list[Real] = []
+        highs: list[Real] = []
+        for a, _ in self.bounds:
+            for c, _ in other.bounds:
+                linear, bent = v * c + w * a, a * c * h
+                slack = _slack(dr.abs(v * c) + dr.abs(w * a) + dr.abs(bent))
+                slack += rv * dr.abs(c) + rw * dr.abs(a)
+                lows += [linear - slack, linear + bent - slack]
+                highs += [linear + slack, linear + bent + slack]
+        return (_least(*lows), 0.0), (_most(*highs), 0.0)
+
+    def _curved_product(self, other: Parabolas) -> tuple[Quadratic, Quadratic]:
+        h = self.length
+        v, rv, w, rw = *_ends(self.value), *_ends(other.value)
+        lows: list[Real] = []
+        highs: list[Real] = []
+        firsts, seconds = self._corners(), other._corners()
+        pairs = [(f, g) for f in firsts for g in seconds]
+        if self is other and len(firsts) == 2:  # of a square, two of the four are the same
+            pairs = [(firsts[0], firsts[0]), (firsts[0], firsts[1]), (firsts[1], firsts[1])]
+        for (a, b, ra, rb), (c, d, rc, rd) in pairs:
+            # Of the derivative by r = s/h, divided by h: c0 + c1 r + c2 r^2 + c3 r^3.
+            ah, bh, ch, dh = a * h, b * h * h, c * h, d * h * h
+            terms = (
+                (v * ch, w * ah),
+                (2 * v * dh, 2 * ah * ch, 2 * bh * w),
+                (3 * ah * dh, 3 * bh * ch),
+                (4 * bh * dh,),
+            )
+            c0, c1, c2, c3 = (sum(one[1:], one[0]) for one in terms)
+            size = sum(
+                ((k + 1) * dr.abs(one) for k, group in enumerate(terms) for one in group), 0 * h
+            )
+            # What the values are not known by, and what the bounds of a polynomial differ by.
+            size_f = dr.abs(ah) + 2 * dr.abs(bh)
+            size_g = dr.abs(ch) + 2 * dr.abs(dh)
+            loose = rv * size_g + rw * size_f
+            off_f, off_g = ra * h + 2 * rb * h * h, rc * h + 2 * rd * h * h
+            loose += off_f * (dr.abs(w) + rw + size_g + off_g)
+            loose += off_g * (dr.abs(v) + rv + size_f)
+            slack = _slack(size) + loose
+            l0, l1, u0, u1 = _lines_around(c0, c1, c2, c3)
+            lows += [l0 - slack, l1 - slack]
+            highs += [u0 + slack, u1 + slack]
+        return (
+            _integral(_least(*lows[::2]), _least(*lows[1::2]), h),
+            _integral(_most(*highs[::2]), _most(*highs[1::2]), h),
+        )
+
+    def _corners(self) -> list[tuple[Real, Real, Real, Real]]:
+        """The bounds as (a, b, 0, 0); one in the middle with radii, if they differ by rounding."""
+        if self.polynomial is None:
+            return [(*self.lower, 0.0, 0.0), (*self.upper, 0.0, 0.0)]
+        a, ra = _middle(self.lower[0], self.upper[0])
+        b, rb = _middle(self.lower[1], self.upper[1])
+        return [(a, b, ra, rb)]
+
+    # Functions.
+
+    def apply(self, function: Function) -> Parabolas:
+        """phi(f), by the tighter of two proofs on either side.
+
+        Chords. With x = f(s) - f(0) between x- and x+, phi(f(0) + x) - phi(f(0)) = m x, where m is
+        the slope of a chord from f(0). It lies in the range of phi' and, for convex phi, between
+        the chords to x- and to x+; if only an upper bound is asked for, convex phi needs the two
+        chords themselves, and a lower one the tangent at f(0), as phi lies above it; for concave
+        phi the same upside down. So f's two parabolas times the ends of the range of m bound phi,
+        and one parabola bounds several (`_above`).
+
+        Taylor. It is phi'(f(0)) x + phi''(z) x^2/2, and x^2 lies in s^2 times the squares of the
+        slopes of f's own chords.
+        """
+        if self.polynomial == 0:
+            value = function.ranges(_dynamic(self.value, self.length))[0]
+            return self._made(value, (0.0, 0.0), (0.0, 0.0), 0)
+        if isinstance(function, ClippedPower) and self.polynomial is not None:
+            return self._clipped_power(function)
+        lower, upper = self.bounds
+        h = self.length
+        start = _dynamic(self.value, h)
+        fall, rise = -_peak(_negative(lower), h), _peak(upper, h)
+        value, slope, _ = function.ranges(start)
+        _, slopes, curvature = function.ranges(
+            Interval((start + Interval(fall, fall)).low, (start + Interval(rise, rise)).high)
+        )
+        chords = [
+            ((function.ranges(start.shifted(x))[0] - value) * Interval.exactly(x).reciprocal())
+            for x in (fall, rise)
+        ]
+        first, last = (one.meet(slopes) for one in chords)
+        convex, concave = curvature.low >= 0, curvature.high <= 0
+
+        # For convex phi, x > 0 needs the upper chord and x < 0 the lower one.
+        upper_slopes = (
+            dr.select(concave, slope.low, dr.select(convex, first.low, slopes.low)),
+            dr.select(concave, slope.high, dr.select(convex, last.high, slopes.high)),
+        )
+        lower_slopes = (
+            dr.select(convex, slope.low, dr.select(concave, last.low, slopes.low)),
+            dr.select(convex, slope.high, dr.select(concave, first.high, slopes.high)),
+        )
+        above = _above([_times(m, one) for m in upper_slopes for one in (lower, upper)], h)
+        below = _below([_times(m, one) for m in lower_slopes for one in (lower, upper)], h)
+        by_taylor = self._taylor(slope, curvature)
+        if self.degree == 1:
+            by_taylor = _straight(*by_taylor, h)
+            below, above = _straight(below, above, h)
+        return self._made(
+            value,
+            _tighter(below, by_taylor[0], h, -1),
+            _tighter(above, by_taylor[1], h, 1),
+        )
+
+    def _taylor(self, slope: Interval, curvature: Interval) -> tuple[Quadratic, Quadratic]:
+        moved = self._scaled(slope)
+        (least, _), (most, _) = _straight(self.lower, self.upper, self.length)
+        half = Interval(0.5 * curvature.low, 0.5 * curvature.high)
+        bend = half * Interval(least, most).square()
+        return (
+            _added(moved.lower, (0.0, bend.low), -1),
+            _added(moved.upper, (0.0, bend.high), 1),
+        )
+
+    def larger(self, other: Any) -> Parabolas:
+        """max(f, g).
+
+        Proof. Above: f <= f(0) + F+ and g the same; with V = max(f(0), g(0)) both lie below V
+        + (f(0) - V) + F+, and one parabola bounds both (`_above`), unless one is larger all the
+        way. Below: max(f, g) is at least whichever is the larger at 0.
+        """
+        f, g = self.value, other.value
+        h = self.length
+        (f_low, f_high), (g_low, g_high) = self.bounds, other.bounds
+        left, right = (f - g).low >= 0, (g - f).low >= 0  # surely, at 0
+        below = _below([f_low, g_low], h)
+        below = _where(left, f_low, _where(right, g_low, below))
+        # Surely, all the way: where f's least is above g's largest.
+        f_least, f_most = -_peak(_negative(f_low), h), _peak(f_high, h)
+        g_least, g_most = -_peak(_negative(g_low), h), _peak(g_high, h)
+        always_f = (f - g).low + _rounded(f_least - g_most, -1, dr.abs(f_least) + g_most) >= 0
+        always_g = (g - f).low + _rounded(g_least - f_most, -1, dr.abs(g_least) + f_most) >= 0
+        offsets = fmin((f - g).high, 0), fmin((g - f).high, 0)
+        above = _above([f_high, g_high], h, offsets)
+        above = _where(always_f, f_high, _where(always_g, g_high, above))
+        below = _where(always_f, f_low, _where(always_g, g_low, below))
+        value = Interval(fmax(f.low, g.low), fmax(f.high, g.high))
+        return self._made(value, below, above)
+
+    def _clipped_power(self, function: ClippedPower) -> Parabolas:
+        """max(f, 0)^n of a polynomial, where it is not zero.
+
+        Proof. If f = v + a s + b s^2 bends down, f > 0 on one interval [s0, s1] of [0, h] at most.
+        There f^n is a product, whose derivative lies between two lines. Elsewhere the derivative is
+        0. A line above the first, raised to at least 0 at both ends of [0, h], is above both; its
+        integral is the bound. Rounding may put s0 and s1 where f is as large as r, a few
+        units of |v| + |a| h + |b| h^2: there the derivative is at most n r^(n-1) (|a| + 2 |b| h).
+        Where f bends up, the interval is [0, h] if f > 0 there and the bounds are those of a convex
+        function else.
+
+        Source: Aydinlilar and Zanni 2023, section 6.2.1, with the extension that holds.
+        """
+        h = self.length
+        (a, ra), (b, rb) = (_middle(self.lower[k], self.upper[k]) for k in range(2))
+        v, rv = _ends(self.value)
+        size = dr.abs(v) + dr.abs(a) * h + dr.abs(b) * h * h
+        off = _slack(size) + rv + ra * h + rb * h * h
+        # The roots of v + a s + b s^2, b < 0, without cancellation.
+        square = a * a - 4 * b * v
+        root = dr.sqrt(fmax(square, 0))
+        q = -0.5 * (a + dr.select(a >= 0, root, -root))
+        one, two = q / b, v / q
+        one = dr.select(dr.isfinite(one), one, 0)
+        two = dr.select(dr.isfinite(two), two, 0)
+        start, end = clamp(fmin(one, two), 0, h), clamp(fmax(one, two), 0, h)
+        empty = (square <= 0) | (end <= start)
+        start, end = dr.select(empty, 0, start), dr.select(empty, h, end)
+
+        n = function.exponent
+        inner = fmax(v + start * (a + b * start), 0)
+        turned = a + 2 * b * start
+        on_it = Parabolas(
+            Interval(fmax(inner - off, 0), inner + off),
+            (turned - _slack(dr.abs(a) + 2 * dr.abs(b) * h) - ra - 2 * rb * h, b - rb),
+            (turned + _slack(dr.abs(a) + 2 * dr.abs(b) * h) + ra + 2 * rb * h, b + rb),
+            end - start,
+            self.degree,
+            2,
+        )._repeated(n)
+        value, _, _ = function.ranges(_dynamic(self.value, h))
+        tail = n * (2 * off) ** (n - 1) * (dr.abs(a) + ra + 2 * (dr.abs(b) + rb) * h)
+        is_cut = (start > 0) | (end < h)
+        if self.degree == 1:
+            lower, upper = on_it._spread(start, end, h, value, is_cut, tail)
+        else:
+            lower, upper = on_it._extended(start, h, is_cut, tail)
+        lower = _where(empty, (-tail, 0.0), lower)
+        upper = _where(empty, (tail, 0.0), upper)
+        general = Parabolas(self.value, self.lower, self.upper, h, self.degree)
+        general = Parabolas.apply(general, function)
+        bends_down = b + rb < 0
+        return self._made(
+            value,
+            _where(bends_down, lower, general.lower),
+            _where(bends_down, upper, general.upper),
+        )
+
+    def _extended(
+        self, start: Real, length: Real, is_cut: Any, tail: Real
+    ) -> tuple[Quadratic, Quadratic]:
+        """Bounds of a function that is this one from `start` on and elsewhere constant."""
+        made: list[Quadratic] = []
+        for sign, (a, b) in ((-1, self.lower), (1, self.upper)):
+            at_start = a - 2 * b * start
+            at_end = a + 2 * b * (length - start)
+            slack = _slack(dr.abs(a) + 2 * dr.abs(b) * length) + tail
+            ends = [one + sign * slack for one in (at_start, at_end)]
+            extreme = _most if sign > 0 else _least
+            ends = [dr.select(is_cut, extreme(one, 0 * one), one) * length for one in ends]
+            made.append(_integral(ends[0], ends[1], length))
+        return made[0], made[1]
+
+    def _spread(
+        self, start: Real, end: Real, length: Real, value: Interval, is_cut: Any, tail: Real
+    ) -> tuple[Quadratic, Quadratic]:
+        """The same with straight bounds.
+
+        Proof. Before `start` f is 0 and so is its value there: a line from 0 at 0 to the bound at
+        `end` lies above. Behind `end` f is 0: a slope of at least -value/s is above -value for all
+        s >= end, if it is at least -value/length.
+        """
+        (low, _), (high, _) = self.bounds
+        part = (end - start) / end * (1 + 8 * unit_of(length))
+        behind = -(value.low / length)
+        behind = behind + _slack(dr.abs(behind))
+        before = start > 0
+        high = dr.select(before, _most(high, 0 * high) * part, high)
+        low = dr.select(before, _least(low, 0 * low) * part, low)
+        high = dr.select(end < length, _most(high, behind), high)
+        low = dr.select(end < length, _least(low, -(value.high / end) * (1 + 1e-6)), low)
+        slack = dr.select(is_cut, tail, 0)
+        return (low - slack, 0.0), (high + slack, 0.0)
+
+
+def _lines_around(c0: Real, c1: Real, c2: Real, c3: Real) -> tuple[Real, Real, Real, Real]:
+    """Lines below and above c0 + c1 r + c2 r^2 + c3 r^3 on [0, 1]: their values at 0 and 1.
+
+    Proof. On either side of its inflection the cubic is convex or concave: between a chord and the
+    tangent at the nearer end to 0. The line through the larger values of two lines at 0 and 1
+    is above both. A bend that is taken for the wrong sign is as small as its rounding.
+    """
+    turn = -c2 / (3 * c3)
+    two = (turn > 0) & (turn < 1)
+    turn = dr.select(two, turn, 1)
+
+    chord = c1 + turn * (c2 + turn * c3)
+    convex = c2 + 1.5 * c3 * turn >= 0
+    u0 = l0 = c0
+    u1 = c0 + dr.select(convex, chord, c1)
+    l1 = c0 + dr.select(convex, c1, chord)
+
+    there = c0 + turn * (c1 + turn * (c2 + turn * c3))
+    tangent = c1 + turn * (2 * c2 + 3 * c3 * turn)
+    chord = c1 + c2 * (1 + turn) + c3 * (1 + turn * (1 + turn))
+    convex = c2 + 1.5 * c3 * (1 + turn) >= 0
+    steep = dr.select(convex, chord, tangent)
+    flat = dr.select(convex, tangent, chord)
+    u0 = dr.select(two, fmax(u0, there - steep * turn), u0)
+    u1 = dr.select(two, fmax(u1, there + steep * (1 - turn)), u1)
+    l0 = dr.select(two, fmin(l0, there - flat * turn), l0)
+    l1 = dr.select(two, fmin(l1, there + flat * (1 - turn)), l1)
+    return l0, l1, u0, u1
+
+
+def _straight(lower: Quadratic, upper: Quadratic, h: Real) -> tuple[Quadratic, Quadratic]:
+    """Lines below and above two parabolas: one through 0 lies between the lines of its slope at 0
+    and of its chord to h."""
+    (a, b), (c, d) = lower, upper
+    if _is_zero(b) and _is_zero(d):
+        return lower, upper
+    low = _least(a, _rounded(a + b * h, -1, dr.abs(a) + dr.abs(b) * h))
+    high = _most(c, _rounded(c + d * h, 1, dr.abs(c) + dr.abs(d) * h))
+    return (low, 0.0), (high, 0.0)
+
+
+def _integral(at_start: Real, at_end: Real, length: Real) -> Quadratic:
+    """The parabola with a straight derivative, given h times that derivative at 0 and at h."""
+    there = length > 0
+    a = dr.select(there, at_start / length, 0)
+    b = dr.select(there, (at_end - at_start) / (2 * length * length), 0)
+    return a, b
+
+
+def _above(several: list[Quadratic], length: Real, offsets: tuple[Real, ...] = ()) -> Quadratic:
+    """A parabola through 0 above several, each with an offset <= 0, on [0, length].
+
+    Proof. On [0, h] c + a s + b s^2 is a mean, with weights >= 0, of the control values c,
+    c + a h/2, c + a h + b h^2 (Bernstein 1912): larger control values make a larger parabola.
+    """
+    h = length
+    middles: list[Real] = []
+    lasts: list[Real] = []
+    for k, (a, b) in enumerate(several):
+        offset = offsets[k] if offsets else 0.0
+        first, second = a * h, b * h * h
+        slack = _slack(dr.abs(offset) + dr.abs(first) + dr.abs(second) + 0 * h)
+        middles.append(offset + 0.5 * first + slack)
+        lasts.append(offset + (first + second) + slack)
+    middle, last = _most(*middles), _most(*lasts)
+    slack = _slack(dr.abs(middle) + dr.abs(last))
+    there = h > 0
+    a = dr.select(there, 2 * middle / h, 0)
+    b = dr.select(there, (last - 2 * middle + slack) / (h * h), 0)
+    return a + _slack(dr.abs(a)), b
+
+
+def _below(several: list[Quadratic], length: Real) -> Quadratic:
+    return _negative(_above([_negative(one) for one in several], length))
+
+
+def _tighter(first: Quadratic, second: Quadratic, length: Real, sign: int) -> Quadratic:
+    """Of two bounds on one side, the nearer at a part of the length; one that is no number gives
+    way."""
+    r = _COMPARED_AT * length
+    one, two = (sign * r * (a + b * r) for a, b in (first, second))
+    return _where((one <= two) | ~dr.isfinite(two), first, second)
+
+
+def _peak(q: Quadratic, length: Real) -> Real:
+    """The largest value of a s + b s^2 on [0, length]."""
+    a, b = q
+    if _is_zero(a) and _is_zero(b):
+        return 0 * length
+    last = length * (a + b * length)
+    last = last + _slack(length * (dr.abs(a) + dr.abs(b) * length))
+    inside = (b < 0) & (a > 0) & (a + 2 * b * length < 0)
+    vertex = a * (a / (-4 * b))
+    vertex = dr.select(inside, vertex + _slack(dr.abs(vertex)), 0)
+    return _most(0 * length, last, vertex)
+
+
+def _added(one: Quadratic, two: Quadratic, sign: int) -> Quadratic:
+    def plus(x: Real, y: Real) -> Real:
+        if _is_zero(y):
+            return x
+        return y if _is_zero(x) else _rounded(x + y, sign, 0.0)
+
+    return plus(one[0], two[0]), plus(one[1], two[1])
+
+
+def _times(m: Real, q: Quadratic) -> Quadratic:
+    return m * q[0], m * q[1]
+
+
+def _negative(q: Quadratic) -> Quadratic:
+    return -q[0], -q[1]
+
+
+def _where(mask: Any, one: Quadratic, two: Quadratic) -> Quadratic:
+    return dr.select(mask, one[0], two[0]), dr.select(mask, one[1], two[1])
+
+
+def _middle(low: Real, high: Real) -> tuple[Real, Real]:
+    """The middle of two numbers and how far both are from it."""
+    if low is high or (_is_zero(low) and _is_zero(high)):
+        return low, 0.0
+    middle = 0.5 * low + 0.5 * high
+    return middle, _rounded(0.5 * high - 0.5 * low, 1, dr.abs(middle))
+
+
+def _ends(x: Interval) -> tuple[Real, Real]:
+    return x.middle, _radius(x)
+
+
+def _radius(x: Interval) -> Real:
+    """How far numbers of an interval are from its middle, with the rounding of the middle."""
+    if x.low is x.high or x.is_zero:
+        return 0.0
+    radius = x.radius
+    return radius if isinstance(radius, float) else radius + _slack(dr.abs(x.middle))
+
+
+def _dynamic(x: Interval, like: Real) -> Interval:
+    """The interval as numbers of the backend."""
+    if not x.is_static:
+        return x
+    kind = cast("Any", type(like))
+    low = kind(x.low)
+    return Interval(low, low if x.low == x.high else kind(x.high))
+
+
+def _is_zero(x: Real) -> bool:
+    return isinstance(x, float) and x == 0.0
+
+
+def _rounded(x: Real, sign: int, size: Real) -> Real:
+    """A number above (sign 1) or below one that was computed from numbers of a size."""
+    return x + sign * _slack(dr.abs(x) + size)
+
+
+def _slack(size: Real) -> Real:
+    """What rounding and underflow may have done to a sum of numbers of this size together."""
+    if isinstance(size, float):
+        assert size == 0.0
+        return 0.0
+    smallest = float(dr.smallest(cast("Any", type(size))))
+    return dr.fma(size, _ROUNDINGS * unit_of(size), _ROUNDINGS * smallest)
+
+
+def _most(*numbers: Real) -> Real:
+    """The largest; infinite if one is not a number."""
+    largest, total = numbers[0], numbers[0]
+    for one in numbers[1:]:
+        largest, total = fmax(largest, one), total + one
+    return dr.select(total == total, largest, dr.inf)
+
+
+def _least(*numbers: Real) -> Real:
+    return -_most(*(-one for one in numbers))

@@ -1,0 +1,1 @@
+"""Proofs by harmonic balls: Harnack's inequality and what is sharper."""

@@ -1,0 +1,163 @@
+"""Proofs of the literature from a formula's own arithmetic, for comparison with pieces of the path.
+
+Parabolas come from the bottom-up arithmetic of `harnack.arithmetic.Parabolas`, bands from affine
+forms and from intervals. All of them prove steps; how many is what benchmarks measure.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import drjit as dr
+
+from harnack.arithmetic import Affine, Interval, Jet, Parabolas
+from harnack.backend.extrema import fmax, fmin
+from harnack.enclosures.enclosure import Enclosure, Gaps, Slopes
+from harnack.enclosures.parabola import Parabola
+from harnack.enclosures.pieces import LinearTaylor, QuadraticTaylor
+from harnack.enclosures.restriction import Evaluable
+
+if TYPE_CHECKING:
+    from typing import Self
+
+    from harnack.backend import Real, Vec3
+    from harnack.enclosures.restriction import Restriction
+
+_ROUND_DOWN = 1.0 - 1e-6
+
+
+@dataclass(frozen=True)
+class BottomUpQuadratic(Parabola):
+    """The parabolas that a formula's arithmetic proves.
+
+    Source: Aydinlilar and Zanni 2023, section 6.2. Proof: that of `Parabolas`, then of `Parabola`.
+    """
+
+    degree: ClassVar[int] = 2
+
+    @classmethod
+    def along(cls, function: Restriction, slopes: Slopes, length: Real) -> Self | None:
+        if not isinstance(function, Evaluable):
+            return None
+        made = _parabolas(function, length, cls.degree)
+        (a, b), (c, d) = made.bounds
+        return cls(Slopes(a, c), 2 * b, 2 * d, length)
+
+    def step(self, gaps: Gaps) -> Real:
+        # All of the length without a pull-back, which would cost a ray that misses a look.
+        nearer = Gaps(gaps.down * _ROUND_DOWN, gaps.up * _ROUND_DOWN)
+        known = dr.isfinite(self.slopes.low + self.slopes.high)
+        known &= dr.isfinite(self.least_curvature + self.most_curvature) & (self.reach > 0)
+        free = known & self.covers(nearer, self.reach)
+        return dr.select(free, self.reach, super().step(gaps))
+
+
+class BottomUpLinear(BottomUpQuadratic):
+    """The lines that a formula's arithmetic proves.
+
+    Source: Aydinlilar and Zanni 2023, section 5.2.
+    """
+
+    degree = 1
+
+
+@dataclass(frozen=True)
+class Mixed(Enclosure):
+    """The longest step of several proofs of one function.
+
+    Source: Aydinlilar and Zanni 2023, section 4 ("mixed"): bounds of derivatives where they are
+    tight, bottom-up arithmetic where they are not.
+    """
+
+    several: tuple[Enclosure, ...]
+
+    kinds: ClassVar[tuple[type[Enclosure], ...]] = (
+        QuadraticTaylor, LinearTaylor, BottomUpQuadratic,
+    )  # fmt: skip
+
+    @classmethod
+    def along(cls, function: Restriction, slopes: Slopes, length: Real) -> Self | None:
+        made = [kind.along(function, slopes, length) for kind in cls.kinds]
+        several = tuple(one for one in made if one is not None)
+        return cls(several) if several else None
+
+    def step(self, gaps: Gaps) -> Real:
+        longest: Real = type(gaps.up)(0)
+        for one in self.several:
+            longest = fmax(one.step(gaps), longest)
+        return fmax(longest, 0)
+
+
+@dataclass(frozen=True)
+class Band(Enclosure):
+    """offsets.low + slopes.low s <= F(s) <= offsets.high + slopes.high s, for 0 <= s <= reach.
+
+    Proof of the step: before the upper line reaches the gap, F cannot. A band is not exact at
+    s = 0: a gap within its offset proves nothing, and the march asks for a third of the length.
+    """
+
+    offsets: Interval
+    slopes: Slopes
+    reach: Real
+
+    def step(self, gaps: Gaps) -> Real:
+        up = self._free(gaps.up, self.offsets.high, self.slopes.high)
+        down = self._free(gaps.down, -self.offsets.low, -self.slopes.low)
+        return fmax(fmin(up, down), 0)
+
+    def _free(self, gap: Real, offset: Real, slope: Real) -> Real:
+        none = gap == dr.inf
+        left = gap - offset
+        reach = dr.select(slope > 0, left / slope * _ROUND_DOWN, self.reach)
+        known = (left > 0) & dr.isfinite(slope)  # and not NaN
+        return dr.select(none, self.reach, dr.select(known, fmin(reach, self.reach), 0))
+
+
+class AffineBand(Band):
+    """The band of revised affine arithmetic; its front is pruned where only the end is in doubt.
+
+    Source: Fryazinov, Pasko and Comninos 2010, as Aydinlilar and Zanni 2023 compare with it.
+    """
+
+    @classmethod
+    def along(cls, function: Restriction, slopes: Slopes, length: Real) -> Self | None:
+        if not isinstance(function, Evaluable):
+            return None
+        form = function.through(lambda p, d: Affine.along(p, d, length))
+        start = _value(function)
+        rate = 2 * form.slope / length
+        line = Interval.exactly(form.centre) + Interval.exactly(-form.slope)
+        offsets = line + Interval(-form.error, form.error) - start
+        slack = 4 * dr.epsilon(type(length)) * dr.abs(rate)
+        return cls(offsets, Slopes(rate - slack, rate + slack), length)
+
+
+class IntervalRange(Band):
+    """The range of interval arithmetic on all of the length asked: all of it is free, or nothing
+    is known.
+
+    Source: Mitchell 1990.
+    """
+
+    @classmethod
+    def along(cls, function: Restriction, slopes: Slopes, length: Real) -> Self | None:
+        if not isinstance(function, Evaluable):
+            return None
+        made = function.through(lambda p, d: Jet.along(p, d, 0.0, length, anchored=False))
+        zero = 0 * length
+        return cls(made.value - _value(function), Slopes(zero, zero), length)
+
+
+def _parabolas(function: Evaluable, length: Real, degree: int) -> Parabolas:
+    return function.through(lambda p, d: Parabolas.along(p, d, length, degree=degree))
+
+
+def _value(function: Evaluable) -> Interval:
+    """f at the start of the path."""
+
+    def here(p: Vec3, direction: Vec3) -> tuple[Jet, Jet, Jet]:
+        del direction
+        return Jet.at_point(p)
+
+    return function.through(here).value

@@ -1,0 +1,356 @@
+"""Solids moved, turned, scaled and sheared."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, cast
+
+import drjit as dr
+import numpy as np
+import numpy.typing as npt
+
+from harnack.backend.lengths import largest_component, length
+from harnack.enclosures import Curvature, HarmonicBall, Promise, Stretched
+from harnack.fields.field import Field
+from harnack.fields.formula import prepared_numbers
+from harnack.fields.look import Look, Path, Sample
+from harnack.fields.solids.solid import Solid
+from harnack.geometry import Ball, ConvexHull
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, FloatArray, Real, Vec3
+    from harnack.geometry import Volume
+
+from harnack.fields.solids.maps import Map, axis_index
+
+# Bounds of f'' in the middle half of a harmonic ball: see `without_balls`.
+_HARMONIC_SECOND = 10 / (3 * math.sqrt(3))
+
+
+@dataclass(frozen=True)
+class Affine(Map):
+    """u -> matrix u + offset, in double precision.
+
+    matrix: (3, 3), rows, not singular. offset: (3,).
+    """
+
+    matrix: tuple[tuple[float, ...], ...]
+    offset: tuple[float, ...]
+
+    @classmethod
+    def of_arrays(cls, matrix: npt.ArrayLike, offset: npt.ArrayLike = (0.0, 0.0, 0.0)) -> Affine:
+        """Raises ValueError for other shapes, what is not finite, and a singular matrix."""
+        m, b = np.asarray(matrix, dtype=np.float64), np.asarray(offset, dtype=np.float64)
+        if m.shape != (3, 3) or b.shape != (3,):
+            raise ValueError(
+                f"a map needs a matrix (3, 3) and an offset (3,), not {m.shape}, {b.shape}"
+            )
+        if not (np.isfinite(m).all() and np.isfinite(b).all()):
+            raise ValueError("matrix and offset must be finite")
+        sizes = np.linalg.svd(m, compute_uv=False)
+        if not sizes[-1] > 1e-12 * sizes[0]:
+            raise ValueError(
+                f"the matrix is singular (singular values {sizes[0]:g} to {sizes[-1]:g}): it would "
+                "flatten the solid"
+            )
+        return cls(tuple(tuple(float(v) for v in row) for row in m), tuple(float(v) for v in b))
+
+    @classmethod
+    def of_matrix(cls, matrix: npt.ArrayLike) -> Affine:
+        """A linear map (3, 3), or an affine one (3, 4) or (4, 4) whose last row is (0, 0, 0, 1)."""
+        m = np.asarray(matrix, dtype=np.float64)
+        if m.shape == (4, 4):
+            if not np.array_equal(m[3], (0.0, 0.0, 0.0, 1.0)):
+                raise ValueError(f"the last row of a (4, 4) map must be (0, 0, 0, 1), not {m[3]}")
+            m = m[:3]
+        if m.shape == (3, 4):
+            return cls.of_arrays(m[:, :3], m[:, 3])
+        return cls.of_arrays(m)
+
+    @classmethod
+    def translation(cls, offset: Sequence[float]) -> Affine:
+        """u -> u + offset."""
+        return cls.of_arrays(np.eye(3), np.asarray(offset, dtype=np.float64))
+
+    @classmethod
+    def rotation(cls, degrees: float, axis: str | Sequence[float]) -> Affine:
+        """The turn about an axis through the origin (Rodrigues' formula)."""
+        if isinstance(axis, str):
+            unit = np.eye(3)[axis_index(axis)]
+        else:
+            unit = np.asarray(axis, dtype=np.float64)
+            size = np.linalg.norm(unit) if unit.shape == (3,) else 0.0
+            if not (np.isfinite(size) and size > 0):
+                raise ValueError(f"axis must be a vector (3,) that is not zero, not {axis!r}")
+            unit = unit / size
+        angle = math.radians(float(degrees))
+        k = np.cross(np.eye(3), unit) * -1
+        turn = np.eye(3) + math.sin(angle) * k + (1 - math.cos(angle)) * (k @ k)
+        return cls.of_arrays(turn)
+
+    @classmethod
+    def scaling(cls, factors: float | Sequence[float]) -> Affine:
+        """u -> factors u."""
+        sizes = np.asarray(factors, dtype=np.float64)
+        sizes = np.broadcast_to(sizes if sizes.shape in ((), (3,)) else np.nan, (3,))
+        if not (np.isfinite(sizes).all() and (sizes > 0).all()):
+            raise ValueError(f"factors must be positive numbers, one or three, not {factors!r}")
+        return cls.of_arrays(np.diag(sizes))
+
+    def of(self, solid: Solid) -> Solid:
+        if isinstance(solid, AffineImage):
+            m, b = np.array(self.matrix), np.array(self.offset)
+            inner = solid.map
+            total = Affine.of_arrays(m @ np.array(inner.matrix), m @ np.array(inner.offset) + b)
+            return AffineImage(solid.inner, total)
+        return AffineImage(solid, self)
+
+    @property
+    def inverse(self) -> FloatArray:
+        """The inverse matrix."""
+        return np.linalg.inv(np.array(self.matrix))
+
+    @property
+    def similarity(self) -> float | None:
+        """The factor by which all lengths grow; None if they do not grow alike."""
+        m = np.array(self.matrix)
+        factor = abs(float(np.linalg.det(m))) ** (1 / 3)
+        grown = np.abs(m.T @ m - factor**2 * np.eye(3)).max()
+        return factor if grown <= 1e-14 * factor**2 else None
+
+    def volume(self, volume: Volume | None) -> Volume | None:
+        """A volume that holds the image of another one; None if that has no bounds."""
+        if volume is None:
+            return None
+        m, b = np.array(self.matrix), np.array(self.offset)
+        factor = self.similarity
+        if isinstance(volume, Ball) and factor is not None:
+            centre = m @ np.array(volume.center) + b
+            pad = 1e-12 * (np.abs(centre).max() + factor * volume.radius)
+            return Ball(
+                (float(centre[0]), float(centre[1]), float(centre[2])), factor * volume.radius + pad
+            )
+        low, high = volume.bounds()
+        if not (np.isfinite(low).all() and np.isfinite(high).all()):
+            return None
+        corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3)
+        image = corners @ m.T + b
+        return ConvexHull.of(image).padded(1e-12 * float(np.abs(image).max()))
+
+
+@dataclass(frozen=True, eq=False)
+class AffineImage(Solid):
+    """A solid under an affine map.
+
+    Proof. A ray o + t d is the image of the straight path M^-1 (o - b) + t M^-1 d, on which the
+    solid is looked at; it is passed at the speed |M^-1 d| (`Stretched`). Coordinates there are
+    rounded by a few units of the sum of the sizes that they are summed from, which enters the error
+    of the value. Where all lengths grow by one factor, f is multiplied by it.
+    """
+
+    inner: Solid
+    map: Affine
+
+    def __post_init__(self) -> None:
+        for name in ("has_detail", "coarsest_detail", "overstep"):
+            object.__setattr__(self, name, getattr(self.inner, name))
+        domain = self.map.volume(self.inner.domain)
+        if self.inner.domain is not None and domain is None:
+            raise ValueError(
+                f"the domain {self.inner.domain} of the solid has no bounds and cannot be mapped: "
+                "cut the field by a volume that has"
+            )
+        object.__setattr__(self, "domain", domain)
+        numbers = _AffineNumbers.of(self.map)
+        object.__setattr__(self, "_numbers", numbers)
+        inner = self.inner.lipschitz
+        lipschitz = None if inner is None else inner * numbers.stretch * numbers.factor
+        object.__setattr__(self, "lipschitz", lipschitz)
+
+    @property
+    def numbers(self) -> _AffineNumbers:
+        """The inverse map, as numbers of the backend once prepared."""
+        return cast("Any", self)._numbers
+
+    def leaves(self, change: Callable[[Solid], Solid]) -> Solid:
+        return change(self)
+
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        own = level / (self.map.similarity or 1.0)
+        return self.map.volume(self.inner.hull(own, above=above))
+
+    def prepare(self, backend: Backend) -> Solid:
+        other = self._of(self.inner.prepare(backend))
+        object.__setattr__(other, "_numbers", self.numbers.prepare(backend))
+        return other
+
+    def at_detail(self, detail: Real) -> Field:
+        return self._of(self.inner.at_detail(detail))
+
+    def _of(self, inner: Field) -> Solid:
+        other = copy.copy(self)
+        object.__setattr__(other, "inner", inner)
+        return other
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        return self.inner.formula(*self.numbers.local(x, y, z)) * self.numbers.factor
+
+    def evaluate(self, p: Vec3) -> Sample:
+        local = type(p)(*self.numbers.local(p.x, p.y, p.z))
+        return self._image(self.inner.evaluate(local), self._size(p, 0.0))
+
+    def differentiable_value(self, p: Vec3) -> Real:
+        local = type(p)(*self.numbers.local(p.x, p.y, p.z))
+        return self.inner.differentiable_value(local) * self.numbers.factor
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        numbers = self.numbers
+        rows = self.inner.hessian(type(p)(*numbers.local(p.x, p.y, p.z)))
+        columns = [numbers.pulled(row) for row in rows]  # H M^-1
+        own = [numbers.pulled(type(p)(*(columns[j][k] for j in range(3)))) for k in range(3)]
+        x, y, z = (one * numbers.factor for one in own)
+        return x, y, z
+
+    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
+        numbers, vector = self.numbers, cast("Any", type(path.origin))
+        o, d = path.origin, path.direction
+        direction = vector(*numbers.local_direction(d.x, d.y, d.z))
+        speed = length(direction)
+        own = Path(vector(*numbers.local(o.x, o.y, o.z)), direction / speed, path.proofs)
+        look = self.inner.look(own, t * speed, ahead * speed, back * speed)
+        sample = self._image(look.sample, self._size(o, t))
+
+        def stretched(enclosures: tuple[Any, ...]) -> tuple[Any, ...]:
+            return tuple(Stretched(one, speed, numbers.factor) for one in enclosures)
+
+        slope = look.slope * speed * numbers.factor
+        ahead_, back_ = stretched(look.ahead), stretched(look.back)
+        return Look(sample, ahead_, back_, slope, look.growth)
+
+    def _size(self, p: Vec3, t: Real) -> Real:
+        """The size of what the local coordinates of p + t d are summed from."""
+        numbers = self.numbers
+        return numbers.stretch * (largest_component(p) + numbers.offset_size + t) * math.sqrt(3)
+
+    def _image(self, sample: Sample, size: Real) -> Sample:
+        numbers = self.numbers
+        unit = 2 * float(dr.epsilon(type(sample.value)))
+        moved = 8 * unit * size * length(sample.gradient)
+        factor, stretch = numbers.factor, numbers.stretch
+
+        def image(one: Promise) -> Promise:
+            if isinstance(one, HarmonicBall):
+                return replace(
+                    one, radius=one.radius / stretch,
+                    lower=one.lower * factor, upper=one.upper * factor,
+                )  # fmt: skip
+            if isinstance(one, Curvature):
+                return Curvature(one.constant * factor * stretch * stretch, one.radius / stretch)
+            return type(one)(one.constant * factor * stretch, one.radius / stretch)
+
+        known, weaker = sample.known, sample.weaker
+        if self.map.similarity is None:
+            known, weaker = (without_balls(group, sample) for group in (known, weaker))
+        return replace(
+            sample,
+            value=sample.value * factor,
+            gradient=numbers.pulled(sample.gradient) * factor,
+            error=(sample.error + moved) * factor,
+            gradient_error=sample.gradient_error * factor * stretch,
+            normal=None,
+            truncation=sample.truncation * factor,
+            known=tuple(image(one) for one in known),
+            weaker=tuple(image(one) for one in weaker),
+        )
+
+
+def without_balls(promises: tuple[Promise, ...], sample: Sample) -> tuple[Promise, ...]:
+    """The promises, harmonic balls as bounds of second derivatives: what is no similarity leaves no
+    function harmonic.
+
+    Proof. On a ball of radius R about its centre, f_vv = R^-2 times the mean of f 5 (3 s^2 - 1)
+    over the sphere, s the cosine of the angle to v; of f between lower and upper that is at most
+    10/(3 sqrt 3) (upper - lower)/R^2. Points within R/2 are centres of balls of radius R/2.
+    """
+    made: list[Promise] = []
+    for one in promises:
+        if isinstance(one, HarmonicBall):
+            span = (one.upper - sample.value) + (sample.value - one.lower)
+            half = 0.5 * one.radius
+            made.append(Curvature(1.0001 * _HARMONIC_SECOND * span / (half * half), half))
+        else:
+            made.append(one)
+    return tuple(made)
+
+
+@dataclass(frozen=True)
+class _AffineNumbers:
+    """The inverse of an affine map as a kernel uses it.
+
+    rows: of M^-1. offset: b. stretch: the largest singular value of M^-1. factor: of f.
+    """
+
+    rows: tuple[tuple[Any, ...], ...]
+    offset: tuple[Any, ...]
+    stretch: Any
+    factor: Any
+    offset_size: Any
+
+    @classmethod
+    def of(cls, change: Affine) -> _AffineNumbers:
+        inverse = change.inverse
+        stretch = float(np.linalg.svd(inverse, compute_uv=False)[0]) * (1 + 1e-6)
+        return cls(
+            tuple(tuple(float(v) for v in row) for row in inverse),
+            change.offset,
+            stretch,
+            float(change.similarity or 1.0),
+            float(np.abs(change.offset).max()),
+        )
+
+    def prepare(self, backend: Backend) -> _AffineNumbers:
+        """With numbers of the backend, but for 0 and 1: they spare most of the work."""
+        prepared = prepared_numbers(self, backend)
+        rows = tuple(
+            tuple(a if a in (0.0, 1.0) else b for a, b in zip(old, new, strict=True))
+            for old, new in zip(
+                (*self.rows, self.offset), (*prepared.rows, prepared.offset), strict=True
+            )
+        )
+        return replace(prepared, rows=rows[:3], offset=rows[3])
+
+    def local(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
+        """M^-1 (p - b), of coordinates of any kind."""
+        a, b, c = (
+            one if _is(shift, 0.0) else one - shift
+            for one, shift in zip((x, y, z), self.offset, strict=True)
+        )
+        return self.local_direction(a, b, c)
+
+    def local_direction(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
+        """M^-1 d."""
+        u, v, w = (_combined(row, (x, y, z)) for row in self.rows)
+        return u, v, w
+
+    def pulled(self, g: Vec3) -> Vec3:
+        """The gradient outside, M^-T g."""
+        columns = (tuple(row[i] for row in self.rows) for i in range(3))
+        return type(g)(*(_combined(column, (g.x, g.y, g.z)) for column in columns))
+
+
+def _combined(weights: tuple[Any, ...], terms: tuple[Any, ...]) -> Any:
+    """The weighted sum, without what is known to be nothing."""
+    total: Any = None
+    for weight, term in zip(weights, terms, strict=True):
+        if _is(weight, 0.0):
+            continue
+        one = term if _is(weight, 1.0) else term * weight
+        total = one if total is None else total + one
+    return total
+
+
+def _is(x: Any, number: float) -> bool:
+    return isinstance(x, float) and x == number

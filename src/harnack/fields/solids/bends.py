@@ -1,0 +1,239 @@
+"""Solids twisted and tapered: maps that bend lines."""
+
+from __future__ import annotations
+
+import abc
+import copy
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from harnack.arithmetic import Jet, cos, sin
+from harnack.backend.extrema import fmax, fmin
+from harnack.enclosures import Lipschitz, Promise
+from harnack.fields.field import Field
+from harnack.fields.formula import prepared_numbers
+from harnack.fields.solids.solid import Shape, Solid
+from harnack.geometry import Ball, Box
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Real, Vec3
+    from harnack.geometry import Volume
+
+from harnack.fields.solids.maps import AXES, Map, axis_index
+
+
+class Bend(Map):
+    """A map that does not keep lines straight, of solids with a formula.
+
+    axis: the coordinate along which it changes.
+    """
+
+    def of(self, solid: Solid) -> Solid:
+        solid.formula(*Jet.at_point(_probe()))  # says early what has no formula
+        return Bent(solid, self)
+
+    @abc.abstractmethod
+    def local(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
+        """The point that is mapped to (x, y, z)."""
+
+    @abc.abstractmethod
+    def volume(self, volume: Volume | None) -> Volume | None:
+        """A volume that holds the image of another one; None if none is known."""
+
+    @abc.abstractmethod
+    def stretch(self, p: Vec3) -> tuple[Real, Real]:
+        """A Lipschitz constant of `local` on a ball about p, and its radius."""
+
+    @abc.abstractmethod
+    def prepare(self, backend: Backend) -> Bend:
+        """With numbers of the backend."""
+
+
+def _probe() -> Any:
+    from harnack.backend import choose_backend
+
+    return choose_backend("double").Array3f(0.1, 0.2, 0.3)
+
+
+@dataclass(frozen=True, eq=False)
+class Bent(Shape):
+    """A solid under a map that bends lines: its formula at the points that are mapped there.
+
+    No Lipschitz constant of the map is needed for a step: ranges of the local coordinates and of
+    their derivatives along the ray are passed on to the formula.
+    """
+
+    inner: Solid
+    map: Bend
+
+    def __post_init__(self) -> None:
+        if self.inner.domain is not None:
+            domain = self.map.volume(self.inner.domain)
+            object.__setattr__(self, "domain", domain)
+
+    def promises(self, p: Vec3) -> tuple[Promise, ...]:
+        """The Lipschitz constant of the solid times that of the map as far as a little away."""
+        inner = self.inner.lipschitz
+        if inner is None:
+            return ()
+        stretch, radius = self.map.stretch(p)
+        return (Lipschitz(inner * stretch, radius),)
+
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        return self.map.volume(self.inner.hull(level, above=above))
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        return self.inner.formula(*self.map.local(x, y, z))
+
+    def prepare(self, backend: Backend) -> Field:
+        other = copy.copy(self)
+        object.__setattr__(other, "inner", self.inner.prepare(backend))
+        object.__setattr__(other, "map", self.map.prepare(backend))
+        return other
+
+
+@dataclass(frozen=True)
+class Twist(Bend):
+    """Turns by `rate` radians a unit of length along an axis (Hart 1996, equation 50).
+
+    Proof of `stretch`. The derivative of the inverse is a rotation times [[1, 0, -y a], [0, 1, x
+    a], [0, 0, 1]], whose largest singular value is (m + sqrt(m^2 + 4))/2, m = |a| times the
+    distance from the axis. (Hart's equation 51 is too small where a is large.)
+    """
+
+    rate: Any
+    axis: str = "z"
+
+    def __post_init__(self) -> None:
+        axis_index(self.axis)
+        if isinstance(self.rate, float) and not math.isfinite(self.rate):
+            raise ValueError(f"rate must be finite, in radians a unit of length, not {self.rate!r}")
+
+    def local(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
+        u, v, w = _turned((x, y, z), self.axis)
+        angle = w * self.rate
+        c, s = cos(angle), sin(angle)
+        return _turned_back((u * c + v * s, v * c - u * s, w), self.axis)
+
+    def volume(self, volume: Volume | None) -> Volume | None:
+        found = _cylinder(volume, self.axis)
+        return None if found is None else _box(found[0], found[1], self.axis)
+
+    def stretch(self, p: Vec3) -> tuple[Real, Real]:
+        rate = dr.abs(0 * p.x + self.rate)
+        rho = _from_axis(p, self.axis)
+        radius = 0.25 * rho + 0.25 / rate
+        m = (rho + radius) * rate
+        constant = 0.5 * (m + dr.sqrt(m * m + 4)) * (1 + 1e-5)
+        # Without a twist m is no number.
+        return dr.select(rate > 0, constant, 1), dr.select(rate > 0, radius, dr.inf)
+
+    def prepare(self, backend: Backend) -> Twist:
+        return prepared_numbers(self, backend)
+
+
+@dataclass(frozen=True)
+class Taper(Bend):
+    """Scales cross sections by r, linear along an axis between two places and constant beyond.
+
+    Proof of `stretch`. The derivative of the inverse acts on the radial and the axial direction as
+    [[k, m], [0, 1]], k = 1/r, m = rho |r'|/r^2 at the distance rho from the axis, and on the third
+    as k. Its largest singular value has sigma^2 = (S + sqrt(S^2 - 4 k^2))/2, S = k^2 + m^2 + 1,
+    which grows with k and m: here their largest values. (Hart's equation 49 has min 1/r.)
+    """
+
+    start: tuple[Any, Any]
+    end: tuple[Any, Any]
+    axis: str = "z"
+
+    def __post_init__(self) -> None:
+        axis_index(self.axis)
+        numbers = (*self.start, *self.end)
+        if not all(isinstance(one, float | int) for one in numbers):
+            return
+        if len(numbers) != 4 or not all(math.isfinite(one) for one in numbers):
+            raise ValueError("start and end must be (coordinate, scale), finite numbers")
+        if not self.start[0] < self.end[0]:
+            raise ValueError(f"start must lie before end: {self.start[0]} < {self.end[0]} is wrong")
+        if not (self.start[1] > 0 and self.end[1] > 0):
+            raise ValueError(f"scales must be positive, not {self.start[1]}, {self.end[1]}")
+        for name in ("start", "end"):
+            object.__setattr__(self, name, tuple(float(one) for one in getattr(self, name)))
+
+    def local(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
+        u, v, w = _turned((x, y, z), self.axis)
+        (a, r), (b, s) = self.start, self.end
+        inside = _clamped((w - a) * (1.0 / (b - a)))
+        shrink = 1.0 / (inside * (s - r) + r)
+        return _turned_back((u * shrink, v * shrink, w), self.axis)
+
+    def volume(self, volume: Volume | None) -> Volume | None:
+        found = _cylinder(volume, self.axis)
+        if found is None:
+            return None
+        return _box(found[0] * max(self.start[1], self.end[1]), found[1], self.axis)
+
+    def stretch(self, p: Vec3) -> tuple[Real, Real]:
+        (a, r), (b, s) = ((0 * p.x + u, 0 * p.x + v) for u, v in (self.start, self.end))
+        rho = _from_axis(p, self.axis)
+        radius = 0.25 * rho + 0.25 * (b - a)
+        k = 1 / fmin(r, s)
+        m = (rho + radius) * dr.abs(s - r) / (b - a) * k * k
+        total = k * k + m * m + 1
+        root = dr.sqrt(fmax(total * total - 4 * k * k, 0))
+        return dr.sqrt(0.5 * (total + root)) * (1 + 1e-5), radius
+
+    def prepare(self, backend: Backend) -> Taper:
+        return prepared_numbers(self, backend)
+
+
+def _from_axis(p: Vec3, axis: str) -> Real:
+    u, v, _ = _turned((p.x, p.y, p.z), axis)
+    return dr.sqrt(u * u + v * v)
+
+
+def _clamped(x: Any) -> Any:
+    """x limited to [0, 1]."""
+    if isinstance(x, Jet):
+        return x.maximum(0.0).minimum(1.0)
+    return dr.clip(x, 0, 1)
+
+
+def _turned(p: tuple[Any, Any, Any], axis: str) -> tuple[Any, Any, Any]:
+    """The coordinates in cyclic order, the axis last."""
+    k = AXES[axis]
+    return p[(k + 1) % 3], p[(k + 2) % 3], p[k]
+
+
+def _turned_back(p: tuple[Any, Any, Any], axis: str) -> tuple[Any, Any, Any]:
+    k = AXES[axis]
+    x, y, z = (p[(i - k - 1) % 3] for i in range(3))
+    return x, y, z
+
+
+def _cylinder(volume: Volume | None, axis: str) -> tuple[float, tuple[float, float]] | None:
+    """The radius about an axis, and the range along it, of a cylinder around a volume."""
+    if volume is None:
+        return None
+    low, high = volume.bounds()
+    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+        return None
+    k = AXES[axis]
+    most = np.maximum(np.abs(low), np.abs(high))
+    radius = float(np.hypot(most[(k + 1) % 3], most[(k + 2) % 3])) * (1 + 1e-12)
+    if isinstance(volume, Ball):
+        centre = np.asarray(volume.center, dtype=float)
+        radius = float(np.hypot(centre[(k + 1) % 3], centre[(k + 2) % 3]) + volume.radius)
+        radius *= 1 + 1e-12
+    return radius, (float(low[k]), float(high[k]))
+
+
+def _box(radius: float, span: tuple[float, float], axis: str) -> Box:
+    low = [-radius] * 3
+    high = [radius] * 3
+    low[AXES[axis]], high[AXES[axis]] = span
+    return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]))

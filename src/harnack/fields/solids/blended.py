@@ -1,0 +1,77 @@
+"""Two solids joined with a rounded edge."""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+
+from harnack.arithmetic import Jet
+from harnack.arithmetic.blends import blend_intersection, blend_union
+from harnack.fields.solids.combined import union
+from harnack.fields.solids.solid import Shape, Solid
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend
+    from harnack.geometry import Volume
+
+
+@dataclass(frozen=True, eq=False)
+class Blend(Shape):
+    """The union or intersection of two solids with a fillet: see `arithmetic.blends`.
+
+    Its Lipschitz constant is 2^(1/p) times the larger of the solids' own. A union's fillet stays
+    within the union of the solids where both are at most the radius: within that of the solids
+    grown by the radius.
+    """
+
+    parts: tuple[Solid, Solid]
+    radius: Any
+    power: Any
+    is_union: bool
+
+    def __post_init__(self) -> None:
+        for name, least, value in (("radius", 0.0, self.radius), ("power", 1.0, self.power)):
+            good = isinstance(value, int | float) and math.isfinite(value) and value >= least
+            if not good or value == 0:
+                raise ValueError(f"{name} must be a number above {least:g}, not {value!r}")
+            object.__setattr__(self, name, float(value))
+        for one in self.parts:
+            if not isinstance(one, Solid):  # pyright: ignore[reportUnnecessaryIsInstance]
+                raise TypeError(f"only solids can be blended, not {one!r}")
+            probe_formula(one)
+        constants = [one.lipschitz for one in self.parts]
+        known = all(one is not None for one in constants)
+        lipschitz = 2 ** (1 / self.power) * max(constants) * (1 + 1e-6) if known else None
+        object.__setattr__(self, "lipschitz", lipschitz)
+        object.__setattr__(self, "domain", union(*self.parts).domain)
+
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        whole = union(*self.parts) if self.is_union else self.parts[0] & self.parts[1]
+        # Between the minimum of both and that less the radius; above for an intersection.
+        if self.is_union:
+            return whole.hull(level, above=True) if above else whole.hull(level + self.radius)
+        return whole.hull(level - self.radius, above=True) if above else whole.hull(level)
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        a, b = (one.formula(x, y, z) for one in self.parts)
+        blend = blend_union if self.is_union else blend_intersection
+        return blend(a, b, self.radius, self.power)
+
+    def prepare(self, backend: Backend) -> Solid:
+        other = copy.copy(self)
+        parts = tuple(one.prepare(backend) for one in self.parts)
+        object.__setattr__(other, "parts", parts)
+        # The power stays a literal: ranges of x^p are found by what p is.
+        object.__setattr__(other, "radius", dr.opaque(backend.Float, self.radius))
+        return other
+
+
+def probe_formula(solid: Solid) -> None:
+    """Raises TypeError early for a solid without a formula."""
+    from harnack.backend import choose_backend
+
+    solid.formula(*Jet.at_point(choose_backend("double").Array3f(0.1, 0.2, 0.3)))

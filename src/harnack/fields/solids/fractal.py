@@ -1,0 +1,317 @@
+"""Noise and fractal noise as fields, and shapes that are displaced by them."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
+
+import drjit as dr
+
+from harnack.arithmetic import Interval, Jet
+from harnack.backend import backend_of
+from harnack.backend.extrema import fmax
+from harnack.enclosures import Curvature, Lipschitz
+from harnack.fields.formula import Formula, prepared_numbers
+from harnack.fields.solids.checks import finite, positive
+from harnack.fields.solids.noise import CONSTANTS, CORNERS, Fade, cell_noise, lattice_vector
+from harnack.fields.solids.solid import Shape
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Real, Vec3
+    from harnack.enclosures import Promise
+    from harnack.fields.field import Field
+    from harnack.geometry import Volume
+
+
+@dataclass(frozen=True)
+class FractalNoise(Shape):
+    """The sum of a_i noise(2^i k p), a_i = amplitude 2^(-beta i), over a number of octaves.
+
+    octaves: how many. beta: how fast they fall: 0 for white noise, 1 for 1/f noise, 2 for Brownian
+        motion. frequency: k, points of the lattice a unit of length. seed: which noise; 32 bits.
+    fade: "quintic", with a continuous second derivative, or "cubic", which is Hart's.
+
+    Hart 1996, equations 52 to 55. Its Lipschitz constant is at most the sum of those of the
+    octaves; amplitudes 2^(-beta i) have the Hurst exponent beta, so that the graph has the fractal
+    dimension 3 - beta, where Hart's equation after 53 has 2 + (3 - beta)/2.
+    """
+
+    octaves: int = 6
+    beta: float = 1.0
+    frequency: float = 1.0
+    amplitude: float = 1.0
+    seed: int = 0
+    fade: Fade = "quintic"
+
+    def __post_init__(self) -> None:
+        count, seed = cast("Any", self.octaves), cast("Any", self.seed)
+        if not isinstance(count, int) or not 1 <= count <= 24:
+            raise ValueError(f"octaves must be an integer from 1 to 24, not {count!r}")
+        if not isinstance(seed, int) or not 0 <= seed < 2**32:
+            raise ValueError(f"the seed must be an integer from 0 to 2^32 - 1, not {seed!r}")
+        if self.fade not in CONSTANTS:
+            raise ValueError(f'the fade must be "quintic" or "cubic", not {self.fade!r}')
+        object.__setattr__(self, "beta", finite(self.beta, "beta of noise"))
+        for name in ("frequency", "amplitude"):
+            value = positive(getattr(self, name), f"the {name} of noise")
+            object.__setattr__(self, name, value)
+
+    def _sum(self, power: float) -> float:
+        """The sum of a_i (2^i k)^power, rounded up."""
+        terms = (2.0 ** (i * (power - self.beta)) for i in range(self.octaves))
+        return self.amplitude * self.frequency**power * sum(terms) * (1.0 + 1e-5)
+
+    @property
+    def largest(self) -> float:
+        """A bound of |f|."""
+        return self._sum(0.0) * CONSTANTS[self.fade].largest
+
+    @property
+    def lipschitz(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self._sum(1.0) * CONSTANTS[self.fade].slope
+
+    @property
+    def most_curvature(self) -> float:
+        """A bound of all second derivatives."""
+        return self._sum(2.0) * CONSTANTS[self.fade].curvature
+
+    def prepare(self, backend: Backend) -> Field:
+        made = prepared_numbers(self, backend)
+        constants = (self._sum(1.0) * CONSTANTS[self.fade].slope, self.most_curvature)
+        numbers = {
+            "_constants": tuple(dr.opaque(backend.Float, one) for one in constants),
+            "_falls": dr.opaque(backend.Float, 2.0**-self.beta),
+            "_seed": dr.opaque(backend.UInt32, self.seed),
+        }
+        for name, value in numbers.items():
+            object.__setattr__(made, name, value)
+        return made
+
+    def promises(self, p: Vec3) -> tuple[Promise, ...]:
+        slope, bend = self._data(p.x)["_constants"]
+        return Lipschitz(0 * p.x + slope), Curvature(0 * p.x + bend)
+
+    def _data(self, like: Real) -> dict[str, Any]:
+        made = self if hasattr(self, "_falls") else self.prepare(backend_of(like))
+        return vars(made)
+
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        del level, above
+        return None
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        jets = [one for one in (x, y, z) if isinstance(one, Jet)]
+        if jets:
+            made = [one if isinstance(one, Jet) else jets[0].of(one) for one in (x, y, z)]
+            return self._ranges(made)
+        return self._octaves([x, y, z])[0][0]
+
+    def _octaves(self, q: list[Real], *, each: bool = False) -> list[tuple[Any, Any, Any]]:
+        """Value, gradient and Hessian of the sum, or of each octave with its own."""
+        data = self._data(q[0])
+        scale, amplitude = data["frequency"], data["amplitude"]
+        found: list[tuple[Any, list[Any], list[Any]]] = []
+        for octave in range(self.octaves):
+            place = [one * scale for one in q]
+            whole = [dr.floor(dr.detach(one)) for one in place]
+            t = [a - b for a, b in zip(place, whole, strict=True)]
+            integer = dr.int32_array_t(cast("Any", type(q[0])))
+            natural = dr.uint32_array_t(cast("Any", type(q[0])))
+            base = [natural(integer(one)) for one in whole]
+            seed = data["_seed"] + octave
+            vectors: list[Any] = []
+            for corner in CORNERS:
+                i, j, k = (b + c for b, c in zip(base, corner, strict=True))
+                vectors.append(lattice_vector(i, j, k, seed, q[0]))
+            value, gradient, hessian = cell_noise(self.fade, t, vectors)
+            slope = amplitude * scale
+            found.append(
+                (
+                    amplitude * value,
+                    [slope * one for one in gradient],
+                    [slope * scale * one for one in hessian],
+                )
+            )
+            amplitude, scale = amplitude * data["_falls"], 2 * scale
+        if each:
+            return found
+        total = found[0]
+        for one in found[1:]:
+            total = (
+                total[0] + one[0],
+                [a + b for a, b in zip(total[1], one[1], strict=True)],
+                [a + b for a, b in zip(total[2], one[2], strict=True)],
+            )
+        return [total]
+
+    def _ranges(self, coordinates: list[Jet]) -> Jet:
+        """The jet of the sum, of jets of the coordinates: the sum of those of the octaves."""
+        like = coordinates[0].kind()
+        like = like if coordinates[0].start is None else coordinates[0].width
+        starts = [one if one.start is None else one.start for one in coordinates]
+        at = [0 * like + one.dynamic_value(like).middle for one in starts]
+        off = [0 * like + one.dynamic_value(like).radius for one in starts]
+        data, constants = self._data(at[0]), CONSTANTS[self.fade]
+        unit = 2 * float(dr.epsilon(cast("Any", type(at[0]))))
+        scale, amplitude = data["frequency"], data["amplitude"]
+        total: Jet | None = None
+        for value, gradient, hessian in self._octaves(at, each=True):
+            # Thirty operations a corner; the place in the cell is off by a rounding of the
+            # coordinate, and nothing is known where the lattice is finer than numbers are.
+            place = fmax(fmax(dr.abs(at[0]), dr.abs(at[1])), dr.abs(at[2])) * scale
+            lost = dr.select(place < 2.0**30, unit * place, dr.inf)
+            octave = _Octave(
+                at=at,
+                value=value,
+                gradient=gradient,
+                hessian=hessian,
+                slope=amplitude * scale * constants.slope * (1 + 1e-5),
+                bend=amplitude * scale * scale * constants.curvature * (1 + 1e-5),
+                error=amplitude * (32 * unit + constants.slope * 2 * lost),
+                slope_error=amplitude * scale * (64 * unit + constants.curvature * 2 * lost),
+            )
+            jet = octave.jet(coordinates, starts, _length(off))
+            total = jet if total is None else total + jet
+            amplitude, scale = amplitude * data["_falls"], 2 * scale
+        return cast("Jet", total)
+
+
+class Noise(FractalNoise):
+    """One octave: lattice noise of random unit vectors (Perlin 1985; Hart 1996, equation 52)."""
+
+    def __init__(
+        self,
+        frequency: float = 1.0,
+        amplitude: float = 1.0,
+        *,
+        seed: int = 0,
+        fade: Fade = "quintic",
+    ) -> None:
+        super().__init__(1, 0.0, frequency, amplitude, seed, fade)
+
+
+@dataclass(frozen=True)
+class Displaced(Shape):
+    """A shape with noise added to its function (Hart 1996, appendix F): f + noise <= 0.
+
+    Its Lipschitz constant is the sum of both; its surface is where f is within `largest` of 0.
+    """
+
+    solid: Formula
+    noise: FractalNoise
+
+    def __post_init__(self) -> None:
+        if not isinstance(cast("Any", self.solid), Formula):
+            raise TypeError(
+                f"only shapes with a formula are displaced, not {type(self.solid).__name__}"
+            )
+        if not isinstance(cast("Any", self.noise), FractalNoise):
+            raise TypeError(f"noise must be Noise or FractalNoise, not {self.noise!r}")
+
+    @property
+    def lipschitz(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+        one, two = self.solid.lipschitz, self.noise.lipschitz
+        return None if one is None else one + two
+
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        if not isinstance(self.solid, Shape):
+            return None
+        moved = level - self.noise.largest if above else level + self.noise.largest
+        return self.solid.hull(moved, above=above)
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        return self.solid.formula(x, y, z) + self.noise.formula(x, y, z)
+
+
+@dataclass(frozen=True)
+class _Octave:
+    """One octave around a point.
+
+    at: the point. value, gradient, hessian: there, off by error, slope_error. slope, bend: bounds
+        of the first and second derivatives everywhere.
+    """
+
+    at: list[Real]
+    value: Real
+    gradient: list[Real]
+    hessian: list[Real]
+    slope: Real
+    bend: Real
+    error: Real
+    slope_error: Real
+
+    def jet(self, coordinates: list[Jet], starts: list[Jet], off: Real) -> Jet:
+        """The jet, of jets of the coordinates and of their starts, which are within `off` of the
+        point.
+
+        Proof. At a place within m of the point the gradient differs from that there by at most bend
+        m (mean value theorem), and derivatives along a path follow by the chain rule. The value is
+        that at the start plus the integral of the slope.
+        """
+        wide = self.error + self.slope * off * (1 + 1e-5)
+        value = Interval(self.value - wide, self.value + wide)
+        if coordinates[0].start is None:
+            # At points of space, not on pieces of length 0: the Hessian is known.
+            is_point = len(coordinates[0].first) > 1
+            return self._derivatives(coordinates, off, value, is_point=is_point)
+        start = self._derivatives(starts, off, value, is_point=False)
+        far = [
+            fmax(dr.abs(one.value.high - q), dr.abs(one.value.low - q))
+            for one, q in zip(coordinates, self.at, strict=True)
+        ]
+        distance = _length(far) * (1 + 1e-5)
+        wide = wide + self.slope * distance
+        wider = Interval(self.value - wide, self.value + wide)
+        piece = self._derivatives(coordinates, distance, wider, is_point=False)
+        return piece.anchored(start, coordinates[0].width)
+
+    def _derivatives(self, jets: list[Jet], reach: Real, value: Interval, *, is_point: bool) -> Jet:
+        change = self.bend * reach + self.slope_error
+        parts = [
+            Interval(fmax(g - change, -self.slope), -fmax(-g - change, -self.slope))
+            for g in self.gradient
+        ]
+        first: list[Interval] = []
+        speeds: list[Real] = []
+        for i in range(len(jets[0].first)):
+            rates = [one.first[i] for one in jets]
+            speed = _length([0 * self.value + r.largest for r in rates]) * (1 + 1e-5)
+            along = _sum([g * r for g, r in zip(parts, rates, strict=True)])
+            most = self.slope * speed
+            first.append(Interval(fmax(along.low, -most), -fmax(-along.high, -most)))
+            speeds.append(speed)
+        rounded = 64 * 2 * float(dr.epsilon(cast("Any", type(self.value)))) * self.bend
+        second: list[Interval] = []
+        for k, (i, j) in enumerate(jets[0].pairs()):
+            bent = self.bend * speeds[i] * speeds[j]
+            own = Interval(-bent, bent)
+            if is_point:
+                own = _quadratic(
+                    [Interval(h - rounded, h + rounded) for h in self.hessian], jets, i, j
+                )
+            along = [g * one.second[k] for g, one in zip(parts, jets, strict=True)]
+            second.append(_sum([own, *along]))
+        return Jet(value, tuple(first), tuple(second))
+
+
+def _sum(parts: list[Interval]) -> Interval:
+    total = parts[0]
+    for one in parts[1:]:
+        total = total + one
+    return total
+
+
+def _quadratic(hessian: list[Interval], jets: list[Jet], i: int, j: int) -> Interval:
+    """x_i^T H x_j."""
+    terms: list[Interval] = []
+    for m, (a, b) in enumerate(itertools.combinations_with_replacement(range(3), 2)):
+        across = jets[a].first[i] * jets[b].first[j]
+        if a != b:
+            across = across + jets[b].first[i] * jets[a].first[j]
+        terms.append(hessian[m] * across)
+    return _sum(terms)
+
+
+def _length(parts: list[Real]) -> Real:
+    return dr.sqrt(parts[0] * parts[0] + parts[1] * parts[1] + parts[2] * parts[2])

@@ -1,0 +1,373 @@
+"""Solids made of any field: where its values lie on one side of a level, or between two."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, cast
+
+import drjit as dr
+import numpy as np
+
+from harnack.arithmetic import Interval, Jet
+from harnack.backend import backend_of
+from harnack.backend.extrema import fmax, fmin
+from harnack.backend.lengths import length
+from harnack.enclosures import Curvature, Enclosure, Gaps, HarmonicBall
+from harnack.fields.field import Field
+from harnack.fields.formula import Formula
+from harnack.fields.look import Look, Path, Sample
+from harnack.fields.solids.affine import without_balls
+from harnack.fields.solids.combined import Complement, Offset, negated_sample
+from harnack.fields.solids.solid import Solid
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.geometry import Volume
+
+
+def solid(
+    field: Field,
+    *,
+    below: float | None = None,
+    above: float | None = None,
+    between: tuple[float, float] | None = None,
+    around: tuple[float, float] | None = None,
+) -> Solid:
+    """The solid where a field's values are below or above a level, or between two.
+
+    around: (level, half_width): where the value is at most half_width from the level. It is the
+        one for angle-valued fields, such as a thickened surface that spans a knot.
+
+        hk.solid(hk.Gyroid(1.0), between=(-0.3, 0.3)) & hk.Torus(0.8, 0.3)
+
+    Raises:
+        ValueError: none, or several, of these given; bad numbers; a field that jumps across sheets,
+            or an angle-valued one without `around`.
+    """
+    given = [one for one in (below, above, between, around) if one is not None]
+    if len(given) != 1:
+        raise ValueError("give exactly one of below=, above=, between=, around=")
+    if not isinstance(field, Field):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise TypeError(
+            f"field must be a harnack field, such as harnack.Gyroid(1.0), not {field!r}"
+        )
+    if field.has_sheets:
+        raise ValueError(
+            f"{type(field).__name__} jumps across sheets: values on both sides of a level may meet "
+            "without any in between, so it bounds no solid"
+        )
+    numbers = between or around or tuple(given)
+    if not all(isinstance(one, int | float) and math.isfinite(one) for one in numbers):
+        raise ValueError(f"levels must be finite numbers, not {given[0]!r}")
+    if field.period is not None and around is None:
+        raise ValueError(
+            f"{type(field).__name__} is angle-valued: no value is below another. Use "
+            "around=(level, half_width) for the solid near a level"
+        )
+    inside = Region(field)
+    if below is not None:
+        return Offset(inside, float(below))
+    if above is not None:
+        return Complement(Offset(inside, float(above)))
+    low, high = (float(one) for one in cast("tuple[float, float]", numbers))
+    if around is not None:
+        if not high > 0:
+            raise ValueError(f"half_width must be positive, not {high:g}")
+        if field.period is not None and not 2 * high < field.period:
+            raise ValueError(f"half_width must be below {field.period / 2:g}, half of the period")
+        return Near(field, low, high)
+    if not low < high:
+        raise ValueError(f"between must be (low, high) with low < high, not {between}")
+    return Near(field, 0.5 * (low + high), 0.5 * (high - low))
+
+
+class _OfField(Solid):
+    """A solid that looks at a field of any kind."""
+
+    field: Field
+
+    def _take_over(self) -> None:
+        """What the field is and needs."""
+        for name in ("has_detail", "coarsest_detail", "overstep"):
+            object.__setattr__(self, name, getattr(self.field, name))
+        domain = None if self.field.is_entire else self.field.domain
+        object.__setattr__(self, "domain", domain)
+
+    def leaves(self, change: Callable[[Solid], Solid]) -> Solid:
+        return change(self)
+
+    def prepare(self, backend: Backend) -> Solid:
+        return self._of(self.field.prepare(backend))
+
+    def at_detail(self, detail: Real) -> Field:
+        return self._of(self.field.at_detail(detail))
+
+    def _of(self, field: Field) -> Solid:
+        other = copy.copy(self)
+        object.__setattr__(other, "field", field)
+        return other
+
+
+@dataclass(frozen=True, eq=False)
+class Region(_OfField):
+    """The points where a field is at most 0."""
+
+    field: Field
+
+    def __post_init__(self) -> None:
+        self._take_over()
+
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        if self.field.is_entire:
+            return None
+
+        def is_inside(value: float) -> bool:
+            return value >= level if above else value <= level
+
+        return bounded_side(self.field, (level,), is_inside)
+
+    def evaluate(self, p: Vec3) -> Sample:
+        return self.field.evaluate(p)
+
+    def differentiable_value(self, p: Vec3) -> Real:
+        return self.field.differentiable_value(p)
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        return self.field.hessian(p)
+
+    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
+        return self.field.look(path, t, ahead, back)
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        if isinstance(self.field, Formula):
+            return self.field.formula(x, y, z)
+        if not isinstance(x, Jet):
+            return self.differentiable_value(_vector(x, y, z))
+        return jet_of_field(self.field, x, y, z)
+
+
+def bounded_side(
+    field: Field, levels: tuple[float, ...], is_inside: Callable[[float], bool]
+) -> Volume | None:
+    """A volume that holds all points inside, if there is one; the field's domain where not.
+
+    Proof. Level sets lie in `extent`, which is convex; if it has bounds, what is outside of it is
+    connected and meets no level, so that one point tells on which side all of it is.
+    """
+    extent = field.extent(levels)
+    if extent is None or field.domain is not None:
+        return field.domain
+    low, high = extent.bounds()
+    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+        return None
+    beyond = high + (high - low) + 1e-3
+    value = float(field.value(beyond, precision="double"))
+    return None if is_inside(value) or not math.isfinite(value) else extent
+
+
+def _vector(x: Real, y: Real, z: Real) -> Vec3:
+    return backend_of(x).Array3f(x, y, z)
+
+
+def jet_of_field(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
+    """The jet of a field whose second derivatives are bounded near a point.
+
+    Proof. Let |f''| <= H within r of q, the point where the piece starts (or the point itself), and
+    let coordinates be within m of q, on the piece and where they are known up to rounding. If m <=
+    r, the gradient on the piece differs from that at q by at most H m, by the mean value theorem,
+    and derivatives along the path follow by the chain rule; the value is that at the start plus the
+    length times the derivative. Where m > r nothing is known of derivatives.
+
+    Raises:
+        TypeError: the field promises no bound of its second derivatives.
+    """
+    coordinates = (x, y, z)
+    starts = [one if one.start is None else one.start for one in coordinates]
+    q = _vector(*(0 * x.width + one.value.middle for one in starts))
+    sample = field.evaluate(q)
+    bound, radius = _second_derivatives(field, sample)
+    off = length(type(q)(*(0 * x.width + one.value.radius for one in starts)))
+
+    def derivatives(
+        jets: list[Jet], distance: Real
+    ) -> tuple[tuple[Interval, ...], tuple[Interval, ...]]:
+        most = dr.select(distance <= radius, bound, dr.inf)
+        change = most * distance * (1 + 1e-5) + sample.gradient_error
+        slopes = [Interval(one - change, one + change) for one in sample.gradient]
+        first = tuple(
+            _sum(g * one.first[i] for g, one in zip(slopes, jets, strict=True))
+            for i in range(len(x.first))
+        )
+        speeds = [
+            length(type(q)(*(0 * x.width + one.first[i].largest for one in jets)))
+            for i in range(len(x.first))
+        ]
+        second: list[Interval] = []
+        for k, (i, j) in enumerate(_pairs(len(x.first), len(x.second))):
+            bent = most * speeds[i] * speeds[j] * (1 + 1e-5)
+            along = _sum(g * one.second[k] for g, one in zip(slopes, jets, strict=True))
+            second.append(along + Interval(-bent, bent))
+        return first, tuple(second)
+
+    steep = length(sample.gradient) + sample.gradient_error
+    unit = 2 * float(dr.epsilon(type(q.x)))
+    wide = sample.error + 8 * unit * dr.abs(sample.value)
+    wide = (wide + off * (steep + dr.select(off <= radius, bound, dr.inf) * off)) * (1 + 1e-5)
+    value = Interval(sample.value - wide, sample.value + wide)
+    first, second = derivatives(starts, off)
+    start = Jet(value, first, second)
+    if x.start is None:
+        return start
+    moves = (
+        fmax(dr.abs(one.value.high - m), dr.abs(one.value.low - m))
+        for one, m in zip(coordinates, q, strict=True)
+    )
+    first, second = derivatives(list(coordinates), length(type(q)(*moves)) * (1 + 1e-5))
+    span = Interval(0 * x.width, 0 * value.low + x.width)
+    return Jet(value + first[0] * span, first, second, start, x.width)
+
+
+def _sum(terms: Iterable[Interval]) -> Interval:
+    total = Interval(0.0, 0.0)
+    for one in terms:
+        total = total + one
+    return total
+
+
+def _pairs(n: int, count: int) -> list[tuple[int, int]]:
+    """The places of `Jet.second`."""
+    return [(i, j) for i in range(n) for j in range(i, n)][:count]
+
+
+def _second_derivatives(field: Field, sample: Sample) -> tuple[Real, Real]:
+    """A bound of all second derivatives, and the radius within which it holds."""
+    for one in without_balls(sample.promises, sample):
+        is_ball = one not in sample.promises
+        if isinstance(one, Curvature):
+            everywhere = isinstance(one.radius, float) and math.isinf(one.radius)
+            if is_ball or everywhere:
+                return one.constant, one.radius
+    raise TypeError(
+        f"{type(field).__name__} promises neither a HarmonicBall with both ends nor a Curvature "
+        "without a radius, and has no formula, so it cannot be blended, twisted or tapered; "
+        "move it by moved, rotated, scaled or transformed, and join it by |, & and -"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Near(_OfField):
+    """The points where a field is at most half_width from a level: |f - level| - half_width.
+
+    Of an angle-valued field from the level plus any multiple of the period.
+
+    Proof. It moves as f does but for its sign, so it has a value v as long as f keeps off level + v
+    + half_width and level - v - half_width, and these plus multiples of the period (`Folded`).
+    """
+
+    field: Field
+    level: float
+    half_width: float
+
+    def __post_init__(self) -> None:
+        self._take_over()
+
+    def prepare(self, backend: Backend) -> Solid:
+        other = self._of(self.field.prepare(backend))
+        for name in ("level", "half_width"):
+            object.__setattr__(other, name, dr.opaque(backend.Float, getattr(self, name)))
+        return other
+
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        ends = tuple(self.level + sign * (self.half_width + level) for sign in (-1, 1))
+        if above or (self.field.is_entire and self.field.period is None):
+            return self.domain
+        return bounded_side(self.field, ends, self._is_inside)
+
+    def _is_inside(self, value: float) -> bool:
+        offset, period = value - self.level, self.field.period
+        if period is not None:
+            offset -= period * round(offset / period)
+        return abs(offset) <= self.half_width
+
+    def evaluate(self, p: Vec3) -> Sample:
+        return self._folded(self.field.evaluate(p))[0]
+
+    def differentiable_value(self, p: Vec3) -> Real:
+        offset = self._offset(self.field.differentiable_value(p))
+        return dr.abs(offset) - self.half_width
+
+    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
+        look = self.field.look(path, t, ahead, back)
+        sample, offset = self._folded(look.sample)
+
+        def folded(enclosures: tuple[Enclosure, ...]) -> tuple[Enclosure, ...]:
+            return tuple(Folded(one, offset, self.field.period) for one in enclosures)
+
+        slope = dr.mulsign(look.slope, offset)
+        return Look(sample, folded(look.ahead), folded(look.back), slope, look.growth)
+
+    def _offset(self, value: Real) -> Real:
+        """f - level, reduced to half a period on either side."""
+        offset, period = value - self.level, self.field.period
+        return offset if period is None else offset - period * dr.round(offset / period)
+
+    def _folded(self, sample: Sample) -> tuple[Sample, Real]:
+        offset = self._offset(sample.value)
+        turned = negated_sample(sample)
+        below = offset < 0
+        unit = 2 * float(dr.epsilon(type(offset)))
+        rounding = 8 * unit * (dr.abs(sample.value) + abs(self.level) + self.half_width)
+        known = tuple(one for one in sample.known if not isinstance(one, HarmonicBall | Curvature))
+        return replace(
+            sample,
+            value=dr.abs(offset) - self.half_width,
+            gradient=dr.select(below, turned.gradient, sample.gradient),
+            error=sample.error + rounding,
+            normal=None,
+            known=known,
+            weaker=(),
+        ), offset
+
+
+@dataclass(frozen=True)
+class Folded(Enclosure):
+    """The movement of |r| from that of r, r known modulo a period (reduced to half of it about 0).
+
+    Proof. |r| rises to |r| + g, or falls to |r| - g >= 0, only where r reaches plus or minus that,
+    or either plus a multiple of the period. Those nearest to r above and below are levels of r.
+    Where |r| - g < 0, or |r| + g is beyond half a period, there is no such place.
+    """
+
+    inner: Enclosure
+    offset: Real
+    period: float | None
+
+    def step(self, gaps: Gaps) -> Real:
+        return self.inner.step(self._gaps(gaps))
+
+    def covers(self, gaps: Gaps, length: Real) -> Mask:
+        return self.inner.covers(self._gaps(gaps), length)
+
+    def _gaps(self, gaps: Gaps) -> Gaps:
+        """As far as r must go, for r >= 0 with s = |r| (else mirrored), to A = s + up or B = s -
+        down: upwards to A or P - B, downwards to B or -A."""
+        size, none = dr.abs(self.offset), type(self.offset)(dr.inf)
+        has_below = gaps.down <= size * _SLACK
+        upwards, downwards = gaps.up, 2 * size + gaps.up
+        if self.period is not None:
+            has_above = size + gaps.up <= 0.5 * self.period * _SLACK
+            upwards, downwards = (dr.select(has_above, one, none) for one in (upwards, downwards))
+            around = self.period - 2 * size + gaps.down
+            upwards = dr.select(has_below, fmin(around, upwards), upwards)
+        downwards = dr.select(has_below, fmin(gaps.down, downwards), downwards)
+        positive = self.offset >= 0
+        return Gaps(
+            dr.select(positive, downwards, upwards), dr.select(positive, upwards, downwards)
+        )
+
+
+# What rounding may have done to the question whether there is such a place.
+_SLACK = 1.0 + 1e-5

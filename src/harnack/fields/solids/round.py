@@ -1,0 +1,245 @@
+"""Planes, and shapes that are round: sphere, ellipsoid, cylinder, cone, capsule, torus.
+
+Each is its signed distance, or a bound of it, with the Lipschitz constant 1 (Hart 1996, appendix
+A): negative inside, and no larger than the distance outside. Shapes lie at the origin with their
+axis along z; move and turn them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from harnack.arithmetic import cos, maximum, minimum, norm, sin
+from harnack.arithmetic.blends import corner
+from harnack.fields.solids.checks import ball_around, box_around, finite, positive, triple
+from harnack.fields.solids.solid import Shape
+
+if TYPE_CHECKING:
+    from harnack.geometry import Volume
+
+Point = tuple[float, float, float]
+
+
+def _set(shape: Any, name: str, value: Any) -> None:
+    object.__setattr__(shape, name, value)
+
+
+@dataclass(frozen=True)
+class Plane(Shape):
+    """The half-space n.x <= distance, n the normal made a unit vector.
+
+    The signed distance (Hart, equation 23): its gradient is n, so that its Lipschitz constant is 1.
+    """
+
+    # The unit vector is rounded.
+    lipschitz = 1.0 + 1e-6
+
+    normal: Point = (0.0, 0.0, 1.0)
+    distance: float = 0.0
+
+    def __post_init__(self) -> None:
+        normal = triple(self.normal, "the normal of a plane")
+        length = math.hypot(*normal)
+        if length == 0.0:
+            raise ValueError("the normal of a plane must not be zero")
+        _set(self, "normal", tuple(v / length for v in normal))
+        _set(self, "distance", finite(self.distance, "the distance of a plane"))
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        a, b, c = self.normal
+        return x * a + y * b + z * c - self.distance
+
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        del level, above
+        return None
+
+
+@dataclass(frozen=True)
+class Sphere(Shape):
+    """The ball |x - center| <= radius.
+
+    The signed distance (Hart, equation 24): by the triangle inequality the constant is 1.
+    """
+
+    radius: float = 1.0
+    center: Point = (0.0, 0.0, 0.0)
+
+    lipschitz = 1.0
+
+    def __post_init__(self) -> None:
+        _set(self, "radius", positive(self.radius, "the radius of a sphere"))
+        _set(self, "center", triple(self.center, "the center of a sphere"))
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        a, b, c = self.center
+        return norm(x - a, y - b, z - c) - self.radius
+
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        if above:
+            return None
+        return ball_around(self.center, self.radius + level)
+
+
+@dataclass(frozen=True)
+class Ellipsoid(Shape):
+    """The points with |(x/a, y/b, z/c)| <= 1, radii = (a, b, c).
+
+    f = m (|(x/a, y/b, z/c)| - 1) with m the least radius. Proof of the constant 1: the norm has the
+    constant 1 and the stretched coordinates 1/m; it is attained along the shortest axis. So f is no
+    larger than the distance, which no formula in closed form gives.
+    """
+
+    radii: Point = (1.0, 1.0, 1.0)
+
+    lipschitz = 1.0 + 1e-6  # quotients of radii are rounded
+
+    def __post_init__(self) -> None:
+        radii = triple(self.radii, "the radii of an ellipsoid", all_positive=True)
+        _set(self, "radii", radii)
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        a, b, c = self.radii
+        return (norm(x / a, y / b, z / c) - 1.0) * minimum(a, b, c)
+
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        if above:
+            return None
+        a, b, c = self.radii
+        size = 1.0 + level / min(self.radii)
+        return box_around((size * a, size * b, size * c))
+
+
+@dataclass(frozen=True)
+class Cylinder(Shape):
+    """The points within `radius` of the z axis, and of |z| <= half_height if that is given.
+
+    Without ends the signed distance |(x, y)| - r (Hart, equation 25). With ends the distances to
+    the side and to the ends have gradients at right angles, so that `corner` gives the signed
+    distance; its Lipschitz constant is 1.
+    """
+
+    radius: float = 1.0
+    half_height: float | None = None
+
+    lipschitz = 1.0
+
+    def __post_init__(self) -> None:
+        _set(self, "radius", positive(self.radius, "the radius of a cylinder"))
+        if self.half_height is not None:
+            height = positive(self.half_height, "half the height of a cylinder")
+            _set(self, "half_height", height)
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        side = norm(x, y) - self.radius
+        return side if self.half_height is None else corner(side, abs(z) - self.half_height)
+
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        if above:
+            return None
+        if self.half_height is None:
+            return None
+        r, most = self.radius, level
+        return box_around((r + most, r + most, self.half_height + most))
+
+
+@dataclass(frozen=True)
+class DoubleCone(Shape):
+    """The double cone around the z axis whose sides make an angle with it, in radians.
+
+    f = |(x, y)| cos(angle) - |z| sin(angle) (Hart, equation 26). Its gradient is a unit vector off
+    the axis and the plane z = 0: the constant is 1. It is the signed distance where the nearest
+    point of a side is not beyond the apex, and smaller elsewhere.
+    """
+
+    angle: float = math.pi / 6
+
+    lipschitz = 1.0 + 1e-6  # sine and cosine are rounded
+
+    def __post_init__(self) -> None:
+        angle = finite(self.angle, "the angle of a cone")
+        if not 0.0 < angle < math.pi / 2:
+            raise ValueError(
+                "the angle of a cone between axis and side must be between 0 and pi/2, "
+                f"not {self.angle!r}"
+            )
+        _set(self, "angle", angle)
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        return norm(x, y) * cos(self.angle) - abs(z) * sin(self.angle)
+
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        del level, above
+        return None
+
+
+@dataclass(frozen=True)
+class Capsule(Shape):
+    """The points within `radius` of the segment from start to end.
+
+    The signed distance |q - max(0, min(1, t)) (end - start)| - r, q = x - start, t the parameter of
+    the nearest point of the line. As a distance of a set it has the constant 1.
+    """
+
+    start: Point = (0.0, 0.0, -1.0)
+    end: Point = (0.0, 0.0, 1.0)
+    radius: float = 0.5
+
+    lipschitz = 1.0
+
+    def __post_init__(self) -> None:
+        start = triple(self.start, "the start of a capsule")
+        end = triple(self.end, "the end of a capsule")
+        if start == end:
+            raise ValueError(f"a capsule from {start} to the same point is a sphere: use Sphere")
+        _set(self, "start", start)
+        _set(self, "end", end)
+        _set(self, "radius", positive(self.radius, "the radius of a capsule"))
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        axis = [b - a for a, b in zip(self.start, self.end, strict=True)]
+        q = [v - a for v, a in zip((x, y, z), self.start, strict=True)]
+        square = axis[0] * axis[0] + axis[1] * axis[1] + axis[2] * axis[2]
+        t = (q[0] * axis[0] + q[1] * axis[1] + q[2] * axis[2]) / square
+        # Along the axis what lies beyond the ends, and across it the distance from the line.
+        size = norm(*axis)
+        beyond = maximum(-t, t - 1.0, 0.0) * size
+        across = norm(*(v - t * a for v, a in zip(q, axis, strict=True)))
+        return norm(across, beyond) - self.radius
+
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        if above:
+            return None
+        r = self.radius + level
+        pairs = list(zip(self.start, self.end, strict=True))
+        half = [abs(b - a) / 2 + r for a, b in pairs]
+        middle = tuple((a + b) / 2 for a, b in pairs)
+        return box_around((half[0], half[1], half[2]), middle)
+
+
+@dataclass(frozen=True)
+class Torus(Shape):
+    """The points within `minor` of the circle of radius `major` around the z axis.
+
+    The signed distance | (|(x, y)| - R, z) | - r (Hart, equation 27); a distance of a set, so its
+    constant is 1. With minor > major (a spindle) it is a bound inside.
+    """
+
+    major: float = 1.0
+    minor: float = 0.25
+
+    lipschitz = 1.0
+
+    def __post_init__(self) -> None:
+        _set(self, "major", positive(self.major, "the major radius of a torus"))
+        _set(self, "minor", positive(self.minor, "the minor radius of a torus"))
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        return norm(norm(x, y) - self.major, z) - self.minor
+
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        if above:
+            return None
+        r = self.minor + level
+        return box_around((self.major + r, self.major + r, r))

@@ -1,0 +1,266 @@
+"""Contact with a level: what makes crossings of hits, each of them counted once.
+
+A first hit ends a ray where f is within the tolerance of a level. A ray that goes on has to get off
+the surface with a proof, and rounding, or a ray that runs along the surface, must not make several
+crossings of one. So a level that has been reached counts as lying the tolerance *beyond*, until f
+has left the tolerance around it (hysteresis): there is always a gap to it, and steps stay long.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import drjit as dr
+
+from harnack.backend.extrema import fmax, fmin
+from harnack.enclosures import Gaps, TargetLevels
+
+if TYPE_CHECKING:
+    from typing import Any
+
+    from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.fields.sheets import Crossing
+
+# The tolerance is at least so many roundings of f, and at most this part of the distance in value
+# between two levels, so that there is no doubt which of them was reached.
+_ROUNDINGS = 8.0
+_OF_SPACING = 0.25
+# The farthest that a ray in contact looks for the next level, as a part of that distance.
+_HALFWAY = 0.5
+# A crossing is over where f is beyond the level by this part of the tolerance. The rest is the gap
+# that a ray in contact always has.
+_PASSED = 0.5
+# Trials aim at this part of the way that the level beyond is farther: where the crossing is over,
+# and the gap that is left tells by far on which side f is.
+AIM = 0.75
+# A sample in contact has a truncation error this much smaller than what makes a hit.
+CLOSER = 0.5
+# Rounds of the search for the root of a cubic.
+_ROUNDS = 4
+
+
+@dataclass(frozen=True)
+class Contact:
+    """What a ray knows of the level that it has reached last.
+
+    side: of that level, where the ray is: 1 where f is larger, -1 where it is smaller; 0 as long as
+        the ray has not been seen off the level at which it started. Of no meaning, but for being 0
+        or not, while there is no contact.
+    is_touching: whether f is, or may still be, within the tolerance of that level.
+    root: where f took the level last, between two points looked at where it is on different
+        sides; where the contact began if it began beyond the level.
+    gradient: of f at the root.
+    """
+
+    side: Real
+    is_touching: Mask
+    root: Real
+    gradient: Vec3
+
+    @classmethod
+    def none(cls, backend: Backend) -> Contact:
+        """Before anything was looked at."""
+        return cls(backend.Float(0), backend.Bool(False), backend.Float(0), backend.Array3f(0))
+
+
+@dataclass(frozen=True)
+class Accepted:
+    """A sample at an accepted point of a ray.
+
+    t, value, gradient, slope: there. before: the same of the last accepted point, as (t, value,
+    slope, gradient). total_error: of the value. is_near: whether it would be a hit. band: the
+    tolerance in value (`Hysteresis.band`). is_end: whether the ray ends there.
+    """
+
+    t: Real
+    value: Real
+    gradient: Vec3
+    slope: Real
+    before: tuple[Real, Real, Real, Vec3]
+    total_error: Real
+    is_near: Mask
+    band: Real
+    is_end: Mask
+
+
+@dataclass(frozen=True)
+class Hysteresis:
+    """The rule by which contacts begin, are crossings, and end.
+
+    Let W be the largest of the tolerances in value (`band`) at the points of a contact that are
+    looked at. What is guaranteed:
+
+    1. *Nothing is missed.* If f is farther than W from a level on one side at some point of the
+       ray, and on the other side at a later one, there is a crossing between them. Proof: in
+       contact on the side of larger values, the ray is proved free of `level - band`, the band
+       being that of the last point looked at, as a ray is proved free of a level before contact
+       (`March.advance`). So f > level - W as long as no crossing was noticed. Before the contact,
+       f was proved not to take the level at all.
+    2. *Nothing is counted twice.* A crossing is noticed at a point where f is proved to be on the
+       other side of the level, `band/2` being more than its error; the next one only where it is
+       proved to be on the first side again. So crossings of a level alternate, and between two that
+       are noticed f takes the level. A ray that starts within the tolerance of a level is on
+       neither side until it is seen half the tolerance off it: that it leaves is no crossing.
+    3. *Nothing sticks.* In contact, f is `band/2` or more away from the level beyond and no further
+       than its error, so the gap that steps are solved for is at least a fifth of the band.
+
+    The lift of an angle-valued f. Before contact, f lies between two neighbouring levels of the
+    ladder, and in contact it is proved to stay nearer to the level reached than to all others: the
+    window is less than a period wide, and the value tells where in it f is. (Looking back from a
+    point takes the window there, and the two stretches proved share a point, so their lifts agree.)
+
+    levels: all of them. spacing: the distance in value between the two closest, inf for one.
+    is_free_before, is_free_after: whether the ray is proved free before the part of it that is
+        marched and behind it, by where the surface lies. Then f stays on the side of a level that
+        it is on at that end, and that it is more than its error off the level there is enough.
+    start, rounding: where the part begins, and how far off a sheet rounding may have put a ray that
+        starts on it.
+    """
+
+    levels: TargetLevels
+    spacing: Real
+    is_free_before: Mask
+    is_free_after: Mask
+    start: Real
+    rounding: Real
+
+    @classmethod
+    def of(
+        cls,
+        levels: TargetLevels,
+        free: tuple[Mask, Mask],
+        start: Real,
+        rounding: Real,
+    ) -> Hysteresis:
+        """The rule for some levels. free: before and after the part of the ray."""
+        period = levels.period
+        spacing: Real = dr.inf if period is None else period
+        for k, one in enumerate(levels.values):
+            for other in levels.values[:k]:
+                apart = dr.abs(one - other)
+                if period is not None:
+                    apart = apart - period * dr.floor(apart / period)
+                    apart = fmin(apart, period - apart)
+                spacing = fmin(spacing, dr.select(apart > 0, apart, dr.inf))
+        return cls(levels, spacing, *free, start, rounding)
+
+    def within(self, within: Real) -> Real:
+        """How near in value a level must be for contact, where the tolerance asks for `within`."""
+        return fmin(within, _OF_SPACING * self.spacing)
+
+    def band(self, within: Real, rounding: Real) -> Real:
+        """The tolerance in value around a level: `within`, or what rounding leaves open."""
+        return fmin(fmax(within, _ROUNDINGS * rounding), _OF_SPACING * self.spacing)
+
+    def gaps(
+        self, contact: Contact, value: Real, gaps: Gaps, band: Real, part: float = 1.0
+    ) -> Gaps:
+        """How far f may move, given the gaps to the true levels.
+
+        In contact the level counts as lying the band beyond, and steps end halfway to the next
+        level; or that part of it.
+        """
+        x, far = -self.levels.to_nearest(value), part * _HALFWAY * self.spacing
+        band = part * band
+        below = dr.select(contact.side < 0, far, band)
+        above = dr.select(contact.side > 0, far, band)
+        return Gaps(
+            dr.select(contact.is_touching, fmax(below + x, 0), gaps.down),
+            dr.select(contact.is_touching, fmax(above - x, 0), gaps.up),
+        )
+
+    def update(self, now: Contact, active: Mask, seen: Accepted) -> tuple[Contact, Mask]:
+        """The contact behind an accepted point, and whether the ray has crossed the level."""
+        x = -self.levels.to_nearest(seen.value)
+        touching = now.is_touching
+        side = dr.select(touching, now.side, self._side(now, seen, x))
+
+        # The root, if f has changed sides since the last point.
+        t, value, slope, gradient = seen.before
+        x_before = -self.levels.to_nearest(value)
+        passes = active & touching & (side * x_before > 0) & (side * x <= 0)
+        share = root_between(x_before, x, (seen.t - t) * slope, (seen.t - t) * seen.slope)
+        begins = active & ~touching & seen.is_near
+        root = dr.select(passes, t + share * (seen.t - t), dr.select(begins, seen.t, now.root))
+        at_root = dr.select(begins, seen.gradient, now.gradient)
+        at_root = dr.select(passes, dr.lerp(gradient, seen.gradient, share), at_root)
+
+        # Is it well beyond, or has it left?
+        is_first = (now.side == 0) & ~touching
+        stays = (is_first & self.is_free_before) | (seen.is_end & self.is_free_after)
+        enough = dr.select(stays, 0, _PASSED * seen.band)
+        is_off = dr.abs(x) > fmax(enough, seen.total_error)
+        crosses = active & touching & is_off & (side * x < 0)
+        settles = active & is_off & (side == 0)
+        side = dr.select(settles | crosses, dr.select(x > 0, type(x)(1), -1), side)
+        is_touching = dr.select(touching, dr.abs(x) <= seen.band, seen.is_near)
+        return Contact(
+            dr.select(active, side, now.side),
+            dr.select(active, is_touching, touching),
+            root,
+            at_root,
+        ), crosses
+
+    def jump(
+        self, now: Contact, active: Mask, seen: Accepted, ahead: Crossing, d: Vec3
+    ) -> tuple[Contact, Mask]:
+        """The contact behind the sheet `ahead`, and whether the jump of f there crosses the level.
+
+        now: the contact at an accepted point just before the sheet. d: the direction of the ray.
+        Of a field with sheets there is one level. A ray that starts on a sheet is on neither side.
+        """
+        x = -self.levels.to_nearest(seen.value)
+        one = type(x)(1)
+        side = dr.select(now.is_touching, now.side, dr.select(x > 0, one, -1))
+        starts = dr.abs(dr.dot(ahead.normal, d)) * (seen.t - self.start) <= self.rounding
+        side = dr.select(starts, 0, side)
+        behind = x + ahead.jump
+        passes = active & (side * x > 0) & (side * behind <= 0)
+        begins = active & ~now.is_touching & (dr.abs(behind) <= seen.band)
+        is_off = dr.abs(behind) > fmax(_PASSED * seen.band, seen.total_error)
+        crosses = active & is_off & (side * behind < 0)
+        side = dr.select(is_off, dr.select(behind > 0, one, -1), side)
+        at_sheet = passes | begins
+        return Contact(
+            dr.select(active, side, now.side),
+            dr.select(active, dr.abs(behind) <= seen.band, now.is_touching),
+            dr.select(at_sheet, seen.t, now.root),
+            dr.select(at_sheet, ahead.normal, now.gradient),
+        ), crosses
+
+    def _side(self, now: Contact, seen: Accepted, x: Real) -> Real:
+        """From which side of the nearest level a ray comes that was not in contact with it.
+
+        x: f less that level. The ray was proved free, so a real-valued f is on the side of the last
+        accepted value. On a ladder both sides may be the same value: there the value decides and,
+        where it is on the level up to its error, the slope.
+        """
+        if self.levels.period is None:
+            above = seen.before[1] > seen.value - x
+        else:
+            above = dr.select(dr.abs(x) > seen.total_error, x > 0, seen.slope < 0)
+        # Off all levels, that a ray was seen is all there is to know.
+        known = (now.side != 0) | ~seen.is_near
+        return dr.select(known, dr.select(above, type(x)(1), -1), 0)
+
+
+def root_between(start: Real, end: Real, slope: Real, end_slope: Real) -> Any:
+    """A root in [0, 1] of the cubic with these values, of different signs, and slopes at 0 and 1.
+
+    Newton's method, and bisection where it leaves the bracket.
+    """
+    # start + slope u + b u^2 + c u^3
+    b = 3 * (end - start) - 2 * slope - end_slope
+    c = slope + end_slope - 2 * (end - start)
+    low, high = type(start)(0), type(start)(1)
+    u = start / (start - end)
+    for _ in range(_ROUNDS):
+        value = dr.fma(dr.fma(dr.fma(c, u, b), u, slope), u, start)
+        rate = dr.fma(dr.fma(3 * c, u, 2 * b), u, slope)
+        before = (value > 0) == (start > 0)
+        low, high = dr.select(before, u, low), dr.select(before, high, u)
+        next_u = u - value / rate
+        inside = (next_u >= low) & (next_u <= high)
+        u = dr.select(inside, next_u, 0.5 * (low + high))
+    return dr.clip(u, 0, 1)
