@@ -198,7 +198,7 @@ def test_ranges_hold_and_are_attained(kernel: Any, precision: Any, offset: float
         slack += [(first.min(1) - low[:, 0]) / steep[0], (high[:, 0] - first.max(1)) / steep[0]]
         slack += [(second.min(1) - least[:, 0]) / steep[1], (most[:, 0] - second.max(1)) / steep[1]]
     # Sampling misses an extreme by the square of its spacing, and jumps altogether.
-    assert np.quantile(slack, 0.8) < (1e-3 if precision == "single" else 1e-5)
+    assert np.quantile(slack, 0.8) < (1e-2 if precision == "single" else 1e-5)
 
 
 def scale_of(sampled: Any) -> float:

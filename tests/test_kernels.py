@@ -69,6 +69,21 @@ def test_another_surface_compiles_no_kernel(make: Callable[[int], hk.Field], lev
     assert [trace(k) for k in range(2, 22)] == [0] * 20
 
 
+@pytest.mark.parametrize("settings", [{"all_hits": 5}, {"confirm": True}])
+@pytest.mark.parametrize(("make", "level"), [(knot, 6.0), (cut_sphere, 0.5)])
+def test_crossings_of_another_surface_compile_no_kernel(
+    make: Callable[[int], hk.Field], level: float, settings: dict[str, Any]
+) -> None:
+    o = 3 * np.random.default_rng(0).normal(size=(300, 3))
+
+    def trace(k: int) -> int:
+        own = {"level": level * (1 - 0.01 * k), "tolerance": 1e-4 * (1 + 0.1 * k), **settings}
+        return compiled(lambda: hk.trace(make(k), o, -o, **own), size=300)
+
+    trace(0), trace(1)
+    assert [trace(k) for k in range(2, 6)] == [0] * 4
+
+
 def camera(k: int) -> Camera:
     return Camera(azimuth=-50 + 7.3 * k, elevation=20 + k, fov=20 + k, zoom=1 + 0.05 * k)
 
@@ -106,6 +121,9 @@ PICTURES: dict[str, Callable[[int], int]] = {
     "clipped": lambda k: drawn(HARMONIC, k, "color", level=0.1 + 0.01 * k, clip=cut(k)),
     "glass": lambda k: drawn(
         HARMONIC, k, "color", solid=(-np.inf, 0.1 + 0.01 * k), clip=cut(k), material="glass"
+    ),
+    "amber": lambda k: drawn(
+        HARMONIC, k, "shaded", solid=(-np.inf, 0.1 + 0.01 * k), clip=cut(k), material="amber"
     ),
     "wall": lambda k: drawn(HARMONIC, k, "shaded", solid=(-0.1 - 0.01 * k, 0.2), clip=cut(k)),
     "mesh": lambda k: drawn(cut_sphere(k), k, "shaded"),

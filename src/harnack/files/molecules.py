@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections import Counter
 from dataclasses import dataclass
@@ -58,7 +59,10 @@ def atoms_in(path: Path, data: bytes) -> Atoms:
         if path.suffix.lower() in CIF_FILES:
             structure = gemmi.make_structure_from_block(gemmi.cif.read_string(text).sole_block())
         else:
+            _check_coordinates(path, text)
             structure = gemmi.read_pdb_string(text)
+    except FileFormatError:
+        raise
     except (RuntimeError, ValueError, IndexError, UnicodeError) as error:
         first = " ".join(str(error).split())
         raise place.error(f"the molecule cannot be read ({first})") from None
@@ -77,6 +81,25 @@ def atoms_in(path: Path, data: bytes) -> Atoms:
     radii = np.array([round(atom.element.vdw_r, 6) for atom in known], dtype=np.float64)
     elements = tuple(atom.element.name for atom in known)
     return Atoms(positions, radii, elements, _said(elements, len(found) - len(known), structure))
+
+
+def _check_coordinates(path: Path, text: str) -> None:
+    """That columns 31 to 54 of all atoms are three numbers: gemmi takes what is none for 0.
+
+    Raises:
+        FileFormatError: naming the first line where they are not.
+    """
+    for number, line in enumerate(text.splitlines(), start=1):
+        if line[:6] not in ("ATOM  ", "HETATM"):
+            continue
+        try:
+            finite = all(math.isfinite(float(line[k : k + 8])) for k in (30, 38, 46))
+        except ValueError:
+            finite = False
+        if not finite:
+            raise Place(path, f"line {number}").error(
+                f"columns 31 to 54 must be the three coordinates of an atom, not {line[30:54]!r}"
+            )
 
 
 def _said(elements: tuple[str, ...], left_out: int, structure: Any) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
+from harnack.gallery.blobs import BLOBS
 from harnack.gallery.classic import CURVES, HARMONICS, SOLIDS
 from harnack.gallery.damaged import MESHES
 from harnack.gallery.scene import Scene
@@ -15,6 +16,6 @@ from harnack.gallery.scene import Scene
 __all__ = ["SCENES", "Scene"]
 
 SCENES: Mapping[str, Scene] = MappingProxyType(
-    {scene.name: scene for scene in (*CURVES, *HARMONICS, *SOLIDS, *MESHES)}
+    {scene.name: scene for scene in (*CURVES, *HARMONICS, *SOLIDS, *MESHES, *BLOBS)}
 )
 """All scenes by name."""

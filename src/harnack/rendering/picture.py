@@ -93,6 +93,10 @@ def render(
     In shaded pictures, the side of larger values of an open surface in one color is darker, and
     what spans the gaps of a mesh is amber, or teal on warm colors.
 
+    Light goes through solids of glass ("glass", "frosted", "amber", "cobalt", "jelly"), bent, and
+    tinted glass takes some of it away by the law of Beer and Lambert. Shaded pictures look straight
+    through it and leave out caustics, blur, and reflections of anything but the sky.
+
     Returns the numbers: (h, w, 3) linear sRGB radiance; (h, w, 3) normals; or (h, w), of which
     depths are in units of the (first) surface's coordinates.
 

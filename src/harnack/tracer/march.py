@@ -249,6 +249,9 @@ class March:
             # After a step of zero enclosures are asked for a third of the length: bisection.
             shorter = dr.select(dr.isfinite(candidate), candidate / 3, 1 + 16 * (size + t))
             tried = dr.select(forward > 0, look.growth * forward, shorter)
+            if now.contact is not None and contact is not None:  # off the surface, all lies ahead
+                leaves = now.contact.is_touching & ~contact.is_touching
+                tried = dr.select(leaves | hit, end - t, tried)
             free = base + reach >= end
             if self.hysteresis is not None and contact is not None:  # a contact may end at the end
                 undecided = contact.is_touching & self.hysteresis.is_free_after

@@ -16,7 +16,7 @@ from harnack.backend import FloatArray, backend_of
 from harnack.backend.extrema import fmax, fmin
 from harnack.backend.numbers import check_finite, check_size, check_vectors, real_array
 from harnack.backend.records import Records
-from harnack.enclosures import Piece, Slopes
+from harnack.enclosures import Lipschitz, Piece, Slopes
 from harnack.fields.blobs.jets import summed
 from harnack.fields.blobs.sums import PIECES, Along, BlobValue, Knots, State, over
 from harnack.fields.formula import Formula
@@ -59,6 +59,7 @@ class HRBF(Formula):
         low, high = self.points.min(axis=0), self.points.max(axis=0)
         more = _MARGIN * float((high - low).max())
         self.domain = Box(low - more, high + more) if domain is None else domain
+        self.lipschitz = self._largest_gradient()
         self._on: tuple[Backend, Records] | None = None
 
     @prepared_once
@@ -66,8 +67,18 @@ class HRBF(Formula):
         """The points as records of the backend; others compile no other kernel."""
         prepared = copy.copy(self)
         prepared._on = self._uploaded(backend)
-        prepared.domain = None if self.domain is None else self.domain.prepare(backend)
+        if self.lipschitz is not None:
+            prepared.lipschitz = dr.opaque(backend.Float, self.lipschitz)
         return prepared
+
+    def _largest_gradient(self) -> float | None:
+        """A bound of |grad f| in the domain: |grad (a r^3 + b.grad r^3)| <= 3 |a| r^2 + 6 |b| r."""
+        if self.domain is None or not np.isfinite(corners := np.array(self.domain.bounds())).all():
+            return None
+        far = np.abs(corners[:, None] - self.points).max(axis=0)
+        r = np.linalg.norm(far, axis=1)
+        strong = np.linalg.norm(self.vectors, axis=1)
+        return float((3 * np.abs(self.factors) * r * r + 6 * strong * r).sum()) * (1 + 1e-6)
 
     def _uploaded(self, backend: Backend) -> tuple[Backend, Records]:
         near = self.points.astype(backend.dtype).astype(np.float64)
@@ -84,7 +95,8 @@ class HRBF(Formula):
         return self._sample(self._along(p, d, (0.0,)).start)
 
     def _sample(self, found: BlobValue) -> Sample:
-        return Sample(found.value, found.gradient, (), found.error, found.gradient_error)
+        known = () if self.lipschitz is None else (Lipschitz(0 * found.value + self.lipschitz),)
+        return Sample(found.value, found.gradient, known, found.error, found.gradient_error)
 
     def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
         """Value and ranges by one loop over the points; looking back nothing is proved."""

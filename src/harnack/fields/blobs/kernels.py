@@ -97,6 +97,11 @@ class Kernel(abc.ABC):
     def derivatives(self, height: Real, inside: Real, x: Real) -> tuple[Real, Real]:
         """The first two derivatives along such lines at |x| <= S."""
 
+    def share(self, inside: Real, nearest: Real) -> Real:
+        """What part of `steepness` is enough on lines with S^2 = `inside`, for x^2 >= `nearest`."""
+        del inside, nearest
+        return 1.0
+
     @abc.abstractmethod
     def ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
         """Ranges of k and of its first two derivatives in q, on an interval of q >= 0."""
@@ -327,8 +332,8 @@ class Gaussian(Kernel):
     name = "gaussian"
 
     def __post_init__(self) -> None:
-        if not 0 < self.sharpness <= 20:
-            raise ValueError(f"sharpness must be in (0, 20], not {self.sharpness!r}")
+        if not 0 < self.sharpness <= 12:
+            raise ValueError(f"sharpness must be in (0, 12], not {self.sharpness!r}")
         if not 1e-6 <= self.tail <= 0.5:
             raise ValueError(
                 f"tail must lie between 1e-6 and 0.5, not {self.tail!r}: it is what is left of a "
@@ -390,6 +395,15 @@ class Gaussian(Kernel):
         y = b * (x * x)
         e = dr.exp(b * inside - y)
         return -2 * b * x * (e - 1), 2 * b * dr.fma(e, dr.fma(2, y, -1), 1)
+
+    def share(self, inside: Real, nearest: Real) -> Real:
+        """All constants are multiples of the largest e^z, and e^y >= (1 + y/32)^32."""
+        b = self._rate
+        power = dr.fma(b / 32, nearest, 1)
+        for _ in range(5):
+            power = power * power
+        most = 1.01 if isinstance(inside, float) else 1.01 * dr.exp(b * (inside - 1))
+        return fmin(most / power, 1)
 
     def ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
         w = _rest(q)

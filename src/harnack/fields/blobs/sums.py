@@ -9,9 +9,9 @@ then so are t, the distance h of the line from the centre (as a length), and the
 within 8u(2 + |t|) where they matter: that is a displacement of the blob beside the path, in which
 also falls that |d| is 1 up to 2u only. A displacement by e changes f' by at most `Steepness.slope`
 times e, and f'' by `Steepness.bend` times e (its jumps at the end of the support are looked for
-within a margin). A sum of n terms adds n u times the sum of their largest absolute values. Both are
-added to the ranges, outwards. The value at the point is right within 8u |dk/dq|, by the rounding of
-q, and (16 + n)u m, with m as in `Kernel.profile`.
+within a margin), or by `Kernel.share` of that. A sum of n terms adds n u times the sum of their
+largest absolute values. Both are added to the ranges, outwards. The value at the point is right
+within 8u |dk/dq|, by the rounding of q, and (16 + n)u m, with m as in `Kernel.profile`.
 """
 
 from __future__ import annotations
@@ -145,7 +145,9 @@ def sum_along(
                 sums[4 * k + at + 1] = dr.fma(high, scale, sums[4 * k + at + 1])
             a, first_a, second_a = b, first_b, second_b
 
-        weight = dr.select(near, size + 1, 0)
+        nearest = fmax(fmax(places[0], -places[-1]), 0)
+        share = kernel.share(inside, nearest * nearest)
+        weight = dr.select(near, (size + 1) * share, 0)
         sums[-3] = dr.fma(dr.abs(slope_scale), weight, sums[-3])
         sums[-2] = dr.fma(dr.abs(bend_scale), weight, sums[-2])
         sums[-1] = sums[-1] + dr.select(near, real(1), 0)
@@ -204,7 +206,7 @@ def _add_value(kernel: Kernel, v: Vec3, inverse: Real, amplitude: Real, state: S
         dr.fma(pull, v.z, z),
         moved + dr.abs(steep),
         dr.fma(size, scale, noise),
-        slope_size + dr.select(here, size * inverse, 0),
+        slope_size + dr.select(here, size * inverse * kernel.share(1.0, q), 0),
         terms + dr.select(here, type(q)(1), 0),
     )
 

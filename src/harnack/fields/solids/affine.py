@@ -94,7 +94,8 @@ class Affine(Map):
     @classmethod
     def scaling(cls, factors: float | Sequence[float]) -> Affine:
         """u -> factors u."""
-        sizes = np.broadcast_to(np.asarray(factors, dtype=np.float64), (3,))
+        sizes = np.asarray(factors, dtype=np.float64)
+        sizes = np.broadcast_to(sizes if sizes.shape in ((), (3,)) else np.nan, (3,))
         if not (np.isfinite(sizes).all() and (sizes > 0).all()):
             raise ValueError(f"factors must be positive numbers, one or three, not {factors!r}")
         return cls.of_arrays(np.diag(sizes))

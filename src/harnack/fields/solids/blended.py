@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -49,10 +48,6 @@ class Blend(Shape):
         lipschitz = 2 ** (1 / self.power) * max(constants) * (1 + 1e-6) if known else None
         object.__setattr__(self, "lipschitz", lipschitz)
         object.__setattr__(self, "domain", union(*self.parts).domain)
-
-    def leaves(self, change: Callable[[Solid], Solid]) -> Solid:
-        a, b = (one.leaves(change) for one in self.parts)
-        return Blend((a, b), self.radius, self.power, self.is_union)
 
     def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         whole = union(*self.parts) if self.is_union else self.parts[0] & self.parts[1]

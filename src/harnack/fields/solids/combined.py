@@ -331,7 +331,7 @@ class Offset(Solid):
             object.__setattr__(self, name, getattr(self.inner, name))
 
     def leaves(self, change: Callable[[Solid], Solid]) -> Solid:
-        return Offset(self.inner.leaves(change), self.distance)
+        return change(self)  # a map may measure f in another unit
 
     def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         return self.inner.hull(level + self.distance, above=above)

@@ -30,14 +30,15 @@ class NoiseConstants:
 
     The derivative along v is sum g_c.(A_c v) with A_c = w_c I + r_c grad w_c^T, at most sum |A_c v|
     <= sqrt(v^T (sum A_c^T A_c / o_c) v) for weights o_c > 0 with the sum 1 (Cauchy and Schwarz).
-    With the spectral norms of the A_c as weights the largest eigenvalue over the cell gives 2.183
-    for the cubic and sqrt(499)/8 = 2.7923 for the quintic fade. In the middle sqrt(19)/2 = 2.1794
-    and sqrt(499)/8 are attained. Hart's 3 (1996, appendix F) is a bound, but its reason (3/2 of the
-    fade times 2 of the vectors) is none: values of a table have no Lipschitz constant.
+    With the spectral norms of the A_c as weights the root of the largest eigenvalue is at most
+    2.183 for the cubic and sqrt(499)/8 = 2.7923 for the quintic fade on a grid of the cell, and
+    changes slowly between its points: 2.2 and 2.82 leave room for that. In the middle sqrt(19)/2 =
+    2.1794 and sqrt(499)/8 are attained. Hart's 3 (1996, appendix F) is a bound, but its reason (3/2
+    of the fade times 2 of the vectors) is none: values of a table have no Lipschitz constant.
 
     A second derivative d_ij is, in the same way along the other axes, at most a sum over the
     corners of one or two axes; the largest sum of a row of these bounds is one of the spectral norm
-    of the Hessian: 17.64 and 24.35.
+    of the Hessian: 17.64 and 24.35 on a grid.
     """
 
     largest: float
@@ -46,8 +47,8 @@ class NoiseConstants:
 
 
 CONSTANTS: dict[Fade, NoiseConstants] = {
-    "cubic": NoiseConstants(math.sqrt(0.75), 2.19, 17.7),
-    "quintic": NoiseConstants(math.sqrt(0.75), 2.795, 24.4),
+    "cubic": NoiseConstants(math.sqrt(0.75), 2.2, 18.0),
+    "quintic": NoiseConstants(math.sqrt(0.75), 2.82, 25.0),
 }
 
 

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from harnack.geometry import Volume
 
 _MOST_SEGMENTS = 1_000_000
+# Where the broken line bends, in parts of the length looked ahead.
+_KNOTS = (0.125, 0.25, 0.5, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,11 +140,11 @@ class Tube(Solid):
         p = path.point(t)
         if Pieces not in path.proofs.kinds:
             return path.look(self.evaluate(p))
-        knots = tuple(one * ahead for one in Pieces.knots)
+        knots = tuple(one * ahead for one in _KNOTS)
         sample, distance, lows = self._seen(p, path.direction, knots)
         slope = dr.dot(sample.gradient, path.direction)
         most = fmin(slope + sample.gradient_error, 1.0)
-        return Look(sample, (TubeAhead(distance, most, knots, lows),), (), slope)
+        return Look(sample, (TubeAhead(distance, most, knots, lows),), (), slope, 4.0)
 
     def _seen(
         self, p: Vec3, direction: Vec3 | None, knots: tuple[Real, ...]

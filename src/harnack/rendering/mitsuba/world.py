@@ -51,6 +51,10 @@ class World:
             limit = dr.select(event, met.t, limit)
         return si, first
 
+    def nothing(self, si: Any) -> SurfaceHit:
+        """What rays have met before they are traced, given as many interactions that are none."""
+        return self._of_scene(si, self.mi.Bool(False))
+
     def _of_scene(self, si: Any, active: Mask) -> SurfaceHit:
         mi, vector = self.mi, mitsuba_backend(self.mi).Array3f
         return SurfaceHit(

@@ -58,24 +58,23 @@ class Through:
     def look(self, ray: Any) -> Sight:
         """What camera rays see."""
         mi, world = self.world.mi, self.world
-        nothing = dr.zeros(mi.SurfaceInteraction3f)
-        si, first = world.intersect(ray, nothing, mi.Bool(True))
-        width = dr.width(si)
+        nothing = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray.d))
         sight = Sight(
-            ray, si, first, mi.Spectrum(1), mi.Spectrum(0), mi.Float(0), mi.UInt32(0),
-            dr.full(mi.Bool, True, width),
+            ray, nothing, world.nothing(nothing), mi.Spectrum(1), mi.Spectrum(0), mi.Float(0),
+            mi.UInt32(0), dr.full(mi.Bool, True, dr.width(ray.d)),
         )  # fmt: skip
         if not self.indices:
+            start = dr.zeros(mi.SurfaceInteraction3f)
+            sight.si, sight.first = world.intersect(ray, start, mi.Bool(True))
             return sight
-        sight.active = self._is_clear(si) & first.met
 
         def running(sight: Sight) -> Mask:
             return sight.active
 
-        def beyond(sight: Sight) -> tuple[Sight]:
-            return (self._beyond(sight),)
+        def on(sight: Sight) -> tuple[Sight]:
+            return (self._on(sight),)
 
-        (sight,) = dr.while_loop((sight,), running, beyond, label="clear")
+        (sight,) = dr.while_loop((sight,), running, on, label="clear")
         return sight
 
     def _is_clear(self, si: Any) -> Mask:
@@ -84,33 +83,37 @@ class Through:
             clear |= si.shape == self.world.mi.ShapePtr(carrier)
         return clear
 
-    def _beyond(self, sight: Sight) -> Sight:
-        """The next thing behind a boundary that rays have come to."""
-        mi, world = self.world.mi, self.world
-        si, d = sight.si, sight.ray.d
+    def _on(self, sight: Sight) -> Sight:
+        """The next thing that rays meet and, where it is clear, the way behind it."""
+        mi, world, d = self.world.mi, self.world, sight.ray.d
+        si, first = world.intersect(sight.ray, sight.si, sight.active)
+        throughput = sight.throughput * transmittance(mi, world.carriers, sight.si, si, d)
+        boundaries = sight.boundaries + 1
+        clear = self._is_clear(si) & first.met & (boundaries <= _MOST)
         index = mi.Float(1)
         for carrier, own in self.indices:
             index = dr.select(si.shape == mi.ShapePtr(carrier), own, index)
         normal = mi.Vector3f(si.n)
         onward, reflected = refracted(normal, d, index)
-        outside = dr.dot(normal, d) < 0
-        gathered = sight.gathered
-        gathered += dr.select(outside, sight.throughput * self._reflected(si, d, index), 0)
-        goes_on = reflected < 1
-        throughput = sight.throughput * dr.select(goes_on, 1 - reflected, 1)
-        ray = leaving_ray(mi, si, sight.first.clearance, onward)
-        new, first = world.intersect(ray, si, sight.active)
-        throughput *= transmittance(mi, world.carriers, si, new, onward)
-        boundaries = sight.boundaries + 1
-        more = self._is_clear(new) & first.met & (boundaries < _MOST)
-        way = sight.travelled + dr.select(sight.first.met, sight.first.t, 0)
-        return Sight(ray, new, first, throughput, gathered, way, boundaries, sight.active & more)
+        outside = clear & (dr.dot(normal, d) < 0)
+        gathered = dr.select(outside, throughput * self._reflected(si, d, index, reflected), 0)
+        part = dr.select(clear & (reflected < 1), 1 - reflected, 1)
+        way = leaving_ray(mi, si, first.clearance, onward)
+        return Sight(
+            ray=dr.select(clear, way, sight.ray),
+            si=si,
+            first=first,
+            throughput=throughput * part,
+            gathered=sight.gathered + gathered,
+            travelled=sight.travelled + dr.select(clear, first.t, 0),
+            boundaries=boundaries,
+            active=sight.active & clear,
+        )
 
-    def _reflected(self, si: Any, d: Any, index: Any) -> Any:
+    def _reflected(self, si: Any, d: Any, index: Any, share: Real) -> Any:
         """Light of the sky, and of the key light in a highlight, that boundaries send back."""
         mi = self.world.mi
         normal = mi.Vector3f(si.n)
-        _, share = refracted(normal, d, index)
         back = d - 2 * dr.dot(normal, d) * normal
         straight = dr.square((index - 1) / (index + 1))
         black, one = dr.zeros(mi.Color3f), mi.Float(1)

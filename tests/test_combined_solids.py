@@ -1,0 +1,274 @@
+"""Solids put together, moved and bent: first hits against a dense oracle, and contracts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+import harnack as hk
+from harnack.backend import FloatArray, choose_backend, to_numpy
+from harnack.enclosures import Gaps, Greatest, Negated, Parabola, Part, Slopes
+from harnack.testing import check_field
+
+Values = Callable[[FloatArray], FloatArray]
+
+
+def sphere(p: FloatArray, radius: float = 1.0, centre: Any = (0, 0, 0)) -> FloatArray:
+    return np.linalg.norm(p - np.asarray(centre), axis=-1) - radius
+
+
+def torus(p: FloatArray, major: float, minor: float) -> FloatArray:
+    return np.hypot(np.hypot(p[..., 0], p[..., 1]) - major, p[..., 2]) - minor
+
+
+def gyroid(p: FloatArray) -> FloatArray:
+    x, y, z = np.moveaxis(2 * np.pi * p, -1, 0)
+    return np.sin(x) * np.cos(y) + np.sin(y) * np.cos(z) + np.sin(z) * np.cos(x)
+
+
+def untwisted(p: FloatArray, rate: float) -> FloatArray:
+    x, y, z = np.moveaxis(p, -1, 0)
+    c, s = np.cos(rate * z), np.sin(rate * z)
+    return np.stack([x * c + y * s, y * c - x * s, z], axis=-1)
+
+
+def untapered(p: FloatArray) -> FloatArray:
+    scale = 0.6 + 0.6 * np.clip((p[..., 2] + 1) / 2, 0, 1)
+    return np.stack([p[..., 0] / scale, p[..., 1] / scale, p[..., 2]], axis=-1)
+
+
+def shrunk(p: FloatArray) -> FloatArray:
+    return (p - [1, 2, 3]) / 0.7
+
+
+def blended(a: FloatArray, b: FloatArray, radius: float, power: float) -> FloatArray:
+    g, h = np.maximum(1 - a / radius, 0), np.maximum(1 - b / radius, 0)
+    near = radius * (1 - (g**power + h**power) ** (1 / power))
+    return near + np.maximum(np.minimum(a, b) - radius, 0)
+
+
+TURN = np.array(hk.Sphere(1.0).rotated(40, (1, 2, 3)).map.matrix)  # type: ignore[attr-defined]
+CURVE = np.stack(
+    [f(np.arange(24) * np.pi / 12) for f in (np.cos, np.sin, lambda t: 0.3 * np.sin(2 * t))], axis=1
+)
+SPANNING = hk.SolidAngle(CURVE)
+
+
+def near_spanning(p: FloatArray) -> FloatArray:
+    offset = SPANNING.value(p.reshape(-1, 3), precision="double") - 2 * np.pi
+    offset -= 4 * np.pi * np.round(offset / (4 * np.pi))
+    return (np.abs(offset) - 0.4).reshape(p.shape[:-1])
+
+
+CASES: dict[str, tuple[Callable[[], hk.Solid], Values]] = {
+    "difference": (
+        lambda: hk.Sphere(1.0) - hk.Torus(0.8, 0.3),
+        lambda p: np.maximum(sphere(p), -torus(p, 0.8, 0.3)),
+    ),
+    "union": (
+        lambda: hk.Sphere(0.9) | hk.Torus(1.2, 0.2),
+        lambda p: np.minimum(sphere(p, 0.9), torus(p, 1.2, 0.2)),
+    ),
+    "hollow": (
+        lambda: hk.Sphere(1.0) & ~hk.Sphere(0.9) & hk.Plane((0, 0, 1), 0.2),
+        lambda p: np.maximum(np.maximum(sphere(p), -sphere(p, 0.9)), p[..., 2] - 0.2),
+    ),
+    "grown": (
+        lambda: (hk.Sphere(0.7) | hk.Torus(1.0, 0.1)).grown(0.1),
+        lambda p: np.minimum(sphere(p, 0.7), torus(p, 1.0, 0.1)) - 0.1,
+    ),
+    "affine": (
+        lambda: hk.Sphere(1.0).scaled((1, 0.5, 1.5)).rotated(40, (1, 2, 3)).moved((0.2, 0.1, -0.3)),
+        lambda p: sphere(((p - [0.2, 0.1, -0.3]) @ TURN) / [1, 0.5, 1.5]),
+    ),
+    "twisted": (
+        lambda: (hk.Sphere(1.0) - hk.Torus(0.8, 0.3).moved((0.3, 0, 0))).twisted(2.0),
+        lambda p: np.maximum(
+            sphere(untwisted(p, 2.0)), -torus(untwisted(p, 2.0) - [0.3, 0, 0], 0.8, 0.3)
+        ),
+    ),
+    "tapered": (
+        lambda: (hk.solid(hk.Gyroid(1.0), below=0.2) & hk.Sphere(1.1)).tapered((-1, 0.6), (1, 1.2)),
+        lambda p: np.maximum(gyroid(untapered(p)) - 0.2, sphere(untapered(p), 1.1)),
+    ),
+    "gyroid in a torus": (
+        lambda: hk.solid(hk.Gyroid(1.0), between=(-0.3, 0.3)) & hk.Torus(0.8, 0.4),
+        lambda p: np.maximum(np.abs(gyroid(p)) - 0.3, torus(p, 0.8, 0.4)),
+    ),
+    "moved gyroid": (
+        lambda: (hk.solid(hk.Gyroid(1.0), above=0.1) & hk.Sphere(1.0)).scaled(0.7).moved((1, 2, 3)),
+        lambda p: 0.7 * np.maximum(0.1 - gyroid(shrunk(p)), sphere(shrunk(p))),
+    ),
+    "twisted gyroid": (
+        lambda: (hk.solid(hk.Gyroid(1.0), below=0.2) & hk.Torus(0.8, 0.4)).twisted(1.0),
+        lambda p: np.maximum(gyroid(untwisted(p, 1.0)) - 0.2, torus(untwisted(p, 1.0), 0.8, 0.4)),
+    ),
+    "blend": (
+        lambda: hk.Sphere(1.0).blended(hk.Sphere(0.7).moved((1.2, 0, 0)), 0.4),
+        lambda p: blended(sphere(p), sphere(p, 0.7, (1.2, 0, 0)), 0.4, 2.0),
+    ),
+    "blended gyroid": (
+        lambda: (hk.solid(hk.Gyroid(1.0), below=0.2) & hk.Sphere(1.1)).blended(
+            hk.Torus(1.2, 0.2), 0.2, power=3.0
+        ),
+        lambda p: blended(
+            np.maximum(gyroid(p) - 0.2, sphere(p, 1.1)), torus(p, 1.2, 0.2), 0.2, 3.0
+        ),
+    ),
+    "spanning surface and tube": (
+        lambda: hk.solid(SPANNING, around=(2 * np.pi, 0.4)) | hk.Torus(1.0, 0.1),
+        lambda p: np.minimum(near_spanning(p), torus(p, 1.0, 0.1)),
+    ),
+}  # fmt: skip
+QUICK = ("difference", "twisted", "gyroid in a torus", "spanning surface and tube")
+EVERY = [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in CASES]
+
+
+def rays(count: int, seed: int, centre: Any, size: float) -> tuple[FloatArray, FloatArray]:
+    rng = np.random.default_rng(seed)
+    o = rng.normal(size=(count, 3))
+    o *= 3 * size / np.linalg.norm(o, axis=1, keepdims=True)
+    d = rng.normal(size=(count, 3)) * 0.5 * size - o
+    return o + np.asarray(centre), d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+def missed(make: Callable[[], hk.Solid], value: Values, precision: Any, count: int) -> FloatArray:
+    """By how much hits come after the first sample inside, in units of the samples' distance."""
+    centre = (1, 2, 3) if value is CASES["moved gyroid"][1] else (0, 0, 0)
+    o, d = rays(count, 3, centre, 1.3)
+    t = np.linspace(0, 8, 3201)
+    inside = np.stack([value(o + one * d) <= 0 for one in t], axis=1)
+    first = np.where(inside.any(axis=1), t[inside.argmax(axis=1)], np.inf)
+    hits = hk.trace(make(), o, d, t_max=8.0, precision=precision)
+    assert (hits.status != hk.Status.OUT_OF_STEPS).all()
+    assert np.isfinite(first).mean() > 0.1
+    # What is hit lies on the surface, within the tolerance and the slope of f.
+    on = hits.hit
+    p, n = hits.position[on].astype(float), 1e-4 * hits.normal[on]
+    slope = np.abs(value(p + n) - value(p - n)) / 2e-4
+    assert (np.abs(value(p)) < 4e-4 * np.maximum(slope, 1)).all()
+    assert on.sum() >= np.isfinite(first).sum()
+    with np.errstate(invalid="ignore"):
+        return np.where(np.isfinite(first), hits.t - first, -np.inf)
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_no_hit_of_a_combination_is_missed(name: str) -> None:
+    late = missed(*CASES[name], "single", 1000)
+    assert late.max() <= 1e-4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_no_hit_of_a_combination_is_missed_in_double_precision(name: str) -> None:
+    late = missed(*CASES[name], "double", 4000)
+    assert late.max() <= 1e-9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_combinations_keep_their_promises(name: str) -> None:
+    check_field(CASES[name][0]())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["difference", "affine", "twisted", "blend", "union"])
+def test_sphere_tracing_finds_the_same_hits(name: str) -> None:
+    o, d = rays(2000, 5, (0, 0, 0), 1.3)
+    solid = CASES[name][0]()
+    ours, theirs = (hk.trace(solid, o, d, t_max=8.0, bound=one) for one in (None, "lipschitz"))
+    same = ours.hit == theirs.hit
+    assert same.mean() > 0.998  # rays that graze within the tolerance stop anywhere
+    both = ours.hit & theirs.hit
+    assert np.quantile(np.abs(ours.t - theirs.t)[both], 0.98) < 1e-3
+    assert ours.evaluations.mean() < 0.7 * theirs.evaluations.mean()
+
+
+def test_the_greatest_falls_only_where_all_parts_have_fallen() -> None:
+    """Two functions 1 - s and -1 + 3s: the greatest is 0 at s = 1/2 at the lowest."""
+    real = choose_backend("double").Float
+    down = Parabola(Slopes(real(-1), real(-1)), real(0), real(0), real(10))
+    up = Parabola(Slopes(real(3), real(3)), real(0), real(0), real(10))
+    parts = (Part(real(0), real(0), (down,)), Part(real(2), real(2), (up,)))
+
+    def step(enclosure: Any, below: Any, above: Any) -> float:
+        return float(to_numpy(enclosure.step(Gaps(real(below), real(above))) + real(0))[0])
+
+    greatest = Greatest(parts)
+    assert step(greatest, np.inf, 0.5) == pytest.approx(2.5 / 3, rel=1e-5)  # -1 + 3s = 1.5
+    assert step(greatest, 0.25, np.inf) == pytest.approx(0.25, rel=1e-5)  # 1 - s = 0.75
+    assert step(greatest, 0.25, 0.5) == pytest.approx(0.25, rel=1e-5)
+    negative = Negated(greatest)
+    assert step(negative, 0.5, np.inf) == pytest.approx(2.5 / 3, rel=1e-5)
+
+
+def test_a_part_past_the_level_proves_nothing() -> None:
+    """A part that lies below the level below already does not keep the greatest above it,
+    whichever way it runs."""
+    real = choose_backend("double").Float
+    falling = Parabola(Slopes(real(-1), real(-1)), real(0), real(0), real(10))
+    rising = Parabola(Slopes(real(-1), real(-1)), real(4), real(4), real(10))
+    parts = (Part(real(0), real(0), (falling,)), Part(real(2), real(2), (rising,)))
+    step = Greatest(parts).step(Gaps(real(1), real(np.inf)))
+    assert float(to_numpy(step + real(0))[0]) <= 1.0
+
+
+def test_operators_and_methods_read_like_the_drawing() -> None:
+    model = (hk.Sphere(1.0) - hk.Torus(0.8, 0.2)).twisted(2.0)
+    hits = hk.trace(model, [[3.0, 0.1, 0.2]], [[-1.0, 0.0, 0.0]])
+    assert hits.hit.all()
+    assert (~(~model)).hull() == model.hull()
+    flat = hk.union(hk.Sphere(1.0), hk.Sphere(0.5) | hk.Torus(1.0, 0.1))
+    assert len(flat.parts) == 3  # type: ignore[attr-defined]
+
+
+def test_a_union_reaches_as_far_as_its_parts() -> None:
+    far = hk.Sphere(1.0) | hk.Sphere(1.0).moved((5, 0, 0))
+    hull = far.hull()
+    assert hull is not None
+    low, high = hull.bounds()
+    assert low[0] <= -1
+    assert high[0] >= 6
+    assert (far - hk.Sphere(9.0)).hull() is not None
+    assert (far | hk.Plane()).hull() is None
+    assert (~far).hull() is None
+    inside = hk.solid(hk.Blobs([[0, 0, 0]], [1.0]), above=0.5).hull()
+    assert inside is None or np.isfinite(inside.bounds()).all()
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (lambda: hk.Sphere(1.0) | 3, TypeError, "unsupported operand"),
+        (lambda: hk.union(), ValueError, "at least one solid"),
+        (lambda: hk.union(hk.Gyroid(1.0)), TypeError, "is no solid: make one of a field"),
+        (lambda: hk.Sphere(1.0).scaled(0), ValueError, "factors must be positive"),
+        (lambda: hk.Sphere(1.0).scaled((1, 2)), ValueError, "factors must be positive"),
+        (lambda: hk.Sphere(1.0).rotated(10, "w"), ValueError, 'axis must be "x", "y" or "z"'),
+        (lambda: hk.Sphere(1.0).rotated(10, (0, 0, 0)), ValueError, "axis must be a vector"),
+        (lambda: hk.Sphere(1.0).moved((1, 2)), ValueError, r"offset \(3,\)"),
+        (lambda: hk.Sphere(1.0).transformed(np.ones((3, 3))), ValueError, "singular"),
+        (lambda: hk.Sphere(1.0).transformed(np.eye(2)), ValueError, r"matrix \(3, 3\)"),
+        (lambda: hk.Sphere(1.0).twisted(np.nan), ValueError, "rate must be finite"),
+        (lambda: hk.Sphere(1.0).tapered((1, 1), (0, 1)), ValueError, "start must lie before end"),
+        (lambda: hk.Sphere(1.0).tapered((0, 1), (1, -1)), ValueError, "scales must be positive"),
+        (lambda: hk.Sphere(1.0).grown(np.inf), ValueError, "distance must be finite"),
+        (lambda: hk.Sphere(1.0).blended(hk.Torus(1, 0.1), 0), ValueError, "radius must be"),
+        (lambda: hk.Sphere(1.0).blended(hk.Torus(1, 0.1), 1, power=0.5), ValueError, "power must"),
+        (lambda: hk.solid(SPANNING, below=1.0), ValueError, "is angle-valued"),
+        (lambda: hk.solid(hk.Gyroid(1.0)), ValueError, "exactly one of"),
+        (lambda: hk.solid(hk.Gyroid(1.0), between=(1, 0)), ValueError, "low < high"),
+        (lambda: hk.solid(hk.Gyroid(1.0), below=np.nan), ValueError, "finite numbers"),
+        (lambda: hk.solid(SPANNING, around=(0, 7)), ValueError, "half of the period"),
+        (
+            lambda: hk.solid(SPANNING, around=(0, 1)).twisted(1.0), TypeError,
+            "cannot be blended, twisted or tapered",
+        ),
+    ],
+)  # fmt: skip
+def test_mistakes_are_refused(make: Any, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        make()

@@ -1,0 +1,415 @@
+"""Shapes: what each promises, against formulas in NumPy that share nothing with it."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+
+import harnack as hk
+from harnack.arithmetic.blends import blend_intersection, blend_union
+from harnack.backend import choose_backend, to_numpy, to_vector3
+from harnack.backend.lengths import length
+from harnack.enclosures import Gaps, choose_proofs
+from harnack.enclosures.proofs import longest_step
+from harnack.fields.formula import Formula
+from harnack.fields.look import Path, value_error
+from harnack.fields.solids.noise import CORNERS, lattice_vector
+from harnack.testing import check_field
+
+Oracle = Callable[[Any], Any]
+CURVE = np.array([[0, 0, 0], [1, 0.2, 0], [0.3, 1, 0.4], [-0.5, 0.5, 0.8], [-1, 0, 1],
+                  [-0.2, -0.9, 0.3], [0.4, -0.6, -0.4]])  # fmt: skip
+
+
+def norm(x: Any, p: float = 2.0) -> Any:
+    return np.linalg.norm(x, p, axis=-1)
+
+
+def pair(a: Any, b: Any, p: float = 2.0) -> Any:
+    return norm(np.stack([a, b], -1), p)
+
+
+def box(x: Any, half: Any) -> Any:
+    q = np.abs(x) - half
+    return norm(np.maximum(q, 0)) + np.minimum(q.max(-1), 0)
+
+
+def segments(x: Any, points: Any) -> Any:
+    best = np.full(x.shape[:-1], np.inf)
+    for a, b in itertools.pairwise(points):
+        t = np.clip((x - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
+        best = np.minimum(best, norm(x - a - t[..., None] * (b - a)))
+    return best
+
+
+def julia(x: Any, c: Any, count: int, w: float) -> Any:
+    q = np.concatenate([x, np.full((*x.shape[:-1], 1), w)], -1).astype(np.longdouble)
+    log, share = np.zeros(x.shape[:-1]), np.ones(x.shape[:-1])
+    for _ in range(count):
+        far = norm(q) > 1e30
+        log = np.where(far, log, 0)
+        square = np.concatenate(
+            [
+                q[..., :1] ** 2 - (q[..., 1:] ** 2).sum(-1, keepdims=True),
+                2 * q[..., :1] * q[..., 1:],
+            ],
+            -1,
+        )
+        q = np.where(far[..., None], q, square + np.array(c))
+        share = np.where(far, share, share / 2)
+    b = 0.5 + math.sqrt(0.25 + math.hypot(*c))
+    size = np.sqrt((q * q).sum(-1))
+    last = 2.0**-count
+    with np.errstate(divide="ignore"):
+        return np.maximum(share * np.log(size) - last * math.log(b), -last).astype(float)
+
+
+def noise(x: Any, field: Any) -> Any:
+    backend = choose_backend("double")
+    flat = x.reshape(-1, 3)
+    total = np.zeros(len(flat))
+    for octave in range(field.octaves):
+        q = flat * field.frequency * 2.0**octave
+        base = np.floor(q)
+        for corner in CORNERS:
+            at = (base + corner).astype(np.int64).astype(np.uint32)
+            seed = backend.UInt32((field.seed + octave) % 2**32)
+            g = lattice_vector(*(backend.UInt32(v) for v in at.T), seed, backend.Float(0))
+            g = np.stack([np.array(v) for v in g], -1)
+            away = q - base - corner
+            t = 1 - np.abs(away)
+            s = t**3 * (t * (6 * t - 15) + 10) if field.fade == "quintic" else t**2 * (3 - 2 * t)
+            total += (
+                field.amplitude * 2.0 ** (-field.beta * octave) * s.prod(-1) * (g * away).sum(-1)
+            )
+    return total.reshape(x.shape[:-1])
+
+
+def powered(x: Any, powers: Any, radii: Any) -> Any:
+    y = x / np.array(radii)
+    return min(radii) * (pair(norm(y[..., :2], powers[0]), y[..., 2], powers[1]) - 1)
+
+
+def supertorus(x: Any, powers: Any, major: float, minor: float) -> Any:
+    return pair(norm(x[..., :2], powers[0]) - major, x[..., 2], powers[1]) - minor
+
+
+NOISE = hk.Noise(2.0, 0.7, seed=5)
+FRACTAL = hk.FractalNoise(3, 1.0, 2.0, 0.15, fade="cubic")
+TUBE = hk.Tube.bezier(CURVE, 0.2, tolerance=2e-3)
+C = (-0.2, 0.8, 0.0, 0.0)
+
+SHAPES: dict[str, tuple[Any, Oracle]] = {
+    "plane": (
+        hk.Plane((1.0, 2.0, -2.0), 0.3),
+        lambda x: x @ np.array([1.0, 2.0, -2.0]) / 3 - 0.3,
+    ),
+    "sphere": (hk.Sphere(0.8, (0.1, 0.2, 0.0)), lambda x: norm(x - [0.1, 0.2, 0.0]) - 0.8),
+    "ellipsoid": (
+        hk.Ellipsoid((1.0, 0.5, 0.7)),
+        lambda x: 0.5 * (norm(x / np.array([1.0, 0.5, 0.7])) - 1),
+    ),
+    "cylinder": (hk.Cylinder(0.5), lambda x: norm(x[..., :2]) - 0.5),
+    "cut cylinder": (
+        hk.Cylinder(0.5, 0.8),
+        lambda x: box(np.stack([norm(x[..., :2]), x[..., 2]], -1), [0.5, 0.8]),
+    ),
+    "double cone": (
+        hk.DoubleCone(0.6),
+        lambda x: norm(x[..., :2]) * math.cos(0.6) - np.abs(x[..., 2]) * math.sin(0.6),
+    ),
+    "capsule": (
+        hk.Capsule((0.2, 0.0, 0.0), (1.0, 0.5, -0.3), 0.3),
+        lambda x: segments(x, np.array([[0.2, 0.0, 0.0], [1.0, 0.5, -0.3]])) - 0.3,
+    ),
+    "torus": (hk.Torus(0.9, 0.3), lambda x: pair(norm(x[..., :2]) - 0.9, x[..., 2]) - 0.3),
+    "box": (hk.Cuboid((1.0, 0.5, 0.7)), lambda x: box(x, [1.0, 0.5, 0.7])),
+    "rounded box": (
+        hk.Cuboid((1.0, 0.5, 0.7), 0.2),
+        lambda x: box(x, [0.8, 0.3, 0.5]) - 0.2,
+    ),
+    **{
+        f"superellipsoid {p} {q}": (
+            hk.Superellipsoid((p, q), (1.0, 0.7, 0.9)),
+            lambda x, p=p, q=q: powered(x, (p, q), (1.0, 0.7, 0.9)),
+        )
+        for p, q in ((4.0, 4.0), (1.0, 1.0), (1.5, 3.0), (2.0, 1.3))
+    },
+    **{
+        f"supertorus {p} {q}": (
+            hk.Supertorus((p, q), 0.9, 0.3),
+            lambda x, p=p, q=q: supertorus(x, (p, q), 0.9, 0.3),
+        )
+        for p, q in ((4.0, 4.0), (1.2, 1.5))
+    },
+    "tube": (TUBE, lambda x: segments(x, TUBE.points) - 0.2),
+    "noise": (NOISE, lambda x: noise(x, NOISE)),
+    "displaced": (
+        hk.Displaced(hk.Sphere(), FRACTAL),
+        lambda x: norm(x) - 1 + noise(x, FRACTAL),
+    ),
+    "julia": (hk.Julia(C, 8, 0.1), lambda x: julia(x, C, 8, 0.1)),
+}  # fmt: skip
+
+EVERY = pytest.mark.parametrize("name", SHAPES)
+PRECISIONS = pytest.mark.parametrize("precision", ["single", "double"])
+
+
+@EVERY
+def test_contract(name: str) -> None:
+    check_field(SHAPES[name][0], rng=1, count=40, directions=3)
+
+
+@EVERY
+@PRECISIONS
+def test_values(name: str, precision: Any) -> None:
+    shape, oracle = SHAPES[name]
+    x = np.random.default_rng(2).uniform(-1.5, 1.5, (400, 3)).astype(np.float32).astype(float)
+    off = np.abs(shape.value(x, precision=precision) - oracle(x))
+    assert off.max() < (1e-3 if name == "julia" else 3e-6) * (1 if precision == "single" else 1e-6)
+
+
+def unit_vectors(rng: Any, n: int) -> Any:
+    d = rng.normal(size=(n, 3))
+    return d / norm(d)[:, None]
+
+
+@EVERY
+@PRECISIONS
+def test_no_level_within_a_step(name: str, precision: Any) -> None:
+    """Along random paths, with levels near and far; the same steps times 1.001 meet one."""
+    shape, oracle = SHAPES[name]
+    backend, rng, n = choose_backend(precision), np.random.default_rng(3), 800
+    x = rng.uniform(-1.3, 1.3, (n, 3))
+    x[: n // 5] = np.round(x[: n // 5])  # on axes and planes of symmetry
+    d = unit_vectors(rng, n)
+    d[: n // 10] = np.eye(3)[rng.integers(0, 3, n // 10)]
+    x, d = (v.astype(backend.dtype).astype(float) for v in (x, d))
+    ahead = 10.0 ** rng.uniform(-4, 0.5, n)
+    gaps = ahead * 10.0 ** rng.uniform(-2, 0.5, (2, n))
+    p, along = to_vector3(backend, x), to_vector3(backend, d)
+    path = Path(p, along, choose_proofs(None))
+    look = shape.prepare(backend).look(
+        path, backend.Float(0), backend.Float(ahead), backend.Float(0)
+    )
+    blur = value_error(look.sample, length(look.sample.gradient), 1.5)
+    seen = Gaps(*(backend.Float(one) for one in gaps)).less(blur)
+    step = to_numpy(longest_step(look.ahead, seen)).astype(float) * np.ones(n)
+    start = oracle(x)
+    assert (step > 0).mean() > 0.5
+
+    def passes(factor: float) -> Any:
+        t = factor * step[:, None] * np.linspace(0, 1, 33)
+        moved = oracle(x[:, None] + t[..., None] * d[:, None]) - start[:, None]
+        slack = 1e-12 if precision == "double" else 0.0
+        return (moved > gaps[1][:, None] + slack).any(1) | (moved < -gaps[0][:, None] - slack).any(
+            1
+        )
+
+    assert not passes(1.0).any()
+    if precision == "double" and name != "julia":  # whose steps are never that long
+        assert passes(1.001).any()
+
+
+CONSTANTS = [
+    *[name for name in SHAPES if name not in ("tube", "noise", "displaced", "julia")],
+]
+
+
+def steepest(oracle: Oracle, rng: Any, spread: float = 1.5) -> float:
+    """The largest difference quotient that a search finds."""
+    h = 1e-6
+    x, d = rng.uniform(-spread, spread, (5_000, 3)), unit_vectors(rng, 5_000)
+
+    def slope(x: Any, d: Any) -> Any:
+        return (oracle(x + h * d) - oracle(x - h * d)) / (2 * h)
+
+    best = slope(x, d)
+    size = 0.3
+    for _ in range(90):
+        keep = np.argsort(best)[-200:]
+        x, d, best = x[keep], d[keep], best[keep]
+        y = x + size * rng.normal(size=x.shape)
+        e = d + size * rng.normal(size=x.shape)
+        e /= norm(e)[:, None]
+        new = slope(y, e)
+        better = new > best
+        x[better], d[better], best[better] = y[better], e[better], new[better]
+        size *= 0.93
+    return float(best.max())
+
+
+@pytest.mark.parametrize("name", CONSTANTS)
+def test_lipschitz_constants_are_attained(name: str) -> None:
+    shape, oracle = SHAPES[name]
+    most = steepest(oracle, np.random.default_rng(4))
+    if name.startswith("superellipsoid"):  # attained where the radii are equal
+        assert most <= shape.lipschitz * (1 + 1e-6)
+        return
+    assert 0.99 * shape.lipschitz <= most <= shape.lipschitz * (1 + 1e-6)
+
+
+@pytest.mark.parametrize(
+    "powers", [(1.0, 1.0), (1.0, 2.0), (2.0, 1.0), (1.3, 1.7), (4.0, 4.0), (3.0, 1.2), (1.5, 5.0)]
+)
+def test_constants_of_norms_are_attained(powers: tuple[float, float]) -> None:
+    shape = hk.Superellipsoid(powers)
+    most = steepest(lambda x: powered(x, powers, (1.0, 1.0, 1.0)), np.random.default_rng(5))
+    assert 0.99 * shape.lipschitz <= most <= shape.lipschitz * (1 + 1e-6)
+
+
+@EVERY
+@pytest.mark.parametrize("level", [-0.1, 0.0, 0.2])
+def test_hulls_hold_the_solid(name: str, level: float) -> None:
+    shape, oracle = SHAPES[name]
+    hull = shape.hull(level)
+    if name in ("plane", "cylinder", "double cone", "noise"):
+        assert hull is None
+        return
+    rng = np.random.default_rng(6)
+    if name == "julia":
+        level *= 0.1
+        hull = shape.hull(level)
+    x = rng.uniform(-2.5, 2.5, (8_000, 3))
+    inside = oracle(x) <= level
+    assert hull.contains_points(x[inside]).all()
+
+
+@EVERY
+@PRECISIONS
+def test_first_hits(name: str, precision: Any) -> None:
+    """No ray passes a place where f is negative before its hit; hits are on the surface."""
+    shape, oracle = SHAPES[name]
+    rng, n = np.random.default_rng(7), 150
+    o = 3 * unit_vectors(rng, n)
+    d = rng.uniform(-0.9, 0.9, (n, 3)) - o
+    d /= norm(d)[:, None]
+    o, d = (v.astype(np.float32).astype(float) for v in (o, d))
+    d /= norm(d)[:, None]
+    hits = hk.trace(shape, o, d, t_max=6.0, precision=precision)
+    status = np.array(hits.status)
+    assert (status != int(hk.Status.OUT_OF_STEPS)).all()
+    is_hit = status == int(hk.Status.HIT)
+    end = np.where(is_hit, np.array(hits.t), 6.0)
+    t = end[:, None] * np.linspace(0, 1, 501)[:-1]
+    start = np.sign(oracle(o))
+    f = start[:, None] * oracle(o[:, None] + t[..., None] * d[:, None])
+    slack = 1e-5 if precision == "single" else 1e-12  # of f before the hit
+    assert (f > -slack).all()
+    assert np.abs(oracle(o + end[:, None] * d)[is_hit]).max() < 1e-3  # ten times the tolerance
+    assert is_hit.mean() > 0.05
+
+
+@EVERY
+def test_sphere_tracing_finds_the_same(name: str) -> None:
+    shape, _ = SHAPES[name]
+    rng = np.random.default_rng(8)
+    o = 3 * unit_vectors(rng, 300)
+    d = rng.uniform(-0.9, 0.9, (300, 3)) - o
+    d /= norm(d)[:, None]
+    one, two = (
+        hk.trace(shape, o, d, t_max=6.0, precision="double", bound=b) for b in (None, "lipschitz")
+    )
+    a, b = np.array(one.t), np.array(two.t)
+    both = np.isfinite(a) & np.isfinite(b)
+    assert (np.isfinite(a) != np.isfinite(b)).mean() < 0.01
+    assert np.median(np.abs(a[both] - b[both])) < 2e-4  # the tolerance of a hit is 1e-4
+
+
+@pytest.mark.parametrize("power", [1.0, 2.0, 4.0, 8.0])
+def test_blends(power: float) -> None:
+    """The constant 2^(1/p) is attained, and 1 holds of gradients at right angles, p >= 2."""
+    rng, r = np.random.default_rng(9), 0.5
+
+    def blended(a: Any, b: Any) -> Any:
+        return np.asarray(blend_union(a, b, r, power))
+
+    same = steepest(lambda x: blended(x[..., 0], x[..., 0]), rng, 0.45)
+    assert same == pytest.approx(2 ** (1 / power), rel=1e-3)
+    across = steepest(lambda x: blended(x[..., 0], x[..., 1]), rng, 1.0)
+    if power >= 2:
+        assert across == pytest.approx(1.0, abs=1e-3)
+    x = rng.uniform(-1, 2, (2, 1000))
+    assert (blended(*x) <= np.minimum(*x) + 1e-12).all()
+    far = x.min(0) > r
+    assert np.allclose(blended(*x)[far], x.min(0)[far])
+    assert np.allclose(blend_intersection(-x[0], -x[1], r, power), -blended(*x))
+
+
+class Blended(Formula):
+    """A blended union of a sphere and a box."""
+
+    lipschitz = 2**0.5
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        a = hk.norm(x - 0.6, y, z) - 0.5
+        b = hk.maximum(abs(x + 0.4), abs(y), abs(z)) - 0.4
+        return blend_union(a, b, 0.4)
+
+
+def test_blends_keep_their_promises() -> None:
+    check_field(Blended(), rng=3, count=100)
+    o = np.array([[0.1, 0.0, 3.0]])
+    d = np.array([[0.0, 0.0, -1.0]])
+    sharp = hk.trace(hk.Sphere(0.5, (0.6, 0.0, 0.0)), o, d)
+    blended = hk.trace(Blended(), o, d)
+    assert blended.t[0] < sharp.t[0]
+
+
+def test_flattening_is_as_stated() -> None:
+    t = np.linspace(0, 1, 400)[:, None]
+    for start in (0, 3):
+        a, b, c, e = CURVE[start : start + 4]
+        curve = (1 - t) ** 3 * a + 3 * t * (1 - t) ** 2 * b + 3 * t**2 * (1 - t) * c + t**3 * e
+        assert segments(curve, TUBE.points).max() <= TUBE.flattening + 1e-12
+    assert TUBE.flattening <= 2e-3
+    finer = hk.Tube.bezier(CURVE, 0.2, tolerance=1e-5)
+    assert finer.describe()["segments"] > 5 * TUBE.describe()["segments"]
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: hk.Sphere(0.0), "radius of a sphere must be positive"),
+        (lambda: hk.Sphere(1.0, (0, math.nan, 0)), "must be finite"),
+        (lambda: hk.Plane((0, 0, 0)), "must not be zero"),
+        (lambda: hk.Plane((0, 1)), "three numbers, not 2"),
+        (lambda: hk.Ellipsoid((1, -1, 1)), "must be positive"),
+        (lambda: hk.Cylinder(1.0, 0.0), "half the height"),
+        (lambda: hk.DoubleCone(2.0), "between 0 and pi/2"),
+        (lambda: hk.Capsule((0, 0, 0), (0, 0, 0)), "use Sphere"),
+        (lambda: hk.Torus(1.0, math.inf), "minor radius"),
+        (lambda: hk.Cuboid((1, 1, 1), 2.0), "least half side"),
+        (lambda: hk.Superellipsoid((0.5, 2.0)), "at least 1"),
+        (lambda: hk.Supertorus((2.0,)), "two numbers"),
+        (lambda: hk.Tube(np.zeros((3, 3)), 0.1), "two points or more"),
+        (lambda: hk.Tube(np.zeros((3, 2)), 0.1), "must have shape"),
+        (lambda: hk.Tube.bezier(np.zeros((5, 3)), 0.1), "3 n \\+ 1"),
+        (lambda: hk.Noise(0.0), "frequency of noise"),
+        (lambda: hk.Noise(fade="linear"), "quintic"),
+        (lambda: hk.FractalNoise(0), "octaves"),
+        (lambda: hk.Julia((1, 2, 3)), "four numbers"),
+        (lambda: hk.Julia(iterations=0), "from 1 to 60"),
+        (lambda: hk.Julia((20.0, 0, 0, 0)), "no longer than 10"),
+    ],
+)
+def test_wrong_numbers(make: Callable[[], Any], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        make()
+
+
+def test_numbers_are_data_of_a_kernel() -> None:
+    """Another radius compiles nothing."""
+    o, d = np.array([[0.0, 0.0, 3.0]]), np.array([[0.0, 0.0, -1.0]])
+    hk.trace(hk.Sphere(0.9), o, d)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        hk.trace(hk.Sphere(0.7), o, d)
+        made = dr.kernel_history([dr.KernelType.JIT])
+    assert all(one["cache_hit"] for one in made)
