@@ -85,7 +85,7 @@ def _lattice() -> list[LevelSet]:
 
 def _knot() -> list[LevelSet]:
     """A thick Seifert surface of the trefoil knot, and a tube around the knot itself."""
-    curve: FloatArray = shapes.trefoil(120)
+    curve: FloatArray = shapes.torus_knot(2, 3, 120)
     surface = solid(SolidAngle(curve), around=(2 * math.pi, 0.12))
     return _drawn(surface, Tube(np.concatenate([curve, curve[:1]]), 0.09))
 
