@@ -17,10 +17,12 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+import harnack as hk
 from harnack.arithmetic import clipped_power
 from harnack.backend.extrema import clamp, fmax, fmin
 from harnack.backend.records import Records
 from harnack.enclosures import Piece, Slopes
+from harnack.fields.blobs.kernels import Compact
 from harnack.fields.formula import Formula, FormulaAlong
 
 # Rounding of a blob's derivatives, in units of their largest absolute values.
@@ -38,6 +40,7 @@ class Scene:
     reaches: np.ndarray
     heights: np.ndarray
     threshold: float
+    width: float
 
     @classmethod
     def random(
@@ -49,7 +52,7 @@ class Scene:
         centres = generator.uniform(-size, size, (count, 3))
         radius = generator.uniform(*radii, count)
         height = np.full(count, 1.0 / (1 - 1 / width**2) ** 3)
-        return cls(centres, width * radius, height, 1.0)
+        return cls(centres, width * radius, height, 1.0, width)
 
     @property
     def box(self) -> tuple[np.ndarray, np.ndarray]:
@@ -75,13 +78,30 @@ class Scene:
         kept = length > 1e-6
         return a[kept], ((b - a) / length[:, None])[kept], length[kept]
 
-    def values(self, points: np.ndarray) -> np.ndarray:
-        """f in double precision, at points (n, 3)."""
-        total = np.full(len(points), -self.threshold)
-        for c, reach, height in zip(self.centres, self.reaches, self.heights, strict=True):
-            w = 1 - ((points - c) ** 2).sum(1) / reach**2
-            total += height * np.maximum(w, 0) ** 3
-        return total
+    def values(self, points: np.ndarray, groups: int = 1) -> np.ndarray:
+        """f in double precision, at points (n, 3): of several groups the largest sum, where blob k
+        is in group k modulo their number."""
+        sums = np.full((groups, len(points)), -self.threshold)
+        for k, c in enumerate(self.centres):
+            w = 1 - ((points - c) ** 2).sum(1) / self.reaches[k] ** 2
+            sums[k % groups] += self.heights[k] * np.maximum(w, 0) ** 3
+        return sums.max(0)
+
+    def crossings(self, rays: tuple[np.ndarray, ...], groups: int, samples: int) -> np.ndarray:
+        """How often f changes sign between so many points of each ray."""
+        o, d, length = rays
+        before, count = None, np.zeros(len(o), int)
+        for k in range(samples + 1):
+            inside = self.values(o + (length * k / samples)[:, None] * d, groups) >= 0
+            count += 0 if before is None else inside != before
+            before = inside
+        return count
+
+    def field(self, groups: int = 1) -> hk.Blobs:
+        """The same field plus its threshold, as the library has it."""
+        grouped = None if groups == 1 else np.arange(len(self.centres)) % groups
+        kernel = Compact(support=self.width)
+        return hk.Blobs(self.centres, self.reaches / self.width, kernel=kernel, groups=grouped)
 
     def first_inside(self, rays: tuple[np.ndarray, ...], samples: int) -> np.ndarray:
         """Where f is first seen to be positive, at so many points of each ray; else infinity."""
@@ -101,26 +121,32 @@ class BlobFormula(Formula):
     exact: whether ranges of the first derivative are exact, for each blob; else products of the
         ranges of the kernel's and the distance's derivative, as in segment tracing (Galin et al.
         2020; Aydinlilar and Zanni 2023, equation 21).
+    groups: as in `Scene.values`; with several, ranges of derivatives are not to be asked for.
     """
 
     scene: Scene
     exact: bool = True
-    records: Records | None = None
+    groups: int = 1
+    records: tuple[Records, ...] = ()
 
     def prepare(self, backend: Any) -> BlobFormula:
         scene = self.scene
         table = np.column_stack([scene.centres, scene.reaches**-2.0, scene.heights])
-        return dataclasses.replace(self, records=Records.upload(backend, table))
+        parts = [Records.upload(backend, table[k :: self.groups]) for k in range(self.groups)]
+        return dataclasses.replace(self, records=tuple(parts))
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        assert self.records is not None, "call prepare"
+        assert self.records, "call prepare"
         kernel = clipped_power(3)
 
         def blob(row: list[Any]) -> Any:
             u, v, w = x - row[0], y - row[1], z - row[2]
             return kernel(1.0 - (u * u + v * v + w * w) * row[3]) * row[4]
 
-        return summed(self.records, blob) - self.scene.threshold
+        sums = [summed(one, blob) for one in self.records]
+        for one in sums[1:]:
+            sums[0] = hk.maximum(sums[0], one)
+        return sums[0] - self.scene.threshold
 
     def restricted(self, p: Any, direction: Any) -> BlobsAlong:
         return BlobsAlong(self, p, direction, piece_count=4)
@@ -175,7 +201,7 @@ class BlobsAlong(FormulaAlong):
                 ]  # fmt: skip
             return tuple(new)
 
-        state = field.records.for_each(body, (zero,) * (4 * count), "blobs along")
+        state = field.records[0].for_each(body, (zero,) * (4 * count), "blobs along")
         return tuple(
             Piece(end - start, Slopes(*state[4 * k : 4 * k + 2]), *state[4 * k + 2 : 4 * k + 4])
             for k, (start, end) in enumerate(itertools.pairwise(knots))
