@@ -46,7 +46,8 @@ class Formula(Field):
     @abc.abstractmethod
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         """f of the coordinates, which may be jets or Dr.Jit numbers: written with + - * / ** and
-        the functions of `harnack.arithmetic`."""
+        the functions of `harnack.arithmetic`. A Dr.Jit number stands behind what is made of the
+        coordinates: x * radius, for Dr.Jit's own operators refuse jets."""
 
     def evaluate(self, p: Vec3) -> Sample:
         sample = self.sample_alone(p)
@@ -172,15 +173,16 @@ def prepared_numbers(field: Any, backend: Backend) -> Any:
     other = copy.copy(field)
     for entry in dataclasses.fields(cast("Any", field)) if dataclasses.is_dataclass(field) else ():
         value = getattr(field, entry.name)
-        if (prepared := _prepared(value, backend)) is not value:
+        if (prepared := as_data(value, backend)) is not value:
             object.__setattr__(other, entry.name, prepared)
     return other
 
 
-def _prepared(value: Any, backend: Backend) -> Any:
+def as_data(value: Any, backend: Backend) -> Any:
+    """Numbers, those of tuples too, as data of the backend; fields prepared; all else as it is."""
     if isinstance(value, float):
         return dr.opaque(backend.Float, value)
     if isinstance(value, tuple):
         entries = cast("tuple[Any, ...]", value)
-        return tuple(_prepared(one, backend) for one in entries)
+        return tuple(as_data(one, backend) for one in entries)
     return value.prepare(backend) if isinstance(value, Field) else value

@@ -7,10 +7,9 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import drjit as dr
-
 from harnack.arithmetic import Jet
 from harnack.arithmetic.blends import blend_intersection, blend_union
+from harnack.fields.formula import as_data
 from harnack.fields.solids.combined import union
 from harnack.fields.solids.solid import Shape, Solid
 
@@ -66,7 +65,7 @@ class Blend(Shape):
         parts = tuple(one.prepare(backend) for one in self.parts)
         object.__setattr__(other, "parts", parts)
         # The power stays a literal: ranges of x^p are found by what p is.
-        object.__setattr__(other, "radius", dr.opaque(backend.Float, self.radius))
+        object.__setattr__(other, "radius", as_data(self.radius, backend))
         return other
 
 

@@ -24,6 +24,7 @@ from harnack.enclosures import (
     Promise,
 )
 from harnack.fields.field import Field
+from harnack.fields.formula import as_data
 from harnack.fields.look import Look, Path, Sample, value_error
 from harnack.fields.solids.solid import Solid
 from harnack.geometry import Box, Intersection
@@ -338,7 +339,7 @@ class Offset(Solid):
 
     def prepare(self, backend: Backend) -> Solid:
         other = self._of(self.inner.prepare(backend))
-        object.__setattr__(other, "distance", dr.opaque(backend.Float, self.distance))
+        object.__setattr__(other, "distance", as_data(self.distance, backend))
         return other
 
     def at_detail(self, detail: Real) -> Field:

@@ -17,7 +17,7 @@ from harnack.backend.extrema import fmax, fmin
 from harnack.backend.lengths import length
 from harnack.enclosures import Curvature, Enclosure, Gaps, HarmonicBall
 from harnack.fields.field import Field
-from harnack.fields.formula import Formula
+from harnack.fields.formula import Formula, as_data
 from harnack.fields.look import Look, Path, Sample
 from harnack.fields.solids.affine import without_balls
 from harnack.fields.solids.combined import Complement, Offset, negated_sample
@@ -277,7 +277,7 @@ class Near(_OfField):
     def prepare(self, backend: Backend) -> Solid:
         other = self._of(self.field.prepare(backend))
         for name in ("level", "half_width"):
-            object.__setattr__(other, name, dr.opaque(backend.Float, getattr(self, name)))
+            object.__setattr__(other, name, as_data(getattr(self, name), backend))
         return other
 
     def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
