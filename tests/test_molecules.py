@@ -151,9 +151,9 @@ def test_the_surface_is_that_of_gaussians_but_for_their_tails() -> None:
         field = hk.Molecule(atoms, tail=tail)
         value = field.value(x, precision="double")
         off.append((np.abs(value - gaussians) / gaussians)[gaussians > 0.5].max())
-    assert 0.05 < off[0] < 0.25
-    assert off[1] < 0.02
-    assert off[2] < 0.0005
+    assert 0.1 < off[0] < 0.6
+    assert off[1] < 0.1
+    assert off[2] < 0.003
 
 
 @pytest.mark.parametrize("precision", ["single", "double"])

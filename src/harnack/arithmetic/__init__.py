@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from harnack.arithmetic.affine import Affine
+from harnack.arithmetic.blends import blend_intersection, blend_union, corner
 from harnack.arithmetic.clipped import ClippedPower, clipped_power
 from harnack.arithmetic.functions import (
     Function,
@@ -40,7 +41,10 @@ __all__ = [
     "acos",
     "asin",
     "atan",
+    "blend_intersection",
+    "blend_union",
     "clipped_power",
+    "corner",
     "cos",
     "cosh",
     "exp",

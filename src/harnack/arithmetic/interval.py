@@ -188,7 +188,9 @@ class Interval:
                 return Interval(-math.inf, math.inf, self.is_single)
             return self._outwards(1 / self.high, 1 / self.low)
         has_zero = ~((self.low > 0) | (self.high < 0))
-        low, high = _down(_lost(1 / self.high, -1)), _up(_lost(1 / self.low, 1))
+        # Quotients are off by two units on CUDA.
+        low = _down(_lost(1 / self.high, -1), 4.0)
+        high = _up(_lost(1 / self.low, 1), 4.0)
         return Interval(dr.select(has_zero, -dr.inf, low), dr.select(has_zero, dr.inf, high))
 
     def _outwards(self, low: Real, high: Real, other: Interval | None = None) -> Interval:
@@ -225,14 +227,14 @@ def select(condition: Mask, a: Real, b: Real, like: Real) -> Real:
     return dr.select(condition, kind(a) if dr.is_array_v(kind) else a, b)
 
 
-def _down(x: Real) -> Real:
-    """A number below x, by a whole unit in the last place at least."""
-    return dr.fma(dr.abs(x), -unit_of(x), x)
+def _down(x: Real, units: float = 1.0) -> Real:
+    """A number below x, by a whole unit in the last place at least, or so many."""
+    return dr.fma(dr.abs(x), -units * unit_of(x), x)
 
 
-def _up(x: Real) -> Real:
-    """A number above x, by a whole unit in the last place at least."""
-    return dr.fma(dr.abs(x), unit_of(x), x)
+def _up(x: Real, units: float = 1.0) -> Real:
+    """A number above x, by a whole unit in the last place at least, or so many."""
+    return dr.fma(dr.abs(x), units * unit_of(x), x)
 
 
 def _lost(x: Real, sign: int) -> Real:

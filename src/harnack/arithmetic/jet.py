@@ -72,6 +72,14 @@ class Jet:
         return x, y, z
 
     @classmethod
+    def within(cls, p: Vec3, radius: Real) -> tuple[Jet, Jet, Jet]:
+        """The coordinates as functions of themselves, on boxes around the balls B(p, radius)."""
+        x, y, z = cls.at_point(p)
+        ends = Interval(-radius, radius)
+        x, y, z = (dataclasses.replace(one, value=one.value + ends) for one in (x, y, z))
+        return x, y, z
+
+    @classmethod
     def along(
         cls, p: Vec3, direction: Vec3, start: Real, end: Real, *, anchored: bool = True
     ) -> tuple[Jet, Jet, Jet]:

@@ -17,10 +17,10 @@ from harnack.fields.meshes.winding_number import WindingNumber
 from harnack.fields.polynomials.polynomial import HarmonicPolynomial, SphericalHarmonic
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.fields.solids.combined import intersection, union
-from harnack.fields.solids.fractal import Displaced, FractalNoise, Noise
-from harnack.fields.solids.julia import Julia
 from harnack.fields.solids.region import solid
-from harnack.fields.solids.round import (
+from harnack.fields.solids.shapes.fractal import Displaced, FractalNoise, Noise
+from harnack.fields.solids.shapes.julia import Julia
+from harnack.fields.solids.shapes.round import (
     Capsule,
     Cylinder,
     DoubleCone,
@@ -29,9 +29,9 @@ from harnack.fields.solids.round import (
     Sphere,
     Torus,
 )
+from harnack.fields.solids.shapes.square import Cuboid, Superellipsoid, Supertorus
+from harnack.fields.solids.shapes.tube import Tube
 from harnack.fields.solids.solid import Shape, Solid
-from harnack.fields.solids.square import Cuboid, Superellipsoid, Supertorus
-from harnack.fields.solids.tube import Tube
 from harnack.fields.waves.periodic import EigenfunctionSum, Gyroid, SchwarzD, SchwarzP
 from harnack.fields.waves.waves import PlaneWave, Product, cosine, sine
 

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 
 from harnack.arithmetic import Jet
+from harnack.backend.extrema import fmin
 from harnack.enclosures import Lipschitz, Piece, Slopes
 from harnack.fields.field import Field
 from harnack.fields.look import Look, Path, Sample
@@ -25,6 +26,10 @@ from harnack.fields.look import Look, Path, Sample
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
     from harnack.enclosures import Promise
+
+
+# Radii of the balls on which a Lipschitz constant is promised, in multiples of |f|/|grad f|.
+_RADII, _LARGEST_RADIUS = (0.25, 1.0, 4.0), 1e12
 
 
 class Formula(Field):
@@ -44,6 +49,11 @@ class Formula(Field):
         the functions of `harnack.arithmetic`."""
 
     def evaluate(self, p: Vec3) -> Sample:
+        sample = self.sample_alone(p)
+        return dataclasses.replace(sample, weaker=self._lipschitz_near(p, sample))
+
+    def sample_alone(self, p: Vec3) -> Sample:
+        """Value and gradient, without promises that a look along a path has no use for."""
         jet = self._jet(Jet.at_point(p), p.x)
         zero = 0 * p.x
         gradient = type(p)(*(zero + one.middle for one in jet.first))
@@ -53,6 +63,20 @@ class Formula(Field):
         known = self.promises(p)
         value, error = zero + jet.value.middle, zero + jet.value.radius
         return Sample(value, gradient, known, error, doubt)
+
+    def _lipschitz_near(self, p: Vec3, sample: Sample) -> tuple[Lipschitz, ...]:
+        """Lipschitz constants on balls about p: the largest gradient on the box around each. The
+        radii are some multiples of Newton's estimate of the distance to level 0."""
+        steps = dr.abs(sample.value) / dr.norm(sample.gradient)
+        made: list[Lipschitz] = []
+        for multiple in _RADII:
+            radius = fmin(multiple * steps, _LARGEST_RADIUS)
+            jet = self._jet(Jet.within(p, radius), p.x)
+            slopes = (0 * p.x + one.largest for one in jet.first)
+            constant = dr.norm(type(p)(*slopes)) * (1 + 1e-5)
+            known = dr.isfinite(constant) & (radius > 0)
+            made.append(Lipschitz(dr.select(known, constant, dr.inf), dr.select(known, radius, 0)))
+        return tuple(made)
 
     def promises(self, p: Vec3) -> tuple[Promise, ...]:
         """What holds in every direction from p: a Lipschitz constant, where one is known."""
@@ -71,7 +95,7 @@ class Formula(Field):
         """The sample, and the enclosures that its ranges prove; looking back nothing is proved."""
         del back
         p = path.point(t)
-        sample = self.evaluate(p)
+        sample = self.sample_alone(p)
         slope = dr.dot(sample.gradient, path.direction)
         slopes = Slopes.around(slope, sample.gradient_error)
         function = self.restricted(p, path.direction)

@@ -41,9 +41,6 @@ if TYPE_CHECKING:
 
 # From so many blobs on, a grid is quicker than a sum over all, by experiment.
 _MANY = 64
-# Looks reach beyond what is asked for by more than what steps are rounded down by: then one that is
-# free to the end says so, and no other look is needed there.
-_BEYOND_END = 1 + 4e-6
 
 
 class BlobError(ValueError):
@@ -156,7 +153,6 @@ class Blobs(Formula):
         if asked.knots is None:
             return path.look(self.evaluate(p))
         on = self._prepared(p)
-        ahead = ahead * _BEYOND_END
         run: Real | None = None
         there, length = p, fmin(ahead, on.across)
         if on.grid is not None:

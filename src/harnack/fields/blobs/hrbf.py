@@ -103,7 +103,7 @@ class HRBF(Formula):
         del back
         p, d = path.point(t), path.direction
         asked = Knots()
-        length = ahead * (1 + 4e-6)
+        length = ahead
         path.proofs.along(asked, Slopes(0.0, 0.0), length)
         if asked.knots is None:
             return path.look(self.evaluate(p))

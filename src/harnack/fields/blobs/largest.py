@@ -182,8 +182,8 @@ class LargestAlong(Enclosure):
             enclosures = self.path.proofs.along(one, slopes, self.length)
             lower = self.value - one.start.value
             none = real(dr.inf)
-            rising = longest_step(enclosures, Gaps(none, gaps.up + lower))
-            falling = longest_step(enclosures, Gaps(gaps.down - lower, none))
+            rising = longest_step(enclosures, Gaps(none, gaps.up + lower, is_one_sided=True))
+            falling = longest_step(enclosures, Gaps(gaps.down - lower, none, is_one_sided=True))
             clear = gaps.down > lower
             return fmin(rising, up), fmax(dr.select(clear, falling, 0), down)
 

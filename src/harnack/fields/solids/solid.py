@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import functools
 from typing import TYPE_CHECKING, Any
 
 from harnack.fields.field import Field
@@ -13,8 +14,20 @@ if TYPE_CHECKING:
 
     import numpy.typing as npt
 
+    from harnack.backend import Backend
     from harnack.fields.solids.maps import Map
     from harnack.geometry import Volume
+
+
+def _remembering(prepare: Callable[[Any, Backend], Field]) -> Callable[[Any, Backend], Field]:
+    @functools.wraps(prepare)
+    def remembering(self: Any, backend: Backend) -> Field:
+        prepared = prepare(self, backend)
+        if prepared is not self:
+            object.__setattr__(prepared, "_source", vars(self).get("_source", self))
+        return prepared
+
+    return remembering
 
 
 class Solid(Field):
@@ -40,7 +53,14 @@ class Solid(Field):
         return self.domain
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        return self.hull(max(levels)) or self.hull(min(levels), above=True)
+        own: Solid = vars(self).get("_source", self)
+        return own.hull(max(levels)) or own.hull(min(levels), above=True)
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Has a prepared solid, whose numbers lie on a backend, remember the one that it is of."""
+        super().__init_subclass__(**kwargs)
+        if "prepare" in vars(cls):
+            cls.prepare = _remembering(cls.prepare)  # type: ignore[method-assign]
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         """f of coordinates that are jets; see `Formula`.
@@ -157,6 +177,9 @@ class Solid(Field):
 
 class Shape(Formula, Solid):
     """A solid given by a formula of the coordinates."""
+
+    def prepare(self, backend: Backend) -> Field:
+        return super().prepare(backend)
 
     def leaves(self, change: Callable[[Solid], Solid]) -> Solid:
         return change(self)

@@ -13,8 +13,8 @@ from harnack.backend import backend_of
 from harnack.backend.extrema import fmax
 from harnack.enclosures import Curvature, Lipschitz
 from harnack.fields.formula import Formula, prepared_numbers
-from harnack.fields.solids.checks import finite, positive
-from harnack.fields.solids.noise import CONSTANTS, CORNERS, Fade, cell_noise, lattice_vector
+from harnack.fields.solids.shapes.checks import finite, positive
+from harnack.fields.solids.shapes.noise import CONSTANTS, CORNERS, Fade, cell_noise, lattice_vector
 from harnack.fields.solids.solid import Shape
 
 if TYPE_CHECKING:

@@ -1,0 +1,1 @@
+"""Shapes: solids that are given by a few numbers."""
