@@ -15,7 +15,7 @@ import pytest
 import harnack as hk
 from harnack import enclosures, fields
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.enclosures import Caps, Classic, Cone, Enclosure, Gaps, Parabola, Slope, Taylor
+from harnack.enclosures import Caps, Classic, Cone, Enclosure, Gaps, Slope, Taylor, choose_proofs
 from harnack.fields import (
     Curvature,
     Field,
@@ -31,10 +31,12 @@ from harnack.fields import (
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.geometry import shapes
 from harnack.geometry.mesh_shapes import bumpy_sphere, icosphere, remove_faces
-from harnack.testing import BrokenPromiseError, check_field, scaled
+from harnack.testing import BrokenPromiseError, check_field, check_looks, scaled
 from harnack.testing.cases import case_of
 from tests.oracles.direct_sums import dipole_sum, winding_sum
 from tests.oracles.step_contracts import check_steps
+from tests.test_arithmetics import PROOFS
+from tests.test_shapes import SHAPES
 
 BOUNDS = (Classic, Slope, Caps, Cone, Taylor)
 
@@ -176,21 +178,52 @@ APPROXIMATE: dict[str, Field] = {
 }
 
 
+# Proofs from ranges of derivatives, which `check_looks` tries on every shape.
+LOOKS = ("pieces", "segment", "linear-taylor", "quadratic-taylor")
+
+
 def test_every_field_there_is_is_tested() -> None:
     exported = {
         kind
         for kind in vars(fields).values()
         if inspect.isclass(kind) and issubclass(kind, Field) and not inspect.isabstract(kind)
     }
-    assert exported <= {type(field) for field in (*FIELDS.values(), *APPROXIMATE.values())}
+    shapes = [shape for shape, _ in SHAPES.values()]
+    tested = {type(field) for field in (*FIELDS.values(), *APPROXIMATE.values(), *shapes)}
+    # Those have contracts in the test files of their own.
+    tested |= {hk.Blobs, hk.HRBF, hk.Molecule}
+    assert all(any(issubclass(one, kind) for one in tested) for kind in exported)
     proofs = {
         kind
         for kind in vars(enclosures).values()
         if inspect.isclass(kind) and issubclass(kind, Enclosure) and not inspect.isabstract(kind)
     }
-    # A bare parabola is made of no promise; `test_bounds` tries it by itself.
-    assert proofs - {Parabola} == set(BOUNDS)
+    # A bare parabola is made of no promise; `test_bounds` tries it by itself. Proofs from ranges
+    # along a path are tried in `test_arithmetics`, those of combinations in `test_combined_solids`.
+    promised = {kind for kind in proofs if kind.of.__func__ is not Enclosure.of.__func__}
+    assert promised == set(BOUNDS)
+    others = {"Parabola", "Greatest", "Negated", "Stretched", "Band", "Tangent"}
+    ranged = {kind for kind in proofs if kind.along.__func__ is not Enclosure.along.__func__}
+    bases = {"OnePiece"}
+    assert {kind.__name__ for kind in proofs - promised - ranged} == others
+    named = {type_ for name in (*PROOFS, *LOOKS) for type_ in choose_proofs(name).kinds}
+    assert {kind for kind in ranged if kind.__name__ not in bases} <= named
     assert {bound for _, bound in PAIRS} == set(BOUNDS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bound", [*LOOKS, *PROOFS])
+@pytest.mark.parametrize("name", ["torus", "rounded box", "displaced", "capsule"])
+def test_every_proof_from_ranges_holds(name: str, bound: str) -> None:
+    points = np.random.default_rng(4).uniform(-1.5, 1.5, (80, 3))
+    if (
+        name == "displaced" and bound in PROOFS and bound != "interval"
+    ):  # noise is known by its derivatives alone
+        with pytest.raises(TypeError, match="gives ranges of derivatives alone"):
+            check_looks(SHAPES[name][0], points, bound=bound)
+        return
+    for precision in ("single", "double"):
+        check_looks(SHAPES[name][0], points, rng=5, bound=bound, precision=precision)
 
 
 @pytest.mark.parametrize("name", FIELDS)

@@ -1,6 +1,7 @@
 """Functions of several numbers: the larger, the smaller, and norms (Hart 1996, appendix B).
 
-They take jets, Dr.Jit and NumPy arrays and Python numbers, also mixed.
+They take jets, numbers of the other arithmetics, Dr.Jit and NumPy arrays and Python numbers, also
+mixed.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 from harnack.arithmetic.functions import absolute, power, reciprocal, sqrt
 from harnack.arithmetic.interval import ONE, Interval
 from harnack.arithmetic.jet import Jet, spanned
+from harnack.arithmetic.operators import Operators
 from harnack.backend.extrema import fmax, fmin
 
 if TYPE_CHECKING:
@@ -35,9 +37,9 @@ def minimum(*values: Any) -> Any:
 def _folded(name: str, values: tuple[Any, ...]) -> Any:
     if len(values) < 2:
         raise TypeError(f"{name} compares two numbers or more, and {len(values)} was given")
-    if any(isinstance(one, Jet) for one in values):
-        # Jets first, so that one of them takes each of the others.
-        ordered = sorted(values, key=lambda one: not isinstance(one, Jet))
+    if any(isinstance(one, Jet | Operators) for one in values):
+        # Jets and their like first, so that one of them takes each of the others.
+        ordered = sorted(values, key=lambda one: not isinstance(one, Jet | Operators))
         return functools.reduce(lambda a, b: getattr(a, name)(b), ordered)
     of_arrays, of_others = _PAIRS[name]
 
@@ -80,6 +82,13 @@ def norm(*values: Any, p: float = 2.0) -> Any:
         return sizes[0] if len(sizes) == 1 else maximum(*sizes)
     if p == 1.0:
         return functools.reduce(lambda a, b: a + b, [absolute(one) for one in values])
+    if any(isinstance(one, Operators) for one in values):
+        sizes = [one if p == 2.0 else absolute(one) for one in values]
+        powers = [one.apply(power(p)) if isinstance(one, Operators) else one**p for one in sizes]
+        # One of them first that takes numbers of other kinds.
+        powers.sort(key=lambda one: not isinstance(one, Operators))
+        total = functools.reduce(lambda a, b: a + b, powers)
+        return total.apply(sqrt if p == 2.0 else power(1 / p))
     jets = [one for one in values if isinstance(one, Jet)]
     if not jets:
         return _plain_norm(values, p)

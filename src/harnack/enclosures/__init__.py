@@ -28,6 +28,7 @@ from harnack.enclosures.promises import (
 )
 from harnack.enclosures.proofs import Choice, Proofs, any_covers, choose_proofs, longest_step
 from harnack.enclosures.restriction import Evaluable, Piece, Restriction
+from harnack.enclosures.tangent import Tangent
 
 __all__ = [
     "AffineBand",
@@ -64,6 +65,7 @@ __all__ = [
     "Slope",
     "Slopes",
     "Stretched",
+    "Tangent",
     "TargetLevels",
     "Taylor",
     "any_covers",

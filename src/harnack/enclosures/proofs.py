@@ -23,13 +23,14 @@ from harnack.enclosures.literature import (
 from harnack.enclosures.parabola import Cone, Taylor
 from harnack.enclosures.pieces import LinearTaylor, Pieces, QuadraticTaylor, Segment
 from harnack.enclosures.promises import LineLipschitz, Promise
+from harnack.enclosures.tangent import Tangent
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real
     from harnack.enclosures.restriction import Restriction
 
 _NAMED: dict[str, tuple[type[Enclosure], ...]] = {
-    "pieces": (Pieces, Taylor, Caps, Slope, Cone),
+    "pieces": (Pieces, Tangent, Taylor, Caps, Slope, Cone),
     "quadratic-taylor": (QuadraticTaylor,),
     "linear-taylor": (LinearTaylor,),
     "segment": (Segment,),

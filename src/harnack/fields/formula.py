@@ -18,8 +18,9 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 
 from harnack.arithmetic import Jet
+from harnack.arithmetic.operators import Operators
 from harnack.backend.extrema import fmin
-from harnack.enclosures import Lipschitz, Piece, Slopes
+from harnack.enclosures import Lipschitz, Piece, Slopes, Tangent
 from harnack.fields.field import Field
 from harnack.fields.look import Look, Path, Sample
 
@@ -37,8 +38,10 @@ class Formula(Field):
 
     lipschitz: a proved bound of |grad f| everywhere, for sphere tracing (bound="lipschitz"); None
         where none is known.
+    is_convex: whether f, as a function, is convex: it then stays above its tangents.
     """
 
+    is_convex: bool = False
     has_creases = True  # it may use abs, maximum and minimum
     overstep = 1.0  # longer steps than proved cost looks: what is proved is long already
     lipschitz: Real | None = None
@@ -103,7 +106,10 @@ class Formula(Field):
         enclosures = path.proofs.along(function, slopes, ahead)
         if not enclosures:
             return path.look(sample)
-        return Look(sample, enclosures, (), slope, max(one.growth for one in enclosures))
+        growth = max(one.growth for one in enclosures)
+        if self.is_convex and Tangent in path.proofs.kinds:
+            enclosures = (*enclosures, Tangent(slopes))
+        return Look(sample, enclosures, (), slope, growth)
 
     def restricted(self, p: Vec3, direction: Vec3) -> FormulaAlong:
         """The field along the path from p, as enclosures ask for it."""
@@ -116,6 +122,20 @@ class Formula(Field):
 
     def _jet(self, coordinates: tuple[Jet, Jet, Jet], like: Real) -> Jet:
         return as_jet(self.formula(*coordinates), coordinates[0], type(self).__name__)
+
+
+def is_jet(x: Any, name: str) -> bool:
+    """Whether a coordinate is a jet, and no plain number, of a formula that knows nothing else.
+
+    Raises:
+        TypeError: it is a number of another arithmetic.
+    """
+    if isinstance(x, Operators):
+        raise TypeError(
+            f"{name} gives ranges of derivatives alone, and the bound asked for is made of others: "
+            'leave bound=None, or use "pieces", "quadratic-taylor", "linear-taylor" or "segment"'
+        )
+    return isinstance(x, Jet)
 
 
 def as_jet(value: Any, like: Jet, name: str) -> Jet:

@@ -48,6 +48,8 @@ def check_looks(
     scale = np.abs(rough.moved).max(axis=1) + 1e-6
     for forwards in (True, False):
         gaps = scale[:, None] * 10.0 ** generator.uniform(-3, 0.5, (n, 2))
+        without = generator.integers(0, 3, n)  # a level below, above, or on both sides
+        gaps[without < 2, without[without < 2]] = np.inf
         steps = free_lengths(
             field, points, directions if forwards else -directions, ahead, gaps,
             bound=bound, precision=precision, forwards=forwards,

@@ -31,7 +31,7 @@ from harnack.fields.blobs.sums import (
     sum_along,
     value_at,
 )
-from harnack.fields.formula import Formula
+from harnack.fields.formula import Formula, is_jet
 from harnack.fields.kept import prepared_once
 from harnack.fields.look import Look, Path, Sample
 from harnack.geometry import Box
@@ -188,7 +188,7 @@ class Blobs(Formula):
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         """f of jets of the coordinates, or of Dr.Jit numbers: a sum over all blobs, near or not."""
-        if not isinstance(x, Jet):
+        if not is_jet(x, type(self).__name__):
             return self.differentiable_value(backend_of(x).Array3f(x, y, z))
         on = self._prepared_for(backend_of(_number_of(x, y, z)))
         zero = on.backend.Float(0)

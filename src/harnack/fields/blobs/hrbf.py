@@ -19,7 +19,7 @@ from harnack.backend.records import Records
 from harnack.enclosures import Lipschitz, Piece, Slopes
 from harnack.fields.blobs.jets import summed
 from harnack.fields.blobs.sums import PIECES, Along, BlobValue, Knots, State, over
-from harnack.fields.formula import Formula
+from harnack.fields.formula import Formula, is_jet
 from harnack.fields.kept import prepared_once
 from harnack.fields.look import Look, Path, Sample
 from harnack.geometry import Box
@@ -115,7 +115,7 @@ class HRBF(Formula):
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         """f of jets of the coordinates, or of Dr.Jit numbers."""
-        if not isinstance(x, Jet):
+        if not is_jet(x, type(self).__name__):
             return self.differentiable_value(backend_of(x).Array3f(x, y, z))
         numbers = (end for jet in (x, y, z) for one in (jet.value, *jet.first)
                    for end in (one.low, one.high) if dr.is_array_v(type(end)))  # fmt: skip

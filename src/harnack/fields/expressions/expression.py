@@ -24,6 +24,7 @@ class Expression(Formula):
     function: Callable[[Any, Any, Any], Any]
     domain: Volume | None = None
     default_level: float = field(default=0.0, kw_only=True)
+    is_convex: bool = field(default=False, kw_only=True)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         return self.function(x, y, z)
@@ -34,7 +35,11 @@ class Expression(Formula):
 
 
 def expression(
-    function: Callable[[Any, Any, Any], Any], *, domain: Volume | None = None, level: float = 0.0
+    function: Callable[[Any, Any, Any], Any],
+    *,
+    domain: Volume | None = None,
+    level: float = 0.0,
+    is_convex: bool = False,
 ) -> Expression:
     """The implicit surface f(x, y, z) = level of a formula of your own.
 
@@ -42,6 +47,9 @@ def expression(
         `cos`, `tan`, `exp`, `log`, `sqrt`, `tanh`, `atan`, `asin`, `acos`, `sinh`, `cosh`,
         `maximum`, `minimum`, `norm`; NumPy's of the same names do too.
     domain: the volume to draw it in, such as `harnack.Ball()`; None for all of space.
+    level: the one drawn when none is asked for.
+    is_convex: a promise of yours that the function is convex, as quadrics and norms are: steps
+        towards it are longer then. `harnack.testing.check_field` samples it.
 
         torus = hk.expression(lambda x, y, z: (hk.norm(x, y) - 1) ** 2 + z**2 - 0.1)
 
@@ -51,7 +59,7 @@ def expression(
     """
     if not callable(function):
         raise TypeError(f"function must be callable with x, y, z, not {function!r}")
-    made = Expression(function, domain, default_level=level)
+    made = Expression(function, domain, default_level=level, is_convex=is_convex)
     made.formula(*_probe())
     return made
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import numpy as np
 
-from harnack.arithmetic import Jet, cos, sin
+from harnack.arithmetic import Jet, cos, maximum, minimum, sin
 from harnack.backend.extrema import fmax, fmin
 from harnack.enclosures import Lipschitz, Promise
 from harnack.fields.field import Field
@@ -167,7 +167,7 @@ class Taper(Bend):
     def local(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
         u, v, w = _turned((x, y, z), self.axis)
         (a, r), (b, s) = self.start, self.end
-        inside = _clamped((w - a) * (1.0 / (b - a)))
+        inside = minimum(maximum((w - a) * (1.0 / (b - a)), 0.0), 1.0)
         shrink = 1.0 / (inside * (s - r) + r)
         return _turned_back((u * shrink, v * shrink, w), self.axis)
 
@@ -194,13 +194,6 @@ class Taper(Bend):
 def _from_axis(p: Vec3, axis: str) -> Real:
     u, v, _ = _turned((p.x, p.y, p.z), axis)
     return dr.sqrt(u * u + v * v)
-
-
-def _clamped(x: Any) -> Any:
-    """x limited to [0, 1]."""
-    if isinstance(x, Jet):
-        return x.maximum(0.0).minimum(1.0)
-    return dr.clip(x, 0, 1)
 
 
 def _turned(p: tuple[Any, Any, Any], axis: str) -> tuple[Any, Any, Any]:

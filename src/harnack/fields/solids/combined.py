@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import numpy as np
 
-from harnack.arithmetic import Jet
+from harnack.arithmetic import maximum, minimum
 from harnack.backend.extrema import fmax, fmin
 from harnack.backend.lengths import largest_component, length
 from harnack.enclosures import (
@@ -114,10 +114,9 @@ class Combined(Solid):
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         values = [one.formula(x, y, z) for one in self.parts]
-        total = values[0]
-        for one in values[1:]:
-            total = _least(total, one) if self.is_union else -_least(-total, -one)
-        return total
+        if len(values) == 1:
+            return values[0]
+        return minimum(*values) if self.is_union else maximum(*values)
 
     def evaluate(self, p: Vec3) -> Sample:
         samples = [one.evaluate(p) for one in self.parts]
@@ -217,12 +216,6 @@ class Combined(Solid):
             constant = fmax(0 * sample.value + own[0].constant, constant)
             radius = fmin(0 * sample.value + own[0].radius, radius)
         return (Lipschitz(constant, radius),)
-
-
-def _least(a: Any, b: Any) -> Any:
-    if isinstance(a, Jet):
-        return a.minimum(b)
-    return b.minimum(a) if isinstance(b, Jet) else fmin(a, b)
 
 
 def _around(volumes: list[Volume]) -> Volume | None:

@@ -17,7 +17,7 @@ from harnack.backend.extrema import fmax, fmin
 from harnack.backend.lengths import length
 from harnack.enclosures import Curvature, Enclosure, Gaps, HarmonicBall
 from harnack.fields.field import Field
-from harnack.fields.formula import Formula, as_data
+from harnack.fields.formula import Formula, as_data, is_jet
 from harnack.fields.look import Look, Path, Sample
 from harnack.fields.solids.affine import without_balls
 from harnack.fields.solids.combined import Complement, Offset, negated_sample
@@ -144,7 +144,7 @@ class Region(_OfField):
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         if isinstance(self.field, Formula):
             return self.field.formula(x, y, z)
-        if not isinstance(x, Jet):
+        if not is_jet(x, type(self.field).__name__):
             return self.differentiable_value(_vector(x, y, z))
         return jet_of_field(self.field, x, y, z)
 

@@ -12,7 +12,7 @@ from harnack.arithmetic import Interval, Jet
 from harnack.backend import backend_of
 from harnack.backend.extrema import fmax
 from harnack.enclosures import Curvature, Lipschitz
-from harnack.fields.formula import Formula, prepared_numbers
+from harnack.fields.formula import Formula, is_jet, prepared_numbers
 from harnack.fields.solids.shapes.checks import finite, positive
 from harnack.fields.solids.shapes.noise import CONSTANTS, CORNERS, Fade, cell_noise, lattice_vector
 from harnack.fields.solids.solid import Shape
@@ -101,7 +101,7 @@ class FractalNoise(Shape):
         return None
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        jets = [one for one in (x, y, z) if isinstance(one, Jet)]
+        jets = [one for one in (x, y, z) if is_jet(one, type(self).__name__)]
         if jets:
             made = [one if isinstance(one, Jet) else jets[0].of(one) for one in (x, y, z)]
             return self._ranges(made)

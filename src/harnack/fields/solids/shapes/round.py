@@ -33,6 +33,8 @@ class Plane(Shape):
     The signed distance (Hart, equation 23): its gradient is n, so that its Lipschitz constant is 1.
     """
 
+    is_convex = True
+
     # The unit vector is rounded.
     lipschitz = 1.0 + 1e-6
 
@@ -63,6 +65,8 @@ class Sphere(Shape):
     The signed distance (Hart, equation 24): by the triangle inequality the constant is 1.
     """
 
+    is_convex = True
+
     radius: float = 1.0
     center: Point = (0.0, 0.0, 0.0)
 
@@ -90,6 +94,8 @@ class Ellipsoid(Shape):
     constant 1 and the stretched coordinates 1/m; it is attained along the shortest axis. So f is no
     larger than the distance, which no formula in closed form gives.
     """
+
+    is_convex = True
 
     radii: Point = (1.0, 1.0, 1.0)
 
@@ -119,6 +125,8 @@ class Cylinder(Shape):
     the side and to the ends have gradients at right angles, so that `corner` gives the signed
     distance; its Lipschitz constant is 1.
     """
+
+    is_convex = True
 
     radius: float = 1.0
     half_height: float | None = None
@@ -181,6 +189,8 @@ class Capsule(Shape):
     The signed distance |q - max(0, min(1, t)) (end - start)| - r, q = x - start, t the parameter of
     the nearest point of the line. As a distance of a set it has the constant 1.
     """
+
+    is_convex = True
 
     start: Point = (0.0, 0.0, -1.0)
     end: Point = (0.0, 0.0, 1.0)

@@ -30,6 +30,8 @@ class Cuboid(Shape):
     The signed distance: that of the box smaller by the radius (`corner`), less the radius.
     """
 
+    is_convex = True
+
     half_sides: Point = (1.0, 1.0, 1.0)
     radius: float = 0.0
 
@@ -108,6 +110,8 @@ class Superellipsoid(_Powered):
     f = m (that norm - 1) with m the least radius (Hart, equations 28 to 30), whose constant is that
     of the norm for equal radii, and no larger for others: see `lipschitz_of_norms`.
     """
+
+    is_convex = True
 
     powers: tuple[float, float] = (4.0, 4.0)
     radii: Point = (1.0, 1.0, 1.0)

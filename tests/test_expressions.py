@@ -1,0 +1,126 @@
+"""Formulas of users: values and derivatives, what may go wrong, and steps that are sharp."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+import harnack as hk
+from harnack.testing import BrokenPromiseError, check_field, check_looks
+from harnack.testing.scaled import scaled
+
+POINTS = np.random.default_rng(2).uniform(-0.9, 0.9, (200, 3))
+
+
+def waves(x: Any, y: Any, z: Any) -> Any:
+    return hk.sin(3 * x) * hk.exp(-y * y) + hk.sqrt(z * z + 1) / (2 + x) - hk.tanh(y) ** 3
+
+
+def reference(p: Any) -> Any:
+    x, y, z = np.moveaxis(p, -1, 0)
+    first = np.sin(3 * x) * np.exp(-y * y)
+    return first + np.sqrt(z * z + 1) / (2 + x) - np.tanh(y) ** 3
+
+
+def test_value_gradient_and_hessian_are_those_of_the_formula() -> None:
+    field = hk.expression(waves)
+    assert np.abs(field.value(POINTS, precision="double") - reference(POINTS)).max() < 1e-14
+    h = 1e-5
+    steps = h * np.eye(3)
+    gradient = [(reference(POINTS + s) - reference(POINTS - s)) / (2 * h) for s in steps]
+    found = field.gradient(POINTS, precision="double")
+    assert np.abs(found - np.stack(gradient, axis=1)).max() < 1e-9
+    rows = [
+        (field.gradient(POINTS + s, precision="double")
+         - field.gradient(POINTS - s, precision="double")) / (2 * h) for s in steps
+    ]  # fmt: skip
+    hessian = field.hessian(POINTS, precision="double")
+    assert np.abs(hessian - np.stack(rows, axis=1)).max() < 1e-8
+
+
+def test_numpy_and_plain_operators_mean_the_same() -> None:
+    ours = hk.expression(lambda x, y, z: hk.cos(x) + abs(y) ** 3 - hk.maximum(z, 0.1))
+    theirs = hk.expression(lambda x, y, z: np.cos(x) + np.abs(y) ** 3 - np.maximum(z, 0.1))
+    o, d = [[0.1, -3, 0.2]], [[0.05, 1, 0.1]]
+    one, two = (hk.trace(field, o, d, level=0.5) for field in (ours, theirs))
+    assert one.t == two.t
+    assert one.evaluations == two.evaluations
+
+
+@pytest.mark.parametrize(
+    ("function", "error", "message"),
+    [
+        (3, TypeError, "must be callable"),
+        (lambda x, y: x, TypeError, "positional argument"),
+        (lambda x, y, z: math.sin(x), TypeError, "use harnack.sin"),
+        (lambda x, y, z: x if x > 0 else y, TypeError, ""),
+        (lambda x, y, z: np.arctan2(x, y), TypeError, "has no proved ranges"),
+        (lambda x, y, z: x / 0, ZeroDivisionError, "constant 0"),
+        (lambda x, y, z: hk.norm(x, y, p=0.5), ValueError, "at least 1"),
+    ],
+)
+def test_mistakes_are_told_when_the_field_is_made(
+    function: Any, error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        hk.expression(function)
+
+
+def test_what_is_returned_must_be_a_number() -> None:
+    field = hk.expression(lambda x, y, z: "nothing")
+    with pytest.raises(TypeError, match="returned an object of type str"):
+        hk.trace(field, [[0, 0, 3]], [[0, 0, -1]], t_max=5.0)
+    constant = hk.expression(lambda x, y, z: 1.0)
+    assert hk.trace(constant, [[0, 0, 3]], [[0, 0, -1]], t_max=5.0).status == hk.Status.MISS
+
+
+def test_where_a_formula_is_not_defined_nothing_is_claimed() -> None:
+    """log(x) - y at x < 0: neither a hit nor a proved miss."""
+    field = hk.expression(lambda x, y, z: hk.log(x) - y)
+    hits = hk.trace(field, [[-1, 0, 3], [1.0, 3.0, 0]], [[0, 0, -1], [0, -1, 0]], t_max=5.0,
+                    max_steps=60)  # fmt: skip
+    assert hits.status.tolist() == [hk.Status.OUT_OF_STEPS, hk.Status.HIT]
+    assert hits.t[1] == pytest.approx(3.0, abs=1e-3)
+
+
+def test_a_false_claim_of_convexity_is_found() -> None:
+    check_field(hk.expression(lambda x, y, z: x * x + 2 * y * y + z * z - 1, is_convex=True))
+    saddle = hk.expression(lambda x, y, z: x * x - y * y + z, is_convex=True)
+    with pytest.raises(BrokenPromiseError, match="an enclosure looking ahead is left"):
+        check_looks(saddle, POINTS)
+
+
+def test_steps_of_a_parabola_are_the_longest_there_are() -> None:
+    """x^2 has a constant second derivative: the proof is attained, and 1.001 times it is wrong."""
+    field = hk.expression(lambda x, y, z: x * x + 0 * y)
+    check_looks(field, POINTS, rng=4)
+    for factor in (1.001, 1.01):
+        with pytest.raises(BrokenPromiseError):
+            check_looks(field, POINTS, rng=4, bound=scaled_pieces(factor))
+
+
+def scaled_pieces(factor: float) -> Any:
+    return scaled(hk.Pieces, factor)
+
+
+def test_a_twisted_ellipsoid_takes_less_than_six_looks() -> None:
+    """The path is passed on, and not a Lipschitz factor, with which it takes 49."""
+    size = np.array([1.0, 0.3, 2.0])
+
+    def twisted(x: Any, y: Any, z: Any) -> Any:
+        c, s = hk.cos(2 * z), hk.sin(2 * z)
+        u, v = x * c + y * s, y * c - x * s
+        return (u / size[0]) ** 2 + (v / size[1]) ** 2 + (z / size[2]) ** 2 - 1
+
+    box = np.array([1.05, 1.05, 2.05])
+    field = hk.expression(twisted, domain=hk.Box(tuple(-box), tuple(box)))
+    rng = np.random.default_rng(0)
+    o = rng.normal(size=(4000, 3))
+    o *= 5 / np.linalg.norm(o, axis=1, keepdims=True)
+    hits = hk.trace(field, o, rng.uniform(-1, 1, (4000, 3)) * box - o,
+                    tolerance=hk.Tolerance(value=1e-3, distance=1e-12))  # fmt: skip
+    assert hits.evaluations.mean() < 6
+    assert (hits.status != hk.Status.OUT_OF_STEPS).all()
