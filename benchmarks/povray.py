@@ -70,8 +70,8 @@ class Drawn:
 class Oracle:
     """First roots along the camera's rays, by dense sampling and bisection in double precision.
 
-    t: infinite where there is none. doubtful: pixels where f nearly touches 0 without a change of
-        sign that was seen, so that either answer is right.
+    t: infinite where there is none. doubtful: pixels where the ray grazes the surface within the
+        tolerance, before the first root or in it, so that either answer is right.
     """
 
     t: np.ndarray
@@ -245,13 +245,25 @@ def oracle(drawn: Drawn, d: np.ndarray) -> Oracle:
         t = near + (far - near) * (real(k) / SAMPLES)
         return k + 1, dr.minimum(least, dr.abs(value(t)))
 
+    def behind_root(k: Any, most: Any) -> tuple[Any, ...]:
+        now = value(near + (far - near) * (real(k) / SAMPLES))
+        behind = (now > 0) != (start > 0)
+        return k + 1, dr.select(behind, dr.maximum(most, dr.abs(now)), most), behind
+
     least = dr.while_loop(
         (dr.zeros(count, len(d)), dr.full(real, dr.inf, len(d))),
         lambda k, _: crosses & (k <= last),
         touched,
     )[1]
+    # Or behind it for so short that it is within the tolerance of the surface all the time.
+    beyond = dr.while_loop(
+        (count(found), dr.zeros(real, len(d)), dr.full(backend.Bool, True, len(d))),
+        lambda k, most, behind: has_root & behind & (k <= SAMPLES),
+        lambda k, most, behind: behind_root(k, most),
+    )
+    shallow = has_root & ~beyond[2] & (beyond[1] < 1.1 * TOLERANCE * drawn.steepest)
     edge = has_root & ((found <= 3) | (found + 3 >= SAMPLES))
-    doubtful = (least < 1.1 * TOLERANCE * drawn.steepest) | edge
+    doubtful = (least < 1.1 * TOLERANCE * drawn.steepest) | edge | shallow
     t = dr.select(has_root, b, dr.inf)
     dr.eval(t, doubtful)
     return Oracle(t.numpy(), doubtful.numpy())

@@ -21,6 +21,7 @@ from harnack.fields.blobs.kernels import Kernel, choose_kernel
 from harnack.fields.blobs.largest import GroupedList, LargestAlong, largest_at, largest_jet
 from harnack.fields.blobs.sums import (
     PIECES,
+    PIECES_IN_CELL,
     BlobValue,
     ForEach,
     Knots,
@@ -147,7 +148,9 @@ class Blobs(Formula):
         """
         del back
         p, d = path.point(t), path.direction
-        asked = Knots()
+        on = self._prepared(p)
+        count = PIECES if on.grid is None else PIECES_IN_CELL
+        asked = Knots(count)
         nothing = Slopes(0.0, 0.0)
         path.proofs.along(asked, nothing, ahead)
         if asked.knots is None:
@@ -181,7 +184,7 @@ class Blobs(Formula):
             )  # fmt: skip
         if run is not None:
             enclosures = tuple(_After(run, one) for one in enclosures)
-        return Look(self._sample(start), enclosures, (), slope, PIECES)
+        return Look(self._sample(start), enclosures, (), slope, max(2, count))
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         """f of jets of the coordinates, or of Dr.Jit numbers: a sum over all blobs, near or not."""

@@ -48,8 +48,9 @@ class BlobValue:
     gradient_error: Real
 
 
-# Pieces of a path that take the least time: finding what is near costs more than ranges.
-PIECES = 4
+# Pieces of a path that take the least time, for sums over all blobs and over those of a cell, which
+# is left soon: finding what is near costs more than ranges.
+PIECES, PIECES_IN_CELL = 4, 2
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,11 @@ class Along:
 
     start: BlobValue
     parts: tuple[Piece, ...]
-    piece_count: int = PIECES
+
+    @property
+    def piece_count(self) -> int:
+        """How many there are."""
+        return len(self.parts)
 
     def pieces(self, knots: Sequence[Real]) -> tuple[Piece, ...]:
         """The ranges between the knots that it was made with."""
@@ -69,8 +74,8 @@ class Along:
 class Knots:
     """A function along a path that is asked in advance which ranges will be wanted."""
 
-    def __init__(self) -> None:
-        self.piece_count = PIECES
+    def __init__(self, piece_count: int = PIECES) -> None:
+        self.piece_count = piece_count
         self.knots: tuple[Real, ...] | None = None
 
     def pieces(self, knots: Sequence[Real]) -> tuple[Piece, ...]:

@@ -1,0 +1,91 @@
+"""The parts of benchmarks that decide what is compared: scenes, oracles, counts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import harnack as hk
+from benchmarks import blobs, hart, inclusion, povray
+from harnack.backend import choose_backend, to_vector3
+from harnack.enclosures import BottomUpLinear
+
+SCENE = blobs.Scene.random(6, 1.5, (0.6, 1.0), 1.6, seed=2)
+
+
+def test_the_blobs_of_the_benchmark_and_of_the_library_are_the_same() -> None:
+    backend = choose_backend("double")
+    p = np.random.default_rng(0).uniform(-2, 2, (500, 3))
+    points = to_vector3(backend, p)
+    for groups in (1, 3):
+        expected = SCENE.values(p, groups)
+        own = blobs.BlobFormula(SCENE, groups=groups).prepare(backend).evaluate(points)
+        np.testing.assert_allclose(own.value.numpy(), expected, atol=1e-12)
+        library = SCENE.field(groups).prepare(backend).evaluate(points)
+        np.testing.assert_allclose(library.value.numpy() - SCENE.threshold, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("method", inclusion.METHODS, ids=lambda one: one[0])
+def test_no_method_misses_a_hit(method: inclusion.Method) -> None:
+    reference = SCENE.first_inside(SCENE.rays(300), 500)
+    assert 50 < np.isfinite(reference).sum() < 280
+    row = inclusion.measure(SCENE, method, 300, reference)
+    assert row.missed == 0
+    assert 1 <= row.looks < 25
+
+
+def test_methods_come_in_the_published_order() -> None:
+    """Those of table 1 of Aydinlilar and Zanni (2023), from the most looks to the fewest."""
+    scene = inclusion.table1_scene()
+    compared = [one for one in inclusion.METHODS if one[3] is not None]
+    looks = [inclusion.measure(scene, one, 3000, precision="double").looks for one in compared]
+    assert looks == sorted(looks, reverse=True)
+
+
+def test_enhancements_see_the_same_surface_with_fewer_evaluations() -> None:
+    solids = hart.scenes()["nine balls and a plane"]
+    plain = hart.trace(solids)
+    seen = np.isfinite(plain.t)
+    assert 0.5 < seen.mean() <= 1
+    for asked in ({"convexity": True}, {"triangle": True}, {"bounding": True}):
+        made = hart.trace(solids, **asked)
+        assert made.evaluations < 0.5 * plain.evaluations
+        np.testing.assert_array_equal(np.isfinite(made.t), seen)
+        np.testing.assert_allclose(made.t[seen], plain.t[seen], atol=0.02)
+
+
+def test_bisection_is_bounded_by_its_depth() -> None:
+    from benchmarks.bisection import bisect
+
+    backend = choose_backend("double")
+    o, d, length = SCENE.rays(200)
+    rays = to_vector3(backend, o), to_vector3(backend, d), backend.Float(length)
+    t, looks, _ = bisect(backend, blobs.BlobFormula(SCENE), BottomUpLinear, rays, 1e-3)
+    assert looks.numpy().max() < 300
+    hit = np.isfinite(t.numpy())
+    values = SCENE.values((o + np.where(hit, t.numpy(), 0)[:, None] * d)[hit])
+    assert np.abs(values).max() < 0.05
+
+
+def test_scene_files_name_the_camera_and_the_container() -> None:
+    gyroid, some_blobs = povray.pictures()
+    text = povray.pov_scene(gyroid, positions=False)
+    assert "contained_by { sphere { <0,0,0>, 1.000000000 } }" in text
+    assert "max_gradient 16.32" in text
+    assert text.count("isosurface") == 1
+    text = povray.pov_scene(some_blobs, positions=True)
+    assert text.count("pow(max(0,1-") == 40
+    assert "pigment_map" in text
+
+
+def test_the_oracle_finds_the_roots_of_the_tracer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(povray, "WIDTH", 24)
+    gyroid = povray.pictures()[0]
+    d = povray.camera_rays()
+    truth = povray.oracle(gyroid, d)
+    assert 0.3 < np.isfinite(truth.t).mean() < 0.7
+    t, _, _ = povray.by_harnack(gyroid, d, 1)
+    assert truth.wrong(gyroid, d, t)[0] == 0
+    off = np.where(np.isfinite(t), t + 0.05, t)
+    assert truth.wrong(gyroid, d, off)[0] > 50
+    assert isinstance(gyroid.field, hk.Gyroid)
