@@ -207,8 +207,13 @@ class Jet:
         return self.apply(power(float(exponent)))
 
     def __rpow__(self, base: Any) -> Jet:
+        if isinstance(base, int | float) and not base > 0:
+            raise ValueError(f"{base:g}**x is no real number for most x: the base must be positive")
         b = self._with(base)
-        return NotImplemented if b is None else b**self
+        if b is None:
+            return NotImplemented
+        # A number known while a kernel is recorded does not know of which kind it is.
+        return self._constant(b.dynamic_value(self.kind())) ** self
 
     def __abs__(self) -> Jet:
         return self.apply(absolute)

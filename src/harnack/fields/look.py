@@ -96,8 +96,11 @@ class Look:
 
     ahead: enclosures of f(path(t+s)) - f(path(t)).
     back: enclosures of f(path(t-s)) - f(path(t)), from the same evaluation.
-    slope: the derivative of f along the path, known up to `Sample.gradient_error`.
+    slope: the derivative of f along the path, known up to `slope_error`.
     growth: how many times the step from here the next look should be asked to reach.
+    slope_error: how far off `slope` may be, where that is known to be less than
+        `Sample.gradient_error`: on a crease the gradient is a range, and the derivative along a ray
+        that runs in the crease may still be a number. None where nothing better is known.
     """
 
     sample: Sample
@@ -105,6 +108,12 @@ class Look:
     back: tuple[Enclosure, ...]
     slope: Real
     growth: float = 2.0
+    slope_error: Real | None = None
+
+    @property
+    def slope_doubt(self) -> Real:
+        """How far off `slope` may be."""
+        return self.sample.gradient_error if self.slope_error is None else self.slope_error
 
 
 @dataclass(frozen=True)

@@ -178,18 +178,22 @@ class March:
             total_error = value_error(sample, gradient_norm, size + t)
 
             # Is all up to there proved free, and is the sample fine enough to say so?
-            within = self.tolerance.in_value(
-                fmax(gradient_norm - sample.gradient_error, real(0)), t
-            )
+            steepness = fmax(gradient_norm - sample.gradient_error, real(0))
+            if look.slope_error is not None:  # the gradient is at least as long as its shadow
+                steepness = fmax(dr.abs(look.slope) - look.slope_error, steepness)
+            within = self.tolerance.in_value(steepness, t)
+            knows_gradient = (sample.gradient_error <= gradient_norm) | (steepness > 0)
             if self.hysteresis is not None:
                 within = self.hysteresis.within(within)
+            # Where not even the gradient is known, rounding makes no hits.
+            rounding = dr.select(knows_gradient, total_error - sample.truncation, 0)
             is_near = self._is_near(
-                gaps.smaller, within, total_error, sample, gradient_norm, size + t
+                gaps.smaller, within, total_error, rounding, sample, gradient_norm, size + t
             )
             excess = fmax(gaps.smaller + total_error - within, real(0))
             band, may_pass = within, is_near
             if self.hysteresis is not None and now.contact is not None:
-                band = self._band(within, total_error, sample, gradient_norm)
+                band = self.hysteresis.band(within, rounding)
                 gaps = self.hysteresis.gaps(now.contact, sample.value, gaps, band)
                 within = CLOSER * within
                 may_pass &= ~now.contact.is_touching
@@ -285,32 +289,24 @@ class March:
         gap: Real,
         within: Real,
         total_error: Real,
+        rounding: Real,
         sample: Sample,
         gradient_norm: Real,
         size: Real,
     ) -> Mask:
         """Whether a level is near enough in value for a hit; see `advance`.
 
-        within: how near the tolerance asks it to be. A point is no hit if rounding leaves the
+        within: how near the tolerance asks it to be. rounding: what it may have done to f.
+        A point is no hit if it leaves the
         distance to the surface uncertain by more than a sixteenth of the size of the coordinates
         or, if that is larger, of the radius on which f is known to be smooth.
         """
-        # Where not even the gradient is known, rounding makes no hits.
-        knows_gradient = sample.gradient_error <= gradient_norm
-        rounded = dr.select(knows_gradient, 2 * (total_error - sample.truncation), 0)
-        near = gap <= fmax(within - sample.truncation, rounded)
+        near = gap <= fmax(within - sample.truncation, 2 * rounding)
         for promise in sample.known:
             radius = promise.radius
             if not isinstance(promise, LineLipschitz):
                 size = fmax(dr.select(dr.isfinite(radius), radius, 0), size)
         return near & (gap + total_error - within <= _LARGEST_UNCERTAINTY * gradient_norm * size)
-
-    def _band(self, within: Real, total_error: Real, sample: Sample, gradient_norm: Real) -> Real:
-        """The tolerance in value that contacts go by (`Hysteresis.band`)."""
-        assert self.hysteresis is not None
-        knows_gradient = sample.gradient_error <= gradient_norm
-        rounding = dr.select(knows_gradient, total_error - sample.truncation, 0)
-        return self.hysteresis.band(within, rounding)
 
     def _trial(
         self, forward: Real, look: Look, gaps: Gaps, now: MarchState, path: Path, is_smooth: bool

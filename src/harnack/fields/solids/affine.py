@@ -87,7 +87,7 @@ class Affine(Map):
                 raise ValueError(f"axis must be a vector (3,) that is not zero, not {axis!r}")
             unit = unit / size
         angle = math.radians(float(degrees))
-        k = np.cross(np.eye(3), unit) * -1
+        k = np.cross(np.eye(3), unit)  # k v = unit x v
         turn = np.eye(3) + math.sin(angle) * k + (1 - math.cos(angle)) * (k @ k)
         return cls.of_arrays(turn)
 
@@ -228,7 +228,8 @@ class AffineImage(Solid):
 
         slope = look.slope * speed * numbers.factor
         ahead_, back_ = stretched(look.ahead), stretched(look.back)
-        return Look(sample, ahead_, back_, slope, look.growth)
+        error = None if look.slope_error is None else look.slope_error * speed * numbers.factor
+        return Look(sample, ahead_, back_, slope, look.growth, error)
 
     def _size(self, p: Vec3, t: Real) -> Real:
         """The size of what the local coordinates of p + t d are summed from."""

@@ -50,10 +50,19 @@ class Blend(Shape):
 
     def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         whole = union(*self.parts) if self.is_union else self.parts[0] & self.parts[1]
-        # Between the minimum of both and that less the radius; above for an intersection.
         if self.is_union:
-            return whole.hull(level, above=True) if above else whole.hull(level + self.radius)
-        return whole.hull(level - self.radius, above=True) if above else whole.hull(level)
+            return whole.hull(level, above=True) if above else whole.hull(self._reached(level))
+        return whole.hull(-self._reached(-level), above=True) if above else whole.hull(level)
+
+    def _reached(self, level: float) -> float:
+        """What the lesser of both is at most where their blended union is at most `level`.
+
+        Proof. The blend grows with both, so it is at least that of the lesser value m taken twice:
+        r - 2^(1/p) (r - m) for m < r, and m beyond.
+        """
+        if level >= self.radius:
+            return level
+        return self.radius - (self.radius - level) / 2 ** (1 / self.power) * (1 - 1e-9)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         a, b = (one.formula(x, y, z) for one in self.parts)

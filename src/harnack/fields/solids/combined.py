@@ -147,10 +147,15 @@ class Combined(Solid):
         looks = [one.look(path, t, ahead, back) for one in self.parts]
         size = largest_component(path.origin) + t
         sample, below = self._joined([one.sample for one in looks], size)
-        slope = dr.dot(sample.gradient, path.direction)
+        slope, slope_error = looks[-1].slope, looks[-1].slope_doubt
+        for look in looks[:-1]:
+            is_chosen = look.sample.value == sample.value
+            slope = dr.select(is_chosen, look.slope, slope)
+            slope_error = dr.select(is_chosen, look.slope_doubt, slope_error)
         front = self._enclosures([one.ahead for one in looks], below)
         behind = self._enclosures([one.back for one in looks], below)
-        return Look(sample, front, behind, slope, max(one.growth for one in looks))
+        growth = max(one.growth for one in looks)
+        return Look(sample, front, behind, slope, growth, slope_error)
 
     def _enclosures(
         self, parts: list[tuple[Enclosure, ...]], below: list[tuple[Real, Real]]
@@ -201,7 +206,7 @@ class Combined(Solid):
         )  # fmt: skip
         whole = value_error(joined, length(gradient), size)
         return joined, [
-            (fmax(greatest - own - fmax(off - whole, 0), 0), greatest - own + off)
+            (fmax(greatest - own - fmax(off - whole, 0), 0), greatest - own + fmax(off - whole, 0))
             for own, off in zip(values, errors, strict=True)
         ]
 
@@ -285,6 +290,7 @@ def negated_look(look: Look) -> Look:
         tuple(Negated(one) for one in look.back),
         -look.slope,
         look.growth,
+        look.slope_error,
     )
 
 

@@ -284,13 +284,14 @@ class Near(_OfField):
         ends = tuple(self.level + sign * (self.half_width + level) for sign in (-1, 1))
         if above or (self.field.is_entire and self.field.period is None):
             return self.domain
-        return bounded_side(self.field, ends, self._is_inside)
 
-    def _is_inside(self, value: float) -> bool:
-        offset, period = value - self.level, self.field.period
-        if period is not None:
-            offset -= period * round(offset / period)
-        return abs(offset) <= self.half_width
+        def is_inside(value: float) -> bool:
+            offset, period = value - self.level, self.field.period
+            if period is not None:
+                offset -= period * round(offset / period)
+            return abs(offset) <= self.half_width + level
+
+        return bounded_side(self.field, ends, is_inside)
 
     def evaluate(self, p: Vec3) -> Sample:
         return self._folded(self.field.evaluate(p))[0]
@@ -307,7 +308,8 @@ class Near(_OfField):
             return tuple(Folded(one, offset, self.field.period) for one in enclosures)
 
         slope = dr.mulsign(look.slope, offset)
-        return Look(sample, folded(look.ahead), folded(look.back), slope, look.growth)
+        ahead_, back_ = folded(look.ahead), folded(look.back)
+        return Look(sample, ahead_, back_, slope, look.growth, look.slope_error)
 
     def _offset(self, value: Real) -> Real:
         """f - level, reduced to half a period on either side."""

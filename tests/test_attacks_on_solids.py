@@ -1,0 +1,84 @@
+"""Cases that attacks on solids and formulas found, kept as they were."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import harnack as hk
+
+PRECISIONS = ("single", "double")
+
+
+@pytest.mark.parametrize(
+    ("axis", "degrees", "start", "end"),
+    [
+        ("x", 90, (0, 1, 0), (0, 0, 1)),
+        ("y", 90, (0, 0, 1), (1, 0, 0)),
+        ("z", 90, (1, 0, 0), (0, 1, 0)),
+        ((1, 1, 1), 120, (1, 0, 0), (0, 1, 0)),
+    ],
+)
+def test_solids_turn_anticlockwise(axis: Any, degrees: float, start: Any, end: Any) -> None:
+    """As seen from the end of the axis; they turned clockwise."""
+    ball = hk.Sphere(0.1, start).rotated(degrees, axis)
+    assert ball.value(np.array([end], dtype=float))[0] == pytest.approx(-0.1, abs=1e-6)
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize(
+    ("solid", "o", "d", "t"),
+    [
+        (hk.DoubleCone(), (0, 0, 3), (0, 0, -1), 3.0),
+        (hk.DoubleCone().rotated(90, "x").moved((0, 3, 0)), (0, 0, 0), (0, 1, 0), 3.0),
+        (hk.DoubleCone().twisted(2.0) - hk.Torus(1.0, 0.2), (0, 0, 3), (0, 0, -1), 3.0),
+        (hk.Torus(0.5, 0.75), (0, 0, 3), (0, 0, -1), 3 - np.sqrt(0.75**2 - 0.5**2)),
+        (hk.Superellipsoid((1.0, 1.0)), (-3, 0, 0), (1, 0, 0), 2.0),
+        (hk.Supertorus((1.0, 3.0), 0.75, 0.25), (-3, 0, 0), (1, 0, 0), 2.0),
+        (hk.expression(lambda x, y, z: hk.maximum(x, y, z) - 0.3), (-1, 2.5, 2.5), (1, -2, -2), 3.3),
+    ],
+    ids=["cone", "moved", "combined", "spindle", "octahedron", "diamond", "crease"],
+)  # fmt: skip
+def test_rays_along_creases_hit(solid: Any, o: Any, d: Any, t: float, precision: Any) -> None:
+    """Where f has no gradient but a derivative along the ray; they ran out of steps."""
+    hits = hk.trace(solid, [o], [d], precision=precision)
+    assert hits.hit.all()
+    assert hits.t[0] == pytest.approx(t, abs=2e-3)
+    assert hits.evaluations[0] < 40
+
+
+def test_what_is_near_a_level_and_grown_is_not_clipped() -> None:
+    """Far from the blobs the value is 0, within 0.9 + 0.2 of the level 1: all but a core is inside,
+    but the whole was clipped to where blobs are."""
+    blobs = hk.Blobs([[0, 0, 0], [0.9, 0, 0]], radii=0.5)
+    solid = hk.solid(blobs, around=(1.0, 0.9)).grown(0.2) & hk.Sphere(2.0)
+    hits = hk.trace(solid, [[0, 1.8, 3.0]], [[0, 0, -1.0]])
+    assert hits.hit.all()
+    assert hits.t[0] == pytest.approx(3 - np.sqrt(4 - 1.8**2), abs=1e-3)
+
+
+@pytest.mark.parametrize("power", [1.0, 2.0])
+def test_shrunk_blends_are_not_clipped(power: float) -> None:
+    """Where both solids are deep inside, their blend is lower than the lesser less the radius: rays
+    along their common axis hit the clipped volume."""
+    two = (hk.Sphere(1.0), hk.Sphere(1.0).moved((0.6, 0.0, 0.0)))
+    shrunk = two[0].blended(two[1], 0.1, power=power).grown(-0.3)
+    factor = 2 ** (1 / power)
+
+    # In the plane of symmetry both distances are m, and f = 0.1 - factor (0.1 - m) + 0.3.
+    m = 0.1 - 0.4 / factor
+    hits = hk.trace(shrunk, [[0.3, 0, 3.0]], [[0, 0, -1.0]])
+    assert hits.hit.all()
+    assert hits.t[0] == pytest.approx(3 - np.sqrt((1 + m) ** 2 - 0.09), abs=1e-3)
+
+
+@pytest.mark.parametrize("bound", [None, "affine", "bottom-up-quadratic", "interval"])
+def test_powers_of_numbers(bound: Any) -> None:
+    """2**x was a TypeError of Dr.Jit, when it was traced."""
+    field = hk.expression(lambda x, y, z: 2**x - y - 1)
+    hits = hk.trace(field, [[2.0, 0, 0]], [[0, 1.0, 0]], t_max=9.0, bound=bound)
+    assert hits.t[0] == pytest.approx(3.0, abs=1e-3)
+    with pytest.raises(ValueError, match="the base must be positive"):
+        hk.expression(lambda x, y, z: (-2) ** x - y)
