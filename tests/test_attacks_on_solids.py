@@ -37,7 +37,7 @@ def test_solids_turn_anticlockwise(axis: Any, degrees: float, start: Any, end: A
         (hk.Torus(0.5, 0.75), (0, 0, 3), (0, 0, -1), 3 - np.sqrt(0.75**2 - 0.5**2)),
         (hk.Superellipsoid((1.0, 1.0)), (-3, 0, 0), (1, 0, 0), 2.0),
         (hk.Supertorus((1.0, 3.0), 0.75, 0.25), (-3, 0, 0), (1, 0, 0), 2.0),
-        (hk.expression(lambda x, y, z: hk.maximum(x, y, z) - 0.3), (-1, 2.5, 2.5), (1, -2, -2), 3.3),
+        (hk.expression(lambda x, y, z: hk.maximum(x, y, z) - 0.3), (-1, 2.5, 2.5), (1, -2, -2), 3.3),  # noqa: E501
     ],
     ids=["cone", "moved", "combined", "spindle", "octahedron", "diamond", "crease"],
 )  # fmt: skip
