@@ -240,13 +240,14 @@ class Jet:
             f"harnack.{', '.join(sorted(_UFUNCS))}, maximum, minimum, norm"
         )
 
-    def __float__(self) -> float:
+    def _undecided(self, *others: Any) -> Any:
+        del others
         raise TypeError(
             "a formula cannot use functions of plain numbers, such as math.sin, nor decide by its "
             "coordinates: use harnack.sin and its like, harnack.maximum and harnack.minimum"
         )
 
-    __bool__ = __float__  # type: ignore[assignment]
+    __float__ = __bool__ = __lt__ = __le__ = __gt__ = __ge__ = _undecided
 
     # Functions.
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from harnack.fields.formula import Formula
+from harnack.fields.formula import Formula, as_jet
 
 if TYPE_CHECKING:
     from harnack.geometry import Volume
@@ -60,7 +60,8 @@ def expression(
     if not callable(function):
         raise TypeError(f"function must be callable with x, y, z, not {function!r}")
     made = Expression(function, domain, default_level=level, is_convex=is_convex)
-    made.formula(*_probe())
+    probe = _probe()
+    as_jet(made.formula(*probe), probe[0], "expression")
     return made
 
 

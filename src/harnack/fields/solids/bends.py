@@ -152,10 +152,18 @@ class Taper(Bend):
 
     def __post_init__(self) -> None:
         axis_index(self.axis)
-        numbers = (*self.start, *self.end)
+        try:
+            numbers = (*self.start, *self.end)
+        except TypeError:
+            numbers = ()
+        if len(numbers) != 4:
+            raise ValueError(
+                "start and end must be (coordinate, scale), two numbers each, "
+                f"not {self.start!r} and {self.end!r}"
+            )
         if not all(isinstance(one, float | int) for one in numbers):
             return
-        if len(numbers) != 4 or not all(math.isfinite(one) for one in numbers):
+        if not all(math.isfinite(one) for one in numbers):
             raise ValueError("start and end must be (coordinate, scale), finite numbers")
         if not self.start[0] < self.end[0]:
             raise ValueError(f"start must lie before end: {self.start[0]} < {self.end[0]} is wrong")

@@ -6,7 +6,7 @@ import copy
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
@@ -59,9 +59,11 @@ def solid(
             f"{type(field).__name__} jumps across sheets: values on both sides of a level may meet "
             "without any in between, so it bounds no solid"
         )
-    numbers = between or around or tuple(given)
-    if not all(isinstance(one, int | float) and math.isfinite(one) for one in numbers):
-        raise ValueError(f"levels must be finite numbers, not {given[0]!r}")
+    two = between is not None or around is not None
+    numbers = _levels(given[0] if two else (given[0],), 2 if two else 1)
+    if numbers is None:
+        wanted = "two finite numbers" if two else "a finite number"
+        raise ValueError(f"give {wanted}, not {given[0]!r}")
     if field.period is not None and around is None:
         raise ValueError(
             f"{type(field).__name__} is angle-valued: no value is below another. Use "
@@ -69,10 +71,10 @@ def solid(
         )
     inside = Region(field)
     if below is not None:
-        return Offset(inside, float(below))
+        return Offset(inside, numbers[0])
     if above is not None:
-        return Complement(Offset(inside, float(above)))
-    low, high = (float(one) for one in cast("tuple[float, float]", numbers))
+        return Complement(Offset(inside, numbers[0]))
+    low, high = numbers
     if around is not None:
         if not high > 0:
             raise ValueError(f"half_width must be positive, not {high:g}")
@@ -82,6 +84,15 @@ def solid(
     if not low < high:
         raise ValueError(f"between must be (low, high) with low < high, not {between}")
     return Near(field, 0.5 * (low + high), 0.5 * (high - low))
+
+
+def _levels(given: Any, count: int) -> tuple[float, ...] | None:
+    """So many finite numbers; None where they are not."""
+    try:
+        numbers = tuple(float(one) for one in given)
+    except (TypeError, ValueError):
+        return None
+    return numbers if len(numbers) == count and all(map(math.isfinite, numbers)) else None
 
 
 class _OfField(Solid):
