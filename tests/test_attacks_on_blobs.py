@@ -152,6 +152,27 @@ def test_rays_that_all_but_touch(name: str, precision: Any, kind: str) -> None:
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("name", KERNELS)
+def test_rays_that_all_but_touch_cross_twice(name: str, precision: Any) -> None:
+    """However small the tolerance, in single precision what swings by 2e-5 of the coordinates' size
+    is a crossing; less need not be (`trace`)."""
+    scene = Sum(name, np.zeros((1, 3)), np.ones(1), np.ones(1), None)
+    depths = np.array([0.1, 1e-3, 2e-4] if precision == "single" else [0.1, 1e-4, 1e-6, 1e-9])
+    o = np.column_stack([1 - depths, 0 * depths - 6, 0 * depths])
+    hits = hk.trace(scene.blobs, o, [[0, 1.0, 0]], precision=precision, tolerance=1e-10, all_hits=4)
+    half = np.sqrt(1 - (1 - depths) ** 2)
+    assert (hits.count == 2).all()
+    assert (hits.side[:, :2] == [1, -1]).all()
+    off = 2e-5 / half if precision == "single" else 1e-13 / half
+    assert (np.abs(hits.t[:, 0] - (6 - half)) < off + 1e-9).all()
+    assert (np.abs(hits.t[:, 1] - (6 + half)) < off + 1e-9).all()
+    confirmed = hk.trace(
+        scene.blobs, o, [[0, 1.0, 0]], precision=precision, tolerance=1e-10, confirm=True
+    )
+    np.testing.assert_array_equal(confirmed.t, hits.t[:, 0])
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("kind", ["lattice", "giants", "clusters", "tiny"])
 def test_rays_along_faces_and_edges_of_cells(precision: Any, kind: str) -> None:
     rng = np.random.default_rng(8)
