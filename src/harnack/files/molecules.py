@@ -84,19 +84,21 @@ def atoms_in(path: Path, data: bytes) -> Atoms:
 
 
 def _check_coordinates(path: Path, text: str) -> None:
-    """That columns 31 to 54 of all atoms are three numbers: gemmi takes what is none for 0.
+    """That columns 31 to 54 of all atoms are three numbers: gemmi takes what is none for 0, and the
+    digits before what is none for the number. It knows atoms by the first four letters of a line,
+    small or capital: serial numbers above 99,999 may begin right behind them.
 
     Raises:
         FileFormatError: naming the first line where they are not.
     """
     for number, line in enumerate(text.splitlines(), start=1):
-        if line[:6] not in ("ATOM  ", "HETATM"):
+        if line[:4].upper() not in ("ATOM", "HETA"):
             continue
         try:
             finite = all(math.isfinite(float(line[k : k + 8])) for k in (30, 38, 46))
         except ValueError:
             finite = False
-        if not finite:
+        if not finite or "_" in line[30:54]:  # Python reads 1_0 as 10
             raise Place(path, f"line {number}").error(
                 f"columns 31 to 54 must be the three coordinates of an atom, not {line[30:54]!r}"
             )

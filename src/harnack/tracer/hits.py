@@ -146,7 +146,10 @@ def trace(
         missed whose function swings farther than the tolerance to both sides of the level, and none
         is counted twice; touching a level without passing to its other side is no crossing, and
         neither is starting on it. Where levels are closer in value than four tolerances, a quarter
-        of their distance is the tolerance. `max_steps` is for all of the ray.
+        of their distance is the tolerance; rays run out of steps where that is below rounding.
+        Where it is not, the tolerance is at least eight times what rounding does to f, in single
+        precision about 1e-5 of the size of the coordinates: whatever swings less than that to one
+        side may be no crossing. `max_steps` is for all of the ray.
 
     With Dr.Jit input, t, position and normal carry derivatives with respect to whatever had
     them enabled: rays, level, vertices of the field (implicit differentiation at the hit).

@@ -12,7 +12,7 @@ import numpy as np
 from harnack.arithmetic import Jet
 from harnack.backend import FloatArray, IntArray, backend_of
 from harnack.backend.extrema import fmin
-from harnack.backend.numbers import check_finite, check_size, check_vectors, real_array
+from harnack.backend.numbers import check_finite, check_size, check_vectors, real_array, vector_text
 from harnack.backend.records import Records
 from harnack.enclosures import Enclosure, Gaps, Lipschitz, Slopes
 from harnack.fields.blobs.grid import CellLists, Grid, uploaded_integers
@@ -288,15 +288,25 @@ class _BlobData:
 def _rows(backend: Backend, blobs: Blobs) -> FloatArray:
     """Records (n, 8): the centre, what of it the precision leaves over, 1/R, and the amplitude."""
     supports = blobs.radii * blobs.kernel.support
-    amplitude = blobs.weights * blobs.kernel.amplitude
-    with np.errstate(over="ignore"):
+    info = np.finfo(backend.dtype)
+    largest, smallest = float(info.max), float(info.smallest_normal)
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+        amplitude = blobs.weights * blobs.kernel.amplitude
         near = blobs.centres.astype(backend.dtype).astype(np.float64)
-        bend = (np.abs(amplitude) * blobs.kernel.steepness.bend / supports**2).astype(backend.dtype)
-    if not (np.isfinite(bend).all() and np.isfinite(near).all() and (1 / supports < 1e30).all()):
-        worst = int(np.argmin(blobs.radii))
+        strong = np.abs(amplitude) * max(1.0, blobs.kernel.steepness.bend)
+        inverse = 1 / supports
+        bend = strong * inverse * inverse
+    outside = ~((np.abs(blobs.centres) <= largest) & (supports[:, None] * smallest < 1)).all(axis=1)
+    outside |= ~((inverse < 1e30) & (strong <= largest) & (bend <= largest))
+    if outside.any():
+        worst = int(np.argmax(outside))
+        precision = "single" if backend.dtype == np.float32 else "double"
+        help_ = 'use precision="double" or ' if precision == "single" else ""
         raise BlobError(
-            f"blob {worst} has a radius of {blobs.radii[worst]:g}, too small for single precision: "
-            'use precision="double" or larger units'
+            f"blob {worst}, with a radius of {blobs.radii[worst]:g}, a weight of "
+            f"{blobs.weights[worst]:g} and its centre at {vector_text(blobs.centres[worst])}, is "
+            f"too small, too large or too far away for {precision} precision: "
+            f"{help_}choose units nearer to 1"
         )
     rest = blobs.centres - near
     return np.column_stack([near, rest, 1 / supports, amplitude])
@@ -356,6 +366,7 @@ def _checked(
     bad = np.flatnonzero(~(r > 0))
     if bad.size:
         raise BlobError(f"radius {bad[0]} is {r[bad[0]]:g}: radii must be positive")
+    check_size(r, BlobError)
     w = np.ones(len(c)) if weights is None else _numbers(weights, "weights", len(c))
     if groups is None:
         return c, r, w, None
