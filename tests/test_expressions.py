@@ -70,9 +70,8 @@ def test_mistakes_are_told_when_the_field_is_made(
 
 
 def test_what_is_returned_must_be_a_number() -> None:
-    field = hk.expression(lambda x, y, z: "nothing")
     with pytest.raises(TypeError, match="returned an object of type str"):
-        hk.trace(field, [[0, 0, 3]], [[0, 0, -1]], t_max=5.0)
+        hk.expression(lambda x, y, z: "nothing")
     constant = hk.expression(lambda x, y, z: 1.0)
     assert hk.trace(constant, [[0, 0, 3]], [[0, 0, -1]], t_max=5.0).status == hk.Status.MISS
 
