@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 # A passage begins within this part of the radius outside the cover, is over this many radii off the
 # surface, and steps are aimed a little farther than that, or than a radius behind the surface.
 _WITHIN, _AWAY, _BEYOND = 0.02, 1.1, 0.05
+# The first of them for approximate fields, which cost more the closer they are asked for.
+_WITHIN_APPROXIMATE = 0.25
 # Steps of a passage: the shortest and the longest of the first, in radii, and the longest of the
 # others, as a multiple of that before.
 _SHORTEST, _FIRST, _LONGER = 0.25, 32.0, 4.0
@@ -86,7 +88,8 @@ class Cones:
         state = MarchState.at(
             backend, start, end, active, has_detail=prepared.field.has_detail
         )  # fmt: skip
-        tolerance = PreparedTolerance(real(0), _WITHIN * self.radius, real(0))
+        within = _WITHIN_APPROXIMATE if prepared.field.has_detail else _WITHIN
+        tolerance = PreparedTolerance(real(0), within * self.radius, real(0))
         settings = prepared.levels, tolerance, prepared.max_steps, prepared.overstep
         march = March(backend, *settings, cover=self.radius)
         now = march.advance(prepared.field, path, real(end), state)
@@ -96,7 +99,8 @@ class Cones:
         level, side = now.value + gap, dr.select(gap < 0, real(1), -1)
 
         def look(t: Real) -> tuple[Real, Real]:
-            sample = prepared.sample(dr.fma(backend.Array3f(t), self.direction, self.origin))
+            seen = prepared.field if now.detail is None else prepared.field.at_detail(now.detail)
+            sample = seen.evaluate(dr.fma(backend.Array3f(t), self.direction, self.origin))
             return self._height(sample.value, sample.gradient, t, side, level)
 
         def body(old: _Passage) -> _Passage:
