@@ -12,6 +12,7 @@ from rich.progress import track
 import harnack as hk
 
 from .agreement import agreement
+from .antialiasing import antialiasing
 from .convergence import plot
 from .growth import growth
 from .hart import hart
@@ -25,6 +26,7 @@ from .winding import throughput
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 SECTIONS = (
     "rays", "convergence", "winding", "agreement", "versions", "inclusion", "hart", "povray",
+    "antialiasing",
 )  # fmt: skip
 
 
@@ -62,6 +64,7 @@ def main() -> None:
         "versions": lambda: beside(arguments.before),
         "inclusion": inclusion,
         "hart": hart,
+        "antialiasing": antialiasing,
         "povray": compare_with_povray,
         "winding": lambda: _winding(arguments.bunny, arguments.out.with_name("growth.png")),
     }

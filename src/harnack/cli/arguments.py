@@ -14,7 +14,7 @@ from harnack.cli.messages import printable
 from harnack.files.surfaces import SURFACE_FILES
 from harnack.opening import UP_AXES
 from harnack.rendering import MATERIALS, SHOW_MODES
-from harnack.rendering.arguments import MAX_SIDE, MAX_SPP
+from harnack.rendering.arguments import ANTIALIASING, MAX_SIDE, MAX_SPP
 
 # Of what was typed, this much is repeated in messages.
 _SHOWN = 60
@@ -86,6 +86,11 @@ def _add_render(commands: Any) -> None:
         one, "--show", SHOW_MODES,
         "what to draw: color follows light paths, shaded lights first hits by a formula, "
         "without noise (shaded for meshes and clouds, else color)",
+    )  # fmt: skip
+    _add_choice(
+        one, "--antialias", ANTIALIASING,
+        "which pixels of a shaded picture get all samples: edges in the picture, or also what "
+        "cones around pixels find, wires thinner than a pixel (edges)",
     )  # fmt: skip
     one.add_argument(
         "--confirm", action="store_true",

@@ -38,6 +38,8 @@ def _render(options: Any) -> int:
     settings = _quality(options)
     if options.show is not None:
         settings["show"] = options.show
+    if options.antialias is not None:
+        settings["antialias"] = options.antialias
     if options.azimuth is not None or options.elevation is not None:
         settings["camera"] = _camera(options)
     kind = source.suffix.lower()

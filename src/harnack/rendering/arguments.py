@@ -17,6 +17,7 @@ from harnack.rendering.studio.camera import Camera
 from harnack.tracer import level_set
 
 __all__ = [
+    "ANTIALIASING",
     "MAX_SIDE",
     "MAX_SPP",
     "SHOW_MODES",
@@ -33,6 +34,7 @@ __all__ = [
 ]
 
 SHOW_MODES: tuple[str, ...] = ("color", "shaded", *VIEWS)
+ANTIALIASING = ("edges", "cones")
 MAX_SIDE = 16384
 MAX_SPP = 1_000_000
 # Of the path tracer's counters.
@@ -52,10 +54,18 @@ class Request:
     max_depth: int | None
     seed: int
     camera: Camera
+    antialias: str | None = None
 
 
 def checked_request(
-    *, show: Any, size: Any, spp: Any, max_depth: Any, seed: Any, camera: Any
+    *,
+    show: Any,
+    size: Any,
+    spp: Any,
+    max_depth: Any,
+    seed: Any,
+    camera: Any,
+    antialias: Any = None,
 ) -> Request:
     """What was asked for.
 
@@ -63,6 +73,7 @@ def checked_request(
         TypeError, ValueError: naming the argument that is wrong, and what it should be.
     """
     check_show(show)
+    check_antialias(antialias, show, spp)
     return Request(
         show,
         None if size is None else check_size(size),
@@ -70,6 +81,7 @@ def checked_request(
         None if max_depth is None else check_integer("max_depth", max_depth),
         check_integer("seed", seed),
         Camera() if camera is None else check_camera(camera),
+        antialias,
     )
 
 
@@ -79,6 +91,24 @@ def check_show(show: Any) -> None:
         raise ValueError(
             f"show must be one of {', '.join(SHOW_MODES)}, not {show!r}"
             f"{did_you_mean(show, SHOW_MODES)}"
+        )
+
+
+def check_antialias(antialias: Any, show: str, spp: Any) -> None:
+    """Raise ValueError for what is no way to choose pixels, or where there is none to choose."""
+    if antialias is None:
+        return
+    if not isinstance(antialias, str) or antialias not in ANTIALIASING:
+        raise ValueError(
+            f"antialias must be one of {', '.join(ANTIALIASING)}, not {antialias!r}"
+            f"{did_you_mean(antialias, ANTIALIASING)}"
+        )
+    if show != "shaded":
+        raise ValueError(f'antialias is of pictures with show="shaded", not show="{show}"')
+    if antialias == "cones" and spp == 1:
+        raise ValueError(
+            'antialias="cones" finds pixels for more than one sample, and spp is 1: give spp=9, '
+            "or leave it away"
         )
 
 

@@ -111,6 +111,7 @@ class March:
     """How to march: towards which levels, until when, and with which over-stepping factor.
 
     hysteresis: for rays that end where they have crossed a level, and not where they reach one.
+    cover: for cones that end where they come near a level: their radius per unit of t (`covers`).
     """
 
     backend: Backend
@@ -119,6 +120,7 @@ class March:
     max_steps: int
     overstep: float
     hysteresis: Hysteresis | None = None
+    cover: Real | None = None
 
     def advance(
         self,
@@ -175,6 +177,8 @@ class March:
             look = seen.look(path, t, candidate, fmax(unproved, real(0)))
             sample, gradient_norm = look.sample, length(look.sample.gradient)
             gaps = self.levels.gaps(sample.value)
+            if self.cover is not None:
+                gaps = gaps.less(self.cover * t * gradient_norm)
             total_error = value_error(sample, gradient_norm, size + t)
 
             # Is all up to there proved free, and is the sample fine enough to say so?

@@ -2,7 +2,8 @@
 
 The rays through the middles of all pixels are traced first. Pixels that differ visibly from a
 neighbour are then drawn again as the mean of a fixed grid of samples: outlines are smooth, and
-the inside of a surface costs one ray a pixel.
+the inside of a surface costs one ray a pixel. Cones find more pixels to draw again, if asked for:
+those that a surface covers in part, though no ray through a middle tells.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import numpy.typing as npt
 from harnack.backend import to_numpy
 from harnack.rendering.mitsuba.integrator import LOST_COLOUR
 from harnack.rendering.mitsuba.world import World
+from harnack.rendering.pictures.cones import Finder
 from harnack.rendering.pictures.exposure import as_rgb, mean_of_blocks
 from harnack.rendering.pictures.floor import Floor
 from harnack.rendering.pictures.images import tone_mapped
@@ -74,16 +76,19 @@ def shaded(
     *,
     spp: int,
     on_floor: bool,
+    cones: bool = False,
     advance: Callable[[float], None],
 ) -> tuple[npt.NDArray[np.float32], int]:
     """Linear sRGB radiance (h, w, 3), and how many rays ran out of steps.
 
     spp: rays of a pixel on an edge, at least; 1 for one ray a pixel everywhere.
     on_floor: whether the scene is a studio's, whose floor shows shadows.
+    cones: whether cones find pixels to draw again, besides the edges in the picture.
     advance: told what part of the picture has been finished since the last call.
 
     Raises:
-        ValueError: the Mitsuba variant is spectral, whose four wavelengths a ray are no colour.
+        ValueError: the Mitsuba variant is spectral, whose four wavelengths a ray are no colour;
+            or cones are asked to find a field that jumps.
     """
     if mi.is_spectral:
         raise ValueError(
@@ -91,6 +96,7 @@ def shaded(
             'set one such as "llvm_ad_rgb", or draw in color'
         )
     painter = _Painter(mi, World.of(mi, scene), sensor, on_floor=on_floor)
+    finder = Finder(mi, painter.world) if cones else None
     count = painter.size[0] * painter.size[1]
     order = in_tiles(painter.size)
     seen = _Seen.nothing(mi, count)
@@ -105,7 +111,14 @@ def shaded(
     dr.eval(sky)
     image = to_numpy(painter.paint(seen, sky)).reshape(*painter.size[::-1], 3)
     lost = int(dr.count(seen.lost)[0])
-    edges = order[_edges(image).ravel()[order]] if spp > 1 else order[:0]
+    again = _edges(image).ravel()
+    if finder is not None:
+        for start, stop in bands(count, _RAYS_A_BAND):
+            pixel = pixels_of_band(mi, mi.UInt32(order), start, stop)
+            ray, _ = painter.ray(pixel, mi.Vector2f(0.5))
+            there = dr.gather(mi.Vector3f, seen.position, pixel)
+            again[order[start:stop]] |= finder.find(ray, there)
+    edges = order[again[order]] if spp > 1 else order[:0]
     offsets = grid_offsets(spp)
     for start, stop in bands(len(edges), max(1, _RAYS_A_BAND // len(offsets))):
         chosen = edges[start:stop]
@@ -131,10 +144,7 @@ class _Painter:
     def look(self, pixel: Any, offset: Any) -> _Seen:
         """What rays through places in pixels meet first."""
         mi, scene = self.mi, self.world.scene
-        place = film_places(mi, pixel, offset, self.size)
-        ray, weight = self.sensor.sample_ray_differential(
-            self.sensor.shutter_open(), 0.5, place, mi.Point2f(0.5)
-        )
+        ray, weight = self.ray(pixel, offset)
         sight = self.through.look(mi.Ray3f(ray))
         si, first = sight.si, sight.first
         lost = first.lost | dr.zeros(mi.Bool, dr.width(pixel))
@@ -156,6 +166,14 @@ class _Painter:
         glossy = mi.has_flag(flags, mi.BSDFFlags.Glossy) | mi.has_flag(flags, mi.BSDFFlags.Delta)
         position = dr.select(met, mi.Vector3f(si.p), dr.nan)
         return _Seen(position, normal, -d, width, colour, light, through, glossy, met, lost)
+
+    def ray(self, pixel: Any, offset: Any) -> tuple[Any, Any]:
+        """Rays with differentials through places in pixels, and what their light is weighted by."""
+        mi = self.mi
+        place = film_places(mi, pixel, offset, self.size)
+        return self.sensor.sample_ray_differential(
+            self.sensor.shutter_open(), 0.5, place, mi.Point2f(0.5)
+        )
 
     def _reflectance(self, si: Any, side: int) -> Any:
         """Of the side that is seen (1) or the other (-1), seen straight on."""

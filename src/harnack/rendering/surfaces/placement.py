@@ -13,6 +13,7 @@ import numpy.typing as npt
 from harnack.backend import FloatArray
 from harnack.rendering.surfaces.encounter import SurfaceHit, meet_surface
 from harnack.rendering.surfaces.solid import Solid
+from harnack.tracer.covers import Cones
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -128,6 +129,19 @@ class PlacedSurface:
         if self.solid is not None:
             return self.solid.occludes(o, d, t_max, active)
         return self.prepared.occluded(o, d, 0, t_max, active)
+
+    def covers_in_part(
+        self, o: Vec3, d: Vec3, radius: Real, t_max: Real, around: tuple[Vec3, Real] | None
+    ) -> Mask:
+        """Which cones around rays of the world it covers in part, before t_max or anything else.
+
+        radius: per unit of t. around: middle of the box around its extent, and half the shortest
+        side; None where there is none. The surface must be prepared for crossings.
+        """
+        o, d, t_max = self._local_ray(o, d, t_max)
+        solid = None if self.solid is None else (self.solid.low, self.solid.high)
+        cones = Cones(self.prepared, o, d, self.prepared.backend.Float(radius), around, solid)
+        return cones.are_covered_in_part(t_max, True)[0]
 
     def _local_ray(self, o: Vec3, d: Vec3, t_max: Real) -> tuple[Vec3, Vec3, Real]:
         backend = self.prepared.backend

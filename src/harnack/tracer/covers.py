@@ -1,0 +1,169 @@
+"""Where cones pass a surface: which pixels it may cover in part, though their rays miss it.
+
+A cover is the surface moved outwards by the radius of the cone (Thomas et al. 1989; Hart 1996,
+Section 3). A cone that enters it and leaves it again on the same side is covered in part; one whose
+ray gets a radius behind the surface is covered altogether. All this is to first order: the distance
+to a level is |f - level| / |grad f|, which is the distance only close to a smooth surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
+
+import drjit as dr
+
+from harnack.backend.extrema import fmax, fmin
+from harnack.backend.lengths import length
+from harnack.backend.loops import while_active
+from harnack.fields.look import Path
+from harnack.tracer.march import March, MarchState
+from harnack.tracer.tolerance import PreparedTolerance, Status
+
+if TYPE_CHECKING:
+    from harnack.backend import Mask, Real, Vec3
+    from harnack.tracer.prepared import PreparedLevelSet
+
+# A passage begins within this part of the radius outside the cover, is over this many radii off the
+# surface, and steps are aimed a little farther than that, or than a radius behind the surface.
+_WITHIN, _AWAY, _BEYOND = 0.02, 1.1, 0.05
+# The first of them for approximate fields, which cost more the closer they are asked for.
+_WITHIN_APPROXIMATE = 0.25
+# Steps of a passage: the shortest and the longest of the first, in radii, and the longest of the
+# others, as a multiple of that before.
+_SHORTEST, _FIRST, _LONGER = 0.25, 32.0, 4.0
+# Looks of a passage; a cone that has none left counts as covered in part.
+_MOST = 48
+# Less than any slope or bend that matters, in radii.
+_NONE = 1e-12
+
+
+@dataclass(frozen=True)
+class _Passage:
+    """Where a ray is in the cover.
+
+    t, height, slope: of the last look; the height over the surface is in radii, and less than 0
+        behind it. step: from there to the next.
+    """
+
+    t: Real
+    height: Real
+    slope: Real
+    step: Real
+    looks: Any
+    active: Mask
+
+
+@dataclass(frozen=True)
+class Cones:
+    """Cones around rays o + t d, |d| = 1, that may touch a level set.
+
+    radius: of a cone, per unit of t.
+    middle, half: of the box around the surface's extent, and half its shortest side; None for an
+        extent that has no end.
+    solid: (low, high) of a solid {low <= f <= high}; None for a surface with two sides.
+    """
+
+    prepared: PreparedLevelSet
+    origin: Vec3
+    direction: Vec3
+    radius: Real
+    around: tuple[Vec3, Real] | None = None
+    solid: tuple[Real, Real] | None = None
+
+    def are_covered_in_part(self, t_max: Real, active: Mask) -> tuple[Mask, Any]:
+        """Whether the first passage of each cone that begins before t_max leaves some of it
+        uncovered, and how often the field was looked at.
+
+        The march to the cover is `March.advance`, for levels that lie nearer in value by
+        |grad f| times the radius: a step that is proved for those keeps the ray a radius off the
+        surface, to first order. Within the cover steps are predicted and not proved. Nothing is
+        missed by that but surfaces in the cover of another one.
+        """
+        backend, prepared = self.prepared.backend, self.prepared
+        real = backend.Float
+        path = Path(self.origin, self.direction, prepared.proofs)
+        start, last = self._clip()
+        end = fmin(last, real(t_max))
+        state = MarchState.at(
+            backend, start, end, active, has_detail=prepared.field.has_detail
+        )  # fmt: skip
+        within = _WITHIN_APPROXIMATE if prepared.field.has_detail else _WITHIN
+        tolerance = PreparedTolerance(real(0), within * self.radius, real(0))
+        settings = prepared.levels, tolerance, prepared.max_steps, prepared.overstep
+        march = March(backend, *settings, cover=self.radius)
+        now = march.advance(prepared.field, path, real(end), state)
+        met = now.status == int(Status.HIT)
+        begin = dr.select(met, now.base, 0)
+        gap = prepared.levels.to_nearest(now.value)
+        level, side = now.value + gap, dr.select(gap < 0, real(1), -1)
+
+        def look(t: Real) -> tuple[Real, Real]:
+            seen = prepared.field if now.detail is None else prepared.field.at_detail(now.detail)
+            sample = seen.evaluate(dr.fma(backend.Array3f(t), self.direction, self.origin))
+            return self._height(sample.value, sample.gradient, t, side, level)
+
+        def body(old: _Passage) -> _Passage:
+            t = old.t + old.step
+            height, slope = look(t)
+            step = _next_step(height, slope, (slope - old.slope) / old.step, _LONGER * old.step)
+            looks = old.looks + 1
+            off = (height >= _AWAY) & (slope >= 0)
+            over = (height <= -1) | off | (looks >= _MOST) | (t >= last)
+            step = fmax(step, _SHORTEST * self.radius * t)
+            return _Passage(t, height, slope, step, looks, old.active & ~over)
+
+        height, slope = self._height(now.value, now.gradient, begin, side, level)
+        first = _next_step(height, slope, real(0), _FIRST * self.radius * begin)
+        none = backend.UInt32(0)
+        passage = _Passage(begin, height, slope, first, none, met & (height > -1))
+        passage = while_active(passage, body, "harnack cover")
+        return met & ~(passage.height <= -1), now.evaluations + passage.looks
+
+    def _height(
+        self, value: Real, gradient: Vec3, t: Real, side: Real, level: Real
+    ) -> tuple[Real, Real]:
+        """The height over the surface in radii, and its slope along the ray."""
+        period = self.prepared.levels.period
+        away = value - level
+        if period is not None:
+            away = dr.fma(dr.round(away / period), -period, away)
+        height = side * away
+        if self.solid is not None:
+            low, high = self.solid
+            height = fmax(low - value, value - high)
+            side = dr.select(low - value > value - high, -1, type(value)(1))
+        radius = length(gradient) * self.radius * t
+        known = radius > 0
+        slope = dr.select(known, side * dr.dot(gradient, self.direction) / radius, 0)
+        return dr.select(known, height / radius, dr.inf), slope
+
+    def _clip(self) -> tuple[Real, Real]:
+        """The part of rays whose cones can touch the surface.
+
+        Its extent is made larger about its middle, which a ray meets as one that is made smaller
+        meets the extent itself: by so much that the planes of its box move by the radius.
+        """
+        real = self.prepared.backend.Float
+        start, end = real(0), real(dr.inf)
+        if self.around is not None and self.prepared.volume is not None:
+            middle, half = self.around
+            farthest = length(middle - self.origin) + 4 * half
+            factor = 1 + self.radius * farthest / half
+            o = (self.origin - middle) / factor + middle
+            start, end = self.prepared.volume.clip(o, self.direction, start, end)
+            start, end = start * factor, end * factor
+        if self.prepared.region is not None:
+            start, end = self.prepared.region.clip(self.origin, self.direction, start, end)
+        return real(start), real(end)
+
+
+def _next_step(height: Real, slope: Real, bend: Real, longest: Real) -> Real:
+    """To where the height is predicted to be lowest, a radius behind the surface, or outside."""
+    real = cast("Any", type(height))
+    through = (height + 1 + _BEYOND) / fmax(-slope, real(_NONE))
+    lowest = dr.select(bend > _NONE, (1 + _BEYOND) * -slope / fmax(bend, real(_NONE)), dr.inf)
+    rest = fmax(_AWAY + _BEYOND - height, real(0))
+    root = dr.sqrt(slope * slope + 2 * fmax(bend, real(0)) * rest)
+    off = 2 * rest / fmax(slope + root, real(_NONE))
+    return fmin(dr.select(slope < 0, fmin(through, lowest), off), longest)
