@@ -184,7 +184,7 @@ class Blobs(Formula):
             )  # fmt: skip
         if run is not None:
             enclosures = tuple(_After(run, one) for one in enclosures)
-        return Look(self._sample(start), enclosures, (), slope, max(2, count))
+        return Look(self._sample(start), enclosures, (), slope, float(count))
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         """f of jets of the coordinates, or of Dr.Jit numbers: a sum over all blobs, near or not."""

@@ -50,7 +50,7 @@ class BlobValue:
 
 # Pieces of a path that take the least time, for sums over all blobs and over those of a cell, which
 # is left soon: finding what is near costs more than ranges.
-PIECES, PIECES_IN_CELL = 4, 2
+PIECES, PIECES_IN_CELL = 4, 3
 
 
 @dataclass(frozen=True)
