@@ -62,8 +62,8 @@ def solid(
     two = between is not None or around is not None
     numbers = _levels(given[0] if two else (given[0],), 2 if two else 1)
     if numbers is None:
-        wanted = "two finite numbers" if two else "a finite number"
-        raise ValueError(f"give {wanted}, not {given[0]!r}")
+        count = ", two of them" if two else ""
+        raise ValueError(f"levels must be finite numbers{count}, not {given[0]!r}")
     if field.period is not None and around is None:
         raise ValueError(
             f"{type(field).__name__} is angle-valued: no value is below another. Use "
