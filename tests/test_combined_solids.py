@@ -225,6 +225,17 @@ def test_operators_and_methods_read_like_the_drawing() -> None:
     assert len(flat.parts) == 3  # type: ignore[attr-defined]
 
 
+def test_lower_bounds_of_distances_hold_for_parts_of_any_kind() -> None:
+    """Harmonic fields promise no Lipschitz constant; one follows from their balls."""
+    walls = hk.solid(hk.SphericalHarmonic(3, 1), between=(-0.2, 0.2))
+    for model in (walls & hk.Sphere(0.9), hk.Capsule((0, 0, -1), (0, 0, 1), 0.3) - walls):
+        points = np.random.default_rng(3).uniform(-0.6, 0.6, (40, 3))
+        lower = hk.signed_distance(model, points, method="lower")
+        near = np.abs(hk.signed_distance(model, points))
+        assert (np.abs(lower) <= near * (1 + 1e-6) + 1e-9)[np.isfinite(near)].all()
+        assert (np.abs(lower) > 0).mean() > 0.9
+
+
 def test_a_union_reaches_as_far_as_its_parts() -> None:
     far = hk.Sphere(1.0) | hk.Sphere(1.0).moved((5, 0, 0))
     hull = far.hull()
@@ -242,9 +253,13 @@ def test_a_union_reaches_as_far_as_its_parts() -> None:
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [
-        (lambda: hk.Sphere(1.0) | 3, TypeError, "unsupported operand"),
+        (lambda: hk.Sphere(1.0) | 3, TypeError, "only solids, such as"),
+        (lambda: hk.Gyroid(1.0) | hk.Sphere(1.0), TypeError, "Gyroid is a field and no solid"),
+        (lambda: hk.Sphere(1.0) - hk.Gyroid(1.0), TypeError, r"make one of it by harnack.solid\("),
+        (lambda: hk.Gyroid(1.0).twisted(1.0), AttributeError, "make a solid of the field first"),
+        (lambda: hk.expression(lambda x, y, z: x ^ 2), TypeError, r"powers as x\*\*2"),
         (lambda: hk.union(), ValueError, "at least one solid"),
-        (lambda: hk.union(hk.Gyroid(1.0)), TypeError, "is no solid: make one of a field"),
+        (lambda: hk.union(hk.Gyroid(1.0)), TypeError, "is a field and no solid"),
         (lambda: hk.Sphere(1.0).scaled(0), ValueError, "factors must be positive"),
         (lambda: hk.Sphere(1.0).scaled((1, 2)), ValueError, "factors must be positive"),
         (lambda: hk.Sphere(1.0).rotated(10, "w"), ValueError, 'axis must be "x", "y" or "z"'),

@@ -69,6 +69,13 @@ def test_mistakes_are_told_when_the_field_is_made(
         hk.expression(function)
 
 
+def test_domain_and_level_are_checked() -> None:
+    with pytest.raises(TypeError, match="must be a volume"):
+        hk.expression(waves, domain="ball")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="level must be finite"):
+        hk.expression(waves, level=math.nan)
+
+
 def test_what_is_returned_must_be_a_number() -> None:
     with pytest.raises(TypeError, match="returned an object of type str"):
         hk.expression(lambda x, y, z: "nothing")

@@ -215,6 +215,11 @@ class Jet:
         # A number known while a kernel is recorded does not know of which kind it is.
         return self._constant(b.dynamic_value(self.kind())) ** self
 
+    def __xor__(self, other: Any) -> Jet:
+        raise TypeError("formulas write powers as x**2, not x^2")
+
+    __rxor__ = __xor__
+
     def __abs__(self) -> Jet:
         return self.apply(absolute)
 

@@ -40,6 +40,10 @@ __all__ = [
     "lengthened",
 ]
 
+# Methods that solids have and other fields have not.
+_OF_SOLIDS = frozenset(
+    ("moved", "rotated", "scaled", "transformed", "twisted", "tapered", "grown", "blended")
+)
 # A detail at which nothing is left out.
 _EVERYTHING = 1e9
 
@@ -142,6 +146,13 @@ class Field(abc.ABC):
         if "hessian" in vars(cls):
             general = _of_points(cls.hessian)
             cls.hessian = general  # pyright: ignore[reportAttributeAccessIssue]
+
+    def __getattr__(self, name: str) -> Any:
+        """Says of what a field would have to be a solid for."""
+        own = f"{type(self).__name__!r} object has no attribute {name!r}"
+        if name in _OF_SOLIDS:
+            own += ": make a solid of the field first, by harnack.solid(field, below=level)"
+        raise AttributeError(own)
 
     @abc.abstractmethod
     def evaluate(self, p: Vec3) -> Sample:

@@ -36,7 +36,8 @@ class Tolerance:
     value: also a hit where |f - level| <= value, whatever the gradient.
 
     Beside a pole of f, |f - level|/|grad f| is the distance to the pole and none to the level: rays
-    that pass a point charge within the tolerance are called hits of every level.
+    that pass a point charge within the tolerance are called hits of every level. The same holds
+    where the slope of f has no bound, as that of sqrt(|x|) beside x = 0.
 
     Where rounding leaves the distance to the level less certain than this, that uncertainty is
     the tolerance: about 1e-6 of the coordinates' size in single precision, 1e-15 in double.

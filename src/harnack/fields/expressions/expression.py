@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -55,10 +56,15 @@ def expression(
 
     Raises:
         TypeError: function cannot be called with three coordinates, or uses what has no proved
-            ranges.
+            ranges; domain is no volume.
+        ValueError: level is not finite.
     """
     if not callable(function):
         raise TypeError(f"function must be callable with x, y, z, not {function!r}")
+    if domain is not None and not callable(getattr(domain, "bounds", None)):
+        raise TypeError(f"domain must be a volume, such as harnack.Ball(), not {domain!r}")
+    if not math.isfinite(level):
+        raise ValueError(f"level must be finite, not {level!r}")
     made = Expression(function, domain, default_level=level, is_convex=is_convex)
     probe = _probe()
     as_jet(made.formula(*probe), probe[0], "expression")

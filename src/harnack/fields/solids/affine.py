@@ -73,6 +73,8 @@ class Affine(Map):
     @classmethod
     def translation(cls, offset: Sequence[float]) -> Affine:
         """u -> u + offset."""
+        if np.shape(offset) != (3,):
+            raise ValueError(f"offset (3,): give a vector (x, y, z), not {offset!r}")
         return cls.of_arrays(np.eye(3), np.asarray(offset, dtype=np.float64))
 
     @classmethod

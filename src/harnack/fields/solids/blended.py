@@ -11,7 +11,7 @@ from harnack.arithmetic import Jet
 from harnack.arithmetic.blends import blend_intersection, blend_union
 from harnack.fields.formula import as_data
 from harnack.fields.solids.combined import union
-from harnack.fields.solids.solid import Shape, Solid
+from harnack.fields.solids.solid import Shape, Solid, not_a_solid
 
 if TYPE_CHECKING:
     from harnack.backend import Backend
@@ -36,11 +36,12 @@ class Blend(Shape):
         for name, least, value in (("radius", 0.0, self.radius), ("power", 1.0, self.power)):
             good = isinstance(value, int | float) and math.isfinite(value) and value >= least
             if not good or value == 0:
-                raise ValueError(f"{name} must be a number above {least:g}, not {value!r}")
+                bound = "above 0" if least == 0.0 else f"of at least {least:g}"
+                raise ValueError(f"{name} must be a number {bound}, not {value!r}")
             object.__setattr__(self, name, float(value))
         for one in self.parts:
             if not isinstance(one, Solid):  # pyright: ignore[reportUnnecessaryIsInstance]
-                raise TypeError(f"only solids can be blended, not {one!r}")
+                raise TypeError(not_a_solid(one))
             probe_formula(one)
         constants = [one.lipschitz for one in self.parts]
         known = all(one is not None for one in constants)

@@ -15,12 +15,12 @@ from harnack.arithmetic import Interval, Jet
 from harnack.backend import backend_of
 from harnack.backend.extrema import fmax, fmin
 from harnack.backend.lengths import length
-from harnack.enclosures import Curvature, Enclosure, Gaps, HarmonicBall
+from harnack.enclosures import Curvature, Enclosure, Gaps
 from harnack.fields.field import Field
 from harnack.fields.formula import Formula, as_data, is_jet
 from harnack.fields.look import Look, Path, Sample
 from harnack.fields.solids.affine import without_balls
-from harnack.fields.solids.combined import Complement, Offset, negated_sample
+from harnack.fields.solids.combined import Complement, Offset, lipschitz_of, negated_sample
 from harnack.fields.solids.solid import Solid
 
 if TYPE_CHECKING:
@@ -333,14 +333,14 @@ class Near(_OfField):
         below = offset < 0
         unit = 2 * float(dr.epsilon(type(offset)))
         rounding = 8 * unit * (dr.abs(sample.value) + abs(self.level) + self.half_width)
-        known = tuple(one for one in sample.known if not isinstance(one, HarmonicBall | Curvature))
+        lipschitz = lipschitz_of(sample)
         return replace(
             sample,
             value=dr.abs(offset) - self.half_width,
             gradient=dr.select(below, turned.gradient, sample.gradient),
             error=sample.error + rounding,
             normal=None,
-            known=known,
+            known=() if lipschitz is None else (lipschitz,),
             weaker=(),
         ), offset
 

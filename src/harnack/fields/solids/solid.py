@@ -19,6 +19,17 @@ if TYPE_CHECKING:
     from harnack.geometry import Volume
 
 
+def not_a_solid(other: Any) -> str:
+    """What to do with something that is no solid."""
+    kind = type(other).__name__
+    if isinstance(other, Field):
+        return (
+            f"{kind} is a field and no solid: make one of it by harnack.solid(field, below=level), "
+            "above=level or between=(low, high); blobs are solid above 1, formulas mostly below 0"
+        )
+    return f"only solids, such as harnack.Sphere(1.0), are combined, not {kind}"
+
+
 def _remembering(prepare: Callable[[Any, Backend], Field]) -> Callable[[Any, Backend], Field]:
     @functools.wraps(prepare)
     def remembering(self: Any, backend: Backend) -> Field:
@@ -78,22 +89,27 @@ class Solid(Field):
     def leaves(self, change: Callable[[Solid], Solid]) -> Solid:
         """The same combination of changed parts: a map of space is one of each part."""
 
-    # Combinations.
+    # Combinations. What is no solid is refused on either side.
 
     def __or__(self, other: Any) -> Solid:
         from harnack.fields.solids.combined import union
 
-        return union(self, other) if isinstance(other, Solid) else NotImplemented
+        return union(self, other)
 
     def __and__(self, other: Any) -> Solid:
         from harnack.fields.solids.combined import intersection
 
-        return intersection(self, other) if isinstance(other, Solid) else NotImplemented
+        return intersection(self, other)
 
     def __sub__(self, other: Any) -> Solid:
         from harnack.fields.solids.combined import Complement, intersection
 
-        return intersection(self, Complement(other)) if isinstance(other, Solid) else NotImplemented
+        return intersection(self, Complement(other) if isinstance(other, Solid) else other)
+
+    def __ror__(self, other: Any) -> Solid:
+        raise TypeError(not_a_solid(other))
+
+    __rand__ = __rsub__ = __ror__
 
     def __invert__(self) -> Solid:
         from harnack.fields.solids.combined import Complement
@@ -127,7 +143,7 @@ class Solid(Field):
     # Maps of space. Those that bend are for solids with a formula.
 
     def moved(self, offset: Sequence[float]) -> Solid:
-        """The solid, moved by a vector (3,)."""
+        """The solid, moved by a vector (x, y, z)."""
         from harnack.fields.solids.affine import Affine
 
         return self._mapped(Affine.translation(offset))
@@ -155,7 +171,7 @@ class Solid(Field):
         return self._mapped(Affine.of_matrix(matrix))
 
     def twisted(self, rate: float, axis: str = "z") -> Solid:
-        """The solid, turned about an axis by so many radians for each unit of length along it."""
+        """The solid, turned about an axis by `rate` radians for each unit of length along it."""
         from harnack.fields.solids.bends import Twist
 
         return self._mapped(Twist(float(rate), axis))
