@@ -224,7 +224,7 @@ def test_steps_meet_no_level_and_slightly_longer_ones_would(kind: Any) -> None:
         assert ((values[0] - values.min(0))[cut] >= gap[cut]).all()
 
 
-@pytest.mark.parametrize("precision", ["single", "double"])
+@pytest.mark.parametrize("precision", ["single", pytest.param("double", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", ["torus", "gyroid", "quartic", "blobs", "clipped by hand"])
 def test_all_proofs_hit_the_same(name: str, precision: str) -> None:
     level = 0.3 if name == "clipped by hand" else 0.0

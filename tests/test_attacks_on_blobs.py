@@ -30,6 +30,10 @@ KERNELS: dict[str, tuple[Any, float, Any]] = {
         lambda q: np.exp(SHARPNESS * GAUSSIAN**2 * (1 - q)) - 1 - SHARPNESS * GAUSSIAN**2 * (1 - q),
     ),
 }
+QUICK_KERNELS = [
+    pytest.param(name, marks=() if name in ("compact", "gaussian") else pytest.mark.slow)
+    for name in KERNELS
+]
 
 
 class Sum:
@@ -128,8 +132,8 @@ def check_rays(scene: Sum, o: Any, d: Any, precision: Any, tolerance: float) -> 
         assert largest - sign <= allowed, (o[i].tolist(), d[i].tolist())
 
 
-@pytest.mark.parametrize("precision", PRECISIONS)
-@pytest.mark.parametrize("name", KERNELS)
+@pytest.mark.parametrize("precision", ["single", pytest.param("double", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", QUICK_KERNELS)
 @pytest.mark.parametrize("kind", ["equal and nested", "negative", "groups", "grid"])
 def test_rays_that_all_but_touch(name: str, precision: Any, kind: str) -> None:
     rng = np.random.default_rng(4)

@@ -26,6 +26,13 @@ KERNELS = {
     "sharp": hk.Gaussian(5.0, 0.2),
 }
 PRECISIONS = ("single", "double")
+SLOWLY = pytest.mark.slow
+# Kernels that end and one that is cut; the others go through the same code, and are slow.
+QUICK_KERNELS = [
+    pytest.param(kernel, id=name, marks=() if name in ("compact", "gaussian") else SLOWLY)
+    for name, kernel in KERNELS.items()
+]
+QUICK_PRECISIONS = ["single", pytest.param("double", marks=SLOWLY)]
 
 
 def scene(count: int = 40, seed: int = 5, **settings: Any) -> hk.Blobs:
@@ -100,7 +107,7 @@ def test_a_single_blob_is_a_ball(kernel: Any) -> None:
     np.testing.assert_allclose(hits.t, 3 - 1.4, atol=1e-7)
 
 
-@pytest.mark.parametrize("kernel", KERNELS.values(), ids=KERNELS)
+@pytest.mark.parametrize("kernel", QUICK_KERNELS)
 @pytest.mark.parametrize("grouped", [False, True])
 @pytest.mark.parametrize("count", [40, 90])  # 90 blobs are kept in a grid
 def test_values_and_derivatives(kernel: Any, grouped: bool, count: int) -> None:
@@ -122,7 +129,7 @@ def test_values_and_derivatives(kernel: Any, grouped: bool, count: int) -> None:
         np.testing.assert_allclose(to_numpy(mine), to_numpy(other), atol=1e-9)
 
 
-@pytest.mark.parametrize("kernel", KERNELS.values(), ids=KERNELS)
+@pytest.mark.parametrize("kernel", QUICK_KERNELS)
 def test_what_is_promised(kernel: Any) -> None:
     check_field(scene(12, weights=np.linspace(-1, 2, 12), kernel=kernel), count=60, directions=6)
 
@@ -144,8 +151,8 @@ def test_single_precision_is_within_the_stated_error(kernel: Any) -> None:
         assert (off <= to_numpy(sample.gradient_error)).all()
 
 
-@pytest.mark.parametrize("precision", PRECISIONS)
-@pytest.mark.parametrize("kernel", KERNELS.values(), ids=KERNELS)
+@pytest.mark.parametrize("precision", QUICK_PRECISIONS)
+@pytest.mark.parametrize("kernel", QUICK_KERNELS)
 @pytest.mark.parametrize("offset", [0.0, 1e4])
 def test_ranges_hold_and_are_attained(kernel: Any, precision: Any, offset: float) -> None:
     """First and second differences of a single blob along a line lie in its ranges, which is where
@@ -224,7 +231,7 @@ def derivatives(kernel: Any, q: Any) -> tuple[Any, Any]:
 
 
 @pytest.mark.parametrize("bound", ["pieces", "quadratic-taylor", "linear-taylor", "segment"])
-@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("precision", QUICK_PRECISIONS)
 @pytest.mark.parametrize("grouped", [False, True])
 @pytest.mark.parametrize("count", [40, 90])
 def test_steps_are_free_and_no_longer(
@@ -268,7 +275,7 @@ def test_first_hits_and_looks(precision: Any) -> None:
     check_first_hits(scene(), 700, precision)
 
 
-@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("precision", QUICK_PRECISIONS)
 @pytest.mark.parametrize("grouped", [False, True])
 def test_first_hits_in_a_grid(precision: Any, grouped: bool) -> None:
     groups = np.arange(90) % 4 if grouped else None

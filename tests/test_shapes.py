@@ -159,9 +159,17 @@ SHAPES: dict[str, tuple[Any, Oracle]] = {
 
 EVERY = pytest.mark.parametrize("name", SHAPES)
 PRECISIONS = pytest.mark.parametrize("precision", ["single", "double"])
+# One precision, and one shape of each kind, tell most of what goes wrong; the rest is slow.
+QUICK_PRECISIONS = pytest.mark.parametrize(
+    "precision", ["single", pytest.param("double", marks=pytest.mark.slow)]
+)
+QUICK = ("sphere", "torus", "tube", "rounded box", "displaced", "julia")
+SOME_QUICK = pytest.mark.parametrize(
+    "name", [pytest.param(one, marks=() if one in QUICK else pytest.mark.slow) for one in SHAPES]
+)
 
 
-@EVERY
+@SOME_QUICK
 def test_contract(name: str) -> None:
     check_field(SHAPES[name][0], rng=1, count=25, directions=2)
 
@@ -181,7 +189,7 @@ def unit_vectors(rng: Any, n: int) -> Any:
 
 
 @EVERY
-@PRECISIONS
+@QUICK_PRECISIONS
 def test_no_level_within_a_step(name: str, precision: Any) -> None:
     """Along random paths, with levels near and far; the same steps times 1.001 meet one."""
     shape, oracle = SHAPES[name]
@@ -282,7 +290,7 @@ def test_hulls_hold_the_solid(name: str, level: float) -> None:
 
 
 @EVERY
-@PRECISIONS
+@QUICK_PRECISIONS
 def test_first_hits(name: str, precision: Any) -> None:
     """No ray passes a place where f is negative before its hit; hits are on the surface."""
     shape, oracle = SHAPES[name]
