@@ -267,6 +267,16 @@ def aligned(backend: Backend, values: npt.NDArray[Any]) -> Real:
     return copy
 
 
+def aligned_integers(backend: Backend, values: npt.NDArray[Any]) -> Index:
+    """A one-dimensional NumPy array of integers >= 0 as backend.UInt32, as `aligned` does: whether
+    mapped memory happens to be aligned is part of a kernel, which would be compiled again."""
+    mapped = backend.UInt32(np.array(values, dtype=np.uint32, order="C"))
+    lane = dr.arange(backend.UInt32, len(values)) ^ dr.opaque(backend.UInt32, 0)
+    copy = dr.gather(backend.UInt32, mapped, lane)
+    dr.eval(copy)
+    return copy
+
+
 def to_numpy(array: Any) -> npt.NDArray[Any]:
     """A Dr.Jit array of n lanes as NumPy: shape (n,), or (n, k) for vectors. Derivatives are cut.
 

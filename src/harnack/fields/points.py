@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.backend.arrays import finite_vectors, upload_vectors
+from harnack.backend.arrays import aligned_integers, finite_vectors, upload_vectors
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Precision, Vec3
@@ -127,4 +127,4 @@ def morton_order(backend: Backend, x: Vec3) -> Any:
         for bit in range(_BITS):
             key |= (cell & (1 << bit)) << (2 * bit + axis)
     keys = to_numpy(key).astype(np.uint16)
-    return index(np.argsort(keys, kind="stable").astype(np.uint32))
+    return aligned_integers(backend, np.argsort(keys, kind="stable"))

@@ -11,11 +11,12 @@ import numpy as np
 
 from harnack.arithmetic import Jet
 from harnack.backend import FloatArray, IntArray, backend_of
+from harnack.backend.arrays import aligned_integers
 from harnack.backend.extrema import fmin
 from harnack.backend.numbers import check_finite, check_size, check_vectors, real_array, vector_text
 from harnack.backend.records import Records
 from harnack.enclosures import Enclosure, Gaps, Lipschitz, Slopes
-from harnack.fields.blobs.grid import CellLists, Grid, uploaded_integers
+from harnack.fields.blobs.grid import CellLists, Grid
 from harnack.fields.blobs.jets import blob_term, summed
 from harnack.fields.blobs.kernels import Kernel, choose_kernel
 from harnack.fields.blobs.largest import GroupedList, LargestAlong, largest_at, largest_jet
@@ -251,7 +252,7 @@ class _BlobData:
         groups = None
         if blobs.groups is not None:
             count = dr.opaque(backend.UInt32, int(blobs.groups.max()) + 1)
-            groups = uploaded_integers(backend, blobs.groups), count
+            groups = aligned_integers(backend, blobs.groups), count
         low, high = blobs.extent(()).bounds()
         return cls(
             backend,

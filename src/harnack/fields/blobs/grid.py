@@ -15,6 +15,7 @@ import drjit as dr
 import numpy as np
 from scipy import ndimage
 
+from harnack.backend.arrays import aligned_integers
 from harnack.backend.extrema import clamp, fmin
 
 if TYPE_CHECKING:
@@ -147,9 +148,9 @@ class Grid:
             vector(lists.origin),
             dr.opaque(backend.Float, lists.cell),
             vector(lists.shape),
-            uploaded_integers(backend, lists.starts),
-            uploaded_integers(backend, lists.entries),
-            uploaded_integers(backend, lists.free),
+            aligned_integers(backend, lists.starts),
+            aligned_integers(backend, lists.entries),
+            aligned_integers(backend, lists.free),
         )
 
     def cell(self, p: Vec3) -> Cell:
@@ -217,11 +218,3 @@ class Cell:
             reach = (gap + _BEYOND) / dr.abs(d[k])
             length = fmin(dr.select(ends | (d[k] == 0), dr.inf, reach), length)
         return length * self.grid.size
-
-
-def uploaded_integers(backend: Backend, numbers: IntArray) -> Any:
-    """Integers on a backend, in memory of their own."""
-    mapped = backend.UInt32(np.array(numbers, dtype=np.uint32))
-    copy = dr.gather(backend.UInt32, mapped, dr.arange(backend.UInt32, len(numbers)))
-    dr.eval(copy)
-    return copy
