@@ -89,7 +89,7 @@ def wide(x: Any, like: Any) -> Any:
     return (0 * like + x).numpy().astype(np.longdouble)
 
 
-@pytest.mark.parametrize("precision", ["single", "double"])
+@pytest.mark.parametrize("precision", ["single", pytest.param("double", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", FORMULAS)
 def test_parabolas_enclose(name: str, precision: str) -> None:
     formula = FORMULAS[name]
@@ -113,7 +113,7 @@ def test_parabolas_enclose(name: str, precision: str) -> None:
         assert ((low <= values[0] + allowed[0]) & (values[0] <= high + allowed[0])).all()
 
 
-@pytest.mark.parametrize("precision", ["single", "double"])
+@pytest.mark.parametrize("precision", ["single", pytest.param("double", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", FORMULAS)
 def test_affine_forms_enclose(name: str, precision: str) -> None:
     formula = FORMULAS[name]

@@ -230,7 +230,16 @@ def derivatives(kernel: Any, q: Any) -> tuple[Any, Any]:
     return np.where(inside, -rate * (e - 1), 0), np.where(inside, rate * rate * e, 0)
 
 
-@pytest.mark.parametrize("bound", ["pieces", "quadratic-taylor", "linear-taylor", "segment"])
+@pytest.mark.parametrize(
+    "bound",
+    [
+        "pieces",
+        *(
+            pytest.param(one, marks=SLOWLY)
+            for one in ("quadratic-taylor", "linear-taylor", "segment")
+        ),
+    ],
+)
 @pytest.mark.parametrize("precision", QUICK_PRECISIONS)
 @pytest.mark.parametrize("grouped", [False, True])
 @pytest.mark.parametrize("count", [40, 90])

@@ -158,7 +158,6 @@ SHAPES: dict[str, tuple[Any, Oracle]] = {
 }  # fmt: skip
 
 EVERY = pytest.mark.parametrize("name", SHAPES)
-PRECISIONS = pytest.mark.parametrize("precision", ["single", "double"])
 # One precision, and one shape of each kind, tell most of what goes wrong; the rest is slow.
 QUICK_PRECISIONS = pytest.mark.parametrize(
     "precision", ["single", pytest.param("double", marks=pytest.mark.slow)]
@@ -175,7 +174,7 @@ def test_contract(name: str) -> None:
 
 
 @EVERY
-@PRECISIONS
+@QUICK_PRECISIONS
 def test_values(name: str, precision: Any) -> None:
     shape, oracle = SHAPES[name]
     x = np.random.default_rng(2).uniform(-1.5, 1.5, (400, 3)).astype(np.float32).astype(float)
@@ -273,7 +272,10 @@ def test_constants_of_norms_are_attained(powers: tuple[float, float]) -> None:
 
 
 @EVERY
-@pytest.mark.parametrize("level", [-0.1, 0.0, 0.2])
+@pytest.mark.parametrize(
+    "level",
+    [pytest.param(-0.1, marks=pytest.mark.slow), 0.0, pytest.param(0.2, marks=pytest.mark.slow)],
+)
 def test_hulls_hold_the_solid(name: str, level: float) -> None:
     shape, oracle = SHAPES[name]
     hull = shape.hull(level)
