@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import subprocess
 import sys
@@ -411,6 +412,20 @@ def test_aligned_memory_is_aligned_and_its_own(backend: hb.Backend) -> None:
         np.testing.assert_array_equal(hb.to_numpy(buffer), expected)
         if backend.name == "llvm":
             assert buffer.numpy().ctypes.data % 64 == 0
+
+
+def test_where_memory_lies_compiles_no_kernel(backend: hb.Backend) -> None:
+    integers = functools.partial(hb.arrays.aligned_integers, backend)
+    for upload in (functools.partial(hb.aligned, backend), integers):
+        dr.eval(upload(np.arange(40)) + 1)
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            for offset in range(1, 17):
+                memory = np.arange(80, dtype=np.uint32)[offset : 40 + offset]
+                np.testing.assert_array_equal(hb.to_numpy(upload(memory) + 1), memory + 1)
+            kernels = dr.kernel_history((dr.KernelType.JIT,))
+        assert len(kernels) == 16
+        assert all(one["cache_hit"] for one in kernels)
 
 
 def test_aligned_takes_strided_arrays_and_only_one_dimension(backend: hb.Backend) -> None:

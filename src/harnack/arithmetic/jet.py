@@ -14,36 +14,17 @@ from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 
-from harnack.arithmetic.functions import (
-    Function,
-    absolute,
-    cos,
-    cosh,
-    exp,
-    log,
-    power,
-    reciprocal,
-    sin,
-    sinh,
-    sqrt,
-    tan,
-    tanh,
-)
+from harnack.arithmetic.functions import Function, exp, log, power, reciprocal
 from harnack.arithmetic.interval import ONE, ZERO, Interval, select
+from harnack.arithmetic.operators import Operators
 from harnack.backend.extrema import fmax, fmin
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
 
-# NumPy's functions of jets: numpy.sin(x) is sin(x).
-_UFUNCS = {
-    "sin": sin, "cos": cos, "tan": tan, "exp": exp, "log": log, "sqrt": sqrt, "tanh": tanh,
-    "sinh": sinh, "cosh": cosh, "absolute": absolute, "fabs": absolute, "square": power(2),
-}  # fmt: skip
-
 
 @dataclass(frozen=True)
-class Jet:
+class Jet(Operators):
     """Ranges of a function of n variables on a box of them; mostly n = 1, the length along a path,
     or n = 3 at a point.
 
@@ -97,8 +78,10 @@ class Jet:
 
     # Operators.
 
-    def constant(self, x: float) -> Jet:
+    def constant(self, x: float | Real) -> Jet:
         """A constant number as a function of the same variables."""
+        if dr.is_array_v(cast("Any", type(x))):
+            return self._constant(Interval.exactly(x))
         return self._constant(Interval.constant(float(x), type(self.kind())))
 
     def of(self, other: Any) -> Jet:
@@ -107,7 +90,7 @@ class Jet:
         Raises:
             TypeError: it is no number.
         """
-        b = self._with(other)
+        b = self._operand(other)
         if b is None:
             raise TypeError(f"expected a number, not an object of type {type(other).__name__}")
         return b
@@ -124,29 +107,13 @@ class Jet:
                 return jet.low
         return self.width
 
-    def _with(self, other: Any) -> Jet | None:
-        """Another operand as a jet; None where it is none."""
-        if isinstance(other, Jet):
-            return other
-        if dr.is_array_v(cast("Any", type(other))) and dr.depth_v(type(other)) == 1:
-            return self._constant(Interval.exactly(other))
-        try:
-            return self.constant(float(other))
-        except (TypeError, ValueError):
-            return None
-
-    def __add__(self, other: Any) -> Jet:
-        b = self._with(other)
-        if b is None:
-            return NotImplemented
+    def sum(self, other: Jet) -> Jet:
         jet = Jet(
-            self.value + b.value,
-            tuple(x + y for x, y in zip(self.first, b.first, strict=True)),
-            tuple(x + y for x, y in zip(self.second, b.second, strict=True)),
+            self.value + other.value,
+            tuple(x + y for x, y in zip(self.first, other.first, strict=True)),
+            tuple(x + y for x, y in zip(self.second, other.second, strict=True)),
         )
-        return jet if self.start is None else jet.anchored(self.start + b.start, self.width)
-
-    __radd__ = __add__
+        return jet if self.start is None else jet.anchored(self.start + other.start, self.width)
 
     def __neg__(self) -> Jet:
         return dataclasses.replace(
@@ -157,39 +124,24 @@ class Jet:
             start=None if self.start is None else -self.start,
         )
 
-    def __pos__(self) -> Jet:
-        return self
-
-    def __sub__(self, other: Any) -> Jet:
-        b = self._with(other)
-        return NotImplemented if b is None else self + -b
-
-    def __rsub__(self, other: Any) -> Jet:
-        return -self + other
-
-    def __mul__(self, other: Any) -> Jet:
+    def product(self, other: Jet) -> Jet:
         if other is self:  # a square: ranges of products know nothing of that
             return self.apply(power(2))
-        b = self._with(other)
-        if b is None:
-            return NotImplemented
-        x, y = self.value, b.value
-        first = tuple(x * v + y * u for u, v in zip(self.first, b.first, strict=True))
+        x, y = self.value, other.value
+        first = tuple(x * v + y * u for u, v in zip(self.first, other.first, strict=True))
         second = tuple(
-            x * b.second[k]
-            + (self.first[i] * b.first[j] + self.first[j] * b.first[i])
+            x * other.second[k]
+            + (self.first[i] * other.first[j] + self.first[j] * other.first[i])
             + y * self.second[k]
             for k, (i, j) in enumerate(self.pairs())
         )
         jet = Jet(x * y, first, second)
-        return jet if self.start is None else jet.anchored(self.start * b.start, self.width)
+        return jet if self.start is None else jet.anchored(self.start * other.start, self.width)
 
-    __rmul__ = __mul__
-
-    def __truediv__(self, other: Any) -> Jet:
+    def __truediv__(self, other: Any) -> Any:
         if isinstance(other, Jet):
             return self * other.apply(reciprocal)
-        b = self._with(other)
+        b = self._operand(other)
         if b is None:
             return NotImplemented
         if not b.value.is_static:
@@ -198,61 +150,13 @@ class Jet:
             raise ZeroDivisionError("a formula divides by the constant 0")
         return self * self._constant(b.value.reciprocal())
 
-    def __rtruediv__(self, other: Any) -> Jet:
-        return self.apply(reciprocal) * other
-
     def __pow__(self, exponent: Any) -> Jet:
         if isinstance(exponent, Jet):
+            if self.value.is_static:  # such a number does not know of which kind it is
+                base = exponent._constant(self.dynamic_value(exponent.kind()))
+                return (base.apply(log) * exponent).apply(exp)
             return (self.apply(log) * exponent).apply(exp)
         return self.apply(power(float(exponent)))
-
-    def __rpow__(self, base: Any) -> Jet:
-        if isinstance(base, int | float) and not base > 0:
-            raise ValueError(f"{base:g}**x is no real number for most x: the base must be positive")
-        b = self._with(base)
-        if b is None:
-            return NotImplemented
-        # A number known while a kernel is recorded does not know of which kind it is.
-        return self._constant(b.dynamic_value(self.kind())) ** self
-
-    def __xor__(self, other: Any) -> Jet:
-        raise TypeError("formulas write powers as x**2, not x^2")
-
-    __rxor__ = __xor__
-
-    def __abs__(self) -> Jet:
-        return self.apply(absolute)
-
-    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **settings: Any) -> Any:
-        """NumPy's functions and operators, of jets."""
-        name = ufunc.__name__
-        if method == "__call__" and not settings:
-            if name in _UFUNCS:
-                return self.apply(_UFUNCS[name])
-            plain = {
-                "add": "__add__", "subtract": "__sub__", "multiply": "__mul__",
-                "true_divide": "__truediv__", "divide": "__truediv__", "power": "__pow__",
-                "maximum": "maximum", "minimum": "minimum",
-            }.get(name)  # fmt: skip
-            if plain is not None:
-                if plain in ("maximum", "minimum"):
-                    a, b = sorted(inputs, key=lambda one: not isinstance(one, Jet))
-                else:
-                    a, b = inputs
-                return getattr(a if isinstance(a, Jet) else self._with(a), plain)(b)
-        raise TypeError(
-            f"numpy.{name} has no proved ranges: write formulas with + - * / **, abs, and "
-            f"harnack.{', '.join(sorted(_UFUNCS))}, maximum, minimum, norm"
-        )
-
-    def _undecided(self, *others: Any) -> Any:
-        del others
-        raise TypeError(
-            "a formula cannot use functions of plain numbers, such as math.sin, nor decide by its "
-            "coordinates: use harnack.sin and its like, harnack.maximum and harnack.minimum"
-        )
-
-    __float__ = __bool__ = __lt__ = __le__ = __gt__ = __ge__ = _undecided
 
     # Functions.
 
@@ -269,15 +173,14 @@ class Jet:
         jet = Jet(value, first, second)
         return jet if self.start is None else jet.anchored(self.start.apply(function), self.width)
 
-    def maximum(self, other: Any) -> Jet:
+    def larger(self, other: Jet) -> Jet:
         """The larger of two functions at each place.
 
         Proof. Where one is larger everywhere, it is the maximum. Elsewhere the derivative is one of
         the two, the second derivative too, but for the places where they cross: there the first
         derivative jumps up, which has no upper bound.
         """
-        b = self.of(other)
-        x, y = self.dynamic_value(), b.dynamic_value(self.kind())
+        x, y = self.dynamic_value(), other.dynamic_value(self.kind())
         left, right = x.low > y.high, y.low > x.high
 
         def chosen(u: Interval, v: Interval, *, kink: bool) -> Interval:
@@ -292,20 +195,17 @@ class Jet:
 
         pairs = self.pairs()
         value = Interval(x.meet(y).low, x.hull(y).high)
-        first = tuple(chosen(u, v, kink=False) for u, v in zip(self.first, b.first, strict=True))
+        first = tuple(
+            chosen(u, v, kink=False) for u, v in zip(self.first, other.first, strict=True)
+        )
         second = tuple(
             chosen(u, v, kink=i == j)
-            for (i, j), u, v in zip(pairs, self.second, b.second, strict=True)
+            for (i, j), u, v in zip(pairs, self.second, other.second, strict=True)
         )
         jet = Jet(value, first, second)
         if self.start is None:
             return jet
-        return jet.anchored(self.start.maximum(b.start), self.width)
-
-    def minimum(self, other: Any) -> Jet:
-        """The smaller of two functions at each place."""
-        b = self.of(other)
-        return -((-self).maximum(-b))
+        return jet.anchored(self.start.maximum(other.start), self.width)
 
     def selected(self, condition: Mask, other: Jet) -> Jet:
         """This one where the condition holds, elsewhere the other; each lane is all of one."""

@@ -37,9 +37,9 @@ def minimum(*values: Any) -> Any:
 def _folded(name: str, values: tuple[Any, ...]) -> Any:
     if len(values) < 2:
         raise TypeError(f"{name} compares two numbers or more, and {len(values)} was given")
-    if any(isinstance(one, Jet | Operators) for one in values):
+    if any(isinstance(one, Operators) for one in values):
         # Jets and their like first, so that one of them takes each of the others.
-        ordered = sorted(values, key=lambda one: not isinstance(one, Jet | Operators))
+        ordered = sorted(values, key=lambda one: not isinstance(one, Operators))
         return functools.reduce(lambda a, b: getattr(a, name)(b), ordered)
     of_arrays, of_others = _PAIRS[name]
 
@@ -82,14 +82,14 @@ def norm(*values: Any, p: float = 2.0) -> Any:
         return sizes[0] if len(sizes) == 1 else maximum(*sizes)
     if p == 1.0:
         return functools.reduce(lambda a, b: a + b, [absolute(one) for one in values])
-    if any(isinstance(one, Operators) for one in values):
+    jets = [one for one in values if isinstance(one, Jet)]
+    if not jets and any(isinstance(one, Operators) for one in values):
         sizes = [one if p == 2.0 else absolute(one) for one in values]
         powers = [one.apply(power(p)) if isinstance(one, Operators) else one**p for one in sizes]
         # One of them first that takes numbers of other kinds.
         powers.sort(key=lambda one: not isinstance(one, Operators))
         total = functools.reduce(lambda a, b: a + b, powers)
         return total.apply(sqrt if p == 2.0 else power(1 / p))
-    jets = [one for one in values if isinstance(one, Jet)]
     if not jets:
         return _plain_norm(values, p)
     given = [one if isinstance(one, Jet) else jets[0].of(one) for one in values]

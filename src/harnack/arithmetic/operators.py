@@ -130,8 +130,15 @@ class Operators(abc.ABC):
         return square.product(self) if n % 2 else square
 
     def __rpow__(self, base: Any) -> Any:
+        if isinstance(base, int | float) and not base > 0:
+            raise ValueError(f"{base:g}**x is no real number for most x: the base must be positive")
         b = self._operand(base)
         return NotImplemented if b is None else b**self
+
+    def __xor__(self, other: Any) -> Any:
+        raise TypeError("formulas write powers as x**2, not x^2")
+
+    __rxor__ = __xor__
 
     def __abs__(self) -> Self:
         return self.apply(absolute)
@@ -165,9 +172,14 @@ class Operators(abc.ABC):
 
     def __float__(self) -> float:
         raise TypeError(
-            "a formula cannot use functions of plain numbers, such as math.sin, nor decide by its "
-            "coordinates: use harnack.sin and its like, harnack.maximum and harnack.minimum"
+            "a formula cannot use functions of plain numbers, such as math.sin: use harnack.sin "
+            "and its like"
         )
 
-    def __bool__(self) -> bool:
-        raise TypeError("a formula cannot decide by its coordinates: use harnack.maximum")
+    def _undecided(self, *others: Any) -> Any:
+        del others
+        raise TypeError(
+            "a formula cannot decide by its coordinates: use harnack.maximum and harnack.minimum"
+        )
+
+    __bool__ = __lt__ = __le__ = __gt__ = __ge__ = _undecided

@@ -29,6 +29,7 @@ BackendName: TypeAlias = Literal["llvm", "cuda"]
 Precision: TypeAlias = Literal["single", "double"]
 
 BACKEND_VARIABLE = "HARNACK_BACKEND"
+_ALIGNMENT = 64  # bytes: the widest vectors of any processor
 
 
 @dataclass(frozen=True)
@@ -249,31 +250,31 @@ def _cast(backend: Backend, values: npt.NDArray[Any], name: str) -> npt.NDArray[
 
 
 def aligned(backend: Backend, values: npt.NDArray[Any]) -> Real:
-    """A one-dimensional NumPy array as an evaluated backend.Float with memory of its own.
-
-    Dr.Jit maps a NumPy array in place, and if that memory is not aligned to the vector width,
-    packet gathers silently fall apart into scalar ones. A gather copies it to Dr.Jit's own memory;
-    an index that Dr.Jit cannot see through keeps it from optimising the gather away. NumPy copies
-    first, for the gather may still run when the caller writes to `values` again.
-    """
+    """A copy of a one-dimensional NumPy array as an evaluated backend.Float in aligned memory."""
     if values.ndim != 1:
         raise ValueError(f"expected a one-dimensional array, got shape {values.shape}")
     if values.size == 0:
         return dr.zeros(backend.Float, 0)
-    mapped = backend.Float(np.array(_cast(backend, values, "an array"), order="C"))
-    lane = dr.arange(backend.UInt32, values.size) ^ dr.opaque(backend.UInt32, 0)
-    copy = dr.gather(backend.Float, mapped, lane)
-    dr.eval(copy)
-    return copy
+    return backend.Float(_aligned(_cast(backend, values, "an array"), np.dtype(backend.dtype)))
 
 
 def aligned_integers(backend: Backend, values: npt.NDArray[Any]) -> Index:
-    """A one-dimensional NumPy array of integers >= 0 as backend.UInt32, as `aligned` does: whether
-    mapped memory happens to be aligned is part of a kernel, which would be compiled again."""
-    mapped = backend.UInt32(np.array(values, dtype=np.uint32, order="C"))
-    lane = dr.arange(backend.UInt32, len(values)) ^ dr.opaque(backend.UInt32, 0)
-    copy = dr.gather(backend.UInt32, mapped, lane)
-    dr.eval(copy)
+    """A copy of a one-dimensional NumPy array of integers >= 0 as backend.UInt32, likewise."""
+    return backend.UInt32(_aligned(values, np.dtype(np.uint32)))
+
+
+def _aligned(values: npt.NDArray[Any], dtype: np.dtype[Any]) -> npt.NDArray[Any]:
+    """A copy that begins at a multiple of _ALIGNMENT bytes, with as many unused bytes after it.
+
+    Dr.Jit maps a NumPy array in place. NumPy's memory is aligned to the vector width by chance
+    only; if it is not, packet gathers silently fall apart into scalar ones, and since a kernel
+    knows whether it is, the same work would compile a kernel again.
+    """
+    size = values.size * dtype.itemsize
+    memory = np.empty(size + 2 * _ALIGNMENT, np.uint8)
+    start = -memory.ctypes.data % _ALIGNMENT
+    copy = memory[start : start + size].view(dtype)
+    copy[:] = values
     return copy
 
 

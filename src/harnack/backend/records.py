@@ -15,6 +15,8 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
+from harnack.backend.arrays import aligned
+
 if TYPE_CHECKING:
     from harnack.backend.arrays import Backend, Mask, Real
 
@@ -59,9 +61,8 @@ class Records:
             table = np.concatenate([table, np.tile(filling, (missing, 1))])
         rows, width = table.shape
         padded = -(-width // PACKET) * PACKET
-        mapped = backend.Float(np.array(table, backend.dtype, order="C").ravel())
-        # Dr.Jit must not see that this may be the array itself, which need not be aligned.
-        lane = dr.arange(backend.UInt32, rows * padded) ^ dr.opaque(backend.UInt32, 0)
+        mapped = aligned(backend, np.ascontiguousarray(table).ravel())
+        lane = dr.arange(backend.UInt32, rows * padded)
         row, column = lane // padded, lane % padded
         copy = dr.gather(backend.Float, mapped, row * width + column, column < width)
         dr.eval(copy)

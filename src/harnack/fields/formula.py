@@ -141,7 +141,7 @@ def is_jet(x: Any, name: str) -> bool:
     Raises:
         TypeError: it is a number of another arithmetic.
     """
-    if isinstance(x, Operators):
+    if isinstance(x, Operators) and not isinstance(x, Jet):
         raise TypeError(
             f"{name} gives ranges of derivatives alone, and the bound asked for is made of others: "
             'leave bound=None, or use "pieces", "quadratic-taylor", "linear-taylor" or "segment"'

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray, choose_backend, to_numpy
-from harnack.backend.arrays import aligned
+from harnack.backend.arrays import aligned, aligned_integers
 from harnack.backend.extrema import fmax, fmin
 from harnack.fields.multipoles.moments import KEYS, KNOWN, Pairs, moved, of_dipole, regular
 from harnack.tree import NO_PRIMITIVE, Hierarchy
@@ -63,7 +63,7 @@ def all_levels(
     low, high: (n, 3) boxes that hold the primitives.
     """
     backend, each = choose_backend("double"), points.shape[1]
-    p, n, lows, highs = (backend.Float(x.ravel()) for x in (points, normals, low, high))
+    p, n, lows, highs = (aligned(backend, x.ravel()) for x in (points, normals, low, high))
 
     def primitive(i: Any) -> _Primitive:
         dipoles = [
@@ -78,7 +78,7 @@ def all_levels(
 def triangle_levels(tree: Hierarchy, corners: FloatArray) -> list[NodeMoments]:
     """Moments of the nodes of all levels, for triangles (n, 3, 3): exact up to rounding."""
     backend = choose_backend("double")
-    buffer = backend.Float(corners.ravel())
+    buffer = aligned(backend, corners.ravel())
     rule = tuple(zip(*(part.tolist() for part in triangle_rule()), strict=True))
 
     def primitive(i: Any) -> _Primitive:
@@ -133,11 +133,10 @@ def _leaves(
     """
     index, real, vector = backend.UInt32, backend.Float, backend.Array3f
     filled = tree.slots != NO_PRIMITIVE
-    slots = index(np.where(filled, tree.slots, 0).astype(np.uint32).ravel())
-    # An index that Dr.Jit cannot see through: what NumPy may have put unaligned is gathered.
-    leaf = dr.arange(index, len(filled)) ^ dr.opaque(index, 0)
+    slots = aligned_integers(backend, np.where(filled, tree.slots, 0).ravel())
+    leaf = dr.arange(index, len(filled))
     first = leaf * dr.opaque(index, tree.leaf_size)
-    end = first + dr.gather(index, index(filled.sum(axis=1).astype(np.uint32)), leaf)
+    end = first + dr.gather(index, aligned_integers(backend, filled.sum(axis=1)), leaf)
 
     def visit(body: Callable[..., tuple[Any, ...]], state: tuple[Any, ...]) -> tuple[Any, ...]:
         def step(slot: Any, *state: Any) -> tuple[Any, ...]:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from harnack.backend import aligned
 from harnack.rendering.mitsuba.clear import tint_of
 from harnack.rendering.mitsuba.variant import load_mitsuba, mitsuba_backend
 from harnack.rendering.surfaces.extent import box_of
@@ -71,7 +72,7 @@ def _carrier_class(variant: str) -> Any:
             self.placed = PlacedSurface.of(surface, placement, mitsuba_backend(mi))
             params = mi.traverse(self)
             corners = np.concatenate(placement.world_bounds(ends))
-            params["vertex_positions"] = mi.Float(corners.astype(np.float32))
+            params["vertex_positions"] = aligned(mitsuba_backend(mi), corners)
             params["faces"] = mi.UInt32([0, 0, 0, 1, 1, 1])
             params.update()
 

@@ -6,10 +6,11 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
-import drjit as dr
 import numpy as np
 
 from harnack.backend import FloatArray, IntArray
+from harnack.backend.arrays import aligned_integers
+from harnack.rendering.mitsuba.variant import mitsuba_backend
 
 _TILE = 4
 
@@ -34,11 +35,9 @@ def in_tiles(size: tuple[int, int]) -> IntArray:
     return order[order >= 0]
 
 
-def pixels_of_band(mi: Any, order: Any, start: int, stop: int) -> Any:
-    """Entries `start` to `stop` of an array of pixels."""
-    return dr.gather(
-        mi.UInt32, order, dr.arange(mi.UInt32, stop - start) + dr.opaque(mi.UInt32, start)
-    )
+def uploaded(mi: Any, pixels: IntArray) -> Any:
+    """Pixels as one of Mitsuba's arrays."""
+    return aligned_integers(mitsuba_backend(mi), pixels)
 
 
 def film_places(mi: Any, pixel: Any, offset: Any, size: tuple[int, int]) -> Any:

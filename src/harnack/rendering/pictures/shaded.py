@@ -16,8 +16,9 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend import to_numpy
+from harnack.backend import aligned, to_numpy
 from harnack.rendering.mitsuba.integrator import LOST_COLOUR
+from harnack.rendering.mitsuba.variant import mitsuba_backend
 from harnack.rendering.mitsuba.world import World
 from harnack.rendering.pictures.cones import Finder
 from harnack.rendering.pictures.exposure import as_rgb, mean_of_blocks
@@ -29,7 +30,7 @@ from harnack.rendering.pictures.pixels import (
     film_places,
     grid_offsets,
     in_tiles,
-    pixels_of_band,
+    uploaded,
 )
 from harnack.rendering.pictures.shading import Light, of_mended, of_side, reflectance
 from harnack.rendering.pictures.through import Through
@@ -101,7 +102,7 @@ def shaded(
     order = in_tiles(painter.size)
     seen = _Seen.nothing(mi, count)
     for start, stop in bands(count, _RAYS_A_BAND):
-        pixel = pixels_of_band(mi, mi.UInt32(order), start, stop)
+        pixel = uploaded(mi, order[start:stop])
         part = painter.look(pixel, mi.Vector2f(0.5))
         dr.scatter(seen, part, pixel)
         dr.eval(seen)
@@ -114,7 +115,7 @@ def shaded(
     again = _edges(image).ravel()
     if finder is not None:
         for start, stop in bands(count, _RAYS_A_BAND):
-            pixel = pixels_of_band(mi, mi.UInt32(order), start, stop)
+            pixel = uploaded(mi, order[start:stop])
             ray, _ = painter.ray(pixel, mi.Vector2f(0.5))
             there = dr.gather(mi.Vector3f, seen.position, pixel)
             again[order[start:stop]] |= finder.find(ray, there)
@@ -206,8 +207,8 @@ class _Painter:
         mi, spp = self.mi, len(offsets)
         lane = dr.arange(mi.UInt32, len(chosen) * spp)
         many = dr.opaque(mi.UInt32, spp)
-        pixel = dr.gather(mi.UInt32, mi.UInt32(chosen.astype(np.uint32)), lane // many)
-        table = mi.Vector2f(np.ascontiguousarray(offsets.T, dtype=np.float32))
+        pixel = dr.gather(mi.UInt32, uploaded(mi, chosen), lane // many)
+        table = mi.Vector2f(*(aligned(mitsuba_backend(mi), one) for one in offsets.T))
         seen = self.look(pixel, dr.gather(mi.Vector2f, table, lane % many))
         colour = self.paint(seen, self._nearest_sky(seen, pixel, position, sky))
         dr.eval(colour, seen.lost)

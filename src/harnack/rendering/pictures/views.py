@@ -18,7 +18,7 @@ from harnack.rendering.mitsuba.integrator import LOST_COLOUR
 from harnack.rendering.mitsuba.world import World
 from harnack.rendering.pictures.colormap import viridis
 from harnack.rendering.pictures.images import as_bytes
-from harnack.rendering.pictures.pixels import bands, film_places, in_tiles, pixels_of_band
+from harnack.rendering.pictures.pixels import bands, film_places, in_tiles, uploaded
 from harnack.tracer import Status
 
 FloatArray = npt.NDArray[np.floating[Any]]
@@ -56,7 +56,7 @@ def look(mi: Any, scene: Any, sensor: Any, unit: float = 1.0) -> View:
     world = World.of(mi, scene)
     order = in_tiles((width, height))
     parts = [
-        _look_at(mi, world, sensor, pixels_of_band(mi, mi.UInt32(order), start, stop))
+        _look_at(mi, world, sensor, uploaded(mi, order[start:stop]))
         for start, stop in bands(width * height, _RAYS_A_BAND)
     ]
 
