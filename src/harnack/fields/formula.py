@@ -19,6 +19,7 @@ import drjit as dr
 
 from harnack.arithmetic import Interval, Jet
 from harnack.arithmetic.operators import Operators
+from harnack.backend import choose_backend
 from harnack.backend.extrema import fmin
 from harnack.enclosures import Lipschitz, Piece, Slopes, Tangent
 from harnack.fields.field import Field
@@ -133,6 +134,11 @@ class Formula(Field):
 
     def _jet(self, coordinates: tuple[Jet, Jet, Jet], like: Real) -> Jet:
         return as_jet(self.formula(*coordinates), coordinates[0], type(self).__name__)
+
+
+def probe() -> tuple[Jet, Jet, Jet]:
+    """Coordinates of some point, to try a formula on when it is made."""
+    return Jet.at_point(choose_backend("double").Array3f(0.1, 0.2, 0.3))
 
 
 def is_jet(x: Any, name: str) -> bool:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from harnack.fields.formula import Formula, as_jet
+from harnack.fields.formula import Formula, as_jet, probe
 
 if TYPE_CHECKING:
     from harnack.geometry import Volume
@@ -66,13 +66,6 @@ def expression(
     if not math.isfinite(level):
         raise ValueError(f"level must be finite, not {level!r}")
     made = Expression(function, domain, default_level=level, is_convex=is_convex)
-    probe = _probe()
-    as_jet(made.formula(*probe), probe[0], "expression")
+    point = probe()
+    as_jet(made.formula(*point), point[0], "expression")
     return made
-
-
-def _probe() -> tuple[Any, Any, Any]:
-    from harnack.arithmetic import Jet
-    from harnack.backend import choose_backend
-
-    return Jet.at_point(choose_backend("double").Array3f(0.1, 0.2, 0.3))

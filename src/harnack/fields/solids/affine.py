@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, cast
 
@@ -14,10 +13,9 @@ import numpy.typing as npt
 
 from harnack.backend.lengths import largest_component, length
 from harnack.enclosures import Curvature, HarmonicBall, Promise, Stretched
-from harnack.fields.field import Field
 from harnack.fields.formula import prepared_numbers
 from harnack.fields.look import Look, Path, Sample
-from harnack.fields.solids.solid import Solid
+from harnack.fields.solids.solid import Derived, Solid
 from harnack.geometry import Ball, ConvexHull
 
 if TYPE_CHECKING:
@@ -144,7 +142,7 @@ class Affine(Map):
 
 
 @dataclass(frozen=True, eq=False)
-class AffineImage(Solid):
+class AffineImage(Derived):
     """A solid under an affine map.
 
     Proof. A ray o + t d is the image of the straight path M^-1 (o - b) + t M^-1 d, on which the
@@ -157,8 +155,7 @@ class AffineImage(Solid):
     map: Affine
 
     def __post_init__(self) -> None:
-        for name in ("has_detail", "coarsest_detail", "overstep"):
-            object.__setattr__(self, name, getattr(self.inner, name))
+        self._take_over()
         domain = self.map.volume(self.inner.domain)
         if self.inner.domain is not None and domain is None:
             raise ValueError(
@@ -177,24 +174,13 @@ class AffineImage(Solid):
         """The inverse map, as numbers of the backend once prepared."""
         return cast("Any", self)._numbers
 
-    def leaves(self, change: Callable[[Solid], Solid]) -> Solid:
-        return change(self)
-
     def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         own = level / (self.map.similarity or 1.0)
         return self.map.volume(self.inner.hull(own, above=above))
 
     def prepare(self, backend: Backend) -> Solid:
-        other = self._of(self.inner.prepare(backend))
+        other = super().prepare(backend)
         object.__setattr__(other, "_numbers", self.numbers.prepare(backend))
-        return other
-
-    def at_detail(self, detail: Real) -> Field:
-        return self._of(self.inner.at_detail(detail))
-
-    def _of(self, inner: Field) -> Solid:
-        other = copy.copy(self)
-        object.__setattr__(other, "inner", inner)
         return other
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import numpy as np
 
-from harnack.arithmetic import Jet, cos, maximum, minimum, sin
+from harnack.arithmetic import cos, maximum, minimum, sin
 from harnack.backend.extrema import fmax, fmin
 from harnack.enclosures import Lipschitz, Promise
 from harnack.fields.field import Field
-from harnack.fields.formula import prepared_numbers
+from harnack.fields.formula import prepared_numbers, probe
 from harnack.fields.solids.solid import Shape, Solid
 from harnack.geometry import Ball, Box
 
@@ -33,7 +33,7 @@ class Bend(Map):
     """
 
     def of(self, solid: Solid) -> Solid:
-        solid.formula(*Jet.at_point(_probe()))  # says early what has no formula
+        solid.formula(*probe())  # says early what has no formula
         return Bent(solid, self)
 
     @abc.abstractmethod
@@ -51,12 +51,6 @@ class Bend(Map):
     @abc.abstractmethod
     def prepare(self, backend: Backend) -> Bend:
         """With numbers of the backend."""
-
-
-def _probe() -> Any:
-    from harnack.backend import choose_backend
-
-    return choose_backend("double").Array3f(0.1, 0.2, 0.3)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,9 +7,8 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from harnack.arithmetic import Jet
 from harnack.arithmetic.blends import blend_intersection, blend_union
-from harnack.fields.formula import as_data
+from harnack.fields.formula import as_data, probe
 from harnack.fields.solids.combined import union
 from harnack.fields.solids.solid import Shape, Solid, not_a_solid
 
@@ -42,7 +41,7 @@ class Blend(Shape):
         for one in self.parts:
             if not isinstance(one, Solid):  # pyright: ignore[reportUnnecessaryIsInstance]
                 raise TypeError(not_a_solid(one))
-            probe_formula(one)
+            one.formula(*probe())  # says early what has no formula
         constants = [one.lipschitz for one in self.parts]
         known = all(one is not None for one in constants)
         lipschitz = 2 ** (1 / self.power) * max(constants) * (1 + 1e-6) if known else None
@@ -77,10 +76,3 @@ class Blend(Shape):
         # The power stays a literal: ranges of x^p are found by what p is.
         object.__setattr__(other, "radius", as_data(self.radius, backend))
         return other
-
-
-def probe_formula(solid: Solid) -> None:
-    """Raises TypeError early for a solid without a formula."""
-    from harnack.backend import choose_backend
-
-    solid.formula(*Jet.at_point(choose_backend("double").Array3f(0.1, 0.2, 0.3)))

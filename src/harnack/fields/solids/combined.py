@@ -26,7 +26,7 @@ from harnack.enclosures import (
 from harnack.fields.field import Field
 from harnack.fields.formula import as_data
 from harnack.fields.look import Look, Path, Sample, value_error
-from harnack.fields.solids.solid import Solid, not_a_solid
+from harnack.fields.solids.solid import Derived, Solid, not_a_solid
 from harnack.geometry import Box, Intersection
 
 if TYPE_CHECKING:
@@ -255,14 +255,13 @@ def _around(volumes: list[Volume]) -> Volume | None:
 
 
 @dataclass(frozen=True, eq=False)
-class Complement(Solid):
+class Complement(Derived):
     """All points that are not inside a solid: -f."""
 
     inner: Solid
 
     def __post_init__(self) -> None:
-        for name in ("domain", "has_detail", "coarsest_detail", "overstep", "lipschitz"):
-            object.__setattr__(self, name, getattr(self.inner, name))
+        self._take_over("domain", "lipschitz")
 
     def __invert__(self) -> Solid:
         return self.inner
@@ -272,17 +271,6 @@ class Complement(Solid):
 
     def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         return self.inner.hull(-level, above=not above)
-
-    def prepare(self, backend: Backend) -> Solid:
-        return self._of(self.inner.prepare(backend))
-
-    def at_detail(self, detail: Real) -> Field:
-        return self._of(self.inner.at_detail(detail))
-
-    def _of(self, inner: Field) -> Solid:
-        other = copy.copy(self)
-        object.__setattr__(other, "inner", inner)
-        return other
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         return -self.inner.formula(x, y, z)
@@ -334,7 +322,7 @@ def negated_sample(sample: Sample) -> Sample:
 
 
 @dataclass(frozen=True, eq=False)
-class Offset(Solid):
+class Offset(Derived):
     """The points where f <= distance.
 
     Proof. f - distance has the enclosures of f, and its Lipschitz constant.
@@ -346,26 +334,14 @@ class Offset(Solid):
     def __post_init__(self) -> None:
         if not math.isfinite(self.distance):
             raise ValueError(f"distance must be finite, not {self.distance!r}")
-        for name in ("domain", "has_detail", "coarsest_detail", "overstep", "lipschitz"):
-            object.__setattr__(self, name, getattr(self.inner, name))
-
-    def leaves(self, change: Callable[[Solid], Solid]) -> Solid:
-        return change(self)  # a map may measure f in another unit
+        self._take_over("domain", "lipschitz")
 
     def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         return self.inner.hull(level + self.distance, above=above)
 
     def prepare(self, backend: Backend) -> Solid:
-        other = self._of(self.inner.prepare(backend))
+        other = super().prepare(backend)
         object.__setattr__(other, "distance", as_data(self.distance, backend))
-        return other
-
-    def at_detail(self, detail: Real) -> Field:
-        return self._of(self.inner.at_detail(detail))
-
-    def _of(self, inner: Field) -> Solid:
-        other = copy.copy(self)
-        object.__setattr__(other, "inner", inner)
         return other
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -21,7 +20,7 @@ from harnack.fields.formula import Formula, as_data, is_jet
 from harnack.fields.look import Look, Path, Sample
 from harnack.fields.solids.affine import without_balls
 from harnack.fields.solids.combined import Complement, Offset, lipschitz_of, negated_sample
-from harnack.fields.solids.solid import Solid
+from harnack.fields.solids.solid import Derived, Solid
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -95,69 +94,44 @@ def _levels(given: Any, count: int) -> tuple[float, ...] | None:
     return numbers if len(numbers) == count and all(map(math.isfinite, numbers)) else None
 
 
-class _OfField(Solid):
-    """A solid that looks at a field of any kind."""
-
-    field: Field
-
-    def _take_over(self) -> None:
-        """What the field is and needs."""
-        for name in ("has_detail", "coarsest_detail", "overstep"):
-            object.__setattr__(self, name, getattr(self.field, name))
-        domain = None if self.field.is_entire else self.field.domain
-        object.__setattr__(self, "domain", domain)
-
-    def leaves(self, change: Callable[[Solid], Solid]) -> Solid:
-        return change(self)
-
-    def prepare(self, backend: Backend) -> Solid:
-        return self._of(self.field.prepare(backend))
-
-    def at_detail(self, detail: Real) -> Field:
-        return self._of(self.field.at_detail(detail))
-
-    def _of(self, field: Field) -> Solid:
-        other = copy.copy(self)
-        object.__setattr__(other, "field", field)
-        return other
-
-
 @dataclass(frozen=True, eq=False)
-class Region(_OfField):
+class Region(Derived):
     """The points where a field is at most 0."""
 
-    field: Field
+    inner: Field
 
     def __post_init__(self) -> None:
         self._take_over()
+        domain = None if self.inner.is_entire else self.inner.domain
+        object.__setattr__(self, "domain", domain)
 
     def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
-        if self.field.is_entire:
+        if self.inner.is_entire:
             return None
 
         def is_inside(value: float) -> bool:
             return value >= level if above else value <= level
 
-        return bounded_side(self.field, (level,), is_inside)
+        return bounded_side(self.inner, (level,), is_inside)
 
     def evaluate(self, p: Vec3) -> Sample:
-        return self.field.evaluate(p)
+        return self.inner.evaluate(p)
 
     def differentiable_value(self, p: Vec3) -> Real:
-        return self.field.differentiable_value(p)
+        return self.inner.differentiable_value(p)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        return self.field.hessian(p)
+        return self.inner.hessian(p)
 
     def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
-        return self.field.look(path, t, ahead, back)
+        return self.inner.look(path, t, ahead, back)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        if isinstance(self.field, Formula):
-            return self.field.formula(x, y, z)
-        if not is_jet(x, type(self.field).__name__):
+        if isinstance(self.inner, Formula):
+            return self.inner.formula(x, y, z)
+        if not is_jet(x, type(self.inner).__name__):
             return self.differentiable_value(_vector(x, y, z))
-        return jet_of_field(self.field, x, y, z)
+        return jet_of_field(self.inner, x, y, z)
 
 
 def bounded_side(
@@ -269,7 +243,7 @@ def _second_derivatives(field: Field, sample: Sample) -> tuple[Real, Real]:
 
 
 @dataclass(frozen=True, eq=False)
-class Near(_OfField):
+class Near(Derived):
     """The points where a field is at most half_width from a level: |f - level| - half_width.
 
     Of an angle-valued field from the level plus any multiple of the period.
@@ -278,45 +252,47 @@ class Near(_OfField):
     + half_width and level - v - half_width, and these plus multiples of the period (`Folded`).
     """
 
-    field: Field
+    inner: Field
     level: float
     half_width: float
 
     def __post_init__(self) -> None:
         self._take_over()
+        domain = None if self.inner.is_entire else self.inner.domain
+        object.__setattr__(self, "domain", domain)
 
     def prepare(self, backend: Backend) -> Solid:
-        other = self._of(self.field.prepare(backend))
+        other = super().prepare(backend)
         for name in ("level", "half_width"):
             object.__setattr__(other, name, as_data(getattr(self, name), backend))
         return other
 
     def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         ends = tuple(self.level + sign * (self.half_width + level) for sign in (-1, 1))
-        if above or (self.field.is_entire and self.field.period is None):
+        if above or (self.inner.is_entire and self.inner.period is None):
             return self.domain
 
         def is_inside(value: float) -> bool:
-            offset, period = value - self.level, self.field.period
+            offset, period = value - self.level, self.inner.period
             if period is not None:
                 offset -= period * round(offset / period)
             return abs(offset) <= self.half_width + level
 
-        return bounded_side(self.field, ends, is_inside)
+        return bounded_side(self.inner, ends, is_inside)
 
     def evaluate(self, p: Vec3) -> Sample:
-        return self._folded(self.field.evaluate(p))[0]
+        return self._folded(self.inner.evaluate(p))[0]
 
     def differentiable_value(self, p: Vec3) -> Real:
-        offset = self._offset(self.field.differentiable_value(p))
+        offset = self._offset(self.inner.differentiable_value(p))
         return dr.abs(offset) - self.half_width
 
     def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
-        look = self.field.look(path, t, ahead, back)
+        look = self.inner.look(path, t, ahead, back)
         sample, offset = self._folded(look.sample)
 
         def folded(enclosures: tuple[Enclosure, ...]) -> tuple[Enclosure, ...]:
-            return tuple(Folded(one, offset, self.field.period) for one in enclosures)
+            return tuple(Folded(one, offset, self.inner.period) for one in enclosures)
 
         slope = dr.mulsign(look.slope, offset)
         ahead_, back_ = folded(look.ahead), folded(look.back)
@@ -324,7 +300,7 @@ class Near(_OfField):
 
     def _offset(self, value: Real) -> Real:
         """f - level, reduced to half a period on either side."""
-        offset, period = value - self.level, self.field.period
+        offset, period = value - self.level, self.inner.period
         return offset if period is None else offset - period * dr.round(offset / period)
 
     def _folded(self, sample: Sample) -> tuple[Sample, Real]:

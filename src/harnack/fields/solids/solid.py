@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import copy
 import functools
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
 
     import numpy.typing as npt
 
-    from harnack.backend import Backend
+    from harnack.backend import Backend, Real
     from harnack.fields.solids.maps import Map
     from harnack.geometry import Volume
 
@@ -189,6 +190,31 @@ class Solid(Field):
 
     def _mapped(self, change: Map) -> Solid:
         return self.leaves(change.of)
+
+
+class Derived(Solid):
+    """A solid made of one other field, `inner`, which needs what that one needs."""
+
+    inner: Any
+
+    def _take_over(self, *names: str) -> None:
+        """Has these attributes of the inner field as well as what marching needs."""
+        for name in ("has_detail", "coarsest_detail", "overstep", *names):
+            object.__setattr__(self, name, getattr(self.inner, name))
+
+    def leaves(self, change: Callable[[Solid], Solid]) -> Solid:
+        return change(self)
+
+    def prepare(self, backend: Backend) -> Solid:
+        return self._of(self.inner.prepare(backend))
+
+    def at_detail(self, detail: Real) -> Field:
+        return self._of(self.inner.at_detail(detail))
+
+    def _of(self, inner: Field) -> Solid:
+        other = copy.copy(self)
+        object.__setattr__(other, "inner", inner)
+        return other
 
 
 class Shape(Formula, Solid):

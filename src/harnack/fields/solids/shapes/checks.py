@@ -7,6 +7,8 @@ from typing import Any
 
 from harnack.geometry import Ball, Box, Volume
 
+Point = tuple[float, float, float]
+
 # Extents are widened by this part of the coordinates: numbers of a shape are rounded to the
 # precision in which it is traced.
 _ROUNDED = 1e-6
@@ -39,7 +41,7 @@ def finite(value: Any, name: str) -> float:
     return number
 
 
-def triple(value: Any, name: str, *, all_positive: bool = False) -> tuple[float, float, float]:
+def triple(value: Any, name: str, *, all_positive: bool = False) -> Point:
     """Three finite numbers.
 
     Raises:
@@ -68,3 +70,8 @@ def ball_around(center: tuple[float, float, float], radius: float) -> Volume:
     """The ball of the radius given; where that is not positive, one that holds no surface."""
     slack = _ROUNDED * (abs(radius) + sum(abs(c) for c in center)) + 1e-30
     return Ball(center, max(radius, 0.0) + slack)
+
+
+def set_checked(shape: Any, name: str, value: Any) -> None:
+    """Puts a number that was checked in the place of the one given."""
+    object.__setattr__(shape, name, value)

@@ -13,17 +13,19 @@ from typing import TYPE_CHECKING, Any
 
 from harnack.arithmetic import cos, maximum, minimum, norm, sin
 from harnack.arithmetic.blends import corner
-from harnack.fields.solids.shapes.checks import ball_around, box_around, finite, positive, triple
+from harnack.fields.solids.shapes.checks import (
+    Point,
+    ball_around,
+    box_around,
+    finite,
+    positive,
+    set_checked,
+    triple,
+)
 from harnack.fields.solids.solid import Shape
 
 if TYPE_CHECKING:
     from harnack.geometry import Volume
-
-Point = tuple[float, float, float]
-
-
-def _set(shape: Any, name: str, value: Any) -> None:
-    object.__setattr__(shape, name, value)
 
 
 @dataclass(frozen=True)
@@ -46,8 +48,8 @@ class Plane(Shape):
         length = math.hypot(*normal)
         if length == 0.0:
             raise ValueError("the normal of a plane must not be zero")
-        _set(self, "normal", tuple(v / length for v in normal))
-        _set(self, "distance", finite(self.distance, "the distance of a plane"))
+        set_checked(self, "normal", tuple(v / length for v in normal))
+        set_checked(self, "distance", finite(self.distance, "the distance of a plane"))
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         a, b, c = self.normal
@@ -73,8 +75,8 @@ class Sphere(Shape):
     lipschitz = 1.0
 
     def __post_init__(self) -> None:
-        _set(self, "radius", positive(self.radius, "the radius of a sphere"))
-        _set(self, "center", triple(self.center, "the center of a sphere"))
+        set_checked(self, "radius", positive(self.radius, "the radius of a sphere"))
+        set_checked(self, "center", triple(self.center, "the center of a sphere"))
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         a, b, c = self.center
@@ -103,7 +105,7 @@ class Ellipsoid(Shape):
 
     def __post_init__(self) -> None:
         radii = triple(self.radii, "the radii of an ellipsoid", all_positive=True)
-        _set(self, "radii", radii)
+        set_checked(self, "radii", radii)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         a, b, c = self.radii
@@ -134,10 +136,10 @@ class Cylinder(Shape):
     lipschitz = 1.0
 
     def __post_init__(self) -> None:
-        _set(self, "radius", positive(self.radius, "the radius of a cylinder"))
+        set_checked(self, "radius", positive(self.radius, "the radius of a cylinder"))
         if self.half_height is not None:
             height = positive(self.half_height, "half the height of a cylinder")
-            _set(self, "half_height", height)
+            set_checked(self, "half_height", height)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         side = norm(x, y) - self.radius
@@ -172,7 +174,7 @@ class DoubleCone(Shape):
                 "the angle of a cone between axis and side must be between 0 and pi/2, "
                 f"not {self.angle!r}"
             )
-        _set(self, "angle", angle)
+        set_checked(self, "angle", angle)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         return norm(x, y) * cos(self.angle) - abs(z) * sin(self.angle)
@@ -203,9 +205,9 @@ class Capsule(Shape):
         end = triple(self.end, "the end of a capsule")
         if start == end:
             raise ValueError(f"a capsule from {start} to the same point is a sphere: use Sphere")
-        _set(self, "start", start)
-        _set(self, "end", end)
-        _set(self, "radius", positive(self.radius, "the radius of a capsule"))
+        set_checked(self, "start", start)
+        set_checked(self, "end", end)
+        set_checked(self, "radius", positive(self.radius, "the radius of a capsule"))
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         axis = [b - a for a, b in zip(self.start, self.end, strict=True)]
@@ -242,8 +244,8 @@ class Torus(Shape):
     lipschitz = 1.0
 
     def __post_init__(self) -> None:
-        _set(self, "major", positive(self.major, "the major radius of a torus"))
-        _set(self, "minor", positive(self.minor, "the minor radius of a torus"))
+        set_checked(self, "major", positive(self.major, "the major radius of a torus"))
+        set_checked(self, "minor", positive(self.minor, "the minor radius of a torus"))
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         return norm(norm(x, y) - self.major, z) - self.minor

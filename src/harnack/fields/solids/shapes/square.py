@@ -8,19 +8,20 @@ from typing import TYPE_CHECKING, Any
 from harnack.arithmetic import minimum, norm
 from harnack.arithmetic.blends import corner
 from harnack.fields.formula import prepared_numbers
-from harnack.fields.solids.shapes.checks import box_around, finite, positive, triple
+from harnack.fields.solids.shapes.checks import (
+    Point,
+    box_around,
+    finite,
+    positive,
+    set_checked,
+    triple,
+)
 from harnack.fields.solids.solid import Shape
 
 if TYPE_CHECKING:
     from harnack.backend import Backend
     from harnack.fields.field import Field
     from harnack.geometry import Volume
-
-Point = tuple[float, float, float]
-
-
-def _set(shape: Any, name: str, value: Any) -> None:
-    object.__setattr__(shape, name, value)
 
 
 @dataclass(frozen=True)
@@ -39,14 +40,14 @@ class Cuboid(Shape):
 
     def __post_init__(self) -> None:
         sides = triple(self.half_sides, "the half sides of a box", all_positive=True)
-        _set(self, "half_sides", sides)
+        set_checked(self, "half_sides", sides)
         radius = finite(self.radius, "the radius of the edges of a box")
         if not 0.0 <= radius <= min(sides):
             raise ValueError(
                 "the radius of the edges of a box must be between 0 and its least half side "
                 f"{min(sides):g}, not {self.radius!r}"
             )
-        _set(self, "radius", radius)
+        set_checked(self, "radius", radius)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         sides = (
@@ -99,7 +100,7 @@ class _Powered(Shape):
 
     def prepare(self, backend: Backend) -> Field:
         made = prepared_numbers(self, backend)
-        _set(made, "powers", self.powers)
+        set_checked(made, "powers", self.powers)
         return made
 
 
@@ -117,9 +118,9 @@ class Superellipsoid(_Powered):
     radii: Point = (1.0, 1.0, 1.0)
 
     def __post_init__(self) -> None:
-        _set(self, "powers", _checked_powers(self.powers, "superellipsoid"))
+        set_checked(self, "powers", _checked_powers(self.powers, "superellipsoid"))
         radii = triple(self.radii, "the radii of a superellipsoid", all_positive=True)
-        _set(self, "radii", radii)
+        set_checked(self, "radii", radii)
 
     @property
     def lipschitz(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -149,9 +150,9 @@ class Supertorus(_Powered):
     minor: float = 0.25
 
     def __post_init__(self) -> None:
-        _set(self, "powers", _checked_powers(self.powers, "supertorus"))
-        _set(self, "major", positive(self.major, "the major radius of a supertorus"))
-        _set(self, "minor", positive(self.minor, "the minor radius of a supertorus"))
+        set_checked(self, "powers", _checked_powers(self.powers, "supertorus"))
+        set_checked(self, "major", positive(self.major, "the major radius of a supertorus"))
+        set_checked(self, "minor", positive(self.minor, "the minor radius of a supertorus"))
 
     @property
     def lipschitz(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
