@@ -15,6 +15,7 @@ import drjit as dr
 from harnack.backend import lengths
 from harnack.backend.extrema import clamp, fmax, fmin
 from harnack.distance.tangent import Eigen, TangentPlane
+from harnack.enclosures import Lipschitz
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -91,36 +92,39 @@ class Descent:
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
         mask = self.backend.Bool
         x = vector(x)
-        first, on_level = self._to_level(start, mask(True))
 
         def body(
-            y: Vec3,
-            g: Vec3,
-            noise: Real,
-            reach: Real,
-            share: Real,
-            found: Mask,
-            n: Any,
-            active: Mask,
-        ) -> tuple[Any, ...]:
-            here = _Place(y, g, noise, reach)
+            y: Vec3, g: Vec3, noise: Real, reach: Real,
+            share: Real, on_level: Mask, found: Mask, n: Any, active: Mask,
+        ) -> tuple[Any, ...]:  # fmt: skip
+            here, first = _Place(y, g, noise, reach), n == 0
             move, settled = self._step_along(x, here, share)
+            settled &= ~first
             going = active & ~settled
-            there, on_level = self._to_level(y + move, going)
+            there, arrived = self._to_level(dr.select(first, y, y + move), going)
             limit = dr.norm(x - y) * (1 + 8 * self.backend.epsilon) + 4 * noise
-            better = going & on_level & (dr.norm(x - there.y) <= limit)
-            share = dr.select(better, fmin(4 * share, 1), 0.25 * share)
+            better = going & arrived & (dr.norm(x - there.y) <= limit)
+            longer = dr.select(better, fmin(4 * share, 1), 0.25 * share)
+            share = dr.select(first, share, longer)
             found |= active & settled
+            on_level = dr.select(first, arrived, on_level)
             # Where f ceases to be smooth the surface ends: no minimum inside it.
             inner = there.reach > _RIM * dr.norm(x - there.y)
-            active = going & inner & (n < _STEPS_ALONG) & (share > _LEAST_SHARE)
-            return *there.where(better, here), share, found, n + 1, active
+            inner &= (n <= _STEPS_ALONG) & (share > _LEAST_SHARE)
+            active = going & dr.select(first, arrived, inner)
+            return *there.where(better | first, here), share, on_level, found, n + 1, active
 
         def more(*state: Any) -> Mask:
             return state[-1]
 
-        state = (*first.parts(), real(1), mask(False), count(0), mask(on_level))
-        y, _, _, _, _, found, _, _ = dr.while_loop(state, more, body, label="along the level")
+        # Round 0 goes to the level: f is recorded once for both.
+        state = (
+            *_Place(vector(start), vector(0), real(0), real(0)).parts(),
+            real(1), mask(False), mask(False), count(0), mask(True),
+        )  # fmt: skip
+        y, _, _, _, _, on_level, found, _, _ = dr.while_loop(
+            state, more, body, label="along the level"
+        )
         return y, found, on_level
 
     def noise(self, y: Vec3) -> Real:
@@ -136,6 +140,8 @@ class Descent:
         noise = dr.fma(4 * epsilon, size, blur / gradient_norm)
         reach = real(0)
         for known in sample.promises:
+            if isinstance(known, Lipschitz):  # of what may have creases
+                continue
             radius = real(known.radius)
             reach = fmax(reach, dr.select(dr.isfinite(radius), radius, 0))
         reach = dr.select(reach > 0, reach, dr.inf)
@@ -161,22 +167,25 @@ class Descent:
             above: Real, y: Vec3, g: Vec3, noise: Real, reach: Real,
             share: Real, close: Mask, n: Any, active: Mask,
         ) -> tuple[Any, ...]:  # fmt: skip
-            here, gradient_norm = _Place(y, g, noise, reach), lengths.length(g)
+            here, gradient_norm, first = _Place(y, g, noise, reach), lengths.length(g), n == 0
             length = share * clamp(-above / gradient_norm, -reach, reach)
-            above2, there = self._look(dr.fma(vector(length / gradient_norm), g, y))
-            better = active & (dr.abs(above2) < dr.abs(above))
-            share = dr.select(better, fmin(2 * share, 1), 0.25 * share)
+            nearer = dr.fma(vector(length / gradient_norm), g, y)
+            above2, there = self._look(dr.select(first, y, nearer))
+            better = active & (first | (dr.abs(above2) < dr.abs(above)))
+            longer = dr.select(better, fmin(2 * share, 1), 0.25 * share)
+            share = dr.select(first, share, longer)
             close |= better & is_close(above2, there)
-            active &= ~close & (n < _STEPS_TO_LEVEL) & (share > _LEAST_SHARE)
+            active &= ~close & (n <= _STEPS_TO_LEVEL) & (share > _LEAST_SHARE)
             above = dr.select(better, above2, above)
             return above, *there.where(better, here), share, close, n + 1, active
 
         def more(*state: Any) -> Mask:
             return state[-1]
 
-        above, first = self._look(vector(start))
-        close = is_close(above, first)
-        state = (above, *first.parts(), real(1), close, count(0), active & ~close)
+        # Round 0 looks at the start.
+        first = _Place(vector(start), vector(0), real(0), real(0))
+        close = self.backend.Bool(False)
+        state = (real(dr.inf), *first.parts(), real(1), close, count(0), self.backend.Bool(active))
         _, *place, _, close, _, _ = dr.while_loop(state, more, body, label="to the level")
         return _Place(*place), close
 
@@ -210,12 +219,23 @@ class Descent:
         their errors only cost steps."""
         if self.has_hessian:
             return plane.restricted(self.field.hessian(y))
-        vector = self.backend.Array3f
+        vector, count = self.backend.Array3f, self.backend.UInt32
         h = fmax(self.backend.epsilon**0.5 * size, 1e-30)
-        ahead, aside = (
-            (self.field.evaluate(dr.fma(vector(h), way, y)).gradient
-             - self.field.evaluate(dr.fma(vector(-h), way, y)).gradient) * (0.5 / h)
-            for way in (plane.u, plane.v)
-        )  # fmt: skip
+
+        def body(ahead: Vec3, aside: Vec3, k: Any) -> tuple[Any, ...]:
+            way, sign = dr.select(k < 2, plane.u, plane.v), dr.select((k & 1) == 0, h, -h)
+            gradient = self.field.evaluate(dr.fma(vector(sign), way, y)).gradient
+            change = gradient * (0.5 / sign)
+            return (
+                dr.select(k < 2, ahead + change, ahead),
+                dr.select(k < 2, aside, aside + change),
+                k + 1,
+            )
+
+        def more(*state: Any) -> Mask:
+            return state[-1] < 4
+
+        state = (0 * y, 0 * y, count(0))
+        ahead, aside, _ = dr.while_loop(state, more, body, label="second derivatives")
         cross = 0.5 * (dr.dot(plane.v, ahead) + dr.dot(plane.u, aside))
         return dr.dot(plane.u, ahead), dr.dot(plane.v, aside), cross
