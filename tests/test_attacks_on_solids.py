@@ -103,7 +103,7 @@ def test_little_is_lost_far_from_the_origin() -> None:
     ("make", "error", "message"),
     [
         (lambda: hk.expression(lambda x, y, z: None), TypeError, "returned an object of type None"),
-        (lambda: hk.expression(lambda x, y, z: x if x > 0 else y), TypeError, "decide by its coordinates"),
+        (lambda: hk.expression(lambda x, y, z: x if x > 0 else y), TypeError, "cannot decide by"),
         (lambda: hk.solid(hk.Gyroid(1.0), between=(1.0,)), ValueError, "numbers, two of them"),  # type: ignore[arg-type]
         (lambda: hk.solid(hk.Gyroid(1.0), around=3.0), ValueError, "numbers, two of them"),  # type: ignore[arg-type]
         (lambda: hk.Sphere(1.0).tapered(0.0, 1.0), ValueError, "two numbers each"),  # type: ignore[arg-type]

@@ -129,7 +129,9 @@ def test_values_are_differentiable_in_a_curves_vertices() -> None:
     np.testing.assert_allclose(rate, (ahead - behind) / (2 * h), atol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["curve", "mesh", "tree", "cloud", "screened"])
+@pytest.mark.parametrize(
+    "name", ["curve", "mesh", pytest.param("tree", marks=pytest.mark.slow), "cloud", "screened"]
+)
 def test_hits_carry_derivatives_backwards(name: str) -> None:
     """Through sums that loops evaluate, in reverse mode: those of meshes and clouds raised."""
     field, backend = FIELDS[name], choose_backend("double")

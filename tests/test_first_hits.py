@@ -193,7 +193,9 @@ def check(tally: Tally, failures: list[str]) -> None:
     assert tally.crossings > 0.2 * tally.rays
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize(
+    "seed", [0, 1, *(pytest.param(k, marks=pytest.mark.slow) for k in range(2, 5))]
+)
 def test_random_curves(seed: int) -> None:
     failures: list[str] = []
     check(compare_random(seed, 8, 50, failures), failures)

@@ -119,7 +119,13 @@ def test_it_is_symmetric_and_of_harmonic_fields_free_of_trace(name: str) -> None
         assert np.median(trace) > 0.01 * np.median(size(found))
 
 
-@pytest.mark.parametrize("l", range(13))
+@pytest.mark.parametrize(
+    "l",
+    [
+        pytest.param(degree, marks=() if degree in (0, 1, 2, 3, 7, 12) else pytest.mark.slow)
+        for degree in range(13)
+    ],
+)
 def test_every_solid_harmonic(l: int) -> None:  # noqa: E741
     rng = np.random.default_rng(l)
     x = rng.uniform(-0.6, 0.6, (20, 3))

@@ -39,15 +39,18 @@ def test_a_field_is_uploaded_once_to_each_backend(name: str) -> None:
     assert field.prepare(choose_backend()) is not prepared
 
 
-def test_what_is_kept_goes_with_the_field() -> None:
-    for make in FIELDS.values():
-        field = make()
-        prepared = field.prepare(choose_backend())
-        hk.render(field, show="status", size=(8, 6), progress=False)
-        gone = weakref.ref(field), weakref.ref(prepared)
-        del field, prepared
-        gc.collect()
-        assert [one() for one in gone] == [None, None]
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(one, marks=() if one == "curve" else pytest.mark.slow) for one in FIELDS],
+)
+def test_what_is_kept_goes_with_the_field(name: str) -> None:
+    field = FIELDS[name]()
+    prepared = field.prepare(choose_backend())
+    hk.render(field, show="status", size=(8, 6), progress=False)
+    gone = weakref.ref(field), weakref.ref(prepared)
+    del field, prepared
+    gc.collect()
+    assert [one() for one in gone] == [None, None]
 
 
 def test_a_field_with_an_attribute_set_is_uploaded_again() -> None:

@@ -63,7 +63,14 @@ def dense_crossings(
     return first, inside[:, 0]
 
 
-@pytest.mark.parametrize("volume", [BALL, BOX, hk.Intersection((BALL, BOX))])
+@pytest.mark.parametrize(
+    "volume",
+    [
+        pytest.param(BALL, marks=pytest.mark.slow),
+        pytest.param(BOX, marks=pytest.mark.slow),
+        hk.Intersection((BALL, BOX)),
+    ],
+)
 @pytest.mark.parametrize(("low", "high"), [(-0.4, 0.3), (-math.inf, 0.1), (0.2, math.inf)])
 @pytest.mark.parametrize("t_max", [pytest.param(0.4, marks=pytest.mark.slow), 4.0])
 def test_rays_cross_the_boundary_where_the_solid_begins_or_ends(

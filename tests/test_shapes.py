@@ -162,7 +162,7 @@ EVERY = pytest.mark.parametrize("name", SHAPES)
 QUICK_PRECISIONS = pytest.mark.parametrize(
     "precision", ["single", pytest.param("double", marks=pytest.mark.slow)]
 )
-QUICK = ("sphere", "torus", "tube", "rounded box", "displaced", "julia")
+QUICK = ("torus", "tube", "rounded box", "julia")
 SOME_QUICK = pytest.mark.parametrize(
     "name", [pytest.param(one, marks=() if one in QUICK else pytest.mark.slow) for one in SHAPES]
 )

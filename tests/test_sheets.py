@@ -394,9 +394,7 @@ KINDS = [BruteForceWinding, CountedWinding]
 @pytest.mark.parametrize(
     "name",
     [
-        name
-        if name in ("nested boxes", "self-intersecting", "strip", "doubled faces")
-        else pytest.param(name, marks=pytest.mark.slow)
+        name if name in ("nested boxes", "strip") else pytest.param(name, marks=pytest.mark.slow)
         for name in MESHES
     ],
 )
