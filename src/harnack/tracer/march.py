@@ -197,7 +197,8 @@ class March:
             excess = fmax(gaps.smaller + total_error - within, real(0))
             band, may_pass = within, is_near
             if self.hysteresis is not None and now.contact is not None:
-                band = self.hysteresis.band(within, rounding)
+                # In contact all that rounding does to f counts, or a ray would stick in a crease.
+                band = self.hysteresis.band(within, total_error - sample.truncation)
                 gaps = self.hysteresis.gaps(now.contact, sample.value, gaps, band)
                 within = CLOSER * within
                 may_pass &= ~now.contact.is_touching
