@@ -13,7 +13,9 @@ import harnack as hk
 
 from .agreement import agreement
 from .antialiasing import antialiasing
+from .baselines import baselines
 from .convergence import plot
+from .formulas import formulas
 from .growth import growth
 from .hart import hart
 from .inclusion import inclusion
@@ -26,7 +28,7 @@ from .winding import throughput
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 SECTIONS = (
     "rays", "convergence", "winding", "agreement", "versions", "inclusion", "hart", "povray",
-    "antialiasing",
+    "antialiasing", "baselines", "formulas",
 )  # fmt: skip
 
 
@@ -65,6 +67,8 @@ def main() -> None:
         "inclusion": inclusion,
         "hart": hart,
         "antialiasing": antialiasing,
+        "baselines": baselines,
+        "formulas": formulas,
         "povray": compare_with_povray,
         "winding": lambda: _winding(arguments.bunny, arguments.out.with_name("growth.png")),
     }

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from benchmarks import blobs, hart, inclusion, povray
+from benchmarks import baselines, blobs, formulas, hart, inclusion, povray
 from harnack.backend import choose_backend, to_vector3
 from harnack.enclosures import BottomUpLinear
+from harnack.geometry import shapes
 
 SCENE = blobs.Scene.random(6, 1.5, (0.6, 1.0), 1.6, seed=2)
 
@@ -89,3 +90,32 @@ def test_the_oracle_finds_the_roots_of_the_tracer(monkeypatch: pytest.MonkeyPatc
     off = np.where(np.isfinite(t), t + 0.05, t)
     assert truth.wrong(gyroid, d, off)[0] > 50
     assert isinstance(gyroid.field, hk.Gyroid)
+
+
+def test_methods_without_a_proof_miss_first_hits(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(baselines, "SAMPLES", 1500)
+    field = hk.SolidAngle(shapes.wavy_polygon(12))
+    results, truth = baselines.compare(field, 2 * np.pi, across=16)
+    found = {one.name: one for one in results}
+    assert np.isfinite(truth).sum() > 50
+    assert found["harnack"].missed == found["harnack"].false == 0
+    assert found["sphere tracing, L = 5"].missed > 20
+    assert found["Newton"].missed > 10
+    # Jumps of the angle are taken for crossings.
+    assert found["bisection"].false > 100
+    assert found["interval analysis"].false > 10
+
+
+def test_formulas_of_the_solid_angle_are_equal_modulo_4_pi() -> None:
+    loop = shapes.wavy_polygon(12)
+    x = np.random.default_rng(0).uniform(-1.2, 1.2, (500, 3))
+    expected = formulas.fan(loop, x)
+    for other in (formulas.quaternions(loop, x), hk.SolidAngle(loop).value(x, precision="double")):
+        turns = (other - expected) / (4 * np.pi)
+        np.testing.assert_allclose(turns, np.round(turns), atol=1e-10)
+    turns = (formulas.angle_sum(loop, x) - expected) / (2 * np.pi)
+    np.testing.assert_allclose(turns, np.round(turns), atol=1e-10)
+    gradient = formulas.adiels(loop, x)
+    np.testing.assert_allclose(formulas.biot_savart(loop, x), gradient, rtol=1e-8, atol=1e-10)
+    near = np.median(np.abs(formulas.differences(loop, x) / gradient - 1))
+    assert near < 0.01

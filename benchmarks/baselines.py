@@ -1,0 +1,364 @@
+"""What is commonly used to trace such surfaces, and how many first hits it misses.
+
+None of these methods proves anything about singular or angle-valued functions: they are here for
+comparison alone (the paper's Figs. 25 to 27). Rays are followed for 0 <= t <= 10 with at most 2500
+steps, and a value within 1e-3 of the level is a hit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+import harnack as hk
+from harnack.geometry import shapes
+
+from .scenes import camera
+
+Array = npt.NDArray[np.float64]
+
+FAR, EPS, MOST = 10.0, 1e-3, 2500
+# A hit that is farther from the oracle's than this is another one.
+APART = 0.02
+ACROSS, SAMPLES = 64, 6000
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Values of a field along rays, counted: n rays, of which `far` (n,) is looked at."""
+
+    field: hk.Field
+    level: float
+    origins: Array
+    directions: Array
+    far: Array
+    counts: npt.NDArray[np.int64]
+
+    @classmethod
+    def of(cls, field: hk.Field, level: float, across: int) -> Rays:
+        """Of the camera of all benchmarks; from where they enter the field's domain."""
+        eye, d = camera(across)
+        o, far = np.tile(eye, (len(d), 1)), np.full(len(d), FAR)
+        if isinstance(field.domain, hk.Ball):
+            middle = -(o * d).sum(axis=1)
+            half = field.domain.radius**2 - (o**2).sum(axis=1) + middle**2
+            meets, half = half > 0, np.sqrt(np.maximum(half, 0))
+            o, d, far = (o + (middle - half)[:, None] * d)[meets], d[meets], 2 * half[meets]
+        return cls(field, level, o, d, far, np.zeros(len(d), np.int64))
+
+    def points(self, t: Array, rows: npt.NDArray[np.int64]) -> Array:
+        """(n, 3) the points at t of some rays."""
+        return self.origins[rows] + t[:, None] * self.directions[rows]
+
+    def above(self, t: Array, rows: npt.NDArray[np.int64]) -> Array:
+        """(n,) f - level; of an angle, from the nearest of its levels, so that it jumps halfway
+        between two of them."""
+        self.counts[rows] += 1
+        value = self.field.value(self.points(t, rows), precision="double") - self.level
+        period = self.field.period
+        return value if period is None else value - period * np.round(value / period)
+
+    def slope(self, t: Array, rows: npt.NDArray[np.int64]) -> Array:
+        """(n,) df/dt."""
+        gradient = self.field.gradient(self.points(t, rows), precision="double")
+        return (gradient * self.directions[rows]).sum(axis=1)
+
+
+Method = Callable[[Rays], Array]
+
+
+def fixed_steps(step: float) -> Method:
+    """Equal steps until f - level changes its sign, by less than half a period."""
+
+    def method(rays: Rays) -> Array:
+        n = len(rays.counts)
+        found, active = np.full(n, np.inf), np.arange(n)
+        t, before = np.zeros(n), rays.above(np.zeros(n), np.arange(n))
+        half = math.inf if rays.field.period is None else 0.5 * rays.field.period
+        for _ in range(min(MOST, math.ceil(FAR / step))):
+            if not len(active):
+                break
+            now = rays.above(t[active] + step, active)
+            last = before[active]
+            hit = (last * now <= 0) & (np.abs(last - now) < half)
+            share = last / np.where(last == now, 1, last - now)
+            found[active[hit]] = (t[active] + step * share)[hit]
+            t[active] += step
+            before[active] = now
+            active = active[~hit]
+        return found
+
+    return method
+
+
+def sphere_tracing(constant: float) -> Method:
+    """Steps of |f - level|/L with a constant that is claimed and does not hold."""
+
+    def method(rays: Rays) -> Array:
+        n = len(rays.counts)
+        found, t, active = np.full(n, np.inf), np.zeros(n), np.arange(n)
+        for _ in range(MOST):
+            if not len(active):
+                break
+            gap = np.abs(rays.above(t[active], active))
+            hit = gap < EPS
+            found[active[hit]] = t[active[hit]]
+            t[active] += gap / constant
+            active = active[~hit & (t[active] <= FAR)]
+        return found
+
+    return method
+
+
+def newton(rays: Rays) -> Array:
+    """Eight iterations from t = 0, no step longer than 2."""
+    n = len(rays.counts)
+    t, rows = np.zeros(n), np.arange(n)
+    for _ in range(8):
+        value, slope = rays.above(t, rows), rays.slope(t, rows)
+        t = t - np.clip(value / np.where(slope == 0, 1e-30, slope), -2, 2)
+    good = (np.abs(rays.above(t, rows)) < EPS) & (t >= 0) & (t <= FAR)
+    return np.where(good, t, np.inf)
+
+
+def bisection(rays: Rays) -> Array:
+    """The first of [0, 1/8], [0, 1/4], ... in which f - level changes its sign, halved 100 times.
+
+    It ends at a jump of an angle as well.
+    """
+    n = len(rays.counts)
+    rows = np.arange(n)
+    low, high = np.zeros(n), np.full(n, 0.125)
+    start = rays.above(low, rows)
+    end, found = start.copy(), np.full(n, np.inf)
+    active = rows
+    for _ in range(10):
+        end[active] = rays.above(high[active], active)
+        active = active[start[active] * end[active] > 0]
+        high[active] *= 2
+    active = rows[start * end <= 0]
+    for _ in range(100):
+        if not len(active):
+            break
+        middle = 0.5 * (low[active] + high[active])
+        value = rays.above(middle, active)
+        hit = (np.abs(value) < EPS) | (high[active] - low[active] < 1e-8)
+        found[active[hit]] = middle[hit]
+        before = value * start[active] > 0
+        low[active] = np.where(before, middle, low[active])
+        high[active] = np.where(before, high[active], middle)
+        active = active[~hit]
+    return np.where(found <= FAR, found, np.inf)
+
+
+def interval_analysis(rays: Rays) -> Array:
+    """The first interval of a bisection of [0, 10], 14 times, in which f may take the level.
+
+    Of a curve: the fan of triangles in interval arithmetic. An arctangent whose arguments may lie
+    on the cut is anything between -pi and pi.
+    """
+    n = len(rays.counts)
+    bound = _fan_bounds if isinstance(rays.field, hk.SolidAngle) else _gyroid_bounds
+    found, depth = np.full(n, np.inf), 14
+    low = np.zeros((n, depth + 2))
+    high = np.full((n, depth + 2), FAR)
+    top = np.ones(n, np.int64)
+    active = np.arange(n)
+    while len(active):
+        k = top[active] - 1
+        a, b = low[active, k], high[active, k]
+        top[active] = k
+        lower, upper = bound(rays, a, b, active)
+        rays.counts[active] += 1
+        straddles = (lower <= rays.level) & (upper >= rays.level)
+        if rays.field.period is not None:  # any of the levels
+            turns = np.ceil((lower - rays.level) / rays.field.period)
+            straddles = rays.level + turns * rays.field.period <= upper
+        leaf = b - a < max(2 * EPS, 1.5 * FAR / 2**depth)
+        hit, split = straddles & leaf, straddles & ~leaf
+        found[active[hit]] = 0.5 * (a + b)[hit]
+        rows, middle, k = active[split], 0.5 * (a + b)[split], k[split]
+        low[rows, k], high[rows, k] = middle, b[split]
+        low[rows, k + 1], high[rows, k + 1] = a[split], middle
+        top[rows] = k + 2
+        active = active[~hit & (top[active] > 0)]
+    return found
+
+
+Interval = tuple[Array, Array]
+
+
+def _product(x: Interval, y: Interval) -> Interval:
+    ends = np.stack([x[0] * y[0], x[0] * y[1], x[1] * y[0], x[1] * y[1]])
+    return ends.min(axis=0), ends.max(axis=0)
+
+
+def _sum(*terms: Interval) -> Interval:
+    return sum(t[0] for t in terms), sum(t[1] for t in terms)  # type: ignore[return-value]
+
+
+def _dot(x: list[Interval], y: list[Interval]) -> Interval:
+    return _sum(*(_product(a, b) for a, b in zip(x, y, strict=True)))
+
+
+def _less(x: Interval, y: Interval) -> Interval:
+    return x[0] - y[1], x[1] - y[0]
+
+
+def _length(x: list[Interval]) -> Interval:
+    low, high = 0.0, 0.0
+    for a, b in x:
+        least = np.where((a <= 0) & (b >= 0), 0, np.minimum(np.abs(a), np.abs(b)))
+        low, high = low + least**2, high + np.maximum(np.abs(a), np.abs(b)) ** 2
+    return np.sqrt(low), np.sqrt(high)
+
+
+def _fan_bounds(
+    rays: Rays, start: Array, end: Array, rows: npt.NDArray[np.int64]
+) -> tuple[Array, Array]:
+    """Bounds of the solid angle between two lengths, of a fan about the centre of the vertices."""
+    field = rays.field
+    assert isinstance(field, hk.SolidAngle)
+    p, q = rays.points(start, rows), rays.points(end, rows)
+    box = np.minimum(p, q), np.maximum(p, q)
+    low, high = np.zeros(len(rows)), np.zeros(len(rows))
+    for loop in field.loops:
+        middle = loop.mean(axis=0)
+        for first, second in zip(loop, np.roll(loop, -1, axis=0), strict=True):
+            a, b, c = (
+                [(v[k] - box[1][:, k], v[k] - box[0][:, k]) for k in range(3)]
+                for v in (first, second, middle)
+            )
+            cross = [
+                _less(_product(b[i], c[j]), _product(b[j], c[i]))
+                for i, j in ((1, 2), (2, 0), (0, 1))
+            ]
+            y = _dot(a, cross)
+            la, lb, lc = _length(a), _length(b), _length(c)
+            x = _sum(
+                _product(_product(la, lb), lc), _product(_dot(a, b), lc),
+                _product(_dot(b, c), la), _product(_dot(c, a), lb),
+            )  # fmt: skip
+            cut = (x[0] <= 0) & (y[0] <= 0) & (y[1] >= 0)
+            angles = np.stack([np.arctan2(v, u) for u in x for v in y])
+            low += np.where(cut, -2 * np.pi, 2 * angles.min(axis=0))
+            high += np.where(cut, 2 * np.pi, 2 * angles.max(axis=0))
+    return low, high
+
+
+def _gyroid_bounds(
+    rays: Rays, start: Array, end: Array, rows: npt.NDArray[np.int64]
+) -> tuple[Array, Array]:
+    """Bounds of sin x cos y + sin y cos z + sin z cos x between two lengths."""
+    field = rays.field
+    assert isinstance(field, hk.Gyroid)
+    unit = 2 * np.pi / field.cell
+    p, q = unit * rays.points(start, rows), unit * rays.points(end, rows)
+    box = np.minimum(p, q), np.maximum(p, q)
+    sines = [_sine(box[0][:, k], box[1][:, k]) for k in range(3)]
+    cosines = [_sine(box[0][:, k] + np.pi / 2, box[1][:, k] + np.pi / 2) for k in range(3)]
+    return _sum(*(_product(sines[k], cosines[(k + 1) % 3]) for k in range(3)))
+
+
+def _sine(low: Array, high: Array) -> Interval:
+    ends = np.sin(low), np.sin(high)
+    top = np.floor((high - np.pi / 2) / (2 * np.pi)) > np.floor((low - np.pi / 2) / (2 * np.pi))
+    foot = np.floor((high + np.pi / 2) / (2 * np.pi)) > np.floor((low + np.pi / 2) / (2 * np.pi))
+    return np.where(foot, -1, np.minimum(*ends)), np.where(top, 1, np.maximum(*ends))
+
+
+METHODS: tuple[tuple[str, Method], ...] = (
+    ("fixed steps of 0.1", fixed_steps(0.1)),
+    ("fixed steps of 0.02", fixed_steps(0.02)),
+    ("fixed steps of 0.004", fixed_steps(0.004)),
+    ("sphere tracing, L = 5", sphere_tracing(5.0)),
+    ("sphere tracing, L = 50", sphere_tracing(50.0)),
+    ("Newton", newton),
+    ("bisection", bisection),
+    ("interval analysis", interval_analysis),
+)
+
+
+def oracle(rays: Rays) -> Array:
+    """First crossings by samples 1/2000 apart."""
+    n = len(rays.counts)
+    found = np.full(n, np.inf)
+    middle = -(rays.origins * rays.directions).sum(axis=1)
+    start, end = np.maximum(middle - 1.5, 0), np.minimum(middle + 1.5, rays.far)
+    t = start + (end - start) * np.linspace(0, 1, SAMPLES)[:, None]
+    rows = np.arange(n)
+    half = math.inf if rays.field.period is None else 0.5 * rays.field.period
+    before = rays.above(t[0], rows)
+    for k in range(1, SAMPLES):
+        now = rays.above(t[k], rows)
+        crosses = (before * now <= 0) & (np.abs(before - now) < half) & ~np.isfinite(found)
+        share = before / np.where(before == now, 1, before - now)
+        found = np.where(crosses, t[k - 1] + share * (t[k] - t[k - 1]), found)
+        before = now
+    return found
+
+
+@dataclass(frozen=True)
+class Result:
+    """Of one method: first hits that it passed, hits that are none, evaluations a ray."""
+
+    name: str
+    missed: int
+    false: int
+    evaluations: float
+    t: Array
+
+
+def compare(field: hk.Field, level: float, across: int = ACROSS) -> tuple[list[Result], Array]:
+    """All methods on one field, ours last, and the oracle's first crossings."""
+    rays = Rays.of(field, level, across)
+    truth = oracle(rays)
+    results = []
+    for name, method in METHODS:
+        rays.counts[:] = 0
+        t = method(rays)
+        t = np.where(t <= rays.far, t, np.inf)
+        results.append(_result(name, t, float(rays.counts.mean()), truth))
+    ours = hk.trace(
+        field, rays.origins, rays.directions, level=level, t_max=rays.far, tolerance=1e-6
+    )
+    t = np.where(ours.hit, ours.t, np.inf)
+    results.append(_result("harnack", t, float(ours.evaluations.mean()), truth))
+    return results, truth
+
+
+def _result(name: str, t: Array, evaluations: float, truth: Array) -> Result:
+    late = np.isfinite(truth) & (t > truth + APART)
+    early = np.isfinite(t) & (t < truth - APART)
+    return Result(name, int(late.sum()), int(early.sum()), evaluations, t)
+
+
+def baselines() -> str:
+    """The section of the page."""
+    scenes: tuple[tuple[str, hk.Field, float], ...] = (
+        ("polygon, N = 12, 2 pi", hk.SolidAngle(shapes.wavy_polygon(12)), 2 * math.pi),
+        ("gyroid, 3 cells, 0", hk.Gyroid(cell=2 / 3, domain=hk.Ball(radius=1)), 0.0),
+    )
+    lines = [
+        "## Methods without a proof\n",
+        "What is commonly used where no bound is known, as in Figs. 25 to 27 of the paper, for "
+        f"{ACROSS} x {ACROSS} rays with 0 <= t <= 10, against {SAMPLES} samples of each "
+        "ray near the surface. Missed: the first crossing was passed. False: a hit where there is "
+        f"none, or more than {APART} before the first. In double precision, but harnack in single, "
+        "with a tolerance of 1e-6 and else its defaults.\n",
+        "| surface | method | first hits missed | false hits | evaluations a ray |",
+        "|---|---|---:|---:|---:|",
+    ]
+    for scene, field, level in scenes:
+        results, truth = compare(field, level)
+        hits = int(np.isfinite(truth).sum())
+        for one in results:
+            lines.append(
+                f"| {scene} ({hits} hits) | {one.name} | {one.missed} | {one.false} "
+                f"| {one.evaluations:.1f} |"
+            )
+    return "\n".join(lines) + "\n"
