@@ -14,6 +14,7 @@ from harnack.fields.expressions.expression import expression
 from harnack.fields.field import Field, Sample
 from harnack.fields.formula import Formula
 from harnack.fields.meshes.winding_number import WindingNumber
+from harnack.fields.polynomials.hyperspherical import HypersphericalHarmonic
 from harnack.fields.polynomials.polynomial import HarmonicPolynomial, SphericalHarmonic
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.fields.solids.combined import intersection, union
@@ -59,6 +60,7 @@ __all__ = [
     "Gyroid",
     "HarmonicBall",
     "HarmonicPolynomial",
+    "HypersphericalHarmonic",
     "Julia",
     "Kernel",
     "LineLipschitz",
