@@ -31,7 +31,6 @@ from harnack.geometry.volumes import Ball
 
 if TYPE_CHECKING:
     from harnack.backend import Real, Vec3
-    from harnack.enclosures import Promise
     from harnack.geometry.volumes import Volume
 
 __all__ = ["HypersphericalHarmonic"]
@@ -82,6 +81,8 @@ class HypersphericalHarmonic(Field):
 
     l, j, m: degree 0 <= l <= 6, and 0 <= j <= l, -j <= m <= j: (l+1)^2 functions for each l.
         For more general ones see `from_polynomial`.
+    domain: a volume to draw it in; None for all of space. Surfaces of the level that f tends to far
+        away (0 for j > 0) may have no end, nor have rays along them: those need one, or a t_max.
 
     Proofs. Let P be of degree l with |P| <= M and half of its range A on S^3 (`HypersphereRange`).
     P is harmonic and homogeneous, so |grad P| <= l M there and |v.H v| <= l (l-1) M for unit
@@ -101,8 +102,9 @@ class HypersphericalHarmonic(Field):
     """
 
     overstep = 1.6
+    is_entire = True
 
-    def __init__(self, l: int, j: int, m: int) -> None:  # noqa: E741
+    def __init__(self, l: int, j: int, m: int, *, domain: Volume | None = None) -> None:  # noqa: E741
         l, j, m = operator.index(l), operator.index(j), operator.index(m)  # noqa: E741
         if not 0 <= l <= LARGEST_DEGREE:
             raise ValueError(f"the degree l must be 0 to {LARGEST_DEGREE}, not {l}")
@@ -110,10 +112,12 @@ class HypersphericalHarmonic(Field):
             raise ValueError(f"j must be 0 to l = {l}, not {j}")
         if not -j <= m <= j:
             raise ValueError(f"the order m must be -{j} to {j}, not {m}")
-        self._set(l, {(j, m): 1.0})
+        self._set(l, {(j, m): 1.0}, domain)
 
     @classmethod
-    def from_polynomial(cls, coefficients: Monomials) -> HypersphericalHarmonic:
+    def from_polynomial(
+        cls, coefficients: Monomials, *, domain: Volume | None = None
+    ) -> HypersphericalHarmonic:
         """Of a homogeneous harmonic polynomial of R^4, by its coefficients.
 
         coefficients: (a, b, c, d) -> that of x^a y^b z^c w^d, a + b + c + d = l for all, l <= 6;
@@ -135,10 +139,11 @@ class HypersphericalHarmonic(Field):
             a, b, c, d = powers
             terms[a, b, c, d] = terms.get((a, b, c, d), 0.0) + float(value)
         made = cls.__new__(cls)
-        made._set(*from_monomials(terms))
+        made._set(*from_monomials(terms), domain)
         return made
 
-    def _set(self, l: int, weights: SphereWeights) -> None:  # noqa: E741
+    def _set(self, l: int, weights: SphereWeights, domain: Volume | None) -> None:  # noqa: E741
+        self.domain = domain
         self.degree = l
         self._orders = [_Order.of(l, j, sums) for j, sums in weights_by_order(l, weights).items()]
         self._known = HypersphereRange.of(l, weights)
@@ -152,11 +157,9 @@ class HypersphericalHarmonic(Field):
         square = dr.squared_norm(p)
         value, gradient, error, gradient_error = self._values(p, 1 + square)
         known = tuple(self._curvatures(square))
-        largest = 2 * self.degree * 0.5 * (self._known.high - self._known.low)
-        weaker: tuple[Promise, ...] = (
-            Lipschitz(self._scale(square, _WIDE) * (largest * (1 + _ROUNDING)), self._reach(square, _WIDE)),
-        )  # fmt: skip
-        return Sample(value, gradient, known, error, gradient_error, weaker=weaker)
+        steep = self.degree * (self._known.high - self._known.low) * (1 + _ROUNDING)
+        lipschitz = Lipschitz(steep / self._least(square, _WIDE), self._reach(square, _WIDE))
+        return Sample(value, gradient, known, error, gradient_error, weaker=(lipschitz,))
 
     def _values(self, p: Vec3, total: Real) -> tuple[Real, Vec3, Real, Real]:
         """Value, gradient, and the rounding of both, total = 1 + |p|^2.
@@ -205,9 +208,6 @@ class HypersphericalHarmonic(Field):
 
     def _reach(self, square: Real, share: float) -> Real:
         return share * dr.sqrt(1 + square)
-
-    def _scale(self, square: Real, share: float) -> Real:
-        return dr.rcp(self._least(square, share))
 
     def _curvatures(self, square: Real) -> list[Curvature]:
         """Bounds of the Hessian on three balls, the last one all of space."""
@@ -258,7 +258,7 @@ class HypersphericalHarmonic(Field):
         second derivatives 4 s^2 (4s x_i x_k x_m - x_m d_ik - x_k d_im - x_i d_km) of y_i and
         4 s^2 (d_km - 4s x_k x_m) of w.
         """
-        vector = type(p)
+        vector: Any = type(p)
         s = 1 / (1 + dr.squared_norm(p))
         y, w, zero = 2 * s * p, 1 - 2 * s, 0 * p.x
         rows = [[zero] * 4 for _ in range(4)]
@@ -299,6 +299,8 @@ class HypersphericalHarmonic(Field):
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """A ball about the origin; None for levels that the surface may follow to infinity."""
+        if self.domain is not None:
+            return self.domain
         radius = max((self._known.radius(level) for level in levels), default=0.0)
         return Ball(radius=radius) if 0 < radius < math.inf else None
 

@@ -5,8 +5,8 @@ With X = (y, w), y in R^3, the homogeneous harmonic polynomials of degree l of R
     P_ljm(X) = N_lj S_jm(y) |X|^(l-j) C_(l-j)^(j+1)(w/|X|),   0 <= j <= l, -j <= m <= j,
 
 S_jm = |y|^j Y_jm the solid harmonics of `solid_harmonics`, C_n^k Gegenbauer polynomials (which obey
-n C_n = 2 (n+k-1) w C_(n-1) - (n+2k-2) C_(n-2)) and N_lj such that the integral of P^2 over S^3 is 1:
-with n = l-j, k = j+1 (DLMF 18.3),
+n C_n = 2 (n+k-1) w C_(n-1) - (n+2k-2) C_(n-2)) and N_lj such that the integral of P^2 over S^3
+is 1: with n = l-j, k = j+1 (DLMF 18.3),
 
     N^-2 = integral of sin(a)^(2k) C_n^k(cos a)^2 = pi 2^(1-2k) (n+2k-1)!/(n! (n+k) ((k-1)!)^2).
 
