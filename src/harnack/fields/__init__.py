@@ -33,6 +33,7 @@ from harnack.fields.solids.shapes.round import (
 from harnack.fields.solids.shapes.square import Cuboid, Superellipsoid, Supertorus
 from harnack.fields.solids.shapes.tube import Tube
 from harnack.fields.solids.solid import Shape, Solid
+from harnack.fields.waves.fourier_series import FourierSeries
 from harnack.fields.waves.periodic import EigenfunctionSum, Gyroid, SchwarzD, SchwarzP
 from harnack.fields.waves.waves import PlaneWave, Product, cosine, sine
 
@@ -55,6 +56,7 @@ __all__ = [
     "Ellipsoid",
     "Field",
     "Formula",
+    "FourierSeries",
     "FractalNoise",
     "Gaussian",
     "Gyroid",

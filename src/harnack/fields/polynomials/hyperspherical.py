@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import operator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 
@@ -258,7 +258,7 @@ class HypersphericalHarmonic(Field):
         second derivatives 4 s^2 (4s x_i x_k x_m - x_m d_ik - x_k d_im - x_i d_km) of y_i and
         4 s^2 (d_km - 4s x_k x_m) of w.
         """
-        vector: Any = type(p)
+        vector = cast("Any", type(p))
         s = 1 / (1 + dr.squared_norm(p))
         y, w, zero = 2 * s * p, 1 - 2 * s, 0 * p.x
         rows = [[zero] * 4 for _ in range(4)]
