@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 
 from harnack.backend.extrema import fmax, fmin
-from harnack.enclosures import Curvature, Lipschitz, Pieces, Slopes
-from harnack.enclosures.arc import Arc
+from harnack.enclosures import Arc, Curvature, Lipschitz, Pieces, Slopes
 from harnack.fields.field import Field
 from harnack.fields.look import Look, Path, Sample
 from harnack.fields.polynomials.axial_bounds import AxialBound, gradient_bound, value_bound

@@ -63,9 +63,9 @@ def on_nodes(
     """Derivatives of these orders in the angles on the grid of angles (n_x, n_y, n_z)."""
     values = coefficients
     for angle, order in zip(angles, orders, strict=True):
-        k = np.arange(values.shape[0])
+        k: FloatArray = np.arange(values.shape[0], dtype=np.float64)
         # cos(k u) differentiated `order` times.
-        waves = k**order * np.cos(np.outer(angle, k) + 0.5 * math.pi * order)
+        waves: FloatArray = k**order * np.cos(np.outer(angle, k) + 0.5 * math.pi * order)
         values = np.moveaxis(np.tensordot(waves, values, axes=(1, 0)), 0, -1)
     return values
 
