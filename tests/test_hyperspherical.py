@@ -192,6 +192,17 @@ def test_first_hits(precision: Any) -> None:
     assert hits.evaluations.mean() < 13  # 10.2; the proofs alone, without aimed trials, took 17
 
 
+@pytest.mark.parametrize("precision", ["single", "double"])
+@pytest.mark.parametrize("indices", [(6, 6, 6), (5, 5, 0), (6, 4, -4)])
+def test_zeros_of_high_order(indices: tuple[int, int, int], precision: Any) -> None:
+    """Level 0 crosses itself at the origin and on the axis, to the order of j and m."""
+    field = hk.HypersphericalHarmonic(*indices, domain=hk.Ball(radius=25.0))
+    hits = missed(field, lambda X: reference(*indices, X), 0.0, 400, precision)
+    assert hits.evaluations.mean() < 30  # without bounds beside the zeros up to 170
+    near = points(300, 4) * np.random.default_rng(1).choice([0.02, 0.1, 1], (300, 3))
+    check_field(field, near, directions=4)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("precision", ["single", "double"])
 def test_first_hits_of_many_rays(precision: Any) -> None:

@@ -10,10 +10,15 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 
 from harnack.backend.extrema import fmax, fmin
-from harnack.enclosures import Arc, Curvature, Lipschitz, Pieces, Slopes
+from harnack.enclosures import Arc, Curvature, Lipschitz, Parabola, Pieces, Slopes
 from harnack.fields.field import Field
 from harnack.fields.look import Look, Path, Sample
-from harnack.fields.polynomials.axial_bounds import AxialBound, gradient_bound, value_bound
+from harnack.fields.polynomials.axial_bounds import (
+    AxialBound,
+    gradient_bound,
+    hessian_bound,
+    value_bound,
+)
 from harnack.fields.polynomials.harmonic_rounding import HarmonicRounding
 from harnack.fields.polynomials.hyperspherical_basis import (
     LARGEST_DEGREE,
@@ -37,7 +42,10 @@ __all__ = ["HypersphericalHarmonic"]
 # Constants are moved up by this much for the roundings of float32.
 _ROUNDING = 1e-5
 # Radii of the balls on which the Hessian is bounded, in units of sqrt(1 + |p|^2).
-_NEAR, _WIDE = 0.2, 0.6
+_SHARES = _NEAR, _WIDE = 0.2, 0.6
+# Beside zeros of high order: radii in units of the distance to them over the order less 2, and at
+# most, as above; and what a radius is of the chord of the sphere that it leads to, over 1 + |p|^2.
+_BESIDE, _MOST_BESIDE, _OF_CHORD = 0.5, 0.3, 0.349
 # What is of second order in the unit roundoff, and roundings of the bounds themselves.
 _SECOND_ORDER = 1.05
 # Roundings, in units of u: of 1/(1 + |p|^2), relative; of w; of operations that join the parts.
@@ -54,14 +62,21 @@ class _Order:
     weights: Weights
     value: AxialBound
     gradient: AxialBound
+    hessian: AxialBound
     rounding: HarmonicRounding
 
     @classmethod
     def of(cls, l: int, j: int, weights: Weights) -> _Order:  # noqa: E741
+        bounds = value_bound(weights), gradient_bound(weights), hessian_bound(weights)
         rounding = HarmonicRounding.of(weights, is_divided=True)
-        return cls(
-            j, l - j, j + 1, weights, value_bound(weights), gradient_bound(weights), rounding
-        )
+        return cls(j, l - j, j + 1, weights, *bounds, rounding)
+
+    def largest(self, rho: Real, r: Real) -> tuple[Real, Real]:
+        """Bounds of first and second derivatives of S(y) C(w) in R^4, where y is within rho of
+        the third axis and r of 0: C and its derivatives are largest at w = 1."""
+        c, first, second = (float(one) for one in self.axial(1.0))
+        value, slope, bent = self.value(rho, r), self.gradient(rho, r), self.hessian(rho, r)
+        return slope * c + value * first, bent * c + slope * first + value * second
 
     def axial(self, w: Real) -> tuple[Real, Real, Real]:
         """C_n^k(w) and its first two derivatives."""
@@ -91,6 +106,11 @@ class HypersphericalHarmonic(Field):
       4/S^1.5 (`Arc` has the circle: it is sqrt(c^2 + t^2) 4/S^2). By the chain rule
       |f''| <= M l (4 (l-1)/S^2 + 4/S^1.5) with the least S on the ball, and |grad f| <= 2 l A/S
       (Bernstein on the great circle along the line).
+    - Where f vanishes to an order above 2, at y = 0 or for |m| > 2 on the circle y_1 = y_2 = 0,
+      another `Curvature`, on a ball that is a share of the distance there. With bounds of S_jm, its
+      gradient and its Hessian at such distances (`AxialBound`), and 2ab <= 1 for the parts (a, b)
+      of unit vectors, it is the same chain rule for S_jm(y) C(w). The ball: R <= 0.3 sqrt(S) leaves
+      1 + |q|^2 >= 0.49 S at q, so that on the sphere it is within the chord 2R/(0.7 S).
     - Along a ray: `Arc`. On the circle of radius 1/c, in its angle, the first derivative of the
       point has length 1/c and the second too, so |f_aa| <= M l ((l-1)/c^2 + 1/c); and f is a
       trigonometric polynomial of degree l of the angle, so |f_aa| <= l^2 A (Bernstein).
@@ -155,7 +175,7 @@ class HypersphericalHarmonic(Field):
     def evaluate(self, p: Vec3) -> Sample:
         square = dr.squared_norm(p)
         value, gradient, error, gradient_error = self._values(p, 1 + square)
-        known = tuple(self._curvatures(square))
+        known = (*self._beside(p, square), *self._curvatures(square))
         steep = self.degree * (self._known.high - self._known.low) * (1 + _ROUNDING)
         lipschitz = Lipschitz(steep / self._least(square, _WIDE), self._reach(square, _WIDE))
         return Sample(value, gradient, known, error, gradient_error, weaker=(lipschitz,))
@@ -213,11 +233,31 @@ class HypersphericalHarmonic(Field):
         l = self.degree  # noqa: E741
         size = l * self._known.largest * (1 + _ROUNDING)
         made: list[Curvature] = []
-        for share in (_NEAR, _WIDE):
+        for share in _SHARES:
             least = self._least(square, share)
             bent = (4 * (l - 1) / least + 4 / dr.sqrt(least)) / least
             made.append(Curvature(fmax(size * bent, 0), self._reach(square, share)))
         return [*made, Curvature(0 * square + max(size * 4.0 * l, 0.0), dr.inf)]
+
+    def _beside(self, p: Vec3, square: Real) -> tuple[Curvature, ...]:
+        """The bound of the Hessian beside a zero of high order; none where there is none."""
+        by_axis = min(abs(m) for one in self._orders for _, m in one.weights)
+        by_centre = min(one.j for one in self._orders)
+        if by_centre < 3:
+            return ()
+        y = (2 / (1 + square)) * p
+        r, rho = dr.norm(y), dr.norm(type(y)(y.x, y.y, 0))
+        chord = _BESIDE / (by_centre - 2) * r
+        if by_axis > 2:
+            chord = fmin(chord, _BESIDE / (by_axis - 2) * rho)
+        least = self._least(square, _MOST_BESIDE)
+        root = dr.rcp(dr.sqrt(least))
+        bent = 0 * square
+        for one in self._orders:
+            first, second = one.largest(rho + chord, r + chord)
+            bent = bent + 4 * root * root * root * dr.fma(root, second, first)
+        radius = fmin(_OF_CHORD * chord * (1 + square), _MOST_BESIDE * dr.sqrt(1 + square))
+        return (Curvature(bent * (1 + _ROUNDING), radius),)
 
     def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
         """The sample, with arcs of circles where the sharpest proofs are asked for."""
@@ -240,7 +280,13 @@ class HypersphericalHarmonic(Field):
         bent = fmin(known.largest * l * ((l - 1) / square + 1 / c), most) * (1 + _ROUNDING)
         forward = Arc(slopes, bent, along, square)
         backward = Arc(slopes.negated(), bent, -along, square)
-        return Look(sample, (forward,), (backward,), slope)
+        curvatures = [one for one in sample.known if isinstance(one, Curvature)]
+        beside = curvatures[: -len(_SHARES) - 1]
+        around = [Parabola(slopes, -one.constant, one.constant, one.radius) for one in beside]
+        behind = [
+            Parabola(slopes.negated(), -one.constant, one.constant, one.radius) for one in beside
+        ]
+        return Look(sample, (forward, *around), (backward, *behind), slope)
 
     def differentiable_value(self, p: Vec3) -> Real:
         s = 1 / (1 + dr.squared_norm(p))
