@@ -34,6 +34,7 @@ class CosineSums:
     """The coefficients and local bounds of a series on a backend.
 
     lower: corner of the box. rate: pi over its size, angles per length.
+    rounding: of value and gradient, in units of u, but for what moves the point.
     """
 
     backend: Backend
@@ -41,6 +42,7 @@ class CosineSums:
     lower: Vec3
     rate: Vec3
     rows: Records
+    rounding: tuple[Real, Real]
     curvature: Real
     cells: tuple[_Cells, ...]
 
@@ -52,6 +54,7 @@ class CosineSums:
         lower: FloatArray,
         size: FloatArray,
         bounds: CosineBounds,
+        rounding: tuple[float, float],
     ) -> CosineSums:
         """The series of these coefficients (K_x, K_y, K_z)."""
         count, along_y, along_z = coefficients.shape
@@ -63,6 +66,7 @@ class CosineSums:
             _data(backend, lower),
             _data(backend, np.pi / size),
             Records.upload(backend, table),
+            (dr.opaque(backend.Float, rounding[0]), dr.opaque(backend.Float, rounding[1])),
             dr.opaque(backend.Float, bounds.curvature * (1 + _ROUNDING)),
             tuple(_Cells.upload(backend, one, size) for one in bounds.cells),
         )

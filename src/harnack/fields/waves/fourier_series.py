@@ -223,7 +223,9 @@ class FourierSeries(Field):
         return prepared
 
     def _upload(self, backend: Backend) -> CosineSums:
-        return CosineSums.upload(backend, self.coefficients, self._lower, self._size, self._bounds)
+        return CosineSums.upload(
+            backend, self.coefficients, self._lower, self._size, self._bounds, self._rounding
+        )
 
     def _on(self, p: Vec3) -> CosineSums:
         return self._upload(backend_of(p)) if self._device is None else self._device
@@ -235,9 +237,9 @@ class FourierSeries(Field):
         # The rounding of p - lower, times pi/size, moves the point.
         moved = [dr.fma(3.0, dr.abs(p[k] - on.lower[k]), dr.abs(on.lower[k])) for k in range(3)]
         error = sum((moved[k] * dr.abs(gradient[k]) for k in range(3)), 0 * p.x)
-        error = unit * (error + self._rounding[0])
+        error = unit * (error + on.rounding[0])
         length = dr.norm(on.backend.Array3f(*moved))
-        slope_error = unit * dr.fma(self._bounds.curvature, length, self._rounding[1])
+        slope_error = unit * dr.fma(on.curvature, length, on.rounding[1])
         return Sample(value, gradient, on.curvatures(p), error, slope_error)
 
     def differentiable_value(self, p: Vec3) -> Real:
