@@ -126,6 +126,13 @@ REAL: dict[str, Field] = {
             Product(0.25),
         ]
     ),
+    "hyperspherical 4,2,1": hk.HypersphericalHarmonic(4, 2, 1),
+    "hyperspherical 6,6,5, in a ball": hk.HypersphericalHarmonic(6, 6, 5, domain=hk.Ball()),
+    "Fourier series": hk.FourierSeries.fit(
+        lambda x: np.exp(-4 * (x**2).sum(axis=1)) + 0.2 * x[:, 0],
+        ((-1.0, -1.0, -0.5), (1.0, 1.0, 0.5)),
+        (7, 6, 4),
+    ),
 }
 OWN: dict[str, Field] = {"charges": Charges(), "azimuth": Azimuth(), "plane": Plane()}
 _POINTS = np.random.default_rng(5).normal(size=(60, 3))
@@ -202,7 +209,7 @@ def test_every_field_there_is_is_tested() -> None:
     # along a path are tried in `test_arithmetics`, those of combinations in `test_combined_solids`.
     promised = {kind for kind in proofs if kind.of.__func__ is not Enclosure.of.__func__}
     assert promised == set(BOUNDS)
-    others = {"Parabola", "Greatest", "Negated", "Stretched", "Band", "Tangent"}
+    others = {"Arc", "Parabola", "Greatest", "Negated", "Stretched", "Band", "Tangent"}
     ranged = {kind for kind in proofs if kind.along.__func__ is not Enclosure.along.__func__}
     bases = {"OnePiece"}
     assert {kind.__name__ for kind in proofs - promised - ranged} == others

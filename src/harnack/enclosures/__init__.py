@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from harnack.enclosures.arc import Arc
 from harnack.enclosures.balls.ball import Ball
 from harnack.enclosures.balls.caps import Caps
 from harnack.enclosures.balls.classic import Classic
@@ -32,6 +33,7 @@ from harnack.enclosures.tangent import Tangent
 
 __all__ = [
     "AffineBand",
+    "Arc",
     "Ball",
     "Band",
     "BottomUpLinear",

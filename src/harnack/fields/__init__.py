@@ -14,6 +14,7 @@ from harnack.fields.expressions.expression import expression
 from harnack.fields.field import Field, Sample
 from harnack.fields.formula import Formula
 from harnack.fields.meshes.winding_number import WindingNumber
+from harnack.fields.polynomials.hyperspherical import HypersphericalHarmonic
 from harnack.fields.polynomials.polynomial import HarmonicPolynomial, SphericalHarmonic
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.fields.solids.combined import intersection, union
@@ -32,6 +33,7 @@ from harnack.fields.solids.shapes.round import (
 from harnack.fields.solids.shapes.square import Cuboid, Superellipsoid, Supertorus
 from harnack.fields.solids.shapes.tube import Tube
 from harnack.fields.solids.solid import Shape, Solid
+from harnack.fields.waves.fourier_series import FourierSeries
 from harnack.fields.waves.periodic import EigenfunctionSum, Gyroid, SchwarzD, SchwarzP
 from harnack.fields.waves.waves import PlaneWave, Product, cosine, sine
 
@@ -54,11 +56,13 @@ __all__ = [
     "Ellipsoid",
     "Field",
     "Formula",
+    "FourierSeries",
     "FractalNoise",
     "Gaussian",
     "Gyroid",
     "HarmonicBall",
     "HarmonicPolynomial",
+    "HypersphericalHarmonic",
     "Julia",
     "Kernel",
     "LineLipschitz",

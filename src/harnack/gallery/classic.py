@@ -11,8 +11,10 @@ from harnack.backend import FloatArray
 from harnack.fields import (
     EigenfunctionSum,
     Field,
+    FourierSeries,
     Gyroid,
     HarmonicPolynomial,
+    HypersphericalHarmonic,
     Product,
     SchwarzD,
     SchwarzP,
@@ -66,6 +68,36 @@ def _eigenfunctions() -> list[LevelSet]:
 
 def _harmonic(field: Field) -> list[LevelSet]:
     return [level_set(field, tolerance=DRAWN)]
+
+
+def _on_the_sphere(field: HypersphericalHarmonic, level: float) -> list[LevelSet]:
+    """Both levels of a function of S^3, whole: nothing is clipped."""
+    return [level_set(field, [-level, level], tolerance=DRAWN)]
+
+
+def _quartic() -> list[LevelSet]:
+    """The talk's x^3 y + x y^3 - 3 x y (w^2 + z^2), which is at most 1/2."""
+    terms = {(3, 1, 0, 0): 1.0, (1, 3, 0, 0): 1.0, (1, 1, 0, 2): -3.0, (1, 1, 2, 0): -3.0}
+    return _on_the_sphere(HypersphericalHarmonic.from_polynomial(terms), 0.15)
+
+
+def _fitted_knot() -> list[LevelSet]:
+    """Gaussians along a trefoil knot, by sixteen cosines a side."""
+    curve = shapes.torus_knot(2, 3, 150)
+    step = np.linalg.norm(np.roll(curve, -1, axis=0) - curve, axis=1)
+    width = 0.15 * float(np.ptp(curve, axis=0).max()) / 2
+
+    def density(x: FloatArray) -> FloatArray:
+        parts = [
+            np.exp(-((some[:, None] - curve) ** 2).sum(axis=2) / width**2) @ step
+            for some in np.array_split(x, len(x) // 4000 + 1)
+        ]
+        return np.concatenate(parts) / (width * math.sqrt(math.pi))
+
+    low, high = curve.min(axis=0) - 2.6 * width, curve.max(axis=0) + 2.6 * width
+    box = low.tolist(), high.tolist()
+    series = FourierSeries.fit(density, box, (16, 16, 9), samples=(48, 48, 28))
+    return [level_set(series, solid=(0.4, math.inf), tolerance=DRAWN)]
 
 
 CURVES = (
@@ -136,6 +168,19 @@ HARMONICS = (
         "the harmonic polynomial of the paper's Eq. 8",
         lambda: _harmonic(HarmonicPolynomial({(2, 1, 0): 1.0, (0, 1, 2): -1.0})),
     ),
+    Scene(
+        "hyperspherical",
+        "a quartic on the sphere S^3, projected: levels of both signs, unclipped",
+        _quartic,
+        camera=Camera(azimuth=-35, elevation=22),
+        demo_spp=25,
+    ),
+    Scene(
+        "hyperspherical-sextic",
+        "a hyperspherical harmonic of degree 6 (j = 4, m = 3)",
+        lambda: _on_the_sphere(HypersphericalHarmonic(6, 4, 3), 0.3),
+        camera=Camera(elevation=48),
+    ),
 )
 
 SOLIDS = (
@@ -170,5 +215,14 @@ SOLIDS = (
         "a sum of Laplacian eigenfunctions (the paper's Fig. 21)",
         _eigenfunctions,
         ("clay",),
+    ),
+    Scene(
+        "fourier",
+        "a knot of Gaussians by a Fourier series fitted to it",
+        _fitted_knot,
+        ("clay",),
+        Camera(azimuth=-80, elevation=52),
+        show="shaded",
+        demo_spp=4,
     ),
 )
