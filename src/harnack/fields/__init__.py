@@ -14,6 +14,8 @@ from harnack.fields.expressions.expression import expression
 from harnack.fields.field import Field, Sample
 from harnack.fields.formula import Formula
 from harnack.fields.meshes.winding_number import WindingNumber
+from harnack.fields.plane.branches import BranchPoint
+from harnack.fields.plane.riemann_surface import RiemannSurface
 from harnack.fields.polynomials.polynomial import HarmonicPolynomial, SphericalHarmonic
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.fields.solids.combined import intersection, union
@@ -40,6 +42,7 @@ __all__ = [
     "NO_SHEET",
     "BlobError",
     "Blobs",
+    "BranchPoint",
     "Capsule",
     "Compact",
     "Crossing",
@@ -68,6 +71,7 @@ __all__ = [
     "Plane",
     "PlaneWave",
     "Product",
+    "RiemannSurface",
     "Sample",
     "SchwarzD",
     "SchwarzP",
