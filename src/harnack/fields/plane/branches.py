@@ -22,6 +22,10 @@ if TYPE_CHECKING:
 # A Dr.Jit complex number, one a lane.
 Complex = Any
 
+# Points as close to a singular one are moved off it: the squares of such numbers still exist.
+_LEAST = 1e-12
+# What is taken for the distance to a singular point where there is none.
+_NO_POINT = 2.0
 # What bounds of second derivatives are widened by: logarithms and powers of them are rounded.
 _WIDENED = 1 + 2e-4
 
@@ -35,6 +39,13 @@ def complex_type(backend: Backend) -> Any:
 def complex_of(x: Real, y: Real) -> Complex:
     """x + i y."""
     return complex_type(backend_of(x))(x, y)
+
+
+def derivatives(number: Complex, part: str) -> tuple[Real, Real]:
+    """d/dx and d/dy of the part, "imag" or "real", of a function with this derivative."""
+    if part == "imag":
+        return number.imag, number.real
+    return number.real, -number.imag
 
 
 @dataclass(frozen=True)
@@ -163,6 +174,21 @@ class Branches(abc.ABC):
     @abc.abstractmethod
     def bend(self, part: Part) -> Real:
         """A bound of |g''|, of all branches, on a part of the plane."""
+
+    def moved_off(self, z: Complex, rounding: Real) -> Complex:
+        """z, moved by its rounding off singular points, where no derivative is a number."""
+        least = rounding + _LEAST
+        for point in self.points:
+            at = type(z)(point.at.real, point.at.imag)
+            z = dr.select(abs(z - at) < least, type(z)(at.real + least, at.imag), z)
+        return z
+
+    def clearance(self, z: Complex) -> Real:
+        """The distance to the nearest singular point."""
+        nearest = 0 * z.real + (dr.inf if self.points else _NO_POINT)
+        for point in self.points:
+            nearest = fmin(abs(z - type(z)(point.at.real, point.at.imag)), nearest)
+        return nearest
 
     def largest(self, middle: complex, reach: float) -> float:
         """A bound of |g| on the disk of that radius about a point; inf where none is known."""

@@ -24,6 +24,7 @@ __all__ = ["branches_of", "power_product"]
 _NAMES = ("log", "sqrt", "cbrt", "power", "asin")
 # Exponents are fractions with denominators up to this: so many sheets can still be told apart.
 _MOST_SHEETS = 24
+_LARGEST = 6
 # A point at which a function of one's own is tried.
 _PROBE = 0.31, 0.17
 
@@ -115,8 +116,8 @@ def _fraction(value: Any) -> Fraction:
             "function has too many sheets to be drawn, infinitely many if it is irrational; write "
             "Fraction(2, 3) for two thirds"
         )
-    if not abs(near) <= 12:
-        raise ValueError(f"exponents must be at most 12 in size, not {value!r}")
+    if not abs(near) <= _LARGEST:
+        raise ValueError(f"exponents must be at most {_LARGEST} in size, not {value!r}")
     return near
 
 

@@ -28,7 +28,7 @@ from harnack.enclosures import (
 )
 from harnack.fields.field import Field
 from harnack.fields.look import Look, Path, Sample
-from harnack.fields.plane.branches import Branches, Disk, Stretch, complex_of
+from harnack.fields.plane.branches import Branches, Disk, Stretch, complex_of, derivatives
 from harnack.fields.plane.functions import branches_of
 from harnack.geometry.volumes import Ball, Box, Intersection
 
@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 # Second derivatives are bounded on the way ahead as far as is asked, and to these parts of the
 # distance to the nearest singular point; the best of several sets by experiment.
 _PARTS = (0.4, 0.8)
-# Promises hold in disks of this part of that distance, or of this radius where there is none.
-_DISK, _NO_POINT = 0.5, 1.0
+# Promises hold in disks of this part of that distance.
+_DISK = 0.5
 # No part of a path is longer than this.
 _LONGEST = 1e6
 # Second derivatives are widened by this much for the rounding of slopes.
@@ -208,7 +208,7 @@ class RiemannSurface(Field):
     def evaluate(self, p: Vec3) -> Sample:
         place = self._place(p)
         sample = self._sample(place)
-        reach = self._clearance(place.z)
+        reach = self.branches.clearance(place.z)
         radius = _DISK * fmin(reach, _LONGEST)
         bend = self._size * self.branches.bend(Disk(place.z, radius, place.rounding)) * _WIDENED
         steepest: Real = 0.0
@@ -246,7 +246,7 @@ class RiemannSurface(Field):
         shadow = complex_of(d.x, d.y)
         speed = abs(shadow)
         longest = fmin(ahead, _LONGEST * (1 + largest_component(p)))
-        reach = self._clearance(place.z)
+        reach = self.branches.clearance(place.z)
         lengths = [longest, *(fmin(longest, part * reach / speed) for part in _PARTS)]
         forwards = [self._enclosure(place, d, shadow, length) for length in lengths]
         if not self._is_single:
@@ -262,8 +262,8 @@ class RiemannSurface(Field):
         Raises:
             NotImplementedError: the branches of your own come without second derivatives.
         """
-        z = self._moved_off(complex_of(p.x, p.y), self._rounding(p))
-        branches = self._branches(z)
+        z = self.branches.moved_off(complex_of(p.x, p.y), self._rounding(p))
+        branches = self.branches.at(z)
         graphs = self._graphs(p, branches)
         xx, xy = 0 * p.x, 0 * p.x
         place = self._choose(z, p.z, graphs, 0.0, 0.0)
@@ -274,7 +274,7 @@ class RiemannSurface(Field):
                     "the branches of this Riemann surface come without second derivatives: return "
                     "(g, g', g'') for each"
                 )
-            one_xx, one_xy = self._parts(second)
+            one_xx, one_xy = derivatives(second, self.part)
             here = (sheet.phi == place.nearest.phi) & (sheet.x == place.nearest.x)
             xx, xy = dr.select(here, one_xx, xx), dr.select(here, one_xy, xy)
         share = -place.sign * self._height
@@ -302,23 +302,6 @@ class RiemannSurface(Field):
         """How far rounding may have moved a point in the plane, generously."""
         return 4 * backend_of(p).epsilon * largest_component(p)
 
-    def _moved_off(self, z: Complex, rounding: Real) -> Complex:
-        """z, moved by rounding off singular points, where no derivative is a number."""
-        least = rounding + float(dr.smallest(type(z.real))) * 2.0**40
-        for point in self.branches.points:
-            at = type(z)(point.at.real, point.at.imag)
-            z = dr.select(abs(z - at) < least, type(z)(at.real + least, at.imag), z)
-        return z
-
-    def _branches(self, z: Complex) -> tuple[Branch, ...]:
-        return self.branches.at(z)
-
-    def _parts(self, number: Complex) -> tuple[Real, Real]:
-        """d/dx and d/dy of the part that is drawn of a function with this derivative."""
-        if self.part == "imag":
-            return number.imag, number.real
-        return number.real, -number.imag
-
     def _graphs(self, p: Vec3, branches: tuple[Branch, ...]) -> list[_Graph]:
         """phi of all sheets; with a period and several branches, of two next to the point each.
 
@@ -328,7 +311,7 @@ class RiemannSurface(Field):
         others: list[_Graph] = []
         for one in branches:
             u = one.value.imag if self.part == "imag" else one.value.real
-            x, y = self._parts(one.first)
+            x, y = derivatives(one.first, self.part)
             phi, x, y = p.z - self._height * u, -self._height * x, -self._height * y
             real = cast("Any", type(phi))
             side = dr.select(phi < 0, real(-1), 1)
@@ -342,8 +325,8 @@ class RiemannSurface(Field):
 
     def _place(self, p: Vec3) -> _Place:
         rounding = self._rounding(p)
-        z = self._moved_off(complex_of(p.x, p.y), rounding)
-        branches = self._branches(z)
+        z = self.branches.moved_off(complex_of(p.x, p.y), rounding)
+        branches = self.branches.at(z)
         units = self._size * self.branches.roundings(z, branches) + 4 * dr.abs(p.z)
         error = backend_of(p).epsilon * units
         for point in self.branches.points:  # values there are not rounded in proportion to slopes
@@ -433,13 +416,6 @@ class RiemannSurface(Field):
         return beyond
 
     # Along a ray.
-
-    def _clearance(self, z: Complex) -> Real:
-        """The distance to the nearest singular point."""
-        nearest = 0 * z.real + (_NO_POINT / _DISK if not self.branches.points else dr.inf)
-        for point in self.branches.points:
-            nearest = fmin(abs(z - type(z)(point.at.real, point.at.imag)), nearest)
-        return nearest
 
     def _enclosure(self, place: _Place, d: Vec3, shadow: Complex, length: Real) -> Enclosure:
         """What is proved for a length along a ray with direction d and its shadow in the plane."""
