@@ -15,6 +15,8 @@ from harnack.fields.field import Field, Sample
 from harnack.fields.formula import Formula
 from harnack.fields.meshes.winding_number import WindingNumber
 from harnack.fields.plane.branches import BranchPoint
+from harnack.fields.plane.height_field import HeightField
+from harnack.fields.plane.level_curves import LevelCurves
 from harnack.fields.plane.riemann_surface import RiemannSurface
 from harnack.fields.polynomials.polynomial import HarmonicPolynomial, SphericalHarmonic
 from harnack.fields.sheets import NO_SHEET, Crossing
@@ -62,8 +64,10 @@ __all__ = [
     "Gyroid",
     "HarmonicBall",
     "HarmonicPolynomial",
+    "HeightField",
     "Julia",
     "Kernel",
+    "LevelCurves",
     "LineLipschitz",
     "Lipschitz",
     "Molecule",
