@@ -81,7 +81,7 @@ PLANE = (
         "riemann-log-open",
         "the Riemann surface of log z, without an end in the picture",
         lambda: _surface("log", domain=Ball(radius=30.0)),
-        camera=Camera(azimuth=-60, elevation=20, zoom=2.4),
+        camera=Camera(azimuth=-60, elevation=9, zoom=1.7),
     ),
     Scene(
         "riemann-sqrt-open",

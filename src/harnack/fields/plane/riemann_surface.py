@@ -405,14 +405,19 @@ class RiemannSurface(Field):
         """A length that the surface is proved to be away beside a branch point; 0 for none.
 
         With y the height over the value there, a ball of radius r about p holds nothing of the
-        surface if C (|z - a| + r)^alpha <= y - r: so if r <= y/2 and that power is at most y/2.
+        surface if C (|z - a| + r)^alpha <= y - r: so if r <= m and that power is y - m, for any m.
+        Tried are m = y/2, and the m by which that power is y at r = m, for which it is nearly sharp
+        where the surface is steep.
         """
         beyond = 0 * place.h
         for point, away, y in self._ends_of_branches(place):
-            half = 0.5 * dr.abs(y)
-            assert point.power is not None
-            radius = dr.power(half / (self._size * point.constant), 1 / point.power)
-            beyond = fmax(fmin(half, fmin(radius, point.radius) - abs(away)), beyond)
+            power, constant = point.power, self._size * point.constant
+            assert power is not None
+            y, r = dr.abs(y), abs(away)
+            for most in (0.5 * y, dr.power(y / constant, 1 / power) - r):
+                radius = dr.power(fmax(y - most, 0) / constant, 1 / power) - r
+                radius = fmin(fmin(radius, point.radius - r), most)
+                beyond = fmax(radius, beyond)
         return beyond
 
     # Along a ray.
