@@ -364,11 +364,31 @@ def test_errors_say_what_is_wrong(arguments: Any, settings: Any, message: str) -
         hk.RiemannSurface(*arguments, **settings)
 
 
-def test_levels_other_than_zero_are_refused_of_several_sheets() -> None:
-    with pytest.raises(ValueError, match="level 0"):
-        hk.level_set(hk.RiemannSurface("sqrt"), 0.5)
+def test_levels_of_the_logarithm_are_the_surface_moved_up() -> None:
     hits = hk.trace(hk.RiemannSurface("log"), [[1, 0, 3.0]], [[0, 0, -1]], level=0.5)
-    assert hits.t[0] == pytest.approx(2.5, abs=1e-3)  # log's is the same surface, moved up
+    assert hits.t[0] == pytest.approx(2.5, abs=1e-3)
+
+
+@pytest.mark.parametrize("precision", ["single", "double"])
+def test_walls_about_all_sheets_are_met_first(precision: Any) -> None:
+    """Levels +-0.05 of the cube root: the nearest sheet is so far below or above."""
+    field = hk.RiemannSurface("cbrt")
+    o, d = rays(300, 1.0, seed=8)
+    hits = hk.trace(field, o, d, level=(-0.05, 0.05), precision=precision)
+    hit = hits.status == hk.Status.HIT
+    assert (hits.status != hk.Status.OUT_OF_STEPS).all()
+    across = -np.einsum("nk,nk->n", o, d)
+    half = np.sqrt(1 - np.einsum("nk,nk->n", o, o) + across**2) * (1 - 1e-6)
+    end = np.where(hit, hits.t - 3e-5, across + half)
+    share = np.linspace(0, 1, 3000)
+    t = (across - half)[:, None] * (1 - share) + end[:, None] * share
+    p = o[:, None] + t[..., None] * d[:, None]
+    g = (p[..., 0] + 1j * p[..., 1]) ** (1 / 3)
+    sheets = [(g * np.exp(2j * math.pi * k / 3)).imag for k in range(3)]
+    beyond = np.min([abs(p[..., 2] - u) for u in sheets], axis=0) - 0.05
+    passed = (beyond[:, 1:] * beyond[:, :-1] < 0).any(axis=1) & (end > across - half)
+    assert not passed.any()
+    assert hit.sum() > 150
 
 
 def test_own_branches_without_second_derivatives_say_so() -> None:

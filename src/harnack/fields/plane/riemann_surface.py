@@ -107,8 +107,9 @@ class RiemannSurface(Field):
         radius 4 for "log" and 2 for "asin".
 
     With several branches f = s min_j |phi_j|, phi_j = h - Im g_j, s the sign of the product of all
-    phi_j: it is continuous and single-valued, as the product is, and zero on the surface alone, so
-    0 is its only level. With one branch f = phi, of a logarithm up to its period.
+    phi_j: it is continuous and single-valued, as the product is, and zero on the surface alone.
+    With one branch f = phi, of a logarithm up to its period. solid=(-w, w) makes the surface a wall
+    whose points are at most w above or below it.
 
     Proof. Along a ray the set of branches is continued as long as no singular point is met: so no
     cut matters, and no branch is called the first. `Nearest` takes the minimum over all of the
@@ -166,18 +167,6 @@ class RiemannSurface(Field):
         made.branches = self.branches.prepare(backend)
         made._height = dr.opaque(backend.Float, self.height)
         return made
-
-    def check_levels(self, levels: tuple[float, ...]) -> None:
-        """Refuse levels other than 0 of several branches.
-
-        Raises:
-            ValueError: there is one.
-        """
-        if not self._is_single and any(level != 0 for level in levels):
-            raise ValueError(
-                "a Riemann surface with several sheets is the level 0 of its function; to move it "
-                "up or down, move the camera and the domain, not the level"
-            )
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """The domain, and the heights that the surface can have over it."""
