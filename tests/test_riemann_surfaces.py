@@ -17,6 +17,7 @@ from harnack.backend import choose_backend, to_numpy
 from harnack.fields.plane.branches import Branches, Disk, Stretch, complex_type
 from harnack.fields.plane.functions import branches_of
 from harnack.testing import BrokenPromiseError, check_field
+from tests.test_kernels import compiled
 
 Product = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -389,6 +390,16 @@ def test_walls_about_all_sheets_are_met_first(precision: Any) -> None:
     passed = (beyond[:, 1:] * beyond[:, :-1] < 0).any(axis=1) & (end > across - half)
     assert not passed.any()
     assert hit.sum() > 150
+
+
+def test_other_heights_and_places_compile_no_kernel() -> None:
+    def trace(k: int) -> int:
+        exponents = {0.1 * k: 0.5, 1 + 0.1j * k: Fraction(1, 3)}
+        field = hk.RiemannSurface(exponents, height=1 + 0.1 * k, domain=hk.Ball(radius=2 + 0.1 * k))
+        return compiled(lambda: hk.trace(field, *rays(300, 1.0, seed=k)), size=300)
+
+    trace(0), trace(1)
+    assert [trace(k) for k in range(2, 5)] == [0] * 3
 
 
 def test_own_branches_without_second_derivatives_say_so() -> None:

@@ -76,6 +76,23 @@ class BranchPoint:
 
 
 @dataclass(frozen=True)
+class PreparedPoint:
+    """A `BranchPoint` as numbers of a backend, which no kernel is compiled anew for."""
+
+    at: Complex
+    power: float | None
+    constant: Real
+    radius: Real
+    value: Complex
+
+    @classmethod
+    def of(cls, point: BranchPoint, number: Callable[[float], Real], made: Any) -> PreparedPoint:
+        """number: makes a number of the backend, made: a complex one of two."""
+        at, value = (made(number(one.real), number(one.imag)) for one in (point.at, point.value))
+        return cls(at, point.power, number(point.constant), number(point.radius), value)
+
+
+@dataclass(frozen=True)
 class Branch:
     """One branch at z: its value, its derivative, and its second derivative where it is known."""
 
@@ -144,8 +161,13 @@ class Disk(Part):
         return self.z, self.radius + self.rounding
 
 
+@dataclass(frozen=True)
 class Branches(abc.ABC):
     """All branches of an analytic function, with what is proved about them."""
+
+    _prepared: tuple[PreparedPoint, ...] = field(
+        default=(), kw_only=True, repr=False, compare=False
+    )
 
     @property
     @abc.abstractmethod
@@ -164,8 +186,21 @@ class Branches(abc.ABC):
 
     def prepare(self, backend: Backend) -> Branches:
         """The same with its numbers as data of the backend."""
-        del backend
-        return self
+
+        def number(value: float) -> Real:
+            return dr.opaque(backend.Float, value)
+
+        made = complex_type(backend)
+        return replace(
+            self, _prepared=tuple(PreparedPoint.of(one, number, made) for one in self.points)
+        )
+
+    def points_on(self, z: Complex) -> tuple[PreparedPoint, ...]:
+        """The points as numbers of the type of z."""
+        if self._prepared:
+            return self._prepared
+        real, made = cast("Any", type(z.real)), cast("Any", type(z))
+        return tuple(PreparedPoint.of(one, real, made) for one in self.points)
 
     @abc.abstractmethod
     def at(self, z: Complex) -> tuple[Branch, ...]:
@@ -178,16 +213,16 @@ class Branches(abc.ABC):
     def moved_off(self, z: Complex, rounding: Real) -> Complex:
         """z, moved by its rounding off singular points, where no derivative is a number."""
         least = rounding + _LEAST
-        for point in self.points:
-            at = type(z)(point.at.real, point.at.imag)
-            z = dr.select(abs(z - at) < least, type(z)(at.real + least, at.imag), z)
+        for point in self.points_on(z):
+            beside = type(z)(point.at.real + least, point.at.imag)
+            z = dr.select(abs(z - point.at) < least, beside, z)
         return z
 
     def clearance(self, z: Complex) -> Real:
         """The distance to the nearest singular point."""
         nearest = 0 * z.real + (dr.inf if self.points else _NO_POINT)
-        for point in self.points:
-            nearest = fmin(abs(z - type(z)(point.at.real, point.at.imag)), nearest)
+        for point in self.points_on(z):
+            nearest = fmin(abs(z - point.at), nearest)
         return nearest
 
     def largest(self, middle: complex, reach: float) -> float:
@@ -248,8 +283,8 @@ class PowerProduct(Branches):
             made.append(BranchPoint(a, alpha, constant * (1 + 1e-6), radius))
         return tuple(made)
 
-    def prepare(self, backend: Backend) -> PowerProduct:
-        return replace(self, _on=_uploaded(self.places, backend))
+    def prepare(self, backend: Backend) -> Branches:
+        return replace(super().prepare(backend), _on=_uploaded(self.places, backend))
 
     def _centres(self, z: Complex) -> tuple[Complex, ...]:
         return self._on or tuple(type(z)(a.real, a.imag) for a in self.places)
@@ -334,8 +369,8 @@ class Logarithm(Branches):
     def period(self, imaginary: bool) -> float | None:
         return 2 * math.pi * math.gcd(*self.multiplicities) if imaginary else None
 
-    def prepare(self, backend: Backend) -> Logarithm:
-        return replace(self, _on=_uploaded(self.places, backend))
+    def prepare(self, backend: Backend) -> Branches:
+        return replace(super().prepare(backend), _on=_uploaded(self.places, backend))
 
     def _centres(self, z: Complex) -> tuple[Complex, ...]:
         return self._on or tuple(type(z)(a.real, a.imag) for a in self.places)
@@ -443,8 +478,8 @@ class OwnBranches(Branches):
     def bend(self, part: Part) -> Real:
         middle, radius = part.disk()
         free = radius == radius
-        for point in self.singular:
-            free &= abs(middle - type(middle)(point.at.real, point.at.imag)) > radius
+        for point in self.points_on(middle):
+            free = free & (abs(middle - point.at) > radius)
         bound = 0 * radius + self.second(middle, radius)
         return dr.select(free & (bound >= 0), bound, dr.inf)
 

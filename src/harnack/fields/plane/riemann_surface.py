@@ -34,7 +34,7 @@ from harnack.geometry.volumes import Ball, Box, Intersection
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
-    from harnack.fields.plane.branches import Branch, BranchPoint, Complex
+    from harnack.fields.plane.branches import Branch, Complex, PreparedPoint
     from harnack.geometry import Volume
 
 # Second derivatives are bounded on the way ahead as far as is asked, and to these parts of the
@@ -156,7 +156,7 @@ class RiemannSurface(Field):
         self.domain = Ball(radius=radius) if domain is None else domain
         self._height: Any = self.height
         shift = self.branches.period(part == "imag")
-        self._shift = None if shift is None else abs(self.height) * shift
+        self._shift: Any = None if shift is None else abs(self.height) * shift
         self._is_single = self.branches.count == 1
         self.has_creases = not self._is_single
         if self._is_single:
@@ -166,6 +166,8 @@ class RiemannSurface(Field):
         made = copy.copy(self)
         made.branches = self.branches.prepare(backend)
         made._height = dr.opaque(backend.Float, self.height)
+        if self._shift is not None and not self._is_single:
+            made._shift = dr.opaque(backend.Float, self._shift)
         return made
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
@@ -318,9 +320,9 @@ class RiemannSurface(Field):
         branches = self.branches.at(z)
         units = self._size * self.branches.roundings(z, branches) + 4 * dr.abs(p.z)
         error = backend_of(p).epsilon * units
-        for point in self.branches.points:  # values there are not rounded in proportion to slopes
+        for point in self.branches.points_on(z):  # values are not rounded there as slopes say
             if point.power is not None:
-                close = abs(z - type(z)(point.at.real, point.at.imag)) <= 2 * rounding
+                close = abs(z - point.at) <= 2 * rounding
                 jump = 2 * self._size * point.constant * dr.power(3 * rounding, point.power)
                 error += dr.select(close, jump, 0)
         return self._choose(z, p.z, self._graphs(p, branches), error, rounding)
@@ -356,19 +358,19 @@ class RiemannSurface(Field):
 
     # Beside branch points.
 
-    def _ends_of_branches(self, place: _Place) -> list[tuple[BranchPoint, Complex, Real]]:
+    def _ends_of_branches(self, place: _Place) -> list[tuple[PreparedPoint, Complex, Real]]:
         """Branch points with a power, where z lies from them, and the height over their value."""
-        made: list[tuple[BranchPoint, Complex, Real]] = []
+        made: list[tuple[PreparedPoint, Complex, Real]] = []
         if self._is_single:
             return made
-        for point in self.branches.points:
+        for point in self.branches.points_on(place.z):
             if point.power is None:
                 continue
             value = point.value.imag if self.part == "imag" else point.value.real
             y = place.h - self._height * value
             if self._shift is not None:
                 y -= self._shift * dr.round(y / self._shift)
-            made.append((point, place.z - type(place.z)(point.at.real, point.at.imag), y))
+            made.append((point, place.z - point.at, y))
         return made
 
     def _cusps(self, place: _Place, d: Vec3, shadow: Complex) -> list[Enclosure]:
