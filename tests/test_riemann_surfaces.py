@@ -405,3 +405,26 @@ def test_other_heights_and_places_compile_no_kernel() -> None:
 def test_own_branches_without_second_derivatives_say_so() -> None:
     with pytest.raises(NotImplementedError, match="g''"):
         OWN.hessian(np.array([[0.3, 0.2, 0.1]]))
+
+
+@pytest.mark.parametrize("name", ["sqrt", "real asin"])
+def test_rays_past_branch_points_take_no_small_steps(name: str) -> None:
+    """Down to no distance at all: without `Cusp` such rays end out of steps in single precision."""
+    hits = hk.trace(CASES[name].field, *hostile_rays(1000, CASES[name], seed=3))
+    assert hits.evaluations.max() <= 40
+
+
+def test_hits_carry_derivatives() -> None:
+    backend = choose_backend("double")
+    place = np.array([0.3, 0.4, 2.0])
+    o = backend.Array3f(*place)
+    dr.enable_grad(o)
+    field = hk.RiemannSurface("sqrt")
+    dr.backward(hk.trace(field, o, backend.Array3f(0.05, 0, -1)).t)
+    for k in range(3):
+        step = 1e-5 * np.eye(3)[k]
+        ends = [
+            hk.trace(field, [start], [[0.05, 0, -1]], precision="double", tolerance=1e-12).t[0]
+            for start in (place + step, place - step)
+        ]
+        assert to_numpy(o.grad)[0, k] == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-5)
