@@ -168,8 +168,8 @@ def test_no_sheet_is_passed_on_the_way_to_a_hit(name: str, precision: str) -> No
 @pytest.mark.parametrize("name", CASES)
 def test_no_sheet_is_passed_by_thousands_of_rays(name: str, precision: str) -> None:
     case = CASES[name]
-    assert check_first_hits(case, *rays(5000, case.radius), precision, 6000) > 1000
-    check_first_hits(case, *hostile_rays(2000, case), precision, 6000)
+    assert check_first_hits(case, *rays(5000, case.radius), precision, 4000) > 1000
+    check_first_hits(case, *hostile_rays(2000, case), precision, 4000)
 
 
 @pytest.mark.parametrize("name", QUICK)
@@ -417,7 +417,7 @@ def test_rays_past_branch_points_take_no_small_steps(name: str) -> None:
 def test_hits_carry_derivatives() -> None:
     backend = choose_backend("double")
     place = np.array([0.3, 0.4, 2.0])
-    o = backend.Array3f(*place)
+    o = backend.Array3f(*place.tolist())
     dr.enable_grad(o)
     field = hk.RiemannSurface("sqrt")
     dr.backward(hk.trace(field, o, backend.Array3f(0.05, 0, -1)).t)
