@@ -47,6 +47,7 @@ FIELD_ROOMS = (
     "meshes",
     "clouds",
     "polynomials",
+    "plane",
     "waves",
     "expressions",
     "solids",

@@ -7,6 +7,7 @@ from harnack.enclosures.balls.ball import Ball
 from harnack.enclosures.balls.caps import Caps
 from harnack.enclosures.balls.classic import Classic
 from harnack.enclosures.balls.slope import Slope
+from harnack.enclosures.cusp import Cusp
 from harnack.enclosures.enclosure import Enclosure, Gaps, Slopes
 from harnack.enclosures.extremum import Greatest, Negated, Part, Stretched
 from harnack.enclosures.levels import TargetLevels
@@ -18,6 +19,7 @@ from harnack.enclosures.literature import (
     IntervalRange,
     Mixed,
 )
+from harnack.enclosures.nearest import Nearest, Sheet
 from harnack.enclosures.parabola import Cone, Parabola, Taylor
 from harnack.enclosures.pieces import LinearTaylor, OnePiece, Pieces, QuadraticTaylor, Segment
 from harnack.enclosures.promises import (
@@ -43,6 +45,7 @@ __all__ = [
     "Classic",
     "Cone",
     "Curvature",
+    "Cusp",
     "Enclosure",
     "Evaluable",
     "Gaps",
@@ -53,6 +56,7 @@ __all__ = [
     "LinearTaylor",
     "Lipschitz",
     "Mixed",
+    "Nearest",
     "Negated",
     "OnePiece",
     "Parabola",
@@ -64,6 +68,7 @@ __all__ = [
     "QuadraticTaylor",
     "Restriction",
     "Segment",
+    "Sheet",
     "Slope",
     "Slopes",
     "Stretched",

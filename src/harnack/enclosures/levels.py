@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import drjit as dr
 
-from harnack.backend.extrema import clamp, fmin
+from harnack.backend.extrema import fmin
 from harnack.enclosures.enclosure import Gaps
 
 if TYPE_CHECKING:
@@ -42,9 +42,11 @@ class TargetLevels:
         for level in self.values:
             above = f - level  # > 0: the level lies below f
             if self.period is not None:
-                reduced = above - self.period * dr.floor(above / self.period)
-                below_gap = clamp(reduced, 0, self.period)
-                above_gap = self.period - below_gap
+                # Within half a period of 0, so that neither side of a level is lost to rounding.
+                reduced = above - self.period * dr.round(above / self.period)
+                is_above = reduced >= 0
+                below_gap = dr.select(is_above, reduced, self.period + reduced)
+                above_gap = dr.select(is_above, self.period - reduced, -reduced)
             else:
                 below_gap = dr.select(above >= 0, above, math.inf)
                 above_gap = dr.select(above <= 0, -above, math.inf)

@@ -14,6 +14,10 @@ from harnack.fields.expressions.expression import expression
 from harnack.fields.field import Field, Sample
 from harnack.fields.formula import Formula
 from harnack.fields.meshes.winding_number import WindingNumber
+from harnack.fields.plane.branches import BranchPoint
+from harnack.fields.plane.height_field import HeightField
+from harnack.fields.plane.level_curves import LevelCurves
+from harnack.fields.plane.riemann_surface import RiemannSurface
 from harnack.fields.polynomials.hyperspherical import HypersphericalHarmonic
 from harnack.fields.polynomials.polynomial import HarmonicPolynomial, SphericalHarmonic
 from harnack.fields.sheets import NO_SHEET, Crossing
@@ -42,6 +46,7 @@ __all__ = [
     "NO_SHEET",
     "BlobError",
     "Blobs",
+    "BranchPoint",
     "Capsule",
     "Compact",
     "Crossing",
@@ -62,9 +67,11 @@ __all__ = [
     "Gyroid",
     "HarmonicBall",
     "HarmonicPolynomial",
+    "HeightField",
     "HypersphericalHarmonic",
     "Julia",
     "Kernel",
+    "LevelCurves",
     "LineLipschitz",
     "Lipschitz",
     "Molecule",
@@ -72,6 +79,7 @@ __all__ = [
     "Plane",
     "PlaneWave",
     "Product",
+    "RiemannSurface",
     "Sample",
     "SchwarzD",
     "SchwarzP",

@@ -1,0 +1,1 @@
+"""Functions of the plane: height fields, Riemann surfaces, level curves."""
