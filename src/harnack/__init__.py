@@ -87,7 +87,7 @@ from harnack.fields import (
     solid,
     union,
 )
-from harnack.geometry import Ball, Box, ConvexHull, HalfSpace, Intersection
+from harnack.geometry import Ball, Box, Circle, ConvexHull, HalfSpace, Intersection
 from harnack.rendering import render
 from harnack.tracer import AllHits, Hits, LevelSet, Status, Tolerance, level_set, trace
 
@@ -99,6 +99,7 @@ __all__ = [
     "Box",
     "Caps",
     "Capsule",
+    "Circle",
     "Classic",
     "Compact",
     "Cone",
