@@ -27,7 +27,13 @@ from harnack.arithmetic import (
     tan,
     tanh,
 )
-from harnack.distance import Curvatures, closest_points, curvature, signed_distance
+from harnack.distance import (
+    Curvatures,
+    closest_points,
+    curvature,
+    curvature_lines,
+    signed_distance,
+)
 from harnack.enclosures import (
     Caps,
     Classic,
@@ -164,6 +170,7 @@ __all__ = [
     "cosh",
     "cosine",
     "curvature",
+    "curvature_lines",
     "exp",
     "expression",
     "files",
