@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import drjit as dr
 import numpy as np
 
-from harnack.backend import FloatArray, choose_backend, to_numpy
+from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy
 from harnack.backend.arrays import finite_vectors, upload_vectors
 from harnack.backend.extrema import fmax
 from harnack.backend.loops import while_active
@@ -51,6 +51,8 @@ def curvature_lines(
 ) -> list[FloatArray]:
     """The lines of curvature of a level set through seeds (n, 3): n polylines (k, 3), with k >= 1.
 
+    A line that comes back to its seed ends there, and its first point is its last.
+
     seeds: points near the surface, from which Newton's method leads to it.
     step: length of the steps, as a length of arc. length: how far to follow a line to either side.
     family: whether to follow the direction of the larger principal curvature or of the smaller; the
@@ -88,11 +90,13 @@ def curvature_lines(
         return []
     level = field.default_level if level is None else float(level)
     backend = choose_backend(precision)
-    at, h = dr.opaque(backend.Float, level), dr.opaque(backend.Float, step)
-    guide = _Guide(backend, field.prepare(backend), at, h, family == "largest")
+    # Data, so that another level, step or family compiles no other kernel.
+    most = 1.0 if family == "largest" else 0.0
+    at, h, share = (dr.opaque(backend.Float, one) for one in (level, step, most))
+    guide = _Guide(backend, field.prepare(backend), at, h, share)
     with dr.suspend_grad():
         both = guide.follow(start, count)
-    return [_joined(ahead, back, clip) for ahead, back in zip(*both, strict=True)]
+    return [_joined(ahead, back, step, clip) for ahead, back in zip(*both, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -107,13 +111,13 @@ class _Step:
 
 @dataclass(frozen=True)
 class _Guide:
-    """Follows the lines of one family."""
+    """Follows the lines of one family: largest is 1 for the larger curvature, 0 for the smaller."""
 
     backend: Backend
     field: Field
     level: Real
     step: Real
-    is_largest: bool
+    largest: Real
 
     def follow(self, seeds: FloatArray, count: int) -> tuple[list[FloatArray], list[FloatArray]]:
         """The points of each line to both sides of its seed, each from the seed on."""
@@ -156,7 +160,7 @@ class _Guide:
         """The principal direction that agrees with the one before, and whether there is one."""
         plane = TangentPlane.of(self.field.evaluate(x).gradient)
         eigen = Eigen.of(*plane.restricted(self.field.hessian(x)))
-        u, v = eigen.combination(*((1.0, 0.0) if self.is_largest else (0.0, 1.0)))
+        u, v = eigen.combination(self.largest, 1 - self.largest)
         direction = u * plane.u + v * plane.v
         if before is not None:
             direction = dr.select(dr.dot(direction, before) < 0, -direction, direction)
@@ -193,11 +197,26 @@ def _repeated(step: Callable[[Vec3], Vec3], x: Vec3, times: int, backend: Backen
     return dr.while_loop(start, more, body, label="to the surface")[1]
 
 
-def _joined(ahead: FloatArray, back: FloatArray, clip: Volume | None) -> FloatArray:
-    """One line of its two halves, each cut where it first leaves the volume."""
+def _joined(ahead: FloatArray, back: FloatArray, step: float, clip: Volume | None) -> FloatArray:
+    """One line of its two halves, each cut where it first leaves the volume; of one that comes
+    back to its seed, one turn, which ends in the seed."""
     if clip is not None:
         ahead, back = (_inside(half, clip) for half in (ahead, back))
+    if len(ahead) > 3:
+        # Passed within half a step, by a step that leads from one side of the seed to the other.
+        moves, to_seed = np.diff(ahead, axis=0), ahead[0] - ahead[:-1]
+        share = (moves * to_seed).sum(axis=1) / np.maximum((moves * moves).sum(axis=1), 1e-300)
+        passing = np.linalg.norm(to_seed - share[:, None] * moves, axis=1) < 0.25 * step
+        agrees = moves @ moves[0] > 0
+        closed = np.flatnonzero(passing & (share > 0) & (share <= 1) & agrees & _far(len(moves)))
+        if closed.size:
+            return np.concatenate([ahead[: closed[0] + 1], ahead[:1]])
     return np.concatenate([back[:0:-1], ahead])
+
+
+def _far(count: int) -> BoolArray:
+    """Not the first step, which starts in the seed."""
+    return np.arange(count) > 1
 
 
 def _inside(line: FloatArray, clip: Volume) -> FloatArray:

@@ -12,11 +12,15 @@ from harnack.gallery.blobs import BLOBS
 from harnack.gallery.classic import CURVES, HARMONICS, SOLIDS
 from harnack.gallery.damaged import MESHES
 from harnack.gallery.scene import Scene
+from harnack.gallery.shells import SHELLS
 from harnack.gallery.solids import SHAPES
 
 __all__ = ["SCENES", "Scene"]
 
 SCENES: Mapping[str, Scene] = MappingProxyType(
-    {scene.name: scene for scene in (*CURVES, *HARMONICS, *SOLIDS, *MESHES, *BLOBS, *SHAPES)}
+    {
+        scene.name: scene
+        for scene in (*CURVES, *SHELLS, *HARMONICS, *SOLIDS, *MESHES, *BLOBS, *SHAPES)
+    }
 )
 """All scenes by name."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, cast
 
@@ -36,6 +36,8 @@ class Tube(Solid):
     """The points within `radius` of a polyline.
 
     points: (n, 3) its vertices, one after the other; repeat the first to close it.
+    starts: indices of vertices at which another polyline starts, that the one before does not lead
+        to: see `around`.
     flattening: how far the polyline is at most from the curve that it stands for, so that the
         surface is as far from that of the curve: see `bezier`.
 
@@ -45,6 +47,7 @@ class Tube(Solid):
 
     points: FloatArray
     radius: float
+    starts: tuple[int, ...] = field(default=(), kw_only=True)
     flattening: float = field(default=0.0, kw_only=True)
 
     lipschitz = 1.0
@@ -55,14 +58,37 @@ class Tube(Solid):
         points = np.array(array, dtype=np.float64)
         check_finite(points, "point {} of a tube", ValueError)
         check_size(points, ValueError)
-        if len(points):
-            moves = np.any(points[1:] != points[:-1], axis=1)
-            points = points[np.concatenate([[True], moves])]
-        if len(points) < 2:
-            raise ValueError("a tube needs two points or more that differ: use Sphere for one")
+        parts: list[FloatArray] = []
+        for part in np.split(points, self.starts):
+            if len(part):
+                moves = np.any(part[1:] != part[:-1], axis=1)
+                part = part[np.concatenate([[True], moves])]
+            if len(part) < 2:
+                raise ValueError("a tube needs two points or more that differ: use Sphere for one")
+            parts.append(part)
+        points = np.concatenate(parts)
+        ends = np.cumsum([len(part) for part in parts])[:-1]
+        object.__setattr__(self, "starts", tuple(int(one) for one in ends))
         points.setflags(write=False)
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "radius", positive(self.radius, "the radius of a tube"))
+
+    @classmethod
+    def around(cls, polylines: Iterable[npt.ArrayLike], radius: float) -> Tube:
+        """The points within `radius` of any of several polylines (n_i, 3): one distance for all.
+
+        Raises:
+            ValueError: no polylines, or one that is none; TypeError: not numbers.
+        """
+        parts: list[FloatArray] = []
+        for k, one in enumerate(polylines):
+            array = real_array(one, f"polyline {k} of a tube")
+            check_vectors(array, f"polyline {k} of a tube")
+            parts.append(np.array(array, dtype=np.float64))
+        if not parts:
+            raise ValueError("a tube needs a polyline, and there are none")
+        ends = np.cumsum([len(part) for part in parts])[:-1]
+        return cls(np.concatenate(parts), radius, starts=tuple(int(one) for one in ends))
 
     @classmethod
     def bezier(
@@ -109,7 +135,8 @@ class Tube(Solid):
         return change(self)
 
     def describe(self) -> dict[str, Any]:
-        return {"segments": len(self.points) - 1, "flattening": self.flattening}
+        segments = len(self.points) - 1 - len(self.starts)
+        return {"segments": segments, "flattening": self.flattening}
 
     def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         if above:
@@ -122,7 +149,9 @@ class Tube(Solid):
     @prepared_once
     def prepare(self, backend: Backend) -> Tube:
         made = copy.copy(self)
-        start, side = self.points[:-1], np.diff(self.points, axis=0)
+        joined = np.ones(len(self.points) - 1, dtype=np.bool_)
+        joined[[one - 1 for one in self.starts]] = False
+        start, side = self.points[:-1][joined], np.diff(self.points, axis=0)[joined]
         rows = np.column_stack([start, side, 1.0 / np.sum(side * side, axis=1)])
         object.__setattr__(made, "_records", Records.upload(backend, rows))
         object.__setattr__(made, "_radius", dr.opaque(backend.Float, self.radius))
