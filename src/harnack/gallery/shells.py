@@ -60,7 +60,7 @@ class GridShell:
         def lines(seeds: FloatArray) -> tuple[list[FloatArray], list[FloatArray]]:
             step = 0.25 * self.spacing
             one, other = (
-                curvature_lines(field, seeds, step=step, length=60 * step, family=family,
+                curvature_lines(field, seeds, step=step, length=100 * step, family=family,
                                 level=self.level, clip=above)
                 for family in _FAMILIES
             )  # fmt: skip
@@ -71,15 +71,15 @@ class GridShell:
             max(pair, key=lambda line: _rise_above(line, near))
             for pair in zip(*lines(ground + near * rise), strict=True)
         ]
-        kept = _apart(crossing, 0.3 * self.spacing)
-        # Along the longest of them, seeds of the other family.
-        spine = max(kept, key=len)
-        seeds = spine[4:-4:4]
+        kept = _apart(crossing, 0.55 * self.spacing)
+        # Along some of them, seeds of the other family.
+        spines = kept[:: max(1, len(kept) // 6)]
+        seeds = np.concatenate([spine[2:-2:2] for spine in spines])
         along = [
-            min(pair, key=lambda line: _agreement(line, spine))
+            min(pair, key=lambda line: min(_agreement(line, spine) for spine in spines))
             for pair in zip(*lines(seeds), strict=True)
         ]
-        return [*kept, *_apart(along, 0.3 * self.spacing), *self._edges()]
+        return [*kept, *_apart(along, 0.55 * self.spacing), *self._edges()]
 
     def _rims(self) -> tuple[FloatArray, FloatArray]:
         """Points (n, 2) of the rims, and unit vectors from there into the region."""
