@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from harnack.geometry import Volume
 
 _MOST_SEGMENTS = 1_000_000
+# Segments in a group, and how many there are at least where groups are made.
+_GROUP, _MANY = 8, 64
 # Where the broken line bends, in parts of the length looked ahead.
 _KNOTS = (0.125, 0.25, 0.5, 1.0)
 
@@ -153,7 +155,12 @@ class Tube(Solid):
         joined[[one - 1 for one in self.starts]] = False
         start, side = self.points[:-1][joined], np.diff(self.points, axis=0)[joined]
         rows = np.column_stack([start, side, 1.0 / np.sum(side * side, axis=1)])
+        groups = None
+        if len(rows) >= _MANY:
+            rows, balls = _grouped(rows)
+            groups = Records.upload(backend, balls)
         object.__setattr__(made, "_records", Records.upload(backend, rows))
+        object.__setattr__(made, "_groups", groups)
         object.__setattr__(made, "_radius", dr.opaque(backend.Float, self.radius))
         return made
 
@@ -210,7 +217,11 @@ class Tube(Solid):
 
         zero = 0 * p.x
         start = (zero + dr.inf, zero, zero, zero, zero, *(zero + dr.inf for _ in knots))
-        found = records.for_each(body, start, "tube")
+        groups: Records | None = cast("Any", self)._groups
+        if groups is None:
+            found = records.for_each(body, start, "tube")
+        else:
+            found = _by_groups(p, direction, knots, records, groups, body, start)
         distance, error = found[0], found[4]
         away = vector(*found[1:4])
         gradient = dr.select(distance > 0, away / distance, vector(0))
@@ -222,6 +233,74 @@ class Tube(Solid):
 
     def _number(self, name: str) -> Any:
         return getattr(self, name)
+
+
+def _grouped(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Records of segments in groups of `_GROUP`, the last filled up with copies, and a ball
+    (centre, radius) around each group."""
+    missing = -len(rows) % _GROUP
+    rows = np.concatenate([rows, np.repeat(rows[-1:], missing, axis=0)])
+    ends = np.concatenate([rows[:, :3], rows[:, :3] + rows[:, 3:6]], axis=1)
+    points = ends.reshape(-1, 2 * _GROUP, 3)
+    centres = 0.5 * (points.min(axis=1) + points.max(axis=1))
+    radii = np.linalg.norm(points - centres[:, None], axis=2).max(axis=1)
+    return rows, np.column_stack([centres, radii * (1 + 1e-5)])
+
+
+def _by_groups(
+    p: Vec3,
+    direction: Vec3 | None,
+    knots: tuple[Real, ...],
+    records: Records,
+    groups: Records,
+    body: Callable[[list[Real], tuple[Any, ...]], tuple[Any, ...]],
+    start: tuple[Any, ...],
+) -> tuple[Any, ...]:
+    """As `body` for all segments, but groups that are far away stand for theirs as balls.
+
+    Proof. A segment in a ball of radius r about c is at least |p - c| - r and at most |p - c| + r
+    away. So the nearest segment is in no group whose ball begins farther away than another one
+    ends. The distance from the ball, which bounds that of all its segments, is convex along the
+    ray as well, and lies above its own tangent.
+    """
+    real, vector = cast("Any", type(p.x)), cast("Any", type(p))
+    unit = 2 * float(dr.epsilon(real))
+
+    def bound(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+        return (fmin(dr.norm(p - vector(*row[:3])) + row[3], state[0]),)
+
+    (most,) = groups.for_each(bound, (real(dr.inf),), "tube groups")
+    limit = most * (1 + 16 * unit) + 16 * unit * dr.norm(p)
+
+    def visit(i: Any, *state: Any) -> tuple[Any, ...]:
+        row = groups.row(i)
+        away = p - vector(*row[:3])
+        distance = dr.norm(away)
+        is_near = distance - row[3] <= limit
+        found = list(state)
+        if direction is not None:
+            off = 8 * unit * (dr.norm(p) + distance + row[3])
+            slope = fmax(dr.dot(away, direction) / distance - 2 * off / distance, -1)
+            for k, knot in enumerate(knots):
+                low = dr.fma(knot, slope, distance - row[3] - off) - 4 * unit * (distance + knot)
+                low = dr.select(is_near, dr.inf, low)
+                found[5 + k] = fmin(low, found[5 + k])
+
+        def each(j: Any, *inner: Any) -> tuple[Any, ...]:
+            return j + 1, *body(records.row(i * _GROUP + j), inner)
+
+        def more(j: Any, *_: Any) -> Any:
+            return j < last
+
+        last = dr.select(is_near, type(i)(_GROUP), type(i)(0))
+        inside = dr.while_loop((type(i)(0), *found), more, each, label="tube")
+        return i + 1, *inside[1:]
+
+    def more_groups(i: Any, *_: Any) -> Any:
+        return i < groups.trips
+
+    index = groups.backend.UInt32(0)
+    return dr.while_loop((index, *start), more_groups, visit, label="tube by groups")[1:]
 
 
 @dataclass(frozen=True)
