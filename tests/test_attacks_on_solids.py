@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
 import numpy as np
 import pytest
 
 import harnack as hk
+from harnack.arithmetic import Jet
+from harnack.backend import choose_backend
 
 PRECISIONS = ("single", "double")
 CREASE = hk.expression(lambda x, y, z: hk.maximum(x, y, z) - 0.3)
@@ -104,6 +107,12 @@ def test_little_is_lost_far_from_the_origin() -> None:
     [
         (lambda: hk.expression(lambda x, y, z: None), TypeError, "returned an object of type None"),
         (lambda: hk.expression(lambda x, y, z: x if x > 0 else y), TypeError, "cannot decide by"),
+        (lambda: hk.expression(lambda x, y, z: 1.0 if x == 0 else y), TypeError, "cannot decide"),
+        (lambda: hk.expression(lambda x, y, z: np.ones(2) * x), TypeError, "type ndarray"),
+        (lambda: hk.expression(lambda x, y, z: x * np.ones(2)), TypeError, "type ndarray"),
+        (lambda: hk.expression(lambda x, y, z: hk.maximum(x, None)), TypeError, "type NoneType"),
+        (lambda: hk.expression(lambda x, y, z: x ** "2"[1:]), TypeError, "exponent of x"),  # type: ignore[operator]
+        (lambda: hk.expression(lambda x, y, z: np.float64(-2) ** x), ValueError, "must be pos"),
         (lambda: hk.solid(hk.Gyroid(1.0), between=(1.0,)), ValueError, "numbers, two of them"),  # type: ignore[arg-type]
         (lambda: hk.solid(hk.Gyroid(1.0), around=3.0), ValueError, "numbers, two of them"),  # type: ignore[arg-type]
         (lambda: hk.Sphere(1.0).tapered(0.0, 1.0), ValueError, "two numbers each"),  # type: ignore[arg-type]
@@ -116,3 +125,60 @@ def test_bad_input_is_named(make: Any, error: Any, message: str) -> None:
 
 def test_levels_may_be_numbers_of_numpy() -> None:
     assert isinstance(hk.solid(hk.Gyroid(1.0), below=np.float32(0.25)), hk.Solid)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize(
+    ("formula", "value"),
+    [
+        (lambda x: np.sin(x**0), np.sin(1.0)),
+        (lambda x: hk.cos(0 * x + 0.3), np.cos(0.3)),
+        (lambda x: 0 * x + 0.1, 0.1),
+        (lambda x: hk.norm(0 * x + 0.1, 0 * x + 0.2), np.hypot(0.1, 0.2)),
+        (lambda x: x**0 / 3, 1 / 3),
+    ],
+)
+def test_constants_made_of_coordinates_are_held(formula: Any, value: float, precision: Any) -> None:
+    """At points and at the start of pieces their jets did not know of which precision they are:
+    sines of them were those of single precision, and were not held by their ranges."""
+    backend = choose_backend(precision)
+    p, d = (backend.Array3f(*one) for one in ((1.0, 2.0, 3.0), (1.0, 0.0, 0.0)))
+    along = Jet.along(p, d, backend.Float(0), backend.Float(1))[0]
+    jets = [formula(one) for one in (along, Jet.at_point(p)[0])]
+    for one in (jets[0].value, jets[0].start.value, jets[1].value):
+        low, high = (np.float64((backend.Float(0) + end)[0]) for end in (one.low, one.high))
+        if one.is_static:  # numbers of the precision themselves
+            low, high = one.low, one.high
+        assert low <= value <= high
+        assert high - low < 1e2 * float(dr.epsilon(backend.Float))
+
+
+def test_functions_of_numpy_with_the_same_meaning() -> None:
+    """numpy.arctan and its like had no ranges, although harnack.atan has."""
+    hits = hk.trace(
+        hk.expression(lambda x, y, z: np.arctan(x) - 0.5), [[-2.0, 0, 0]], [[1.0, 0, 0]]
+    )
+    assert hits.t[0] == pytest.approx(2 + np.tan(0.5), abs=1e-3)
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize(
+    ("solid", "o", "d", "roots"),
+    [
+        # Rays from the origin ended where their box touches the solid, f not yet seen off 0.
+        (hk.Cuboid((0.32, 0.89, 0.803)).scaled(100), (0, 0, 0), (0, 0, 1), [80.3]),
+        # Behind a flat solid f rose too little beyond its box for the side to be known.
+        (hk.Cuboid((100, 100, 1)), (-50, 0, 1 - 1e-3), (1, 0, 2e-5), [50]),
+        # On the rim the gradient is not known, and the ray was left without a gap to go on with.
+        (hk.Cylinder(100, 1), (150, 0, 1.01), (-1, 0, -1e-4), [100, 250]),
+    ],
+    ids=["origin", "flat", "rim"],
+)  # fmt: skip
+def test_no_crossing_is_lost(solid: Any, o: Any, d: Any, roots: Any, precision: Any) -> None:
+    all_hits = hk.trace(solid, [o], [d], all_hits=4, precision=precision)
+    assert all_hits.status[0] == hk.Status.MISS  # there are no others
+    assert all_hits.count[0] == len(roots)
+    off = 2.0 if d[2] == 2e-5 else 1e-2  # at so small an angle rounding moves it far
+    assert all_hits.t[0, : len(roots)] == pytest.approx(roots, abs=off)
+    confirmed = hk.trace(solid, [o], [d], confirm=True, precision=precision)
+    assert confirmed.t[0] == pytest.approx(roots[0], abs=off)

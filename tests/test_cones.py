@@ -12,6 +12,7 @@ import harnack as hk
 from harnack.backend import choose_backend
 from harnack.geometry import mesh_shapes
 from harnack.rendering import Camera, register, render, shape
+from harnack.rendering.pictures.cones import balls_of
 from harnack.rendering.pictures.shading import Light
 from harnack.tracer.covers import Cones
 
@@ -26,11 +27,12 @@ RADIUS = 0.01
 def covered(what: Any, o: Any, d: Any, precision: str = "single", **settings: Any) -> np.ndarray:
     """Which cones of radius 0.01 at a distance of 4 a level set covers in part."""
     backend = choose_backend(precision)
-    prepared = hk.level_set(what, **settings).prepare(backend, crosses=True)
+    surface = hk.level_set(what, **settings)
+    prepared = surface.prepare(backend, crosses=True)
     kind = np.float32 if precision == "single" else np.float64
     rays = (backend.Array3f(np.asarray(a, dtype=kind).T.copy()) for a in np.broadcast_arrays(o, d))
-    middle = backend.Array3f(0), backend.Float(1)
-    found, _ = Cones(prepared, *rays, backend.Float(RADIUS / AWAY), middle).are_covered_in_part(
+    around = balls_of(surface.volume, backend)
+    found, _ = Cones(prepared, *rays, backend.Float(RADIUS / AWAY), around).are_covered_in_part(
         backend.Float(dr.inf), backend.Bool(True)
     )
     return np.array(found)
@@ -69,6 +71,23 @@ def test_no_wire_is_overlooked(thin: float) -> None:
     away = np.abs(heights) / np.sqrt(2) / RADIUS - thin
     assert found[away < 0.95].all()
     assert not found[away > 1.07].any()
+
+
+FLAT = (hk.Cuboid((0.5, 0.5, 1e-3)), hk.Superellipsoid((1.0, 1.0), (1, 1, 0.02)))
+
+
+@pytest.mark.parametrize("solid", FLAT)
+def test_cones_widen_along_the_way(solid: Any) -> None:
+    """Beside flat solids f hardly changes: one step led past all of them, and the cone, wider there
+    than where it was looked at, had reached them unseen."""
+    heights = np.linspace(0, 0.05, 401)
+    o = np.stack([np.full_like(heights, -AWAY), np.full_like(heights, 0.01), heights], axis=-1)
+    t = np.linspace(3, 5, 2001)[:, None]
+    over = solid.formula(t - AWAY, 0.01 + 0 * heights, heights)
+    off = (over / (RADIUS * t / AWAY)).min(axis=0)
+    touched = (over.min(axis=0) > 0) & (off < 0.93)
+    assert touched.sum() > 10
+    assert covered(solid, o, (1.0, 0.0, 0.0))[touched].all()
 
 
 def test_what_is_covered_altogether_is_not_found() -> None:
@@ -144,6 +163,15 @@ def test_wires_thinner_than_a_pixel_are_lines(thin: float) -> None:
     assert columns.mean() == pytest.approx(expected, rel=0.05)
     broken = drawn(wire, antialias="edges", spp=144).sum(axis=0)
     assert (broken == 0).any()
+
+
+@pytest.mark.usefixtures("black")
+def test_a_turned_plate_seen_on_edge_is_a_line() -> None:
+    """Its hull is thin and the box around that is not: cones that passed it were cut away."""
+    plate = hk.Cuboid((0.3, 0.5, 1e-3)).rotated(20, "x")
+    columns = drawn(hk.level_set(plate, tolerance=1e-5), antialias="cones", spp=64).sum(axis=0)
+    middle = columns[12:-12]
+    assert middle.min() > 0.5 * np.median(middle)
 
 
 @pytest.mark.usefixtures("black")

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _ROUNDINGS = 16.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Affine(Operators):
     """centre + slope e + r for -1 <= e <= 1, with |r| <= error.
 

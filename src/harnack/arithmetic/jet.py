@@ -16,14 +16,14 @@ import drjit as dr
 
 from harnack.arithmetic.functions import Function, exp, log, power, reciprocal
 from harnack.arithmetic.interval import ONE, ZERO, Interval, select
-from harnack.arithmetic.operators import Operators
+from harnack.arithmetic.operators import Operators, exponent_of
 from harnack.backend.extrema import fmax, fmin
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Jet(Operators):
     """Ranges of a function of n variables on a box of them; mostly n = 1, the length along a path,
     or n = 3 at a point.
@@ -35,7 +35,8 @@ class Jet(Operators):
         the range has no upper or no lower end.
     start: with n = 1, the jet at the start of the piece, from which ranges are narrowed; None where
         the jet is that of a point.
-    width: the length of the piece.
+    width: the length of the piece; 0 at a point. A number of the backend, so that jets whose ranges
+        are Python numbers know of which kind those are.
     """
 
     value: Interval
@@ -49,7 +50,8 @@ class Jet(Operators):
         """The coordinates as functions of themselves, at points p: for gradients and Hessians."""
         second = (ZERO,) * 6 if order > 1 else ()
         units = [tuple(ONE if i == k else ZERO for i in range(3)) for k in range(3)]
-        x, y, z = (Jet(Interval.exactly(p[k]), units[k], second) for k in range(3))
+        zero = 0 * p.x
+        x, y, z = (Jet(Interval.exactly(p[k]), units[k], second, width=zero) for k in range(3))
         return x, y, z
 
     @classmethod
@@ -70,7 +72,7 @@ class Jet(Operators):
             rate = Interval.exactly(slope)
             here = _moved(x, slope, start)
             first, second = (rate,), (ZERO,)
-            anchor = Jet(here, first, second) if anchored else None
+            anchor = Jet(here, first, second, width=0 * x) if anchored else None
             return Jet(here.hull(_moved(x, slope, end)), first, second, anchor, end - start)
 
         x, y, z = (coordinate(p[k], direction[k]) for k in range(3))
@@ -84,20 +86,9 @@ class Jet(Operators):
             return self._constant(Interval.exactly(x))
         return self._constant(Interval.constant(float(x), type(self.kind())))
 
-    def of(self, other: Any) -> Jet:
-        """A number of any kind as a function of the same variables.
-
-        Raises:
-            TypeError: it is no number.
-        """
-        b = self._operand(other)
-        if b is None:
-            raise TypeError(f"expected a number, not an object of type {type(other).__name__}")
-        return b
-
     def _constant(self, value: Interval) -> Jet:
         zeros = (ZERO,) * len(self.first), (ZERO,) * len(self.second)
-        start = None if self.start is None else Jet(value, *zeros)
+        start = None if self.start is None else Jet(value, *zeros, width=self.start.width)
         return Jet(value, *zeros, start, self.width)
 
     def kind(self) -> Any:
@@ -112,6 +103,7 @@ class Jet(Operators):
             self.value + other.value,
             tuple(x + y for x, y in zip(self.first, other.first, strict=True)),
             tuple(x + y for x, y in zip(self.second, other.second, strict=True)),
+            width=self.width,
         )
         return jet if self.start is None else jet.anchored(self.start + other.start, self.width)
 
@@ -135,7 +127,7 @@ class Jet(Operators):
             + y * self.second[k]
             for k, (i, j) in enumerate(self.pairs())
         )
-        jet = Jet(x * y, first, second)
+        jet = Jet(x * y, first, second, width=self.width)
         return jet if self.start is None else jet.anchored(self.start * other.start, self.width)
 
     def __truediv__(self, other: Any) -> Any:
@@ -156,7 +148,7 @@ class Jet(Operators):
                 base = exponent._constant(self.dynamic_value(exponent.kind()))
                 return (base.apply(log) * exponent).apply(exp)
             return (self.apply(log) * exponent).apply(exp)
-        return self.apply(power(float(exponent)))
+        return self.apply(power(exponent_of(exponent)))
 
     # Functions.
 
@@ -170,7 +162,7 @@ class Jet(Operators):
             + slope * self.second[k]
             for k, (i, j) in enumerate(self.pairs())
         )
-        jet = Jet(value, first, second)
+        jet = Jet(value, first, second, width=self.width)
         return jet if self.start is None else jet.anchored(self.start.apply(function), self.width)
 
     def larger(self, other: Jet) -> Jet:
@@ -202,7 +194,7 @@ class Jet(Operators):
             chosen(u, v, kink=i == j)
             for (i, j), u, v in zip(pairs, self.second, other.second, strict=True)
         )
-        jet = Jet(value, first, second)
+        jet = Jet(value, first, second, width=self.width)
         if self.start is None:
             return jet
         return jet.anchored(self.start.maximum(other.start), self.width)

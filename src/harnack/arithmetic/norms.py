@@ -148,7 +148,7 @@ def _norm(xs: list[Jet], p: float) -> Jet:
         if i == j:
             bent = Interval(fmax(bent.low, 0), bent.high)
         second.append(bent + _total([u * x.second[k] for u, x in zip(pulls, xs, strict=True)]))
-    jet = Jet(length, first, tuple(second))
+    jet = Jet(length, first, tuple(second), width=xs[0].width)
     starts = [one.start for one in xs]
     if any(one is None for one in starts):
         return jet

@@ -9,6 +9,9 @@ import drjit as dr
 
 from harnack.arithmetic.functions import (
     absolute,
+    acos,
+    asin,
+    atan,
     cos,
     cosh,
     exp,
@@ -31,12 +34,18 @@ if TYPE_CHECKING:
 # NumPy's functions of such numbers: numpy.sin(x) is sin(x).
 _UFUNCS = {
     "sin": sin, "cos": cos, "tan": tan, "exp": exp, "log": log, "sqrt": sqrt, "tanh": tanh,
-    "sinh": sinh, "cosh": cosh, "absolute": absolute, "fabs": absolute, "square": power(2),
+    "sinh": sinh, "cosh": cosh, "arctan": atan, "arcsin": asin, "arccos": acos,
+    "absolute": absolute, "fabs": absolute, "square": power(2),
 }  # fmt: skip
+# With such a number on the left, and with one on the right alone.
 _OPERATORS = {
-    "add": "__add__", "subtract": "__sub__", "multiply": "__mul__", "true_divide": "__truediv__",
-    "divide": "__truediv__", "power": "__pow__", "maximum": "maximum", "minimum": "minimum",
+    "add": ("__add__", "__radd__"), "subtract": ("__sub__", "__rsub__"),
+    "multiply": ("__mul__", "__rmul__"), "divide": ("__truediv__", "__rtruediv__"),
+    "true_divide": ("__truediv__", "__rtruediv__"), "power": ("__pow__", "__rpow__"),
+    "maximum": ("maximum", "maximum"), "minimum": ("minimum", "minimum"),
 }  # fmt: skip
+# What those functions and operators are called in formulas.
+_NAMES = "sin, cos, tan, exp, log, sqrt, tanh, atan, asin, acos, sinh, cosh, maximum, minimum, norm"
 
 
 class Operators(abc.ABC):
@@ -78,6 +87,17 @@ class Operators(abc.ABC):
         except (TypeError, ValueError):
             return None
 
+    def of(self, other: Any) -> Self:
+        """A number of any kind as one of this arithmetic.
+
+        Raises:
+            TypeError: it is no number.
+        """
+        b = self._operand(other)
+        if b is None:
+            raise TypeError(f"expected a number, not an object of type {type(other).__name__}")
+        return b
+
     def __add__(self, other: Any) -> Any:
         b = self._operand(other)
         return NotImplemented if b is None else self.sum(b)
@@ -114,7 +134,7 @@ class Operators(abc.ABC):
     def __pow__(self, exponent: Any) -> Self:
         if isinstance(exponent, type(self)):
             return (self.apply(log) * exponent).apply(exp)
-        n = float(exponent)
+        n = exponent_of(exponent)
         if not n.is_integer():
             return self.apply(power(n))
         return self._repeated(int(n)) if n >= 0 else self._repeated(int(-n)).apply(reciprocal)
@@ -130,10 +150,14 @@ class Operators(abc.ABC):
         return square.product(self) if n % 2 else square
 
     def __rpow__(self, base: Any) -> Any:
-        if isinstance(base, int | float) and not base > 0:
-            raise ValueError(f"{base:g}**x is no real number for most x: the base must be positive")
         b = self._operand(base)
-        return NotImplemented if b is None else b**self
+        if b is None:
+            return NotImplemented
+        if not dr.is_array_v(cast("Any", type(base))) and not float(base) > 0:
+            raise ValueError(
+                f"{float(base):g}**x is no real number for most x: the base must be positive"
+            )
+        return b**self
 
     def __xor__(self, other: Any) -> Any:
         raise TypeError("formulas write powers as x**2, not x^2")
@@ -145,15 +169,11 @@ class Operators(abc.ABC):
 
     def maximum(self, other: Any) -> Self:
         """The larger of two functions at each place."""
-        b = self._operand(other)
-        assert b is not None
-        return self.larger(b)
+        return self.larger(self.of(other))
 
     def minimum(self, other: Any) -> Self:
         """The smaller of two functions at each place."""
-        b = self._operand(other)
-        assert b is not None
-        return -((-self).larger(-b))
+        return -((-self).larger(-self.of(other)))
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **settings: Any) -> Any:
         """NumPy's functions and operators, of these numbers."""
@@ -163,11 +183,16 @@ class Operators(abc.ABC):
                 return self.apply(_UFUNCS[name])
             if name in _OPERATORS:
                 a, b = inputs
-                first = a if isinstance(a, Operators) else self._operand(a)
-                return getattr(first, _OPERATORS[name])(b)
+                left, right = _OPERATORS[name]
+                is_left = isinstance(a, Operators)
+                made = getattr(a, left)(b) if is_left else getattr(b, right)(a)
+                if made is NotImplemented:
+                    other = type(b if is_left else a).__name__
+                    raise TypeError(f"expected a number, not an object of type {other}")
+                return made
         raise TypeError(
             f"numpy.{name} has no proved ranges: write formulas with + - * / **, abs, and "
-            f"harnack.{', '.join(sorted(_UFUNCS))}, maximum, minimum, norm"
+            f"harnack.{_NAMES}"
         )
 
     def __float__(self) -> float:
@@ -183,3 +208,21 @@ class Operators(abc.ABC):
         )
 
     __bool__ = __lt__ = __le__ = __gt__ = __ge__ = _undecided
+
+    def __eq__(self, other: object) -> bool:
+        return self._undecided(other)
+
+    __hash__ = object.__hash__
+
+
+def exponent_of(n: Any) -> float:
+    """An exponent that is the same everywhere.
+
+    Raises:
+        TypeError: it is no number.
+    """
+    try:
+        return float(n)
+    except (TypeError, ValueError):
+        kind = type(n).__name__
+        raise TypeError(f"the exponent of x**n must be a number, not of type {kind}") from None

@@ -40,7 +40,7 @@ _ROUNDINGS = 32.0
 _COMPARED_AT = 0.6
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Parabolas(Operators):
     """A function along a path between two parabolas through its value at the start.
 

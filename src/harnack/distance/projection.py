@@ -226,16 +226,15 @@ class Descent:
             way, sign = dr.select(k < 2, plane.u, plane.v), dr.select((k & 1) == 0, h, -h)
             gradient = self.field.evaluate(dr.fma(vector(sign), way, y)).gradient
             change = gradient * (0.5 / sign)
-            return (
-                dr.select(k < 2, ahead + change, ahead),
-                dr.select(k < 2, aside, aside + change),
-                k + 1,
-            )
+            first, second = dr.select((k & 1) == 0, change, ahead + change), aside + change
+            second = dr.select((k & 1) == 0, change, second)
+            return dr.select(k < 2, first, ahead), dr.select(k < 2, aside, second), k + 1
 
         def more(*state: Any) -> Mask:
             return state[-1] < 4
 
-        state = (0 * y, 0 * y, count(0))
+        # From what is no number: a sum that stays 0, of a constant field, would be no state.
+        state = (vector(dr.nan), vector(dr.nan), count(0))
         ahead, aside, _ = dr.while_loop(state, more, body, label="second derivatives")
         cross = 0.5 * (dr.dot(plane.v, ahead) + dr.dot(plane.u, aside))
         return dr.dot(plane.u, ahead), dr.dot(plane.v, aside), cross

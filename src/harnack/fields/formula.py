@@ -116,11 +116,12 @@ class Formula(Field):
         """The derivative along a direction, and how far off it may be: in a crease, where the
         gradient is a range, it is known of directions that keep to the crease. It is what pieces of
         the path start from, so it costs nothing more."""
+        zero = 0 * p.x
         x, y, z = (
-            Jet(Interval.exactly(p[k]), (Interval.exactly(direction[k]),), ()) for k in range(3)
+            Jet(Interval.exactly(p[k]), (Interval.exactly(direction[k]),), (), width=zero)
+            for k in range(3)
         )
         (slope,) = self._jet((x, y, z), p.x).first
-        zero = 0 * p.x
         return zero + slope.middle, zero + slope.radius
 
     def restricted(self, p: Vec3, direction: Vec3) -> FormulaAlong:

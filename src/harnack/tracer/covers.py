@@ -59,8 +59,8 @@ class Cones:
     """Cones around rays o + t d, |d| = 1, that may touch a level set.
 
     radius: of a cone, per unit of t.
-    middle, half: of the box around the surface's extent, and half its shortest side; None for an
-        extent that has no end.
+    around: (middle, depth, size), the middle and the radii of a ball in the surface's extent and of
+        one around it; None for an extent that has no end.
     solid: (low, high) of a solid {low <= f <= high}; None for a surface with two sides.
     """
 
@@ -68,7 +68,7 @@ class Cones:
     origin: Vec3
     direction: Vec3
     radius: Real
-    around: tuple[Vec3, Real] | None = None
+    around: tuple[Vec3, Real, Real] | None = None
     solid: tuple[Real, Real] | None = None
 
     def are_covered_in_part(self, t_max: Real, active: Mask) -> tuple[Mask, Any]:
@@ -141,15 +141,17 @@ class Cones:
     def _clip(self) -> tuple[Real, Real]:
         """The part of rays whose cones can touch the surface.
 
-        Its extent is made larger about its middle, which a ray meets as one that is made smaller
-        meets the extent itself: by so much that the planes of its box move by the radius.
+        Its extent is made larger about a point in it, which a ray meets as one that is made smaller
+        meets the extent itself: by so much that it holds all points within the radius. Proof. A
+        convex C that holds the ball of radius h about m = 0 holds h u for every unit vector u, so
+        that (1 + a) C = C + a C holds C moved by any vector of length a h.
         """
         real = self.prepared.backend.Float
         start, end = real(0), real(dr.inf)
         if self.around is not None and self.prepared.volume is not None:
-            middle, half = self.around
-            farthest = length(middle - self.origin) + 4 * half
-            factor = 1 + self.radius * farthest / half
+            middle, depth, size = self.around
+            farthest = (length(middle - self.origin) + size) * (1 + 2 * self.radius)
+            factor = 1 + self.radius * farthest / depth
             o = (self.origin - middle) / factor + middle
             start, end = self.prepared.volume.clip(o, self.direction, start, end)
             start, end = start * factor, end * factor

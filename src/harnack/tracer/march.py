@@ -40,6 +40,8 @@ _COARSEN = 0.2
 _AIM, _AIM_BY_SLOPE = 0.999, 0.99
 # How far from the surface rounding may leave a point that is a hit: see `March._is_near`.
 _LARGEST_UNCERTAINTY = 1 / 16
+# Of the gap to the cover of a cone, what the cone may widen by in a step.
+_WIDENING = 0.1
 # A repeated sample is closer by these factors at least and at most.
 _CLOSER = 1.25, 16.0
 # Truncation falls like this power of detail; beyond the largest detail there is none.
@@ -153,6 +155,10 @@ class March:
         that lie where the hysteresis puts them, and ends as a hit where it has crossed one. It may
         be made active again there, to go on to the next.
 
+        With `cover` the levels lie nearer by |grad f| times the radius of a cone, which grows with
+        t: a tenth of the gap is left to that, and no step is longer than the cone takes to widen
+        by so much, unless the level is never met and f leaves it faster than the cone widens.
+
         ahead: of a field with sheets, the crossing at `end`, on lanes where there is one. Those
         lanes look at that point as well. Accepted there, they hit the sheet or have passed it: a
         miss, with the step that the value behind the sheet allows from there. With `hysteresis`
@@ -197,7 +203,8 @@ class March:
             excess = fmax(gaps.smaller + total_error - within, real(0))
             band, may_pass = within, is_near
             if self.hysteresis is not None and now.contact is not None:
-                band = self.hysteresis.band(within, rounding)
+                # In contact all that rounding does to f counts, or a ray would stick in a crease.
+                band = self.hysteresis.band(within, total_error - sample.truncation)
                 gaps = self.hysteresis.gaps(now.contact, sample.value, gaps, band)
                 within = CLOSER * within
                 may_pass &= ~now.contact.is_touching
@@ -248,7 +255,15 @@ class March:
                 gaps_ahead, aims = self.hysteresis.gaps(*after), self.hysteresis.gaps(*after, AIM)
 
             # How far to go from there.
+            spent = _WIDENING * gaps.smaller
+            if self.cover is not None:
+                gaps_ahead = gaps_ahead.less(spent)
             forward = longest_step(look.ahead, gaps_ahead.less(total_error))
+            if self.cover is not None:
+                widening = fmax(self.cover * gradient_norm, float(dr.smallest(real)))
+                away = dr.select(gaps.down <= gaps.up, look.slope, -look.slope)
+                for_ever = (forward == dr.inf) & (away >= widening)
+                forward = dr.select(for_ever, forward, fmin(forward, spent / widening))
             forward = dr.select(gaps_ahead.smaller > total_error, forward, 0)
             trial = self._trial(forward, look, aims, now, path, is_smooth)
             base = dr.select(accepted, t, now.base)

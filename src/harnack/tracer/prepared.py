@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 # Rays that look for crossings begin and end outside the proved extent of the surface by this part
 # of the size of coordinates, to be seen on one side of it.
 _AROUND = 1 / 64
+# And by this part of the length between, for rays that leave it at small angles.
+_ALONG = 1 / 7
 # Rays that start so many roundings off a sheet start on it.
 _ON_SHEET = 8.0
 
@@ -133,7 +135,13 @@ class PreparedLevelSet:
         """The part of rays to look at for crossings, given the part that can hold the surface.
 
         The surface may touch the ends of the latter, so that on it f is on one side only. Beyond
-        it the ray is free. So a little more of the ray is looked at, if there is more of it.
+        it the ray is free. So a little more of the ray is looked at, if there is more of it, and
+        behind a ray that leaves a flat solid at a small angle more than that.
+
+        Proof that it is enough where f is convex along the ray. Let f be W below the level in the
+        extent and pass it at its end, and e be the error of f there: W >= 8 e (`Hysteresis.band`).
+        Then f rises at least as steeply behind as on the way there, no longer than end - start: a
+        seventh of that behind the end it is 8/7 e above the level, and is seen there.
         """
         none, size = self.backend.Bool(False), largest_component(path.origin)
         rounding = _ON_SHEET * self.backend.epsilon * (size + t_min)
@@ -142,9 +150,11 @@ class PreparedLevelSet:
         first, last = t_min, t_max
         if self.region is not None:
             first, last = self.region.clip(path.origin, path.direction, t_min, t_max)
-        around = _AROUND * (size + dr.abs(start))
         holds = start < end
-        before, after = fmax(start - around, first), fmin(end + around, last)
+        length = dr.select(dr.isfinite(start) & dr.isfinite(end), end - start, 0)
+        around = _ALONG * length
+        before = fmax(start - fmax(_AROUND * (size + dr.abs(start)), around), first)
+        after = fmin(end + fmax(_AROUND * (size + dr.abs(end)), around), last)
         free_before, free_after = before > first, after < last
         start, end = dr.select(holds, before, start), dr.select(holds, after, end)
         free = holds & free_before, holds & free_after

@@ -203,7 +203,7 @@ def jet_of_field(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
     wide = (wide + off * (steep + dr.select(off <= radius, bound, dr.inf) * off)) * (1 + 1e-5)
     value = Interval(sample.value - wide, sample.value + wide)
     first, second = derivatives(starts, off)
-    start = Jet(value, first, second)
+    start = Jet(value, first, second, width=starts[0].width)
     if x.start is None:
         return start
     moves = (

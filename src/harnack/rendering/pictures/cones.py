@@ -7,15 +7,19 @@ so do those of its neighbours. The cone that holds the pixel does not.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
 
-from harnack.backend import BoolArray, to_numpy
+from harnack.backend import BoolArray, choose_backend, to_numpy
 from harnack.rendering.mitsuba.variant import mitsuba_backend
 from harnack.rendering.mitsuba.world import World
 from harnack.rendering.surfaces.placement import PlacedSurface
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Real, Vec3
+    from harnack.geometry import Volume
 
 
 class Finder:
@@ -48,7 +52,7 @@ class Finder:
 
 
 def _prepared(mi: Any, carrier: Any) -> tuple[PlacedSurface, Any]:
-    """A surface that can be looked at outside its extent, and the box around the extent."""
+    """A surface that can be looked at outside its extent, and balls in and around the extent."""
     surface, backend = carrier.surface, mitsuba_backend(mi)
     if surface.field.has_sheets:
         raise ValueError(
@@ -56,11 +60,23 @@ def _prepared(mi: Any, carrier: Any) -> tuple[PlacedSurface, Any]:
             'values tell no distance. Leave antialias at "edges"'
         )
     placed = replace(carrier.placed, prepared=surface.prepare(backend, crosses=True))
-    if surface.volume is None:
-        return placed, None
-    lower, upper = (np.asarray(end, dtype=np.float64) for end in surface.volume.bounds())
-    half = float((upper - lower).min()) / 2
-    if not (np.isfinite(upper - lower).all() and half > 0):
-        return placed, None
-    middle = backend.Array3f(*(dr.opaque(backend.Float, x) for x in (lower + upper).tolist()))
-    return placed, (middle / 2, dr.opaque(backend.Float, half))
+    return placed, balls_of(surface.volume, backend)
+
+
+def balls_of(volume: Volume | None, backend: Backend) -> tuple[Vec3, Real, Real] | None:
+    """The middle of a volume, and the radii about it of a ball in it and of one around it; None
+    where it has no end or no such ball was found."""
+    if volume is None:
+        return None
+    lower, upper = (np.asarray(end, dtype=np.float64) for end in volume.bounds())
+    if not np.isfinite(upper - lower).all():
+        return None
+    middle = (0.5 * (lower + upper)).tolist()
+    # Not half the box: other volumes have faces that lie nearer to its middle.
+    there = choose_backend("double").Array3f(*middle)
+    depth = -float(to_numpy(volume.signed_distance(there))[0]) * (1 - 1e-6)
+    if not depth > 0:
+        return None
+    size = 0.5 * float(np.linalg.norm(upper - lower))
+    numbers = [dr.opaque(backend.Float, x) for x in (*middle, depth, size)]
+    return backend.Array3f(*numbers[:3]), numbers[3], numbers[4]

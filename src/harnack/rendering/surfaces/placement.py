@@ -131,12 +131,11 @@ class PlacedSurface:
         return self.prepared.occluded(o, d, 0, t_max, active)
 
     def covers_in_part(
-        self, o: Vec3, d: Vec3, radius: Real, t_max: Real, around: tuple[Vec3, Real] | None
+        self, o: Vec3, d: Vec3, radius: Real, t_max: Real, around: tuple[Vec3, Real, Real] | None
     ) -> Mask:
         """Which cones around rays of the world it covers in part, before t_max or anything else.
 
-        radius: per unit of t. around: middle of the box around its extent, and half the shortest
-        side; None where there is none. The surface must be prepared for crossings.
+        radius: per unit of t. around: see `Cones`. The surface must be prepared for crossings.
         """
         o, d, t_max = self._local_ray(o, d, t_max)
         solid = None if self.solid is None else (self.solid.low, self.solid.high)
