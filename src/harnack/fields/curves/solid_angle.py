@@ -56,7 +56,7 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
     loops: one (n, 3) array-like of vertices, n >= 3, a `Circle`, or a list of these. Every loop is
     closed by itself. Orientation matters: a hole runs against its outer loop. A Dr.Jit 3-vector of
     n lanes is one loop whose vertices hits can be differentiated by. Circles are exact, and cost
-    about as much as three vertices.
+    about as much as nine vertices.
 
     Edges that are run there and back, by one loop or by two neighbours, are taken out before
     anything is computed (`net_loops`): f does not see them. If none is left, f is 0 everywhere,
