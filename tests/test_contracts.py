@@ -100,6 +100,8 @@ CURVES: dict[str, Field] = {
     "Hopf link": hk.SolidAngle(shapes.hopf_link(20)),
     "Borromean rings": hk.SolidAngle(shapes.borromean_rings(20)),
     "holes": hk.SolidAngle(shapes.square_with_holes(12)),
+    "ring of circles": hk.SolidAngle([hk.Circle(1.0), hk.Circle(0.4, normal=(0, 0, -1))]),
+    "trefoil and circle": hk.SolidAngle([shapes.torus_knot(2, 3, 60), hk.Circle(0.5)]),
     "spiky": hk.SolidAngle(shapes.spiky_polygon(_RNG, 17)),
     "random": hk.SolidAngle(shapes.random_closed_curve(_RNG, 40)),
 }

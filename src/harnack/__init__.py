@@ -27,7 +27,13 @@ from harnack.arithmetic import (
     tan,
     tanh,
 )
-from harnack.distance import Curvatures, closest_points, curvature, signed_distance
+from harnack.distance import (
+    Curvatures,
+    closest_points,
+    curvature,
+    curvature_lines,
+    signed_distance,
+)
 from harnack.enclosures import (
     Caps,
     Classic,
@@ -93,7 +99,7 @@ from harnack.fields import (
     solid,
     union,
 )
-from harnack.geometry import Ball, Box, ConvexHull, HalfSpace, Intersection
+from harnack.geometry import Ball, Box, Circle, ConvexHull, HalfSpace, Intersection
 from harnack.rendering import render
 from harnack.tracer import AllHits, Hits, LevelSet, Status, Tolerance, level_set, trace
 
@@ -106,6 +112,7 @@ __all__ = [
     "BranchPoint",
     "Caps",
     "Capsule",
+    "Circle",
     "Classic",
     "Compact",
     "Cone",
@@ -175,6 +182,7 @@ __all__ = [
     "cosh",
     "cosine",
     "curvature",
+    "curvature_lines",
     "exp",
     "expression",
     "files",

@@ -3,6 +3,15 @@
 from __future__ import annotations
 
 from harnack.distance.curvature import Curvatures, curvature
+from harnack.distance.curvature_lines import Family, curvature_lines
 from harnack.distance.signed_distance import Method, closest_points, signed_distance
 
-__all__ = ["Curvatures", "Method", "closest_points", "curvature", "signed_distance"]
+__all__ = [
+    "Curvatures",
+    "Family",
+    "Method",
+    "closest_points",
+    "curvature",
+    "curvature_lines",
+    "signed_distance",
+]

@@ -13,6 +13,7 @@ from harnack.gallery.classic import CURVES, HARMONICS, SOLIDS
 from harnack.gallery.damaged import MESHES
 from harnack.gallery.plane import PLANE
 from harnack.gallery.scene import Scene
+from harnack.gallery.shells import SHELLS
 from harnack.gallery.solids import SHAPES
 
 __all__ = ["SCENES", "Scene"]
@@ -20,7 +21,7 @@ __all__ = ["SCENES", "Scene"]
 SCENES: Mapping[str, Scene] = MappingProxyType(
     {
         scene.name: scene
-        for scene in (*CURVES, *HARMONICS, *SOLIDS, *MESHES, *BLOBS, *SHAPES, *PLANE)
+        for scene in (*CURVES, *SHELLS, *HARMONICS, *SOLIDS, *MESHES, *BLOBS, *SHAPES, *PLANE)
     }
 )
 """All scenes by name."""

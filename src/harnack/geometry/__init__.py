@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from harnack.geometry import mesh_shapes, shapes
+from harnack.geometry.circles import Circle
 from harnack.geometry.cloud_normals import estimate_normals
 from harnack.geometry.clouds import CloudError, estimate_areas, validate_cloud
 from harnack.geometry.curves import (
@@ -24,6 +25,7 @@ from harnack.geometry.volumes import Ball, Box, ConvexHull, HalfSpace, Intersect
 __all__ = [
     "Ball",
     "Box",
+    "Circle",
     "CloudError",
     "ConvexHull",
     "CurveError",

@@ -54,7 +54,7 @@ def is_convex_position(loops: tuple[FloatArray, ...]) -> bool:
     # All comparisons of this module are written so that NaN refuses.
     if not _edge_lengths(x).min() >= MIN_SEPARATION:
         return False
-    return (_is_flat(x) or _lies_on_hull(x)) and _is_simple(x)
+    return (_is_flat(x) or _lies_on_hull(x)) and is_simple(x)
 
 
 def _edge_lengths(x: FloatArray) -> FloatArray:
@@ -126,7 +126,7 @@ def _free_direction(a: FloatArray, b: FloatArray) -> FloatArray:
     return middle[:, 0]
 
 
-def _is_simple(x: FloatArray) -> bool:
+def is_simple(x: FloatArray) -> bool:
     """Whether edges without a common vertex are MIN_SEPARATION apart, and none folds back."""
     count = len(x)
     ends = np.roll(x, -1, axis=0)

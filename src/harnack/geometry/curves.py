@@ -21,6 +21,7 @@ from harnack.backend.numbers import (
     real_array,
     vector_text,
 )
+from harnack.geometry.circles import Circle
 from harnack.geometry.convexity import is_convex_position
 
 __all__ = [
@@ -37,6 +38,7 @@ __all__ = [
     "edges",
     "is_convex_position",
     "total_length",
+    "validate_curves",
     "validate_loops",
 ]
 
@@ -92,6 +94,35 @@ def validate_loops(loops: LoopsLike) -> Loops:
     if total > MAX_VERTICES:
         raise TooManyVerticesError(_too_many("the curve", total))
     return tuple(checked)
+
+
+def validate_curves(curves: Any) -> tuple[Loops, tuple[Circle, ...]]:
+    """Closed curves as loops of vertices and circles: what `validate_loops` accepts, a `Circle`, or
+    a list in which each entry is one of the two.
+
+    Raises:
+        CurveError: as `validate_loops`.
+    """
+    if isinstance(curves, Circle):
+        return (), (curves,)
+    parts = _as_parts(curves)
+    if not any(isinstance(one, Circle) for one in parts):
+        return validate_loops(curves), ()
+    circles = tuple(one for one in parts if isinstance(one, Circle))
+    loops = [
+        _validate_loop(one, f"loop {k}")
+        for k, one in enumerate(parts)
+        if not isinstance(one, Circle)
+    ]
+    total = sum(len(loop) for loop in loops)
+    if total > MAX_VERTICES:
+        raise TooManyVerticesError(_too_many("the curve", total))
+    return tuple(loops), circles
+
+
+def _as_parts(curves: Any) -> list[Any]:
+    """The entries of a list or tuple; none of anything else."""
+    return list(curves) if isinstance(curves, list | tuple) else []  # pyright: ignore[reportUnknownArgumentType, reportUnknownVariableType]
 
 
 def _as_list(loops: Any) -> list[tuple[int, Any]]:

@@ -14,10 +14,11 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy, to_vector3
 from harnack.backend.extrema import fmin
+from harnack.fields.curves.circle_sums import Circles
 from harnack.fields.edges.edge import Edge
 from harnack.fields.edges.edge_records import LoopEdges
 from harnack.fields.edges.edge_sums import inner_product, spinor
-from harnack.geometry import ConvexHull
+from harnack.geometry import Circle, ConvexHull
 
 if TYPE_CHECKING:
     from harnack.backend import Real, Vec3
@@ -28,20 +29,28 @@ _FINEST = 5
 
 
 def tight_extent(
-    loops: tuple[FloatArray, ...], lower: FloatArray, upper: FloatArray, levels: tuple[float, ...]
+    loops: tuple[FloatArray, ...],
+    circles: tuple[Circle, ...],
+    lower: FloatArray,
+    upper: FloatArray,
+    levels: tuple[float, ...],
 ) -> ConvexHull:
     """A polytope of few planes that holds every point of the level sets inside a box.
 
     A cell with centre x and half-diagonal h is empty if h < d (its distance to the curves) and
     no level lies in [f(x) - S, f(x) + S], where S bounds the variation of the lift on B(x, h):
     S = sum_e 2 [asinh(a/(d_e - h)) - asinh(a/d_e)], the integral of the edge bound
-    2a/(rho sqrt(rho^2 + a^2)) along the way (see `SolidAngle`). Cells that are not proved empty
-    are split; those left at the end are wrapped in 26 planes.
+    2a/(rho sqrt(rho^2 + a^2)) along the way (see `SolidAngle`); a circle of radius a at distances d
+    and P adds the integral of its bound 2 pi a/((P-t)(d-t)) (see `circle_sums`), which is at most
+    2 pi a/(P-h) ln(d/(d-h)). Cells that are not proved empty are split; those left at the end are
+    wrapped in 26 planes.
     """
     corner, size = np.zeros((1, 3)), upper - lower
-    scale, count = float(size.max()), sum(len(loop) for loop in loops)
+    scale, count = float(size.max()), sum(len(loop) for loop in loops) + 3 * len(circles)
     unit = tuple((loop - lower) / scale for loop in loops)
-    edges = LoopEdges.upload(choose_backend("double"), unit)
+    backend = choose_backend("double")
+    edges = LoopEdges.upload(backend, unit) if unit else None
+    rounds = Circles.upload(backend, circles, lower, scale) if circles else None
     size = size / scale
     for _ in range(_FINEST):
         if 8 * len(corner) * count > _MOST_PAIRS:
@@ -50,7 +59,7 @@ def tight_extent(
         steps = np.array(list(itertools.product((0, 1), repeat=3))) * size
         corner = (corner[:, None] + steps).reshape(-1, 3)
         half_diagonal = 0.5 * float(np.linalg.norm(size))
-        corner = corner[~_proved_empty(edges, corner + size / 2, half_diagonal, levels)]
+        corner = corner[~_proved_empty(edges, rounds, corner + size / 2, half_diagonal, levels)]
     if not len(corner):
         corner, size = np.zeros((1, 3)), (upper - lower) / scale
     slack = 1e-4 * float(np.linalg.norm(upper - lower))
@@ -58,11 +67,31 @@ def tight_extent(
 
 
 def _proved_empty(
-    edges: LoopEdges, centres: FloatArray, h: float, levels: tuple[float, ...]
+    edges: LoopEdges | None,
+    circles: Circles | None,
+    centres: FloatArray,
+    h: float,
+    levels: tuple[float, ...],
 ) -> BoolArray:
     """Whether no level lies within h of centres (n, 3); h and centres in the edges' units."""
-    real, x = edges.backend.Float, to_vector3(edges.backend, centres)
-    h_device = dr.opaque(real, h)
+    backend = choose_backend("double")
+    x, h_device = to_vector3(backend, centres), dr.opaque(backend.Float, h)
+    f, d, s = np.zeros(len(centres)), np.full(len(centres), math.inf), np.zeros(len(centres))
+    parts = [_around_edges(edges, x, h_device)] if edges is not None else []
+    if circles is not None:
+        parts.append(circles.angle_and_variation(x, h_device))
+    for part in parts:
+        angle, nearest, variation = (to_numpy(one) for one in part)
+        f, d, s = f + angle, np.minimum(d, nearest), s + variation
+    gap = np.full(len(f), math.inf)
+    for level in levels:
+        gap = np.minimum(gap, np.abs(np.remainder(f - level + 2 * np.pi, 4 * np.pi) - 2 * np.pi))
+    return (d > h * 1.001) & (gap > s * (1 + 1e-9) + 1e-9)
+
+
+def _around_edges(edges: LoopEdges, x: Vec3, h_device: Real) -> tuple[Real, Real, Real]:
+    """Solid angle at x, distance, and a bound S of the variation within h."""
+    real = edges.backend.Float
 
     def add(p: Vec3, q: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
         zr, zi, nearest, variation = state
@@ -76,11 +105,7 @@ def _proved_empty(
 
     start = (real(1), real(0), real(dr.inf), real(0))
     zr, zi, nearest, variation = edges.for_each(add, start, "edge extent")
-    f, d, s = (to_numpy(one) for one in (2 * dr.atan2(zi, zr), nearest, variation))
-    gap = np.full(len(f), math.inf)
-    for level in levels:
-        gap = np.minimum(gap, np.abs(np.remainder(f - level + 2 * np.pi, 4 * np.pi) - 2 * np.pi))
-    return (d > h * 1.001) & (gap > s * (1 + 1e-9) + 1e-9)
+    return 2 * dr.atan2(zi, zr), nearest, variation
 
 
 def _wrapped(centres: FloatArray, half: FloatArray) -> ConvexHull:

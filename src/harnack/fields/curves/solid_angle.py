@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -9,15 +11,18 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import drjit as dr
 import numpy as np
 
-from harnack.backend import backend_of, to_numpy
+from harnack.backend import FloatArray, backend_of, to_numpy
+from harnack.backend.extrema import fmin
 from harnack.choices import did_you_mean
 from harnack.enclosures import HarmonicBall, LineLipschitz
+from harnack.fields.curves.circle_sums import Circles, CircleSums
 from harnack.fields.curves.edge_angles import differentiable_angle
 from harnack.fields.curves.edge_extent import tight_extent
 from harnack.fields.curves.edge_nearest import closest_on_segments, segments
+from harnack.fields.curves.planar import PlanarRegion, planar_region
 from harnack.fields.edges.edge_passing import Line, known_along, rates_along
 from harnack.fields.edges.edge_records import LoopEdges
-from harnack.fields.edges.edge_sums import EdgeSums, hessian_over_edges, sum_over_edges
+from harnack.fields.edges.edge_sums import hessian_over_edges, sum_over_edges
 from harnack.fields.field import Look, Path, Sample
 from harnack.fields.sums import (
     SECOND_ROUNDINGS,
@@ -26,15 +31,16 @@ from harnack.fields.sums import (
     rounding_of_sum,
 )
 from harnack.fields.unit_coordinates import UnitCoordinates, UploadedField, epsilon_at, placed
-from harnack.geometry import ConvexHull, is_convex_position, total_length, validate_loops
-from harnack.geometry.curves import Loops
+from harnack.geometry import Circle, ConvexHull, is_convex_position, total_length
+from harnack.geometry.circles import net_circles
+from harnack.geometry.curves import Loops, validate_curves
 from harnack.geometry.net_loops import net_loops, uncancelled_edges
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.geometry import Volume
 
-CertificateName = Literal["auto", "edges", "convex", "paper"]
+CertificateName = Literal["auto", "planar", "edges", "convex", "paper"]
 
 _PERIOD = 4 * math.pi
 # The ball of the edge certificate is this fraction of the distance to the curve (by experiment:
@@ -47,16 +53,17 @@ _NARROW = 1e-9 * _PERIOD
 class SolidAngle(UploadedField["_CurveBuffers"]):
     """The signed solid angle of closed curves, in steradians, with period 4 pi (paper, Eq. 10).
 
-    loops: one (n, 3) array-like of vertices, n >= 3, or a list of them. Every loop is closed by
-    itself. Orientation matters: a hole runs against its outer loop. A Dr.Jit 3-vector of n lanes
-    is one loop whose vertices hits can be differentiated by.
+    loops: one (n, 3) array-like of vertices, n >= 3, a `Circle`, or a list of these. Every loop is
+    closed by itself. Orientation matters: a hole runs against its outer loop. A Dr.Jit 3-vector of
+    n lanes is one loop whose vertices hits can be differentiated by. Circles are exact, and cost
+    about as much as nine vertices.
 
     Edges that are run there and back, by one loop or by two neighbours, are taken out before
     anything is computed (`net_loops`): f does not see them. If none is left, f is 0 everywhere,
     every ray a proved miss, and levels that are multiples of 4 pi are refused.
 
-    certificate: how the lift is bounded near a point. "auto" takes "convex" where its hypothesis
-    is checked to hold, else "edges".
+    certificate: how the lift is bounded near a point. "auto" takes "planar" for curves with circles
+    where its hypothesis is checked to hold, "convex" where that does, else "edges".
 
     - "edges" holds for **every** curve. Let d_e be the distance from x to edge e of length 2a_e
       and r = d/2, d = min d_e. At distance rho an edge's Biot-Savart field is at most
@@ -69,6 +76,9 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
           S <= sum_e 2a/sqrt(d_e^2+a^2) (r/d_e)/(1-r/d_e)
             <= 2 r sum_e a/(d_e sqrt(..)) + 4 r^2 sum_e a/(d_e^2 sqrt(..)).
 
+      Circles add a bound of the same form (`circle_sums`).
+    - "planar": on B(x, d) the lift stays in a window 4 pi wide if all loops together bound a region
+      of a plane (`planar`); else, for circles alone, in the sum of one such window a circle.
     - "convex": on B(x, d) the lift stays in (-6 pi, 6 pi) if the curve is one loop without
       self-intersections on the boundary of a convex set: a segment crosses the 2 pi level, where
       the principal value in (-2 pi, 2 pi) jumps by 4 pi, at most once net (paper, Theorem C.1).
@@ -85,31 +95,63 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
     def __init__(self, loops: Any, *, certificate: CertificateName = "auto") -> None:
         super().__init__()
         vertices = loops if _is_drjit(loops) else None
-        self.loops: Loops = validate_loops(to_numpy(loops) if vertices is not None else loops)
+        self.loops: Loops
+        self.circles: tuple[Circle, ...]
+        curves = to_numpy(loops) if vertices is not None else loops
+        self.loops, self.circles = validate_curves(curves)
         self.vertices: Vec3 | None = vertices
-        self._net: Loops = net_loops(self.loops)
-        self.convex_position = is_convex_position(self._net)
+        self._net: Loops = net_loops(self.loops) if self.loops else ()
+        self._net_circles = net_circles(self.circles)
+        is_circle = not self._net and len(self._net_circles) == 1
+        self.convex_position = is_circle or (
+            not self._net_circles and is_convex_position(self._net)
+        )
+        self._region: PlanarRegion | None = None
+        if self._net_circles:
+            self._region = planar_region(self._net, self._net_circles)
         if self.convex_position:
             self.overstep = 1.6
         self._asked = certificate
         self.certificate = self._choose(certificate)
-        points = np.concatenate(self._net or self.loops)
+        points = self._points_around()
         self._centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
         self._size = float(np.linalg.norm(points - self._centre, axis=1).max())
         self._extents: dict[tuple[float, ...], Volume | None] = {}
 
-    def _choose(self, asked: CertificateName) -> Literal["edges", "range"]:
+    @property
+    def _is_empty(self) -> bool:
+        """Whether nothing is left of the curves."""
+        return not self._net and not self._net_circles
+
+    def _points_around(self) -> FloatArray:
+        """Points (n, 3) whose convex hull holds the curves: vertices, and polygons around circles;
+        those of curves that cancel where nothing else is left."""
+        loops, circles = self._net, self._net_circles
+        if self._is_empty:
+            loops, circles = self.loops, self.circles
+        return np.concatenate([*loops, *(one.polygon(64, around=True) for one in circles)])
+
+    def _choose(self, asked: CertificateName) -> Literal["edges", "planar", "range"]:
         if asked == "auto":
+            if self._region is not None or (self._net_circles and not self._net):
+                return "planar"
             return "range" if self.convex_position else "edges"
         if asked == "convex" and not self.convex_position:
             raise ValueError(
                 'certificate="convex" needs one loop without self-intersections on the boundary '
                 'of its convex hull, and this is not one; use certificate="auto"'
             )
+        if asked == "planar":
+            if self._region is None and (self._net or not self._net_circles):
+                raise ValueError(
+                    'certificate="planar" needs disjoint loops that bound a region of a plane, or '
+                    'circles alone, and this is neither; use certificate="auto"'
+                )
+            return "planar"
         if asked not in ("edges", "convex", "paper"):
-            names = ("auto", "edges", "convex", "paper")
+            names = ("auto", "planar", "edges", "convex", "paper")
             raise ValueError(
-                f"unknown certificate {asked!r}; use auto, edges, convex or paper"
+                f"unknown certificate {asked!r}; use auto, planar, edges, convex or paper"
                 f"{did_you_mean(asked, names)}"
             )
         return "edges" if asked == "edges" else "range"
@@ -129,11 +171,21 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         centre = self._centre.astype(cast).astype(np.float64)
         unit = tuple((loop - centre) / self._size for loop in self._net)
         edges = LoopEdges.upload(backend, unit) if unit else None
-        magnitude = float(np.abs(np.concatenate(self._net or self.loops)).max() / self._size)
+        circles = None
+        if self._net_circles:
+            circles = Circles.upload(backend, self._net_circles, centre, self._size)
+        plane = None
+        if self._region is not None:
+            height = (self._region.offset - float(self._region.normal @ centre)) / self._size
+            numbers = (*self._region.normal.tolist(), height)
+            plane = tuple(dr.opaque(backend.Float, number) for number in numbers)
+        magnitude = float(np.abs(self._points_around()).max() / self._size)
         factors = sum(len(loop) for loop in self._net)
         return _CurveBuffers(
             *placed(backend, centre, self._size),
             edges,
+            circles,
+            plane,
             dr.opaque(backend.Float, backend.epsilon * (6 + 2 * magnitude)),
             rounding_of_sum(backend, factors, own=8, growth=2),
         )
@@ -144,22 +196,24 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
     def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
         """With what edges promise along the ray, which is much beside a long edge along it."""
         del ahead, back
-        knows_lines = self._net and self._asked != "paper"
+        knows_lines = not self._is_empty and self._asked != "paper"
         direction = path.direction if knows_lines else None
         return path.look(self._sample(path.point(t), direction))
 
     def _sample(self, p: Vec3, direction: Vec3 | None) -> Sample:
         """The sample at p; with promises along a unit direction, if one is given."""
         on = self._on(p)
-        if on.edges is None:
+        if self._is_empty:
             return self._constant(on, p)
         x = on.unit(p)
-        sums = sum_over_edges(on.edges, x, variation=self.certificate == "edges")
+        sums = on.sums(x, variation=self.certificate == "edges")
         epsilon = on.backend.epsilon
         rounding = on.rounding
         distance = sums.distance * (1 - SUM_ROUNDING) - rounding
         if self.certificate == "edges":
             ball = self._edge_ball(on, sums, distance)
+        elif self.certificate == "planar":
+            ball = self._planar_ball(on, x, sums, distance)
         else:
             ball = HarmonicBall(distance * on.size, -1.5 * _PERIOD, 1.5 * _PERIOD)
         # On the curve itself, to rounding, every level meets (`uncancelled_edges`) and no gradient
@@ -168,14 +222,38 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         met = sums.distance <= 2 * rounding
         steep = on.backend.Array3f(0, 0, 4 * _PERIOD / rounding)
         gradient = dr.select(met, steep, sums.gradient) / on.size
-        error = on.value_rounding
+        error, gradient_error = on.value_rounding, 0.0
         if self.certificate == "edges":
             # Ends of edges, rounded, move each edge's angle by that times its field, which is at
             # most twice `first`: where edges nearly cancel, the gradient does not show it.
             error = error + dr.select(met, 0, 4 * epsilon * sums.first)
+        if sums.circles is not None:
+            own = sums.circles
+            # Measured: 15 units in the last place of a circle's angle and 60 of its gradient (near
+            # it, 10 elsewhere). Its place is rounded by a few units besides.
+            place = epsilon * (4 + 4 * dr.max(dr.abs(x)))
+            value = 16 * epsilon * len(self._net_circles) + 2 * place * own.first
+            error = error + dr.select(met, 0, value)
+            slope = 64 * epsilon * own.first + 3 * place * own.bend
+            gradient_error = dr.select(met, 0, slope) / on.size
         error = dr.select(met, 8 * _PERIOD, error)  # that gradient times 2 rounding
-        known = (ball, *_along_edges(on, x, sums, direction))
-        return Sample(dr.select(met, 0, sums.angle), gradient, known, error)
+        balls = (ball,)
+        if self.certificate == "planar" and self._region is None:
+            # A window each is wide: the variation proves more on half of the way.
+            balls = (ball, self._edge_ball(on, sums, distance))
+        known = (*balls, *_along_curves(on, x, sums, direction))
+        return Sample(dr.select(met, 0, sums.angle), gradient, known, error, gradient_error)
+
+    def _planar_ball(
+        self, on: _CurveBuffers, x: Vec3, sums: CurveSums, distance: Real
+    ) -> HarmonicBall:
+        if self._region is None:
+            own = sums.circles
+            assert own is not None
+            return HarmonicBall(distance * on.size, own.lower, own.upper)
+        slack = on.rounding + on.backend.epsilon * 4 * dr.max(dr.abs(x))
+        ball = self._region.window(sums.angle, on.height(x), distance, slack)
+        return dataclasses.replace(ball, radius=ball.radius * on.size)
 
     def _constant(self, on: _CurveBuffers, p: Vec3) -> Sample:
         """The sample of f = 0, for a curve of which nothing is left: it is true on any ball. The
@@ -186,7 +264,7 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         ball = HarmonicBall(radius, zero - _NARROW, zero + _NARROW)
         return Sample(zero, on.backend.Array3f(zero), (ball,))
 
-    def _edge_ball(self, on: _CurveBuffers, sums: EdgeSums, distance: Real) -> HarmonicBall:
+    def _edge_ball(self, on: _CurveBuffers, sums: CurveSums, distance: Real) -> HarmonicBall:
         r = _REACH * distance
         variation = 2 * r * (sums.first + r / (1 - _REACH) * sums.second) * (1 + SUM_ROUNDING)
         return HarmonicBall(r * on.size, sums.angle - variation, sums.angle + variation)
@@ -194,37 +272,50 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         """Rows of the Hessian, free of trace to rounding. It grows without limit at the curve."""
         on = self._on(p)
-        if on.edges is None:
+        if self._is_empty:
             zero = dr.zeros(on.backend.Array3f, dr.width(p))
             return zero, zero, zero
-        x, y, z = hessian_over_edges(on.edges, on.unit(p))
-        share = 1 / (on.size * on.size)
-        return x * share, y * share, z * share
+        x, share = on.unit(p), 1 / (on.size * on.size)
+        rows = on.backend.Array3f(0), on.backend.Array3f(0), on.backend.Array3f(0)
+        if on.edges is not None:
+            rows = hessian_over_edges(on.edges, x)
+        if on.circles is not None:
+            more = on.circles.hessian(x).rows(on.backend.Array3f)
+            rows = tuple(one + other for one, other in zip(rows, more, strict=True))
+        first, second, third = (row * share for row in rows)
+        return first, second, third
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
         """Rounding of positions, as for sums over boundary edges (`sums.SLOPE_ROUNDINGS`), with
         distances less by what it may have done to them. Without bound at the curve."""
         del sample
         on = self._on(p)
-        if on.edges is None:
+        if self._is_empty:
             return 0.0, 0.0
         x = on.unit(p)
-        sums, unit = sum_over_edges(on.edges, x, variation=True), epsilon_at(x)
+        sums, unit = on.sums(x, variation=True), epsilon_at(x)
         distance = sums.distance - 4 * unit
         known = (distance > 0) & (sums.distance > 2 * on.rounding)  # see `evaluate`
         share = dr.select(known, dr.square(dr.square(sums.distance / distance)), dr.inf)
-        slope = (SLOPE_ROUNDINGS * 2 / 3) * unit * sums.second * share / on.size
-        second = 0.5 * SECOND_ROUNDINGS * unit * sums.second / sums.distance * share
+        slope = (SLOPE_ROUNDINGS * 2 / 3) * unit * sums.bend * share / on.size
+        second = 0.5 * SECOND_ROUNDINGS * unit * sums.bend / sums.distance * share
         return slope, second / (on.size * on.size)
 
     def closest_on_boundary(self, p: Vec3) -> Vec3 | None:
         """The closest point of the curve, edges that cancel left out (`uncancelled_edges`)."""
-        if not self._net:
+        if self._is_empty:
             return None
         on = self._on(p)
-        centre = to_numpy(on.centre).reshape(3).astype(np.float64)
-        start, end = ((q - centre) / self._size for q in uncancelled_edges(self._net))
-        nearest = closest_on_segments(segments(on.backend, start, end), on.unit(p))
+        x = on.unit(p)
+        nearest, square = on.backend.Array3f(0), on.backend.Float(dr.inf)
+        if self._net:
+            centre = to_numpy(on.centre).reshape(3).astype(np.float64)
+            start, end = ((q - centre) / self._size for q in uncancelled_edges(self._net))
+            nearest = closest_on_segments(segments(on.backend, start, end), x)
+            square = dr.squared_norm(x - nearest)
+        if on.circles is not None:
+            other, apart = on.circles.closest(x)
+            nearest = dr.select(apart < square, other, nearest)
         return nearest * on.size + on.centre
 
     def parameters(self) -> tuple[Any, ...]:
@@ -234,11 +325,19 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         backend = backend_of(p)
         # Vertices that can be moved one by one are all there: moved, edges cancel no longer.
         loops = (self.vertices,) if self.vertices is not None else self._net
-        return differentiable_angle(backend, loops, p)
+        angle = differentiable_angle(backend, loops, p)
+        on = self._on(p)
+        if on.circles is None:
+            return angle
+        # To first order in p, as its loop cannot be passed in reverse.
+        with dr.suspend_grad():
+            q = dr.detach(p)
+            own = on.circles.sums(on.unit(q))
+        return angle + own.angle + dr.dot(own.gradient / on.size, p - q)
 
     def check_levels(self, levels: tuple[float, ...]) -> None:
         for level in levels:
-            if not self._net and abs(math.remainder(float(level), _PERIOD)) < _NARROW:
+            if self._is_empty and abs(math.remainder(float(level), _PERIOD)) < _NARROW:
                 raise ValueError(
                     f"level {level:g}: all edges of this curve cancel each other, so that its "
                     "solid angle is 0 everywhere modulo 4 pi, and no surface is where it takes "
@@ -262,23 +361,25 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         return self._extents[levels]
 
     def _extent(self, levels: tuple[float, ...]) -> Volume | None:
-        points = np.concatenate(self._net or self.loops)
+        points = self._points_around()
         away = [abs(math.remainder(float(level), _PERIOD)) for level in levels]
         nearest = min(away)
         if nearest < _NARROW:
             return None
-        if not self._net:
+        if self._is_empty:
             return ConvexHull.of(points)  # holds what there is: nothing
         if self.convex_position and nearest > 2 * math.pi * (1 - 1e-9):
             return ConvexHull.of(points).padded(1e-4 * self._size)
-        reach = 1.0001 * total_length(self._net) / math.sqrt(nearest * (_PERIOD - nearest))
-        return tight_extent(
-            self._net, points.min(axis=0) - reach, points.max(axis=0) + reach, levels
-        )
+        length = sum(one.length for one in self._net_circles)
+        length += total_length(self._net) if self._net else 0.0
+        reach = 1.0001 * length / math.sqrt(nearest * (_PERIOD - nearest))
+        lower, upper = points.min(axis=0) - reach, points.max(axis=0) + reach
+        return tight_extent(self._net, self._net_circles, lower, upper, levels)
 
     def describe(self) -> dict[str, Any]:
         return {
-            "loops": len(self.loops),
+            "loops": len(self.loops) + len(self.circles),
+            "circles": len(self.circles),
             "vertices": sum(len(loop) for loop in self.loops),
             "cancelled edges": sum(map(len, self.loops)) - sum(map(len, self._net)),
             "convex position": self.convex_position,
@@ -290,6 +391,7 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
 class _CurveBuffers(UnitCoordinates):
     """The edges on a backend, None if there are none.
 
+    circles: likewise. plane: normal (x, y, z) and offset of the `PlanarRegion`, if there is one.
     rounding: how far a point may be from where it was meant to be, in units of the curve. Near the
         curve p - centre is exact, division and the curve's own coordinates have a few roundings of
         size 1, and p itself was rounded once, at the curve's distance from 0.
@@ -297,21 +399,76 @@ class _CurveBuffers(UnitCoordinates):
     """
 
     edges: LoopEdges | None
+    circles: Circles | None
+    plane: tuple[Real, ...] | None
     rounding: Real
     value_rounding: Real
 
+    def height(self, x: Vec3) -> Real:
+        """Of x over the plane."""
+        assert self.plane is not None
+        return dr.dot(self.backend.Array3f(*self.plane[:3]), x) - self.plane[3]
 
-def _along_edges(
-    on: _CurveBuffers, x: Vec3, sums: EdgeSums, direction: Vec3 | None
+    def sums(self, x: Vec3, *, variation: bool) -> CurveSums:
+        """All sums at x, in unit coordinates; those that bound the variation only if asked for."""
+        parts: list[CurveSums] = []
+        if self.edges is not None:
+            one = sum_over_edges(self.edges, x, variation=variation)
+            first, second = one.first, one.second
+            parts.append(CurveSums(one.angle, one.gradient, one.distance, first, second, second))
+        if self.circles is not None:
+            own = self.circles.sums(x)
+            parts.append(
+                CurveSums(
+                    own.angle, own.gradient, own.distance, own.first, own.second, own.bend, own
+                )
+            )
+        return functools.reduce(CurveSums.plus, parts)
+
+
+@dataclass(frozen=True)
+class CurveSums:
+    """Sums over edges and circles, as `EdgeSums`; bend: a third of a bound of second derivatives.
+
+    circles: those over circles alone, None if there are none.
+    """
+
+    angle: Real
+    gradient: Vec3
+    distance: Real
+    first: Real
+    second: Real
+    bend: Real
+    circles: CircleSums | None = None
+
+    def plus(self, other: CurveSums) -> CurveSums:
+        """The sums of both."""
+        return CurveSums(
+            self.angle + other.angle,
+            self.gradient + other.gradient,
+            fmin(self.distance, other.distance),
+            self.first + other.first,
+            self.second + other.second,
+            self.bend + other.bend,
+            other.circles if self.circles is None else self.circles,
+        )
+
+
+def _along_curves(
+    on: _CurveBuffers, x: Vec3, sums: CurveSums, direction: Vec3 | None
 ) -> tuple[LineLipschitz, ...]:
     """What is known at x, in unit coordinates, along a direction, if one is given."""
-    edges = on.edges
-    if direction is None or edges is None:
+    if direction is None:
         return ()
     line = Line(x, on.backend.Array3f(direction), on.rounding)
 
     def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
-        return rates_along(edges, line, lengths, active)
+        found: list[tuple[Real, ...]] = []
+        if on.edges is not None:
+            found.append(rates_along(on.edges, line, lengths, active))
+        if on.circles is not None:
+            found.append(on.circles.rates_along(line, lengths, active))
+        return tuple(sum(several) for several in zip(*found, strict=True))
 
     known = known_along(line, sums.gradient, sums.distance, rates)
     return tuple(LineLipschitz(one.constant / on.size, one.radius * on.size) for one in known)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, cast
 
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from harnack.geometry import Volume
 
 _MOST_SEGMENTS = 1_000_000
+# Segments in a group, and how many there are at least where groups are made.
+_GROUP, _MANY = 8, 64
 # Where the broken line bends, in parts of the length looked ahead.
 _KNOTS = (0.125, 0.25, 0.5, 1.0)
 
@@ -36,6 +38,8 @@ class Tube(Solid):
     """The points within `radius` of a polyline.
 
     points: (n, 3) its vertices, one after the other; repeat the first to close it.
+    starts: indices of vertices at which another polyline starts, that the one before does not lead
+        to: see `around`.
     flattening: how far the polyline is at most from the curve that it stands for, so that the
         surface is as far from that of the curve: see `bezier`.
 
@@ -45,6 +49,7 @@ class Tube(Solid):
 
     points: FloatArray
     radius: float
+    starts: tuple[int, ...] = field(default=(), kw_only=True)
     flattening: float = field(default=0.0, kw_only=True)
 
     lipschitz = 1.0
@@ -55,14 +60,37 @@ class Tube(Solid):
         points = np.array(array, dtype=np.float64)
         check_finite(points, "point {} of a tube", ValueError)
         check_size(points, ValueError)
-        if len(points):
-            moves = np.any(points[1:] != points[:-1], axis=1)
-            points = points[np.concatenate([[True], moves])]
-        if len(points) < 2:
-            raise ValueError("a tube needs two points or more that differ: use Sphere for one")
+        parts: list[FloatArray] = []
+        for part in np.split(points, self.starts):
+            if len(part):
+                moves = np.any(part[1:] != part[:-1], axis=1)
+                part = part[np.concatenate([[True], moves])]
+            if len(part) < 2:
+                raise ValueError("a tube needs two points or more that differ: use Sphere for one")
+            parts.append(part)
+        points = np.concatenate(parts)
+        ends = np.cumsum([len(part) for part in parts])[:-1]
+        object.__setattr__(self, "starts", tuple(int(one) for one in ends))
         points.setflags(write=False)
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "radius", positive(self.radius, "the radius of a tube"))
+
+    @classmethod
+    def around(cls, polylines: Iterable[npt.ArrayLike], radius: float) -> Tube:
+        """The points within `radius` of any of several polylines (n_i, 3): one distance for all.
+
+        Raises:
+            ValueError: no polylines, or one that is none; TypeError: not numbers.
+        """
+        parts: list[FloatArray] = []
+        for k, one in enumerate(polylines):
+            array = real_array(one, f"polyline {k} of a tube")
+            check_vectors(array, f"polyline {k} of a tube")
+            parts.append(np.array(array, dtype=np.float64))
+        if not parts:
+            raise ValueError("a tube needs a polyline, and there are none")
+        ends = np.cumsum([len(part) for part in parts])[:-1]
+        return cls(np.concatenate(parts), radius, starts=tuple(int(one) for one in ends))
 
     @classmethod
     def bezier(
@@ -109,7 +137,8 @@ class Tube(Solid):
         return change(self)
 
     def describe(self) -> dict[str, Any]:
-        return {"segments": len(self.points) - 1, "flattening": self.flattening}
+        segments = len(self.points) - 1 - len(self.starts)
+        return {"segments": segments, "flattening": self.flattening}
 
     def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         if above:
@@ -122,9 +151,16 @@ class Tube(Solid):
     @prepared_once
     def prepare(self, backend: Backend) -> Tube:
         made = copy.copy(self)
-        start, side = self.points[:-1], np.diff(self.points, axis=0)
+        joined = np.ones(len(self.points) - 1, dtype=np.bool_)
+        joined[[one - 1 for one in self.starts]] = False
+        start, side = self.points[:-1][joined], np.diff(self.points, axis=0)[joined]
         rows = np.column_stack([start, side, 1.0 / np.sum(side * side, axis=1)])
+        groups = None
+        if len(rows) >= _MANY:
+            rows, balls = _grouped(rows)
+            groups = Records.upload(backend, balls)
         object.__setattr__(made, "_records", Records.upload(backend, rows))
+        object.__setattr__(made, "_groups", groups)
         object.__setattr__(made, "_radius", dr.opaque(backend.Float, self.radius))
         return made
 
@@ -181,7 +217,11 @@ class Tube(Solid):
 
         zero = 0 * p.x
         start = (zero + dr.inf, zero, zero, zero, zero, *(zero + dr.inf for _ in knots))
-        found = records.for_each(body, start, "tube")
+        groups: Records | None = cast("Any", self)._groups
+        if groups is None:
+            found = records.for_each(body, start, "tube")
+        else:
+            found = _by_groups(p, direction, knots, records, groups, body, start)
         distance, error = found[0], found[4]
         away = vector(*found[1:4])
         gradient = dr.select(distance > 0, away / distance, vector(0))
@@ -193,6 +233,74 @@ class Tube(Solid):
 
     def _number(self, name: str) -> Any:
         return getattr(self, name)
+
+
+def _grouped(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Records of segments in groups of `_GROUP`, the last filled up with copies, and a ball
+    (centre, radius) around each group."""
+    missing = -len(rows) % _GROUP
+    rows = np.concatenate([rows, np.repeat(rows[-1:], missing, axis=0)])
+    ends = np.concatenate([rows[:, :3], rows[:, :3] + rows[:, 3:6]], axis=1)
+    points = ends.reshape(-1, 2 * _GROUP, 3)
+    centres = 0.5 * (points.min(axis=1) + points.max(axis=1))
+    radii = np.linalg.norm(points - centres[:, None], axis=2).max(axis=1)
+    return rows, np.column_stack([centres, radii * (1 + 1e-5)])
+
+
+def _by_groups(
+    p: Vec3,
+    direction: Vec3 | None,
+    knots: tuple[Real, ...],
+    records: Records,
+    groups: Records,
+    body: Callable[[list[Real], tuple[Any, ...]], tuple[Any, ...]],
+    start: tuple[Any, ...],
+) -> tuple[Any, ...]:
+    """As `body` for all segments, but groups that are far away stand for theirs as balls.
+
+    Proof. A segment in a ball of radius r about c is at least |p - c| - r and at most |p - c| + r
+    away. So the nearest segment is in no group whose ball begins farther away than another one
+    ends. The distance from the ball, which bounds that of all its segments, is convex along the
+    ray as well, and lies above its own tangent.
+    """
+    real, vector = cast("Any", type(p.x)), cast("Any", type(p))
+    unit = 2 * float(dr.epsilon(real))
+
+    def bound(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+        return (fmin(dr.norm(p - vector(*row[:3])) + row[3], state[0]),)
+
+    (most,) = groups.for_each(bound, (real(dr.inf),), "tube groups")
+    limit = most * (1 + 16 * unit) + 16 * unit * dr.norm(p)
+
+    def visit(i: Any, *state: Any) -> tuple[Any, ...]:
+        row = groups.row(i)
+        away = p - vector(*row[:3])
+        distance = dr.norm(away)
+        is_near = distance - row[3] <= limit
+        found = list(state)
+        if direction is not None:
+            off = 8 * unit * (dr.norm(p) + distance + row[3])
+            slope = fmax(dr.dot(away, direction) / distance - 2 * off / distance, -1)
+            for k, knot in enumerate(knots):
+                low = dr.fma(knot, slope, distance - row[3] - off) - 4 * unit * (distance + knot)
+                low = dr.select(is_near, dr.inf, low)
+                found[5 + k] = fmin(low, found[5 + k])
+
+        def each(j: Any, *inner: Any) -> tuple[Any, ...]:
+            return j + 1, *body(records.row(i * _GROUP + j), inner)
+
+        def more(j: Any, *_: Any) -> Any:
+            return j < last
+
+        last = dr.select(is_near, type(i)(_GROUP), type(i)(0))
+        inside = dr.while_loop((type(i)(0), *found), more, each, label="tube")
+        return i + 1, *inside[1:]
+
+    def more_groups(i: Any, *_: Any) -> Any:
+        return i < groups.trips
+
+    index = groups.backend.UInt32(0)
+    return dr.while_loop((index, *start), more_groups, visit, label="tube by groups")[1:]
 
 
 @dataclass(frozen=True)

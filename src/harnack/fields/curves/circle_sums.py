@@ -1,0 +1,256 @@
+"""Sums over circles at a point: solid angles, derivatives, distances and what bounds them.
+
+For a circle of radius a, of which the nearest point is at distance d and the farthest at P, Biot
+and Savart's integrals are bounded by
+
+    |grad Omega| <= integral of |dp|/D^2 = 2 pi a/(P d)
+
+(D^2 = A - 2r cos(phi) has this integral exactly; attained at the centre), and
+
+    integral of |dp|/D^3 = 4 a E/(P d^2) <= 2 pi a B,   B = sqrt((1/d^2 + 1/P^2)/2)/(P d),
+
+as E <= (pi/2) sqrt((1 + kc^2)/2) by Jensen's inequality for the root. Walking by t, both distances
+fall by at most t, and both bounds fall with both distances. Hence, within s < d of a point:
+
+- Variation. |Omega(y) - Omega(x)| <= integral over [0, s] of 2 pi a g(t) dt, g(t) = 1/((P-t)(d-t)).
+  g is convex, so up to t = d/2 it lies below its chord there: with s <= d/2 the integral is at most
+  2 pi a [s/(P d) + (s/d)^2 (2/(P - d/2) - 1/P)].
+- Curvature. The second derivative along a unit direction v is a sum of 3 (v.D)(v.(D x dp))/D^5, and
+  |(v.D)(v.(D x dp))| <= D^2 |dp|/2, as D and D x dp are at right angles: |v.H.v| <= 3 pi a B.
+- Lines. Points at r from the axis are at least |r - a| from the circle, which tells of a line that
+  passes beside it more than the distance of one of its points does. At height z above the circle's
+  plane the gradient's part along the plane is at most |z| times the integral of |dp|/D^3. A line
+  with the component w along the normal sees no more than |w| 2 pi a/(P d) + sqrt(1-w^2) |z| 2 pi a
+  B, which is small where it runs along the plane.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend.extrema import clamp, fmax, fmin
+from harnack.backend.records import Records
+from harnack.fields.curves.circle import UnitCircle
+from harnack.fields.symmetric import SymmetricSum
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, FloatArray, Mask, Real, Vec3
+    from harnack.fields.edges.edge_passing import Line
+    from harnack.geometry.circles import Circle
+
+__all__ = ["CircleSums", "Circles"]
+
+
+@dataclass(frozen=True)
+class CircleSums:
+    """Sums over circles at x.
+
+    angle, gradient: of the solid angle; each circle's is in (-2 pi, 2 pi).
+    distance: to the nearest circle.
+    first, second: a circle varies by at most 2 r first + 4 r^2 second within r <= d/2.
+    bend: of pi a B; three times it bounds second derivatives.
+    lower, upper: a range of the lift on the ball of the radius `distance`: see `planar_window`.
+    """
+
+    angle: Real
+    gradient: Vec3
+    distance: Real
+    first: Real
+    second: Real
+    bend: Real
+    lower: Real
+    upper: Real
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """A circle of radius a as seen from x: outward is the part of x - centre in its plane, of
+    length r a, and x is z a above it."""
+
+    a: Real
+    normal: Vec3
+    outward: Vec3
+    circle: UnitCircle
+
+    @property
+    def distance(self) -> Real:
+        return self.a * self.circle.nearest
+
+    @property
+    def farthest(self) -> Real:
+        return self.a * self.circle.farthest
+
+
+@dataclass(frozen=True)
+class Circles:
+    """Circles on a backend, as records of centre, radius and normal, in units of order one."""
+
+    records: Records
+
+    @classmethod
+    def upload(
+        cls, backend: Backend, circles: Sequence[Circle], centre: FloatArray, size: float
+    ) -> Circles:
+        """Circles in coordinates with another centre, divided by a size."""
+        rows = [
+            [*(np.array(one.centre) - centre) / size, one.radius / size, *one.normal, 0.0]
+            for one in circles
+        ]
+        return cls(Records.upload(backend, np.array(rows)))
+
+    def sums(self, x: Vec3) -> CircleSums:
+        """All sums at x in one loop."""
+        real, vector = self._types
+        x = vector(x)
+
+        def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+            angle, gradient, distance, first, second, bend, lower = state
+            seen = self._seen(row, x)
+            circle, a = seen.circle, seen.a
+            # Lengths times 1/a here, divided out at the end: all of it stays of order one.
+            gradient = dr.fma(vector(circle.across / (a * a)), seen.outward, gradient)
+            gradient = dr.fma(vector(circle.axial / a), seen.normal, gradient)
+            near, far = circle.nearest, circle.farthest
+            slope = math.pi / (near * far)
+            rise = 2 / (far - 0.5 * near) - 1 / far
+            mean = dr.sqrt(0.5 * (dr.rcp(near * near) + dr.rcp(far * far)))
+            above = circle.angle < 0
+            window = dr.select(circle.r < 1, dr.select(above, real(-4 * math.pi), 0), -2 * math.pi)
+            return (
+                angle + circle.angle,
+                gradient,
+                fmin(seen.distance, distance),
+                first + slope / a,
+                second + 0.5 * math.pi * rise / (near * near * a * a),
+                bend + slope * mean / (a * a),
+                lower + window,
+            )
+
+        start = (real(0), vector(0), real(dr.inf), real(0), real(0), real(0), real(0))
+        angle, gradient, distance, first, second, bend, lower = self.records.for_each(
+            add, start, "circles"
+        )
+        upper = lower + 4 * math.pi * real(self.records.trips)
+        return CircleSums(angle, gradient, distance, first, second, bend, lower, upper)
+
+    def angle_and_variation(self, x: Vec3, reach: Real) -> tuple[Real, Real, Real]:
+        """The sum of solid angles at x, the distance, and a bound of the variation of the lift
+        within `reach`; infinite where that is farther than a circle."""
+        real, vector = self._types
+        x = vector(x)
+
+        def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+            angle, distance, variation = state
+            seen = self._seen(row, x)
+            near = seen.distance - reach
+            rise = 2 * math.pi * seen.a / (seen.farthest - reach) * dr.log(1 + reach / near)
+            return (
+                angle + seen.circle.angle,
+                fmin(seen.distance, distance),
+                variation + dr.select(near > 0, rise, dr.inf),
+            )
+
+        start = (real(0), real(dr.inf), real(0))
+        angle, distance, variation = self.records.for_each(add, start, "circle extent")
+        return angle, distance, variation
+
+    def hessian(self, x: Vec3) -> SymmetricSum:
+        """The Hessian of the sum of solid angles."""
+        real, vector = self._types
+        x = vector(x)
+
+        def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+            seen = self._seen(row, x)
+            a, n, e = seen.a, seen.normal, seen.outward
+            along, mixed, around = seen.circle.second_derivatives()
+            share = dr.rcp(a * a)
+            length = dr.norm(e)
+            out = dr.select(length > 0, e / length, 0)
+            # f_tt (I - n n - out out) + f_rr out out + f_zz n n + f_rz (n out + out n)
+            total = SymmetricSum(*state)
+            total = total.plus(n, ((along - around) * share) * n)
+            total = total.plus(out, ((-along - 2 * around) * share) * out)
+            total = total.plus(n, (2 * mixed * share / a) * e)
+            return (*(one + around * share for one in total.parts()[:3]), *total.parts()[3:])
+
+        start = SymmetricSum.zero(real).parts()
+        return SymmetricSum(*self.records.for_each(add, start, "circle hessian"))
+
+    def rates_along(self, line: Line, lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
+        """For each length T, a bound of the derivative along the line up to T to both sides; inf
+        where a circle may be as near as that, and on lanes that are not active."""
+        real, vector = self._types
+
+        def add(row: list[Real], rates: tuple[Any, ...]) -> tuple[Any, ...]:
+            seen = self._seen(row, line.x)
+            slack, up = line.slack, fmin(dr.abs(dr.dot(seen.normal, line.v)), 1)
+            across = dr.sqrt(fmax(1 - up * up, 0))
+            # Of two numbers of order one: their rounding is not small beside them.
+            up += 4 * float(dr.epsilon(line.x))
+            height = dr.abs(seen.circle.z) * seen.a + slack
+            # The line seen along the axis: at s it is |outward + s along| from there.
+            along = dr.fma(vector(-dr.dot(seen.normal, line.v)), seen.normal, line.v)
+            square = dr.squared_norm(along)
+            foot = dr.select(square > 0, -dr.dot(seen.outward, along) / square, 0)
+            grown: list[Real] = []
+            for length, rate in zip(lengths, rates, strict=True):
+                ends = (clamp(foot, -length, length), -length, length)
+                low, one, other = (dr.norm(dr.fma(vector(s), along, seen.outward)) for s in ends)
+                passing = fmax(low - seen.a, seen.a - fmax(one, other))
+                near = fmax(seen.distance - length, passing) - slack
+                far = fmax(seen.farthest - length, near + slack) - slack
+                slope = 2 * math.pi * seen.a / (near * far)
+                mean = dr.sqrt(0.5 * (dr.rcp(near * near) + dr.rcp(far * far)))
+                highest = dr.fma(length, up, height)
+                term = slope * dr.fma(across * highest, mean, up)
+                grown.append(rate + dr.select(near > 0, term, dr.inf))
+            return tuple(grown)
+
+        start = tuple(real(0) for _ in lengths)
+        rates = self.records.for_each(add, start, "circles along", active)
+        return tuple(dr.select(active, rate, dr.inf) for rate in rates)
+
+    def closest(self, x: Vec3) -> tuple[Vec3, Real]:
+        """The point of the circles that is closest to x, and the square of its distance."""
+        real, vector = self._types
+        x = vector(x)
+
+        def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+            best, nearest = state
+            seen = self._seen(row, x)
+            # On the axis every point is as near: any direction in the plane will do.
+            length = dr.norm(seen.outward)
+            aside = dr.normalize(_across(vector, seen.normal))
+            out = dr.select(length > 0, seen.outward / length, aside)
+            foot = dr.fma(vector(seen.a), out, vector(*row[:3]))
+            square = dr.squared_norm(x - foot)
+            closer = square < nearest
+            return dr.select(closer, foot, best), dr.select(closer, square, nearest)
+
+        return self.records.for_each(add, (vector(0), real(dr.inf)), "nearest circle")
+
+    @property
+    def _types(self) -> tuple[Any, Any]:
+        return self.records.backend.Float, self.records.backend.Array3f
+
+    def _seen(self, row: list[Real], x: Vec3) -> _Seen:
+        vector = self.records.backend.Array3f
+        centre, a, normal = vector(*row[:3]), row[3], vector(*row[4:7])
+        away = x - centre
+        height = dr.dot(normal, away)
+        # A second projection takes out what the normal, rounded, has left of the first.
+        outward = dr.fma(vector(-height), normal, away)
+        outward = dr.fma(vector(-dr.dot(normal, outward)), normal, outward)
+        return _Seen(a, normal, outward, UnitCircle.at(dr.norm(outward) / a, height / a))
+
+
+def _across(vector: Any, n: Vec3) -> Vec3:
+    """A vector at right angles to n, not short."""
+    flat = dr.abs(n.z) < 0.7
+    return dr.select(flat, vector(-n.y, n.x, 0), vector(0, -n.z, n.y))

@@ -1,0 +1,193 @@
+"""Grid shells: solid angles of outlines with round holes, with their lines of curvature.
+
+After Fig. 17 of Gillespie et al. (2024), whose data are not public: outlines and holes are
+reconstructed. The level -2 pi + a leaves the ground at the angle a/2 everywhere, so that outline
+and holes are lines of curvature themselves (Joachimsthal), and lines of the other family meet them
+at right angles: beams that can be built.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from harnack.backend import FloatArray
+from harnack.distance import Family, curvature_lines
+from harnack.fields import SolidAngle, Tube
+from harnack.gallery.scene import DRAWN, Scene
+from harnack.geometry import Circle, HalfSpace
+from harnack.rendering import Camera
+from harnack.tracer import LevelSet, level_set
+
+_FAMILIES: tuple[Family, Family] = ("largest", "smallest")
+
+
+@dataclass(frozen=True)
+class GridShell:
+    """A shell over the region of the ground between an outline and holes.
+
+    outline: (n, 2), counter-clockwise. holes: (x, y, radius) each.
+    angle: a, twice the angle at which it leaves the ground.
+    spacing: of the beams, on the outline and the holes. thickness: radius of the beams.
+    """
+
+    outline: FloatArray
+    holes: tuple[tuple[float, float, float], ...]
+    angle: float
+    spacing: float
+    thickness: float
+
+    def field(self) -> SolidAngle:
+        """The solid angle, whose level `level` is the shell."""
+        corners = np.column_stack([self.outline, np.zeros(len(self.outline))])
+        return SolidAngle([corners, *(Circle(r, (x, y, 0), (0, 0, -1)) for x, y, r in self.holes)])
+
+    @property
+    def level(self) -> float:
+        return -2 * math.pi + self.angle
+
+    def beams(self, field: SolidAngle) -> list[FloatArray]:
+        """Lines from the rims across the shell, lines that cross these, and the rims."""
+        above = HalfSpace((0, 0, -1), 0.0)
+        points, inward = self._rims()
+        slope = 0.5 * self.angle
+        rise = np.column_stack([math.cos(slope) * inward, np.full(len(points), math.sin(slope))])
+        ground = np.column_stack([points, np.zeros(len(points))])
+
+        def lines(seeds: FloatArray) -> tuple[list[FloatArray], list[FloatArray]]:
+            step = 0.25 * self.spacing
+            one, other = (
+                curvature_lines(field, seeds, step=step, length=100 * step, family=family,
+                                level=self.level, clip=above)
+                for family in _FAMILIES
+            )  # fmt: skip
+            return one, other
+
+        near = 0.3 * self.spacing
+        crossing = [
+            max(pair, key=lambda line: _rise_above(line, near))
+            for pair in zip(*lines(ground + near * rise), strict=True)
+        ]
+        kept = _apart(crossing, 0.55 * self.spacing)
+        # Along some of them, seeds of the other family.
+        spines = kept[:: max(1, len(kept) // 6)]
+        seeds = np.concatenate([spine[2:-2:2] for spine in spines])
+        along = [
+            min(pair, key=lambda line: min(_agreement(line, spine) for spine in spines))
+            for pair in zip(*lines(seeds), strict=True)
+        ]
+        return [*kept, *_apart(along, 0.55 * self.spacing), *self._edges()]
+
+    def _rims(self) -> tuple[FloatArray, FloatArray]:
+        """Points (n, 2) of the rims, and unit vectors from there into the region."""
+        points: list[FloatArray] = []
+        inward: list[FloatArray] = []
+        for a, b in zip(self.outline, np.roll(self.outline, -1, axis=0), strict=True):
+            length = float(np.linalg.norm(b - a))
+            count = max(1, round(length / self.spacing))
+            share = (np.arange(count)[:, None] + 0.5) / count
+            points.append(a + share * (b - a))
+            inward.append(np.tile(np.array([a[1] - b[1], b[0] - a[0]]) / length, (count, 1)))
+        for x, y, r in self.holes:
+            count = max(8, round(2 * math.pi * r / self.spacing))
+            turn = 2 * math.pi * (np.arange(count) + 0.5) / count
+            out = np.column_stack([np.cos(turn), np.sin(turn)])
+            points.append(np.array([x, y]) + r * out)
+            inward.append(out)
+        return np.concatenate(points), np.concatenate(inward)
+
+    def _edges(self) -> list[FloatArray]:
+        closed = np.concatenate([self.outline, self.outline[:1]])
+        edges = [np.column_stack([closed, np.zeros(len(closed))])]
+        for x, y, r in self.holes:
+            ring = Circle(r, (x, y, 0.0)).polygon(32)
+            edges.append(np.concatenate([ring, ring[:1]]))
+        return edges
+
+
+def _rise_above(line: FloatArray, reach: float) -> float:
+    """How far from its start, over the reach, a line gets: lines along a rim stay beside it."""
+    return float(line[:, 2].max() - line[:, 2].min()) / reach if len(line) else -1.0
+
+
+def _agreement(line: FloatArray, other: FloatArray) -> float:
+    """|cos| of the angle at which a line crosses another that passes through its middle."""
+    if len(line) < 3:
+        return 2.0
+    distance = np.linalg.norm(line[:, None] - other[None], axis=2)
+    i, j = np.unravel_index(int(distance.argmin()), distance.shape)
+    i, j = min(max(int(i), 1), len(line) - 2), min(max(int(j), 1), len(other) - 2)
+    a, b = line[i + 1] - line[i - 1], other[j + 1] - other[j - 1]
+    return float(abs(a @ b) / (np.linalg.norm(a) * np.linalg.norm(b)))
+
+
+def _apart(lines: Sequence[FloatArray], gap: float) -> list[FloatArray]:
+    """The lines, longest first, that do not run beside one that was kept for most of their way;
+    of each, every second point."""
+    kept: list[FloatArray] = []
+    for line in sorted(lines, key=len, reverse=True):
+        if len(line) < 3:
+            continue
+        if kept:
+            others = np.concatenate(kept)
+            nearest = np.linalg.norm(line[:, None] - others[None], axis=2).min(axis=1)
+            if (nearest < gap).mean() > 0.6:
+                continue
+        kept.append(line)
+    return [np.concatenate([line[:-1:2], line[-1:]]) for line in kept]
+
+
+def _drawn(shell: GridShell) -> list[LevelSet]:
+    field = shell.field()
+    ground = HalfSpace((0, 0, -1), 0.0)
+    beams = Tube.around(shell.beams(field), shell.thickness)
+    return [
+        level_set(field, shell.level, clip=ground, tolerance=DRAWN),
+        level_set(beams, solid=(-math.inf, 0.0), tolerance=DRAWN),
+    ]
+
+
+def _regular(sides: int) -> FloatArray:
+    turn = 2 * math.pi * (np.arange(sides) + 0.5) / sides
+    return np.column_stack([np.cos(turn), np.sin(turn)])
+
+
+# The Great Court of the British Museum (Williams 2001), in units of half its width.
+_UNIT = 36.625
+_COURT = np.array([(-36.625, -51.125), (36.625, -51.125), (36.625, 46.025), (-36.625, 46.025)])
+_PAVILION = np.array(
+    [(-1.6, -1), (0.2, -1.15), (1.7, -0.8), (1.9, 0.4), (0.6, 1.1), (-1.1, 1), (-1.9, 0.2)]
+)
+_COLUMNS = ((-1.1, -0.3), (0.0, -0.5), (1.1, -0.2), (0.9, 0.5), (-0.5, 0.4))
+
+SHELLS = (
+    Scene(
+        "shell-ring",
+        "a grid shell over a 12-gon with a round hole (after the paper's Fig. 17)",
+        lambda: _drawn(GridShell(_regular(12), ((0.0, 0.0, 0.4),), 1.4, 0.13, 0.006)),
+        ("porcelain", "copper"),
+        Camera(azimuth=-60, elevation=34),
+        show="shaded",
+    ),
+    Scene(
+        "shell-court",
+        "a grid shell over the Great Court of the British Museum (after the paper's Fig. 17)",
+        lambda: _drawn(GridShell(_COURT / _UNIT, ((0.0, 0.0, 22.245 / _UNIT),), 1.2, 0.15, 0.008)),
+        ("porcelain", "copper"),
+        Camera(azimuth=-60, elevation=34),
+        show="shaded",
+    ),
+    Scene(
+        "shell-columns",
+        "a grid shell on five columns (after the paper's Fig. 17)",
+        lambda: _drawn(
+            GridShell(_PAVILION, tuple((x, y, 0.13) for x, y in _COLUMNS), 1.2, 0.16, 0.008)
+        ),
+        ("porcelain", "copper"),
+        Camera(azimuth=-60, elevation=38),
+        show="shaded",
+    ),
+)

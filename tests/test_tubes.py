@@ -1,0 +1,77 @@
+"""Tubes around many polylines, whose segments are looked at in groups."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import numpy as np
+import pytest
+
+import harnack as hk
+from harnack.testing import check_field
+
+
+def polylines(count: int) -> list[np.ndarray]:
+    rng = np.random.default_rng(count)
+    return [
+        rng.uniform(-1, 1, 3) + np.cumsum(0.06 * rng.normal(size=(int(rng.integers(2, 30)), 3)), 0)
+        for _ in range(count)
+    ]
+
+
+def distance(x: np.ndarray, lines: list[np.ndarray]) -> np.ndarray:
+    """From points (n, 3) to the nearest segment, one by one."""
+    nearest = np.full(len(x), np.inf)
+    for line in lines:
+        for a, b in itertools.pairwise(line):
+            share = np.clip((x - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
+            away = np.linalg.norm(x - a - share[:, None] * (b - a), axis=1)
+            nearest = np.minimum(nearest, away)
+    return nearest
+
+
+@pytest.mark.parametrize("precision", ["single", "double"])
+@pytest.mark.parametrize("count", [2, 25])
+def test_the_distance_is_that_from_the_nearest_of_all(count: int, precision: Any) -> None:
+    """With few segments one by one, with many in groups; nothing joins one line to the next."""
+    lines = polylines(count)
+    tube = hk.Tube.around(lines, 0.03)
+    assert tube.describe()["segments"] == sum(len(line) - 1 for line in lines)
+    x = np.random.default_rng(1).uniform(-1.3, 1.3, (2000, 3))
+    x[:200] = np.concatenate(lines * 200)[:200]  # at vertices themselves
+    found = tube.value(x, precision=precision)
+    small = 2e-6 if precision == "single" else 1e-14
+    np.testing.assert_allclose(found, distance(x, lines) - 0.03, atol=small)
+
+
+def test_contracts_of_tubes_in_groups() -> None:
+    check_field(hk.Tube.around(polylines(25), 0.03))
+
+
+@pytest.mark.parametrize("precision", ["single", "double"])
+def test_first_hits_of_tubes_in_groups(precision: Any) -> None:
+    lines = polylines(12)
+    whole = hk.Tube.around(lines, 0.03)
+    rng = np.random.default_rng(2)
+    o = 3 * rng.normal(size=(400, 3))
+    aim = np.concatenate(lines)[rng.integers(0, sum(map(len, lines)), 400)]
+    d = aim + 0.03 * rng.normal(size=(400, 3)) - o
+    found = hk.trace(whole, o, d, precision=precision, tolerance=1e-5)
+    first = np.min([hk.trace(hk.Tube(one, 0.03), o, d, precision=precision, tolerance=1e-5).t
+                    for one in lines], axis=0)  # fmt: skip
+    assert (found.status != hk.Status.OUT_OF_STEPS).all()
+    assert found.hit.mean() > 0.3
+    # Rays that graze the tube within the tolerance may hit one and not the other.
+    both = np.isfinite(found.t) & np.isfinite(first)
+    assert (np.isfinite(found.t) != np.isfinite(first)).mean() < 0.01
+    assert (np.abs(found.t[both] - first[both]) < 2e-3).mean() > 0.99
+
+
+def test_what_is_no_bundle_of_tubes() -> None:
+    with pytest.raises(ValueError, match="there are none"):
+        hk.Tube.around([], 0.1)
+    with pytest.raises(ValueError, match="two points or more"):
+        hk.Tube.around([[[0, 0, 0], [1, 0, 0]], [[0, 0, 1.0]]], 0.1)
+    with pytest.raises(ValueError, match="polyline 1 of a tube"):
+        hk.Tube.around([[[0, 0, 0], [1, 0, 0]], [[0, 0.0]]], 0.1)
