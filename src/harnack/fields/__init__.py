@@ -9,6 +9,7 @@ from harnack.fields.blobs.kernels import Compact, Cubic, Gaussian, Kernel, Sexti
 from harnack.fields.blobs.molecule import Molecule
 from harnack.fields.clouds.dipole import DipolePotential
 from harnack.fields.clouds.screened import ScreenedWindingNumber
+from harnack.fields.curves.polygon_mesh import PolygonMesh
 from harnack.fields.curves.solid_angle import SolidAngle
 from harnack.fields.expressions.expression import expression
 from harnack.fields.field import Field, Sample
@@ -67,6 +68,7 @@ __all__ = [
     "Noise",
     "Plane",
     "PlaneWave",
+    "PolygonMesh",
     "Product",
     "Sample",
     "SchwarzD",
