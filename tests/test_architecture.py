@@ -40,6 +40,7 @@ FIELD_ROOMS = (
     "kept",
     "symmetric",
     "unit_coordinates",
+    "boxed_parts",
     "batch",
     "sums",
     "edges",

@@ -32,6 +32,7 @@ from harnack.fields.solids.shapes.round import (
 )
 from harnack.fields.solids.shapes.square import Cuboid, Superellipsoid, Supertorus
 from harnack.fields.solids.shapes.tube import Tube
+from harnack.fields.solids.shapes.tubes import Tubes
 from harnack.fields.solids.solid import Shape, Solid
 from harnack.fields.waves.periodic import EigenfunctionSum, Gyroid, SchwarzD, SchwarzP
 from harnack.fields.waves.waves import PlaneWave, Product, cosine, sine
@@ -84,6 +85,7 @@ __all__ = [
     "Supertorus",
     "Torus",
     "Tube",
+    "Tubes",
     "WindingNumber",
     "cosine",
     "expression",

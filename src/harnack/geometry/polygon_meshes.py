@@ -184,16 +184,15 @@ def _flattened(faces: Any) -> tuple[IntArray, IntArray, IntArray]:
         raise MeshError(f"{len(faces):,} faces are too many: at most {MAX_FACES:,}")
     loops: list[Any] = []
     owners: list[int] = []
-    for k in range(len(faces)):
-        several = _loops_of(faces[k], k)
+    for k, face in enumerate(faces):
+        several = _loops_of(face, k)
         loops += several
         owners += [k] * len(several)
     sizes = np.array([len(loop) for loop in loops], dtype=np.int64)
     if (short := np.flatnonzero(sizes < 3)).size:
-        k = owners[short[0]]
         raise MeshError(
-            f"face {k} has a loop of {sizes[short[0]]} vertices{and_more(short.size)}: a face "
-            "needs three or more; leave it out"
+            f"face {owners[int(short[0])]} has a loop of {sizes[short[0]]} vertices"
+            f"{and_more(short.size)}: a face needs three or more; leave it out"
         )
     corners = np.concatenate(loops).astype(np.int64)
     return corners, sizes, np.array(owners, dtype=np.int64)

@@ -7,19 +7,17 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
 
-import numpy as np
-
 from harnack.backend import FloatArray, IntArray
+from harnack.fields.boxed_parts import BoxedParts
 from harnack.fields.curves.face_boxes import face_boxes
 from harnack.fields.curves.face_curves import PERIOD, FaceCurves
 from harnack.fields.curves.solid_angle import SolidAngle
 from harnack.fields.field import Field
 from harnack.fields.kept import prepared_once
 from harnack.fields.parts import PartEntry
-from harnack.fields.unit_coordinates import UnitCoordinates, placed, single
 from harnack.geometry import Box
 from harnack.geometry.polygon_meshes import PolygonFaces, validate_polygons
-from harnack.tree.boxes import MOST_BOXES, BoxTree
+from harnack.tree.boxes import MOST_BOXES
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -111,22 +109,15 @@ class PolygonMesh(Field):
 
     @prepared_once
     def prepare(self, backend: Backend) -> PolygonMesh:
-        if self._device is not None and self._device.backend is backend:
+        if self._device is not None and self._device.boxes.backend is backend:
             return self
         prepared = copy.copy(self)
         prepared._device = self._upload(backend)
         return prepared
 
     def _upload(self, backend: Backend) -> _MeshBuffers:
-        lower, upper = self.boxes()
-        low, high = lower.min(axis=0), upper.max(axis=0)
-        centre = single(0.5 * (low + high))
-        # A power of two, so that places along rays are scaled exactly, and keep their order.
-        size = 2.0 ** math.ceil(math.log2(np.abs(np.stack([low, high]) - centre).max()))
-        tree = BoxTree.of(backend, (lower - centre) / size, (upper - centre) / size)
-        return _MeshBuffers(
-            *placed(backend, centre, size), tree, FaceCurves.upload(backend, self.faces)
-        )
+        boxes = BoxedParts.upload(backend, *self.boxes())
+        return _MeshBuffers(boxes, FaceCurves.upload(backend, self.faces))
 
     def _on(self) -> _MeshBuffers:
         if self._device is None:
@@ -136,12 +127,7 @@ class PolygonMesh(Field):
     def next_part(
         self, o: Vec3, d: Vec3, after: PartEntry, start: Real, end: Real, active: Mask
     ) -> PartEntry:
-        on = self._on()
-        behind = after.enter / on.size, after.part
-        enter, leave, box = on.tree.next(
-            on.unit(o), d, behind, start / on.size, end / on.size, active
-        )
-        return PartEntry(enter * on.size, leave * on.size, box)
+        return self._on().boxes.next(o, d, after, start, end, active)
 
     def part(self, index: Any) -> Field:
         return self._on().curves.face(index)
@@ -170,8 +156,8 @@ class PolygonMesh(Field):
 
 
 @dataclass(frozen=True)
-class _MeshBuffers(UnitCoordinates):
+class _MeshBuffers:
     """The faces' boxes and curves on a backend."""
 
-    tree: BoxTree
+    boxes: BoxedParts
     curves: FaceCurves
