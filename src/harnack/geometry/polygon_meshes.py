@@ -7,6 +7,7 @@ runs counter-clockwise and holes clockwise. Faces need not be joined, and may cr
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -25,6 +26,7 @@ from harnack.backend.numbers import (
     check_vectors,
     real_array,
 )
+from harnack.geometry.convexity import is_convex_position
 from harnack.geometry.meshes import MAX_FACES, MAX_VERTICES, MeshError
 
 __all__ = ["PolygonFaces", "validate_polygons"]
@@ -35,6 +37,8 @@ _ON_A_LINE = 1e-9
 _TURN = 1e-6
 # Turns of a convex polygon add up to one revolution, to this many radians.
 _REVOLUTION = 1e-6
+# So many faces whose shadows are not convex are examined further, at half a millisecond each.
+_MOST_EXAMINED = 20_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,16 +90,27 @@ class PolygonFaces:
 
     def boxes(self) -> tuple[FloatArray, FloatArray]:
         """Lower and upper corners (m, 3) of the boxes around the vertices of each face."""
-        x, first = self.vertices[self.corners], self._first_corners()
+        x, first = self.vertices[self.corners], self.first_corners
         return np.minimum.reduceat(x, first), np.maximum.reduceat(x, first)
 
     def lengths(self) -> FloatArray:
         """(m,) the total length of the edges of each face."""
         x = self.vertices[self.corners]
         edges = np.linalg.norm(x[self.following] - x, axis=1)
-        return np.add.reduceat(edges, self._first_corners())
+        return np.add.reduceat(edges, self.first_corners)
 
-    def are_convex(self) -> BoolArray:
+    @functools.cached_property
+    def in_convex_position(self) -> BoolArray:
+        """(m,) whether each face is one loop without self-intersections that is proved to lie on
+        the boundary of a convex set; False where no proof was found."""
+        found = self._have_convex_shadows()
+        single = np.bincount(self.face_of_loop, minlength=self.count) == 1
+        rest = np.flatnonzero(single & ~found)[:_MOST_EXAMINED]
+        for k in rest:
+            found[k] = is_convex_position(tuple(self.loops(int(k))))
+        return found
+
+    def _have_convex_shadows(self) -> BoolArray:
         """(m,) whether each face is one loop whose shadow along its mean normal is a convex polygon
         run round once.
 
@@ -104,26 +119,27 @@ class PolygonFaces:
         of the edges on, far above rounding: a face that is called convex is.
         """
         x = self.vertices[self.corners]
-        face, first = self.face_of_corner, self._first_corners()
+        face, first = self.face_of_corner, self.first_corners
         middle = np.add.reduceat(x, first) / np.diff(np.append(first, len(x)))[:, None]
         a = x - middle[face]
         normal = np.add.reduceat(np.cross(a, a[self.following]), first)
         length = np.linalg.norm(normal, axis=1)
         normal /= np.where(length > 0, length, 1)[:, None]
         edge = x[self.following] - x
+        least = np.linalg.norm(edge, axis=1)
+        least *= _TURN * least[self.following]
         edge -= (edge * normal[face]).sum(axis=1)[:, None] * normal[face]
         after = edge[self.following]
         sine = (np.cross(edge, after) * normal[face]).sum(axis=1)
         cosine = (edge * after).sum(axis=1)
-        least = _TURN * np.linalg.norm(x[self.following] - x, axis=1)
-        least *= np.linalg.norm(x[self.following] - x, axis=1)[self.following]
         turns = np.logical_and.reduceat(sine > least, first)
         turned = np.add.reduceat(np.arctan2(sine, cosine), first)
         once = np.abs(turned - 2 * np.pi) < _REVOLUTION
         single = np.bincount(self.face_of_loop, minlength=self.count) == 1
         return turns & once & single & (length > 0)
 
-    def _first_corners(self) -> IntArray:
+    @functools.cached_property
+    def first_corners(self) -> IntArray:
         """(m,) place in `corners` of the first of each face."""
         new = np.flatnonzero(np.diff(self.face_of_loop, prepend=-1))
         return self.starts[new]
@@ -281,7 +297,7 @@ def _check_breadth(found: PolygonFaces) -> None:
     line = off[order[last]]
     line /= np.linalg.norm(line, axis=1, keepdims=True)
     rest = np.linalg.norm(off - (off * line[face]).sum(axis=1)[:, None] * line[face], axis=1)
-    widest = np.maximum.reduceat(rest, found._first_corners())  # pyright: ignore[reportPrivateUsage]
+    widest = np.maximum.reduceat(rest, found.first_corners)
     if (flat := np.flatnonzero(widest < _ON_A_LINE)).size:
         raise MeshError(
             f"the vertices of face {flat[0]}{and_more(flat.size)} lie on a line: it has no "

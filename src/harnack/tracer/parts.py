@@ -104,11 +104,13 @@ class PartTracer:
         active = walk.active & (entry.part != NO_PART)
         near, far = fmax(entry.enter, self.start), fmin(entry.leave, walk.t)
         part = self.field.part(dr.select(active, entry.part, 0))
-        now = MarchState.at(backend, near, far, active, has_detail=False)
+        spent = active & (walk.evaluations >= self.march.max_steps)
+        now = MarchState.at(backend, near, far, active & ~spent, has_detail=False)
         now = dataclasses.replace(now, evaluations=backend.UInt32(walk.evaluations))
         now = self.march.advance(part, path, backend.Float(far), now)
+        out = backend.UInt32(int(Status.OUT_OF_STEPS))
         hit = active & (now.status == int(Status.HIT))
-        lost = active & (now.status == int(Status.OUT_OF_STEPS))
+        lost = spent | (active & (now.status == int(Status.OUT_OF_STEPS)))
         ended = hit | lost
         looked = active & (ended | (walk.part == NO_PART))
         goes_on = active & ~ended if self.any_hit else active & ~lost
@@ -120,7 +122,7 @@ class PartTracer:
             gradient=dr.select(ended, now.gradient, walk.gradient),
             excess=dr.select(ended, now.excess, walk.excess),
             evaluations=dr.select(active, now.evaluations, walk.evaluations),
-            status=dr.select(ended, now.status, walk.status),
+            status=dr.select(hit, now.status, dr.select(lost, out, walk.status)),
             part=dr.select(hit, entry.part, dr.select(lost, NO_PART, walk.part)),
             active=goes_on,
         )

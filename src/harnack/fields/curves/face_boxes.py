@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -25,8 +26,9 @@ if TYPE_CHECKING:
 
 __all__ = ["face_boxes"]
 
-# Cells are split up to so many times, as long as edges x cells are not more than this.
-_FINEST, _MOST_PAIRS = 5, 30_000_000
+# All cells are split so many times, and those in which a box ends this many times altogether; in so
+# many rounds, as long as the pairs of edges and cells are not more than this.
+_COARSE, _FINEST, _ROUNDS, _MOST_PAIRS = 2, 7, 24, 30_000_000
 # Boxes are wider than proved by this part of the size of a face.
 _SLACK = 1e-4
 _CORNERS = np.array(list(itertools.product((0, 1), repeat=3)), dtype=np.float64)
@@ -35,14 +37,15 @@ _CORNERS = np.array(list(itertools.product((0, 1), repeat=3)), dtype=np.float64)
 def face_boxes(faces: PolygonFaces, levels: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
     """Lower and upper corners (m, 3) of boxes that hold the level sets of the faces' solid angles.
 
-    The 2 pi level of a convex face lies in its convex hull (paper, Theorem B.1), which lies in the
-    box of its vertices. Other surfaces lie in the isoperimetric box of `SolidAngle.extent`, of
-    which cells that are proved empty are cut away (`_are_empty`); what is left is put in a box.
+    The 2 pi level of a face in convex position lies in its convex hull (paper, Theorem B.1), which
+    lies in the box of its vertices. Other surfaces lie in the isoperimetric box of
+    `SolidAngle.extent`, of which cells that are proved empty are cut away (`_are_empty`); what is
+    left is put in a box.
     """
     low, high = faces.boxes()
     nearest = min(abs(math.remainder(level, PERIOD)) for level in levels)
     size = 0.5 * np.linalg.norm(high - low, axis=1)[:, None]
-    in_hull = faces.are_convex() & (nearest > 2 * math.pi * (1 - 1e-9))
+    in_hull = faces.in_convex_position & (nearest > 2 * math.pi * (1 - 1e-9))
     reach = 1.0001 * faces.lengths()[:, None] / math.sqrt(nearest * (PERIOD - nearest))
     lower = np.where(in_hull[:, None], low, low - reach)
     upper = np.where(in_hull[:, None], high, high + reach)
@@ -56,23 +59,79 @@ def _carved(
     faces: PolygonFaces, carved: IntArray, lower: FloatArray, upper: FloatArray,
     levels: tuple[float, ...],
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-    """Boxes of some faces, less the cells that are proved empty."""
+    """Boxes of some faces, less the cells that are proved empty.
+
+    Only the cells in which a box ends can make it smaller, so only these are split further.
+    """
     curves = FaceCurves.upload(choose_backend("double"), faces)
-    sides = upper - lower
+    sides, pairs = upper - lower, 0
     corners = np.bincount(faces.face_of_corner)
-    face, corner = carved, lower[carved]
-    for _ in range(_FINEST):
-        if 8 * corners[face].sum() > _MOST_PAIRS:
+    cells = _Cells(carved, lower[carved], np.zeros(len(carved), dtype=np.int64))
+    low, high = cells.boxes(sides)
+    for turn in range(_ROUNDS):
+        ends = cells.depth < _COARSE
+        if turn >= _COARSE:
+            place = np.searchsorted(carved, cells.face)
+            ends = cells.touch(low[place], high[place], sides) & (cells.depth < _FINEST)
+        pairs += 8 * int(corners[cells.face[ends]].sum())
+        if not ends.any() or pairs > _MOST_PAIRS:
             break
-        sides = sides / 2
-        face = np.repeat(face, 8)
-        corner = (corner[:, None] + _CORNERS * sides[face[::8], None]).reshape(-1, 3)
-        half = 0.5 * np.linalg.norm(sides, axis=1)[face]
-        kept = ~_are_empty(curves, face, corner + 0.5 * sides[face], half, levels)
-        face, corner = face[kept], corner[kept]
-    first = np.flatnonzero(np.diff(face, prepend=-1))
-    low = np.minimum.reduceat(corner, first)
-    return low, np.maximum.reduceat(corner, first) + sides[carved]
+        parts = cells.taken(ends).split(sides)
+        size = parts.sizes(sides)
+        half = 0.5 * np.linalg.norm(size, axis=1)
+        empty = _are_empty(curves, parts.face, parts.corner + 0.5 * size, half, levels)
+        cells = cells.taken(~ends).joined(parts.taken(~empty))
+        low, high = cells.boxes(sides)
+    return low, high
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """Boxes within the boxes of faces: the face, the lower corner and how often it was split.
+
+    face: (k,) rising; every face that there was has a cell.
+    """
+
+    face: IntArray
+    corner: FloatArray
+    depth: IntArray
+
+    def sizes(self, sides: FloatArray) -> FloatArray:
+        """(k, 3), of cells in boxes with such sides (m, 3)."""
+        return sides[self.face] * (0.5**self.depth)[:, None]
+
+    def boxes(self, sides: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper corners of the boxes around the cells of each face."""
+        first = np.flatnonzero(np.diff(self.face, prepend=-1))
+        low = np.minimum.reduceat(self.corner, first)
+        return low, np.maximum.reduceat(self.corner + self.sizes(sides), first)
+
+    def touch(self, low: FloatArray, high: FloatArray, sides: FloatArray) -> BoolArray:
+        """(k,) whether a cell touches a side of the box from low to high (k, 3), to a part of its
+        size."""
+        size = self.sizes(sides)
+        at_low = self.corner < low + 0.25 * size
+        at_high: BoolArray = self.corner > high - 1.25 * size
+        return np.logical_or.reduce(at_low | at_high, axis=1)
+
+    def taken(self, chosen: BoolArray) -> _Cells:
+        """Some of them."""
+        return _Cells(self.face[chosen], self.corner[chosen], self.depth[chosen])
+
+    def split(self, sides: FloatArray) -> _Cells:
+        """Each cut in eight."""
+        depth = np.repeat(self.depth + 1, 8)
+        face = np.repeat(self.face, 8)
+        half = sides[face] * (0.5**depth)[:, None]
+        steps = np.tile(_CORNERS, (len(self.face), 1))
+        return _Cells(face, np.repeat(self.corner, 8, axis=0) + steps * half, depth)
+
+    def joined(self, others: _Cells) -> _Cells:
+        """These and others."""
+        face = np.concatenate([self.face, others.face])
+        order = np.argsort(face, kind="stable")
+        corner = np.concatenate([self.corner, others.corner])
+        return _Cells(face[order], corner[order], np.append(self.depth, others.depth)[order])
 
 
 def _are_empty(

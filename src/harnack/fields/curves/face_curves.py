@@ -38,8 +38,8 @@ class FaceCurves:
     """Records of all faces: where their edges are, and in which coordinates.
 
     heads: of a face, its centre and size, the first record of its edges, how many there are (less
-    than 0 if the face is convex, see `PolygonFaces.are_convex`), and what rounding may do to a
-    point, in units of the face, and to the value.
+    than 0 if it is in convex position), and what rounding may do to a point, in units of the face,
+    and to the value.
     """
 
     heads: Records
@@ -66,10 +66,10 @@ class FaceCurves:
                 f"{len(x):,} corners of faces are too many: cut the mesh into parts, and give "
                 "them as a list to draw"
             )
-        corners = np.bincount(face)
+        corners, signed = np.bincount(face), np.where(faces.in_convex_position, -trips, trips)
         heads = np.column_stack(
             [
-                centre, size, np.cumsum(trips) - trips, np.where(faces.are_convex(), -trips, trips),
+                centre, size, np.cumsum(trips) - trips, signed,
                 backend.epsilon * (6 + 2 * magnitude),
                 backend.epsilon * (8 + 2 * np.sqrt(corners)),
             ]

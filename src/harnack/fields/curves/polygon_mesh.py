@@ -151,7 +151,7 @@ class PolygonMesh(Field):
             "faces": self.faces.count,
             "vertices": len(self.vertices),
             "corners": len(self.faces.corners),
-            "convex faces": int(self.faces.are_convex().sum()),
+            "in convex position": int(self.faces.in_convex_position.sum()),
         }
 
 
