@@ -11,12 +11,16 @@ from types import MappingProxyType
 from harnack.gallery.blobs import BLOBS
 from harnack.gallery.classic import CURVES, HARMONICS, SOLIDS
 from harnack.gallery.damaged import MESHES
+from harnack.gallery.exoskeletons import EXOSKELETONS
 from harnack.gallery.scene import Scene
 from harnack.gallery.solids import SHAPES
 
 __all__ = ["SCENES", "Scene"]
 
 SCENES: Mapping[str, Scene] = MappingProxyType(
-    {scene.name: scene for scene in (*CURVES, *HARMONICS, *SOLIDS, *MESHES, *BLOBS, *SHAPES)}
+    {
+        scene.name: scene
+        for scene in (*CURVES, *HARMONICS, *SOLIDS, *MESHES, *EXOSKELETONS, *BLOBS, *SHAPES)
+    }
 )
 """All scenes by name."""

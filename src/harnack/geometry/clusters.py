@@ -21,11 +21,19 @@ _NORMAL_WEIGHT = 0.25
 
 
 def polygon_patches(
-    vertices: FloatArray, faces: IntArray, count: int, *, iterations: int = 12, seed: int = 0
+    vertices: FloatArray,
+    faces: IntArray,
+    count: int,
+    *,
+    iterations: int = 12,
+    smoothing: int = 0,
+    seed: int = 0,
 ) -> tuple[FloatArray, list[list[list[int]]]]:
     """Vertices and polygon faces, a list of loops each, of about `count` patches of a mesh.
 
-    Corners of a patch are vertices of the mesh; vertices within patches are left out.
+    Corners of a patch are vertices of the mesh; vertices within patches are left out. smoothing:
+    how often corners of just two edges are moved to the middle between where they are and the mean
+    of their neighbours, since boundaries along triangles run in zigzags.
 
     Raises:
         ValueError: fewer than two patches, or more than triangles.
@@ -41,7 +49,28 @@ def polygon_patches(
     number = np.full(len(vertices), -1)
     number[used] = np.arange(len(used))
     numbered = [[[int(number[corner]) for corner in loop] for loop in one] for one in loops]
-    return vertices[used], numbered
+    points = vertices[used]
+    if smoothing:
+        ends = np.array([(a, b) for one in numbered for loop in one for a, b in _edges(loop)])
+        points = _smoothed(points, np.unique(np.sort(ends, axis=1), axis=0), smoothing)
+    return points, numbered
+
+
+def _edges(loop: list[int]) -> list[tuple[int, int]]:
+    return list(zip(loop, [*loop[1:], loop[0]], strict=True))
+
+
+def _smoothed(points: FloatArray, edges: IntArray, times: int) -> FloatArray:
+    """Points, of which those that just two edges (e, 2) meet at were moved along."""
+    both = np.concatenate([edges, edges[:, ::-1]])
+    inner = np.bincount(both[:, 0], minlength=len(points)) == 2
+    both = both[np.argsort(both[:, 0], kind="stable")]
+    neighbours = both[inner[both[:, 0]], 1].reshape(-1, 2)
+    for _ in range(times):
+        moved = points.copy()
+        moved[inner] = 0.5 * (points[inner] + points[neighbours].mean(axis=1))
+        points = moved
+    return points
 
 
 def _clusters(
