@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
 from typing import Any
@@ -11,13 +12,15 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.backend import choose_backend, to_numpy, to_vector3
+from harnack.backend import Backend, backend_of, choose_backend, to_numpy, to_vector3
 from harnack.backend.numbers import FloatArray
 from harnack.fields.sheets import NO_SHEET
 from harnack.geometry.clusters import polygon_patches
 from harnack.geometry.mesh_shapes import bumpy_sphere, icosphere
 from harnack.geometry.meshes import MeshError
 from harnack.rendering import Camera
+from harnack.testing import check_field
+from harnack.tree.boxes import NO_BOX, BoxTree
 from tests.test_kernels import compiled
 
 PRECISIONS = ("single", "double")
@@ -73,6 +76,82 @@ def by_face(
         nearer = hits.hit & (hits.t < t)
         t[nearer], face[nearer], normal[nearer] = hits.t[nearer], k, hits.normal[nearer]
     return t, face, normal
+
+
+class OnePart(hk.Field):
+    """One part of a field, as a field of its own."""
+
+    def __init__(self, whole: hk.PolygonMesh | hk.Tubes, index: int) -> None:
+        self.whole, self.index, self.one = whole, index, whole
+        self.period, self.default_level = whole.period, whole.default_level  # type: ignore[misc]
+        lower, upper = (ends[index] for ends in whole.boxes())
+        self.box = hk.Box(tuple(lower), tuple(upper))
+
+    def prepare(self, backend: Backend) -> hk.Field:
+        made = copy.copy(self)
+        made.one = self.whole.prepare(backend).part(dr.opaque(backend.UInt32, self.index))
+        return made
+
+    def evaluate(self, p: Any) -> hk.Sample:
+        if self.one is self.whole:
+            return self.prepare(backend_of(p)).evaluate(p)
+        return self.one.evaluate(p)
+
+    def look(self, path: Any, t: Any, ahead: Any, back: Any) -> Any:
+        return self.one.look(path, t, ahead, back)
+
+    def extent(self, levels: tuple[float, ...]) -> hk.Box:
+        return self.box
+
+
+@pytest.mark.parametrize("index", range(5))
+def test_parts_keep_their_promises(index: int) -> None:
+    check_field(OnePart(hostile(), index), count=60, directions=4)
+
+
+def test_segments_keep_their_promises() -> None:
+    tubes = hk.Tubes(10 * SQUARE, [[0, 1], [1, 2], [0, 2]], [0.5, 0.1, 1e-3])
+    for index in range(3):
+        check_field(OnePart(tubes, index), count=60, directions=4)
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_rays_enter_all_boxes_in_order(precision: Any) -> None:
+    """Against all boxes one by one in double precision; those next to a ray may be more."""
+    rng, backend = np.random.default_rng(8), choose_backend(precision)
+    middle = rng.uniform(-0.9, 0.9, (300, 3))
+    half = rng.uniform(0, 0.1, (300, 3)) * (rng.random((300, 3)) < 0.8)  # some are flat
+    o, d = rng.uniform(-2, 2, (50, 3)), rng.normal(size=(50, 3))
+    d[:9] = np.repeat(np.eye(3), 3, axis=0) * np.array([1, -1, 1])  # along axes
+    d /= np.linalg.norm(d, axis=1)[:, None]
+    tree = BoxTree.of(backend, middle - half, middle + half)
+    origin, direction = to_vector3(backend, o), to_vector3(backend, d)
+    start, end = dr.full(backend.Float, 0.25, 50), dr.full(backend.Float, 2.0, 50)
+    behind = dr.full(backend.Float, -1.0, 50), dr.full(backend.UInt32, NO_BOX, 50)
+    entered: list[list[tuple[float, float, int]]] = [[] for _ in range(50)]
+    for _ in range(301):
+        near, far, box = tree.next(origin, direction, behind, start, end, True)
+        dr.eval(near, far, box)
+        behind = near, box
+        for k, one in enumerate(zip(to_numpy(near), to_numpy(far), to_numpy(box), strict=True)):
+            if one[2] != NO_BOX:
+                entered[k].append(one)
+    for k in range(50):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            a, b = (middle - half - o[k]) / d[k], (middle + half - o[k]) / d[k]
+        low, high = np.fmin(a, b).max(axis=1), np.fmax(a, b).min(axis=1)
+        meets = (low <= high) & (high >= 0.25) & (low <= 2.0)
+        order = [(near, box) for near, _, box in entered[k]]
+        assert order == sorted(set(order))
+        found = {box: (near, far) for near, far, box in entered[k]}
+        assert len(found) == len(entered[k])
+        assert set(np.flatnonzero(meets)) <= set(found)
+        for box in np.flatnonzero(meets):
+            assert found[box][0] <= max(low[box], 0.25)
+            assert found[box][1] >= high[box]
+        slack = 1e-4 if precision == "single" else 1e-12
+        wide = (low <= high + slack) & (high >= 0.25 - slack) & (low <= 2.0 + slack)
+        assert set(found) <= set(np.flatnonzero(wide | np.isnan(low) | np.isnan(high)))
 
 
 def assert_same_hits(mesh: hk.PolygonMesh, n: int, precision: Any, **settings: Any) -> None:
