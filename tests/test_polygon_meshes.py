@@ -188,6 +188,37 @@ def test_first_hits_of_many_faces(precision: Any, level: float) -> None:
     assert_same_hits(hostile(), 5000, precision, level=level)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("level", [2 * np.pi, 5.5])
+def test_rays_along_edges_and_through_vertices(precision: Any, level: float) -> None:
+    """What the faces one by one say is hit is hit, up to rays that an edge passes within the
+    tolerance, where both are right."""
+    settings: dict[str, Any] = {"level": level, "precision": precision, "tolerance": 1e-4}
+    rng = np.random.default_rng(9)
+    for mesh in (hostile(), hk.PolygonMesh(*patches(24))):
+        n, x = 600, mesh.vertices
+        a, b = (x[ends] for ends in mesh.edges[rng.integers(len(mesh.edges), size=n)].T)
+        back = a - (b - a) * rng.uniform(1, 30, (n, 1))
+        o = 2 * rng.normal(size=(n, 3))
+        ways = (
+            (back, b - a),
+            (back + 1e-4 * rng.normal(size=(n, 3)), b - a),
+            (o, a - o),
+            (o, a + rng.uniform(0, 1, (n, 1)) * (b - a) - o),
+            (a, rng.normal(size=(n, 3))),
+            (np.round(o, 1), np.eye(3)[rng.integers(3, size=n)] * np.sign(o[:, :1])),
+        )
+        for o, d in ways:
+            hits = hk.trace(mesh, o, d, t_max=8.0, **settings)
+            t, _, _ = by_face(mesh, o, d, **settings)
+            assert not (hits.status == hk.Status.OUT_OF_STEPS).any()
+            found = np.where(hits.hit, hits.t, np.inf)
+            with np.errstate(invalid="ignore"):
+                apart = (found != t) & ~(np.abs(found - t) < 1e-2)
+            assert apart.sum() <= 6
+
+
 @pytest.mark.parametrize(("scale", "shift"), [(1e-6, 0.0), (1e6, 0.0), (1.0, 300.0)])
 def test_hits_move_with_the_mesh(scale: float, shift: float) -> None:
     vertices, faces = patches(24)

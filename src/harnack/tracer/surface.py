@@ -134,6 +134,11 @@ def level_set(
             raise ValueError(f"solid must be (low, high) with low < high, one finite, not {solid}")
         if field.period is not None:
             raise ValueError("an angle-valued field has no inside: solid needs a real-valued one")
+        if field.has_parts:
+            raise ValueError(
+                f"a {type(field).__name__} is many surfaces and no closed solid: draw it without "
+                "solid"
+            )
         if field.has_sheets:
             raise ValueError(
                 "a field that jumps across sheets has no closed solid: values between low and "
