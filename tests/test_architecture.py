@@ -32,6 +32,7 @@ ROOMS = (
 # Within `fields`: the interface, what families share, and the families.
 FIELD_ROOMS = (
     "sheets",
+    "parts",
     "points",
     "look",
     "field",
@@ -39,6 +40,7 @@ FIELD_ROOMS = (
     "kept",
     "symmetric",
     "unit_coordinates",
+    "boxed_parts",
     "batch",
     "sums",
     "edges",

@@ -200,7 +200,7 @@ def test_every_field_there_is_is_tested() -> None:
     shapes = [shape for shape, _ in SHAPES.values()]
     tested = {type(field) for field in (*FIELDS.values(), *APPROXIMATE.values(), *shapes)}
     # Those have contracts in the test files of their own.
-    tested |= {hk.Blobs, hk.HRBF, hk.Molecule}
+    tested |= {hk.Blobs, hk.HRBF, hk.Molecule, hk.PolygonMesh, hk.Tubes}
     assert all(any(issubclass(one, kind) for one in tested) for kind in exported)
     proofs = {
         kind

@@ -14,6 +14,7 @@ import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from harnack.fields import PolygonMesh
 from harnack.files import gltf
 from harnack.files import ply as ply_files
 from harnack.files.file_format import FileFormatError
@@ -21,6 +22,7 @@ from harnack.files.surfaces import ClosedCurves, Cloud, Mesh, read_surface
 from harnack.geometry.mesh_shapes import icosphere, remove_faces, torus_mesh
 from harnack.geometry.polygons import triangulate
 from harnack.geometry.singular import singular_edges, weld_vertices
+from harnack.opening import open_surface
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 FORMATS = ("obj", "stl", "stl_ascii", "off", "ply", "ply_ascii", "glb")
@@ -325,7 +327,7 @@ def test_what_cannot_be_taken_as_asked(save, name, content, as_, message):
 
 
 def test_as_must_be_known(save):
-    with pytest.raises(ValueError, match='as_ must be "winding", "dipole", "loops" or None'):
+    with pytest.raises(ValueError, match=r'as_ must be .*"loops", "polygons" or None'):
         read_surface(save("a.xyz", XYZ), "mesh")
 
 
@@ -561,7 +563,7 @@ SEEDS = [
     seed=st.sampled_from(SEEDS),
     edits=st.lists(st.tuples(st.integers(0, 900), st.binary(max_size=4)), max_size=4),
     cut=st.integers(0, 900) | st.none(),
-    as_=st.sampled_from([None, "winding", "dipole", "loops"]),
+    as_=st.sampled_from([None, "winding", "dipole", "loops", "polygons"]),
 )
 def test_a_damaged_file_is_read_or_refused_but_nothing_else(save, seed, edits, cut, as_):
     name, data = seed
@@ -592,3 +594,21 @@ def test_files_of_many_irregular_elements_take_neither_all_memory_nor_minutes(
         monkeypatch.setattr("harnack.files.file_format.MAX_ELEMENTS", 500)
     with pytest.raises(FileFormatError, match=r"elements are too many .* let the program"):
         read_surface(save(name, content))
+
+
+def test_polygons_are_read_as_they_are(save):
+    corners = "v 0 0 0\nv 2 0 0\nv 2 1 1\nv 1 2 0\nv 0 1 1\nv 3 3 0\n"
+    path = save("net.obj", corners + "f 1 2 3 4 5\nf 3 2 6\nf 4/1 3/2 6/3\n")
+    surface = read_surface(path, "polygons")
+    assert [face.tolist() for face in surface.faces] == [[0, 1, 2, 3, 4], [2, 1, 5], [3, 2, 5]]
+    assert surface.said.startswith("3 polygons of 3 to 5 corners")
+    opened = open_surface(path, as_="polygons", up="z")
+    assert isinstance(opened.field, PolygonMesh)
+    assert opened.field.faces.count == 3
+    assert opened.show == "shaded"
+    # Without being asked they are cut into triangles.
+    assert len(read_surface(path, "winding").faces) == 5
+    with pytest.raises(FileFormatError, match="face 1 visits vertex 0 twice"):
+        open_surface(save("bad.obj", corners + "f 1 2 3\nf 1 2 1 3\n"), as_="polygons")
+    with pytest.raises(FileFormatError, match='cannot be taken as "polygons", which needs faces'):
+        read_surface(save("a.xyz", XYZ), "polygons")

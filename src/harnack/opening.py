@@ -15,6 +15,7 @@ from harnack.fields import (
     DipolePotential,
     Field,
     Molecule,
+    PolygonMesh,
     SolidAngle,
     WindingNumber,
 )
@@ -25,6 +26,7 @@ from harnack.files import (
     FileFormatError,
     Mesh,
     Metaballs,
+    PolygonSurface,
     read_loops,
     read_surface,
 )
@@ -71,13 +73,14 @@ def open_surface(
     normals: Literal["estimate"] | None = None,
     up: Axis | None = None,
 ) -> OpenedSurface:
-    """The field of a surface file: meshes wind, clouds are dipoles, curves span solid angles,
-    metaballs and atoms are blobs.
+    """The field of a surface file: meshes wind, clouds are dipoles, curves span solid angles, and
+    so do polygons if asked for; metaballs and atoms are blobs.
 
-    as_: "winding", "dipole" or "loops" instead of what `read_surface` decides. boundary: the
-    curves that bound the faces. normals: "estimate" finds those of a point cloud, and replaces
-    those of the file. up: the file's axis that turns to z, by default y for glTF, whose standard
-    says so, and for meshes and clouds of .obj files, most of which have it so; else z.
+    as_: "winding", "dipole", "loops" or "polygons" instead of what `read_surface` decides.
+    boundary: the curves that bound the faces. normals: "estimate" finds those of a point cloud,
+    and replaces those of the file. up: the file's axis that turns to z, by default y for glTF,
+    whose standard says so, and for meshes and clouds of .obj files, most of which have it so;
+    else z.
 
     Raises:
         FileFormatError: as `read_surface`; a point cloud without normals.
@@ -130,6 +133,8 @@ def _field(surface: Surface, normals: str | None, rotation: FloatArray) -> Field
         return WindingNumber(surface.vertices @ rotation.T, surface.faces)
     if isinstance(surface, ClosedCurves):
         return SolidAngle([loop @ rotation.T for loop in surface.loops])
+    if isinstance(surface, PolygonSurface):
+        return PolygonMesh(surface.vertices @ rotation.T, surface.faces)
     if isinstance(surface, Metaballs):
         centres = surface.centres @ rotation.T
         return Blobs(centres, surface.radii, surface.weights, groups=surface.groups)

@@ -8,7 +8,7 @@ records is recorded once, whatever their number: another table does not compile 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import drjit as dr
@@ -32,6 +32,7 @@ class Records:
     """Rows of a table, each filled up with zeros to whole packets.
 
     packets: of a record. at_once: records a trip of the loop over all of them. trips: of that loop.
+    first: the record that counts as the first; None for that of the table.
     """
 
     backend: Backend
@@ -39,6 +40,7 @@ class Records:
     packets: int
     at_once: int
     trips: Any
+    first: Any | None = None
 
     @classmethod
     def upload(
@@ -68,9 +70,16 @@ class Records:
         dr.eval(copy)
         return cls(backend, copy, padded // PACKET, at_once, dr.opaque(backend.UInt32, trips))
 
+    def part(self, first: Any, trips: Any) -> Records:
+        """So many records from `first` on, others in each lane, of a table read one at a time."""
+        if self.at_once != 1:
+            raise ValueError(f"records are read {self.at_once} at once: no part can be taken")
+        return replace(self, first=first, trips=trips)
+
     def row(self, i: Any, active: Mask = True) -> list[Real]:
         """The numbers of record i, fetched where active."""
         numbers: list[Real] = []
+        i = i if self.first is None else i + self.first
         for k in range(self.packets):
             place = i * self.packets + k
             eight = dr.gather(self.backend.ArrayXf, self.buffer, place, active, shape=(PACKET, 1))

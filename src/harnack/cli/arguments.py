@@ -102,9 +102,10 @@ def _add_render(commands: Any) -> None:
         )
     file = one.add_argument_group("surface files")
     _add_choice(
-        file, "--as", ("winding", "dipole", "loops"),
+        file, "--as", ("winding", "dipole", "loops", "polygons"),
         "take the file as a mesh, as points with normals (of a mesh: the centers of its "
-        "faces) or as curves (of a mesh: its boundary), whatever it looks like",
+        "faces), as curves (of a mesh: its boundary) or as polygons that need not be flat, each "
+        "spanned by a surface, whatever it looks like",
         dest="as_",
     )  # fmt: skip
     file.add_argument(

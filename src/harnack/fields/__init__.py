@@ -9,6 +9,7 @@ from harnack.fields.blobs.kernels import Compact, Cubic, Gaussian, Kernel, Sexti
 from harnack.fields.blobs.molecule import Molecule
 from harnack.fields.clouds.dipole import DipolePotential
 from harnack.fields.clouds.screened import ScreenedWindingNumber
+from harnack.fields.curves.polygon_mesh import PolygonMesh
 from harnack.fields.curves.solid_angle import SolidAngle
 from harnack.fields.expressions.expression import expression
 from harnack.fields.field import Field, Sample
@@ -36,6 +37,7 @@ from harnack.fields.solids.shapes.round import (
 )
 from harnack.fields.solids.shapes.square import Cuboid, Superellipsoid, Supertorus
 from harnack.fields.solids.shapes.tube import Tube
+from harnack.fields.solids.shapes.tubes import Tubes
 from harnack.fields.solids.solid import Shape, Solid
 from harnack.fields.waves.fourier_series import FourierSeries
 from harnack.fields.waves.periodic import EigenfunctionSum, Gyroid, SchwarzD, SchwarzP
@@ -78,6 +80,7 @@ __all__ = [
     "Noise",
     "Plane",
     "PlaneWave",
+    "PolygonMesh",
     "Product",
     "RiemannSurface",
     "Sample",
@@ -94,6 +97,7 @@ __all__ = [
     "Supertorus",
     "Torus",
     "Tube",
+    "Tubes",
     "WindingNumber",
     "cosine",
     "expression",

@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from harnack.enclosures import Curvature, HarmonicBall, LineLipschitz, Lipschitz
 from harnack.fields.look import Look, Path, Sample, lengthened
+from harnack.fields.parts import NO_PART, PartEntry
 from harnack.fields.points import at_points
 from harnack.fields.sheets import NO_SHEET, Crossing, NearestSheet
 
@@ -125,6 +126,10 @@ class Field(abc.ABC):
     has_sheets: bool = False
     """Whether f jumps across sheets (see `harnack.fields.sheets`). Then `next_crossing` and
     `between` are needed, and what `evaluate` promises is about f with the jumps taken out."""
+
+    has_parts: bool = False
+    """Whether the surface is that of many level sets, each of a field of its own (see
+    `harnack.fields.parts`). Then `next_part` and `part` are needed."""
 
     has_creases: bool = False
     """Whether the gradient jumps somewhere, as it does where the surfaces of a union meet."""
@@ -333,6 +338,31 @@ class Field(abc.ABC):
         offset: `offset` at the start of the ray plus all jumps since.
         """
         del o, d, behind, ahead, offset
+        return self
+
+    # Of fields with parts only; the last two likewise.
+
+    def for_levels(self, levels: tuple[float, ...]) -> Field:
+        """This field with boxes that hold the parts of these levels, to be prepared."""
+        del levels
+        return self
+
+    def next_part(
+        self, o: Vec3, d: Vec3, after: PartEntry, start: Real, end: Real, active: Mask
+    ) -> PartEntry:
+        """The first box behind `after` that a ray enters at start <= t <= end.
+
+        A ray that begins in a box enters it at `start`. Entries are ordered by (enter, part), and
+        every box that the ray meets between `start` and `end` must come up in that order, once,
+        after an entry at less than `start`. Where there is none, part = NO_PART.
+        """
+        del o, d, after, start, end, active
+        return PartEntry(float("inf"), float("inf"), NO_PART)
+
+    def part(self, index: Any) -> Field:
+        """The field, in each lane another, whose level set the part with that index is. Its
+        `evaluate` and `look` may be called for points of any size, promises hold in all space."""
+        del index
         return self
 
     def distance_to_sheets(self, p: Vec3) -> Real:

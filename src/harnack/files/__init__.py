@@ -6,7 +6,7 @@ from harnack.files.file_format import FileFormatError
 from harnack.files.loops import read_loops
 from harnack.files.metaballs import Metaballs
 from harnack.files.molecules import Atoms, read_molecule
-from harnack.files.surfaces import ClosedCurves, Cloud, Mesh, read_surface
+from harnack.files.surfaces import ClosedCurves, Cloud, Mesh, PolygonSurface, read_surface
 from harnack.files.writing import write_atomically
 
 __all__ = [
@@ -16,6 +16,7 @@ __all__ = [
     "FileFormatError",
     "Mesh",
     "Metaballs",
+    "PolygonSurface",
     "read_loops",
     "read_molecule",
     "read_surface",

@@ -28,9 +28,19 @@ from harnack.geometry.meshes import MeshError, without_zero_area_faces
 from harnack.geometry.polygons import triangulate
 from harnack.geometry.singular import net_faces, singular_edges, singular_loops, weld_vertices
 
-__all__ = ["SURFACE_FILES", "ClosedCurves", "Cloud", "Mesh", "ReadAs", "read_surface"]
+__all__ = [
+    "SURFACE_FILES",
+    "ClosedCurves",
+    "Cloud",
+    "Mesh",
+    "PolygonSurface",
+    "ReadAs",
+    "read_surface",
+]
 
-ReadAs: TypeAlias = Literal["winding", "dipole", "loops"]
+ReadAs: TypeAlias = Literal["winding", "dipole", "loops", "polygons"]
+
+_READ_AS = ("winding", "dipole", "loops", "polygons")
 
 _READERS: dict[str, Callable[[Path, bytes], Contents]] = {
     ".obj": read_obj, ".ply": read_ply, ".stl": read_stl, ".off": read_off,
@@ -70,7 +80,19 @@ class ClosedCurves:
     said: str
 
 
-Surface: TypeAlias = Mesh | Cloud | ClosedCurves | Metaballs | Atoms
+@dataclass(frozen=True, eq=False)
+class PolygonSurface:
+    """Polygons from a file as they are: vertices (n, 3), and for each face its corners (k,).
+
+    said: what was found.
+    """
+
+    vertices: FloatArray
+    faces: list[IntArray]
+    said: str
+
+
+Surface: TypeAlias = Mesh | Cloud | ClosedCurves | PolygonSurface | Metaballs | Atoms
 
 
 def read_surface(path: str | os.PathLike[str], as_: ReadAs | None = None) -> Surface:
@@ -85,7 +107,8 @@ def read_surface(path: str | os.PathLike[str], as_: ReadAs | None = None) -> Sur
 
     as_: "winding": the faces, as a mesh. "dipole": the points; of a mesh the centers of its
     triangles, with their normals and areas. "loops": what `read_loops` finds; of a mesh its
-    boundary, the singular edges joined. None decides as above.
+    boundary, the singular edges joined. "polygons": the faces as they are, not cut into triangles.
+    None decides as above.
 
     Raises:
         FileFormatError: unreadable, malformed, truncated or hostile; of another format; nothing in
@@ -93,10 +116,10 @@ def read_surface(path: str | os.PathLike[str], as_: ReadAs | None = None) -> Sur
     """
     path = Path(path)
     kind = path.suffix.lower()
-    if as_ not in (None, "winding", "dipole", "loops"):
+    if as_ not in (None, *_READ_AS):
         raise ValueError(
-            f'as_ must be "winding", "dipole", "loops" or None, not {as_!r}'
-            + did_you_mean(as_, ("winding", "dipole", "loops"))
+            f'as_ must be "winding", "dipole", "loops", "polygons" or None, not {as_!r}'
+            + did_you_mean(as_, _READ_AS)
         )
     if kind not in SURFACE_FILES:
         raise FileFormatError(f"{path}: surfaces are read from {', '.join(SURFACE_FILES)} files")
@@ -133,14 +156,21 @@ def _read(path: Path, kind: str, as_: ReadAs | None) -> Surface:
 
 def _refuse(path: Path, as_: ReadAs | None, possible: tuple[str, ...], held: str) -> None:
     """Raises unless what was asked for can be made of what the file holds."""
-    needs = {"winding": "faces", "dipole": "points or faces", "loops": "polylines or faces"}
+    needs = {
+        "winding": "faces", "dipole": "points or faces", "loops": "polylines or faces",
+        "polygons": "faces",
+    }  # fmt: skip
     if as_ is not None and as_ not in possible:
         raise Place(path).error(
             f'it holds {held} only: it cannot be taken as "{as_}", which needs {needs[as_]}'
         )
 
 
-def _of_faces(contents: Contents, as_: ReadAs | None) -> Mesh | Cloud | ClosedCurves:
+def _of_faces(
+    contents: Contents, as_: ReadAs | None
+) -> Mesh | Cloud | ClosedCurves | PolygonSurface:
+    if as_ == "polygons":
+        return _polygons(contents)
     can_be_loops = contents.path.suffix.lower() in _LOOP_FILES
     if as_ == "loops" and len(contents.polylines) and can_be_loops:
         return _loops(loops_in(contents), "polylines and faces, taken as curves as asked")
@@ -152,6 +182,16 @@ def _of_faces(contents: Contents, as_: ReadAs | None) -> Mesh | Cloud | ClosedCu
     if as_ == "loops":
         return _boundary(contents.path, mesh)
     return mesh
+
+
+def _polygons(contents: Contents) -> PolygonSurface:
+    sizes = contents.faces.sizes
+    end, wide = np.cumsum(sizes), np.flatnonzero(sizes >= 3)
+    kept = [contents.faces.corners[end[k] - sizes[k] : end[k]] for k in wide]
+    few, many = min(map(len, kept)), max(map(len, kept))
+    corners = f"{few}" if few == many else f"{few} to {many}"
+    said = f"{len(kept):,} polygons of {corners} corners, each spanned by a surface, as asked"
+    return PolygonSurface(contents.vertices, kept, said)
 
 
 def _are_curves(contents: Contents) -> bool:

@@ -11,6 +11,7 @@ from types import MappingProxyType
 from harnack.gallery.blobs import BLOBS
 from harnack.gallery.classic import CURVES, HARMONICS, SOLIDS
 from harnack.gallery.damaged import MESHES
+from harnack.gallery.exoskeletons import EXOSKELETONS
 from harnack.gallery.plane import PLANE
 from harnack.gallery.scene import Scene
 from harnack.gallery.shells import SHELLS
@@ -21,7 +22,17 @@ __all__ = ["SCENES", "Scene"]
 SCENES: Mapping[str, Scene] = MappingProxyType(
     {
         scene.name: scene
-        for scene in (*CURVES, *SHELLS, *HARMONICS, *SOLIDS, *MESHES, *BLOBS, *SHAPES, *PLANE)
+        for scene in (
+            *CURVES,
+            *SHELLS,
+            *HARMONICS,
+            *SOLIDS,
+            *MESHES,
+            *EXOSKELETONS,
+            *BLOBS,
+            *SHAPES,
+            *PLANE,
+        )
     }
 )
 """All scenes by name."""

@@ -54,7 +54,7 @@ def attach(
     normal: unit, as traced. Normals carry no derivative (they would need the Hessian). At hits
     on sheets t is exact already, and does not depend on the level.
     """
-    t, hit = end.t, end.status == int(Status.HIT)
+    t, hit, prepared = end.t, end.status == int(Status.HIT), prepared.of_hit(end)
     if prepared.field.has_sheets:
         t = _on_plane(prepared, o, d, end)
         hit &= ~end.on_sheet

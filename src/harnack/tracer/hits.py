@@ -45,8 +45,9 @@ class Hits:
         sheet was hit, f just before it.
     evaluations: (n,) how many times the field was evaluated.
     status: (n,) a `Status`.
-    sheet: (n,) index of the sheet, such as a triangle, that was hit; -1 where none was: misses,
-        hits of a smooth level set, and all rays of fields that have no sheets.
+    sheet: (n,) index of the sheet, such as a triangle, or of the part, such as a face of a
+        `PolygonMesh`, that was hit; -1 where none was: misses, hits of a smooth level set, and all
+        rays of fields that have neither.
     uncertainty: (n,) a length: at a hit of a smooth level set, |f - level| is proved to be at most
         (tolerance + uncertainty) |grad f|. It is 0 unless rounding leaves f less certain than the
         tolerance asks; 0 for all other rays.
@@ -239,6 +240,8 @@ def _trace(
         sheet = dr.full(backend.Int32, -1, dr.width(end.status))
         if prepared.field.has_sheets:
             sheet = dr.reinterpret_array(backend.Int32, end.sheet)  # NO_SHEET becomes -1
+        if end.part is not None:
+            sheet = dr.reinterpret_array(backend.Int32, end.part)
         smooth = hit & ~end.on_sheet
         uncertainty = dr.select(smooth & (end.excess > 0), end.excess / length, 0)
     t = end.t

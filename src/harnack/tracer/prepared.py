@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -10,9 +10,11 @@ import drjit as dr
 from harnack.backend.extrema import fmax, fmin
 from harnack.backend.lengths import largest_component
 from harnack.fields.look import Path
+from harnack.fields.parts import NO_PART
 from harnack.fields.sheets import NO_SHEET
 from harnack.tracer.contact import Hysteresis
 from harnack.tracer.march import March, MarchState
+from harnack.tracer.parts import PartTracer
 from harnack.tracer.stretches import SheetTracer
 from harnack.tracer.tolerance import PreparedTolerance, Status
 
@@ -44,6 +46,8 @@ class MarchResult:
     Where hits are confirmed, t and gradient are those of the crossing, f at which is the level;
     `value` is f a little behind it, and `side` 1 where f rises through the level along the ray, -1
     where it falls through it. Where they are not, `side` is None.
+
+    part: of a field with parts, the index of the one that was hit, NO_PART elsewhere; else None.
     """
 
     t: Real
@@ -54,6 +58,7 @@ class MarchResult:
     status: Any
     sheet: Any
     side: Real | None = None
+    part: Any | None = None
 
     @property
     def on_sheet(self) -> Mask:
@@ -84,6 +89,13 @@ class PreparedLevelSet:
         """The field at p."""
         return self.field.evaluate(p)
 
+    def of_hit(self, hit: MarchResult) -> PreparedLevelSet:
+        """The level set that was hit: of a field with parts that of the part, else this."""
+        if hit.part is None:
+            return self
+        part = dr.select(hit.part == NO_PART, self.backend.UInt32(0), hit.part)
+        return replace(self, field=self.field.part(part))
+
     def clip(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real) -> tuple[Real, Real]:
         """The part of [t_min, t_max] that can hold the surface; empty unless start < end."""
         if self.volume is None:
@@ -93,7 +105,8 @@ class PreparedLevelSet:
     def occluded(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask = True) -> Mask:
         """Whether the surface lies between t_min and t_max. Out of steps counts as occluded:
         what is not proved free must not let light through."""
-        return self._march(o, d, t_min, t_max, active)[0].status != int(Status.MISS)
+        end, _ = self._march(o, d, t_min, t_max, active, any_hit=True)
+        return end.status != int(Status.MISS)
 
     def first_hit(
         self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask = True
@@ -107,7 +120,12 @@ class PreparedLevelSet:
             gradient = dr.select(crossed, end.contact.gradient, gradient)
             excess, side = dr.zeros(type(excess)), end.contact.side
         t = dr.select(end.status == int(Status.MISS), dr.inf, t)
-        return MarchResult(t, end.value, gradient, excess, end.evaluations, end.status, sheet, side)
+        part = None
+        if self.field.has_parts:
+            sheet, part = self.backend.UInt32(NO_SHEET), sheet
+        return MarchResult(
+            t, end.value, gradient, excess, end.evaluations, end.status, sheet, side, part
+        )
 
     def ready(
         self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask, *, crosses: bool
@@ -161,12 +179,24 @@ class PreparedLevelSet:
         return start, end, Hysteresis.of(self.levels, free, start, rounding)
 
     def _march(
-        self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask
+        self,
+        o: Vec3,
+        d: Vec3,
+        t_min: Real,
+        t_max: Real,
+        active: Mask,
+        *,
+        any_hit: bool = False,
     ) -> tuple[MarchState, Any]:
-        """The end state of rays, and the index of the sheet that each hit."""
+        """The end state of rays, and the index of the sheet or the part that each hit.
+
+        any_hit: whether any hit will do, if that is found with less work than the first.
+        """
         march, path, start, end, state = self.ready(
             o, d, t_min, t_max, active, crosses=self.confirm
         )
         if self.field.has_sheets:
             return SheetTracer(march, self.field, path, start, end).run(state)
+        if self.field.has_parts:
+            return PartTracer(march, self.field, path, start, end, any_hit).run(state)
         return march.advance(self.field, path, end, state), self.backend.UInt32(NO_SHEET)

@@ -59,10 +59,15 @@ class LevelSet:
 
     def check_crossings(self, setting: str) -> None:
         """Raise ValueError for several levels of a field with sheets: a jump may cross more than
-        one of them at once.
+        one of them at once; NotImplementedError for a field with parts.
 
         setting: what asks for crossings.
         """
+        if self.field.has_parts:
+            raise NotImplementedError(
+                f"{setting} takes one function, and this {type(self.field).__name__} has one for "
+                "each part: trace a part by itself, such as mesh.face(0) of a polygon mesh"
+            )
         if self.field.has_sheets and len(self.levels) > 1:
             raise ValueError(
                 f"{setting} takes one level of a field with sheets, such as this "
@@ -93,7 +98,7 @@ class LevelSet:
         )
         return PreparedLevelSet(
             backend,
-            self.field.prepare(backend),
+            self.field.for_levels(self.numbers).prepare(backend),
             TargetLevels(levels, self.field.period),
             None if volume is None else volume.prepare(backend),
             self.bound,
@@ -129,6 +134,11 @@ def level_set(
             raise ValueError(f"solid must be (low, high) with low < high, one finite, not {solid}")
         if field.period is not None:
             raise ValueError("an angle-valued field has no inside: solid needs a real-valued one")
+        if field.has_parts:
+            raise ValueError(
+                f"a {type(field).__name__} is many surfaces and no closed solid: draw it without "
+                "solid"
+            )
         if field.has_sheets:
             raise ValueError(
                 "a field that jumps across sheets has no closed solid: values between low and "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -54,9 +54,11 @@ class LoopEdges:
     run: int
 
     @classmethod
-    def upload(cls, backend: Backend, loops: tuple[FloatArray, ...]) -> LoopEdges:
-        """The edges of closed loops, each of shape (n, 3)."""
-        run, number = _run_for(loops), backend.dtype
+    def upload(
+        cls, backend: Backend, loops: tuple[FloatArray, ...], run: int | None = None
+    ) -> LoopEdges:
+        """The edges of closed loops, each of shape (n, 3); run: None for what suits them."""
+        run, number = run or _run_for(loops), backend.dtype
         rounded = (loop.astype(number).astype(np.float64) for loop in loops)
         table = np.concatenate([_runs(loop, run) for loop in rounded])
         return cls(Records.upload(backend, table), run)
@@ -65,6 +67,10 @@ class LoopEdges:
     def backend(self) -> Backend:
         """The one they lie on."""
         return self.records.backend
+
+    def part(self, first: Any, trips: Any) -> LoopEdges:
+        """The edges of so many records from `first` on, others in each lane."""
+        return replace(self, records=self.records.part(first, trips))
 
     def vertex(self, row: list[Real], k: int) -> Vec3:
         """Vertex k of a record, at which its edge k starts."""

@@ -54,6 +54,11 @@ class Finder:
 def _prepared(mi: Any, carrier: Any) -> tuple[PlacedSurface, Any]:
     """A surface that can be looked at outside its extent, and balls in and around the extent."""
     surface, backend = carrier.surface, mitsuba_backend(mi)
+    if surface.field.has_parts:
+        raise ValueError(
+            f'antialias="cones" takes a level set of one function, and {surface.field!r} has one '
+            'for each part. Leave antialias at "edges"'
+        )
     if surface.field.has_sheets:
         raise ValueError(
             f'antialias="cones" takes fields without jumps, and {surface.field!r} jumps: its '

@@ -25,8 +25,9 @@ if TYPE_CHECKING:
     from harnack.rendering.studio.materials import Material
 
 
-# Of fitted surfaces, on the stage.
-_TOLERANCE = 1e-4
+# Of fitted surfaces, on the stage. Those of many parts end inside the picture, in the edges of two:
+# what a ray meets within the tolerance of such an edge has the normal of neither.
+_TOLERANCE, _OF_PARTS = 1e-4, 1e-5
 # Light of one path, where white is 1.
 _CLAMP = 2.0
 
@@ -75,7 +76,8 @@ def studio(
     for k, one in enumerate(exhibits):
         surface = one.surface
         if one.fitted:
-            surface = replace(surface, tolerance=Tolerance(_TOLERANCE / placement.scale))
+            close = _OF_PARTS if surface.field.has_parts else _TOLERANCE
+            surface = replace(surface, tolerance=Tolerance(close / placement.scale))
         bsdf = one.material.bsdf(solid=surface.solid is not None)
         scene[f"surface{k}"] = shape(
             surface, bsdf=bsdf, to_world=placement.matrix, tint=one.material.tint

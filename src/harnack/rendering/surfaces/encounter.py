@@ -70,6 +70,7 @@ def meet_surface(
     """
     vector = prepared.backend.Array3f
     trace = prepared.first_hit(o, d, 0, t_max, active)
+    prepared = prepared.of_hit(trace)
     met = trace.status == int(Status.HIT)
     smooth = met & ~trace.on_sheet if prepared.field.has_sheets else met
     gap = prepared.levels.to_nearest(trace.value)

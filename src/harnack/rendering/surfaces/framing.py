@@ -45,7 +45,7 @@ def visible_points(surface: LevelSet, backend: Backend) -> FloatArray:
             f"computed in single precision, for sizes from {_SMALLEST:g} and coordinates up to "
             f"{_LARGEST:g}; choose units nearer to 1"
         )
-    prepared = surface.field.prepare(backend)
+    prepared = surface.field.for_levels(surface.numbers).prepare(backend)
 
     def found() -> FloatArray:
         return _found(surface, backend, ends)

@@ -1,0 +1,305 @@
+"""Meshes of polygons that need not be flat: what is accepted, and their measures.
+
+A face is a closed curve through vertices, or several, such as an outline and holes: it is given
+by the indices of its vertices, counted from 0. Its positive side is the one from which the outline
+runs counter-clockwise and holes clockwise. Faces need not be joined, and may cross each other.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from harnack.backend.numbers import (
+    TRANSPOSE,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    and_more,
+    check_finite,
+    check_size,
+    check_vectors,
+    real_array,
+)
+from harnack.geometry.convexity import is_convex_position
+from harnack.geometry.meshes import MAX_FACES, MAX_VERTICES, MeshError
+
+__all__ = ["PolygonFaces", "validate_polygons"]
+
+# A face whose corners lie as close to one line, as a part of its size, has no surface to speak of.
+_ON_A_LINE = 1e-9
+# Of the lengths of two edges, the part that a turn must be at least to count as one.
+_TURN = 1e-6
+# Turns of a convex polygon add up to one revolution, to this many radians.
+_REVOLUTION = 1e-6
+# So many faces whose shadows are not convex are examined further, at half a millisecond each.
+_MOST_EXAMINED = 20_000
+
+
+@dataclass(frozen=True, eq=False)
+class PolygonFaces:
+    """Faces with any number of corners.
+
+    vertices: (n, 3). corners: (k,) indices of them, loop after loop. sizes: (l,) corners of each
+    loop. face_of_loop: (l,) rising; every face has a loop.
+    """
+
+    vertices: FloatArray
+    corners: IntArray
+    sizes: IntArray
+    face_of_loop: IntArray
+
+    @property
+    def count(self) -> int:
+        """How many faces there are."""
+        return int(self.face_of_loop[-1]) + 1
+
+    @property
+    def face_of_corner(self) -> IntArray:
+        """(k,) the face of each corner."""
+        return np.repeat(self.face_of_loop, self.sizes)
+
+    @property
+    def starts(self) -> IntArray:
+        """(l,) where each loop starts in `corners`."""
+        return np.cumsum(self.sizes) - self.sizes
+
+    @property
+    def following(self) -> IntArray:
+        """(k,) place in `corners` of the next corner of the same loop."""
+        after = np.arange(1, len(self.corners) + 1, dtype=np.int64)
+        after[self.starts + self.sizes - 1] = self.starts
+        return after
+
+    @property
+    def edges(self) -> IntArray:
+        """(e, 2) pairs of vertices that some face joins, each once."""
+        ends = np.column_stack([self.corners, self.corners[self.following]])
+        return np.unique(np.sort(ends, axis=1), axis=0)
+
+    def loops(self, face: int) -> list[FloatArray]:
+        """The closed curves of a face, (n, 3) each."""
+        chosen = np.flatnonzero(self.face_of_loop == face)
+        pieces = (slice(self.starts[k], self.starts[k] + self.sizes[k]) for k in chosen)
+        return [self.vertices[self.corners[piece]] for piece in pieces]
+
+    def boxes(self) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper corners (m, 3) of the boxes around the vertices of each face."""
+        x, first = self.vertices[self.corners], self.first_corners
+        return np.minimum.reduceat(x, first), np.maximum.reduceat(x, first)
+
+    def lengths(self) -> FloatArray:
+        """(m,) the total length of the edges of each face."""
+        x = self.vertices[self.corners]
+        edges = np.linalg.norm(x[self.following] - x, axis=1)
+        return np.add.reduceat(edges, self.first_corners)
+
+    @functools.cached_property
+    def in_convex_position(self) -> BoolArray:
+        """(m,) whether each face is one loop without self-intersections that is proved to lie on
+        the boundary of a convex set; False where no proof was found."""
+        found = self._have_convex_shadows()
+        single = np.bincount(self.face_of_loop, minlength=self.count) == 1
+        rest = np.flatnonzero(single & ~found)[:_MOST_EXAMINED]
+        for k in rest:
+            found[k] = is_convex_position(tuple(self.loops(int(k))))
+        return found
+
+    def _have_convex_shadows(self) -> BoolArray:
+        """(m,) whether each face is one loop whose shadow along its mean normal is a convex polygon
+        run round once.
+
+        Such a loop has no self-intersection, for its shadow has none, and it lies on the boundary
+        of a convex set, the cylinder over the shadow. A turn counts from a millionth of the lengths
+        of the edges on, far above rounding: a face that is called convex is.
+        """
+        x = self.vertices[self.corners]
+        face, first = self.face_of_corner, self.first_corners
+        middle = np.add.reduceat(x, first) / np.diff(np.append(first, len(x)))[:, None]
+        a = x - middle[face]
+        normal = np.add.reduceat(np.cross(a, a[self.following]), first)
+        length = np.linalg.norm(normal, axis=1)
+        normal /= np.where(length > 0, length, 1)[:, None]
+        edge = x[self.following] - x
+        least = np.linalg.norm(edge, axis=1)
+        least *= _TURN * least[self.following]
+        edge -= (edge * normal[face]).sum(axis=1)[:, None] * normal[face]
+        after = edge[self.following]
+        sine = (np.cross(edge, after) * normal[face]).sum(axis=1)
+        cosine = (edge * after).sum(axis=1)
+        turns = np.logical_and.reduceat(sine > least, first)
+        turned = np.add.reduceat(np.arctan2(sine, cosine), first)
+        once = np.abs(turned - 2 * np.pi) < _REVOLUTION
+        single = np.bincount(self.face_of_loop, minlength=self.count) == 1
+        return turns & once & single & (length > 0)
+
+    @functools.cached_property
+    def first_corners(self) -> IntArray:
+        """(m,) place in `corners` of the first of each face."""
+        new = np.flatnonzero(np.diff(self.face_of_loop, prepend=-1))
+        return self.starts[new]
+
+
+def validate_polygons(vertices: Any, faces: Any) -> PolygonFaces:
+    """Vertices (n, 3), and faces: a sequence of faces of any lengths, each a sequence of at least
+    three indices or a sequence of such loops; or an integer array (m, k).
+
+    Raises:
+        MeshError: not numbers of these shapes, nothing at all; a coordinate that is not finite; an
+            index that is no integer or has no vertex; a loop of fewer than three vertices, or that
+            visits one twice; an edge without a length, or run twice by its face; a face whose
+            vertices lie on a line.
+    """
+    x = _checked_vertices(vertices)
+    corners, sizes, face_of_loop = _flattened(faces)
+    out = np.flatnonzero((corners < 0) | (corners >= len(x)))
+    face = np.repeat(face_of_loop, sizes)
+    if out.size:
+        index = int(corners[out[0]])
+        hint = ""
+        if index == len(x) and int(corners.min()) == 1:
+            hint = "; these indices seem to count from 1: subtract 1"
+        raise MeshError(
+            f"face {face[out[0]]} has vertex {index}{and_more(out.size)}, which is out of range: "
+            f"there are {len(x):,} vertices, counted from 0{hint}"
+        )
+    found = PolygonFaces(x, corners, sizes, face_of_loop)
+    _check_edges(found)
+    _check_breadth(found)
+    for array in (x, corners, sizes, face_of_loop):
+        array.setflags(write=False)
+    return found
+
+
+def _checked_vertices(vertices: Any) -> FloatArray:
+    array = real_array(vertices, "the vertices", MeshError, ragged="must all have 3 coordinates")
+    if array.size == 0:
+        raise MeshError("there are no vertices: give an array (n, 3)")
+    check_vectors(array, "the vertices", MeshError, transposed=TRANSPOSE)
+    if len(array) > MAX_VERTICES:
+        raise MeshError(f"{len(array):,} vertices are too many: at most {MAX_VERTICES:,}")
+    x = np.array(array, dtype=np.float64, order="C")
+    advice = "coordinates must be finite; remove it and the faces that use it"
+    check_finite(x, "vertex {}", MeshError, advice)
+    check_size(x, MeshError)
+    return x
+
+
+def _flattened(faces: Any) -> tuple[IntArray, IntArray, IntArray]:
+    """Corners of all loops, the size of each, and the face of each."""
+    if not _is_list(faces):
+        raise MeshError(f"the faces must be a list of lists of vertex indices, not {faces!r}")
+    if len(faces) == 0:
+        raise MeshError("there are no faces: give a list of lists of vertex indices")
+    if len(faces) > MAX_FACES:
+        raise MeshError(f"{len(faces):,} faces are too many: at most {MAX_FACES:,}")
+    loops: list[Any] = []
+    owners: list[int] = []
+    for k, face in enumerate(faces):
+        several = _loops_of(face, k)
+        loops += several
+        owners += [k] * len(several)
+    sizes = np.array([len(loop) for loop in loops], dtype=np.int64)
+    if (short := np.flatnonzero(sizes < 3)).size:
+        raise MeshError(
+            f"face {owners[int(short[0])]} has a loop of {sizes[short[0]]} vertices"
+            f"{and_more(short.size)}: a face needs three or more; leave it out"
+        )
+    corners = np.concatenate(loops).astype(np.int64)
+    return corners, sizes, np.array(owners, dtype=np.int64)
+
+
+def _loops_of(face: Any, k: int) -> list[Any]:
+    """The loops of a face, integer arrays (n,)."""
+    if not _is_list(face):
+        raise MeshError(
+            f"face {k} is {face!r}: it must be a list of vertex indices, or a list of such loops"
+        )
+    if len(face) == 0:
+        raise MeshError(f"face {k} is empty: it needs three or more vertices; leave it out")
+    nested = [_is_list(one) for one in face]
+    if any(nested) and not all(nested):
+        raise MeshError(f"face {k} mixes indices and loops: give one kind or the other")
+    loops: list[Any] = []
+    for loop in face if all(nested) else [face]:
+        try:
+            array: npt.NDArray[Any] = np.asarray(loop)
+        except (ValueError, OverflowError):
+            raise MeshError(f"face {k} is ragged: a loop is a list of integers") from None
+        if array.size == 0:
+            raise MeshError(f"face {k} has an empty loop: leave it out")
+        if array.ndim != 1 or array.dtype.kind not in "iu":
+            hint = ": convert them with .astype(int)" if array.dtype.kind == "f" else ""
+            raise MeshError(f"face {k} must list integer indices, not {array.dtype}{hint}")
+        loops.append(array)
+    return loops
+
+
+def _is_list(value: Any) -> bool:
+    is_array = isinstance(value, np.ndarray) and value.ndim > 0
+    return is_array or (isinstance(value, Sequence) and not isinstance(value, str))
+
+
+def _check_edges(found: PolygonFaces) -> None:
+    n = len(found.vertices)
+    loop = np.repeat(np.arange(len(found.sizes)), found.sizes)
+    face = found.face_of_corner
+    first = _first_double(loop * n + found.corners)
+    if first is not None:
+        raise MeshError(
+            f"face {face[first]} visits vertex {found.corners[first]} twice: split it there into "
+            "two loops of one face, or into two faces"
+        )
+    begin, end = found.corners, found.corners[found.following]
+    length = np.abs(found.vertices[begin] - found.vertices[end]).max(axis=1)
+    if (none := np.flatnonzero(length < 1e-100)).size:
+        k = none[0]
+        raise MeshError(
+            f"face {face[k]} has an edge without a length, from vertex {begin[k]} to "
+            f"{end[k]}{and_more(none.size)}: join vertices at the same place"
+        )
+    _, edge = np.unique(np.minimum(begin, end) * n + np.maximum(begin, end), return_inverse=True)
+    if (first := _first_double(face * len(edge) + edge.reshape(-1))) is not None:
+        raise MeshError(
+            f"face {face[first]} runs along the edge from vertex {begin[first]} to {end[first]} "
+            "twice: leave it out of both loops, or join its neighbours"
+        )
+
+
+def _first_double(keys: IntArray) -> int | None:
+    """The index of the first key that came before."""
+    _, first = np.unique(keys, return_index=True)
+    if len(first) == len(keys):
+        return None
+    return int(np.setdiff1d(np.arange(len(keys)), first)[0])
+
+
+def _check_breadth(found: PolygonFaces) -> None:
+    """That no face lies on a line: about the corner farthest from its middle, through that."""
+    x, face = found.vertices[found.corners], found.face_of_corner
+    low, high = found.boxes()
+    a = x - (0.5 * (low + high))[face]
+    a /= np.abs(high - low).max(axis=1)[face][:, None]
+    # The direction of the longest row, and how far the others are from it.
+    square = (a * a).sum(axis=1)
+    order = np.lexsort((square, face))
+    last = np.append(np.flatnonzero(np.diff(face[order])), len(order) - 1)
+    pole = a[order[last]]
+    off = a - pole[face]
+    # From the pole to the corner that is farthest from it.
+    far = (off * off).sum(axis=1)
+    order = np.lexsort((far, face))
+    line = off[order[last]]
+    line /= np.linalg.norm(line, axis=1, keepdims=True)
+    rest = np.linalg.norm(off - (off * line[face]).sum(axis=1)[:, None] * line[face], axis=1)
+    widest = np.maximum.reduceat(rest, found.first_corners)
+    if (flat := np.flatnonzero(widest < _ON_A_LINE)).size:
+        raise MeshError(
+            f"the vertices of face {flat[0]}{and_more(flat.size)} lie on a line: it has no "
+            "surface; leave it out"
+        )
