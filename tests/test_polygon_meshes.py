@@ -15,7 +15,7 @@ import harnack as hk
 from harnack.backend import Backend, backend_of, choose_backend, to_numpy, to_vector3
 from harnack.backend.numbers import FloatArray
 from harnack.fields.sheets import NO_SHEET
-from harnack.geometry.clusters import polygon_patches
+from harnack.geometry.faces.clusters import polygon_patches
 from harnack.geometry.mesh_shapes import bumpy_sphere, icosphere
 from harnack.geometry.meshes import MeshError
 from harnack.rendering import Camera
@@ -89,7 +89,7 @@ class OnePart(hk.Field):
 
     def prepare(self, backend: Backend) -> hk.Field:
         made = copy.copy(self)
-        made.one = self.whole.prepare(backend).part(dr.opaque(backend.UInt32, self.index))
+        made.one = self.whole.prepare(backend).part_at(dr.opaque(backend.UInt32, self.index))
         return made
 
     def evaluate(self, p: Any) -> hk.Sample:
@@ -266,7 +266,7 @@ def test_a_face_in_a_lane_is_the_solid_angle_of_that_face(precision: Any) -> Non
     p = rng.uniform(-1.5, 1.5, (600, 3))
     index = np.arange(600) % mesh.faces.count
     prepared = mesh.prepare(backend)
-    part = prepared.part(backend.UInt32(index.astype(np.uint32)))
+    part = prepared.part_at(backend.UInt32(index.astype(np.uint32)))
     sample = part.evaluate(to_vector3(backend, p))
     tolerance = 2e-4 if precision == "single" else 1e-11
     for k in range(mesh.faces.count):

@@ -6,9 +6,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, cast
 
 import numpy as np
-from scipy.special import ellipe, ellipkm1, elliprf, elliprj
+import scipy.special
 
 import harnack as hk
 from harnack.backend import FloatArray
@@ -44,14 +45,17 @@ def circle_values(circle: hk.Circle, x: FloatArray) -> OracleValues:
     r = np.linalg.norm(outward, axis=1)
     near, far = (1 - r) ** 2 + z * z, (1 + r) ** 2 + z * z
     kc = near / far  # squared
-    k, e = ellipkm1(kc), ellipe(1 - kc)
+    special = cast("Any", scipy.special)
+    k, e = special.ellipkm1(kc), special.ellipe(1 - kc)
     with np.errstate(divide="ignore", invalid="ignore"):
         # Pi(n, m) = R_F + n/3 R_J at the characteristic n = 4r/(1+r)^2.
         gamma = ((1 - r) / (1 + r)) ** 2
-        pi = elliprf(0, kc, 1) + (1 - gamma) / 3 * elliprj(0, kc, 1, np.where(r == 1, 1, gamma))
+        pi = special.elliprf(0, kc, 1) + (1 - gamma) / 3 * special.elliprj(
+            0, kc, 1, np.where(r == 1, 1, gamma)
+        )
         height = np.abs(z)
         third = 2 * height / np.sqrt(far) * (r - 1) / (r + 1) * pi
-        w = np.where(r < 1, 2 * np.pi, 0) - 2 * height / np.sqrt(far) * k + third
+        w: FloatArray = np.where(r < 1, 2 * np.pi, 0) - 2 * height / np.sqrt(far) * k + third
         w = np.where(r == 1, np.pi - 2 * height / np.sqrt(far) * k, w)
         size = 1 + r * r + z * z
         # For r near 0 the difference cancels: C3 = 3 pi r/(1+z^2)^2.5 to first order.

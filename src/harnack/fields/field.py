@@ -129,7 +129,7 @@ class Field(abc.ABC):
 
     has_parts: bool = False
     """Whether the surface is that of many level sets, each of a field of its own (see
-    `harnack.fields.parts`). Then `next_part` and `part` are needed."""
+    `harnack.fields.parts`). Then `next_part` and `part_at` are needed."""
 
     has_creases: bool = False
     """Whether the gradient jumps somewhere, as it does where the surfaces of a union meet."""
@@ -359,7 +359,7 @@ class Field(abc.ABC):
         del o, d, after, start, end, active
         return PartEntry(float("inf"), float("inf"), NO_PART)
 
-    def part(self, index: Any) -> Field:
+    def part_at(self, index: Any) -> Field:
         """The field, in each lane another, whose level set the part with that index is. Its
         `evaluate` and `look` may be called for points of any size, promises hold in all space."""
         del index

@@ -6,7 +6,7 @@ so the tracer marches those whose boxes the ray enters, one after the other in t
 enters them, and no farther than the first hit so far.
 
 A field with parts says `has_parts = True` and answers two questions (see `Field`): `next_part`,
-which part comes next, and `part`, the field whose level set that is. The parts share the period,
+which part comes next, and `part_at`, the field whose level set that is. The parts share the period,
 the levels and the domain of the field. Its own `evaluate` has no meaning.
 """
 

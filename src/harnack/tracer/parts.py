@@ -103,7 +103,7 @@ class PartTracer:
         )
         active = walk.active & (entry.part != NO_PART)
         near, far = fmax(entry.enter, self.start), fmin(entry.leave, walk.t)
-        part = self.field.part(dr.select(active, entry.part, 0))
+        part = self.field.part_at(dr.select(active, entry.part, 0))
         spent = active & (walk.evaluations >= self.march.max_steps)
         now = MarchState.at(backend, near, far, active & ~spent, has_detail=False)
         now = dataclasses.replace(now, evaluations=backend.UInt32(walk.evaluations))

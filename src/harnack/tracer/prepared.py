@@ -94,7 +94,7 @@ class PreparedLevelSet:
         if hit.part is None:
             return self
         part = dr.select(hit.part == NO_PART, self.backend.UInt32(0), hit.part)
-        return replace(self, field=self.field.part(part))
+        return replace(self, field=self.field.part_at(part))
 
     def clip(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real) -> tuple[Real, Real]:
         """The part of [t_min, t_max] that can hold the surface; empty unless start < end."""

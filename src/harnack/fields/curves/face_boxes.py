@@ -22,7 +22,7 @@ from harnack.fields.edges.edge_sums import inner_product, spinor
 
 if TYPE_CHECKING:
     from harnack.backend import Real, Vec3
-    from harnack.geometry.polygon_meshes import PolygonFaces
+    from harnack.geometry.faces.polygon_meshes import PolygonFaces
 
 __all__ = ["face_boxes"]
 

@@ -16,7 +16,7 @@ from harnack.fields.field import Field
 from harnack.fields.kept import prepared_once
 from harnack.fields.parts import PartEntry
 from harnack.geometry import Box
-from harnack.geometry.polygon_meshes import PolygonFaces, validate_polygons
+from harnack.geometry.faces.polygon_meshes import PolygonFaces, validate_polygons
 from harnack.tree.boxes import MOST_BOXES
 
 if TYPE_CHECKING:
@@ -129,7 +129,7 @@ class PolygonMesh(Field):
     ) -> PartEntry:
         return self._on().boxes.next(o, d, after, start, end, active)
 
-    def part(self, index: Any) -> Field:
+    def part_at(self, index: Any) -> Field:
         return self._on().curves.face(index)
 
     def check_levels(self, levels: tuple[float, ...]) -> None:

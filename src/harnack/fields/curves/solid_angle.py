@@ -379,7 +379,7 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
     def describe(self) -> dict[str, Any]:
         return {
             "loops": len(self.loops) + len(self.circles),
-            "circles": len(self.circles),
+            **({"circles": len(self.circles)} if self.circles else {}),
             "vertices": sum(len(loop) for loop in self.loops),
             "cancelled edges": sum(map(len, self.loops)) - sum(map(len, self._net)),
             "convex position": self.convex_position,

@@ -113,7 +113,7 @@ class Tubes(Field):
     ) -> PartEntry:
         return self._on().boxes.next(o, d, after, start, end, active)
 
-    def part(self, index: Any) -> Field:
+    def part_at(self, index: Any) -> Field:
         on = self._on()
         return _Segment(on.boxes, on.segments.row(index))
 

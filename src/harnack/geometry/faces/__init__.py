@@ -1,0 +1,1 @@
+"""Meshes whose faces are polygons, flat or not."""
