@@ -201,6 +201,7 @@ def test_every_field_there_is_is_tested() -> None:
     tested = {type(field) for field in (*FIELDS.values(), *APPROXIMATE.values(), *shapes)}
     # Those have contracts in the test files of their own.
     tested |= {hk.Blobs, hk.HRBF, hk.Molecule, hk.PolygonMesh, hk.Tubes}
+    tested |= {hk.RiemannSurface, hk.HeightField, hk.LevelCurves}
     assert all(any(issubclass(one, kind) for one in tested) for kind in exported)
     proofs = {
         kind
