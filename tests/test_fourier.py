@@ -90,7 +90,7 @@ def test_a_series_is_fitted_exactly(shape: tuple[int, int, int]) -> None:
         )
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_bounds_hold_between_nodes(seed: int) -> None:
     """On grids that are no multiples of the bounds' own; and they are not far too large."""
     rng = np.random.default_rng(seed)
@@ -123,7 +123,13 @@ def test_bounds_hold_between_nodes(seed: int) -> None:
         assert cells.bounds.mean() < 0.9 * bounds.curvature
 
 
-@pytest.mark.parametrize("kind", ["plain", "anisotropic", "far away", "tiny"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "plain",
+        *(pytest.param(one, marks=pytest.mark.slow) for one in ("anisotropic", "far away", "tiny")),
+    ],
+)
 def test_series_keep_their_promises(kind: str) -> None:
     move, scale = {"far away": (300.0, 1.0), "tiny": (0.0, 1e-3)}.get(kind, (0.0, 1.0))
     box = tuple(tuple(move + scale * v for v in corner) for corner in CUBE)
@@ -179,7 +185,7 @@ def agree(field: Any, level: float, n: int, size: float, precision: Any, **setti
     return hits
 
 
-@pytest.mark.parametrize("precision", ["single", "double"])
+@pytest.mark.parametrize("precision", ["single", pytest.param("double", marks=pytest.mark.slow)])
 def test_first_hits_of_figure_21(precision: Any) -> None:
     field = hk.FourierSeries.fit(figure_21, FIG_21, 10)
     assert field.fit_error is not None

@@ -95,7 +95,7 @@ def drawn(what: Any, k: int, show: str, **settings: Any) -> int:
     return compiled(lambda: hk.render(what, show=show, **settings, **small))
 
 
-@pytest.mark.parametrize("show", ["color", "shaded"])
+@pytest.mark.parametrize("show", [pytest.param("color", marks=pytest.mark.slow), "shaded"])
 def test_another_picture_compiles_no_kernel(show: str) -> None:
     def picture(k: int) -> int:
         settings: dict[str, Any] = {"level": 6 - 0.02 * k, "max_depth": 3 + k}

@@ -344,7 +344,7 @@ def test_derivatives_by_rays() -> None:
     np.testing.assert_allclose(found, -normal / (normal @ d), rtol=1e-5)
 
 
-@pytest.mark.parametrize("show", ["shaded", "color"])
+@pytest.mark.parametrize("show", ["shaded", pytest.param("color", marks=pytest.mark.slow)])
 def test_pictures(show: str) -> None:
     vertices, faces = patches(24)
     mesh = hk.PolygonMesh(vertices, faces)

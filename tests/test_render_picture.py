@@ -310,12 +310,17 @@ def test_other_variants_draw_the_same_picture(variant: str) -> None:
     np.testing.assert_allclose(ours, reference, rtol=0.05)
 
 
-def test_views_look_alike_in_bands(monkeypatch: pytest.MonkeyPatch) -> None:
-    for show in ("normal", "depth", "evaluations", "status"):
-        whole = draw(show=show)
-        monkeypatch.setattr("harnack.rendering.pictures.views._RAYS_A_BAND", 7)
-        np.testing.assert_array_equal(draw(show=show), whole)
-        monkeypatch.undo()
+@pytest.mark.parametrize(
+    "show",
+    [
+        "normal",
+        *(pytest.param(one, marks=pytest.mark.slow) for one in ("depth", "evaluations", "status")),
+    ],
+)
+def test_views_look_alike_in_bands(show: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = draw(show=show)
+    monkeypatch.setattr("harnack.rendering.pictures.views._RAYS_A_BAND", 7)
+    np.testing.assert_array_equal(draw(show=show), whole)
 
 
 def test_tone_mapping_of_many_rows_is_that_of_each() -> None:

@@ -281,7 +281,13 @@ SMALL["large"] = field_of((1e3 * _p + 2e3, _n, 1e6 * _a), 300.0)
 SMALL["small"] = field_of((1e-3 * _p - 1e-3, _n, 1e-6 * _a), 1e-3)
 
 
-@pytest.mark.parametrize("name", SMALL)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(one, marks=() if one in ("sphere", "soup", "large") else pytest.mark.slow)
+        for one in SMALL
+    ],
+)
 def test_field_keeps_its_promises(name: str) -> None:
     field = SMALL[name]
     levels = (field.default_level, 0.5, -0.2)
