@@ -1,21 +1,29 @@
-"""The boxes of a field's parts on a backend (see `harnack.fields.parts`)."""
+"""Fields whose parts lie in boxes, and these boxes on a backend (see `harnack.fields.parts`)."""
 
 from __future__ import annotations
 
+import abc
+import copy
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
 import numpy as np
 
+from harnack.fields.field import Field
+from harnack.fields.kept import prepared_once
 from harnack.fields.parts import PartEntry
 from harnack.fields.unit_coordinates import UnitCoordinates, placed, single
+from harnack.geometry import Box
 from harnack.tree.boxes import BoxTree
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, FloatArray, Mask, Real, Vec3
+    from typing import Self
 
-__all__ = ["BoxedParts"]
+    from harnack.backend import Backend, FloatArray, Mask, Real, Vec3
+    from harnack.geometry import Volume
+
+__all__ = ["BoxedField", "BoxedParts"]
 
 
 @dataclass(frozen=True)
@@ -46,3 +54,70 @@ class BoxedParts(UnitCoordinates):
             self.unit(o), d, behind, start / self.size, end / self.size, active
         )
         return PartEntry(enter * self.size, leave * self.size, box)
+
+
+class Buffers(Protocol):
+    """What a field with parts has on a backend: its boxes, and what its parts are made of."""
+
+    @property
+    def boxes(self) -> BoxedParts: ...
+
+
+_Buffers = TypeVar("_Buffers", bound=Buffers)
+
+
+class BoxedField(Field, Generic[_Buffers]):
+    """A field with parts in boxes, which depend on the levels.
+
+    levels: for which its boxes hold the surfaces once it is prepared.
+    """
+
+    has_parts: bool = True
+
+    def __init__(self) -> None:
+        self.levels: tuple[float, ...] = (self.default_level,)
+        self._for_levels: dict[tuple[float, ...], Self] = {}
+        self._device: _Buffers | None = None
+
+    @abc.abstractmethod
+    def boxes(self, levels: tuple[float, ...] | None = None) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper corners (m, 3) of boxes proved to hold the surface of each part.
+
+        levels: of the surfaces; None for `levels`.
+        """
+
+    @abc.abstractmethod
+    def _upload(self, backend: Backend) -> _Buffers:
+        """What is needed on a backend."""
+
+    def for_levels(self, levels: tuple[float, ...]) -> Self:
+        if levels == self.levels:
+            return self
+        if levels not in self._for_levels:
+            other = copy.copy(self)
+            other.levels = levels
+            self._for_levels[levels] = other
+        return self._for_levels[levels]
+
+    @prepared_once
+    def prepare(self, backend: Backend) -> Self:
+        if self._device is not None and self._device.boxes.backend is backend:
+            return self
+        prepared = copy.copy(self)
+        prepared._device = self._upload(backend)
+        return prepared
+
+    def _on(self) -> _Buffers:
+        if self._device is None:
+            raise RuntimeError("prepare(backend) comes first")
+        return self._device
+
+    def next_part(
+        self, o: Vec3, d: Vec3, after: PartEntry, start: Real, end: Real, active: Mask
+    ) -> PartEntry:
+        return self._on().boxes.next(o, d, after, start, end, active)
+
+    def extent(self, levels: tuple[float, ...]) -> Volume | None:
+        """The box around the boxes of all parts."""
+        lower, upper = self.boxes(levels)
+        return Box(lower.min(axis=0), upper.max(axis=0))

@@ -392,3 +392,18 @@ class AtDetail(Field):
 
     def evaluate(self, p: Vec3) -> Sample:
         return self._evaluate(p)
+
+
+def check_in_range(
+    levels: tuple[float, ...], value_range: tuple[float, float], what: str = "the function"
+) -> None:
+    """Raise ValueError for a level outside the range in which values are proved to lie.
+
+    what: stays within it.
+    """
+    low, high = value_range
+    for level in levels:
+        if not low <= level <= high:
+            raise ValueError(
+                f"no surface has level {level:g}: {what} stays within [{low:.6g}, {high:.6g}]"
+            )

@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
 
 from harnack.backend import FloatArray, IntArray
-from harnack.fields.boxed_parts import BoxedParts
+from harnack.fields.boxed_parts import BoxedField, BoxedParts
 from harnack.fields.curves.face_boxes import face_boxes
 from harnack.fields.curves.face_curves import PERIOD, FaceCurves
 from harnack.fields.curves.solid_angle import SolidAngle
 from harnack.fields.field import Field
-from harnack.fields.kept import prepared_once
-from harnack.fields.parts import PartEntry
-from harnack.geometry import Box
 from harnack.geometry.faces.polygon_meshes import PolygonFaces, validate_polygons
 from harnack.tree.boxes import MOST_BOXES
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.geometry import Volume
+    from harnack.backend import Backend, Vec3
 
 __all__ = ["PolygonMesh"]
 
@@ -29,7 +24,7 @@ __all__ = ["PolygonMesh"]
 _NARROW = 1e-9 * PERIOD
 
 
-class PolygonMesh(Field):
+class PolygonMesh(BoxedField["_MeshBuffers"]):
     """Faces of any number of corners, flat or not, each spanned by a smooth surface: the level set
     of the solid angle of its boundary curve (paper, Sections 4.2.1 and 4.2.4).
 
@@ -49,9 +44,9 @@ class PolygonMesh(Field):
 
     period: ClassVar[float | None] = PERIOD
     default_level: float = 2 * math.pi
-    has_parts: bool = True
 
     def __init__(self, vertices: Any, faces: Any) -> None:
+        super().__init__()
         self.faces: PolygonFaces = validate_polygons(vertices, faces)
         if self.faces.count >= MOST_BOXES:
             raise ValueError(
@@ -59,9 +54,6 @@ class PolygonMesh(Field):
                 "into parts"
             )
         self._boxes: dict[tuple[float, ...], tuple[FloatArray, FloatArray]] = {}
-        self._for_levels: dict[tuple[float, ...], PolygonMesh] = {}
-        self._levels: tuple[float, ...] = (self.default_level,)
-        self._device: _MeshBuffers | None = None
 
     @property
     def vertices(self) -> FloatArray:
@@ -85,7 +77,7 @@ class PolygonMesh(Field):
 
         levels: of the surfaces; None for the default.
         """
-        levels = self._levels if levels is None else levels
+        levels = self.levels if levels is None else levels
         if levels not in self._boxes:
             self._boxes[levels] = face_boxes(self.faces, levels)
         return self._boxes[levels]
@@ -98,36 +90,9 @@ class PolygonMesh(Field):
             "face, such as mesh.face(0), which is a harnack.SolidAngle"
         )
 
-    def for_levels(self, levels: tuple[float, ...]) -> PolygonMesh:
-        if levels == self._levels:
-            return self
-        if levels not in self._for_levels:
-            other = copy.copy(self)
-            other._levels = levels
-            self._for_levels[levels] = other
-        return self._for_levels[levels]
-
-    @prepared_once
-    def prepare(self, backend: Backend) -> PolygonMesh:
-        if self._device is not None and self._device.boxes.backend is backend:
-            return self
-        prepared = copy.copy(self)
-        prepared._device = self._upload(backend)
-        return prepared
-
     def _upload(self, backend: Backend) -> _MeshBuffers:
         boxes = BoxedParts.upload(backend, *self.boxes())
         return _MeshBuffers(boxes, FaceCurves.upload(backend, self.faces))
-
-    def _on(self) -> _MeshBuffers:
-        if self._device is None:
-            raise RuntimeError("prepare(backend) comes first")
-        return self._device
-
-    def next_part(
-        self, o: Vec3, d: Vec3, after: PartEntry, start: Real, end: Real, active: Mask
-    ) -> PartEntry:
-        return self._on().boxes.next(o, d, after, start, end, active)
 
     def part_at(self, index: Any) -> Field:
         return self._on().curves.face(index)
@@ -140,11 +105,6 @@ class PolygonMesh(Field):
                     "comes near far away: its surfaces have no bounds; choose another level, such "
                     "as 2 pi"
                 )
-
-    def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """The box around the boxes of all faces."""
-        lower, upper = self.boxes(levels)
-        return Box(lower.min(axis=0), upper.max(axis=0))
 
     def describe(self) -> dict[str, Any]:
         return {

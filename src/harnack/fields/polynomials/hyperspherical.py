@@ -11,7 +11,7 @@ import drjit as dr
 
 from harnack.backend.extrema import fmax, fmin
 from harnack.enclosures import Arc, Curvature, Lipschitz, Parabola, Pieces, Slopes
-from harnack.fields.field import Field
+from harnack.fields.field import Field, check_in_range
 from harnack.fields.look import Look, Path, Sample
 from harnack.fields.polynomials.axial_bounds import (
     AxialBound,
@@ -350,18 +350,7 @@ class HypersphericalHarmonic(Field):
         return Ball(radius=radius) if 0 < radius < math.inf else None
 
     def check_levels(self, levels: tuple[float, ...]) -> None:
-        """Refuse levels that no point can have.
-
-        Raises:
-            ValueError: a level is proved to lie outside the range of the function.
-        """
-        low, high = self.value_range
-        for level in levels:
-            if not low <= level <= high:
-                raise ValueError(
-                    f"no surface has level {level:g}: the function stays within "
-                    f"[{low:.6g}, {high:.6g}]"
-                )
+        check_in_range(levels, self.value_range)
 
     def describe(self) -> dict[str, Any]:
         return {

@@ -11,7 +11,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.enclosures import Curvature, HarmonicBall, Lipschitz, Promise
-from harnack.fields.field import Field, Sample
+from harnack.fields.field import Field, Sample, check_in_range
 from harnack.fields.polynomials.axial_bounds import order_on_axis
 from harnack.fields.polynomials.harmonic_promises import HarmonicPromises
 from harnack.fields.polynomials.solid_harmonics import (
@@ -83,18 +83,7 @@ class _SolidHarmonics(Field):
         return evaluate(self._weights, s.x, s.y, s.z)[0]
 
     def check_levels(self, levels: tuple[float, ...]) -> None:
-        """Refuse levels that no point of the domain can have.
-
-        Raises:
-            ValueError: a level is proved to lie outside the range in the domain.
-        """
-        low, high = self.value_range
-        for level in levels:
-            if not low <= level <= high:
-                raise ValueError(
-                    f"no surface has level {level:g}: in its domain the function stays within "
-                    f"[{low:.6g}, {high:.6g}]"
-                )
+        check_in_range(levels, self.value_range, "in its domain the function")
 
     def describe(self) -> dict[str, Any]:
         return {

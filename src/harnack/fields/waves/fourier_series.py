@@ -14,7 +14,7 @@ import numpy as np
 
 from harnack.backend import backend_of
 from harnack.backend.numbers import real_array
-from harnack.fields.field import Field, Sample
+from harnack.fields.field import Field, Sample, check_in_range
 from harnack.fields.kept import prepared_once
 from harnack.fields.waves.cosine_series import CosineBounds, fit_cosines, midpoints
 from harnack.fields.waves.cosine_sums import CosineSums
@@ -263,18 +263,7 @@ class FourierSeries(Field):
         return Box(cast("Any", tuple(corners[0].tolist())), cast("Any", tuple(corners[1].tolist())))
 
     def check_levels(self, levels: tuple[float, ...]) -> None:
-        """Refuse levels that no point of the box can have.
-
-        Raises:
-            ValueError: a level is proved to lie outside the range of the series.
-        """
-        low, high = self.value_range
-        for level in levels:
-            if not low <= level <= high:
-                raise ValueError(
-                    f"no surface has level {level:g}: in its box the series stays within "
-                    f"[{low:.6g}, {high:.6g}]"
-                )
+        check_in_range(levels, self.value_range, "in its box the series")
 
     def describe(self) -> dict[str, Any]:
         return {

@@ -11,7 +11,7 @@ import drjit as dr
 
 from harnack.backend.extrema import fmax, fmin
 from harnack.enclosures import Curvature, Lipschitz
-from harnack.fields.field import Field, Sample
+from harnack.fields.field import Field, Sample, check_in_range
 from harnack.fields.waves.extension import ExtensionRange
 from harnack.fields.waves.wave_rounding import WaveRounding
 from harnack.fields.waves.waves import (
@@ -129,18 +129,7 @@ class EigenfunctionSum(Field):
         return x, y, z
 
     def check_levels(self, levels: tuple[float, ...]) -> None:
-        """Refuse levels that no point can have.
-
-        Raises:
-            ValueError: a level is proved to lie outside the range of the function.
-        """
-        least, most = self.value_range
-        for level in levels:
-            if not least <= level <= most:
-                raise ValueError(
-                    f"no surface has level {level:g}: the function stays within "
-                    f"[{least:g}, {most:g}]"
-                )
+        check_in_range(levels, self.value_range)
 
     def wall_levels(self, half_width: float, *, level: float | None = None) -> tuple[float, float]:
         """The two levels of the wall |f - level| <= half_width, as `solid=` wants them.

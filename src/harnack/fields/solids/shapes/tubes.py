@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -14,17 +13,13 @@ from harnack.backend.extrema import clamp, fmax
 from harnack.backend.numbers import check_finite, check_size, check_vectors, real_array
 from harnack.backend.records import Records
 from harnack.enclosures import Curvature, Lipschitz, Promise
-from harnack.fields.boxed_parts import BoxedParts
+from harnack.fields.boxed_parts import BoxedField, BoxedParts
 from harnack.fields.field import Field, Sample
-from harnack.fields.kept import prepared_once
-from harnack.fields.parts import PartEntry
 from harnack.fields.solids.shapes.checks import positive
-from harnack.geometry import Box
 from harnack.tree.boxes import MOST_BOXES
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.geometry import Volume
+    from harnack.backend import Backend, Real, Vec3
 
 __all__ = ["Tubes"]
 
@@ -34,7 +29,7 @@ _SLACK = 1e-5
 _REACH = 0.5
 
 
-class Tubes(Field):
+class Tubes(BoxedField["_TubeBuffers"]):
     """The surfaces at distance `radius` from many segments: edges of meshes, wires, struts.
 
     points: (n, 3). segments: (m, 2) indices of points, counted from 0. radius: a number, or (m,).
@@ -49,9 +44,9 @@ class Tubes(Field):
     """
 
     default_level: float = 0.0
-    has_parts: bool = True
 
     def __init__(self, points: Any, segments: Any, radius: Any) -> None:
+        super().__init__()
         array = real_array(points, "the points of tubes")
         check_vectors(array, "the points of tubes")
         self.points: FloatArray = np.array(array, dtype=np.float64)
@@ -59,13 +54,10 @@ class Tubes(Field):
         check_size(self.points, ValueError)
         self.segments: IntArray = _checked_segments(segments, self.points)
         self.radius: FloatArray = _checked_radius(radius, len(self.segments))
-        self._for_levels: dict[tuple[float, ...], Tubes] = {}
-        self._levels: tuple[float, ...] = (self.default_level,)
-        self._device: _TubeBuffers | None = None
 
     def boxes(self, levels: tuple[float, ...] | None = None) -> tuple[FloatArray, FloatArray]:
         """Lower and upper corners (m, 3) of boxes around the tubes."""
-        level = max(self._levels if levels is None else levels)
+        level = max(self.levels if levels is None else levels)
         ends = self.points[self.segments]
         reach = (self.radius + level)[:, None]
         low, high = ends.min(axis=1) - reach, ends.max(axis=1) + reach
@@ -80,38 +72,14 @@ class Tubes(Field):
             "harnack.Tube for one polyline that is to be evaluated or combined with other solids"
         )
 
-    def for_levels(self, levels: tuple[float, ...]) -> Tubes:
-        if levels == self._levels:
-            return self
-        if levels not in self._for_levels:
-            other = copy.copy(self)
-            other._levels = levels
-            self._for_levels[levels] = other
-        return self._for_levels[levels]
-
-    @prepared_once
-    def prepare(self, backend: Backend) -> Tubes:
-        if self._device is not None and self._device.boxes.backend is backend:
-            return self
-        prepared = copy.copy(self)
+    def _upload(self, backend: Backend) -> _TubeBuffers:
         boxes = BoxedParts.upload(backend, *self.boxes())
         centre = np.array(boxes.centre, dtype=np.float64).reshape(3)
         start, end = ((self.points[ends] - centre) for ends in self.segments.T)
         side = end - start
         inverse = 1.0 / (side * side).sum(axis=1)
         rows = np.column_stack([start, self.radius, side, inverse])
-        prepared._device = _TubeBuffers(boxes, Records.upload(backend, rows))
-        return prepared
-
-    def _on(self) -> _TubeBuffers:
-        if self._device is None:
-            raise RuntimeError("prepare(backend) comes first")
-        return self._device
-
-    def next_part(
-        self, o: Vec3, d: Vec3, after: PartEntry, start: Real, end: Real, active: Mask
-    ) -> PartEntry:
-        return self._on().boxes.next(o, d, after, start, end, active)
+        return _TubeBuffers(boxes, Records.upload(backend, rows))
 
     def part_at(self, index: Any) -> Field:
         on = self._on()
@@ -124,10 +92,6 @@ class Tubes(Field):
                 raise ValueError(
                     f"level {level:g} leaves nothing of the thinnest tube, of radius {least:g}"
                 )
-
-    def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        lower, upper = self.boxes(levels)
-        return Box(lower.min(axis=0), upper.max(axis=0))
 
     def describe(self) -> dict[str, Any]:
         return {"segments": len(self.segments)}
