@@ -14,6 +14,7 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy
+from harnack.enclosures import Cusp, Gaps, Nearest, Sheet, Slopes
 from harnack.fields.plane.branches import Branches, Disk, Stretch, complex_type
 from harnack.fields.plane.functions import branches_of
 from harnack.testing import BrokenPromiseError, check_field
@@ -193,6 +194,67 @@ def test_a_singular_point_left_out_is_found() -> None:
     wrong = hk.RiemannSurface(root, singular=[5], second=lambda z, r: 0.25 * abs(z) ** -1.5)
     with pytest.raises(BrokenPromiseError):
         check_field(wrong)
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.001])
+@pytest.mark.parametrize("rises", [False, True])
+def test_sheets_that_bend_as_far_as_they_may_are_met(rises: bool, factor: float) -> None:
+    """Two sheets on the parabolas of their bounds: the step ends where the first of them meets the
+    level, and one that is 1.001 times as long passes it."""
+    real, rng = choose_backend("double").Float, np.random.default_rng(3)
+    n = 2000
+    near = 10 ** rng.uniform(-4, 0, n)
+    far = near + 10 ** rng.uniform(-4, 0, n)
+    bend = 10 ** rng.uniform(-1, 2, n)
+    slopes = rng.normal(size=(2, n))
+    gap = rng.uniform(0.1, 2, n) * near
+
+    sheets = [
+        Sheet(Slopes(real(slope), real(slope)), real(beyond))
+        for slope, beyond in zip(slopes, (0 * near, far - near), strict=True)
+    ]
+    nearest = Nearest(tuple(sheets), sheets[0], real(near), real(near) > 0, real(bend), real(1e9))
+    none = real(np.full(n, np.inf))
+    gaps = Gaps(none, real(gap)) if rises else Gaps(real(gap), none)
+    s = factor * to_numpy(nearest.step(gaps))
+    # Towards zero sheets fall as fast as they may; away from it the nearest rises so, or falls.
+    sign = 1 if rises else -1
+    first, second = (
+        h + slope * s + sign * bend * s * s / 2
+        for h, slope in zip((near, far), slopes, strict=True)
+    )
+    if rises:
+        below = near + slopes[0] * s - bend * s * s / 2
+        passed = (first > near + gap) | (below < -near - gap)
+    else:
+        # To the level near - gap, which may lie behind zero.
+        passed = np.minimum(first, second) < near - gap
+    assert np.isfinite(s).all()
+    assert passed.all() if factor > 1 else not passed.any()
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.001])
+def test_branches_that_turn_as_far_as_they_may_are_met(factor: float) -> None:
+    """Along a line beside a branch point, with branches as far from their value there as they may
+    be: the step ends where the nearest meets the level."""
+    real, rng = choose_backend("double").Float, np.random.default_rng(4)
+    n = 2000
+    height, fall, constant = 10 ** rng.uniform(-3, 2, (3, n))
+    power = rng.choice([0.25, 1 / 3, 0.5, 2 / 3], n)
+    distance = height * rng.uniform(0.2, 1, n)
+    gap = distance * rng.uniform(0.1, 1, n)
+    room = height - (distance - gap)
+    across = (0.5 * room / constant) ** (1 / power) * (1 - 2e-5)
+    zero, none = real(0 * across), real(np.full(n, np.inf))
+    cusp = Cusp(
+        real(height), real(fall), zero, real(across), zero, real(power), real(constant),
+        none, real(distance), zero == 0,
+    )  # fmt: skip
+    s = factor * to_numpy(cusp.step(Gaps(real(gap), none)))
+    left = height - fall * s - constant * across**power
+    passed = left < distance - gap
+    assert (s > 0).all()
+    assert passed.all() if factor > 1 else not passed.any()
 
 
 @pytest.mark.parametrize(("name", "most"), [("log", 5.7), ("sqrt", 5.0)])
