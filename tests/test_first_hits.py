@@ -286,7 +286,7 @@ def test_the_lift_of_a_coil_leaves_the_assumed_range() -> None:
     centre = np.array([[0.0, 0.0, 1.0]])
     oracle, p = CurveOracle(COIL), to_vector3(choose_backend("double"), centre)
     assumed = hk.SolidAngle(COIL, certificate="paper").evaluate(p).known[0]
-    proved = hk.SolidAngle(COIL).evaluate(p).known[0]
+    proved = hk.SolidAngle(COIL).evaluate(p).weaker[0]
     assert movement(oracle, centre, assumed).min() < -2.5 * FOUR_PI
     assert assumed.lower == -1.5 * FOUR_PI
     value = oracle(centre).value[0]

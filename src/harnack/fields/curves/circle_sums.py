@@ -9,14 +9,10 @@ and Savart's integrals are bounded by
 
     integral of |dp|/D^3 = 4 a E/(P d^2) <= 2 pi a B,   B = sqrt((1/d^2 + 1/P^2)/2)/(P d),
 
-as E <= (pi/2) sqrt((1 + kc^2)/2) by Jensen's inequality for the root. Walking by t, both distances
-fall by at most t, and both bounds fall with both distances. Hence, within s < d of a point:
+as E <= (pi/2) sqrt((1 + kc^2)/2) by Jensen's inequality for the root. What follows within d of a
+point is the same for all curves (`curve_promises`). Walking by t, both distances fall by at most t,
+and both bounds fall with both distances. Hence, for lines:
 
-- Variation. |Omega(y) - Omega(x)| <= integral over [0, s] of 2 pi a g(t) dt, g(t) = 1/((P-t)(d-t)).
-  g is convex, so up to t = d/2 it lies below its chord there: with s <= d/2 the integral is at most
-  2 pi a [s/(P d) + (s/d)^2 (2/(P - d/2) - 1/P)].
-- Curvature. The second derivative along a unit direction v is a sum of 3 (v.D)(v.(D x dp))/D^5, and
-  |(v.D)(v.(D x dp))| <= D^2 |dp|/2, as D and D x dp are at right angles: |v.H.v| <= 3 pi a B.
 - Lines. Points at r from the axis are at least |r - a| from the circle, which tells of a line that
   passes beside it more than the distance of one of its points does. At height z above the circle's
   plane the gradient's part along the plane is at most |z| times the integral of |dp|/D^3. A line
@@ -53,17 +49,16 @@ class CircleSums:
 
     angle, gradient: of the solid angle; each circle's is in (-2 pi, 2 pi).
     distance: to the nearest circle.
-    first, second: a circle varies by at most 2 r first + 4 r^2 second within r <= d/2.
-    bend: of pi a B; three times it bounds second derivatives.
+    squares, cubes, fourths: of the integrals of |dp|/D^k, k = 2, 3 and (a bound) 4, D the distance.
     lower, upper: a range of the lift on the ball of the radius `distance`: see `planar_window`.
     """
 
     angle: Real
     gradient: Vec3
     distance: Real
-    first: Real
-    second: Real
-    bend: Real
+    squares: Real
+    cubes: Real
+    fourths: Real
     lower: Real
     upper: Real
 
@@ -110,34 +105,32 @@ class Circles:
         x = vector(x)
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            angle, gradient, distance, first, second, bend, lower = state
+            angle, gradient, distance, squares, cubes, fourths, lower = state
             seen = self._seen(row, x)
             circle, a = seen.circle, seen.a
             # Lengths times 1/a here, divided out at the end: all of it stays of order one.
             gradient = dr.fma(vector(circle.across / (a * a)), seen.outward, gradient)
             gradient = dr.fma(vector(circle.axial / a), seen.normal, gradient)
             near, far = circle.nearest, circle.farthest
-            slope = math.pi / (near * far)
-            rise = 2 / (far - 0.5 * near) - 1 / far
-            mean = dr.sqrt(0.5 * (dr.rcp(near * near) + dr.rcp(far * far)))
+            cube = circle.third / (a * a)
             above = circle.angle < 0
             window = dr.select(circle.r < 1, dr.select(above, real(-4 * math.pi), 0), -2 * math.pi)
             return (
                 angle + circle.angle,
                 gradient,
                 fmin(seen.distance, distance),
-                first + slope / a,
-                second + 0.5 * math.pi * rise / (near * near * a * a),
-                bend + slope * mean / (a * a),
+                squares + 2 * math.pi / (near * far * a),
+                cubes + cube,
+                fourths + cube / (near * a),
                 lower + window,
             )
 
         start = (real(0), vector(0), real(dr.inf), real(0), real(0), real(0), real(0))
-        angle, gradient, distance, first, second, bend, lower = self.records.for_each(
+        angle, gradient, distance, squares, cubes, fourths, lower = self.records.for_each(
             add, start, "circles"
         )
         upper = lower + 4 * math.pi * real(self.records.trips)
-        return CircleSums(angle, gradient, distance, first, second, bend, lower, upper)
+        return CircleSums(angle, gradient, distance, squares, cubes, fourths, lower, upper)
 
     def angle_and_variation(self, x: Vec3, reach: Real) -> tuple[Real, Real, Real]:
         """The sum of solid angles at x, the distance, and a bound of the variation of the lift

@@ -11,6 +11,7 @@ import numpy as np
 
 from harnack.backend.records import Records
 from harnack.enclosures import HarmonicBall
+from harnack.fields.edges.curve_promises import bends, swept_ball
 from harnack.fields.edges.edge_passing import Line, known_along, rates_along
 from harnack.fields.edges.edge_records import LoopEdges
 from harnack.fields.edges.edge_sums import sum_over_edges
@@ -27,8 +28,6 @@ __all__ = ["PERIOD", "FaceCurve", "FaceCurves", "FaceHead"]
 PERIOD = 4 * math.pi
 # Edges of a record. Always as many: another number is another kernel.
 RUN = 4
-# The ball of the edge certificate, as a part of the distance to the curve: see `SolidAngle`.
-_REACH = 0.5
 # Records are counted in floats; single precision counts no further.
 _MOST_RECORDS = 2**24
 
@@ -98,8 +97,8 @@ class FaceHead(UnitCoordinates):
 class FaceCurve(Field):
     """The solid angle of a face, in each lane another: what `SolidAngle` is, and says why.
 
-    The lift is bounded by the edges of the face, or where it is convex by the range that a curve in
-    convex position has.
+    Its promises are the same. The ball is that of any curve, or where the face is convex, that of a
+    curve in convex position.
     """
 
     period: ClassVar[float | None] = PERIOD
@@ -125,22 +124,22 @@ class FaceCurve(Field):
     def _sample(self, p: Vec3, direction: Vec3 | None) -> Sample:
         face = self.face
         backend, x, rounding = face.backend, face.unit(p), face.rounding
-        sums = sum_over_edges(face.edges, x, variation=True)
+        sums = sum_over_edges(face.edges, x)
         distance = sums.distance * (1 - SUM_ROUNDING) - rounding
-        convex, r = face.trips < 0, _REACH * distance
-        variation = 2 * r * (sums.first + r / (1 - _REACH) * sums.second) * (1 + SUM_ROUNDING)
+        known = bends(sums.cubes, sums.fourths, distance)
+        swept = swept_ball(sums.angle, sums.gradient, sums.squares, known)
+        convex = face.trips < 0
         ball = HarmonicBall(
-            dr.select(convex, distance, r),
-            dr.select(convex, -1.5 * PERIOD, sums.angle - variation),
-            dr.select(convex, 1.5 * PERIOD, sums.angle + variation),
+            dr.select(convex, distance, swept.radius),
+            dr.select(convex, -1.5 * PERIOD, swept.lower),
+            dr.select(convex, 1.5 * PERIOD, swept.upper),
         )
         # On the curve itself, to rounding, every level meets, and no gradient exists.
         met = sums.distance <= 2 * rounding
         steep = backend.Array3f(0, 0, 4 * PERIOD / rounding)
         gradient = dr.select(met, steep, sums.gradient)
-        error = dr.select(met, 0, 4 * backend.epsilon * sums.first) + face.value_rounding
+        error = dr.select(met, 0, 2 * backend.epsilon * sums.squares) + face.value_rounding
         error = dr.select(met, 8 * PERIOD, error)
-        known = (ball,)
         if direction is not None:
             line = Line(x, backend.Array3f(direction), rounding)
 
@@ -148,4 +147,5 @@ class FaceCurve(Field):
                 return rates_along(face.edges, line, lengths, active)
 
             known = (*known, *known_along(line, sums.gradient, sums.distance, rates))
-        return lengthened(Sample(dr.select(met, 0, sums.angle), gradient, known, error), face.size)
+        value = dr.select(met, 0, sums.angle)
+        return lengthened(Sample(value, gradient, known, error, weaker=(ball,)), face.size)

@@ -121,7 +121,8 @@ def planar_region(loops: Loops, circles: Sequence[Circle]) -> PlanarRegion | Non
     flat: list[_Loop] = []
     for loop in loops:
         centred = (loop - origin) / size
-        if len(loop) < 3 or not is_simple(centred):
+        edges = np.roll(centred, -1, axis=0) - centred
+        if len(loop) < 3 or not (edges * edges).sum(axis=1).all() or not is_simple(centred):
             return None
         points = centred @ axes.T
         following = np.roll(points, -1, axis=0)

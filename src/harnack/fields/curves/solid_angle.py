@@ -20,10 +20,11 @@ from harnack.fields.curves.edge_angles import differentiable_angle
 from harnack.fields.curves.edge_extent import tight_extent
 from harnack.fields.curves.edge_nearest import closest_on_segments, segments
 from harnack.fields.curves.planar import PlanarRegion, planar_region
+from harnack.fields.edges.curve_promises import bends, swept_ball
 from harnack.fields.edges.edge_passing import Line, known_along, rates_along
 from harnack.fields.edges.edge_records import LoopEdges
-from harnack.fields.edges.edge_sums import hessian_over_edges, sum_over_edges
-from harnack.fields.field import Look, Path, Sample
+from harnack.fields.edges.edge_sums import EdgeSums, hessian_over_edges, sum_over_edges
+from harnack.fields.field import Look, Path, Sample, lengthened
 from harnack.fields.sums import (
     SECOND_ROUNDINGS,
     SLOPE_ROUNDINGS,
@@ -43,9 +44,6 @@ if TYPE_CHECKING:
 CertificateName = Literal["auto", "planar", "edges", "convex", "paper"]
 
 _PERIOD = 4 * math.pi
-# The ball of the edge certificate is this fraction of the distance to the curve (by experiment:
-# 0.5 to 0.65 need the fewest evaluations, 0.8 more).
-_REACH = 0.5
 # Levels as near as this to a multiple of 4 pi count as one.
 _NARROW = 1e-9 * _PERIOD
 
@@ -62,28 +60,23 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
     anything is computed (`net_loops`): f does not see them. If none is left, f is 0 everywhere,
     every ray a proved miss, and levels that are multiples of 4 pi are refused.
 
-    certificate: how the lift is bounded near a point. "auto" takes "planar" for curves with circles
-    where its hypothesis is checked to hold, "convex" where that does, else "edges".
+    Promises. Second derivatives are bounded near every curve (`curve_promises`), and steps rest on
+    that. The other proofs, chosen by `bound=`, need the range of the lift on a ball, which is
+    longer steps' price: on wavy polygons and knots they take 1.4 to 2 times as many evaluations.
 
-    - "edges" holds for **every** curve. Let d_e be the distance from x to edge e of length 2a_e
-      and r = d/2, d = min d_e. At distance rho an edge's Biot-Savart field is at most
-      2a/(rho sqrt(rho^2+a^2)): the value for the foot at mid-edge, the worst place, as the field
-      is an integral of rho/(rho^2+s^2)^(3/2) that concentrates there. Walking from x, rho falls
-      no faster than the distance walked, so the lift moves on B(x, r) by at most
-      S = sum_e integral_0^r 2a/((d_e-s) sqrt((d_e-s)^2+a^2)) ds, and pulling d_e-s = (1-t) d_e
-      out of the root (which only grows the term) gives with r/d_e <= 1/2
+    certificate: how the lift is bounded on a ball. "auto" takes "planar" where its hypothesis is
+    checked to hold, "convex" where that does, else "edges".
 
-          S <= sum_e 2a/sqrt(d_e^2+a^2) (r/d_e)/(1-r/d_e)
-            <= 2 r sum_e a/(d_e sqrt(..)) + 4 r^2 sum_e a/(d_e^2 sqrt(..)).
-
-      Circles add a bound of the same form (`circle_sums`).
-    - "planar": on B(x, d) the lift stays in a window 4 pi wide if all loops together bound a region
-      of a plane (`planar`); else, for circles alone, in the sum of one such window a circle.
+    - "edges" holds for **every** curve: |grad f| and the bound of second derivatives say how far f
+      moves (`swept_ball`).
+    - "planar": on B(x, d), d the distance to the curve, the lift stays in a window 4 pi wide if all
+      loops together bound a region of a plane (`planar`); else, for circles alone, in the sum of
+      one such window a circle.
     - "convex": on B(x, d) the lift stays in (-6 pi, 6 pi) if the curve is one loop without
       self-intersections on the boundary of a convex set: a segment crosses the 2 pi level, where
       the principal value in (-2 pi, 2 pi) jumps by 4 pi, at most once net (paper, Theorem C.1).
-    - "paper" assumes that range for any curve, as the paper does. It is false for coils and
-      links and exists for comparisons: hits can be missed.
+    - "paper" assumes that range for any curve and promises nothing else, as the paper does. It is
+      false for coils and links and exists for comparisons: hits can be missed.
 
     Raises CurveError for loops that are not closed curves, ValueError for "convex" where the
     hypothesis fails.
@@ -91,6 +84,7 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
 
     period: ClassVar[float | None] = _PERIOD
     default_level: float = 2 * math.pi
+    overstep: float = 1.3  # by experiment
 
     def __init__(self, loops: Any, *, certificate: CertificateName = "auto") -> None:
         super().__init__()
@@ -107,10 +101,8 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
             not self._net_circles and is_convex_position(self._net)
         )
         self._region: PlanarRegion | None = None
-        if self._net_circles:
+        if not self._is_empty:
             self._region = planar_region(self._net, self._net_circles)
-        if self.convex_position:
-            self.overstep = 1.6
         self._asked = certificate
         self.certificate = self._choose(certificate)
         points = self._points_around()
@@ -206,43 +198,42 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         if self._is_empty:
             return self._constant(on, p)
         x = on.unit(p)
-        sums = on.sums(x, variation=self.certificate == "edges")
+        sums = on.sums(x)
         epsilon = on.backend.epsilon
         rounding = on.rounding
         distance = sums.distance * (1 - SUM_ROUNDING) - rounding
+        known = bends(sums.cubes, sums.fourths, distance)
         if self.certificate == "edges":
-            ball = self._edge_ball(on, sums, distance)
+            ball = swept_ball(sums.angle, sums.gradient, sums.squares, known)
         elif self.certificate == "planar":
             ball = self._planar_ball(on, x, sums, distance)
         else:
-            ball = HarmonicBall(distance * on.size, -1.5 * _PERIOD, 1.5 * _PERIOD)
+            ball = HarmonicBall(distance, -1.5 * _PERIOD, 1.5 * _PERIOD)
         # On the curve itself, to rounding, every level meets (`uncancelled_edges`) and no gradient
         # exists: give one so steep that the point counts as close to any level. A value that is
         # not a number anywhere else stays one, and the tracer refuses it.
         met = sums.distance <= 2 * rounding
         steep = on.backend.Array3f(0, 0, 4 * _PERIOD / rounding)
-        gradient = dr.select(met, steep, sums.gradient) / on.size
+        gradient = dr.select(met, steep, sums.gradient)
         error, gradient_error = on.value_rounding, 0.0
-        if self.certificate == "edges":
-            # Ends of edges, rounded, move each edge's angle by that times its field, which is at
-            # most twice `first`: where edges nearly cancel, the gradient does not show it.
-            error = error + dr.select(met, 0, 4 * epsilon * sums.first)
+        # Ends of edges, rounded, move each edge's angle by at most that times the integral of
+        # |dp|/D^2: where edges nearly cancel, the gradient does not show it.
+        error = error + dr.select(met, 0, 2 * epsilon * sums.squares)
         if sums.circles is not None:
             own = sums.circles
             # Measured: 15 units in the last place of a circle's angle and 60 of its gradient (near
             # it, 10 elsewhere). Its place is rounded by a few units besides.
             place = epsilon * (4 + 4 * dr.max(dr.abs(x)))
-            value = 16 * epsilon * len(self._net_circles) + 2 * place * own.first
+            value = 16 * epsilon * len(self._net_circles) + place * own.squares
             error = error + dr.select(met, 0, value)
-            slope = 64 * epsilon * own.first + 3 * place * own.bend
-            gradient_error = dr.select(met, 0, slope) / on.size
+            slope = 32 * epsilon * own.squares + 1.5 * place * own.cubes
+            gradient_error = dr.select(met, 0, slope)
         error = dr.select(met, 8 * _PERIOD, error)  # that gradient times 2 rounding
-        balls = (ball,)
-        if self.certificate == "planar" and self._region is None:
-            # A window each is wide: the variation proves more on half of the way.
-            balls = (ball, self._edge_ball(on, sums, distance))
-        known = (*balls, *_along_curves(on, x, sums, direction))
-        return Sample(dr.select(met, 0, sums.angle), gradient, known, error, gradient_error)
+        along = _along_curves(on, x, sums, direction)
+        known = (ball,) if self._asked == "paper" else (*known, *along)
+        value = dr.select(met, 0, sums.angle)
+        sample = Sample(value, gradient, known, error, gradient_error, weaker=(ball,))
+        return lengthened(sample, on.size)
 
     def _planar_ball(
         self, on: _CurveBuffers, x: Vec3, sums: CurveSums, distance: Real
@@ -250,10 +241,9 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         if self._region is None:
             own = sums.circles
             assert own is not None
-            return HarmonicBall(distance * on.size, own.lower, own.upper)
+            return HarmonicBall(distance, own.lower, own.upper)
         slack = on.rounding + on.backend.epsilon * 4 * dr.max(dr.abs(x))
-        ball = self._region.window(sums.angle, on.height(x), distance, slack)
-        return dataclasses.replace(ball, radius=ball.radius * on.size)
+        return self._region.window(sums.angle, on.height(x), distance, slack)
 
     def _constant(self, on: _CurveBuffers, p: Vec3) -> Sample:
         """The sample of f = 0, for a curve of which nothing is left: it is true on any ball. The
@@ -263,11 +253,6 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         zero = dr.zeros(on.backend.Float, dr.width(p))
         ball = HarmonicBall(radius, zero - _NARROW, zero + _NARROW)
         return Sample(zero, on.backend.Array3f(zero), (ball,))
-
-    def _edge_ball(self, on: _CurveBuffers, sums: CurveSums, distance: Real) -> HarmonicBall:
-        r = _REACH * distance
-        variation = 2 * r * (sums.first + r / (1 - _REACH) * sums.second) * (1 + SUM_ROUNDING)
-        return HarmonicBall(r * on.size, sums.angle - variation, sums.angle + variation)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         """Rows of the Hessian, free of trace to rounding. It grows without limit at the curve."""
@@ -293,12 +278,12 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         if self._is_empty:
             return 0.0, 0.0
         x = on.unit(p)
-        sums, unit = on.sums(x, variation=True), epsilon_at(x)
+        sums, unit = on.sums(x), epsilon_at(x)
         distance = sums.distance - 4 * unit
         known = (distance > 0) & (sums.distance > 2 * on.rounding)  # see `evaluate`
         share = dr.select(known, dr.square(dr.square(sums.distance / distance)), dr.inf)
-        slope = (SLOPE_ROUNDINGS * 2 / 3) * unit * sums.bend * share / on.size
-        second = 0.5 * SECOND_ROUNDINGS * unit * sums.bend / sums.distance * share
+        slope = SLOPE_ROUNDINGS / 3 * unit * sums.cubes * share / on.size
+        second = 0.25 * SECOND_ROUNDINGS * unit * sums.cubes / sums.distance * share
         return slope, second / (on.size * on.size)
 
     def closest_on_boundary(self, p: Vec3) -> Vec3 | None:
@@ -409,37 +394,35 @@ class _CurveBuffers(UnitCoordinates):
         assert self.plane is not None
         return dr.dot(self.backend.Array3f(*self.plane[:3]), x) - self.plane[3]
 
-    def sums(self, x: Vec3, *, variation: bool) -> CurveSums:
-        """All sums at x, in unit coordinates; those that bound the variation only if asked for."""
+    def sums(self, x: Vec3) -> CurveSums:
+        """All sums at x, in unit coordinates."""
         parts: list[CurveSums] = []
         if self.edges is not None:
-            one = sum_over_edges(self.edges, x, variation=variation)
-            first, second = one.first, one.second
-            parts.append(CurveSums(one.angle, one.gradient, one.distance, first, second, second))
+            parts.append(CurveSums.of(sum_over_edges(self.edges, x)))
         if self.circles is not None:
             own = self.circles.sums(x)
-            parts.append(
-                CurveSums(
-                    own.angle, own.gradient, own.distance, own.first, own.second, own.bend, own
-                )
-            )
+            parts.append(dataclasses.replace(CurveSums.of(own), circles=own))
         return functools.reduce(CurveSums.plus, parts)
 
 
 @dataclass(frozen=True)
 class CurveSums:
-    """Sums over edges and circles, as `EdgeSums`; bend: a third of a bound of second derivatives.
-
-    circles: those over circles alone, None if there are none.
-    """
+    """Sums over edges and circles, as `EdgeSums`; circles: those over circles alone, None if there
+    are none."""
 
     angle: Real
     gradient: Vec3
     distance: Real
-    first: Real
-    second: Real
-    bend: Real
+    squares: Real
+    cubes: Real
+    fourths: Real
     circles: CircleSums | None = None
+
+    @classmethod
+    def of(cls, sums: EdgeSums | CircleSums) -> CurveSums:
+        """Those of edges or of circles alone."""
+        integrals = sums.squares, sums.cubes, sums.fourths
+        return cls(sums.angle, sums.gradient, sums.distance, *integrals)
 
     def plus(self, other: CurveSums) -> CurveSums:
         """The sums of both."""
@@ -447,9 +430,9 @@ class CurveSums:
             self.angle + other.angle,
             self.gradient + other.gradient,
             fmin(self.distance, other.distance),
-            self.first + other.first,
-            self.second + other.second,
-            self.bend + other.bend,
+            self.squares + other.squares,
+            self.cubes + other.cubes,
+            self.fourths + other.fourths,
             other.circles if self.circles is None else self.circles,
         )
 
@@ -470,8 +453,7 @@ def _along_curves(
             found.append(on.circles.rates_along(line, lengths, active))
         return tuple(sum(several) for several in zip(*found, strict=True))
 
-    known = known_along(line, sums.gradient, sums.distance, rates)
-    return tuple(LineLipschitz(one.constant / on.size, one.radius * on.size) for one in known)
+    return known_along(line, sums.gradient, sums.distance, rates)
 
 
 def _is_drjit(value: Any) -> bool:

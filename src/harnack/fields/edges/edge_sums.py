@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import drjit as dr
 
 from harnack.backend.extrema import fmin
-from harnack.fields.edges.edge import Edge, edge_variation
+from harnack.fields.edges.edge import Edge
 from harnack.fields.symmetric import SymmetricSum
 from harnack.tree.nearest import squared_distance_to_segment
 
@@ -32,17 +32,18 @@ _RENORMALISE_EVERY = 2
 @dataclass(frozen=True)
 class EdgeSums:
     """Sums over all edges at x: Omega in (-2pi, 2pi], its gradient, distance to the nearest edge,
-    and (if asked for) sums of a/(d sqrt(d^2+a^2)) and of the same over d, where d is the
-    distance to an edge and a half its length."""
+    and of the integrals of |dp|/D^k along the edges, D the distance to p: squares is at least that
+    for k = 2, cubes is that for k = 3, fourths at least that for k = 4."""
 
     angle: Real
     gradient: Vec3
     distance: Real
-    first: Real
-    second: Real
+    squares: Real
+    cubes: Real
+    fourths: Real
 
 
-def sum_over_edges(edges: LoopEdges, x: Vec3, *, variation: bool) -> EdgeSums:
+def sum_over_edges(edges: LoopEdges, x: Vec3) -> EdgeSums:
     """All sums at x in one loop.
 
     Solid angle. For unit spinors chi(a) of the directions a = p_i - x, the product of
@@ -54,11 +55,18 @@ def sum_over_edges(edges: LoopEdges, x: Vec3, *, variation: bool) -> EdgeSums:
 
     Gradient. Biot-Savart: each edge gives (1/|a|+1/|b|)/(|a||b|+a.b) a x b (Eq. 11). The
     bracket cancels beside the edge; |factor|^2 = 2 s_a s_b (|a||b|+a.b) does not.
+
+    Integrals. Biot and Savart's field of an edge of length L at distance h from its line is h times
+    the integral of |dp|/D^3, and |a x b| = h L: so that integral is L times the weight of a x b in
+    the gradient. With d, the distance to the edge, the integral of |dp|/D^4 is at most 1/d of it,
+    and that of |dp|/D^2 at most 2d times it: in polar angles around the foot of x on the line, both
+    are integrals from t1, cos t1 = h/d, to t2, and 2 (sin t2 - sin t1) >= (t2 - t1) cos t1, since
+    the difference is concave in t2, 0 at t1, and at pi/2 not less than 0 (tan(u/2) >= u/2).
     """
     real, x = edges.backend.Float, edges.backend.Array3f(x)
 
     def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-        zr, zi, g, d2, s1, s2 = state
+        zr, zi, g, d2, squares, cubes, fourths = state
         p = edges.vertex(row, 0)
         a = p - x
         la, sa, ca = spinor(a)
@@ -76,15 +84,18 @@ def sum_over_edges(edges: LoopEdges, x: Vec3, *, variation: bool) -> EdgeSums:
             g = dr.fma(type(g)(weight), dr.cross(a, e), g)
             square = squared_distance_to_segment(a, e, inverse)
             d2 = fmin(square, d2)
-            if variation:
-                first, second = edge_variation(square, inverse)
-                s1, s2 = s1 + first, s2 + second
+            share = weight * dr.rsqrt(inverse)
+            near = dr.rsqrt(square)
+            cubes, fourths = cubes + share, dr.fma(share, near, fourths)
+            squares = dr.fma(share, square * near, squares)
             p, a, la, sa, ca = q, b, lb, sb, cb
-        return zr, zi, g, d2, s1, s2
+        return zr, zi, g, d2, squares, cubes, fourths
 
-    start = (real(1), real(0), type(x)(0), real(dr.inf), real(0), real(0))
-    zr, zi, g, d2, s1, s2 = edges.records.for_each(add, start, "edges")
-    return EdgeSums(2 * dr.atan2(zi, zr), 2 * g, dr.sqrt(d2), s1, s2)
+    start = (real(1), real(0), type(x)(0), real(dr.inf), real(0), real(0), real(0))
+    zr, zi, g, d2, squares, cubes, fourths = edges.records.for_each(add, start, "edges")
+    angle = 2 * dr.atan2(zi, zr)
+    # The weights are half of those in the gradient.
+    return EdgeSums(angle, 2 * g, dr.sqrt(d2), 4 * squares, 2 * cubes, 2 * fourths)
 
 
 def hessian_over_edges(edges: LoopEdges, x: Vec3) -> tuple[Vec3, Vec3, Vec3]:
