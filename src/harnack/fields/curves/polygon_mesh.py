@@ -44,6 +44,7 @@ class PolygonMesh(BoxedField["_MeshBuffers"]):
 
     period: ClassVar[float | None] = PERIOD
     default_level: float = 2 * math.pi
+    overstep: float = 1.3  # as of `SolidAngle`
 
     def __init__(self, vertices: Any, faces: Any) -> None:
         super().__init__()

@@ -121,16 +121,15 @@ class LiftedEdge:
         the edge is seen at, and the same bits of an end serve both edges there. It is less than
         4 pi in any case.
 
-        Variation. Along a line the k-th derivative of an edge's field is at most the integral of
-        k!/rho^(k+1) over it (Biot and Savart), so that Taylor's remainder after the linear term is
-        at most that of t^2/(rho^3 (1-t/rho)). With a = L/2 and distance d an edge has int rho^-3 <=
-        2a/(d^2 sqrt(d^2+a^2)) =: 2e, int rho^-4 <= 2e/d; and 1/(1-q) <= 1 + q/(1-b) <= 1 + q rise/4
-        on [0, b] (`FieldSums.sample`). So an edge adds to the remainder what s4 += 2e/3 and
-        s5 += e/(2d) do. d is less by what rounding may have done to it.
+        Variation. Taylor's remainder after the linear term is at most 3/4 t^2 times the integral of
+        |dp|/(rho^3 (1-t/rho)) (`curve_promises`). With a = L/2 and distance d an edge has int rho^-3
+        <= 2a/(d^2 sqrt(d^2+a^2)) =: 2e, int rho^-4 <= 2e/d; and 1/(1-q) <= 1 + q/(1-b) <= 1 + q
+        rise/4 on [0, b] (`FieldSums.sample`). So an edge adds to the remainder what s4 += e/2 and
+        s5 += 3e/(8d) do. d is less by what rounding may have done to it.
         """
         distance = fmax(dr.sqrt(self.edge.square) - 2 * unit, 0)
         first, e = edge_variation(distance * distance, self.edge.inverse)
-        return fmin(2 * unit * first, 4 * dr.pi), 2 / 3 * e, 0.5 * dr.rcp(distance) * e
+        return fmin(2 * unit * first, 4 * dr.pi), 0.5 * e, 0.375 * dr.rcp(distance) * e
 
 
 @dataclass(frozen=True)
