@@ -14,9 +14,9 @@ from harnack.backend.basis import across_rows
 from harnack.distance.around import nearest_seen, surface_box
 from harnack.distance.batches import in_batches
 from harnack.distance.closing_in import close_in, nearer_along
-from harnack.distance.lower_bound import distance_below
 from harnack.distance.on_sheets import SheetSearch
 from harnack.distance.projection import Descent
+from harnack.fields.clearance import distance_below
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3

@@ -14,8 +14,8 @@ from harnack.choices import did_you_mean
 from harnack.distance.batches import in_batches
 from harnack.distance.closest import Closest, find_closest, find_on_sheets
 from harnack.distance.estimates import first_order, second_order
-from harnack.distance.lower_bound import distance_below
 from harnack.enclosures import TargetLevels
+from harnack.fields.clearance import distance_below
 from harnack.fields.field import Field
 from harnack.tracer import level_set
 

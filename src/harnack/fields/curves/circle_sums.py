@@ -132,27 +132,6 @@ class Circles:
         upper = lower + 4 * math.pi * real(self.records.trips)
         return CircleSums(angle, gradient, distance, squares, cubes, fourths, lower, upper)
 
-    def angle_and_variation(self, x: Vec3, reach: Real) -> tuple[Real, Real, Real]:
-        """The sum of solid angles at x, the distance, and a bound of the variation of the lift
-        within `reach`; infinite where that is farther than a circle."""
-        real, vector = self._types
-        x = vector(x)
-
-        def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            angle, distance, variation = state
-            seen = self._seen(row, x)
-            near = seen.distance - reach
-            rise = 2 * math.pi * seen.a / (seen.farthest - reach) * dr.log(1 + reach / near)
-            return (
-                angle + seen.circle.angle,
-                fmin(seen.distance, distance),
-                variation + dr.select(near > 0, rise, dr.inf),
-            )
-
-        start = (real(0), real(dr.inf), real(0))
-        angle, distance, variation = self.records.for_each(add, start, "circle extent")
-        return angle, distance, variation
-
     def hessian(self, x: Vec3) -> SymmetricSum:
         """The Hessian of the sum of solid angles."""
         real, vector = self._types

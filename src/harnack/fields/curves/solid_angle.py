@@ -15,9 +15,9 @@ from harnack.backend import FloatArray, backend_of, to_numpy
 from harnack.backend.extrema import fmin
 from harnack.choices import did_you_mean
 from harnack.enclosures import HarmonicBall, LineLipschitz
+from harnack.fields.clearance import tight_extent
 from harnack.fields.curves.circle_sums import Circles, CircleSums
 from harnack.fields.curves.edge_angles import differentiable_angle
-from harnack.fields.curves.edge_extent import tight_extent
 from harnack.fields.curves.edge_nearest import closest_on_segments, segments
 from harnack.fields.curves.planar import PlanarRegion, planar_region
 from harnack.fields.edges.curve_promises import bends, swept_ball
@@ -46,6 +46,8 @@ CertificateName = Literal["auto", "planar", "edges", "convex", "paper"]
 _PERIOD = 4 * math.pi
 # Levels as near as this to a multiple of 4 pi count as one.
 _NARROW = 1e-9 * _PERIOD
+# Cells times vertices that an extent looks at, at most.
+_MOST_PAIRS = 3_000_000
 
 
 class SolidAngle(UploadedField["_CurveBuffers"]):
@@ -359,7 +361,10 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         length += total_length(self._net) if self._net else 0.0
         reach = 1.0001 * length / math.sqrt(nearest * (_PERIOD - nearest))
         lower, upper = points.min(axis=0) - reach, points.max(axis=0) + reach
-        return tight_extent(self._net, self._net_circles, lower, upper, levels)
+        loops = [*self._net, *self._net_circles]
+        proved = self if self._asked != "paper" else SolidAngle(loops)
+        vertices = sum(map(len, self._net)) + 3 * len(self._net_circles)
+        return tight_extent(proved, levels, lower, upper, max(8, _MOST_PAIRS // vertices))
 
     def describe(self) -> dict[str, Any]:
         return {

@@ -122,10 +122,10 @@ class LiftedEdge:
         4 pi in any case.
 
         Variation. Taylor's remainder after the linear term is at most 3/4 t^2 times the integral of
-        |dp|/(rho^3 (1-t/rho)) (`curve_promises`). With a = L/2 and distance d an edge has int rho^-3
-        <= 2a/(d^2 sqrt(d^2+a^2)) =: 2e, int rho^-4 <= 2e/d; and 1/(1-q) <= 1 + q/(1-b) <= 1 + q
-        rise/4 on [0, b] (`FieldSums.sample`). So an edge adds to the remainder what s4 += e/2 and
-        s5 += 3e/(8d) do. d is less by what rounding may have done to it.
+        |dp|/(rho^3 (1-t/rho)) (`curve_promises`). With a = L/2 and distance d an edge has
+        int rho^-3 <= 2a/(d^2 sqrt(d^2+a^2)) =: 2e, int rho^-4 <= 2e/d; and 1/(1-q) <= 1 + q/(1-b)
+        <= 1 + q rise/4 on [0, b] (`FieldSums.sample`). So an edge adds to the remainder what
+        s4 += e/2 and s5 += 3e/(8d) do. d is less by what rounding may have done to it.
         """
         distance = fmax(dr.sqrt(self.edge.square) - 2 * unit, 0)
         first, e = edge_variation(distance * distance, self.edge.inverse)

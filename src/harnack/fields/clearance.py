@@ -1,23 +1,61 @@
-"""A proved lower bound of the distance to a level set: the safe step of every direction at once."""
+"""A proved lower bound of the distance to a level set: the safe step of every direction at once.
+
+And the extents that follow from it."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 import drjit as dr
+import numpy as np
 
+from harnack.backend import FloatArray, choose_backend, to_numpy, to_vector3
 from harnack.backend.extrema import fmax, fmin
 from harnack.backend.lengths import largest_component, length
+from harnack.cells import Cells, carve
 from harnack.enclosures import Gaps, Slopes, TargetLevels, choose_proofs, longest_step
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
+    from harnack.cells import Clearance
     from harnack.fields.field import Field, Sample
+    from harnack.geometry import ConvexHull
 
-__all__ = ["distance_below"]
+__all__ = ["clearance_of", "distance_below", "tight_extent"]
 
 # All that a field promises: points are few, and the longest proof counts.
 _PROOFS = choose_proofs("curvature")
+
+
+def clearance_of(field: Field, levels: tuple[float, ...]) -> Clearance:
+    """`distance_below` at points (n, 3), in double precision."""
+    backend = choose_backend("double")
+    prepared, targets = field.prepare(backend), TargetLevels(levels, field.period)
+
+    def clearance(points: FloatArray) -> FloatArray:
+        p = to_vector3(backend, points)
+        return to_numpy(distance_below(backend, prepared, targets, p, prepared.evaluate(p)))
+
+    return clearance
+
+
+def tight_extent(
+    field: Field,
+    levels: tuple[float, ...],
+    lower: FloatArray,
+    upper: FloatArray,
+    most: int,
+    finest: int = 5,
+) -> ConvexHull:
+    """A polytope of few planes that holds every point of the level sets inside a box.
+
+    Cells of the box are left out if their ball is within the clearance of its centre; those left at
+    the end are wrapped. most, finest: as for `cells.carve`.
+    """
+    cells = carve(lower, upper, clearance_of(field, levels), most, finest)
+    if not len(cells.corners):  # no level anywhere: any box will do
+        cells = Cells(np.array(lower)[None], np.array(upper) - np.array(lower))
+    return cells.wrapped(1e-4 * float(np.linalg.norm(upper - lower)))
 
 
 def distance_below(
