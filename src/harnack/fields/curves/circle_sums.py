@@ -55,7 +55,7 @@ class CircleSums:
     distance: to the nearest circle.
     first, second: a circle varies by at most 2 r first + 4 r^2 second within r <= d/2.
     bend: of pi a B; three times it bounds second derivatives.
-    lower, upper: a range of the lift on the ball of the radius `distance`: see `planar_window`.
+    lower, upper: a range of the lift on the ball of the radius `distance`: see `planar`.
     """
 
     angle: Real
@@ -120,7 +120,8 @@ class Circles:
             slope = math.pi / (near * far)
             rise = 2 / (far - 0.5 * near) - 1 / far
             mean = dr.sqrt(0.5 * (dr.rcp(near * near) + dr.rcp(far * far)))
-            above = circle.angle < 0
+            # By height: far away the angle is lost in rounding, and its sign with it.
+            above = dr.mulsign(real(1), circle.z) > 0
             window = dr.select(circle.r < 1, dr.select(above, real(-4 * math.pi), 0), -2 * math.pi)
             return (
                 angle + circle.angle,
