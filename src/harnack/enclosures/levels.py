@@ -35,7 +35,8 @@ class TargetLevels:
         """Distances in value from f to the next level below and above.
 
         Either is infinite when there is no such level. A value on a level has both a gap of
-        zero on one side and, for a ladder, of at most one period on the other.
+        zero on one side and, for a ladder, of at most one period on the other. Gaps of a value
+        that is not a number are not numbers.
         """
         down: Real = math.inf
         up: Real = math.inf
@@ -48,8 +49,9 @@ class TargetLevels:
                 below_gap = dr.select(is_above, reduced, self.period + reduced)
                 above_gap = dr.select(is_above, self.period - reduced, -reduced)
             else:
-                below_gap = dr.select(above >= 0, above, math.inf)
-                above_gap = dr.select(above <= 0, -above, math.inf)
+                # In this order a gap of what is not a number is none, and nothing is proved.
+                below_gap = dr.select(above < 0, math.inf, above)
+                above_gap = dr.select(above > 0, math.inf, -above)
             down, up = fmin(down, below_gap), fmin(up, above_gap)
         return Gaps(down, up, len(self.values) == 1 and self.period is None)
 

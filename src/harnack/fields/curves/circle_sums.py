@@ -50,7 +50,7 @@ class CircleSums:
     angle, gradient: of the solid angle; each circle's is in (-2 pi, 2 pi).
     distance: to the nearest circle.
     squares, cubes, fourths: of the integrals of |dp|/D^k, k = 2, 3 and (a bound) 4, D the distance.
-    lower, upper: a range of the lift on the ball of the radius `distance`: see `planar_window`.
+    lower, upper: a range of the lift on the ball of the radius `distance`: see `planar`.
     """
 
     angle: Real
@@ -113,7 +113,8 @@ class Circles:
             gradient = dr.fma(vector(circle.axial / a), seen.normal, gradient)
             near, far = circle.nearest, circle.farthest
             cube = circle.third / (a * a)
-            above = circle.angle < 0
+            # By height: far away the angle is lost in rounding, and its sign with it.
+            above = dr.mulsign(real(1), circle.z) > 0
             window = dr.select(circle.r < 1, dr.select(above, real(-4 * math.pi), 0), -2 * math.pi)
             return (
                 angle + circle.angle,

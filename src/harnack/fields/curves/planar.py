@@ -15,7 +15,8 @@ outside of it.
 f itself tells where D is. Seen from x, D has the solid angle 2 pi (1 - h/d). Inside, |f| is at
 least that, for S contains D; outside, |f| is at most 2 pi less that, for S is in the rest of the
 plane. If h < d/2, |f| = pi parts the two; else one of them may be known, and if none is, B(x, h)
-serves, whose radius is at least d/2.
+serves, whose radius is at least d/2. In rounded arithmetic f is not known well beside the curve:
+where h < d/2 and it is not known where D is, the lift lies in (-4 pi, 4 pi) in either case.
 
 The range is 4 pi wide, where that of a curve in convex position is 12 pi wide.
 """
@@ -45,6 +46,7 @@ __all__ = ["PlanarRegion", "planar_region"]
 # All relative to the size of the curves.
 _FLAT = 1e-12  # how far a vertex may lie off the plane
 _APART = 1e-6  # how near two loops may come to each other
+_TILT = 1e-6  # and the slope of a loop's own plane, relative to the size of the loop
 _MOST_VERTICES = 2048  # the tests take quadratic time
 
 
@@ -70,12 +72,16 @@ class PlanarRegion:
         doubt = 1e-3 + 16 * slack / distance
         is_inside = dr.abs(f) > turn * fmax(share, 0.5) + doubt
         is_outside = dr.abs(f) < turn * fmin(1 - share, 0.5) - doubt
-        is_known = is_inside | is_outside
+        free = fmax(dr.abs(height) - slack, 0)
+        is_beside = ~(is_inside | is_outside) & (free >= 0.4 * distance)
         zero = type(f)(0)
-        radius = dr.select(is_known, distance, fmax(dr.abs(height) - slack, 0))
-        lower = dr.select(is_inside, dr.select(f < 0, -2 * turn, zero), -turn)
-        lower = dr.select(is_known, lower, dr.select(height > 0, -turn, zero))
-        upper = lower + dr.select(is_known, 2 * turn, turn)
+        radius = dr.select(is_beside, free, distance)
+        lower = dr.select(is_outside, -turn, -2 * turn)
+        upper = dr.select(is_outside, turn, 2 * turn)
+        lower = dr.select(is_inside, dr.select(f < 0, lower, zero), lower)
+        upper = dr.select(is_inside, dr.select(f < 0, zero, upper), upper)
+        lower = dr.select(is_beside, dr.select(height > 0, -turn, zero), lower)
+        upper = dr.select(is_beside, dr.select(height > 0, zero, turn), upper)
         # f itself was wrapped, and the promise is about the value that the sample states.
         moved = angle - f
         return HarmonicBall(radius, lower + moved, upper + moved)
@@ -168,6 +174,11 @@ def _plane_of(
         x = (points - origin) / size
     if not np.abs(x @ normal).max() <= _FLAT:
         return None
+    # Small loops may be tilted by as little.
+    for loop in (*loops, *(one.polygon(4) for one in circles)):
+        span = loop - loop[0]
+        if not np.abs(span @ normal).max() <= _TILT * np.abs(span).max():
+            return None
     first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
     first = first / np.linalg.norm(first)
     return normal, origin, size, np.stack([first, np.cross(normal, first)])

@@ -24,6 +24,8 @@ Complex = Any
 
 # Points as close to a singular one are moved off it: the squares of such numbers still exist.
 _LEAST = 1e-12
+# And the least number whose square and its inverse do, in single precision.
+_LEAST_SQUARED = 1e-18
 # What is taken for the distance to a singular point where there is none.
 _NO_POINT = 2.0
 # What bounds of second derivatives are widened by: logarithms and powers of them are rounded.
@@ -288,6 +290,17 @@ class PowerProduct(Branches):
 
     def _centres(self, z: Complex) -> tuple[Complex, ...]:
         return self._on or tuple(type(z)(a.real, a.imag) for a in self.places)
+
+    def moved_off(self, z: Complex, rounding: Real) -> Complex:
+        """Also off zeros, where the logarithm of the product is not a number: by one rounding."""
+        z = super().moved_off(z, rounding)
+        unit = 4 * float(dr.epsilon(z.real))
+        for a, alpha in zip(self._centres(z), self.exponents, strict=True):
+            if alpha > 0 and alpha.is_integer():
+                least = _LEAST_SQUARED + unit * fmax(dr.abs(a.real), dr.abs(a.imag))
+                beside = type(z)(a.real + least, a.imag)
+                z = dr.select(abs(z - a) < least, beside, z)
+        return z
 
     def at(self, z: Complex) -> tuple[Branch, ...]:
         scale, angle = 0 * z.real, 0 * z.real

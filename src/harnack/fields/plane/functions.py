@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping
 from fractions import Fraction
+from numbers import Real
 from typing import Any, cast
 
 from harnack.backend import choose_backend
@@ -128,7 +129,7 @@ def _whole(value: Any) -> int:
     return int(number)
 
 
-def _own(function: Any, singular: Any, second: Any, period: float | None) -> OwnBranches:
+def _own(function: Any, singular: Any, second: Any, period: Any) -> OwnBranches:
     if singular is None or second is None:
         raise ValueError(
             "a function of your own needs singular=, where it is not analytic, such as [0], "
@@ -144,7 +145,7 @@ def _own(function: Any, singular: Any, second: Any, period: float | None) -> Own
         raise TypeError(
             f"singular must be complex numbers or BranchPoints, not {singular!r}"
         ) from None
-    if period is not None and not 0 < period < math.inf:
+    if period is not None and not (isinstance(period, Real) and 0 < float(period) < math.inf):
         raise ValueError(f"period must be a positive number, not {period!r}")
     backend = choose_backend("double")
     z = complex_type(backend)(*(backend.Float(one) for one in _PROBE))
@@ -155,14 +156,27 @@ def _own(function: Any, singular: Any, second: Any, period: float | None) -> Own
         raise TypeError(f"{wrong} what it does ({error})") from None
     if not branches or any(len(one) not in (2, 3) for one in branches):
         raise ValueError(f"{wrong} {branches!r}")
+    for one in (number for branch in branches for number in branch):
+        if not isinstance(one, type(z) | backend.Float | int | float | complex):
+            raise TypeError(f"{wrong} with {one!r}: use operators, drjit.sqrt, drjit.log and so on")
     if period is not None and len(branches) > 1:
         raise ValueError(
             "a function with a period must have one branch up to it: of several, no side of the "
             "surface is told from the other in general; draw each by itself"
         )
+    bound = _tried(second, z, backend.Float(_PROBE[1]))
+    if not isinstance(bound, backend.Float | int | float):
+        raise TypeError(f"second must return a real number, the bound of |g''|, not {bound!r}")
     made = OwnBranches(function, points, second, len(branches), period)
     made.at(z)
     return made
+
+
+def _tried(second: Callable[[Any, Any], Any], z: Any, radius: Any) -> Any:
+    try:
+        return second(z, radius)
+    except TypeError as error:
+        raise TypeError(f"second must take z and a radius, as Dr.Jit numbers: {error}") from error
 
 
 def _refuse(what: str, **settings: Any) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, cast
 
@@ -74,6 +75,8 @@ class LevelCurves(Field):
                 f"{self.branches.count}: draw its Riemann surface, whose plane cuts they are"
             )
         self.domain = Box((-2.0, -2.0, -0.25), (2.0, 2.0, 0.25)) if domain is None else domain
+        if not math.isfinite(level):
+            raise ValueError(f"level must be finite, not {level!r}")
         self.default_level = float(level)
         shift = self.branches.period(part == "imag")
         self.period = shift  # pyright: ignore[reportAttributeAccessIssue]

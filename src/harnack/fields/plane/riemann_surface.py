@@ -33,7 +33,7 @@ from harnack.fields.plane.functions import branches_of
 from harnack.geometry.volumes import Ball, Box, Intersection
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Real, Vec3
+    from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.fields.plane.branches import Branch, Complex, PreparedPoint
     from harnack.geometry import Volume
 
@@ -65,6 +65,11 @@ class _Graph:
 
     def slope(self, direction: Vec3) -> Real:
         return dr.fma(self.x, direction.x, dr.fma(self.y, direction.y, direction.z))
+
+    def touches(self, other: _Graph) -> Mask:
+        """Whether phi and its gradient are those of the other, as of a sheet and itself. On a line
+        of symmetry those of two sheets agree in all but y, and f has a crease."""
+        return (self.phi == other.phi) & (self.x == other.x) & (self.y == other.y)
 
 
 @dataclass(frozen=True)
@@ -206,17 +211,21 @@ class RiemannSurface(Field):
         for sheet in place.sheets:
             steepest = fmax(sheet.steepness, steepest)
         # Where another sheet may become the nearest: |phi_j| - |phi_i| may fall by so much.
-        same = radius
+        # Sheets that touch there have one value and gradient, and stay within one parabola; but the
+        # nearest of two is not harmonic.
+        same, touching = radius, 0 * radius
         for sheet in place.sheets:
             lead = fmax(dr.abs(sheet.phi) - dr.abs(place.nearest.phi), 0)
             rate = sheet.steepness + place.nearest.steepness
             until = 2 * lead / (rate + dr.sqrt(rate * rate + 4 * bend * lead))
-            is_it = (sheet.phi == place.nearest.phi) & (sheet.x == place.nearest.x)
-            same = fmin(dr.select(is_it, radius, until), same)
+            touches = sheet.touches(place.nearest)
+            same = fmin(dr.select(touches, radius, until), same)
+            touching += dr.select(touches, 1, 0)
         curved = Curvature(bend, same)
         most = (steepest + bend * radius) * (1 + 1e-5)
         range_ = (most * same + 0.5 * bend * same * same) * (1 + 1e-5)
-        ball = HarmonicBall(same, sample.value - range_, sample.value + range_)
+        alone = dr.select(touching < 2, same, 0)
+        ball = HarmonicBall(alone, sample.value - range_, sample.value + range_)
         return Sample(
             sample.value,
             sample.gradient,
@@ -266,7 +275,7 @@ class RiemannSurface(Field):
                     "(g, g', g'') for each"
                 )
             one_xx, one_xy = derivatives(second, self.part)
-            here = (sheet.phi == place.nearest.phi) & (sheet.x == place.nearest.x)
+            here = sheet.touches(place.nearest)
             xx, xy = dr.select(here, one_xx, xx), dr.select(here, one_xy, xy)
         share = -place.sign * self._height
         xx, xy, zero = share * xx, share * xy, 0 * p.x

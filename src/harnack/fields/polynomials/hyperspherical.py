@@ -350,6 +350,10 @@ class HypersphericalHarmonic(Field):
         return Ball(radius=radius) if 0 < radius < math.inf else None
 
     def check_levels(self, levels: tuple[float, ...]) -> None:
+        if self.degree == 0:
+            raise ValueError(
+                "a hyperspherical harmonic of degree 0 is constant: it has no level sets"
+            )
         check_in_range(levels, self.value_range)
 
     def describe(self) -> dict[str, Any]:

@@ -33,6 +33,8 @@ _MOST_TERMS = 24
 _SAMPLES, _LEAST_SAMPLES, _MOST_SAMPLES = 4, 64, 1 << 25
 # Points at which the error of a fit is looked at, and how they are brought to the surface.
 _CHECKED, _NEWTON_STEPS, _CONVERGED = 20_000, 12, 1e-9
+# Coefficients as small as this beside the values fitted are the rounding of their sums.
+_NOTHING = 1e-13
 # What is of second order in the unit roundoff.
 _SECOND_ORDER = 1.05
 
@@ -146,7 +148,13 @@ class FourierSeries(Field):
                 )
         if float(np.ptp(grid)) == 0.0:
             raise ValueError("the function is constant: it has no level sets")
-        made = cls(fit_cosines(grid, numbers), space)
+        fitted = fit_cosines(grid, numbers)
+        if np.abs(fitted).sum() - abs(fitted[0, 0, 0]) < _NOTHING * np.abs(grid).max():
+            raise ValueError(
+                f"the series of {numbers} terms is constant, though the function is not: take more "
+                "terms"
+            )
+        made = cls(fitted, space)
         made._source = cast("Any", function) if callable(function) else grid
         made.fit_error = made._largest_difference()
         return made
@@ -279,7 +287,12 @@ def _three(numbers: Any, name: str) -> tuple[int, int, int]:
     try:
         one = operator.index(numbers)
     except TypeError:
-        several = tuple(operator.index(n) for n in numbers)
+        try:
+            several = tuple(operator.index(n) for n in numbers)
+        except TypeError:
+            raise TypeError(
+                f"{name} must be whole numbers, one or three, not {numbers!r}"
+            ) from None
         if len(several) != 3:
             raise ValueError(f"{name} must be one number or three, not {len(several)}") from None
         return several[0], several[1], several[2]
