@@ -19,6 +19,7 @@ from .formulas import formulas
 from .growth import growth
 from .hart import hart
 from .inclusion import inclusion
+from .laplacian import laplacian
 from .povray import compare_with_povray, has_povray
 from .rays import RULES, WIDTH, Row, machine, measure, published
 from .scenes import others, polygons
@@ -27,8 +28,8 @@ from .winding import throughput
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 SECTIONS = (
-    "rays", "convergence", "winding", "agreement", "versions", "inclusion", "hart", "povray",
-    "antialiasing", "baselines", "formulas",
+    "rays", "convergence", "winding", "agreement", "versions", "inclusion", "laplacian", "hart",
+    "povray", "antialiasing", "baselines", "formulas",
 )  # fmt: skip
 
 
@@ -65,6 +66,7 @@ def main() -> None:
         "agreement": lambda: agreement(arguments.meshes),
         "versions": lambda: beside(arguments.before),
         "inclusion": inclusion,
+        "laplacian": laplacian,
         "hart": hart,
         "antialiasing": antialiasing,
         "baselines": baselines,

@@ -16,6 +16,7 @@ from harnack.enclosures import (
     Cone,
     Enclosure,
     Gaps,
+    GreenBall,
     Parabola,
     Slope,
     Slopes,
@@ -27,12 +28,12 @@ from harnack.enclosures import (
 )
 from harnack.fields import Curvature, HarmonicBall, LineLipschitz, Lipschitz
 from harnack.testing import BrokenPromiseError, check_bound, scaled
-from harnack.testing.cases import BallCase, Case, CurvatureCase, LipschitzCase
+from harnack.testing.cases import BallCase, Case, CurvatureCase, LaplacianCase, LipschitzCase
 from harnack.testing.poisson import cap_mass, cap_movement, cap_slope, kernel_movement
 from harnack.testing.scaled import unscaled
 from tests.oracles.exact import exact_step, on_host
 
-BOUNDS = (Classic, Slope, Caps, Cone, Taylor)
+BOUNDS = (Classic, Slope, Caps, GreenBall, Cone, Taylor)
 
 
 # Solved to the end: the default number of rounds trades a little length for time.
@@ -44,7 +45,11 @@ class PatientCaps(Caps):
     rounds = 14
 
 
-PATIENT = (Classic, PatientSlope, PatientCaps, Cone, Taylor)
+class PatientGreenBall(GreenBall):
+    rounds = 14
+
+
+PATIENT = (Classic, PatientSlope, PatientCaps, PatientGreenBall, Cone, Taylor)
 
 
 def name_of(bound: type[Enclosure]) -> str:
@@ -87,6 +92,23 @@ def random_balls(
     return ball, mean * n * limit / radius
 
 
+def random_sources(rng: np.random.Generator, rows: int) -> tuple[LaplacianCase, np.ndarray]:
+    """Cases of all sizes whose Laplacian is large or small beside the ranges, and slopes."""
+
+    def powers(low: float, high: float) -> np.ndarray:
+        return 10 ** rng.uniform(low, high, rows)
+
+    radius, below, above = powers(-3, 3), powers(-3, 3), powers(-3, 3)
+    above = np.where(rng.random(rows) < 0.5, below * powers(-1, 1), above)
+    spread, mean = below * powers(-6, 1), below * rng.choice([-1, 1], rows) * powers(-6, 0.5)
+    spread = np.where(rng.random(rows) < 0.2, 0, spread)
+    down, up = below * powers(-9, 3), above * powers(-9, 3)
+    ends = (mean - spread) / radius**2, (mean + spread) / radius**2
+    flat = np.where(rng.random(rows) < 0.3, powers(-6, 0), 1)
+    slope = 3 * below / radius * rng.uniform(-1.5, 1.5, rows) * flat
+    return LaplacianCase(radius, below, above, *ends, down, up), slope
+
+
 def random_certificates(
     bound: type[Enclosure], rng: np.random.Generator, rows: int, least: float = -9.0
 ) -> list[tuple[Case, np.ndarray]]:
@@ -94,6 +116,7 @@ def random_certificates(
     cases: list[tuple[Case, np.ndarray]] = []
     for n in (2, 3, 4):
         cases += [random_balls(rng, n, sides, rows, least) for sides in ("below", "above", "both")]
+    cases.append(random_sources(rng, rows))
     radius, constant, down, up = 10 ** rng.uniform(-3, 3, (4, rows))
     slope = constant * radius * rng.choice([-1.0, 1.0], rows) * 10 ** rng.uniform(-6, 2, rows)
     cases.append((LipschitzCase(constant, radius, down, up), slope))

@@ -15,7 +15,17 @@ import pytest
 import harnack as hk
 from harnack import enclosures, fields
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.enclosures import Caps, Classic, Cone, Enclosure, Gaps, Slope, Taylor, choose_proofs
+from harnack.enclosures import (
+    Caps,
+    Classic,
+    Cone,
+    Enclosure,
+    Gaps,
+    GreenBall,
+    Slope,
+    Taylor,
+    choose_proofs,
+)
 from harnack.fields import (
     Curvature,
     Field,
@@ -36,9 +46,10 @@ from harnack.testing.cases import case_of
 from tests.oracles.direct_sums import dipole_sum, winding_sum
 from tests.oracles.step_contracts import check_steps
 from tests.test_arithmetics import PROOFS
+from tests.test_bounded_laplacian import FIELDS as SOURCED
 from tests.test_shapes import SHAPES
 
-BOUNDS = (Classic, Slope, Caps, Cone, Taylor)
+BOUNDS = (Classic, Slope, Caps, GreenBall, Cone, Taylor)
 
 
 class Charges(Field):
@@ -136,7 +147,12 @@ REAL: dict[str, Field] = {
         (7, 6, 4),
     ),
 }
-OWN: dict[str, Field] = {"charges": Charges(), "azimuth": Azimuth(), "plane": Plane()}
+OWN: dict[str, Field] = {
+    "charges": Charges(),
+    "azimuth": Azimuth(),
+    "plane": Plane(),
+    **{name: field for name, (field, _) in SOURCED.items()},
+}
 _POINTS = np.random.default_rng(5).normal(size=(60, 3))
 _POINTS /= np.linalg.norm(_POINTS, axis=1, keepdims=True)
 _SPHERE = (_POINTS, _POINTS)
@@ -152,7 +168,18 @@ FIELDS = {
     **OWN,
 }
 # One or two of each kind for what is tried with every bound on every run.
-SOME = ("wavy", "trefoil", "coil", "holes", "Y 5,3", "gyroid", "charges", "azimuth", "plane")
+SOME = (
+    "wavy",
+    "trefoil",
+    "coil",
+    "holes",
+    "Y 5,3",
+    "gyroid",
+    "charges",
+    "azimuth",
+    "plane",
+    "matter",
+)
 
 
 def bounds_for(field: Field) -> list[type[Enclosure]]:

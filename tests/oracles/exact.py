@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray, to_numpy
-from harnack.enclosures import Caps, Classic, Cone, Enclosure, Slope, Taylor
-from harnack.testing.cases import BallCase, Case, CurvatureCase, LipschitzCase
+from harnack.enclosures import Caps, Classic, Cone, Enclosure, GreenBall, Slope, Taylor
+from harnack.testing.cases import BallCase, Case, CurvatureCase, LaplacianCase, LipschitzCase
 from harnack.testing.poisson import cap_movement, kernel_movement
 
 __all__ = ["exact_step", "on_host"]
@@ -35,6 +35,8 @@ def exact_step(kind: type[Enclosure], case: Case, slope: FloatArray) -> FloatArr
             return np.minimum(gap / case.constant, case.radius)
         if isinstance(case, CurvatureCase) and issubclass(kind, Taylor):
             return _parabolas(case, slope)
+        if isinstance(case, LaplacianCase) and issubclass(kind, GreenBall):
+            return case.radius * _green(case, slope)
         if isinstance(case, BallCase):
             for ball, fraction in _FRACTIONS.items():
                 if issubclass(kind, ball):
@@ -85,6 +87,32 @@ def _parabolas(c: CurvatureCase, slope: FloatArray) -> FloatArray:
         return -slope * q * r + 0.5 * h * (q * r) ** 2
 
     return r * np.minimum(largest_free(rise, c.gap_up), largest_free(fall, c.gap_down))
+
+
+def _green(c: LaplacianCase, slope: FloatArray) -> FloatArray:
+    """Mass at the poles, and a density of the kernel's sign, with the constant that is proved."""
+    square = c.radius**2
+    mean = 0.5 * square * (c.laplacian_lower + c.laplacian_upper)
+    spread = 0.5 * square * (c.laplacian_upper - c.laplacian_lower)
+    norm = 0.1907  # of G(0,.) + d_v G(0,.)/3, rounded up: see `green_kernel.Proof.convex`
+    reach: list[FloatArray] = []
+    for u, most, sign, gap in (
+        (c.range_below, c.range_above, 1.0, c.gap_up),
+        (c.range_above, c.range_below, -1.0, c.gap_down),
+    ):
+        w, m = np.maximum(u + sign * mean / 6, 0), np.maximum(sign * mean, 0)
+        s = np.clip(sign * c.radius * slope / 3, -w - norm * spread, w + norm * spread)
+
+        def movement(
+            q: FloatArray, w: FloatArray = w, m: FloatArray = m, s: FloatArray = s
+        ) -> FloatArray:
+            square = q * q
+            top = w * (5 * square - square**2) + s * (3 * q + q**3)
+            top += 0.394 * spread * square * (2 - np.log(np.maximum(q, 1e-300)))
+            return top / (1 - square) ** 2 + m * square / 6
+
+        reach.append(np.where(gap > most, 1.0, largest_free(movement, gap)))
+    return np.minimum(*reach)
 
 
 def _sides(c: BallCase) -> list[tuple[FloatArray, float, FloatArray, FloatArray]]:

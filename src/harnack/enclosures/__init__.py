@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from harnack.enclosures.arc import Arc
 from harnack.enclosures.balls.ball import Ball
+from harnack.enclosures.balls.bounded_laplacian import GreenBall
 from harnack.enclosures.balls.caps import Caps
 from harnack.enclosures.balls.classic import Classic
 from harnack.enclosures.balls.slope import Slope
@@ -23,6 +24,7 @@ from harnack.enclosures.nearest import Nearest, Sheet
 from harnack.enclosures.parabola import Cone, Parabola, Taylor
 from harnack.enclosures.pieces import LinearTaylor, OnePiece, Pieces, QuadraticTaylor, Segment
 from harnack.enclosures.promises import (
+    BoundedLaplacian,
     Curvature,
     HarmonicBall,
     LineLipschitz,
@@ -40,6 +42,7 @@ __all__ = [
     "Band",
     "BottomUpLinear",
     "BottomUpQuadratic",
+    "BoundedLaplacian",
     "Caps",
     "Choice",
     "Classic",
@@ -50,6 +53,7 @@ __all__ = [
     "Evaluable",
     "Gaps",
     "Greatest",
+    "GreenBall",
     "HarmonicBall",
     "IntervalRange",
     "LineLipschitz",

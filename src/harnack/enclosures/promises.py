@@ -29,6 +29,24 @@ class HarmonicBall:
 
 
 @dataclass(frozen=True)
+class BoundedLaplacian:
+    """On the ball B(p, radius) of space f stays within [lower, upper] and its Laplacian within
+    [laplacian_lower, laplacian_upper].
+
+    f is continuously differentiable there and its Laplacian a bounded function, which may jump. All
+    four ends are needed: a subharmonic function is one with laplacian_lower = 0, of which nothing
+    follows unless laplacian_upper is known as well, for it may have spikes. Units: those of f, and
+    of f over length squared.
+    """
+
+    radius: Real
+    lower: Real
+    upper: Real
+    laplacian_lower: Real
+    laplacian_upper: Real
+
+
+@dataclass(frozen=True)
 class Lipschitz:
     """|f(y) - f(p)| <= constant * |y - p| for every y with |y - p| < radius (default: all y).
 
@@ -62,4 +80,4 @@ class LineLipschitz:
     radius: Real
 
 
-Promise: TypeAlias = HarmonicBall | Lipschitz | LineLipschitz | Curvature
+Promise: TypeAlias = HarmonicBall | BoundedLaplacian | Lipschitz | LineLipschitz | Curvature

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from harnack.backend.extrema import fmax
 from harnack.choices import did_you_mean
+from harnack.enclosures.balls.bounded_laplacian import GreenBall
 from harnack.enclosures.balls.caps import Caps
 from harnack.enclosures.balls.classic import Classic
 from harnack.enclosures.balls.slope import Slope
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from harnack.enclosures.restriction import Restriction
 
 _NAMED: dict[str, tuple[type[Enclosure], ...]] = {
-    "pieces": (Pieces, Tangent, Taylor, Caps, Slope, Cone),
+    "pieces": (Pieces, Tangent, Taylor, Caps, Slope, GreenBall, Cone),
     "quadratic-taylor": (QuadraticTaylor,),
     "linear-taylor": (LinearTaylor,),
     "segment": (Segment,),
@@ -39,10 +40,11 @@ _NAMED: dict[str, tuple[type[Enclosure], ...]] = {
     "mixed": (Mixed,),
     "affine": (AffineBand,),
     "interval": (IntervalRange,),
-    "curvature": (Taylor, Caps, Slope, Cone),
-    "caps": (Caps, Slope, Cone),
-    "slope": (Slope, Cone),
+    "curvature": (Taylor, Caps, Slope, GreenBall, Cone),
+    "caps": (Caps, Slope, GreenBall, Cone),
+    "slope": (Slope, GreenBall, Cone),
     "classic": (Classic, Cone),
+    "laplacian": (GreenBall, Cone),
     "lipschitz": (Cone,),
 }
 
@@ -105,7 +107,8 @@ class Proofs:
         if not promises:
             return (
                 f"the bounds asked for ({asked}) need a promise and the field makes none: "
-                "Sample.known is empty, return a HarmonicBall, Curvature or Lipschitz in it"
+                "Sample.known is empty, return a HarmonicBall, BoundedLaplacian, Curvature or "
+                "Lipschitz in it"
             )
         made = " and ".join(sorted({type(one).__name__ for one in promises}))
         usable = [
@@ -116,7 +119,7 @@ class Proofs:
         if not usable:
             return (
                 f"no bound applies: the field promises {made}, from which nothing follows; a "
-                "HarmonicBall needs an end that is not infinite"
+                "HarmonicBall needs an end that is not infinite, a BoundedLaplacian two"
             )
         others = "" if not self.uses_weaker else ", or leave bound=None for the sharpest there is"
         return (
@@ -133,10 +136,11 @@ def choose_proofs(bound: Choice = None) -> Proofs:
     """The proofs asked for: a name, an enclosure's class or several, or None for all that pay.
 
     Names: "classic" (the published rule), "slope", "caps" (caps where both ends are known, the
-    slope bound elsewhere), "lipschitz", and "curvature" (Taylor's formula where second derivatives
-    are bounded, else as "caps"); of fields with a formula, "pieces", and for comparison
-    "quadratic-taylor", "linear-taylor", "segment", and of the formula's own arithmetic
-    "bottom-up-linear", "bottom-up-quadratic", "mixed", "affine", "interval".
+    slope bound elsewhere), "laplacian" (where the Laplacian is bounded), "lipschitz", and
+    "curvature" (Taylor's formula where second derivatives are bounded, else as "caps"); of fields
+    with a formula, "pieces", and for comparison "quadratic-taylor", "linear-taylor", "segment", and
+    of the formula's own arithmetic "bottom-up-linear", "bottom-up-quadratic", "mixed", "affine",
+    "interval".
     None is as "pieces", which is as "curvature" for fields without a formula, and without the
     promises that a field itself calls weaker than its others.
 

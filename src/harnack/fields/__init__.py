@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from harnack.enclosures import Curvature, HarmonicBall, LineLipschitz, Lipschitz
+from harnack.enclosures import BoundedLaplacian, Curvature, HarmonicBall, LineLipschitz, Lipschitz
 from harnack.fields.blobs.blobs import BlobError, Blobs
 from harnack.fields.blobs.hrbf import HRBF
 from harnack.fields.blobs.kernels import Compact, Cubic, Gaussian, Kernel, Sextic
@@ -48,6 +48,7 @@ __all__ = [
     "NO_SHEET",
     "BlobError",
     "Blobs",
+    "BoundedLaplacian",
     "BranchPoint",
     "Capsule",
     "Compact",

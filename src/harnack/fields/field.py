@@ -17,7 +17,14 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from harnack.enclosures import Curvature, HarmonicBall, LineLipschitz, Lipschitz
+from harnack.enclosures import (
+    BoundedLaplacian,
+    Curvature,
+    HarmonicBall,
+    LineLipschitz,
+    Lipschitz,
+    Promise,
+)
 from harnack.fields.look import Look, Path, Sample, lengthened
 from harnack.fields.parts import NO_PART, PartEntry
 from harnack.fields.points import at_points
@@ -30,6 +37,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AtDetail",
+    "BoundedLaplacian",
     "Curvature",
     "Field",
     "HarmonicBall",
@@ -84,7 +92,7 @@ def _checked(evaluate: Callable[[Any, Vec3], Sample]) -> Callable[[Any, Vec3], S
             if not isinstance(given, tuple):
                 raise TypeError(f"{name}: Sample.{place} is {_named(given)}, not a tuple: {_HOW}")
             for one in cast("tuple[Any, ...]", given):
-                if not isinstance(one, HarmonicBall | Lipschitz | LineLipschitz | Curvature):
+                if not isinstance(one, Promise):
                     wrong = f"Sample.{place} holds {_named(one)}, no promise"
                     raise TypeError(f"{name}: {wrong}: {_HOW}")
         gradient: Any = sample.gradient

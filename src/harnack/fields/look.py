@@ -10,6 +10,7 @@ import drjit as dr
 
 from harnack.backend.extrema import fmax
 from harnack.enclosures import (
+    BoundedLaplacian,
     Curvature,
     Enclosure,
     HarmonicBall,
@@ -60,12 +61,15 @@ def lengthened(sample: Sample, size: Real) -> Sample:
     """The sample of x -> f(x / size), at the place that moves there.
 
     Values stay; radii are multiplied by the size, gradients and Lipschitz constants divided by it,
-    curvatures by its square.
+    curvatures and Laplacians by its square.
     """
 
     def longer(one: Promise) -> Promise:
         if isinstance(one, HarmonicBall):
             return HarmonicBall(one.radius * size, one.lower, one.upper, one.dimension)
+        if isinstance(one, BoundedLaplacian):
+            ends = one.laplacian_lower / (size * size), one.laplacian_upper / (size * size)
+            return BoundedLaplacian(one.radius * size, one.lower, one.upper, *ends)
         if isinstance(one, Lipschitz | LineLipschitz):
             return type(one)(one.constant / size, one.radius * size)
         return Curvature(one.constant / (size * size), one.radius * size)

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy
-from harnack.testing.cases import BallCase, Case, CurvatureCase, LipschitzCase
+from harnack.testing.cases import BallCase, Case, CurvatureCase, LaplacianCase, LipschitzCase
 from harnack.testing.failures import BrokenPromiseError
-from harnack.testing.poisson import AxialFunctions, cap_mass, kernel_movement
+from harnack.testing.poisson import AxialFunctions, GreenPotentials, cap_mass, kernel_movement
 
 if TYPE_CHECKING:
     from harnack.backend import Precision
@@ -75,12 +75,15 @@ def check_bound(
 
 
 def trials(rng: np.random.Generator, rows: int) -> Iterator[Trial]:
-    """One trial of each kind: harmonic in 2, 3, 4 dimensions, Lipschitz, bounded curvature."""
+    """One trial of each kind: harmonic in 2, 3, 4 dimensions, of bounded Laplacian, Lipschitz,
+    of bounded curvature."""
     with np.errstate(all="ignore"):
         for dimension in (2, 3, 4):
             yield _positive(rng, rows, dimension, mirrored=False)
             yield _positive(rng, rows, dimension, mirrored=True)
             yield _bounded(rng, rows, dimension)
+        yield _sourced(rng, rows, mirrored=False)
+        yield _sourced(rng, rows, mirrored=True)
         yield _lipschitz(rng, rows)
         yield _curved(rng, rows)
 
@@ -134,6 +137,58 @@ def _bounded(rng: np.random.Generator, rows: int, n: int) -> Trial:
         u.slope,
         u.movement,
         lambda down, up: BallCase(radius, below, above, down, up, n),
+    )
+
+
+def _sourced(rng: np.random.Generator, rows: int, *, mirrored: bool) -> Trial:
+    """Poisson integrals of rings of mass with sources: the Laplacian jumps and varies.
+
+    It is that of an even density, two balls of even density and a multiple of the Legendre
+    polynomial P_2 of the latitude, whose f, q^2 ln(q) P_2/5, has the logarithm of the bound. With
+    one density everywhere, not negative, and mass at the poles alone, the bound is attained.
+    """
+    radius, mass = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
+    places, shares = rng.uniform(-1, 1, (rows, 3)), rng.dirichlet([0.7] * 3, rows)
+    # As h - c >= mass (1-q^2)/8, f stays above c if its Laplacian stays below 0.75 of the mass: a
+    # potential is at most (1-q^2)/6 times the largest density.
+    centres = rng.uniform(-0.9, 0.9, (rows, 2))
+    sizes = (1 - np.abs(centres)) * rng.uniform(0.1, 1, (rows, 2))
+    density = rng.uniform(-0.18, 0.18, (rows, 4)) * 10 ** rng.uniform(-3, 0, (rows, 1))
+    kind = rng.integers(0, 4, rows)
+    places[kind < 2, :2], shares[kind < 2, 2], density[kind < 2, 1:3] = (1, -1), 0, 0
+    density[kind == 0, 0], density[kind == 0, 3] = np.abs(density[kind == 0, 0]), 0
+    density[kind == 1, 0] = 0
+    density[kind == 1, 3] = rng.choice([-0.7, 0.7], rows)[kind == 1]
+    shares /= shares.sum(axis=1, keepdims=True)
+    density *= mass[:, None]
+    balls = GreenPotentials(
+        np.column_stack([np.zeros(rows), centres]), np.column_stack([np.ones(rows), sizes])
+    )
+    even, wave = density[:, :3], density[:, 3]
+    u = AxialFunctions("points", places, shares * mass[:, None], radius, 3)
+    potential, slope = balls.at_centre(even)
+    turns = np.stack([-0.5 * wave, wave])  # P_2 is between -1/2 and 1
+    least = density[:, 0] + np.minimum(even[:, 1:], 0).sum(axis=1) + turns.min(axis=0)
+    most = density[:, 0] + np.maximum(even[:, 1:], 0).sum(axis=1) + turns.max(axis=0)
+    sign = -1.0 if mirrored else 1.0
+
+    def movement(t: FloatArray) -> FloatArray:
+        q = t / radius[:, None]
+        turned = wave[:, None] / 5 * q * q * np.log(np.maximum(q, 1e-300))
+        return sign * (u.movement(t) - balls.movement(q, even) + turned)
+
+    # The ball is taken a little smaller, on which even point masses are bounded.
+    near, far = mass - potential, 1e18 * mass
+    below, above = (far, near) if mirrored else (near, far)
+    low, high = np.sort(sign * np.stack([least, most]) / radius**2, axis=0)
+    return _with_gaps(
+        rng,
+        f"bounded Laplacian, {'upper' if mirrored else 'lower'} end near",
+        near,
+        radius,
+        sign * (u.slope - slope / radius),
+        movement,
+        lambda down, up: LaplacianCase(radius * (1 - 1e-9), below, above, low, high, down, up),
     )
 
 

@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from harnack.enclosures import (
     Ball,
+    BoundedLaplacian,
     Curvature,
     Enclosure,
     Gaps,
+    GreenBall,
     HarmonicBall,
     Lipschitz,
     Promise,
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
     from harnack.backend import Mask, Real
     from harnack.fields.look import Sample
 
-__all__ = ["BallCase", "Case", "CurvatureCase", "LipschitzCase", "case_of"]
+__all__ = ["BallCase", "Case", "CurvatureCase", "LaplacianCase", "LipschitzCase", "case_of"]
 
 
 @dataclass(frozen=True)
@@ -88,6 +90,27 @@ class BallCase(_Case):
 
 
 @dataclass(frozen=True)
+class LaplacianCase(_Case):
+    """f moves on a ball of space by less than the ranges, with a Laplacian between two ends."""
+
+    radius: Real
+    range_below: Real
+    range_above: Real
+    laplacian_lower: Real
+    laplacian_upper: Real
+    gap_down: Real
+    gap_up: Real
+
+    def enclosure(self, kind: type[Enclosure], slopes: Slopes) -> Enclosure | None:
+        ends = self.laplacian_lower, self.laplacian_upper
+        if issubclass(kind, GreenBall):  # without what is taken off for rounding, as above
+            ranges = self.range_below, self.range_above
+            return kind.of_ranges(self.radius, ranges, ends, slopes)
+        promise = BoundedLaplacian(self.radius, -self.range_below, self.range_above, *ends)
+        return kind.of(promise, 0 * self.radius, 0.0, slopes)
+
+
+@dataclass(frozen=True)
 class LipschitzCase(_Case):
     """f moves by at most `constant` times the length within the radius."""
 
@@ -113,7 +136,7 @@ class CurvatureCase(_Case):
         return kind.of(Curvature(self.constant, self.radius), 0.0, 0.0, slopes)
 
 
-Case: TypeAlias = BallCase | LipschitzCase | CurvatureCase
+Case: TypeAlias = BallCase | LaplacianCase | LipschitzCase | CurvatureCase
 
 
 def case_of(promise: Promise, sample: Sample, gaps: Gaps) -> Case:
@@ -125,5 +148,13 @@ def case_of(promise: Promise, sample: Sample, gaps: Gaps) -> Case:
         return BallCase(
             ball.radius, ball.range_below, ball.range_above, gaps.down, gaps.up, ball.dimension
         )
+    if isinstance(promise, BoundedLaplacian):
+        zero = 0 * sample.value
+        green = GreenBall.of(promise, sample.value, sample.error, Slopes(zero, zero))
+        assert green is not None
+        return LaplacianCase(
+            green.radius, green.range_below, green.range_above,
+            promise.laplacian_lower, promise.laplacian_upper, gaps.down, gaps.up,
+        )  # fmt: skip
     kind = CurvatureCase if isinstance(promise, Curvature) else LipschitzCase
     return kind(promise.constant, promise.radius, gaps.down, gaps.up)

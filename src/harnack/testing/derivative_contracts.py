@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy, to_vector3
-from harnack.enclosures import HarmonicBall, Lipschitz
+from harnack.enclosures import BoundedLaplacian, HarmonicBall, Lipschitz
 from harnack.testing.failures import BrokenPromiseError, require
 from harnack.testing.walks import FieldValues, jumps, look_at
 
@@ -200,7 +200,8 @@ def _bend(nearby: list[_Nearby]) -> FloatArray:
 
 def _check_laplacian(points: FloatArray, look: FieldValues, nearby: list[_Nearby]) -> None:
     """By central differences of the gradient."""
-    if not _is_harmonic(look):
+    bounds = [one for one in look.known if isinstance(one, BoundedLaplacian)]
+    if not _is_harmonic(look) and not bounds:
         return
     h = nearby[0].h
     laplacian = np.sum([one.weight * one.gradient[:, one.axis] for one in nearby], axis=0)
@@ -209,8 +210,13 @@ def _check_laplacian(points: FloatArray, look: FieldValues, nearby: list[_Nearby
     wide = np.sum([one.wide * one.gradient[:, one.axis] for one in nearby], axis=0)
     tolerance = 1e-6 * _bend(nearby) + _SHARE * np.abs(laplacian - wide)
     tolerance += 1e-11 * length * (1 + _size(points) / h) / h
-    message = "HarmonicBall: f is not harmonic, its Laplacian is not 0"
-    _agree(np.abs(laplacian), tolerance, allowance, message, points)
+    if _is_harmonic(look):
+        message = "HarmonicBall: f is not harmonic, its Laplacian is not 0"
+        _agree(np.abs(laplacian), tolerance, allowance, message, points)
+    for one in bounds:
+        off = np.maximum(one.laplacian_lower - laplacian, laplacian - one.laplacian_upper)
+        message = "BoundedLaplacian: the Laplacian is not between its ends"
+        _agree(np.maximum(off, 0), tolerance, allowance, message, points)
 
 
 def _is_harmonic(look: FieldValues) -> bool:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from harnack.backend import FloatArray, choose_backend, to_numpy, to_vector3
-from harnack.enclosures import Curvature, HarmonicBall, Lipschitz
+from harnack.enclosures import BoundedLaplacian, Curvature, HarmonicBall, Lipschitz
 from harnack.fields.field import Field
 from harnack.testing.derivative_contracts import check_derivatives
 from harnack.testing.failures import BrokenPromiseError, require
@@ -105,6 +105,11 @@ def _check_numbers(field: Field, points: FloatArray, look: FieldValues) -> None:
             require(inside, "HarmonicBall: the value is not within [lower, upper]", points)
             bounded = np.isfinite(known.lower) | np.isfinite(known.upper)
             require(bounded, "HarmonicBall: both ends are infinite", points)
+        elif isinstance(known, BoundedLaplacian):
+            inside = (known.lower <= look.value) & (look.value <= known.upper)
+            require(inside, f"{name}: the value is not within [lower, upper]", points)
+            is_ordered = known.laplacian_lower <= known.laplacian_upper
+            require(is_ordered, f"{name}: laplacian_lower exceeds laplacian_upper", points)
         else:
             require(known.constant >= 0, f"{name}: the constant is negative", points)
     usable = np.any([known.radius > 0 for known in look.known], axis=0)
@@ -158,7 +163,7 @@ def _check_promise(
 ) -> None:
     """Walk from each point to the border of the promise, or across the points' size.
 
-    A harmonic ball is one wherever it lies; the others are only asked for in the domain.
+    A ball is one wherever it lies; the others are only asked for in the domain.
     """
     name = type(known).__name__
     reach = np.minimum(known.radius, 2 * float(np.ptp(points, axis=0).max()) + 1e-300)
@@ -172,7 +177,7 @@ def _check_promise(
         ways = (steepest, -steepest, random_directions(rng, len(points)))
         d = ways[min(k, 2)]
         t = reach[:, None] * share
-        if not isinstance(known, HarmonicBall):
+        if not isinstance(known, HarmonicBall | BoundedLaplacian):
             t = np.minimum(reach, _way_out(field, points, d))[:, None] * share
         walk = movements(field, points, d, t)
         moved = walk.moved
@@ -180,6 +185,10 @@ def _check_promise(
         rounding += look.error[:, None] + walk.error  # of both ends, also of approximations
         if isinstance(known, HarmonicBall):
             excess = _beyond_ball(known, look.value, moved, share) - rounding
+        elif isinstance(known, BoundedLaplacian):
+            value = look.value[:, None] + moved
+            beyond = np.maximum(known.lower[:, None] - value, value - known.upper[:, None])
+            excess = beyond - rounding
         elif isinstance(known, Lipschitz):
             excess = np.abs(moved) - known.constant[:, None] * t - rounding
         else:

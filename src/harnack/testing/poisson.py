@@ -139,3 +139,46 @@ class AxialFunctions:
             each = kernel_movement if self.kind == "points" else cap_movement
             total += weight * each(q, place, self.dimension)
         return total
+
+
+@dataclass(frozen=True)
+class GreenPotentials:
+    """Potentials, 0 on the unit sphere of space, of balls of constant density on its axis.
+
+    centres, sizes: (rows, k), |centre| + size <= 1. With density s the potential is w with
+    Laplacian -s in the ball and 0 outside: Newton's minus that of the image, which is harmonic in
+    the unit ball and so that of a point mass at the centre.
+    """
+
+    centres: FloatArray
+    sizes: FloatArray
+
+    def at_centre(self, density: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Value and derivative along the axis (rows,) at the centre of the unit ball."""
+        y, size = self.centres, self.sizes
+        distance = np.abs(y)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            outside = distance > size
+            value = np.where(outside, size**3 / (3 * distance), 0.5 * size**2 - y * y / 6)
+            slope = np.where(outside, size**3 * y / (3 * distance**3), y / 3)
+        value, slope = value - size**3 / 3, slope - size**3 * y / 3
+        return (density * value).sum(axis=1), (density * slope).sum(axis=1)
+
+    def movement(self, q: FloatArray, density: FloatArray) -> FloatArray:
+        """w(q) - w(0) at places q (rows, m) on the axis, 0 <= q < 1: (rows, m)."""
+        total = np.zeros_like(q)
+        for j in range(self.centres.shape[1]):
+            y, size = self.centres[:, j, None], self.sizes[:, j, None]
+            total += density[:, j, None] * (_newton(q, y, size) - size**3 / 3 * q * y / (1 - q * y))
+        return total
+
+
+def _newton(q: FloatArray, y: FloatArray, size: FloatArray) -> FloatArray:
+    """Newton's potential of a ball of density 1 at q, minus that at 0."""
+    near, far = np.abs(y), np.abs(q - y)
+    ends: list[FloatArray] = []
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for d in (far, near):
+            ends.append(np.where(d > size, size**3 / (3 * d), 0.5 * size**2 - d * d / 6))
+        both = q * (2 * y - q) / 6  # free of cancellation where both are inside
+        return np.where((near <= size) & (far <= size), both, ends[0] - ends[1])

@@ -10,7 +10,7 @@ import drjit as dr
 
 from harnack.backend.extrema import fmax
 from harnack.enclosures.enclosure import Enclosure, Gaps, Slopes
-from harnack.enclosures.promises import HarmonicBall, Promise
+from harnack.enclosures.promises import BoundedLaplacian, HarmonicBall, Promise
 
 if TYPE_CHECKING:
     from typing import Self
@@ -37,27 +37,11 @@ class Ball(Enclosure):
 
     @classmethod
     def of(cls, promise: Promise, value: Real, error: Real, slopes: Slopes) -> Self | None:
-        """The ends of the promise are moved out by the error and eight units in the last place of
-        f: a promise that seems to leave f no range would otherwise prove f constant. A radius that
-        is not a positive number, or a NaN anywhere, proves nothing (radius 0).
-        """
         if not isinstance(promise, HarmonicBall):
             return None
-        total_error = dr.fma(8 * float(dr.epsilon(type(value))), dr.abs(value), error)
-        known = promise.radius > 0
-
-        def movement(end: Real, sign: float) -> Real | None:
-            nonlocal known
-            if isinstance(end, float) and math.isinf(end):
-                return None
-            distance = sign * (end - value)
-            known = known & (distance == distance)  # not NaN
-            return fmax(distance, 0) + total_error
-
-        below, above = movement(promise.lower, -1.0), movement(promise.upper, 1.0)
+        radius, below, above = known_ranges(promise, value, error)
         if not cls.applies(promise.dimension, below is not None, above is not None):
             return None
-        radius = dr.select(known, promise.radius * _RADIUS_SLACK, 0)
         return cls(radius, below, above, promise.dimension, slopes)
 
     def is_known(self, gaps: Gaps) -> Mask:
@@ -73,3 +57,27 @@ class Ball(Enclosure):
         """Whether the proof is one for balls of this dimension, with these ends known."""
         del dimension
         return is_bounded_below or is_bounded_above
+
+
+def known_ranges(
+    promise: HarmonicBall | BoundedLaplacian, value: Real, error: Real
+) -> tuple[Real, Real | None, Real | None]:
+    """Radius, and how far the promise lets f move down and up (None: that side is not bounded).
+
+    The ends of the promise are moved out by the error and eight units in the last place of f: a
+    promise that seems to leave f no range would otherwise prove f constant. A radius that is not a
+    positive number, or a NaN anywhere, proves nothing (radius 0).
+    """
+    total_error = dr.fma(8 * float(dr.epsilon(type(value))), dr.abs(value), error)
+    known = promise.radius > 0
+
+    def movement(end: Real, sign: float) -> Real | None:
+        nonlocal known
+        if isinstance(end, float) and math.isinf(end):
+            return None
+        distance = sign * (end - value)
+        known = known & (distance == distance)  # not NaN
+        return fmax(distance, 0) + total_error
+
+    below, above = movement(promise.lower, -1.0), movement(promise.upper, 1.0)
+    return dr.select(known, promise.radius * _RADIUS_SLACK, 0), below, above

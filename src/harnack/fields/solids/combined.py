@@ -15,6 +15,7 @@ from harnack.arithmetic import maximum, minimum
 from harnack.backend.extrema import fmax, fmin
 from harnack.backend.lengths import largest_component, length
 from harnack.enclosures import (
+    BoundedLaplacian,
     Enclosure,
     Greatest,
     HarmonicBall,
@@ -26,6 +27,7 @@ from harnack.enclosures import (
 from harnack.fields.field import Field
 from harnack.fields.formula import as_data
 from harnack.fields.look import Look, Path, Sample, value_error
+from harnack.fields.solids.affine import lipschitz_of_laplacian
 from harnack.fields.solids.solid import Derived, Solid, not_a_solid
 from harnack.geometry import Box, Intersection
 
@@ -221,12 +223,12 @@ class Combined(Solid):
 
 
 def lipschitz_of(sample: Sample) -> Lipschitz | None:
-    """A Lipschitz constant that a sample promises, or that follows from a harmonic ball.
+    """A Lipschitz constant that a sample promises, or that follows from a ball.
 
     Proof. Let f be within M of a constant on a ball of radius r in R^n. At its centre f_v is n/r
     times the mean of f s over the sphere, s the cosine of the angle to v, so at most n M/r times
     the mean of |s|: 1.28, 1.5 and 1.7 M/r for n = 2, 3, 4. Points within R/2 are centres of balls
-    of radius R/2, on which M is half of upper - lower.
+    of radius R/2, on which M is half of upper - lower. `lipschitz_of_laplacian` has another proof.
     """
     for one in sample.promises:
         if isinstance(one, Lipschitz):
@@ -235,6 +237,8 @@ def lipschitz_of(sample: Sample) -> Lipschitz | None:
         if isinstance(one, HarmonicBall) and not _is_open(one.lower) and not _is_open(one.upper):
             span = (one.upper - sample.value) + (sample.value - one.lower)
             return Lipschitz(1.7001 * span / one.radius, 0.5 * one.radius)
+        if isinstance(one, BoundedLaplacian):
+            return lipschitz_of_laplacian(one)
     return None
 
 
@@ -305,11 +309,12 @@ def negated_sample(sample: Sample) -> Sample:
     """The sample of -f."""
 
     def turned(one: Promise) -> Promise:
-        return (
-            replace(one, lower=-one.upper, upper=-one.lower)
-            if isinstance(one, HarmonicBall)
-            else one
-        )
+        if isinstance(one, BoundedLaplacian):
+            ends = -one.laplacian_upper, -one.laplacian_lower
+            return BoundedLaplacian(one.radius, -one.upper, -one.lower, *ends)
+        if isinstance(one, HarmonicBall):
+            return replace(one, lower=-one.upper, upper=-one.lower)
+        return one
 
     return replace(
         sample,
@@ -354,7 +359,7 @@ class Offset(Derived):
         """The sample, its value rounded once more."""
 
         def moved(one: Promise) -> Promise:
-            if not isinstance(one, HarmonicBall):
+            if not isinstance(one, HarmonicBall | BoundedLaplacian):
                 return one
             return replace(one, lower=one.lower - self.distance, upper=one.upper - self.distance)
 
