@@ -56,7 +56,15 @@ def test_what_is_not_a_number_is_not_free(bound: Any) -> None:
         return [(z * math.nan, z)]
 
     o, d = [[0.3, 0.2, 3.0], [-2, 0.1, 0.2], [0.3, 0.2, 0.1]], [[0, 0, -1.0], [1, 0, 0], [0, 0, 1]]
-    for field in (hk.RiemannSurface(lost, **settings), hk.LevelCurves(lost, **settings)):
+
+    def one_is_lost(z: Any) -> list[tuple[Any, Any]]:
+        return [(z, 1.0), *lost(z)]
+
+    for field in (
+        hk.RiemannSurface(lost, **settings),
+        hk.RiemannSurface(one_is_lost, **settings),
+        hk.LevelCurves(lost, **settings),
+    ):
         hits = hk.trace(field, o, d, bound=bound, max_steps=20)
         assert (hits.status == hk.Status.OUT_OF_STEPS).all()
 

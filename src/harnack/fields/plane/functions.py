@@ -167,7 +167,8 @@ def _own(function: Any, singular: Any, second: Any, period: Any) -> OwnBranches:
     bound = _tried(second, z, backend.Float(_PROBE[1]))
     if not isinstance(bound, backend.Float | int | float):
         raise TypeError(f"second must return a real number, the bound of |g''|, not {bound!r}")
-    made = OwnBranches(function, points, second, len(branches), period)
+    shift = None if period is None else float(period)
+    made = OwnBranches(function, points, second, len(branches), shift)
     made.at(z)
     return made
 

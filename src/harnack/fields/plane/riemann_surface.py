@@ -334,7 +334,10 @@ class RiemannSurface(Field):
                 close = abs(z - point.at) <= 2 * rounding
                 jump = 2 * self._size * point.constant * dr.power(3 * rounding, point.power)
                 error += dr.select(close, jump, 0)
-        return self._choose(z, p.z, self._graphs(p, branches), error, rounding)
+        graphs = self._graphs(p, branches)
+        for sheet in graphs:  # of which one that is not a number is never the nearest
+            error = dr.select(dr.isnan(sheet.phi), dr.nan, error)
+        return self._choose(z, p.z, graphs, error, rounding)
 
     def _choose(
         self, z: Complex, h: Real, graphs: list[_Graph], error: Real, rounding: Real

@@ -289,9 +289,9 @@ def _three(numbers: Any, name: str) -> tuple[int, int, int]:
     except TypeError:
         try:
             several = tuple(operator.index(n) for n in numbers)
-        except TypeError:
+        except TypeError as error:
             raise TypeError(
-                f"{name} must be whole numbers, one or three, not {numbers!r}"
+                f"{name} must be whole numbers, one or three, not {numbers!r} ({error})"
             ) from None
         if len(several) != 3:
             raise ValueError(f"{name} must be one number or three, not {len(several)}") from None
