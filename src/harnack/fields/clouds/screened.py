@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import drjit as dr
 import numpy as np
-import numpy.typing as npt
 
-from harnack.backend import FloatArray, backend_of, choose_backend, to_numpy, to_vector3
+from harnack.backend import backend_of
 from harnack.choices import did_you_mean
-from harnack.enclosures import Curvature
 from harnack.fields.batch import BatchedField, Values
-from harnack.fields.clouds.dipole_records import dipole_rows
-from harnack.fields.clouds.screened_kernel import mean_at_dipoles, promises
-from harnack.fields.clouds.screened_tree import DirectSum, ScreenedDipoles, TreeSum
+from harnack.fields.clouds.screened_kernel import YukawaKernel, mean_at_dipoles, promises
 from harnack.fields.field import AtDetail, Field, Sample
+from harnack.fields.multipoles.carved_box import carved_box
+from harnack.fields.multipoles.dipole_records import dipole_rows
+from harnack.fields.multipoles.radial_tree import (
+    ClusteredDipoles,
+    DirectSum,
+    RadialDipoles,
+    TreeSum,
+)
 from harnack.fields.sums import SECOND_ROUNDINGS, SLOPE_ROUNDINGS, FieldSums
 from harnack.fields.unit_coordinates import (
     UnitCoordinates,
@@ -28,7 +31,6 @@ from harnack.fields.unit_coordinates import (
     placed,
     single,
 )
-from harnack.geometry import Box
 from harnack.geometry.clouds import estimate_areas, validate_cloud
 from harnack.geometry.meshes import validate_mesh
 
@@ -40,8 +42,6 @@ MethodName = Literal["auto", "sum", "tree"]
 
 # Where a tree becomes faster than the plain sum.
 _MOST_SUMMED = 2000
-# Cells of the extent that are split at most, and how often.
-_MOST_CELLS, _FINEST = 4096, 5
 _SMALLEST_LEVEL = 1e-20
 # Nearer to a dipole than so many roundings w is not known, and any level up to the second number
 # may be there.
@@ -195,17 +195,18 @@ class ScreenedWindingNumber(UploadedField["_ScreenedBuffers"], BatchedField):
         """
         share = dr.rcp(sums.free_distance)
         held = 2e-30 * float(self._rows[:, 6].sum()) * share * share
-        fourth = 0.25 * on.dipoles.kappa * sums.s4
+        fourth = 0.25 * on.kernel.kappa * sums.s4
         second = dr.fma(SECOND_ROUNDINGS * unit, fourth, 6 * held * share * share)
         return held, 2 * held * share, second
 
     def _upload(self, backend: Backend, *, traced: bool) -> _ScreenedBuffers:
         del traced
+        kernel = YukawaKernel(backend, self._kappa)
         if self.method == "sum":
-            dipoles = DirectSum(backend, self._rows, self._kappa)
+            dipoles = DirectSum(backend, self._rows, kernel)
         else:
-            dipoles = TreeSum(backend, self._rows, self._kappa, self.accuracy)
-        return _ScreenedBuffers(*placed(backend, self._centre, self._size), dipoles)
+            dipoles = TreeSum(backend, ClusteredDipoles.of(self._rows), kernel, self.accuracy)
+        return _ScreenedBuffers(*placed(backend, self._centre, self._size), kernel, dipoles)
 
     def _batch(self, backend: Backend) -> _ScreenedBuffers:
         if self._device is not None and self._device.backend is backend:
@@ -232,7 +233,7 @@ class ScreenedWindingNumber(UploadedField["_ScreenedBuffers"], BatchedField):
         steep = on.backend.Array3f(0, 0, _ANY_LEVEL / (_ON_DIPOLE * epsilon))
         value = dr.select(apart, sums.value, 0)
         gradient = dr.select(apart, sums.gradient, steep)
-        known, ball = promises(screened, value, gradient, on.dipoles.kappa, on.size, epsilon)
+        known, ball = promises(screened, value, gradient, on.kernel, on.size, epsilon)
         return Sample(
             value,
             gradient / on.size,
@@ -253,8 +254,7 @@ class ScreenedWindingNumber(UploadedField["_ScreenedBuffers"], BatchedField):
         """A box proved to hold the level sets; None for level 0, which may have no end.
 
         At distance D from the points |w| <= sum_i w_i Q_1(D/l)/D^2 <= least |level|, which falls
-        with D. Of that box, cells with no level in them are cut away: a ball around the cell, on
-        which a curvature promise keeps w from the levels.
+        with D. That box is carved (`carved_box`).
         """
         if levels not in self._extents:
             self._extents[levels] = self._extent(levels)
@@ -273,43 +273,7 @@ class ScreenedWindingNumber(UploadedField["_ScreenedBuffers"], BatchedField):
             low, high = (reach, high) if inside else (low, reach)
         reach = 1.001 * high * self._size
         lower, upper = self.points.min(axis=0) - reach, self.points.max(axis=0) + reach
-        lower, upper = self._cut(lower, upper, levels)
-        slack = 1e-4 * float((upper - lower).max())
-        lower, upper = lower - slack, upper + slack
-        return Box(_point(lower), _point(upper))
-
-    def _cut(
-        self, lower: FloatArray, upper: FloatArray, levels: tuple[float, ...]
-    ) -> tuple[FloatArray, FloatArray]:
-        """The bounds of the cells of a box that are not proved empty."""
-        field = self.prepare(choose_backend("double"))
-        corner, size = lower[None], upper - lower
-        halves = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
-        for _ in range(_FINEST):
-            if 8 * len(corner) > _MOST_CELLS:
-                break
-            size = 0.5 * size
-            split = (corner[:, None] + halves * size).reshape(-1, 3)
-            kept = split[~field._without_level(split + 0.5 * size, size, levels)]
-            if not len(kept):
-                return lower, upper  # no level anywhere: any box will do
-            corner = kept
-        return corner.min(axis=0), corner.max(axis=0) + size
-
-    def _without_level(
-        self, centres: FloatArray, size: FloatArray, levels: tuple[float, ...]
-    ) -> npt.NDArray[np.bool_]:
-        sample = self.evaluate(to_vector3(choose_backend("double"), centres, "centres"))
-        h = 0.5 * float(np.linalg.norm(size))
-        value, error = to_numpy(sample.value), to_numpy(sample.error)
-        away = np.min([np.abs(value - level) for level in levels], axis=0) - error
-        slope = np.linalg.norm(to_numpy(sample.gradient), axis=1) + to_numpy(sample.gradient_error)
-        empty = np.zeros(len(centres), np.bool_)
-        for one in sample.known:
-            if isinstance(one, Curvature):
-                moved = h * (slope + 0.5 * h * to_numpy(one.constant))
-                empty |= (to_numpy(one.radius) > h) & (moved < away)
-        return empty
+        return carved_box(self, lower, upper, levels)
 
     def describe(self) -> dict[str, Any]:
         return {
@@ -324,9 +288,5 @@ class ScreenedWindingNumber(UploadedField["_ScreenedBuffers"], BatchedField):
 class _ScreenedBuffers(UnitCoordinates):
     """The dipoles on a backend."""
 
-    dipoles: ScreenedDipoles
-
-
-def _point(row: FloatArray) -> tuple[float, float, float]:
-    x, y, z = row.tolist()
-    return x, y, z
+    kernel: YukawaKernel
+    dipoles: RadialDipoles
