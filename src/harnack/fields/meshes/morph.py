@@ -35,9 +35,10 @@ class Morph(BatchedField):
     four dimensions' of the talk on Gillespie et al. 2024, with level pi^2 of the sum.)
 
     At w = 0 and w = gap the field is the winding number of the mesh itself, triangles and all.
-    Between the ends what is drawn is the surface of a *quadrature*: each mesh is replaced by the
-    centroids of its triangles, cut so that their edges are at most `spacing` times the height. The
-    sum over these is as harmonic as the integral, and it is that sum whose surface is found with
+    Between the ends what is drawn is the surface of a *quadrature*: each mesh is replaced by
+    oriented points at the centroids of its triangles, cut so that their edges are at most `spacing`
+    times the height; of triangles much smaller than that, one point stands for several. The sum
+    over these is as harmonic as the integral, and it is that sum whose surface is found with
     proof; `quadrature_displacement` bounds how far the surface of the integral is.
 
     mesh_a, mesh_b: pairs (vertices (n, 3), faces (m, 3)), counter-clockwise seen from outside.
@@ -66,8 +67,8 @@ class Morph(BatchedField):
         *,
         gap: float,
         w: float,
-        spacing: float = 0.5,
-        accuracy: float = 4.0,
+        spacing: float = 1.0,
+        accuracy: float = 3.0,
     ) -> None:
         if not (math.isfinite(gap) and gap > 0):
             raise ValueError(f"gap must be positive and finite, not {gap!r}")

@@ -14,7 +14,7 @@ from harnack.backend.extrema import fmax
 from harnack.enclosures import HarmonicBall
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.field import AtDetail, Field, Sample
-from harnack.fields.meshes.centroids import Centroids, centroids, piece_counts
+from harnack.fields.meshes.centroids import FARTHEST, Centroids, centroids, piece_counts
 from harnack.fields.meshes.sliced_kernel import SlicedKernel
 from harnack.fields.multipoles.carved_box import carved_box
 from harnack.fields.multipoles.dipole_records import dipole_rows
@@ -40,8 +40,6 @@ MOST_POINTS = 4_000_000
 """Points of the quadrature of both meshes together."""
 
 _SMALLEST_LEVEL = 1e-6
-# The farthest corner of a triangle is no farther from the centroid, in longest edges.
-_FARTHEST = 2 / 3
 
 
 class MorphSlice(UploadedField["_SliceBuffers"], BatchedField):
@@ -72,12 +70,8 @@ class MorphSlice(UploadedField["_SliceBuffers"], BatchedField):
         self._size = 2.0 ** math.ceil(math.log2(0.5 * float((high - low).max())))
         longest = [spacing * height for height in self.heights]
         _check_count([piece_counts(*one) for one in zip(corners, longest, strict=True)], w, gap)
-        pieces = [
-            centroids(one, piece_counts(one, length))
-            for one, length in zip(corners, longest, strict=True)
-        ]
-        self.spreads = tuple(one.spread for one in pieces)
-        self._dipoles = tuple(self._clustered(one) for one in pieces)
+        self._pieces = tuple(centroids(*one) for one in zip(corners, longest, strict=True))
+        self._dipoles = tuple(self._clustered(one) for one in self._pieces)
         self._extents: dict[tuple[float, ...], Volume] = {}
 
     def _clustered(self, pieces: Centroids) -> ClusteredDipoles:
@@ -103,20 +97,22 @@ class MorphSlice(UploadedField["_SliceBuffers"], BatchedField):
     def quadrature_displacement(self, points: Any, precision: Precision = "single") -> FloatArray:
         """As `Morph.quadrature_displacement`.
 
-        A piece of area a whose centroid is D away is off by the remainder of Taylor's formula
-        behind the linear term, whose integral vanishes: by a times the mean of |d|^2 (3-2q)/
-        ((1-q)^2 D^4), q = |d|/D (`RadialSums.remainder`), |d| <= 2/3 of the longest edge.
+        A part with moment m whose point is D away is off by at most 2 |T|_* /D^3, the nuclear norm
+        of T = sum of m_i times d_i, at most sqrt(3) times Frobenius', and by the remainder of
+        Taylor's formula: |m| times the mean of |d|^2 (3-2q)/((1-q)^2 D^4), q = |d|/D
+        (`RadialSums.remainder`; |d| <= `FARTHEST` of the longest edge).
         """
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Real]:
             on = self._batch(backend)
             x = on.unit(x)
             error, gradient = backend.Float(0), backend.Array3f(0)
-            for cloud, spread, height in zip(on.clouds, self.spreads, self.heights, strict=True):
-                sums, share = cloud.sums(x, 1.0, 1), _FARTHEST * self.spacing
-                farthest = share * height / self._size
-                bend = sums.remainder(share, farthest, 1.0)
-                error = dr.fma(spread / self._size**2, bend, error)
+            share = FARTHEST * self.spacing
+            for cloud, piece, height in zip(on.clouds, self._pieces, self.heights, strict=True):
+                sums = cloud.sums(x, 1.0, 1)
+                bend = sums.remainder(share, share * height / self._size, 1.0)
+                error = dr.fma(piece.spread / self._size**2, bend, error)
+                error = dr.fma(2 * math.sqrt(3) * piece.slant / self._size, sums.steep, error)
                 gradient = gradient + sums.sums.gradient
             return (error / dr.norm(gradient) * on.size,)
 

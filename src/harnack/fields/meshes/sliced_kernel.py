@@ -31,7 +31,7 @@ such angles alternate and grow with x, as x^m (1 - x^2)^(-1/2) does: the integra
 last lobe, which is the largest if it ends at b = 1, where it is below 0.4 for m <= 7 (quadrature in
 `tests/test_morph.py`).
 
-In four dimensions the gradient of n.grad_x K is at most 2 * 1.1856/D^3: its square is
+In four dimensions the gradient of n.grad_x K is at most 2 * 1.1855/D^3: its square is
 cos^2 (K''^2 + (dw K')^2) + sin^2 (K'/r)^2, cos the angle of n to z, and so at most the larger of
 two functions of c alone (maximum at w = r; the same tests).
 """
@@ -51,7 +51,7 @@ from harnack.fields.multipoles.radial_kernel import Radial, RadialKernel
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Real
 
-GRADIENT = 1.1856
+GRADIENT = 1.1855
 """Half the largest gradient of a dipole in four dimensions, times D^3: it serves for Q_2."""
 
 # Degrees of the polynomial for the last i_n in single and double precision: the singularity at
