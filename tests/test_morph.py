@@ -180,10 +180,10 @@ def test_quadrature_bound_holds_against_a_fine_one() -> None:
 # ---------------------------------------------------------------- the field
 
 
-@pytest.mark.parametrize("w", [0.03, 0.15])
+@pytest.mark.parametrize("w", [0.08, 0.15])
 def test_tree_is_the_sum_within_its_error(w: float) -> None:
     field = morph(w, accuracy=2.0)
-    x = np.random.default_rng(4).uniform(-1, 1, (400, 3)).astype(np.float32).astype(float)
+    x = np.random.default_rng(4).uniform(-1, 1, (60, 3)).astype(np.float32).astype(float)
     value, gradient = exact(field, x)
     for precision in ("single", "double"):
         look = look_at(field, x, precision=precision) if precision == "double" else None
@@ -271,12 +271,14 @@ def test_ends_are_the_meshes(w: float, mesh: Any) -> None:
     assert field.describe()["shows"] == ("mesh a" if w == 0 else "mesh b")
 
 
-def test_slices_near_an_end_are_nearly_the_mesh() -> None:
+def test_slices_near_an_end_are_near_the_mesh_in_proportion() -> None:
     o, d = rays(200, 8)
-    near, at = (hk.trace(morph(w), o, d, tolerance=1e-3) for w in (0.01, 0.0))
-    both = near.hit & at.hit
+    farther, near, at = (hk.trace(morph(w), o, d, tolerance=1e-3) for w in (0.02, 0.01, 0.0))
+    all_ = farther.hit & near.hit & at.hit
+    assert all_.sum() > 10
     assert (near.hit != at.hit).mean() < 0.03
-    assert np.median(np.abs(near.t - at.t)[both]) < 0.01
+    first, second = (np.median((one.t - at.t)[all_]) for one in (farther, near))
+    assert 0 < second < 0.7 * first < 0.05
 
 
 def test_meshes_with_holes() -> None:
@@ -333,6 +335,7 @@ def test_bad_input() -> None:
         hk.Morph(TORUS, (vertices * np.nan, faces), gap=GAP, w=0.1)
 
 
+@pytest.mark.slow
 def test_hits_carry_derivatives() -> None:
     backend = choose_backend("double")
     o = backend.Array3f(0.65, 0.1, 2.0)
