@@ -1,4 +1,4 @@
-"""Scenes of meshes, damaged or between two shapes, and of point clouds."""
+"""Scenes of damaged meshes and of point clouds."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from harnack.backend import FloatArray
-from harnack.fields import DipolePotential, Morph, WindingNumber
+from harnack.fields import DipolePotential, WindingNumber
 from harnack.gallery.scene import DRAWN, Scene
 from harnack.geometry import mesh_shapes, shapes
 from harnack.rendering import Camera
@@ -43,20 +43,6 @@ def _soup() -> list[LevelSet]:
     loose = (middle + 0.86 * (corners - middle)).reshape(-1, 3)
     field = WindingNumber(loose, np.arange(len(loose)).reshape(-1, 3))
     return [level_set(field, tolerance=DRAWN)]
-
-
-def _morph() -> list[LevelSet]:
-    """Five slices from a torus to a bumpy sphere, both ends themselves, one beside the other."""
-    torus = mesh_shapes.torus_mesh(0.75, 0.3, 48, 20)
-    vertices, faces = mesh_shapes.bumpy_sphere(4)
-    gap, surfaces = 0.2, list[LevelSet]()
-    for k in range(5):
-        beside = np.array([0.0, 2.5 * k, 0.0])
-        field = Morph(
-            (torus[0] + beside, torus[1]), (0.8 * vertices + beside, faces), gap=gap, w=gap * k / 4
-        )
-        surfaces.append(level_set(field, tolerance=2e-3))
-    return surfaces
 
 
 def _cloud() -> list[LevelSet]:
@@ -109,14 +95,6 @@ MESHES = (
         Camera(elevation=40),
         show="shaded",
         demo_spp=4,
-    ),
-    Scene(
-        "morph",
-        "from a torus to a bumpy sphere, by solid angles in four dimensions",
-        _morph,
-        ("porcelain",),
-        Camera(azimuth=0, elevation=35),
-        show="shaded",
     ),
     Scene(
         "cloud",
