@@ -209,6 +209,7 @@ APPROXIMATE: dict[str, Field] = {
     "screened by tree": hk.ScreenedWindingNumber(*_CLOUD, length=0.7, method="tree"),
     "mesh by tree, accuracy 2": hk.WindingNumber(*_DAMAGED, method="tree", accuracy=2.0),
     "mesh by tree, accuracy 4": hk.WindingNumber(*_DAMAGED, method="tree", accuracy=4.0),
+    "morph": hk.Morph(icosphere(2), _DAMAGED, gap=0.4, w=0.15),
     "mesh, exact": hk.WindingNumber(*_DAMAGED, method="exact"),
     "closed mesh, exact": hk.WindingNumber(*icosphere(1), method="exact"),
 }

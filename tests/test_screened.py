@@ -13,12 +13,12 @@ from scipy.special import eval_legendre, spherical_in, spherical_kn
 import harnack as hk
 from harnack.backend import choose_backend, to_float, to_numpy, to_vector3
 from harnack.enclosures import Curvature, HarmonicBall
-from harnack.fields.clouds.dipole_records import dipole_rows
 from harnack.fields.clouds.screened import ScreenedWindingNumber
-from harnack.fields.clouds.screened_kernel import seen_dipole, thetas
-from harnack.fields.clouds.screened_tree import (
+from harnack.fields.clouds.screened_kernel import YukawaKernel, accepting_distance, thetas
+from harnack.fields.multipoles.dipole_records import dipole_rows
+from harnack.fields.multipoles.radial_kernel import seen_dipole
+from harnack.fields.multipoles.radial_tree import (
     ClusterMoments,
-    accepting_distance,
     clusters,
     coefficients,
     seen_cluster,
@@ -131,7 +131,9 @@ def test_kernel_in_single_precision_from_far_below_a_length_to_a_hundred() -> No
         number = np.float64 if precision == "double" else np.float32
         row = [to_float(backend, column) for column in rows.astype(np.float32).T.astype(number)]
         kappa = to_float(backend, tau.astype(np.float32).astype(number))
-        terms = seen_dipole(row, backend.Array3f(0), kappa, 2).terms
+        yukawa = YukawaKernel(backend, 1.0)
+        yukawa.kappa = kappa  # another in each lane
+        terms = seen_dipole(row, backend.Array3f(0), yukawa, 2).terms
         parts = [terms.value, *terms.gradient, *terms.hessian.parts()]  # type: ignore[union-attr]
         results.append(np.stack([np.broadcast_to(to_numpy(part), n) for part in parts]))
     scale = np.abs(results[0]).max(axis=0)
@@ -197,7 +199,7 @@ def seen(level: ClusterMoments, x: np.ndarray, kappa: float) -> tuple[Any, ...]:
         [to_float(DOUBLE, column) for column in c.T],
         to_vector3(DOUBLE, z),
         to_float(DOUBLE, np.linalg.norm(z, axis=1)),
-        to_float(DOUBLE, kappa),
+        YukawaKernel(DOUBLE, kappa),
         1,
     )
     return tuple(

@@ -14,6 +14,7 @@ from harnack.fields.curves.solid_angle import SolidAngle
 from harnack.fields.expressions.expression import expression
 from harnack.fields.field import Field, Sample
 from harnack.fields.formula import Formula
+from harnack.fields.meshes.morph import Morph
 from harnack.fields.meshes.winding_number import WindingNumber
 from harnack.fields.plane.branches import BranchPoint
 from harnack.fields.plane.height_field import HeightField
@@ -78,6 +79,7 @@ __all__ = [
     "LineLipschitz",
     "Lipschitz",
     "Molecule",
+    "Morph",
     "Noise",
     "Plane",
     "PlaneWave",

@@ -10,9 +10,9 @@ import numpy as np
 
 from harnack.backend import backend_of
 from harnack.fields.batch import BatchedField, Values
-from harnack.fields.clouds.dipole_records import hierarchy_of
 from harnack.fields.clouds.dipole_tree import DipoleTree
 from harnack.fields.field import AtDetail, Field, Sample, lengthened
+from harnack.fields.multipoles.dipole_records import hierarchy_of
 from harnack.fields.unit_coordinates import UnitCoordinates, UploadedField, placed, single
 from harnack.geometry import Box, CloudError, estimate_areas, estimate_normals, validate_cloud
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 
 from harnack.backend.extrema import fmax
-from harnack.fields.clouds.dipole_records import dipole_rows, in_slots
+from harnack.fields.multipoles.dipole_records import dipole_rows, in_slots
 from harnack.fields.multipoles.far_clusters import Treecode
 from harnack.fields.multipoles.multipole import all_levels
 from harnack.fields.sums import FieldSums, Terms, rounding_of_dipole, rounding_of_sum

@@ -14,10 +14,15 @@ from harnack.backend import backend_of
 from harnack.choices import did_you_mean
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.clearance import tight_extent
-from harnack.fields.clouds.dipole_records import dipole_rows
-from harnack.fields.clouds.screened_kernel import mean_at_dipoles, promises
-from harnack.fields.clouds.screened_tree import DirectSum, ScreenedDipoles, TreeSum
+from harnack.fields.clouds.screened_kernel import YukawaKernel, mean_at_dipoles, promises
 from harnack.fields.field import AtDetail, Field, Sample
+from harnack.fields.multipoles.dipole_records import dipole_rows
+from harnack.fields.multipoles.radial_tree import (
+    ClusteredDipoles,
+    DirectSum,
+    RadialDipoles,
+    TreeSum,
+)
 from harnack.fields.sums import SECOND_ROUNDINGS, SLOPE_ROUNDINGS, FieldSums
 from harnack.fields.unit_coordinates import (
     UnitCoordinates,
@@ -192,17 +197,18 @@ class ScreenedWindingNumber(UploadedField["_ScreenedBuffers"], BatchedField):
         """
         share = dr.rcp(sums.free_distance)
         held = 2e-30 * float(self._rows[:, 6].sum()) * share * share
-        fourth = 0.25 * on.dipoles.kappa * sums.s4
+        fourth = 0.25 * on.kernel.kappa * sums.s4
         second = dr.fma(SECOND_ROUNDINGS * unit, fourth, 6 * held * share * share)
         return held, 2 * held * share, second
 
     def _upload(self, backend: Backend, *, traced: bool) -> _ScreenedBuffers:
         del traced
+        kernel = YukawaKernel(backend, self._kappa)
         if self.method == "sum":
-            dipoles = DirectSum(backend, self._rows, self._kappa)
+            dipoles = DirectSum(backend, self._rows, kernel)
         else:
-            dipoles = TreeSum(backend, self._rows, self._kappa, self.accuracy)
-        return _ScreenedBuffers(*placed(backend, self._centre, self._size), dipoles)
+            dipoles = TreeSum(backend, ClusteredDipoles.of(self._rows), kernel, self.accuracy)
+        return _ScreenedBuffers(*placed(backend, self._centre, self._size), kernel, dipoles)
 
     def _batch(self, backend: Backend) -> _ScreenedBuffers:
         if self._device is not None and self._device.backend is backend:
@@ -229,7 +235,7 @@ class ScreenedWindingNumber(UploadedField["_ScreenedBuffers"], BatchedField):
         steep = on.backend.Array3f(0, 0, _ANY_LEVEL / (_ON_DIPOLE * epsilon))
         value = dr.select(apart, sums.value, 0)
         gradient = dr.select(apart, sums.gradient, steep)
-        known, ball = promises(screened, value, gradient, on.dipoles.kappa, on.size, epsilon)
+        known, ball = promises(screened, value, gradient, on.kernel, on.size, epsilon)
         return Sample(
             value,
             gradient / on.size,
@@ -284,4 +290,5 @@ class ScreenedWindingNumber(UploadedField["_ScreenedBuffers"], BatchedField):
 class _ScreenedBuffers(UnitCoordinates):
     """The dipoles on a backend."""
 
-    dipoles: ScreenedDipoles
+    kernel: YukawaKernel
+    dipoles: RadialDipoles

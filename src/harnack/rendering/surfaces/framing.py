@@ -79,7 +79,8 @@ def _point(corner: FloatArray) -> str:
 def _probe(surface: LevelSet, backend: Backend, lower: FloatArray, upper: FloatArray) -> FloatArray:
     """First encounters of parallel rays from the six sides of a box."""
     size = float(np.linalg.norm(upper - lower))
-    rough = replace(surface, tolerance=Tolerance(1e-4 * size))
+    # A twentieth of the way between two rays: sums over trees take long where they are asked for more.
+    rough = replace(surface, tolerance=Tolerance(1e-3 * size))
     placed = PlacedSurface.of(rough, Placement.identity(), backend)
     o, d, length = _rays(lower, upper, 0.01 * size)
     met = placed.meet(

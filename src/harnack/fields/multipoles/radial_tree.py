@@ -1,20 +1,20 @@
-"""Sums of screened dipoles: all of them one by one, or far ones in clusters by a tree.
+"""Sums of dipoles of a radial potential: one by one, or far ones in clusters by a tree.
 
-Expansion. Dipoles m_i at c + d_i, |d_i| <= R, seen from x = c - z, r = |z|: by Taylor in d_i
+Expansion. Dipoles m_i at c + d_i, |d_i| <= R, seen from x = c - z, r = D of z: by Taylor in d_i
 
     w = -sum_i m_i.grad K(z + d_i) = -(T1[D] + T2[D^2] + T3[D^3]/2) K(z) + (rest),
 
-T1 = sum m, T2 = sym sum m d, T3 = sym sum m d d. With psi_k as in `screened_kernel`, D K = -z
+T1 = sum m, T2 = sym sum m d, T3 = sym sum m d d. With psi_k as in `radial_kernel`, D K = -z
 psi_1, T2[D^2] K = T2[z,z] psi_2 - tr T2 psi_1, T3[D^3] K = 3 z.tr T3 psi_2 - T3[z,z,z] psi_3.
-The Yukawa kernel is not harmonic, so that traces count: 19 numbers instead of 15.
+K is not harmonic in three dimensions, so that traces count: 19 numbers instead of 15.
 
 Truncation. The rest of Taylor's formula is an integral of the fourth derivative of K along the way,
-at most |K''''| at the distance r - s |d_i|. In that, Q_4(kappa rho) <= Q_4(kappa (r-R)); what is
+at most 4! Q_4/(r - s |d_i|)^5. In that, Q_4 is at most its value at r - R; what is
 left of the integral is the rest of the Taylor series of 1/(r - .)^2: with q = |d|/r
 
     |rest| <= Q_4 |m| (1/(1-q)^2 - 1 - 2q - 3q^2)/r^2 = Q_4 |m| |d|^3 (4-3q)/((1-q)^2 r^5),
 
-for kappa = 0 attained by a dipole on the line to x that points along it. (4-3q)/(1-q)^2 grows with
+for Q_4 = 1 attained by a dipole on the line to x that points along it. (4-3q)/(1-q)^2 grows with
 q, so R/r serves for all. For the gradient, likewise from 2/(r - .)^3,
 
     Q_5 |m| |d|^3 (20 - 30q + 12q^2)/((1-q)^3 r^6),
@@ -35,21 +35,21 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import FloatArray
-from harnack.backend.extrema import fmax, fmin
+from harnack.backend.extrema import fmax
 from harnack.backend.records import Records
-from harnack.fields.clouds.dipole_records import hierarchy_of, in_slots, padding_row
-from harnack.fields.clouds.screened_kernel import (
-    LONGEST,
-    ScreenedSums,
+from harnack.fields.multipoles.cluster_walk import SeenCluster, walk_clusters
+from harnack.fields.multipoles.dipole_records import hierarchy_of, in_slots, padding_row
+from harnack.fields.multipoles.radial_kernel import (
+    RadialKernel,
+    RadialSums,
     Source,
     Tail,
     cluster_parts,
     combine,
     seen_dipole,
 )
-from harnack.fields.multipoles.cluster_walk import SeenCluster, walk_clusters
 from harnack.fields.sums import rounding_of_sum
-from harnack.tree import Hierarchy, pack
+from harnack.tree import Hierarchy, PackedTree, pack
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -59,61 +59,63 @@ if TYPE_CHECKING:
 
 # Dipoles a trip of the plain sum, by experiment.
 _CHUNK = 4
-# A cluster is never taken as a whole nearer than this many radii.
-_LEAST = 1.5
 
 
-class ScreenedDipoles(abc.ABC):
+class RadialDipoles(abc.ABC):
     """Dipoles on a backend.
 
-    kappa: one over the length. rounding: of sums of so many terms, as `ScreenedSums.plus` takes it.
+    rounding: of sums of so many terms, as `RadialSums.plus` takes it.
     """
 
-    def __init__(self, backend: Backend, rows: FloatArray, kappa: float) -> None:
-        self.backend = backend
-        self.kappa = dr.opaque(backend.Float, kappa)
+    def __init__(self, backend: Backend, rows: FloatArray, kernel: RadialKernel) -> None:
+        self.backend, self.kernel = backend, kernel
         self.rounding = rounding_of_sum(backend, len(rows), 12)
 
-    @abc.abstractmethod
-    def sums(self, x: Vec3, closer: Real, derivatives: int) -> ScreenedSums:
+    def sums(self, x: Vec3, closer: Real, derivatives: int) -> RadialSums:
         """Value, derivatives and bounds at x; clusters are taken as a whole from `closer` times
         the `accepting_distance` on. derivatives: as for `FieldSums.zero`."""
+        return self.added(RadialSums.zero(self.backend, derivatives), x, closer)
+
+    @abc.abstractmethod
+    def added(self, sums: RadialSums, x: Vec3, closer: Real) -> RadialSums:
+        """Sums over other dipoles, with those over these at x; `closer` as for `sums`."""
 
     def _with_dipole(
         self, row: list[Real], x: Vec3, derivatives: int, state: tuple[Any, ...]
     ) -> tuple[Any, ...]:
-        dipole = seen_dipole(row, x, self.kappa, derivatives)
-        return ScreenedSums.of(state).plus(dipole, self.rounding, True).parts()
+        dipole = seen_dipole(row, x, self.kernel, derivatives)
+        return RadialSums.of(state).plus(dipole, self.rounding, True).parts()
 
 
-class DirectSum(ScreenedDipoles):
+class DirectSum(RadialDipoles):
     """All dipoles, one by one; no sum could be closer."""
 
-    def __init__(self, backend: Backend, rows: FloatArray, kappa: float) -> None:
-        super().__init__(backend, rows, kappa)
+    def __init__(self, backend: Backend, rows: FloatArray, kernel: RadialKernel) -> None:
+        super().__init__(backend, rows, kernel)
         self._records = Records.upload(backend, rows, padding_row(rows[0]), _CHUNK)
 
-    def sums(self, x: Vec3, closer: Real, derivatives: int) -> ScreenedSums:
+    def added(self, sums: RadialSums, x: Vec3, closer: Real) -> RadialSums:
         del closer
+        derivatives = sums.sums.derivatives
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
             return self._with_dipole(row, x, derivatives, state)
 
-        start = ScreenedSums.zero(self.backend, derivatives).parts()
-        return ScreenedSums.of(self._records.for_each(add, start, "screened dipoles"))
+        return RadialSums.of(self._records.for_each(add, sums.parts(), "radial dipoles"))
 
 
-class TreeSum(ScreenedDipoles):
-    """Near dipoles one by one, far ones in clusters. See `accepting_distance` for the accuracy."""
+class TreeSum(RadialDipoles):
+    """Near dipoles one by one, far ones in clusters from the kernel's `accepting_distance` on."""
 
-    def __init__(self, backend: Backend, rows: FloatArray, kappa: float, accuracy: float) -> None:
-        super().__init__(backend, rows, kappa)
-        tree = hierarchy_of(rows[:, :3])
-        levels = [columns(level, kappa, accuracy) for level in clusters(tree, rows)]
-        self._tree = pack(backend, tree, levels, in_slots(tree, rows))
+    def __init__(
+        self, backend: Backend, dipoles: ClusteredDipoles, kernel: RadialKernel, accuracy: float
+    ) -> None:
+        super().__init__(backend, dipoles.rows, kernel)
+        self._tree = dipoles.packed(backend, kernel, accuracy)
 
-    def sums(self, x: Vec3, closer: Real, derivatives: int) -> ScreenedSums:
+    def added(self, sums: RadialSums, x: Vec3, closer: Real) -> RadialSums:
         closer = fmax(self.backend.Float(closer), self.backend.Float(1))
+        derivatives = sums.sums.derivatives
 
         def near(row: list[Real], active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
             del active
@@ -122,39 +124,61 @@ class TreeSum(ScreenedDipoles):
         def far(node: SeenCluster, state: tuple[Any, ...]) -> tuple[Any, ...]:
             length = dr.sqrt(node.square)
             cluster = seen_cluster(
-                node.head, node.payload, -node.r, length, self.kappa, derivatives
+                node.head, node.payload, -node.r, length, self.kernel, derivatives
             )
-            return ScreenedSums.of(state).plus(cluster, self.rounding, node.far).parts()
+            return RadialSums.of(state).plus(cluster, self.rounding, node.far).parts()
 
-        start = ScreenedSums.zero(self.backend, derivatives).parts()
-        return ScreenedSums.of(walk_clusters(self._tree, x, closer, far, near, start))
+        height = self.kernel.height_square
+        walked = walk_clusters(self._tree, x, closer, far, near, sums.parts(), height_square=height)
+        return RadialSums.of(walked)
 
 
 def seen_cluster(
-    head: Sequence[Real], c: Sequence[Real], z: Vec3, length: Real, kappa: Real, derivatives: int
-) -> Source:
-    """A node with numbers `columns`, its centre at z, |z| = length, and what is left out."""
+    head: Sequence[Real], c: Sequence[Real], z: Vec3, length: Real, kernel: RadialKernel,
+    derivatives: int,
+) -> Source:  # fmt: skip
+    """A node with numbers `columns`, its centre at z, D = length, and what is left out."""
     radius, weight = head[4], head[5]
     inverse = dr.rcp(length)
-    t = fmin(kappa * length, LONGEST)
     parts = cluster_parts(c, z, inverse)
-    terms = combine(parts, z, inverse, t, dr.exp(-t), derivatives)
+    radial = kernel.at(length, inverse, len(parts) + derivatives)
+    terms = combine(parts, z, inverse, radial, derivatives)
     nearest = length - radius
     share = dr.rcp(nearest)
-    t = fmin(kappa * nearest, LONGEST)
-    decay = dr.exp(-t)
-    tail = Tail.of(nearest, share, t, decay)
-    t4 = t * t * t * t
-    fourth = dr.fma(decay * t4, 1 / 24, tail.third)
-    fifth = dr.fma(decay * t4 * t, 1 / 120, fourth)
+    bounds = kernel.bounds(nearest, 6)
+    tail = Tail.of(nearest, share, bounds)
+    fourth, fifth, sixth = bounds[2:]
     q = radius * inverse
     common = c[23] * inverse * inverse * inverse * share * share
     error = common * fourth * dr.fma(-3, q, 4)
     slope = common * share * fifth * dr.fma(q, dr.fma(12, q, -30), 20)
-    sixth = dr.fma(decay * t4 * t * t, 1 / 720, fifth)
     rest = dr.fma(q, dr.fma(q, dr.fma(-60, q, 216), -270), 120)
     second = common * share * share * sixth * rest
     return Source(terms, weight, tail, error, slope, second)
+
+
+@dataclass(frozen=True)
+class ClusteredDipoles:
+    """Dipoles (n, 8) as `dipole_rows` has them, in the leaves of a tree, with the moments of its
+    levels: all that does not depend on the kernel."""
+
+    rows: FloatArray
+    tree: Hierarchy
+    levels: list[ClusterMoments]
+
+    @classmethod
+    def of(cls, rows: FloatArray) -> ClusteredDipoles:
+        """A tree over the dipoles."""
+        tree = hierarchy_of(rows[:, :3])
+        return cls(rows, tree, clusters(tree, rows))
+
+    def packed(self, backend: Backend, kernel: RadialKernel, accuracy: float) -> PackedTree:
+        """The tree on a backend; clusters are as far as the kernel says, for an accuracy."""
+        numbers = [
+            columns(level, kernel.accepting_distance(level.radius, accuracy))
+            for level in self.levels
+        ]
+        return pack(backend, self.tree, numbers, in_slots(self.tree, self.rows))
 
 
 @dataclass(frozen=True)
@@ -231,25 +255,8 @@ def coefficients(level: ClusterMoments) -> FloatArray:
     return np.concatenate([level.t1, trace2, t2[:, i, j], trace3, t3[:, a, b, c]], axis=1)
 
 
-def columns(level: ClusterMoments, kappa: float, accuracy: float) -> FloatArray:
+def columns(level: ClusterMoments, accept: FloatArray) -> FloatArray:
     """(k, 30): centre, accepting distance, radius, weight | coefficients, third."""
-    accept = accepting_distance(level.radius, kappa, accuracy)
     # Rounding of centre and radius must not let a dipole out.
     head = np.stack([accept, level.radius * (1 + 1e-5) + 1e-6, level.weight], axis=1)
     return np.concatenate([level.centre, head, coefficients(level), level.third[:, None]], axis=1)
-
-
-def accepting_distance(radius: FloatArray, kappa: float, accuracy: float) -> FloatArray:
-    """From where on a cluster is taken as a whole: accuracy R Q_4(kappa (r-R))^(1/5) <= r.
-
-    Clusters of radius R on a surface cost 1/R^2 and err by R^3/r^5 Q_4 an area; the sum of errors
-    is smallest at a given cost if R is proportional to r Q_4^(-1/5). Bisection, from the safe side.
-    """
-    low, high = _LEAST * radius, accuracy * radius
-    for _ in range(40):
-        r = 0.5 * (low + high)
-        t = kappa * (r - radius)
-        q4 = np.exp(-t) * (1 + t * (1 + t / 2 * (1 + t / 3 * (1 + t / 4))))
-        good = accuracy * radius * q4**0.2 <= r
-        low, high = np.where(good, low, r), np.where(good, r, high)
-    return high + 1e-5
