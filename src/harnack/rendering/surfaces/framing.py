@@ -79,7 +79,7 @@ def _point(corner: FloatArray) -> str:
 def _probe(surface: LevelSet, backend: Backend, lower: FloatArray, upper: FloatArray) -> FloatArray:
     """First encounters of parallel rays from the six sides of a box."""
     size = float(np.linalg.norm(upper - lower))
-    # A twentieth of the way between two rays: sums over trees take long where they are asked for more.
+    # A twentieth of the way between rays: sums over trees take long where more is asked for.
     rough = replace(surface, tolerance=Tolerance(1e-3 * size))
     placed = PlacedSurface.of(rough, Placement.identity(), backend)
     o, d, length = _rays(lower, upper, 0.01 * size)
