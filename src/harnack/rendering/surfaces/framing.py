@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import drjit as dr
 import numpy as np
 
 from harnack.backend import FloatArray, to_float, to_numpy, to_vector3
@@ -21,8 +22,10 @@ if TYPE_CHECKING:
     from harnack.backend import Backend
     from harnack.tracer import LevelSet
 
-# Rays a side of the grid on each of the six faces of the box.
-_GRID = 48
+# Rays a side of the grid on each of the six faces of the box, and then of what is found there.
+_GRID, _CLOSER = 48, 32
+# Rays of one tile are followed together.
+_TILE = 8
 # Squares of lengths, divided by tolerances, stay far from the ends of single precision.
 _SMALLEST, _LARGEST = 1e-15, 1e16
 _POINTS: KeptWithFields[FloatArray] = KeptWithFields()
@@ -58,7 +61,7 @@ def visible_points(surface: LevelSet, backend: Backend) -> FloatArray:
 
 def _found(surface: LevelSet, backend: Backend, ends: FloatArray) -> FloatArray:
     """Points on a coarse grid, and on one as close as the surface fills."""
-    points = _probe(surface, backend, *ends)
+    points = _probe(surface, backend, *ends, _GRID)
     if len(points) == 0:
         raise ValueError(
             "nothing is to be seen of this surface: no ray of a grid on the sides of its box "
@@ -68,7 +71,7 @@ def _found(surface: LevelSet, backend: Backend, ends: FloatArray) -> FloatArray:
     margin = 0.6 * float((ends[1] - ends[0]).max()) / _GRID
     lower = np.maximum(points.min(axis=0) - margin, ends[0])
     upper = np.minimum(points.max(axis=0) + margin, ends[1])
-    closer = _probe(surface, backend, lower, upper)
+    closer = _probe(surface, backend, lower, upper, _CLOSER)
     return np.concatenate([points, closer])
 
 
@@ -76,29 +79,37 @@ def _point(corner: FloatArray) -> str:
     return "(" + ", ".join(f"{c:.4g}" for c in corner) + ")"
 
 
-def _probe(surface: LevelSet, backend: Backend, lower: FloatArray, upper: FloatArray) -> FloatArray:
-    """First encounters of parallel rays from the six sides of a box."""
+def _probe(
+    surface: LevelSet, backend: Backend, lower: FloatArray, upper: FloatArray, grid: int
+) -> FloatArray:
+    """First encounters of parallel rays, grid x grid from each of the six sides of a box."""
     size = float(np.linalg.norm(upper - lower))
     # A twentieth of the way between rays: sums over trees take long where more is asked for.
     rough = replace(surface, tolerance=Tolerance(1e-3 * size))
     placed = PlacedSurface.of(rough, Placement.identity(), backend)
-    o, d, length = _rays(lower, upper, 0.01 * size)
+    o, d, length = _rays(lower, upper, 0.01 * size, grid)
     met = placed.meet(
         to_vector3(backend, o),
         to_vector3(backend, d),
         to_float(backend, length),
         backend.Bool(True),
     )
+    dr.eval(met.position, met.met)  # one by one, each would march anew
     points: FloatArray = to_numpy(met.position)[to_numpy(met.met)]
     return points.astype(np.float64)
 
 
 def _rays(
-    lower: FloatArray, upper: FloatArray, gap: float
+    lower: FloatArray, upper: FloatArray, gap: float, grid: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Origins, directions and lengths of a grid of rays through the box along each axis."""
-    cell = (np.arange(_GRID) + 0.5) / _GRID
-    u, v = (grid.ravel() for grid in np.meshgrid(cell, cell))
+    """Origins, directions and lengths of a grid of rays through the box along each axis, tile by
+    tile."""
+    cell = ((np.arange(grid) + 0.5) / grid).reshape(-1, _TILE)
+    u, v = (
+        both.transpose(0, 2, 1, 3).ravel()
+        for both in (np.broadcast_to(cell, (*cell.shape, *cell.shape)),
+                     np.broadcast_to(cell[:, :, None, None], (*cell.shape, *cell.shape)))
+    )  # fmt: skip
     origins: list[FloatArray] = []
     directions: list[FloatArray] = []
     lengths: list[FloatArray] = []
