@@ -198,7 +198,7 @@ def figure_23(width: int) -> Report:
     loop = np.array([[1.0, 1.0, s], [-1.0, 1.0, -s], [-1.0, -1.0, s], [1.0, -1.0, -s]])
     across = max(8, 8 * round(width / 40))
     rules = (("classic", 1.75), ("caps", 1.4))
-    found = errors(loop, across=across, steps=60, rules=rules)
+    found = errors(loop, across=across, steps=240, rules=rules)
     names = {"classic": "published rule, over-stepping 1.75", "caps": "harnack, caps"}
     figure, axes = pyplot.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
     rays, texts = 0, []
@@ -214,7 +214,7 @@ def figure_23(width: int) -> Report:
         count = np.where(within.any(axis=0), within.argmax(axis=0), np.inf)
         texts.append(f"{names.get(name, name)} {np.median(count):.0f}")
     for axis, name in zip(axes, ("|f - level|", "|t - t*|"), strict=True):
-        axis.set(xlabel="evaluations", ylabel=name, ylim=(1e-8, 20))
+        axis.set(xlabel="evaluations", ylabel=name, ylim=(1e-8, 20), xlim=(0, 120))
     axes[0].legend(fontsize=8)
     store = BytesIO()
     figure.savefig(store, dpi=100)
