@@ -19,6 +19,7 @@ STEPS = 120
 SHOWN = 60
 RAYS_ACROSS = 64
 GOALS = (1e-3, 1e-4, 1e-5)
+ARRIVED = 1e-6
 RULES = (("classic", 1.75), ("slope", 1.4), ("caps", 1.4))
 
 
@@ -78,8 +79,8 @@ def errors(
     tree.init(vertices, faces)
     t, at = start.copy(), [start]
     for _ in range(steps):
-        squared = tree.squared_distance(vertices, faces, eye + t[:, None] * d)[0]
-        t = t + np.sqrt(squared)
+        distance = np.sqrt(tree.squared_distance(vertices, faces, eye + t[:, None] * d)[0])
+        t = t + np.where(distance < ARRIVED, 0, distance)  # a ray that has arrived stays
         at.append(t)
     found["sphere tracing, exact distance"] = _measure(field, eye, d, np.array(at), star)
     return found

@@ -39,11 +39,12 @@ def figure_7(width: int) -> Report:
                              f"l = {degree}, m = {order}"))  # fmt: skip
         rows.append(row)
     caption = (
-        f"Level sets of the {len(totals)} solid harmonics of degrees 1 to 4 with m ≥ 0, cut to the unit "
-        "ball: levels ±0.15 and ±0.5 of the largest value on the sphere, positive ones red, traced at "
-        f"once. Evaluations a ray {min(totals):.1f} to {max(totals):.1f}, a hitting ray "
-        f"{min(hits_of):.1f} to {max(hits_of):.1f}, {most} at most, {lost} rays out of steps. Bounds "
-        "are proved from the coefficients, without the radius 1.25 and the constant of the paper."
+        f"Level sets of the {len(totals)} solid harmonics of degrees 1 to 4 with m ≥ 0, cut to "
+        "the unit ball: levels ±0.15 and ±0.5 of the largest value on the sphere, positive ones "
+        f"red, traced at once. Evaluations a ray {min(totals):.1f} to {max(totals):.1f}, a "
+        f"hitting ray {min(hits_of):.1f} to {max(hits_of):.1f}, {most} at most, {lost} rays out "
+        "of steps. Bounds are proved from the coefficients, without the radius 1.25 and the "
+        "constant of the paper."
     )
     differs = "The paper does not give its levels. Orders m < 0 are the same surfaces, turned."
     return Report(montage(*rows), caption, differs)
@@ -87,15 +88,16 @@ def figure_19(width: int) -> Report:
         )
         assert counts.out_of_steps == 0, label
     caption = (
-        "Graphs of the imaginary part of the logarithm, the square and the cube root and of the real "
-        "part of the arc sine with all their branches: cut to a ball (top) and filling the picture "
-        "(bottom). Evaluations of all rays and of those that hit: " + "; ".join(texts)
+        "Graphs of the imaginary part of the logarithm, the square and the cube root and of the "
+        "real part of the arc sine with all their branches: cut to a ball (top) and filling the "
+        "picture (bottom). Evaluations of all rays and of those that hit: "
+        + "; ".join(texts)
         + ". No ray ran out of steps; branches are not followed, each step is free of every sheet."
     )
     differs = (
-        "The paper names log and the square root only; the others are our choice. Balls are of radius "
-        "7, 1, 1 and 6, not all the unit ball; the full views are cut to balls of radius 6 to 30 that "
-        "are larger than the picture."
+        "The paper names log and the square root only; the others are our choice. Balls are of "
+        "radius 7, 1, 1 and 6, not all the unit ball; the full views are cut to balls of radius "
+        "6 to 30 that are larger than the picture."
     )
     return Report(montage(top, below), caption, differs)
 
@@ -119,13 +121,15 @@ def figure_20(width: int) -> Report:
     published = view.trace(sheet, bound="classic", overstep=1.75)
     counts = Counts.of(published.status, published.evaluations)
     caption = (
-        "The gyroid sin x cos y + sin y cos z + sin z cos x, which is not harmonic, but a slice of a "
-        "harmonic function of four variables. " + "; ".join(texts) + ". The published kind of step, "
+        "The gyroid sin x cos y + sin y cos z + sin z cos x, which is not harmonic, but a slice "
+        "of a harmonic function of four variables. "
+        "" + "; ".join(texts) + ". The published kind of step, "
         f"Harnack's inequality in four dimensions alone (over-stepping 1.75): {counts}."
     )
     differs = (
-        "The paper's left half is a photograph of printed parts; ours is drawn. The extension here is "
-        "even in the fourth variable, and steps rest on second derivatives where these prove more."
+        "The paper's left half is a photograph of printed parts; ours is drawn. The extension "
+        "here is even in the fourth variable, and steps rest on second derivatives where these "
+        "prove more."
     )
     panels = [Panel(picture, label) for (picture, _), label in pictures]
     return Report(montage(panels), caption, differs)
@@ -152,8 +156,9 @@ def figure_21(width: int) -> Report:
         found = view.trace(field, level=0.5, bound=bound, overstep=overstep)
         rows.append(f"{name}: {Counts.of(found.status, found.evaluations)}")
     caption = (
-        "The 1/2 level of sin 6x sin 6y sin 6z + sin 2x sin 2y sin 2z, as a solid in a cube of side π: "
-        f"{counts}. The open surface in the same cube, by the proofs used: {'; '.join(rows)}."
+        "The 1/2 level of sin 6x sin 6y sin 6z + sin 2x sin 2y sin 2z, as a solid in a cube of "
+        f"side π: {counts}. The open surface in the same cube, by the proofs used: "
+        f"{'; '.join(rows)}."
     )
     differs = (
         "The cube is our choice. The paper's bound c with R = 0.15 is not ours; see "

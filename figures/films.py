@@ -13,7 +13,7 @@ import harnack as hk
 from harnack.rendering import Camera
 
 from .figure import Report
-from .panels import Panel, fitting, halved, montage
+from .panels import Panel, halved, montage
 from .view import BACK, FRONT, Array, View, mesh_hits
 
 _DISTANCES = (0.2, 0.3, 0.455, 0.5, 0.7)
@@ -38,18 +38,20 @@ def figure_11(width: int) -> Report:
         texts.append(f"{film.neck:.2f}" if film.neck else "two squares")
     last = _last_film()
     caption = (
-        "Two squares of circumradius 1 at heights ±d, run against each other. Top: the 2π level of "
-        "their solid angle. Its waist along x, at z = 0, measured by rays from the axis: "
+        "Two squares of circumradius 1 at heights ±d, run against each other. Top: the 2π level "
+        "of their solid angle. Its waist along x, at z = 0, measured by rays from the axis: "
         + ", ".join(f"{neck:.2f}" if neck else "none" for neck in necks)
-        + ". It closes without a jump at d = √((√2 - 1)/2) = 0.455, where both squares fill a quarter "
-        "of the view from the middle. Bottom (unproved): a film of least area, a mesh of "
-        f"{2 * _AROUND * _ALONG:,} triangles relaxed by the cotangent scheme of Pinkall and Polthier; "
-        f"waists {', '.join(texts)}. The last distance, in steps of 0.01, at which such a film was "
-        f"found is {last[0]:.2f}, where its waist is still {last[1]:.2f}: then it jumps to two squares."
+        + ". It closes without a jump at d = √((√2 - 1)/2) = 0.455, where both squares fill a "
+        "quarter of the view from the middle. Bottom (unproved): a film of least area, a mesh of "
+        f"{2 * _AROUND * _ALONG:,} triangles relaxed by the cotangent scheme of Pinkall and "
+        f"Polthier; waists {', '.join(texts)}. The last distance, in steps of 0.01, at which such "
+        f"a film was found is {last[0]:.2f}, where its waist is still {last[1]:.2f}: then it "
+        "jumps to two squares."
     )
     differs = (
-        "The paper's curves are not public; this pair of squares is a candidate with a closed-form "
-        "change of topology. Films are meshes, found only as far as the relaxation converges."
+        "The paper's curves are not public; this pair of squares is a candidate with a "
+        "closed-form change of topology. Films are meshes, found only as far as the relaxation "
+        "converges."
     )
     return Report(montage(top, below), caption, differs)
 
@@ -118,7 +120,7 @@ def _tube(distance: float) -> tuple[Array, Array]:
     ring = _square(0.0)
     ring = (1 - (turn - k))[:, None] * ring[k] + (turn - k)[:, None] * ring[(k + 1) % 4]
     heights = np.linspace(distance, -distance, _ALONG + 1)
-    vertices = np.concatenate([ring + [0, 0, height] for height in heights])
+    vertices = np.concatenate([ring + np.array([0, 0, height]) for height in heights])
     i, j = np.meshgrid(np.arange(_ALONG), np.arange(_AROUND), indexing="ij")
     a, b = i * _AROUND + j, i * _AROUND + (j + 1) % _AROUND
     c, d = a + _AROUND, b + _AROUND

@@ -15,8 +15,8 @@ from harnack.geometry import shapes
 from harnack.rendering import Camera
 
 from .figure import Report
-from .panels import Panel, fitting, halved, montage
-from .view import FALSE, FRONT, MISSED, Array, Pixels, View, marked, mesh_hits
+from .panels import Panel, doubled, fitting, halved, montage
+from .view import BACK, FALSE, FRONT, MISSED, Array, Pixels, View, marked, mesh_hits
 
 _FALSE_SHEET = (0.85, 0.25, 0.55)
 
@@ -65,7 +65,7 @@ class _Contest:
 
     def panel(self, result: Result) -> Panel:
         text = f"{result.evaluations:.0f} looks, {result.missed} missed, {result.false} false"
-        return Panel(self.drawn(result), f"{result.name}: {text}")
+        return Panel(doubled(self.drawn(result)), f"{result.name}: {text}")
 
     def _all(self, some: Array) -> Array:
         """Of all pixels, from those with a ray."""
@@ -77,7 +77,7 @@ class _Contest:
 @functools.cache
 def _contest(name: str, width: int) -> _Contest:
     """The same for Figs. 25, 26 and 27, whose oracle takes most of the time."""
-    size = fitting(width)
+    size = fitting(max(16, 2 * width // 3))  # drawn at twice this size
     camera = Camera(azimuth=-60, elevation=24, zoom=0.95)
     if name == "gyroid":
         ball = hk.Ball(radius=1)
@@ -98,8 +98,8 @@ def _told(results: list[Result]) -> str:
 
 
 _COLOURS = (
-    "Missed first hits are magenta; hits where nothing is, or more than "
-    f"{APART} before the surface, green; against dense samples of every ray."
+    f"Missed first hits are magenta; hits where nothing is, or more than {APART} before the "
+    "surface, green; against dense samples of every ray."
 )
 
 
@@ -110,9 +110,10 @@ def figure_25(width: int) -> Report:
     results = [contest.measure(f"steps {s:g}", baselines.fixed_steps(s)) for s in steps]
     results.append(contest.ours)
     caption = (
-        f"The 2π level of a polygon of 12 vertices, {len(contest.truth):,} rays with {contest.hits:,} "
-        f"hits, followed in equal steps (unproved) and by harnack. {_COLOURS} {_told(results)}. With "
-        "the smallest step no hit is missed here, and nothing says so beforehand."
+        f"The 2π level of a polygon of 12 vertices, {len(contest.truth):,} rays with "
+        f"{contest.hits:,} hits, followed in equal steps (unproved) and by harnack. {_COLOURS} "
+        f"{_told(results)}. With the smallest step no hit is missed here, and nothing says so "
+        "beforehand."
     )
     differs = (
         "The paper's polygon and steps are not stated; its pictures are 1423 x 800. Ours refuses "
@@ -138,8 +139,8 @@ def figure_26(width: int) -> Report:
             f"{label}, {len(contest.truth):,} rays with {contest.hits:,} hits: {_told(results)}"
         )
     caption = (
-        "Sphere tracing with three claimed Lipschitz constants L, of which none holds near the curve "
-        f"(unproved), and harnack. {_COLOURS} {'. '.join(texts)}."
+        "Sphere tracing with three claimed Lipschitz constants L, of which none holds near the "
+        f"curve (unproved), and harnack. {_COLOURS} {'. '.join(texts)}."
     )
     differs = (
         "The paper's surface is not stated. Its observation that L = 50 costs as much as Harnack "
@@ -167,13 +168,13 @@ def figure_27(width: int) -> Report:
         )
     caption = (
         f"Newton's method, bisection and interval analysis (unproved), and harnack. {_COLOURS} "
-        f"{'. '.join(texts)}. Interval analysis is a proof where the function is continuous, as the "
-        "gyroid is; on the angles it stops at jumps."
+        f"{'. '.join(texts)}. Interval analysis is a proof where the function is continuous, as "
+        "the gyroid is; on the angles it stops at jumps."
     )
     differs = (
-        "The paper's settings are not stated; ours are in `benchmarks/baselines.py`. Bisection and "
-        "interval analysis find the jumps of the angle, as in the paper; that opaque background is "
-        "what is green here."
+        "The paper's settings are not stated; ours are in `benchmarks/baselines.py`. Bisection "
+        "and interval analysis find the jumps of the angle, as in the paper; that opaque "
+        "background is what is green here."
     )
     return Report(montage(*rows), caption, differs)
 
@@ -190,32 +191,33 @@ def figure_24(width: int) -> Report:
         vertices, faces, close = _marching_cubes(field, cells)
         faces, close = (faces[close], close[close]) if keep else (faces, close)
         met = mesh_hits(vertices, faces, view.eye, view.directions())
-        colour = np.where(close[met.face][:, None], FRONT, _FALSE_SHEET)
-        shown = view.shade(met.normal, met.hit, colour, 0.8 * colour)
+        face = np.where(met.hit, met.face, 0)
+        front, back = (np.where(close[face][:, None], c, _FALSE_SHEET) for c in (FRONT, BACK))
+        shown = view.shade(met.normal, met.hit, front, back)
         lost = truth.hit & ~met.hit
         shown = marked(shown, lost, MISSED)
-        wrong = met.hit & ~(np.abs(met.t - real) < APART)
-        name = f"{cells}³ cells, filtered" if keep else f"{cells}³ cells"
+        wrong = met.hit & ~((met.t < real + APART) & (met.t > real - APART))
+        name = f"{cells}^3 cells, filtered" if keep else f"{cells}^3 cells"
         panels.append(Panel(halved(shown), name))
         texts.append(
-            f"{name}: {len(faces):,} triangles, {100 * (~close).mean():.0f} % of them far from the "
-            f"level; of {int(truth.hit.sum()):,} hits {int(lost.sum()):,} are lost, and "
+            f"{name}: {len(faces):,} triangles, {100 * (~close).mean():.0f} % of them far from "
+            f"the level; of {int(truth.hit.sum()):,} hits {int(lost.sum()):,} are lost, and "
             f"{int(wrong.sum()):,} rays end more than {APART} from the surface"
         )
     ours = view.trace(field)
     off = ours.hit != truth.hit
     panels.append(Panel(halved(view.shade(ours.normal, ours.hit)), "harnack"))
     caption = (
-        "Marching cubes (scikit-image; unproved) of the solid angle of 12 vertices modulo 4π, level "
-        "2π, on grids of [-1.3, 1.3]³. Triangles whose middle is farther than π/2 from the level are "
-        "pink: the sheet on which the angle jumps. Filtered are those without them; what is "
-        f"then lost of the true surface is magenta. {'; '.join(texts)}. harnack along the same rays: "
-        f"{ours.evaluations.mean():.1f} evaluations a ray, {int(off.sum())} rays differ from the "
-        "reference in whether they hit."
+        "Marching cubes (scikit-image; unproved) of the solid angle of 12 vertices modulo 4π, "
+        "level 2π, on grids of [-1.3, 1.3]³. Triangles whose middle is farther than π/2 from the "
+        "level are pink: the sheet on which the angle jumps. Filtered are those without them; "
+        f"what is then lost of the true surface is magenta. {'; '.join(texts)}. harnack along the "
+        f"same rays: {ours.evaluations.mean():.1f} evaluations a ray, {int(off.sum())} rays "
+        "differ from the reference in whether they hit."
     )
     differs = (
-        "The paper also shows Mathematica's adaptive `ContourPlot3D`, which is not free software and "
-        "is left out. Its polygon and grid are not stated."
+        "The paper also shows Mathematica's adaptive `ContourPlot3D`, which is not free software "
+        "and is left out. Its polygon and grid are not stated."
     )
     return Report(montage(panels[:3], panels[3:]), caption, differs)
 
@@ -228,7 +230,7 @@ def _marching_cubes(field: hk.SolidAngle, cells: int) -> tuple[Array, Array, Arr
     u = np.linspace(-1.3, 1.3, cells + 1)
     grid = np.stack(np.meshgrid(u, u, u, indexing="ij"), axis=-1).reshape(-1, 3)
     value = np.mod(field.value(grid), 4 * np.pi).reshape((cells + 1,) * 3)
-    vertices, faces, _, _ = marching_cubes(value, 2 * np.pi)
+    vertices, faces, _, _ = marching_cubes(value, 2 * np.pi, gradient_direction="ascent")
     vertices = vertices * (2.6 / cells) - 1.3
     middle = np.mod(field.value(vertices[faces].mean(axis=1)), 4 * np.pi)
     return vertices, faces.astype(np.int64), np.abs(middle - 2 * np.pi) < np.pi / 2

@@ -12,9 +12,9 @@ from benchmarks.baselines import APART
 from harnack.geometry import shapes
 
 from .figure import Report
-from .panels import Panel, fitting, montage
+from .panels import Panel, doubled, fitting, montage
 from .published import MOST, Claim, distance_to_loop, published
-from .view import FALSE, MISSED, Array, Pixels, View, marked
+from .view import FALSE, MISSED, Array, View, marked
 
 # Normals that are farther off than this many degrees are marked.
 _OFF = 1.0
@@ -56,7 +56,7 @@ def figure_12(width: int) -> Report:
         shown = view.shade(truth.normal, truth.hit)
         for where, colour in ((missed, MISSED), (false, FALSE)):
             shown = marked(shown, where, colour)
-        first.append(Panel(_doubled(shown), name))
+        first.append(Panel(doubled(shown), name))
         texts.append(
             f"{name} {int(missed.sum()):,} missed, {int(false.sum()):,} false, "
             f"{int(lost.sum()):,} out of {MOST} steps"
@@ -79,26 +79,22 @@ def figure_12(width: int) -> Report:
         off = np.zeros(len(near), bool)
         off[truth.hit] = ~(angle < _OFF)
         shown = marked(view.shade(normal, truth.hit), off, MISSED)
-        second.append(Panel(_doubled(shown), name))
+        second.append(Panel(doubled(shown), name))
         wrong.append(f"{name} {int(off.sum()):,} (median {np.nanmedian(angle):.1e} degrees)")
     caption = (
-        "Top (unproved): first hits by the published algorithm in single precision with three formulas "
-        f"of the solid angle of 8 vertices, of {int(truth.hit.sum()):,} hits; missed ones are magenta, "
-        f"hits where nothing is or more than {APART} before the surface green: {'; '.join(texts)}. "
-        f"`hk.trace` in single precision differs from the reference on {int(gone.sum())} rays. Bottom: "
-        f"normals at the same hits by three formulas of the gradient; off by more than {_OFF:g} degree "
-        f"in magenta: {'; '.join(wrong)}. The errors at random points are in "
-        "[benchmarks](benchmarks.md)."
+        "Top (unproved): first hits by the published algorithm in single precision with three "
+        f"formulas of the solid angle of 8 vertices, of {int(truth.hit.sum()):,} hits; missed "
+        f"ones are magenta, hits where nothing is or more than {APART} before the surface green: "
+        f"{'; '.join(texts)}. `hk.trace` in single precision differs from the reference on "
+        f"{int(gone.sum())} rays. Bottom: normals at the same hits by three formulas of the "
+        f"gradient; off by more than {_OFF:g} degree in magenta: {'; '.join(wrong)}. The errors "
+        "at random points are in [benchmarks](benchmarks.md)."
     )
     differs = (
-        "The paper's polygon is not public. Its angle sum is in its supplement, which we do not have; "
-        "ours is 2π less the exterior angles, which is right modulo 2π only, so that levels that do "
-        "not exist are false hits as well. Differences are of the fan, 1e-3 apart, as it is: where "
-        "its terms jump between the corners of the tetrahedron, the normal is wrong."
+        "The paper's polygon is not public. Its angle sum is in its supplement, which we do not "
+        "have; ours is 2π less the exterior angles, which is right modulo 2π only, so that "
+        "levels that do not exist are false hits as well. Differences are of the fan, 1e-3 "
+        "apart, as it is: where its terms jump between the corners of the tetrahedron, the "
+        "normal is wrong."
     )
     return Report(montage(first, second), caption, differs)
-
-
-def _doubled(picture: Pixels) -> Pixels:
-    """Each pixel as four."""
-    return picture.repeat(2, axis=0).repeat(2, axis=1)

@@ -13,14 +13,15 @@ from .figure import Figure, Report
 
 _HEADING = """# The paper's figures
 
-Counterparts of the figures of *Ray Tracing Harmonic Functions* (Gillespie, Yang, Botsch, Crane 2024)
-that show a result. Written by `make figures`; not edited by hand. `python -m figures --only 17`
-remakes one.
+Counterparts of the figures of *Ray Tracing Harmonic Functions* (Gillespie, Yang, Botsch, Crane
+2024) that show a result. Written by `make figures`; not edited by hand. `python -m figures --only
+17` remakes one.
 
-An *evaluation* is one look at the function with its gradient; counts are exact and are those of the
-rays through the middles of the pixels shown. Seconds are wall time and depend on the machine. *Hits*
-are first hits. Where the paper's data are not public, ours are a reconstruction, and the section says
-so. Methods marked *unproved* are here for comparison alone: nothing in the library rests on them.
+An *evaluation* is one look at the function with its gradient; counts are exact and are those of
+the rays through the middles of the pixels shown. Seconds are wall time and depend on the machine.
+*Hits* are first hits. Where the paper's data are not public, ours are a reconstruction, and the
+section says so. Methods marked *unproved* are here for comparison alone: nothing in the library
+rests on them.
 """
 _SECTION = re.compile(
     r"<!-- figure (\d+) -->\n(.*?)\n<!-- end of figure \1 -->", re.DOTALL
@@ -54,12 +55,10 @@ def write(page: Path, figure: Figure, report: Report, *, seconds: float, width: 
             report.picture.save(partial, quality=87, subsampling=0, optimize=True)
     today = datetime.date.today().isoformat()
     text = (
-        f"## Fig. {figure.number}: {figure.title}\n\n"
-        f"![{figure.title}](images/figures/{name})\n\n"
-        f"**In the paper:** {figure.paper}\n\n"
-        f"**Here:** {report.caption}\n\n"
-        f"**Differs:** {report.differs}\n\n"
-        f"*Made in {seconds:.0f} s, harnack {hk.__version__}, {today}, panels of {width} pixels.*\n"
+        f"## Fig. {figure.number}: "
+        f"{figure.title}\n\n![{figure.title}](images/figures/{name})\n\n**In the paper:** "
+        f"{figure.paper}\n\n**Here:** {report.caption}\n\n**Differs:** {report.differs}\n\n*Made "
+        f"in {seconds:.0f} s, harnack {hk.__version__}, {today}, panels of {width} pixels.*\n"
     )
     all_of_them = {**sections(page), figure.number: text}
     parts = [

@@ -89,3 +89,8 @@ def heat(numbers: Any, top: float, size: tuple[int, int]) -> Pixels:
 def halved(pixels: Pixels) -> Pixels:
     """A picture of half the size: the mean of blocks of four pixels."""
     return np.asarray(Image.fromarray(pixels).reduce(2))
+
+
+def doubled(pixels: Pixels) -> Pixels:
+    """A picture with four pixels for each of one."""
+    return pixels.repeat(2, axis=0).repeat(2, axis=1)

@@ -49,17 +49,17 @@ def figure_1(width: int) -> Report:
     colours = np.where(light[:, None], 0.92, 0.16) * np.ones(3)
     stripes = view.pixels(np.where(hits.hit[:, None], colours, 1.0))
     caption = (
-        f"The 2π level of the solid angle of a polygon of {len(loop)} vertices, isolines of a slice "
-        "every π/2, a ray, and the balls that the published rule proves empty along it: "
+        f"The 2π level of the solid angle of a polygon of {len(loop)} vertices, isolines of a "
+        "slice every π/2, a ray, and the balls that the published rule proves empty along it: "
         f"{len(places) - 1} steps without over-stepping to a tolerance of 1e-4 (the bound of the "
-        "surface's extent left out), where our proofs along the ray take "
-        f"{len(ours) - 1}. Right: reflection of striped surroundings by the normals of the hits. "
-        f"All pixels: {Counts.of(hits.status, hits.evaluations)}."
+        f"surface's extent left out), where our proofs along the ray take {len(ours) - 1}. Right: "
+        "reflection of striped surroundings by the normals of the hits. All pixels: "
+        f"{Counts.of(hits.status, hits.evaluations)}."
     )
     differs = (
-        "The paper's polygon is not public, nor is its scene; ours is (cos t, sin t, 0.45 cos 3t), "
-        "lit by a formula. Our own steps are not drawn as balls, since they are proved along the ray "
-        "only."
+        "The paper's polygon is not public, nor is its scene; ours is (cos t, sin t, 0.45 cos "
+        "3t), lit by a formula. Our own steps are not drawn as balls, since they are proved "
+        "along the ray only."
     )
     left = Panel(halved(shown), "level set, isolines of a slice, balls of the published rule")
     return Report(montage((left, Panel(halved(stripes), "reflection lines"))), caption, differs)
@@ -143,10 +143,10 @@ def figure_8(width: int) -> Report:
     largest = _motion()
     caption = (
         "Top: the 2π level while the boundary (cos t, sin t, A cos 3t) of 24 vertices leaves its "
-        "plane. Bottom: other levels bulge to one side or the other. Evaluations a hitting ray, in "
-        f"the order of the panels: {', '.join(texts[:4])}; {', '.join(texts[4:])}; no ray ran out of "
-        f"steps. Moving A from 0.60 to 0.61 moves the surface by at most {largest:.4f} along 900 "
-        "vertical rays, where the boundary moves by 0.01."
+        "plane. Bottom: other levels bulge to one side or the other. Evaluations a hitting ray, "
+        f"in the order of the panels: {', '.join(texts[:4])}; {', '.join(texts[4:])}; no ray ran "
+        f"out of steps. Moving A from 0.60 to 0.61 moves the surface by at most {largest:.4f} "
+        "along 900 vertical rays, where the boundary moves by 0.01."
     )
     differs = "The paper's polygons are not public; ours are a family with one parameter."
     return Report(montage(first, second), caption, differs)
@@ -186,12 +186,12 @@ def figure_9(width: int) -> Report:
         ])  # fmt: skip
         most, times = _crossings(field, vertices, faces)
         texts.append(
-            f"{name}: {100 * folded.mean():.0f} % of the patch's parameters are turned over, and a "
-            f"vertical line meets it up to {times} times, the level set up to {most}"
+            f"{name}: {100 * folded.mean():.0f} % of the patch's parameters are turned over, and "
+            f"a vertical line meets it up to {times} times, the level set up to {most}"
         )
     caption = (
-        "A quadrilateral with a reflex corner, in a plane and out of it. Left: the bilinear patch, "
-        "where it is folded over in pink. Right: the 2π level of the solid angle. "
+        "A quadrilateral with a reflex corner, in a plane and out of it. Left: the bilinear "
+        "patch, where it is folded over in pink. Right: the 2π level of the solid angle. "
         f"Measured with 2,500 vertical lines: {'; '.join(texts)}."
     )
     differs = "The paper's quadrilaterals are not public; ours are of the same kind."
@@ -250,12 +250,13 @@ def figure_13(width: int) -> Report:
         texts.append(f"{label} {counts.evaluations:.1f} and {counts.evaluations_hitting:.1f}")
         assert counts.out_of_steps == 0
     caption = (
-        "2π levels of a bent square with holes, a link and two knots: scenes of `harnack gallery`. "
-        f"Evaluations of all rays and of those that hit: {'; '.join(texts)}; none ran out of steps. "
-        "All steps are proved by the edges' certificate, which needs no property of the curve."
+        "2π levels of a bent square with holes, a link and two knots: scenes of `harnack "
+        f"gallery`. Evaluations of all rays and of those that hit: {'; '.join(texts)}; none ran "
+        "out of steps. All steps are proved by the edges' certificate, which needs no property "
+        "of the curve."
     )
     differs = (
-        "The paper's curves are not public; ours are of the same kinds. The paper's own constant is "
-        "unproved for these curves, and false for coils (`hk.SolidAngle`)."
+        "The paper's curves are not public; ours are of the same kinds. The paper's own constant "
+        "is unproved for these curves, and false for coils (`hk.SolidAngle`)."
     )
     return Report(montage(panels[:2], panels[2:]), caption, differs)

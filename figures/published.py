@@ -37,7 +37,8 @@ class Claim:
 
 @dataclass(frozen=True)
 class Ends:
-    """Of n rays: t, inf where there is no hit, and evaluations, MOST for rays out of steps."""
+    """Of n rays: t, inf where there is no hit, and evaluations, at most so many for rays that ran
+    out of steps."""
 
     t: Array
     evaluations: Array
@@ -52,13 +53,14 @@ def published(
     *,
     stop: Literal["gradient", "value"] = "gradient",
     eps: float = 1e-4,
+    most: int = MOST,
 ) -> Ends:
     """First hits without over-stepping. stop: at |f - level| <= eps |grad f|, or at <= eps."""
     t, kind = start.astype(directions.dtype), directions.dtype
     found = np.full(len(t), np.inf, kind)
     count = np.zeros(len(t), np.int64)
     rows = np.flatnonzero(t < end)
-    for _ in range(MOST):
+    for _ in range(most):
         if not len(rows):
             break
         p = origin.astype(kind) + t[rows, None] * directions[rows]

@@ -12,43 +12,43 @@ _ALL = (
     Figure(
         1,
         "A surface without inside or outside",
-        "a nonplanar polygon spanned by a level set, isolines of a slice of the function, spheres "
-        "that show Harnack bounds along a ray, and smooth reflection lines.",
+        "a nonplanar polygon spanned by a level set, isolines of a slice of the function, "
+        "spheres that show Harnack bounds along a ray, and smooth reflection lines.",
         polygons.figure_1,
     ),
     Figure(
         4,
         "Bounds that do not hold",
-        "artifacts where the lower bound c given to the algorithm does not bound the function: worse "
-        "as c grows, and for rays that come from below.",
+        "artifacts where the lower bound c given to the algorithm does not bound the function: "
+        "worse as c grows, and for rays that come from below.",
         tracing.figure_4,
     ),
     Figure(
         5,
         "Stopping conditions",
-        "by |f - f*| < ε alone rays end in a region of uneven thickness; divided by the length of the "
-        "gradient, in one of nearly even thickness.",
+        "by |f - f*| < ε alone rays end in a region of uneven thickness; divided by the length "
+        "of the gradient, in one of nearly even thickness.",
         tracing.figure_5,
     ),
     Figure(
         7,
         "Spherical harmonics",
-        "each spherical harmonic as level sets of its harmonic polynomial, restricted to the unit "
-        "ball.",
+        "each spherical harmonic as level sets of its harmonic polynomial, restricted to the "
+        "unit ball.",
         analysis.figure_7,
     ),
     Figure(
         8,
         "Nonplanar polygons, their boundaries and levels",
-        "well-behaved surfaces while the boundary leaves its plane (top), and other levels, by which "
-        "convexity is adjusted (bottom).",
+        "well-behaved surfaces while the boundary leaves its plane (top), and other levels, by "
+        "which convexity is adjusted (bottom).",
         polygons.figure_8,
     ),
     Figure(
         9,
         "Bilinear patches fold over",
-        "quadrilaterals by bilinear interpolation, which folds over even in a plane, beside level "
-        "sets of the solid angle, which do not.",
+        "quadrilaterals by bilinear interpolation, which folds over even in a plane, beside "
+        "level sets of the solid angle, which do not.",
         polygons.figure_9,
     ),
     Figure(
@@ -75,8 +75,8 @@ _ALL = (
     Figure(
         14,
         "Exoskeletons",
-        "a sparse net of curves that stands for a surface, the surface traced through it, and the "
-        "plain triangulation that mesh viewers show.",
+        "a sparse net of curves that stands for a surface, the surface traced through it, and "
+        "the plain triangulation that mesh viewers show.",
         repairs.figure_14,
     ),
     Figure(
@@ -95,8 +95,8 @@ _ALL = (
     Figure(
         17,
         "Grid shells",
-        "three shells of architecture: level sets of the solid angle of plane outlines with round "
-        "holes, and networks of principal curvature; rendered in 4.5 hours.",
+        "three shells of architecture: level sets of the solid angle of plane outlines with "
+        "round holes, and networks of principal curvature; rendered in 4.5 hours.",
         shells.figure_17,
     ),
     Figure(
@@ -115,29 +115,30 @@ _ALL = (
     Figure(
         21,
         "Any implicit function",
-        "the 1/2 level of a sum of two Laplacian eigenfunctions, which is neither harmonic nor an "
-        "eigenfunction.",
+        "the 1/2 level of a sum of two Laplacian eigenfunctions, which is neither harmonic nor "
+        "an eigenfunction.",
         analysis.figure_21,
     ),
     Figure(
         22,
         "Iterations a ray",
-        "the most iterations are needed near silhouettes; stopping by the gradient takes fewer than by "
-        "the value alone, above all near the boundary.",
+        "the most iterations are needed near silhouettes; stopping by the gradient takes fewer "
+        "than by the value alone, above all near the boundary.",
         tracing.figure_22,
     ),
     Figure(
         23,
         "Convergence",
-        "errors in value and in distance after each iteration, of Harnack tracing and of sphere tracing "
-        "a mesh of the same level set: means and 99 % bands; sphere tracing needs many fewer.",
+        "errors in value and in distance after each iteration, of Harnack tracing and of sphere "
+        "tracing a mesh of the same level set: means and 99 % bands; sphere tracing needs many "
+        "fewer.",
         tracing.figure_23,
     ),
     Figure(
         24,
         "Marching cubes",
-        "marching cubes of the raw function has spurious sheets where the angle jumps, and "
-        "rough edges near singularities (left); filtering faces leaves noise (right).",
+        "marching cubes of the raw function has spurious sheets where the angle jumps, and rough "
+        "edges near singularities (left); filtering faces leaves noise (right).",
         methods.figure_24,
     ),
     Figure(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,7 +11,7 @@ import harnack as hk
 from harnack.gallery import SCENES
 from harnack.rendering import Camera
 
-from .figure import Counts, Report
+from .figure import Report
 from .panels import Panel, drawn, fitting, halved, montage, scene
 from .view import BACK, FRONT, Pixels, View, mesh_hits
 
@@ -42,15 +43,15 @@ def figure_14(width: int) -> Report:
     _, many = scene("patches", width)
     patches = SCENES["patches"].surfaces()[0].field.describe()["faces"]
     caption = (
-        f"A net of curves on a wavy torus, {faces} polygons with {len(mesh.edges)} edges (left); a "
-        "level set for each polygon (middle); and a simple triangulation of the polygons by fans "
-        f"(right). The middle takes {counts}, for all polygons that a ray enters; the picture with "
-        f"tubes, {seconds:.1f} s, compilation and counting included. A bumpy sphere of {patches:,} such "
-        f"polygons (gallery scene `patches`): {many}."
+        f"A net of curves on a wavy torus, {faces} polygons with {len(mesh.edges)} edges (left); "
+        "a level set for each polygon (middle); and a simple triangulation of the polygons by "
+        f"fans (right). The middle takes {counts}, for all polygons that a ray enters; the "
+        f"picture with tubes, {seconds:.1f} s, compilation and counting included. A bumpy sphere "
+        f"of {patches:,} such polygons (gallery scene `patches`): {many}."
     )
     differs = (
-        "The exoskeleton of de Goes et al. (2011) is not public; ours is made by clustering a mesh. "
-        "The paper compares with a mesh viewer's picture."
+        "The exoskeleton of de Goes et al. (2011) is not public; ours is made by clustering a "
+        "mesh. The paper compares with a mesh viewer's picture."
     )
     labels = ("the net", "a level set for each polygon", "fans of triangles")
     pictures = (net, whole, halved(triangles))
@@ -75,9 +76,10 @@ def figure_15(width: int) -> Report:
         ])  # fmt: skip
         texts.append(f"{len(field.points):,} points: {counts}; {seconds:.1f} s with compilation")
     caption = (
-        "Points with normals (left; those that face away in blue) and the level 2π of their dipole "
-        "potential (right), traced through a tree whose truncation is part of the proof. "
-        + ". ".join(texts) + "."
+        "Points with normals (left; those that face away in blue) and the level 2π of their "
+        "dipole potential (right), traced through a tree whose truncation is part of the proof. "
+        + ". ".join(texts)
+        + "."
     )
     differs = (
         "The paper's clouds are not public; ours are random points on a quartic, and a sunflower "
@@ -88,13 +90,12 @@ def figure_15(width: int) -> Report:
 
 
 def _points(field: hk.DipolePotential, size: tuple[int, int], camera: Camera) -> Pixels:
-    """Discs for points, near ones over far ones."""
+    """Squares for points, near ones over far ones."""
     view = View.of(field.points, (2 * size[0], 2 * size[1]), camera)
     pixels, depth = view.project(field.points)
     facing = (field.normals * (view.eye - field.points)).sum(axis=1) > 0
     picture = np.full((2 * size[1], 2 * size[0], 3), 242, np.uint8)
-    reach = max(1, round(size[0] / 160))
-    offsets = np.arange(-reach, reach + 1)
+    offsets = np.arange(max(2, round(size[0] / 120)))
     for k in np.argsort(-depth):
         column, row = np.round(pixels[k]).astype(int)
         light = 255 * (0.6 + 0.4 * (depth.max() - depth[k]) / np.ptp(depth))
@@ -121,24 +122,28 @@ def figure_16(width: int) -> Report:
         start = time.perf_counter()
         picture, counts = scene(name, width)
         seconds = time.perf_counter() - start
-        hits = view.trace(surface)
+        same = replace(view, size=size)  # a quarter of the rays
+        hits = same.trace(surface)
         spans = hits.hit & (hits.sheet < 0)
-        through = met.hit & ((met.normal * view.directions()).sum(axis=1) > 0)
-        rows.append([Panel(halved(before), f"{len(faces):,} triangles"), Panel(picture, "repaired")])
+        met = mesh_hits(vertices, faces, same.eye, same.directions())
+        through = met.hit & ((met.normal * same.directions()).sum(axis=1) > 0)
+        rows.append(
+            [Panel(halved(before), f"{len(faces):,} triangles"), Panel(picture, "repaired")]
+        )
         texts.append(
-            f"{label}, {len(faces):,} triangles with "
-            f"{len(field.mesh.singular):,} open edges: {counts}; of the hits, "
-            f"{100 * (~spans[hits.hit]).mean():.0f} % are on triangles and the others on what spans "
-            f"the gaps, where {int(through.sum()):,} rays met the inside of a triangle before; "
-            f"{seconds:.1f} s with compilation"
+            f"{label}, {len(faces):,} triangles with {len(field.mesh.singular):,} open edges: "
+            f"{counts}; of the hits, {100 * (~spans[hits.hit]).mean():.0f} % are on triangles and "
+            f"the others on what spans the gaps, where {int(through.sum()):,} rays met the inside "
+            f"of a triangle before; {seconds:.1f} s with compilation"
         )
     caption = (
-        "Meshes (left; insides in blue) and the level 1/2 of their winding number (right; what spans "
+        "Meshes (left; insides in blue) and the level 1/2 of their winding number (right; what "
+        "spans "
         "gaps in another colour): " + ". ".join(texts) + ". Hits on triangles are exact."
     )
     differs = (
-        "The paper repeats Fig. 1 of Jacobson et al. (2013), whose mesh we do not have. Ours jump at "
-        "triangles, which is where the paper's formula, used without changes, has no smooth level "
-        "set: sound triangles stay as they are, and only gaps are spanned."
+        "The paper repeats Fig. 1 of Jacobson et al. (2013), whose mesh we do not have. Ours "
+        "jump at triangles, which is where the paper's formula, used without changes, has no "
+        "smooth level set: sound triangles stay as they are, and only gaps are spanned."
     )
     return Report(montage(*rows), caption, differs)

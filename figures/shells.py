@@ -37,15 +37,16 @@ def figure_17(width: int) -> Report:
             f"{seconds:.1f} s at {size[0]} x {size[1]}"
         )
     caption = (
-        "Levels -2π + a of the solid angle of an outline with circles, clipped at the ground, with "
-        "beams along lines of curvature; a is 1.4, 1.2 and 1.2. Without the beams, the shell alone "
-        "takes: " + ". ".join(texts) + f", edges with {_SAMPLES} rays a pixel, shadows included, kernels "
-        "compiled before. The paper reports 4.5 hours for its figure at 1400 x 1000 with 8 cores and a "
-        "path tracer; the two are different light, so that the ratio is not one of tracers."
+        "Levels -2π + a of the solid angle of an outline with circles, clipped at the ground, "
+        "with beams along lines of curvature; a is 1.4, 1.2 and 1.2. Without the beams, the "
+        "shell alone takes: "
+        "" + ". ".join(texts) + f", edges with {_SAMPLES} rays a pixel, shadows included, kernels "
+        "compiled before. The paper reports 4.5 hours for its figure at 1400 x 1000 with 8 cores "
+        "and a path tracer; the two are different light, so that the ratio is not one of tracers."
     )
     differs = (
-        "The outlines of Adiels et al. (2022) are not public: ours are a regular 12-gon with a round "
-        "hole, the Great Court of the British Museum by its published measures, and an outline of "
-        "our own with five columns. Nothing is proved about the lines of curvature."
+        "The outlines of Adiels et al. (2022) are not public: ours are a regular 12-gon with a "
+        "round hole, the Great Court of the British Museum by its published measures, and an "
+        "outline of our own with five columns. Nothing is proved about the lines of curvature."
     )
     return Report(montage(panels), caption, differs)

@@ -105,7 +105,7 @@ def marked(picture: Pixels, where: npt.NDArray[np.bool_], colour: Colour) -> Pix
 
 @dataclass(frozen=True)
 class MeshHits:
-    """First hits of n rays with triangles: t (n,), inf for none, unit normals (n, 3), faces (n,)."""
+    """First hits of n rays with triangles: t (n,), inf for none; normals (n, 3); faces (n,)."""
 
     t: Array
     normal: Array
