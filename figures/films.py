@@ -92,7 +92,7 @@ def _film(distance: float, start: _Film | None = None) -> _Film:
         vertices = _relaxed(vertices, faces, fixed)
         neck, before = _waist(vertices), neck
     corners = np.concatenate([_square(distance), _square(-distance)])
-    flat = np.array([[0, 1, 2], [0, 2, 3], [4, 6, 5], [4, 7, 6]])
+    flat = np.array([[0, 2, 1], [0, 3, 2], [4, 5, 6], [4, 6, 7]])
     return _Film(f"d = {distance:g}: two squares", corners, flat, None)
 
 

@@ -92,7 +92,7 @@ def _contest(name: str, width: int) -> _Contest:
 
 def _told(results: list[Result]) -> str:
     return "; ".join(
-        f"{one.name} {one.missed:,} missed and {one.false:,} false at {one.evaluations:.1f} "
+        f"{one.name}: {one.missed:,} missed and {one.false:,} false at {one.evaluations:.1f} "
         "evaluations a ray" for one in results
     )  # fmt: skip
 
@@ -140,7 +140,8 @@ def figure_26(width: int) -> Report:
         )
     caption = (
         "Sphere tracing with three claimed Lipschitz constants L, of which none holds near the "
-        f"curve (unproved), and harnack. {_COLOURS} {'. '.join(texts)}."
+        f"curve (unproved), and harnack. {_COLOURS} Rays that are still on their way after "
+        f"{baselines.MOST:,} steps count as missed. {'. '.join(texts)}."
     )
     differs = (
         "The paper's surface is not stated. Its observation that L = 50 costs as much as Harnack "
@@ -169,7 +170,8 @@ def figure_27(width: int) -> Report:
     caption = (
         f"Newton's method, bisection and interval analysis (unproved), and harnack. {_COLOURS} "
         f"{'. '.join(texts)}. Interval analysis is a proof where the function is continuous, as "
-        "the gyroid is; on the angles it stops at jumps."
+        "the gyroid is: its false hits there are leaves that it cannot tell from the surface; on the "
+        "angles it stops at jumps."
     )
     differs = (
         "The paper's settings are not stated; ours are in `benchmarks/baselines.py`. Bisection "

@@ -171,10 +171,10 @@ def figure_9(width: int) -> Report:
     flat = np.array([[-1, -0.9, 0], [0.15, -0.1, 0], [1, -0.9, 0], [0, 1, 0]], float)
     bent = flat + np.array([[0, 0, 0.35], [0, 0, -0.35], [0, 0, 0.35], [0, 0, -0.1]])
     rows, texts = [], []
-    for name, quad in (("planar", flat), ("nonplanar", bent)):
+    for name, quad, elevation in (("planar", flat, 62), ("nonplanar", bent, -38)):
         vertices, faces, folded = _bilinear(quad, 96)
         field = hk.SolidAngle(quad)
-        camera = Camera(azimuth=-75, elevation=62)
+        camera = Camera(azimuth=-75, elevation=elevation)
         size = fitting(width)
         view = View.of(quad, (2 * size[0], 2 * size[1]), camera)
         patch = _drawn_patch(view, vertices, faces, folded)
