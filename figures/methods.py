@@ -170,8 +170,8 @@ def figure_27(width: int) -> Report:
     caption = (
         f"Newton's method, bisection and interval analysis (unproved), and harnack. {_COLOURS} "
         f"{'. '.join(texts)}. Interval analysis is a proof where the function is continuous, as "
-        "the gyroid is: its false hits there are leaves that it cannot tell from the surface; on the "
-        "angles it stops at jumps."
+        "the gyroid is: its false hits there are leaves that it cannot tell from the surface; on "
+        "the angles it stops at jumps."
     )
     differs = (
         "The paper's settings are not stated; ours are in `benchmarks/baselines.py`. Bisection "
@@ -215,7 +215,7 @@ def figure_24(width: int) -> Report:
         "level are pink: the sheet on which the angle jumps. Filtered are those without them; "
         f"what is then lost of the true surface is magenta. {'; '.join(texts)}. harnack along the "
         f"same rays: {ours.evaluations.mean():.1f} evaluations a ray, {int(off.sum())} rays "
-        "differ from the reference in whether they hit."
+        "differ in whether they hit from the reference, whose tolerance is a thousandth of its."
     )
     differs = (
         "The paper also shows Mathematica's adaptive `ContourPlot3D`, which is not free software "

@@ -33,8 +33,8 @@ def figure_17(width: int) -> Report:
         outline, holes = shell.field.loops[0], shell.field.circles
         panels.append(Panel(halved(tone_mapped(image)), name))
         texts.append(
-            f"`{name}` ({len(outline)} corners, {len(holes)} circles): {counts}; the picture took "
-            f"{seconds:.1f} s at {size[0]} x {size[1]}"
+            f"`{name}` ({len(outline)} corners, circles: {len(holes)}): {counts}; the picture "
+            f"took {seconds:.1f} s at {size[0]} x {size[1]}"
         )
     caption = (
         "Levels -2π + a of the solid angle of an outline with circles, clipped at the ground, "
