@@ -353,10 +353,11 @@ def measure(rays: Rays, name: str, method: Method, truth: Array) -> Result:
 
 
 def measure_ours(rays: Rays, truth: Array) -> Result:
-    """`hk.trace`, in single precision; as the oracle, it calls nothing a hit that only grazes."""
+    """`hk.trace`, in single precision, with its defaults but for the tolerance. A ray that grazes
+    the surface within that may count as a hit, which the oracle does not see."""
     ours = hk.trace(
         rays.field, rays.origins, rays.directions, level=rays.level, t_max=rays.far,
-        tolerance=1e-6, confirm=True,
+        tolerance=1e-6,
     )  # fmt: skip
     t = np.where(ours.hit, ours.t, np.inf)
     return Result.of("harnack", t, float(ours.evaluations.mean()), truth)
@@ -388,7 +389,7 @@ def baselines() -> str:
         f"{ACROSS} x {ACROSS} rays with 0 <= t <= 10, against {SAMPLES} samples of each "
         "ray near the surface. Missed: the first crossing was passed. False: a hit where there is "
         f"none, or more than {APART} before the first. In double precision, but harnack in single, "
-        "with a tolerance of 1e-6 and hits that are confirmed.\n",
+        "with a tolerance of 1e-6 and else its defaults.\n",
         "| surface | method | first hits missed | false hits | evaluations a ray |",
         "|---|---|---:|---:|---:|",
     ]
