@@ -83,8 +83,8 @@ def figure_15(width: int) -> Report:
     )
     differs = (
         "The paper's clouds are not public; ours are random points on a quartic, and a sunflower "
-        "pattern on a knotted tube. Rays may not end at a point instead of the surface, as the "
-        "paper's do; areas are estimated."
+        "pattern on a knotted tube. The paper ends rays within a set distance of a point, ours "
+        "within the tolerance alone; areas are estimated."
     )
     return Report(montage(*rows), caption, differs)
 

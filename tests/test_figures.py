@@ -107,4 +107,4 @@ def test_figures_are_made_at_any_size(number: int) -> None:
     assert np.asarray(report.picture.convert("RGB")).std() > 5
     assert "nan" not in report.caption
     if number == 25:
-        assert "harnack 0 missed and 0 false" in report.caption
+        assert "harnack: 0 missed and 0 false" in report.caption
