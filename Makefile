@@ -4,7 +4,7 @@ BIN := .venv/bin
 STAMP := .venv/.setup-stamp
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow lint format images bench clean
+.PHONY: help setup demo test test-slow lint format images bench figures clean
 
 help:
 	@echo "make setup      install everything into .venv"
@@ -15,6 +15,7 @@ help:
 	@echo "make format     apply the style"
 	@echo "make images     render the pictures of the README into docs/images"
 	@echo "make bench      run the benchmarks; they write their tables into the docs"
+	@echo "make figures    remake the paper's figures, measured, into docs/figures.md"
 	@echo "make clean      remove .venv, out/ and caches"
 
 setup: $(STAMP)
@@ -48,6 +49,10 @@ images: $(STAMP)
 bench: $(STAMP)
 	$(BIN)/python -m pip install --quiet --editable '.[bench]'
 	$(BIN)/python -m benchmarks
+
+figures: $(STAMP)
+	$(BIN)/python -m pip install --quiet --editable '.[bench]'
+	$(BIN)/python -m figures
 
 clean:
 	rm -rf .venv out build dist .hypothesis .pytest_cache .ruff_cache

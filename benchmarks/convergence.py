@@ -19,6 +19,7 @@ STEPS = 120
 SHOWN = 60
 RAYS_ACROSS = 64
 GOALS = (1e-3, 1e-4, 1e-5)
+ARRIVED = 1e-6
 RULES = (("classic", 1.75), ("slope", 1.4), ("caps", 1.4))
 
 
@@ -47,20 +48,26 @@ def meshed(loop: np.ndarray, rings: int = 320, spokes: int = 960) -> tuple[np.nd
     return vertices, np.concatenate(faces)
 
 
-def errors() -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """For each rule, |f - level| and |t - t*| (STEPS + 1, rays) over the rays that hit."""
+def errors(
+    loop: np.ndarray,
+    *,
+    across: int = RAYS_ACROSS,
+    steps: int = STEPS,
+    rules: tuple[tuple[str, float], ...] = RULES,
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """For each rule, |f - level| and |t - t*| (steps + 1, rays) over the rays that hit the 2 pi
+    level of a polygon (n, 3) that is a graph over the plane."""
     import igl
 
-    loop = shapes.wavy_polygon(64)
     field = hk.SolidAngle(loop)
-    eye, d = camera(RAYS_ACROSS)
+    eye, d = camera(across)
     exact = hk.trace(field, eye[None], d, precision="double", tolerance=1e-10)
     d, star = d[exact.status == hk.Status.HIT], exact.t[exact.status == hk.Status.HIT]
     start, _ = _clip(field, eye, d)
     found: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-    for bound, overstep in RULES:
+    for bound, overstep in rules:
         at = [start]
-        for k in range(1, STEPS + 1):
+        for k in range(1, steps + 1):
             hits = hk.trace(
                 field, eye[None], d, precision="double", tolerance=1e-12,
                 max_steps=k, bound=bound, overstep=overstep,
@@ -68,10 +75,12 @@ def errors() -> dict[str, tuple[np.ndarray, np.ndarray]]:
             at.append(hits.t)
         found[bound] = _measure(field, eye, d, np.array(at), star)
     vertices, faces = meshed(loop)
+    tree = igl.AABB()
+    tree.init(vertices, faces)
     t, at = start.copy(), [start]
-    for _ in range(STEPS):
-        squared = igl.point_mesh_squared_distance(eye + t[:, None] * d, vertices, faces)[0]
-        t = t + np.sqrt(squared)
+    for _ in range(steps):
+        distance = np.sqrt(tree.squared_distance(vertices, faces, eye + t[:, None] * d)[0])
+        t = t + np.where(distance < ARRIVED, 0, distance)  # a ray that has arrived stays
         at.append(t)
     found["sphere tracing, exact distance"] = _measure(field, eye, d, np.array(at), star)
     return found
@@ -108,7 +117,7 @@ def plot(path: Path) -> dict[str, tuple[float, ...]]:
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    found = errors()
+    found = errors(shapes.wavy_polygon(64))
     figure, axes = pyplot.subplots(1, 2, figsize=(10, 4), layout="constrained")
     summary: dict[str, tuple[float, ...]] = {}
     for name, (gap, along) in found.items():

@@ -1,0 +1,96 @@
+"""Panels side by side, with a line of text below each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+import harnack as hk
+from harnack.rendering.pictures.colormap import viridis
+from harnack.rendering.pictures.images import tone_mapped
+
+from .figure import Counts
+from .view import Pixels
+
+_GAP, _INK, _PAPER = 6, (30, 30, 30), (255, 255, 255)
+_LETTERS = 13
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A picture (h, w, 3) of bytes, and a line of text."""
+
+    pixels: Pixels
+    label: str
+
+
+def montage(*rows: Sequence[Panel]) -> Image.Image:
+    """Rows of panels."""
+    strip = _LETTERS + 6
+    font = ImageFont.load_default(_LETTERS)
+    sizes = [
+        (sum(p.pixels.shape[1] + _GAP for p in row) - _GAP, max(p.pixels.shape[0] for p in row))
+        for row in rows
+    ]
+    height = sum(h + strip for _, h in sizes)
+    sheet = Image.new("RGB", (max(w for w, _ in sizes), height), _PAPER)
+    draw, top = ImageDraw.Draw(sheet), 0
+    for row, (_, tall) in zip(rows, sizes, strict=True):
+        left = 0
+        for panel in row:
+            sheet.paste(Image.fromarray(panel.pixels), (left, top))
+            draw.text((left + 2, top + tall + 1), panel.label, _INK, font)
+            left += panel.pixels.shape[1] + _GAP
+        top += tall + strip
+    return sheet
+
+
+def fitting(width: int, share: float = 0.75) -> tuple[int, int]:
+    """The size of a panel of some width."""
+    return width, round(share * width)
+
+
+def scene(name: str, width: int, *, share: float = 0.75, **settings: Any) -> tuple[Pixels, Counts]:
+    """A picture of a scene of the gallery, and what its first hits took."""
+    from harnack.gallery import SCENES
+
+    chosen = SCENES[name]
+    given = {"show": "shaded", "material": list(chosen.materials), **settings}
+    given.setdefault("camera", chosen.camera)
+    surfaces = chosen.surfaces()
+    if len(given["material"]) == 1:
+        given["material"] *= len(surfaces)
+    return drawn(surfaces, fitting(width, share), **given)
+
+
+def drawn(what: Any, size: tuple[int, int], **settings: Any) -> tuple[Pixels, Counts]:
+    """A picture by `hk.render`, shaded if nothing else is asked for, and what its first hits took:
+    one ray through the middle of each pixel."""
+    settings = {"show": "shaded", **settings}
+    image = tone_mapped(hk.render(what, size=size, progress=False, **settings))
+    only = {k: v for k, v in settings.items() if k not in ("show", "spp", "seed", "antialias")}
+    status, evaluations = (
+        hk.render(what, size=size, show=show, progress=False, **only)
+        for show in ("status", "evaluations")
+    )
+    return image, Counts.of(status, evaluations)
+
+
+def heat(numbers: Any, top: float, size: tuple[int, int]) -> Pixels:
+    """Numbers (n,), row by row, as colours: 0 is dark blue; `top`, and all above, yellow."""
+    colours = viridis(np.asarray(numbers, np.float64) / top)
+    return (colours * 255 + 0.5).astype(np.uint8).reshape(*size[::-1], 3)
+
+
+def halved(pixels: Pixels) -> Pixels:
+    """A picture of half the size: the mean of blocks of four pixels."""
+    return np.asarray(Image.fromarray(pixels).reduce(2))
+
+
+def doubled(pixels: Pixels) -> Pixels:
+    """A picture with four pixels for each of one."""
+    return pixels.repeat(2, axis=0).repeat(2, axis=1)
