@@ -147,8 +147,8 @@ class MorphSlice(UploadedField["_SliceBuffers"], BatchedField):
                 raise ValueError("level 0 of a morph reaches to infinity; the surface is at 0.5")
 
     def extent(self, levels: tuple[float, ...]) -> Volume:
-        """A box without its cells that are proved empty (`tight_extent`): at a distance rho from all
-        points |f| is at most their weight over rho^2."""
+        """A box without its cells that are proved empty (`tight_extent`): at a distance rho from
+        all points |f| is at most their weight over rho^2."""
         if levels not in self._extents:
             weight = sum(float(one.rows[:, 6].sum()) for one in self._dipoles)
             reach = 1.0001 * self._size * math.sqrt(weight / min(abs(level) for level in levels))

@@ -104,12 +104,11 @@ def _rays(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Origins, directions and lengths of a grid of rays through the box along each axis, tile by
     tile."""
-    cell = ((np.arange(grid) + 0.5) / grid).reshape(-1, _TILE)
-    u, v = (
-        both.transpose(0, 2, 1, 3).ravel()
-        for both in (np.broadcast_to(cell, (*cell.shape, *cell.shape)),
-                     np.broadcast_to(cell[:, :, None, None], (*cell.shape, *cell.shape)))
-    )  # fmt: skip
+    rows = grid // _TILE
+    # Axes: tiles down and across, and rays down and across a tile.
+    index = np.indices((rows, rows, _TILE, _TILE), dtype=np.float64)
+    u = ((_TILE * index[1] + index[3] + 0.5) / grid).ravel()
+    v = ((_TILE * index[0] + index[2] + 0.5) / grid).ravel()
     origins: list[FloatArray] = []
     directions: list[FloatArray] = []
     lengths: list[FloatArray] = []
