@@ -61,7 +61,8 @@ def visible_points(surface: LevelSet, backend: Backend) -> FloatArray:
 
 def _found(surface: LevelSet, backend: Backend, ends: FloatArray) -> FloatArray:
     """Points on a coarse grid, and on one as close as the surface fills."""
-    points = _probe(surface, backend, *ends, _GRID)
+    lower, upper = ends
+    points = _probe(surface, backend, lower, upper, _GRID)
     if len(points) == 0:
         raise ValueError(
             "nothing is to be seen of this surface: no ray of a grid on the sides of its box "
