@@ -92,7 +92,7 @@ def claimed_angle(field: hk.SolidAngle) -> Claim:
 
     def look(p: Array) -> tuple[Array, Array, Array]:
         sample = ready.evaluate(to_vector3(backend, p))
-        (ball,) = [one for one in sample.known if isinstance(one, hk.HarmonicBall)]
+        (ball,) = [one for one in sample.promises if isinstance(one, hk.HarmonicBall)]
         return to_numpy(sample.value), to_numpy(sample.gradient), to_numpy(ball.radius)
 
     return Claim(look, -4 * math.pi, field.default_level, 4 * math.pi)

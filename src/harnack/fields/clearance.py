@@ -30,7 +30,10 @@ _PROOFS = choose_proofs("curvature")
 def clearance_of(field: Field, levels: tuple[float, ...]) -> Clearance:
     """`distance_below` at points (n, 3), in double precision."""
     backend = choose_backend("double")
-    prepared, targets = field.prepare(backend), TargetLevels(levels, field.period)
+    prepared = field.prepare(backend)
+    # Data, so that other levels compile nothing.
+    values = tuple(dr.opaque(backend.Float, level) for level in levels)
+    targets = TargetLevels(values, field.period)
 
     def clearance(points: FloatArray) -> FloatArray:
         p = to_vector3(backend, points)
