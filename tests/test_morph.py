@@ -165,6 +165,7 @@ def test_balls_in_closed_form() -> None:
         assert (off <= room + field.error_bound(x, precision="double") + 1e-3).all()
 
 
+@pytest.mark.slow
 def test_quadrature_bound_holds_against_a_fine_one() -> None:
     x = np.random.default_rng(3).uniform(-1, 1, (200, 3))
     for w in (0.08, 0.22):
@@ -246,7 +247,7 @@ def compare(field: hk.Morph, n: int, precision: str, seed: int) -> int:
     return int(hits.hit.sum())
 
 
-@pytest.mark.parametrize("precision", ["single", "double"])
+@pytest.mark.parametrize("precision", [pytest.param("single", marks=pytest.mark.slow), "double"])
 def test_first_hits(precision: str) -> None:
     assert compare(morph(0.15), 25, precision, 0) > 2
 
