@@ -180,7 +180,7 @@ def test_what_evaluate_must_return_is_said_at_first_use(name: str, use: str) -> 
 
 def test_bounds_that_do_not_apply_name_those_that_do() -> None:
     field = hk.SolidAngle(shapes.wavy_polygon(20))
-    with pytest.raises(ValueError, match='choose "curvature" or "caps" or .*, or leave'):
+    with pytest.raises(ValueError, match=r'choose "curvature" or "caps" or .*, or leave'):
         hk.trace(field, *RAY, bound="lipschitz")
     with pytest.raises(ValueError, match=r"promises Curvature, .*choose \"curvature\", or leave"):
         hk.trace(Bell(bent, 1.0, 2.0), *RAY, bound="caps")
