@@ -24,6 +24,7 @@ ROOMS = (
     "fields",
     "tracer",
     "distance",
+    "meshing",
     "rendering",
     "opening",
     "gallery",

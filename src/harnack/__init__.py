@@ -105,6 +105,7 @@ from harnack.fields import (
     union,
 )
 from harnack.geometry import Ball, Box, Circle, ConvexHull, HalfSpace, Intersection
+from harnack.meshing import MeshingError, mesh
 from harnack.rendering import render
 from harnack.tracer import AllHits, Hits, LevelSet, Status, Tolerance, level_set, trace
 
@@ -151,6 +152,7 @@ __all__ = [
     "LevelCurves",
     "LevelSet",
     "Lipschitz",
+    "MeshingError",
     "Molecule",
     "Morph",
     "Noise",
@@ -201,6 +203,7 @@ __all__ = [
     "level_set",
     "log",
     "maximum",
+    "mesh",
     "minimum",
     "norm",
     "render",

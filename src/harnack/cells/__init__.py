@@ -1,5 +1,5 @@
 """Cells that may hold a level set, found by leaving out those that are proved empty."""
 
-from harnack.cells.octree import Cells, Clearance, carve
+from harnack.cells.octree import Cells, Clearance, Octree, carve, octree
 
-__all__ = ["Cells", "Clearance", "carve"]
+__all__ = ["Cells", "Clearance", "Octree", "carve", "octree"]

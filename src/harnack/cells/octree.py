@@ -9,10 +9,10 @@ from typing import TypeAlias
 
 import numpy as np
 
-from harnack.backend import FloatArray
+from harnack.backend import BoolArray, FloatArray
 from harnack.geometry import ConvexHull
 
-__all__ = ["Cells", "Clearance", "carve"]
+__all__ = ["Cells", "Clearance", "Octree", "carve", "octree"]
 
 Clearance: TypeAlias = Callable[[FloatArray], FloatArray]
 """For points (n, 3) lengths (n,): no point of the set is nearer than that."""
@@ -56,25 +56,46 @@ class Cells:
         half = 0.5 * self.size
         return Cells((self.corners[:, None] + _OCTANTS * half).reshape(-1, 3), half)
 
-    def without_empty(self, clearance: Clearance) -> Cells:
-        """Those that are not proved empty: whose ball is not within the clearance of its centre."""
+    def some(self, which: BoolArray) -> Cells:
+        """Those chosen by a mask (n,)."""
+        return Cells(self.corners[which], self.size)
+
+    def proved_empty(self, clearance: Clearance) -> BoolArray:
+        """(n,) whether a cell's ball is within the clearance of its centre."""
         if not len(self.corners):
-            return self
-        free = clearance(self.centres) > self.half_diagonal * (1 + 1e-9)
-        return Cells(self.corners[~free], self.size)
+            return np.zeros(0, np.bool_)
+        return clearance(self.centres) > self.half_diagonal * (1 + 1e-9)
+
+
+@dataclass(frozen=True)
+class Octree:
+    """Cells of a box: those of the finest size that may hold the set, and those proved empty on the
+    way there, coarsest first. Together they fill the box."""
+
+    leaves: Cells
+    empty: tuple[Cells, ...]
+
+
+def octree(cells: Cells, clearance: Clearance, most: int, finest: int) -> Octree:
+    """Split `cells`, again and again, where they are not proved empty.
+
+    most: cells that are looked at in one round; when it would be more, no further round is made.
+    finest: rounds at most; each halves the edges.
+    """
+    empty: list[Cells] = []
+    for _ in range(finest):
+        if 8 * len(cells.corners) > most:
+            break
+        split = cells.split()
+        free = split.proved_empty(clearance)
+        cells = split.some(~free)
+        empty.append(split.some(free))
+    return Octree(cells, tuple(empty))
 
 
 def carve(
     lower: FloatArray, upper: FloatArray, clearance: Clearance, most: int, finest: int
 ) -> Cells:
-    """The cells of a box that may hold a set; there are none where the box is proved empty.
-
-    most: cells that are looked at in one round; when it would be more, no further round is made.
-    finest: rounds at most; each halves the edges.
-    """
-    cells = Cells(np.array(lower)[None], np.array(upper) - np.array(lower))
-    for _ in range(finest):
-        if 8 * len(cells.corners) > most:
-            break
-        cells = cells.split().without_empty(clearance)
-    return cells
+    """The leaves of the octree of one box; there are none where the box is proved empty."""
+    root = Cells(np.array(lower)[None], np.array(upper) - np.array(lower))
+    return octree(root, clearance, most, finest).leaves

@@ -56,6 +56,7 @@ def _parsers() -> tuple[_Parser, dict[str, _Parser]]:
     whole.add_argument("--version", action="version", version=f"harnack {__version__}")
     commands = whole.add_subparsers(required=True, metavar="COMMAND", dest="command")
     _add_render(commands)
+    _add_mesh(commands)
     many = commands.add_parser("gallery", help="draw or list the named scenes")
     many.add_argument("names", nargs="*", metavar="NAME", help="scenes to draw (all)")
     many.add_argument("--list", action="store_true", help="list them and draw nothing")
@@ -119,6 +120,27 @@ def _add_render(commands: Any) -> None:
     _add_quality(one)
 
 
+def _add_mesh(commands: Any) -> None:
+    one = commands.add_parser(
+        "mesh", help="make triangles of a surface",
+        description="Write the triangles of a gallery scene's surface, or of the surface that the "
+        "curves of a file span. A surface that ends at a curve ends at its very vertices.",
+    )  # fmt: skip
+    one.add_argument(
+        "scene", metavar="SCENE", help="a name from `harnack gallery --list`, or a file of curves"
+    )
+    one.add_argument("-o", "--output", metavar="FILE", help=".stl, .ply, .obj or .glb (SCENE.stl)")
+    one.add_argument("--level", type=parse_level, help="as for render")
+    one.add_argument(
+        "--tolerance", type=_positive, metavar="PART",
+        help="how far triangles may be from the surface, as a part of its size (0.001)",
+    )  # fmt: skip
+    one.add_argument(
+        "--spacing", type=_positive, metavar="LENGTH", help="of cells before anything is refined"
+    )
+    one.add_argument("--quiet", action="store_true", help="do not say what is being done")
+
+
 def _add_quality(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", type=parse_size, metavar="WxH", help="pixels (800x600)")
     parser.add_argument(
@@ -146,6 +168,16 @@ def _one_of(known: Sequence[str]) -> Callable[[str], str]:
         return text
 
     return chosen
+
+
+def _positive(text: str) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not 0 < number < math.inf:
+        raise argparse.ArgumentTypeError(f"{_shown(text)} must be a positive number")
+    return number
 
 
 def _angle(text: str) -> float:

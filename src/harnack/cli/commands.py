@@ -14,12 +14,16 @@ from harnack.backend import doctor
 from harnack.choices import did_you_mean
 from harnack.cli.messages import in_options, printable
 from harnack.files.surfaces import SURFACE_FILES
+from harnack.files.writing import check_writable, write_atomically
 from harnack.gallery import SCENES, Scene
+from harnack.meshing import mesh
 from harnack.opening import open_surface
 from harnack.rendering import Camera, render
 from harnack.rendering.pictures.images import check_picture_path
 
 _DEMO_SIZE = (480, 360)
+MESH_FILES = (".stl", ".ply", ".obj", ".glb")
+"""What meshes are written to."""
 
 
 def _quality(options: Any) -> dict[str, Any]:
@@ -125,6 +129,39 @@ def _draw_scene(scene: Scene, target: Path, options: Any, settings: dict[str, An
     scene.render(target, **settings)
 
 
+def _mesh(options: Any) -> int:
+    """Triangles of a scene's surface, or of that of a file with curves."""
+    source = Path(options.scene)
+    target = Path(options.output or f"{source.stem or 'surface'}.stl")
+    if target.suffix.lower() not in MESH_FILES:
+        raise ValueError(f"{target} has no extension of a mesh: name it {', '.join(MESH_FILES)}")
+    if options.scene in SCENES:
+        surfaces = SCENES[options.scene].surfaces()
+        if len(surfaces) != 1:
+            raise ValueError(f"scene {source} has {len(surfaces)} surfaces, and a mesh is of one")
+        field, level, clip = surfaces[0].field, surfaces[0].numbers[0], surfaces[0].clip
+    else:
+        _check_source(options.scene)
+        opened = open_surface(source)
+        _say(f"{source}: {in_options(opened.said)}")
+        field, level, clip = opened.field, None, None
+    settings = {"tolerance": options.tolerance, "spacing": options.spacing}
+    chosen = {name: value for name, value in settings.items() if value is not None}
+    check_writable(target)
+    with Console().status("starting") as status:
+        made = mesh(
+            field, level if options.level is None else options.level, clip=clip,
+            progress=None if options.quiet else status.update, **chosen,
+        )  # fmt: skip
+    with write_atomically(target) as partial:
+        made.export(partial)
+    facts = made.metadata["harnack"]
+    closed = "closed" if made.is_watertight else f"{len(facts['boundary'])} edges at its rim"
+    _say(f"{len(made.faces):,} triangles, {closed}, {facts['evaluations']:,} evaluations")
+    _say(f"wrote {target}")
+    return 0
+
+
 def _gallery(options: Any) -> int:
     console = Console()
     if options.list:
@@ -174,6 +211,6 @@ def _doctor(options: Any) -> int:
 
 
 COMMANDS: Mapping[str, Callable[[Any], int]] = MappingProxyType(
-    {"render": _render, "gallery": _gallery, "doctor": _doctor}
+    {"render": _render, "mesh": _mesh, "gallery": _gallery, "doctor": _doctor}
 )
 """By name."""

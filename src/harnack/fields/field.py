@@ -31,7 +31,7 @@ from harnack.fields.points import at_points
 from harnack.fields.sheets import NO_SHEET, Crossing, NearestSheet
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Mask, Precision, Real, Vec3
+    from harnack.backend import Backend, FloatArray, Mask, Precision, Real, Vec3
     from harnack.geometry import Volume
 
 
@@ -190,6 +190,12 @@ class Field(abc.ABC):
         """
         del levels
         return self.domain
+
+    def change_along(self, p: FloatArray, q: FloatArray) -> FloatArray | None:
+        """How an angle-valued f changes along straight segments from p to q (n, 3), followed as it
+        goes round; None if only its values are known. Meshes ask for it on long edges."""
+        del p, q
+        return None
 
     def check_levels(self, levels: tuple[float, ...]) -> None:
         """Raise ValueError if a level is one that no surface can have. The default accepts all."""

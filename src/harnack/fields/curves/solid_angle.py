@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import drjit as dr
 import numpy as np
 
-from harnack.backend import FloatArray, backend_of, to_numpy
+from harnack.backend import FloatArray, backend_of, choose_backend, to_numpy
 from harnack.backend.extrema import fmin
 from harnack.choices import did_you_mean
 from harnack.enclosures import HarmonicBall, LineLipschitz
@@ -20,11 +20,13 @@ from harnack.fields.curves.circle_sums import Circles, CircleSums
 from harnack.fields.curves.edge_angles import differentiable_angle
 from harnack.fields.curves.edge_nearest import closest_on_segments, segments
 from harnack.fields.curves.planar import PlanarRegion, planar_region
+from harnack.fields.curves.swept_angle import change_along_segments
 from harnack.fields.edges.curve_promises import bends, swept_ball
 from harnack.fields.edges.edge_passing import Line, known_along, rates_along
 from harnack.fields.edges.edge_records import LoopEdges
 from harnack.fields.edges.edge_sums import EdgeSums, hessian_over_edges, sum_over_edges
 from harnack.fields.field import Look, Path, Sample, lengthened
+from harnack.fields.points import in_batches
 from harnack.fields.sums import (
     SECOND_ROUNDINGS,
     SLOPE_ROUNDINGS,
@@ -321,6 +323,20 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
             q = dr.detach(p)
             own = on.circles.sums(on.unit(q))
         return angle + own.angle + dr.dot(own.gradient / on.size, p - q)
+
+    def change_along(self, p: FloatArray, q: FloatArray) -> FloatArray | None:
+        if self._net_circles:
+            return None
+        backend = choose_backend("double")
+        on = self.prepare(backend)._on(backend.Array3f(0))
+        if on.edges is None:
+            return np.zeros(len(p))
+        edges = on.edges
+
+        def between(start: Vec3, end: Vec3) -> tuple[Real]:
+            return (change_along_segments(edges, on.unit(start), on.unit(end)),)
+
+        return in_batches(backend, between, p, q)[0]
 
     def check_levels(self, levels: tuple[float, ...]) -> None:
         for level in levels:

@@ -1,0 +1,82 @@
+"""What a mesh of a level set has to satisfy, whatever made it."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import numpy as np
+
+from harnack.meshing.tetrahedra import IntArray, edge_keys
+
+__all__ = ["MeshingError", "boundary_edges", "check_manifold", "euler_characteristic"]
+
+
+class MeshingError(ValueError):
+    """A level set that could not be meshed; the message says why and what to do."""
+
+
+def _directed(faces: IntArray) -> IntArray:
+    """(3m, 2): the edges of faces (m, 3), as they are run."""
+    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+
+
+def boundary_edges(faces: IntArray) -> IntArray:
+    """(k, 2): edges of one face only, as it runs them."""
+    edges = _directed(faces)
+    count = int(faces.max(initial=-1)) + 1
+    _, index, uses = np.unique(edge_keys(edges, count), return_inverse=True, return_counts=True)
+    return edges[uses[index] == 1]
+
+
+def euler_characteristic(faces: IntArray) -> int:
+    """Vertices in use, less edges, and faces."""
+    edges, count = _directed(faces), int(faces.max(initial=-1)) + 1
+    return len(np.unique(faces)) - len(np.unique(edge_keys(edges, count))) + len(faces)
+
+
+def check_manifold(faces: IntArray) -> None:
+    """Raise unless every edge has one or two faces, which run it in opposite directions, and the
+    faces around every vertex are joined by edges.
+
+    Raises:
+        MeshingError: otherwise.
+    """
+    edges, count = _directed(faces), int(faces.max(initial=-1)) + 1
+    _, index, uses = np.unique(edge_keys(edges, count), return_inverse=True, return_counts=True)
+    if (uses > 2).any():
+        raise MeshingError(
+            f"{(uses > 2).sum()} edges of the mesh have more than two faces: the level set crosses "
+            "itself, or cells are too large for it; choose a smaller `spacing`, or another level"
+        )
+    ways = np.zeros(len(uses), np.int64)
+    np.add.at(ways, index, np.where(edges[:, 0] < edges[:, 1], 1, -1))
+    if ((uses == 2) & (ways != 0)).any():
+        raise MeshingError(
+            "neighbouring faces of the mesh do not agree on its two sides: cells are too large for "
+            "this level set; choose a smaller `spacing`"
+        )
+    if _fans(faces, index, uses) > len(np.unique(faces)):
+        raise MeshingError(
+            "sheets of the mesh touch in a point: cells are too large for this level set; choose a "
+            "smaller `spacing`, or another level"
+        )
+
+
+def _fans(faces: IntArray, edge: IntArray, uses: IntArray) -> int:
+    """How many fans of faces, joined by edges, all vertices have together."""
+    import scipy.sparse  # here: half a second that few need
+    import scipy.sparse.csgraph as csgraph_module
+
+    sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
+    m = len(faces)
+    corner = np.arange(3 * m).reshape(m, 3)
+    # Corners at both ends of the edge k of a face, in the order of `_directed`.
+    first = np.concatenate([corner[:, 0], corner[:, 1], corner[:, 2]])
+    second = np.concatenate([corner[:, 1], corner[:, 2], corner[:, 0]])
+    order = np.argsort(edge, kind="stable")
+    pairs = order[np.isin(edge[order], np.flatnonzero(uses == 2))].reshape(-1, 2)
+    one, other = pairs[:, 0], pairs[:, 1]  # run in opposite directions
+    rows = np.concatenate([first[one], second[one]])
+    columns = np.concatenate([second[other], first[other]])
+    joined = sparse.coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(3 * m, 3 * m))
+    return int(csgraph.connected_components(joined, directed=False)[0])

@@ -1,0 +1,285 @@
+"""Triangles of a level set in tetrahedra, when its function may be an angle.
+
+Between two points the function moves from one value to another along the edge: its *lift*. The
+edge crosses the level as often as the lift does, with the sign of the way up, n = 0 or +-1 if cells
+are small enough: of a real-valued function where the signs at the ends differ, of an angle where
+the lift, which may differ from the difference of the two wrapped values by whole periods, passes
+from one interval between levels to the next. In a tetrahedron the crossings on edges between
+corners off the level say on which side of the level each corner is, if they agree around every
+face; that is checked, and so is that no more than one level is between corners. A corner on the
+level, a vertex of the curve among them, is a vertex of the triangles as it is.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+
+from harnack.backend import BoolArray, FloatArray
+from harnack.fields import Field
+from harnack.meshing.checks import MeshingError
+from harnack.meshing.points import PointSet
+from harnack.meshing.samples import LevelFunction
+from harnack.meshing.tetrahedra import IntArray, Tetrahedra
+
+__all__ = ["Crossings", "crossings_of", "triangles_of"]
+
+_ALL = tuple(itertools.combinations(range(4), 2))
+
+
+@dataclass(frozen=True)
+class Crossings:
+    """Of all edges of tetrahedra, between points off the level.
+
+    count: (k,) how often an edge crosses the level, upwards less downwards.
+    change: (k,) of the function along it.
+    proved: how many changes are proved to be the difference of wrapped values. integrated: how many
+        were integrated along the edge.
+    """
+
+    count: IntArray
+    change: FloatArray
+    proved: int
+    integrated: int
+
+
+def crossings_of(function: LevelFunction, points: PointSet, tets: Tetrahedra) -> Crossings:
+    """Count the crossings of every edge.
+
+    Wrapping. From p the function moves by less than a quarter of its period within `reach`; if the
+    reaches of both ends cover the edge, it moves by less than half a period along it, which is the
+    wrapped difference. Other edges are integrated (`Field.change_along`).
+
+    Raises:
+        MeshingError: edges that are not covered, of a field that cannot be integrated.
+    """
+    a, b = tets.ends.T
+    value = points.samples.value
+    off = ~points.is_on[a] & ~points.is_on[b]
+    change = np.where(off, value[b] - value[a], 0.0)
+    if function.period is None:
+        count = np.where(off, (value[b] > 0).astype(np.int64) - (value[a] > 0), 0)
+        return Crossings(count, change, int(off.sum()), 0)
+    period = function.period
+    change -= period * np.round(change / period)
+    span = np.linalg.norm(points.points[a] - points.points[b], axis=1)
+    reach = points.samples.reach
+    unsure = np.flatnonzero(off & (reach[a] + reach[b] < span * (1 + 1e-9)))
+    if len(unsure):
+        p, q = points.points[a[unsure]], points.points[b[unsure]]
+        change[unsure] = _integrated(function.field, p, q, change[unsure], period)
+    # Values between levels lie in (0, period).
+    level = np.remainder(value, period)
+    count = np.where(off, np.round((level[a] + change - level[b]) / period), 0).astype(np.int64)
+    return Crossings(count, change, int(off.sum()) - len(unsure), len(unsure))
+
+
+def _integrated(
+    field: Field, p: FloatArray, q: FloatArray, wrapped: FloatArray, period: float
+) -> FloatArray:
+    """The change of f from p to q (n, 3): what the field says, as it differs from the wrapped one
+    by whole periods."""
+    exact = field.change_along(p, q)
+    if exact is None:
+        raise MeshingError(
+            f"how {type(field).__name__} changes along {len(p)} edges of the mesh is not proved, "
+            "and it has no `change_along`: choose a smaller `spacing`"
+        )
+    turns = np.round((exact - wrapped) / period)
+    if np.abs(exact - wrapped - period * turns).max(initial=0.0) > 1e-6:
+        raise MeshingError(
+            f"{type(field).__name__}.change_along is not the difference of two values, modulo "
+            "the period"
+        )
+    return wrapped + period * turns
+
+
+def triangles_of(
+    function: LevelFunction, points: PointSet, tets: Tetrahedra, crossings: Crossings
+) -> tuple[FloatArray, IntArray]:
+    """Vertices (n, 3) and faces (m, 3), counter-clockwise as seen from where the function is
+    greater. The first vertices are `points`, whether they are in use or not.
+
+    Raises:
+        MeshingError: crossings that do not agree around a face, or two levels between corners.
+    """
+    side = _sides(points, tets, crossings)
+    on = points.is_on[tets.corners]
+    least = np.where(on, np.iinfo(np.int64).max, side).min(axis=1)
+    most = np.where(on, np.iinfo(np.int64).min, side).max(axis=1)
+    if (most - least > 1)[~on.all(axis=1)].any():
+        raise MeshingError(
+            "two sheets of the level set pass between corners of one tetrahedron: choose a smaller "
+            "`spacing`"
+        )
+    cut = np.flatnonzero(~on.all(axis=1) & (most > least))
+    roots, place = _roots(function, points, tets, crossings, cut)
+    vertices = np.concatenate([points.points, roots])
+    parts: list[tuple[IntArray, FloatArray]] = []
+    above = (side > least[:, None]) & ~on
+    pattern = (above[cut] * [1, 2, 4, 8]).sum(axis=1) + 16 * (on[cut] * [1, 2, 4, 8]).sum(axis=1)
+    for code in np.unique(pattern):
+        rows = cut[pattern == code]
+        up = [k for k in range(4) if code >> k & 1]
+        kept = [k for k in range(4) if code >> (4 + k) & 1]
+        down = [k for k in range(4) if k not in up and k not in kept]
+        corner = tets.corners[rows]
+        rise = _mean(points.points, corner[:, up]) - _mean(points.points, corner[:, down])
+
+        def at(i: int, j: int, rows: IntArray = rows) -> IntArray:
+            return place[tets.edge_between(i, j, rows)[0]]
+
+        on_level = [corner[:, k] for k in kept]
+        crossed = [at(i, j) for i in up for j in down]
+        if len(crossed) == 4:  # two and two
+            ring = [at(up[0], down[0]), at(up[0], down[1]), at(up[1], down[1]), at(up[1], down[0])]
+            for face in _halves(vertices, ring):
+                parts.append((face, rise))
+        else:
+            parts.append((np.stack([*on_level, *crossed], axis=1), rise))
+    parts.append(_faces_on_the_level(function, points, tets))
+    faces, rise = (np.concatenate(column) for column in zip(*parts, strict=True))
+    corner = vertices[faces]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    turned = (normal * rise).sum(axis=1) < 0
+    faces[turned] = faces[turned][:, ::-1]
+    return vertices, faces
+
+
+def _mean(points: FloatArray, index: IntArray) -> FloatArray:
+    return points[index].mean(axis=1)
+
+
+def _halves(vertices: FloatArray, ring: list[IntArray]) -> tuple[IntArray, IntArray]:
+    """A quadrilateral cut along its shorter diagonal."""
+    a, b, c, d = ring
+    one, other = (np.linalg.norm(vertices[x] - vertices[y], axis=1) for x, y in ((a, c), (b, d)))
+    longer = (one > other)[:, None]
+    first = np.where(longer, np.stack([a, b, d], axis=1), np.stack([a, b, c], axis=1))
+    second = np.where(longer, np.stack([b, c, d], axis=1), np.stack([a, c, d], axis=1))
+    return first, second
+
+
+def _sides(points: PointSet, tets: Tetrahedra, crossings: Crossings) -> IntArray:
+    """(m, 4): levels between the first corner that is off the level, and each other one."""
+    on = points.is_on[tets.corners]
+    rows = np.arange(len(on))
+    first = np.argmin(on, axis=1)
+    side = np.zeros(on.shape, np.int64)
+
+    def between(i: int, j: int, rows: IntArray) -> IntArray:
+        edge, way = tets.edge_between(i, j, rows)
+        return way * crossings.count[edge]
+
+    for i, j in itertools.permutations(range(4), 2):
+        some = rows[(first == i) & ~on[:, j]]
+        side[some, j] = between(i, j, some)
+    for i, j in _ALL:
+        some = rows[~on[:, i] & ~on[:, j]]
+        if (side[some, j] - side[some, i] != between(i, j, some)).any():
+            raise MeshingError(
+                "crossings of the level set do not agree around a triangle: the curve passes "
+                "through it; choose a smaller `spacing`"
+            )
+    return side
+
+
+def _roots(
+    function: LevelFunction,
+    points: PointSet,
+    tets: Tetrahedra,
+    crossings: Crossings,
+    cut: IntArray,
+) -> tuple[FloatArray, IntArray]:
+    """Where edges of some tetrahedra meet the level (r, 3), and for each edge the index of that
+    vertex, after those of the points; by Chandrupatla's method along the edge."""
+    edges = np.unique(tets.edges[cut])
+    edges = edges[crossings.count[edges] != 0]
+    a, b = tets.ends[edges].T
+    p, way = points.points[a], points.points[b] - points.points[a]
+    value, change = points.samples.value[a], crossings.change[edges]
+    if function.period is not None:
+        # Count from the level that is crossed: below it at one end, above it at the other.
+        value = np.remainder(value, function.period)
+        value = value - np.where(crossings.count[edges] > 0, function.period, 0)
+
+    def lifted(t: FloatArray, *of: FloatArray) -> FloatArray:
+        origin, along, start, rise = (
+            np.stack(of[0:3], axis=-1), np.stack(of[3:6], axis=-1), of[6], of[7]
+        )  # fmt: skip
+        flat = (origin + t[..., None] * along).reshape(-1, 3)
+        found = function.values(flat).reshape(t.shape)
+        if function.period is None:
+            return found
+        return found + function.period * np.rint((start + 0.5 * rise - found) / function.period)
+
+    import scipy.optimize.elementwise as elementwise  # here: half a second that few need
+
+    search = cast("Any", elementwise).find_root
+    arguments = (*p.T, *way.T, value, change)
+    result = search(
+        lifted, (np.zeros(len(a)), np.ones(len(a))), args=arguments,
+        tolerances={"xatol": 1e-10, "fatol": 0.0, "xrtol": 0.0, "frtol": 0.0}, maxiter=60,
+    )  # fmt: skip
+    if not bool(np.all(result.success)):
+        raise MeshingError(
+            f"{int((~result.success).sum())} crossings of edges were not found: the function may "
+            "not be continuous there; choose another level"
+        )
+    place = np.full(len(tets.ends), -1, np.int64)
+    place[edges] = len(points.points) + np.arange(len(edges))
+    share = np.array(result.x, np.float64)
+    return p + share[:, None] * way, place
+
+
+def _faces_on_the_level(
+    function: LevelFunction, points: PointSet, tets: Tetrahedra
+) -> tuple[IntArray, FloatArray]:
+    """Faces of tetrahedra with all corners on the level that have another side of it behind than
+    before them, and the way up through each.
+
+    A side is that of the fourth corner, or if it is on the level too, of the centre.
+    """
+    on = points.is_on[tets.corners]
+    triples: list[IntArray] = []
+    for k in range(4):
+        rows = np.flatnonzero(np.delete(on, k, axis=1).all(axis=1))
+        face = np.sort(np.delete(tets.corners[rows], k, axis=1), axis=1)
+        triples.append(np.column_stack([face, rows, np.full(len(rows), k)]))
+    table = np.concatenate(triples)
+    table = table[np.lexsort(table[:, 2::-1].T)]
+    twice = np.flatnonzero((table[1:, :3] == table[:-1, :3]).all(axis=1))
+    one, other, face = table[twice], table[twice + 1], table[twice, :3]
+    if not len(face):
+        return np.zeros((0, 3), np.int64), np.zeros((0, 3))
+    middle = _mean(points.points, face)
+    sides = [_beside(points, tets, row) for row in (one, other)]
+    value = [function.values(side) for side in sides]
+    if function.period is None:
+        count = (value[1] > 0).astype(np.int64) - (value[0] > 0)
+    else:
+        period = function.period
+        there = function.values(middle)
+        change = sum(
+            sign * _integrated(function.field, side, middle, _wrap(there - start, period), period)
+            for sign, side, start in zip((1, -1), sides, value, strict=True)
+        )
+        level = [np.remainder(one_value, period) for one_value in value]
+        count = np.round((level[0] + change - level[1]) / period).astype(np.int64)
+    rise = (sides[1] - sides[0]) * np.sign(count)[:, None]
+    return face[count != 0], rise[count != 0]
+
+
+def _wrap(change: FloatArray, period: float) -> FloatArray:
+    return change - period * np.round(change / period)
+
+
+def _beside(points: PointSet, tets: Tetrahedra, rows: IntArray) -> FloatArray:
+    corners = tets.corners[rows[:, 3]]
+    apex = corners[np.arange(len(rows)), rows[:, 4]]
+    centre = points.points[corners].mean(axis=1)
+    is_on: BoolArray = points.is_on[apex]
+    return np.where(is_on[:, None], centre, points.points[apex])

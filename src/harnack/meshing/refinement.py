@@ -1,0 +1,148 @@
+"""Finer meshes: edges cut where the surface bulges from them, vertices moved onto it, and smoothed.
+
+Vertices and edges of the boundary stay as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from harnack.backend import BoolArray, FloatArray
+from harnack.meshing.checks import boundary_edges
+from harnack.meshing.points import newton
+from harnack.meshing.samples import LevelFunction
+from harnack.meshing.tetrahedra import IntArray, edge_keys
+
+__all__ = ["refined", "smoothed"]
+
+Walls = tuple[FloatArray, FloatArray] | None
+# Edges shorter than this part of the tolerance are never cut.
+_SHORTEST = 0.5
+_MOST_ROUNDS = 12
+
+
+def refined(
+    function: LevelFunction,
+    vertices: FloatArray,
+    faces: IntArray,
+    tolerance: float,
+    walls: Walls,
+    report: Callable[[str], None],
+) -> tuple[FloatArray, IntArray]:
+    """Cut edges at their middles, and move these onto the surface, until the middles of all edges
+    but those of the boundary, and the centres of all faces, are within `tolerance` of it."""
+    for round_number in range(_MOST_ROUNDS):
+        report(f"refining, round {round_number + 1}: {len(faces):,} triangles")
+        ends, edges, is_rim = _edges(faces)
+        if walls is not None:  # the rim lies in them, and so do the middles of its edges
+            is_rim = np.zeros_like(is_rim)
+        middle = 0.5 * (vertices[ends[:, 0]] + vertices[ends[:, 1]])
+        span = np.linalg.norm(vertices[ends[:, 0]] - vertices[ends[:, 1]], axis=1)
+        samples = function.at(middle)
+        bulge = samples.distance
+        marked = (bulge > tolerance) & (span > _SHORTEST * tolerance)
+        centre = function.at(vertices[faces].mean(axis=1)).distance
+        # Of a face whose centre is off, the longest edge that may be cut.
+        free = np.where(is_rim[edges], 0.0, span[edges])
+        worst = edges[np.arange(len(faces)), free.argmax(axis=1)]
+        marked[worst[centre > tolerance]] = True
+        marked &= ~is_rim
+        if not marked.any():
+            break
+        moved = newton(function, middle[marked], samples.some(marked), 0.5 * span[marked], walls)
+        place = np.full(len(ends), -1, np.int64)
+        place[marked] = len(vertices) + np.arange(int(marked.sum()))
+        vertices = np.concatenate([vertices, moved])
+        faces = _split(vertices, faces, place[edges])
+    return vertices, faces
+
+
+def _edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
+    """All edges (k, 2), those of each face (m, 3) (that of corners 0 and 1 first), and whether they
+    belong to one face only."""
+    pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    count = int(faces.max()) + 1
+    keys, index, uses = np.unique(edge_keys(pairs, count), return_inverse=True, return_counts=True)
+    ends = np.column_stack([keys // count, keys % count])
+    return ends, index.reshape(3, -1).T, uses == 1
+
+
+def _split(vertices: FloatArray, faces: IntArray, middle: IntArray) -> IntArray:
+    """Faces cut at the middles (m, 3) of their edges, -1 for those that are not cut."""
+    cut = middle >= 0
+    number = cut.sum(axis=1)
+    parts = [faces[number == 0]]
+    three = number == 3
+    (a, b, c), (x, y, z) = faces[three].T, middle[three].T
+    parts += [np.stack(t, axis=1) for t in ((a, x, z), (x, b, y), (z, y, c), (x, y, z))]
+    for k in range(3):
+        order = [k, (k + 1) % 3, (k + 2) % 3]
+        one = (number == 1) & cut[:, k]
+        (a, b, c), x = faces[one][:, order].T, middle[one, k]
+        parts += [np.stack(t, axis=1) for t in ((a, x, c), (x, b, c))]
+        two = (number == 2) & ~cut[:, k]
+        # The edge from a to b is whole; y and z are the middles of the others.
+        (a, b, c), y, z = faces[two][:, order].T, middle[two, order[1]], middle[two, order[2]]
+        first = np.linalg.norm(vertices[a] - vertices[y], axis=1)
+        second = np.linalg.norm(vertices[b] - vertices[z], axis=1)
+        shorter = (first < second)[:, None]
+        parts.append(np.stack([z, y, c], axis=1))
+        parts.append(np.where(shorter, np.stack([a, b, y], 1), np.stack([a, b, z], 1)))
+        parts.append(np.where(shorter, np.stack([a, y, z], 1), np.stack([b, y, z], 1)))
+    return np.concatenate(parts)
+
+
+def smoothed(
+    function: LevelFunction,
+    vertices: FloatArray,
+    faces: IntArray,
+    walls: Walls,
+    rounds: int = 3,
+) -> FloatArray:
+    """Vertices moved towards the mean of their neighbours and back onto the surface, a few times;
+    those of the boundary stay. Moves that turn a face by much are taken back."""
+    ends, _, _ = _edges(faces)
+    rim = np.unique(boundary_edges(faces))
+    free = np.zeros(len(vertices), np.bool_)
+    free[np.unique(faces)] = True
+    free[rim] = False
+    count = np.maximum(np.bincount(ends.ravel(), minlength=len(vertices)), 1)
+    rows = np.flatnonzero(free)
+    for _ in range(rounds):
+        sums = np.zeros_like(vertices)
+        for one, other in ((0, 1), (1, 0)):
+            for axis in range(3):
+                sums[:, axis] += np.bincount(
+                    ends[:, one], vertices[ends[:, other], axis], minlength=len(vertices)
+                )
+        aim = 0.5 * (vertices + sums / count[:, None])
+        start = function.at(aim[rows])
+        # No farther than neighbours are: beside the curve gradients turn.
+        span = np.linalg.norm(aim[rows] - vertices[rows], axis=1) + 1e-300
+        there = vertices.copy()
+        there[rows] = newton(function, aim[rows], start, 2 * span, walls)
+        after = function.at(there[rows])
+        worse = after.distance > 1e-7 * (1 + np.linalg.norm(there[rows], axis=1))
+        there[rows[worse]] = vertices[rows[worse]]
+        vertices = _unfolded(vertices, there, faces)
+    return vertices
+
+
+def _unfolded(before: FloatArray, after: FloatArray, faces: IntArray) -> FloatArray:
+    """`after`, but for vertices of faces that have turned over, which stay as before."""
+    for _ in range(8):
+        corner = after[faces]
+        normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        old = before[faces]
+        was = np.cross(old[:, 1] - old[:, 0], old[:, 2] - old[:, 0])
+        turned = (normal * was).sum(axis=1) <= 0.3 * np.linalg.norm(
+            normal, axis=1
+        ) * np.linalg.norm(was, axis=1)
+        if not turned.any():
+            return after
+        after = after.copy()
+        back = np.unique(faces[turned])
+        after[back] = before[back]
+    return before

@@ -1,0 +1,124 @@
+"""The function to be meshed, at many points at a time, and what is proved about it around them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import FloatArray, choose_backend
+from harnack.backend.lengths import length
+from harnack.enclosures import Gaps, Slopes, TargetLevels, choose_proofs, longest_step
+from harnack.fields.clearance import distance_below
+from harnack.fields.points import in_batches
+
+if TYPE_CHECKING:
+    from harnack.backend import Real, Vec3
+    from harnack.fields import Field
+
+__all__ = ["LevelFunction", "Samples"]
+
+_PROOFS = choose_proofs("curvature")
+
+
+@dataclass(frozen=True)
+class Samples:
+    """The function at points.
+
+    value: (n,) f - level; of an angle the nearest to 0, in [-period/2, period/2].
+    gradient: (n, 3).
+    reach: (n,) as far as f is proved to move by less than a quarter of its period; 0 without one.
+    """
+
+    value: FloatArray
+    gradient: FloatArray
+    reach: FloatArray
+
+    def some(self, rows: Any) -> Samples:
+        """Those at some points, by index or mask."""
+        return Samples(self.value[rows], self.gradient[rows], self.reach[rows])
+
+    def replaced(self, rows: Any, others: Samples) -> Samples:
+        """With those at points `rows` replaced."""
+        value, gradient, reach = self.value.copy(), self.gradient.copy(), self.reach.copy()
+        value[rows], gradient[rows], reach[rows] = others.value, others.gradient, others.reach
+        return Samples(value, gradient, reach)
+
+    @property
+    def distance(self) -> FloatArray:
+        """(n,) to the level, by the slope: |f - level|/|gradient|."""
+        steep = np.linalg.norm(self.gradient, axis=1)
+        return np.abs(self.value) / np.maximum(steep, 1e-300)
+
+
+@dataclass
+class LevelFunction:
+    """f - level, in double precision.
+
+    evaluations: of f so far, in points.
+    """
+
+    field: Field
+    level: float
+    evaluations: int = dataclasses.field(default=0, init=False)
+
+    def __post_init__(self) -> None:
+        self._backend = choose_backend("double")
+        self._prepared = self.field.prepare(self._backend)
+        # Data, so that other levels compile nothing.
+        level = dr.opaque(self._backend.Float, self.level)
+        self._levels = TargetLevels((level,), self.field.period)
+
+    @property
+    def period(self) -> float | None:
+        """Of an angle."""
+        return self.field.period
+
+    def wrapped(self, value: FloatArray) -> FloatArray:
+        """f - level, given f."""
+        above = value - self.level
+        if self.period is None:
+            return above
+        return above - self.period * np.round(above / self.period)
+
+    def at(self, points: FloatArray) -> Samples:
+        """The function at points (n, 3)."""
+        value, gradient, reach = self._looked_at(points, self._look)
+        return Samples(self.wrapped(value), gradient, reach)
+
+    def values(self, points: FloatArray) -> FloatArray:
+        """(n,) f - level alone."""
+        (value,) = self._looked_at(points, lambda p: (self._prepared.evaluate(p).value,))
+        return self.wrapped(value)
+
+    def clearance(self, points: FloatArray) -> FloatArray:
+        """(n,) no point of the level set is nearer: see `distance_below`."""
+
+        def bound(p: Vec3) -> tuple[Real]:
+            sample = self._prepared.evaluate(p)
+            return (distance_below(self._backend, self._prepared, self._levels, p, sample),)
+
+        return self._looked_at(points, bound)[0]
+
+    def _look(self, p: Vec3) -> tuple[Real, Vec3, Real]:
+        sample = self._prepared.evaluate(p)
+        if self.period is None:
+            return sample.value, sample.gradient, self._backend.Float(0)
+        steepest = length(sample.gradient) + sample.gradient_error
+        slopes = Slopes(-steepest, steepest)
+        enclosures = _PROOFS.enclose(
+            sample.known, sample.weaker, sample.value, sample.error, slopes
+        )
+        # A quarter above and a quarter below, less what rounding does.
+        quarter = self._backend.Float(0.2499 * self.period) - 2 * sample.error
+        return sample.value, sample.gradient, longest_step(enclosures, Gaps(quarter, quarter))
+
+    def _looked_at(
+        self, points: FloatArray, kernel: Callable[[Vec3], tuple[Any, ...]]
+    ) -> tuple[FloatArray, ...]:
+        self.evaluations += len(points)
+        return in_batches(self._backend, kernel, points, at_once=1 << 18)
