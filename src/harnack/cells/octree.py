@@ -60,11 +60,12 @@ class Cells:
         """Those chosen by a mask (n,)."""
         return Cells(self.corners[which], self.size)
 
-    def proved_empty(self, clearance: Clearance) -> BoolArray:
-        """(n,) whether a cell's ball is within the clearance of its centre."""
+    def proved_empty(self, clearance: Clearance, margin: float = 0.0) -> BoolArray:
+        """(n,) whether a cell's ball is within the clearance of its centre; that of the cell
+        enlarged on all sides by `margin` times its size."""
         if not len(self.corners):
             return np.zeros(0, np.bool_)
-        return clearance(self.centres) > self.half_diagonal * (1 + 1e-9)
+        return clearance(self.centres) > self.half_diagonal * (1 + 2 * margin + 1e-9)
 
 
 @dataclass(frozen=True)
@@ -76,18 +77,21 @@ class Octree:
     empty: tuple[Cells, ...]
 
 
-def octree(cells: Cells, clearance: Clearance, most: int, finest: int) -> Octree:
+def octree(
+    cells: Cells, clearance: Clearance, most: int, finest: int, margin: float = 0.0
+) -> Octree:
     """Split `cells`, again and again, where they are not proved empty.
 
     most: cells that are looked at in one round; when it would be more, no further round is made.
     finest: rounds at most; each halves the edges.
+    margin: as for `Cells.proved_empty`.
     """
     empty: list[Cells] = []
     for _ in range(finest):
         if 8 * len(cells.corners) > most:
             break
         split = cells.split()
-        free = split.proved_empty(clearance)
+        free = split.proved_empty(clearance, margin)
         cells = split.some(~free)
         empty.append(split.some(free))
     return Octree(cells, tuple(empty))

@@ -12,24 +12,28 @@ import numpy as np
 from harnack.backend import FloatArray, choose_backend, to_numpy, to_vector3
 from harnack.backend.extrema import fmax, fmin
 from harnack.backend.lengths import largest_component, length
-from harnack.cells import Cells, carve
+from harnack.cells import Cells, OccupiedCells, carve
 from harnack.enclosures import Gaps, Slopes, TargetLevels, choose_proofs, longest_step
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Real, Vec3
+    from harnack.backend import Backend, Precision, Real, Vec3
     from harnack.cells import Clearance
     from harnack.fields.field import Field, Sample
     from harnack.geometry import ConvexHull
 
-__all__ = ["clearance_of", "distance_below", "tight_extent"]
+__all__ = ["clearance_of", "distance_below", "occupied_cells", "tight_extent"]
 
 # All that a field promises: points are few, and the longest proof counts.
 _PROOFS = choose_proofs("curvature")
+# Of grids: how their box is carved before, and cells along its longest side, by experiment.
+_MOST_CARVED, _FINEST_CARVED, _ACROSS = 40_000, 5, 96
 
 
-def clearance_of(field: Field, levels: tuple[float, ...]) -> Clearance:
-    """`distance_below` at points (n, 3), in double precision."""
-    backend = choose_backend("double")
+def clearance_of(
+    field: Field, levels: tuple[float, ...], precision: Precision = "double"
+) -> Clearance:
+    """`distance_below` at points (n, 3)."""
+    backend = choose_backend(precision)
     prepared = field.prepare(backend)
     # Data, so that other levels compile nothing.
     values = tuple(dr.opaque(backend.Float, level) for level in levels)
@@ -59,6 +63,19 @@ def tight_extent(
     if not len(cells.corners):  # no level anywhere: any box will do
         cells = Cells(np.array(lower)[None], np.array(upper) - np.array(lower))
     return cells.wrapped(1e-4 * float(np.linalg.norm(upper - lower)))
+
+
+def occupied_cells(
+    field: Field, levels: tuple[float, ...], lower: FloatArray, upper: FloatArray
+) -> OccupiedCells:
+    """A grid over all points of the level sets, of which a box holds all.
+
+    The box is carved first, so that the grid's cells are small.
+    """
+    clearance = clearance_of(field, levels, "single")
+    cells = carve(lower, upper, clearance, _MOST_CARVED, _FINEST_CARVED)
+    low, high = cells.bounds() if len(cells.corners) else (lower, upper)
+    return OccupiedCells.of(low, high, clearance, _ACROSS)
 
 
 def distance_below(

@@ -32,6 +32,7 @@ from harnack.fields.sheets import NO_SHEET, Crossing, NearestSheet
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Mask, Precision, Real, Vec3
+    from harnack.cells import OccupiedCells
     from harnack.geometry import Volume
 
 
@@ -190,6 +191,13 @@ class Field(abc.ABC):
         """
         del levels
         return self.domain
+
+    def occupied(self, levels: tuple[float, ...]) -> OccupiedCells | None:
+        """Cells that may hold points of the level sets; there are none elsewhere. None where a
+        field knows of none. First hits jump across the rest: for fields that are dear to evaluate.
+        """
+        del levels
+        return None
 
     def change_along(self, p: FloatArray, q: FloatArray) -> FloatArray | None:
         """How an angle-valued f changes along straight segments from p to q (n, 3), followed as it

@@ -23,6 +23,7 @@ from harnack.tracer.tolerance import PreparedTolerance, Status
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.cells.uniform_grid import UniformGrid
     from harnack.enclosures import Gaps, TargetLevels
     from harnack.fields.field import Field
     from harnack.fields.look import Look, Path, Sample
@@ -114,6 +115,7 @@ class March:
 
     hysteresis: for rays that end where they have crossed a level, and not where they reach one.
     cover: for cones that end where they come near a level: their radius per unit of t (`covers`).
+    occupied: cells outside of which there is no level, for rays that end where they reach one.
     """
 
     backend: Backend
@@ -123,6 +125,7 @@ class March:
     overstep: float
     hysteresis: Hysteresis | None = None
     cover: Real | None = None
+    occupied: UniformGrid | None = None
 
     def advance(
         self,
@@ -265,13 +268,19 @@ class March:
                 for_ever = (forward == dr.inf) & (away >= widening)
                 forward = dr.select(for_ever, forward, fmin(forward, spent / widening))
             forward = dr.select(gaps_ahead.smaller > total_error, forward, 0)
+            proved = forward
             trial = self._trial(forward, look, aims, now, path, is_smooth)
+            if self.occupied is not None:  # what follows is proved to be free, too
+                free_to = dr.select(accepted, t + forward, end)
+                free_to = self.occupied.free_until(path.origin, path.direction, free_to, end)
+                forward = fmax(forward, dr.select(free_to >= end, dr.inf, free_to - t))
+                trial = fmax(trial, forward)
             base = dr.select(accepted, t, now.base)
             step = dr.select(accepted, trial, dr.select(too_coarse, now.step, now.reach))
             reach = dr.select(accepted, forward, now.reach)
             # After a step of zero enclosures are asked for a third of the length: bisection.
             shorter = dr.select(dr.isfinite(candidate), candidate / 3, 1 + 16 * (size + t))
-            tried = dr.select(forward > 0, look.growth * forward, shorter)
+            tried = dr.select(proved > 0, look.growth * proved, shorter)
             if now.contact is not None and contact is not None:  # off the surface, all lies ahead
                 leaves = now.contact.is_touching & ~contact.is_touching
                 tried = dr.select(leaves | hit, end - t, tried)

@@ -20,6 +20,7 @@ from harnack.tracer.tolerance import PreparedTolerance, Status
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.cells.uniform_grid import UniformGrid
     from harnack.enclosures import Proofs, TargetLevels
     from harnack.fields.field import Field, Sample
     from harnack.geometry import Volume
@@ -72,6 +73,7 @@ class PreparedLevelSet:
 
     volume: what holds the surface. region: where the field may be looked at, only for rays that
         look for crossings; it is all of space, or larger than `volume`. Both None for all of space.
+    occupied: cells outside of which there is no level; None where none are known.
     """
 
     backend: Backend
@@ -84,6 +86,7 @@ class PreparedLevelSet:
     overstep: float
     confirm: bool = False
     region: Volume | None = None
+    occupied: UniformGrid | None = None
 
     def sample(self, p: Vec3) -> Sample:
         """The field at p."""
@@ -141,9 +144,20 @@ class PreparedLevelSet:
         hysteresis = None
         if crosses:
             start, end, hysteresis = self._around(path, real(t_min), real(t_max), start, end)
+        occupied = None if crosses else self.occupied
+        if occupied is not None:
+            holds = backend.Bool(active) & (start < end)
+            start, end = dr.select(holds, start, 0), dr.select(holds, end, 0)
+            start = occupied.free_until(path.origin, path.direction, start, end)
         state = MarchState.at(backend, start, end, active, has_detail=has_detail, crosses=crosses)
         march = March(
-            backend, self.levels, self.tolerance, self.max_steps, self.overstep, hysteresis
+            backend,
+            self.levels,
+            self.tolerance,
+            self.max_steps,
+            self.overstep,
+            hysteresis,
+            occupied=occupied,
         )
         return march, path, real(start), real(end), state
 

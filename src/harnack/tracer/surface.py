@@ -90,6 +90,7 @@ class LevelSet:
         crosses: whether rays will look for crossings.
         """
         volume, region = self.volume, None
+        occupied = self.field.occupied(self.numbers)
         if crosses or self.confirm:
             region = _common([self.field.domain, self.clip])
         levels = tuple(
@@ -107,6 +108,7 @@ class LevelSet:
             self.overstep,
             self.confirm,
             None if region is None else region.prepare(backend),
+            None if occupied is None else occupied.upload(backend),
         )
 
 

@@ -267,7 +267,7 @@ class _BlobData:
         """The blobs whose supports may hold p: those of its cell."""
         if self.grid is None:
             return over(self.records)
-        return over_list(self.records, self.grid.entries, *self.grid.cell(p).entries())
+        return over_list(self.records, self.grid.entries, *self.grid.list_at(p))
 
     def grouped(self, p: Vec3 | None) -> GroupedList:
         """The same by groups; all blobs where p is None."""
@@ -276,7 +276,7 @@ class _BlobData:
         if self.grid is None or p is None:
             zero = self.backend.UInt32(0)
             return GroupedList(self.records, of, None, zero, self.records.trips, count)
-        begin, end = self.grid.cell(p).entries()
+        begin, end = self.grid.list_at(p)
         return GroupedList(self.records, of, self.grid.entries, begin, end, count)
 
     def value_at(self, kernel: Kernel, p: Vec3) -> BlobValue:

@@ -10,11 +10,8 @@ import numpy as np
 if TYPE_CHECKING:
     from harnack.backend import FloatArray, IntArray
 
-# Cells in which triangles are merged, and the longest edge of these, in the longest edge of pieces:
-# no point of a merged triangle is then farther from where it goes than a corner of a piece may be.
-_CELL = 0.27
-FARTHEST = 2 / 3
-"""No point of a triangle is farther from the point that stands for it, in longest edges."""
+# Cells in which triangles are merged, and the longest edge of these, in the longest edge of pieces.
+_CELL = 0.54
 
 
 @dataclass(frozen=True)
@@ -22,6 +19,7 @@ class Centroids:
     """Points that stand for parts of triangles.
 
     points: (n, 3) centroids. moments: (n, 3) area times normal, summed up.
+    farthest: no point of a triangle is farther from the point that stands for it.
     spread: the largest integral of |d|^2 over the part that a point stands for, d the distance from
         the point, over the length of its moment; slant: of the Frobenius norm of the sum of moment
         times d, likewise.
@@ -29,6 +27,7 @@ class Centroids:
 
     points: FloatArray
     moments: FloatArray
+    farthest: float
     spread: float
     slant: float
 
@@ -50,6 +49,7 @@ def centroids(corners: FloatArray, longest: float) -> Centroids:
     return Centroids(
         np.concatenate([one.points for one in parts]),
         np.concatenate([one.moments for one in parts]),
+        max(one.farthest for one in parts),
         max(one.spread for one in parts),
         max(one.slant for one in parts),
     )
@@ -57,6 +57,11 @@ def centroids(corners: FloatArray, longest: float) -> Centroids:
 
 def _longest_edges(corners: FloatArray) -> FloatArray:
     return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+
+
+def _farthest(corners: FloatArray, points: FloatArray) -> FloatArray:
+    """The largest distance of a corner (m, 3, 3) from points (m, 3): (m,)."""
+    return np.linalg.norm(corners - points[:, None], axis=2).max(axis=1)
 
 
 def _areas(corners: FloatArray) -> FloatArray:
@@ -86,7 +91,8 @@ def _cut(corners: FloatArray, longest: float) -> Centroids:
         points.append(middle.reshape(-1, 3))
         moments.append(np.repeat(_areas(some) / count**2, count**2, axis=0))
     spread = float((_mean_squares(corners) / counts**2).max())
-    return Centroids(np.concatenate(points), np.concatenate(moments), spread, 0.0)
+    farthest = float((_farthest(corners, corners.mean(axis=1)) / counts).max())
+    return Centroids(np.concatenate(points), np.concatenate(moments), farthest, spread, 0.0)
 
 
 def _merged(corners: FloatArray, longest: float) -> Centroids:
@@ -108,7 +114,8 @@ def _merged(corners: FloatArray, longest: float) -> Centroids:
     outer = np.einsum("ki,kj->kij", moments, d).reshape(-1, 9)
     slant = np.linalg.norm(_sums(group, outer), axis=1)
     spread = float((_sums(group, square[:, None])[:, 0] / length).max())
-    return Centroids(points, total, spread, float((slant / length).max()))
+    farthest = float(_farthest(corners, points[group]).max())
+    return Centroids(points, total, farthest, spread, float((slant / length).max()))
 
 
 def _sums(group: IntArray, values: FloatArray) -> FloatArray:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from harnack.backend import Backend, Mask, Precision, Real, Vec3
+    from harnack.cells import OccupiedCells
     from harnack.fields.sheets import Crossing, NearestSheet
     from harnack.geometry import Volume
 
@@ -47,7 +48,8 @@ class Morph(BatchedField):
     gap: how far apart the solids are, in the unit of the meshes. With a large one the slices in
         the middle are small, or empty: for solids of half-diagonal 1, 0.1 to 0.2 is good.
     w: in [0, gap]. Like `gap` it is data: other numbers compile nothing.
-    spacing: see above, at most 1. Less is sharper, and needs 1/spacing^2 times as many points.
+    spacing: see above, at most 1.4. Less is sharper, and needs 1/spacing^2 times as many points.
+        Of real meshes surfaces were off by at most 0.004 w for 1 (0.01 w for 1.4).
     accuracy: of the tree between the ends: clusters of points are taken as a whole beyond
         `accuracy` times their radius. Bounds of what that leaves out are part of every promise,
         and tracing takes more where the tolerance asks for it. At least 2.
@@ -68,14 +70,14 @@ class Morph(BatchedField):
         gap: float,
         w: float,
         spacing: float = 1.0,
-        accuracy: float = 3.0,
+        accuracy: float = 6.0,
     ) -> None:
         if not (math.isfinite(gap) and gap > 0):
             raise ValueError(f"gap must be positive and finite, not {gap!r}")
         if not 0 <= w <= gap:
             raise ValueError(f"w must lie between 0 and the gap {gap!r}, not {w!r}")
-        if not 0 < spacing <= 1:
-            raise ValueError(f"spacing must be above 0 and at most 1, not {spacing!r}")
+        if not 0 < spacing <= 1.4:
+            raise ValueError(f"spacing must be above 0 and at most 1.4, not {spacing!r}")
         if not 2 <= accuracy <= 100:
             raise ValueError(f"accuracy must lie between 2 and 100, not {accuracy!r}")
         self.w, self.gap = float(w), float(gap)
@@ -129,6 +131,9 @@ class Morph(BatchedField):
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         return self._slice.extent(levels)
+
+    def occupied(self, levels: tuple[float, ...]) -> OccupiedCells | None:
+        return self._slice.occupied(levels)
 
     def next_crossing(
         self, o: Vec3, d: Vec3, after: Crossing, t_max: Real, active: Mask

@@ -13,9 +13,9 @@ from harnack.backend import backend_of
 from harnack.backend.extrema import fmax
 from harnack.enclosures import HarmonicBall
 from harnack.fields.batch import BatchedField, Values
-from harnack.fields.clearance import tight_extent
+from harnack.fields.clearance import occupied_cells
 from harnack.fields.field import AtDetail, Field, Sample
-from harnack.fields.meshes.centroids import FARTHEST, Centroids, centroids, piece_counts
+from harnack.fields.meshes.centroids import Centroids, centroids, piece_counts
 from harnack.fields.meshes.sliced_kernel import SlicedKernel
 from harnack.fields.multipoles.dipole_records import dipole_rows
 from harnack.fields.multipoles.radial_kernel import BALL, RadialSums
@@ -34,14 +34,13 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from harnack.backend import Backend, FloatArray, Precision, Real, Vec3
+    from harnack.cells import OccupiedCells
     from harnack.geometry import Volume
 
 MOST_POINTS = 4_000_000
 """Points of the quadrature of both meshes together."""
 
 _SMALLEST_LEVEL = 1e-6
-# Cells that an extent looks at in one round, and how often they are halved, at most.
-_MOST_CELLS, _FINEST = 40_000, 6
 
 
 class MorphSlice(UploadedField["_SliceBuffers"], BatchedField):
@@ -74,7 +73,7 @@ class MorphSlice(UploadedField["_SliceBuffers"], BatchedField):
         _check_count([piece_counts(*one) for one in zip(corners, longest, strict=True)], w, gap)
         self._pieces = tuple(centroids(*one) for one in zip(corners, longest, strict=True))
         self._dipoles = tuple(self._clustered(one) for one in self._pieces)
-        self._extents: dict[tuple[float, ...], Volume] = {}
+        self._occupied: dict[tuple[float, ...], OccupiedCells] = {}
 
     def _clustered(self, pieces: Centroids) -> ClusteredDipoles:
         """The pieces in unit coordinates, scaled so that f is the sum of both."""
@@ -102,17 +101,19 @@ class MorphSlice(UploadedField["_SliceBuffers"], BatchedField):
         A part with moment m whose point is D away is off by at most 2 |T|_* /D^3, the nuclear norm
         of T = sum of m_i times d_i, at most sqrt(3) times Frobenius', and by the remainder of
         Taylor's formula: |m| times the mean of |d|^2 (3-2q)/((1-q)^2 D^4), q = |d|/D
-        (`RadialSums.remainder`; |d| <= `FARTHEST` of the longest edge).
+        (`RadialSums.remainder`). It is infinite where a part reaches farther than its point is.
         """
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Real]:
             on = self._batch(backend)
             x = on.unit(x)
             error, gradient = backend.Float(0), backend.Array3f(0)
-            share = FARTHEST * self.spacing
             for cloud, piece, height in zip(on.clouds, self._pieces, self.heights, strict=True):
                 sums = cloud.sums(x, 1.0, 1)
-                bend = sums.remainder(share, share * height / self._size, 1.0)
+                share = piece.farthest / height
+                bend = dr.inf
+                if share < 1:
+                    bend = sums.remainder(share, piece.farthest / self._size, 1.0)
                 error = dr.fma(piece.spread / self._size**2, bend, error)
                 error = dr.fma(2 * math.sqrt(3) * piece.slant / self._size, sums.steep, error)
                 gradient = gradient + sums.sums.gradient
@@ -147,16 +148,17 @@ class MorphSlice(UploadedField["_SliceBuffers"], BatchedField):
                 raise ValueError("level 0 of a morph reaches to infinity; the surface is at 0.5")
 
     def extent(self, levels: tuple[float, ...]) -> Volume:
-        """A box without its cells that are proved empty (`tight_extent`): at a distance rho from
-        all points |f| is at most their weight over rho^2."""
-        if levels not in self._extents:
+        return self.occupied(levels).extent()
+
+    def occupied(self, levels: tuple[float, ...]) -> OccupiedCells:
+        """In a box around the points: at a distance rho from all of them |f| is at most their
+        weight over rho^2."""
+        if levels not in self._occupied:
             weight = sum(float(one.rows[:, 6].sum()) for one in self._dipoles)
             reach = 1.0001 * self._size * math.sqrt(weight / min(abs(level) for level in levels))
             low, high = self._box
-            self._extents[levels] = tight_extent(
-                self, levels, low - reach, high + reach, _MOST_CELLS, _FINEST
-            )
-        return self._extents[levels]
+            self._occupied[levels] = occupied_cells(self, levels, low - reach, high + reach)
+        return self._occupied[levels]
 
 
 @dataclass(frozen=True)

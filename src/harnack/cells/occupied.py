@@ -1,0 +1,68 @@
+"""Equal cubes of which those that are proved to hold no level are known: rays jump across them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from harnack.cells.octree import Cells, octree
+from harnack.cells.uniform_grid import GridLayout, UniformGrid, distances_to_full, short_length
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, FloatArray
+    from harnack.cells.octree import Clearance
+    from harnack.geometry import ConvexHull
+
+__all__ = ["OccupiedCells"]
+
+# Empty cells are proved to be empty so far beyond their faces, in cells; cubes of the octree's
+# first round have 2^_ROUNDS cells a side.
+_MARGIN, _ROUNDS = 1 / 16, 3
+
+
+@dataclass(frozen=True)
+class OccupiedCells(GridLayout):
+    """A grid whose empty cells hold no point of a set, nor do their neighbourhoods (`UniformGrid`).
+
+    cells: those that are not proved empty, maybe none.
+    """
+
+    cells: Cells
+
+    @classmethod
+    def of(
+        cls, lower: FloatArray, upper: FloatArray, clearance: Clearance, across: int
+    ) -> OccupiedCells:
+        """A grid over a box that holds the set, with about so many cells along its longest side.
+
+        Outside of the box there is nothing, so a cell at its faces is empty outwards as well.
+        """
+        cell = short_length(float((upper - lower).max()) / across)
+        # Room for rounding the corner down, and for the margin beyond what the set may reach.
+        room = (_MARGIN + 1e-3) * cell
+        origin = np.nextafter((lower - room).astype(np.float32), np.float32(-np.inf))
+        origin = origin.astype(np.float64)
+        side = cell * 2**_ROUNDS
+        nx, ny, nz = (int(count) for count in np.ceil((upper + room - origin) / side))
+        places = np.indices((nx, ny, nz)).reshape(3, -1).T
+        roots = Cells(origin + side * places, np.full(3, side))
+        roots = roots.some(~roots.proved_empty(clearance, _MARGIN))
+        cells = octree(roots, clearance, np.iinfo(np.int64).max, _ROUNDS, _MARGIN).leaves
+        nx, ny, nz = (count << _ROUNDS for count in (nx, ny, nz))
+        empty = np.ones((nz, ny, nx), np.bool_)
+        x, y, z = np.round((cells.corners - origin) / cell).astype(np.int64).T
+        empty[z, y, x] = False
+        return cls(origin, cell, (nx, ny, nz), distances_to_full(empty), cells)
+
+    def extent(self) -> ConvexHull:
+        """A polytope of few planes around the cells; around the grid where there are none."""
+        cells = self.cells
+        if not len(cells.corners):
+            cells = Cells(self.origin[None], self.cell * np.array(self.shape, np.float64))
+        return cells.wrapped(1e-3 * self.cell)
+
+    def upload(self, backend: Backend) -> UniformGrid:
+        """The grid on a backend."""
+        return UniformGrid(*UniformGrid.placed(backend, self), _MARGIN)
