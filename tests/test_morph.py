@@ -19,6 +19,7 @@ from harnack.fields.meshes.sliced_kernel import GRADIENT, SlicedKernel
 from harnack.geometry.mesh_shapes import bumpy_sphere, icosphere, remove_faces, torus_mesh
 from harnack.geometry.meshes import MeshError
 from harnack.testing.walks import look_at, random_directions
+from tests.oracles.direct_sums import sliced_sum
 from tests.oracles.oracle import OracleValues, first_crossings
 from tests.test_kernels import compiled
 
@@ -40,24 +41,16 @@ def ball(x: np.ndarray, radius: float, w: float) -> np.ndarray:
 
 
 def exact(field: hk.Morph, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """f and its gradient at x (n, 3), by the plain sum over the points of the quadrature.
-
-    kappa = (atan(r/w) - r w/D^2)/(2 r^3), and its derivative -(3 kappa - w/D^4)/r by hand.
-    """
+    """f and its gradient at x (n, 3), by the plain sum over the points of the quadrature."""
     slice_: Any = field._slice
-    value, gradient = np.zeros(len(x)), np.zeros_like(x)
-    for one, w in zip(slice_._pieces, slice_.heights, strict=True):
-        for start in range(0, len(x), 200):
-            z = one.points - x[start : start + 200, None]
-            square = (z * z).sum(axis=2)
-            r, d2 = np.sqrt(square), square + w * w
-            kappa = (np.arctan2(r, w) - r * w / d2) / (2 * r * square)
-            slope = (w / d2**2 - 3 * kappa) / square
-            along = (z * one.moments).sum(axis=2)
-            value[start : start + 200] += (along * kappa).sum(axis=1)
-            turned = -kappa[..., None] * one.moments - (slope * along)[..., None] * z
-            gradient[start : start + 200] += turned.sum(axis=1)
-    return value / (2 * math.pi**2), gradient / (2 * math.pi**2)
+    sums = [
+        sliced_sum(one.points, one.moments, w)(x)
+        for one, w in zip(slice_._pieces, slice_.heights, strict=True)
+    ]
+    value, gradient = (
+        np.sum(parts, axis=0) / (2 * math.pi**2) for parts in zip(*sums, strict=True)
+    )
+    return value, gradient
 
 
 # ---------------------------------------------------------------- the kernel and its bounds
@@ -253,10 +246,26 @@ def test_first_hits(precision: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("precision", ["single", "double"])
-@pytest.mark.parametrize("w", [0.05, 0.15, 0.25])
-def test_many_first_hits(w: float, precision: str) -> None:
-    assert compare(morph(w), 50, precision, 1) > 3
+@pytest.mark.parametrize("w", [0.06, 0.15, 0.25])
+def test_many_first_hits(w: float) -> None:
+    """1,800 rays in both precisions: on samples a fifth of the height apart, none before the hit is
+    inside the solid; at the hit f is the level within the tolerance."""
+    field, tolerance = morph(w), 1e-3
+    o, d = rays(1800, 1)
+    middle, half = -(o * d).sum(axis=1), 1.1
+    reach = np.sqrt(np.maximum(half**2 - ((o + middle[:, None] * d) ** 2).sum(axis=1), 0))
+    t = (middle - reach)[:, None] + reach[:, None] * np.arange(0, 2, w / 5 / half)
+    inside = exact(field, (o[:, None] + t[..., None] * d[:, None]).reshape(-1, 3))[0] > 0.5
+    inside = inside.reshape(t.shape)
+    first = np.where(inside.any(axis=1), t[np.arange(len(t)), inside.argmax(axis=1)], np.inf)
+    assert np.isfinite(first).sum() > 200
+    for precision in ("single", "double"):
+        hits = hk.trace(field, o, d, t_max=6.0, tolerance=tolerance, precision=precision)  # type: ignore[arg-type]
+        assert not (hits.t > first + 5 * tolerance).any()
+        assert not (hits.status == hk.Status.OUT_OF_STEPS).any()
+        value, gradient = exact(field, hits.position[hits.hit])
+        steep = np.linalg.norm(gradient, axis=1)
+        assert (np.abs(value - 0.5) <= 2 * tolerance * steep).all()
 
 
 @pytest.mark.parametrize(("w", "mesh"), [(0.0, TORUS), (GAP, BUMPY)])
@@ -278,7 +287,7 @@ def test_slices_near_an_end_are_near_the_mesh_in_proportion() -> None:
     all_ = farther.hit & near.hit & at.hit
     assert all_.sum() > 10
     assert (near.hit != at.hit).mean() < 0.03
-    first, second = (np.median((one.t - at.t)[all_]) for one in (farther, near))
+    first, second = (np.median(one.t[all_] - at.t[all_]) for one in (farther, near))
     assert 0 < second < 0.7 * first < 0.05
 
 
@@ -320,7 +329,7 @@ def test_bad_input() -> None:
     for gap in (0.0, -1.0, math.inf, math.nan):
         with pytest.raises(ValueError, match="gap must be positive"):
             hk.Morph(TORUS, BUMPY, gap=gap, w=0.0)
-    for spacing in (0.0, 1.5, math.nan):
+    for spacing in (0.0, 2.5, math.nan):
         with pytest.raises(ValueError, match="spacing must be"):
             morph(0.1, spacing=spacing)
     with pytest.raises(ValueError, match="accuracy must lie"):

@@ -19,7 +19,7 @@ from harnack.backend.records import Records
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
 
-__all__ = ["ValueAndGradient", "dipole_sum", "winding_sum"]
+__all__ = ["ValueAndGradient", "dipole_sum", "sliced_sum", "winding_sum"]
 
 ValueAndGradient: TypeAlias = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 """Points (n, 3) in, values (n,) and gradients (n, 3) out."""
@@ -62,6 +62,33 @@ def dipole_sum(points: npt.ArrayLike, moments: npt.ArrayLike) -> ValueAndGradien
                 square = dr.squared_norm(z)
                 cube, along = 1 / (square * dr.sqrt(square)), dr.dot(m, z)
                 return sums[0] + along * cube, sums[1] + cube * (3 * along / square * z - m)
+
+            zero = dr.zeros(backend.Float, dr.width(x)), dr.zeros(vector, dr.width(x))
+            return _summed(backend, rows, add, zero)
+
+        value, gradient = _in_parts(at, total)
+        return value, gradient
+
+    return value_and_gradient
+
+
+def sliced_sum(points: npt.ArrayLike, moments: npt.ArrayLike, height: float) -> ValueAndGradient:
+    """The sum of m_i.(y_i - x) (atan(r/w) - r w/D^2)/(2 r^3), D^2 = r^2 + w^2, over points y (m, 3)
+    with moments m (m, 3) at distances r, seen from a height w; and its gradient."""
+    rows = np.concatenate([np.asarray(points), np.asarray(moments)], axis=1).astype(np.float64)
+
+    def value_and_gradient(at: FloatArray) -> tuple[FloatArray, FloatArray]:
+        def total(x: Vec3, backend: Backend) -> tuple[Any, ...]:
+            vector: Any = backend.Array3f
+            w = dr.opaque(backend.Float, height)
+
+            def add(row: list[Real], sums: tuple[Any, ...]) -> tuple[Any, ...]:
+                z, m = vector(*row[:3]) - x, vector(*row[3:6])
+                square = dr.squared_norm(z)
+                r, d2 = dr.sqrt(square), square + w * w
+                kappa = (dr.atan2(r, w) - r * w / d2) / (2 * r * square)
+                slope, along = (w / (d2 * d2) - 3 * kappa) / square, dr.dot(m, z)
+                return sums[0] + along * kappa, sums[1] - kappa * m - slope * along * z
 
             zero = dr.zeros(backend.Float, dr.width(x)), dr.zeros(vector, dr.width(x))
             return _summed(backend, rows, add, zero)

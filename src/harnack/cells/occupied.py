@@ -13,7 +13,6 @@ from harnack.cells.uniform_grid import GridLayout, UniformGrid, distances_to_ful
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray
     from harnack.cells.octree import Clearance
-    from harnack.geometry import ConvexHull
 
 __all__ = ["OccupiedCells"]
 
@@ -24,12 +23,7 @@ _MARGIN, _ROUNDS = 1 / 16, 3
 
 @dataclass(frozen=True)
 class OccupiedCells(GridLayout):
-    """A grid whose empty cells hold no point of a set, nor do their neighbourhoods (`UniformGrid`).
-
-    cells: those that are not proved empty, maybe none.
-    """
-
-    cells: Cells
+    """A grid whose empty cells hold no point of a set, nor do their neighbourhoods (`UniformGrid`)."""
 
     @classmethod
     def of(
@@ -54,14 +48,7 @@ class OccupiedCells(GridLayout):
         empty = np.ones((nz, ny, nx), np.bool_)
         x, y, z = np.round((cells.corners - origin) / cell).astype(np.int64).T
         empty[z, y, x] = False
-        return cls(origin, cell, (nx, ny, nz), distances_to_full(empty), cells)
-
-    def extent(self) -> ConvexHull:
-        """A polytope of few planes around the cells; around the grid where there are none."""
-        cells = self.cells
-        if not len(cells.corners):
-            cells = Cells(self.origin[None], self.cell * np.array(self.shape, np.float64))
-        return cells.wrapped(1e-3 * self.cell)
+        return cls(origin, cell, (nx, ny, nz), distances_to_full(empty))
 
     def upload(self, backend: Backend) -> UniformGrid:
         """The grid on a backend."""

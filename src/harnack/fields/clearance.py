@@ -25,8 +25,8 @@ __all__ = ["clearance_of", "distance_below", "occupied_cells", "tight_extent"]
 
 # All that a field promises: points are few, and the longest proof counts.
 _PROOFS = choose_proofs("curvature")
-# Of grids: how their box is carved before, and cells along its longest side, by experiment.
-_MOST_CARVED, _FINEST_CARVED, _ACROSS = 40_000, 5, 96
+# Cells of a grid along its longest side, by experiment.
+_ACROSS = 128
 
 
 def clearance_of(
@@ -65,17 +65,12 @@ def tight_extent(
     return cells.wrapped(1e-4 * float(np.linalg.norm(upper - lower)))
 
 
-def occupied_cells(
-    field: Field, levels: tuple[float, ...], lower: FloatArray, upper: FloatArray
-) -> OccupiedCells:
-    """A grid over all points of the level sets, of which a box holds all.
-
-    The box is carved first, so that the grid's cells are small.
-    """
-    clearance = clearance_of(field, levels, "single")
-    cells = carve(lower, upper, clearance, _MOST_CARVED, _FINEST_CARVED)
-    low, high = cells.bounds() if len(cells.corners) else (lower, upper)
-    return OccupiedCells.of(low, high, clearance, _ACROSS)
+def occupied_cells(field: Field, levels: tuple[float, ...]) -> OccupiedCells:
+    """A grid over the extent of a field, in cells that are small enough for pictures."""
+    extent = field.extent(levels)
+    if extent is None:
+        raise ValueError(f"{type(field).__name__} does not say where its levels end")
+    return OccupiedCells.of(*extent.bounds(), clearance_of(field, levels, "single"), _ACROSS)
 
 
 def distance_below(

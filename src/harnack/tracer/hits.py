@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     from harnack.fields.field import Field
     from harnack.geometry import Volume
 
+# From so many rays on it pays to look for empty cells first.
+_MANY = 4096
+
 
 @dataclass(frozen=True)
 class Hits:
@@ -231,7 +234,7 @@ def _trace(
     *,
     differentiable: bool,
 ) -> Hits:
-    prepared = surface.prepare(backend)
+    prepared = surface.prepare(backend, many=dr.width(o, d) >= _MANY)
     with dr.suspend_grad():
         end = prepared.first_hit(dr.detach(o), dr.detach(d), dr.detach(near), dr.detach(far))
         hit = end.status == int(Status.HIT)

@@ -84,13 +84,16 @@ class LevelSet:
         """What rays are clipped to: domain, proved extent and clip together; None for all space."""
         return _common([self.field.domain, self.field.extent(self.numbers), self.clip])
 
-    def prepare(self, backend: Backend, *, crosses: bool = False) -> PreparedLevelSet:
+    def prepare(
+        self, backend: Backend, *, crosses: bool = False, many: bool = True
+    ) -> PreparedLevelSet:
         """Everything uploaded to a backend, ready to be traced in a recorded kernel.
 
-        crosses: whether rays will look for crossings.
+        crosses: whether rays will look for crossings. many: whether there will be so many rays that
+            it pays to look for cells without the level first.
         """
         volume, region = self.volume, None
-        occupied = self.field.occupied(self.numbers)
+        occupied = self.field.occupied(self.numbers) if many and not crosses else None
         if crosses or self.confirm:
             region = _common([self.field.domain, self.clip])
         levels = tuple(

@@ -48,7 +48,7 @@ class Morph(BatchedField):
     gap: how far apart the solids are, in the unit of the meshes. With a large one the slices in
         the middle are small, or empty: for solids of half-diagonal 1, 0.1 to 0.2 is good.
     w: in [0, gap]. Like `gap` it is data: other numbers compile nothing.
-    spacing: see above, at most 1.4. Less is sharper, and needs 1/spacing^2 times as many points.
+    spacing: see above, at most 2. Less is sharper, and needs 1/spacing^2 times as many points.
         Of real meshes surfaces were off by at most 0.004 w for 1 (0.01 w for 1.4).
     accuracy: of the tree between the ends: clusters of points are taken as a whole beyond
         `accuracy` times their radius. Bounds of what that leaves out are part of every promise,
@@ -76,8 +76,8 @@ class Morph(BatchedField):
             raise ValueError(f"gap must be positive and finite, not {gap!r}")
         if not 0 <= w <= gap:
             raise ValueError(f"w must lie between 0 and the gap {gap!r}, not {w!r}")
-        if not 0 < spacing <= 1.4:
-            raise ValueError(f"spacing must be above 0 and at most 1.4, not {spacing!r}")
+        if not 0 < spacing <= 2:
+            raise ValueError(f"spacing must be above 0 and at most 2, not {spacing!r}")
         if not 2 <= accuracy <= 100:
             raise ValueError(f"accuracy must lie between 2 and 100, not {accuracy!r}")
         self.w, self.gap = float(w), float(gap)

@@ -13,7 +13,7 @@ from harnack.backend import backend_of
 from harnack.backend.extrema import fmax
 from harnack.enclosures import HarmonicBall
 from harnack.fields.batch import BatchedField, Values
-from harnack.fields.clearance import occupied_cells
+from harnack.fields.clearance import occupied_cells, tight_extent
 from harnack.fields.field import AtDetail, Field, Sample
 from harnack.fields.meshes.centroids import Centroids, centroids, piece_counts
 from harnack.fields.meshes.sliced_kernel import SlicedKernel
@@ -41,6 +41,8 @@ MOST_POINTS = 4_000_000
 """Points of the quadrature of both meshes together."""
 
 _SMALLEST_LEVEL = 1e-6
+# Cells that an extent looks at in one round, at most.
+_MOST_CELLS = 40_000
 
 
 class MorphSlice(UploadedField["_SliceBuffers"], BatchedField):
@@ -73,6 +75,7 @@ class MorphSlice(UploadedField["_SliceBuffers"], BatchedField):
         _check_count([piece_counts(*one) for one in zip(corners, longest, strict=True)], w, gap)
         self._pieces = tuple(centroids(*one) for one in zip(corners, longest, strict=True))
         self._dipoles = tuple(self._clustered(one) for one in self._pieces)
+        self._extents: dict[tuple[float, ...], Volume] = {}
         self._occupied: dict[tuple[float, ...], OccupiedCells] = {}
 
     def _clustered(self, pieces: Centroids) -> ClusteredDipoles:
@@ -148,16 +151,20 @@ class MorphSlice(UploadedField["_SliceBuffers"], BatchedField):
                 raise ValueError("level 0 of a morph reaches to infinity; the surface is at 0.5")
 
     def extent(self, levels: tuple[float, ...]) -> Volume:
-        return self.occupied(levels).extent()
-
-    def occupied(self, levels: tuple[float, ...]) -> OccupiedCells:
-        """In a box around the points: at a distance rho from all of them |f| is at most their
-        weight over rho^2."""
-        if levels not in self._occupied:
+        """A box without its cells that are proved empty (`tight_extent`): at a distance rho from
+        all points |f| is at most their weight over rho^2."""
+        if levels not in self._extents:
             weight = sum(float(one.rows[:, 6].sum()) for one in self._dipoles)
             reach = 1.0001 * self._size * math.sqrt(weight / min(abs(level) for level in levels))
             low, high = self._box
-            self._occupied[levels] = occupied_cells(self, levels, low - reach, high + reach)
+            self._extents[levels] = tight_extent(
+                self, levels, low - reach, high + reach, _MOST_CELLS
+            )
+        return self._extents[levels]
+
+    def occupied(self, levels: tuple[float, ...]) -> OccupiedCells:
+        if levels not in self._occupied:
+            self._occupied[levels] = occupied_cells(self, levels)
         return self._occupied[levels]
 
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
 from harnack.backend import FloatArray
+from harnack.geometry import Box
 
 # The part of the picture that the surface fills at zoom 1.
 _FILLED = 0.86
@@ -21,12 +23,16 @@ class Camera:
         90 is +y, elevation 90 is straight from above.
     fov: the larger of the horizontal and vertical angle of view, in degrees.
     zoom: 1 frames the surface tightly with a margin; more comes closer.
+    box: framed in place of what is to be seen, in the coordinates of the surfaces; it stands on the
+        ground. The pictures of a film, in which surfaces change, then fit each other, and nothing
+        has to be traced to find the frame.
     """
 
     azimuth: float = -50.0
     elevation: float = 28.0
     fov: float = 26.0
     zoom: float = 1.0
+    box: Box | None = None
 
     def __post_init__(self) -> None:
         if not 0 < self.fov < 170:
@@ -35,6 +41,10 @@ class Camera:
             raise ValueError(f"zoom must be positive, not {self.zoom}")
         if not abs(self.elevation) <= 90:
             raise ValueError(f"elevation must lie within -90 and 90 degrees, not {self.elevation}")
+        if self.box is not None and not isinstance(cast("object", self.box), Box):
+            raise TypeError(f"box must be a harnack.Box, not {type(self.box).__name__}")
+        if self.box is not None and not np.isfinite(self.box.bounds()).all():
+            raise ValueError("box must be finite")
 
     def frame(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Unit vectors of the world: to the right, up, and back to the camera."""

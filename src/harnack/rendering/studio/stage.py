@@ -6,6 +6,7 @@ shadows and tolerances of Mitsuba's rays suit every size.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -17,7 +18,7 @@ from harnack.rendering.mitsuba.shapes import shape
 from harnack.rendering.mitsuba.variant import mitsuba_backend
 from harnack.rendering.studio.camera import Camera
 from harnack.rendering.studio.lighting import ground, lights
-from harnack.rendering.surfaces.framing import visible_points
+from harnack.rendering.surfaces.framing import check_size, visible_points
 from harnack.rendering.surfaces.placement import Placement
 from harnack.tracer import LevelSet, Tolerance
 
@@ -66,7 +67,10 @@ def studio(
     bare: only surfaces and camera, without ground and lights.
     """
     backend = mitsuba_backend(mi)
-    points = np.concatenate([visible_points(one.surface, backend) for one in exhibits])
+    if camera.box is None:
+        points = np.concatenate([visible_points(one.surface, backend) for one in exhibits])
+    else:
+        points = _corners(np.array(camera.box.bounds()))
     placement = on_ground(points)
     scene: dict[str, Any] = {
         "type": "scene",
@@ -85,6 +89,12 @@ def studio(
     if not bare:
         scene |= {**ground(mi, backdrop), **lights(mi, camera.azimuth)}
     return Studio(scene, placement.scale)
+
+
+def _corners(ends: FloatArray) -> FloatArray:
+    """Corners (8, 3) of a box (2, 3) of a size that can be drawn."""
+    check_size(ends)
+    return np.array(list(itertools.product(*ends.T)))
 
 
 def on_ground(points: FloatArray) -> Placement:

@@ -42,12 +42,7 @@ def visible_points(surface: LevelSet, backend: Backend) -> FloatArray:
             found of it.
     """
     ends = box_of(surface)
-    if 0.0 < (ends[1] - ends[0]).max() < _SMALLEST or np.abs(ends).max() > _LARGEST:
-        raise ValueError(
-            f"the surface lies in a box from {_point(ends[0])} to {_point(ends[1])}: pictures are "
-            f"computed in single precision, for sizes from {_SMALLEST:g} and coordinates up to "
-            f"{_LARGEST:g}; choose units nearer to 1"
-        )
+    check_size(ends)
     prepared = surface.field.for_levels(surface.numbers).prepare(backend)
 
     def found() -> FloatArray:
@@ -57,6 +52,16 @@ def visible_points(surface: LevelSet, backend: Backend) -> FloatArray:
         return found()
     settings = (surface.numbers, surface.clip, surface.solid, surface.max_steps)
     return _POINTS.get(prepared, (*settings, surface.bound, surface.overstep), found)
+
+
+def check_size(ends: FloatArray) -> None:
+    """Raise ValueError for a box (2, 3) that single precision cannot draw."""
+    if 0.0 < (ends[1] - ends[0]).max() < _SMALLEST or np.abs(ends).max() > _LARGEST:
+        raise ValueError(
+            f"the surface lies in a box from {_point(ends[0])} to {_point(ends[1])}: pictures are "
+            f"computed in single precision, for sizes from {_SMALLEST:g} and coordinates up to "
+            f"{_LARGEST:g}; choose units nearer to 1"
+        )
 
 
 def _found(surface: LevelSet, backend: Backend, ends: FloatArray) -> FloatArray:
