@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -17,9 +18,11 @@ from harnack.meshing.checks import (
     check_manifold,
     euler_characteristic,
 )
+from harnack.meshing.intersections import intersecting_faces, turned_faces
 from harnack.meshing.marching import crossings_of, triangles_of
-from harnack.meshing.points import Boundary, PointSet, box_cells, place_points
-from harnack.meshing.refinement import refined, smoothed
+from harnack.meshing.points import Boundary, Places, PointSet, box_cells, place_points
+from harnack.meshing.refinement import improved, refined, smoothed
+from harnack.meshing.rims import whole_edges
 from harnack.meshing.samples import LevelFunction
 from harnack.meshing.tetrahedra import IntArray, Tetrahedra, delaunay, edge_keys
 
@@ -97,13 +100,10 @@ def mesh(
     start = size / _ACROSS if spacing is None else float(spacing)
     function = LevelFunction(field, level)
     attempts = 1 if spacing is not None else _MOST_ATTEMPTS
-    first = _first_mesh(function, start, attempts, (lower, upper), walls, seed, report)
+    first = _embedded(
+        function, start, attempts, (lower, upper), walls, seed, 0.5 * tolerance * size, report
+    )
     vertices, faces = first.vertices, first.faces
-    absolute = 0.5 * tolerance * size
-    vertices = smoothed(function, vertices, faces, walls)
-    vertices, faces = refined(function, vertices, faces, absolute, walls, report)
-    vertices = smoothed(function, vertices, faces, walls)
-    check_manifold(faces)
     kept = np.unique(faces)
     place = np.full(len(vertices), -1, np.int64)
     place[kept] = np.arange(len(kept))
@@ -116,6 +116,7 @@ def mesh(
         "euler_characteristic": euler_characteristic(faces),
         "proved": first.proved,
         "integrated": first.integrated,
+        "turned": first.turned,
         "boundary": boundary_edges(faces),
     }
     return result
@@ -169,14 +170,58 @@ def _box(
 
 
 @dataclass(frozen=True)
-class _FirstMesh:
-    """Triangles before they are refined. proved, integrated: as of `Crossings`."""
+class _Surface:
+    """Triangles. proved, integrated: as of `Crossings`. turned: faces turned over."""
 
     vertices: FloatArray
     faces: IntArray
+    curve: Boundary
     spacing: float
     proved: int
     integrated: int
+    turned: int = 0
+
+
+def _embedded(
+    function: LevelFunction,
+    spacing: float,
+    attempts: int,
+    box: tuple[FloatArray, FloatArray],
+    walls: tuple[FloatArray, FloatArray] | None,
+    seed: int,
+    tolerance: float,
+    report: Callable[[str], None],
+) -> _Surface:
+    """Triangles within the tolerance, none of which pass through others; where some do, or are
+    turned over, cells are made smaller and all is done again."""
+    finer: tuple[Places, ...] = ()
+    for attempt in range(_MOST_ATTEMPTS):
+        first = _first_mesh(function, spacing, attempts, box, walls, seed, finer, report)
+        spacing = first.spacing
+        faces = first.faces
+        vertices = smoothed(function, first.vertices, faces, walls)
+        vertices, faces = refined(function, vertices, faces, tolerance, walls, report)
+        vertices, faces = improved(function, vertices, faces, tolerance, walls, report)
+        if isinstance(function.field, SolidAngle):
+            kept = sum(map(len, net_loops(function.field.loops)))
+            vertices, faces = whole_edges(
+                function, vertices, faces, kept, len(first.curve.points), tolerance
+            )
+        check_manifold(faces)
+        crossing = intersecting_faces(vertices, faces)
+        turned = turned_faces(function, vertices, faces)
+        bad = np.union1d(crossing, turned)
+        if not len(bad):
+            break
+        if attempt < _MOST_ATTEMPTS - 1:
+            report(f"{len(bad)} triangles fail: smaller cells there")
+            finer = (*finer, Places(vertices[faces[bad]].mean(axis=1), spacing))
+    if len(crossing):
+        raise MeshingError(
+            f"{len(crossing)} triangles pass through others, in cells as small as "
+            f"{spacing / 2 ** len(finer):.3g}: choose a smaller `tolerance` or `spacing`"
+        )
+    return dataclasses.replace(first, vertices=vertices, faces=faces, turned=len(turned))
 
 
 def _first_mesh(
@@ -186,8 +231,9 @@ def _first_mesh(
     box: tuple[FloatArray, FloatArray],
     walls: tuple[FloatArray, FloatArray] | None,
     seed: int,
+    finer: tuple[Places, ...],
     report: Callable[[str], None],
-) -> _FirstMesh:
+) -> _Surface:
     """Triangles in cells of that spacing, or where that fails of smaller ones."""
     loops = net_loops(function.field.loops) if isinstance(function.field, SolidAngle) else ()
     curve = (
@@ -197,7 +243,7 @@ def _first_mesh(
     root = box_cells(box[0] - margin, box[1] + margin, spacing, exact=walls is not None)
     report(f"cells of {spacing:.3g}")
     try:
-        curve, points, tets = _filled(function, root, curve, walls, seed)
+        curve, points, tets = _filled(function, root, curve, walls, seed, finer)
         report(f"{len(points.points):,} points, {len(tets.corners):,} tetrahedra")
         crossings = crossings_of(function, points, tets)
         vertices, faces = triangles_of(function, points, tets, crossings)
@@ -209,8 +255,10 @@ def _first_mesh(
     except MeshingError:
         if attempts == 1:
             raise
-        return _first_mesh(function, 0.6 * spacing, attempts - 1, box, walls, seed, report)
-    return _FirstMesh(vertices, faces, spacing, crossings.proved, crossings.integrated)
+        return _first_mesh(
+            function, 0.6 * spacing, attempts - 1, box, walls, seed, finer, report
+        )
+    return _Surface(vertices, faces, curve, spacing, crossings.proved, crossings.integrated)
 
 
 def _filled(
@@ -219,10 +267,11 @@ def _filled(
     curve: Boundary,
     walls: tuple[FloatArray, FloatArray] | None,
     seed: int,
+    finer: tuple[Places, ...],
 ) -> tuple[Boundary, PointSet, Tetrahedra]:
     """Tetrahedra that have all edges of the curve, which is cut where others are too near."""
     for _ in range(_MOST_CUTS):
-        points = place_points(function, root, curve, walls, seed)
+        points = place_points(function, root, curve, walls, seed, finer)
         tets = delaunay(points.points)
         has_edge = tets.has_edges(curve.edges)
         if has_edge.all():

@@ -10,12 +10,13 @@ from collections.abc import Callable
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.checks import boundary_edges
+from harnack.meshing.checks import boundary_edges, directed_edges
+from harnack.meshing.flips import flipped
 from harnack.meshing.points import newton
 from harnack.meshing.samples import LevelFunction
 from harnack.meshing.tetrahedra import IntArray, edge_keys
 
-__all__ = ["refined", "smoothed"]
+__all__ = ["improved", "refined", "smoothed"]
 
 Walls = tuple[FloatArray, FloatArray] | None
 # Edges shorter than this part of the tolerance are never cut.
@@ -42,13 +43,14 @@ def refined(
         span = np.linalg.norm(vertices[ends[:, 0]] - vertices[ends[:, 1]], axis=1)
         samples = function.at(middle)
         bulge = samples.distance
-        marked = (bulge > tolerance) & (span > _SHORTEST * tolerance)
-        centre = function.at(vertices[faces].mean(axis=1)).distance
-        # Of a face whose centre is off, the longest edge that may be cut.
+        marked = bulge > tolerance
+        centre = function.at(vertices[faces].mean(axis=1))
+        off = centre.distance > tolerance
+        # Of a face that is off, the longest edge that may be cut.
         free = np.where(is_rim[edges], 0.0, span[edges])
         worst = edges[np.arange(len(faces)), free.argmax(axis=1)]
-        marked[worst[centre > tolerance]] = True
-        marked &= ~is_rim
+        marked[worst[off]] = True
+        marked &= ~is_rim & (span > _SHORTEST * tolerance)
         if not marked.any():
             break
         moved = newton(function, middle[marked], samples.some(marked), 0.5 * span[marked], walls)
@@ -62,7 +64,7 @@ def refined(
 def _edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
     """All edges (k, 2), those of each face (m, 3) (that of corners 0 and 1 first), and whether they
     belong to one face only."""
-    pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    pairs = directed_edges(faces)
     count = int(faces.max()) + 1
     keys, index, uses = np.unique(edge_keys(pairs, count), return_inverse=True, return_counts=True)
     ends = np.column_stack([keys // count, keys % count])
@@ -92,6 +94,23 @@ def _split(vertices: FloatArray, faces: IntArray, middle: IntArray) -> IntArray:
         parts.append(np.where(shorter, np.stack([a, b, y], 1), np.stack([a, b, z], 1)))
         parts.append(np.where(shorter, np.stack([a, y, z], 1), np.stack([b, y, z], 1)))
     return np.concatenate(parts)
+
+
+def improved(
+    function: LevelFunction,
+    vertices: FloatArray,
+    faces: IntArray,
+    tolerance: float,
+    walls: Walls,
+    report: Callable[[str], None],
+) -> tuple[FloatArray, IntArray]:
+    """Better angles: edges are flipped and vertices smoothed in turn; then edges are cut again where
+    that has moved the surface's bulges beyond `tolerance`."""
+    for _ in range(2):
+        faces = flipped(function, vertices, faces, tolerance)
+        vertices = smoothed(function, vertices, faces, walls, rounds=2)
+    vertices, faces = refined(function, vertices, faces, tolerance, walls, report)
+    return vertices, flipped(function, vertices, faces, tolerance)
 
 
 def smoothed(
