@@ -239,6 +239,8 @@ def _first_mesh(
     curve = (
         Boundary.of(loops, _LONGEST * spacing) if loops else Boundary(np.zeros((0, 3)), _NO_EDGES)
     )
+    for k, places in enumerate(finer):  # balls on long edges leave no room for points
+        curve = curve.split_near(places, spacing * 0.5**k)
     margin = 0.5 * spacing if walls is None else 0.0
     root = box_cells(box[0] - margin, box[1] + margin, spacing, exact=walls is not None)
     report(f"cells of {spacing:.3g}")

@@ -30,6 +30,24 @@ _CORNERS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
 
 
 @dataclass(frozen=True)
+class Places:
+    """Balls about points (n, 3) in which cells are split once more. radius: of all."""
+
+    points: FloatArray
+    radius: float
+
+    def meet(self, centres: FloatArray, radii: FloatArray | float) -> BoolArray:
+        """(k,) whether balls about points (k, 3) meet one of these."""
+        if not len(centres):
+            return np.zeros(0, np.bool_)
+        import scipy.spatial  # here: half a second that few need
+
+        searching: Any = scipy.spatial
+        apart: FloatArray = searching.cKDTree(self.points).query(centres)[0]
+        return apart < self.radius + radii
+
+
+@dataclass(frozen=True)
 class Boundary:
     """The curve that a level set ends on.
 
@@ -67,6 +85,17 @@ class Boundary:
         halves = np.concatenate([np.stack([a, middle], axis=1), np.stack([middle, b], axis=1)])
         return Boundary(points, np.concatenate([self.edges[~which], halves]))
 
+    def split_near(self, places: Places, longest: float) -> Boundary:
+        """With edges in some places cut until they are no longer than that."""
+        curve = self
+        while True:
+            ends = curve.points[curve.edges]
+            half = 0.5 * np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+            which = (2 * half > longest) & places.meet(ends.mean(axis=1), half)
+            if not which.any():
+                return curve
+            curve = curve.split(which)
+
 
 @dataclass(frozen=True)
 class PointSet:
@@ -76,24 +105,6 @@ class PointSet:
     points: FloatArray
     is_on: BoolArray
     samples: Samples
-
-
-@dataclass(frozen=True)
-class Places:
-    """Balls about points (n, 3) in which cells are split once more. radius: of all."""
-
-    points: FloatArray
-    radius: float
-
-    def meet(self, cells: Cells) -> BoolArray:
-        """(n,) whether cells come near one of the balls: their own balls meet it."""
-        if not len(cells.corners):
-            return np.zeros(0, np.bool_)
-        import scipy.spatial  # here: half a second that few need
-
-        searching: Any = scipy.spatial
-        apart: FloatArray = searching.cKDTree(self.points).query(cells.centres)[0]
-        return apart < self.radius + cells.half_diagonal
 
 
 def box_cells(
@@ -166,7 +177,7 @@ def _finer_cells(
     for places in finer:
         split: list[Cells] = []
         for cells in pool:
-            halves = cells.some(places.meet(cells)).split()
+            halves = cells.some(places.meet(cells.centres, cells.half_diagonal)).split()
             split.append(halves.some(~halves.proved_empty(function.clearance)))
         pool += split
     found = [cells for cells in pool[1:] if len(cells.corners)]
