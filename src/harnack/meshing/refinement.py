@@ -11,6 +11,7 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
 from harnack.meshing.checks import boundary_edges, directed_edges
+from harnack.meshing.collapses import without_slivers
 from harnack.meshing.flips import flipped
 from harnack.meshing.points import newton
 from harnack.meshing.samples import LevelFunction
@@ -104,11 +105,14 @@ def improved(
     walls: Walls,
     report: Callable[[str], None],
 ) -> tuple[FloatArray, IntArray]:
-    """Better angles: edges are flipped and vertices smoothed in turn; then edges are cut again where
-    that has moved the surface's bulges beyond `tolerance`."""
+    """Better angles: edges are flipped and vertices smoothed in turn, slivers are contracted; then
+    edges are cut again where triangles are no longer within `tolerance`."""
     for _ in range(2):
         faces = flipped(function, vertices, faces, tolerance)
         vertices = smoothed(function, vertices, faces, walls, rounds=2)
+    fixed = np.zeros(len(vertices), np.bool_)
+    fixed[boundary_edges(faces)] = True
+    faces = without_slivers(function, vertices, faces, fixed, 2 * tolerance)
     vertices, faces = refined(function, vertices, faces, tolerance, walls, report)
     return vertices, flipped(function, vertices, faces, tolerance)
 
