@@ -3,19 +3,29 @@
 Let f be the function less its level, F its interpolation at the corners of the tetrahedra, linear
 on each, whose zero set are the triangles of `marching`, and H_t = (1-t) F + t f, 0 <= t <= 1.
 
-Theorem. If each tetrahedron T satisfies (a) or (b), the zero sets of f and F are isotopic:
+Theorem. If each tetrahedron T satisfies (a), (b) or (c), the zero sets of f and F are isotopic:
 (a) neither f nor F has a zero in T, and both have the same sign there;
-(b) grad f(x) . grad F|T > 0 for all x in T.
+(b) grad f(x) . grad F|T > 0 for all x in T;
+(c) each corner v of T has a vector n with n . grad F|S > 0 and n . grad f(x) > 0 for all x in S, for
+    all S around v that do not satisfy (a).
 
-Proof. Let H_t(x) = 0 for some t. By (a), x is in tetrahedra of kind (b) alone. Put n = grad f(x),
-which is not 0. H_t is Lipschitz, and Clarke's generalised gradient of it at x is the convex hull of
-(1-t) grad F|T + t n over all T that hold x; each of these has a positive product with n. So 0 is not
-in it: by Clarke's implicit function theorem the zero set of H in (x, t) is near there the graph of
-a Lipschitz function over n's orthogonal plane and t. Vector fields n/(n.n), patched by a partition
-of unity, still have positive products with all these gradients, and following them as t goes from
-0 to 1 moves the zero set of F onto that of f (Thom's argument, for Lipschitz functions). On a wall
-of the box, where the surface ends, x moves within the wall: there (b) is asked of the gradients'
-projections onto it, for each face, edge or corner of a tetrahedron that lies in walls.
+Proof. Let H_t(x) = 0 for some t. By (a), x is in tetrahedra of kinds (b) and (c) alone. Some n has
+n . grad f(x) > 0 and n . grad F|T > 0 for all T that hold x: if all are of kind (b), n = grad f(x);
+else x lies in a simplex of one of kind (c), all corners of which have such an n, and all T that hold
+x are around each of them. H_t is Lipschitz, and Clarke's generalised gradient of it at x is the
+convex hull of (1-t) grad F|T + t grad f(x) over these T: it does not hold 0. By Clarke's implicit
+function theorem the zero set of H in (x, t) is near there the graph of a Lipschitz function over
+n's orthogonal plane and t. The fields n/(n . n), patched by a partition of unity, still have positive
+products with all these gradients, and following them as t goes from 0 to 1 moves the zero set of F
+onto that of f (Thom's argument, for Lipschitz functions). On a wall of the box, where the surface
+ends, x moves within the wall: there (b) is asked of the gradients' projections onto it, for each
+face, edge or corner of a tetrahedron that lies in walls.
+
+Four corners on the level. F is 0 on such a T, and `marching` gives all of it to one side. If two of
+its faces are in the mesh, put F = +-epsilon at the middle of the edge that the other two share: T
+becomes two tetrahedra, on each of which grad F is a normal of one of those faces, F elsewhere
+changes by no more than epsilon, which (b) and (c) bear as they are strict, and the zero set is the
+mesh. So (b) and (c) are asked of both normals. Other such T are not proved.
 
 An angle. Where f's lift stays within half a period of the level on T, which is a part of the check
 of (b), the wrapped values at the corners are that lift's, and all is as for a number.
@@ -45,7 +55,9 @@ from harnack.meshing.tetrahedra import IntArray, Tetrahedra
 __all__ = ["Isotopy", "isotopy_of"]
 
 Walls = tuple[FloatArray, FloatArray] | None
-_HALVINGS = 6
+_HALVINGS = 3
+_TRIALS = 20
+_UNKNOWN = 1e200
 # What is far from the curve is farther than this many cells.
 _FAR = 1.5
 
@@ -57,11 +69,13 @@ class Isotopy:
     proved: of all, those where (b) is proved. proved_far: of those farther than 1.5 cells from the
         curve. If `proved` is 1, mesh and level set are isotopic.
     count: how many there are.
+    open_far: (k, 4) corners of those farther than 1.5 cells from the curve where it is not.
     """
 
     proved: float
     proved_far: float
     count: int
+    open_far: IntArray
 
 
 def isotopy_of(
@@ -69,31 +83,43 @@ def isotopy_of(
     points: PointSet,
     tets: Tetrahedra,
     is_cut: BoolArray,
+    faces: IntArray,
     boundary: Boundary,
     spacing: float,
     walls: Walls,
 ) -> Isotopy:
     """What is proved about the mesh of these tetrahedra.
 
-    is_cut: (m,) whether a tetrahedron holds a point of the mesh.
+    is_cut: (m,) whether a tetrahedron holds a point of the mesh. faces: of the mesh (k, 3); corners
+        that are points come first.
     """
     corners = points.points[tets.corners]
-    centre, radius = _balls(corners)
-    open_ = np.flatnonzero(is_cut | (function.clearance(centre) <= radius * (1 + 1e-9)))
-    corners, centre = corners[open_], centre[open_]
-    values = points.samples.value[tets.corners[open_]]
-    values[points.is_on[tets.corners[open_]]] = 0.0
-    slope, is_sound = _slopes(corners, values)
-    beside = (tets.corners[open_] < len(boundary.points)).any(axis=1)
-    proved = is_sound & ~beside
-    rows = np.flatnonzero(proved)
-    proved[rows] = _regular(function, corners[rows], values[rows, 0], slope[rows], np.ones(3))
+    rest = np.flatnonzero(~is_cut)
+    holds = is_cut.copy()
+    holds[rest[~_free(function, corners[rest])]] = True
+    index, corners = tets.corners[holds], corners[holds]
+    values = points.samples.value[index]
+    values[points.is_on[index]] = 0.0
+    slopes = _slopes_on(function, corners, index, values, faces)
+    beside = (index < len(boundary.points)).any(axis=1)
+    proved = np.bincount(slopes.owner, minlength=len(index)) > 0
+    proved &= ~beside
+    rows = np.flatnonzero(proved[slopes.owner])
+    good = _regular(
+        function, corners[slopes.owner[rows]], values[slopes.owner[rows], 0],
+        slopes.slope[rows], np.ones(3),
+    )  # fmt: skip
+    proved[slopes.owner[rows[~good]]] = False
+    on_walls = np.ones(len(index), np.bool_)
     if walls is not None:
-        proved &= _regular_on_walls(function, corners, values, slope, proved, walls)
-    far = np.ones(len(open_), np.bool_)
+        on_walls = _regular_on_walls(function, corners, values, slopes, proved, walls)
+    far = np.ones(len(index), np.bool_)
     if len(boundary.edges):
-        far = _distances(centre, boundary) > _FAR * spacing
-    return Isotopy(_share(proved), _share(proved[far]), len(open_))
+        far = _distances(corners.mean(axis=1), boundary) > _FAR * spacing
+    stars = ~proved & ~beside & far
+    proved[stars] = _proved_by_stars(function, corners, index, slopes, np.flatnonzero(stars))
+    proved &= on_walls
+    return Isotopy(_share(proved), _share(proved[far]), len(index), index[far & ~proved])
 
 
 def _share(proved: BoolArray) -> float:
@@ -106,17 +132,107 @@ def _balls(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
     return centre, np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)
 
 
-def _slopes(corners: FloatArray, values: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Gradients (n, 3) of the linear functions on tetrahedra, and whether these are not flat and
-    the gradients not 0."""
+@dataclass(frozen=True)
+class _Slopes:
+    """Gradients of F, slope (k, 3), on the tetrahedra owner (k,): one each, or two, or none."""
+
+    owner: IntArray
+    slope: FloatArray
+
+
+def _slopes_on(
+    function: LevelFunction,
+    corners: FloatArray,
+    index: IntArray,
+    values: FloatArray,
+    faces: IntArray,
+) -> _Slopes:
+    """The gradients on tetrahedra with those corners (m, 4, 3), points (m, 4) and values (m, 4);
+    none for flat ones, two for those with four corners on the level and two faces in the mesh."""
     sides = corners[:, 1:] - corners[:, :1]
-    volume = np.linalg.det(sides)
     size = np.linalg.norm(sides, axis=2).max(axis=1)
-    sound = np.abs(volume) > 1e-9 * size**3
-    slope = np.zeros((len(corners), 3))
-    rise = values[sound, 1:] - values[sound, :1]
-    slope[sound] = np.linalg.solve(sides[sound], rise[..., None])[..., 0]
-    return slope, sound & (np.abs(slope).max(axis=1) > 0)
+    sound = np.abs(np.linalg.det(sides)) > 1e-9 * size**3
+    flat = (values == 0).all(axis=1)
+    rows = np.flatnonzero(sound & ~flat)
+    rise = values[rows, 1:] - values[rows, :1]
+    slope = np.linalg.solve(sides[rows], rise[..., None])[..., 0]
+    owners, slopes = [rows], [slope]
+    rows = np.flatnonzero(sound & flat)
+    count = int(index.max(initial=0)) + 1
+    known = _triple_keys(faces[(faces < count).all(axis=1)], count)
+    others = np.array([np.delete(np.arange(4), k) for k in range(4)])
+    there = np.stack(
+        [np.isin(_triple_keys(index[rows][:, some], count), known) for some in others], axis=1
+    )
+    sign = np.sign(function.values(corners[rows].mean(axis=1)))
+    pair = there.sum(axis=1) == 2
+    for k, some in enumerate(others):
+        chosen = np.flatnonzero(pair & there[:, k])
+        a, b, c = (corners[rows[chosen], one] for one in some)
+        normal = np.cross(b - a, c - a)
+        inward = ((corners[rows[chosen], k] - a) * normal).sum(axis=1)
+        owners.append(rows[chosen])
+        slopes.append(normal * (np.sign(inward) * sign[chosen])[:, None])
+    return _Slopes(np.concatenate(owners), np.concatenate(slopes))
+
+
+def _triple_keys(triples: IntArray, count: int) -> IntArray:
+    """One number for each triple (k, 3) of fewer than two million points, whatever its order."""
+    a, b, c = np.sort(triples, axis=1).T
+    keys: IntArray = (a * count + b) * count + c
+    return keys
+
+
+def _proved_by_stars(
+    function: LevelFunction, corners: FloatArray, index: IntArray, slopes: _Slopes, rows: IntArray
+) -> BoolArray:
+    """(k,) whether (c) is proved for tetrahedra `rows` (k,).
+
+    n is found as a perceptron does: beginning with the sum of all unit gradients of F around a
+    corner, those with which the product is not positive are added again, a few times.
+    """
+    wanted = np.unique(index[rows])
+    place = np.full(int(index.max(initial=0)) + 1, -1, np.int64)
+    place[wanted] = np.arange(len(wanted))
+    # Pairs of a corner and a tetrahedron around it; then of a corner and a gradient there.
+    tet, corner = np.nonzero(place[index] >= 0)
+    star = place[index[tet, corner]]
+    entry, column = np.nonzero(place[index[slopes.owner]] >= 0)
+    vertex = place[index[slopes.owner[entry], column]]
+    unit = slopes.slope[entry]
+    unit = unit / np.maximum(np.linalg.norm(unit, axis=1), 1e-300)[:, None]
+    n = np.zeros((len(wanted), 3))
+    np.add.at(n, vertex, unit)
+    for _ in range(_TRIALS):
+        short = (n[vertex] * unit).sum(axis=1) <= 0
+        if not short.any():
+            break
+        np.add.at(n, vertex[short], unit[short])
+    good = np.ones(len(wanted), np.bool_)
+    good[vertex[(n[vertex] * unit).sum(axis=1) <= 1e-9]] = False
+    has_slope = np.bincount(slopes.owner, minlength=len(index)) > 0
+    good[star[~has_slope[tet]]] = False
+    tried = np.flatnonzero(good[star])
+    start = np.zeros(len(tried))
+    fine = _regular(function, corners[tet[tried]], start, n[star[tried]], np.ones(3))
+    good[star[tried[~fine]]] = False
+    return good[place[index[rows]]].all(axis=1)
+
+
+def _free(function: LevelFunction, corners: FloatArray) -> BoolArray:
+    """(n,) whether f is proved to have no zero in tetrahedra (n, 4, 3), by halving them. As F has
+    none and f crosses no level on their edges, net, both are between the same two levels: (a)."""
+    owner, pieces = np.arange(len(corners)), corners
+    for _ in range(_HALVINGS + 1):
+        centre, radius = _balls(pieces)
+        bad = function.clearance(centre) <= radius * (1 + 1e-9)
+        if not bad.any():
+            return np.ones(len(corners), np.bool_)
+        last = owner[bad]
+        owner, pieces = np.concatenate([last, last]), _halved(pieces[bad])
+    free = np.ones(len(corners), np.bool_)
+    free[last] = False
+    return free
 
 
 def _regular(
@@ -140,6 +256,7 @@ def _regular(
         centre, radius = _balls(pieces)
         radius = radius * (1 + 1e-9)
         samples, change = function.slopes(centre, radius)
+        change = np.minimum(change, _UNKNOWN)
         along = slope[owner] * free
         steep = np.linalg.norm(samples.gradient, axis=1)
         moved = (steep + change) * radius
@@ -176,14 +293,15 @@ def _regular_on_walls(
     function: LevelFunction,
     corners: FloatArray,
     values: FloatArray,
-    slope: FloatArray,
+    slopes: _Slopes,
     rows: BoolArray,
     walls: tuple[FloatArray, FloatArray],
 ) -> BoolArray:
-    """(n,) whether (b) is proved for projections, on what of each tetrahedron lies in walls."""
+    """(n,) whether (b) is proved for projections, on what lies in walls of tetrahedra `rows` (n,);
+    True for others without a corner there."""
     slack = 1e-9 * (walls[1] - walls[0])
     on = np.stack([np.abs(corners - wall) <= slack for wall in walls], axis=-1)  # (n, 4, 3, 2)
-    proved = np.ones(len(corners), np.bool_)
+    proved = rows | ~on.any(axis=(1, 2, 3))
     planes = list(itertools.product(range(3), range(2)))
     for count in (1, 2):  # in corners of the box no point moves, and there is nothing to ask
         for some in itertools.combinations(planes, count):
@@ -195,13 +313,15 @@ def _regular_on_walls(
             free[axes] = 0.0
             number = inside.sum(axis=1)
             for k in range(1, 4):
-                chosen = np.flatnonzero((number == k) & rows)
-                if not len(chosen):
+                entry = np.flatnonzero(((number == k) & rows)[slopes.owner])
+                if not len(entry):
                     continue
-                which = np.argsort(~inside[chosen], axis=1, kind="stable")[:, :k]
-                part = np.take_along_axis(corners[chosen], which[..., None], axis=1)
-                start = np.take_along_axis(values[chosen], which[:, :1], axis=1)[:, 0]
-                proved[chosen] &= _regular(function, part, start, slope[chosen], free)
+                owner = slopes.owner[entry]
+                which = np.argsort(~inside[owner], axis=1, kind="stable")[:, :k]
+                part = np.take_along_axis(corners[owner], which[..., None], axis=1)
+                start = np.take_along_axis(values[owner], which[:, :1], axis=1)[:, 0]
+                good = _regular(function, part, start, slopes.slope[entry], free)
+                proved[owner[~good]] = False
     return proved
 
 
@@ -216,5 +336,3 @@ def _distances(points: FloatArray, boundary: Boundary) -> FloatArray:
     found: FloatArray = tree.query(points)[0]
     return found
 
-
-_ = IntArray

@@ -19,7 +19,8 @@ from harnack.meshing.checks import (
     euler_characteristic,
 )
 from harnack.meshing.intersections import intersecting_faces, turned_faces
-from harnack.meshing.marching import crossings_of, triangles_of
+from harnack.meshing.isotopy import Isotopy, isotopy_of
+from harnack.meshing.marching import Crossings, crossings_of, is_cut, triangles_of
 from harnack.meshing.points import Boundary, Places, PointSet, box_cells, place_points
 from harnack.meshing.refinement import improved, refined, smoothed
 from harnack.meshing.rims import whole_edges
@@ -44,6 +45,9 @@ _MOST_ATTEMPTS = 4
 _LONGEST = 2.5
 # How often edges of a curve that are too near to others are halved.
 _MOST_CUTS = 4
+# How often points of flat tetrahedra, which spoil the proof of isotopy, are taken out.
+_MOST_REMOVALS = 3
+_FEW = 200
 
 
 def mesh(
@@ -74,10 +78,15 @@ def mesh(
     progress: told what is being done.
 
     Returns:
-        A trimesh.Trimesh. `metadata["harnack"]` has level, spacing, evaluations, the Euler
-        characteristic, how many changes along edges were proved, how many integrated, and
-        boundary: indices (k, 2) of edges of one face. Vertices of a curve come first, in order;
-        its edges are edges of the mesh, but that those much longer than cells are cut.
+        A trimesh.Trimesh. Vertices of a curve come first, in order, bit by bit, and its edges are
+        the rim. `metadata["harnack"]` has level, spacing, evaluations, the Euler characteristic,
+        boundary: indices (k, 2) of edges of one face, and
+        proved, integrated: how many changes along edges of tetrahedra are proved to be differences
+            of wrapped values, and how many were integrated;
+        isotopy, isotopy_far: the shares of tetrahedra on which the first triangles are proved to
+            have the topology of the level set (`meshing.isotopy`), of all and of those farther than
+            1.5 times the spacing from the curve;
+        turned: triangles, smaller than the tolerance, that are turned over.
 
     Raises:
         MeshingError: a ValueError, if it could not be done; the message says why.
@@ -114,8 +123,10 @@ def mesh(
         "spacing": first.spacing,
         "evaluations": function.evaluations,
         "euler_characteristic": euler_characteristic(faces),
-        "proved": first.proved,
-        "integrated": first.integrated,
+        "proved": first.crossings.proved,
+        "integrated": first.crossings.integrated,
+        "isotopy": first.isotopy.proved,
+        "isotopy_far": first.isotopy.proved_far,
         "turned": first.turned,
         "boundary": boundary_edges(faces),
     }
@@ -171,14 +182,14 @@ def _box(
 
 @dataclass(frozen=True)
 class _Surface:
-    """Triangles. proved, integrated: as of `Crossings`. turned: faces turned over."""
+    """Triangles, and how they were found. turned: faces turned over."""
 
     vertices: FloatArray
     faces: IntArray
     curve: Boundary
     spacing: float
-    proved: int
-    integrated: int
+    crossings: Crossings
+    isotopy: Isotopy
     turned: int = 0
 
 
@@ -247,20 +258,62 @@ def _first_mesh(
     try:
         curve, points, tets = _filled(function, root, curve, walls, seed, finer)
         report(f"{len(points.points):,} points, {len(tets.corners):,} tetrahedra")
-        crossings = crossings_of(function, points, tets)
-        vertices, faces = triangles_of(function, points, tets, crossings)
-        if not len(faces):
-            raise MeshingError("the level set is empty: no cell of the box holds the level")
-        check_manifold(faces)
-        if loops:
-            _check_boundary(faces, curve)
+        surface = _in_tetrahedra(function, points, tets, curve, spacing, walls)
+        for _ in range(_MOST_REMOVALS):
+            # Beside a curve all is never proved, and little is gained.
+            if len(curve.edges) or not 0 < len(surface.isotopy.open_far) < _FEW:
+                break
+            points = _without_slivers(points, surface.isotopy.open_far, walls)
+            try:
+                tets = delaunay(points.points)
+                other = _in_tetrahedra(function, points, tets, curve, spacing, walls)
+            except MeshingError:  # of fewer points; the first surface passed all checks
+                break
+            if len(other.isotopy.open_far) < len(surface.isotopy.open_far):
+                surface = other
     except MeshingError:
         if attempts == 1:
             raise
         return _first_mesh(
             function, 0.6 * spacing, attempts - 1, box, walls, seed, finer, report
         )
-    return _Surface(vertices, faces, curve, spacing, crossings.proved, crossings.integrated)
+    return surface
+
+
+def _in_tetrahedra(
+    function: LevelFunction,
+    points: PointSet,
+    tets: Tetrahedra,
+    curve: Boundary,
+    spacing: float,
+    walls: tuple[FloatArray, FloatArray] | None,
+) -> _Surface:
+    """Triangles in tetrahedra, checked, and what is proved about them."""
+    crossings = crossings_of(function, points, tets)
+    vertices, faces = triangles_of(function, points, tets, crossings)
+    if not len(faces):
+        raise MeshingError("the level set is empty: no cell of the box holds the level")
+    check_manifold(faces)
+    if len(curve.edges):
+        _check_boundary(faces, curve)
+    cut = is_cut(points, tets, crossings)
+    isotopy = isotopy_of(function, points, tets, cut, faces, curve, spacing, walls)
+    return _Surface(vertices, faces, curve, spacing, crossings, isotopy)
+
+
+def _without_slivers(
+    points: PointSet,
+    corners: IntArray,
+    walls: tuple[FloatArray, FloatArray] | None,
+) -> PointSet:
+    """Points but for one of each of some tetrahedra with corners (k, 4), which is on no wall."""
+    count = np.bincount(corners.ravel(), minlength=len(points.points))
+    if walls is not None:
+        x = points.points
+        count[((x <= walls[0]) | (x >= walls[1])).any(axis=1)] = 0
+    often = count[corners]
+    worst = corners[np.arange(len(corners)), often.argmax(axis=1)]
+    return points.without(np.unique(worst[often.max(axis=1) > 0]))
 
 
 def _filled(

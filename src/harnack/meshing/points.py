@@ -106,6 +106,11 @@ class PointSet:
     is_on: BoolArray
     samples: Samples
 
+    def without(self, rows: IntArray) -> PointSet:
+        """All points but those."""
+        kept = np.delete(np.arange(len(self.points)), rows)
+        return PointSet(self.points[kept], self.is_on[kept], self.samples.some(kept))
+
 
 def box_cells(
     lower: FloatArray, upper: FloatArray, spacing: float, exact: bool
