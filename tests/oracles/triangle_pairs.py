@@ -57,11 +57,10 @@ def _separated(a: FloatArray, b: FloatArray) -> npt.NDArray[np.bool_]:
             np.einsum("nij,nj->ni", t - a[:, :1], axis) for t in (a, b)
         )
         slack = _SLACK * size * np.linalg.norm(axis, axis=1)
-        overlap = np.minimum(heights_a.max(axis=1), heights_b.max(axis=1)) - np.maximum(
-            heights_a.min(axis=1), heights_b.min(axis=1)
-        )
+        a_below = heights_a.max(axis=1) <= heights_b.min(axis=1) + slack
+        b_below = heights_b.max(axis=1) <= heights_a.min(axis=1) + slack
         extent = np.maximum(np.ptp(heights_a, axis=1), np.ptp(heights_b, axis=1))
-        separated |= (overlap <= slack) & (extent > 10 * slack)
+        separated |= (a_below | b_below) & (extent > 10 * slack)
     return separated
 
 

@@ -257,6 +257,9 @@ def _regular(
         radius = radius * (1 + 1e-9)
         samples, change = function.slopes(centre, radius)
         change = np.minimum(change, _UNKNOWN)
+        if (change == _UNKNOWN).all():
+            proved[owner] = False
+            break
         along = slope[owner] * free
         steep = np.linalg.norm(samples.gradient, axis=1)
         moved = (steep + change) * radius

@@ -170,6 +170,11 @@ def _box(
             f"{type(field).__name__} ends at its domain, which is no box: give "
             "clip=harnack.Box(lower, upper)"
         )
+    if isinstance(field, SolidAngle) and abs(math.remainder(level, 4 * math.pi)) < 1e-6:
+        raise MeshingError(
+            f"level {level:g} is a multiple of 4 pi: the surface of a curve has no end there; choose "
+            "a level between them, such as 2 pi"
+        )
     extent = field.extent((level,))
     if extent is None:
         raise MeshingError(
@@ -206,6 +211,8 @@ def _embedded(
     """Triangles within the tolerance, none of which pass through others; where some do, or are
     turned over, cells are made smaller and all is done again."""
     finer: tuple[Places, ...] = ()
+    best: _Surface | None = None
+    crossing = np.zeros(0, np.int64)
     for attempt in range(_MOST_ATTEMPTS):
         first = _first_mesh(function, spacing, attempts, box, walls, seed, finer, report)
         spacing = first.spacing
@@ -213,6 +220,7 @@ def _embedded(
         vertices = smoothed(function, first.vertices, faces, walls)
         vertices, faces = refined(function, vertices, faces, tolerance, walls, report)
         vertices, faces = improved(function, vertices, faces, tolerance, walls, report)
+        turned = turned_faces(function, vertices, faces)
         if isinstance(function.field, SolidAngle):
             kept = sum(map(len, net_loops(function.field.loops)))
             vertices, faces = whole_edges(
@@ -220,19 +228,22 @@ def _embedded(
             )
         check_manifold(faces)
         crossing = intersecting_faces(vertices, faces)
-        turned = turned_faces(function, vertices, faces)
+        if not len(crossing) and (best is None or len(turned) < best.turned):
+            best = dataclasses.replace(
+                first, vertices=vertices, faces=faces, turned=len(turned)
+            )
         bad = np.union1d(crossing, turned)
         if not len(bad):
             break
         if attempt < _MOST_ATTEMPTS - 1:
             report(f"{len(bad)} triangles fail: smaller cells there")
             finer = (*finer, Places(vertices[faces[bad]].mean(axis=1), spacing))
-    if len(crossing):
+    if best is None:
         raise MeshingError(
             f"{len(crossing)} triangles pass through others, in cells as small as "
             f"{spacing / 2 ** len(finer):.3g}: choose a smaller `tolerance` or `spacing`"
         )
-    return dataclasses.replace(first, vertices=vertices, faces=faces, turned=len(turned))
+    return best
 
 
 def _first_mesh(

@@ -133,6 +133,7 @@ def smoothed(
     free[rim] = False
     count = np.maximum(np.bincount(ends.ravel(), minlength=len(vertices)), 1)
     rows = np.flatnonzero(free)
+    size = float(np.ptp(vertices[free], axis=0).max(initial=0.0)) if len(rows) else 0.0
     for _ in range(rounds):
         sums = np.zeros_like(vertices)
         for one, other in ((0, 1), (1, 0)):
@@ -147,7 +148,7 @@ def smoothed(
         there = vertices.copy()
         there[rows] = newton(function, aim[rows], start, 2 * span, walls)
         after = function.at(there[rows])
-        worse = after.distance > 1e-7 * (1 + np.linalg.norm(there[rows], axis=1))
+        worse = after.distance > 1e-7 * size + 1e-12 * np.linalg.norm(there[rows], axis=1)
         there[rows[worse]] = vertices[rows[worse]]
         vertices = _unfolded(vertices, there, faces)
     return vertices

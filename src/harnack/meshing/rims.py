@@ -51,9 +51,10 @@ def whole_edges(
     inner = np.array([place for chain in chains for place in chain[1:-1]], np.int64)
     if not len(inner):
         return vertices, faces
-    ends = np.array([(one[0], one[-1]) for one in chains for _ in one[1:-1]], np.int64)
+    owner = np.repeat(np.arange(len(chains)), [len(one) - 2 for one in chains])
+    ends = np.array([(one[0], one[-1]) for one in chains], np.int64)
     vertices = vertices.copy()
-    vertices[inner] = _moved_in(function, vertices, faces, inner, ends, height)
+    vertices[inner] = _moved_in(function, vertices, faces, inner, owner, ends, height)
     gaps = [face for chain in chains for face in _filling(chain)]
     return vertices, np.concatenate([faces, np.array(gaps, np.int64)])
 
@@ -63,16 +64,17 @@ def _moved_in(
     vertices: FloatArray,
     faces: IntArray,
     inner: IntArray,
+    owner: IntArray,
     ends: IntArray,
     height: float,
 ) -> FloatArray:
-    """Points (k, 3) `inner` of edges with these ends (k, 2), off them and on the surface; those in
-    the middle of an edge farthest, so that the chain bulges."""
-    a, along = vertices[ends[:, 0]], vertices[ends[:, 1]] - vertices[ends[:, 0]]
+    """Points (k, 3) `inner` of the edges owner (k,) with these ends (m, 2), off them and on the
+    surface. The heights over an edge are one parabola, so that its filling lies below the chain."""
     here = vertices[inner]
+    a, along = vertices[ends[:, 0]], vertices[ends[:, 1]] - vertices[ends[:, 0]]
     length = np.linalg.norm(along, axis=1)
-    along = along / length[:, None]
-    share = ((here - a) * along).sum(axis=1) / length
+    along, a = (along / length[:, None])[owner], a[owner]
+    share = ((here - a) * along).sum(axis=1) / length[owner]
     inward, shortest = np.zeros_like(vertices), np.full(len(vertices), np.inf)
     for k in range(3):
         place, one, other = (faces[:, (k + j) % 3] for j in range(3))
@@ -80,17 +82,22 @@ def _moved_in(
         for end in (one, other):
             span = np.linalg.norm(vertices[end] - vertices[place], axis=1)
             np.minimum.at(shortest, place, span)
-    way = inward[inner] - (inward[inner] * along).sum(axis=1)[:, None] * along
-    way /= np.maximum(np.linalg.norm(way, axis=1), 1e-300)[:, None]
-    far = 4 * share * (1 - share) * np.minimum(height, _SHALLOW * shortest[inner])
+    most = np.full(len(ends), height)
+    np.minimum.at(most, owner, _SHALLOW * shortest[inner])
+    far = 4 * share * (1 - share) * most[owner]
+    way = _across(inward[inner], along)
     start = here + far[:, None] * way
-    there = newton(function, start, function.at(start), 0.2 * far, None)
-    off = there - here
-    off -= (off * along).sum(axis=1)[:, None] * along
-    # Newton's steps may have led along the edge, or across it: then the first guess stays.
-    apart = (off * way).sum(axis=1)
-    good = (apart > 0.3 * far) & (np.linalg.norm(off, axis=1) < 2 * far)
-    return np.where(good[:, None], there, start)
+    there = newton(function, start, function.at(start), 0.3 * far, None)
+    # Along the edge, and away from it, points stay where they are: about it they are turned.
+    turned = _across(there - here, along)
+    good = (turned * way).sum(axis=1) > 0.3
+    return here + far[:, None] * np.where(good[:, None], turned, way)
+
+
+def _across(vectors: FloatArray, along: FloatArray) -> FloatArray:
+    """The unit vectors (k, 3) of parts of vectors at right angles to unit vectors."""
+    part = vectors - (vectors * along).sum(axis=1)[:, None] * along
+    return part / np.maximum(np.linalg.norm(part, axis=1), 1e-300)[:, None]
 
 
 def _filling(chain: list[int]) -> list[tuple[int, int, int]]:
