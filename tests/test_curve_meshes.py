@@ -31,7 +31,7 @@ CURVES: dict[str, tuple[Any, int]] = {
     "figure-eight": (shapes.figure_eight_knot(160), -5),
     "coil": (shapes.coil(4, 128), 1),
 }
-QUICK = ("wavy", "Hopf link", "three holes")
+QUICK = ("Hopf link", "three holes")
 
 
 def named(quick: tuple[str, ...]) -> list[Any]:
@@ -181,13 +181,8 @@ def squares_to_triangles(t: np.ndarray, p: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("spacing", [0.4, 0.25])
 def test_a_coil_in_cells_that_are_too_large_is_never_wrong(spacing: float) -> None:
-    loops = loops_of("coil")
-    try:
-        mesh = hk.mesh(hk.SolidAngle(loops), spacing=spacing, tolerance=0.02)
-    except hk.MeshingError as error:
-        assert "spacing" in str(error)
-    else:
-        check_surface(mesh, loops, 1)
+    with pytest.raises(hk.MeshingError, match="smaller `spacing`"):
+        hk.mesh(hk.SolidAngle(loops_of("coil")), spacing=spacing, tolerance=0.02)
 
 
 def test_long_edges_of_a_coil_need_to_be_integrated() -> None:
@@ -261,7 +256,7 @@ def test_random_curves(kind: str, seed: int) -> None:
     assert mesh.metadata["harnack"]["euler_characteristic"] % 2 == 1  # one rim
 
 
-@pytest.mark.parametrize("length", [1e-4, 1e-8])
+@pytest.mark.parametrize("length", [1e-4, pytest.param(1e-8, marks=pytest.mark.slow)])
 def test_a_tiny_edge_does_not_force_small_cells(length: float) -> None:
     plain = shapes.wavy_polygon(48)
     tiny = np.insert(plain, 1, plain[0] + length * (plain[1] - plain[0]) + [0, 0, length], axis=0)
@@ -271,9 +266,8 @@ def test_a_tiny_edge_does_not_force_small_cells(length: float) -> None:
     assert counts[1] < 1.3 * counts[0]
 
 
-@pytest.mark.parametrize(
-    ("scale", "offset"), [(1e-3, 0.0), (1e3, 0.0), (1.0, 1e3), (1.0, 1e6)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("scale", "offset"), [(1e-3, 0.0), (1e3, 0.0), (1.0, 1e3), (1.0, 1e6)])
 def test_curves_of_any_size_and_place(scale: float, offset: float) -> None:
     loop = shapes.wavy_polygon(48) * scale + offset
     mesh = hk.mesh(hk.SolidAngle(loop), tolerance=5e-3)
@@ -283,9 +277,9 @@ def test_curves_of_any_size_and_place(scale: float, offset: float) -> None:
 
 
 def test_touching_parts_of_a_curve() -> None:
-    """Two vertices of a figure eight 1e-8 apart."""
+    """Two vertices of a figure eight 1e-6 apart."""
     loop = np.array(
-        [[0, 0, 0], [1, 1, 0], [2, 0, 0], [1, -1, 0], [0, 0, 1e-8], [-1, 1, 0.2], [-2, 0, 0],
+        [[0, 0, 0], [1, 1, 0], [2, 0, 0], [1, -1, 0], [0, 0, 1e-6], [-1, 1, 0.2], [-2, 0, 0],
          [-1, -1, 0]], float,
     )  # fmt: skip
     check_surface(hk.mesh(hk.SolidAngle(loop), tolerance=4e-3), [loop], 1)

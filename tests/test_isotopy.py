@@ -119,14 +119,14 @@ def test_what_is_proved_holds_where_it_is_sampled() -> None:
 
 
 def test_four_corners_on_the_level() -> None:
-    """Corners of a cube on a sphere, in general position: Delaunay's tetrahedra of its faces are
-    flat, with all corners on the level."""
+    """Corners of a cube on a sphere, and no point within: all tetrahedra there have all corners on
+    the level, and the side of each is that of its centre."""
     rng, function = np.random.default_rng(0), LevelFunction(hk.Sphere(1.0), 0.0)
     signs = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
     on = signs + 1e-3 * rng.normal(size=signs.shape)
     on /= np.linalg.norm(on, axis=1)[:, None]
     axes = np.concatenate([np.eye(3), -np.eye(3)])
-    off = np.concatenate([np.zeros((1, 3)), 3 * axes, 2 * signs])
+    off = np.concatenate([3 * axes, 2 * signs])
     points = np.concatenate([on, off + 1e-3 * rng.normal(size=off.shape)])
     is_on = np.arange(len(points)) < len(on)
     given = PointSet(points, is_on, function.at(points))

@@ -14,9 +14,10 @@ from harnack.geometry import shapes
 from harnack.meshing import checks
 from harnack.meshing.points import Boundary
 
+
 def test_periodic_surfaces_end_at_the_faces_of_a_box() -> None:
     box = hk.Box((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
-    mesh = hk.mesh(hk.Gyroid(cell=1.0), 0.2, clip=box, tolerance=4e-3)
+    mesh = hk.mesh(hk.Gyroid(cell=1.0), 0.2, clip=box, tolerance=4e-3, spacing=0.09)
     rim = mesh.vertices[np.unique(mesh.metadata["harnack"]["boundary"])]
     assert (np.abs(np.abs(rim).max(axis=1) - 0.5) < 1e-12).all()
     assert np.abs(mesh.vertices).max() <= 0.5

@@ -1,8 +1,8 @@
-"""Triangles of a mesh that intersect, by separating axes; slow, and shares nothing with the package.
+"""Triangles of a mesh that intersect, by separating axes; slow, shares nothing with the package.
 
-Two triangles that do not intersect are separated by a plane at right angles to one of 17 directions:
-their normals, products of an edge of each, and, if they lie in one plane, normals of edges within
-it. If they touch in a common corner alone, the plane passes through that corner.
+Two triangles that do not intersect are separated by a plane at right angles to one of 17
+directions: their normals, products of an edge of each, and, if they lie in one plane, normals of
+edges within it. If they touch in a common corner alone, the plane passes through that corner.
 """
 
 from __future__ import annotations
@@ -20,9 +20,7 @@ _AT_ONCE = 256
 _SLACK = 1e-11
 
 
-def intersecting_pairs(
-    vertices: FloatArray, faces: npt.NDArray[np.int64]
-) -> npt.NDArray[np.int64]:
+def intersecting_pairs(vertices: FloatArray, faces: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     """Pairs (k, 2) of faces that meet in more than a common corner or edge."""
     corner = vertices[faces]
     lower, upper = corner.min(axis=1), corner.max(axis=1)
@@ -53,9 +51,7 @@ def _separated(a: FloatArray, b: FloatArray) -> npt.NDArray[np.bool_]:
     size = np.linalg.norm(np.concatenate([a, b], axis=1) - a[:, :1], axis=2).max(axis=1)
     separated = np.zeros(len(a), np.bool_)
     for axis in axes:
-        heights_a, heights_b = (
-            np.einsum("nij,nj->ni", t - a[:, :1], axis) for t in (a, b)
-        )
+        heights_a, heights_b = (np.einsum("nij,nj->ni", t - a[:, :1], axis) for t in (a, b))
         slack = _SLACK * size * np.linalg.norm(axis, axis=1)
         a_below = heights_a.max(axis=1) <= heights_b.min(axis=1) + slack
         b_below = heights_b.max(axis=1) <= heights_a.min(axis=1) + slack
@@ -64,9 +60,7 @@ def _separated(a: FloatArray, b: FloatArray) -> npt.NDArray[np.bool_]:
     return separated
 
 
-def _is_folded(
-    a: FloatArray, b: FloatArray, same: npt.NDArray[np.bool_]
-) -> npt.NDArray[np.bool_]:
+def _is_folded(a: FloatArray, b: FloatArray, same: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
     """Whether triangles with a common edge, of which `same` (n, 3) tells the ends, lie on each
     other."""
     n = np.arange(len(a))

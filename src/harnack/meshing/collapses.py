@@ -28,8 +28,8 @@ def without_slivers(
 
     An edge (u, v) can be contracted to u without a change of topology if u and v have just the two
     neighbours in common that are the third corners of its faces (the link condition), and v is not
-    `fixed` (n,), as vertices of the rim are. It is, if no new triangle is a sliver, all face the way
-    that the surface does, and their centres are within `tolerance` of it.
+    `fixed` (n,), as vertices of the rim are. It is, if no new triangle is a sliver, all face the
+    way that the surface does, and their centres are within `tolerance` of it.
     """
     slivers = np.flatnonzero(least_angles(vertices, faces) < _SLIVER)
     gone = np.zeros(len(faces), np.bool_)

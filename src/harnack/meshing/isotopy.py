@@ -6,20 +6,20 @@ on each, whose zero set are the triangles of `marching`, and H_t = (1-t) F + t f
 Theorem. If each tetrahedron T satisfies (a), (b) or (c), the zero sets of f and F are isotopic:
 (a) neither f nor F has a zero in T, and both have the same sign there;
 (b) grad f(x) . grad F|T > 0 for all x in T;
-(c) each corner v of T has a vector n with n . grad F|S > 0 and n . grad f(x) > 0 for all x in S, for
-    all S around v that do not satisfy (a).
+(c) each corner v of T has a vector n with n . grad F|S > 0 and n . grad f(x) > 0 for all x in S,
+    for all S around v that do not satisfy (a).
 
 Proof. Let H_t(x) = 0 for some t. By (a), x is in tetrahedra of kinds (b) and (c) alone. Some n has
 n . grad f(x) > 0 and n . grad F|T > 0 for all T that hold x: if all are of kind (b), n = grad f(x);
-else x lies in a simplex of one of kind (c), all corners of which have such an n, and all T that hold
-x are around each of them. H_t is Lipschitz, and Clarke's generalised gradient of it at x is the
-convex hull of (1-t) grad F|T + t grad f(x) over these T: it does not hold 0. By Clarke's implicit
-function theorem the zero set of H in (x, t) is near there the graph of a Lipschitz function over
-n's orthogonal plane and t. The fields n/(n . n), patched by a partition of unity, still have positive
-products with all these gradients, and following them as t goes from 0 to 1 moves the zero set of F
-onto that of f (Thom's argument, for Lipschitz functions). On a wall of the box, where the surface
-ends, x moves within the wall: there (b) is asked of the gradients' projections onto it, for each
-face, edge or corner of a tetrahedron that lies in walls.
+else x lies in a simplex of one of kind (c), all corners of which have such an n, and all T that
+hold x are around each of them. H_t is Lipschitz, and Clarke's generalised gradient of it at x is
+the convex hull of (1-t) grad F|T + t grad f(x) over these T: it does not hold 0. By Clarke's
+implicit function theorem the zero set of H in (x, t) is near there the graph of a Lipschitz
+function over n's orthogonal plane and t. The fields n/(n . n), patched by a partition of unity,
+still have positive products with all these gradients, and following them as t goes from 0 to 1
+moves the zero set of F onto that of f (Thom's argument, for Lipschitz functions). On a wall of the
+box, where the surface ends, x moves within the wall: there (b) is asked of the gradients'
+projections onto it, for each face, edge or corner of a tetrahedron that lies in walls.
 
 Four corners on the level. F is 0 on such a T, and `marching` gives all of it to one side. If two of
 its faces are in the mesh, put F = +-epsilon at the middle of the edge that the other two share: T
@@ -44,6 +44,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -155,7 +156,7 @@ def _slopes_on(
     flat = (values == 0).all(axis=1)
     rows = np.flatnonzero(sound & ~flat)
     rise = values[rows, 1:] - values[rows, :1]
-    slope = np.linalg.solve(sides[rows], rise[..., None])[..., 0]
+    slope: FloatArray = np.linalg.solve(sides[rows], rise[..., None])[..., 0].astype(np.float64)
     owners, slopes = [rows], [slope]
     rows = np.flatnonzero(sound & flat)
     count = int(index.max(initial=0)) + 1
@@ -216,7 +217,8 @@ def _proved_by_stars(
     start = np.zeros(len(tried))
     fine = _regular(function, corners[tet[tried]], start, n[star[tried]], np.ones(3))
     good[star[tried[~fine]]] = False
-    return good[place[index[rows]]].all(axis=1)
+    proved: BoolArray = good[place[index[rows]]].all(axis=1)
+    return proved
 
 
 def _free(function: LevelFunction, corners: FloatArray) -> BoolArray:
@@ -226,12 +228,12 @@ def _free(function: LevelFunction, corners: FloatArray) -> BoolArray:
     for _ in range(_HALVINGS + 1):
         centre, radius = _balls(pieces)
         bad = function.clearance(centre) <= radius * (1 + 1e-9)
-        if not bad.any():
-            return np.ones(len(corners), np.bool_)
-        last = owner[bad]
-        owner, pieces = np.concatenate([last, last]), _halved(pieces[bad])
+        owner = np.concatenate([owner[bad], owner[bad]])
+        pieces = _halved(pieces[bad])
+        if not len(pieces):
+            break
     free = np.ones(len(corners), np.bool_)
-    free[last] = False
+    free[owner] = False
     return free
 
 
@@ -332,10 +334,9 @@ def _distances(points: FloatArray, boundary: Boundary) -> FloatArray:
     """(n,) from points to the curve, at most by half its longest edge too large."""
     import scipy.spatial  # here: half a second that few need
 
+    searching: Any = scipy.spatial
     a, b = (boundary.points[boundary.edges[:, k]] for k in (0, 1))
     share = np.linspace(0, 1, 9)[:, None, None]
     on: FloatArray = (a + share * (b - a)).reshape(-1, 3)
-    tree = scipy.spatial.cKDTree(on)
-    found: FloatArray = tree.query(points)[0]
+    found: FloatArray = searching.cKDTree(on).query(points)[0]
     return found
-

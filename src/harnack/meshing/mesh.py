@@ -172,8 +172,8 @@ def _box(
         )
     if isinstance(field, SolidAngle) and abs(math.remainder(level, 4 * math.pi)) < 1e-6:
         raise MeshingError(
-            f"level {level:g} is a multiple of 4 pi: the surface of a curve has no end there; choose "
-            "a level between them, such as 2 pi"
+            f"level {level:g} is a multiple of 4 pi: the surface of a curve has no end there; "
+            "choose a level between them, such as 2 pi"
         )
     extent = field.extent((level,))
     if extent is None:
@@ -229,9 +229,7 @@ def _embedded(
         check_manifold(faces)
         crossing = intersecting_faces(vertices, faces)
         if not len(crossing) and (best is None or len(turned) < best.turned):
-            best = dataclasses.replace(
-                first, vertices=vertices, faces=faces, turned=len(turned)
-            )
+            best = dataclasses.replace(first, vertices=vertices, faces=faces, turned=len(turned))
         bad = np.union1d(crossing, turned)
         if not len(bad):
             break
@@ -285,9 +283,7 @@ def _first_mesh(
     except MeshingError:
         if attempts == 1:
             raise
-        return _first_mesh(
-            function, 0.6 * spacing, attempts - 1, box, walls, seed, finer, report
-        )
+        return _first_mesh(function, 0.6 * spacing, attempts - 1, box, walls, seed, finer, report)
     return surface
 
 

@@ -174,9 +174,7 @@ def place_points(
     )
 
 
-def _finer_cells(
-    function: LevelFunction, leaves: Cells, finer: tuple[Places, ...]
-) -> list[Cells]:
+def _finer_cells(function: LevelFunction, leaves: Cells, finer: tuple[Places, ...]) -> list[Cells]:
     """Cells that leaves are split into, smallest first; those proved empty are left out."""
     pool = [leaves]
     for places in finer:
