@@ -26,9 +26,9 @@ _CELL = 2 * math.pi
 
 @dataclass(frozen=True)
 class _Row:
-    """One mesh. far: the largest distance of a point of the mesh from the surface, and rms: its root
-    mean square; missed: the largest distance of a point of the surface from the mesh; all as parts
-    of the size. None where it was not measured."""
+    """One mesh. far: the largest distance of a point of the mesh from the surface, rms: its root
+    mean square; missed: the largest of a point of the surface from the mesh, None where it was not
+    measured; all as parts of the size."""
 
     name: str
     seconds: float
@@ -44,12 +44,12 @@ def meshes() -> str:
     lines = [
         "## Meshes\n",
         "Level 2 pi of two curves, and the wall |f| < 0.3 of a gyroid of cell 1 in a box of two "
-        f"cells, cut by the box. Errors are those of {_SAMPLES:,} random points of the mesh, by the "
-        "slope of the function there, and of as many hits of rays to the mesh, as parts of the "
+        f"cells, cut by the box. Errors are those of {_SAMPLES:,} random points of the mesh, by "
+        "the slope of the function there, and of as many hits of rays to the mesh, as parts of the "
         "size. Time is CPU time, with the evaluations of f, which for marching cubes are made by "
         "harnack in one batch. Marching cubes (scikit-image) meets the angle's jumps of 4 pi as "
-        "surfaces; *cleaned* leaves out triangles where the angle is not near the level. Of harnack "
-        "the time includes the checks and what is proved about the topology.\n",
+        "surfaces; *cleaned* leaves out triangles where the angle is not near the level. Of "
+        "harnack the time includes the checks and what is proved about the topology.\n",
         "| surface | mesh | seconds | evaluations | triangles | Euler characteristic | pieces "
         "| ends at the curve | largest error | rms | surface to mesh |",
         "|---|---|---:|---:|---:|---:|---:|---|---:|---:|---:|",

@@ -1,8 +1,10 @@
-"""Better triangles with the same vertices: edges turned within the two triangles beside them.
+"""Better triangles: edges turned within the two triangles beside them, slivers taken out.
 
-Two triangles (a, b, c) and (b, a, d) become (c, d, b) and (d, c, a) where that makes the smaller of
-their least angles larger, where the new edge is as near to the surface as is asked for, and where
-the new triangles face the way the surface does.
+Flips. Two triangles (a, b, c) and (b, a, d) become (c, d, b) and (d, c, a) where that makes the
+smaller of their least angles larger, where the new edge is as near to the surface as is asked for,
+and where the new triangles face the way the surface does.
+
+Contractions. The ends of a sliver's shortest edge are merged: see `without_slivers`.
 """
 
 from __future__ import annotations
@@ -14,12 +16,16 @@ from harnack.meshing.checks import directed_edges
 from harnack.meshing.samples import LevelFunction
 from harnack.meshing.tetrahedra import IntArray, edge_keys
 
-__all__ = ["flipped", "least_angles"]
+__all__ = ["flipped", "least_angles", "without_slivers"]
 
 # Cosines: by how much a least angle has to grow, and how far normals may turn.
 _GAIN = 0.01
 _FACING = 0.5
 _MOST_ROUNDS = 12
+# Triangles with a smaller angle, in radians, are slivers: 4 degrees.
+_SLIVER = 0.07
+# The least cosine between normals of the triangles around a contracted edge and the slope.
+_STILL_FACING = 0.3
 
 
 def flipped(
@@ -116,3 +122,62 @@ def least_angles(vertices: FloatArray, faces: IntArray) -> FloatArray:
     shortest = square.argmin(axis=1)
     rest = 0.5 * (square.sum(axis=1) - 2 * square[np.arange(len(faces)), shortest])
     return np.arctan2(twice_area, rest)
+
+
+def without_slivers(
+    function: LevelFunction,
+    vertices: FloatArray,
+    faces: IntArray,
+    fixed: BoolArray,
+    tolerance: float,
+) -> IntArray:
+    """Faces without those slivers of which an end of the shortest edge can be moved to the other.
+
+    An edge (u, v) can be contracted to u without a change of topology if u and v have just the two
+    neighbours in common that are the third corners of its faces (the link condition), and v is not
+    `fixed` (n,), as vertices of the rim are. It is, if no new triangle is a sliver, all face the
+    way that the surface does, and their centres are within `tolerance` of it.
+    """
+    slivers = np.flatnonzero(least_angles(vertices, faces) < _SLIVER)
+    gone = np.zeros(len(faces), np.bool_)
+    faces = faces.copy()
+    for row in slivers:
+        if gone[row]:
+            continue
+        corner = vertices[faces[row]]
+        lengths = np.linalg.norm(np.roll(corner, -1, axis=0) - corner, axis=1)
+        k = int(lengths.argmin())
+        ends = int(faces[row, k]), int(faces[row, (k + 1) % 3])
+        for kept, lost in (ends, ends[::-1]):
+            if fixed[lost]:
+                continue
+            around = np.flatnonzero((faces == lost).any(axis=1) & ~gone)
+            beside = (faces[around] == kept).any(axis=1)
+            if not _can_contract(faces[~gone], kept, lost):
+                continue
+            new = np.where(faces[around[~beside]] == lost, kept, faces[around[~beside]])
+            if _is_good(function, vertices, new, tolerance):
+                faces[around[~beside]] = new
+                gone[around[beside]] = True
+                break
+    return faces[~gone]
+
+
+def _can_contract(faces: IntArray, kept: int, lost: int) -> bool:
+    """The link condition, of an edge with two faces."""
+    near, far = (faces[(faces == v).any(axis=1)] for v in (kept, lost))
+    common = np.setdiff1d(np.intersect1d(near, far), [kept, lost])
+    beside = far[(far == kept).any(axis=1)]
+    return len(beside) == 2 and np.array_equal(common, np.setdiff1d(beside, [kept, lost]))
+
+
+def _is_good(
+    function: LevelFunction, vertices: FloatArray, new: IntArray, tolerance: float
+) -> bool:
+    corner = vertices[new]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    samples = function.at(corner.mean(axis=1))
+    size = np.linalg.norm(normal, axis=1) * np.linalg.norm(samples.gradient, axis=1)
+    facing = (normal * samples.gradient).sum(axis=1) > _STILL_FACING * size
+    near = samples.distance <= tolerance
+    return bool((facing & near & (least_angles(vertices, new) > _SLIVER)).all())

@@ -217,8 +217,7 @@ def _proved_by_stars(
     start = np.zeros(len(tried))
     fine = _regular(function, corners[tet[tried]], start, n[star[tried]], np.ones(3))
     good[star[tried[~fine]]] = False
-    proved: BoolArray = good[place[index[rows]]].all(axis=1)
-    return proved
+    return np.asarray(good[place[index[rows]]].all(axis=1), np.bool_)
 
 
 def _free(function: LevelFunction, corners: FloatArray) -> BoolArray:

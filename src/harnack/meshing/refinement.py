@@ -11,8 +11,7 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
 from harnack.meshing.checks import boundary_edges, directed_edges
-from harnack.meshing.collapses import without_slivers
-from harnack.meshing.flips import flipped
+from harnack.meshing.flips import flipped, without_slivers
 from harnack.meshing.points import newton
 from harnack.meshing.samples import LevelFunction
 from harnack.meshing.tetrahedra import IntArray, edge_keys
