@@ -47,8 +47,8 @@ def meshes() -> str:
         "Level 2 pi of two curves, and the wall |f| < 0.3 of a gyroid of cell 1 in a box of two "
         f"cells, cut by the box. Errors are those of {_SAMPLES:,} random points of the mesh, by "
         f"the slope of the function there, and of {_HITS:,} hits of rays to the mesh, as parts of "
-        "the size. Time is CPU time, with the evaluations of f, which for marching cubes are made by "
-        "harnack in one batch. Marching cubes (scikit-image) meets the angle's jumps of 4 pi as "
+        "the size. Time is CPU time, with the evaluations of f, which for marching cubes are made "
+        "by harnack in one batch. Marching cubes (scikit-image) meets the angle's jumps of 4 pi as "
         "surfaces; *cleaned* leaves out triangles where the angle is not near the level. Of "
         "harnack the time includes the checks and what is proved about the topology.\n",
         "| surface | mesh | seconds | evaluations | triangles | Euler characteristic | pieces "
