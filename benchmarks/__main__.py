@@ -20,6 +20,7 @@ from .growth import growth
 from .hart import hart
 from .inclusion import inclusion
 from .laplacian import laplacian
+from .meshes import meshes
 from .povray import compare_with_povray, has_povray
 from .rays import RULES, WIDTH, Row, machine, measure, published
 from .scenes import others, polygons
@@ -29,7 +30,7 @@ from .winding import throughput
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 SECTIONS = (
     "rays", "convergence", "winding", "agreement", "versions", "inclusion", "laplacian", "hart",
-    "povray", "antialiasing", "baselines", "formulas",
+    "povray", "antialiasing", "baselines", "formulas", "meshes",
 )  # fmt: skip
 
 
@@ -71,6 +72,7 @@ def main() -> None:
         "antialiasing": antialiasing,
         "baselines": baselines,
         "formulas": formulas,
+        "meshes": meshes,
         "povray": compare_with_povray,
         "winding": lambda: _winding(arguments.bunny, arguments.out.with_name("growth.png")),
     }

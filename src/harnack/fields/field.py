@@ -205,6 +205,12 @@ class Field(abc.ABC):
         del p, q
         return None
 
+    def slope_change(self, p: Vec3, radius: Real) -> Real:
+        """A length that |grad f(y) - grad f(p)| is proved not to exceed for any y with
+        |y - p| <= radius; infinite where nothing is known, which is the default. Proofs that a mesh
+        has the surface's topology ask for it."""
+        return 0 * p.x + radius + dr.inf
+
     def check_levels(self, levels: tuple[float, ...]) -> None:
         """Raise ValueError if a level is one that no surface can have. The default accepts all."""
         del levels

@@ -8,21 +8,28 @@ import numpy as np
 
 from harnack.meshing.tetrahedra import IntArray, edge_keys
 
-__all__ = ["MeshingError", "boundary_edges", "check_manifold", "euler_characteristic"]
+__all__ = [
+    "MeshingError",
+    "boundary_edges",
+    "check_manifold",
+    "directed_edges",
+    "euler_characteristic",
+]
 
 
 class MeshingError(ValueError):
     """A level set that could not be meshed; the message says why and what to do."""
 
 
-def _directed(faces: IntArray) -> IntArray:
-    """(3m, 2): the edges of faces (m, 3), as they are run."""
+def directed_edges(faces: IntArray) -> IntArray:
+    """(3m, 2): the edges of faces (m, 3), as they are run: all first ones (corners 0 and 1), then
+    all second and all third ones."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
 def boundary_edges(faces: IntArray) -> IntArray:
     """(k, 2): edges of one face only, as it runs them."""
-    edges = _directed(faces)
+    edges = directed_edges(faces)
     count = int(faces.max(initial=-1)) + 1
     _, index, uses = np.unique(edge_keys(edges, count), return_inverse=True, return_counts=True)
     return edges[uses[index] == 1]
@@ -30,8 +37,11 @@ def boundary_edges(faces: IntArray) -> IntArray:
 
 def euler_characteristic(faces: IntArray) -> int:
     """Vertices in use, less edges, and faces."""
-    edges, count = _directed(faces), int(faces.max(initial=-1)) + 1
-    return len(np.unique(faces)) - len(np.unique(edge_keys(edges, count))) + len(faces)
+    import trimesh  # here: half a second that few need
+
+    nowhere = np.zeros((int(faces.max(initial=-1)) + 1, 3))
+    surface: Any = trimesh.Trimesh(nowhere, faces, process=False, validate=False)
+    return int(surface.euler_number)
 
 
 def check_manifold(faces: IntArray) -> None:
@@ -41,7 +51,7 @@ def check_manifold(faces: IntArray) -> None:
     Raises:
         MeshingError: otherwise.
     """
-    edges, count = _directed(faces), int(faces.max(initial=-1)) + 1
+    edges, count = directed_edges(faces), int(faces.max(initial=-1)) + 1
     _, index, uses = np.unique(edge_keys(edges, count), return_inverse=True, return_counts=True)
     if (uses > 2).any():
         raise MeshingError(
@@ -70,7 +80,7 @@ def _fans(faces: IntArray, edge: IntArray, uses: IntArray) -> int:
     sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
     m = len(faces)
     corner = np.arange(3 * m).reshape(m, 3)
-    # Corners at both ends of the edge k of a face, in the order of `_directed`.
+    # Corners at both ends of the edge k of a face, in the order of `directed_edges`.
     first = np.concatenate([corner[:, 0], corner[:, 1], corner[:, 2]])
     second = np.concatenate([corner[:, 1], corner[:, 2], corner[:, 0]])
     order = np.argsort(edge, kind="stable")

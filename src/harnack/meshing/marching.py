@@ -25,7 +25,7 @@ from harnack.meshing.points import PointSet
 from harnack.meshing.samples import LevelFunction
 from harnack.meshing.tetrahedra import IntArray, Tetrahedra
 
-__all__ = ["Crossings", "crossings_of", "triangles_of"]
+__all__ = ["Crossings", "crossings_of", "is_cut", "triangles_of"]
 
 _ALL = tuple(itertools.combinations(range(4), 2))
 
@@ -147,6 +147,11 @@ def triangles_of(
     turned = (normal * rise).sum(axis=1) < 0
     faces[turned] = faces[turned][:, ::-1]
     return vertices, faces
+
+
+def is_cut(points: PointSet, tets: Tetrahedra, crossings: Crossings) -> BoolArray:
+    """(m,) whether a level passes between corners of a tetrahedron, or through one."""
+    return points.is_on[tets.corners].any(axis=1) | (crossings.count[tets.edges] != 0).any(axis=1)
 
 
 def _mean(points: FloatArray, index: IntArray) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -17,9 +18,12 @@ from harnack.meshing.checks import (
     check_manifold,
     euler_characteristic,
 )
-from harnack.meshing.marching import crossings_of, triangles_of
-from harnack.meshing.points import Boundary, PointSet, box_cells, place_points
-from harnack.meshing.refinement import refined, smoothed
+from harnack.meshing.intersections import intersecting_faces, turned_faces
+from harnack.meshing.isotopy import Isotopy, isotopy_of
+from harnack.meshing.marching import Crossings, crossings_of, is_cut, triangles_of
+from harnack.meshing.points import Boundary, Places, PointSet, box_cells, place_points
+from harnack.meshing.refinement import improved, refined, smoothed
+from harnack.meshing.rims import whole_edges
 from harnack.meshing.samples import LevelFunction
 from harnack.meshing.tetrahedra import IntArray, Tetrahedra, delaunay, edge_keys
 
@@ -41,6 +45,9 @@ _MOST_ATTEMPTS = 4
 _LONGEST = 2.5
 # How often edges of a curve that are too near to others are halved.
 _MOST_CUTS = 4
+# How often points of flat tetrahedra, which spoil the proof of isotopy, are taken out.
+_MOST_REMOVALS = 3
+_FEW = 200
 
 
 def mesh(
@@ -71,10 +78,15 @@ def mesh(
     progress: told what is being done.
 
     Returns:
-        A trimesh.Trimesh. `metadata["harnack"]` has level, spacing, evaluations, the Euler
-        characteristic, how many changes along edges were proved, how many integrated, and
-        boundary: indices (k, 2) of edges of one face. Vertices of a curve come first, in order;
-        its edges are edges of the mesh, but that those much longer than cells are cut.
+        A trimesh.Trimesh. Vertices of a curve come first, in order, bit by bit, and its edges are
+        the rim. `metadata["harnack"]` has level, spacing, evaluations, the Euler characteristic,
+        boundary: indices (k, 2) of edges of one face, and
+        proved, integrated: how many changes along edges of tetrahedra are proved to be differences
+            of wrapped values, and how many were integrated;
+        isotopy, isotopy_far: the shares of tetrahedra on which the first triangles are proved to
+            have the topology of the level set (`meshing.isotopy`), of all and of those farther than
+            1.5 times the spacing from the curve;
+        turned: triangles, smaller than the tolerance, that are turned over.
 
     Raises:
         MeshingError: a ValueError, if it could not be done; the message says why.
@@ -97,13 +109,10 @@ def mesh(
     start = size / _ACROSS if spacing is None else float(spacing)
     function = LevelFunction(field, level)
     attempts = 1 if spacing is not None else _MOST_ATTEMPTS
-    first = _first_mesh(function, start, attempts, (lower, upper), walls, seed, report)
+    first = _embedded(
+        function, start, attempts, (lower, upper), walls, seed, 0.5 * tolerance * size, report
+    )
     vertices, faces = first.vertices, first.faces
-    absolute = 0.5 * tolerance * size
-    vertices = smoothed(function, vertices, faces, walls)
-    vertices, faces = refined(function, vertices, faces, absolute, walls, report)
-    vertices = smoothed(function, vertices, faces, walls)
-    check_manifold(faces)
     kept = np.unique(faces)
     place = np.full(len(vertices), -1, np.int64)
     place[kept] = np.arange(len(kept))
@@ -114,8 +123,11 @@ def mesh(
         "spacing": first.spacing,
         "evaluations": function.evaluations,
         "euler_characteristic": euler_characteristic(faces),
-        "proved": first.proved,
-        "integrated": first.integrated,
+        "proved": first.crossings.proved,
+        "integrated": first.crossings.integrated,
+        "isotopy": first.isotopy.proved,
+        "isotopy_far": first.isotopy.proved_far,
+        "turned": first.turned,
         "boundary": boundary_edges(faces),
     }
     return result
@@ -158,6 +170,11 @@ def _box(
             f"{type(field).__name__} ends at its domain, which is no box: give "
             "clip=harnack.Box(lower, upper)"
         )
+    if isinstance(field, SolidAngle) and abs(math.remainder(level, 4 * math.pi)) < 1e-6:
+        raise MeshingError(
+            f"level {level:g} is a multiple of 4 pi: the surface of a curve has no end there; "
+            "choose a level between them, such as 2 pi"
+        )
     extent = field.extent((level,))
     if extent is None:
         raise MeshingError(
@@ -169,14 +186,62 @@ def _box(
 
 
 @dataclass(frozen=True)
-class _FirstMesh:
-    """Triangles before they are refined. proved, integrated: as of `Crossings`."""
+class _Surface:
+    """Triangles, and how they were found. turned: faces turned over."""
 
     vertices: FloatArray
     faces: IntArray
+    curve: Boundary
     spacing: float
-    proved: int
-    integrated: int
+    crossings: Crossings
+    isotopy: Isotopy
+    turned: int = 0
+
+
+def _embedded(
+    function: LevelFunction,
+    spacing: float,
+    attempts: int,
+    box: tuple[FloatArray, FloatArray],
+    walls: tuple[FloatArray, FloatArray] | None,
+    seed: int,
+    tolerance: float,
+    report: Callable[[str], None],
+) -> _Surface:
+    """Triangles within the tolerance, none of which pass through others; where some do, or are
+    turned over, cells are made smaller and all is done again."""
+    finer: tuple[Places, ...] = ()
+    best: _Surface | None = None
+    crossing = np.zeros(0, np.int64)
+    for attempt in range(_MOST_ATTEMPTS):
+        first = _first_mesh(function, spacing, attempts, box, walls, seed, finer, report)
+        spacing = first.spacing
+        faces = first.faces
+        vertices = smoothed(function, first.vertices, faces, walls)
+        vertices, faces = refined(function, vertices, faces, tolerance, walls, report)
+        vertices, faces = improved(function, vertices, faces, tolerance, walls, report)
+        turned = turned_faces(function, vertices, faces)
+        if isinstance(function.field, SolidAngle):
+            kept = sum(map(len, net_loops(function.field.loops)))
+            vertices, faces = whole_edges(
+                function, vertices, faces, kept, len(first.curve.points), tolerance
+            )
+        check_manifold(faces)
+        crossing = intersecting_faces(vertices, faces)
+        if not len(crossing) and (best is None or len(turned) < best.turned):
+            best = dataclasses.replace(first, vertices=vertices, faces=faces, turned=len(turned))
+        bad = np.union1d(crossing, turned)
+        if not len(bad):
+            break
+        if attempt < _MOST_ATTEMPTS - 1:
+            report(f"{len(bad)} triangles fail: smaller cells there")
+            finer = (*finer, Places(vertices[faces[bad]].mean(axis=1), spacing))
+    if best is None:
+        raise MeshingError(
+            f"{len(crossing)} triangles pass through others, in cells as small as "
+            f"{spacing / 2 ** len(finer):.3g}: choose a smaller `tolerance` or `spacing`"
+        )
+    return best
 
 
 def _first_mesh(
@@ -186,31 +251,76 @@ def _first_mesh(
     box: tuple[FloatArray, FloatArray],
     walls: tuple[FloatArray, FloatArray] | None,
     seed: int,
+    finer: tuple[Places, ...],
     report: Callable[[str], None],
-) -> _FirstMesh:
+) -> _Surface:
     """Triangles in cells of that spacing, or where that fails of smaller ones."""
     loops = net_loops(function.field.loops) if isinstance(function.field, SolidAngle) else ()
     curve = (
         Boundary.of(loops, _LONGEST * spacing) if loops else Boundary(np.zeros((0, 3)), _NO_EDGES)
     )
+    for k, places in enumerate(finer):  # balls on long edges leave no room for points
+        curve = curve.split_near(places, spacing * 0.5**k)
     margin = 0.5 * spacing if walls is None else 0.0
     root = box_cells(box[0] - margin, box[1] + margin, spacing, exact=walls is not None)
     report(f"cells of {spacing:.3g}")
     try:
-        curve, points, tets = _filled(function, root, curve, walls, seed)
+        curve, points, tets = _filled(function, root, curve, walls, seed, finer)
         report(f"{len(points.points):,} points, {len(tets.corners):,} tetrahedra")
-        crossings = crossings_of(function, points, tets)
-        vertices, faces = triangles_of(function, points, tets, crossings)
-        if not len(faces):
-            raise MeshingError("the level set is empty: no cell of the box holds the level")
-        check_manifold(faces)
-        if loops:
-            _check_boundary(faces, curve)
+        surface = _in_tetrahedra(function, points, tets, curve, spacing, walls)
+        for _ in range(_MOST_REMOVALS):
+            # Beside a curve all is never proved, and little is gained.
+            if len(curve.edges) or not 0 < len(surface.isotopy.open_far) < _FEW:
+                break
+            points = _without_slivers(points, surface.isotopy.open_far, walls)
+            try:
+                tets = delaunay(points.points)
+                other = _in_tetrahedra(function, points, tets, curve, spacing, walls)
+            except MeshingError:  # of fewer points; the first surface passed all checks
+                break
+            if len(other.isotopy.open_far) < len(surface.isotopy.open_far):
+                surface = other
     except MeshingError:
         if attempts == 1:
             raise
-        return _first_mesh(function, 0.6 * spacing, attempts - 1, box, walls, seed, report)
-    return _FirstMesh(vertices, faces, spacing, crossings.proved, crossings.integrated)
+        return _first_mesh(function, 0.6 * spacing, attempts - 1, box, walls, seed, finer, report)
+    return surface
+
+
+def _in_tetrahedra(
+    function: LevelFunction,
+    points: PointSet,
+    tets: Tetrahedra,
+    curve: Boundary,
+    spacing: float,
+    walls: tuple[FloatArray, FloatArray] | None,
+) -> _Surface:
+    """Triangles in tetrahedra, checked, and what is proved about them."""
+    crossings = crossings_of(function, points, tets)
+    vertices, faces = triangles_of(function, points, tets, crossings)
+    if not len(faces):
+        raise MeshingError("the level set is empty: no cell of the box holds the level")
+    check_manifold(faces)
+    if len(curve.edges):
+        _check_boundary(faces, curve)
+    cut = is_cut(points, tets, crossings)
+    isotopy = isotopy_of(function, points, tets, cut, faces, curve, spacing, walls)
+    return _Surface(vertices, faces, curve, spacing, crossings, isotopy)
+
+
+def _without_slivers(
+    points: PointSet,
+    corners: IntArray,
+    walls: tuple[FloatArray, FloatArray] | None,
+) -> PointSet:
+    """Points but for one of each of some tetrahedra with corners (k, 4), which is on no wall."""
+    count = np.bincount(corners.ravel(), minlength=len(points.points))
+    if walls is not None:
+        x = points.points
+        count[((x <= walls[0]) | (x >= walls[1])).any(axis=1)] = 0
+    often = count[corners]
+    worst = corners[np.arange(len(corners)), often.argmax(axis=1)]
+    return points.without(np.unique(worst[often.max(axis=1) > 0]))
 
 
 def _filled(
@@ -219,10 +329,11 @@ def _filled(
     curve: Boundary,
     walls: tuple[FloatArray, FloatArray] | None,
     seed: int,
+    finer: tuple[Places, ...],
 ) -> tuple[Boundary, PointSet, Tetrahedra]:
     """Tetrahedra that have all edges of the curve, which is cut where others are too near."""
     for _ in range(_MOST_CUTS):
-        points = place_points(function, root, curve, walls, seed)
+        points = place_points(function, root, curve, walls, seed, finer)
         tets = delaunay(points.points)
         has_edge = tets.has_edges(curve.edges)
         if has_edge.all():

@@ -19,7 +19,7 @@ from harnack.cells import Cells, Octree, octree
 from harnack.meshing.samples import LevelFunction, Samples
 from harnack.meshing.tetrahedra import IntArray
 
-__all__ = ["Boundary", "PointSet", "box_cells", "place_points"]
+__all__ = ["Boundary", "Places", "PointSet", "box_cells", "place_points"]
 
 # All in parts of the size of a cell, by experiment.
 _JITTER = 1e-3  # no five points on a sphere
@@ -27,6 +27,24 @@ _SNAPPED = 0.3  # points so near to the level are moved onto it
 _FREE = 0.45  # of points around the curve
 _MOST_CELLS = 4_000_000
 _CORNERS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
+
+
+@dataclass(frozen=True)
+class Places:
+    """Balls about points (n, 3) in which cells are split once more. radius: of all."""
+
+    points: FloatArray
+    radius: float
+
+    def meet(self, centres: FloatArray, radii: FloatArray | float) -> BoolArray:
+        """(k,) whether balls about points (k, 3) meet one of these."""
+        if not len(centres):
+            return np.zeros(0, np.bool_)
+        import scipy.spatial  # here: half a second that few need
+
+        searching: Any = scipy.spatial
+        apart: FloatArray = searching.cKDTree(self.points).query(centres)[0]
+        return apart < self.radius + radii
 
 
 @dataclass(frozen=True)
@@ -67,6 +85,17 @@ class Boundary:
         halves = np.concatenate([np.stack([a, middle], axis=1), np.stack([middle, b], axis=1)])
         return Boundary(points, np.concatenate([self.edges[~which], halves]))
 
+    def split_near(self, places: Places, longest: float) -> Boundary:
+        """With edges in some places cut until they are no longer than that."""
+        curve = self
+        while True:
+            ends = curve.points[curve.edges]
+            half = 0.5 * np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+            which = (2 * half > longest) & places.meet(ends.mean(axis=1), half)
+            if not which.any():
+                return curve
+            curve = curve.split(which)
+
 
 @dataclass(frozen=True)
 class PointSet:
@@ -76,6 +105,11 @@ class PointSet:
     points: FloatArray
     is_on: BoolArray
     samples: Samples
+
+    def without(self, rows: IntArray) -> PointSet:
+        """All points but those."""
+        kept = np.delete(np.arange(len(self.points)), rows)
+        return PointSet(self.points[kept], self.is_on[kept], self.samples.some(kept))
 
 
 def box_cells(
@@ -107,20 +141,26 @@ def place_points(
     boundary: Boundary,
     walls: tuple[FloatArray, FloatArray] | None,
     seed: int,
+    finer: tuple[Places, ...] = (),
 ) -> PointSet:
     """Points as the module says. walls: a box whose faces points on them do not leave.
+
+    finer: where leaves of the octree are split again, once for each of the entries that they meet.
 
     Raises MemoryError for more than four million cells.
     """
     tree = octree(root[0], function.clearance, _MOST_CELLS, root[1])
-    points, size = _corners_and_centres(tree)
-    is_far = _is_far(points, size, boundary)
+    points, size = _corners_and_centres(tree, _finer_cells(function, tree.leaves, finer))
+    free = _FREE * np.minimum(size, 2 * float(tree.leaves.size.max()))
+    is_far = _is_far(points, free, boundary)
     points, size = points[is_far], size[is_far]
     rng = np.random.default_rng(seed)
     jitter = rng.uniform(-1, 1, points.shape) * _JITTER * size[:, None]
     points = points + (jitter if walls is None else jitter * _off_walls(points, walls))
     samples = function.at(points)
-    points, samples, is_on = _snapped(function, points, size, samples, boundary, walls)
+    points, samples, is_on = _snapped(
+        function, points, size, free[is_far], samples, boundary, walls
+    )
     n = len(boundary.points)
     zeros = Samples(np.zeros(n), np.zeros((n, 3)), np.zeros(n))
     together = [
@@ -134,25 +174,42 @@ def place_points(
     )
 
 
-def _corners_and_centres(tree: Octree) -> tuple[FloatArray, FloatArray]:
-    """Points (n, 3), each once: corners of all cells and centres of leaves; and the size (n,) of
-    the smallest cell at each."""
-    cells = [tree.leaves, *reversed(tree.empty)]
-    points = [tree.leaves.centres]
-    sizes = [np.full(len(tree.leaves.corners), float(tree.leaves.size.max()))]
-    for some in cells:
+def _finer_cells(function: LevelFunction, leaves: Cells, finer: tuple[Places, ...]) -> list[Cells]:
+    """Cells that leaves are split into, smallest first; those proved empty are left out."""
+    pool = [leaves]
+    for places in finer:
+        split: list[Cells] = []
+        for cells in pool:
+            halves = cells.some(places.meet(cells.centres, cells.half_diagonal)).split()
+            split.append(halves.some(~halves.proved_empty(function.clearance)))
+        pool += split
+    found = [cells for cells in pool[1:] if len(cells.corners)]
+    return sorted(found, key=lambda cells: float(cells.size.max()))
+
+
+def _corners_and_centres(tree: Octree, finer: list[Cells]) -> tuple[FloatArray, FloatArray]:
+    """Points (n, 3), each once: corners of all cells, and centres of leaves and of `finer` ones;
+    and the size (n,) of the smallest cell at each."""
+    leaves = [*finer, tree.leaves]
+    points = [cells.centres for cells in leaves]
+    sizes = [np.full(len(cells.corners), float(cells.size.max())) for cells in leaves]
+    for some in [*leaves, *reversed(tree.empty)]:
         corners = (some.corners[:, None] + _CORNERS * some.size).reshape(-1, 3)
         points.append(corners)
         sizes.append(np.full(len(corners), float(some.size.max())))
     x, size = np.concatenate(points), np.concatenate(sizes)
-    steps: FloatArray = (x - x.min(axis=0)) / (0.25 * tree.leaves.size)
+    order = np.argsort(size, kind="stable")
+    x, size = x[order], size[order]
+    steps: FloatArray = (x - x.min(axis=0)) / (0.25 * leaves[0].size)
     keys = np.rint(steps).astype(np.int64)
+    # Of points at one place the first, which is that of the smallest cell.
     first: IntArray = np.sort(np.unique(keys, axis=0, return_index=True)[1])
     return x[first], size[first]
 
 
-def _is_far(points: FloatArray, size: FloatArray, boundary: Boundary) -> BoolArray:
-    """Whether points are far enough from the curve: see the module."""
+def _is_far(points: FloatArray, free: FloatArray, boundary: Boundary) -> BoolArray:
+    """Whether points are farther from the curve than `free` (n,), and out of the balls on its edges
+    as diameters."""
     if not len(boundary.edges):
         return np.ones(len(points), np.bool_)
     import scipy.spatial  # here: half a second that few need
@@ -175,7 +232,7 @@ def _is_far(points: FloatArray, size: FloatArray, boundary: Boundary) -> BoolArr
         away = np.linalg.norm(points[:, None] - middle[index], axis=2)
         near = np.minimum(near, gap.min(axis=1))
         is_far &= (away > 1.1 * half[index]).all(axis=1)
-    return is_far & (near > _FREE * np.minimum(size, 2 * size.min()))
+    return is_far & (near > free)
 
 
 def _off_walls(points: FloatArray, walls: tuple[FloatArray, FloatArray]) -> FloatArray:
@@ -189,6 +246,7 @@ def _snapped(
     function: LevelFunction,
     points: FloatArray,
     size: FloatArray,
+    free: FloatArray,
     samples: Samples,
     boundary: Boundary,
     walls: tuple[FloatArray, FloatArray] | None,
@@ -200,7 +258,7 @@ def _snapped(
     apart = np.linalg.norm(moved - points[near], axis=1)
     steep = np.linalg.norm(there.gradient, axis=1)
     good = np.abs(there.value) < 1e-9 * np.maximum(steep * size[near], 1e-300)
-    good &= (apart < 1.5 * _SNAPPED * size[near]) & _is_far(moved, size[near], boundary)
+    good &= (apart < 1.5 * _SNAPPED * size[near]) & _is_far(moved, free[near], boundary)
     rows = near[good]
     points, is_on = points.copy(), np.zeros(len(points), np.bool_)
     points[rows], is_on[rows] = moved[good], True

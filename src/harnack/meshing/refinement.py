@@ -10,12 +10,13 @@ from collections.abc import Callable
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.checks import boundary_edges
+from harnack.meshing.checks import boundary_edges, directed_edges
+from harnack.meshing.flips import flipped, without_slivers
 from harnack.meshing.points import newton
 from harnack.meshing.samples import LevelFunction
 from harnack.meshing.tetrahedra import IntArray, edge_keys
 
-__all__ = ["refined", "smoothed"]
+__all__ = ["improved", "refined", "smoothed"]
 
 Walls = tuple[FloatArray, FloatArray] | None
 # Edges shorter than this part of the tolerance are never cut.
@@ -42,13 +43,14 @@ def refined(
         span = np.linalg.norm(vertices[ends[:, 0]] - vertices[ends[:, 1]], axis=1)
         samples = function.at(middle)
         bulge = samples.distance
-        marked = (bulge > tolerance) & (span > _SHORTEST * tolerance)
-        centre = function.at(vertices[faces].mean(axis=1)).distance
-        # Of a face whose centre is off, the longest edge that may be cut.
+        marked = bulge > tolerance
+        centre = function.at(vertices[faces].mean(axis=1))
+        off = centre.distance > tolerance
+        # Of a face that is off, the longest edge that may be cut.
         free = np.where(is_rim[edges], 0.0, span[edges])
         worst = edges[np.arange(len(faces)), free.argmax(axis=1)]
-        marked[worst[centre > tolerance]] = True
-        marked &= ~is_rim
+        marked[worst[off]] = True
+        marked &= ~is_rim & (span > _SHORTEST * tolerance)
         if not marked.any():
             break
         moved = newton(function, middle[marked], samples.some(marked), 0.5 * span[marked], walls)
@@ -62,7 +64,7 @@ def refined(
 def _edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
     """All edges (k, 2), those of each face (m, 3) (that of corners 0 and 1 first), and whether they
     belong to one face only."""
-    pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    pairs = directed_edges(faces)
     count = int(faces.max()) + 1
     keys, index, uses = np.unique(edge_keys(pairs, count), return_inverse=True, return_counts=True)
     ends = np.column_stack([keys // count, keys % count])
@@ -94,6 +96,26 @@ def _split(vertices: FloatArray, faces: IntArray, middle: IntArray) -> IntArray:
     return np.concatenate(parts)
 
 
+def improved(
+    function: LevelFunction,
+    vertices: FloatArray,
+    faces: IntArray,
+    tolerance: float,
+    walls: Walls,
+    report: Callable[[str], None],
+) -> tuple[FloatArray, IntArray]:
+    """Better angles: edges are flipped and vertices smoothed in turn, slivers are contracted; then
+    edges are cut again where triangles are no longer within `tolerance`."""
+    for _ in range(2):
+        faces = flipped(function, vertices, faces, tolerance)
+        vertices = smoothed(function, vertices, faces, walls, rounds=2)
+    fixed = np.zeros(len(vertices), np.bool_)
+    fixed[boundary_edges(faces)] = True
+    faces = without_slivers(function, vertices, faces, fixed, 2 * tolerance)
+    vertices, faces = refined(function, vertices, faces, tolerance, walls, report)
+    return vertices, flipped(function, vertices, faces, tolerance)
+
+
 def smoothed(
     function: LevelFunction,
     vertices: FloatArray,
@@ -110,6 +132,7 @@ def smoothed(
     free[rim] = False
     count = np.maximum(np.bincount(ends.ravel(), minlength=len(vertices)), 1)
     rows = np.flatnonzero(free)
+    size = float(np.ptp(vertices[free], axis=0).max(initial=0.0)) if len(rows) else 0.0
     for _ in range(rounds):
         sums = np.zeros_like(vertices)
         for one, other in ((0, 1), (1, 0)):
@@ -124,7 +147,7 @@ def smoothed(
         there = vertices.copy()
         there[rows] = newton(function, aim[rows], start, 2 * span, walls)
         after = function.at(there[rows])
-        worse = after.distance > 1e-7 * (1 + np.linalg.norm(there[rows], axis=1))
+        worse = after.distance > 1e-7 * size + 1e-12 * np.linalg.norm(there[rows], axis=1)
         there[rows[worse]] = vertices[rows[worse]]
         vertices = _unfolded(vertices, there, faces)
     return vertices

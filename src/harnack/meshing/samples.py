@@ -95,6 +95,21 @@ class LevelFunction:
         (value,) = self._looked_at(points, lambda p: (self._prepared.evaluate(p).value,))
         return self.wrapped(value)
 
+    def slopes(self, points: FloatArray, radius: FloatArray) -> tuple[Samples, FloatArray]:
+        """The function at points (n, 3), its reach left out, and by how much at most its gradient
+        changes within `radius` (n,) of each, rounding included: see `Field.slope_change`."""
+
+        def look(p: Vec3, r: Vec3) -> tuple[Real, Vec3, Real]:
+            sample = self._prepared.evaluate(p)
+            change = self._prepared.slope_change(p, r.x) + sample.gradient_error
+            return sample.value, sample.gradient, change
+
+        self.evaluations += 2 * len(points)
+        value, gradient, change = in_batches(
+            self._backend, look, points, np.column_stack([radius] * 3), at_once=1 << 18
+        )
+        return Samples(self.wrapped(value), gradient, np.zeros(len(points))), change
+
     def clearance(self, points: FloatArray) -> FloatArray:
         """(n,) no point of the level set is nearer: see `distance_below`."""
 

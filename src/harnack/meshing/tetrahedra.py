@@ -60,9 +60,9 @@ def delaunay(points: FloatArray) -> Tetrahedra:
     middle, size = points.mean(axis=0), float(np.ptp(points, axis=0).max())
     turn = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
     around = np.array(list(itertools.product((-1.0, 1.0), repeat=3))) @ turn
-    far = middle + 20 * size * around
     n = len(points)
-    together = np.concatenate([points, far])
+    # About the middle, so that Qhull does not round far from the origin.
+    together = np.concatenate([points - middle, 20 * size * around])
     corners: IntArray = qhull.Delaunay(together).simplices.astype(np.int64)
     corners = corners[(corners < n).all(axis=1)]
     pairs = np.concatenate([corners[:, pair] for pair in _PAIRS])

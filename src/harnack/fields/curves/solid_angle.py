@@ -21,7 +21,7 @@ from harnack.fields.curves.edge_angles import differentiable_angle
 from harnack.fields.curves.edge_nearest import closest_on_segments, segments
 from harnack.fields.curves.planar import PlanarRegion, planar_region
 from harnack.fields.curves.swept_angle import change_along_segments
-from harnack.fields.edges.curve_promises import bends, swept_ball
+from harnack.fields.edges.curve_promises import bends, slope_change, swept_ball
 from harnack.fields.edges.edge_passing import Line, known_along, rates_along
 from harnack.fields.edges.edge_records import LoopEdges
 from harnack.fields.edges.edge_sums import EdgeSums, hessian_over_edges, sum_over_edges
@@ -289,6 +289,16 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         slope = SLOPE_ROUNDINGS / 3 * unit * sums.cubes * share / on.size
         second = 0.25 * SECOND_ROUNDINGS * unit * sums.cubes / sums.distance * share
         return slope, second / (on.size * on.size)
+
+    def slope_change(self, p: Vec3, radius: Real) -> Real:
+        """See `curve_promises`; positions may be off by rounding."""
+        on = self._on(p)
+        if self._is_empty:
+            return 0 * p.x
+        x, reach = on.unit(p), radius / on.size + on.rounding
+        sums = on.sums(x)
+        distance = sums.distance * (1 - SUM_ROUNDING) - on.rounding
+        return slope_change(sums.cubes, sums.fourths, distance, reach) / on.size
 
     def closest_on_boundary(self, p: Vec3) -> Vec3 | None:
         """The closest point of the curve, edges that cancel left out (`uncancelled_edges`)."""

@@ -1,0 +1,341 @@
+"""How much of a mesh in tetrahedra is proved to have the topology of the level set.
+
+Let f be the function less its level, F its interpolation at the corners of the tetrahedra, linear
+on each, whose zero set are the triangles of `marching`, and H_t = (1-t) F + t f, 0 <= t <= 1.
+
+Theorem. If each tetrahedron T satisfies (a), (b) or (c), the zero sets of f and F are isotopic:
+(a) neither f nor F has a zero in T, and both have the same sign there;
+(b) grad f(x) . grad F|T > 0 for all x in T;
+(c) each corner v of T has a vector n with n . grad F|S > 0 and n . grad f(x) > 0 for all x in S,
+    for all S around v that do not satisfy (a).
+
+Proof. Let H_t(x) = 0 for some t. By (a), x is in tetrahedra of kinds (b) and (c) alone. Some n has
+n . grad f(x) > 0 and n . grad F|T > 0 for all T that hold x: if all are of kind (b), n = grad f(x);
+else x lies in a simplex of one of kind (c), all corners of which have such an n, and all T that
+hold x are around each of them. H_t is Lipschitz, and Clarke's generalised gradient of it at x is
+the convex hull of (1-t) grad F|T + t grad f(x) over these T: it does not hold 0. By Clarke's
+implicit function theorem the zero set of H in (x, t) is near there the graph of a Lipschitz
+function over n's orthogonal plane and t. The fields n/(n . n), patched by a partition of unity,
+still have positive products with all these gradients, and following them as t goes from 0 to 1
+moves the zero set of F onto that of f (Thom's argument, for Lipschitz functions). On a wall of the
+box, where the surface ends, x moves within the wall: there (b) is asked of the gradients'
+projections onto it, for each face, edge or corner of a tetrahedron that lies in walls.
+
+Four corners on the level. F is 0 on such a T, and `marching` gives all of it to one side. If two of
+its faces are in the mesh, put F = +-epsilon at the middle of the edge that the other two share: T
+becomes two tetrahedra, on each of which grad F is a normal of one of those faces, F elsewhere
+changes by no more than epsilon, which (b) and (c) bear as they are strict, and the zero set is the
+mesh. So (b) and (c) are asked of both normals. Other such T are not proved.
+
+An angle. Where f's lift stays within half a period of the level on T, which is a part of the check
+of (b), the wrapped values at the corners are that lift's, and all is as for a number.
+
+The check. |grad f(y) - grad f(c)| <= D for all y in the ball around T with centre c and radius R,
+by the field's own promise (`Field.slope_change`). So (b) holds if grad f(c) . grad F > D |grad F|,
+and f has no zero in T if |f(c)| > (|grad f(c)| + D) R. If neither holds T is halved, across its
+longest edge, a few times: grad F is the same in both halves, and (a) or (b) may hold in each.
+
+Beside the curve nothing is proved. It is about the first triangles, before these are refined. Of
+what follows, that the triangles do not meet (`intersections`) and face along the gradient is
+checked, and not that they were moved without meeting on the way.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from harnack.backend import BoolArray, FloatArray
+from harnack.meshing.points import Boundary, PointSet
+from harnack.meshing.samples import LevelFunction
+from harnack.meshing.tetrahedra import IntArray, Tetrahedra
+
+__all__ = ["Isotopy", "isotopy_of"]
+
+Walls = tuple[FloatArray, FloatArray] | None
+_HALVINGS = 3
+_TRIALS = 20
+_UNKNOWN = 1e200
+# What is far from the curve is farther than this many cells.
+_FAR = 1.5
+
+
+@dataclass(frozen=True)
+class Isotopy:
+    """Shares of the tetrahedra that may hold a point of the level set, or hold one of the mesh.
+
+    proved: of all, those where (b) is proved. proved_far: of those farther than 1.5 cells from the
+        curve. If `proved` is 1, mesh and level set are isotopic.
+    count: how many there are.
+    open_far: (k, 4) corners of those farther than 1.5 cells from the curve where it is not.
+    """
+
+    proved: float
+    proved_far: float
+    count: int
+    open_far: IntArray
+
+
+def isotopy_of(
+    function: LevelFunction,
+    points: PointSet,
+    tets: Tetrahedra,
+    is_cut: BoolArray,
+    faces: IntArray,
+    boundary: Boundary,
+    spacing: float,
+    walls: Walls,
+) -> Isotopy:
+    """What is proved about the mesh of these tetrahedra.
+
+    is_cut: (m,) whether a tetrahedron holds a point of the mesh. faces: of the mesh (k, 3); corners
+        that are points come first.
+    """
+    corners = points.points[tets.corners]
+    rest = np.flatnonzero(~is_cut)
+    holds = is_cut.copy()
+    holds[rest[~_free(function, corners[rest])]] = True
+    index, corners = tets.corners[holds], corners[holds]
+    values = points.samples.value[index]
+    values[points.is_on[index]] = 0.0
+    slopes = _slopes_on(function, corners, index, values, faces)
+    beside = (index < len(boundary.points)).any(axis=1)
+    proved = np.bincount(slopes.owner, minlength=len(index)) > 0
+    proved &= ~beside
+    rows = np.flatnonzero(proved[slopes.owner])
+    good = _regular(
+        function, corners[slopes.owner[rows]], values[slopes.owner[rows], 0],
+        slopes.slope[rows], np.ones(3),
+    )  # fmt: skip
+    proved[slopes.owner[rows[~good]]] = False
+    on_walls = np.ones(len(index), np.bool_)
+    if walls is not None:
+        on_walls = _regular_on_walls(function, corners, values, slopes, proved, walls)
+    far = np.ones(len(index), np.bool_)
+    if len(boundary.edges):
+        far = _distances(corners.mean(axis=1), boundary) > _FAR * spacing
+    stars = ~proved & ~beside & far
+    proved[stars] = _proved_by_stars(function, corners, index, slopes, np.flatnonzero(stars))
+    proved &= on_walls
+    return Isotopy(_share(proved), _share(proved[far]), len(index), index[far & ~proved])
+
+
+def _share(proved: BoolArray) -> float:
+    return float(proved.mean()) if len(proved) else 1.0
+
+
+def _balls(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Centres (n, 3) and radii (n,) of balls around simplices (n, k, 3)."""
+    centre = corners.mean(axis=1)
+    return centre, np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)
+
+
+@dataclass(frozen=True)
+class _Slopes:
+    """Gradients of F, slope (k, 3), on the tetrahedra owner (k,): one each, or two, or none."""
+
+    owner: IntArray
+    slope: FloatArray
+
+
+def _slopes_on(
+    function: LevelFunction,
+    corners: FloatArray,
+    index: IntArray,
+    values: FloatArray,
+    faces: IntArray,
+) -> _Slopes:
+    """The gradients on tetrahedra with those corners (m, 4, 3), points (m, 4) and values (m, 4);
+    none for flat ones, two for those with four corners on the level and two faces in the mesh."""
+    sides = corners[:, 1:] - corners[:, :1]
+    size = np.linalg.norm(sides, axis=2).max(axis=1)
+    sound = np.abs(np.linalg.det(sides)) > 1e-9 * size**3
+    flat = (values == 0).all(axis=1)
+    rows = np.flatnonzero(sound & ~flat)
+    rise = values[rows, 1:] - values[rows, :1]
+    slope: FloatArray = np.linalg.solve(sides[rows], rise[..., None])[..., 0].astype(np.float64)
+    owners, slopes = [rows], [slope]
+    rows = np.flatnonzero(sound & flat)
+    count = int(index.max(initial=0)) + 1
+    known = _triple_keys(faces[(faces < count).all(axis=1)], count)
+    others = np.array([np.delete(np.arange(4), k) for k in range(4)])
+    there = np.stack(
+        [np.isin(_triple_keys(index[rows][:, some], count), known) for some in others], axis=1
+    )
+    sign = np.sign(function.values(corners[rows].mean(axis=1)))
+    pair = there.sum(axis=1) == 2
+    for k, some in enumerate(others):
+        chosen = np.flatnonzero(pair & there[:, k])
+        a, b, c = (corners[rows[chosen], one] for one in some)
+        normal = np.cross(b - a, c - a)
+        inward = ((corners[rows[chosen], k] - a) * normal).sum(axis=1)
+        owners.append(rows[chosen])
+        slopes.append(normal * (np.sign(inward) * sign[chosen])[:, None])
+    return _Slopes(np.concatenate(owners), np.concatenate(slopes))
+
+
+def _triple_keys(triples: IntArray, count: int) -> IntArray:
+    """One number for each triple (k, 3) of fewer than two million points, whatever its order."""
+    a, b, c = np.sort(triples, axis=1).T
+    keys: IntArray = (a * count + b) * count + c
+    return keys
+
+
+def _proved_by_stars(
+    function: LevelFunction, corners: FloatArray, index: IntArray, slopes: _Slopes, rows: IntArray
+) -> BoolArray:
+    """(k,) whether (c) is proved for tetrahedra `rows` (k,).
+
+    n is found as a perceptron does: beginning with the sum of all unit gradients of F around a
+    corner, those with which the product is not positive are added again, a few times.
+    """
+    wanted = np.unique(index[rows])
+    place = np.full(int(index.max(initial=0)) + 1, -1, np.int64)
+    place[wanted] = np.arange(len(wanted))
+    # Pairs of a corner and a tetrahedron around it; then of a corner and a gradient there.
+    tet, corner = np.nonzero(place[index] >= 0)
+    star = place[index[tet, corner]]
+    entry, column = np.nonzero(place[index[slopes.owner]] >= 0)
+    vertex = place[index[slopes.owner[entry], column]]
+    unit = slopes.slope[entry]
+    unit = unit / np.maximum(np.linalg.norm(unit, axis=1), 1e-300)[:, None]
+    n = np.zeros((len(wanted), 3))
+    np.add.at(n, vertex, unit)
+    for _ in range(_TRIALS):
+        short = (n[vertex] * unit).sum(axis=1) <= 0
+        if not short.any():
+            break
+        np.add.at(n, vertex[short], unit[short])
+    good = np.ones(len(wanted), np.bool_)
+    good[vertex[(n[vertex] * unit).sum(axis=1) <= 1e-9]] = False
+    has_slope = np.bincount(slopes.owner, minlength=len(index)) > 0
+    good[star[~has_slope[tet]]] = False
+    tried = np.flatnonzero(good[star])
+    start = np.zeros(len(tried))
+    fine = _regular(function, corners[tet[tried]], start, n[star[tried]], np.ones(3))
+    good[star[tried[~fine]]] = False
+    return np.asarray(good[place[index[rows]]].all(axis=1), np.bool_)
+
+
+def _free(function: LevelFunction, corners: FloatArray) -> BoolArray:
+    """(n,) whether f is proved to have no zero in tetrahedra (n, 4, 3), by halving them. As F has
+    none and f crosses no level on their edges, net, both are between the same two levels: (a)."""
+    owner, pieces = np.arange(len(corners)), corners
+    for _ in range(_HALVINGS + 1):
+        centre, radius = _balls(pieces)
+        bad = function.clearance(centre) <= radius * (1 + 1e-9)
+        owner = np.concatenate([owner[bad], owner[bad]])
+        pieces = _halved(pieces[bad])
+        if not len(pieces):
+            break
+    free = np.ones(len(corners), np.bool_)
+    free[owner] = False
+    return free
+
+
+def _regular(
+    function: LevelFunction,
+    corners: FloatArray,
+    start: FloatArray,
+    slope: FloatArray,
+    free: FloatArray,
+) -> BoolArray:
+    """(n,) whether (a) or (b) is proved all over simplices (n, k, 3), by halving them.
+
+    start: (n,) F at their first corners. slope: grad F. free: (3,) 1 for the coordinates in which
+        walls let points move, else 0.
+    """
+    owner, first = np.arange(len(corners)), corners[:, 0]
+    pieces, proved = corners, np.ones(len(corners), np.bool_)
+    half_period = np.inf if function.period is None else 0.499 * function.period
+    for halving in range(_HALVINGS + 1):
+        if not len(pieces):
+            break
+        centre, radius = _balls(pieces)
+        radius = radius * (1 + 1e-9)
+        samples, change = function.slopes(centre, radius)
+        change = np.minimum(change, _UNKNOWN)
+        if (change == _UNKNOWN).all():
+            proved[owner] = False
+            break
+        along = slope[owner] * free
+        steep = np.linalg.norm(samples.gradient, axis=1)
+        moved = (steep + change) * radius
+        rise = (samples.gradient * along).sum(axis=1)
+        good = rise > change * np.linalg.norm(along, axis=1) * (1 + 1e-9)
+        within = np.abs(samples.value) + moved < half_period
+        linear = start[owner, None] + ((pieces - first[owner, None]) * slope[owner, None]).sum(2)
+        sign = np.sign(samples.value)
+        good |= (np.abs(samples.value) > moved) & (linear * sign[:, None] > 0).all(axis=1)
+        if halving == 0:
+            proved &= within
+        bad = ~good & proved[owner]
+        if halving == _HALVINGS or pieces.shape[1] == 1:
+            proved[owner[bad]] = False
+            break
+        owner = np.concatenate([owner[bad], owner[bad]])
+        pieces = _halved(pieces[bad])
+    return proved
+
+
+def _halved(pieces: FloatArray) -> FloatArray:
+    """Simplices (2n, k, 3): both halves of each, cut at the middle of its longest edge."""
+    pairs = list(itertools.combinations(range(pieces.shape[1]), 2))
+    span = [np.linalg.norm(pieces[:, i] - pieces[:, j], axis=1) for i, j in pairs]
+    i, j = np.array(pairs)[np.argmax(span, axis=0)].T if len(pieces) else (np.zeros(0, int),) * 2
+    rows = np.arange(len(pieces))
+    middle = 0.5 * (pieces[rows, i] + pieces[rows, j])
+    one, other = pieces.copy(), pieces.copy()
+    one[rows, j], other[rows, i] = middle, middle
+    return np.concatenate([one, other])
+
+
+def _regular_on_walls(
+    function: LevelFunction,
+    corners: FloatArray,
+    values: FloatArray,
+    slopes: _Slopes,
+    rows: BoolArray,
+    walls: tuple[FloatArray, FloatArray],
+) -> BoolArray:
+    """(n,) whether (b) is proved for projections, on what lies in walls of tetrahedra `rows` (n,);
+    True for others without a corner there."""
+    slack = 1e-9 * (walls[1] - walls[0])
+    on = np.stack([np.abs(corners - wall) <= slack for wall in walls], axis=-1)  # (n, 4, 3, 2)
+    proved = rows | ~on.any(axis=(1, 2, 3))
+    planes = list(itertools.product(range(3), range(2)))
+    for count in (1, 2):  # in corners of the box no point moves, and there is nothing to ask
+        for some in itertools.combinations(planes, count):
+            axes = [axis for axis, _ in some]
+            if len(set(axes)) < count:
+                continue
+            inside = np.all([on[:, :, axis, side] for axis, side in some], axis=0)
+            free = np.ones(3)
+            free[axes] = 0.0
+            number = inside.sum(axis=1)
+            for k in range(1, 4):
+                entry = np.flatnonzero(((number == k) & rows)[slopes.owner])
+                if not len(entry):
+                    continue
+                owner = slopes.owner[entry]
+                which = np.argsort(~inside[owner], axis=1, kind="stable")[:, :k]
+                part = np.take_along_axis(corners[owner], which[..., None], axis=1)
+                start = np.take_along_axis(values[owner], which[:, :1], axis=1)[:, 0]
+                good = _regular(function, part, start, slopes.slope[entry], free)
+                proved[owner[~good]] = False
+    return proved
+
+
+def _distances(points: FloatArray, boundary: Boundary) -> FloatArray:
+    """(n,) from points to the curve, at most by half its longest edge too large."""
+    import scipy.spatial  # here: half a second that few need
+
+    searching: Any = scipy.spatial
+    a, b = (boundary.points[boundary.edges[:, k]] for k in (0, 1))
+    share = np.linspace(0, 1, 9)[:, None, None]
+    on: FloatArray = (a + share * (b - a)).reshape(-1, 3)
+    found: FloatArray = searching.cKDTree(on).query(points)[0]
+    return found

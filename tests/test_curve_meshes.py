@@ -1,0 +1,302 @@
+"""Meshes of surfaces that end at curves: topology, rim, self-intersections, errors, hard curves."""
+
+from __future__ import annotations
+
+import math
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+
+import harnack as hk
+from harnack.geometry import shapes
+from harnack.meshing import checks
+from harnack.meshing.flips import least_angles
+from harnack.meshing.intersections import intersecting_faces
+from harnack.meshing.samples import LevelFunction
+from tests.oracles.oracle import CurveOracle
+from tests.oracles.triangle_pairs import intersecting_pairs
+
+PERIOD = 4 * math.pi
+# Curves with their Euler characteristic at level 2 pi.
+CURVES: dict[str, tuple[Any, int]] = {
+    "wavy": (shapes.wavy_polygon(64), 1),
+    "trefoil": (shapes.torus_knot(2, 3, 96), -1),
+    "Hopf link": (shapes.hopf_link(48), 0),
+    "three holes": (shapes.square_with_holes(24), -2),
+    "T(2,5)": (shapes.torus_knot(2, 5, 160), -3),
+    "T(3,4)": (shapes.torus_knot(3, 4, 200), -5),
+    "Borromean rings": (shapes.borromean_rings(64), -3),
+    "figure-eight": (shapes.figure_eight_knot(160), -5),
+    "coil": (shapes.coil(4, 128), 1),
+}
+QUICK = ("Hopf link", "three holes")
+
+
+def named(quick: tuple[str, ...]) -> list[Any]:
+    """All names; those that are not quick are marked as slow."""
+    return [
+        name if name in quick else pytest.param(name, marks=pytest.mark.slow) for name in CURVES
+    ]
+
+
+def loops_of(name: str) -> list[np.ndarray]:
+    given = CURVES[name][0]
+    return given if isinstance(given, list) else [given]
+
+
+def undirected(edges: Any) -> set[tuple[int, int]]:
+    return {(min(a, b), max(a, b)) for a, b in np.asarray(edges).tolist()}
+
+
+def check_surface(mesh: Any, loops: list[np.ndarray], expected: int) -> None:
+    """Its rim is the curve by index and bitwise; it is an oriented manifold without
+    self-intersections, of that Euler characteristic, and faces the way the angle grows."""
+    vertices = np.concatenate(loops)
+    assert (mesh.vertices[: len(vertices)] == vertices).all()
+    first, edges = 0, []
+    for loop in loops:
+        edges += [(first + k, first + (k + 1) % len(loop)) for k in range(len(loop))]
+        first += len(loop)
+    facts = mesh.metadata["harnack"]
+    assert undirected(facts["boundary"]) == undirected(edges)
+    checks.check_manifold(mesh.faces)
+    assert facts["euler_characteristic"] == expected
+    assert mesh.is_winding_consistent
+    assert not len(intersecting_pairs(mesh.vertices, mesh.faces))
+    assert facts["turned"] == 0
+
+
+@pytest.mark.parametrize("name", named(QUICK))
+def test_surfaces_of_curves_end_at_the_curve(name: str) -> None:
+    loops, expected = loops_of(name), CURVES[name][1]
+    mesh = hk.mesh(hk.SolidAngle(loops), tolerance=2e-3)
+    check_surface(mesh, loops, expected)
+    assert mesh.body_count == 1
+    facts = mesh.metadata["harnack"]
+    assert facts["isotopy_far"] >= 0.95
+    assert 0.4 < facts["isotopy"] < facts["isotopy_far"]
+    # Triangles beside the rim may be as thin as its edges force them to be.
+    on_rim = np.zeros(len(mesh.vertices), bool)
+    on_rim[facts["boundary"]] = True
+    inner = ~on_rim[mesh.faces].any(axis=1)
+    angles = np.degrees(least_angles(mesh.vertices, mesh.faces))
+    assert np.percentile(angles[inner], 5) >= 25
+    slope = hk.SolidAngle(loops).gradient(mesh.triangles_center, precision="double")
+    turned = (slope * np.cross(*edge_vectors(mesh))).sum(axis=1) <= 0
+    assert turned.mean() < 1e-3  # only between a long edge and the chain beside it
+
+
+def edge_vectors(mesh: Any) -> tuple[np.ndarray, np.ndarray]:
+    corner = mesh.triangles
+    return corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(1, 6))
+@pytest.mark.parametrize("name", ["wavy", "trefoil", "Hopf link", "three holes"])
+def test_topology_does_not_depend_on_seed_or_spacing(name: str, seed: int) -> None:
+    loops, expected = loops_of(name), CURVES[name][1]
+    for spacing in (None, 0.16, 0.07):
+        mesh = hk.mesh(hk.SolidAngle(loops), spacing=spacing, seed=seed, tolerance=4e-3)
+        check_surface(mesh, loops, expected)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "spacing"), [(1, None), (2, 0.11), (3, 0.09)])
+@pytest.mark.parametrize("name", ["T(2,5)", "T(3,4)", "Borromean rings", "figure-eight", "coil"])
+def test_topology_of_larger_curves(name: str, seed: int, spacing: float | None) -> None:
+    loops, expected = loops_of(name), CURVES[name][1]
+    mesh = hk.mesh(hk.SolidAngle(loops), spacing=spacing, seed=seed, tolerance=4e-3)
+    check_surface(mesh, loops, expected)
+
+
+@pytest.mark.parametrize(
+    ("name", "tolerance", "hits"),
+    [
+        ("wavy", 2e-3, 1500),
+        pytest.param("wavy", 1e-3, 20_000, marks=pytest.mark.slow),
+        pytest.param("trefoil", 1e-3, 20_000, marks=pytest.mark.slow),
+    ],
+)
+def test_mesh_and_surface_are_within_the_tolerance(name: str, tolerance: float, hits: int) -> None:
+    """Both ways: from points of the mesh, the function passes the level within the tolerance, by
+    its lift along the normal; and hits of rays are that near to triangles."""
+    loops, rng = loops_of(name), np.random.default_rng(0)
+    field = hk.SolidAngle(loops)
+    mesh = hk.mesh(field, tolerance=tolerance)
+    facts = mesh.metadata["harnack"]
+    assert facts["evaluations"] < 300_000
+    assert len(mesh.faces) < 25_000
+    angles = np.degrees(least_angles(mesh.vertices, mesh.faces))
+    assert np.percentile(angles, 5) >= 25
+    reach = tolerance * float(np.ptp(mesh.bounds, axis=0).max())
+    points = np.asarray(mesh.sample(max(hits, 5000), seed=0))
+    seen = CurveOracle(loops)(points)
+    points, slope = points[seen.smooth > reach], seen.gradient[seen.smooth > reach]
+    step = reach * slope / np.linalg.norm(slope, axis=1)[:, None]
+    ends = [CurveOracle(loops)(points + sign * step).value - 2 * math.pi for sign in (-1, 1)]
+    below, above = (end - PERIOD * np.round(end / PERIOD) for end in ends)
+    assert ((below < 0) & (above > 0) & (above - below < 0.5 * PERIOD)).all()
+    found = np.zeros((0, 3))
+    while len(found) < hits:
+        direction = rng.normal(size=(hits, 3))
+        origin = 4 * direction / np.linalg.norm(direction, axis=1)[:, None]
+        aim = rng.uniform(-1.0, 1.0, origin.shape)
+        seen_by = hk.trace(field, origin, aim - origin)
+        found = np.concatenate([found, seen_by.position[seen_by.hit]])
+    assert distances(mesh, found[:hits]).max() < reach
+
+
+def distances(mesh: Any, points: np.ndarray) -> np.ndarray:
+    """From points to the triangles of a mesh, one by one."""
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(mesh.triangles_center)
+    reach = float(np.linalg.norm(mesh.triangles - mesh.triangles_center[:, None], axis=2).max())
+    near = tree.query(points)[0]
+    out = np.full(len(points), np.inf)
+    for k, (p, r) in enumerate(zip(points, near + 2 * reach, strict=True)):
+        triangles = mesh.triangles[tree.query_ball_point(p, r)]
+        out[k] = np.sqrt(squares_to_triangles(triangles, p).min())
+    return out
+
+
+def squares_to_triangles(t: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """Squared distances of a point from triangles (n, 3, 3)."""
+    normal = np.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0])
+    normal /= np.linalg.norm(normal, axis=1)[:, None]
+    height = ((p - t[:, 0]) * normal).sum(axis=1)
+    foot = p - height[:, None] * normal
+    inside = np.ones(len(t), bool)
+    best = np.full(len(t), np.inf)
+    for k in range(3):
+        a, b = t[:, k], t[:, (k + 1) % 3]
+        inside &= (np.cross(b - a, foot - a) * normal).sum(axis=1) >= 0
+        share = np.clip(((p - a) * (b - a)).sum(axis=1) / ((b - a) ** 2).sum(axis=1), 0, 1)
+        best = np.minimum(best, ((a + share[:, None] * (b - a) - p) ** 2).sum(axis=1))
+    return np.where(inside, height**2, best)
+
+
+@pytest.mark.parametrize("spacing", [0.4, 0.25])
+def test_a_coil_in_cells_that_are_too_large_is_never_wrong(spacing: float) -> None:
+    with pytest.raises(hk.MeshingError, match="smaller `spacing`"):
+        hk.mesh(hk.SolidAngle(loops_of("coil")), spacing=spacing, tolerance=0.02)
+
+
+def test_long_edges_of_a_coil_need_to_be_integrated() -> None:
+    """With large cells wrapped differences are wrong on some edges between its turns."""
+    field = hk.SolidAngle(loops_of("coil"))
+    rng = np.random.default_rng(0)
+    p = rng.uniform(-1, 1, (4000, 3)) * [1.2, 1.2, 0.8]
+    q = p + rng.normal(size=p.shape) * 0.2
+    exact = field.change_along(p, q)
+    assert exact is not None
+    value = field.value(p, precision="double"), field.value(q, precision="double")
+    wrapped = value[1] - value[0]
+    wrapped -= PERIOD * np.round(wrapped / PERIOD)
+    turns = (exact - wrapped) / PERIOD
+    np.testing.assert_allclose(turns, np.round(turns), atol=1e-9)
+    assert (np.round(turns) != 0).sum() > 20
+    # Against the lift followed in small steps.
+    steps = np.linspace(0, 1, 400)
+    for k in range(40):
+        x = p[k] + steps[:, None] * (q[k] - p[k])
+        lift = np.unwrap(CurveOracle(loops_of("coil"))(x).value, period=PERIOD)
+        assert exact[k] == pytest.approx(lift[-1] - lift[0], abs=1e-6)
+
+
+def test_wrapping_alone_would_be_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without integration a mesh of the coil in large cells fails its checks, and says so."""
+    field, spacing = hk.SolidAngle(loops_of("coil")), 0.16
+    mesh = hk.mesh(field, spacing=spacing, tolerance=0.05)
+    assert mesh.metadata["harnack"]["euler_characteristic"] == 1
+    marching = sys.modules["harnack.meshing.marching"]
+    monkeypatch.setattr(marching, "_integrated", lambda field, p, q, wrapped, period: wrapped)
+    with pytest.raises(hk.MeshingError, match="spacing"):
+        hk.mesh(field, spacing=spacing, tolerance=0.05)
+
+
+def test_reaches_are_proved() -> None:
+    """Within its reach of a point an angle moves by less than a quarter of its period."""
+    field, rng = hk.SolidAngle(loops_of("trefoil")), np.random.default_rng(2)
+    function = LevelFunction(field, 2 * math.pi)
+    x = rng.uniform(-3, 3, (2000, 3))
+    samples = function.at(x)
+    d = rng.normal(size=x.shape)
+    d /= np.linalg.norm(d, axis=1)[:, None]
+    change = field.change_along(x, x + samples.reach[:, None] * d)
+    assert change is not None
+    assert np.abs(change).max() <= math.pi
+    assert np.abs(change).max() > 0.55 * math.pi
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("level", [0.5, 1.0, 1.5, 2.5, 3.0, 3.5])
+def test_levels(level: float) -> None:
+    loops = loops_of("wavy")
+    mesh = hk.mesh(hk.SolidAngle(loops), level * math.pi, tolerance=4e-3)
+    check_surface(mesh, loops, 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("kind", ["random", "spiky"])
+def test_random_curves(kind: str, seed: int) -> None:
+    """Seeds 0 and 3 of spiky ones have surfaces that wind about their edges: the triangles between
+    an edge and the chain beside it went through others when the chain was not convex."""
+    rng = np.random.default_rng(seed)
+    if kind == "random":
+        loop = shapes.random_closed_curve(rng, 60)
+    else:
+        loop = shapes.spiky_polygon(rng, 16)
+    mesh = hk.mesh(hk.SolidAngle(loop), tolerance=4e-3)
+    check_surface(mesh, [loop], mesh.metadata["harnack"]["euler_characteristic"])
+    assert mesh.metadata["harnack"]["euler_characteristic"] % 2 == 1  # one rim
+
+
+@pytest.mark.parametrize("length", [1e-4, pytest.param(1e-8, marks=pytest.mark.slow)])
+def test_a_tiny_edge_does_not_force_small_cells(length: float) -> None:
+    plain = shapes.wavy_polygon(48)
+    tiny = np.insert(plain, 1, plain[0] + length * (plain[1] - plain[0]) + [0, 0, length], axis=0)
+    one, other = (hk.mesh(hk.SolidAngle(loop), tolerance=5e-3) for loop in (plain, tiny))
+    check_surface(other, [tiny], 1)
+    counts = [mesh.metadata["harnack"]["evaluations"] for mesh in (one, other)]
+    assert counts[1] < 1.3 * counts[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("scale", "offset"), [(1e-3, 0.0), (1e3, 0.0), (1.0, 1e3), (1.0, 1e6)])
+def test_curves_of_any_size_and_place(scale: float, offset: float) -> None:
+    loop = shapes.wavy_polygon(48) * scale + offset
+    mesh = hk.mesh(hk.SolidAngle(loop), tolerance=5e-3)
+    check_surface(mesh, [loop], 1)
+    plain = hk.mesh(hk.SolidAngle(shapes.wavy_polygon(48)), tolerance=5e-3)
+    assert len(mesh.faces) == pytest.approx(len(plain.faces), rel=0.05)
+
+
+def test_touching_parts_of_a_curve() -> None:
+    """Two vertices of a figure eight 1e-6 apart."""
+    loop = np.array(
+        [[0, 0, 0], [1, 1, 0], [2, 0, 0], [1, -1, 0], [0, 0, 1e-6], [-1, 1, 0.2], [-2, 0, 0],
+         [-1, -1, 0]], float,
+    )  # fmt: skip
+    check_surface(hk.mesh(hk.SolidAngle(loop), tolerance=4e-3), [loop], 1)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_faces_that_pass_through_others_are_all_found(seed: int) -> None:
+    """Against separating axes, in soups with and without common corners."""
+    rng = np.random.default_rng(seed)
+    for vertices, faces in (
+        (rng.uniform(size=(200, 3)), rng.integers(0, 200, (200, 3))),
+        (rng.normal(size=(200, 1, 3)) + 0.4 * rng.normal(size=(200, 3, 3)), None),
+    ):
+        if faces is None:
+            faces = np.arange(600).reshape(-1, 3)
+        x = vertices.reshape(-1, 3)
+        faces = faces[[len(set(face)) == 3 for face in faces.tolist()]]
+        expected = np.unique(intersecting_pairs(x, faces))
+        assert len(expected) > 50
+        assert (intersecting_faces(x, faces) == expected).all()
