@@ -1,0 +1,6 @@
+"""Level sets of real-valued functions in the tetrahedra of a regular lattice."""
+
+from harnack.meshing.lattice.cells import Lattice
+from harnack.meshing.lattice.surface import Surface, closed_surface, open_surface
+
+__all__ = ["Lattice", "Surface", "closed_surface", "open_surface"]
