@@ -10,6 +10,7 @@ from harnack.meshing.tetrahedra import IntArray, edge_keys
 
 __all__ = [
     "MeshingError",
+    "TooLargeError",
     "boundary_edges",
     "check_manifold",
     "euler_characteristic",
@@ -19,6 +20,10 @@ __all__ = [
 
 class MeshingError(ValueError):
     """A level set that could not be meshed; the message says why and what to do."""
+
+
+class TooLargeError(MeshingError):
+    """A mesh that would be so large that it was not begun."""
 
 
 def _directed(faces: IntArray) -> IntArray:

@@ -22,7 +22,7 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
 from harnack.cells import Cells, Clearance, octree
-from harnack.meshing.checks import MeshingError
+from harnack.meshing.checks import MeshingError, TooLargeError
 from harnack.meshing.tetrahedra import IntArray
 
 __all__ = ["Lattice", "distinct", "distinct_rows"]
@@ -154,9 +154,9 @@ def distinct_rows(rows: IntArray) -> IntArray:
     return _key_rows(distinct(_keys(rows, shape)), shape)
 
 
-def too_large(cells: float) -> MeshingError:
+def too_large(cells: float) -> TooLargeError:
     """The error about so many cells."""
-    return MeshingError(
+    return TooLargeError(
         f"about {cells:.1e} cells hold the surface, which makes some {3 * cells:.0e} triangles; "
         f"at most {MOST_CELLS:,} cells are made: choose a larger `spacing` or `tolerance`, or a "
         "smaller `clip`"

@@ -8,6 +8,7 @@ one triangle or quadrilateral, and signs at its corners alone say how.
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -80,8 +81,8 @@ def closed_surface(function: LevelFunction, lattice: Lattice, tolerance: float,
     """The boundary of the points of a lattice's box where the function is negative.
 
     On the box it is made of the faces of the cells whose centres are negative, as if the points of
-    the lattice there were on the level. Triangles that reach into the outermost cells are coarse,
-    are left as they are, and may touch in vertices: they are to be cut away. There are no faces if
+    the lattice there were on the level. Triangles in the two outermost layers of cells are coarse
+    and may touch in vertices: they are to be cut away. There are no faces if
     the function is nowhere negative.
 
     Raises:
@@ -104,10 +105,30 @@ def closed_surface(function: LevelFunction, lattice: Lattice, tolerance: float,
     # What ends at the outermost cells is moved and cut, its ends are not.
     if len(rest):
         vertices = smoothed(function, vertices, rest, None)
-        vertices, rest = refined(function, vertices, rest, tolerance, None, report)
+        inside = _Inside(function.field, function.level, function, lattice)
+        vertices, rest = refined(inside, vertices, rest, tolerance, None, report)
         vertices = smoothed(function, vertices, rest, None)
     faces = np.concatenate([rest, *caps])
     return Surface.of(vertices, faces) if len(faces) else Surface(np.zeros((0, 3)), faces)
+
+
+@dataclass
+class _Inside(LevelFunction):
+    """A function that is on the level wherever it is within one and a half cells of the box.
+
+    So nothing is cut there. Triangles that end in the outermost cells would be cut again and again:
+    the edge they end with stays as it is, and their centres are no deeper than that.
+    """
+
+    function: LevelFunction
+    lattice: Lattice
+
+    def at(self, points: FloatArray) -> Samples:
+        samples = self.function.at(points)
+        depth = np.minimum(points - self.lattice.lower, self.lattice.upper - points)
+        return dataclasses.replace(
+            samples, value=np.where((depth < 1.5 * self.lattice.size).any(axis=1), 0.0, samples.value)
+        )
 
 
 def _wall_faces(

@@ -105,7 +105,7 @@ class RegionMesher:
         spacing = min(self.spacing, size / 8)
         function = _WithinDomain(_entire(field), level)
         self.report(f"level {level:g} of {type(field).__name__} in cells of {spacing:.3g}")
-        lattice = Lattice.filling(lower, upper, spacing, layers=1)
+        lattice = Lattice.filling(lower, upper, spacing, layers=2)
         made = closed_surface(function, lattice, self.tolerance, self.report)
         self.evaluations += function.evaluations
         self.levels += 1
