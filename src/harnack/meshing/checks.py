@@ -13,6 +13,7 @@ __all__ = [
     "TooLargeError",
     "boundary_edges",
     "check_manifold",
+    "directed_edges",
     "euler_characteristic",
     "singular_vertices",
 ]
@@ -26,14 +27,15 @@ class TooLargeError(MeshingError):
     """A mesh that would be so large that it was not begun."""
 
 
-def _directed(faces: IntArray) -> IntArray:
-    """(3m, 2): the edges of faces (m, 3), as they are run."""
+def directed_edges(faces: IntArray) -> IntArray:
+    """(3m, 2): the edges of faces (m, 3), as they are run: all first ones (corners 0 and 1), then
+    all second and all third ones."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
 def boundary_edges(faces: IntArray) -> IntArray:
     """(k, 2): edges of one face only, as it runs them."""
-    edges = _directed(faces)
+    edges = directed_edges(faces)
     count = int(faces.max(initial=-1)) + 1
     _, index, uses = np.unique(edge_keys(edges, count), return_inverse=True, return_counts=True)
     return edges[uses[index] == 1]
@@ -41,7 +43,7 @@ def boundary_edges(faces: IntArray) -> IntArray:
 
 def euler_characteristic(faces: IntArray) -> int:
     """Vertices in use, less edges, and faces."""
-    edges, count = _directed(faces), int(faces.max(initial=-1)) + 1
+    edges, count = directed_edges(faces), int(faces.max(initial=-1)) + 1
     return len(np.unique(faces)) - len(np.unique(edge_keys(edges, count))) + len(faces)
 
 
@@ -52,7 +54,7 @@ def check_manifold(faces: IntArray) -> None:
     Raises:
         MeshingError: otherwise.
     """
-    edges, count = _directed(faces), int(faces.max(initial=-1)) + 1
+    edges, count = directed_edges(faces), int(faces.max(initial=-1)) + 1
     _, index, uses = np.unique(edge_keys(edges, count), return_inverse=True, return_counts=True)
     if (uses > 2).any():
         raise MeshingError(
@@ -76,7 +78,7 @@ def check_manifold(faces: IntArray) -> None:
 def singular_vertices(faces: IntArray) -> IntArray:
     """Vertices, by index, at which faces (m, 3) are not a manifold: those of edges with more than
     two faces, and those that have more than one fan of faces."""
-    edges, count = _directed(faces), int(faces.max(initial=-1)) + 1
+    edges, count = directed_edges(faces), int(faces.max(initial=-1)) + 1
     _, index, uses = np.unique(edge_keys(edges, count), return_inverse=True, return_counts=True)
     many = np.unique(edges[uses[index] > 2])
     _, fan = _fans(faces, index, uses)
@@ -95,7 +97,7 @@ def _fans(faces: IntArray, edge: IntArray, uses: IntArray) -> tuple[int, IntArra
     sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
     m = len(faces)
     corner = np.arange(3 * m).reshape(m, 3)
-    # Corners at both ends of the edge k of a face, in the order of `_directed`.
+    # Corners at both ends of the edge k of a face, in the order of `directed_edges`.
     first = np.concatenate([corner[:, 0], corner[:, 1], corner[:, 2]])
     second = np.concatenate([corner[:, 1], corner[:, 2], corner[:, 0]])
     order = np.argsort(edge, kind="stable")

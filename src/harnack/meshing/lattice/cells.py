@@ -2,9 +2,9 @@
 
 Its points are the corners and the centres of equal cells, and where a cell lies on the box, the
 centres of its faces there. Two centres on both sides of a face make four tetrahedra with the four
-edges of the face; at the box, where the outer centre is that of the face itself, half as large ones.
-So the tetrahedra fill the box, and those at the faces of some cells contain these cells. In cubes
-their dihedral angles are 60 and 90 degrees (Labelle and Shewchuk 2007, "Isosurface stuffing").
+edges of the face; at the box, where the outer centre is that of the face itself, half as large
+ones. So the tetrahedra fill the box, and those at the faces of some cells contain these cells. In
+cubes their dihedral angles are 60 and 90 degrees (Labelle and Shewchuk 2007, "Isosurface stuffing").
 
 Cells that are proved empty need none. Proof. Let the level set meet chosen cells only, and let a
 tetrahedron at a face of a chosen cell have its other apex in a cell that is not: that cell holds no
@@ -112,7 +112,8 @@ class Lattice:
         return np.argwhere(~inner)
 
     def tetrahedra(self, cells: IntArray) -> tuple[IntArray, IntArray]:
-        """Points (n, 3) by their coordinates, and tetrahedra (m, 4) at all faces of cells (k, 3)."""
+        """Tetrahedra at all faces of cells (k, 3): their points (n, 3) by coordinates, and for each
+        the indices of four of them (m, 4)."""
         shape = 2 * self.counts + 1
         found: list[IntArray] = []
         for axis in range(3):
@@ -121,7 +122,7 @@ class Lattice:
             face = np.concatenate([2 * cells, lower])
             face = _key_rows(distinct(_keys(face, shape)), shape)
             others = [k for k in range(3) if k != axis]
-            ends = []
+            ends: list[IntArray] = []
             for way in (-1, 1):
                 centre = face + 1
                 centre[:, axis] = np.clip(face[:, axis] + way, 0, shape[axis] - 1)

@@ -52,8 +52,9 @@ class Surface:
         return Surface(self.vertices, self.faces[:, ::-1])
 
 
-def open_surface(function: LevelFunction, lattice: Lattice, tolerance: float,
-                 report: Callable[[str], None]) -> Surface:
+def open_surface(
+    function: LevelFunction, lattice: Lattice, tolerance: float, report: Callable[[str], None]
+) -> Surface:
     """The level set in the box of a lattice, which ends on the box's faces.
 
     tolerance: of the middles of edges and faces, a length.
@@ -76,8 +77,9 @@ def open_surface(function: LevelFunction, lattice: Lattice, tolerance: float,
     return Surface.of(smoothed(function, vertices, faces, walls), faces)
 
 
-def closed_surface(function: LevelFunction, lattice: Lattice, tolerance: float,
-                   report: Callable[[str], None]) -> Surface:
+def closed_surface(
+    function: LevelFunction, lattice: Lattice, tolerance: float, report: Callable[[str], None]
+) -> Surface:
     """The boundary of the points of a lattice's box where the function is negative.
 
     On the box it is made of the faces of the cells whose centres are negative, as if the points of
@@ -127,7 +129,8 @@ class _Inside(LevelFunction):
         samples = self.function.at(points)
         depth = np.minimum(points - self.lattice.lower, self.lattice.upper - points)
         return dataclasses.replace(
-            samples, value=np.where((depth < 1.5 * self.lattice.size).any(axis=1), 0.0, samples.value)
+            samples,
+            value=np.where((depth < 1.5 * self.lattice.size).any(axis=1), 0.0, samples.value),
         )
 
 
@@ -177,6 +180,7 @@ def _marched(
     at_rest, original = points, samples
     points, samples, is_on = _snapped(function, points, samples, is_fixed, lattice, walls)
     is_on |= is_wall
+    wrong = np.zeros(0, np.int64)
     for _ in range(_MOST_ROUNDS):
         tets = _cut_tetrahedra(points, samples.value, is_on, corners)
         some = PointSet(points, is_on, samples)

@@ -52,12 +52,14 @@ def normals_of(field: Field, level: float, surface: Surface) -> FloatArray:
         np.add.at(mean, surface.faces[:, k], normal)
     mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-300)[:, None]
     slope = LevelFunction(field, level).at(surface.vertices).gradient
-    steep = np.linalg.norm(slope, axis=1)
+    steep: FloatArray = np.linalg.norm(slope, axis=1)
     slope = slope / np.maximum(steep, 1e-300)[:, None]
     # Beside the curve slopes turn within a triangle.
     good = np.isfinite(steep) & (steep > 0) & ((slope * mean).sum(axis=1) > 0.7)
-    good[np.unique(boundary_edges(surface.faces))] = False
-    return np.where(good[:, None], slope, mean)
+    if field.period is not None:
+        good[np.unique(boundary_edges(surface.faces))] = False
+    chosen: FloatArray = np.where(good[:, None], slope, mean)
+    return chosen
 
 
 def largest_part(surface: Surface) -> Surface:

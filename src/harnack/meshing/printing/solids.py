@@ -106,9 +106,7 @@ def mesh_solid(
     return SolidMesh(made, cells, mesher.evaluations, mesher.levels, size)
 
 
-def _bounds(
-    solid: Solid, level: float, volume: Volume | None
-) -> tuple[FloatArray, FloatArray]:
+def _bounds(solid: Solid, level: float, volume: Volume | None) -> tuple[FloatArray, FloatArray]:
     """A box that holds the solid within the volume.
 
     Raises:
@@ -149,4 +147,3 @@ def _on_box(surface: Surface, volume: Volume) -> Surface:
                 near = np.abs(vertices - end) <= 1e-12 * (1 + np.abs(end))
                 vertices = np.where(near, end, vertices)
     return Surface(vertices, surface.faces)
-

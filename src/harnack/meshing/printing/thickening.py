@@ -15,15 +15,19 @@ from typing import Any
 import numpy as np
 
 from harnack.backend import FloatArray
-from harnack.meshing.checks import MeshingError, boundary_edges
+from harnack.meshing.checks import MeshingError, boundary_edges, directed_edges
 from harnack.meshing.intersections import intersecting_faces
 from harnack.meshing.lattice import Surface
+from harnack.meshing.lattice.cells import distinct
 from harnack.meshing.printing.manifolds import surface_of
+from harnack.meshing.tetrahedra import edge_keys
 
 __all__ = ["thickened"]
 
+# So much of the area may turn over where the two sides are made: slivers.
+_TURNED = 1e-2
 # More triangles than that are not each made a hull of.
-_MOST_HULLS = 60_000
+_MOST_HULLS = 20_000
 # A side that comes so near to the surface, in parts of t/2, is within its reach.
 _NEAR = 0.98
 
@@ -48,7 +52,7 @@ def thickened(
         if not len(crossing):
             return part, {**facts, "thickened_by": "offset"}
         why = f"{len(crossing)} triangles of the two sides pass through each other"
-    return _hulls(surface, 0.5 * thickness, tolerance), {
+    return _hulls(surface, 0.5 * thickness, tolerance, why), {
         **facts, "thickened_by": "hulls of balls", "why": why
     }  # fmt: skip
 
@@ -60,14 +64,26 @@ def _crosses(vertices: FloatArray, faces: Any) -> FloatArray:
 
 def _offset(surface: Surface, normals: FloatArray, thickness: float) -> Surface:
     """Both sides, and walls along the rim."""
-    n, move = len(surface.vertices), 0.5 * thickness * normals
+    n = len(surface.vertices)
+    move = 0.5 * thickness * normals / _slants(surface, normals)[:, None]
     a, b = boundary_edges(surface.faces).T
     # A face above the rim runs it from a to b, so the wall runs it from b to a.
     walls = [np.stack([b, a, a + n], axis=1), np.stack([b, a + n, b + n], axis=1)]
     vertices = np.concatenate([surface.vertices + move, surface.vertices - move])
-    return Surface(
-        vertices, np.concatenate([surface.faces, surface.faces[:, ::-1] + n, *walls])
-    )
+    return Surface(vertices, np.concatenate([surface.faces, surface.faces[:, ::-1] + n, *walls]))
+
+
+def _slants(surface: Surface, normals: FloatArray) -> FloatArray:
+    """(n,) cosines between normals at vertices and those of the faces there, means by area: as much
+    farther vertices are moved, so that faces are moved by the thickness."""
+    cross = _crosses(surface.vertices, surface.faces)
+    total, area = np.zeros(len(normals)), np.zeros(len(normals))
+    size = np.linalg.norm(cross, axis=1)
+    for k in range(3):
+        rows = surface.faces[:, k]
+        total += np.bincount(rows, (cross * normals[rows]).sum(axis=1), minlength=len(normals))
+        area += np.bincount(rows, size, minlength=len(normals))
+    return np.clip(total / np.maximum(area, 1e-300), 0.7, 1.0)
 
 
 def _beyond_reach(surface: Surface, normals: FloatArray, thickness: float) -> str | None:
@@ -77,34 +93,43 @@ def _beyond_reach(surface: Surface, normals: FloatArray, thickness: float) -> st
     searching: Any = scipy.spatial
     half = 0.5 * thickness
     flat = _crosses(surface.vertices, surface.faces)
+    areas = np.linalg.norm(flat, axis=1)
+    tree = searching.cKDTree(surface.vertices)
+    own = np.arange(len(surface.vertices))
+    few = min(16, len(own))
+    neighbours = distinct(edge_keys(directed_edges(surface.faces), len(own)))
     for sign in (1, -1):
         side = surface.vertices + sign * half * normals
         turned = (_crosses(side, surface.faces) * flat).sum(axis=1) <= 0
-        if turned.any():
+        if areas[turned].sum() > _TURNED * areas.sum():  # less are slivers
             return f"{turned.sum()} triangles turn over: the surface bends more than 1/{half:.3g}"
-        # Of all vertices the one that a point was moved from is the nearest.
-        away = searching.cKDTree(surface.vertices).query(side)[0]
-        if (away < _NEAR * half).any():
-            return f"{(away < _NEAR * half).sum()} points of a side are nearer to another place"
+        # Nearer than the vertex that a point was moved from are at most its neighbours.
+        away, other = tree.query(side, k=few)
+        pairs = np.stack([np.broadcast_to(own[:, None], other.shape), other], axis=-1)
+        near = (away < _NEAR * half) & (pairs[..., 0] != pairs[..., 1])
+        found = distinct(edge_keys(pairs[near], len(own)))
+        count = int((~np.isin(found, neighbours)).sum())
+        if count:
+            return f"{count} points of a side are nearer to another place than to their own"
     return None
 
 
-def _hulls(surface: Surface, radius: float, tolerance: float) -> Surface:
+def _hulls(surface: Surface, radius: float, tolerance: float, why: str) -> Surface:
     """The union of the hulls of three balls around the corners of each triangle.
 
     Balls are polyhedra with corners on the sphere, so that the part is inside of what it should be,
-    by at most `tolerance` or a twentieth of the radius.
+    by at most `tolerance` or a tenth of the radius.
     """
     from manifold3d import Manifold, OpType
 
     if len(surface.faces) > _MOST_HULLS:
         raise MeshingError(
-            f"the surface is to be {2 * radius:.3g} thick, which is beyond its reach, and has "
+            f"{2 * radius:.3g} is thicker than the surface's reach allows ({why}), and there are "
             f"{len(surface.faces):,} triangles, too many for a union of as many hulls: choose a "
             "larger `tolerance`, or a smaller thickness"
         )
-    allowed = max(tolerance, 0.05 * radius)
-    segments = int(np.clip(4 * np.ceil(np.pi / 2 * np.sqrt(radius / (2 * allowed))), 8, 32))
+    allowed = max(tolerance, 0.1 * radius)
+    segments = int(np.clip(4 * np.ceil(np.pi / 2 * np.sqrt(radius / (2 * allowed))), 8, 16))
     mesh = Manifold.sphere(radius, segments).to_mesh64()
     ball = np.array(mesh.vert_properties, np.float64)[:, :3]
     parts = [
