@@ -17,7 +17,7 @@ from harnack.meshing.checks import (
     boundary_edges,
     check_manifold,
 )
-from harnack.meshing.lattice import Lattice, Surface, open_surface
+from harnack.meshing.lattice import Lattice, Surface, check_size, open_surface
 from harnack.meshing.marching import crossings_of, triangles_of
 from harnack.meshing.points import Boundary, PointSet, box_cells, place_points
 from harnack.meshing.printing.clipping import cut_by
@@ -282,6 +282,7 @@ def _spanned(
     walls = ends if box.has_walls else None
     first = _first_mesh(function, spacing, attempts, ends, walls, seed, report)
     vertices, faces = first.vertices, first.faces
+    check_size(function, vertices, faces, tolerance)
     vertices = smoothed(function, vertices, faces, walls)
     vertices, faces = refined(function, vertices, faces, tolerance, walls, report)
     vertices = smoothed(function, vertices, faces, walls)

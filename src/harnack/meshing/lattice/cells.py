@@ -4,7 +4,7 @@ Its points are the corners and the centres of equal cells, and where a cell lies
 centres of its faces there. Two centres on both sides of a face make four tetrahedra with the four
 edges of the face; at the box, where the outer centre is that of the face itself, half as large
 ones. So the tetrahedra fill the box, and those at the faces of some cells contain these cells. In
-cubes their dihedral angles are 60 and 90 degrees (Labelle and Shewchuk 2007, "Isosurface stuffing").
+cubes their dihedral angles are 60 and 90 degrees (Labelle and Shewchuk 2007).
 
 Cells that are proved empty need none. Proof. Let the level set meet chosen cells only, and let a
 tetrahedron at a face of a chosen cell have its other apex in a cell that is not: that cell holds no

@@ -18,6 +18,7 @@ import numpy as np
 from harnack.backend import BoolArray, FloatArray
 from harnack.meshing.checks import MeshingError, singular_vertices
 from harnack.meshing.lattice.cells import Lattice, distinct_rows
+from harnack.meshing.lattice.estimates import check_size
 from harnack.meshing.marching import crossings_of, triangles_of
 from harnack.meshing.points import PointSet, newton
 from harnack.meshing.refinement import refined, smoothed
@@ -72,6 +73,7 @@ def open_surface(
     vertices, faces = _marched(function, points, samples, corners, nowhere, nowhere, lattice, walls)
     if not len(faces):
         raise MeshingError("the level set is empty: no cell of the box holds the level")
+    check_size(function, vertices, faces, tolerance)
     vertices = smoothed(function, vertices, faces, walls)
     vertices, faces = refined(function, vertices, faces, tolerance, walls, report)
     return Surface.of(smoothed(function, vertices, faces, walls), faces)
@@ -106,6 +108,7 @@ def closed_surface(
     rest, caps = faces[~is_cap], [faces[is_cap], _wall_faces(points, samples, corners, is_wall)]
     # What ends at the outermost cells is moved and cut, its ends are not.
     if len(rest):
+        check_size(function, vertices, rest, tolerance)
         vertices = smoothed(function, vertices, rest, None)
         inside = _Inside(function.field, function.level, function, lattice)
         vertices, rest = refined(inside, vertices, rest, tolerance, None, report)
