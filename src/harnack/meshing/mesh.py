@@ -440,7 +440,9 @@ def _check_boundary(
     edges = boundary_edges(faces)
     count = max(int(faces.max()) + 1, len(curve.points))
     if walls is not None:  # where the surface ends as well
-        on = ((vertices == walls[0]) | (vertices == walls[1])).any(axis=1)
+        slack = 1e-9 * (walls[1] - walls[0])
+        near = (np.abs(vertices - end) <= slack for end in walls)
+        on = np.logical_or(*near).any(axis=1)
         edges = edges[~on[edges].all(axis=1)]
     if not np.array_equal(np.sort(edge_keys(edges, count)), np.sort(edge_keys(curve.edges, count))):
         raise MeshingError(

@@ -84,6 +84,9 @@ class Lattice:
         Raises:
             MeshingError: there are too many.
         """
+        # A surface across the box, at the least, meets so many cells.
+        if (least := float(np.prod(np.sort(self.counts)[:2].astype(float)))) > MOST_CELLS:
+            raise too_large(least)
         halvings = 0
         while halvings < 3 and (self.counts >= 2 ** (halvings + 2)).all():
             halvings += 1
@@ -107,9 +110,13 @@ class Lattice:
 
     def outer_cells(self) -> IntArray:
         """(n, 3) indices of the cells at the box."""
-        inner = np.zeros(self.counts, np.bool_)
-        inner[1:-1, 1:-1, 1:-1] = True
-        return np.argwhere(~inner)
+        found: list[IntArray] = []
+        for axis in range(3):
+            ranges = [np.arange(count) for count in self.counts]
+            ranges[axis] = np.unique([0, self.counts[axis] - 1])
+            grid = np.stack(np.meshgrid(*ranges, indexing="ij"), axis=-1)
+            found.append(grid.reshape(-1, 3).astype(np.int64))
+        return distinct_rows(np.concatenate(found))
 
     def tetrahedra(self, cells: IntArray) -> tuple[IntArray, IntArray]:
         """Tetrahedra at all faces of cells (k, 3): their points (n, 3) by coordinates, and for each
