@@ -247,6 +247,26 @@ def test_too_many_hulls_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
         hk.mesh(hk.Sphere(0.3), thickness=0.8, tolerance=0.05, spacing=0.2)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("part", "volume", "bodies"),
+    [
+        (hk.Sphere(0.5) | hk.Sphere(0.5).moved((1, 0, 0)), math.pi / 3, 2),
+        (hk.Sphere(0.5) | hk.Sphere(0.5), math.pi / 6, 1),
+        (hk.Sphere(0.5).moved((1e6, 0, 0)), math.pi / 6, 1),
+        (hk.Sphere(1e-6), 8e-18 * math.pi / 6, 1),
+        (hk.Sphere(1e6), 8e18 * math.pi / 6, 1),
+        (hk.Cuboid((0.5,) * 3) | hk.Cuboid((0.5,) * 3).moved((1, 0, 0)), 2.0, 1),
+    ],
+    ids=["touching", "twice", "far", "tiny", "huge", "sharing a face"],
+)
+def test_parts_that_touch_or_are_far(part: Any, volume: float, bodies: int) -> None:
+    mesh = hk.mesh(part, tolerance=4e-3)
+    assert is_part(mesh)
+    assert mesh.body_count == bodies
+    assert mesh.volume == pytest.approx(volume, rel=1e-2)
+
+
 # Last steps
 
 
@@ -308,6 +328,9 @@ CURVE = hk.SolidAngle(shapes.wavy_polygon(12))
         (hk.Sphere(0.5), {"tolerance": math.nan}, "tolerance"),
         (hk.Sphere(0.5), {"tolerance": 1e-12}, "triangles"),
         (hk.Sphere(0.5), {"spacing": 1e-7}, "cells"),
+        (hk.Gyroid(1.0), {"solid": (-1e-8, 1e-8), "clip": BOX}, "thick, and its sides"),
+        (hk.Gyroid(1.0), {"solid": (-1e-3, 1e-3), "clip": BOX}, "thick, and its sides"),
+        (hk.Gyroid(1.0), {"solid": (-0.3, 0.3), "clip": hk.Box((0, 0, 0), (1, 1, 0))}, "empty"),
         (CURVE, {"simplify": True}, "closed meshes"),
         (CURVE, {"solid": (1.0, math.inf)}, "angle-valued"),
         (CURVE, {"clip": hk.Ball((9, 9, 9), 1)}, "empty"),

@@ -112,10 +112,12 @@ class Lattice:
         """(n, 3) indices of the cells at the box."""
         found: list[IntArray] = []
         for axis in range(3):
-            ranges = [np.arange(count) for count in self.counts]
-            ranges[axis] = np.unique([0, self.counts[axis] - 1])
-            grid = np.stack(np.meshgrid(*ranges, indexing="ij"), axis=-1)
-            found.append(grid.reshape(-1, 3).astype(np.int64))
+            ends = self.counts.copy()
+            ends[axis] = 1
+            layer: IntArray = np.indices(tuple(ends.tolist())).reshape(3, -1).T.copy()
+            found.append(layer.copy())
+            layer[:, axis] = self.counts[axis] - 1
+            found.append(layer)
         return distinct_rows(np.concatenate(found))
 
     def tetrahedra(self, cells: IntArray) -> tuple[IntArray, IntArray]:

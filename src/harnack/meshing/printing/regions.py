@@ -126,6 +126,8 @@ class RegionMesher:
         field = wall.inner
         if field.period is None:
             inside = Region(field)
+            if not isinstance(field, Solid):
+                self._check_wall(field, low, high)
             return self.below(inside, high) - self.below(inside, low)
         if 2 * half >= field.period:
             return self._space()
@@ -135,6 +137,24 @@ class RegionMesher:
                 "be meshed: only those of a SolidAngle"
             )
         return manifold_of(self._lens(field, low, high))
+
+    def _check_wall(self, field: Field, low: float, high: float) -> None:
+        """Raise if a wall is thinner than both of its sides' tolerance: they would meet."""
+        lattice = Lattice.filling(
+            self.lower, self.upper, float((self.upper - self.lower).max()) / 8
+        )
+        points = lattice.points(2 * np.argwhere(np.ones(lattice.counts)) + 1)
+        middle = 0.5 * (low + high)
+        samples = _WithinDomain(field, middle).at(points)
+        # Where the wall may be near.
+        near = samples.distance <= np.median(samples.distance)
+        steep = float(np.median(np.linalg.norm(samples.gradient[near], axis=1)))
+        self.evaluations += len(points)
+        if high - low < 2 * self.tolerance * steep:
+            raise MeshingError(
+                f"the wall is about {(high - low) / steep:.2g} thick, and its sides are made within "
+                f"{self.tolerance:.2g}: choose a smaller `tolerance`, or a thicker wall"
+            )
 
     def _lens(self, field: SolidAngle, low: float, high: float) -> Surface:
         """Between two levels of an angle: both end at the same vertices, those of the curve."""
