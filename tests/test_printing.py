@@ -104,6 +104,7 @@ def test_points_of_gyroid_walls_are_on_walls_or_on_caps(walls: Any) -> None:
     assert 0.05 < on_cap.mean() < 0.4
 
 
+@pytest.mark.slow
 def test_solids_are_given_by_levels_as_they_are_drawn() -> None:
     """The same part by `solid=`, by `hk.solid`, and by the domain in place of the clip."""
     settings: dict[str, Any] = {"tolerance": 4e-3}
@@ -164,6 +165,7 @@ def test_balls_cut_solids() -> None:
     assert mesh.volume == pytest.approx(expected, rel=5e-3)
 
 
+@pytest.mark.slow
 def test_a_thick_seifert_surface_ends_at_the_knot() -> None:
     """The two sides of a solid around a level of an angle share the vertices of the curve."""
     solid = hk.solid(hk.SolidAngle(KNOT), around=(2 * math.pi, 0.3))
@@ -197,6 +199,7 @@ def test_spheres_that_are_cut_have_the_area_left(clip: Any) -> None:
         np.testing.assert_allclose(np.linalg.norm(rim - clip.center, axis=1), 0.5, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_level_without_extent_is_cut_by_the_clip() -> None:
     curve = shapes.wavy_polygon(32)
     mesh = hk.mesh(
@@ -223,6 +226,7 @@ def test_a_thick_surface_has_the_volume_of_area_times_thickness() -> None:
     assert facts["euler_characteristic"] == -2
 
 
+@pytest.mark.slow
 def test_a_thick_sphere_is_a_shell() -> None:
     mesh = hk.mesh(hk.Sphere(0.8), thickness=0.1, tolerance=2e-3)
     assert is_part(mesh)
@@ -230,6 +234,7 @@ def test_a_thick_sphere_is_a_shell() -> None:
     assert mesh.volume == pytest.approx(4 / 3 * math.pi * (0.85**3 - 0.75**3), rel=5e-3)
 
 
+@pytest.mark.slow
 def test_beyond_its_reach_a_surface_is_made_of_hulls() -> None:
     """A small sphere, thicker than its diameter, is a ball."""
     mesh = hk.mesh(hk.Sphere(0.3), thickness=0.8, tolerance=0.05, spacing=0.2)
@@ -270,6 +275,7 @@ def test_parts_that_touch_or_are_far(part: Any, volume: float, bodies: int) -> N
 # Last steps
 
 
+@pytest.mark.slow
 def test_simplified_parts_are_within_the_tolerance() -> None:
     settings: dict[str, Any] = {"clip": hk.Box((-0.4, -0.4, -0.4), (0.4, 0.4, 0.4))}
     tolerance, size = 1e-2, 0.8

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
     import trimesh
 
-    from harnack.backend import BoolArray, FloatArray
+    from harnack.backend import FloatArray
     from harnack.cells import Cells
 
 __all__ = ["mesh"]
@@ -442,7 +442,7 @@ def _check_boundary(
     if walls is not None:  # where the surface ends as well
         slack = 1e-9 * (walls[1] - walls[0])
         near = np.minimum(np.abs(vertices - walls[0]), np.abs(vertices - walls[1]))
-        on: BoolArray = (near <= slack).any(axis=1)
+        on = np.asarray((near <= slack).any(axis=1))
         edges = edges[~on[edges].all(axis=1)]
     if not np.array_equal(np.sort(edge_keys(edges, count)), np.sort(edge_keys(curve.edges, count))):
         raise MeshingError(

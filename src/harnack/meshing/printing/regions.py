@@ -152,8 +152,8 @@ class RegionMesher:
         self.evaluations += len(points)
         if high - low < 2 * self.tolerance * steep:
             raise MeshingError(
-                f"the wall is about {(high - low) / steep:.2g} thick, and its sides are made within "
-                f"{self.tolerance:.2g}: choose a smaller `tolerance`, or a thicker wall"
+                f"the wall is about {(high - low) / steep:.2g} thick, and its sides are made "
+                f"within {self.tolerance:.2g}: choose a smaller `tolerance`, or a thicker wall"
             )
 
     def _lens(self, field: SolidAngle, low: float, high: float) -> Surface:
