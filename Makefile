@@ -4,11 +4,12 @@ BIN := .venv/bin
 STAMP := .venv/.setup-stamp
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow lint format images bench figures clean
+.PHONY: help setup demo parts test test-slow lint format images bench figures clean
 
 help:
 	@echo "make setup      install everything into .venv"
 	@echo "make demo       render the gallery's demo pictures into out/"
+	@echo "make parts      make parts to print into out/"
 	@echo "make test       run the quick tests"
 	@echo "make test-slow  run the slow tests"
 	@echo "make lint       check style and types"
@@ -26,6 +27,11 @@ $(STAMP): pyproject.toml scripts/bootstrap.py
 
 demo: $(STAMP)
 	$(BIN)/harnack gallery --demo -o out
+
+parts: $(STAMP)
+	mkdir -p out
+	$(BIN)/harnack mesh gyroid --tolerance 0.002 --scale 30 -o out/gyroid.stl
+	$(BIN)/harnack mesh trefoil --thickness 0.08 --scale 25 -o out/trefoil.stl
 
 # One worker a core; tests/conftest.py divides Dr.Jit's threads among them.
 test: $(STAMP)

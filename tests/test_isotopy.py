@@ -59,7 +59,7 @@ def first_mesh(
     tets = delaunay(points.points)
     crossings = crossings_of(function, points, tets)
     cut, faces = is_cut(points, tets, crossings), np.zeros((0, 3), np.int64)
-    found = isotopy.isotopy_of(function, points, tets, cut, faces, NO_CURVE, spacing, BOX)
+    found = isotopy.isotopy_of(function, points, tets.corners, cut, faces, NO_CURVE, spacing, BOX)
     return found, points
 
 

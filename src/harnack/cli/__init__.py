@@ -21,10 +21,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return COMMANDS[options.command](options)
         except KeyboardInterrupt:
             interrupts.asked = True
-        except (ValueError, TypeError, OSError, RuntimeError, MemoryError) as error:
+        except (ValueError, TypeError, OSError, ImportError, RuntimeError, MemoryError) as error:
             # A Ctrl-C within a plug-in reaches us as an error of Mitsuba or Dr.Jit.
             if not interrupts.asked:
                 print(error_line(error), file=sys.stderr)
                 return 1
-        print("stopped; nothing was written for the picture in progress", file=sys.stderr)
+        print("stopped; nothing was written for what was in progress", file=sys.stderr)
         return 130

@@ -10,6 +10,7 @@ from typing import Any, NoReturn
 
 from harnack._version import __version__
 from harnack.choices import did_you_mean
+from harnack.cli.mesh_files import MESH_FILES
 from harnack.cli.messages import printable
 from harnack.files.surfaces import SURFACE_FILES
 from harnack.opening import UP_AXES
@@ -122,14 +123,15 @@ def _add_render(commands: Any) -> None:
 
 def _add_mesh(commands: Any) -> None:
     one = commands.add_parser(
-        "mesh", help="make triangles of a surface",
+        "mesh", help="make triangles of a surface, or a closed part to print",
         description="Write the triangles of a gallery scene's surface, or of the surface that the "
-        "curves of a file span. A surface that ends at a curve ends at its very vertices.",
+        "curves of a file span. A surface that ends at a curve ends at its very vertices. Solids "
+        "are closed, with caps where they are cut; --thickness makes a closed part of a surface.",
     )  # fmt: skip
     one.add_argument(
         "scene", metavar="SCENE", help="a name from `harnack gallery --list`, or a file of curves"
     )
-    one.add_argument("-o", "--output", metavar="FILE", help=".stl, .ply, .obj or .glb (SCENE.stl)")
+    one.add_argument("-o", "--output", metavar="FILE", help=f"{', '.join(MESH_FILES)} (SCENE.stl)")
     one.add_argument("--level", type=parse_level, help="as for render")
     one.add_argument(
         "--tolerance", type=_positive, metavar="PART",
@@ -138,6 +140,27 @@ def _add_mesh(commands: Any) -> None:
     one.add_argument(
         "--spacing", type=_positive, metavar="LENGTH", help="of cells before anything is refined"
     )
+    one.add_argument(
+        "--solid", type=_ends, metavar="LOW:HIGH",
+        help="the closed part where the function is between two values; one may be left out: :0",
+    )  # fmt: skip
+    one.add_argument(
+        "--thickness", type=_positive, metavar="LENGTH",
+        help="a closed part so thick, in the scene's unit, half on each side of the surface",
+    )  # fmt: skip
+    clip = one.add_mutually_exclusive_group()
+    clip.add_argument(
+        "--box", type=_six_numbers, metavar="X,Y,Z,X,Y,Z", help="cut by a box between two corners"
+    )
+    clip.add_argument("--ball", type=_four_numbers, metavar="X,Y,Z,R", help="cut by a ball")
+    one.add_argument(
+        "--simplify", action="store_true", help="fewer triangles of closed parts, as exact"
+    )
+    one.add_argument("--largest", action="store_true", help="only the largest connected part")
+    one.add_argument(
+        "--scale", type=_positive, metavar="FACTOR",
+        help="multiply all lengths at the end: millimetres for one unit of the scene (1)",
+    )  # fmt: skip
     one.add_argument("--quiet", action="store_true", help="do not say what is being done")
 
 
@@ -178,6 +201,35 @@ def _positive(text: str) -> float:
     if not 0 < number < math.inf:
         raise argparse.ArgumentTypeError(f"{_shown(text)} must be a positive number")
     return number
+
+
+def _ends(text: str) -> tuple[float, float]:
+    """ "-0.3:0.3" as (-0.3, 0.3), ":0" as (-inf, 0)."""
+    low, colon, high = text.partition(":")
+    if not colon:
+        raise argparse.ArgumentTypeError(f"{_shown(text)}: write two values as -0.3:0.3")
+    ends = (parse_level(low) if low else -math.inf, parse_level(high) if high else math.inf)
+    if not ends[0] < ends[1] or all(map(math.isinf, ends)):
+        raise argparse.ArgumentTypeError(f"{_shown(text)}: the first value must be the lower one")
+    return ends
+
+
+def _six_numbers(text: str) -> tuple[float, ...]:
+    return _numbers(text, 6)
+
+
+def _four_numbers(text: str) -> tuple[float, ...]:
+    return _numbers(text, 4)
+
+
+def _numbers(text: str, count: int) -> tuple[float, ...]:
+    try:
+        numbers = tuple(float(one) for one in text.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
+        raise argparse.ArgumentTypeError(f"{_shown(text)} must be {count} numbers with commas")
+    return numbers
 
 
 def _angle(text: str) -> float:

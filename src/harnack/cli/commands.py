@@ -12,18 +12,18 @@ from rich.console import Console
 
 from harnack.backend import doctor
 from harnack.choices import did_you_mean
+from harnack.cli.mesh_files import check_mesh_path, write_mesh
 from harnack.cli.messages import in_options, printable
+from harnack.fields import Field
 from harnack.files.surfaces import SURFACE_FILES
-from harnack.files.writing import check_writable, write_atomically
 from harnack.gallery import SCENES, Scene
+from harnack.geometry import Ball, Box
 from harnack.meshing import mesh
 from harnack.opening import open_surface
 from harnack.rendering import Camera, render
 from harnack.rendering.pictures.images import check_picture_path
 
 _DEMO_SIZE = (480, 360)
-MESH_FILES = (".stl", ".ply", ".obj", ".glb")
-"""What meshes are written to."""
 
 
 def _quality(options: Any) -> dict[str, Any]:
@@ -132,34 +132,66 @@ def _draw_scene(scene: Scene, target: Path, options: Any, settings: dict[str, An
 def _mesh(options: Any) -> int:
     """Triangles of a scene's surface, or of that of a file with curves."""
     source = Path(options.scene)
-    target = Path(options.output or f"{source.stem or 'surface'}.stl")
-    if target.suffix.lower() not in MESH_FILES:
-        raise ValueError(f"{target} has no extension of a mesh: name it {', '.join(MESH_FILES)}")
-    if options.scene in SCENES:
-        surfaces = SCENES[options.scene].surfaces()
-        if len(surfaces) != 1:
-            raise ValueError(f"scene {source} has {len(surfaces)} surfaces, and a mesh is of one")
-        field, level, clip = surfaces[0].field, surfaces[0].numbers[0], surfaces[0].clip
+    if options.output == "":
+        raise ValueError("-o is empty: name the file to write, such as a.stl")
+    target = check_mesh_path(options.output or f"{source.stem or 'surface'}.stl")
+    field, settings = _meshed(options, source)
+    for name in ("tolerance", "spacing", "solid", "thickness"):
+        value = getattr(options, name)
+        if value is not None:
+            settings[name] = value
+    if options.level is not None:
+        settings["level"] = options.level
+    if options.thickness is not None and options.solid is None:
+        settings.pop("solid", None)
+    if settings.get("solid") is not None and options.level is None:
+        settings.pop("level", None)
+    if options.box is not None:
+        x0, y0, z0, x1, y1, z1 = options.box
+        settings["clip"] = Box((x0, y0, z0), (x1, y1, z1))
+    elif options.ball is not None:
+        x, y, z, radius = options.ball
+        settings["clip"] = Ball((x, y, z), radius)
+    settings |= {"simplify": options.simplify, "largest": options.largest}
+    if options.quiet:
+        made = mesh(field, **settings)
     else:
+        with Console().status("starting") as status:
+            made = mesh(field, progress=status.update, **settings)
+    facts = made.metadata["harnack"]
+    if options.scale is not None:
+        made.apply_scale(options.scale)
+    write_mesh(made, target)
+    closed = made.is_watertight
+    _say(
+        f"{len(made.faces):,} triangles, "
+        f"{'closed' if closed else str(len(facts['boundary'])) + ' edges at its rim'}, "
+        f"{facts['evaluations']:,} evaluations"
+    )
+    x, y, z = made.extents
+    _say(f"{x:.4g} x {y:.4g} x {z:.4g}{f', volume {made.volume:.4g}' if closed else ''}")
+    if "why" in facts:
+        _say(f"made of {facts['thickened_by']}: {facts['why']}")
+    _say(f"wrote {target}")
+    return 0
+
+
+def _meshed(options: Any, source: Path) -> tuple[Field, dict[str, Any]]:
+    """The field of a scene or a file, and what the scene says of its surface."""
+    if options.scene not in SCENES:
         _check_source(options.scene)
         opened = open_surface(source)
         _say(f"{source}: {in_options(opened.said)}")
-        field, level, clip = opened.field, None, None
-    settings = {"tolerance": options.tolerance, "spacing": options.spacing}
-    chosen = {name: value for name, value in settings.items() if value is not None}
-    check_writable(target)
-    with Console().status("starting") as status:
-        made = mesh(
-            field, level if options.level is None else options.level, clip=clip,
-            progress=None if options.quiet else status.update, **chosen,
-        )  # fmt: skip
-    with write_atomically(target) as partial:
-        made.export(partial)
-    facts = made.metadata["harnack"]
-    closed = "closed" if made.is_watertight else f"{len(facts['boundary'])} edges at its rim"
-    _say(f"{len(made.faces):,} triangles, {closed}, {facts['evaluations']:,} evaluations")
-    _say(f"wrote {target}")
-    return 0
+        return opened.field, {}
+    surfaces = SCENES[options.scene].surfaces()
+    if len(surfaces) != 1:
+        raise ValueError(f"scene {source} has {len(surfaces)} surfaces, and a mesh is of one")
+    surface = surfaces[0]
+    if surface.solid is not None:
+        if options.level is not None:  # then it is the level that is asked for
+            return surface.field, {"clip": surface.clip}
+        return surface.field, {"solid": surface.solid, "clip": surface.clip}
+    return surface.field, {"level": surface.numbers[0], "clip": surface.clip}
 
 
 def _gallery(options: Any) -> int:

@@ -10,15 +10,21 @@ from harnack.meshing.tetrahedra import IntArray, edge_keys
 
 __all__ = [
     "MeshingError",
+    "TooLargeError",
     "boundary_edges",
     "check_manifold",
     "directed_edges",
     "euler_characteristic",
+    "singular_vertices",
 ]
 
 
 class MeshingError(ValueError):
     """A level set that could not be meshed; the message says why and what to do."""
+
+
+class TooLargeError(MeshingError):
+    """A mesh that would be so large that it was not begun."""
 
 
 def directed_edges(faces: IntArray) -> IntArray:
@@ -65,15 +71,29 @@ def check_manifold(faces: IntArray) -> None:
             "neighbouring faces of the mesh do not agree on its two sides: cells are too large for "
             "this level set; choose a smaller `spacing`"
         )
-    if _fans(faces, index, uses) > len(np.unique(faces)):
+    if _fans(faces, index, uses)[0] > len(np.unique(faces)):
         raise MeshingError(
             "sheets of the mesh touch in a point: cells are too large for this level set; choose a "
             "smaller `spacing`, or another level"
         )
 
 
-def _fans(faces: IntArray, edge: IntArray, uses: IntArray) -> int:
-    """How many fans of faces, joined by edges, all vertices have together."""
+def singular_vertices(faces: IntArray) -> IntArray:
+    """Vertices, by index, at which faces (m, 3) are not a manifold: those of edges with more than
+    two faces, and those that have more than one fan of faces."""
+    edges, count = directed_edges(faces), int(faces.max(initial=-1)) + 1
+    _, index, uses = np.unique(edge_keys(edges, count), return_inverse=True, return_counts=True)
+    many = np.unique(edges[uses[index] > 2])
+    _, fan = _fans(faces, index, uses)
+    # Each fan once, at its vertex.
+    _, first = np.unique(fan, return_index=True)
+    fans = np.bincount(faces.ravel()[first], minlength=count)
+    return np.union1d(many, np.flatnonzero(fans > 1))
+
+
+def _fans(faces: IntArray, edge: IntArray, uses: IntArray) -> tuple[int, IntArray]:
+    """How many fans of faces, joined by edges, all vertices have together, and of each corner of
+    the faces (3m,) the fan that it belongs to."""
     import scipy.sparse  # here: half a second that few need
     import scipy.sparse.csgraph as csgraph_module
 
@@ -89,4 +109,5 @@ def _fans(faces: IntArray, edge: IntArray, uses: IntArray) -> int:
     rows = np.concatenate([first[one], second[one]])
     columns = np.concatenate([second[other], first[other]])
     joined = sparse.coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(3 * m, 3 * m))
-    return int(csgraph.connected_components(joined, directed=False)[0])
+    number, fan = csgraph.connected_components(joined, directed=False)
+    return int(number), np.asarray(fan, np.int64)

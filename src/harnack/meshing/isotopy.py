@@ -51,7 +51,7 @@ import numpy as np
 from harnack.backend import BoolArray, FloatArray
 from harnack.meshing.points import Boundary, PointSet
 from harnack.meshing.samples import LevelFunction
-from harnack.meshing.tetrahedra import IntArray, Tetrahedra
+from harnack.meshing.tetrahedra import IntArray
 
 __all__ = ["Isotopy", "isotopy_of"]
 
@@ -78,27 +78,31 @@ class Isotopy:
     count: int
     open_far: IntArray
 
+    def shares(self) -> dict[str, float]:
+        """For the metadata of a mesh."""
+        return {"isotopy": self.proved, "isotopy_far": self.proved_far}
+
 
 def isotopy_of(
     function: LevelFunction,
     points: PointSet,
-    tets: Tetrahedra,
+    tetrahedra: IntArray,
     is_cut: BoolArray,
     faces: IntArray,
     boundary: Boundary,
     spacing: float,
     walls: Walls,
 ) -> Isotopy:
-    """What is proved about the mesh of these tetrahedra.
+    """What is proved about the mesh of tetrahedra with those corners (m, 4).
 
     is_cut: (m,) whether a tetrahedron holds a point of the mesh. faces: of the mesh (k, 3); corners
         that are points come first.
     """
-    corners = points.points[tets.corners]
+    corners = points.points[tetrahedra]
     rest = np.flatnonzero(~is_cut)
     holds = is_cut.copy()
     holds[rest[~_free(function, corners[rest])]] = True
-    index, corners = tets.corners[holds], corners[holds]
+    index, corners = tetrahedra[holds], corners[holds]
     values = points.samples.value[index]
     values[points.is_on[index]] = 0.0
     slopes = _slopes_on(function, corners, index, values, faces)

@@ -5,23 +5,35 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from harnack.fields import Field, SolidAngle
-from harnack.geometry import Box
+from harnack.fields import Field, Solid, SolidAngle
+from harnack.geometry import Box, Intersection, Volume
 from harnack.geometry.net_loops import net_loops
 from harnack.meshing.checks import (
     MeshingError,
+    TooLargeError,
     boundary_edges,
     check_manifold,
-    euler_characteristic,
 )
 from harnack.meshing.intersections import intersecting_faces, turned_faces
 from harnack.meshing.isotopy import Isotopy, isotopy_of
+from harnack.meshing.lattice import Lattice, Surface, check_size, open_surface
 from harnack.meshing.marching import Crossings, crossings_of, is_cut, triangles_of
 from harnack.meshing.points import Boundary, Places, PointSet, box_cells, place_points
+from harnack.meshing.printing.clipping import cut_by
+from harnack.meshing.printing.finishing import (
+    check_options,
+    finished,
+    largest_part,
+    normals_of,
+    simplified,
+)
+from harnack.meshing.printing.regions import Sheet
+from harnack.meshing.printing.solids import mesh_solid, region_of
+from harnack.meshing.printing.thickening import thickened
 from harnack.meshing.refinement import improved, refined, smoothed
 from harnack.meshing.rims import whole_edges
 from harnack.meshing.samples import LevelFunction
@@ -34,7 +46,6 @@ if TYPE_CHECKING:
 
     from harnack.backend import FloatArray
     from harnack.cells import Cells
-    from harnack.geometry import Volume
 
 __all__ = ["mesh"]
 
@@ -43,6 +54,9 @@ _ACROSS = 24
 _MOST_ATTEMPTS = 4
 # Edges of a curve that are longer than so many cells are cut.
 _LONGEST = 2.5
+# Room around what has an extent, and around a curve whose surface has none, as a part of the size.
+_MARGIN = 0.01
+_ROOM = 0.05
 # How often edges of a curve that are too near to others are halved.
 _MOST_CUTS = 4
 # How often points of flat tetrahedra, which spoil the proof of isotopy, are taken out.
@@ -57,14 +71,19 @@ def mesh(
     tolerance: float = 1e-3,
     spacing: float | None = None,
     clip: Volume | None = None,
+    solid: tuple[float, float] | bool | None = None,
+    thickness: float | None = None,
+    simplify: bool = False,
+    largest: bool = False,
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> trimesh.Trimesh:
-    """Triangles of a level set.
+    """Triangles of a level set, or the closed surface of a solid.
 
     Tetrahedra around the level set, found by an octree whose empty cells are proved empty, are cut
     by it; the surface of an angle ends exactly at its curve. Then edges are cut and vertices moved
     onto the surface until middles of edges and centres of triangles are within the tolerance.
+    Solids are put together from the meshes of smooth levels by manifold3d, and so cut by the clip.
 
     field: a `SolidAngle` of polygons, or a real-valued field that is continuous.
     level: None for the field's default.
@@ -72,8 +91,16 @@ def mesh(
         box (its longest side), sampled and not proved.
     spacing: of cells before anything is refined, in the field's unit; None chooses. Sheets that are
         nearer to each other are told apart where that is noticed; else a MeshingError says so.
-    clip: a `Box`, needed where the level set has no extent; the surface ends at its faces. None for
-        the field's domain, if that is a box.
+    clip: a volume, needed where the level set has no extent. The surface ends at its boundary; a
+        solid is closed there. None for the field's domain.
+    solid: the closed surface of the points where low <= f <= high, given as (low, high); one of
+        them may be infinite, as in `level_set` and `render`. For an angle-valued field, those
+        between the two levels. None is True for a `Solid`, whose inside is f <= level; False for
+        its surface alone, open where it is cut.
+    thickness: makes a closed part so thick, in the field's unit, of a surface: half on each side.
+    simplify: leave out vertices that are not needed within the tolerance, of closed meshes: half of
+        the tolerance is for this, half for all else.
+    largest: keep the connected part with the largest area alone.
     seed: of the small random moves that keep points in general position.
     progress: told what is being done.
 
@@ -86,54 +113,50 @@ def mesh(
         isotopy, isotopy_far: the shares of tetrahedra on which the first triangles are proved to
             have the topology of the level set (`meshing.isotopy`), of all and of those farther than
             1.5 times the spacing from the curve;
-        turned: triangles, smaller than the tolerance, that are turned over.
+        turned: triangles of an angle, smaller than the tolerance, that are turned over.
+        Solids and thick surfaces have more: see `docs/printing.md`.
 
     Raises:
         MeshingError: a ValueError, if it could not be done; the message says why.
-        TypeError: a field that jumps or has parts, or another clip volume than a box.
+        TypeError: a field that jumps or has parts; a clip that is no volume.
+        ValueError: options out of range, or that contradict each other.
     """
-    import trimesh
-
     report = progress or _silent
+    check_options(tolerance, spacing, thickness, seed)
     field = _checked(field, clip)
-    level = field.default_level if level is None else float(level)
-    field.check_levels((level,))
-    if not (0 < tolerance < 0.5):
-        raise ValueError(
-            f"tolerance is a part of the size: it must lie in (0, 0.5), not {tolerance}"
-        )
-    lower, upper, walls = _box(field, level, clip)
-    size = float((upper - lower).max())
-    if spacing is not None and not 0 < spacing < math.inf:
-        raise ValueError(f"spacing must be a positive length, not {spacing!r}")
-    start = size / _ACROSS if spacing is None else float(spacing)
-    function = LevelFunction(field, level)
-    attempts = 1 if spacing is not None else _MOST_ATTEMPTS
-    first = _embedded(
-        function, start, attempts, (lower, upper), walls, seed, 0.5 * tolerance * size, report
-    )
-    vertices, faces = first.vertices, first.faces
-    kept = np.unique(faces)
-    place = np.full(len(vertices), -1, np.int64)
-    place[kept] = np.arange(len(kept))
-    faces = place[faces]
-    result = trimesh.Trimesh(vertices[kept], faces, process=False, validate=False)
-    result.metadata["harnack"] = {
-        "level": level,
-        "spacing": first.spacing,
-        "evaluations": function.evaluations,
-        "euler_characteristic": euler_characteristic(faces),
-        "proved": first.crossings.proved,
-        "integrated": first.crossings.integrated,
-        "isotopy": first.isotopy.proved,
-        "isotopy_far": first.isotopy.proved_far,
-        "turned": first.turned,
-        "boundary": boundary_edges(faces),
-    }
-    return result
+    if solid is None and isinstance(field, Solid) and thickness is None:
+        solid = True
+    if solid and thickness is not None:
+        raise ValueError("give either solid or thickness: a solid is thick already")
+    is_closed = bool(solid) or thickness is not None
+    if simplify and not is_closed:
+        raise ValueError("simplify is for closed meshes: give solid or thickness as well")
+    share = 0.5 * tolerance if simplify else tolerance
+    facts: dict[str, Any]
+    if solid:
+        made, size, facts = _solid(field, level, solid, clip, share, spacing, seed, report)
+    else:
+        level = field.default_level if level is None else float(level)
+        made, size, facts = _surface(field, level, clip, share, spacing, seed, report)
+        if largest:
+            made = largest_part(made)
+        if thickness is not None:
+            report("thickening")
+            made, more = thickened(
+                made, normals_of(field, level, made), float(thickness), 0.5 * share * size
+            )
+            facts |= more
+    if largest:
+        made = largest_part(made)
+    if simplify:
+        report("simplifying")
+        made, more = simplified(made, 0.5 * share * size)
+        facts |= more
+    check_manifold(made.faces)
+    return finished(made, facts, is_closed)
 
 
-def _checked(field: Any, clip: Volume | None) -> Field:
+def _checked(field: Any, clip: Any) -> Field:
     if not isinstance(field, Field):
         raise TypeError(f"mesh needs a field, not {type(field).__name__}")
     if field.has_parts or field.has_sheets:
@@ -141,48 +164,215 @@ def _checked(field: Any, clip: Volume | None) -> Field:
             f"{type(field).__name__} is not one continuous function: mesh its parts, or the "
             "solid angle of its boundary"
         )
-    if clip is not None and not isinstance(clip, Box):
-        raise TypeError(f"clip must be a harnack.Box, not {type(clip).__name__}")
+    if clip is not None and not isinstance(clip, Volume):
+        raise TypeError(
+            f"clip must be a volume, such as harnack.Box or harnack.Ball, not {type(clip).__name__}"
+        )
     if isinstance(field, SolidAngle):
         if field.circles:
             raise TypeError(
                 "the mesh of a circle ends on a polygon: give circle.polygon(n) in its place"
             )
-        if clip is not None:
-            raise TypeError("the surface of a curve ends at its curve: leave clip out")
         return SolidAngle(list(field.loops))
     if field.period is not None:
         raise TypeError(f"{type(field).__name__} is angle-valued and does not say where it ends")
     return field
 
 
-def _box(
-    field: Field, level: float, clip: Volume | None
-) -> tuple[FloatArray, FloatArray, tuple[FloatArray, FloatArray] | None]:
-    """The box to be filled, and its faces if the surface ends there."""
-    if clip is None and isinstance(field.domain, Box):
-        clip = field.domain
-    if clip is not None:
-        lower, upper = (np.array(end, np.float64) for end in clip.bounds())
-        return lower, upper, (lower, upper)
-    if field.domain is not None:
-        raise MeshingError(
-            f"{type(field).__name__} ends at its domain, which is no box: give "
-            "clip=harnack.Box(lower, upper)"
-        )
-    if isinstance(field, SolidAngle) and abs(math.remainder(level, 4 * math.pi)) < 1e-6:
-        raise MeshingError(
-            f"level {level:g} is a multiple of 4 pi: the surface of a curve has no end there; "
-            "choose a level between them, such as 2 pi"
-        )
+def _volume(field: Field, clip: Volume | None) -> Volume | None:
+    """What the level sets are cut by: the clip, and the domain where the field ends there."""
+    if clip is None or field.domain is None:
+        return clip or field.domain
+    return clip if field.is_entire or clip == field.domain else Intersection((clip, field.domain))
+
+
+def _solid(
+    field: Field,
+    level: float | None,
+    solid: Any,
+    clip: Volume | None,
+    tolerance: float,
+    spacing: float | None,
+    seed: int,
+    report: Callable[[str], None],
+) -> tuple[Surface, float, dict[str, Any]]:
+    """The closed surface of a solid, its size, and what is known of it."""
+    region, at = region_of(field, solid, level)
+    evaluations = [0]
+
+    def sheets(error: float, cells: float) -> Sheet:
+        def sheet(angle: SolidAngle, value: float) -> Surface:
+            angle = cast("SolidAngle", _checked(angle, None))
+            box = _box(angle, value, None)
+            made, facts = _spanned(angle, value, box, error, cells, 1, seed, report)
+            evaluations[0] += facts["evaluations"]
+            return made
+
+        return sheet
+
+    made = mesh_solid(region, at, _volume(field, clip), tolerance, spacing, sheets, report)
+    facts = {
+        "level": at,
+        "solid": solid,
+        "spacing": made.spacing,
+        "evaluations": made.evaluations + evaluations[0],
+        "level_sets": made.levels,
+    }
+    return made.surface, made.size, facts
+
+
+def _surface(
+    field: Field,
+    level: float,
+    clip: Volume | None,
+    tolerance: float,
+    spacing: float | None,
+    seed: int,
+    report: Callable[[str], None],
+) -> tuple[Surface, float, dict[str, Any]]:
+    """A level set, its size, and what is known of it."""
+    field.check_levels((level,))
+    volume = _volume(field, clip)
+    box = _box(field, level, volume)
+    size = float((box.upper - box.lower).max())
+    cells = size / _ACROSS if spacing is None else float(spacing)
+    attempts = 1 if spacing is not None else _MOST_ATTEMPTS
+    if isinstance(field, SolidAngle):
+        made, facts = _spanned(field, level, box, 0.5 * tolerance * size, cells, attempts, seed,
+                               report)  # fmt: skip
+    else:
+        made, facts = _filling(field, level, box, 0.5 * tolerance * size, cells, attempts, report)
+    if volume is not None and not (isinstance(volume, Box) and box.has_walls):
+        made = cut_by(made, volume)
+        if not len(made.faces):
+            raise MeshingError("the level set is empty: it lies outside of the clip")
+    return made, size, {"level": level, **facts}
+
+
+def _filling(
+    field: Field,
+    level: float,
+    box: _Filled,
+    tolerance: float,
+    spacing: float,
+    attempts: int,
+    report: Callable[[str], None],
+) -> tuple[Surface, dict[str, Any]]:
+    """The level set of a real-valued field in a box, in cells of a lattice."""
+    function = LevelFunction(field, level)
+    while True:
+        report(f"cells of {spacing:.3g}")
+        try:
+            lattice = Lattice.filling(box.lower, box.upper, spacing)
+            made, isotopy = open_surface(function, lattice, tolerance, report)
+            check_manifold(made.faces)
+            break
+        except TooLargeError:
+            raise
+        except MeshingError:
+            attempts -= 1
+            if not attempts:
+                raise
+            spacing *= 0.6
+    facts = {
+        "spacing": spacing,
+        "evaluations": function.evaluations,
+        "proved": 0,
+        "integrated": 0,
+        **isotopy.shares(),
+    }
+    return made, facts
+
+
+def _spanned(
+    field: SolidAngle,
+    level: float,
+    box: _Filled,
+    tolerance: float,
+    spacing: float,
+    attempts: int,
+    seed: int,
+    report: Callable[[str], None],
+) -> tuple[Surface, dict[str, Any]]:
+    """The level set of an angle, which ends at its curve."""
+    function = LevelFunction(field, level)
+    ends = box.lower, box.upper
+    walls = ends if box.has_walls else None
+    made = _embedded(function, spacing, attempts, ends, walls, seed, tolerance, report)
+    facts = {
+        "spacing": made.spacing,
+        "evaluations": function.evaluations,
+        "proved": made.crossings.proved,
+        "integrated": made.crossings.integrated,
+        **made.isotopy.shares(),
+        "turned": made.turned,
+    }
+    return Surface.of(made.vertices, made.faces), facts
+
+
+@dataclass(frozen=True)
+class _Filled:
+    """The box to be filled, from `lower` to `upper`, (3,) each, and whether the surface may end at
+    its faces."""
+
+    lower: FloatArray
+    upper: FloatArray
+    has_walls: bool
+
+
+def _box(field: Field, level: float, volume: Volume | None) -> _Filled:
+    """The box to be filled: around the level set, if it has an extent, and the volume.
+
+    Raises:
+        MeshingError: neither has bounds, or they have nothing in common.
+    """
     extent = field.extent((level,))
-    if extent is None:
+    if volume is None and extent is None:
         raise MeshingError(
             f"{type(field).__name__} does not say where its level {level:g} ends: give "
-            "clip=harnack.Box(lower, upper)"
+            "clip=harnack.Box(lower, upper) or harnack.Ball(center, radius)"
         )
-    lower, upper = (np.array(end, np.float64) for end in extent.bounds())
-    return lower, upper, None
+    if isinstance(field, SolidAngle):
+        return _around_curve(field, extent, volume)
+    lower, upper = _common_bounds(extent if volume is None else volume)
+    if volume is not None and extent is not None and extent != volume:
+        # A little room, so that what touches its extent does not end there.
+        low, high = _common_bounds(extent)
+        pad = _MARGIN * float((high - low).max())
+        if math.isfinite(pad):
+            lower, upper = np.maximum(lower, low - pad), np.minimum(upper, high + pad)
+    elif volume is None:
+        pad = _MARGIN * (upper - lower).max()
+        lower, upper = lower - pad, upper + pad
+    if not (np.isfinite(lower).all() and np.isfinite(upper).all()):
+        raise MeshingError(
+            f"the clip {volume} has no bounds, and {type(field).__name__} does not say where its "
+            f"level {level:g} ends: give clip=harnack.Box(lower, upper)"
+        )
+    if not (lower < upper).all():
+        raise MeshingError("the level set is empty: it lies outside of the clip")
+    return _Filled(lower, upper, volume is not None)
+
+
+def _around_curve(field: SolidAngle, extent: Volume | None, volume: Volume | None) -> _Filled:
+    """Around the whole surface that a curve spans, which is cut later; or if that has no extent,
+    around the curve and the volume."""
+    if extent is not None:
+        return _Filled(*_common_bounds(extent), False)
+    assert volume is not None
+    points = np.concatenate(list(field.loops))
+    low, high = _common_bounds(volume)
+    lower, upper = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
+    if not np.isfinite(upper - lower).all():
+        raise MeshingError("the clip has no bounds: give clip=harnack.Box(lower, upper)")
+    pad = _ROOM * (upper - lower).max()
+    return _Filled(lower - pad, upper + pad, True)
+
+
+def _common_bounds(volume: Volume | None) -> tuple[FloatArray, FloatArray]:
+    assert volume is not None
+    lower, upper = (np.array(end, np.float64) for end in volume.bounds())
+    return lower, upper
 
 
 @dataclass(frozen=True)
@@ -217,6 +407,7 @@ def _embedded(
         first = _first_mesh(function, spacing, attempts, box, walls, seed, finer, report)
         spacing = first.spacing
         faces = first.faces
+        check_size(function, first.vertices, faces, tolerance)
         vertices = smoothed(function, first.vertices, faces, walls)
         vertices, faces = refined(function, vertices, faces, tolerance, walls, report)
         vertices, faces = improved(function, vertices, faces, tolerance, walls, report)
@@ -302,9 +493,9 @@ def _in_tetrahedra(
         raise MeshingError("the level set is empty: no cell of the box holds the level")
     check_manifold(faces)
     if len(curve.edges):
-        _check_boundary(faces, curve)
+        _check_boundary(vertices, faces, curve, walls)
     cut = is_cut(points, tets, crossings)
-    isotopy = isotopy_of(function, points, tets, cut, faces, curve, spacing, walls)
+    isotopy = isotopy_of(function, points, tets.corners, cut, faces, curve, spacing, walls)
     return _Surface(vertices, faces, curve, spacing, crossings, isotopy)
 
 
@@ -349,9 +540,19 @@ def _silent(text: str) -> None:
 _NO_EDGES = np.zeros((0, 2), np.int64)
 
 
-def _check_boundary(faces: IntArray, curve: Boundary) -> None:
+def _check_boundary(
+    vertices: FloatArray,
+    faces: IntArray,
+    curve: Boundary,
+    walls: tuple[FloatArray, FloatArray] | None,
+) -> None:
     edges = boundary_edges(faces)
     count = max(int(faces.max()) + 1, len(curve.points))
+    if walls is not None:  # where the surface ends as well
+        slack = 1e-9 * (walls[1] - walls[0])
+        near = np.minimum(np.abs(vertices - walls[0]), np.abs(vertices - walls[1]))
+        on = np.asarray((near <= slack).any(axis=1))
+        edges = edges[~on[edges].all(axis=1)]
     if not np.array_equal(np.sort(edge_keys(edges, count)), np.sort(edge_keys(curve.edges, count))):
         raise MeshingError(
             "the mesh does not end at the curve: cells are too large for it; choose a smaller "

@@ -1,0 +1,62 @@
+"""Writing triangle meshes: STL, PLY, OBJ, GLB and 3MF, by trimesh."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from harnack.files.writing import check_writable, write_atomically
+
+if TYPE_CHECKING:
+    import trimesh
+
+__all__ = ["MESH_FILES", "check_mesh_path", "write_mesh"]
+
+MESH_FILES = (".stl", ".ply", ".obj", ".glb", ".3mf")
+"""What meshes are written to."""
+
+# What trimesh needs for 3MF.
+_FOR_3MF = ("lxml", "networkx")
+
+
+def check_mesh_path(path: str | os.PathLike[str]) -> Path:
+    """The path of a mesh that is to be written, with all that can be said early.
+
+    Raises:
+        ValueError: an extension that is none of a mesh.
+        ImportError: a format that needs packages which are not installed.
+        OSError: as `check_writable`.
+    """
+    target = Path(path)
+    if target.suffix.lower() not in MESH_FILES:
+        raise ValueError(f"{target} has no extension of a mesh: name it {', '.join(MESH_FILES)}")
+    if target.suffix.lower() == ".3mf":
+        missing = [name for name in _FOR_3MF if importlib.util.find_spec(name) is None]
+        if missing:
+            raise ImportError(
+                f"{target}: 3MF needs {' and '.join(missing)}: pip install 'harnack[3mf]', or name "
+                "the file .stl"
+            )
+    check_writable(target)
+    return target
+
+
+def write_mesh(mesh: trimesh.Trimesh, path: str | os.PathLike[str]) -> None:
+    """Write a mesh in the format that the name ends in; if that fails no file is left.
+
+    3MF has millimetres as its unit, which is written there; the other formats have none.
+
+    Raises:
+        ValueError, ImportError, OSError: as `check_mesh_path`.
+    """
+    target = check_mesh_path(path)
+    kind = target.suffix.lower()[1:]
+    plain = mesh.copy()
+    # Formats that keep metadata know no arrays.
+    plain.metadata.clear()
+    if kind == "3mf":
+        plain.units = "millimeters"
+    with write_atomically(target) as partial:
+        plain.export(partial, file_type=kind)

@@ -1,0 +1,182 @@
+"""Tetrahedra that fill cells of a box without a Delaunay triangulation: a body-centred lattice.
+
+Its points are the corners and the centres of equal cells, and where a cell lies on the box, the
+centres of its faces there. Two centres on both sides of a face make four tetrahedra with the four
+edges of the face; at the box, where the outer centre is that of the face itself, half as large
+ones. So the tetrahedra fill the box, and those at the faces of some cells contain these cells. In
+cubes their dihedral angles are 60 and 90 degrees (Labelle and Shewchuk 2007).
+
+Cells that are proved empty need none. Proof. Let the level set meet chosen cells only, and let a
+tetrahedron at a face of a chosen cell have its other apex in a cell that is not: that cell holds no
+level, so its centre and the corners of the face, which it has too, are on one side. Of the faces of
+the tetrahedron only those with the chosen cell's centre and a corner of another side are crossed,
+and the tetrahedron behind such a face belongs to a face of the chosen cell as well.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from harnack.backend import BoolArray, FloatArray
+from harnack.cells import Cells, Clearance, octree
+from harnack.meshing.checks import MeshingError, TooLargeError
+from harnack.meshing.tetrahedra import IntArray
+
+__all__ = ["Lattice", "distinct", "distinct_rows"]
+
+# More cells than that are refused: about five million triangles.
+MOST_CELLS = 2_000_000
+# Points of the whole lattice that are looked up in a table.
+_MOST_LISTED = 20_000_000
+# Cells of the first round of the octree.
+_MOST_ROOTS = 200_000
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """counts: (3,) cells along each side of a box from `lower`, each with edges `size` (3,).
+
+    Points have even coordinates (n, 3) in half cells if they are corners, and odd ones if centres;
+    centres of faces on the box have one even coordinate.
+    """
+
+    lower: FloatArray
+    size: FloatArray
+    counts: IntArray
+
+    @classmethod
+    def filling(
+        cls, lower: FloatArray, upper: FloatArray, spacing: float, layers: int = 0
+    ) -> Lattice:
+        """Cells as nearly cubes of edge `spacing` as fit a box, and so many layers around it.
+
+        Raises:
+            MeshingError: a box without volume.
+        """
+        sides = upper - lower
+        if not (sides > 0).all():
+            raise MeshingError("the box to be filled has no volume: choose a larger `clip`")
+        counts = np.maximum(1, np.ceil(sides / spacing * (1 - 1e-9))).astype(np.int64)
+        size = sides / counts
+        return cls(lower - layers * size, size, counts + 2 * layers)
+
+    @property
+    def upper(self) -> FloatArray:
+        """(3,) the far corner of the box."""
+        return self.lower + self.counts * self.size
+
+    def points(self, coordinates: IntArray) -> FloatArray:
+        """(n, 3), given their coordinates; those on the box exactly there."""
+        x = self.lower + 0.5 * self.size * coordinates
+        x = np.where(coordinates == 0, self.lower, x)
+        return np.where(coordinates == 2 * self.counts, self.upper, x)
+
+    def is_outer(self, coordinates: IntArray) -> BoolArray:
+        """(n,) whether points lie on the box."""
+        return ((coordinates == 0) | (coordinates == 2 * self.counts)).any(axis=1)
+
+    def cells_not_empty(self, clearance: Clearance) -> IntArray:
+        """(n, 3) indices of the cells that are not proved empty, by octrees over blocks of them.
+
+        Raises:
+            MeshingError: there are too many.
+        """
+        # A surface across the box, at the least, meets so many cells.
+        if (least := float(np.prod(np.sort(self.counts)[:2].astype(float)))) > MOST_CELLS:
+            raise too_large(least)
+        halvings = 0
+        while halvings < 3 and (self.counts >= 2 ** (halvings + 2)).all():
+            halvings += 1
+        blocks = -(-self.counts // 2**halvings)
+        while math.prod(blocks.tolist()) > _MOST_ROOTS and halvings < 12:
+            halvings += 1
+            blocks = -(-self.counts // 2**halvings)
+        grid = np.stack(np.meshgrid(*map(np.arange, blocks), indexing="ij"), axis=-1)
+        edges = self.size * 2**halvings
+        root = Cells(self.lower + grid.reshape(-1, 3) * edges, edges)
+        root = root.some(~root.proved_empty(clearance))
+        leaves = octree(root, clearance, 8 * MOST_CELLS, halvings).leaves
+        if not len(leaves.corners):
+            return np.zeros((0, 3), np.int64)
+        rounds = round(math.log2(edges[0] / leaves.size[0]))
+        expected = len(leaves.corners) * 4 ** (halvings - rounds)
+        if expected > MOST_CELLS or rounds < halvings:
+            raise too_large(expected)
+        index = np.rint((leaves.corners - self.lower) / self.size).astype(np.int64)
+        return index[(index < self.counts).all(axis=1)]
+
+    def outer_cells(self) -> IntArray:
+        """(n, 3) indices of the cells at the box."""
+        found: list[IntArray] = []
+        for axis in range(3):
+            ends = self.counts.copy()
+            ends[axis] = 1
+            layer: IntArray = np.indices(tuple(ends.tolist())).reshape(3, -1).T.copy()
+            found.append(layer.copy())
+            layer[:, axis] = self.counts[axis] - 1
+            found.append(layer)
+        return distinct_rows(np.concatenate(found))
+
+    def tetrahedra(self, cells: IntArray) -> tuple[IntArray, IntArray]:
+        """Tetrahedra at all faces of cells (k, 3): their points (n, 3) by coordinates, and for each
+        the indices of four of them (m, 4)."""
+        shape = 2 * self.counts + 1
+        found: list[IntArray] = []
+        for axis in range(3):
+            lower = 2 * cells
+            lower[:, axis] += 2
+            face = np.concatenate([2 * cells, lower])
+            face = _key_rows(distinct(_keys(face, shape)), shape)
+            others = [k for k in range(3) if k != axis]
+            ends: list[IntArray] = []
+            for way in (-1, 1):
+                centre = face + 1
+                centre[:, axis] = np.clip(face[:, axis] + way, 0, shape[axis] - 1)
+                ends.append(_keys(centre, shape))
+            ring: list[IntArray] = []
+            for i, j in ((0, 0), (2, 0), (2, 2), (0, 2)):
+                corner = face.copy()
+                corner[:, others] += [i, j]
+                ring.append(_keys(corner, shape))
+            for k in range(4):
+                found.append(np.stack([*ends, ring[k], ring[(k + 1) % 4]], axis=1))
+        keys = np.concatenate(found)
+        used = distinct(keys.ravel())
+        if math.prod(shape.tolist()) < _MOST_LISTED:
+            place = np.zeros(math.prod(shape.tolist()), np.int64)
+            place[used] = np.arange(len(used))
+            return _key_rows(used, shape), place[keys]
+        return _key_rows(used, shape), np.searchsorted(used, keys)
+
+
+def distinct(keys: IntArray) -> IntArray:
+    """The numbers (n,), each once and in order: several times as fast as `np.unique`."""
+    keys = np.sort(keys)
+    return keys[np.flatnonzero(np.diff(keys, prepend=keys[:1] - 1))]
+
+
+def distinct_rows(rows: IntArray) -> IntArray:
+    """The rows (n, 3) of numbers that are not negative, each once and in order."""
+    shape = rows.max(axis=0, initial=0) + 1
+    return _key_rows(distinct(_keys(rows, shape)), shape)
+
+
+def too_large(cells: float) -> TooLargeError:
+    """The error about so many cells."""
+    return TooLargeError(
+        f"about {cells:.1e} cells hold the surface, which makes some {3 * cells:.0e} triangles; "
+        f"at most {MOST_CELLS:,} cells are made: choose a larger `spacing` or `tolerance`, or a "
+        "smaller `clip`"
+    )
+
+
+def _keys(coordinates: IntArray, shape: IntArray) -> IntArray:
+    return (coordinates[:, 0] * shape[1] + coordinates[:, 1]) * shape[2] + coordinates[:, 2]
+
+
+def _key_rows(keys: IntArray, shape: IntArray) -> IntArray:
+    rest, z = np.divmod(keys, shape[2])
+    return np.stack([*np.divmod(rest, shape[1]), z], axis=1)

@@ -1,0 +1,40 @@
+"""How many triangles a tolerance will take, before they are made."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from harnack.backend import FloatArray
+from harnack.meshing.checks import TooLargeError
+from harnack.meshing.samples import LevelFunction
+from harnack.meshing.tetrahedra import IntArray
+
+__all__ = ["check_size"]
+
+_MOST_FACES = 6_000_000
+
+
+def check_size(
+    function: LevelFunction, vertices: FloatArray, faces: IntArray, tolerance: float
+) -> None:
+    """Raise if the triangles that refinement would make of these are more than six millions.
+
+    How far the middle of a triangle is from the surface falls with its area: one that is k times
+    the tolerance away takes about k others. Looked at is one triangle in several.
+
+    Raises:
+        TooLargeError: with the estimate, and a tolerance that would do.
+    """
+    some = faces[:: max(1, len(faces) // 20_000)]
+    if not len(some):
+        return
+    corner = vertices[some]
+    middle = function.at(0.5 * (corner + np.roll(corner, 1, axis=1)).reshape(-1, 3)).distance
+    ratio = middle.reshape(-1, 3).max(axis=1) / tolerance
+    expected = float(np.maximum(1.0, ratio).mean()) * len(faces)
+    if expected > _MOST_FACES:
+        enough = expected / _MOST_FACES
+        raise TooLargeError(
+            f"the tolerance takes about {expected:.1e} triangles, and at most {_MOST_FACES:,} are "
+            f"made: choose a `tolerance` {enough:.2g} times as large"
+        )

@@ -1,0 +1,1 @@
+"""Closed meshes: solids with caps, thick surfaces, simplified meshes."""

@@ -1,0 +1,115 @@
+"""The last steps of a mesh: its largest part, fewer triangles, what is said of it."""
+
+from __future__ import annotations
+
+import math
+import operator
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from harnack.backend import FloatArray
+from harnack.meshing.checks import MeshingError, boundary_edges, euler_characteristic
+from harnack.meshing.lattice import Surface
+from harnack.meshing.printing.manifolds import manifold_of, surface_of
+from harnack.meshing.samples import LevelFunction
+
+if TYPE_CHECKING:
+    import trimesh
+
+    from harnack.fields import Field
+
+__all__ = ["check_options", "finished", "largest_part", "normals_of", "simplified"]
+
+
+def check_options(tolerance: Any, spacing: Any, thickness: Any, seed: Any) -> None:
+    """Raise ValueError or TypeError for numbers out of range."""
+    if not 0 < _number(tolerance, "tolerance") < 0.5:
+        raise ValueError(
+            f"tolerance is a part of the size: it must lie in (0, 0.5), not {tolerance}"
+        )
+    for name, value in (("spacing", spacing), ("thickness", thickness)):
+        if value is not None and not 0 < _number(value, name) < math.inf:
+            raise ValueError(f"{name} must be a positive length, not {value!r}")
+    if operator.index(seed) < 0:
+        raise ValueError(f"seed must not be negative, not {seed}")
+
+
+def _number(value: Any, name: str) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise TypeError(f"{name} must be a number, not {value!r}") from None
+
+
+def normals_of(field: Field, level: float, surface: Surface) -> FloatArray:
+    """Unit normals (n, 3) at vertices: the slope of the field, and where it has none, as at the
+    curve that a surface ends on, the mean of the faces there by area."""
+    corner = surface.vertices[surface.faces]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    mean = np.zeros_like(surface.vertices)
+    for k in range(3):
+        np.add.at(mean, surface.faces[:, k], normal)
+    mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-300)[:, None]
+    slope = LevelFunction(field, level).at(surface.vertices).gradient
+    steep: FloatArray = np.linalg.norm(slope, axis=1)
+    slope = slope / np.maximum(steep, 1e-300)[:, None]
+    # Beside the curve slopes turn within a triangle.
+    good = np.isfinite(steep) & (steep > 0) & ((slope * mean).sum(axis=1) > 0.7)
+    if field.period is not None:
+        good[np.unique(boundary_edges(surface.faces))] = False
+    chosen: FloatArray = np.where(good[:, None], slope, mean)
+    return chosen
+
+
+def largest_part(surface: Surface) -> Surface:
+    """The connected part with the largest area."""
+    import scipy.sparse  # here: half a second that few need
+    import scipy.sparse.csgraph as csgraph_module
+
+    sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
+    faces, n = surface.faces, len(surface.vertices)
+    rows, columns = np.concatenate([faces[:, :2], faces[:, 1:]]).T
+    joined = sparse.coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(n, n))
+    part = np.asarray(csgraph.connected_components(joined, directed=False)[1])[faces[:, 0]]
+    corner = surface.vertices[faces]
+    cross = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    areas = np.bincount(part, np.linalg.norm(cross, axis=1))
+    return Surface.of(surface.vertices, faces[part == areas.argmax()])
+
+
+def simplified(surface: Surface, tolerance: float) -> tuple[Surface, dict[str, Any]]:
+    """A closed surface with fewer triangles, all within `tolerance` of where they were.
+
+    manifold3d's simplification: vertices are a part of those before, and the surface moves by less
+    than the tolerance.
+    """
+    made = surface_of(manifold_of(surface).simplify(tolerance))
+    if not len(made.faces):
+        raise MeshingError("the part is thinner than the tolerance: choose a smaller `tolerance`")
+    return made, {"triangles_before_simplification": len(surface.faces)}
+
+
+def finished(surface: Surface, facts: dict[str, Any], is_closed: bool) -> trimesh.Trimesh:
+    """The mesh, with what is known of it in its metadata.
+
+    Raises:
+        MeshingError: it ought to be closed and to have a positive volume, and is not.
+    """
+    import trimesh
+
+    made = trimesh.Trimesh(surface.vertices, surface.faces, process=False, validate=False)
+    if is_closed:
+        if not (made.is_watertight and made.is_winding_consistent and made.volume > 0):
+            raise MeshingError(
+                "the part did not close, or is inside out: choose a smaller `spacing`"
+            )
+        facts = {**facts, "volume": float(made.volume)}
+    made.metadata["harnack"] = {
+        "proved": 0,
+        "integrated": 0,
+        **facts,
+        "euler_characteristic": euler_characteristic(surface.faces),
+        "boundary": boundary_edges(surface.faces),
+    }
+    return made

@@ -1,0 +1,248 @@
+"""The solid where a function is at most a level, as a closed mesh: smooth levels put together.
+
+A wall |g| <= w is not meshed as the level 0 of |g| - w, of which marching cubes makes hundreds of
+pieces where cells are thicker than the wall. It is {g <= w} less {g <= -w}, two smooth surfaces
+which do not meet, in a box a little larger than the clip; and it is cut by the clip itself. Unions,
+intersections and complements likewise are those of the parts' meshes, so that the creases where
+parts meet are edges of the mesh. Creases of a single function, such as a cylinder's, are chamfered
+within the tolerance.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from harnack.backend import FloatArray
+from harnack.fields import Cuboid, Field, Plane, Solid, SolidAngle
+from harnack.fields.solids.affine import AffineImage
+from harnack.fields.solids.combined import Combined, Complement, Offset
+from harnack.fields.solids.region import Near, Region, bounded_side
+from harnack.geometry import Ball, Box
+from harnack.meshing.checks import MeshingError
+from harnack.meshing.lattice import Lattice, Surface, closed_surface
+from harnack.meshing.printing.manifolds import box_manifold, manifold_of
+from harnack.meshing.samples import LevelFunction, Samples
+
+if TYPE_CHECKING:
+    from manifold3d import Manifold
+
+    from harnack.geometry import Volume
+
+__all__ = ["RegionMesher", "Sheet", "is_smooth"]
+
+# Mesh the level set of an angle, which ends at its curve: field, level -> vertices and faces.
+Sheet = Callable[[SolidAngle, float], Surface]
+
+
+@dataclass
+class RegionMesher:
+    """Meshes solids in a box from `lower` to `upper`, (3,) each.
+
+    tolerance: a length, of the middles of edges and faces. spacing: of cells, at most.
+    sheet: meshes surfaces that end at a curve.
+    evaluations, levels: of fields, in points, and how many level sets were meshed so far.
+    """
+
+    lower: FloatArray
+    upper: FloatArray
+    tolerance: float
+    spacing: float
+    sheet: Sheet
+    report: Callable[[str], None]
+    evaluations: int = 0
+    levels: int = 0
+
+    def below(self, solid: Solid, level: float) -> Manifold:
+        """The points of the box where a solid's function is at most `level`; what there is outside
+        of the box has no meaning.
+
+        Raises:
+            MeshingError: a part cannot be meshed.
+        """
+        from manifold3d import Manifold, OpType
+
+        if isinstance(solid, Combined):
+            parts = [self.below(one, level) for one in solid.parts]
+            how = OpType.Add if solid.is_union else OpType.Intersect
+            return Manifold.batch_boolean(parts, how)
+        if isinstance(solid, Complement):  # -f <= c where f >= -c
+            return self._space() - self.below(solid.inner, -level)
+        if isinstance(solid, Offset):
+            return self.below(solid.inner, level + solid.distance)
+        if isinstance(solid, Near):
+            return self._wall(solid, level)
+        if isinstance(solid, Region) and isinstance(solid.inner, Solid):
+            return self.below(solid.inner, level)
+        if isinstance(solid, AffineImage) and not is_smooth(solid.inner):
+            return self._image(solid, level)
+        if isinstance(solid, Cuboid) and solid.radius == 0 and level <= 0:
+            half = np.array(solid.half_sides) + level
+            return box_manifold(-half, half) if (half > 0).all() else Manifold()
+        if isinstance(solid, Plane):
+            x, y, z = solid.normal
+            return self._space().trim_by_plane((-x, -y, -z), -(solid.distance + level))
+        return manifold_of(self.smooth(solid, level)[0])
+
+    def smooth(self, field: Field, level: float) -> tuple[Surface, bool]:
+        """The boundary of {f <= level} as one level set, and whether it is all of it: if not, it is
+        closed outside of the box in a way that has no meaning."""
+        hull = _hull(field, level)
+        lower, upper = self.lower, self.upper
+        is_whole = False
+        if hull is not None:
+            low, high = hull.bounds()
+            is_whole = bool((low >= lower).all() and (high <= upper).all())
+            lower, upper = np.maximum(lower, low), np.minimum(upper, high)
+            if not (lower < upper).all():
+                return Surface(np.zeros((0, 3)), np.zeros((0, 3), np.int64)), is_whole
+        size = float((upper - lower).max())
+        spacing = min(self.spacing, size / 8)
+        function = _WithinDomain(_entire(field), level)
+        self.report(f"level {level:g} of {type(field).__name__} in cells of {spacing:.3g}")
+        lattice = Lattice.filling(lower, upper, spacing, layers=2)
+        made = closed_surface(function, lattice, self.tolerance, self.report)
+        self.evaluations += function.evaluations
+        self.levels += 1
+        return made, is_whole
+
+    def _space(self) -> Manifold:
+        pad = 1e-3 * (self.upper - self.lower)
+        return box_manifold(self.lower - pad, self.upper + pad)
+
+    def _wall(self, wall: Near, level: float) -> Manifold:
+        """Where a field is within half_width + level of the wall's level."""
+        from manifold3d import Manifold
+
+        half = wall.half_width + level
+        if half <= 0:
+            return Manifold()
+        low, high = wall.level - half, wall.level + half
+        field = wall.inner
+        if field.period is None:
+            inside = Region(field)
+            if not isinstance(field, Solid):
+                self._check_wall(field, low, high)
+            return self.below(inside, high) - self.below(inside, low)
+        if 2 * half >= field.period:
+            return self._space()
+        if not isinstance(field, SolidAngle):
+            raise MeshingError(
+                f"a solid around a level of {type(field).__name__}, which is angle-valued, cannot "
+                "be meshed: only those of a SolidAngle"
+            )
+        return manifold_of(self._lens(field, low, high))
+
+    def _check_wall(self, field: Field, low: float, high: float) -> None:
+        """Raise if a wall is thinner than both of its sides' tolerance: they would meet."""
+        lattice = Lattice.filling(
+            self.lower, self.upper, float((self.upper - self.lower).max()) / 8
+        )
+        points = lattice.points(2 * np.argwhere(np.ones(lattice.counts)) + 1)
+        middle = 0.5 * (low + high)
+        samples = _WithinDomain(field, middle).at(points)
+        # Where the wall may be near.
+        near = samples.distance <= np.median(samples.distance)
+        steep = float(np.median(np.linalg.norm(samples.gradient[near], axis=1)))
+        self.evaluations += len(points)
+        if high - low < 2 * self.tolerance * steep:
+            raise MeshingError(
+                f"the wall is about {(high - low) / steep:.2g} thick, and its sides are made "
+                f"within {self.tolerance:.2g}: choose a smaller `tolerance`, or a thicker wall"
+            )
+
+    def _lens(self, field: SolidAngle, low: float, high: float) -> Surface:
+        """Between two levels of an angle: both end at the same vertices, those of the curve."""
+        inner, outer = self.sheet(field, low), self.sheet(field, high)
+        count = sum(map(len, field.loops))
+        if not np.array_equal(inner.vertices[:count], outer.vertices[:count]):
+            raise MeshingError("the two sides of the solid do not end at the same curve")
+        place = np.arange(len(inner.vertices)) - count + len(outer.vertices)
+        place[:count] = np.arange(count)
+        vertices = np.concatenate([outer.vertices, inner.vertices[count:]])
+        self.levels += 2
+        return Surface(vertices, np.concatenate([outer.faces, place[inner.faces][:, ::-1]]))
+
+    def _image(self, solid: AffineImage, level: float) -> Manifold:
+        """Of a solid under an affine map: the image of its mesh."""
+        matrix, offset = np.array(solid.map.matrix), np.array(solid.map.offset)
+        ends = np.stack([self.lower, self.upper])
+        corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3)
+        own = (corners - offset) @ solid.map.inverse.T
+        scale = float(np.linalg.norm(matrix, 2))
+        local = dataclasses.replace(
+            self, lower=own.min(axis=0), upper=own.max(axis=0), tolerance=self.tolerance / scale,
+            spacing=self.spacing / scale, evaluations=0, levels=0,
+        )  # fmt: skip
+        made = local.below(solid.inner, level / (solid.map.similarity or 1.0))
+        self.evaluations += local.evaluations
+        self.levels += local.levels
+        return made.transform(np.column_stack([matrix, offset]))
+
+
+def is_smooth(solid: Solid) -> bool:
+    """Whether a solid is meshed as one level set."""
+    if isinstance(solid, Region):
+        return not isinstance(solid.inner, Solid) or is_smooth(solid.inner)
+    return not isinstance(solid, Combined | Complement | Offset | Near | Cuboid | Plane)
+
+
+def _hull(field: Field, level: float) -> Volume | None:
+    """A volume that holds {f <= level}, if it has bounds. A domain does not count: what ends there
+    is cut by it."""
+    if isinstance(field, Solid):
+        found = field.hull(level)
+    else:
+        found = bounded_side(field, (level,), lambda value: value <= level)
+    if found is None or found == field.domain:
+        return None
+    if isinstance(field, Region) and found == field.inner.domain:
+        return None
+    low, high = found.bounds()
+    return found if np.isfinite(low).all() and np.isfinite(high).all() else None
+
+
+def _entire(field: Field) -> Field:
+    return field.inner if isinstance(field, Region) else field
+
+
+@dataclass
+class _WithinDomain(LevelFunction):
+    """A field continued beyond its domain as it is at the domain's closest point.
+
+    The closest points of two points are no farther from each other than the two are, so that the
+    clearance of the closest point of p holds around p.
+    """
+
+    def at(self, points: FloatArray) -> Samples:
+        return super().at(self._closest(points))
+
+    def values(self, points: FloatArray) -> FloatArray:
+        return super().values(self._closest(points))
+
+    def clearance(self, points: FloatArray) -> FloatArray:
+        return super().clearance(self._closest(points))
+
+    def _closest(self, points: FloatArray) -> FloatArray:
+        domain = self.field.domain
+        if domain is None or self.field.is_entire:
+            return points
+        if isinstance(domain, Box):
+            return np.clip(points, *domain.bounds())
+        if isinstance(domain, Ball):
+            away = points - domain.center
+            length = np.linalg.norm(away, axis=1)
+            shrunk = np.minimum(1.0, domain.radius / np.maximum(length, 1e-300))
+            return np.array(domain.center) + away * shrunk[:, None]
+        low, high = domain.bounds()
+        if math.prod(high - low) < math.inf and domain.contains_points(points).all():
+            return points
+        raise MeshingError(
+            f"{type(self.field).__name__} ends at a {type(domain).__name__}, near which it cannot "
+            "be meshed: give the field a box or a ball as its domain"
+        )

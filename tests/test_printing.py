@@ -1,0 +1,405 @@
+"""Closed meshes: solids with caps, clips, thick surfaces, what is refused, files."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+import harnack as hk
+from harnack.cli import main
+from harnack.geometry import shapes
+from harnack.meshing import checks
+from harnack.meshing.intersections import intersecting_faces
+from harnack.meshing.lattice import Lattice
+from harnack.meshing.printing import thickening
+
+BOX = hk.Box((-1, -1, -1), (1, 1, 1))
+KNOT = shapes.torus_knot(2, 3, 64)
+
+
+def is_part(mesh: Any) -> bool:
+    """Closed, with its outside outside, and nowhere more than two faces at an edge."""
+    checks.check_manifold(mesh.faces)
+    return mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0
+
+
+# The lattice
+
+
+def test_tetrahedra_fill_the_box_and_share_their_faces() -> None:
+    lattice = Lattice.filling(np.zeros(3), np.array([1.0, 2.0, 1.5]), 0.5)
+    cells = np.argwhere(np.ones(lattice.counts))
+    coordinates, corners = lattice.tetrahedra(cells)
+    points = lattice.points(coordinates)
+    t = points[corners]
+    volume = np.abs(np.linalg.det(t[:, 1:] - t[:, :1])) / 6
+    assert volume.min() > 0.9 * volume.max() / 2
+    assert volume.sum() == pytest.approx(3.0)
+    faces = np.sort(np.concatenate([np.delete(corners, k, axis=1) for k in range(4)]), axis=1)
+    distinct, uses = np.unique(faces, axis=0, return_counts=True)
+    assert uses.max() == 2
+    once = points[distinct[uses == 1]]
+    on_box = (once == lattice.lower) | (once == lattice.upper)
+    assert on_box.all(axis=1).any(axis=1).all()
+
+
+def test_tetrahedra_of_a_lattice_have_no_small_angles() -> None:
+    """60 and 90 degrees, 45 where halves lie at the box."""
+    lattice = Lattice.filling(np.zeros(3), np.ones(3), 0.25)
+    coordinates, corners = lattice.tetrahedra(np.argwhere(np.ones(lattice.counts)))
+    t = lattice.points(coordinates)[corners]
+    for i, j in itertools.combinations(range(4), 2):
+        k, m = (x for x in range(4) if x not in (i, j))
+        edge = t[:, j] - t[:, i]
+        a, b = (np.cross(edge, t[:, x] - t[:, i]) for x in (k, m))
+        cosine = (a * b).sum(1) / np.linalg.norm(a, axis=1) / np.linalg.norm(b, axis=1)
+        angles = np.degrees(np.arccos(cosine))
+        assert np.isclose(angles[:, None], [45, 60, 90]).any(axis=1).all()
+
+
+def test_vertices_where_faces_are_no_manifold_are_found() -> None:
+    two = np.array([[0, 1, 2], [0, 3, 4]])  # fans that touch in 0
+    assert checks.singular_vertices(two).tolist() == [0]
+    fin = np.array([[0, 1, 2], [1, 0, 3], [0, 1, 4]])
+    assert checks.singular_vertices(fin).tolist() == [0, 1]
+    assert not len(checks.singular_vertices(np.array([[0, 1, 2], [1, 0, 3]])))
+
+
+# Solids
+
+
+@pytest.fixture(scope="module")
+def walls() -> Any:
+    """Gyroid walls |g| < 0.3 in a box."""
+    return hk.mesh(hk.Gyroid(1.0), solid=(-0.3, 0.3), clip=BOX, tolerance=2e-3)
+
+
+def gyroid(x: np.ndarray) -> np.ndarray:
+    s, c = np.sin(2 * np.pi * x), np.cos(2 * np.pi * x)
+    return s[:, 0] * c[:, 1] + s[:, 1] * c[:, 2] + s[:, 2] * c[:, 0]
+
+
+def test_gyroid_walls_are_a_part_within_the_box(walls: Any) -> None:
+    """The volume by quadrature of 400^3 points is 1.54867."""
+    assert is_part(walls)
+    assert walls.volume == pytest.approx(1.54867, rel=2.5e-3)
+    assert np.abs(walls.vertices).max() == 1.0
+    assert walls.body_count == 3
+    assert walls.euler_number == -102
+
+
+def test_points_of_gyroid_walls_are_on_walls_or_on_caps(walls: Any) -> None:
+    points = np.asarray(trimesh.sample.sample_surface(walls, 20_000, seed=0)[0])
+    on_cap = np.abs(np.abs(points).max(axis=1) - 1) < 1e-9
+    off = np.abs(np.abs(gyroid(points)) - 0.3)
+    assert off[~on_cap].max() < 2e-3 * 2 * 7.7  # its slope is at most 2 pi sqrt(1.5)
+    assert (np.abs(gyroid(points[on_cap])) < 0.3 + 2e-3 * 2 * 7.7).all()
+    assert 0.05 < on_cap.mean() < 0.4
+
+
+@pytest.mark.slow
+def test_solids_are_given_by_levels_as_they_are_drawn() -> None:
+    """The same part by `solid=`, by `hk.solid`, and by the domain in place of the clip."""
+    settings: dict[str, Any] = {"tolerance": 4e-3}
+    box = hk.Box((-0.4, -0.4, -0.4), (0.4, 0.4, 0.4))
+    field = hk.SchwarzP(1.0, domain=box)
+    one = hk.mesh(field, solid=(-0.2, 0.2), **settings)
+    other = hk.mesh(hk.solid(hk.SchwarzP(1.0), between=(-0.2, 0.2)), clip=box, **settings)
+    assert is_part(one)
+    assert one.volume == pytest.approx(other.volume, rel=1e-9)
+    inside = hk.mesh(field, solid=(-math.inf, -0.2), **settings)
+    outside = hk.mesh(field, solid=(0.2, math.inf), **settings)
+    assert is_part(inside)
+    assert is_part(outside)
+    assert one.volume + inside.volume + outside.volume == pytest.approx(0.8**3, rel=1e-6)
+
+
+def lens(r: float, s: float, d: float) -> float:
+    """Of two balls of radii r and s, d apart, what they have in common."""
+    return (
+        math.pi * (r + s - d) ** 2 * (d * d + 2 * d * (r + s) - 3 * (r - s) ** 2) / (12 * d)
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("part", "volume"),
+    [
+        (hk.Sphere(0.8), 4 / 3 * math.pi * 0.512),
+        (hk.Sphere(0.8) - hk.Sphere(0.5).moved((0.6, 0, 0)),
+         4 / 3 * math.pi * 0.512 - lens(0.8, 0.5, 0.6)),
+        (hk.Sphere(0.8) | hk.Sphere(0.5).moved((0.6, 0, 0)),
+         4 / 3 * math.pi * (0.512 + 0.125) - lens(0.8, 0.5, 0.6)),
+        (hk.Sphere(0.8) & ~hk.Plane((0, 0, 1), 0.0), 2 / 3 * math.pi * 0.512),
+        (hk.Torus(0.8, 0.2).rotated(20, "x"), 2 * math.pi**2 * 0.8 * 0.04),
+    ],
+    ids=["ball", "difference", "union", "half", "torus"],
+)  # fmt: skip
+def test_volumes_of_solids(part: Any, volume: float) -> None:
+    mesh = hk.mesh(part, tolerance=2e-3)
+    assert is_part(mesh)
+    assert mesh.volume == pytest.approx(volume, rel=8e-3)
+
+
+def test_boxes_are_exact_and_so_are_their_creases() -> None:
+    part = hk.Cuboid((0.5, 0.4, 0.3)) - hk.Cuboid((0.2, 0.2, 1.0)).rotated(45, "z")
+    mesh = hk.mesh(part)
+    assert is_part(mesh)
+    assert mesh.volume == pytest.approx((1 - 0.16) * 0.8 * 0.6 + 0.16 * 0.8 * 0.6 - 0.16 * 0.6)
+    assert len(mesh.faces) < 100
+    assert mesh.euler_number == 0
+
+
+def test_balls_cut_solids() -> None:
+    ball = hk.Ball((0.1, 0.2, 0.3), 0.7)
+    mesh = hk.mesh(~hk.Sphere(0.3), clip=ball, tolerance=2e-3)
+    assert is_part(mesh)
+    assert (np.linalg.norm(mesh.vertices - ball.center, axis=1) <= 0.7 * (1 + 1e-12)).all()
+    expected = 4 / 3 * math.pi * (0.7**3 - 0.3**3)
+    assert mesh.volume == pytest.approx(expected, rel=5e-3)
+
+
+@pytest.mark.slow
+def test_a_thick_seifert_surface_ends_at_the_knot() -> None:
+    """The two sides of a solid around a level of an angle share the vertices of the curve."""
+    solid = hk.solid(hk.SolidAngle(KNOT), around=(2 * math.pi, 0.3))
+    mesh = hk.mesh(solid, tolerance=4e-3)
+    assert is_part(mesh)
+    assert mesh.euler_number == -2  # of two surfaces of -1 each
+    stored = {tuple(v) for v in mesh.vertices.tolist()}
+    assert all(tuple(v) in stored for v in KNOT.tolist())
+
+
+# Open surfaces that are cut
+
+
+@pytest.mark.parametrize(
+    "clip", [hk.Ball((0.1, 0, 0), 0.5), hk.HalfSpace((1, 1, 0), 0.1), hk.Box((0, 0, 0), (1, 1, 1))]
+)
+def test_spheres_that_are_cut_have_the_area_left(clip: Any) -> None:
+    """Of a sphere of radius r, a plane at height h leaves 2 pi r (r + h) or 2 pi r (r - h)."""
+    mesh = hk.mesh(hk.Sphere(0.5), solid=False, clip=clip, tolerance=2e-3)
+    checks.check_manifold(mesh.faces)
+    assert clip.padded(1e-12).contains_points(mesh.vertices).all()
+    expected = {
+        hk.Ball: 2 * math.pi * 0.5 * (0.5 - 0.05),
+        hk.HalfSpace: 2 * math.pi * 0.5 * (0.5 + 0.1 / math.sqrt(2)),
+        hk.Box: 4 * math.pi * 0.25 / 8,
+    }[type(clip)]
+    assert mesh.area == pytest.approx(expected, rel=5e-3)
+    rim = mesh.vertices[np.unique(mesh.metadata["harnack"]["boundary"])]
+    assert len(rim) > 20
+    if isinstance(clip, hk.Ball):
+        np.testing.assert_allclose(np.linalg.norm(rim - clip.center, axis=1), 0.5, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_a_level_without_extent_is_cut_by_the_clip() -> None:
+    curve = shapes.wavy_polygon(32)
+    mesh = hk.mesh(
+        hk.SolidAngle(curve), 4 * math.pi, clip=hk.Ball(radius=2.0), tolerance=1e-2, spacing=0.2
+    )
+    assert np.linalg.norm(mesh.vertices, axis=1).max() <= 2 * (1 + 1e-9)
+    rim = mesh.vertices[np.unique(mesh.metadata["harnack"]["boundary"])]
+    stored = {tuple(v) for v in rim.tolist()}
+    assert all(tuple(v) in stored for v in curve.tolist())
+    others = rim[[tuple(v) not in {tuple(c) for c in curve.tolist()} for v in rim.tolist()]]
+    assert np.abs(np.linalg.norm(others, axis=1) - 2).min() < 1e-8
+
+
+# Thickness
+
+
+def test_a_thick_surface_has_the_volume_of_area_times_thickness() -> None:
+    mesh = hk.mesh(hk.SolidAngle(KNOT), thickness=0.06, tolerance=2e-3)
+    facts = mesh.metadata["harnack"]
+    assert is_part(mesh)
+    assert facts["thickened_by"] == "offset"
+    assert mesh.volume == pytest.approx(facts["area"] * 0.06, rel=5e-3)
+    assert not len(intersecting_faces(mesh.vertices, mesh.faces))
+    assert facts["euler_characteristic"] == -2
+
+
+@pytest.mark.slow
+def test_a_thick_sphere_is_a_shell() -> None:
+    mesh = hk.mesh(hk.Sphere(0.8), thickness=0.1, tolerance=2e-3)
+    assert is_part(mesh)
+    assert mesh.body_count == 2
+    assert mesh.volume == pytest.approx(4 / 3 * math.pi * (0.85**3 - 0.75**3), rel=5e-3)
+
+
+@pytest.mark.slow
+def test_beyond_its_reach_a_surface_is_made_of_hulls() -> None:
+    """A small sphere, thicker than its diameter, is a ball."""
+    mesh = hk.mesh(hk.Sphere(0.3), thickness=0.8, tolerance=0.05, spacing=0.2)
+    facts = mesh.metadata["harnack"]
+    assert is_part(mesh)
+    assert facts["thickened_by"] == "hulls of balls"
+    assert "turn over" in facts["why"] or "nearer" in facts["why"]
+    assert mesh.body_count == 1
+    assert mesh.volume == pytest.approx(4 / 3 * math.pi * 0.7**3, rel=0.15)
+
+
+def test_too_many_hulls_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(thickening, "_MOST_HULLS", 10)
+    with pytest.raises(hk.MeshingError, match="reach"):
+        hk.mesh(hk.Sphere(0.3), thickness=0.8, tolerance=0.05, spacing=0.2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("part", "volume", "bodies"),
+    [
+        (hk.Sphere(0.5) | hk.Sphere(0.5).moved((1, 0, 0)), math.pi / 3, 2),
+        (hk.Sphere(0.5) | hk.Sphere(0.5), math.pi / 6, 1),
+        (hk.Sphere(0.5).moved((1e6, 0, 0)), math.pi / 6, 1),
+        (hk.Sphere(1e-6), 8e-18 * math.pi / 6, 1),
+        (hk.Sphere(1e6), 8e18 * math.pi / 6, 1),
+        (hk.Cuboid((0.5,) * 3) | hk.Cuboid((0.5,) * 3).moved((1, 0, 0)), 2.0, 1),
+    ],
+    ids=["touching", "twice", "far", "tiny", "huge", "sharing a face"],
+)
+def test_parts_that_touch_or_are_far(part: Any, volume: float, bodies: int) -> None:
+    mesh = hk.mesh(part, tolerance=4e-3)
+    assert is_part(mesh)
+    assert mesh.body_count == bodies
+    assert mesh.volume == pytest.approx(volume, rel=1e-2)
+
+
+# Last steps
+
+
+@pytest.mark.slow
+def test_simplified_parts_are_within_the_tolerance() -> None:
+    settings: dict[str, Any] = {"clip": hk.Box((-0.4, -0.4, -0.4), (0.4, 0.4, 0.4))}
+    tolerance, size = 1e-2, 0.8
+    mesh = hk.mesh(
+        hk.Gyroid(1.0), solid=(0.0, math.inf), simplify=True, tolerance=tolerance, **settings
+    )
+    assert is_part(mesh)
+    assert len(mesh.faces) < 0.7 * mesh.metadata["harnack"]["triangles_before_simplification"]
+    points = np.asarray(trimesh.sample.sample_surface(mesh, 10_000, seed=0)[0])
+    field = hk.Gyroid(1.0)
+    steep = np.linalg.norm(field.gradient(points, precision="double"), axis=1)
+    # From the wall, or from the caps if inside.
+    apart = np.minimum(np.abs(gyroid(points)) / steep, 0.4 - np.abs(points).max(axis=1))
+    assert apart.max() < tolerance * size
+
+
+def test_the_largest_part_is_kept() -> None:
+    both = hk.Sphere(0.3) | hk.Sphere(0.5).moved((1.5, 0, 0))
+    mesh = hk.mesh(both, largest=True, tolerance=4e-3)
+    assert is_part(mesh)
+    assert mesh.body_count == 1
+    assert mesh.volume == pytest.approx(4 / 3 * math.pi * 0.125, rel=1e-2)
+
+
+class Holed(hk.Shape):
+    """A sphere that is no number beside its centre."""
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        return hk.sqrt(x * x + y * y + z * z - 0.3) - 0.7
+
+
+CURVE = hk.SolidAngle(shapes.wavy_polygon(12))
+
+
+@pytest.mark.parametrize(
+    ("field", "arguments", "message"),
+    [
+        (hk.Gyroid(1.0), {"solid": (-0.3, 0.3), "thickness": 0.1}, "either solid or thickness"),
+        (hk.Gyroid(1.0), {"solid": (0.3, -0.3)}, "low < high"),
+        (hk.Gyroid(1.0), {"solid": (-math.inf, math.inf)}, "one finite"),
+        (hk.Gyroid(1.0), {"solid": (math.nan, 0.3)}, "low < high"),
+        (hk.Gyroid(1.0), {"solid": 0.3}, "two numbers"),
+        (hk.Gyroid(1.0), {"solid": True}, "two sides"),
+        (hk.Gyroid(1.0), {"solid": (-9.0, 9.0)}, "no surface has level"),
+        (hk.Gyroid(1.0), {"solid": (-0.3, 0.3), "level": 0.1}, "either level or solid"),
+        (hk.Gyroid(1.0), {"solid": (0.0, 1.0), "clip": hk.HalfSpace((1, 0, 0), 0)}, "clip="),
+        (~hk.Sphere(0.5), {}, "where it ends"),
+        (hk.Sphere(0.5), {"clip": hk.Box((1, 1, 1), (2, 2, 2))}, "empty"),
+        (hk.Sphere(0.5), {"solid": False, "clip": hk.Ball((3, 0, 0), 1)}, "empty"),
+        (hk.Sphere(0.5) & hk.Sphere(0.5).moved((3, 0, 0)), {}, "empty"),
+        (hk.Sphere(0.5), {"clip": "box"}, "must be a volume"),
+        (hk.Sphere(0.5), {"thickness": 0.0}, "thickness must be a positive length"),
+        (hk.Sphere(0.5), {"thickness": -1.0}, "thickness must be a positive length"),
+        (hk.Sphere(0.5), {"thickness": math.inf}, "thickness must be a positive length"),
+        (hk.Sphere(0.5), {"thickness": "thick"}, "must be a number"),
+        (hk.Sphere(0.5), {"tolerance": math.nan}, "tolerance"),
+        (hk.Sphere(0.5), {"tolerance": 1e-12}, "triangles"),
+        (hk.Sphere(0.5), {"spacing": 1e-7}, "cells"),
+        (hk.Gyroid(1.0), {"solid": (-1e-8, 1e-8), "clip": BOX}, "thick, and its sides"),
+        (hk.Gyroid(1.0), {"solid": (-1e-3, 1e-3), "clip": BOX}, "thick, and its sides"),
+        (hk.Gyroid(1.0), {"solid": (-0.3, 0.3), "clip": hk.Box((0, 0, 0), (1, 1, 0))}, "empty"),
+        (CURVE, {"simplify": True}, "closed meshes"),
+        (CURVE, {"solid": (1.0, math.inf)}, "angle-valued"),
+        (CURVE, {"clip": hk.Ball((9, 9, 9), 1)}, "empty"),
+        (CURVE, {"tolerance": 1e-9}, "triangles"),
+        (hk.RiemannSurface("log"), {}, "angle-valued"),
+        (Holed(), {"clip": BOX}, "no finite value"),
+    ],
+)  # fmt: skip
+def test_what_is_no_part_is_refused(field: Any, arguments: Any, message: str) -> None:
+    with pytest.raises((ValueError, TypeError), match=message):
+        hk.mesh(field, **arguments)
+
+
+# Files
+
+
+@pytest.mark.parametrize("kind", ["stl", "ply", "obj", "glb", "3mf"])
+def test_files_of_every_format_are_closed_when_read_again(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / f"part.{kind}"
+    command = ["mesh", "gyroid", "--tolerance", "0.01", "--scale", "10", "--quiet"]
+    command += ["--box=-.3,-.3,-.3,.3,.3,.3", "-o", str(path)]
+    assert main(command) == 0
+    assert [one.name for one in tmp_path.iterdir()] == [path.name]
+    again: Any = trimesh.load(path, force="mesh")
+    again.merge_vertices()
+    assert again.is_watertight
+    assert again.volume > 0
+    np.testing.assert_allclose(again.bounds, [[-3] * 3, [3] * 3], atol=1e-5)
+
+
+def test_formats_whose_packages_lack_are_refused_early(
+    monkeypatch: pytest.MonkeyPatch, capsys: Any, tmp_path: Path
+) -> None:
+    import importlib.util
+
+    found = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: None if name == "lxml" else found(name)
+    )
+    assert main(["mesh", "trefoil", "-o", str(tmp_path / "a.3mf")]) == 1
+    assert "pip install 'harnack[3mf]'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["-o", "a.step"], "no extension of a mesh"),
+        (["-o", "missing/a.stl"], "create the folder"),
+        (["--solid", "1:0"], "lower one"),
+        (["--ball", "1,2"], "4 numbers"),
+        (["--thickness", "0"], "positive"),
+        (["--box=0,0,0,1,1,1", "--ball=0,0,0,1"], "not allowed"),
+    ],
+)
+def test_wrong_commands_are_refused(
+    options: list[str], said: str, capsys: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    try:
+        code = main(["mesh", "trefoil", *options])
+    except SystemExit as end:
+        code = int(end.code or 0)
+    assert code != 0
+    assert said in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+    assert sys.exc_info() == (None, None, None)
