@@ -1,5 +1,13 @@
 """Cells that may hold a level set, found by leaving out those that are proved empty."""
 
-from harnack.cells.octree import Cells, Clearance, Octree, carve, octree
+from harnack.cells.octree import (
+    Cells,
+    Clearance,
+    Octree,
+    carve,
+    octree,
+    union,
+    wrapped_points,
+)
 
-__all__ = ["Cells", "Clearance", "Octree", "carve", "octree"]
+__all__ = ["Cells", "Clearance", "Octree", "carve", "octree", "union", "wrapped_points"]

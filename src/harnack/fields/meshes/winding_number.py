@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import drjit as dr
-import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import backend_of
@@ -18,11 +17,11 @@ from harnack.enclosures import LineLipschitz
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.field import Field, Sample, lengthened
 from harnack.fields.meshes.winding_exact import ExactWinding
+from harnack.fields.meshes.winding_extent import winding_extent
 from harnack.fields.meshes.winding_mesh import WindingMesh
 from harnack.fields.meshes.winding_tree import TreeWinding
 from harnack.fields.sheets import NO_SHEET, Crossing, NearestSheet
 from harnack.fields.unit_coordinates import UnitCoordinates, UploadedField, epsilon_at, placed
-from harnack.geometry import Box
 from harnack.tree.nearest import distance_to_triangles, jumps_within, nearest_triangle
 from harnack.tree.triangles import Frame, TriangleRays
 
@@ -90,6 +89,7 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
             ("exact" if few else "tree") if method == "auto" else method
         )
         self.accuracy, self.order = accuracy, order
+        self._extents: dict[tuple[float, ...], Volume | None] = {}
 
     def moved(self, vertices: Any) -> WindingNumber:
         """The winding number of the same faces with their vertices (n, 3) elsewhere, for less work.
@@ -102,7 +102,7 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
         """
         field = copy.copy(self)
         field.mesh = self.mesh.moved(vertices)
-        field._batches, field._device = {}, None
+        field._batches, field._device, field._extents = {}, None, {}
         return field
 
     @property
@@ -190,29 +190,10 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
                 raise ValueError("level 0 of a winding number is no surface; try 0.5")
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """A box around the mesh, wider by the less of two distances.
-
-        (a) At distance rho from the mesh |w| <= area/(4 pi rho^2). (b) Off the triangles 4 pi w
-        is the solid angle of the singular edges mod 4 pi, and a level at distance l from the
-        multiples of 4 pi lies within L/sqrt(l (4 pi - l)) of edges of total length L (isoperimetry
-        on the sphere: see `SolidAngle.extent`).
-        """
-        mesh = self.mesh
-        low, high = mesh.box
-        slack = 1e-4 * float((high - low).max())
-        nearest = min(abs(level) for level in levels)
-        wide = math.sqrt(mesh.area / (4 * math.pi * max(nearest, 1e-12)))
-        away = min(abs(math.remainder(level, 1.0)) for level in levels) * 4 * math.pi
-        narrow = mesh.boundary_length / math.sqrt(max(away * (4 * math.pi - away), 1e-12))
-        if len(mesh.singular):
-            ends = mesh.vertices[mesh.singular].reshape(-1, 3)
-            near = np.minimum(low, ends.min(axis=0) - narrow)
-            reach = near, np.maximum(high, ends.max(axis=0) + narrow)
-        else:
-            reach = low, high
-        return Box(
-            np.maximum(reach[0], low - wide) - slack, np.minimum(reach[1], high + wide) + slack
-        )
+        """All triangles, and cells around them that are not proved empty (`winding_extent`)."""
+        if levels not in self._extents:
+            self._extents[levels] = winding_extent(self, self.mesh, levels)
+        return self._extents[levels]
 
     def describe(self) -> dict[str, Any]:
         mesh = self.mesh
