@@ -19,9 +19,10 @@ from harnack.enclosures import Lipschitz
 from harnack.fields.batch import Values
 from harnack.fields.edges.edge_lift import LiftedEdges, lifted_sums
 from harnack.fields.edges.edge_passing import Line, known_along
+from harnack.fields.edges.lifted_trails import LiftedTrails
 from harnack.fields.field import Sample
 from harnack.fields.meshes.edge_chains import EdgeChains
-from harnack.fields.meshes.edge_trails import EdgeTrails
+from harnack.fields.meshes.edge_trails import EdgeTrails, closed_trails
 from harnack.fields.sums import rounding_of_sum
 from harnack.fields.symmetric import SymmetricSum
 from harnack.fields.unit_coordinates import epsilon_at
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
     from harnack.fields.sheets import Crossing
 
 
+# Up to so many edges all of them are summed up along rays, beyond by a tree of chains: measured.
+_MOST_EDGES = 0
 _SHARE = 1 / (4 * math.pi)
 
 
@@ -47,7 +50,7 @@ class ExactWinding:
     rays: TriangleRays
     edges: LiftedEdges | None
     trails: EdgeTrails | None
-    chains: EdgeChains | None
+    chains: EdgeChains | LiftedTrails | None
     rounding: Real
 
     @classmethod
@@ -58,19 +61,24 @@ class ExactWinding:
         if not len(mesh.singular):
             return cls(backend, rays, None, None, None, rounding_of_sum(backend, 0))
         vertices, edges = mesh.unit_vertices, mesh.singular
+        chains = None
+        if traced and len(edges) <= _MOST_EDGES:
+            chains = LiftedTrails.upload(backend, vertices, closed_trails(edges))
+        elif traced:
+            chains = EdgeChains.upload(backend, vertices, edges)
         return cls(
             backend,
             rays,
             LiftedEdges.upload(backend, vertices, edges),
             EdgeTrails.upload(backend, vertices, edges),
-            EdgeChains.upload(backend, vertices, edges) if traced else None,
+            chains,
             rounding_of_sum(backend, len(edges)),
         )
 
     @property
     def has_detail(self) -> bool:
         """Whether coarse samples cost less."""
-        return self.chains is not None
+        return isinstance(self.chains, EdgeChains)
 
     @property
     def coarsest_detail(self) -> float:

@@ -1,29 +1,45 @@
-"""Where the level sets of a winding number can be: its triangles, and what spans its holes."""
+"""Where the level sets of a winding number can be: its triangles, and what spans its holes.
+
+Modulo 1 a winding number does not jump, and it takes a level only on the surfaces that span holes.
+Cells in which it is proved not to are free, triangles or not: rays pass them without a look at the
+winding number, but for where they cross triangles.
+"""
 
 from __future__ import annotations
 
 import copy
+import dataclasses
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import drjit as dr
 import numpy as np
 
-from harnack.fields.clearance import tight_extent
+from harnack.cells import free_cells
+from harnack.enclosures import Enclosure, TargetLevels
+from harnack.fields.clearance import clearance_of, tight_extent
 from harnack.fields.field import Field, Sample
 from harnack.geometry import Box
 
 if TYPE_CHECKING:
     from typing import Self
 
-    from harnack.backend import Backend, Vec3
+    from harnack.backend import Backend, Real, Vec3
+    from harnack.cells import FreeCells
+    from harnack.enclosures import Gaps
     from harnack.fields.meshes.winding_mesh import WindingMesh
     from harnack.geometry import Volume
 
-__all__ = ["winding_box", "winding_extent"]
+__all__ = ["FreeWay", "free_of_winding", "winding_box", "winding_extent"]
 
 # Cells that an extent looks at in one round at most, and how often the box is halved.
 _MOST_CELLS = 20_000
 _FINEST = 6
+# Cells that are looked at for `FreeCells` in one round at most.
+_MOST_FREE_CELLS = 40_000
+# In free cells w stays so far from the level, which leaves room for the errors of samples.
+MARGIN = 0.01
 
 
 class _WindingModuloOne(Field):
@@ -31,12 +47,13 @@ class _WindingModuloOne(Field):
 
     winding: a `WindingNumber`, whose samples promise what they do of its lift, with all jumps
         taken out; the lift and w differ by whole numbers.
+    margin: counts as an error of values.
     """
 
     period: ClassVar[float | None] = 1.0
 
-    def __init__(self, winding: Field) -> None:
-        self._winding = winding
+    def __init__(self, winding: Field, margin: float = 0.0) -> None:
+        self._winding, self._margin = winding, margin
 
     def prepare(self, backend: Backend) -> Self:
         prepared = copy.copy(self)
@@ -44,7 +61,42 @@ class _WindingModuloOne(Field):
         return prepared
 
     def evaluate(self, p: Vec3) -> Sample:
-        return self._winding.evaluate(p)
+        sample = self._winding.evaluate(p)
+        return dataclasses.replace(sample, error=sample.error + self._margin)
+
+
+def free_of_winding(
+    winding: Field, extent: Volume, levels: tuple[float, ...]
+) -> FreeCells:
+    """Cells over an extent, free where w modulo 1 is proved to stay `MARGIN` off the levels."""
+    clearance = clearance_of(_WindingModuloOne(winding, MARGIN), levels)
+    return free_cells(*extent.bounds(), clearance, _MOST_FREE_CELLS)
+
+
+@dataclass(frozen=True)
+class FreeWay(Enclosure):
+    """F stays between the levels, modulo 1, around it, and `MARGIN` off them: 0 <= s < length.
+
+    down, up: how far below and above f these are, rounding included.
+
+    Proof. On free cells the lift does not come nearer than the margin to a level modulo 1, and so
+    stays between the two around it. It is a range of its own, that no slope enters.
+    """
+
+    down: Real
+    up: Real
+    length: Real
+
+    @classmethod
+    def ahead(cls, levels: TargetLevels, value: Real, error: Real, length: Real) -> FreeWay:
+        """From a point at which f is `value` up to `error`; levels: with period 1."""
+        gaps = levels.gaps(value)
+        reach = error - MARGIN
+        return cls(gaps.down + reach, gaps.up + reach, length)
+
+    def step(self, gaps: Gaps) -> Real:
+        proved = (gaps.down >= self.down) & (gaps.up >= self.up)
+        return dr.select(proved, self.length, 0)
 
 
 def winding_extent(winding: Field, mesh: WindingMesh, levels: tuple[float, ...]) -> Volume | None:

@@ -13,11 +13,11 @@ import numpy.typing as npt
 
 from harnack.backend import backend_of
 from harnack.choices import did_you_mean
-from harnack.enclosures import LineLipschitz
+from harnack.enclosures import LineLipschitz, TargetLevels
 from harnack.fields.batch import BatchedField, Values
-from harnack.fields.field import Field, Sample, lengthened
+from harnack.fields.field import Field, Look, Path, Sample, lengthened
 from harnack.fields.meshes.winding_exact import ExactWinding
-from harnack.fields.meshes.winding_extent import winding_extent
+from harnack.fields.meshes.winding_extent import FreeWay, free_of_winding, winding_extent
 from harnack.fields.meshes.winding_mesh import WindingMesh
 from harnack.fields.meshes.winding_tree import TreeWinding
 from harnack.fields.sheets import NO_SHEET, Crossing, NearestSheet
@@ -27,12 +27,15 @@ from harnack.tree.triangles import Frame, TriangleRays
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.cells import FreeCells, PreparedFreeCells
     from harnack.geometry import Volume
 
 MethodName = Literal["auto", "exact", "tree"]
 
 # One boundary edge costs about a nanosecond, a tree two to three microseconds.
 _MOST_EDGES = 2048
+# Of fewer edges samples cost so little that free cells are not made for them.
+_FEW_EDGES = 64
 # The accuracy of values at points, and of traces, by experiment.
 _VALUES, _TRACED = 2.0, 4.0
 # Roundings of a coordinate within which a point may be on either side of a triangle.
@@ -90,6 +93,8 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
         )
         self.accuracy, self.order = accuracy, order
         self._extents: dict[tuple[float, ...], Volume | None] = {}
+        self._for_levels: dict[tuple[float, ...], WindingNumber] = {}
+        self._free: tuple[FreeCells, tuple[float, ...]] | None = None
 
     def moved(self, vertices: Any) -> WindingNumber:
         """The winding number of the same faces with their vertices (n, 3) elsewhere, for less work.
@@ -102,7 +107,8 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
         """
         field = copy.copy(self)
         field.mesh = self.mesh.moved(vertices)
-        field._batches, field._device, field._extents = {}, None, {}
+        field._batches, field._device, field._free = {}, None, None
+        field._extents, field._for_levels = {}, {}
         return field
 
     @property
@@ -133,7 +139,25 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
             winding = ExactWinding.of(backend, mesh, rays, traced)
         else:
             winding = TreeWinding.of(backend, mesh, accuracy, self.order)
-        return _MeshBuffers(*placed(backend, mesh.centre, mesh.size), winding, rays)
+        free = None
+        if traced and self._free is not None:
+            cells, levels = self._free
+            numbers = tuple(dr.opaque(backend.Float, level) for level in levels)
+            free = cells.prepare(backend), TargetLevels(numbers, 1.0)
+        return _MeshBuffers(*placed(backend, mesh.centre, mesh.size), winding, rays, free)
+
+    def for_levels(self, levels: tuple[float, ...]) -> WindingNumber:
+        """With cells that are proved free of these levels, if there are holes to span."""
+        if self._free is not None or len(self.mesh.singular) < _FEW_EDGES:
+            return self
+        extent = self.extent(levels)
+        if extent is None:
+            return self
+        if levels not in self._for_levels:
+            other = copy.copy(self)
+            other._free = free_of_winding(self, extent, levels), levels
+            self._for_levels[levels] = other
+        return self._for_levels[levels]
 
     def evaluate(self, p: Vec3) -> Sample:
         """w as it is, jumps and all, with what is known of it as a lift."""
@@ -210,6 +234,7 @@ class _MeshBuffers(UnitCoordinates):
 
     winding: ExactWinding | TreeWinding
     rays: TriangleRays
+    free: tuple[PreparedFreeCells, TargetLevels] | None = None
 
 
 class _Stretch(Field):
@@ -232,3 +257,14 @@ class _Stretch(Field):
             self._frame, on.unit(p), self._behind, self._offset, self._detail
         )
         return lengthened(sample, on.size)
+
+    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
+        """With the free cells ahead, which need no slope."""
+        del ahead, back
+        found, free = path.look(self.evaluate(path.point(t))), self._on.free
+        if free is None:
+            return found
+        cells, levels = free
+        length = cells.free_along(path.origin, path.direction, t)
+        way = FreeWay.ahead(levels, found.sample.value, found.sample.error, length)
+        return dataclasses.replace(found, ahead=(*found.ahead, way))
