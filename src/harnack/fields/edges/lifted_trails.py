@@ -21,7 +21,6 @@ from harnack.backend.extrema import fmax, fmin
 from harnack.backend.records import Records
 from harnack.fields.edges.edge import Edge
 from harnack.fields.edges.edge_lift import LiftedProduct, ends_factor, sight_of
-from harnack.fields.edges.edge_passing import with_edge_rates
 from harnack.fields.edges.edge_records import inverse_squares
 from harnack.fields.sums import FieldSums
 from harnack.fields.unit_coordinates import epsilon_at
@@ -29,7 +28,6 @@ from harnack.fields.unit_coordinates import epsilon_at
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, IntArray, Mask, Real, Vec3
     from harnack.fields.edges.edge_lift import Sight
-    from harnack.fields.edges.edge_passing import Line
     from harnack.tree.triangles import Frame
 
 __all__ = ["LiftedTrails"]
@@ -57,10 +55,8 @@ class LiftedTrails:
         rows = [_rows(rounded, trail, run) for trail in trails]
         return cls(Records.upload(backend, np.concatenate(rows)), run)
 
-    def near(self, frame: Frame, x: Vec3, detail: Real) -> FieldSums:
-        """The sum of Omega_e at points x of rays, and what a certificate needs.
-
-        detail: of no meaning, for nothing is left out.
+    def near(self, frame: Frame, x: Vec3, active: Mask = True) -> FieldSums:
+        """The sum of Omega_e at points x of rays, where active, and what a certificate needs.
 
         Derivatives. With w of `edge`, L w is the integral of |dp|/rho^3 over an edge, and 1/d times
         that bounds the integral of |dp|/rho^4, d the distance to it; for edges of a record at most
@@ -72,7 +68,6 @@ class LiftedTrails:
         up over a record to at most the root of (sum of L w) (sum of d^2 L w). d is less by what
         rounding may have done to it, for all bounds.
         """
-        del detail
         backend = self.records.backend
         real, unit = backend.Float, fmax(epsilon_at(frame.o), epsilon_at(x))
 
@@ -103,9 +98,8 @@ class LiftedTrails:
 
         one = LiftedProduct.one(real).parts()
         start = (one, backend.Array3f(0), real(dr.inf), real(0), real(0), real(0))
-        product, g, least, rounding, s4, s5 = self.records.for_each(add, start, "trails along")
+        product, g, least, rounding, s4, s5 = self.records.for_each(add, start, "trails along", active)
         sums = FieldSums.zero(backend, dr.inf, 1)
-        # The nearest edge is nearer by rounding, to all powers of its distance.
         return dataclasses.replace(
             sums,
             value=LiftedProduct(*product).angle(),
@@ -115,26 +109,6 @@ class LiftedTrails:
             s4=s4,
             s5=s5,
         )
-
-    def rates(
-        self, frame: Frame, line: Line, lengths: tuple[Real, ...], active: Mask
-    ) -> tuple[Real, ...]:
-        """The constants of `edge_passing` for the sum of Omega_e along lines."""
-        del frame
-
-        def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            for k in range(self.run):
-                p, q = self._vertex(row, k), self._vertex(row, k + 1)
-                inverse, signed = self._edge(row, k)
-                edge = Edge.between(p, q, inverse, line.x)
-                new = with_edge_rates(line, edge, lengths, state)
-                pairs = zip(new, state, strict=True)
-                state = tuple(dr.select(signed != 0, one, other) for one, other in pairs)
-            return state
-
-        start = tuple(self.records.backend.Float(0) for _ in lengths)
-        found = self.records.for_each(add, start, "trails passing", active)
-        return tuple(dr.select(active, rate, dr.inf) for rate in found)
 
     def _vertex(self, row: list[Real], k: int) -> Vec3:
         return self.records.backend.Array3f(*row[3 * k : 3 * k + 3])

@@ -56,8 +56,8 @@ class EdgeChains:
         records = tree.gather(edge_records(vertices, leaves.edges))
         return cls(backend, pack(backend, tree, levels, records))
 
-    def near(self, frame: Frame, x: Vec3, detail: Real) -> FieldSums:
-        """The sum of Omega_e at points x of rays, and what a certificate needs.
+    def near(self, frame: Frame, x: Vec3, detail: Real, active: Mask = True) -> FieldSums:
+        """The sum of Omega_e at points x of rays, where active, and what a certificate needs.
 
         detail: `Field.at_detail`; 1 leaves out no more than rounding does. Edges add to the
         remainder what `LiftedEdge.bounds` says, and so do chords: none is nearer than the ball
@@ -69,7 +69,7 @@ class EdgeChains:
             return LiftedSums.of(state).plus(edge, unit, active).parts()
 
         own = LiftedProduct.one(self.backend.Float).parts()
-        return LiftedSums.of(self._walk(frame, x, detail, add, own)).whole()
+        return LiftedSums.of(self._walk(frame, x, detail, add, own, active)).whole()
 
     def rates(
         self, frame: Frame, line: Line, lengths: tuple[Real, ...], active: Mask

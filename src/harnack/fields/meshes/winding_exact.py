@@ -50,7 +50,8 @@ class ExactWinding:
     rays: TriangleRays
     edges: LiftedEdges | None
     trails: EdgeTrails | None
-    chains: EdgeChains | LiftedTrails | None
+    chains: EdgeChains | None
+    all_edges: LiftedTrails | None
     rounding: Real
 
     @classmethod
@@ -59,26 +60,27 @@ class ExactWinding:
     ) -> ExactWinding:
         """Everything uploaded; traced: for `on_stretch` as well."""
         if not len(mesh.singular):
-            return cls(backend, rays, None, None, None, rounding_of_sum(backend, 0))
+            return cls(backend, rays, None, None, None, None, rounding_of_sum(backend, 0))
         vertices, edges = mesh.unit_vertices, mesh.singular
-        chains = None
-        if traced and len(edges) <= _MOST_EDGES:
-            chains = LiftedTrails.upload(backend, vertices, closed_trails(edges))
-        elif traced:
+        chains, all_edges = None, None
+        if traced:
             chains = EdgeChains.upload(backend, vertices, edges)
+        if traced and len(edges) <= _MOST_EDGES:
+            all_edges = LiftedTrails.upload(backend, vertices, closed_trails(edges))
         return cls(
             backend,
             rays,
             LiftedEdges.upload(backend, vertices, edges),
             EdgeTrails.upload(backend, vertices, edges),
             chains,
+            all_edges,
             rounding_of_sum(backend, len(edges)),
         )
 
     @property
     def has_detail(self) -> bool:
         """Whether coarse samples cost less."""
-        return isinstance(self.chains, EdgeChains)
+        return self.chains is not None
 
     @property
     def coarsest_detail(self) -> float:
@@ -131,7 +133,7 @@ class ExactWinding:
             return Sample(self.backend.Float(turns), nothing, (Lipschitz(0.0),), 0.0)
         if self.chains is None:
             raise RuntimeError("uploaded for points and not for rays")
-        found = self.chains.near(frame, x, detail)
+        found = self._near(self.chains, frame, x, detail)
         found = dataclasses.replace(found, value=dr.fma(4 * math.pi, turns, found.value))
         unit = fmax(epsilon_at(frame.o), epsilon_at(x))
         line, chains = Line(x, frame.d, 8 * unit), self.chains
@@ -141,3 +143,15 @@ class ExactWinding:
 
         known = known_along(line, found.gradient, found.free_distance, rates)
         return found.sample(_SHARE, unit, self.rounding, along=known)
+
+    def _near(self, chains: EdgeChains, frame: Frame, x: Vec3, detail: Real) -> FieldSums:
+        """The sum over boundary edges: coarse by chains, close over all edges if they are few.
+
+        Close sums over chains go down to the leaves nearly everywhere.
+        """
+        if self.all_edges is None:
+            return chains.near(frame, x, detail)
+        is_close = self.backend.Float(detail) >= 1
+        close = self.all_edges.near(frame, x, is_close)
+        coarse = chains.near(frame, x, detail, ~is_close)
+        return coarse.where(is_close, close)
