@@ -51,9 +51,7 @@ class FreeCells:
         )
 
 
-def free_cells(
-    lower: FloatArray, upper: FloatArray, clearance: Clearance, most: int
-) -> FreeCells:
+def free_cells(lower: FloatArray, upper: FloatArray, clearance: Clearance, most: int) -> FreeCells:
     """Cubes over a box, 64 along its longest side, or fewer where more than `most` would have to be
     looked at in a round."""
     edge = float((upper - lower).max()) / _FIRST

@@ -242,9 +242,7 @@ def edge_factor(a: Vec3, b: Vec3, la: Real, lb: Real) -> tuple[Real, Real]:
     return _factor((a.x, a.y), (b.x, b.y), _s(a, la), _s(b, lb))
 
 
-def _factor(
-    a: tuple[Real, Real], b: tuple[Real, Real], sa: Real, sb: Real
-) -> tuple[Real, Real]:
+def _factor(a: tuple[Real, Real], b: tuple[Real, Real], sa: Real, sb: Real) -> tuple[Real, Real]:
     """F_e of ends seen across the direction, with s of each.
 
     A ray exactly through an edge or a vertex is decided as `tree.triangles.crossing` does: as if

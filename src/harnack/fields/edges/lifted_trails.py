@@ -98,7 +98,9 @@ class LiftedTrails:
 
         one = LiftedProduct.one(real).parts()
         start = (one, backend.Array3f(0), real(dr.inf), real(0), real(0), real(0))
-        product, g, least, rounding, s4, s5 = self.records.for_each(add, start, "trails along", active)
+        product, g, least, rounding, s4, s5 = self.records.for_each(
+            add, start, "trails along", active
+        )
         sums = FieldSums.zero(backend, dr.inf, 1)
         return dataclasses.replace(
             sums,

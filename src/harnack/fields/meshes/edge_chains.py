@@ -133,9 +133,7 @@ class EdgeChains:
         in a loop of one trip, or of none, chords cost nothing where no lane has one."""
 
         def once(trip: Any, *state: Any) -> State:
-            chord = LiftedEdge.between(
-                type(x)(*c[19:22]), type(x)(*c[22:25]), 1, c[25], frame, x
-            )
+            chord = LiftedEdge.between(type(x)(*c[19:22]), type(x)(*c[22:25]), 1, c[25], frame, x)
             return trip + 1, *add(chord, active, state)
 
         start = (self.backend.UInt32(0), *state)

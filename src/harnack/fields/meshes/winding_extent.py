@@ -11,7 +11,7 @@ import copy
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar, Protocol
 
 import drjit as dr
 import numpy as np
@@ -42,17 +42,29 @@ _MOST_FREE_CELLS = 40_000
 MARGIN = 0.01
 
 
+class WindingField(Protocol):
+    """What is needed of a `WindingNumber`."""
+
+    def prepare(self, backend: Backend) -> WindingField:
+        """See `Field.prepare`."""
+        ...
+
+    def evaluate_at(self, p: Vec3, detail: float) -> Sample:
+        """See `WindingNumber.evaluate_at`."""
+        ...
+
+
 class _WindingModuloOne(Field):
     """A winding number modulo 1: continuous off the singular edges, sheets or not.
 
-    winding: a `WindingNumber`, whose samples promise what they do of its lift, with all jumps
-        taken out; the lift and w differ by whole numbers.
+    winding: samples of it promise what they do of its lift, with all jumps taken out; the lift and
+        w differ by whole numbers. Coarse ones will do.
     margin: counts as an error of values.
     """
 
     period: ClassVar[float | None] = 1.0
 
-    def __init__(self, winding: Field, margin: float = 0.0) -> None:
+    def __init__(self, winding: WindingField, margin: float = 0.0) -> None:
         self._winding, self._margin = winding, margin
 
     def prepare(self, backend: Backend) -> Self:
@@ -61,13 +73,11 @@ class _WindingModuloOne(Field):
         return prepared
 
     def evaluate(self, p: Vec3) -> Sample:
-        sample = self._winding.evaluate(p)
+        sample = self._winding.evaluate_at(p, 0.0)
         return dataclasses.replace(sample, error=sample.error + self._margin)
 
 
-def free_of_winding(
-    winding: Field, extent: Volume, levels: tuple[float, ...]
-) -> FreeCells:
+def free_of_winding(winding: WindingField, extent: Volume, levels: tuple[float, ...]) -> FreeCells:
     """Cells over an extent, free where w modulo 1 is proved to stay `MARGIN` off the levels."""
     clearance = clearance_of(_WindingModuloOne(winding, MARGIN), levels)
     return free_cells(*extent.bounds(), clearance, _MOST_FREE_CELLS)
@@ -99,7 +109,9 @@ class FreeWay(Enclosure):
         return dr.select(proved, self.length, 0)
 
 
-def winding_extent(winding: Field, mesh: WindingMesh, levels: tuple[float, ...]) -> Volume | None:
+def winding_extent(
+    winding: WindingField, mesh: WindingMesh, levels: tuple[float, ...]
+) -> Volume | None:
     """A polytope that holds the level sets of the winding number of a mesh; of a closed one a box.
 
     A point of a level set lies on a triangle, where w jumps over the level, or off the triangles,
@@ -112,8 +124,9 @@ def winding_extent(winding: Field, mesh: WindingMesh, levels: tuple[float, ...])
         return box
     corners = mesh.vertices[mesh.faces].reshape(-1, 3)
     lower, upper = box.bounds()
-    field: Any = _WindingModuloOne(winding)
-    return tight_extent(field, levels, lower, upper, _MOST_CELLS, _FINEST, corners)
+    return tight_extent(
+        _WindingModuloOne(winding), levels, lower, upper, _MOST_CELLS, _FINEST, corners
+    )
 
 
 def winding_box(mesh: WindingMesh, levels: tuple[float, ...]) -> Box:
