@@ -1,11 +1,10 @@
 """The solid angle of closed trails of edges along rays, edge by edge, and as fast as it will go.
 
-The formula is that of `edge_lift`, and its decisions are made by the same bits. Sums over a tree of
-chains (`edge_chains`) take fewer edges; but neighbouring rays visit other nodes, and a node costs as
-much as several edges, so that up to some thousands of edges a plain loop over all of them is
-faster, and exact. It is arranged so that little is done twice: what is needed of a vertex is
-computed once and not once for each of its edges, and roots and divisions, which cost most, are
-shared by edges where a bound allows it.
+The formula is that of `edge_lift`, and its decisions are made by the same bits. A close sum over a
+tree of chains (`edge_chains`) goes down to most of its leaves, on other ways in neighbouring lanes,
+so that up to some thousands of edges a plain loop over all of them is faster, and exact. What is
+needed of a vertex is computed once and not once for each of its edges, and roots and divisions,
+which cost most, are shared by edges where a bound allows it.
 """
 
 from __future__ import annotations
@@ -27,7 +26,6 @@ from harnack.fields.unit_coordinates import epsilon_at
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, IntArray, Mask, Real, Vec3
-    from harnack.fields.edges.edge_lift import Sight
     from harnack.tree.triangles import Frame
 
 __all__ = ["LiftedTrails"]

@@ -1,7 +1,7 @@
 """A tree of the edges of closed trails in which every node is one chain, or whole trails.
 
-A trail takes up 2^j leaves and begins at a multiple of that: a node of 2^i leaves lies within a trail
-or holds some entirely.
+A trail takes up 2^j leaves and begins at a multiple of that: a node of 2^i leaves lies within a
+trail or holds some entirely.
 """
 
 from __future__ import annotations

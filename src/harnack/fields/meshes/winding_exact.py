@@ -23,7 +23,7 @@ from harnack.fields.edges.lifted_trails import LiftedTrails
 from harnack.fields.field import Sample
 from harnack.fields.meshes.edge_chains import EdgeChains
 from harnack.fields.meshes.edge_trails import EdgeTrails, closed_trails
-from harnack.fields.sums import rounding_of_sum
+from harnack.fields.sums import FieldSums, rounding_of_sum
 from harnack.fields.symmetric import SymmetricSum
 from harnack.fields.unit_coordinates import epsilon_at
 from harnack.tree.triangles import Frame, TriangleRays

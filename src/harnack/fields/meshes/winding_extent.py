@@ -49,8 +49,8 @@ class WindingField(Protocol):
         """See `Field.prepare`."""
         ...
 
-    def evaluate_at(self, p: Vec3, detail: float) -> Sample:
-        """See `WindingNumber.evaluate_at`."""
+    def evaluate(self, p: Vec3) -> Sample:
+        """See `WindingNumber.evaluate`."""
         ...
 
 
@@ -58,7 +58,7 @@ class _WindingModuloOne(Field):
     """A winding number modulo 1: continuous off the singular edges, sheets or not.
 
     winding: samples of it promise what they do of its lift, with all jumps taken out; the lift and
-        w differ by whole numbers. Coarse ones will do.
+        w differ by whole numbers.
     margin: counts as an error of values.
     """
 
@@ -73,7 +73,7 @@ class _WindingModuloOne(Field):
         return prepared
 
     def evaluate(self, p: Vec3) -> Sample:
-        sample = self._winding.evaluate_at(p, 0.0)
+        sample = self._winding.evaluate(p)
         return dataclasses.replace(sample, error=sample.error + self._margin)
 
 

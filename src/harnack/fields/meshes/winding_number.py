@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import drjit as dr
+import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import backend_of
@@ -161,17 +162,13 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
 
     def evaluate(self, p: Vec3) -> Sample:
         """w as it is, jumps and all, with what is known of it as a lift."""
-        return self.evaluate_at(p, 1.0)
-
-    def evaluate_at(self, p: Vec3, detail: float) -> Sample:
-        """The same at a detail (`Field.at_detail`)."""
         on = self._on(p)
         # A ray from p of length zero: everything lies ahead, nothing has been passed.
         up = on.backend.Array3f(0, 0, 1)
         frame = Frame.along(on.backend, on.unit(p), up)
         turns = on.winding.start(frame, 0, True)
         nowhere = Crossing(0.0, on.backend.UInt32(NO_SHEET), 0.0, up)
-        sample = on.winding.on_stretch(frame, frame.o, nowhere, turns, on.backend.Float(detail))
+        sample = on.winding.on_stretch(frame, frame.o, nowhere, turns, on.backend.Float(1))
         known = tuple(one for one in sample.known if not isinstance(one, LineLipschitz))
         return lengthened(dataclasses.replace(sample, known=known), on.size)
 
