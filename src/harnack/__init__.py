@@ -105,7 +105,7 @@ from harnack.fields import (
     union,
 )
 from harnack.geometry import Ball, Box, Circle, ConvexHull, HalfSpace, Intersection
-from harnack.meshing import MeshingError, mesh
+from harnack.meshing import MeshingError, mesh, repair
 from harnack.rendering import render
 from harnack.tracer import AllHits, Hits, LevelSet, Status, Tolerance, level_set, trace
 
@@ -207,6 +207,7 @@ __all__ = [
     "minimum",
     "norm",
     "render",
+    "repair",
     "rendering",
     "signed_distance",
     "sin",
