@@ -175,7 +175,7 @@ def _is_far(points: FloatArray, size: FloatArray, boundary: Boundary) -> BoolArr
         away = np.linalg.norm(points[:, None] - middle[index], axis=2)
         near = np.minimum(near, gap.min(axis=1))
         is_far &= (away > 1.1 * half[index]).all(axis=1)
-    return is_far & (near > _FREE * np.minimum(size, 2 * size.min()))
+    return is_far & (near > _FREE * np.minimum(size, 2 * size.min(initial=np.inf)))
 
 
 def _off_walls(points: FloatArray, walls: tuple[FloatArray, FloatArray]) -> FloatArray:

@@ -36,6 +36,8 @@ _LEVEL = 2 * math.pi
 # Cells across the patches at first, and how often they are made smaller where that fails.
 _ACROSS = 24
 _ATTEMPTS = 5
+# How often edges of holes that are too near to others are halved for the tetrahedra.
+_MOST_CUTS = 5
 # How far w may be from 1/2, modulo 1, at vertices of patches.
 _NEAR = 1e-6
 
@@ -191,16 +193,24 @@ def _patches(
     rim, place = np.unique(edges, return_inverse=True)
     boundary = Boundary(vertices[rim], place.reshape(-1, 2))
     root = box_cells(box[0] - 0.5 * spacing, box[1] + 0.5 * spacing, spacing, exact=False)
-    points = place_points(function, root, boundary, None, seed)
-    tets = delaunay(points.points)
-    report(f"{len(points.points):,} points, {len(tets.corners):,} tetrahedra")
-    lacking = int((~tets.has_edges(boundary.edges)).sum())
-    if lacking:
+    cut, middles = boundary, np.zeros((0, 2), np.int64)
+    for _ in range(_MOST_CUTS):
+        points = place_points(function, root, cut, None, seed)
+        tets = delaunay(points.points)
+        lacks = ~tets.has_edges(cut.edges)
+        if not lacks.any():
+            break
+        middles = np.concatenate([middles, cut.edges[lacks]])
+        cut = cut.split(lacks)
+    else:
         raise MeshingError(
-            f"{lacking} boundary edges of the mesh are too near to others for a patch that ends at "
-            "them: subdivide the mesh there, or choose a smaller `spacing`"
+            f"{int(lacks.sum())} boundary edges of the mesh are too near to others for a patch "
+            "that ends at them: subdivide the mesh there, or choose a smaller `spacing`"
         )
+    report(f"{len(points.points):,} points, {len(tets.corners):,} tetrahedra")
     x, faces = triangles_of(function, points, tets, crossings_of(function, points, tets))
+    for k, ends in reversed(list(enumerate(middles.tolist(), start=len(rim)))):
+        faces = _collapsed(x, faces, k, ends)
     if not len(faces):
         raise MeshingError("no patch was found: choose a smaller `spacing`")
     _check_rim(faces, boundary)
@@ -215,6 +225,40 @@ def _patches(
     index[: len(rim)] = rim
     index[inner] = len(vertices) + np.arange(len(inner))
     return _Patches(x[inner], index[faces], spacing, function.evaluations)
+
+
+def _collapsed(x: FloatArray, faces: IntArray, middle: int, ends: list[int]) -> IntArray:
+    """The faces with a vertex in the middle of a boundary edge moved to one of its ends: that which
+    turns the faces around it less.
+
+    Raises:
+        MeshingError: both ends would join more than the two faces at the edge.
+    """
+    around = (faces == middle).any(axis=1)
+    star = faces[around]
+    best = -np.inf, star
+    for end in ends:
+        joined = (faces == end).any(axis=1)
+        if len(np.intersect1d(star, faces[joined])) != 3:  # these two, and the face's third corner
+            continue
+        moved = np.where(star == middle, end, star)
+        kept = ~(star == end).any(axis=1)
+        one, other = _normals(x[star[kept]]), _normals(x[moved[kept]])
+        worst = float((one * other).sum(axis=1).min(initial=1.0))
+        if worst > best[0]:
+            best = worst, moved[kept]
+    if best[0] == -np.inf:
+        raise MeshingError(
+            "boundary edges of the mesh are too near to others for patches that end at them: "
+            "subdivide the mesh there, or choose a smaller `spacing`"
+        )
+    return np.concatenate([faces[~around], best[1]])
+
+
+def _normals(corners: FloatArray) -> FloatArray:
+    """Unit normals of triangles (m, 3, 3), 0 of those without an area."""
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
 
 
 def _check_rim(faces: IntArray, boundary: Boundary) -> None:
