@@ -55,7 +55,8 @@ def repair(
     mesh: anything with `vertices` (n, 3) and `faces` (m, 3): every edge has one or two faces, which
         agree on its two sides.
     tolerance: how far triangles of the patches may be from the surface, as a part of the size of
-        the patches' box, sampled and not proved.
+        the patches' box, sampled and not proved. Where triangles so small would pass through each
+        other, at sharp corners of holes, patches stay coarser.
     spacing: of cells before anything is refined, in the mesh's unit; None chooses.
     seed: of the small random moves that keep points in general position.
     progress: told what is being done.
@@ -214,9 +215,7 @@ def _patches(
     if not len(faces):
         raise MeshingError("no patch was found: choose a smaller `spacing`")
     _check_rim(faces, boundary)
-    x = smoothed(function, x, faces, None)
-    x, faces = refined(function, x, faces, 0.5 * tolerance, None, report)
-    x = smoothed(function, x, faces, None)
+    x, faces = _finished(function, x, faces, tolerance, report)
     # Faces of level sets are seen from where w is greater, those of meshes from outside.
     faces = faces[:, ::-1]
     kept = np.unique(faces)
@@ -225,6 +224,25 @@ def _patches(
     index[: len(rim)] = rim
     index[inner] = len(vertices) + np.arange(len(inner))
     return _Patches(x[inner], index[faces], spacing, function.evaluations)
+
+
+def _finished(
+    function: LevelFunction,
+    x: FloatArray,
+    faces: IntArray,
+    tolerance: float,
+    report: Callable[[str], None],
+) -> tuple[FloatArray, IntArray]:
+    """Patches refined and smoothed; where they would pass through themselves, which happens at
+    sharp corners of holes, refined alone, or as the tetrahedra cut them."""
+    even = smoothed(function, x, faces, None)
+    finer, split = refined(function, even, faces, 0.5 * tolerance, None, report)
+    finer = smoothed(function, finer, split, None)
+    if not edges_through(finer, split, split):
+        return finer, split
+    report("refining again, without smoothing")
+    finer, split = refined(function, x, faces, 0.5 * tolerance, None, report)
+    return (x, faces) if edges_through(finer, split, split) else (finer, split)
 
 
 def _collapsed(x: FloatArray, faces: IntArray, middle: int, ends: list[int]) -> IntArray:
