@@ -8,15 +8,17 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 
 from harnack.backend import doctor
 from harnack.choices import did_you_mean
 from harnack.cli.messages import in_options, printable
-from harnack.files.surfaces import SURFACE_FILES
+from harnack.files.surfaces import SURFACE_FILES, Mesh, read_surface
 from harnack.files.writing import check_writable, write_atomically
 from harnack.gallery import SCENES, Scene
-from harnack.meshing import mesh
+from harnack.geometry.singular import weld_vertices
+from harnack.meshing import mesh, repair
 from harnack.opening import open_surface
 from harnack.rendering import Camera, render
 from harnack.rendering.pictures.images import check_picture_path
@@ -162,6 +164,37 @@ def _mesh(options: Any) -> int:
     return 0
 
 
+def _repair(options: Any) -> int:
+    """A mesh with patches over its holes."""
+    import trimesh  # here: half a second that few need
+
+    source = Path(options.mesh)
+    target = Path(options.output or f"{source.stem}-repaired.ply")
+    if target.suffix.lower() not in MESH_FILES:
+        raise ValueError(f"{target} has no extension of a mesh: name it {', '.join(MESH_FILES)}")
+    found = read_surface(source, "winding")
+    if not isinstance(found, Mesh):
+        raise ValueError(f"{source} holds no mesh to repair")
+    _say(f"{source}: {in_options(found.said)}")
+    settings = {"tolerance": options.tolerance, "spacing": options.spacing}
+    chosen = {name: value for name, value in settings.items() if value is not None}
+    check_writable(target)
+    # Files such as .stl list the corners of each face anew.
+    kept, faces = np.unique(weld_vertices(found.vertices)[found.faces], return_inverse=True)
+    given = trimesh.Trimesh(found.vertices[kept], faces.reshape(-1, 3), process=False)
+    with Console().status("starting") as status:
+        made = repair(given, progress=None if options.quiet else status.update, **chosen)
+    with write_atomically(target) as partial:
+        made.export(partial)
+    facts = made.metadata["harnack"]
+    _say(
+        f"{facts['holes']:,} hole{'s' if facts['holes'] != 1 else ''}, {facts['patches']:,} triangles added: {len(made.faces):,} in "
+        f"all, Euler characteristic {facts['euler_characteristic']}"
+    )
+    _say(f"wrote {target}")
+    return 0
+
+
 def _gallery(options: Any) -> int:
     console = Console()
     if options.list:
@@ -211,6 +244,6 @@ def _doctor(options: Any) -> int:
 
 
 COMMANDS: Mapping[str, Callable[[Any], int]] = MappingProxyType(
-    {"render": _render, "mesh": _mesh, "gallery": _gallery, "doctor": _doctor}
+    {"render": _render, "mesh": _mesh, "repair": _repair, "gallery": _gallery, "doctor": _doctor}
 )
 """By name."""
