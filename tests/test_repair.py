@@ -82,7 +82,7 @@ def test_units_and_places(scale: float, shift: float) -> None:
 
 
 def test_two_openings_of_a_tube_are_capped_or_joined() -> None:
-    """A short wide tube has a 1/2 level that joins its rims inside: a torus; a long one has caps."""
+    """Patches of a long tube are caps; those of a short wide one join its rims to a torus."""
     for height, euler in ((6.0, 2), (0.3, 0)):
         angle = np.arange(24) * (2 * np.pi / 24)
         ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(24)])

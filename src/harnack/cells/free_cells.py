@@ -105,7 +105,11 @@ class PreparedFreeCells:
             step = dr.select(leaves > 0, leaves, 0) + _OVER * self.edge
             return dr.select(within, at + step, at), within
 
+        def goes_on(at: Real, inside: Mask) -> Mask:
+            del at
+            return inside
+
         start = real(t), self.backend.Bool(known)
-        end, _ = dr.while_loop(start, lambda _, inside: inside, body, label="free cells")
+        end, _ = dr.while_loop(start, goes_on, body, label="free cells")
         # The last step ended in a cell that is not free, but within the margin of one that is.
         return end - t

@@ -187,10 +187,9 @@ def _repair(options: Any) -> int:
     with write_atomically(target) as partial:
         made.export(partial)
     facts = made.metadata["harnack"]
-    _say(
-        f"{facts['holes']:,} hole{'s' if facts['holes'] != 1 else ''}, {facts['patches']:,} triangles added: {len(made.faces):,} in "
-        f"all, Euler characteristic {facts['euler_characteristic']}"
-    )
+    holes = f"{facts['holes']:,} hole" + ("" if facts["holes"] == 1 else "s")
+    added = f"{facts['patches']:,} triangles added to {len(faces):,}"
+    _say(f"{holes}, {added}, Euler characteristic {facts['euler_characteristic']}")
     _say(f"wrote {target}")
     return 0
 

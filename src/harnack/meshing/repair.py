@@ -195,18 +195,20 @@ def _patches(
     boundary = Boundary(vertices[rim], place.reshape(-1, 2))
     root = box_cells(box[0] - 0.5 * spacing, box[1] + 0.5 * spacing, spacing, exact=False)
     cut, middles = boundary, np.zeros((0, 2), np.int64)
+    points = place_points(function, root, cut, None, seed)
+    tets = delaunay(points.points)
     for _ in range(_MOST_CUTS):
-        points = place_points(function, root, cut, None, seed)
-        tets = delaunay(points.points)
         lacks = ~tets.has_edges(cut.edges)
         if not lacks.any():
             break
         middles = np.concatenate([middles, cut.edges[lacks]])
         cut = cut.split(lacks)
-    else:
+        points = place_points(function, root, cut, None, seed)
+        tets = delaunay(points.points)
+    if lacking := int((~tets.has_edges(cut.edges)).sum()):
         raise MeshingError(
-            f"{int(lacks.sum())} boundary edges of the mesh are too near to others for a patch "
-            "that ends at them: subdivide the mesh there, or choose a smaller `spacing`"
+            f"{lacking} boundary edges of the mesh are too near to others for a patch that ends at "
+            "them: subdivide the mesh there, or choose a smaller `spacing`"
         )
     report(f"{len(points.points):,} points, {len(tets.corners):,} tetrahedra")
     x, faces = triangles_of(function, points, tets, crossings_of(function, points, tets))

@@ -136,5 +136,7 @@ class EdgeChains:
             chord = LiftedEdge.between(type(x)(*c[19:22]), type(x)(*c[22:25]), 1, c[25], frame, x)
             return trip + 1, *add(chord, active, state)
 
-        start = (self.backend.UInt32(0), *state)
-        return dr.while_loop(start, lambda trip, *_: active & (trip < 1), once, label="chord")[1:]
+        def is_first(trip: Any, *_: Any) -> Mask:
+            return active & (trip < 1)
+
+        return dr.while_loop((self.backend.UInt32(0), *state), is_first, once, label="chord")[1:]

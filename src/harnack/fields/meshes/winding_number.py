@@ -148,8 +148,8 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
         return _MeshBuffers(*placed(backend, mesh.centre, mesh.size), winding, rays, free)
 
     def for_levels(self, levels: tuple[float, ...]) -> WindingNumber:
-        """With cells that are proved free of these levels, if there are holes to span."""
-        if self._free is not None or len(self.mesh.singular) < _FEW_EDGES:
+        """With cells that are proved free of these levels, where edges are summed up exactly."""
+        if self.method != "exact" or self._free or len(self.mesh.singular) < _FEW_EDGES:
             return self
         extent = self.extent(levels)
         if extent is None:
