@@ -34,8 +34,9 @@ if TYPE_CHECKING:
     from harnack.fields.sheets import Crossing
 
 
-# Up to so many edges all of them are summed up along rays, beyond by a tree of chains: measured.
-_MOST_EDGES = 0
+# Up to so many edges close sums along rays run over all of them: at 4 ns an edge and point, where a
+# tree of chains takes 13 to 30 us a point, measured with 1,585 edges.
+_MOST_EDGES = 4000
 _SHARE = 1 / (4 * math.pi)
 
 
