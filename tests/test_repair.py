@@ -223,7 +223,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     ball(AXES[:1], subdivisions=2).export(source)
     assert main(["repair", str(source), "-o", str(target), "--quiet"]) == 0
     assert "1 hole," in capsys.readouterr().out
-    assert trimesh.load(target).is_watertight
+    assert trimesh.load_mesh(target).is_watertight
     assert sorted(tmp_path.iterdir()) == [source, target]
     assert main(["repair", str(source), "-o", str(tmp_path / "a.txt")]) == 1
     assert "extension of a mesh" in capsys.readouterr().err
