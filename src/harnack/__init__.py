@@ -105,7 +105,7 @@ from harnack.fields import (
     union,
 )
 from harnack.geometry import Ball, Box, Circle, ConvexHull, HalfSpace, Intersection
-from harnack.meshing import MeshingError, mesh
+from harnack.meshing import MeshingError, mesh, repair
 from harnack.rendering import render
 from harnack.tracer import AllHits, Hits, LevelSet, Status, Tolerance, level_set, trace
 
@@ -208,6 +208,7 @@ __all__ = [
     "norm",
     "render",
     "rendering",
+    "repair",
     "signed_distance",
     "sin",
     "sine",

@@ -1,6 +1,23 @@
 """Cells that may hold a level set, found by leaving out those that are proved empty."""
 
 from harnack.cells.occupied import OccupiedCells
-from harnack.cells.octree import Cells, Clearance, Octree, carve, octree
+from harnack.cells.octree import (
+    Cells,
+    Clearance,
+    Octree,
+    carve,
+    octree,
+    union,
+    wrapped_points,
+)
 
-__all__ = ["Cells", "Clearance", "OccupiedCells", "Octree", "carve", "octree"]
+__all__ = [
+    "Cells",
+    "Clearance",
+    "OccupiedCells",
+    "Octree",
+    "carve",
+    "octree",
+    "union",
+    "wrapped_points",
+]

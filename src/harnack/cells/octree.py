@@ -12,7 +12,7 @@ import numpy as np
 from harnack.backend import BoolArray, FloatArray
 from harnack.geometry import ConvexHull
 
-__all__ = ["Cells", "Clearance", "Octree", "carve", "octree"]
+__all__ = ["Cells", "Clearance", "Octree", "carve", "octree", "union", "wrapped_points"]
 
 Clearance: TypeAlias = Callable[[FloatArray], FloatArray]
 """For points (n, 3) lengths (n,): no point of the set is nearer than that."""
@@ -44,12 +44,7 @@ class Cells:
     def wrapped(self, slack: float) -> ConvexHull:
         """A polytope around all of them, `slack` thicker, with the 26 directions of a cube's faces,
         edges and corners."""
-        normals = np.array([v for v in itertools.product((-1, 0, 1), repeat=3) if any(v)], float)
-        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        half = 0.5 * self.size + slack
-        offsets = (self.centres @ normals.T).max(axis=0) + np.abs(normals) @ half
-        lower, upper = self.bounds()
-        return ConvexHull(normals, offsets, lower - slack, upper + slack)
+        return _wrapped(self.centres, 0.5 * self.size + slack)
 
     def split(self) -> Cells:
         """Eight of each."""
@@ -66,6 +61,29 @@ class Cells:
         if not len(self.corners):
             return np.zeros(0, np.bool_)
         return clearance(self.centres) > self.half_diagonal * (1 + 2 * margin + 1e-9)
+
+
+def wrapped_points(points: FloatArray, slack: float) -> ConvexHull:
+    """A polytope around points (n, 3), `slack` thicker, with the directions of `Cells.wrapped`."""
+    return _wrapped(points, np.full(3, slack))
+
+
+def union(one: ConvexHull, other: ConvexHull) -> ConvexHull:
+    """The smallest polytope with the directions of `Cells.wrapped` around two such."""
+    return ConvexHull(
+        one.normals,
+        np.maximum(one.offsets, other.offsets),
+        np.minimum(one.lower, other.lower),
+        np.maximum(one.upper, other.upper),
+    )
+
+
+def _wrapped(centres: FloatArray, half: FloatArray) -> ConvexHull:
+    """The polytope around boxes of half sizes (3,)."""
+    normals = np.array([v for v in itertools.product((-1, 0, 1), repeat=3) if any(v)], float)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    offsets = (centres @ normals.T).max(axis=0) + np.abs(normals) @ half
+    return ConvexHull(normals, offsets, centres.min(axis=0) - half, centres.max(axis=0) + half)
 
 
 @dataclass(frozen=True)

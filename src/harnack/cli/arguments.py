@@ -58,6 +58,7 @@ def _parsers() -> tuple[_Parser, dict[str, _Parser]]:
     commands = whole.add_subparsers(required=True, metavar="COMMAND", dest="command")
     _add_render(commands)
     _add_mesh(commands)
+    _add_repair(commands)
     many = commands.add_parser("gallery", help="draw or list the named scenes")
     many.add_argument("names", nargs="*", metavar="NAME", help="scenes to draw (all)")
     many.add_argument("--list", action="store_true", help="list them and draw nothing")
@@ -161,6 +162,26 @@ def _add_mesh(commands: Any) -> None:
         "--scale", type=_positive, metavar="FACTOR",
         help="multiply all lengths at the end: millimetres for one unit of the scene (1)",
     )  # fmt: skip
+    one.add_argument("--quiet", action="store_true", help="do not say what is being done")
+
+
+def _add_repair(commands: Any) -> None:
+    one = commands.add_parser(
+        "repair", help="close the holes of a mesh",
+        description="Write a mesh with patches over its holes. The triangles that there are stay "
+        "as they are.",
+    )  # fmt: skip
+    one.add_argument("mesh", metavar="FILE", help="a mesh: .obj, .ply, .stl, .off, .glb or .gltf")
+    one.add_argument(
+        "-o", "--output", metavar="FILE", help=".stl, .ply, .obj or .glb (FILE-repaired.ply)"
+    )
+    one.add_argument(
+        "--tolerance", type=_positive, metavar="PART",
+        help="how far patches may be from the surface, as a part of their size (0.001)",
+    )  # fmt: skip
+    one.add_argument(
+        "--spacing", type=_positive, metavar="LENGTH", help="of cells before anything is refined"
+    )
     one.add_argument("--quiet", action="store_true", help="do not say what is being done")
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 
 from harnack.backend import doctor
@@ -15,10 +16,11 @@ from harnack.choices import did_you_mean
 from harnack.cli.mesh_files import check_mesh_path, write_mesh
 from harnack.cli.messages import in_options, printable
 from harnack.fields import Field
-from harnack.files.surfaces import SURFACE_FILES
+from harnack.files.surfaces import SURFACE_FILES, Mesh, read_surface
 from harnack.gallery import SCENES, Scene
 from harnack.geometry import Ball, Box
-from harnack.meshing import mesh
+from harnack.geometry.singular import weld_vertices
+from harnack.meshing import mesh, repair
 from harnack.opening import open_surface
 from harnack.rendering import Camera, render
 from harnack.rendering.pictures.images import check_picture_path
@@ -194,6 +196,32 @@ def _meshed(options: Any, source: Path) -> tuple[Field, dict[str, Any]]:
     return surface.field, {"level": surface.numbers[0], "clip": surface.clip}
 
 
+def _repair(options: Any) -> int:
+    """A mesh with patches over its holes."""
+    import trimesh  # here: half a second that few need
+
+    source = Path(options.mesh)
+    target = check_mesh_path(options.output or f"{source.stem}-repaired.ply")
+    found = read_surface(source, "winding")
+    if not isinstance(found, Mesh):
+        raise ValueError(f"{source} holds no mesh to repair")
+    _say(f"{source}: {in_options(found.said)}")
+    settings = {"tolerance": options.tolerance, "spacing": options.spacing}
+    chosen = {name: value for name, value in settings.items() if value is not None}
+    # Files such as .stl list the corners of each face anew.
+    kept, faces = np.unique(weld_vertices(found.vertices)[found.faces], return_inverse=True)
+    given = trimesh.Trimesh(found.vertices[kept], faces.reshape(-1, 3), process=False)
+    with Console().status("starting") as status:
+        made = repair(given, progress=None if options.quiet else status.update, **chosen)
+    write_mesh(made, target)
+    facts = made.metadata["harnack"]
+    holes = f"{facts['holes']:,} hole" + ("" if facts["holes"] == 1 else "s")
+    added = f"{facts['patches']:,} triangles added to {len(faces):,}"
+    _say(f"{holes}, {added}, Euler characteristic {facts['euler_characteristic']}")
+    _say(f"wrote {target}")
+    return 0
+
+
 def _gallery(options: Any) -> int:
     console = Console()
     if options.list:
@@ -243,6 +271,6 @@ def _doctor(options: Any) -> int:
 
 
 COMMANDS: Mapping[str, Callable[[Any], int]] = MappingProxyType(
-    {"render": _render, "mesh": _mesh, "gallery": _gallery, "doctor": _doctor}
+    {"render": _render, "mesh": _mesh, "repair": _repair, "gallery": _gallery, "doctor": _doctor}
 )
 """By name."""

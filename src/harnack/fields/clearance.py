@@ -12,14 +12,14 @@ import numpy as np
 from harnack.backend import FloatArray, choose_backend, to_numpy, to_vector3
 from harnack.backend.extrema import fmax, fmin
 from harnack.backend.lengths import largest_component, length
-from harnack.cells import Cells, OccupiedCells, carve
+from harnack.cells import Cells, OccupiedCells, carve, union, wrapped_points
 from harnack.enclosures import Gaps, Slopes, TargetLevels, choose_proofs, longest_step
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Precision, Real, Vec3
     from harnack.cells import Clearance
     from harnack.fields.field import Field, Sample
-    from harnack.geometry import ConvexHull
+    from harnack.geometry import ConvexHull, Volume
 
 __all__ = ["clearance_of", "distance_below", "occupied_cells", "tight_extent"]
 
@@ -53,23 +53,43 @@ def tight_extent(
     upper: FloatArray,
     most: int,
     finest: int = 5,
+    points: FloatArray | None = None,
 ) -> ConvexHull:
     """A polytope of few planes that holds every point of the level sets inside a box.
 
     Cells of the box are left out if their ball is within the clearance of its centre; those left at
     the end are wrapped. most, finest: as for `cells.carve`.
+
+    points: (n, 3) that the polytope is to hold in any case. What lies in the polytope around them
+    needs no look: a ball that is inside it is as good as empty.
     """
-    cells = carve(lower, upper, clearance_of(field, levels), most, finest)
+    clearance = clearance_of(field, levels)
+    slack = 1e-4 * float(np.linalg.norm(upper - lower))
+    if points is not None:
+        held = wrapped_points(points, slack)
+        cells = carve(lower, upper, _outside(held, clearance), most, finest)
+        return union(held, cells.wrapped(slack)) if len(cells.corners) else held
+    cells = carve(lower, upper, clearance, most, finest)
     if not len(cells.corners):  # no level anywhere: any box will do
         cells = Cells(np.array(lower)[None], np.array(upper) - np.array(lower))
-    return cells.wrapped(1e-4 * float(np.linalg.norm(upper - lower)))
+    return cells.wrapped(slack)
 
 
-def occupied_cells(field: Field, levels: tuple[float, ...]) -> OccupiedCells:
-    """A grid over the extent of a field, in cells that are small enough for pictures."""
-    extent = field.extent(levels)
-    if extent is None:
-        raise ValueError(f"{type(field).__name__} does not say where its levels end")
+def _outside(held: ConvexHull, clearance: Clearance) -> Clearance:
+    """The clearance from what lies outside a polytope: inside, the distance to its faces."""
+
+    def beyond(points: FloatArray) -> FloatArray:
+        depth = (held.offsets - points @ held.normals.T).min(axis=1)
+        outside = depth <= 0
+        if outside.any():
+            depth[outside] = clearance(points[outside])
+        return depth
+
+    return beyond
+
+
+def occupied_cells(field: Field, levels: tuple[float, ...], extent: Volume) -> OccupiedCells:
+    """A grid over an extent, in cells that are small enough for pictures."""
     return OccupiedCells.of(*extent.bounds(), clearance_of(field, levels, "single"), _ACROSS)
 
 

@@ -195,6 +195,8 @@ class Field(abc.ABC):
     def occupied(self, levels: tuple[float, ...]) -> OccupiedCells | None:
         """Cells that may hold points of the level sets; there are none elsewhere. None where a
         field knows of none. First hits jump across the rest: for fields that are dear to evaluate.
+
+        Of a field with sheets, cells elsewhere hold no level of any lift: the jumps do not count.
         """
         del levels
         return None

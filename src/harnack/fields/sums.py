@@ -131,6 +131,11 @@ class FieldSums:
         bounds = self.truncation, self.slope_truncation, self.second_truncation, self.rounding
         return self.value, self.gradient, hessian, *bounds, self.free_distance, self.s4, self.s5
 
+    def where(self, mask: Mask, other: FieldSums) -> FieldSums:
+        """The sums of another where the mask holds. Without Hessians."""
+        pairs = zip(other.parts(), self.parts(), strict=True)
+        return FieldSums(*(None if b is None else dr.select(mask, a, b) for a, b in pairs))
+
     @property
     def derivatives(self) -> int:
         """How many were asked for."""

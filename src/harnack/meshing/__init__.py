@@ -2,5 +2,6 @@
 
 from harnack.meshing.checks import MeshingError
 from harnack.meshing.mesh import mesh
+from harnack.meshing.repair import repair
 
-__all__ = ["MeshingError", "mesh"]
+__all__ = ["MeshingError", "mesh", "repair"]

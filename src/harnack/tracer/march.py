@@ -115,7 +115,8 @@ class March:
 
     hysteresis: for rays that end where they have crossed a level, and not where they reach one.
     cover: for cones that end where they come near a level: their radius per unit of t (`covers`).
-    occupied: cells outside of which there is no level, for rays that end where they reach one.
+    occupied: cells outside of which there is no level, not even behind a sheet, for rays that end
+        where they reach one; and `last`, where these rays end.
     """
 
     backend: Backend
@@ -126,6 +127,7 @@ class March:
     hysteresis: Hysteresis | None = None
     cover: Real | None = None
     occupied: UniformGrid | None = None
+    last: Real = 0.0
 
     def advance(
         self,
@@ -271,9 +273,9 @@ class March:
             proved = forward
             trial = self._trial(forward, look, aims, now, path, is_smooth)
             if self.occupied is not None:  # what follows is proved to be free, too
-                free_to = dr.select(accepted, t + forward, end)
-                free_to = self.occupied.free_until(path.origin, path.direction, free_to, end)
-                forward = fmax(forward, dr.select(free_to >= end, dr.inf, free_to - t))
+                free_to = dr.select(accepted, t + forward, self.last)
+                free_to = self.occupied.free_until(path.origin, path.direction, free_to, self.last)
+                forward = fmax(forward, dr.select(free_to >= self.last, dr.inf, free_to - t))
                 trial = fmax(trial, forward)
             base = dr.select(accepted, t, now.base)
             step = dr.select(accepted, trial, dr.select(too_coarse, now.step, now.reach))

@@ -148,7 +148,8 @@ class PreparedLevelSet:
         if occupied is not None:
             holds = backend.Bool(active) & (start < end)
             start, end = dr.select(holds, start, 0), dr.select(holds, end, 0)
-            start = occupied.free_until(path.origin, path.direction, start, end)
+            if not self.field.has_sheets:  # a sheet on the start must be looked at
+                start = occupied.free_until(path.origin, path.direction, start, end)
         state = MarchState.at(backend, start, end, active, has_detail=has_detail, crosses=crosses)
         march = March(
             backend,
@@ -158,6 +159,7 @@ class PreparedLevelSet:
             self.overstep,
             hysteresis,
             occupied=occupied,
+            last=end,
         )
         return march, path, real(start), real(end), state
 

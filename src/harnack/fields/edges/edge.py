@@ -84,6 +84,14 @@ class Edge:
         square = dr.squared_norm(c)
         return dr.select(square > 0, (la + lb) / (la * lb * self._bracket(square)), 0), c
 
+    def field_of_lengths(self, la: Real, lb: Real) -> tuple[Real, Vec3]:
+        """The same for given |a| and |b|, by one division."""
+        c, both, dot = dr.cross(self.a, self.e), la * lb, dr.dot(self.a, self.b)
+        square, beside = dr.squared_norm(c), dot < 0
+        above = (la + lb) * dr.select(beside, both - dot, 1)
+        below = both * dr.select(beside, square, both + dot)
+        return dr.select(square > 0, above / below, 0), c
+
     def rates(self) -> tuple[Vec3, Vec3]:
         """c and grad w: the edge's share of the Hessian is (c grad w^T + grad w c^T)/2.
 

@@ -197,19 +197,63 @@ def lifted_sums(edges: LiftedEdges, x: Vec3, derivatives: int) -> LiftedSums:
     return LiftedSums.of(edges.records.for_each(add, start, "lift"))
 
 
+@dataclass(frozen=True)
+class Sight:
+    """A vertex seen from x along rays.
+
+    offset: from x to it. length: of that. u, v: where it is across the rays. s: length less the
+    component of the offset along them.
+    """
+
+    offset: Vec3
+    length: Real
+    u: Real
+    v: Real
+    s: Real
+
+
+def sight_of(p: Vec3, frame: Frame, x: Vec3) -> Sight:
+    """A vertex p as seen from x on rays of a frame."""
+    offset = p - x
+    length = dr.norm(offset)
+    u, v = frame.across(p)
+    a = cast("Any", type(x))(u, v, frame.component(offset))
+    return Sight(offset, length, u, v, _s(a, length))
+
+
+def ends_factor(a: Sight, b: Sight, direction: Real) -> tuple[Real, Real]:
+    """F_e of the edge from a to b; direction: positive if a has the lower index, else negative.
+
+    `side` is asked for the ends in the order of their indices, as everywhere.
+    """
+    rises = direction > 0
+    low, high = (dr.select(rises, a.u, b.u), dr.select(rises, a.v, b.v)), (
+        dr.select(rises, b.u, a.u), dr.select(rises, b.v, a.v)
+    )  # fmt: skip
+    re, im = _factor(low, high, a.s, b.s)
+    return re, dr.select(rises, im, -im)
+
+
 def edge_factor(a: Vec3, b: Vec3, la: Real, lb: Real) -> tuple[Real, Real]:
     """F_e of the edge from a to b, seen as (u, v, z): across the direction, and along it.
 
     s_a is taken as |a'|^2/(|a| + a.d) where a.d > 0, so that nothing cancels.
+    """
+    return _factor((a.x, a.y), (b.x, b.y), _s(a, la), _s(b, lb))
+
+
+def _factor(a: tuple[Real, Real], b: tuple[Real, Real], sa: Real, sb: Real) -> tuple[Real, Real]:
+    """F_e of ends seen across the direction, with s of each.
+
     A ray exactly through an edge or a vertex is decided as `tree.triangles.crossing` does: as if
     it passed at v, and then u, infinitely little below zero.
     """
-    real = cast("Any", type(la))
-    in_line = (a.x == 0) & (a.y == 0), (b.x == 0) & (b.y == 0)
-    ax, bx = dr.select(in_line[0], real(-1e-18), a.x), dr.select(in_line[1], real(-1e-18), b.x)
-    im = -side((ax, a.y), (bx, b.y))
-    re = dr.fma(_s(a, la), _s(b, lb), dr.fma(ax, bx, a.y * b.y))
-    tie = dr.select(a.y == b.y, ax - bx, b.y - a.y)
+    real, (au, av), (bu, bv) = cast("Any", type(sa)), a, b
+    in_line = (au == 0) & (av == 0), (bu == 0) & (bv == 0)
+    ax, bx = dr.select(in_line[0], real(-1e-18), au), dr.select(in_line[1], real(-1e-18), bu)
+    im = -side((ax, av), (bx, bv))
+    re = dr.fma(sa, sb, dr.fma(ax, bx, av * bv))
+    tie = dr.select(av == bv, ax - bx, bv - av)
     # Of a real factor the sign counts alone. Left as small as it may be, it would be no longer than
     # what stands for its imaginary part.
     straight = im == 0

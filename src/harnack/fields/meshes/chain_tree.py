@@ -1,7 +1,7 @@
 """A tree of the edges of closed trails in which every node is one chain, or whole trails.
 
-A trail takes up 2^j leaves, trails of many leaves come before those of few, and so each begins at a
-multiple of its own size: a node of 2^i leaves lies within a trail or holds some entirely.
+A trail takes up 2^j leaves and begins at a multiple of that: a node of 2^i leaves lies within a
+trail or holds some entirely.
 """
 
 from __future__ import annotations
@@ -46,19 +46,31 @@ class ChainLeaves:
 
 
 def chain_leaves(vertices: FloatArray, trails: list[IntArray]) -> ChainLeaves:
-    """Trails of vertices, each ending where it begins, laid out; neighbours next to each other."""
+    """Trails of vertices, each ending where it begins, laid out; neighbours next to each other.
+
+    Trails of as many leaves are the primitives of a tree of their own. Its empty slots stay empty
+    leaves, so that its nodes are nodes here. The largest such tree comes first, and so each begins
+    at a multiple of its own size.
+    """
     middles = np.array([vertices[trail].mean(axis=0) for trail in trails])
-    near = build_hierarchy(middles, leaf_size=1).slots.ravel()
-    counts = [len(trail) - 1 for trail in trails]
-    spans = [1 << (-(-count // _LEAF_SIZE) - 1).bit_length() for count in counts]
-    some = [int(k) for k in near if k != NO_PRIMITIVE]
-    order = sorted(some, key=spans.__getitem__, reverse=True)
+    counts = np.array([len(trail) - 1 for trail in trails])
+    spans = np.array([1 << (-(-int(count) // _LEAF_SIZE) - 1).bit_length() for count in counts])
+    blocks: list[tuple[int, IntArray]] = []
+    for span in np.unique(spans):
+        alike = np.flatnonzero(spans == span)
+        slots = build_hierarchy(middles[alike], leaf_size=1).slots.ravel()
+        blocks.append((int(span), np.where(slots == NO_PRIMITIVE, slots, alike[slots])))
+    blocks.sort(key=lambda block: -block[0] * len(block[1]))
+    order: list[int] = []
     ends: list[IntArray] = [np.zeros(1, np.int64)]
     start = 0
-    for k in order:
-        ends.append(_shares(start, counts[k], spans[k])[1:])
-        start += counts[k]
-    used = sum(spans)
+    for span, slots in blocks:
+        for k in slots.tolist():
+            count = 0 if k == NO_PRIMITIVE else int(counts[k])
+            ends.append(_shares(start, count, span)[1:])
+            start += count
+            order += [] if k == NO_PRIMITIVE else [k]
+    used = sum(map(len, ends)) - 1
     ends.append(np.full((1 << (used - 1).bit_length()) - used, start))
     edges = [np.column_stack([trails[k][:-1], trails[k][1:]]) for k in order]
     laid = [counts[k] for k in order]

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import drjit as dr
 
@@ -56,8 +56,8 @@ class EdgeChains:
         records = tree.gather(edge_records(vertices, leaves.edges))
         return cls(backend, pack(backend, tree, levels, records))
 
-    def near(self, frame: Frame, x: Vec3, detail: Real) -> FieldSums:
-        """The sum of Omega_e at points x of rays, and what a certificate needs.
+    def near(self, frame: Frame, x: Vec3, detail: Real, active: Mask = True) -> FieldSums:
+        """The sum of Omega_e at points x of rays, where active, and what a certificate needs.
 
         detail: `Field.at_detail`; 1 leaves out no more than rounding does. Edges add to the
         remainder what `LiftedEdge.bounds` says, and so do chords: none is nearer than the ball
@@ -69,7 +69,7 @@ class EdgeChains:
             return LiftedSums.of(state).plus(edge, unit, active).parts()
 
         own = LiftedProduct.one(self.backend.Float).parts()
-        return LiftedSums.of(self._walk(frame, x, detail, add, own)).whole()
+        return LiftedSums.of(self._walk(frame, x, detail, add, own, active)).whole()
 
     def rates(
         self, frame: Frame, line: Line, lengths: tuple[Real, ...], active: Mask
@@ -114,8 +114,7 @@ class EdgeChains:
                 free_part(RATIO) * (square * inverse),
                 unit,
             )
-            chord = LiftedEdge.between(vector(*c[19:22]), vector(*c[22:25]), 1, c[25], frame, x)
-            state = add(chord, far & (c[25] > 0), (sums.parts(), state[1]))
+            state = self._with_chord(frame, x, c, far & (c[25] > 0), add, (sums.parts(), state[1]))
             return ~far, for_each(node, ~far & node.is_leaf, edge, state)
 
         def edge(row: list[Real], active: Mask, state: State) -> State:
@@ -126,3 +125,18 @@ class EdgeChains:
 
         start = (FieldSums.zero(self.backend, dr.inf, 1).parts(), own)
         return walk(self.tree, visit, start, active)
+
+    def _with_chord(
+        self, frame: Frame, x: Vec3, c: list[Real], active: Mask, add: AddEdge, state: State
+    ) -> State:
+        """The state with the chord of a node of payload c, where active. Whole trails have none:
+        in a loop of one trip, or of none, chords cost nothing where no lane has one."""
+
+        def once(trip: Any, *state: Any) -> State:
+            chord = LiftedEdge.between(type(x)(*c[19:22]), type(x)(*c[22:25]), 1, c[25], frame, x)
+            return trip + 1, *add(chord, active, state)
+
+        def is_first(trip: Any, *_: Any) -> Mask:
+            return active & (trip < 1)
+
+        return dr.while_loop((self.backend.UInt32(0), *state), is_first, once, label="chord")[1:]

@@ -164,7 +164,7 @@ class MorphSlice(UploadedField["_SliceBuffers"], BatchedField):
 
     def occupied(self, levels: tuple[float, ...]) -> OccupiedCells:
         if levels not in self._occupied:
-            self._occupied[levels] = occupied_cells(self, levels)
+            self._occupied[levels] = occupied_cells(self, levels, self.extent(levels))
         return self._occupied[levels]
 
 

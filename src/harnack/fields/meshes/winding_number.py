@@ -18,22 +18,25 @@ from harnack.enclosures import LineLipschitz
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.field import Field, Sample, lengthened
 from harnack.fields.meshes.winding_exact import ExactWinding
+from harnack.fields.meshes.winding_extent import winding_cells, winding_extent
 from harnack.fields.meshes.winding_mesh import WindingMesh
 from harnack.fields.meshes.winding_tree import TreeWinding
 from harnack.fields.sheets import NO_SHEET, Crossing, NearestSheet
 from harnack.fields.unit_coordinates import UnitCoordinates, UploadedField, epsilon_at, placed
-from harnack.geometry import Box
 from harnack.tree.nearest import distance_to_triangles, jumps_within, nearest_triangle
 from harnack.tree.triangles import Frame, TriangleRays
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.cells import OccupiedCells
     from harnack.geometry import Volume
 
 MethodName = Literal["auto", "exact", "tree"]
 
 # One boundary edge costs about a nanosecond, a tree two to three microseconds.
 _MOST_EDGES = 2048
+# Of fewer edges samples cost so little that no cells are made for them.
+_FEW_EDGES = 64
 # The accuracy of values at points, and of traces, by experiment.
 _VALUES, _TRACED = 2.0, 4.0
 # Roundings of a coordinate within which a point may be on either side of a triangle.
@@ -90,6 +93,8 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
             ("exact" if few else "tree") if method == "auto" else method
         )
         self.accuracy, self.order = accuracy, order
+        self._extents: dict[tuple[float, ...], Volume | None] = {}
+        self._occupied: dict[tuple[float, ...], OccupiedCells] = {}
 
     def moved(self, vertices: Any) -> WindingNumber:
         """The winding number of the same faces with their vertices (n, 3) elsewhere, for less work.
@@ -103,6 +108,7 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
         field = copy.copy(self)
         field.mesh = self.mesh.moved(vertices)
         field._batches, field._device = {}, None
+        field._extents, field._occupied = {}, {}
         return field
 
     @property
@@ -134,6 +140,17 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
         else:
             winding = TreeWinding.of(backend, mesh, accuracy, self.order)
         return _MeshBuffers(*placed(backend, mesh.centre, mesh.size), winding, rays)
+
+    def occupied(self, levels: tuple[float, ...]) -> OccupiedCells | None:
+        """Where edges are summed up exactly, and are not few."""
+        if self.method != "exact" or len(self.mesh.singular) < _FEW_EDGES:
+            return None
+        extent = self.extent(levels)
+        if extent is None:
+            return None
+        if levels not in self._occupied:
+            self._occupied[levels] = winding_cells(self, extent, levels)
+        return self._occupied[levels]
 
     def evaluate(self, p: Vec3) -> Sample:
         """w as it is, jumps and all, with what is known of it as a lift."""
@@ -190,29 +207,10 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
                 raise ValueError("level 0 of a winding number is no surface; try 0.5")
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """A box around the mesh, wider by the less of two distances.
-
-        (a) At distance rho from the mesh |w| <= area/(4 pi rho^2). (b) Off the triangles 4 pi w
-        is the solid angle of the singular edges mod 4 pi, and a level at distance l from the
-        multiples of 4 pi lies within L/sqrt(l (4 pi - l)) of edges of total length L (isoperimetry
-        on the sphere: see `SolidAngle.extent`).
-        """
-        mesh = self.mesh
-        low, high = mesh.box
-        slack = 1e-4 * float((high - low).max())
-        nearest = min(abs(level) for level in levels)
-        wide = math.sqrt(mesh.area / (4 * math.pi * max(nearest, 1e-12)))
-        away = min(abs(math.remainder(level, 1.0)) for level in levels) * 4 * math.pi
-        narrow = mesh.boundary_length / math.sqrt(max(away * (4 * math.pi - away), 1e-12))
-        if len(mesh.singular):
-            ends = mesh.vertices[mesh.singular].reshape(-1, 3)
-            near = np.minimum(low, ends.min(axis=0) - narrow)
-            reach = near, np.maximum(high, ends.max(axis=0) + narrow)
-        else:
-            reach = low, high
-        return Box(
-            np.maximum(reach[0], low - wide) - slack, np.minimum(reach[1], high + wide) + slack
-        )
+        """All triangles, and cells around them that are not proved empty (`winding_extent`)."""
+        if levels not in self._extents:
+            self._extents[levels] = winding_extent(self, self.mesh, levels)
+        return self._extents[levels]
 
     def describe(self) -> dict[str, Any]:
         mesh = self.mesh

@@ -17,9 +17,9 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
 from harnack.meshing.checks import MeshingError, singular_vertices
+from harnack.meshing.isotopy import Isotopy, isotopy_of
 from harnack.meshing.lattice.cells import Lattice, distinct_rows
 from harnack.meshing.lattice.estimates import check_size
-from harnack.meshing.isotopy import Isotopy, isotopy_of
 from harnack.meshing.marching import crossings_of, is_cut, triangles_of
 from harnack.meshing.points import Boundary, PointSet, newton
 from harnack.meshing.refinement import refined, smoothed
@@ -211,7 +211,7 @@ def _marched(
         wrong = wrong[wrong < len(points)]
         wrong = wrong[~is_wall[wrong]]
         if not len(wrong):
-            cut = is_on[corners].any(axis=1)
+            cut: BoolArray = np.asarray(is_on[corners].any(axis=1))
             cut[rows] |= is_cut(some, tets, crossings)
             return _First(vertices, faces, some, cut)
         points, is_on = points.copy(), is_on.copy()

@@ -1,0 +1,229 @@
+"""Repaired meshes: what is kept, what is added, and what is refused."""
+
+from __future__ import annotations
+
+import itertools
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+import harnack as hk
+from harnack.cli import main
+from harnack.geometry import MeshError
+from harnack.geometry.mesh_shapes import icosphere
+from harnack.meshing.crossed import edges_through
+from harnack.meshing.repair import _collapsed  # pyright: ignore[reportPrivateUsage]
+
+AXES = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, -0.6, -0.8))
+
+
+def ball(directions: Any = AXES, radius: float = 0.5, subdivisions: int = 3) -> trimesh.Trimesh:
+    """A sphere without the triangles within an angle of some directions."""
+    vertices, faces = icosphere(subdivisions)
+    middle = vertices[faces].mean(axis=1)
+    middle /= np.linalg.norm(middle, axis=1, keepdims=True)
+    gone = (middle @ np.array(directions).T > np.cos(radius)).any(axis=1)
+    return trimesh.Trimesh(vertices, faces[~gone], process=False)
+
+
+def check(given: trimesh.Trimesh, euler: int = 2) -> trimesh.Trimesh:
+    """Repairs a mesh and judges the result by other means than `repair` does."""
+    made = hk.repair(given)
+    n, m = len(given.vertices), len(given.faces)
+    assert made.vertices[:n].tobytes() == given.vertices.tobytes()
+    assert made.faces[:m].tobytes() == given.faces.tobytes()
+    assert made.is_watertight
+    assert made.is_winding_consistent
+    # Vertices of faces that are missing may be left without any.
+    used = len(np.unique(made.faces))
+    edges = len(np.unique(np.sort(made.edges, axis=1), axis=0))
+    assert used - edges + len(made.faces) == euler
+    field = hk.WindingNumber(given.vertices, given.faces)
+    if len(made.vertices) > n:
+        w = field.value(made.vertices[n:], precision="double")
+        assert np.abs(w - 0.5).max() <= 1e-6
+    return made
+
+
+def test_a_ball_with_three_holes() -> None:
+    made = check(ball())
+    facts = made.metadata["harnack"]
+    assert facts["holes"] == 3
+    assert facts["euler_characteristic"] == 2
+    assert facts["patches"] == len(made.faces) - len(ball().faces)
+    assert 3.8 < made.volume < 4.19  # holes are closed from rim to rim, a little flatter than caps
+
+
+def test_holes_that_touch_in_vertices() -> None:
+    vertices, faces = icosphere(2)
+    kept = np.random.default_rng(1).random(len(faces)) > 0.12
+    check(trimesh.Trimesh(vertices, faces[kept], process=False))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+def test_many_random_holes(seed: int) -> None:
+    vertices, faces = icosphere(3)
+    rng = np.random.default_rng(seed)
+    vertices = vertices * (1 + 0.2 * np.sin(3 * vertices[:, [1]])) + 0.004 * rng.normal(
+        size=vertices.shape
+    )
+    check(trimesh.Trimesh(vertices, faces[rng.random(len(faces)) > 0.1], process=False))
+
+
+@pytest.mark.parametrize(("scale", "shift"), [(1e-5, 0.0), (1.0, 300.0), (2e4, -1e5)])
+def test_units_and_places(scale: float, shift: float) -> None:
+    given = ball(AXES[:1], subdivisions=2)
+    check(trimesh.Trimesh(given.vertices * scale + shift, given.faces, process=False))
+
+
+def test_two_openings_of_a_tube_are_capped_or_joined() -> None:
+    """Patches of a long tube are caps; those of a short wide one join its rims to a torus."""
+    for height, euler in ((6.0, 2), (0.3, 0)):
+        angle = np.arange(24) * (2 * np.pi / 24)
+        ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(24)])
+        rings = np.concatenate([ring + np.array([0, 0, z]) for z in np.linspace(0, height, 9)])
+        k = np.arange(8 * 24)
+        after = np.where(k % 24 == 23, k - 23, k + 1)
+        halves = np.stack([k, after, after + 24], 1), np.stack([k, after + 24, k + 24], 1)
+        faces = np.concatenate(halves)
+        check(trimesh.Trimesh(rings, faces, process=False), euler)
+
+
+def test_a_closed_mesh_gets_nothing_added() -> None:
+    given = ball(((0.0, 0.0, 1.0),), radius=0.0)
+    made = hk.repair(given)
+    assert len(made.faces) == len(given.faces)
+    assert made.metadata["harnack"]["holes"] == 0
+
+
+def test_patches_that_meet_the_mesh_are_refused() -> None:
+    """A small ball stands in the hole of a large one."""
+    large = ball(AXES[:1])
+    vertices, faces = icosphere(1)
+    together = trimesh.Trimesh(
+        np.concatenate([large.vertices, 0.1 * vertices + [0.02, 0.01, 0.88]]),
+        np.concatenate([large.faces, faces + len(large.vertices)]),
+        process=False,
+    )
+    with pytest.raises(hk.MeshingError, match="meet triangles of the mesh"):
+        hk.repair(together, spacing=0.08)
+
+
+def doubled() -> trimesh.Trimesh:
+    given = ball()
+    three = np.concatenate([given.faces, [[given.faces[5][0], given.faces[5][1], 0]]])
+    return trimesh.Trimesh(given.vertices, three, process=False)
+
+
+def one_reversed() -> trimesh.Trimesh:
+    given = ball()
+    faces = given.faces.copy()
+    faces[7] = faces[7][::-1]
+    return trimesh.Trimesh(given.vertices, faces, process=False)
+
+
+def soup() -> trimesh.Trimesh:
+    given = ball()
+    loose = given.vertices[given.faces].reshape(-1, 3)
+    return trimesh.Trimesh(loose, np.arange(len(loose)).reshape(-1, 3), process=False)
+
+
+def flat() -> trimesh.Trimesh:
+    given = ball()
+    faces = np.concatenate([given.faces, [[1, 1, 2]]])
+    return trimesh.Trimesh(given.vertices, faces, process=False)
+
+
+def not_a_number() -> trimesh.Trimesh:
+    given = ball()
+    vertices = np.array(given.vertices)
+    vertices[int(given.faces[3][0]), 1] = np.nan
+    return trimesh.Trimesh(vertices, given.faces, process=False)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (doubled, "more than two faces"),
+        (one_reversed, "do not agree which side is outside"),
+        (soup, "at the same place"),
+        (flat, "zero area"),
+        (not_a_number, "finite"),
+    ],
+)
+def test_meshes_that_are_refused(make: Any, message: str) -> None:
+    with pytest.raises(MeshError, match=message):
+        hk.repair(make())
+
+
+def test_settings_that_are_refused() -> None:
+    with pytest.raises(TypeError, match="vertices and faces"):
+        hk.repair(np.zeros((3, 3)))  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="tolerance"):
+        hk.repair(ball(), tolerance=0)
+    with pytest.raises(ValueError, match="spacing"):
+        hk.repair(ball(), spacing=float("nan"))
+
+
+def crosses(p: Any, q: Any, triangle: Any) -> bool:
+    """Whether the open segment pq passes through the inside of a triangle, in exact arithmetic."""
+    p, q, a, b, c = (np.array([Fraction(float(t)) for t in x]) for x in (p, q, *triangle))
+
+    def volume(a: Any, b: Any, c: Any, d: Any) -> Fraction:
+        u, v, w = b - a, c - a, d - a
+        return (
+            u[0] * (v[1] * w[2] - v[2] * w[1])
+            + u[1] * (v[2] * w[0] - v[0] * w[2])
+            + u[2] * (v[0] * w[1] - v[1] * w[0])
+        )
+
+    if volume(a, b, c, p) * volume(a, b, c, q) >= 0:
+        return False
+    sides = [volume(p, q, x, y) for x, y in ((a, b), (b, c), (c, a))]
+    return all(s > 0 for s in sides) or all(s < 0 for s in sides)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_edges_through_triangles_are_those_of_exact_arithmetic(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    x = rng.normal(size=(40, 3))
+    faces = np.array([rng.choice(40, 3, replace=False) for _ in range(24)])
+    one, other = faces[:12], faces[12:]
+    edges = {tuple(sorted(pair)) for f in one.tolist() for pair in itertools.combinations(f, 2)}
+    expected = sum(
+        any(crosses(x[a], x[b], x[f]) for f in other if a not in f and b not in f) for a, b in edges
+    )
+    assert expected > 3
+    assert edges_through(x, one, other) == expected
+
+
+def test_neighbours_do_not_pass_through_each_other() -> None:
+    vertices, faces = icosphere(2)
+    assert edges_through(vertices, faces, faces) == 0
+    moved = vertices.copy()
+    moved[0] *= -1.5
+    assert edges_through(moved, faces, faces) > 0
+
+
+def test_a_middle_goes_to_an_end_of_its_edge() -> None:
+    """Vertex 4 halves the edge from 0 to 1 of two triangles below vertex 2 and 3."""
+    x = np.array([[0.0, 0, 0], [2, 0, 0], [2, 1, 0], [0, 1, 0], [1, 0, 0]])
+    faces = np.array([[0, 4, 3], [4, 2, 3], [4, 1, 2]])
+    left = _collapsed(x, faces, 4, [0, 1])
+    assert sorted(map(sorted, left.tolist())) in ([[0, 1, 2], [0, 2, 3]], [[0, 1, 3], [1, 2, 3]])
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source, target = tmp_path / "broken.stl", tmp_path / "whole.ply"
+    ball(AXES[:1], subdivisions=2).export(source)
+    assert main(["repair", str(source), "-o", str(target), "--quiet"]) == 0
+    assert "1 hole," in capsys.readouterr().out
+    assert trimesh.load_mesh(target).is_watertight
+    assert sorted(tmp_path.iterdir()) == [source, target]
+    assert main(["repair", str(source), "-o", str(tmp_path / "a.txt")]) == 1
+    assert "extension of a mesh" in capsys.readouterr().err
