@@ -23,7 +23,8 @@ _MARGIN, _ROUNDS = 1 / 16, 3
 
 @dataclass(frozen=True)
 class OccupiedCells(GridLayout):
-    """A grid whose empty cells hold no point of a set, as do their neighbourhoods (`UniformGrid`)."""
+    """A grid whose empty cells hold no point of a set, nor does what is around them: see
+    `UniformGrid`."""
 
     @classmethod
     def of(

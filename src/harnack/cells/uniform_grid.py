@@ -112,7 +112,8 @@ class UniformGrid:
         a point is off by at most four roundings of the largest number in it.
         """
         rounding = 4 * self.backend.epsilon * (largest_component(o) + end)
-        length = dr.select(rounding < _ROUNDING * self.size, end - t, 0)
+        known = (rounding < _ROUNDING * self.size) & dr.all(dr.isfinite(o))
+        length = dr.select(known, end - t, 0)
         run = self.run(dr.fma(type(o)(t), d, o), d, length)
         return dr.select(length > 0, fmin(t + run, end), t)
 

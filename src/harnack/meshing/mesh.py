@@ -327,6 +327,11 @@ def _box(field: Field, level: float, volume: Volume | None) -> _Filled:
         MeshingError: neither has bounds, or they have nothing in common.
     """
     extent = field.extent((level,))
+    if volume is None and extent is None and isinstance(field, SolidAngle):
+        raise MeshingError(
+            f"level {level:g} is a multiple of 4 pi: the surface of a curve has no end there; "
+            "choose a level between them, such as 2 pi, or give clip=harnack.Box(lower, upper)"
+        )
     if volume is None and extent is None:
         raise MeshingError(
             f"{type(field).__name__} does not say where its level {level:g} ends: give "
