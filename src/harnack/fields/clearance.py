@@ -25,8 +25,6 @@ __all__ = ["clearance_of", "distance_below", "occupied_cells", "tight_extent"]
 
 # All that a field promises: points are few, and the longest proof counts.
 _PROOFS = choose_proofs("curvature")
-# Cells of a grid along its longest side, by experiment.
-_ACROSS = 128
 
 
 def clearance_of(
@@ -88,9 +86,11 @@ def _outside(held: ConvexHull, clearance: Clearance) -> Clearance:
     return beyond
 
 
-def occupied_cells(field: Field, levels: tuple[float, ...], extent: Volume) -> OccupiedCells:
-    """A grid over an extent, in cells that are small enough for pictures."""
-    return OccupiedCells.of(*extent.bounds(), clearance_of(field, levels, "single"), _ACROSS)
+def occupied_cells(
+    field: Field, levels: tuple[float, ...], extent: Volume, across: int
+) -> OccupiedCells:
+    """A grid over an extent, with about so many cells along its longest side."""
+    return OccupiedCells.of(*extent.bounds(), clearance_of(field, levels, "single"), across)
 
 
 def distance_below(

@@ -43,6 +43,8 @@ MOST_POINTS = 4_000_000
 _SMALLEST_LEVEL = 1e-6
 # Cells that an extent looks at in one round, at most.
 _MOST_CELLS = 40_000
+# Cells of the grid along its longest side, by experiment.
+_ACROSS = 128
 
 
 class MorphSlice(UploadedField["_SliceBuffers"], BatchedField):
@@ -164,7 +166,7 @@ class MorphSlice(UploadedField["_SliceBuffers"], BatchedField):
 
     def occupied(self, levels: tuple[float, ...]) -> OccupiedCells:
         if levels not in self._occupied:
-            self._occupied[levels] = occupied_cells(self, levels, self.extent(levels))
+            self._occupied[levels] = occupied_cells(self, levels, self.extent(levels), _ACROSS)
         return self._occupied[levels]
 
 

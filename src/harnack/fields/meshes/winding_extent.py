@@ -30,6 +30,8 @@ __all__ = ["winding_box", "winding_cells", "winding_extent"]
 # Cells that an extent looks at in one round at most, and how often the box is halved.
 _MOST_CELLS = 20_000
 _FINEST = 6
+# Cells of the grid along its longest side, by experiment.
+_ACROSS = 192
 
 
 class WindingField(Protocol):
@@ -69,7 +71,7 @@ def winding_cells(
     winding: WindingField, extent: Volume, levels: tuple[float, ...]
 ) -> OccupiedCells:
     """Cells over an extent, empty where w modulo 1 is proved to stay off the levels."""
-    return occupied_cells(_WindingModuloOne(winding), levels, extent)
+    return occupied_cells(_WindingModuloOne(winding), levels, extent, _ACROSS)
 
 
 def winding_extent(
