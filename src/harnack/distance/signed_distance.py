@@ -12,7 +12,7 @@ import numpy as np
 from harnack.backend import FloatArray, choose_backend
 from harnack.choices import did_you_mean
 from harnack.distance.batches import in_batches
-from harnack.distance.closest import Closest, find_closest, find_on_sheets
+from harnack.distance.closest import Closest, find_closest
 from harnack.distance.estimates import first_order, second_order
 from harnack.enclosures import TargetLevels
 from harnack.fields.clearance import distance_below
@@ -75,7 +75,7 @@ def signed_distance(
     surface = _surface(field, level)
     levels = _levels(backend, surface)
     if method == "newton":
-        found = find_closest(backend, surface, levels, points)
+        found = find_closest(backend, surface, levels, points, _silent)
         _warn("signed_distance", found)
         return np.copysign(found.distance, found.above)
     prepared = field.prepare(backend)
@@ -88,7 +88,7 @@ def signed_distance(
     if method == "lower":
         _check_domain(field, x)
     if field.has_sheets and method != "lower":
-        to_sheet = np.linalg.norm(x - find_on_sheets(backend, surface, x), axis=1)
+        to_sheet = find_closest(backend, surface, levels, x, _silent).distance
         result = np.copysign(np.fmin(to_sheet, np.abs(result)), result)
     return result
 
@@ -114,9 +114,13 @@ def closest_points(
     """
     backend = choose_backend(precision)
     surface = _surface(field, level)
-    found = find_closest(backend, surface, _levels(backend, surface), points)
+    found = find_closest(backend, surface, _levels(backend, surface), points, _silent)
     _warn("closest_points", found)
     return found.feet
+
+
+def _silent(message: str) -> None:
+    del message
 
 
 def _surface(field: Field, level: Any) -> LevelSet:

@@ -31,7 +31,7 @@ from harnack.fields.points import at_points
 from harnack.fields.sheets import NO_SHEET, Crossing, NearestSheet
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, FloatArray, Mask, Precision, Real, Vec3
+    from harnack.backend import Backend, FloatArray, IntArray, Mask, Precision, Real, Vec3
     from harnack.geometry import Volume
 
 
@@ -270,6 +270,11 @@ class Field(abc.ABC):
         Only distances ask for it, while no loop is being recorded. Ends at `domain` do not count.
         """
         del p
+        return None
+
+    def closed_mesh(self) -> tuple[FloatArray, IntArray] | None:
+        """Vertices (n, 3) and faces (m, 3) of the mesh whose winding number f is, faces as often as
+        they count, if f is a whole number everywhere off them; else None. Distances ask for it."""
         return None
 
     def describe(self) -> dict[str, Any]:

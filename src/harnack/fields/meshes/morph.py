@@ -130,6 +130,9 @@ class Morph(BatchedField):
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         return self._slice.extent(levels)
 
+    def closed_mesh(self) -> tuple[FloatArray, IntArray] | None:
+        return self._slice.closed_mesh()
+
     def next_crossing(
         self, o: Vec3, d: Vec3, after: Crossing, t_max: Real, active: Mask
     ) -> Crossing:
