@@ -6,6 +6,7 @@ cells know a point of the surface, their foot.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ import numpy as np
 from harnack.backend import BoolArray, FloatArray
 from harnack.backend.extrema import fmax, fmin
 from harnack.tree import PackedTree, build_hierarchy, for_each, pack, walk
+from harnack.tree.nearest import square_to_some_point
 from harnack.tree.triangles import box_levels
 
 if TYPE_CHECKING:
@@ -80,10 +82,12 @@ class CellTree:
         levels = box_levels(hierarchy, cells.centre - half, cells.centre + half)
         return cls(pack(backend, hierarchy, levels, placed))
 
-    def nearest_foot(self, x: Vec3, apart_from: Vec3, apart: Real, limit: Real) -> tuple[Real, Vec3]:
+    def nearest_foot(
+        self, x: Vec3, apart_from: Vec3, apart: Real, limit: Real, *, unbounded: bool = False
+    ) -> tuple[Real, Vec3]:
         """The squared distance of the nearest foot nearer than `limit`, of cells that come nearer
         than that, and the foot; infinite if there is none. Feet that are within `apart` cells of
-        a point are left out."""
+        a point are left out. unbounded: whether limits say nothing."""
         vector, real = self.tree.backend.Array3f, self.tree.backend.Float
         limit = real(limit)
 
@@ -96,48 +100,42 @@ class CellTree:
             taken = active & other & (square < best) & (_lower(vector, row, x) < limit)
             return dr.select(taken, square, best), dr.select(taken, here, foot)
 
-        start = (limit * limit, vector(FAR))
-        best, foot = self._walk(x, limit, each, start, shrinks=True)
+        some = real(square_to_some_point(self.tree, x, 4)) if unbounded else limit * limit
+        best, foot = self._walk(x, each, (some, vector(FAR)), lambda state: state[0])
         return dr.select(foot.x < 0.5 * FAR, best, dr.inf), foot
 
-    def lower(self, x: Vec3, y: Vec3, free: Real, limit: Real) -> Real:
-        """A length that the surface in all cells is no nearer than, at most `limit`; but for the
-        part of it within the distance `free` of y."""
-        vector, real = self.tree.backend.Array3f, self.tree.backend.Float
+    def mark(
+        self, x: Vec3, y: Vec3, free: Real, distance: Real, tolerance: Real, marks: Any
+    ) -> Real:
+        """Mark the cells in which the surface may be nearer to x than `distance` by more than
+        `tolerance`, farther than `free` from y: a Bool for each is set in `marks`.
 
-        def each(row: list[Real], active: Mask, state: State) -> State:
-            counts = active & ~_within(vector, row, y, free) & (row[12] >= 0)
-            return (dr.select(counts, fmin(state[0], _lower(vector, row, x)), state[0]),)
-
-        return self._walk(x, real(limit), each, (real(limit),), shrinks=True, squared=False)[0]
-
-    def mark(self, x: Vec3, y: Vec3, free: Real, limit: Real, marks: Any) -> None:
-        """Mark the cells in which the surface may be nearer to x than `limit`, farther than `free`
-        from y: a Bool for each is set in `marks`."""
+        Returns a length that the surface, but for what is within `free` of y, is no nearer than;
+        at most `distance`.
+        """
         backend = self.tree.backend
         vector, index = backend.Array3f, backend.UInt32
 
         def each(row: list[Real], active: Mask, state: State) -> State:
-            wanted = active & ~_within(vector, row, y, free) & (row[12] >= 0)
-            wanted &= _lower(vector, row, x) < limit
+            counts = active & ~_within(vector, row, y, free) & (row[12] >= 0)
+            lower = _lower(vector, row, x)
+            wanted = counts & (lower < distance - tolerance)
             dr.scatter(marks, backend.Bool(True), index(fmax(row[12], 0)), wanted)
-            return (state[0] + dr.select(wanted, index(1), 0),)
+            return (dr.select(counts, fmin(state[0], lower), state[0]),)
 
-        dr.eval(self._walk(x, backend.Float(limit), each, (index(0),)), marks)
+        limit = backend.Float(distance)
+        (lower,) = self._walk(x, each, (limit,), lambda state: limit * limit)
+        dr.eval(lower, marks)
+        return lower
 
-    def _walk(
-        self, x: Vec3, limit: Real, each: Any, start: State, *, shrinks: bool = False,
-        squared: bool = True,
-    ) -> State:  # fmt: skip
+    def _walk(self, x: Vec3, each: Any, start: State, limit: Callable[[State], Real]) -> State:
+        """limit: the squared distance, given the state, beyond which boxes are passed by."""
         vector = self.tree.backend.Array3f
 
         def visit(node: Node, state: State) -> tuple[Mask, State]:
-            best = state[0] if shrinks and squared else limit * limit
-            if shrinks and not squared:
-                best = state[0] * state[0]
             low, high = vector(*node.head[:3]), vector(*node.head[3:6])
             away = dr.select(x < low, low - x, dr.select(x > high, x - high, 0))
-            close = dr.squared_norm(away) < best
+            close = dr.squared_norm(away) < limit(state)
             return close, for_each(node, close & node.is_leaf, each, state)
 
         return walk(self.tree, visit, start)

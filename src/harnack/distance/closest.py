@@ -131,11 +131,13 @@ class _Points:
         set_ = object.__setattr__
         set_(self, "_field", field)
         exact = field.without_truncation(backend)
-        set_(self, "_descent", Descent.of(backend, exact, self.levels))
+        set_(self, "_descent", Descent.of(backend, field, self.levels))
+        set_(self, "_exact", Descent.of(backend, exact, self.levels) if field.has_detail else None)
         set_(self, "_prepared", self.surface.prepare(backend) if field.has_sheets else None)
 
     _field: Field = dataclasses.field(init=False)
     _descent: Descent = dataclasses.field(init=False)
+    _exact: Descent | None = dataclasses.field(init=False)
     _prepared: Any = dataclasses.field(init=False)
 
     def look(self, points: Any) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -180,6 +182,8 @@ class _Points:
 
     def _descend(self, p: Vec3, start: Vec3) -> tuple[Vec3, Real]:
         y, found, on_level = self._descent.closest(p, start)
+        if self._exact is not None:  # what clusters leave out moves the level a little
+            y, on_level = self._exact.onto_level(y)
         return dr.select(on_level, y, dr.nan), dr.select(found, self._free(y, length(p - y)), 0)
 
     def _free(self, y: Vec3, d: Real) -> Real:

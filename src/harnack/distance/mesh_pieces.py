@@ -46,8 +46,8 @@ def pieces_of_faces(rays: TriangleRays, vertices: FloatArray, faces: IntArray) -
     turn = np.arange(len(cut)) - np.searchsorted(cut, cut)  # the how manieth cut of its face
     whole = np.ones(len(faces), np.bool_)
     whole[cut] = False
-    pieces, source = corners[~whole], np.flatnonzero(whole)
-    pieces, owner = corners[source], source
+    owner = np.flatnonzero(~whole)
+    pieces = corners[owner]
     cutter = np.full(len(faces), -1)
     for k in range(int(turn.max()) + 1):
         cutter[:] = -1

@@ -2,37 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import drjit as dr
 import numpy as np
 
-from harnack.backend import FloatArray, choose_backend, to_numpy, to_vector3
+from harnack.backend import BoolArray, FloatArray, IntArray, choose_backend, to_numpy
+from harnack.backend.arrays import aligned, upload_vectors
 from harnack.cells import Cells
 from harnack.distance.cell_tree import FAR, CellTree, SurfaceCells
 from harnack.distance.surface_cells import CellProofs
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from harnack.tracer import LevelSet
 
 __all__ = ["Found", "Polish", "search"]
 
 # From points x and places y of the surface nearby: nearer places of it, NaN where none was found,
 # and radii about these within which none is nearer.
-Polish = "Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]"
+Polish: TypeAlias = "Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]"
 
 # Cells that are split before the points are asked which of them matter.
 _COARSE = 1500
 # Cells at most: so many for each point, within these limits.
-_FEWEST, _EACH, _MOST = 6_000, 1.0, 120_000
+_FEWEST, _EACH, _MOST = 40_000, 0.5, 150_000
 _MOST_ON_SHEETS = 20_000
 _FINEST = 40
 # Feet of other parts of the surface that are tried after the nearest: of cells so far apart, in
 # edges.
-_CHALLENGES, _APART = 2, 4.0
+_CHALLENGES, _APART = 2, 3.0
 # Points that are looked at together, so that memory is bounded.
 _AT_ONCE = 1 << 18
 _GROWTHS = 6
@@ -48,7 +48,7 @@ class Found:
 
 
 def search(
-    surface: LevelSet, points: FloatArray, polish: Any, start: FloatArray, tolerance: float,
+    surface: LevelSet, points: FloatArray, polish: Polish, start: FloatArray, tolerance: float,
     progress: Callable[[str], None],
 ) -> Found:  # fmt: skip
     """The nearest points of a level set to `points` (n, 3).
@@ -98,16 +98,16 @@ def _cube(lower: FloatArray, upper: FloatArray) -> Cells:
 
 
 def _in_parts(
-    surface: LevelSet, root: Cells, whole: bool, points: FloatArray, polish: Any,
+    surface: LevelSet, root: Cells, whole: bool, points: FloatArray, polish: Polish,
     start: FloatArray, tolerance: float, progress: Callable[[str], None],
 ) -> Found:  # fmt: skip
     """`whole`: whether all of the surface is in the root."""
     proofs = CellProofs(surface)
-    cells, size = _split(proofs, root, _COARSE, progress)
+    cells = _split(proofs, root, _COARSE, progress)
     parts: list[Found] = []
     for first in range(0, max(len(points), 1), _AT_ONCE):
         rows = slice(first, first + _AT_ONCE)
-        job = _Search(proofs, cells, size, points[rows], polish, start[rows].copy(), tolerance)
+        job = _Search(proofs, cells, points[rows], polish, start[rows].copy(), tolerance)
         parts.append(job.run(progress))
     found = Found(*(np.concatenate([getattr(p, k) for p in parts]) for k in ("feet", "lower")))
     if not whole:
@@ -118,17 +118,15 @@ def _in_parts(
 
 def _split(
     proofs: CellProofs, root: Cells, most: int, progress: Callable[[str], None]
-) -> tuple[SurfaceCells, float]:
-    """Cells of one size, split from the root until there are many, and their size."""
-    cells = root
+) -> SurfaceCells:
+    """Cells of one size, split from the root until there are many."""
     kept = proofs.kept(root)
     for _ in range(_FINEST):
         if not 0 < len(kept) <= most:
             break
-        cells = _halves(kept)
-        kept = proofs.kept(cells)
+        kept = proofs.kept(_halves(kept))
         progress(f"distances: {len(kept):,} cells")
-    return kept, float(cells.size[0])
+    return kept
 
 
 def _halves(cells: SurfaceCells) -> Cells:
@@ -138,95 +136,106 @@ def _halves(cells: SurfaceCells) -> Cells:
 
 
 class _Search:
-    """The search for some points, from cells that hold all of the surface."""
+    """The search for some points, from cells that hold all of the surface.
+
+    feet: (n, 3) the nearest points so far, or NaN. free: (n,) within these radii about them none is
+    nearer. lower: (n,) proved bounds of distances. is_open: (n,) whether these may be raised.
+    done: cells that are split no more. finest: those that may be.
+    """
 
     def __init__(
-        self, proofs: CellProofs, cells: SurfaceCells, size: float, points: FloatArray, polish: Any,
+        self, proofs: CellProofs, cells: SurfaceCells, points: FloatArray, polish: Polish,
         feet: FloatArray, tolerance: float,
     ) -> None:  # fmt: skip
         self.proofs, self.points, self.polish = proofs, points, polish
         self.backend = choose_backend("double")
-        self.finest, self.done = cells, []
+        self.finest, self.done = cells, list[SurfaceCells]()
         self.feet, self.free = feet, np.zeros(len(points))
-        self.tolerance, self.size = tolerance, size
+        self.lower, self.is_open = np.zeros(len(points)), np.ones(len(points), np.bool_)
+        self.tolerance = tolerance
         most = _MOST_ON_SHEETS if proofs.surface.field.has_sheets else _MOST
         self.most = int(min(max(_FEWEST, _EACH * len(points)), most))
 
     def run(self, progress: Callable[[str], None]) -> Found:
-        n = len(self.points)
-        if not n or not len(self.finest):
-            return Found(self.feet, np.full(n, np.inf))
-        tree = self._tree()
-        self._improve(tree, apart=0.0)
+        """What is found."""
+        self._improve(self._tree(), others=False)
         for _ in range(_FINEST):
-            wanted = self._wanted(tree)
+            wanted = self._bounded(self._tree())
             count = int(wanted.sum())
             if not count or sum(map(len, self.done)) + 4 * count > self.most:
                 break
             self.done.append(self.finest.some(~wanted))
             self.finest = self.proofs.kept(_halves(self.finest.some(wanted)))
-            progress(f"distances: {len(self.finest):,} cells for {n:,} points")
-            if not sum(map(len, [*self.done, self.finest])):
-                return Found(self.feet, np.full(n, np.inf))
-            tree = self._tree()
-            if not len(self.finest):
-                break
-        self._improve(tree, apart=0.0)
+            progress(
+                f"distances: {len(self.finest):,} cells for {int(self.is_open.sum()):,} points"
+            )
+            self._improve(self._tree(), others=False)
         for _ in range(_CHALLENGES):
-            self._improve(tree, apart=_APART)
-        return Found(self.feet, self._lower(tree))
+            self._improve(self._tree(), others=True)
+        self._bounded(self._tree())
+        return Found(self.feet, self.lower)
 
-    def _tree(self) -> CellTree:
-        return CellTree.of(self.backend, SurfaceCells.joined([*self.done, self.finest]))
+    def _tree(self) -> CellTree | None:
+        cells = SurfaceCells.joined([*self.done, self.finest])
+        return CellTree.of(self.backend, cells) if len(cells) else None
 
-    def _distance(self) -> FloatArray:
+    def _distance(self, rows: IntArray) -> FloatArray:
         """Of the best feet so far; FAR where there is none."""
-        away = np.linalg.norm(self.points - self.feet, axis=1)
+        away = np.linalg.norm(self.points[rows] - self.feet[rows], axis=1)
         return np.where(np.isnan(away), FAR, away)
 
-    def _on_device(self) -> tuple[Any, ...]:
-        backend = self.backend
-        feet = np.where(np.isnan(self.feet), FAR, self.feet)
+    def _of_rows(self, rows: IntArray) -> tuple[Any, ...]:
+        """Points, their best feet, radii about these and the distances, on the backend."""
+        backend, feet = self.backend, self.feet[rows]
         return (
-            to_vector3(backend, self.points), to_vector3(backend, feet),
-            backend.Float(self.free), backend.Float(self._distance()),
+            upload_vectors(backend, self.points[rows]),
+            upload_vectors(backend, np.where(np.isnan(feet), FAR, feet)),
+            aligned(backend, self.free[rows]), aligned(backend, self._distance(rows)),
         )  # fmt: skip
 
-    def _improve(self, tree: CellTree, apart: float) -> None:
-        """From the nearest feet of cells, those of other parts of the surface, to nearer points."""
-        backend = self.backend
-        x, y, _, distance = self._on_device()
-        square, foot = tree.nearest_foot(
-            x, y, dr.opaque(backend.Float, apart * 2), distance * (1 + 1e-9)
-            if apart == 0 else distance + dr.minimum(0.05 * distance, 2 * self._cell()),
-        )
-        dr.eval(square, foot)
-        there = np.sqrt(to_numpy(square))
-        before = self._distance()
-        rows = np.flatnonzero(there < (before if apart == 0 else np.inf))
-        if not len(rows):
+    def _improve(self, tree: CellTree | None, *, others: bool) -> None:
+        """To nearer points from the nearest feet of cells that are nearer than the best. others:
+        from those of other parts of the surface, even if they are a little farther."""
+        rows = np.flatnonzero(self.is_open)
+        if tree is None or not len(rows):
             return
-        start = to_numpy(foot)[rows]
+        before = self._distance(rows)
+        x, y, free, distance = self._of_rows(rows)
+        apart, limit = 0 * free, distance
+        if others:
+            apart = dr.select(free > 0, 2 * _APART, self.backend.Float(0))
+            limit = limit + dr.minimum(0.1 * limit, 2 * self._cell())
+        first = bool((before == FAR).all())
+        square, foot = tree.nearest_foot(x, y, apart, limit, unbounded=first)
+        dr.eval(square, foot)
+        there, start = np.sqrt(to_numpy(square)), to_numpy(foot)
+        some = np.isfinite(there)
+        rows, before, there, start = rows[some], before[some], there[some], start[some]
         better, free = self.polish(self.points[rows], start)
         away = np.linalg.norm(self.points[rows] - better, axis=1)
-        off = ~(away <= there[rows])  # the way down led nowhere: the foot itself
-        better[off], away[off], free[off] = start[off], there[rows][off], 0
-        nearer = away < before[rows]
+        off = ~(away <= there)  # the way down led nowhere: the foot itself
+        better[off], away[off], free[off] = start[off], there[off], 0
+        nearer = away < before
         self.feet[rows[nearer]], self.free[rows[nearer]] = better[nearer], free[nearer]
 
     def _cell(self) -> float:
-        half = [part.half.max() for part in (*self.done[-1:], self.finest) if len(part)]
-        return 2 * float(min(half)) if half else 0.0
+        """The length of an edge of the finest cells."""
+        return 2 * min((float(part.half[0]) for part in [*self.done, self.finest] if len(part)))
 
-    def _wanted(self, tree: CellTree) -> Any:
-        """Which of the finest cells may hold a point that is nearer than the best."""
-        x, y, free, distance = self._on_device()
+    def _bounded(self, tree: CellTree | None) -> BoolArray:
+        """Raise the lower bounds. Returns which of the finest cells may hold a point that is nearer
+        than the best."""
+        rows = np.flatnonzero(self.is_open)
+        if tree is None:  # no surface
+            self.lower[:], self.is_open[:] = np.inf, False
+        if tree is None or not len(rows):
+            return np.zeros(len(self.finest), np.bool_)
+        x, y, free, distance = self._of_rows(rows)
         count = sum(map(len, self.done)) + len(self.finest)
         marks = dr.zeros(self.backend.Bool, count)
-        tree.mark(x, y, free, distance - self.tolerance, marks)
+        tolerance = dr.opaque(self.backend.Float, self.tolerance)
+        lower = to_numpy(tree.mark(x, y, free, distance, tolerance, marks))
+        self.is_open[rows] = lower < to_numpy(distance) - self.tolerance
+        size = np.abs(self.points[rows]).max(axis=1)
+        self.lower[rows] = np.maximum(lower * (1 - 1e-12) - 1e-15 * size, 0)
         return to_numpy(marks)[count - len(self.finest) :]
-
-    def _lower(self, tree: CellTree) -> FloatArray:
-        x, y, free, distance = self._on_device()
-        lower = to_numpy(tree.lower(x, y, free, distance))
-        return np.maximum(lower * (1 - 1e-12) - 1e-15 * np.abs(self.points).max(axis=1), 0)

@@ -21,6 +21,7 @@ from harnack.tree.walk import Node, State, for_each, walk
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
+    from harnack.tree.packed import PackedTree
 
 # In epsilons, of coordinates and of the mesh's size: how far rounding may move a distance.
 _ROUNDING = 16.0
@@ -71,11 +72,18 @@ def distance_to_triangles(rays: TriangleRays, x: Vec3) -> Real:
 
 def square_to_some_vertex(rays: TriangleRays, x: Vec3) -> Real:
     """The squared distance from x to a vertex of a triangle nearby, rounded up: walks that begin
-    with it pass by most boxes.
+    with it pass by most boxes."""
+    square, pad = square_to_some_point(rays.tree, x, 0), _pad(rays, x)
+    return square + 2 * pad * (dr.sqrt(square) + pad)
+
+
+def square_to_some_point(tree: PackedTree, x: Vec3, column: int) -> Real:
+    """The least squared distance from x to the points of a leaf nearby, whose coordinates begin at
+    a column of their records.
 
     From the root on, the child whose box has the nearest centre, down to a leaf.
     """
-    tree, backend = rays.tree, rays.tree.backend
+    backend = tree.backend
     real, index, vector = backend.Float, backend.UInt32, backend.Array3f
     x = vector(x)
 
@@ -105,15 +113,15 @@ def square_to_some_vertex(rays: TriangleRays, x: Vec3) -> Real:
     leaf = dr.while_loop(start, more, body, label="to a leaf")[5]
 
     def add(slot: Any, square: Real) -> State:
-        corner = vector(*tree.primitive(leaf, slot, backend.Bool(True))[:3])
-        return slot + 1, fmin(square, dr.squared_norm(corner - x))
+        row = tree.primitive(leaf, slot, backend.Bool(True))
+        point = vector(*row[column : column + 3])
+        return slot + 1, fmin(square, dr.squared_norm(point - x))
 
     def left(slot: Any, square: Real) -> Mask:
         del square
         return slot < tree.leaf_size
 
-    square = dr.while_loop((index(0), real(dr.inf)), left, add, label="a leaf's vertices")[1]
-    return square + (2 * _pad(rays, x)) * (dr.sqrt(square) + _pad(rays, x))
+    return dr.while_loop((index(0), real(dr.inf)), left, add, label="points of a leaf")[1]
 
 
 def nearest_triangle(
