@@ -83,11 +83,11 @@ class CellTree:
         return cls(pack(backend, hierarchy, levels, placed))
 
     def nearest_foot(
-        self, x: Vec3, apart_from: Vec3, apart: Real, limit: Real, *, unbounded: bool = False
+        self, x: Vec3, others: tuple[Vec3, ...], apart: Real, limit: Real, *, unbounded: bool = False
     ) -> tuple[Real, Vec3]:
         """The squared distance of the nearest foot nearer than `limit`, of cells that come nearer
-        than that, and the foot; infinite if there is none. Feet that are within `apart` cells of
-        a point are left out. unbounded: whether limits say nothing."""
+        than that, and the foot; infinite if there is none. Feet that are within `apart` half
+        cells of others are left out. unbounded: whether limits say nothing."""
         vector, real = self.tree.backend.Array3f, self.tree.backend.Float
         limit = real(limit)
 
@@ -96,8 +96,8 @@ class CellTree:
             here = vector(*row[4:7])
             square = dr.squared_norm(here - x)
             radius = apart * row[3]
-            other = dr.squared_norm(here - apart_from) >= radius * radius
-            taken = active & other & (square < best) & (_lower(vector, row, x) < limit)
+            apart_from = [dr.squared_norm(here - one) >= radius * radius for one in others]
+            taken = active & dr.all(apart_from) & (square < best) & (_lower(vector, row, x) < limit)
             return dr.select(taken, square, best), dr.select(taken, here, foot)
 
         some = real(square_to_some_point(self.tree, x, 4)) if unbounded else limit * limit

@@ -18,7 +18,8 @@ from harnack.distance.batches import in_batches
 from harnack.distance.closing_in import close_in
 from harnack.distance.mesh_surface import MeshSurface
 from harnack.distance.projection import Descent
-from harnack.distance.search import Found, search
+from harnack.distance.rim import RimDescent
+from harnack.distance.search import search
 from harnack.distance.surface_cells import remainder
 from harnack.fields.clearance import distance_below
 from harnack.fields.points import morton_order
@@ -88,7 +89,7 @@ def _in_order(
     job = _Points(backend, surface, levels)
     x, start, above, lower = job.look(points)
     found = search(surface, x, job.polish, start, _TOLERANCE * _size(surface, x), progress)
-    found = job.with_descents(x, found, lower)
+    found.feet = job.refined(x, found.feet)
     distance = _length(x - found.feet)
     # One foot may be no point of the surface but for rounding: a promise may not hold either.
     short = distance < lower
@@ -133,11 +134,15 @@ class _Points:
         exact = field.without_truncation(backend)
         set_(self, "_descent", Descent.of(backend, field, self.levels))
         set_(self, "_exact", Descent.of(backend, exact, self.levels) if field.has_detail else None)
+        domain = field.domain
+        rim = domain and RimDescent(backend, field, self.levels, domain.prepare(backend))
+        set_(self, "_rim", rim)
         set_(self, "_prepared", self.surface.prepare(backend) if field.has_sheets else None)
 
     _field: Field = dataclasses.field(init=False)
     _descent: Descent = dataclasses.field(init=False)
     _exact: Descent | None = dataclasses.field(init=False)
+    _rim: RimDescent | None = dataclasses.field(init=False)
     _prepared: Any = dataclasses.field(init=False)
 
     def look(self, points: Any) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -178,12 +183,17 @@ class _Points:
 
             return in_batches(self.backend, close, points, start)[0], np.zeros(len(points))
         feet, free = in_batches(self.backend, self._descend, points, start)
-        return self._within(feet), free
+        feet = self._within(feet)
+        left, rim = np.flatnonzero(np.isnan(feet[:, 0])), self._rim
+        if rim is not None and len(left):  # out of the domain
+            along = in_batches(
+                self.backend, lambda p, y: (rim.closest(p, y),), points[left], start[left]
+            )
+            feet[left], free[left] = self._within(along[0]), 0
+        return feet, free
 
     def _descend(self, p: Vec3, start: Vec3) -> tuple[Vec3, Real]:
         y, found, on_level = self._descent.closest(p, start)
-        if self._exact is not None:  # what clusters leave out moves the level a little
-            y, on_level = self._exact.onto_level(y)
         return dr.select(on_level, y, dr.nan), dr.select(found, self._free(y, length(p - y)), 0)
 
     def _free(self, y: Vec3, d: Real) -> Real:
@@ -203,15 +213,22 @@ class _Points:
             best = dr.select((best == 0) & holds, r, best)
         return best
 
-    def with_descents(self, x: FloatArray, found: Found, lower: FloatArray) -> Found:
-        """With the ends of descents from the points themselves, where no cell led to any foot."""
-        rows = np.flatnonzero(np.isnan(found.feet[:, 0]))
-        if not len(rows) or self.surface.field.has_sheets:
-            return found
-        del lower
-        feet, _ = self.polish(x[rows], x[rows])
-        found.feet[rows] = feet
-        return found
+    def refined(self, points: FloatArray, feet: FloatArray) -> FloatArray:
+        """The feet (n, 3) moved onto the level of the field without what clusters leave out."""
+        rows = np.flatnonzero(np.isfinite(feet[:, 0]))
+        exact = self._exact
+        if exact is None or not len(rows):
+            return feet
+
+        def move(p: Vec3, start: Vec3) -> tuple[Vec3]:
+            y, _, on_level = exact.closest(p, start)
+            return (dr.select(on_level, y, start),)
+
+        feet = feet.copy()
+        (there,) = in_batches(self.backend, move, points[rows], feet[rows])
+        inside = ~np.isnan(self._within(there)[:, 0])
+        feet[rows[inside]] = there[inside]
+        return feet
 
     def noise(self, feet: FloatArray) -> FloatArray:
         """How far rounding and approximation may have moved the level at feet (n, 3)."""

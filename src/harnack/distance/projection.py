@@ -127,11 +127,6 @@ class Descent:
         )
         return y, found, on_level
 
-    def onto_level(self, start: Vec3) -> tuple[Vec3, Mask]:
-        """Where Newton's method leads from `start`, and whether that is a point of the level."""
-        place, arrived = self._to_level(start, self.backend.Bool(True))
-        return place.y, arrived
-
     def noise(self, y: Vec3) -> Real:
         """How far rounding and approximation may have moved the level at y, as a length."""
         return self._look(y)[1].noise

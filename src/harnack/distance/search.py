@@ -32,7 +32,7 @@ _MOST_ON_SHEETS = 20_000
 _FINEST = 40
 # Feet of other parts of the surface that are tried after the nearest: of cells so far apart, in
 # edges.
-_CHALLENGES, _APART = 2, 3.0
+_CHALLENGES, _APART = 3, 3.0
 # Points that are looked at together, so that memory is bounded.
 _AT_ONCE = 1 << 18
 _GROWTHS = 6
@@ -140,6 +140,7 @@ class _Search:
 
     feet: (n, 3) the nearest points so far, or NaN. free: (n,) within these radii about them none is
     nearer. lower: (n,) proved bounds of distances. is_open: (n,) whether these may be raised.
+    tried: (n, 3) where the last challenge began.
     done: cells that are split no more. finest: those that may be.
     """
 
@@ -152,13 +153,15 @@ class _Search:
         self.finest, self.done = cells, list[SurfaceCells]()
         self.feet, self.free = feet, np.zeros(len(points))
         self.lower, self.is_open = np.zeros(len(points)), np.ones(len(points), np.bool_)
-        self.tolerance = tolerance
+        self.tolerance, self.tried = tolerance, np.full_like(points, FAR)
         most = _MOST_ON_SHEETS if proofs.surface.field.has_sheets else _MOST
         self.most = int(min(max(_FEWEST, _EACH * len(points)), most))
 
     def run(self, progress: Callable[[str], None]) -> Found:
         """What is found."""
-        self._improve(self._tree(), others=False)
+        if not self.proofs.surface.field.has_sheets:
+            self._descend(np.arange(len(self.points)), self.points)
+        self._improve(self._tree())
         for _ in range(_FINEST):
             wanted = self._bounded(self._tree())
             count = int(wanted.sum())
@@ -169,9 +172,9 @@ class _Search:
             progress(
                 f"distances: {len(self.finest):,} cells for {int(self.is_open.sum()):,} points"
             )
-            self._improve(self._tree(), others=False)
-        for _ in range(_CHALLENGES):
-            self._improve(self._tree(), others=True)
+            self._improve(self._tree())
+        for challenge in range(1, _CHALLENGES + 1):
+            self._improve(self._tree(), challenge)
         self._bounded(self._tree())
         return Found(self.feet, self.lower)
 
@@ -193,29 +196,37 @@ class _Search:
             aligned(backend, self.free[rows]), aligned(backend, self._distance(rows)),
         )  # fmt: skip
 
-    def _improve(self, tree: CellTree | None, *, others: bool) -> None:
-        """To nearer points from the nearest feet of cells that are nearer than the best. others:
-        from those of other parts of the surface, even if they are a little farther."""
+    def _improve(self, tree: CellTree | None, challenge: int = 0) -> None:
+        """To nearer points from the nearest feet of cells that are nearer than the best. challenge:
+        from those of parts of the surface that were not tried yet, even if they are a little
+        farther; its number, from 1."""
         rows = np.flatnonzero(self.is_open)
         if tree is None or not len(rows):
             return
         before = self._distance(rows)
         x, y, free, distance = self._of_rows(rows)
-        apart, limit = 0 * free, distance
-        if others:
-            apart = dr.select(free > 0, 2 * _APART, self.backend.Float(0))
+        tried, apart, limit = upload_vectors(self.backend, self.tried[rows]), 0 * free, distance
+        if challenge:
+            some = free > 0 if challenge == 1 else self.backend.Bool(True)
+            apart = dr.select(some, 2 * _APART, self.backend.Float(0))
             limit = limit + dr.minimum(0.1 * limit, 2 * self._cell())
         first = bool((before == FAR).all())
-        square, foot = tree.nearest_foot(x, y, apart, limit, unbounded=first)
+        square, foot = tree.nearest_foot(x, (y, tried), apart, limit, unbounded=first)
         dr.eval(square, foot)
         there, start = np.sqrt(to_numpy(square)), to_numpy(foot)
         some = np.isfinite(there)
         rows, before, there, start = rows[some], before[some], there[some], start[some]
+        if challenge:
+            self.tried[rows] = start
+        nearer = there < before
+        self.feet[rows[nearer]], self.free[rows[nearer]] = start[nearer], 0
+        self._descend(rows, start)
+
+    def _descend(self, rows: IntArray, start: FloatArray) -> None:
+        """To nearer points from places (k, 3), if there are any."""
         better, free = self.polish(self.points[rows], start)
         away = np.linalg.norm(self.points[rows] - better, axis=1)
-        off = ~(away <= there)  # the way down led nowhere: the foot itself
-        better[off], away[off], free[off] = start[off], there[off], 0
-        nearer = away < before
+        nearer = away < self._distance(rows)
         self.feet[rows[nearer]], self.free[rows[nearer]] = better[nearer], free[nearer]
 
     def _cell(self) -> float:
