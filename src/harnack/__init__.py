@@ -29,9 +29,11 @@ from harnack.arithmetic import (
 )
 from harnack.distance import (
     Curvatures,
+    DistanceBounds,
     closest_points,
     curvature,
     curvature_lines,
+    distance_bounds,
     signed_distance,
 )
 from harnack.enclosures import (
@@ -128,6 +130,7 @@ __all__ = [
     "Cuboid",
     "Curvature",
     "Curvatures",
+    "DistanceBounds",
     "Cylinder",
     "DipolePotential",
     "Displaced",
@@ -195,6 +198,7 @@ __all__ = [
     "cosine",
     "curvature",
     "curvature_lines",
+    "distance_bounds",
     "exp",
     "expression",
     "files",

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray, to_numpy
+from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy
 from harnack.backend.arrays import finite_vectors, upload_vectors
 from harnack.backend.extrema import fmax
 from harnack.backend.lengths import length
@@ -137,7 +137,9 @@ class _Points:
         domain = field.domain
         rim = domain and RimDescent(backend, field, self.levels, domain.prepare(backend))
         set_(self, "_rim", rim)
-        set_(self, "_prepared", self.surface.prepare(backend) if field.has_sheets else None)
+        # Rays are compared by differences of angles, for which single precision is too short.
+        double = choose_backend("double")
+        set_(self, "_prepared", self.surface.prepare(double) if field.has_sheets else None)
 
     _field: Field = dataclasses.field(init=False)
     _descent: Descent = dataclasses.field(init=False)
@@ -181,7 +183,7 @@ class _Points:
             def close(p: Vec3, start: Vec3) -> tuple[Vec3]:
                 return (close_in(self._prepared, p, start),)
 
-            return in_batches(self.backend, close, points, start)[0], np.zeros(len(points))
+            return in_batches(self._prepared.backend, close, points, start)[0], np.zeros(len(points))
         feet, free = in_batches(self.backend, self._descend, points, start)
         feet = self._within(feet)
         left, rim = np.flatnonzero(np.isnan(feet[:, 0])), self._rim

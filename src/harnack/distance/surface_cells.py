@@ -93,28 +93,29 @@ class CellProofs:
         self.looked_at += len(cells.corners)
         centre, half = cells.centres, 0.5 * float(cells.size[0])
         radius = dr.opaque(self._backend.Float, cells.half_diagonal * (1 + 1e-9))
-        inside = np.ones(len(centre), np.bool_)
+        inside, start = np.ones(len(centre), np.bool_), centre
         if self._volume is not None:
             inside = self._volume.contains_points(centre)
-            (away,) = self._at(centre, self._outside)
+            away, start = self._at(centre, self._pulled_inside)
             some = inside | (away <= cells.half_diagonal * (1 + 1e-9))
-            centre, inside = centre[some], inside[some]
+            centre, inside, start = centre[some], inside[some], start[some]
         n = len(centre)
         result = SurfaceCells(
             centre, np.full(n, half), np.full((n, 3), FAR), np.tile([0.0, 0.0, 1.0], (n, 1)),
             np.zeros(n), np.full(n, FAR),
         )  # fmt: skip
         kept = np.ones(n, np.bool_)
+        # Nothing is promised about places outside the domain.
         empty, result.normal[inside], result.offset[inside], result.thickness[inside] = self._at(
             centre[inside], lambda p: self._slab(p, radius)
         )
         kept[inside] = empty == 0
-        result, inside = result.some(kept), inside[kept]
+        result, start = result.some(kept), start[kept]
         find = self._hit if self.surface.field.has_sheets else self._foot
-        (foot,) = self._at(result.centre[inside], lambda p: (find(p, radius),))
+        (foot,) = self._at(start, lambda p: (find(p, radius),))
         if self._volume is not None and len(foot):
             foot[~self._volume.contains_points(np.where(foot < FAR, foot, 0))] = FAR
-        result.foot[inside] = foot
+        result.foot[:] = foot
         return result
 
     def _at(
@@ -122,9 +123,12 @@ class CellProofs:
     ) -> tuple[Any, ...]:
         return in_batches(self._backend, compute, points)
 
-    def _outside(self, p: Vec3) -> tuple[Real]:
+    def _pulled_inside(self, p: Vec3) -> tuple[Real, Vec3]:
+        """How far p is from the domain, at least, and p or a place near it on the boundary."""
         assert self._volume is not None
-        return (self._volume.signed_distance(p),)
+        away = self._volume.signed_distance(p)
+        normal = self._volume.outward_normal(p)
+        return away, dr.select(away > 0, p - self._backend.Array3f(away) * normal, p)
 
     def _slab(self, p: Vec3, radius: Real) -> tuple[Real | Vec3, ...]:
         """Whether there is no level in the ball (1 or 0); the slab that the level lies in."""
@@ -150,6 +154,7 @@ class CellProofs:
     def _foot(self, p: Vec3, radius: Real) -> Vec3:
         """Where Newton's method leads from the centre, if that is near."""
         real, vector, count = self._backend.Float, self._backend.Array3f, self._backend.UInt32
+        zero = dr.opaque(real, 0.0)  # no component of a gradient is a constant of the loop
 
         def body(y: Vec3, off: Real, k: Any) -> tuple[Any, ...]:
             sample = self._field.evaluate(y)
@@ -158,7 +163,7 @@ class CellProofs:
             move = clamp(wanted, -radius, radius)
             going = dr.isfinite(move) & (dr.norm(y - p) < 4 * radius)
             off = dr.select(going, dr.abs(wanted), dr.inf)
-            y = dr.select(going, dr.fma(vector(move / steep), sample.gradient, y), y)
+            y = dr.select(going, dr.fma(vector(move / steep), sample.gradient + zero, y), y)
             return y, off, dr.select(going & (off > 1e-9 * radius), k + 1, _STEPS)
 
         def more(y: Vec3, off: Real, k: Any) -> Mask:
