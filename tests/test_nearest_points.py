@@ -1,4 +1,4 @@
-"""Nearest points: against exact distances to triangles and dense samples, and with hostile input."""
+"""Nearest points: against exact distances and dense samples, and with hostile input."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from scipy.spatial import cKDTree
 import harnack as hk
 from harnack.backend import choose_backend
 from harnack.distance import search
+from harnack.distance.surface_cells import remainder
 from harnack.fields.look import Sample
 from harnack.geometry import mesh_shapes, shapes
-from harnack.distance.surface_cells import remainder
 from tests.test_distance import CURVED, Bare, surface_points, unit
 from tests.test_mesh_distances import (
     beside_faces,
@@ -58,9 +58,9 @@ def test_distances_to_a_closed_mesh_are_exact(precision: Any) -> None:
 
 
 def test_slivers_duplicates_and_ties() -> None:
-    """A prism as thin as a hair, given twice; points in the middle of it, as far from both sides."""
+    """A prism as thin as a hair, given twice; points in the middle, as far from both sides."""
     corners = np.array([[0, 0, 0], [1, 0, 0], [0.5, 1e-7, 0.0]])
-    vertices = np.concatenate([corners, corners + [0, 0, 2.0]])
+    vertices = np.concatenate([corners, corners + np.array([0, 0, 2.0])])
     faces = [(0, 2, 1), (3, 4, 5)]
     for a, b in ((0, 1), (1, 2), (2, 0)):
         faces += [(a, b, b + 3), (a, b + 3, a + 3)]
@@ -82,7 +82,7 @@ def test_a_level_that_a_mesh_has_not() -> None:
 def test_faces_that_pass_through_one_another_are_cut() -> None:
     """Two balls: what of each lies within the other is not the surface."""
     ball, faces = mesh_shapes.icosphere(2)
-    vertices = np.concatenate([ball, ball + [0.9, 0.05, 0.02]])
+    vertices = np.concatenate([ball, ball + np.array([0.9, 0.05, 0.02])])
     both = np.concatenate([faces, faces + len(ball)])
     x = np.random.default_rng(2).uniform(-1.5, 2.5, (400, 3))
     found = check_bounds(hk.WindingNumber(vertices, both), x)

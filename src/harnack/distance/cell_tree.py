@@ -83,8 +83,14 @@ class CellTree:
         return cls(pack(backend, hierarchy, levels, placed))
 
     def nearest_foot(
-        self, x: Vec3, others: tuple[Vec3, ...], apart: Real, limit: Real, *, unbounded: bool = False
-    ) -> tuple[Real, Vec3]:
+        self,
+        x: Vec3,
+        others: tuple[Vec3, ...],
+        apart: Real,
+        limit: Real,
+        *,
+        unbounded: bool = False,
+    ) -> tuple[Real, Vec3]:  # fmt: skip
         """The squared distance of the nearest foot nearer than `limit`, of cells that come nearer
         than that, and the foot; infinite if there is none. Feet that are within `apart` half
         cells of others are left out. unbounded: whether limits say nothing."""

@@ -183,15 +183,19 @@ class _Points:
             def close(p: Vec3, start: Vec3) -> tuple[Vec3]:
                 return (close_in(self._prepared, p, start),)
 
-            return in_batches(self._prepared.backend, close, points, start)[0], np.zeros(len(points))
+            return in_batches(self._prepared.backend, close, points, start)[0], np.zeros(
+                len(points)
+            )
         feet, free = in_batches(self.backend, self._descend, points, start)
         feet = self._within(feet)
         left, rim = np.flatnonzero(np.isnan(feet[:, 0])), self._rim
         if rim is not None and len(left):  # out of the domain
-            along = in_batches(
-                self.backend, lambda p, y: (rim.closest(p, y),), points[left], start[left]
-            )
-            feet[left], free[left] = self._within(along[0]), 0
+
+            def along(p: Vec3, y: Vec3) -> tuple[Vec3]:
+                return (rim.closest(p, y),)
+
+            (there,) = in_batches(self.backend, along, points[left], start[left])
+            feet[left], free[left] = self._within(there), 0
         return feet, free
 
     def _descend(self, p: Vec3, start: Vec3) -> tuple[Vec3, Real]:
@@ -236,7 +240,11 @@ class _Points:
         """How far rounding and approximation may have moved the level at feet (n, 3)."""
         if not len(feet):
             return np.zeros(0)
-        return in_batches(self.backend, lambda y: (self._descent.noise(y),), feet)[0]
+
+        def compute(y: Vec3) -> tuple[Real]:
+            return (self._descent.noise(y),)
+
+        return in_batches(self.backend, compute, feet)[0]
 
 
 def _length(vectors: FloatArray) -> FloatArray:

@@ -7,17 +7,14 @@ cut along these first.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any, cast
 
 import drjit as dr
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray, IntArray, choose_backend, to_numpy, to_vector3
+from harnack.backend import BoolArray, FloatArray, IntArray, to_numpy, to_vector3
 from harnack.backend.arrays import aligned_integers
 from harnack.tree.triangles import NO_TRIANGLE, Frame, TriangleRays
-
-if TYPE_CHECKING:
-    from harnack.backend import Backend, Vec3
 
 __all__ = ["on_level", "pieces_of_faces"]
 
@@ -108,7 +105,8 @@ def _crossing_faces(
 
 def _counted(count: IntArray) -> IntArray:
     """0, 1, .. for each of the counts in turn."""
-    return np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    first = np.cumsum(count) - count
+    return cast("IntArray", np.arange(int(count.sum())) - np.repeat(first, count))
 
 
 def _crossings_of_edges(
@@ -116,7 +114,6 @@ def _crossings_of_edges(
 ) -> tuple[IntArray, IntArray]:
     """Which edges (m, 2) cross which faces that have neither end: indices of both."""
     backend = rays.tree.backend
-    index = backend.UInt32
     corner = [aligned_integers(backend, one) for one in faces.T]
     way = vertices[edges[:, 1]] - vertices[edges[:, 0]]
     length = np.linalg.norm(way, axis=1)
@@ -130,26 +127,36 @@ def _crossings_of_edges(
         end = backend.Float(length[rows] + _SAME)
         p, q = (aligned_integers(backend, one) for one in edges[rows].T)
 
-        def body(t: Any, n: Any, active: Any) -> tuple[Any, ...]:
-            t, n, _, _ = rays.next(frame, (t, n), end, active)
-            known = active & (n != NO_TRIANGLE)
-            ours = [dr.gather(index, one, n, known) for one in corner]
-            is_ours = known & dr.any([(one == p) | (one == q) for one in ours])
-            return t, n, is_ours
-
-        def more(t: Any, n: Any, active: Any) -> Any:
-            del t, n
-            return active
-
-        start = (backend.Float(after_t[rows]), aligned_integers(backend, after_n[rows]),
-                 backend.Bool(True))
-        t, n, _ = dr.while_loop(start, more, body, label="crossings of edges")
+        after = backend.Float(after_t[rows]), aligned_integers(backend, after_n[rows])
+        t, n = _next_of_others(rays, corner, frame, (p, q), end, after)
         number = to_numpy(n).astype(np.int64)
         hit = number != NO_TRIANGLE
         after_t[rows], after_n[rows] = to_numpy(t), number
         rows, number = rows[hit], number[hit]
         found.append((rows, number))
-    return tuple(np.concatenate(one) for one in zip(*found, strict=True))
+    return np.concatenate([one for one, _ in found]), np.concatenate([one for _, one in found])
+
+
+def _next_of_others(
+    rays: TriangleRays, corner: list[Any], frame: Frame, ends: tuple[Any, Any], end: Any,
+    after: tuple[Any, Any],
+) -> tuple[Any, Any]:  # fmt: skip
+    """The first crossing of rays behind another one with a face that has neither of two vertices;
+    corner: those of the faces."""
+    index = rays.tree.backend.UInt32
+
+    def body(t: Any, n: Any, active: Any) -> tuple[Any, ...]:
+        t, n, _, _ = rays.next(frame, (t, n), end, active)
+        known = active & (n != NO_TRIANGLE)
+        ours = [dr.gather(index, one, n, known) for one in corner]
+        return t, n, known & dr.any([(one == ends[0]) | (one == ends[1]) for one in ours])
+
+    def more(t: Any, n: Any, active: Any) -> Any:
+        del t, n
+        return active
+
+    start = (*after, rays.tree.backend.Bool(True))
+    return dr.while_loop(start, more, body, label="crossings of edges")[:2]
 
 
 def _cut(pieces: FloatArray, knives: FloatArray) -> tuple[FloatArray, IntArray]:

@@ -29,6 +29,8 @@ _COARSE = 1500
 # Cells at most: so many for each point, within these limits.
 _FEWEST, _EACH, _MOST = 40_000, 0.5, 150_000
 _MOST_ON_SHEETS = 20_000
+# Of these shares where evaluations are as dear as those of many terms.
+_DEAR = 0.25
 _FINEST = 40
 # Feet of other parts of the surface that are tried after the nearest: of cells so far apart, in
 # edges.
@@ -155,7 +157,8 @@ class _Search:
         self.lower, self.is_open = np.zeros(len(points)), np.ones(len(points), np.bool_)
         self.tolerance, self.tried = tolerance, np.full_like(points, FAR)
         most = _MOST_ON_SHEETS if proofs.surface.field.has_sheets else _MOST
-        self.most = int(min(max(_FEWEST, _EACH * len(points)), most))
+        share = _DEAR if proofs.surface.field.has_detail else 1.0
+        self.most = int(share * min(max(_FEWEST, _EACH * len(points)), most))
 
     def run(self, progress: Callable[[str], None]) -> Found:
         """What is found."""
@@ -231,7 +234,7 @@ class _Search:
 
     def _cell(self) -> float:
         """The length of an edge of the finest cells."""
-        return 2 * min((float(part.half[0]) for part in [*self.done, self.finest] if len(part)))
+        return 2 * min(float(part.half[0]) for part in [*self.done, self.finest] if len(part))
 
     def _bounded(self, tree: CellTree | None) -> BoolArray:
         """Raise the lower bounds. Returns which of the finest cells may hold a point that is nearer

@@ -196,8 +196,8 @@ def _warn(name: str, found: Closest) -> None:
     unresolved = int(np.isnan(found.feet[:, 0]).sum())
     if unresolved:
         warnings.warn(
-            f"{name}: no closest point was found for {unresolved} of {n} points (NaN): no cell that "
-            "may hold the surface, and no descent from the points, led to a point of it",
+            f"{name}: no closest point was found for {unresolved} of {n} points (NaN): no cell "
+            "that may hold the surface, and no descent from the points, led to a point of it",
             RuntimeWarning,
             stacklevel=4,
         )

@@ -14,14 +14,14 @@ from harnack.backend.extrema import clamp, fmin
 from harnack.backend.lengths import length
 from harnack.distance.batches import in_batches
 from harnack.distance.cell_tree import FAR, SurfaceCells
-from harnack.enclosures import Curvature, HarmonicBall, TargetLevels
+from harnack.enclosures import Curvature, HarmonicBall
 from harnack.fields.clearance import distance_below
 from harnack.tracer import Status
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from harnack.backend import Backend, BoolArray, Mask, Real, Vec3
+    from harnack.backend import Mask, Real, Vec3
     from harnack.cells import Cells
     from harnack.enclosures.promises import Promise
     from harnack.fields.field import Field, Sample
@@ -201,5 +201,3 @@ class CellProofs:
 
 def _domain(surface: LevelSet) -> Any:
     return surface.field.domain if surface.clip is None else surface.volume
-
-

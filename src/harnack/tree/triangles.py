@@ -72,9 +72,7 @@ def box_levels(tree: Hierarchy, low: FloatArray, high: FloatArray) -> list[Float
     return levels
 
 
-def slab_levels(
-    tree: Hierarchy, corners: FloatArray, boxes: list[FloatArray]
-) -> list[FloatArray]:
+def slab_levels(tree: Hierarchy, corners: FloatArray, boxes: list[FloatArray]) -> list[FloatArray]:
     """Slabs (k, 6) of the nodes of all levels: a unit normal n, an offset, half a thickness and a
     radius. With c the centre of a node's box, the triangles' points are c + h n + r, r at right
     angles to n, with |h - offset| <= thickness and |r| <= radius.
