@@ -15,6 +15,7 @@ from .agreement import agreement
 from .antialiasing import antialiasing
 from .baselines import baselines
 from .convergence import plot
+from .distances import distances
 from .formulas import formulas
 from .growth import growth
 from .hart import hart
@@ -29,7 +30,7 @@ from .winding import throughput
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 SECTIONS = (
     "rays", "convergence", "winding", "agreement", "versions", "inclusion", "laplacian", "hart",
-    "povray", "antialiasing", "baselines", "formulas",
+    "povray", "antialiasing", "baselines", "formulas", "distances",
 )  # fmt: skip
 
 
@@ -70,6 +71,7 @@ def main() -> None:
         "hart": hart,
         "antialiasing": antialiasing,
         "baselines": baselines,
+        "distances": distances,
         "formulas": formulas,
         "povray": compare_with_povray,
         "winding": lambda: _winding(arguments.bunny, arguments.out.with_name("growth.png")),

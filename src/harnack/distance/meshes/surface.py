@@ -11,7 +11,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import FloatArray, choose_backend
-from harnack.distance.mesh_pieces import on_level, pieces_of_faces
+from harnack.distance.meshes.pieces import on_level, pieces_of_faces
 from harnack.fields.unit_coordinates import placed, single
 from harnack.tree import build_hierarchy
 from harnack.tree.nearest import nearest_triangle, square_to_some_vertex
