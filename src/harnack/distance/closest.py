@@ -84,10 +84,12 @@ def _in_order(
     progress: Callable[[str], None],
 ) -> Closest:  # fmt: skip
     mesh = MeshSurface.of(surface)
-    if mesh is not None:
+    if mesh is not None and mesh.is_all:
         return _closest_on_mesh(backend, surface, levels, mesh, points)
     job = _Points(backend, surface, levels)
     x, start, above, lower = job.look(points)
+    if mesh is not None:
+        start = _nearer(x, start, mesh)
     found = search(surface, x, job.polish, start, _TOLERANCE * _size(surface, x), progress)
     found.feet = job.refined(x, found.feet)
     distance = _length(x - found.feet)
@@ -117,6 +119,15 @@ def _closest_on_mesh(
     slack = _ROUNDING * backend.epsilon * (np.abs(x).max(axis=1, initial=0.0) + mesh.size)
     lower = np.maximum(distance - slack, 0)
     return Closest(x, feet, distance, above, lower, np.zeros(len(x), np.bool_))
+
+
+def _nearer(points: FloatArray, start: FloatArray, mesh: MeshSurface) -> FloatArray:
+    """The places (n, 3), or the nearest points of triangles where these are nearer."""
+    backend = choose_backend("double")
+    nearest = mesh.upload(backend)
+    (way,) = in_batches(backend, lambda p: (nearest(p),), points)  # pyright: ignore
+    nearer = ~(_length(points - start) <= _length(way))
+    return np.where(nearer[:, None], points + way, start)
 
 
 @dataclass(frozen=True)

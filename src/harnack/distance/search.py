@@ -162,7 +162,8 @@ class _Search:
 
     def run(self, progress: Callable[[str], None]) -> Found:
         """What is found."""
-        if not self.proofs.surface.field.has_sheets:
+        has_sheets = self.proofs.surface.field.has_sheets
+        if not has_sheets:
             self._descend(np.arange(len(self.points)), self.points)
         self._improve(self._tree())
         for _ in range(_FINEST):
@@ -176,7 +177,9 @@ class _Search:
                 f"distances: {len(self.finest):,} cells for {int(self.is_open.sum()):,} points"
             )
             self._improve(self._tree())
-        for challenge in range(1, _CHALLENGES + 1):
+        # With sheets they would be as dear as all else, and triangles that are known say enough.
+        known = has_sheets and not np.isnan(self.feet).any()
+        for challenge in range(1, (0 if known else _CHALLENGES) + 1):
             self._improve(self._tree(), challenge)
         self._bounded(self._tree())
         return Found(self.feet, self.lower)

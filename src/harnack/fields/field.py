@@ -272,9 +272,10 @@ class Field(abc.ABC):
         del p
         return None
 
-    def closed_mesh(self) -> tuple[FloatArray, IntArray] | None:
+    def mesh_of_sheets(self) -> tuple[FloatArray, IntArray, bool] | None:
         """Vertices (n, 3) and faces (m, 3) of the mesh whose winding number f is, faces as often as
-        they count, if f is a whole number everywhere off them; else None. Distances ask for it."""
+        they count, and whether f is a whole number everywhere off them; None if f is no winding
+        number. Distances ask for it."""
         return None
 
     def describe(self) -> dict[str, Any]:

@@ -130,8 +130,8 @@ class Morph(BatchedField):
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         return self._slice.extent(levels)
 
-    def closed_mesh(self) -> tuple[FloatArray, IntArray] | None:
-        return self._slice.closed_mesh()
+    def mesh_of_sheets(self) -> tuple[FloatArray, IntArray, bool] | None:
+        return self._slice.mesh_of_sheets()
 
     def next_crossing(
         self, o: Vec3, d: Vec3, after: Crossing, t_max: Real, active: Mask

@@ -184,9 +184,8 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
         is_inner = found.is_inner & (length > 0)
         return NearestSheet(found.square, found.number, found.offset * on.size, normal, is_inner)
 
-    def closed_mesh(self) -> tuple[FloatArray, IntArray] | None:
-        mesh = self.mesh
-        return None if len(mesh.singular) else (mesh.vertices, mesh.triangles)
+    def mesh_of_sheets(self) -> tuple[FloatArray, IntArray, bool] | None:
+        return self.mesh.vertices, self.mesh.triangles, not len(self.mesh.singular)
 
     def check_levels(self, levels: tuple[float, ...]) -> None:
         for level in levels:
