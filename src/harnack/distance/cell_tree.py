@@ -106,7 +106,7 @@ class CellTree:
             taken = active & dr.all(apart_from) & (square < best) & (_lower(vector, row, x) < limit)
             return dr.select(taken, square, best), dr.select(taken, here, foot)
 
-        some = real(square_to_some_point(self.tree, x, 4)) if unbounded else limit * limit
+        some = (1 + 1e-9) * square_to_some_point(self.tree, x, 4) if unbounded else limit * limit
         best, foot = self._walk(x, each, (some, vector(FAR)), lambda state: state[0])
         return dr.select(foot.x < 0.5 * FAR, best, dr.inf), foot
 
