@@ -15,6 +15,7 @@ from .agreement import agreement
 from .antialiasing import antialiasing
 from .baselines import baselines
 from .convergence import plot
+from .distances import distances
 from .formulas import formulas
 from .growth import growth
 from .hart import hart
@@ -30,7 +31,7 @@ from .winding import throughput
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 SECTIONS = (
     "rays", "convergence", "winding", "agreement", "versions", "inclusion", "laplacian", "hart",
-    "povray", "antialiasing", "baselines", "formulas", "meshes",
+    "povray", "antialiasing", "baselines", "formulas", "meshes", "distances",
 )  # fmt: skip
 
 
@@ -71,6 +72,7 @@ def main() -> None:
         "hart": hart,
         "antialiasing": antialiasing,
         "baselines": baselines,
+        "distances": distances,
         "formulas": formulas,
         "meshes": meshes,
         "povray": compare_with_povray,

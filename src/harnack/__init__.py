@@ -29,9 +29,11 @@ from harnack.arithmetic import (
 )
 from harnack.distance import (
     Curvatures,
+    DistanceBounds,
     closest_points,
     curvature,
     curvature_lines,
+    distance_bounds,
     signed_distance,
 )
 from harnack.enclosures import (
@@ -131,6 +133,7 @@ __all__ = [
     "Cylinder",
     "DipolePotential",
     "Displaced",
+    "DistanceBounds",
     "DoubleCone",
     "EigenfunctionSum",
     "Ellipsoid",
@@ -195,6 +198,7 @@ __all__ = [
     "cosine",
     "curvature",
     "curvature_lines",
+    "distance_bounds",
     "exp",
     "expression",
     "files",

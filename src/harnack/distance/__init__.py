@@ -4,14 +4,22 @@ from __future__ import annotations
 
 from harnack.distance.curvature import Curvatures, curvature
 from harnack.distance.curvature_lines import Family, curvature_lines
-from harnack.distance.signed_distance import Method, closest_points, signed_distance
+from harnack.distance.signed_distance import (
+    DistanceBounds,
+    Method,
+    closest_points,
+    distance_bounds,
+    signed_distance,
+)
 
 __all__ = [
     "Curvatures",
+    "DistanceBounds",
     "Family",
     "Method",
     "closest_points",
     "curvature",
     "curvature_lines",
+    "distance_bounds",
     "signed_distance",
 ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import drjit as dr
@@ -12,7 +13,7 @@ import numpy as np
 from harnack.backend import FloatArray, choose_backend
 from harnack.choices import did_you_mean
 from harnack.distance.batches import in_batches
-from harnack.distance.closest import Closest, find_closest, find_on_sheets
+from harnack.distance.closest import Closest, find_closest
 from harnack.distance.estimates import first_order, second_order
 from harnack.enclosures import TargetLevels
 from harnack.fields.clearance import distance_below
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Precision, Real, Vec3
     from harnack.tracer import LevelSet
 
-__all__ = ["Method", "closest_points", "signed_distance"]
+__all__ = ["DistanceBounds", "Method", "closest_points", "distance_bounds", "signed_distance"]
 
 Method = Literal["first", "second", "newton", "lower"]
 # As close as rounding allows: the tracer raises it to that.
@@ -37,6 +38,7 @@ def signed_distance(
     level: Any = None,
     method: Method = "newton",
     precision: Precision = "double",
+    progress: Callable[[str], None] | None = None,
 ) -> FloatArray:
     """Signed distances (n,) from points (n, 3) to a level set: positive where f > level.
 
@@ -47,19 +49,19 @@ def signed_distance(
         "first": (f - level)/|grad f|. Off by O(d^2) at distance d; infinite where grad f = 0.
         "second": the same with the curvature of f along its gradient. Off by O(d^3); needs the
             field's `hessian`.
-        "newton": to a point of the surface found by search, the closest in its neighbourhood
-            (`closest_points`). Exact to rounding if it is the closest of all, else too long in
-            size: an upper bound, and never below what "lower" proves but for rounding. NaN, with a
-            RuntimeWarning that counts them, where no surface is found at all, as where there is
-            none, or only within a radius that the field promises to be free.
-            The slowest by far: some hundred evaluations, and as many rays for points beside sheets
-            that are not the surface.
+        "newton": to the nearest point of the surface that a search finds (`closest_points` says
+            how): an upper bound of the distance, exact to rounding if that is the nearest of all.
+            `distance_bounds` says what is proved about it. Of a closed triangle mesh it is exact to
+            rounding. NaN, with a RuntimeWarning that counts them, where no surface is found at all,
+            as where there is none, or only within a radius that the field promises to be free.
         "lower": never longer in size than the true distance, with proof: no level lies in the
             ball of that radius about the point, not even outside the field's domain. Of first
             order too: the nearer the surface, the smaller the share that it falls short by.
         Of a field that jumps across sheets, "first" and "second" see the smooth part of the
         surface, and the nearest sheet if that is nearer and the surface lies there.
-    precision: of the computation; "lower" allows for rounding in both.
+    precision: of the computation; "lower" allows for rounding in both. The search of "newton" is
+        done in double precision in any case.
+    progress: told what is being done.
 
     Raises:
         TypeError, ValueError: points that are not an (n, 3) array of finite numbers, an unknown
@@ -71,14 +73,12 @@ def signed_distance(
         known = ", ".join(f'"{one}"' for one in get_args(Method))
         hint = did_you_mean(method, get_args(Method))
         raise ValueError(f"unknown method {method!r}; choose one of {known}{hint}")
+    if method == "newton":
+        found = _found("signed_distance", field, points, level, precision, progress)
+        return np.copysign(found.distance, found.above)
     backend = choose_backend(precision)
     surface = _surface(field, level)
-    levels = _levels(backend, surface)
-    if method == "newton":
-        found = find_closest(backend, surface, levels, points)
-        _warn("signed_distance", found)
-        return np.copysign(found.distance, found.above)
-    prepared = field.prepare(backend)
+    levels, prepared = _levels(backend, surface), field.prepare(backend)
     compute = _COMPUTE[method]
 
     def of_points(p: Vec3) -> tuple[Real | Vec3, ...]:
@@ -88,35 +88,89 @@ def signed_distance(
     if method == "lower":
         _check_domain(field, x)
     if field.has_sheets and method != "lower":
-        to_sheet = np.linalg.norm(x - find_on_sheets(backend, surface, x), axis=1)
+        to_sheet = find_closest(backend, surface, levels, x, _silent).distance
         result = np.copysign(np.fmin(to_sheet, np.abs(result)), result)
     return result
 
 
 def closest_points(
-    field: Field, points: Any, *, level: Any = None, precision: Precision = "double"
+    field: Field,
+    points: Any,
+    *,
+    level: Any = None,
+    precision: Precision = "double",
+    progress: Callable[[str], None] | None = None,
 ) -> FloatArray:
-    """The closest points (n, 3) of a level set to `points` (n, 3) that a search finds.
+    """The closest points (n, 3) of a level set to `points` (n, 3), as far as a search finds them.
 
-    Each lies on the surface to rounding, and no point of the surface in its neighbourhood is
-    nearer; one elsewhere may be, though several descents are tried (`find_closest`). Of sheets,
-    such as the triangles of a mesh, the nearest that is the surface is found, and where a nearer
-    one is not, rays look for what may be nearer, such as a crease in which two meet. The curve in
-    which the level sets of a field end counts as part of them, such as the vertices and edges of
-    a solid angle. Where every descent ends at a critical or singular point of f, or outside the
-    field's domain, the nearest point of the surface that some rays find is taken, and from there
-    as far down as descent leads: that need not be a minimum, such as where the rim of a surface
-    cut by the domain is closest. NaN, with a RuntimeWarning that counts them, where rays find no
-    surface either.
+    Of the winding number of a closed mesh they are exact: the nearest of the triangles that are the
+    level, cut where others pass through them. Of other fields the surface is enclosed in cells that
+    are split where a nearer point may be (`distance_bounds`), and descents from the points of the
+    surface that cells know lead to places where no neighbour is nearer. The curve in which the
+    level sets of a field end counts as part of them, such as the vertices and edges of a solid
+    angle, and so does the rim at which the field's domain cuts them. NaN, with a RuntimeWarning
+    that counts them, where no surface is found.
 
     Raises:
         TypeError, ValueError: as `signed_distance`.
     """
+    found = _found("closest_points", field, points, level, precision, progress)
+    return found.feet
+
+
+@dataclass(frozen=True)
+class DistanceBounds:
+    """What is known about distances to a surface. The true distance d has lower <= d <= upper.
+
+    feet: (n, 3) points of the surface, NaN where none was found.
+    upper: (n,) distances to these; NaN likewise. lower: (n,) proved; infinite where there is proved
+        to be no surface.
+    """
+
+    feet: FloatArray
+    upper: FloatArray
+    lower: FloatArray
+
+
+def distance_bounds(
+    field: Field,
+    points: Any,
+    *,
+    level: Any = None,
+    precision: Precision = "double",
+    progress: Callable[[str], None] | None = None,
+) -> DistanceBounds:
+    """Distances of points (n, 3) from a level set, with proved lower bounds.
+
+    What is proved: cells that hold no surface by the field's promises are left out; in the others
+    it lies in a slab, where the promises say so (`surface_cells.remainder`); and about a foot there
+    is a ball in which no point of the surface is nearer (`closest._Points`). The least distance
+    of what is left is `lower`. Cells are split where that is less than `upper` by more than 1e-6
+    of the size of the surface, up to about half as many cells as there are points, but at least
+    40,000: so a few points are proved to that tolerance, of many those for which the balls suffice.
+    What is not proved: that `upper` is the distance where `lower` is less; it is the least of
+    several descents, from the point and from feet of cells in different places.
+
+    Raises:
+        TypeError, ValueError: as `signed_distance`.
+    """
+    found = _found("distance_bounds", field, points, level, precision, progress)
+    return DistanceBounds(found.feet, found.distance, found.lower)
+
+
+def _found(
+    name: str, field: Field, points: Any, level: Any, precision: Precision,
+    progress: Callable[[str], None] | None,
+) -> Closest:  # fmt: skip
     backend = choose_backend(precision)
     surface = _surface(field, level)
-    found = find_closest(backend, surface, _levels(backend, surface), points)
-    _warn("closest_points", found)
-    return found.feet
+    found = find_closest(backend, surface, _levels(backend, surface), points, progress or _silent)
+    _warn(name, found)
+    return found
+
+
+def _silent(message: str) -> None:
+    del message
 
 
 def _surface(field: Field, level: Any) -> LevelSet:
@@ -142,10 +196,10 @@ def _warn(name: str, found: Closest) -> None:
     unresolved = int(np.isnan(found.feet[:, 0]).sum())
     if unresolved:
         warnings.warn(
-            f"{name}: no closest point was found for {unresolved} of {n} points (NaN): no descent "
-            "from there ends on the surface, and no ray that was tried meets it",
+            f"{name}: no closest point was found for {unresolved} of {n} points (NaN): no cell "
+            "that may hold the surface, and no descent from the points, led to a point of it",
             RuntimeWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
     refused = int(found.is_refused.sum())
     if refused:
@@ -154,7 +208,7 @@ def _warn(name: str, found: Closest) -> None:
             "radius that the field's own promises prove to be free of it, and left out: the "
             "promises in `Sample.known` do not hold (harnack.testing.check_field tests them)",
             RuntimeWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
 
 

@@ -31,7 +31,7 @@ from harnack.fields.points import at_points
 from harnack.fields.sheets import NO_SHEET, Crossing, NearestSheet
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, FloatArray, Mask, Precision, Real, Vec3
+    from harnack.backend import Backend, FloatArray, IntArray, Mask, Precision, Real, Vec3
     from harnack.cells import OccupiedCells
     from harnack.geometry import Volume
 
@@ -286,6 +286,12 @@ class Field(abc.ABC):
         Only distances ask for it, while no loop is being recorded. Ends at `domain` do not count.
         """
         del p
+        return None
+
+    def mesh_of_sheets(self) -> tuple[FloatArray, IntArray, bool] | None:
+        """Vertices (n, 3) and faces (m, 3) of the mesh whose winding number f is, faces as often as
+        they count, and whether f is a whole number everywhere off them; None if f is no winding
+        number. Distances ask for it."""
         return None
 
     def describe(self) -> dict[str, Any]:

@@ -111,8 +111,11 @@ def _back_in_place(values: Any, order: Any, n: int) -> Any:
     return kind([_back_in_place(one, order, n) for one in values])
 
 
-def morton_order(backend: Backend, x: Vec3) -> Any:
-    """An order that visits points cell by cell, cells along a Morton curve (a Dr.Jit UInt32)."""
+def morton_order(backend: Backend, x: Vec3, bits: int = _BITS) -> Any:
+    """An order that visits points cell by cell, cells along a Morton curve (a Dr.Jit UInt32).
+
+    bits: cells along an axis, as a power of two, at most 10.
+    """
     index, vector = backend.UInt32, backend.Array3f
     n = dr.width(x)
     if n < 2:
@@ -120,11 +123,11 @@ def morton_order(backend: Backend, x: Vec3) -> Any:
     low = vector(*(dr.min(one) for one in x))
     sides = [dr.max(x[k]) - low[k] for k in range(3)]
     size = dr.maximum(dr.maximum(sides[0], sides[1]), sides[2])
-    scale = (2**_BITS - 1e-3) / dr.maximum(size, 1e-30)
+    scale = (2**bits - 1e-3) / dr.maximum(size, 1e-30)
     key = index(0)
     for axis in range(3):
         cell = index((x[axis] - low[axis]) * scale)
-        for bit in range(_BITS):
+        for bit in range(bits):
             key |= (cell & (1 << bit)) << (2 * bit + axis)
-    keys = to_numpy(key).astype(np.uint16)
+    keys = to_numpy(key).astype(np.uint16 if 3 * bits <= 16 else np.uint32)
     return aligned_integers(backend, np.argsort(keys, kind="stable"))

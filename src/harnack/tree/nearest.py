@@ -21,6 +21,7 @@ from harnack.tree.walk import Node, State, for_each, walk
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
+    from harnack.tree.packed import PackedTree
 
 # In epsilons, of coordinates and of the mesh's size: how far rounding may move a distance.
 _ROUNDING = 16.0
@@ -58,14 +59,69 @@ def distance_to_triangles(rays: TriangleRays, x: Vec3) -> Real:
     inside = _boxes(rays, x, pad)
 
     def visit(node: Node, state: State) -> tuple[Mask, State]:
-        closer = inside(node) < state[0]
+        closer = inside(node, state[0])
         return closer, for_each(node, closer & node.is_leaf, nearer, state)
 
     def nearer(row: list[Real], active: Mask, state: State) -> State:
         square = NearestPoint.of(row, x).square
         return (dr.select(active, fmin(square, state[0]), state[0]),)
 
-    return fmax(dr.sqrt(walk(rays.tree, visit, (real(dr.inf),))[0]) - pad, real(0))
+    start = (square_to_some_vertex(rays, x),)
+    return fmax(dr.sqrt(walk(rays.tree, visit, start)[0]) - pad, real(0))
+
+
+def square_to_some_vertex(rays: TriangleRays, x: Vec3) -> Real:
+    """The squared distance from x to a vertex of a triangle nearby, rounded up: walks that begin
+    with it pass by most boxes."""
+    square, pad = square_to_some_point(rays.tree, x, 0), _pad(rays, x)
+    return square + 2 * pad * (dr.sqrt(square) + pad)
+
+
+def square_to_some_point(tree: PackedTree, x: Vec3, column: int) -> Real:
+    """The least squared distance from x to the points of a leaf nearby, whose coordinates begin at
+    a column of their records.
+
+    From the root on, the child whose box has the nearest centre, down to a leaf.
+    """
+    backend = tree.backend
+    real, index, vector = backend.Float, backend.UInt32, backend.Array3f
+    x = vector(x)
+
+    def body(i: Any, end: Any, best: Real, first: Any, after: Any, found: Any) -> State:
+        head = tree.head(i)
+        middle = 0.5 * (vector(*head[:3]) + vector(*head[3:6]))
+        square = dr.squared_norm(middle - x)
+        nearer, following = square < best, index(head[6])
+        best = dr.select(nearer, square, best)
+        is_leaf, number = head[7] >= 0, index(dr.abs(head[7]))
+        # A leaf, or the first child of an inner node, and the end of its children.
+        found = dr.select(nearer, dr.select(is_leaf, number, NO_TRIANGLE), found)
+        first = dr.select(nearer, number, first)
+        after = dr.select(nearer, following, after)
+        is_last = following == end
+        down = is_last & (found == NO_TRIANGLE)
+        i = dr.select(down, first, following)
+        end, best = dr.select(down, after, end), dr.select(down, dr.inf, best)
+        return i, end, best, first, after, found
+
+    def more(i: Any, end: Any, *state: Any) -> Mask:
+        return i != end
+
+    start = (
+        index(0), index(tree.node_count), real(dr.inf), index(0), index(0), index(NO_TRIANGLE),
+    )  # fmt: skip
+    leaf = dr.while_loop(start, more, body, label="to a leaf")[5]
+
+    def add(slot: Any, square: Real) -> State:
+        row = tree.primitive(leaf, slot, backend.Bool(True))
+        point = vector(*row[column : column + 3])
+        return slot + 1, fmin(square, dr.squared_norm(point - x))
+
+    def left(slot: Any, square: Real) -> Mask:
+        del square
+        return slot < tree.leaf_size
+
+    return dr.while_loop((index(0), real(dr.inf)), left, add, label="points of a leaf")[1]
 
 
 def nearest_triangle(
@@ -83,7 +139,7 @@ def nearest_triangle(
     inside = _boxes(rays, x, _pad(rays, x))
 
     def visit(node: Node, state: State) -> tuple[Mask, State]:
-        closer = inside(node) <= state[0]
+        closer = inside(node, state[0])
         return closer, for_each(node, closer & node.is_leaf, nearer, state)
 
     def nearer(row: list[Real], active: Mask, state: State) -> State:
@@ -112,14 +168,26 @@ def _pad(rays: TriangleRays, x: Vec3) -> Real:
 
 
 def _boxes(rays: TriangleRays, x: Vec3, pad: Real) -> Any:
-    """The squared distance from x to a node's box widened by `pad`."""
+    """Whether a node comes within a squared distance of x: its box widened by `pad`, and, where
+    the tree has them, its slab (`slab_levels`) as well."""
     vector = rays.tree.backend.Array3f
 
-    def square(node: Node) -> Real:
+    def within(node: Node, square: Real) -> Mask:
         low, high = vector(*node.head[:3]) - pad, vector(*node.head[3:]) + pad
-        return dr.squared_norm(dr.select(x < low, low - x, dr.select(x > high, x - high, 0)))
+        away = dr.select(x < low, low - x, dr.select(x > high, x - high, 0))
+        close = dr.squared_norm(away) <= square
+        slab = node.payload(close)
+        if not slab:
+            return close
+        n, offset, thickness, radius = vector(*slab[:3]), slab[3], slab[4], slab[5]
+        from_centre = x - 0.5 * (low + high)
+        height = dr.dot(from_centre, n)
+        across = dr.norm(dr.fma(vector(-height), n, from_centre))
+        off = fmax(dr.abs(height - offset) - (thickness + pad), 0)
+        beside = fmax(across - (radius + pad), 0)
+        return close & (dr.fma(off, off, beside * beside) <= square)
 
-    return square
+    return within
 
 
 @dataclass(frozen=True)
@@ -209,7 +277,7 @@ def jumps_within(rays: TriangleRays, x: Vec3, distance: Real) -> Real:
     reach, inside = distance * distance, _boxes(rays, x, distance)
 
     def visit(node: Node, state: State) -> tuple[Mask, State]:
-        close = inside(node) <= reach
+        close = inside(node, reach)
         return close, for_each(node, close & node.is_leaf, add, state)
 
     def add(row: list[Real], active: Mask, state: State) -> State:

@@ -72,6 +72,32 @@ def box_levels(tree: Hierarchy, low: FloatArray, high: FloatArray) -> list[Float
     return levels
 
 
+def slab_levels(tree: Hierarchy, corners: FloatArray, boxes: list[FloatArray]) -> list[FloatArray]:
+    """Slabs (k, 6) of the nodes of all levels: a unit normal n, an offset, half a thickness and a
+    radius. With c the centre of a node's box, the triangles' points are c + h n + r, r at right
+    angles to n, with |h - offset| <= thickness and |r| <= radius.
+
+    A patch of a smooth surface is much thinner than its box, and seen from far away what counts is
+    how thin it is: with boxes alone, a walk visits the whole cap of the surface whose bulge is less
+    than a box is wide.
+    """
+    points = tree.gather(corners, np.nan).reshape(len(tree.slots), -1, 3)
+    edges = corners - corners[:, :1]
+    normals = tree.gather(np.cross(edges[:, 1], edges[:, 2])).sum(axis=1)
+    levels: list[FloatArray] = []
+    for box, arity in zip(boxes, (*tree.arities, 1), strict=True):
+        n = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+        n[~(np.linalg.norm(n, axis=1) > 0.5)] = (0.0, 0.0, 1.0)
+        away = points.reshape(len(n), -1, 3) - 0.5 * (box[:, None, :3] + box[:, None, 3:])
+        height = (away @ n[:, :, None])[..., 0]
+        low, high = np.nanmin(height, axis=1), np.nanmax(height, axis=1)
+        square = np.einsum("nij,nij->ni", away, away) - height * height
+        radius = np.sqrt(np.maximum(np.nanmax(square, axis=1), 0)) * (1 + 1e-6) + 1e-7
+        levels.append(np.column_stack([n, 0.5 * (low + high), 0.5 * (high - low), radius]))
+        normals = normals.reshape(-1, arity, 3).sum(axis=1)
+    return levels
+
+
 @dataclass(frozen=True)
 class Frame:
     """Rays o + t d seen along themselves: right-handed unit vectors u, v and d."""
@@ -146,10 +172,18 @@ class TriangleRays:
     tree: PackedTree
 
     @classmethod
-    def of(cls, backend: Backend, tree: Hierarchy, records: FloatArray) -> TriangleRays:
-        """From the records of `triangle_records`."""
+    def of(
+        cls, backend: Backend, tree: Hierarchy, records: FloatArray, *, slabs: bool = False
+    ) -> TriangleRays:
+        """From the records of `triangle_records`.
+
+        slabs: whether nodes have slabs besides boxes, for nearest points from far away.
+        """
         corners = records[:, :9].reshape(-1, 3, 3)
         levels = box_levels(tree, corners.min(axis=1), corners.max(axis=1))
+        if slabs:
+            pairs = zip(levels, slab_levels(tree, corners, levels), strict=True)
+            levels = [np.concatenate(pair, axis=1) for pair in pairs]
         return cls(pack(backend, tree, levels, in_slots(tree, records)))
 
     def next(

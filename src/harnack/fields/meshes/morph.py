@@ -135,6 +135,9 @@ class Morph(BatchedField):
     def occupied(self, levels: tuple[float, ...]) -> OccupiedCells | None:
         return self._slice.occupied(levels)
 
+    def mesh_of_sheets(self) -> tuple[FloatArray, IntArray, bool] | None:
+        return self._slice.mesh_of_sheets()
+
     def next_crossing(
         self, o: Vec3, d: Vec3, after: Crossing, t_max: Real, active: Mask
     ) -> Crossing:

@@ -12,7 +12,7 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend import backend_of
+from harnack.backend import FloatArray, IntArray, backend_of
 from harnack.choices import did_you_mean
 from harnack.enclosures import LineLipschitz
 from harnack.fields.batch import BatchedField, Values
@@ -200,6 +200,9 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
         normal = dr.select(length > 0, found.normal / length, up)
         is_inner = found.is_inner & (length > 0)
         return NearestSheet(found.square, found.number, found.offset * on.size, normal, is_inner)
+
+    def mesh_of_sheets(self) -> tuple[FloatArray, IntArray, bool] | None:
+        return self.mesh.vertices, self.mesh.triangles, not len(self.mesh.singular)
 
     def check_levels(self, levels: tuple[float, ...]) -> None:
         for level in levels:

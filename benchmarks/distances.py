@@ -1,0 +1,93 @@
+"""Distances to surfaces: how long a point takes, against trimesh's nearest points and scipy's."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+import harnack as hk
+from harnack.geometry import mesh_shapes, shapes
+
+from .rays import machine
+
+FloatArray = npt.NDArray[np.float64]
+POINTS, FEW = 1_000_000, 2_000
+
+
+def _cpu(compute: Callable[[], object]) -> float:
+    """CPU seconds of all threads."""
+    start = time.process_time()
+    compute()
+    return time.process_time() - start
+
+
+def _around(field: hk.Field, n: int) -> FloatArray:
+    """Points (n, 3), uniform in the middle half of the box around the surface."""
+    volume = field.domain or field.extent((field.default_level,))
+    assert volume is not None
+    low, high = volume.bounds()
+    return 0.5 * (low + high) + np.random.default_rng(0).uniform(-0.25, 0.25, (n, 3)) * (high - low)
+
+
+def _cloud(n: int) -> hk.DipolePotential:
+    k = np.arange(n) + 0.5
+    z, turn = 1 - 2 * k / n, np.pi * (1 + np.sqrt(5)) * k
+    flat = np.sqrt(1 - z * z)
+    p = np.column_stack([flat * np.cos(turn), flat * np.sin(turn), z])
+    return hk.DipolePotential(p, p, np.full(n, 4 * np.pi / n))
+
+
+def distances(n: int = POINTS) -> str:
+    """The section's text."""
+    fields: dict[str, tuple[hk.Field, int]] = {
+        "closed mesh, 81,920 faces": (hk.WindingNumber(*mesh_shapes.bumpy_sphere(6)), n),
+        "polygon, 24 edges": (hk.SolidAngle(shapes.wavy_polygon(24)), n // 20),
+        "trefoil, 60 edges": (hk.SolidAngle(shapes.torus_knot(2, 3, 60)), n // 20),
+        "gyroid": (hk.Gyroid(), n // 20),
+        "cloud of 2,000 points": (_cloud(2000), n // 100),
+    }
+    rows = [
+        "| surface | points | us a point | gap, median | gap, 90 % |", "|---|---|---|---|---|"
+    ]  # fmt: skip
+    for name, (field, count) in fields.items():
+        x = _around(field, count)
+        hk.signed_distance(field, x[:200])
+        seconds = _cpu(lambda field=field, x=x: hk.signed_distance(field, x))
+        found = hk.distance_bounds(field, x[: min(count, 20_000)])
+        gap = (found.upper - found.lower) / np.ptp(x, axis=0).max()
+        middle, high = np.quantile(gap, [0.5, 0.9])
+        rows.append(
+            f"| {name} | {count:,} | {1e6 * seconds / count:.1f} | {middle:.1g} | {high:.1g} |"
+        )
+    vertices, faces = mesh_shapes.bumpy_sphere(6)
+    x = _around(fields["closed mesh, 81,920 faces"][0], FEW)
+    nearest = _cpu(lambda: cKDTree(vertices).query(x))
+    others = [f"scipy's k-d tree, to the nearest vertex alone: {1e6 * nearest / FEW:.1f} us"]
+    try:
+        import trimesh
+
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
+        mesh.nearest.on_surface(x[:10])  # pyright: ignore
+        seconds = _cpu(lambda: mesh.nearest.on_surface(x))  # pyright: ignore
+        others.append(
+            f"trimesh's `nearest.on_surface`, without a sign: {1e6 * seconds / FEW:.0f} us"
+        )
+    except ImportError:
+        pass
+    return "\n".join([
+        "## Distances",
+        "",
+        f"`signed_distance` at points in the middle half of the box around a surface, double "
+        f"precision, CPU time of all threads with all preparations ({machine()}). The gap is that "
+        "between the distance and what is proved (`distance_bounds`), in sizes of that box, of the "
+        "first 20,000 points.",
+        "",
+        *rows,
+        "",
+        f"To the same mesh, {FEW:,} points: " + "; ".join(others) + ".",
+        "",
+    ])  # fmt: skip

@@ -1,0 +1,241 @@
+"""Nearest points: against exact distances and dense samples, and with hostile input."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+import harnack as hk
+from harnack.backend import choose_backend
+from harnack.distance import search
+from harnack.distance.surface_cells import remainder
+from harnack.fields.look import Sample
+from harnack.geometry import mesh_shapes, shapes
+from tests.test_distance import CURVED, Bare, surface_points, unit
+from tests.test_mesh_distances import (
+    beside_faces,
+    distance_to_closed_mesh,
+    distances_to_triangles,
+)
+
+PRECISIONS = ("double", "single")
+
+
+def check_bounds(field: hk.Field, x: np.ndarray, **given: Any) -> hk.DistanceBounds:
+    """That the parts of the answer agree with one another."""
+    found = hk.distance_bounds(field, x, **given)
+    away = np.linalg.norm(x - found.feet, axis=1)
+    assert np.allclose(found.upper, away, rtol=1e-6, atol=1e-12 * (1 + np.abs(x).max()))
+    assert (found.lower <= found.upper).all()
+    return found
+
+
+# --- closed meshes -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_distances_to_a_closed_mesh_are_exact(precision: Any) -> None:
+    vertices, faces = mesh_shapes.bumpy_sphere(3)
+    rng = np.random.default_rng(0)
+    x = np.concatenate([
+        rng.uniform(-1.5, 1.5, (300, 3)), 1e3 * rng.normal(size=(50, 3)), np.zeros((1, 3)),
+        beside_faces(vertices, faces, 300, np.repeat([1e-9, 1e-6, 1e-3], 100)),
+        vertices[:50], vertices[faces[:50]].mean(axis=1), vertices[faces[:50, :2]].mean(axis=1),
+    ])  # fmt: skip
+    field, exact = hk.WindingNumber(vertices, faces), distance_to_closed_mesh(vertices, faces, x)
+    found = check_bounds(field, x, precision=precision) if precision == "double" else None
+    distance = np.abs(hk.signed_distance(field, x, precision=precision))
+    size = 1e-6 if precision == "single" else 1e-13
+    assert (np.abs(distance - exact) <= size * (1 + np.abs(x).max(axis=1))).all()
+    if found is not None:
+        assert (found.lower <= exact).all()
+        assert (found.upper - found.lower <= 1e-12 * (1 + np.abs(x).max(axis=1))).all()
+
+
+def test_slivers_duplicates_and_ties() -> None:
+    """A prism as thin as a hair, given twice; points in the middle, as far from both sides."""
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0.5, 1e-7, 0.0]])
+    vertices = np.concatenate([corners, corners + np.array([0, 0, 2.0])])
+    faces = [(0, 2, 1), (3, 4, 5)]
+    for a, b in ((0, 1), (1, 2), (2, 0)):
+        faces += [(a, b, b + 3), (a, b + 3, a + 3)]
+    faces = np.array(faces)
+    rng = np.random.default_rng(1)
+    x = np.concatenate([rng.uniform(-1, 3, (200, 3)), [[0.5, 5e-8, 1.0], [0.5, 0, 1.0]]])
+    exact = distances_to_triangles(x, vertices[faces]).min(axis=1)
+    for times in (1, 2):
+        found = check_bounds(hk.WindingNumber(vertices, np.tile(faces, (times, 1))), x)
+        assert np.abs(found.upper - exact).max() < 1e-12
+
+
+def test_a_level_that_a_mesh_has_not() -> None:
+    field = hk.WindingNumber(*mesh_shapes.icosphere(1))
+    with pytest.warns(RuntimeWarning, match="no closest point was found for 2 of 2"):
+        assert np.isnan(hk.signed_distance(field, [[0, 0, 0], [2, 0, 0]], level=1.5)).all()
+
+
+def test_faces_that_pass_through_one_another_are_cut() -> None:
+    """Two balls: what of each lies within the other is not the surface."""
+    ball, faces = mesh_shapes.icosphere(2)
+    vertices = np.concatenate([ball, ball + np.array([0.9, 0.05, 0.02])])
+    both = np.concatenate([faces, faces + len(ball)])
+    x = np.random.default_rng(2).uniform(-1.5, 2.5, (400, 3))
+    found = check_bounds(hk.WindingNumber(vertices, both), x)
+    on = []
+    for part, other in ((faces, faces + len(ball)), (faces + len(ball), faces)):
+        y = beside_faces(vertices, part, 100_000, 0.0, seed=3)
+        inside = hk.WindingNumber(vertices, other).value(y, precision="double") > 0.5
+        on.append(y[~inside])
+    nearest, _ = cKDTree(np.concatenate(on)).query(x)
+    assert (found.upper <= nearest + 1e-12).all()
+    # No foot lies inside either ball, but for rounding.
+    for part in (faces, faces + len(ball)):
+        off = hk.signed_distance(hk.WindingNumber(vertices, part), found.feet)
+        assert off.max() < 1e-9
+
+
+# --- smooth surfaces ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["wavy", "knot", "gyroid"])
+@pytest.mark.parametrize(
+    ("n", "rays"), [(1500, 30_000), pytest.param(20_000, 300_000, marks=pytest.mark.slow)]
+)
+def test_no_dense_sample_is_nearer(name: str, n: int, rays: int) -> None:
+    """Neither than the distance nor, with more reason, than the proved lower bound."""
+    field = CURVED[name]
+    volume = field.domain or field.extent((field.default_level,))
+    assert volume is not None
+    lower, upper = volume.bounds()
+    x = np.random.default_rng(4).uniform(lower, upper, (n, 3))
+    if field.domain is not None:
+        x = x[field.domain.contains_points(x)]
+    found = check_bounds(field, x)
+    nearest, _ = cKDTree(surface_points(field, rays)).query(x)
+    assert (found.upper <= nearest + 1e-9).all()
+    assert (found.lower <= nearest + 1e-12).all()
+    # What is proved says something: within a cell's size of the truth.
+    assert np.quantile(found.upper - found.lower, 0.9) < 0.03 * np.linalg.norm(upper - lower)
+
+
+def test_a_few_points_are_proved_to_the_tolerance() -> None:
+    """Up to 1e-6 of the size, but for points whose nearest is where the surface ends."""
+    field = CURVED["wavy"]
+    x = np.random.default_rng(5).uniform(-0.8, 0.8, (20, 3))
+    found = check_bounds(field, x)
+    assert np.quantile(found.upper - found.lower, 0.9) < 1e-5
+    assert (found.upper - found.lower).max() < 1e-3
+
+
+def test_beside_the_surface_all_is_proved() -> None:
+    for name in ("wavy", "gyroid"):
+        field = CURVED[name]
+        y = surface_points(field, 400)[:100]
+        above = unit(field.gradient(y, precision="double"))
+        inner = y + 1e-9 * above
+        found = check_bounds(field, inner)
+        assert np.abs(found.upper - 1e-9).max() < 1e-13, name
+        assert (found.lower >= 0.99e-9).mean() > 0.9, name
+
+
+def test_far_away_and_on_the_axis() -> None:
+    """From 1000 sizes away, and from where many points are as near as one another."""
+    disk = hk.SolidAngle(shapes.regular_polygon(12))
+    corners = shapes.regular_polygon(12)
+    x = np.array([[0, 0, 1e3], [1e3, 0, 0], [0, 0, 0.5], [0, 0, 0], *corners[:2]])
+    found = check_bounds(disk, x)
+    reach = np.linalg.norm(corners - [1e3, 0, 0], axis=1).min()
+    assert found.upper == pytest.approx([1e3, reach, 0.5, 0, 0, 0], abs=1e-10)
+
+
+def test_a_surface_without_extent() -> None:
+    """Cells are looked for around the points, and farther out until the nearest is within."""
+    x = np.array([[0.0, 0.0, 0.0], [700.0, 0.0, 0.0], [0.0, 1.25, 0.0]])
+    found = check_bounds(Bare(), x)
+    assert found.upper == pytest.approx([1.0, 699.0, 0.25], rel=1e-9)
+
+    class Waves(hk.Field):
+        """sin x: planes at all multiples of pi, which have no end."""
+
+        def evaluate(self, p: Any) -> hk.Sample:
+            import drjit as dr
+
+            return hk.Sample(dr.sin(p.x), type(p)(dr.cos(p.x), 0, 0), (hk.Curvature(1.0),))
+
+    x = np.random.default_rng(6).uniform(-20, 20, (200, 3))
+    exact = np.abs(x[:, 0] - np.pi * np.round(x[:, 0] / np.pi))
+    found = check_bounds(Waves(), x)
+    assert np.abs(found.upper - exact).max() < 1e-12
+    assert (found.lower <= exact + 1e-12).all()
+
+
+def test_an_empty_level_set() -> None:
+    """exp(x) + 1 has no level 0, within its domain."""
+
+    class Positive(hk.Field):
+        domain = hk.Ball(radius=1.0)
+
+        def evaluate(self, p: Any) -> hk.Sample:
+            return hk.Sample(2 + p.x, type(p)(1, 0, 0), (hk.Curvature(0.0),))
+
+    with pytest.warns(RuntimeWarning, match="no closest point was found for 1 of 1"):
+        found = hk.distance_bounds(Positive(), [[0.1, 0.2, 0.3]])
+    assert np.isnan(found.upper).all()
+
+
+def test_the_rim_of_a_domain() -> None:
+    """A plane cut by a ball: beyond the disk its rim is the nearest."""
+    field = hk.HarmonicPolynomial({(0, 0, 1): 1.0}, domain=hk.Ball(radius=2.0))
+    x = np.random.default_rng(7).uniform(-4, 4, (500, 3))
+    rim = np.hypot(np.maximum(np.hypot(x[:, 0], x[:, 1]) - math.sqrt(4 - 0.25), 0), x[:, 2] - 0.5)
+    found = check_bounds(field, x, level=0.5)
+    assert (found.lower <= rim + 1e-12).all()
+    assert (np.abs(found.upper - rim) < 1e-9).mean() > 0.99
+    assert np.abs(found.upper - rim).max() < 0.05
+
+
+def test_parts_make_no_difference(monkeypatch: pytest.MonkeyPatch) -> None:
+    field, x = CURVED["wavy"], np.random.default_rng(8).uniform(-1, 1, (60, 3))
+    whole = hk.signed_distance(field, x)
+    monkeypatch.setattr(search, "_AT_ONCE", 17)
+    messages: list[str] = []
+    parts = hk.signed_distance(field, x, progress=messages.append)
+    assert np.allclose(parts, whole, rtol=1e-12)
+    assert any("cells for" in one for one in messages)
+
+
+# --- what is proved ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dimension", [2, 3, 4])
+def test_the_remainder_is_attained_by_poissons_kernel(dimension: int) -> None:
+    """f = P(q, s) - 1 >= -1, with mass 1 at s = 1: along its axis nothing is to spare."""
+    real = choose_backend("double").Float
+    q = np.linspace(0.01, 0.9, 30)
+    rest = (1 + q) / (1 - q) ** (dimension - 1) - 1 - dimension * q
+    ball = hk.HarmonicBall(1.0, -1.0, math.inf, dimension)
+    zero = choose_backend("double").Array3f(0)
+    found = np.array(remainder(Sample(real(0), zero, (ball,)), real(q)))
+    assert (found >= rest * (1 - 1e-9)).all()
+    assert found == pytest.approx(rest, rel=1e-9)
+    assert np.isinf(np.array(remainder(Sample(real(0), zero, (ball,)), real(1.5)))).all()
+
+
+def test_lower_bounds_of_clouds_hold() -> None:
+    k = np.arange(300) + 0.5
+    z, turn = 1 - 2 * k / 300, np.pi * (1 + np.sqrt(5)) * k
+    p = np.column_stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z])
+    field = hk.DipolePotential(p, p, np.full(300, 4 * np.pi / 300))
+    x = np.random.default_rng(9).uniform(-1.5, 1.5, (400, 3))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = check_bounds(field, x)
+    on = surface_points(field, 20_000)
+    nearest, _ = cKDTree(np.concatenate([on, p])).query(x)
+    assert (found.upper <= nearest + 1e-9).all()
+    assert (found.lower <= nearest + 1e-9).all()
