@@ -5,19 +5,20 @@ from __future__ import annotations
 import abc
 import copy
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import TYPE_CHECKING, ClassVar, Generic, TypeVar
 
 import drjit as dr
 import numpy as np
 
 from harnack.backend import backend_of
-from harnack.fields.field import Field
+from harnack.fields.field import AtDetail, Field
 from harnack.fields.kept import prepared_once
 
 if TYPE_CHECKING:
     from typing import Self
 
     from harnack.backend import Backend, FloatArray, Real, Vec3
+    from harnack.fields.look import Sample
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,33 @@ class UploadedField(Field, Generic[Uploaded]):
         if backend not in self._batches:
             self._batches[backend] = self._upload(backend, traced=False)
         return self._batches[backend]
+
+
+class DetailedField(UploadedField[Uploaded]):
+    """One that is evaluated more coarsely or more closely. Subclasses define `_sample`."""
+
+    has_detail = True
+
+    values_take_more: ClassVar[bool] = True
+    """Whether `_upload` of values at points differs from that for tracing."""
+
+    @abc.abstractmethod
+    def _sample(self, on: Uploaded, p: Vec3, detail: Real) -> Sample:
+        """f at p from the data, at a detail (`Field.at_detail`)."""
+
+    def evaluate(self, p: Vec3) -> Sample:
+        on = self._on(p)
+        return self._sample(on, p, on.backend.Float(1))
+
+    def at_detail(self, detail: Real) -> Field:
+        on = self._prepared()
+        return AtDetail(lambda p: self._sample(on, p, detail))
+
+    def _batch(self, backend: Backend) -> Uploaded:
+        device = self._device
+        if self.values_take_more or device is None or device.backend is not backend:
+            return super()._batch(backend)
+        return device
 
 
 def single(centre: FloatArray) -> FloatArray:

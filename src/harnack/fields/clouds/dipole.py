@@ -11,9 +11,9 @@ import numpy as np
 from harnack.backend import backend_of
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.clouds.dipole_tree import DipoleTree
-from harnack.fields.field import AtDetail, Field, Sample, lengthened
+from harnack.fields.field import Sample, lengthened
 from harnack.fields.multipoles.dipole_records import hierarchy_of
-from harnack.fields.unit_coordinates import UnitCoordinates, UploadedField, placed, single
+from harnack.fields.unit_coordinates import DetailedField, UnitCoordinates, placed, single
 from harnack.geometry import Box, CloudError, estimate_areas, estimate_normals, validate_cloud
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _VALUES, _TRACED = 2.0, 4.0
 
 
-class DipolePotential(UploadedField["_DipoleBuffers"], BatchedField):
+class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
     """f(x) = sum a_i n_i.(p_i - x)/|p_i - x|^3 of oriented points (paper, Eq. 12).
 
     With a_i the areas that the points stand for, f is about 4 pi inside and 0 outside: the
@@ -47,7 +47,6 @@ class DipolePotential(UploadedField["_DipoleBuffers"], BatchedField):
 
     period: ClassVar[float | None] = None
     default_level: float = 2 * math.pi
-    has_detail = True
 
     def __init__(
         self,
@@ -121,13 +120,8 @@ class DipolePotential(UploadedField["_DipoleBuffers"], BatchedField):
             prepared.coarsest_detail = prepared._device.tree.clusters.coarsest
         return prepared
 
-    def evaluate(self, p: Vec3) -> Sample:
-        on = self._on(p)
-        return on.sample(p, on.backend.Float(1))
-
-    def at_detail(self, detail: Real) -> Field:
-        on = self._prepared()
-        return AtDetail(lambda p: on.sample(p, detail))
+    def _sample(self, on: _DipoleBuffers, p: Vec3, detail: Real) -> Sample:
+        return on.sample(p, detail)
 
     def check_levels(self, levels: tuple[float, ...]) -> None:
         for level in levels:

@@ -15,7 +15,7 @@ from harnack.choices import did_you_mean
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.clearance import tight_extent
 from harnack.fields.clouds.screened_kernel import YukawaKernel, mean_at_dipoles, promises
-from harnack.fields.field import AtDetail, Field, Sample
+from harnack.fields.field import Sample
 from harnack.fields.multipoles.dipole_records import dipole_rows
 from harnack.fields.multipoles.radial_tree import (
     ClusteredDipoles,
@@ -25,8 +25,8 @@ from harnack.fields.multipoles.radial_tree import (
 )
 from harnack.fields.sums import SECOND_ROUNDINGS, SLOPE_ROUNDINGS, FieldSums
 from harnack.fields.unit_coordinates import (
+    DetailedField,
     UnitCoordinates,
-    UploadedField,
     epsilon_at,
     placed,
     single,
@@ -50,7 +50,7 @@ _SMALLEST_LEVEL = 1e-20
 _ON_DIPOLE, _ANY_LEVEL = 32, 1e5
 
 
-class ScreenedWindingNumber(UploadedField["_ScreenedBuffers"], BatchedField):
+class ScreenedWindingNumber(DetailedField["_ScreenedBuffers"], BatchedField):
     """w(x) = (1/4 pi) sum_i a_i n_i.(y_i - x) (1 + rho_i/l) exp(-rho_i/l)/rho_i^3, rho_i = |y_i-x|.
 
     Minus the derivative of the Yukawa kernel exp(-rho/l)/rho along n_i at y_i; as l grows, the
@@ -95,6 +95,8 @@ class ScreenedWindingNumber(UploadedField["_ScreenedBuffers"], BatchedField):
     Raises CloudError (a ValueError) as `validate_cloud`; ValueError for a length, method or
     accuracy that cannot be.
     """
+
+    values_take_more = False
 
     def __init__(
         self,
@@ -209,18 +211,6 @@ class ScreenedWindingNumber(UploadedField["_ScreenedBuffers"], BatchedField):
         else:
             dipoles = TreeSum(backend, ClusteredDipoles.of(self._rows), kernel, self.accuracy)
         return _ScreenedBuffers(*placed(backend, self._centre, self._size), kernel, dipoles)
-
-    def _batch(self, backend: Backend) -> _ScreenedBuffers:
-        if self._device is not None and self._device.backend is backend:
-            return self._device  # values at points take nothing else
-        return super()._batch(backend)
-
-    def evaluate(self, p: Vec3) -> Sample:
-        return self._sample(self._on(p), p, 1.0)
-
-    def at_detail(self, detail: Real) -> Field:
-        on = self._prepared()
-        return AtDetail(lambda p: self._sample(on, p, detail))
 
     def _sample(self, on: _ScreenedBuffers, p: Vec3, detail: Real) -> Sample:
         x = on.unit(p)

@@ -14,7 +14,7 @@ from harnack.backend.extrema import fmax
 from harnack.enclosures import HarmonicBall
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.clearance import occupied_cells, tight_extent
-from harnack.fields.field import AtDetail, Field, Sample
+from harnack.fields.field import Sample
 from harnack.fields.meshes.centroids import Centroids, centroids, piece_counts
 from harnack.fields.meshes.sliced_kernel import SlicedKernel
 from harnack.fields.multipoles.dipole_records import dipole_rows
@@ -23,8 +23,8 @@ from harnack.fields.multipoles.radial_tree import ClusteredDipoles, TreeSum
 from harnack.fields.points import at_points
 from harnack.fields.sums import SLOPE_ROUNDINGS, SUM_ROUNDING
 from harnack.fields.unit_coordinates import (
+    DetailedField,
     UnitCoordinates,
-    UploadedField,
     epsilon_at,
     placed,
     single,
@@ -47,7 +47,7 @@ _MOST_CELLS = 40_000
 _ACROSS = 128
 
 
-class MorphSlice(UploadedField["_SliceBuffers"], BatchedField):
+class MorphSlice(DetailedField["_SliceBuffers"], BatchedField):
     """f(x) = (U_a(x, w) + U_b(x, gap - w))/(2 pi^2), 0 < w < gap: see `Morph`.
 
     corners: two arrays (m, 3, 3) of triangles. w, gap, spacing, accuracy: as for `Morph`.
@@ -58,7 +58,7 @@ class MorphSlice(UploadedField["_SliceBuffers"], BatchedField):
     """
 
     default_level = 0.5
-    has_detail = True
+    values_take_more = False
 
     def __init__(
         self, corners: Sequence[FloatArray], *, w: float, gap: float, spacing: float,
@@ -134,18 +134,8 @@ class MorphSlice(UploadedField["_SliceBuffers"], BatchedField):
         )
         return _SliceBuffers(*placed(backend, self._centre, self._size), clouds)
 
-    def _batch(self, backend: Backend) -> _SliceBuffers:
-        if self._device is not None and self._device.backend is backend:
-            return self._device  # values at points take nothing else
-        return super()._batch(backend)
-
-    def evaluate(self, p: Vec3) -> Sample:
-        on = self._on(p)
-        return on.sample(p, on.backend.Float(1))
-
-    def at_detail(self, detail: Real) -> Field:
-        on = self._prepared()
-        return AtDetail(lambda p: on.sample(p, detail))
+    def _sample(self, on: _SliceBuffers, p: Vec3, detail: Real) -> Sample:
+        return on.sample(p, detail)
 
     def check_levels(self, levels: tuple[float, ...]) -> None:
         for level in levels:
