@@ -148,6 +148,7 @@ def test_the_remainder_is_attained_on_the_axis_of_a_circle() -> None:
     # The constant is 3/2 (I3 + r I4/(1 - q)); of that, 3/2 I3 is attained as t tends to 0.
     circle = 3 / 2 * 2 * math.pi / 2**1.5
     constant, radius = float(narrowest.constant[0]), float(narrowest.radius[0])
+    assert radius == pytest.approx(0.3 * 2**0.5, rel=1e-4)
     spread = 3 / 2 * 2 * math.pi / 2**2 * radius / (1 - 0.3)
     assert constant == pytest.approx(circle + spread, rel=1e-4)
     t = 1e-3
