@@ -10,19 +10,33 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-BLOCKS = [
-    block
-    for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
-    for block in re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
-]
+
+
+def blocks_of(page: Path) -> list[str]:
+    return re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+
+
+README = blocks_of(ROOT / "README.md")
+DOCS = [block for page in sorted((ROOT / "docs").glob("*.md")) for block in blocks_of(page)]
 
 
 def test_there_is_code() -> None:
-    assert len(BLOCKS) >= 3
+    assert len(README) >= 3
+    assert len(DOCS) >= 10
 
 
-@pytest.mark.parametrize("block", BLOCKS, ids=lambda b: b.splitlines()[-1][:40])
-def test_code_runs(block: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("block", README, ids=lambda b: b.splitlines()[-1][:40])
+def test_code_of_the_readme_runs(block: str, tmp_path: Path) -> None:
+    run_code(block, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("block", DOCS, ids=lambda b: b.splitlines()[-1][:40])
+def test_code_of_other_pages_runs(block: str, tmp_path: Path) -> None:
+    run_code(block, tmp_path)
+
+
+def run_code(block: str, tmp_path: Path) -> None:
     script = tmp_path / "example.py"
     script.write_text(block, encoding="utf-8")
     run = subprocess.run(

@@ -364,6 +364,7 @@ class Blended(Formula):
         return blend_union(a, b, 0.4)
 
 
+@pytest.mark.slow
 def test_blends_keep_their_promises() -> None:
     check_field(Blended(), rng=3, count=100)
     o = np.array([[0.1, 0.0, 3.0]])

@@ -393,10 +393,7 @@ KINDS = [BruteForceWinding, CountedWinding]
 
 @pytest.mark.parametrize(
     "name",
-    [
-        name if name in ("nested boxes", "strip") else pytest.param(name, marks=pytest.mark.slow)
-        for name in MESHES
-    ],
+    [name if name == "strip" else pytest.param(name, marks=pytest.mark.slow) for name in MESHES],
 )
 def test_first_hits_agree_with_samples_of_the_exact_value(name: str) -> None:
     vertices, faces = MESHES[name]
