@@ -17,6 +17,7 @@ from harnack.backend.lengths import length
 from harnack.distance.batches import in_batches
 from harnack.distance.closing_in import close_in
 from harnack.distance.meshes.surface import MeshSurface
+from harnack.distance.on_sheets import SheetSearch
 from harnack.distance.projection import Descent
 from harnack.distance.rim import RimDescent
 from harnack.distance.search import search
@@ -40,6 +41,8 @@ _TOLERANCE = 1e-6
 _BITS = 10
 # Radii about a foot in which it may be proved the nearest, in distances from it: powers of two.
 _FREE = range(8, -12, -1)
+# Sheets that are looked at for each point before cells are.
+_SHEETS = 16
 
 
 @dataclass(frozen=True)
@@ -90,6 +93,8 @@ def _in_order(
     x, start, above, lower = job.look(points)
     if mesh is not None:
         start = _nearer(x, start, mesh)
+    if surface.field.has_sheets:
+        start = job.on_sheets(x, start)
     found = search(surface, x, job.polish, start, _TOLERANCE * _size(surface, x), progress)
     found.feet = job.refined(x, found.feet)
     distance = _length(x - found.feet)
@@ -178,6 +183,18 @@ class _Points:
         if domain is not None and len(x):
             lower[~domain.contains_points(x)] = 0
         return x, self._within(start), above, lower
+
+    def on_sheets(self, points: FloatArray, start: FloatArray) -> FloatArray:
+        """The places (n, 3), or points of the surface on sheets where these are nearer."""
+        x = np.concatenate([points, np.nan_to_num(start)])
+        search = SheetSearch(self._prepared, max(float(np.abs(x).max(initial=0)), 1e-30), _SHEETS)
+
+        def look(p: Vec3, foot: Vec3) -> tuple[Vec3]:
+            away = length(foot - p)
+            return (search.closest(p, dr.select(dr.isnan(away), dr.inf, away))[0],)
+
+        (feet,) = in_batches(self._prepared.backend, look, points, start)
+        return np.where(np.isnan(feet), start, feet)
 
     def _within(self, feet: FloatArray) -> FloatArray:
         """The points (n, 3), NaN for those outside the field's domain: the surface is cut there."""
