@@ -16,8 +16,8 @@ from harnack.backend.extrema import fmax
 from harnack.backend.lengths import length
 from harnack.distance.batches import in_batches
 from harnack.distance.closing_in import close_in
+from harnack.distance.meshes.on_sheets import SheetSearch
 from harnack.distance.meshes.surface import MeshSurface
-from harnack.distance.on_sheets import SheetSearch
 from harnack.distance.projection import Descent
 from harnack.distance.rim import RimDescent
 from harnack.distance.search import search
