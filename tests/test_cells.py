@@ -160,7 +160,9 @@ def test_cells_are_empty_where_the_clearance_says_so() -> None:
     rest = ball.origin + (index_of(ball, empty=False) + 0.5) * ball.cell
     assert np.abs(np.linalg.norm(rest, axis=1) - 0.5).max() <= 1.01 * ball.cell
     empty = ball.origin + (index_of(ball, empty=True) + 0.5) * ball.cell
-    assert np.abs(np.linalg.norm(empty, axis=1) - 0.5).min() > 0.97 * ball.cell
+    # A ball around the cell and a sixteenth more: clearances 1.001 times as long would be seen.
+    least = 0.5 * 3**0.5 * (1 + 2 / 16) * ball.cell
+    assert least <= np.abs(np.linalg.norm(empty, axis=1) - 0.5).min() < 1.001 * least
     full = OccupiedCells.of(np.full(3, -1.0), np.full(3, 1.0), lambda x: np.zeros(len(x)), 8)
     assert not full.free.any()
     none = OccupiedCells.of(np.full(3, -1.0), np.full(3, 1.0), lambda x: np.full(len(x), 9.0), 8)
@@ -183,3 +185,14 @@ def test_sums_over_trails_are_those_over_single_edges() -> None:
         one, two = to_numpy(getattr(found, name)), to_numpy(getattr(other, name))
         assert (one > 0.05 * two).all()
         assert (one < 1.5 * two).all()
+
+
+def test_a_step_ends_at_its_margin() -> None:
+    """Steps 1.001 times as long would be seen."""
+    empty = np.ones((1, 1, 64), np.bool_)
+    empty[0, 0, 40] = False
+    cells = OccupiedCells(np.zeros(3), 1.0, (64, 1, 1), distances_to_full(empty))
+    backend = choose_backend("double")
+    o, d = to_vector3(backend, np.array([[0.5, 0.5, 0.5]])), to_vector3(backend, np.eye(3)[:1])
+    found = to_numpy(cells.upload(backend).free_until(o, d, backend.Float(0), backend.Float(60)))
+    assert found[0] == pytest.approx(39.5 + 1 / 16 - 1 / 64, abs=1e-9)

@@ -84,7 +84,10 @@ class UniformGrid:
     def run(self, p: Vec3, d: Vec3, length: Real) -> Real:
         """How far p + s d stays in empty cells; about `length` if it is that at least.
 
-        The end lies in the next cell, but within the margin of the last.
+        Proof. The cell of a point and all fewer than `free` away are empty, and so is what is
+        within the margin around each: the cube of these cells, wider by the margin. A step
+        leaves that cube by `margin` less `_ROUNDING` at most, so that all of it is empty; the rest
+        of the margin is for the rounding of positions. Steps end where a cell is not empty.
         """
 
         def state_of(s: Real) -> tuple[Real, Mask]:

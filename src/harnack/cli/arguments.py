@@ -173,7 +173,7 @@ def _add_repair(commands: Any) -> None:
     )  # fmt: skip
     one.add_argument("mesh", metavar="FILE", help="a mesh: .obj, .ply, .stl, .off, .glb or .gltf")
     one.add_argument(
-        "-o", "--output", metavar="FILE", help=".stl, .ply, .obj or .glb (FILE-repaired.ply)"
+        "-o", "--output", metavar="FILE", help=f"{', '.join(MESH_FILES)} (FILE-repaired.ply)"
     )
     one.add_argument(
         "--tolerance", type=_positive, metavar="PART",

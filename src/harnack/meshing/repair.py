@@ -17,7 +17,12 @@ import numpy as np
 from harnack.fields import SolidAngle, WindingNumber
 from harnack.geometry import MeshError, validate_mesh
 from harnack.geometry.singular import singular_loops, weld_vertices
-from harnack.meshing.checks import MeshingError, check_manifold, euler_characteristic
+from harnack.meshing.checks import (
+    MeshingError,
+    check_manifold,
+    directed_edges,
+    euler_characteristic,
+)
 from harnack.meshing.crossed import edges_through
 from harnack.meshing.marching import crossings_of, triangles_of
 from harnack.meshing.points import Boundary, box_cells, place_points
@@ -143,17 +148,13 @@ def _checked(mesh: Any) -> tuple[FloatArray, IntArray]:
     return vertices, faces
 
 
-def _directed(faces: IntArray) -> IntArray:
-    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-
-
 def _open_edges(faces: IntArray) -> IntArray:
     """(k, 2): edges of one face, as it runs them.
 
     Raises:
         MeshError: an edge of more than two faces, or of two that run it the same way.
     """
-    edges, count = _directed(faces), int(faces.max()) + 1
+    edges, count = directed_edges(faces), int(faces.max()) + 1
     keys = edge_keys(edges, count)
     found, index, uses = np.unique(keys, return_inverse=True, return_counts=True)
     several = np.flatnonzero(uses > 2)
@@ -284,7 +285,7 @@ def _normals(corners: FloatArray) -> FloatArray:
 def _check_rim(faces: IntArray, boundary: Boundary) -> None:
     """Raise unless patches end at the boundary, and run each of its edges as the mesh does: they
     are reversed afterwards."""
-    directed = {(int(a), int(b)) for a, b in _directed(faces)}
+    directed = {(int(a), int(b)) for a, b in directed_edges(faces)}
     rim = {(a, b) for a, b in directed if (b, a) not in directed}
     if rim != {(int(a), int(b)) for a, b in boundary.edges}:
         raise MeshingError(

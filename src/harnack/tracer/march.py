@@ -164,6 +164,9 @@ class March:
         t: a tenth of the gap is left to that, and no step is longer than the cone takes to widen
         by so much, unless the level is never met and f leaves it faster than the cone widens.
 
+        With `occupied` what follows a proved step is passed as well, as far as it lies in cells
+        that hold no level (`UniformGrid.run` has the proof): a union of free intervals is free.
+
         ahead: of a field with sheets, the crossing at `end`, on lanes where there is one. Those
         lanes look at that point as well. Accepted there, they hit the sheet or have passed it: a
         miss, with the step that the value behind the sheet allows from there. With `hysteresis`
