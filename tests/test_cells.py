@@ -56,6 +56,23 @@ def test_empty_cells_are_off_the_level(seed: int) -> None:
     assert off_the_level(field, x).min() < 0.01  # the surface is in some of them
 
 
+@pytest.mark.parametrize("precision", ["single", "double"])
+def test_coarse_samples_are_w_less_a_whole_number(precision: str) -> None:
+    field = broken()
+    x = np.random.default_rng(1).normal(size=(4000, 3))
+    backend = choose_backend(precision)  # type: ignore[arg-type]
+    p = to_vector3(backend, x)
+    sample = field.prepare(backend).evaluate_modulo_one(p)
+    error = to_numpy(backend.Float(sample.error))
+    whole = winding_sum(field.mesh.vertices[field.mesh.triangles])(x)
+    off = to_numpy(sample.value) - whole
+    slack = np.linalg.norm(to_numpy(sample.gradient), axis=1) * 4 * backend.epsilon
+    off = np.abs(off - np.round(off))
+    assert (off <= error + slack + 8 * backend.epsilon).all()
+    assert off.max() > 1e-5  # coarse: not all edges were summed up
+    assert np.median(error) < 0.05
+
+
 def test_extents_hold_the_level_set_and_the_triangles() -> None:
     field = broken()
     extent = field.extent((0.5,))

@@ -16,6 +16,7 @@ from harnack.fields.field import Field, Sample
 from harnack.geometry import mesh_shapes, shapes
 from harnack.rendering import Camera, Material, register, render, shape
 from harnack.rendering.mitsuba.world import World
+from harnack.rendering.pictures import shaded
 from harnack.rendering.pictures.floor import Floor
 from harnack.rendering.pictures.occlusion import visible_sky
 from harnack.rendering.pictures.pixels import grid_offsets, in_tiles
@@ -274,3 +275,21 @@ def test_tiles_hold_every_pixel_once(size: tuple[int, int]) -> None:
     if size == (9, 5):  # the first tile, and the first of the narrow one at the right
         assert order[:16].tolist() == [y * 9 + x for y in range(4) for x in range(4)]
         assert order[32:36].tolist() == [8, 17, 26, 35]
+
+
+def test_what_first_rays_have_seen_is_not_traced_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Edges are the mean of nine samples, one of which is that of the first ray: the same picture
+    as if all nine were traced anew."""
+    counts: list[int] = []
+    own = shaded._Painter.refine
+
+    def refine(self: Any, chosen: Any, offsets: Any, *rest: Any) -> Any:
+        counts.append(len(offsets))
+        return own(self, chosen, offsets, *rest)
+
+    monkeypatch.setattr(shaded._Painter, "refine", refine)
+    image = drawn(shape(Sphere()), spp=9)
+    monkeypatch.setattr(shaded, "grid_offsets", lambda spp: grid_offsets(spp) + 1e-12)
+    again = drawn(shape(Sphere()), spp=9)
+    assert set(counts) == {8, 9}
+    np.testing.assert_allclose(image, again, atol=2e-5)

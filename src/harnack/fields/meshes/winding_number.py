@@ -154,15 +154,18 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
 
     def evaluate(self, p: Vec3) -> Sample:
         """w as it is, jumps and all, with what is known of it as a lift."""
+        on, frame = self._upward(p)
+        return _at_start(on, frame, on.winding.start(frame, 0, True), 1.0)
+
+    def evaluate_modulo_one(self, p: Vec3) -> Sample:
+        """w less a whole number, other ones at other points, as coarsely as can be."""
+        on, frame = self._upward(p)
+        return _at_start(on, frame, on.backend.Float(0), 0.0)
+
+    def _upward(self, p: Vec3) -> tuple[_MeshBuffers, Frame]:
+        """Rays from p: everything lies ahead, nothing has been passed."""
         on = self._on(p)
-        # A ray from p of length zero: everything lies ahead, nothing has been passed.
-        up = on.backend.Array3f(0, 0, 1)
-        frame = Frame.along(on.backend, on.unit(p), up)
-        turns = on.winding.start(frame, 0, True)
-        nowhere = Crossing(0.0, on.backend.UInt32(NO_SHEET), 0.0, up)
-        sample = on.winding.on_stretch(frame, frame.o, nowhere, turns, on.backend.Float(1))
-        known = tuple(one for one in sample.known if not isinstance(one, LineLipschitz))
-        return lengthened(dataclasses.replace(sample, known=known), on.size)
+        return on, Frame.along(on.backend, on.unit(p), on.backend.Array3f(0, 0, 1))
 
     def next_crossing(
         self, o: Vec3, d: Vec3, after: Crossing, t_max: Real, active: Mask
@@ -230,6 +233,14 @@ class _MeshBuffers(UnitCoordinates):
 
     winding: ExactWinding | TreeWinding
     rays: TriangleRays
+
+
+def _at_start(on: _MeshBuffers, frame: Frame, turns: Real, detail: float) -> Sample:
+    """The sample where rays begin; turns: the crossings that are ahead."""
+    nowhere = Crossing(0.0, on.backend.UInt32(NO_SHEET), 0.0, on.backend.Array3f(0, 0, 1))
+    sample = on.winding.on_stretch(frame, frame.o, nowhere, turns, on.backend.Float(detail))
+    known = tuple(one for one in sample.known if not isinstance(one, LineLipschitz))
+    return lengthened(dataclasses.replace(sample, known=known), on.size)
 
 
 class _Stretch(Field):

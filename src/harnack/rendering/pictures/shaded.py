@@ -37,6 +37,8 @@ from harnack.rendering.pictures.through import Through
 
 # Rays of one band.
 _RAYS_A_BAND = 2**17
+# Where in its pixel the first ray goes through.
+_MIDDLE = 0.5
 # Neighbours that differ by more than this, of 255, are an edge.
 _EDGE = 16
 # The share of the time that is spent on the first rays, as the progress bar guesses.
@@ -103,7 +105,7 @@ def shaded(
     seen = _Seen.nothing(mi, count)
     for start, stop in bands(count, _RAYS_A_BAND):
         pixel = uploaded(mi, order[start:stop])
-        part = painter.look(pixel, mi.Vector2f(0.5))
+        part = painter.look(pixel, mi.Vector2f(_MIDDLE))
         dr.scatter(seen, part, pixel)
         dr.eval(seen)
         dr.sync_thread()
@@ -116,15 +118,18 @@ def shaded(
     if finder is not None:
         for start, stop in bands(count, _RAYS_A_BAND):
             pixel = uploaded(mi, order[start:stop])
-            ray, _ = painter.ray(pixel, mi.Vector2f(0.5))
+            ray, _ = painter.ray(pixel, mi.Vector2f(_MIDDLE))
             there = dr.gather(mi.Vector3f, seen.position, pixel)
             again[order[start:stop]] |= finder.find(ray, there)
     edges = order[again[order]] if spp > 1 else order[:0]
     offsets = grid_offsets(spp)
-    for start, stop in bands(len(edges), max(1, _RAYS_A_BAND // len(offsets))):
+    traced = (offsets == _MIDDLE).all(axis=1)  # what a pixel's first ray has seen
+    rest, share = offsets[~traced], float(traced.mean())
+    for start, stop in bands(len(edges), _RAYS_A_BAND // max(1, len(rest))):
         chosen = edges[start:stop]
-        colour, gone = painter.refine(chosen, offsets, seen.position, sky)
-        image.reshape(-1, 3)[chosen] = colour
+        colour, gone = painter.refine(chosen, rest, seen.position, sky)
+        first = image.reshape(-1, 3)[chosen]
+        image.reshape(-1, 3)[chosen] = colour + share * (first - colour)
         lost += gone
         advance((1 - _FIRST) * (stop - start) / len(edges))
     return image, lost

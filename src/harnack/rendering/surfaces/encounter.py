@@ -13,6 +13,7 @@ import drjit as dr
 
 from harnack.backend import Mask, Real, Vec3  # at run time: Dr.Jit reads SurfaceHit's annotations
 from harnack.backend.lengths import length as norm
+from harnack.fields.look import Sample
 from harnack.tracer import Status
 
 if TYPE_CHECKING:
@@ -83,7 +84,8 @@ def meet_surface(
         step, side = dr.zeros(type(step)), trace.side
     t = dr.maximum(dr.select(met, trace.t, 0) + step, 0)
     p = dr.fma(vector(t), d, o)
-    sample = prepared.sample(p)
+    sheets = prepared.field.has_sheets
+    sample = _sample_where(prepared, p, d, smooth) if sheets else prepared.sample(p)
     length = norm(sample.gradient)
     normal = dr.select(length > 0, sample.gradient / length, -d)
     shading = normal if sample.normal is None else sample.normal
@@ -106,6 +108,31 @@ def meet_surface(
     if not prepared.field.has_sheets:
         return encounter
     return dr.select(trace.on_sheet, _on_sheet(prepared, o, d, trace, encounter), encounter)
+
+
+def _sample_where(prepared: PreparedLevelSet, p: Vec3, d: Vec3, active: Mask) -> Sample:
+    """Value, error, gradient and normal at p where active, zeros elsewhere, and no promises.
+
+    d: of the ray; a point without a slope has the normal -d.
+
+    A loop of one trip or of none: of a broken mesh a look costs more than a ray that meets a
+    triangle or nothing, and most rays do.
+    """
+    real, vector = prepared.backend.Float, prepared.backend.Array3f
+
+    def once(trip: Any, *_: Any) -> tuple[Any, ...]:
+        sample = prepared.sample(p)
+        length = norm(sample.gradient)
+        normal = dr.select(length > 0, sample.gradient / length, -d)
+        shading = vector(normal if sample.normal is None else sample.normal)
+        return trip + 1, real(sample.value), real(sample.error), vector(sample.gradient), shading
+
+    def is_first(trip: Any, *_: Any) -> Mask:
+        return active & (trip < 1)
+
+    start = prepared.backend.UInt32(0), real(0), real(0), vector(0), vector(0)
+    _, value, error, gradient, normal = dr.while_loop(start, is_first, once, label="at hits")
+    return Sample(value, gradient, (), error, normal=normal)
 
 
 def _on_sheet(
