@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +13,8 @@ import harnack as hk
 from harnack.cli import main
 from harnack.geometry import MeshError
 from harnack.geometry.mesh_shapes import icosphere
-from harnack.meshing.crossed import edges_through
 from harnack.meshing.repair import _collapsed  # pyright: ignore[reportPrivateUsage]
+from tests.oracles.triangle_pairs import intersecting_pairs
 
 AXES = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, -0.6, -0.8))
 
@@ -46,6 +44,20 @@ def check(given: trimesh.Trimesh, euler: int = 2) -> trimesh.Trimesh:
     if len(made.vertices) > n:
         w = field.value(made.vertices[n:], precision="double")
         assert np.abs(w - 0.5).max() <= 1e-6
+    patches = np.asarray(made.faces)[m:]
+    assert not (intersecting_pairs(np.asarray(made.vertices), np.asarray(made.faces)) >= m).any()
+    # Refined: centres are within the tolerance, by the slope there.
+    facts = made.metadata["harnack"]
+    centre = made.vertices[patches].mean(axis=1)
+    off = field.value(centre, precision="double") - 0.5
+    slope = np.linalg.norm(field.gradient(centre, precision="double"), axis=1)
+    rim = trimesh.grouping.group_rows(given.edges_sorted, require_count=1)
+    size = np.ptp(given.vertices[np.unique(given.edges_sorted[rim])], axis=0).max()
+    ends = {tuple(edge) for edge in given.edges_sorted[rim].tolist()}
+    sides = np.sort(patches[:, [[0, 1], [1, 2], [2, 0]]], axis=2).tolist()
+    between = np.array([all(tuple(side) in ends for side in face) for face in sides])
+    assert (np.abs(off) <= 1e-3 * size * slope)[~between].all()
+    assert facts["refined"]
     return made
 
 
@@ -110,7 +122,7 @@ def test_patches_that_meet_the_mesh_are_refused() -> None:
         np.concatenate([large.faces, faces + len(large.vertices)]),
         process=False,
     )
-    with pytest.raises(hk.MeshingError, match="meet triangles of the mesh"):
+    with pytest.raises(hk.MeshingError, match="meet [0-9]+ triangles of the mesh"):
         hk.repair(together, spacing=0.08)
 
 
@@ -168,46 +180,6 @@ def test_settings_that_are_refused() -> None:
         hk.repair(ball(), tolerance=0)
     with pytest.raises(ValueError, match="spacing"):
         hk.repair(ball(), spacing=float("nan"))
-
-
-def crosses(p: Any, q: Any, triangle: Any) -> bool:
-    """Whether the open segment pq passes through the inside of a triangle, in exact arithmetic."""
-    p, q, a, b, c = (np.array([Fraction(float(t)) for t in x]) for x in (p, q, *triangle))
-
-    def volume(a: Any, b: Any, c: Any, d: Any) -> Fraction:
-        u, v, w = b - a, c - a, d - a
-        return (
-            u[0] * (v[1] * w[2] - v[2] * w[1])
-            + u[1] * (v[2] * w[0] - v[0] * w[2])
-            + u[2] * (v[0] * w[1] - v[1] * w[0])
-        )
-
-    if volume(a, b, c, p) * volume(a, b, c, q) >= 0:
-        return False
-    sides = [volume(p, q, x, y) for x, y in ((a, b), (b, c), (c, a))]
-    return all(s > 0 for s in sides) or all(s < 0 for s in sides)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_edges_through_triangles_are_those_of_exact_arithmetic(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    x = rng.normal(size=(40, 3))
-    faces = np.array([rng.choice(40, 3, replace=False) for _ in range(24)])
-    one, other = faces[:12], faces[12:]
-    edges = {tuple(sorted(pair)) for f in one.tolist() for pair in itertools.combinations(f, 2)}
-    expected = sum(
-        any(crosses(x[a], x[b], x[f]) for f in other if a not in f and b not in f) for a, b in edges
-    )
-    assert expected > 3
-    assert edges_through(x, one, other) == expected
-
-
-def test_neighbours_do_not_pass_through_each_other() -> None:
-    vertices, faces = icosphere(2)
-    assert edges_through(vertices, faces, faces) == 0
-    moved = vertices.copy()
-    moved[0] *= -1.5
-    assert edges_through(moved, faces, faces) > 0
 
 
 def test_a_middle_goes_to_an_end_of_its_edge() -> None:

@@ -22,11 +22,12 @@ from harnack.meshing.checks import (
     check_manifold,
     directed_edges,
     euler_characteristic,
+    singular_vertices,
 )
-from harnack.meshing.crossed import edges_through
+from harnack.meshing.intersections import intersecting_faces
 from harnack.meshing.marching import crossings_of, triangles_of
-from harnack.meshing.points import Boundary, box_cells, place_points
-from harnack.meshing.refinement import refined, smoothed
+from harnack.meshing.points import Boundary, Places, box_cells, place_points
+from harnack.meshing.refinement import improved, refined, smoothed
 from harnack.meshing.samples import LevelFunction
 from harnack.meshing.tetrahedra import IntArray, delaunay, edge_keys
 
@@ -38,11 +39,13 @@ if TYPE_CHECKING:
 __all__ = ["repair"]
 
 _LEVEL = 2 * math.pi
-# Cells across the patches at first, and how often they are made smaller where that fails.
+# Cells across the holes at first, and how often they are made smaller where that fails.
 _ACROSS = 24
-_ATTEMPTS = 5
+_ATTEMPTS = 6
 # How often edges of holes that are too near to others are halved for the tetrahedra.
 _MOST_CUTS = 5
+# How often patches that meet the mesh are made again, of smaller cells.
+_MOST_MET = 1
 # How far w may be from 1/2, modulo 1, at vertices of patches.
 _NEAR = 1e-6
 
@@ -60,8 +63,8 @@ def repair(
     mesh: anything with `vertices` (n, 3) and `faces` (m, 3): every edge has one or two faces, which
         agree on its two sides.
     tolerance: how far triangles of the patches may be from the surface, as a part of the size of
-        the patches' box, sampled and not proved. Where triangles so small would pass through each
-        other, at sharp corners of holes, patches stay coarser.
+        the box around all holes, sampled and not proved; but for triangles between three edges of
+        holes, which stay as they are.
     spacing: of cells before anything is refined, in the mesh's unit; None chooses.
     seed: of the small random moves that keep points in general position.
     progress: told what is being done.
@@ -71,7 +74,9 @@ def repair(
         order; vertices inside of patches and their faces follow. Every edge has two faces, which
         agree, and no patch meets another triangle but at the edges and corners that they share.
         `metadata["harnack"]` has holes (loops of edges that were open), patches (triangles added),
-        spacing, evaluations and the Euler characteristic. A closed mesh gets nothing added.
+        refined (whether they are within the tolerance: they stay as the cells cut them if finer
+        ones would pass through each other, however small cells are made there), spacing,
+        evaluations and the Euler characteristic. A closed mesh gets nothing added.
 
     Raises:
         MeshError: a ValueError, for a mesh that is not as said above; the message says where.
@@ -88,38 +93,53 @@ def repair(
     vertices, faces = _checked(mesh)
     edges = _open_edges(faces)
     if not len(edges):
-        return _joined(vertices, faces, _Patches(vertices[:0], faces[:0], 0.0, 0), 0)
+        return _joined(vertices, faces, _Patches(vertices[:0], faces[:0], True, 0.0, 0), 0)
     loops = singular_loops(edges, np.ones(len(edges), np.int64))
-    field = SolidAngle([vertices[loop] for loop in loops])
-    function = LevelFunction(field, _LEVEL)
-    hull: Any = field.extent((_LEVEL,))
-    lower, upper = (np.array(end, np.float64) for end in hull.bounds())
-    size = float((upper - lower).max())
+    function = LevelFunction(SolidAngle([vertices[loop] for loop in loops]), _LEVEL)
+    size = float(np.ptp(vertices[np.unique(edges)], axis=0).max())
     cell = size / _ACROSS if spacing is None else float(spacing)
-    for attempt in range(_ATTEMPTS if spacing is None else 1):
-        report(f"cells of {cell:.3g}")
+    finer: tuple[Places, ...] = ()
+    times_met = 0
+    for attempt in range(_ATTEMPTS):
+        last = attempt == _ATTEMPTS - 1
+        report(f"cells of {cell:.3g}" + ", smaller in places" * bool(finer))
         try:
             patches = _patches(
-                function, vertices, edges, (lower, upper), cell, tolerance * size, seed, report
+                function, vertices, edges, cell, finer, tolerance * size, seed, last, report
             )
             result = _joined(vertices, faces, patches, len(loops))
             _check(vertices, faces, result, report)
-        except MeshingError:
-            if spacing is not None or attempt == _ATTEMPTS - 1:
+        except _LocalError as error:
+            times_met += isinstance(error, _MetError)
+            if last or times_met > _MOST_MET:
                 raise
-            cell *= 0.6
+            report(f"{error} ({len(error.points)} places)")
+            finer = (*finer, Places(error.points, 2 * cell * 0.5 ** len(finer)))
         else:
             return result
     raise AssertionError("unreachable: the last attempt returns or raises")
 
 
+class _LocalError(MeshingError):
+    """What smaller cells about some points (n, 3) may mend."""
+
+    def __init__(self, message: str, points: FloatArray) -> None:
+        super().__init__(message)
+        self.points = points
+
+
+class _MetError(_LocalError):
+    """Patches meet the mesh."""
+
+
 @dataclass(frozen=True)
 class _Patches:
     """What is added: vertices (k, 3), and faces (p, 3) whose indices below the number of vertices
-    given are of these."""
+    given are of these. is_fine: whether they were refined to the tolerance."""
 
     vertices: FloatArray
     faces: IntArray
+    is_fine: bool
     spacing: float
     evaluations: int
 
@@ -181,44 +201,54 @@ def _patches(
     function: LevelFunction,
     vertices: FloatArray,
     edges: IntArray,
-    box: tuple[FloatArray, FloatArray],
     spacing: float,
+    finer: tuple[Places, ...],
     tolerance: float,
     seed: int,
+    last: bool,
     report: Callable[[str], None],
 ) -> _Patches:
     """The level set, ending at the edges (k, 2) of the mesh.
+
+    last: whether patches that cannot be refined will do.
 
     Raises:
         MeshingError: as `mesh`; or Delaunay's tetrahedra lack an edge.
     """
     rim, place = np.unique(edges, return_inverse=True)
     boundary = Boundary(vertices[rim], place.reshape(-1, 2))
-    root = box_cells(box[0] - 0.5 * spacing, box[1] + 0.5 * spacing, spacing, exact=False)
+    hull: Any = function.field.extent((_LEVEL,))
+    lower, upper = (np.array(end, np.float64) for end in hull.bounds())
+    root = box_cells(lower - 0.5 * spacing, upper + 0.5 * spacing, spacing, exact=False)
     cut, middles = boundary, np.zeros((0, 2), np.int64)
-    points = place_points(function, root, cut, None, seed)
-    tets = delaunay(points.points)
-    for _ in range(_MOST_CUTS):
+    for _ in range(_MOST_CUTS + 1):
+        points = place_points(function, root, cut, None, seed, finer)
+        tets = delaunay(points.points)
         lacks = ~tets.has_edges(cut.edges)
         if not lacks.any():
             break
         middles = np.concatenate([middles, cut.edges[lacks]])
         cut = cut.split(lacks)
-        points = place_points(function, root, cut, None, seed)
-        tets = delaunay(points.points)
-    if lacking := int((~tets.has_edges(cut.edges)).sum()):
-        raise MeshingError(
-            f"{lacking} boundary edges of the mesh are too near to others for a patch that ends at "
-            "them: subdivide the mesh there, or choose a smaller `spacing`"
+    else:
+        raise _LocalError(
+            f"{int(lacks.sum())} boundary edges of the mesh are too near to others for a patch "
+            "that ends at them: subdivide the mesh there, or choose a smaller `spacing`",
+            cut.points[cut.edges[lacks]].mean(axis=1),
         )
     report(f"{len(points.points):,} points, {len(tets.corners):,} tetrahedra")
     x, faces = triangles_of(function, points, tets, crossings_of(function, points, tets))
     for k, ends in reversed(list(enumerate(middles.tolist(), start=len(rim)))):
         faces = _collapsed(x, faces, k, ends)
     if not len(faces):
-        raise MeshingError("no patch was found: choose a smaller `spacing`")
-    _check_rim(faces, boundary)
-    x, faces = _finished(function, x, faces, tolerance, report)
+        raise _LocalError("no patch was found: choose a smaller `spacing`", boundary.points)
+    _check_rim(x, faces, boundary)
+    is_fine = True
+    try:
+        x, faces = _finished(function, x, faces, tolerance, report)
+    except _LocalError:
+        if not last or len(intersecting_faces(x, faces)):
+            raise
+        is_fine = False
     # Faces of level sets are seen from where w is greater, those of meshes from outside.
     faces = faces[:, ::-1]
     kept = np.unique(faces)
@@ -226,7 +256,7 @@ def _patches(
     index = np.full(len(x), -1, np.int64)
     index[: len(rim)] = rim
     index[inner] = len(vertices) + np.arange(len(inner))
-    return _Patches(x[inner], index[faces], spacing, function.evaluations)
+    return _Patches(x[inner], index[faces], is_fine, spacing, function.evaluations)
 
 
 def _finished(
@@ -236,28 +266,43 @@ def _finished(
     tolerance: float,
     report: Callable[[str], None],
 ) -> tuple[FloatArray, IntArray]:
-    """Patches refined and smoothed; where they would pass through themselves, which happens at
-    sharp corners of holes, refined alone, or as the tetrahedra cut them."""
-    even = smoothed(function, x, faces, None)
-    finer, split = refined(function, even, faces, 0.5 * tolerance, None, report)
-    finer = smoothed(function, finer, split, None)
-    if not edges_through(finer, split, split):
-        return finer, split
-    report("refining again, without smoothing")
-    finer, split = refined(function, x, faces, 0.5 * tolerance, None, report)
-    return (x, faces) if edges_through(finer, split, split) else (finer, split)
+    """Vertices and faces of patches refined to the tolerance: smoothed and improved, or only
+    smoothed, or as they are, whichever first does not pass through itself.
+
+    Raises:
+        MeshingError: all do; triangles so small turn over each other beside sharp corners of holes.
+    """
+    bad = x[:0]
+    for way in ("improving", "smoothing", "refining alone"):
+        report(way)
+        finer, split = (x if way == "refining alone" else smoothed(function, x, faces, None)), faces
+        finer, split = refined(function, finer, split, 0.5 * tolerance, None, report)
+        if way == "improving":
+            finer, split = improved(function, finer, split, 0.5 * tolerance, None, report)
+        elif way == "smoothing":
+            finer = smoothed(function, finer, split, None)
+        met = finer[split[intersecting_faces(finer, split)]].mean(axis=1)
+        bad = np.concatenate([met, finer[_new_singular(faces, split)]])
+        if not len(bad):
+            return finer, split
+    raise _LocalError("the patches meet each other: choose a smaller `spacing`", bad)
+
+
+def _new_singular(before: IntArray, after: IntArray) -> IntArray:
+    """Vertices at which faces are not a manifold any more; holes may touch in others."""
+    return np.setdiff1d(singular_vertices(after), singular_vertices(before))
 
 
 def _collapsed(x: FloatArray, faces: IntArray, middle: int, ends: list[int]) -> IntArray:
-    """The faces with a vertex in the middle of a boundary edge moved to one of its ends: that which
-    turns the faces around it less.
+    """The faces with a vertex in the middle of a boundary edge moved to one of its ends: that with
+    which fewer faces meet or, if they are as many, the faces around it are turned less.
 
     Raises:
         MeshingError: both ends would join more than the two faces at the edge.
     """
     around = (faces == middle).any(axis=1)
-    star = faces[around]
-    best = -np.inf, star
+    star, rest = faces[around], faces[~around]
+    found: list[tuple[int, float, IntArray]] = []
     for end in ends:
         joined = (faces == end).any(axis=1)
         if len(np.intersect1d(star, faces[joined])) != 3:  # these two, and the face's third corner
@@ -265,15 +310,17 @@ def _collapsed(x: FloatArray, faces: IntArray, middle: int, ends: list[int]) -> 
         moved = np.where(star == middle, end, star)
         kept = ~(star == end).any(axis=1)
         one, other = _normals(x[star[kept]]), _normals(x[moved[kept]])
-        worst = float((one * other).sum(axis=1).min(initial=1.0))
-        if worst > best[0]:
-            best = worst, moved[kept]
-    if best[0] == -np.inf:
-        raise MeshingError(
+        turned = float((one * other).sum(axis=1).min(initial=1.0))
+        made = np.concatenate([rest, moved[kept]])
+        is_moved = np.arange(len(made)) >= len(rest)
+        found.append((len(intersecting_faces(x, made, is_moved)), -turned, made))
+    if not found:
+        raise _LocalError(
             "boundary edges of the mesh are too near to others for patches that end at them: "
-            "subdivide the mesh there, or choose a smaller `spacing`"
+            "subdivide the mesh there, or choose a smaller `spacing`",
+            x[[middle]],
         )
-    return np.concatenate([faces[~around], best[1]])
+    return min(found, key=lambda one: one[:2])[2]
 
 
 def _normals(corners: FloatArray) -> FloatArray:
@@ -282,15 +329,17 @@ def _normals(corners: FloatArray) -> FloatArray:
     return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
 
 
-def _check_rim(faces: IntArray, boundary: Boundary) -> None:
+def _check_rim(x: FloatArray, faces: IntArray, boundary: Boundary) -> None:
     """Raise unless patches end at the boundary, and run each of its edges as the mesh does: they
     are reversed afterwards."""
     directed = {(int(a), int(b)) for a, b in directed_edges(faces)}
     rim = {(a, b) for a, b in directed if (b, a) not in directed}
-    if rim != {(int(a), int(b)) for a, b in boundary.edges}:
-        raise MeshingError(
+    wrong = rim ^ {(int(a), int(b)) for a, b in boundary.edges}
+    if wrong:
+        raise _LocalError(
             "the patches do not end at the edges of the holes: cells are too large for them; "
-            "choose a smaller `spacing`"
+            "choose a smaller `spacing`",
+            x[np.array(sorted(wrong))].mean(axis=1),
         )
 
 
@@ -307,6 +356,7 @@ def _joined(
     result.metadata["harnack"] = {
         "holes": holes,
         "patches": len(patches.faces),
+        "refined": patches.is_fine,
         "spacing": patches.spacing,
         "evaluations": patches.evaluations,
         "euler_characteristic": euler_characteristic(together),
@@ -325,21 +375,29 @@ def _check(
     report("checking the patches")
     x = np.asarray(result.vertices, np.float64)
     together = np.asarray(result.faces, np.int64)
-    patches = together[len(faces) :]
-    check_manifold(together)
-    w = WindingNumber(vertices, faces).value(x[len(vertices) :], precision="double")
+    try:
+        check_manifold(together)
+    except MeshingError as error:
+        raise _LocalError(str(error), x[singular_vertices(together)]) from None
+    added = x[len(vertices) :]
+    w = WindingNumber(vertices, faces).value(added, precision="double")
     off = np.abs(w - np.floor(w) - 0.5)
     if not (off <= _NEAR).all():
-        raise MeshingError(
+        raise _LocalError(
             f"the winding number is off 1/2 by {off.max():.2g} at a vertex of the patches: choose "
-            "a smaller `spacing`"
+            "a smaller `spacing`",
+            added[off > _NEAR],
         )
-    met = edges_through(x, patches, faces) | edges_through(x, faces, patches)
-    if met:
-        raise MeshingError(
-            f"the patches meet triangles of the mesh in {met:,} places, where the winding number "
-            "jumps: the hole cannot be closed by its 1/2 level alone; remove the triangles that "
-            "stand in it, or draw the mesh with WindingNumber, which needs no repair"
-        )
-    if edges_through(x, patches, patches):
-        raise MeshingError("the patches meet each other: choose a smaller `spacing`")
+    is_patch = np.arange(len(together)) >= len(faces)
+    met = intersecting_faces(x, together, is_patch)
+    if not len(met):
+        return
+    places = x[together[met[is_patch[met]]]].mean(axis=1)
+    if is_patch[met].all():
+        raise _LocalError("the patches meet each other: choose a smaller `spacing`", places)
+    raise _MetError(
+        f"the patches meet {int((~is_patch[met]).sum()):,} triangles of the mesh, where the "
+        "winding number jumps: the hole cannot be closed by its 1/2 level alone; remove the "
+        "triangles that stand in it, or draw the mesh with WindingNumber, which needs no repair",
+        places,
+    )

@@ -50,7 +50,7 @@ class _WindingModuloOne(Field):
     """A winding number modulo 1: continuous off the singular edges, sheets or not.
 
     winding: samples of it promise what they do of its lift, with all jumps taken out; the lift and
-        w differ by whole numbers. They are coarse ones, which cost half as much: with close ones 2 %
+        w differ by whole numbers. They are coarse, which costs half as much: with close ones 2 %
         fewer cells are full.
     """
 
