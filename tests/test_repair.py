@@ -122,7 +122,7 @@ def test_patches_that_meet_the_mesh_are_refused() -> None:
         np.concatenate([large.faces, faces + len(large.vertices)]),
         process=False,
     )
-    with pytest.raises(hk.MeshingError, match="meet [0-9]+ triangles of the mesh"):
+    with pytest.raises(hk.MeshingError, match=r"meet \d+ triangles of the mesh"):
         hk.repair(together, spacing=0.08)
 
 

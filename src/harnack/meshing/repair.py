@@ -221,15 +221,18 @@ def _patches(
     lower, upper = (np.array(end, np.float64) for end in hull.bounds())
     root = box_cells(lower - 0.5 * spacing, upper + 0.5 * spacing, spacing, exact=False)
     cut, middles = boundary, np.zeros((0, 2), np.int64)
-    for _ in range(_MOST_CUTS + 1):
-        points = place_points(function, root, cut, None, seed, finer)
-        tets = delaunay(points.points)
+    points = place_points(function, root, cut, None, seed, finer)
+    tets = delaunay(points.points)
+    for _ in range(_MOST_CUTS):
         lacks = ~tets.has_edges(cut.edges)
         if not lacks.any():
             break
         middles = np.concatenate([middles, cut.edges[lacks]])
         cut = cut.split(lacks)
-    else:
+        points = place_points(function, root, cut, None, seed, finer)
+        tets = delaunay(points.points)
+    lacks = ~tets.has_edges(cut.edges)
+    if lacks.any():
         raise _LocalError(
             f"{int(lacks.sum())} boundary edges of the mesh are too near to others for a patch "
             "that ends at them: subdivide the mesh there, or choose a smaller `spacing`",
