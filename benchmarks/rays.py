@@ -22,6 +22,7 @@ RULES: tuple[tuple[str, str | None, float | None], ...] = (
     ("slope, over-stepping", "slope", 1.4),
     ("caps", "caps", 1.0),
     ("caps, over-stepping", "caps", 1.4),
+    ("all proofs, over-stepping", None, None),
 )
 
 
