@@ -23,12 +23,15 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.tree.walk import Node, State
 
-__all__ = ["FAR", "NO_CELL", "CellTree", "SurfaceCells"]
+__all__ = ["FAR", "Best", "CellTree", "SurfaceCells"]
 
-NO_CELL = 0xFFFFFFFF
 FAR = 1e150
 """Coordinates of feet that there are not, and the thickness of slabs that say nothing."""
 _LEAF_SIZE = 4
+# Feet closer to one another than so many half cells lead to the same place.
+_APART = 6.0
+# Of a cell's spread: how much nearer than it seems the surface may be, where that is not proved.
+_DOUBT = 0.25
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,10 @@ class SurfaceCells:
     centre: (n, 3). half: (n,) half the length of an edge.
     foot: (n, 3) a point of the surface, no farther from the centre than the cell is wide, or FAR.
     normal: (n, 3), offset, thickness: (n,) the surface within the ball around the cell has
-        |normal . (y - centre) - offset| <= thickness; FAR where nothing is known.
+        |normal . (y - centre) - offset| <= thickness, which is FAR where nothing is known. The
+        normal is zero where no plane is known that is nearly the surface.
+    spread: (n,) within this radius about its foot the surface is nearly that plane.
+    rim: (n, 3) a point of the rim at which a domain cuts the surface, or FAR.
     """
 
     centre: FloatArray
@@ -47,6 +53,17 @@ class SurfaceCells:
     normal: FloatArray
     offset: FloatArray
     thickness: FloatArray
+    spread: FloatArray
+    rim: FloatArray
+
+    @classmethod
+    def unknown(cls, centre: FloatArray, half: FloatArray) -> SurfaceCells:
+        """Cubes of which nothing is known."""
+        n = len(half)
+        far, zero = np.full((n, 3), FAR), np.zeros(n)
+        return cls(
+            centre, half, far, np.zeros((n, 3)), zero, np.full(n, FAR), zero.copy(), far.copy()
+        )
 
     def __len__(self) -> int:
         return len(self.half)
@@ -63,6 +80,16 @@ class SurfaceCells:
 
 
 @dataclass(frozen=True)
+class Best:
+    """The nearest point of the surface so far: its place, how far it is, and a radius about it
+    within which none is nearer."""
+
+    foot: Vec3
+    distance: Real
+    free: Real
+
+
+@dataclass(frozen=True)
 class CellTree:
     """Cells on a backend; there is at least one."""
 
@@ -70,69 +97,73 @@ class CellTree:
 
     @classmethod
     def of(cls, backend: Backend, cells: SurfaceCells) -> CellTree:
-        hierarchy = build_hierarchy(cells.centre, leaf_size=_LEAF_SIZE)
-        number = np.arange(len(cells), dtype=np.float64)
+        # Points of the rim are feet of cells of their own, of which nothing else is known.
+        cut = np.flatnonzero(cells.rim[:, 0] < FAR)
+        both = np.concatenate([np.arange(len(cells)), cut])
+        number = np.where(np.arange(len(both)) < len(cells), both, -1.0)
         records = np.column_stack([
-            cells.centre, cells.half, cells.foot, cells.thickness, cells.normal, cells.offset,
-            number,
+            cells.centre[both], cells.half[both], cells.foot[both], cells.thickness[both],
+            cells.normal[both], cells.offset[both], number, cells.spread[both],
         ])  # fmt: skip
+        rim = records[len(cells) :]
+        rim[:, 4:7], rim[:, 7], rim[:, 8:12] = cells.rim[cut], FAR, 0
+        rim[:, 13] = 4 * cells.half[cut]
+        centre, half = cells.centre[both], cells.half[both, None]
+        hierarchy = build_hierarchy(centre, leaf_size=_LEAF_SIZE)
         placed = hierarchy.gather(records)
-        placed[hierarchy.slots < 0] = [FAR] * 3 + [0] + [FAR] * 4 + [0, 0, 1, 0, -1]
-        half = cells.half[:, None]
-        levels = box_levels(hierarchy, cells.centre - half, cells.centre + half)
+        placed[hierarchy.slots < 0] = [FAR] * 3 + [0] + [FAR] * 4 + [0, 0, 0, 0, -1, 0]
+        levels = box_levels(hierarchy, centre - half, centre + half)
         return cls(pack(backend, hierarchy, levels, placed))
 
-    def nearest_foot(
-        self,
-        x: Vec3,
-        others: tuple[Vec3, ...],
-        apart: Real,
-        limit: Real,
-        *,
-        unbounded: bool = False,
-    ) -> tuple[Real, Vec3]:  # fmt: skip
-        """The squared distance of the nearest foot nearer than `limit`, of cells that come nearer
-        than that, and the foot; infinite if there is none. Feet that are within `apart` half
-        cells of others are left out. unbounded: whether limits say nothing."""
-        vector, real = self.tree.backend.Array3f, self.tree.backend.Float
-        limit = real(limit)
+    def nearest(self, x: Vec3) -> tuple[Real, Vec3]:
+        """The foot of the cell in which the surface seems to come nearest to x, and how near
+        (`_estimate`); infinite if no cell has a foot."""
+        vector = self.tree.backend.Array3f
 
         def each(row: list[Real], active: Mask, state: State) -> State:
             best, foot = state
-            here = vector(*row[4:7])
-            square = dr.squared_norm(here - x)
-            radius = apart * row[3]
-            apart_from = [dr.squared_norm(here - one) >= radius * radius for one in others]
-            taken = active & dr.all(apart_from) & (square < best) & (_lower(vector, row, x) < limit)
-            return dr.select(taken, square, best), dr.select(taken, here, foot)
+            near = _estimate(vector, row, x)
+            taken = active & (near < best)
+            return dr.select(taken, near, best), dr.select(taken, vector(*row[4:7]), foot)
 
-        some = (1 + 1e-9) * square_to_some_point(self.tree, x, 4) if unbounded else limit * limit
-        best, foot = self._walk(x, each, (some, vector(FAR)), lambda state: state[0])
+        some = (1 + 1e-9) * dr.sqrt(square_to_some_point(self.tree, x, 4))
+        start = some, vector(FAR)
+        best, foot = self._walk(x, each, start, lambda state: dr.square(state[0]))
         return dr.select(foot.x < 0.5 * FAR, best, dr.inf), foot
 
-    def mark(
-        self, x: Vec3, y: Vec3, free: Real, distance: Real, tolerance: Real, marks: Any
-    ) -> Real:
-        """Mark the cells in which the surface may be nearer to x than `distance` by more than
-        `tolerance`, farther than `free` from y: a Bool for each is set in `marks`.
+    def nearer(
+        self, x: Vec3, best: Best, others: tuple[Vec3, ...], tolerance: Real, marks: Any
+    ) -> tuple[Real, Vec3]:
+        """What cells say about points of the surface that are nearer to x than the best.
 
-        Returns a length that the surface, but for what is within `free` of y, is no nearer than;
-        at most `distance`.
+        Returns a length that the surface is no nearer than, at most the distance of the best; and
+        the foot (else FAR) of the cell where it seems to come nearest, of those in which it may be
+        nearer than the best by more than `tolerance`. Feet within `_APART` half cells of the best
+        or of `others` are left out. In `marks` a Bool is set for each of those cells, wherever
+        their feet are.
         """
         backend = self.tree.backend
         vector, index = backend.Array3f, backend.UInt32
 
         def each(row: list[Real], active: Mask, state: State) -> State:
-            counts = active & ~_within(vector, row, y, free) & (row[12] >= 0)
-            lower = _lower(vector, row, x)
-            wanted = counts & (lower < distance - tolerance)
-            dr.scatter(marks, backend.Bool(True), index(fmax(row[12], 0)), wanted)
-            return (dr.select(counts, fmin(state[0], lower), state[0]),)
+            lower, nearest, foot = state
+            counts = active & ~_within(vector, row, best.foot, best.free)
+            here = _lower(vector, row, x)
+            wanted = counts & (here < best.distance - tolerance)
+            is_cell = row[12] >= 0
+            dr.scatter(marks, backend.Bool(True), index(fmax(row[12], 0)), wanted & is_cell)
+            lower = dr.select(counts & is_cell, fmin(lower, here), lower)
+            y, near, apart = vector(*row[4:7]), _estimate(vector, row, x), _APART * row[3]
+            taken = wanted & (near < nearest) & (near < best.distance + _DOUBT * row[13])
+            for one in (best.foot, *others):
+                taken &= dr.squared_norm(y - one) >= apart * apart
+            return lower, dr.select(taken, near, nearest), dr.select(taken, y, foot)
 
-        limit = backend.Float(distance)
-        (lower,) = self._walk(x, each, (limit,), lambda state: limit * limit)
-        dr.eval(lower, marks)
-        return lower
+        limit = backend.Float(best.distance)
+        start = limit, backend.Float(dr.inf), vector(FAR)
+        lower, _, foot = self._walk(x, each, start, lambda state: limit * limit)
+        dr.eval(lower, foot, marks)
+        return lower, foot
 
     def _walk(self, x: Vec3, each: Any, start: State, limit: Callable[[State], Real]) -> State:
         """limit: the squared distance, given the state, beyond which boxes are passed by."""
@@ -158,6 +189,17 @@ def _lower(vector: Any, row: list[Real], x: Vec3) -> Real:
     off = fmax(dr.abs(height - row[11]) - thickness, 0)
     beside = fmax(across - 1.7321 * half, 0)
     return fmax(box, dr.norm(vector(off, beside, 0)))
+
+
+def _estimate(vector: Any, row: list[Real], x: Vec3) -> Real:
+    """How near the surface in a cell seems to come to x: where it is the plane through its foot, up
+    to its spread; not nearer than is proved. A plane at right angles to which x is beyond that is
+    taken for a line towards x."""
+    away = x - vector(*row[4:7])
+    square, height = dr.squared_norm(away), dr.dot(away, vector(*row[8:11]))
+    across = fmax(square - height * height - row[13] * row[13], 0)
+    near = fmax(dr.sqrt(dr.fma(height, height, across)), _lower(vector, row, x))
+    return dr.select(row[4] < 0.5 * FAR, near, dr.inf)
 
 
 def _within(vector: Any, row: list[Real], y: Vec3, radius: Real) -> Mask:

@@ -41,6 +41,8 @@ _TOLERANCE = 1e-6
 _BITS = 10
 # Radii about a foot in which it may be proved the nearest, in distances from it: powers of two.
 _FREE = range(8, -12, -1)
+# Descents that Newton's method alone does not end.
+_UNFINISHED = 1.0
 # Sheets that are looked at for each point before cells are.
 _SHEETS = 16
 
@@ -214,7 +216,12 @@ class _Points:
             return in_batches(self._prepared.backend, close, points, start)[0], np.zeros(
                 len(points)
             )
-        feet, free = in_batches(self.backend, self._descend, points, start)
+        feet, free, state = in_batches(self.backend, self._directly, points, start)
+        rows = np.flatnonzero(state == _UNFINISHED)
+        if len(rows):
+            feet[rows], free[rows] = in_batches(
+                self.backend, self._descend, points[rows], start[rows]
+            )
         feet = self._within(feet)
         left, rim = np.flatnonzero(np.isnan(feet[:, 0])), self._rim
         if rim is not None and len(left):  # out of the domain
@@ -225,6 +232,14 @@ class _Points:
             (there,) = in_batches(self.backend, along, points[left], start[left])
             feet[left], free[left] = self._within(there), 0
         return feet, free
+
+    def _directly(self, p: Vec3, start: Vec3) -> tuple[Vec3, Real, Real]:
+        """By Newton's method: feet or NaN, radii about them, and `_UNFINISHED` where that does not
+        say whether there is one nearby, else 0."""
+        y, found, singular = self._descent.directly(p, start)
+        free = dr.select(found, self._free(y, length(p - y)), 0)
+        unfinished = ~found & ~singular
+        return dr.select(found, y, dr.nan), free, dr.select(unfinished, _UNFINISHED, 0 * free)
 
     def _descend(self, p: Vec3, start: Vec3) -> tuple[Vec3, Real]:
         y, found, on_level = self._descent.closest(p, start)
