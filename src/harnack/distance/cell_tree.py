@@ -32,6 +32,8 @@ _LEAF_SIZE = 4
 _APART = 6.0
 # Of a cell's spread: how much nearer than it seems the surface may be, where that is not proved.
 _DOUBT = 0.25
+# In half cells: so far from its point in a cell the rim is nearly a line.
+_RIM_SPREAD = 4.0
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,7 @@ class SurfaceCells:
         |normal . (y - centre) - offset| <= thickness, which is FAR where nothing is known. The
         normal is zero where no plane is known that is nearly the surface.
     spread: (n,) within this radius about its foot the surface is nearly that plane.
-    rim: (n, 3) a point of the rim at which a domain cuts the surface, or FAR.
+    rim: (n, 3) a point of the rim at which a domain cuts the surface, or FAR. rim_curvature: (n,).
     """
 
     centre: FloatArray
@@ -55,6 +57,7 @@ class SurfaceCells:
     thickness: FloatArray
     spread: FloatArray
     rim: FloatArray
+    rim_curvature: FloatArray
 
     @classmethod
     def unknown(cls, centre: FloatArray, half: FloatArray) -> SurfaceCells:
@@ -62,8 +65,9 @@ class SurfaceCells:
         n = len(half)
         far, zero = np.full((n, 3), FAR), np.zeros(n)
         return cls(
-            centre, half, far, np.zeros((n, 3)), zero, np.full(n, FAR), zero.copy(), far.copy()
-        )
+            centre, half, far, np.zeros((n, 3)), zero, np.full(n, FAR), zero.copy(), far.copy(),
+            zero.copy(),
+        )  # fmt: skip
 
     def __len__(self) -> int:
         return len(self.half)
@@ -97,21 +101,22 @@ class CellTree:
 
     @classmethod
     def of(cls, backend: Backend, cells: SurfaceCells) -> CellTree:
-        # Points of the rim are feet of cells of their own, of which nothing else is known.
+        # Points of the rim are feet of cells of their own.
         cut = np.flatnonzero(cells.rim[:, 0] < FAR)
-        both = np.concatenate([np.arange(len(cells)), cut])
-        number = np.where(np.arange(len(both)) < len(cells), both, -1.0)
+        n, both = len(cells), np.concatenate([np.arange(len(cells)), cut])
+        number = np.where(np.arange(len(both)) < n, both, -1.0)
+        doubt = np.minimum(_DOUBT * cells.spread, 2 * cells.thickness)
         records = np.column_stack([
             cells.centre[both], cells.half[both], cells.foot[both], cells.thickness[both],
-            cells.normal[both], cells.offset[both], number, cells.spread[both],
+            cells.normal[both], cells.offset[both], number, cells.spread[both], doubt[both],
         ])  # fmt: skip
-        rim = records[len(cells) :]
-        rim[:, 4:7], rim[:, 7], rim[:, 8:12] = cells.rim[cut], FAR, 0
-        rim[:, 13] = 4 * cells.half[cut]
+        reach = _RIM_SPREAD * cells.half[cut]
+        records[n:, 4:7], records[n:, 13] = cells.rim[cut], reach
+        records[n:, 14] = np.minimum(_DOUBT * reach, cells.rim_curvature[cut] * reach**2)
         centre, half = cells.centre[both], cells.half[both, None]
         hierarchy = build_hierarchy(centre, leaf_size=_LEAF_SIZE)
         placed = hierarchy.gather(records)
-        placed[hierarchy.slots < 0] = [FAR] * 3 + [0] + [FAR] * 4 + [0, 0, 0, 0, -1, 0]
+        placed[hierarchy.slots < 0] = [FAR] * 3 + [0] + [FAR] * 4 + [0, 0, 0, 0, -1, 0, 0]
         levels = box_levels(hierarchy, centre - half, centre + half)
         return cls(pack(backend, hierarchy, levels, placed))
 
@@ -154,7 +159,7 @@ class CellTree:
             dr.scatter(marks, backend.Bool(True), index(fmax(row[12], 0)), wanted & is_cell)
             lower = dr.select(counts & is_cell, fmin(lower, here), lower)
             y, near, apart = vector(*row[4:7]), _estimate(vector, row, x), _APART * row[3]
-            taken = wanted & (near < nearest) & (near < best.distance + _DOUBT * row[13])
+            taken = wanted & (near < nearest) & (near < best.distance + row[14])
             for one in (best.foot, *others):
                 taken &= dr.squared_norm(y - one) >= apart * apart
             return lower, dr.select(taken, near, nearest), dr.select(taken, y, foot)
@@ -192,12 +197,13 @@ def _lower(vector: Any, row: list[Real], x: Vec3) -> Real:
 
 
 def _estimate(vector: Any, row: list[Real], x: Vec3) -> Real:
-    """How near the surface in a cell seems to come to x: where it is the plane through its foot, up
-    to its spread; not nearer than is proved. A plane at right angles to which x is beyond that is
-    taken for a line towards x."""
+    """How near the surface in a cell seems to come to x, not nearer than is proved.
+
+    Within the spread about its foot the surface is taken for a plane, the rim for a line. Then the
+    foot is farther than the nearest point by no more than the spread at right angles to the way."""
     away = x - vector(*row[4:7])
-    square, height = dr.squared_norm(away), dr.dot(away, vector(*row[8:11]))
-    across = fmax(square - height * height - row[13] * row[13], 0)
+    height = dr.select(row[12] >= 0, dr.dot(away, vector(*row[8:11])), 0)
+    across = fmax(dr.squared_norm(away) - height * height - row[13] * row[13], 0)
     near = fmax(dr.sqrt(dr.fma(height, height, across)), _lower(vector, row, x))
     return dr.select(row[4] < 0.5 * FAR, near, dr.inf)
 

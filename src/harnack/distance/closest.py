@@ -227,7 +227,7 @@ class _Points:
         if rim is not None and len(left):  # out of the domain
 
             def along(p: Vec3, y: Vec3) -> tuple[Vec3]:
-                return (rim.closest(p, y),)
+                return (rim.closest(p, y)[0],)
 
             (there,) = in_batches(self.backend, along, points[left], start[left])
             feet[left], free[left] = self._within(there), 0

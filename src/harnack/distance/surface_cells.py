@@ -116,7 +116,9 @@ class CellProofs:
         self._outside(cells.foot)
         if self._rim is not None and len(cells):
             cut = np.flatnonzero(np.abs(away[kept]) <= radius)
-            cells.rim[cut] = self._at(self._on_rim, start[cut], radius[cut])[0]
+            cells.rim[cut], cells.rim_curvature[cut] = self._at(
+                self._on_rim, start[cut], radius[cut]
+            )
             self._outside(cells.rim)
         return cells
 
@@ -177,11 +179,12 @@ class CellProofs:
             spread = fmin(spread, length(boundary - at))
         return foot, dr.select(is_plane, n, normal), dr.select(found, spread, 0)
 
-    def _on_rim(self, p: Vec3, radii: Vec3) -> tuple[Vec3]:
-        """A point of the rim near p."""
+    def _on_rim(self, p: Vec3, radii: Vec3) -> tuple[Vec3, Real]:
+        """A point of the rim near p, and the rim's curvature."""
         assert self._rim is not None
-        y = self._rim.closest(p, p)
-        return (dr.select(length(y - p) < 2 * radii.x, y, self._backend.Array3f(FAR)),)
+        y, curvature = self._rim.closest(p, p)
+        near = length(y - p) < 2 * radii.x
+        return dr.select(near, y, self._backend.Array3f(FAR)), dr.select(near, curvature, 0)
 
     def _foot(self, p: Vec3, radius: Real) -> Vec3:
         """Where Newton's method leads from the centre, if that is near."""
