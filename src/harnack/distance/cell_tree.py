@@ -29,7 +29,7 @@ FAR = 1e150
 """Coordinates of feet that there are not, and the thickness of slabs that say nothing."""
 _LEAF_SIZE = 4
 # Feet closer to one another than so many half cells lead to the same place.
-_APART = 6.0
+_APART = 3.0
 # Of a cell's spread: how much nearer than it seems the surface may be, where that is not proved.
 _DOUBT = 0.25
 # In half cells: so far from its point in a cell the rim is nearly a line.

@@ -25,6 +25,8 @@ Polish: TypeAlias = "Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatA
 
 # Cells before points are asked which of them matter: so many for each point, within these limits.
 _EACH, _FEWEST, _MOST = 0.25, 1500, 60_000
+# In half cells: what a slab is thin for, so that the surface in it is one sheet.
+_SHEET = 0.5
 # Cells at most, after those that matter are split.
 _AT_MOST, _AT_MOST_ON_SHEETS = 40_000, 20_000
 # Of these shares where evaluations are as dear as those of many terms.
@@ -126,13 +128,14 @@ def _in_parts(
 def _split(
     proofs: CellProofs, root: _Cube, enough: int, progress: Callable[[str], None]
 ) -> SurfaceCells:
-    """Cells of the root: in each round those of the thicker slabs are split, until there are
-    enough."""
+    """Cells of the root, split until there are enough: in each round the larger half of those where
+    the surface may be more than one sheet, and the others by how much it may bend."""
     cells = proofs.kept(root.centre[None], np.array([root.half]))
     for _ in range(_FINEST):
         if not 0 < len(cells) < enough:
             break
-        size = np.minimum(cells.thickness, cells.half)
+        is_sheet = cells.thickness < _SHEET * cells.half
+        size = np.where(is_sheet, 0.25 * cells.thickness, cells.half)
         cells = _halved(proofs, cells, size >= np.median(size))
         progress(f"distances: {len(cells):,} cells")
     return cells
