@@ -18,9 +18,10 @@ from harnack.distance.batches import in_batches
 from harnack.distance.closing_in import close_in
 from harnack.distance.meshes.on_sheets import SheetSearch
 from harnack.distance.meshes.surface import MeshSurface
+from harnack.distance.estimates import first_order
 from harnack.distance.projection import Descent
 from harnack.distance.rim import RimDescent
-from harnack.distance.search import search
+from harnack.distance.search import Known, search
 from harnack.distance.surface_cells import remainder
 from harnack.fields.clearance import distance_below
 from harnack.fields.points import morton_order
@@ -92,12 +93,14 @@ def _in_order(
     if mesh is not None and mesh.is_all:
         return _closest_on_mesh(backend, surface, levels, mesh, points)
     job = _Points(backend, surface, levels)
-    x, start, above, lower = job.look(points)
+    x, start, above, lower, near = job.look(points)
     if mesh is not None:
         start = _nearer(x, start, mesh)
     if surface.field.has_sheets:
         start = job.on_sheets(x, start)
-    found = search(surface, x, job.polish, start, _TOLERANCE * _size(surface, x), progress)
+    found = search(
+        surface, x, Known(start, near), job.polish, _TOLERANCE * _size(surface, x), progress
+    )
     found.feet = job.refined(x, found.feet)
     distance = _length(x - found.feet)
     # One foot may be no point of the surface but for rounding: a promise may not hold either.
@@ -165,9 +168,9 @@ class _Points:
     _rim: RimDescent | None = dataclasses.field(init=False)
     _prepared: Any = dataclasses.field(init=False)
 
-    def look(self, points: Any) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """The points as rounded, what is known of the surface near them, f - level, and proved
-        lower bounds of the distance."""
+    def look(self, points: Any) -> tuple[FloatArray, ...]:
+        """The points as rounded, what is known of the surface near them, f - level, proved lower
+        bounds of the distance, and what it is to first order."""
 
         def compute(p: Vec3) -> tuple[Real | Vec3, ...]:
             sample = self._field.evaluate(p)
@@ -178,13 +181,13 @@ class _Points:
             lower = self.backend.Float(0)
             if sample.promises:
                 lower = distance_below(self.backend, self._field, self.levels, p, sample)
-            return p, start, above, lower
+            return p, start, above, lower, dr.abs(first_order(above, sample.gradient))
 
-        x, start, above, lower = in_batches(self.backend, compute, points)
+        x, start, above, lower, near = in_batches(self.backend, compute, points)
         domain = self.surface.field.domain
         if domain is not None and len(x):
             lower[~domain.contains_points(x)] = 0
-        return x, self._within(start), above, lower
+        return x, self._within(start), above, lower, near
 
     def on_sheets(self, points: FloatArray, start: FloatArray) -> FloatArray:
         """The places (n, 3), or points of the surface on sheets where these are nearer."""
@@ -269,12 +272,21 @@ class _Points:
         if exact is None or not len(rows):
             return feet
 
-        def move(p: Vec3, start: Vec3) -> tuple[Vec3]:
+        def directly(p: Vec3, start: Vec3) -> tuple[Vec3]:
+            y, found, _ = exact.directly(p, start)
+            return (dr.select(found, y, dr.nan),)
+
+        def closest(p: Vec3, start: Vec3) -> tuple[Vec3]:
             y, _, on_level = exact.closest(p, start)
             return (dr.select(on_level, y, start),)
 
         feet = feet.copy()
-        (there,) = in_batches(self.backend, move, points[rows], feet[rows])
+        (there,) = in_batches(self.backend, directly, points[rows], feet[rows])
+        left = np.flatnonzero(np.isnan(there[:, 0]))
+        if len(left):
+            (there[left],) = in_batches(
+                self.backend, closest, points[rows[left]], feet[rows[left]]
+            )
         inside = ~np.isnan(self._within(there)[:, 0])
         feet[rows[inside]] = there[inside]
         return feet

@@ -65,7 +65,7 @@ class RimDescent:
             distance = length(x - y)
             met = dr.isfinite(nearest)
             is_other = dr.dot(there.normal, normal) < 1 - _SAME
-            turns = (hop == _TURNING) & is_other & (distance < nearest + 8 * there.near)
+            turns = (hop == _TURNING) & is_other & (distance < nearest + 100 * there.near)
             counts = there.is_on & (~met | (distance < nearest) | turns)
             # Beyond another face: that is a wall. Else off the curve: back to it, for some rounds.
             is_free = ~(dr.squared_norm(wall) > 0)

@@ -17,7 +17,7 @@ from harnack.distance.surface_cells import CellProofs
 if TYPE_CHECKING:
     from harnack.tracer import LevelSet
 
-__all__ = ["Found", "Polish", "search"]
+__all__ = ["Found", "Known", "Polish", "search"]
 
 # From points x and places y of the surface nearby: nearer places of it, NaN where none was found,
 # and radii about these within which none is nearer.
@@ -34,6 +34,8 @@ _DEAR = 0.25
 _FINEST = 40
 # Feet of other parts of the surface that are tried, from the same cells.
 _CHALLENGES = 4
+# Descents begin at points that seem nearer to the surface than so many times the best.
+_NEARER = 0.9
 # Points that are looked at together, so that memory is bounded.
 _AT_ONCE = 1 << 18
 _GROWTHS = 6
@@ -47,6 +49,21 @@ class Found:
 
     feet: FloatArray
     lower: FloatArray
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known of the surface from the points alone.
+
+    feet: (n, 3) points of the surface, or NaN. near: (n,) estimates of the distance, to first order.
+    """
+
+    feet: FloatArray
+    near: FloatArray
+
+    def some(self, rows: IntArray | slice) -> Known:
+        """Of some points."""
+        return Known(self.feet[rows], self.near[rows])
 
 
 @dataclass(frozen=True)
@@ -65,12 +82,11 @@ class _Cube:
 
 
 def search(
-    surface: LevelSet, points: FloatArray, polish: Polish, start: FloatArray, tolerance: float,
+    surface: LevelSet, points: FloatArray, known: Known, polish: Polish, tolerance: float,
     progress: Callable[[str], None],
 ) -> Found:  # fmt: skip
     """The nearest points of a level set to `points` (n, 3).
 
-    start: (n, 3) points of the surface that are known already, or NaN.
     tolerance: of distances: cells are split until none may hold a point that is nearer than the
         best by more than that, or there are too many.
     """
@@ -78,8 +94,8 @@ def search(
     if box is not None:
         if (box[0] > box[1]).any():
             return Found(np.full_like(points, np.nan), np.full(len(points), np.inf))
-        return _in_parts(surface, _Cube.around(*box), points, polish, start, tolerance, progress)
-    feet, lower = start.copy(), np.zeros(len(points))
+        return _in_parts(surface, _Cube.around(*box), points, known, polish, tolerance, progress)
+    feet, lower = known.feet.copy(), np.zeros(len(points))
     rows = np.arange(len(points))
     half = 0.0
     for _ in range(_GROWTHS):
@@ -87,10 +103,11 @@ def search(
             break
         x = points[rows]
         root = _Cube.around(x.min(axis=0), x.max(axis=0))
-        known = np.linalg.norm(x - feet[rows], axis=1)
-        half = max(4 * half, 1.0 + 4 * root.half, 1.1 * float(np.nanmax(known, initial=0.0)))
+        away = np.linalg.norm(x - feet[rows], axis=1)
+        half = max(4 * half, 1.0 + 4 * root.half, 1.1 * float(np.nanmax(away, initial=0.0)))
         root = _Cube(root.centre, root.half + half)
-        found = _in_parts(surface, root, x, polish, feet[rows], tolerance, progress)
+        so_far = Known(feet[rows], known.near[rows])
+        found = _in_parts(surface, root, x, so_far, polish, tolerance, progress)
         # Beyond the cube there may be more.
         to_walls = root.half - np.abs(x - root.centre).max(axis=1)
         feet[rows], lower[rows] = found.feet, np.minimum(found.lower, to_walls)
@@ -108,7 +125,7 @@ def _box(surface: LevelSet) -> tuple[FloatArray, FloatArray] | None:
 
 
 def _in_parts(
-    surface: LevelSet, root: _Cube, points: FloatArray, polish: Polish, start: FloatArray,
+    surface: LevelSet, root: _Cube, points: FloatArray, known: Known, polish: Polish,
     tolerance: float, progress: Callable[[str], None],
 ) -> Found:  # fmt: skip
     """The nearest points in a cube, for so many points at a time."""
@@ -120,7 +137,7 @@ def _in_parts(
     parts: list[Found] = []
     for first in range(0, max(len(points), 1), _AT_ONCE):
         rows = slice(first, first + _AT_ONCE)
-        job = _Search(proofs, cells, points[rows], polish, start[rows].copy(), tolerance)
+        job = _Search(proofs, cells, points[rows], known.some(rows), polish, tolerance)
         parts.append(job.run(progress))
     return Found(*(np.concatenate([getattr(p, k) for p in parts]) for k in ("feet", "lower")))
 
@@ -157,12 +174,12 @@ class _Search:
     """
 
     def __init__(
-        self, proofs: CellProofs, cells: SurfaceCells, points: FloatArray, polish: Polish,
-        feet: FloatArray, tolerance: float,
+        self, proofs: CellProofs, cells: SurfaceCells, points: FloatArray, known: Known,
+        polish: Polish, tolerance: float,
     ) -> None:  # fmt: skip
         self.proofs, self.cells, self.points, self.polish = proofs, cells, points, polish
         self.backend = choose_backend("double")
-        self.feet, self.free = feet, np.zeros(len(points))
+        self.feet, self.free, self.near = known.feet.copy(), np.zeros(len(points)), known.near
         self.lower, self.tolerance = np.zeros(len(points)), tolerance
 
     def run(self, progress: Callable[[str], None]) -> Found:
@@ -172,7 +189,6 @@ class _Search:
         that may be nearer. If some may still be, and there are not too many cells, those cells are
         split, and so on.
         """
-        rows = np.arange(len(self.points))
         if not len(self.cells):
             self.lower[:] = np.inf
             return Found(self.feet, self.lower)
@@ -181,16 +197,26 @@ class _Search:
         most = int(most * (_DEAR if field.has_detail else 1.0))
         tree = CellTree.of(self.backend, self.cells)
         tried = self._first(tree)
+        rows = np.arange(len(self.points))
         for _ in range(_FINEST):
             marks = self._challenge(tree, rows, tried[rows])
-            rows = np.flatnonzero(self.lower < self._distance(slice(None)) - self.tolerance)
+            rows = self._open()
             count = int(marks.sum())
             if not count or not len(rows) or len(self.cells) + 4 * count > most:
                 break
             self.cells = _halved(self.proofs, self.cells, marks)
             progress(f"distances: {len(self.cells):,} cells for {len(rows):,} points")
             tree = CellTree.of(self.backend, self.cells)
+        if not field.has_sheets:
+            # Where sheets meet or cross within a cell, one may have no foot there.
+            rows = self._open()
+            rows = rows[self.near[rows] < _NEARER * self._distance(rows)]
+            self._descend(rows, self.points[rows])
         return Found(self.feet, self.lower)
+
+    def _open(self) -> IntArray:
+        """The points of which it is not proved that none is nearer than the best."""
+        return np.flatnonzero(self.lower < self._distance(slice(None)) - self.tolerance)
 
     def _distance(self, rows: IntArray | slice) -> FloatArray:
         """Of the best feet so far; FAR where there is none."""
@@ -243,9 +269,12 @@ class _Search:
         return to_numpy(foot)
 
     def _descend(self, rows: IntArray, start: FloatArray) -> None:
-        """To nearer points from points (k, 3) of the surface, if there are any."""
+        """To nearer points from points (k, 3) of the surface, or from the points themselves, if
+        there are any."""
         before, x = self._distance(rows), self.points[rows]
         better, free = self.polish(x, start)
+        on = (start != x).any(axis=1)
+        start = np.where(on[:, None], start, np.nan)
         for feet, radius in ((start, np.zeros(len(rows))), (better, free)):
             away = np.linalg.norm(x - feet, axis=1)
             nearer = away < before
