@@ -31,7 +31,7 @@ _LEAF_SIZE = 4
 # Feet closer to one another than so many half cells lead to the same place.
 _APART = 3.0
 # Of a cell's spread: how much nearer than it seems the surface may be, where that is not proved.
-_DOUBT = 0.25
+_DOUBT = 0.0
 # In half cells: so far from its point in a cell the rim is nearly a line.
 _RIM_SPREAD = 4.0
 

@@ -42,6 +42,8 @@ _TOLERANCE = 1e-6
 _BITS = 10
 # Radii about a foot in which it may be proved the nearest, in distances from it: powers of two.
 _FREE = range(8, -12, -1)
+# The cosine of the angle by which a surface may begin away from a point and yet come nearer.
+_AWAY = 0.02
 # Descents that Newton's method alone does not end.
 _UNFINISHED = 1.0
 # Sheets that are looked at for each point before cells are.
@@ -99,7 +101,7 @@ def _in_order(
     if surface.field.has_sheets:
         start = job.on_sheets(x, start)
     found = search(
-        surface, x, Known(start, near), job.polish, _TOLERANCE * _size(surface, x), progress
+        surface, x, Known(start, near), job, _TOLERANCE * _size(surface, x), progress
     )
     found.feet = job.refined(x, found.feet)
     distance = _length(x - found.feet)
@@ -210,7 +212,7 @@ class _Points:
         return np.where(inside[:, None], feet, np.nan)
 
     def polish(self, points: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """`search.Polish`: by descent, or with sheets by rays."""
+        """`search.Descents`: by descent, or with sheets by rays."""
         if self.surface.field.has_sheets:
 
             def close(p: Vec3, start: Vec3) -> tuple[Vec3]:
@@ -235,6 +237,26 @@ class _Points:
             (there,) = in_batches(self.backend, along, points[left], start[left])
             feet[left], free[left] = self._within(there), 0
         return feet, free
+
+    def leave_boundary(
+        self, points: FloatArray, boundary: FloatArray, aside: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """`search.Descents`."""
+
+        def beside(p: Vec3, b: Vec3, length_: Vec3) -> tuple[Vec3]:
+            y = self._descent.beside(p, b, length_.x)
+            towards = dr.dot(p - b, y - b) > -_AWAY * length(p - b) * length(y - b)
+            return (dr.select(towards, y, dr.nan),)
+
+        feet, free = np.full_like(points, np.nan), np.zeros(len(points))
+        lengths = np.tile(aside[:, None], 3)
+        (start,) = in_batches(self.backend, beside, points, boundary, lengths)
+        rows = np.flatnonzero(~np.isnan(start[:, 0]))
+        if len(rows):
+            feet[rows], free[rows] = in_batches(
+                self.backend, self._descend, points[rows], start[rows]
+            )
+        return self._within(feet), free
 
     def _directly(self, p: Vec3, start: Vec3) -> tuple[Vec3, Real, Real]:
         """By Newton's method: feet or NaN, radii about them, and `_UNFINISHED` where that does not

@@ -164,6 +164,14 @@ class Descent:
         )
         return y, found, on_level
 
+    def beside(self, x: Vec3, boundary: Vec3, aside: Real) -> Vec3:
+        """A point of the level set from so far beside a point of its boundary, towards x; NaN where
+        none is found."""
+        way = x - boundary
+        start = dr.fma(self.backend.Array3f(aside / dr.norm(way)), way, boundary)
+        place, found = self._to_level(start, self.backend.Bool(True))
+        return dr.select(found, place.y, dr.nan)
+
     def noise(self, y: Vec3) -> Real:
         """How far rounding and approximation may have moved the level at y, as a length."""
         return self._look(y)[1].noise

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Protocol
 
 import drjit as dr
 import numpy as np
@@ -17,11 +17,7 @@ from harnack.distance.surface_cells import CellProofs
 if TYPE_CHECKING:
     from harnack.tracer import LevelSet
 
-__all__ = ["Found", "Known", "Polish", "search"]
-
-# From points x and places y of the surface nearby: nearer places of it, NaN where none was found,
-# and radii about these within which none is nearer.
-Polish: TypeAlias = "Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]"
+__all__ = ["Found", "Known", "Descents", "search"]
 
 # Cells before points are asked which of them matter: so many for each point, within these limits.
 _EACH, _FEWEST, _MOST = 0.25, 1500, 60_000
@@ -34,6 +30,8 @@ _DEAR = 0.25
 _FINEST = 40
 # Feet of other parts of the surface that are tried, from the same cells.
 _CHALLENGES = 4
+# In tolerances: how far to the side of its boundary the surface is looked for.
+_ASIDE = 100.0
 # Descents begin at points that seem nearer to the surface than so many times the best.
 _NEARER = 0.9
 # Points that are looked at together, so that memory is bounded.
@@ -49,6 +47,22 @@ class Found:
 
     feet: FloatArray
     lower: FloatArray
+
+
+class Descents(Protocol):
+    """Ways to nearer points of the surface from points x (n, 3). They return feet, NaN where none
+    was found, and radii about these within which none is nearer."""
+
+    def polish(self, points: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """From places (n, 3) near the surface."""
+        ...
+
+    def leave_boundary(
+        self, points: FloatArray, boundary: FloatArray, aside: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """From points (n, 3) of the curve that the surface ends in, along the surface if it begins
+        towards x; by how much (n,) to the side it is looked for."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -82,7 +96,7 @@ class _Cube:
 
 
 def search(
-    surface: LevelSet, points: FloatArray, known: Known, polish: Polish, tolerance: float,
+    surface: LevelSet, points: FloatArray, known: Known, descents: Descents, tolerance: float,
     progress: Callable[[str], None],
 ) -> Found:  # fmt: skip
     """The nearest points of a level set to `points` (n, 3).
@@ -94,7 +108,7 @@ def search(
     if box is not None:
         if (box[0] > box[1]).any():
             return Found(np.full_like(points, np.nan), np.full(len(points), np.inf))
-        return _in_parts(surface, _Cube.around(*box), points, known, polish, tolerance, progress)
+        return _in_parts(surface, _Cube.around(*box), points, known, descents, tolerance, progress)
     feet, lower = known.feet.copy(), np.zeros(len(points))
     rows = np.arange(len(points))
     half = 0.0
@@ -107,7 +121,7 @@ def search(
         half = max(4 * half, 1.0 + 4 * root.half, 1.1 * float(np.nanmax(away, initial=0.0)))
         root = _Cube(root.centre, root.half + half)
         so_far = Known(feet[rows], known.near[rows])
-        found = _in_parts(surface, root, x, so_far, polish, tolerance, progress)
+        found = _in_parts(surface, root, x, so_far, descents, tolerance, progress)
         # Beyond the cube there may be more.
         to_walls = root.half - np.abs(x - root.centre).max(axis=1)
         feet[rows], lower[rows] = found.feet, np.minimum(found.lower, to_walls)
@@ -125,7 +139,7 @@ def _box(surface: LevelSet) -> tuple[FloatArray, FloatArray] | None:
 
 
 def _in_parts(
-    surface: LevelSet, root: _Cube, points: FloatArray, known: Known, polish: Polish,
+    surface: LevelSet, root: _Cube, points: FloatArray, known: Known, descents: Descents,
     tolerance: float, progress: Callable[[str], None],
 ) -> Found:  # fmt: skip
     """The nearest points in a cube, for so many points at a time."""
@@ -137,7 +151,7 @@ def _in_parts(
     parts: list[Found] = []
     for first in range(0, max(len(points), 1), _AT_ONCE):
         rows = slice(first, first + _AT_ONCE)
-        job = _Search(proofs, cells, points[rows], known.some(rows), polish, tolerance)
+        job = _Search(proofs, cells, points[rows], known.some(rows), descents, tolerance)
         parts.append(job.run(progress))
     return Found(*(np.concatenate([getattr(p, k) for p in parts]) for k in ("feet", "lower")))
 
@@ -175,11 +189,11 @@ class _Search:
 
     def __init__(
         self, proofs: CellProofs, cells: SurfaceCells, points: FloatArray, known: Known,
-        polish: Polish, tolerance: float,
+        descents: Descents, tolerance: float,
     ) -> None:  # fmt: skip
-        self.proofs, self.cells, self.points, self.polish = proofs, cells, points, polish
+        self.proofs, self.cells, self.points, self.descents = proofs, cells, points, descents
         self.backend = choose_backend("double")
-        self.feet, self.free, self.near = known.feet.copy(), np.zeros(len(points)), known.near
+        self.known, self.feet, self.free = known, known.feet.copy(), np.zeros(len(points))
         self.lower, self.tolerance = np.zeros(len(points)), tolerance
 
     def run(self, progress: Callable[[str], None]) -> Found:
@@ -197,6 +211,8 @@ class _Search:
         most = int(most * (_DEAR if field.has_detail else 1.0))
         tree = CellTree.of(self.backend, self.cells)
         tried = self._first(tree)
+        if not field.has_sheets:
+            self._leave_boundary()
         rows = np.arange(len(self.points))
         for _ in range(_FINEST):
             marks = self._challenge(tree, rows, tried[rows])
@@ -210,7 +226,7 @@ class _Search:
         if not field.has_sheets:
             # Where sheets meet or cross within a cell, one may have no foot there.
             rows = self._open()
-            rows = rows[self.near[rows] < _NEARER * self._distance(rows)]
+            rows = rows[self.known.near[rows] < _NEARER * self._distance(rows)]
             self._descend(rows, self.points[rows])
         return Found(self.feet, self.lower)
 
@@ -268,15 +284,23 @@ class _Search:
         self.lower[rows] = np.maximum(proved, self.lower[rows])
         return to_numpy(foot)
 
+    def _leave_boundary(self) -> None:
+        """From the boundary of the surface, where that is the nearest."""
+        rows = np.flatnonzero((self.feet == self.known.feet).all(axis=1))
+        distance = self._distance(rows)
+        rows, distance = rows[distance > 0], distance[distance > 0]
+        aside = np.minimum(0.25 * distance, _ASIDE * self.tolerance)
+        x = self.points[rows]
+        self._take(rows, *self.descents.leave_boundary(x, self.feet[rows], aside))
+
     def _descend(self, rows: IntArray, start: FloatArray) -> None:
-        """To nearer points from points (k, 3) of the surface, or from the points themselves, if
-        there are any."""
-        before, x = self._distance(rows), self.points[rows]
-        better, free = self.polish(x, start)
-        on = (start != x).any(axis=1)
-        start = np.where(on[:, None], start, np.nan)
-        for feet, radius in ((start, np.zeros(len(rows))), (better, free)):
-            away = np.linalg.norm(x - feet, axis=1)
-            nearer = away < before
-            before[nearer] = away[nearer]
-            self.feet[rows[nearer]], self.free[rows[nearer]] = feet[nearer], radius[nearer]
+        """To nearer points from places (k, 3), points of the surface or the points themselves."""
+        x = self.points[rows]
+        on_surface = (start != x).any(axis=1, keepdims=True)
+        self._take(rows, np.where(on_surface, start, np.nan), np.zeros(len(rows)))
+        self._take(rows, *self.descents.polish(x, start))
+
+    def _take(self, rows: IntArray, feet: FloatArray, free: FloatArray) -> None:
+        """Points of the surface (k, 3) or NaN, and their radii, where they are nearer."""
+        nearer = np.linalg.norm(self.points[rows] - feet, axis=1) < self._distance(rows)
+        self.feet[rows[nearer]], self.free[rows[nearer]] = feet[nearer], free[nearer]
