@@ -28,8 +28,11 @@ __all__ = ["FAR", "Best", "CellTree", "SurfaceCells"]
 FAR = 1e150
 """Coordinates of feet that there are not, and the thickness of slabs that say nothing."""
 _LEAF_SIZE = 4
-# Feet closer to one another than so many half cells lead to the same place.
-_APART = 3.0
+# Feet closer to one another than so many half cells lead to the same place: where the surface in a
+# cell is one sheet, and elsewhere.
+_APART, _APART_ELSEWHERE = 6.0, 3.0
+# In half cells: what a slab is thin for, so that the surface in it is one sheet.
+_SHEET = 0.5
 # Of a cell's spread: how much nearer than it seems the surface may be, where that is not proved.
 _DOUBT = 0.0
 # In half cells: so far from its point in a cell the rim is nearly a line.
@@ -76,6 +79,11 @@ class SurfaceCells:
         """Those chosen by a mask (n,)."""
         return SurfaceCells(*(part[which] for part in vars(self).values()))
 
+    @property
+    def is_sheet(self) -> BoolArray:
+        """(n,) whether the surface in a cell is one sheet, as far as its slab tells."""
+        return self.thickness < _SHEET * self.half
+
     @classmethod
     def joined(cls, parts: list[SurfaceCells]) -> SurfaceCells:
         """All of several."""
@@ -86,11 +94,13 @@ class SurfaceCells:
 @dataclass(frozen=True)
 class Best:
     """The nearest point of the surface so far: its place, how far it is, and a radius about it
-    within which none is nearer."""
+    within which none is nearer. apart: how many times farther from it than from others feet are to
+    be."""
 
     foot: Vec3
     distance: Real
     free: Real
+    apart: Real
 
 
 @dataclass(frozen=True)
@@ -105,24 +115,27 @@ class CellTree:
         cut = np.flatnonzero(cells.rim[:, 0] < FAR)
         n, both = len(cells), np.concatenate([np.arange(len(cells)), cut])
         number = np.where(np.arange(len(both)) < n, both, -1.0)
+        apart = np.where(cells.is_sheet, _APART, _APART_ELSEWHERE) * cells.half
         doubt = np.minimum(_DOUBT * cells.spread, 2 * cells.thickness)
         records = np.column_stack([
             cells.centre[both], cells.half[both], cells.foot[both], cells.thickness[both],
             cells.normal[both], cells.offset[both], number, cells.spread[both], doubt[both],
+            apart[both],
         ])  # fmt: skip
         reach = _RIM_SPREAD * cells.half[cut]
         records[n:, 4:7], records[n:, 13] = cells.rim[cut], reach
+        records[n:, 15] = _APART_ELSEWHERE * cells.half[cut]
         records[n:, 14] = np.minimum(_DOUBT * reach, cells.rim_curvature[cut] * reach**2)
         centre, half = cells.centre[both], cells.half[both, None]
         hierarchy = build_hierarchy(centre, leaf_size=_LEAF_SIZE)
         placed = hierarchy.gather(records)
-        placed[hierarchy.slots < 0] = [FAR] * 3 + [0] + [FAR] * 4 + [0, 0, 0, 0, -1, 0, 0]
+        placed[hierarchy.slots < 0] = [FAR] * 3 + [0] + [FAR] * 4 + [0, 0, 0, 0, -1, 0, 0, 0]
         levels = box_levels(hierarchy, centre - half, centre + half)
         return cls(pack(backend, hierarchy, levels, placed))
 
-    def nearest(self, x: Vec3) -> tuple[Real, Vec3]:
-        """The foot of the cell in which the surface seems to come nearest to x, and how near
-        (`_estimate`); infinite if no cell has a foot."""
+    def nearest(self, x: Vec3, limit: Real) -> Vec3:
+        """The foot of the cell in which the surface seems to come nearest to x (`_estimate`), and
+        nearer than `limit`; FAR where it does not."""
         vector = self.tree.backend.Array3f
 
         def each(row: list[Real], active: Mask, state: State) -> State:
@@ -132,9 +145,8 @@ class CellTree:
             return dr.select(taken, near, best), dr.select(taken, vector(*row[4:7]), foot)
 
         some = (1 + 1e-9) * dr.sqrt(square_to_some_point(self.tree, x, 4))
-        start = some, vector(FAR)
-        best, foot = self._walk(x, each, start, lambda state: dr.square(state[0]))
-        return dr.select(foot.x < 0.5 * FAR, best, dr.inf), foot
+        start = fmin(some, limit), vector(FAR)
+        return self._walk(x, each, start, lambda state: dr.square(state[0]))[1]
 
     def nearer(
         self, x: Vec3, best: Best, others: tuple[Vec3, ...], tolerance: Real, marks: Any
@@ -143,8 +155,8 @@ class CellTree:
 
         Returns a length that the surface is no nearer than, at most the distance of the best; and
         the foot (else FAR) of the cell where it seems to come nearest, of those in which it may be
-        nearer than the best by more than `tolerance`. Feet within `_APART` half cells of the best
-        or of `others` are left out. In `marks` a Bool is set for each of those cells, wherever
+        nearer than the best by more than `tolerance`. Feet that are not apart from the
+        best and from `others` (`_APART`) are left out. In `marks` a Bool is set for each of those cells, wherever
         their feet are.
         """
         backend = self.tree.backend
@@ -158,9 +170,9 @@ class CellTree:
             is_cell = row[12] >= 0
             dr.scatter(marks, backend.Bool(True), index(fmax(row[12], 0)), wanted & is_cell)
             lower = dr.select(counts & is_cell, fmin(lower, here), lower)
-            y, near, apart = vector(*row[4:7]), _estimate(vector, row, x), _APART * row[3]
+            y, near = vector(*row[4:7]), _estimate(vector, row, x)
             taken = wanted & (near < nearest) & (near < best.distance + row[14])
-            for one in (best.foot, *others):
+            for one, apart in ((best.foot, best.apart * row[15]), *((o, row[15]) for o in others)):
                 taken &= dr.squared_norm(y - one) >= apart * apart
             return lower, dr.select(taken, near, nearest), dr.select(taken, y, foot)
 

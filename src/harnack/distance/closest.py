@@ -221,7 +221,12 @@ class _Points:
             return in_batches(self._prepared.backend, close, points, start)[0], np.zeros(
                 len(points)
             )
-        feet, free, state = in_batches(self.backend, self._directly, points, start)
+        feet, free = np.full_like(points, np.nan), np.zeros(len(points))
+        state = np.full(len(points), _UNFINISHED)
+        rows = np.flatnonzero((start != points).any(axis=1))  # else it would be far
+        feet[rows], free[rows], state[rows] = in_batches(
+            self.backend, self._directly, points[rows], start[rows]
+        )
         rows = np.flatnonzero(state == _UNFINISHED)
         if len(rows):
             feet[rows], free[rows] = in_batches(

@@ -21,8 +21,6 @@ __all__ = ["Found", "Known", "Descents", "search"]
 
 # Cells before points are asked which of them matter: so many for each point, within these limits.
 _EACH, _FEWEST, _MOST = 0.25, 1500, 60_000
-# In half cells: what a slab is thin for, so that the surface in it is one sheet.
-_SHEET = 0.5
 # Cells at most, after those that matter are split.
 _AT_MOST, _AT_MOST_ON_SHEETS = 40_000, 20_000
 # Of these shares where evaluations are as dear as those of many terms.
@@ -32,6 +30,8 @@ _FINEST = 40
 _CHALLENGES = 4
 # In tolerances: how far to the side of its boundary the surface is looked for.
 _ASIDE = 100.0
+# Beside the boundary the surface was looked for there: how many times farther away feet are tried.
+_APART_FROM_BOUNDARY = 2.0
 # Descents begin at points that seem nearer to the surface than so many times the best.
 _NEARER = 0.9
 # Points that are looked at together, so that memory is bounded.
@@ -165,8 +165,7 @@ def _split(
     for _ in range(_FINEST):
         if not 0 < len(cells) < enough:
             break
-        is_sheet = cells.thickness < _SHEET * cells.half
-        size = np.where(is_sheet, 0.25 * cells.thickness, cells.half)
+        size = np.where(cells.is_sheet, 0.25 * cells.thickness, cells.half)
         cells = _halved(proofs, cells, size >= np.median(size))
         progress(f"distances: {len(cells):,} cells")
     return cells
@@ -239,12 +238,15 @@ class _Search:
         away = np.linalg.norm(self.points[rows] - self.feet[rows], axis=1)
         return np.where(np.isnan(away), FAR, away)
 
+    def _is_boundary(self, rows: IntArray | slice) -> BoolArray:
+        """Whether the best is what was known."""
+        return (self.feet[rows] == self.known.feet[rows]).all(axis=1)
+
     def _first(self, tree: CellTree) -> FloatArray:
         """To the nearest points from the feet that seem nearest, which are returned (n, 3)."""
-        near, foot = tree.nearest(upload_vectors(self.backend, self.points))
-        dr.eval(near, foot)
-        start = to_numpy(foot)
-        rows = np.flatnonzero(to_numpy(near) < self._distance(slice(None)))
+        limit = aligned(self.backend, self._distance(slice(None)))
+        start = to_numpy(tree.nearest(upload_vectors(self.backend, self.points), limit))
+        rows = np.flatnonzero(start[:, 0] < 0.5 * FAR)
         self._descend(rows, start[rows])
         return start
 
@@ -274,6 +276,7 @@ class _Search:
         best = Best(
             upload_vectors(backend, np.where(np.isnan(feet), FAR, feet)),
             aligned(backend, self._distance(rows)), aligned(backend, self.free[rows]),
+            aligned(backend, np.where(self._is_boundary(rows), _APART_FROM_BOUNDARY, 1.0)),
         )  # fmt: skip
         x = upload_vectors(backend, self.points[rows])
         tried = tuple(upload_vectors(backend, one) for one in others)
@@ -286,7 +289,7 @@ class _Search:
 
     def _leave_boundary(self) -> None:
         """From the boundary of the surface, where that is the nearest."""
-        rows = np.flatnonzero((self.feet == self.known.feet).all(axis=1))
+        rows = np.flatnonzero(self._is_boundary(slice(None)))
         distance = self._distance(rows)
         rows, distance = rows[distance > 0], distance[distance > 0]
         aside = np.minimum(0.25 * distance, _ASIDE * self.tolerance)
