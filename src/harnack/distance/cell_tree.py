@@ -29,12 +29,10 @@ FAR = 1e150
 """Coordinates of feet that there are not, and the thickness of slabs that say nothing."""
 _LEAF_SIZE = 4
 # Feet closer to one another than so many half cells lead to the same place: where the surface in a
-# cell is one sheet, and elsewhere.
-_APART, _APART_ELSEWHERE = 6.0, 3.0
+# cell is one sheet that does not end, and elsewhere.
+_APART, _APART_ELSEWHERE = 4.0, 3.0
 # In half cells: what a slab is thin for, so that the surface in it is one sheet.
 _SHEET = 0.5
-# Of a cell's spread: how much nearer than it seems the surface may be, where that is not proved.
-_DOUBT = 0.0
 # In half cells: so far from its point in a cell the rim is nearly a line.
 _RIM_SPREAD = 4.0
 
@@ -115,8 +113,9 @@ class CellTree:
         cut = np.flatnonzero(cells.rim[:, 0] < FAR)
         n, both = len(cells), np.concatenate([np.arange(len(cells)), cut])
         number = np.where(np.arange(len(both)) < n, both, -1.0)
-        apart = np.where(cells.is_sheet, _APART, _APART_ELSEWHERE) * cells.half
-        doubt = np.minimum(_DOUBT * cells.spread, 2 * cells.thickness)
+        is_plain = cells.is_sheet & (cells.rim[:, 0] == FAR)
+        apart = np.where(is_plain, _APART, _APART_ELSEWHERE) * cells.half
+        doubt = np.where(cells.is_sheet, cells.thickness, 0)
         records = np.column_stack([
             cells.centre[both], cells.half[both], cells.foot[both], cells.thickness[both],
             cells.normal[both], cells.offset[both], number, cells.spread[both], doubt[both],
@@ -125,7 +124,7 @@ class CellTree:
         reach = _RIM_SPREAD * cells.half[cut]
         records[n:, 4:7], records[n:, 13] = cells.rim[cut], reach
         records[n:, 15] = _APART_ELSEWHERE * cells.half[cut]
-        records[n:, 14] = np.minimum(_DOUBT * reach, cells.rim_curvature[cut] * reach**2)
+        records[n:, 14] = reach * np.minimum(0.25, cells.rim_curvature[cut] * reach)
         centre, half = cells.centre[both], cells.half[both, None]
         hierarchy = build_hierarchy(centre, leaf_size=_LEAF_SIZE)
         placed = hierarchy.gather(records)
