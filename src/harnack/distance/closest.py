@@ -43,7 +43,7 @@ _BITS = 10
 # Radii about a foot in which it may be proved the nearest, in distances from it: powers of two.
 _FREE = range(8, -12, -1)
 # The cosine of the angle by which a surface may begin away from a point and yet come nearer.
-_AWAY = 0.02
+_AWAY = 0.2
 # Descents that Newton's method alone does not end.
 _UNFINISHED = 1.0
 # Sheets that are looked at for each point before cells are.

@@ -22,6 +22,8 @@ _ROUNDS, _LANDINGS = 80, 8
 # In epsilons, of coordinates: so far inside the domain feet are put, by how much they may miss
 # that, and how near they are to the level.
 _INSIDE, _MISS, _NEAR = 64.0, 48.0, 256.0
+# Of the way to another face: steps end there.
+_BEFORE = 0.999
 # At a corner of the domain, whether the search turns into the other face, or has.
 _TURNING, _TURNED = 1, 2
 _LEAST_SHARE = 1e-9  # of a step: shorter ones are given up
@@ -65,7 +67,8 @@ class RimDescent:
             distance = length(x - y)
             met = dr.isfinite(nearest)
             is_other = dr.dot(there.normal, normal) < 1 - _SAME
-            turns = (hop == _TURNING) & is_other & (distance < nearest + 100 * there.near)
+            gap = fmax(wall_height - dr.dot(wall, best), 0)
+            turns = (hop == _TURNING) & is_other & (distance < nearest + 8 * gap + 100 * there.near)
             counts = there.is_on & (~met | (distance < nearest) | turns)
             # Beyond another face: that is a wall. Else off the curve: back to it, for some rounds.
             is_free = ~(dr.squared_norm(wall) > 0)
@@ -86,15 +89,18 @@ class RimDescent:
             normal = dr.select(counts, there.normal, normal)
             share = dr.select(counts, fmin(4 * share, 1), share)
             share = dr.select(fails & ~crosses, 0.25 * share, share)
-            s, rate = share * w, dr.dot(wall, tangent)
-            until = fmax((wall_height - dr.dot(wall, best)) / dr.abs(rate), 0)
-            s = dr.select(s * rate > 0, clamp(s, -until, until), s)
+            # The wall is met where rate |s| + s^2/2 wall.bend is the gap.
+            s, gap = share * w, fmax(wall_height - dr.dot(wall, best), 0)
+            rate = dr.sign(w) * dr.dot(wall, tangent)
+            root = rate + dr.sqrt(rate * rate + 2 * gap * dr.dot(wall, bend))
+            until = dr.select(root > 0, _BEFORE * 2 * gap / root, dr.inf)
+            s = dr.select(is_free & ~crosses, s, clamp(s, -until, until))
             onward = dr.fma(vector(s), tangent, best) + vector(0.5 * s * s) * bend
             is_short = dr.abs(s) <= fmax(_LEAST_STEP * nearest, there.near)
             hop = dr.select((hop == _TURNING) & ~lands, _TURNED, hop)
             ends = is_short & ~lands & (hop == 0) & (dr.squared_norm(wall) > 0)
             hop = dr.select(ends, _TURNING, hop)
-            onward = dr.select(ends, dr.fma(vector(8 * there.near), wall, best), onward)
+            onward = dr.select(ends, dr.fma(vector(gap + 8 * there.near), wall, best), onward)
             active &= (lands | counts | met) & (share > _LEAST_SHARE) & (k + 1 < _ROUNDS)
             active &= lands | ends | ~is_short
             y, landing = dr.select(lands, y + there.back, onward), dr.select(lands, landing + 1, 0)

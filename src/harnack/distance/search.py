@@ -22,7 +22,7 @@ __all__ = ["Found", "Known", "Descents", "search"]
 # Cells before points are asked which of them matter: so many for each point, within these limits.
 _EACH, _FEWEST, _MOST = 0.25, 1500, 60_000
 # Cells at most, after those that matter are split.
-_AT_MOST, _AT_MOST_ON_SHEETS = 40_000, 20_000
+_AT_MOST, _AT_MOST_ON_SHEETS = 60_000, 20_000
 # Of these shares where evaluations are as dear as those of many terms.
 _DEAR = 0.25
 _FINEST = 40
