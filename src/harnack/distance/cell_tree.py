@@ -112,19 +112,19 @@ class CellTree:
         # Points of the rim are feet of cells of their own.
         cut = np.flatnonzero(cells.rim[:, 0] < FAR)
         n, both = len(cells), np.concatenate([np.arange(len(cells)), cut])
-        number = np.where(np.arange(len(both)) < n, both, -1.0)
         is_plain = cells.is_sheet & (cells.rim[:, 0] == FAR)
         apart = np.where(is_plain, _APART, _APART_ELSEWHERE) * cells.half
-        doubt = np.where(cells.is_sheet, cells.thickness, 0)
+        doubt = np.where(cells.is_sheet, cells.thickness, 0.0)
         records = np.column_stack([
-            cells.centre[both], cells.half[both], cells.foot[both], cells.thickness[both],
-            cells.normal[both], cells.offset[both], number, cells.spread[both], doubt[both],
-            apart[both],
-        ])  # fmt: skip
+            cells.centre, cells.half, cells.foot, cells.thickness, cells.normal, cells.offset,
+            np.arange(n, dtype=np.float64), cells.spread, doubt, apart,
+        ])[both]  # fmt: skip
         reach = _RIM_SPREAD * cells.half[cut]
-        records[n:, 4:7], records[n:, 13] = cells.rim[cut], reach
-        records[n:, 15] = _APART_ELSEWHERE * cells.half[cut]
-        records[n:, 14] = reach * np.minimum(0.25, cells.rim_curvature[cut] * reach)
+        bulge = reach * np.minimum(0.25, cells.rim_curvature[cut] * reach)
+        records[n:, 4:7] = cells.rim[cut]
+        records[n:, 12:] = np.column_stack([
+            np.full(len(cut), -1), reach, bulge, _APART_ELSEWHERE * cells.half[cut],
+        ])  # fmt: skip
         centre, half = cells.centre[both], cells.half[both, None]
         hierarchy = build_hierarchy(centre, leaf_size=_LEAF_SIZE)
         placed = hierarchy.gather(records)
@@ -133,15 +133,16 @@ class CellTree:
         return cls(pack(backend, hierarchy, levels, placed))
 
     def nearest(self, x: Vec3, limit: Real) -> Vec3:
-        """The foot of the cell in which the surface seems to come nearest to x (`_estimate`), and
-        nearer than `limit`; FAR where it does not."""
+        """The foot of the cell in which the surface seems to come nearest to x
+        (`_Record.estimate`), and nearer than `limit`; FAR where it does not."""
         vector = self.tree.backend.Array3f
 
         def each(row: list[Real], active: Mask, state: State) -> State:
             best, foot = state
-            near = _estimate(vector, row, x)
+            cell = _Record.of(vector, row)
+            near = cell.estimate(x)
             taken = active & (near < best)
-            return dr.select(taken, near, best), dr.select(taken, vector(*row[4:7]), foot)
+            return dr.select(taken, near, best), dr.select(taken, cell.foot, foot)
 
         some = (1 + 1e-9) * dr.sqrt(square_to_some_point(self.tree, x, 4))
         start = fmin(some, limit), vector(FAR)
@@ -154,26 +155,27 @@ class CellTree:
 
         Returns a length that the surface is no nearer than, at most the distance of the best; and
         the foot (else FAR) of the cell where it seems to come nearest, of those in which it may be
-        nearer than the best by more than `tolerance`. Feet that are not apart from the
-        best and from `others` (`_APART`) are left out. In `marks` a Bool is set for each of those cells, wherever
-        their feet are.
+        nearer than the best by more than `tolerance`. Feet that are not apart from the best and
+        from `others` (`_APART`) are left out. In `marks` a Bool is set for each of those cells,
+        wherever their feet are.
         """
         backend = self.tree.backend
         vector, index = backend.Array3f, backend.UInt32
 
         def each(row: list[Real], active: Mask, state: State) -> State:
             lower, nearest, foot = state
-            counts = active & ~_within(vector, row, best.foot, best.free)
-            here = _lower(vector, row, x)
+            cell = _Record.of(vector, row)
+            counts = active & ~cell.is_within(best.foot, best.free)
+            here = cell.lower(x)
             wanted = counts & (here < best.distance - tolerance)
-            is_cell = row[12] >= 0
-            dr.scatter(marks, backend.Bool(True), index(fmax(row[12], 0)), wanted & is_cell)
-            lower = dr.select(counts & is_cell, fmin(lower, here), lower)
-            y, near = vector(*row[4:7]), _estimate(vector, row, x)
-            taken = wanted & (near < nearest) & (near < best.distance + row[14])
-            for one, apart in ((best.foot, best.apart * row[15]), *((o, row[15]) for o in others)):
-                taken &= dr.squared_norm(y - one) >= apart * apart
-            return lower, dr.select(taken, near, nearest), dr.select(taken, y, foot)
+            number = index(fmax(cell.number, 0))
+            dr.scatter(marks, backend.Bool(True), number, wanted & cell.is_cell)
+            lower = dr.select(counts & cell.is_cell, fmin(lower, here), lower)
+            near = cell.estimate(x)
+            taken = wanted & (near < nearest) & (near < best.distance + cell.doubt)
+            for one, times in ((best.foot, best.apart), *((other, 1.0) for other in others)):
+                taken &= dr.squared_norm(cell.foot - one) >= dr.square(times * cell.apart)
+            return lower, dr.select(taken, near, nearest), dr.select(taken, cell.foot, foot)
 
         limit = backend.Float(best.distance)
         start = limit, backend.Float(dr.inf), vector(FAR)
@@ -194,32 +196,63 @@ class CellTree:
         return walk(self.tree, visit, start)
 
 
-def _lower(vector: Any, row: list[Real], x: Vec3) -> Real:
-    """A length that the surface in a cell is no nearer than: of its box, and of its slab."""
-    centre, half, thickness = vector(*row[:3]), row[3], row[7]
-    away = x - centre
-    box = dr.norm(vector(*(fmax(dr.abs(away[k]) - half, 0) for k in range(3))))
-    n = vector(*row[8:11])
-    height = dr.dot(away, n)
-    across = dr.norm(dr.fma(vector(-height), n, away))
-    off = fmax(dr.abs(height - row[11]) - thickness, 0)
-    beside = fmax(across - 1.7321 * half, 0)
-    return fmax(box, dr.norm(vector(off, beside, 0)))
+@dataclass(frozen=True)
+class _Record:
+    """What the tree holds of a cell, or of a point of the rim in a cell (number < 0): the columns
+    of `SurfaceCells`, and
 
+    doubt: by how much the surface may be nearer than it seems.
+    apart: feet that are closer to this one than that lead to the same place.
+    """
 
-def _estimate(vector: Any, row: list[Real], x: Vec3) -> Real:
-    """How near the surface in a cell seems to come to x, not nearer than is proved.
+    centre: Vec3
+    half: Real
+    foot: Vec3
+    thickness: Real
+    normal: Vec3
+    offset: Real
+    number: Real
+    spread: Real
+    doubt: Real
+    apart: Real
 
-    Within the spread about its foot the surface is taken for a plane, the rim for a line. Then the
-    foot is farther than the nearest point by no more than the spread at right angles to the way."""
-    away = x - vector(*row[4:7])
-    height = dr.select(row[12] >= 0, dr.dot(away, vector(*row[8:11])), 0)
-    across = fmax(dr.squared_norm(away) - height * height - row[13] * row[13], 0)
-    near = fmax(dr.sqrt(dr.fma(height, height, across)), _lower(vector, row, x))
-    return dr.select(row[4] < 0.5 * FAR, near, dr.inf)
+    @classmethod
+    def of(cls, vector: Any, row: list[Real]) -> _Record:
+        """From a row of numbers."""
+        return cls(
+            vector(*row[:3]), row[3], vector(*row[4:7]), row[7], vector(*row[8:11]), *row[11:16]
+        )
 
+    @property
+    def is_cell(self) -> Mask:
+        """Whether it is a cell of its own."""
+        return self.number >= 0
 
-def _within(vector: Any, row: list[Real], y: Vec3, radius: Real) -> Mask:
-    """Whether a whole cell is within a radius of y."""
-    away = dr.abs(y - vector(*row[:3])) + row[3]
-    return dr.squared_norm(away) < radius * radius
+    def lower(self, x: Vec3) -> Real:
+        """A length that the surface in the cell is no nearer than: of its box, and of its slab."""
+        vector: Any = type(x)
+        away = x - self.centre
+        box = dr.norm(vector(*(fmax(dr.abs(away[k]) - self.half, 0) for k in range(3))))
+        height = dr.dot(away, self.normal)
+        across = dr.norm(dr.fma(vector(-height), self.normal, away))
+        off = fmax(dr.abs(height - self.offset) - self.thickness, 0)
+        beside = fmax(across - 1.7321 * self.half, 0)
+        return fmax(box, dr.norm(vector(off, beside, 0)))
+
+    def estimate(self, x: Vec3) -> Real:
+        """How near the surface in the cell seems to come to x, not nearer than is proved; infinite
+        without a foot.
+
+        Within the spread about the foot the surface is taken for a plane, the rim for a line: the
+        way to its nearest point is at right angles to that from there to the foot.
+        """
+        away = x - self.foot
+        height = dr.select(self.is_cell, dr.dot(away, self.normal), 0)
+        square = dr.squared_norm(away) - height * height - self.spread * self.spread
+        near = dr.sqrt(dr.fma(height, height, fmax(square, 0)))
+        return dr.select(self.foot.x < 0.5 * FAR, fmax(near, self.lower(x)), dr.inf)
+
+    def is_within(self, y: Vec3, radius: Real) -> Mask:
+        """Whether the whole cell is within a radius of y."""
+        away = dr.abs(y - self.centre) + self.half
+        return dr.squared_norm(away) < radius * radius

@@ -16,9 +16,9 @@ from harnack.backend.extrema import fmax
 from harnack.backend.lengths import length
 from harnack.distance.batches import in_batches
 from harnack.distance.closing_in import close_in
+from harnack.distance.estimates import first_order
 from harnack.distance.meshes.on_sheets import SheetSearch
 from harnack.distance.meshes.surface import MeshSurface
-from harnack.distance.estimates import first_order
 from harnack.distance.projection import Descent
 from harnack.distance.rim import RimDescent
 from harnack.distance.search import Known, search
@@ -100,9 +100,7 @@ def _in_order(
         start = _nearer(x, start, mesh)
     if surface.field.has_sheets:
         start = job.on_sheets(x, start)
-    found = search(
-        surface, x, Known(start, near), job, _TOLERANCE * _size(surface, x), progress
-    )
+    found = search(surface, x, Known(start, near), job, _TOLERANCE * _size(surface, x), progress)
     found.feet = job.refined(x, found.feet)
     distance = _length(x - found.feet)
     # One foot may be no point of the surface but for rounding: a promise may not hold either.
@@ -249,8 +247,9 @@ class _Points:
         """`search.Descents`."""
 
         def beside(p: Vec3, b: Vec3, length_: Vec3) -> tuple[Vec3]:
-            y = self._descent.beside(p, b, length_.x)
-            towards = dr.dot(p - b, y - b) > -_AWAY * length(p - b) * length(y - b)
+            way = p - b
+            y = self._descent.onto_level(b + length_.x / length(way) * way)
+            towards = dr.dot(way, y - b) > -_AWAY * length(way) * length(y - b)
             return (dr.select(towards, y, dr.nan),)
 
         feet, free = np.full_like(points, np.nan), np.zeros(len(points))
@@ -293,7 +292,8 @@ class _Points:
         return best
 
     def refined(self, points: FloatArray, feet: FloatArray) -> FloatArray:
-        """The feet (n, 3) moved onto the level of the field without what clusters leave out."""
+        """The feet (n, 3) moved onto the level of the field without what clusters leave out: by
+        Newton's method for the closest point, else straight to the level."""
         rows = np.flatnonzero(np.isfinite(feet[:, 0]))
         exact = self._exact
         if exact is None or not len(rows):
@@ -303,17 +303,15 @@ class _Points:
             y, found, _ = exact.directly(p, start)
             return (dr.select(found, y, dr.nan),)
 
-        def closest(p: Vec3, start: Vec3) -> tuple[Vec3]:
-            y, _, on_level = exact.closest(p, start)
-            return (dr.select(on_level, y, start),)
+        def to_level(start: Vec3) -> tuple[Vec3]:
+            y = exact.onto_level(start)
+            return (dr.select(dr.isfinite(dr.squared_norm(y)), y, start),)
 
         feet = feet.copy()
         (there,) = in_batches(self.backend, directly, points[rows], feet[rows])
         left = np.flatnonzero(np.isnan(there[:, 0]))
         if len(left):
-            (there[left],) = in_batches(
-                self.backend, closest, points[rows[left]], feet[rows[left]]
-            )
+            (there[left],) = in_batches(self.backend, to_level, feet[rows[left]])
         inside = ~np.isnan(self._within(there)[:, 0])
         feet[rows[inside]] = there[inside]
         return feet

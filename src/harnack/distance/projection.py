@@ -78,7 +78,8 @@ class Descent:
     def directly(self, x: Vec3, start: Vec3) -> tuple[Vec3, Mask, Mask]:
         """The closest point y to x that Newton's method for f(y) = level and (x - y) parallel to
         grad f(y) leads to from a point of the surface nearby; whether it is one, by the criterion
-        of `closest`, no farther than `start`; and whether the search goes on to where f is singular.
+        of `closest`, no farther than `start` but for twice what that is off the level; and whether
+        the search goes on to where f is singular.
 
         Each step is that of `closest` along the surface, which follows its curvature, and one to
         the level, both from derivatives at one place: errors are squared by each of both.
@@ -86,11 +87,15 @@ class Descent:
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
         x, mask = vector(x), self.backend.Bool
 
-        def body(y: Vec3, found: Mask, singular: Mask, k: Any, active: Mask) -> tuple[Any, ...]:
+        def body(
+            y: Vec3, first: Real, found: Mask, singular: Mask, k: Any, active: Mask
+        ) -> tuple[Any, ...]:
             above, here = self._look(y)
             gradient_norm = lengths.length(here.gradient)
             move, settled = self._step_along(x, here, real(1))
-            off = clamp(-above / gradient_norm, -here.reach, here.reach)
+            off = -above / gradient_norm
+            first = dr.select(k == 0, dr.abs(off), first)
+            off = clamp(off, -here.reach, here.reach)
             move = dr.fma(vector(off / gradient_norm), here.gradient, move)
             length = dr.norm(move)
             longest = 0.5 * here.reach
@@ -100,14 +105,14 @@ class Descent:
             found |= active & done
             singular = dr.select(active, too_long, singular)
             active &= ~done & dr.isfinite(length) & (k + 1 < _STEPS_DIRECT)
-            return dr.select(active, there, y), found, singular, k + 1, active
+            return dr.select(active, there, y), first, found, singular, k + 1, active
 
         def more(*state: Any) -> Mask:
             return state[-1]
 
-        state = vector(start), mask(False), mask(False), count(0), mask(True)
-        y, found, singular, _, _ = dr.while_loop(state, more, body, label="Newton's method")
-        limit = dr.norm(x - start) * (1 + 64 * self.backend.epsilon)
+        state = vector(start), real(0), mask(False), mask(False), count(0), mask(True)
+        y, first, found, singular, _, _ = dr.while_loop(state, more, body, label="Newton's method")
+        limit = (dr.norm(x - start) + 2 * first) * (1 + 64 * self.backend.epsilon)
         limit = dr.fma(64 * self.backend.epsilon, lengths.largest_component(y), limit)
         return y, found & (dr.norm(x - y) <= limit), singular & ~found
 
@@ -164,11 +169,8 @@ class Descent:
         )
         return y, found, on_level
 
-    def beside(self, x: Vec3, boundary: Vec3, aside: Real) -> Vec3:
-        """A point of the level set from so far beside a point of its boundary, towards x; NaN where
-        none is found."""
-        way = x - boundary
-        start = dr.fma(self.backend.Array3f(aside / dr.norm(way)), way, boundary)
+    def onto_level(self, start: Vec3) -> Vec3:
+        """The point of a level that Newton's method along the gradient leads to; NaN for none."""
         place, found = self._to_level(start, self.backend.Bool(True))
         return dr.select(found, place.y, dr.nan)
 

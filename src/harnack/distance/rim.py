@@ -50,10 +50,10 @@ class RimDescent:
         f and h along t (differences of their gradients). Half the squared distance has the
         derivative -(x - y).t along the curve and the second derivative 1 - (x - y).y'', which give
         Newton's step w t + w^2/2 y''. After a step Newton's method for both equations leads back to
-        the curve. The step counts if that comes nearer to x, else a quarter of it is tried. Where it
-        led to another face of the domain instead, that face ends steps from then on, so that they
-        lead to the corner where both faces meet; from there the search goes on, once, along the
-        curve in the other face.
+        the curve. The step counts if that comes nearer to x, else a quarter of it is tried. Where
+        it led to another face of the domain instead, that face ends steps from then on, so that
+        they lead to the corner where both faces meet; from there the search goes on, once, along
+        the curve in the other face.
         """
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
         x = vector(x)
@@ -145,7 +145,9 @@ class RimDescent:
         # Beside an edge of the domain the normal is another one ahead: no curvature.
         turns = dr.select(dr.abs(turns) * h < 1e-3, turns, 0)
         is_on = (dr.abs(off) <= near) & (dr.abs(inwards) <= _MISS * self.backend.epsilon * size)
-        return _RimPlace(is_on, near, solution(off, inwards), t, solution(-falls, -turns), n, inwards)
+        return _RimPlace(
+            is_on, near, solution(off, inwards), t, solution(-falls, -turns), n, inwards
+        )
 
 
 @dataclass(frozen=True)

@@ -17,14 +17,12 @@ from harnack.distance.surface_cells import CellProofs
 if TYPE_CHECKING:
     from harnack.tracer import LevelSet
 
-__all__ = ["Found", "Known", "Descents", "search"]
+__all__ = ["Descents", "Found", "Known", "search"]
 
-# Cells before points are asked which of them matter: so many for each point, within these limits.
-_EACH, _FEWEST, _MOST = 0.25, 1500, 60_000
-# Cells at most, after those that matter are split.
-_AT_MOST, _AT_MOST_ON_SHEETS = 60_000, 20_000
-# Of these shares where evaluations are as dear as those of many terms.
-_DEAR = 0.25
+# Cells before points are asked which of them matter: so many for each point, and at least these.
+_EACH, _FEWEST = 0.25, 1500
+# Cells at most, and which share of that where evaluations are as dear as those of many terms.
+_MOST, _MOST_ON_SHEETS, _DEAR = 60_000, 20_000, 0.25
 _FINEST = 40
 # Feet of other parts of the surface that are tried, from the same cells.
 _CHALLENGES = 4
@@ -69,7 +67,7 @@ class Descents(Protocol):
 class Known:
     """What is known of the surface from the points alone.
 
-    feet: (n, 3) points of the surface, or NaN. near: (n,) estimates of the distance, to first order.
+    feet: (n, 3) points of the surface, or NaN. near: (n,) what the distance is to first order.
     """
 
     feet: FloatArray
@@ -144,9 +142,7 @@ def _in_parts(
 ) -> Found:  # fmt: skip
     """The nearest points in a cube, for so many points at a time."""
     proofs = CellProofs(surface)
-    share = _DEAR if surface.field.has_detail else 1.0
-    limit = share * (_AT_MOST_ON_SHEETS if surface.field.has_sheets else _MOST)
-    enough = min(max(_FEWEST, int(_EACH * len(points))), int(limit))
+    enough = min(max(_FEWEST, int(_EACH * len(points))), _most(surface))
     cells = _split(proofs, root, enough, progress)
     parts: list[Found] = []
     for first in range(0, max(len(points), 1), _AT_ONCE):
@@ -154,6 +150,12 @@ def _in_parts(
         job = _Search(proofs, cells, points[rows], known.some(rows), descents, tolerance)
         parts.append(job.run(progress))
     return Found(*(np.concatenate([getattr(p, k) for p in parts]) for k in ("feet", "lower")))
+
+
+def _most(surface: LevelSet) -> int:
+    """How many cells there may be."""
+    most = _MOST_ON_SHEETS if surface.field.has_sheets else _MOST
+    return int(most * (_DEAR if surface.field.has_detail else 1.0))
 
 
 def _split(
@@ -196,42 +198,45 @@ class _Search:
         self.lower, self.tolerance = np.zeros(len(points)), tolerance
 
     def run(self, progress: Callable[[str], None]) -> Found:
-        """What is found.
-
-        First comes the foot of the cell where the surface seems nearest, then those of other parts
-        that may be nearer. If some may still be, and there are not too many cells, those cells are
-        split, and so on.
-        """
-        if not len(self.cells):
-            self.lower[:] = np.inf
+        """What is found."""
+        if not len(self.points):
             return Found(self.feet, self.lower)
-        field = self.proofs.surface.field
-        most = _AT_MOST_ON_SHEETS if field.has_sheets else _AT_MOST
-        most = int(most * (_DEAR if field.has_detail else 1.0))
+        has_sheets = self.proofs.surface.field.has_sheets
+        if len(self.cells):
+            self._search_cells(has_sheets, progress)
+        else:
+            self.lower[:] = np.inf
+        if not has_sheets:
+            # Where sheets meet or cross within a cell, one may have no foot there; and a promise
+            # that does not hold may have left out cells.
+            rows = np.flatnonzero(self._is_open() | np.isnan(self.feet[:, 0]))
+            rows = rows[self.known.near[rows] < _NEARER * self._distance(rows)]
+            self._descend(rows, self.points[rows])
+        return Found(self.feet, self.lower)
+
+    def _search_cells(self, has_sheets: bool, progress: Callable[[str], None]) -> None:
+        """First from the foot of the cell where the surface seems nearest, then from those of other
+        parts that may be nearer. If some may still be, and there are not too many cells, those
+        cells are split, and so on."""
+        most = _most(self.proofs.surface)
         tree = CellTree.of(self.backend, self.cells)
         tried = self._first(tree)
-        if not field.has_sheets:
+        if not has_sheets:
             self._leave_boundary()
         rows = np.arange(len(self.points))
         for _ in range(_FINEST):
             marks = self._challenge(tree, rows, tried[rows])
-            rows = self._open()
+            rows = np.flatnonzero(self._is_open())
             count = int(marks.sum())
             if not count or not len(rows) or len(self.cells) + 4 * count > most:
                 break
             self.cells = _halved(self.proofs, self.cells, marks)
             progress(f"distances: {len(self.cells):,} cells for {len(rows):,} points")
             tree = CellTree.of(self.backend, self.cells)
-        if not field.has_sheets:
-            # Where sheets meet or cross within a cell, one may have no foot there.
-            rows = self._open()
-            rows = rows[self.known.near[rows] < _NEARER * self._distance(rows)]
-            self._descend(rows, self.points[rows])
-        return Found(self.feet, self.lower)
 
-    def _open(self) -> IntArray:
-        """The points of which it is not proved that none is nearer than the best."""
-        return np.flatnonzero(self.lower < self._distance(slice(None)) - self.tolerance)
+    def _is_open(self) -> BoolArray:
+        """Whether it is not proved that no point is nearer than the best."""
+        return self.lower < self._distance(slice(None)) - self.tolerance
 
     def _distance(self, rows: IntArray | slice) -> FloatArray:
         """Of the best feet so far; FAR where there is none."""

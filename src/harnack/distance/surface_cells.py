@@ -3,7 +3,6 @@ points of it."""
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -96,6 +95,7 @@ class CellProofs:
         what is known of them."""
         radius = _WITHIN * half
         inside, start = np.ones(len(centre), np.bool_), centre
+        away: FloatArray = np.zeros(len(centre))
         if self._volume is not None:
             inside = self._volume.contains_points(centre)
             away, start = self._at(self._pulled_inside, centre)
@@ -165,7 +165,7 @@ class CellProofs:
     def _disk(self, p: Vec3, radii: Vec3, normal: Vec3) -> tuple[Vec3, Vec3, Real]:
         """A foot near p, the normal of a plane that is nearly the surface there, and how far about
         the foot: up to the curve that the surface ends in."""
-        radius, vector = radii.x, self._backend.Array3f
+        radius = radii.x
         if self.surface.field.has_sheets:
             return self._hit(p, radius), normal, self._backend.Float(0)
         foot = self._foot(p, radius)
