@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import numpy as np
@@ -230,7 +230,7 @@ class _Record:
 
     def lower(self, x: Vec3) -> Real:
         """A length that the surface in the cell is no nearer than: of its box, and of its slab."""
-        vector: Any = type(x)
+        vector = cast("Any", type(x))
         away = x - self.centre
         box = dr.norm(vector(*(fmax(dr.abs(away[k]) - self.half, 0) for k in range(3))))
         height = dr.dot(away, self.normal)
