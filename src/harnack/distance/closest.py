@@ -21,7 +21,7 @@ from harnack.distance.meshes.on_sheets import SheetSearch
 from harnack.distance.meshes.surface import MeshSurface
 from harnack.distance.projection import Descent
 from harnack.distance.rim import RimDescent
-from harnack.distance.search import Known, search
+from harnack.distance.search import Known, Tolerance, search
 from harnack.distance.surface_cells import remainder
 from harnack.fields.clearance import distance_below
 from harnack.fields.points import morton_order
@@ -72,16 +72,18 @@ class Closest:
 
 def find_closest(
     backend: Backend, surface: LevelSet, levels: TargetLevels, points: Any,
-    progress: Callable[[str], None],
+    progress: Callable[[str], None], *, is_proved: bool = False,
 ) -> Closest:  # fmt: skip
     """The closest point of a surface to each of the points (n, 3).
+
+    is_proved: whether `lower` is wanted as close as cells can prove it.
 
     They are looked at cell by cell along a Morton curve, so that neighbouring lanes walk a tree
     together.
     """
     x = finite_vectors(points, "points")
     order = to_numpy(morton_order(backend, upload_vectors(backend, x), _BITS))
-    found = _in_order(backend, surface, levels, x[order], progress)
+    found = _in_order(backend, surface, levels, x[order], progress, is_proved)
     back = np.empty_like(order)
     back[order] = np.arange(len(order), dtype=order.dtype)
     return Closest(*(part[back] for part in vars(found).values()))
@@ -89,7 +91,7 @@ def find_closest(
 
 def _in_order(
     backend: Backend, surface: LevelSet, levels: TargetLevels, points: FloatArray,
-    progress: Callable[[str], None],
+    progress: Callable[[str], None], is_proved: bool,
 ) -> Closest:  # fmt: skip
     mesh = MeshSurface.of(surface)
     if mesh is not None and mesh.is_all:
@@ -100,7 +102,8 @@ def _in_order(
         start = _nearer(x, start, mesh)
     if surface.field.has_sheets:
         start = job.on_sheets(x, start)
-    found = search(surface, x, Known(start, near), job, _TOLERANCE * _size(surface, x), progress)
+    tolerance = Tolerance(_TOLERANCE * _size(surface, x), is_proved)
+    found = search(surface, x, Known(start, near), job, tolerance, progress)
     found.feet = job.refined(x, found.feet)
     distance = _length(x - found.feet)
     # One foot may be no point of the surface but for rounding: a promise may not hold either.

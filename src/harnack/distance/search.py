@@ -17,12 +17,13 @@ from harnack.distance.surface_cells import CellProofs
 if TYPE_CHECKING:
     from harnack.tracer import LevelSet
 
-__all__ = ["Descents", "Found", "Known", "search"]
+__all__ = ["Descents", "Found", "Known", "Tolerance", "search"]
 
-# Cells before points are asked which of them matter: so many for each point, and at least these.
-_EACH, _FEWEST = 0.25, 1500
+# Cells before points are asked which of them matter: so many for each point, and at least these;
+# with sheets, which are searched in turn as well, these.
+_EACH, _FEWEST, _FEWEST_ON_SHEETS = 0.25, 10_000, 1500
 # Cells at most, and which share of that where evaluations are as dear as those of many terms.
-_MOST, _MOST_ON_SHEETS, _DEAR = 60_000, 20_000, 0.25
+_MOST, _MOST_TO_PROVE, _MOST_ON_SHEETS, _DEAR = 60_000, 150_000, 20_000, 0.25
 _FINEST = 40
 # Feet of other parts of the surface that are tried, from the same cells.
 _CHALLENGES = 4
@@ -79,6 +80,19 @@ class Known:
 
 
 @dataclass(frozen=True)
+class Tolerance:
+    """When a search is at an end.
+
+    length: points that are nearer by less do not matter.
+    is_proved: whether cells are split until none may hold a point that is nearer than the best by
+        more than that, or there are too many.
+    """
+
+    length: float
+    is_proved: bool
+
+
+@dataclass(frozen=True)
 class _Cube:
     """A cube that holds the surface, or the part of it that is looked at."""
 
@@ -94,14 +108,10 @@ class _Cube:
 
 
 def search(
-    surface: LevelSet, points: FloatArray, known: Known, descents: Descents, tolerance: float,
-    progress: Callable[[str], None],
+    surface: LevelSet, points: FloatArray, known: Known, descents: Descents,
+    tolerance: Tolerance, progress: Callable[[str], None],
 ) -> Found:  # fmt: skip
-    """The nearest points of a level set to `points` (n, 3).
-
-    tolerance: of distances: cells are split until none may hold a point that is nearer than the
-        best by more than that, or there are too many.
-    """
+    """The nearest points of a level set to `points` (n, 3)."""
     box = _box(surface)
     if box is not None:
         if (box[0] > box[1]).any():
@@ -138,23 +148,31 @@ def _box(surface: LevelSet) -> tuple[FloatArray, FloatArray] | None:
 
 def _in_parts(
     surface: LevelSet, root: _Cube, points: FloatArray, known: Known, descents: Descents,
-    tolerance: float, progress: Callable[[str], None],
+    tolerance: Tolerance, progress: Callable[[str], None],
 ) -> Found:  # fmt: skip
     """The nearest points in a cube, for so many points at a time."""
     proofs = CellProofs(surface)
-    enough = min(max(_FEWEST, int(_EACH * len(points))), _most(surface))
+    most = _most(surface, len(points), tolerance.is_proved)
+    enough = min(max(_FEWEST, int(_EACH * len(points))), _MOST, most)
+    if surface.field.has_sheets:
+        enough = _FEWEST_ON_SHEETS
     cells = _split(proofs, root, enough, progress)
     parts: list[Found] = []
     for first in range(0, max(len(points), 1), _AT_ONCE):
         rows = slice(first, first + _AT_ONCE)
-        job = _Search(proofs, cells, points[rows], known.some(rows), descents, tolerance)
+        at_most = most if tolerance.is_proved else 0
+        job = _Search(
+            proofs, cells, points[rows], known.some(rows), descents, tolerance.length, at_most
+        )
         parts.append(job.run(progress))
     return Found(*(np.concatenate([getattr(p, k) for p in parts]) for k in ("feet", "lower")))
 
 
-def _most(surface: LevelSet) -> int:
+def _most(surface: LevelSet, points: int, is_proved: bool) -> int:
     """How many cells there may be."""
-    most = _MOST_ON_SHEETS if surface.field.has_sheets else _MOST
+    if surface.field.has_sheets:
+        return _MOST_ON_SHEETS
+    most = min(max(_MOST, points // 2), _MOST_TO_PROVE) if is_proved else _MOST
     return int(most * (_DEAR if surface.field.has_detail else 1.0))
 
 
@@ -185,17 +203,18 @@ class _Search:
     """The search for some points, from cells that hold all of the surface.
 
     feet: (n, 3) the nearest points so far, or NaN. free: (n,) within these radii about them none is
-    nearer. lower: (n,) proved bounds of distances.
+    nearer. lower: (n,) proved bounds of distances. most: cells are split while they are not more.
     """
 
     def __init__(
         self, proofs: CellProofs, cells: SurfaceCells, points: FloatArray, known: Known,
-        descents: Descents, tolerance: float,
+        descents: Descents, tolerance: float, most: int,
     ) -> None:  # fmt: skip
         self.proofs, self.cells, self.points, self.descents = proofs, cells, points, descents
         self.backend = choose_backend("double")
         self.known, self.feet, self.free = known, known.feet.copy(), np.zeros(len(points))
         self.lower, self.tolerance = np.zeros(len(points)), tolerance
+        self.most = most
 
     def run(self, progress: Callable[[str], None]) -> Found:
         """What is found."""
@@ -218,7 +237,6 @@ class _Search:
         """First from the foot of the cell where the surface seems nearest, then from those of other
         parts that may be nearer. If some may still be, and there are not too many cells, those
         cells are split, and so on."""
-        most = _most(self.proofs.surface)
         tree = CellTree.of(self.backend, self.cells)
         tried = self._first(tree)
         if not has_sheets:
@@ -228,7 +246,7 @@ class _Search:
             marks = self._challenge(tree, rows, tried[rows])
             rows = np.flatnonzero(self._is_open())
             count = int(marks.sum())
-            if not count or not len(rows) or len(self.cells) + 4 * count > most:
+            if not count or not len(rows) or len(self.cells) + 4 * count > self.most:
                 break
             self.cells = _halved(self.proofs, self.cells, marks)
             progress(f"distances: {len(self.cells):,} cells for {len(rows):,} points")

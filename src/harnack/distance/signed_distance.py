@@ -154,17 +154,18 @@ def distance_bounds(
     Raises:
         TypeError, ValueError: as `signed_distance`.
     """
-    found = _found("distance_bounds", field, points, level, precision, progress)
+    found = _found("distance_bounds", field, points, level, precision, progress, is_proved=True)
     return DistanceBounds(found.feet, found.distance, found.lower)
 
 
 def _found(
     name: str, field: Field, points: Any, level: Any, precision: Precision,
-    progress: Callable[[str], None] | None,
+    progress: Callable[[str], None] | None, *, is_proved: bool = False,
 ) -> Closest:  # fmt: skip
     backend = choose_backend(precision)
     surface = _surface(field, level)
-    found = find_closest(backend, surface, _levels(backend, surface), points, progress or _silent)
+    levels = _levels(backend, surface)
+    found = find_closest(backend, surface, levels, points, progress or _silent, is_proved=is_proved)
     _warn(name, found)
     return found
 
