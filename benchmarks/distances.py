@@ -45,10 +45,10 @@ def distances(n: int = POINTS) -> str:
     """The section's text."""
     fields: dict[str, tuple[hk.Field, int]] = {
         "closed mesh, 81,920 faces": (hk.WindingNumber(*mesh_shapes.bumpy_sphere(6)), n),
-        "polygon, 24 edges": (hk.SolidAngle(shapes.wavy_polygon(24)), n // 20),
-        "trefoil, 60 edges": (hk.SolidAngle(shapes.torus_knot(2, 3, 60)), n // 20),
-        "gyroid": (hk.Gyroid(), n // 20),
-        "cloud of 2,000 points": (_cloud(2000), n // 100),
+        "polygon, 24 edges": (hk.SolidAngle(shapes.wavy_polygon(24)), n // 10),
+        "trefoil, 60 edges": (hk.SolidAngle(shapes.torus_knot(2, 3, 60)), n // 10),
+        "gyroid": (hk.Gyroid(), n // 10),
+        "cloud of 2,000 points": (_cloud(2000), n // 50),
     }
     rows = [
         "| surface | points | us a point | gap, median | gap, 90 % |", "|---|---|---|---|---|"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import numpy as np
@@ -23,12 +23,18 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.tree.walk import Node, State
 
-__all__ = ["FAR", "NO_CELL", "CellTree", "SurfaceCells"]
+__all__ = ["FAR", "Best", "CellTree", "SurfaceCells"]
 
-NO_CELL = 0xFFFFFFFF
 FAR = 1e150
 """Coordinates of feet that there are not, and the thickness of slabs that say nothing."""
 _LEAF_SIZE = 4
+# Feet closer to one another than so many half cells lead to the same place: where the surface in a
+# cell is one sheet that does not end, and elsewhere.
+_APART, _APART_ELSEWHERE = 4.0, 3.0
+# In half cells: what a slab is thin for, so that the surface in it is one sheet.
+_SHEET = 0.5
+# In half cells: so far from its point in a cell the rim is nearly a line.
+_RIM_SPREAD = 4.0
 
 
 @dataclass(frozen=True)
@@ -38,7 +44,10 @@ class SurfaceCells:
     centre: (n, 3). half: (n,) half the length of an edge.
     foot: (n, 3) a point of the surface, no farther from the centre than the cell is wide, or FAR.
     normal: (n, 3), offset, thickness: (n,) the surface within the ball around the cell has
-        |normal . (y - centre) - offset| <= thickness; FAR where nothing is known.
+        |normal . (y - centre) - offset| <= thickness, which is FAR where nothing is known. The
+        normal is zero where no plane is known that is nearly the surface.
+    spread: (n,) within this radius about its foot the surface is nearly that plane.
+    rim: (n, 3) a point of the rim at which a domain cuts the surface, or FAR. rim_curvature: (n,).
     """
 
     centre: FloatArray
@@ -47,6 +56,19 @@ class SurfaceCells:
     normal: FloatArray
     offset: FloatArray
     thickness: FloatArray
+    spread: FloatArray
+    rim: FloatArray
+    rim_curvature: FloatArray
+
+    @classmethod
+    def unknown(cls, centre: FloatArray, half: FloatArray) -> SurfaceCells:
+        """Cubes of which nothing is known."""
+        n = len(half)
+        far, zero = np.full((n, 3), FAR), np.zeros(n)
+        return cls(
+            centre, half, far, np.zeros((n, 3)), zero, np.full(n, FAR), zero.copy(), far.copy(),
+            zero.copy(),
+        )  # fmt: skip
 
     def __len__(self) -> int:
         return len(self.half)
@@ -55,11 +77,28 @@ class SurfaceCells:
         """Those chosen by a mask (n,)."""
         return SurfaceCells(*(part[which] for part in vars(self).values()))
 
+    @property
+    def is_sheet(self) -> BoolArray:
+        """(n,) whether the surface in a cell is one sheet, as far as its slab tells."""
+        return self.thickness < _SHEET * self.half
+
     @classmethod
     def joined(cls, parts: list[SurfaceCells]) -> SurfaceCells:
         """All of several."""
         columns = zip(*(vars(part).values() for part in parts), strict=True)
         return cls(*(np.concatenate(column) for column in columns))
+
+
+@dataclass(frozen=True)
+class Best:
+    """The nearest point of the surface so far: its place, how far it is, and a radius about it
+    within which none is nearer. apart: how many times farther from it than from others feet are to
+    be."""
+
+    foot: Vec3
+    distance: Real
+    free: Real
+    apart: Real
 
 
 @dataclass(frozen=True)
@@ -70,69 +109,79 @@ class CellTree:
 
     @classmethod
     def of(cls, backend: Backend, cells: SurfaceCells) -> CellTree:
-        hierarchy = build_hierarchy(cells.centre, leaf_size=_LEAF_SIZE)
-        number = np.arange(len(cells), dtype=np.float64)
+        # Points of the rim are feet of cells of their own.
+        cut = np.flatnonzero(cells.rim[:, 0] < FAR)
+        n, both = len(cells), np.concatenate([np.arange(len(cells)), cut])
+        is_plain = cells.is_sheet & (cells.rim[:, 0] == FAR)
+        apart = np.where(is_plain, _APART, _APART_ELSEWHERE) * cells.half
+        doubt = np.where(cells.is_sheet, cells.thickness, 0.0)
         records = np.column_stack([
             cells.centre, cells.half, cells.foot, cells.thickness, cells.normal, cells.offset,
-            number,
+            np.arange(n, dtype=np.float64), cells.spread, doubt, apart,
+        ])[both]  # fmt: skip
+        reach = _RIM_SPREAD * cells.half[cut]
+        bulge = reach * np.minimum(0.25, cells.rim_curvature[cut] * reach)
+        records[n:, 4:7] = cells.rim[cut]
+        records[n:, 12:] = np.column_stack([
+            np.full(len(cut), -1), reach, bulge, _APART_ELSEWHERE * cells.half[cut],
         ])  # fmt: skip
+        centre, half = cells.centre[both], cells.half[both, None]
+        hierarchy = build_hierarchy(centre, leaf_size=_LEAF_SIZE)
         placed = hierarchy.gather(records)
-        placed[hierarchy.slots < 0] = [FAR] * 3 + [0] + [FAR] * 4 + [0, 0, 1, 0, -1]
-        half = cells.half[:, None]
-        levels = box_levels(hierarchy, cells.centre - half, cells.centre + half)
+        placed[hierarchy.slots < 0] = [FAR] * 3 + [0] + [FAR] * 4 + [0, 0, 0, 0, -1, 0, 0, 0]
+        levels = box_levels(hierarchy, centre - half, centre + half)
         return cls(pack(backend, hierarchy, levels, placed))
 
-    def nearest_foot(
-        self,
-        x: Vec3,
-        others: tuple[Vec3, ...],
-        apart: Real,
-        limit: Real,
-        *,
-        unbounded: bool = False,
-    ) -> tuple[Real, Vec3]:  # fmt: skip
-        """The squared distance of the nearest foot nearer than `limit`, of cells that come nearer
-        than that, and the foot; infinite if there is none. Feet that are within `apart` half
-        cells of others are left out. unbounded: whether limits say nothing."""
-        vector, real = self.tree.backend.Array3f, self.tree.backend.Float
-        limit = real(limit)
+    def nearest(self, x: Vec3, limit: Real) -> Vec3:
+        """The foot of the cell in which the surface seems to come nearest to x
+        (`_Record.estimate`), and nearer than `limit`; FAR where it does not."""
+        vector = self.tree.backend.Array3f
 
         def each(row: list[Real], active: Mask, state: State) -> State:
             best, foot = state
-            here = vector(*row[4:7])
-            square = dr.squared_norm(here - x)
-            radius = apart * row[3]
-            apart_from = [dr.squared_norm(here - one) >= radius * radius for one in others]
-            taken = active & dr.all(apart_from) & (square < best) & (_lower(vector, row, x) < limit)
-            return dr.select(taken, square, best), dr.select(taken, here, foot)
+            cell = _Record.of(vector, row)
+            near = cell.estimate(x)
+            taken = active & (near < best)
+            return dr.select(taken, near, best), dr.select(taken, cell.foot, foot)
 
-        some = (1 + 1e-9) * square_to_some_point(self.tree, x, 4) if unbounded else limit * limit
-        best, foot = self._walk(x, each, (some, vector(FAR)), lambda state: state[0])
-        return dr.select(foot.x < 0.5 * FAR, best, dr.inf), foot
+        some = (1 + 1e-9) * dr.sqrt(square_to_some_point(self.tree, x, 4))
+        start = fmin(some, limit), vector(FAR)
+        return self._walk(x, each, start, lambda state: dr.square(state[0]))[1]
 
-    def mark(
-        self, x: Vec3, y: Vec3, free: Real, distance: Real, tolerance: Real, marks: Any
-    ) -> Real:
-        """Mark the cells in which the surface may be nearer to x than `distance` by more than
-        `tolerance`, farther than `free` from y: a Bool for each is set in `marks`.
+    def nearer(
+        self, x: Vec3, best: Best, others: tuple[Vec3, ...], tolerance: Real, marks: Any
+    ) -> tuple[Real, Vec3]:
+        """What cells say about points of the surface that are nearer to x than the best.
 
-        Returns a length that the surface, but for what is within `free` of y, is no nearer than;
-        at most `distance`.
+        Returns a length that the surface is no nearer than, at most the distance of the best; and
+        the foot (else FAR) of the cell where it seems to come nearest, of those in which it may be
+        nearer than the best by more than `tolerance`. Feet that are not apart from the best and
+        from `others` (`_APART`) are left out. In `marks` a Bool is set for each of those cells,
+        wherever their feet are.
         """
         backend = self.tree.backend
         vector, index = backend.Array3f, backend.UInt32
 
         def each(row: list[Real], active: Mask, state: State) -> State:
-            counts = active & ~_within(vector, row, y, free) & (row[12] >= 0)
-            lower = _lower(vector, row, x)
-            wanted = counts & (lower < distance - tolerance)
-            dr.scatter(marks, backend.Bool(True), index(fmax(row[12], 0)), wanted)
-            return (dr.select(counts, fmin(state[0], lower), state[0]),)
+            lower, nearest, foot = state
+            cell = _Record.of(vector, row)
+            counts = active & ~cell.is_within(best.foot, best.free)
+            here = cell.lower(x)
+            wanted = counts & (here < best.distance - tolerance)
+            number = index(fmax(cell.number, 0))
+            dr.scatter(marks, backend.Bool(True), number, wanted & cell.is_cell)
+            lower = dr.select(counts & cell.is_cell, fmin(lower, here), lower)
+            near = cell.estimate(x)
+            taken = wanted & (near < nearest) & (near < best.distance + cell.doubt)
+            for one, times in ((best.foot, best.apart), *((other, 1.0) for other in others)):
+                taken &= dr.squared_norm(cell.foot - one) >= dr.square(times * cell.apart)
+            return lower, dr.select(taken, near, nearest), dr.select(taken, cell.foot, foot)
 
-        limit = backend.Float(distance)
-        (lower,) = self._walk(x, each, (limit,), lambda state: limit * limit)
-        dr.eval(lower, marks)
-        return lower
+        limit = backend.Float(best.distance)
+        start = limit, backend.Float(dr.inf), vector(FAR)
+        lower, _, foot = self._walk(x, each, start, lambda state: limit * limit)
+        dr.eval(lower, foot, marks)
+        return lower, foot
 
     def _walk(self, x: Vec3, each: Any, start: State, limit: Callable[[State], Real]) -> State:
         """limit: the squared distance, given the state, beyond which boxes are passed by."""
@@ -147,20 +196,63 @@ class CellTree:
         return walk(self.tree, visit, start)
 
 
-def _lower(vector: Any, row: list[Real], x: Vec3) -> Real:
-    """A length that the surface in a cell is no nearer than: of its box, and of its slab."""
-    centre, half, thickness = vector(*row[:3]), row[3], row[7]
-    away = x - centre
-    box = dr.norm(vector(*(fmax(dr.abs(away[k]) - half, 0) for k in range(3))))
-    n = vector(*row[8:11])
-    height = dr.dot(away, n)
-    across = dr.norm(dr.fma(vector(-height), n, away))
-    off = fmax(dr.abs(height - row[11]) - thickness, 0)
-    beside = fmax(across - 1.7321 * half, 0)
-    return fmax(box, dr.norm(vector(off, beside, 0)))
+@dataclass(frozen=True)
+class _Record:
+    """What the tree holds of a cell, or of a point of the rim in a cell (number < 0): the columns
+    of `SurfaceCells`, and
 
+    doubt: by how much the surface may be nearer than it seems.
+    apart: feet that are closer to this one than that lead to the same place.
+    """
 
-def _within(vector: Any, row: list[Real], y: Vec3, radius: Real) -> Mask:
-    """Whether a whole cell is within a radius of y."""
-    away = dr.abs(y - vector(*row[:3])) + row[3]
-    return dr.squared_norm(away) < radius * radius
+    centre: Vec3
+    half: Real
+    foot: Vec3
+    thickness: Real
+    normal: Vec3
+    offset: Real
+    number: Real
+    spread: Real
+    doubt: Real
+    apart: Real
+
+    @classmethod
+    def of(cls, vector: Any, row: list[Real]) -> _Record:
+        """From a row of numbers."""
+        return cls(
+            vector(*row[:3]), row[3], vector(*row[4:7]), row[7], vector(*row[8:11]), *row[11:16]
+        )
+
+    @property
+    def is_cell(self) -> Mask:
+        """Whether it is a cell of its own."""
+        return self.number >= 0
+
+    def lower(self, x: Vec3) -> Real:
+        """A length that the surface in the cell is no nearer than: of its box, and of its slab."""
+        vector = cast("Any", type(x))
+        away = x - self.centre
+        box = dr.norm(vector(*(fmax(dr.abs(away[k]) - self.half, 0) for k in range(3))))
+        height = dr.dot(away, self.normal)
+        across = dr.norm(dr.fma(vector(-height), self.normal, away))
+        off = fmax(dr.abs(height - self.offset) - self.thickness, 0)
+        beside = fmax(across - 1.7321 * self.half, 0)
+        return fmax(box, dr.norm(vector(off, beside, 0)))
+
+    def estimate(self, x: Vec3) -> Real:
+        """How near the surface in the cell seems to come to x, not nearer than is proved; infinite
+        without a foot.
+
+        Within the spread about the foot the surface is taken for a plane, the rim for a line: the
+        way to its nearest point is at right angles to that from there to the foot.
+        """
+        away = x - self.foot
+        height = dr.select(self.is_cell, dr.dot(away, self.normal), 0)
+        square = dr.squared_norm(away) - height * height - self.spread * self.spread
+        near = dr.sqrt(dr.fma(height, height, fmax(square, 0)))
+        return dr.select(self.foot.x < 0.5 * FAR, fmax(near, self.lower(x)), dr.inf)
+
+    def is_within(self, y: Vec3, radius: Real) -> Mask:
+        """Whether the whole cell is within a radius of y."""
+        away = dr.abs(y - self.centre) + self.half
+        return dr.squared_norm(away) < radius * radius

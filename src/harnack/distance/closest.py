@@ -16,11 +16,12 @@ from harnack.backend.extrema import fmax
 from harnack.backend.lengths import length
 from harnack.distance.batches import in_batches
 from harnack.distance.closing_in import close_in
+from harnack.distance.estimates import first_order
 from harnack.distance.meshes.on_sheets import SheetSearch
 from harnack.distance.meshes.surface import MeshSurface
 from harnack.distance.projection import Descent
 from harnack.distance.rim import RimDescent
-from harnack.distance.search import search
+from harnack.distance.search import Known, Tolerance, search
 from harnack.distance.surface_cells import remainder
 from harnack.fields.clearance import distance_below
 from harnack.fields.points import morton_order
@@ -41,6 +42,10 @@ _TOLERANCE = 1e-6
 _BITS = 10
 # Radii about a foot in which it may be proved the nearest, in distances from it: powers of two.
 _FREE = range(8, -12, -1)
+# The cosine of the angle by which a surface may begin away from a point and yet come nearer.
+_AWAY = 0.2
+# Descents that Newton's method alone does not end.
+_UNFINISHED = 1.0
 # Sheets that are looked at for each point before cells are.
 _SHEETS = 16
 
@@ -67,16 +72,18 @@ class Closest:
 
 def find_closest(
     backend: Backend, surface: LevelSet, levels: TargetLevels, points: Any,
-    progress: Callable[[str], None],
+    progress: Callable[[str], None], *, is_proved: bool = False,
 ) -> Closest:  # fmt: skip
     """The closest point of a surface to each of the points (n, 3).
+
+    is_proved: whether `lower` is wanted as close as cells can prove it.
 
     They are looked at cell by cell along a Morton curve, so that neighbouring lanes walk a tree
     together.
     """
     x = finite_vectors(points, "points")
     order = to_numpy(morton_order(backend, upload_vectors(backend, x), _BITS))
-    found = _in_order(backend, surface, levels, x[order], progress)
+    found = _in_order(backend, surface, levels, x[order], progress, is_proved)
     back = np.empty_like(order)
     back[order] = np.arange(len(order), dtype=order.dtype)
     return Closest(*(part[back] for part in vars(found).values()))
@@ -84,18 +91,19 @@ def find_closest(
 
 def _in_order(
     backend: Backend, surface: LevelSet, levels: TargetLevels, points: FloatArray,
-    progress: Callable[[str], None],
+    progress: Callable[[str], None], is_proved: bool,
 ) -> Closest:  # fmt: skip
     mesh = MeshSurface.of(surface)
     if mesh is not None and mesh.is_all:
         return _closest_on_mesh(backend, surface, levels, mesh, points)
     job = _Points(backend, surface, levels)
-    x, start, above, lower = job.look(points)
+    x, start, above, lower, near = job.look(points)
     if mesh is not None:
         start = _nearer(x, start, mesh)
     if surface.field.has_sheets:
         start = job.on_sheets(x, start)
-    found = search(surface, x, job.polish, start, _TOLERANCE * _size(surface, x), progress)
+    tolerance = Tolerance(_TOLERANCE * _size(surface, x), is_proved)
+    found = search(surface, x, Known(start, near), job, tolerance, progress)
     found.feet = job.refined(x, found.feet)
     distance = _length(x - found.feet)
     # One foot may be no point of the surface but for rounding: a promise may not hold either.
@@ -163,9 +171,9 @@ class _Points:
     _rim: RimDescent | None = dataclasses.field(init=False)
     _prepared: Any = dataclasses.field(init=False)
 
-    def look(self, points: Any) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """The points as rounded, what is known of the surface near them, f - level, and proved
-        lower bounds of the distance."""
+    def look(self, points: Any) -> tuple[FloatArray, ...]:
+        """The points as rounded, what is known of the surface near them, f - level, proved lower
+        bounds of the distance, and what it is to first order."""
 
         def compute(p: Vec3) -> tuple[Real | Vec3, ...]:
             sample = self._field.evaluate(p)
@@ -176,13 +184,13 @@ class _Points:
             lower = self.backend.Float(0)
             if sample.promises:
                 lower = distance_below(self.backend, self._field, self.levels, p, sample)
-            return p, start, above, lower
+            return p, start, above, lower, dr.abs(first_order(above, sample.gradient))
 
-        x, start, above, lower = in_batches(self.backend, compute, points)
+        x, start, above, lower, near = in_batches(self.backend, compute, points)
         domain = self.surface.field.domain
         if domain is not None and len(x):
             lower[~domain.contains_points(x)] = 0
-        return x, self._within(start), above, lower
+        return x, self._within(start), above, lower, near
 
     def on_sheets(self, points: FloatArray, start: FloatArray) -> FloatArray:
         """The places (n, 3), or points of the surface on sheets where these are nearer."""
@@ -205,7 +213,7 @@ class _Points:
         return np.where(inside[:, None], feet, np.nan)
 
     def polish(self, points: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """`search.Polish`: by descent, or with sheets by rays."""
+        """`search.Descents`: by descent, or with sheets by rays."""
         if self.surface.field.has_sheets:
 
             def close(p: Vec3, start: Vec3) -> tuple[Vec3]:
@@ -214,17 +222,56 @@ class _Points:
             return in_batches(self._prepared.backend, close, points, start)[0], np.zeros(
                 len(points)
             )
-        feet, free = in_batches(self.backend, self._descend, points, start)
+        feet, free = np.full_like(points, np.nan), np.zeros(len(points))
+        state = np.full(len(points), _UNFINISHED)
+        rows = np.flatnonzero((start != points).any(axis=1))  # else it would be far
+        feet[rows], free[rows], state[rows] = in_batches(
+            self.backend, self._directly, points[rows], start[rows]
+        )
+        rows = np.flatnonzero(state == _UNFINISHED)
+        if len(rows):
+            feet[rows], free[rows] = in_batches(
+                self.backend, self._descend, points[rows], start[rows]
+            )
         feet = self._within(feet)
         left, rim = np.flatnonzero(np.isnan(feet[:, 0])), self._rim
         if rim is not None and len(left):  # out of the domain
 
             def along(p: Vec3, y: Vec3) -> tuple[Vec3]:
-                return (rim.closest(p, y),)
+                return (rim.closest(p, y)[0],)
 
             (there,) = in_batches(self.backend, along, points[left], start[left])
             feet[left], free[left] = self._within(there), 0
         return feet, free
+
+    def leave_boundary(
+        self, points: FloatArray, boundary: FloatArray, aside: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """`search.Descents`."""
+
+        def beside(p: Vec3, b: Vec3, length_: Vec3) -> tuple[Vec3]:
+            way = p - b
+            y = self._descent.onto_level(b + length_.x / length(way) * way)
+            towards = dr.dot(way, y - b) > -_AWAY * length(way) * length(y - b)
+            return (dr.select(towards, y, dr.nan),)
+
+        feet, free = np.full_like(points, np.nan), np.zeros(len(points))
+        lengths = np.tile(aside[:, None], 3)
+        (start,) = in_batches(self.backend, beside, points, boundary, lengths)
+        rows = np.flatnonzero(~np.isnan(start[:, 0]))
+        if len(rows):
+            feet[rows], free[rows] = in_batches(
+                self.backend, self._descend, points[rows], start[rows]
+            )
+        return self._within(feet), free
+
+    def _directly(self, p: Vec3, start: Vec3) -> tuple[Vec3, Real, Real]:
+        """By Newton's method: feet or NaN, radii about them, and `_UNFINISHED` where that does not
+        say whether there is one nearby, else 0."""
+        y, found, singular = self._descent.directly(p, start)
+        free = dr.select(found, self._free(y, length(p - y)), 0)
+        unfinished = ~found & ~singular
+        return dr.select(found, y, dr.nan), free, dr.select(unfinished, _UNFINISHED, 0 * free)
 
     def _descend(self, p: Vec3, start: Vec3) -> tuple[Vec3, Real]:
         y, found, on_level = self._descent.closest(p, start)
@@ -248,18 +295,26 @@ class _Points:
         return best
 
     def refined(self, points: FloatArray, feet: FloatArray) -> FloatArray:
-        """The feet (n, 3) moved onto the level of the field without what clusters leave out."""
+        """The feet (n, 3) moved onto the level of the field without what clusters leave out: by
+        Newton's method for the closest point, else straight to the level."""
         rows = np.flatnonzero(np.isfinite(feet[:, 0]))
         exact = self._exact
         if exact is None or not len(rows):
             return feet
 
-        def move(p: Vec3, start: Vec3) -> tuple[Vec3]:
-            y, _, on_level = exact.closest(p, start)
-            return (dr.select(on_level, y, start),)
+        def directly(p: Vec3, start: Vec3) -> tuple[Vec3]:
+            y, found, _ = exact.directly(p, start)
+            return (dr.select(found, y, dr.nan),)
+
+        def to_level(start: Vec3) -> tuple[Vec3]:
+            y = exact.onto_level(start)
+            return (dr.select(dr.isfinite(dr.squared_norm(y)), y, start),)
 
         feet = feet.copy()
-        (there,) = in_batches(self.backend, move, points[rows], feet[rows])
+        (there,) = in_batches(self.backend, directly, points[rows], feet[rows])
+        left = np.flatnonzero(np.isnan(there[:, 0]))
+        if len(left):
+            (there[left],) = in_batches(self.backend, to_level, feet[rows[left]])
         inside = ~np.isnan(self._within(there)[:, 0])
         feet[rows[inside]] = there[inside]
         return feet

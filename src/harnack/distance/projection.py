@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Descent"]
 
+_STEPS_DIRECT = 10
 _STEPS_TO_LEVEL = 60
 _STEPS_ALONG = 60
 _LEAST_SHARE = 1e-7  # of a step: shorter ones are given up
@@ -73,6 +74,47 @@ class Descent:
         except NotImplementedError:
             return cls(backend, field, levels, False)
         return cls(backend, field, levels, True)
+
+    def directly(self, x: Vec3, start: Vec3) -> tuple[Vec3, Mask, Mask]:
+        """The closest point y to x that Newton's method for f(y) = level and (x - y) parallel to
+        grad f(y) leads to from a point of the surface nearby; whether it is one, by the criterion
+        of `closest`, no farther than `start` but for twice what that is off the level; and whether
+        the search goes on to where f is singular.
+
+        Each step is that of `closest` along the surface, which follows its curvature, and one to
+        the level, both from derivatives at one place: errors are squared by each of both.
+        """
+        real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
+        x, mask = vector(x), self.backend.Bool
+
+        def body(
+            y: Vec3, first: Real, found: Mask, singular: Mask, k: Any, active: Mask
+        ) -> tuple[Any, ...]:
+            above, here = self._look(y)
+            gradient_norm = lengths.length(here.gradient)
+            move, settled = self._step_along(x, here, real(1))
+            off = -above / gradient_norm
+            first = dr.select(k == 0, dr.abs(off), first)
+            off = clamp(off, -here.reach, here.reach)
+            move = dr.fma(vector(off / gradient_norm), here.gradient, move)
+            length = dr.norm(move)
+            longest = 0.5 * here.reach
+            too_long = length > longest
+            there = dr.fma(vector(dr.select(too_long, longest / length, 1)), move, y)
+            done = settled & self._is_close(above, here)
+            found |= active & done
+            singular = dr.select(active, too_long, singular)
+            active &= ~done & dr.isfinite(length) & (k + 1 < _STEPS_DIRECT)
+            return dr.select(active, there, y), first, found, singular, k + 1, active
+
+        def more(*state: Any) -> Mask:
+            return state[-1]
+
+        state = vector(start), real(0), mask(False), mask(False), count(0), mask(True)
+        y, first, found, singular, _, _ = dr.while_loop(state, more, body, label="Newton's method")
+        limit = (dr.norm(x - start) + 2 * first) * (1 + 64 * self.backend.epsilon)
+        limit = dr.fma(64 * self.backend.epsilon, lengths.largest_component(y), limit)
+        return y, found & (dr.norm(x - y) <= limit), singular & ~found
 
     def closest(self, x: Vec3, start: Vec3) -> tuple[Vec3, Mask, Mask]:
         """The closest point y to x that is found from `start`, whether it is one (see above), and
@@ -127,6 +169,11 @@ class Descent:
         )
         return y, found, on_level
 
+    def onto_level(self, start: Vec3) -> Vec3:
+        """The point of a level that Newton's method along the gradient leads to; NaN for none."""
+        place, found = self._to_level(start, self.backend.Bool(True))
+        return dr.select(found, place.y, dr.nan)
+
     def noise(self, y: Vec3) -> Real:
         """How far rounding and approximation may have moved the level at y, as a length."""
         return self._look(y)[1].noise
@@ -148,6 +195,13 @@ class Descent:
         above = real(-self.levels.to_nearest(sample.value))
         return above, _Place(y, self.backend.Array3f(sample.gradient), noise, reach)
 
+    @staticmethod
+    def _is_close(above: Real, place: _Place) -> Mask:
+        """Whether a place is on the level, to rounding; not where that hardly says where it is."""
+        size = lengths.largest_component(place.y)
+        known = place.noise <= _CLEAR * fmax(size, place.reach)
+        return known & (dr.abs(above) <= 2 * lengths.length(place.gradient) * place.noise)
+
     def _to_level(self, start: Vec3, active: Mask) -> tuple[_Place, Mask]:
         """From `start` to the nearest level by Newton's method along the gradient.
 
@@ -155,13 +209,6 @@ class Descent:
         nearer to a level. Returns the end, and whether it is on a level to rounding.
         """
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
-
-        def is_close(above: Real, place: _Place) -> Mask:
-            # Not where rounding hardly says where the level is.
-            y = place.y
-            size = lengths.largest_component(y)
-            known = place.noise <= _CLEAR * fmax(size, place.reach)
-            return known & (dr.abs(above) <= 2 * lengths.length(place.gradient) * place.noise)
 
         def body(
             above: Real, y: Vec3, g: Vec3, noise: Real, reach: Real,
@@ -174,7 +221,7 @@ class Descent:
             better = active & (first | (dr.abs(above2) < dr.abs(above)))
             longer = dr.select(better, fmin(2 * share, 1), 0.25 * share)
             share = dr.select(first, share, longer)
-            close |= better & is_close(above2, there)
+            close |= better & self._is_close(above2, there)
             active &= ~close & (n <= _STEPS_TO_LEVEL) & (share > _LEAST_SHARE)
             above = dr.select(better, above2, above)
             return above, *there.where(better, here), share, close, n + 1, active
@@ -190,7 +237,7 @@ class Descent:
         return _Place(*place), close
 
     def _step_along(self, x: Vec3, here: _Place, share: Real) -> tuple[Vec3, Mask]:
-        """The tangential step, and whether y already is a local minimum of the distance."""
+        """The step along the surface, and whether y already is a local minimum of the distance."""
         plane = TangentPlane.of(here.gradient)
         r = x - here.y
         distance = dr.norm(r)
@@ -210,7 +257,10 @@ class Descent:
         scale = dr.select(length > 0, fmin(limit / length, 1), 0)
         a, b = eigen.combination(scale * most, scale * least)
         vector = self.backend.Array3f
-        return dr.fma(vector(a), plane.u, vector(b) * plane.v), level & ~saddle
+        falls = a * dr.fma(a, uu, 2 * b * uv) + b * b * vv  # w.Aw
+        falls = clamp(0.5 * falls / plane.gradient_norm, -scale * length, scale * length)
+        along = dr.fma(vector(a), plane.u, vector(b) * plane.v)
+        return dr.fma(vector(-falls), plane.n, along), level & ~saddle
 
     def _second_derivatives(
         self, y: Vec3, plane: TangentPlane, size: Real

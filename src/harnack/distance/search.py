@@ -4,40 +4,39 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Protocol
 
 import drjit as dr
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, IntArray, choose_backend, to_numpy
 from harnack.backend.arrays import aligned, upload_vectors
-from harnack.cells import Cells
-from harnack.distance.cell_tree import FAR, CellTree, SurfaceCells
+from harnack.distance.cell_tree import FAR, Best, CellTree, SurfaceCells
 from harnack.distance.surface_cells import CellProofs
 
 if TYPE_CHECKING:
     from harnack.tracer import LevelSet
 
-__all__ = ["Found", "Polish", "search"]
+__all__ = ["Descents", "Found", "Known", "Tolerance", "search"]
 
-# From points x and places y of the surface nearby: nearer places of it, NaN where none was found,
-# and radii about these within which none is nearer.
-Polish: TypeAlias = "Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]"
-
-# Cells that are split before the points are asked which of them matter.
-_COARSE = 1500
-# Cells at most: so many for each point, within these limits.
-_FEWEST, _EACH, _MOST = 40_000, 0.5, 150_000
-_MOST_ON_SHEETS = 20_000
-# Of these shares where evaluations are as dear as those of many terms.
-_DEAR = 0.25
+# Cells before points are asked which of them matter: so many for each point, and at least these;
+# with sheets, which are searched in turn as well, these.
+_EACH, _FEWEST, _FEWEST_ON_SHEETS = 0.25, 10_000, 1500
+# Cells at most, and which share of that where evaluations are as dear as those of many terms.
+_MOST, _MOST_TO_PROVE, _MOST_ON_SHEETS, _DEAR = 60_000, 150_000, 20_000, 0.25
 _FINEST = 40
-# Feet of other parts of the surface that are tried after the nearest: of cells so far apart, in
-# edges.
-_CHALLENGES, _APART = 3, 3.0
+# Feet of other parts of the surface that are tried, from the same cells.
+_CHALLENGES = 4
+# In tolerances: how far to the side of its boundary the surface is looked for.
+_ASIDE = 100.0
+# Beside the boundary the surface was looked for there: how many times farther away feet are tried.
+_APART_FROM_BOUNDARY = 2.0
+# Descents begin at points that seem nearer to the surface than so many times the best.
+_NEARER = 0.9
 # Points that are looked at together, so that memory is bounded.
 _AT_ONCE = 1 << 18
 _GROWTHS = 6
+_CORNERS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
 
 
 @dataclass
@@ -49,38 +48,92 @@ class Found:
     lower: FloatArray
 
 
-def search(
-    surface: LevelSet, points: FloatArray, polish: Polish, start: FloatArray, tolerance: float,
-    progress: Callable[[str], None],
-) -> Found:  # fmt: skip
-    """The nearest points of a level set to `points` (n, 3).
+class Descents(Protocol):
+    """Ways to nearer points of the surface from points x (n, 3). They return feet, NaN where none
+    was found, and radii about these within which none is nearer."""
 
-    start: (n, 3) points of the surface that are known already, or NaN.
-    tolerance: of distances: cells are split until none may hold a point that is nearer than the
-        best by more than that, or there are too many.
+    def polish(self, points: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """From places (n, 3) near the surface."""
+        ...
+
+    def leave_boundary(
+        self, points: FloatArray, boundary: FloatArray, aside: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """From points (n, 3) of the curve that the surface ends in, along the surface if it begins
+        towards x; by how much (n,) to the side it is looked for."""
+        ...
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known of the surface from the points alone.
+
+    feet: (n, 3) points of the surface, or NaN. near: (n,) what the distance is to first order.
     """
+
+    feet: FloatArray
+    near: FloatArray
+
+    def some(self, rows: IntArray | slice) -> Known:
+        """Of some points."""
+        return Known(self.feet[rows], self.near[rows])
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """When a search is at an end.
+
+    length: points that are nearer by less do not matter.
+    is_proved: whether cells are split until none may hold a point that is nearer than the best by
+        more than that, or there are too many.
+    """
+
+    length: float
+    is_proved: bool
+
+
+@dataclass(frozen=True)
+class _Cube:
+    """A cube that holds the surface, or the part of it that is looked at."""
+
+    centre: FloatArray
+    half: float
+
+    @classmethod
+    def around(cls, lower: FloatArray, upper: FloatArray) -> _Cube:
+        """The smallest around a box, and a little more."""
+        half = 0.5 * float((upper - lower).max()) * (1 + 1e-6)
+        half += 1e-12 * float(np.abs([lower, upper]).max())
+        return cls(0.5 * (lower + upper), max(half, 1e-30))
+
+
+def search(
+    surface: LevelSet, points: FloatArray, known: Known, descents: Descents,
+    tolerance: Tolerance, progress: Callable[[str], None],
+) -> Found:  # fmt: skip
+    """The nearest points of a level set to `points` (n, 3)."""
     box = _box(surface)
     if box is not None:
         if (box[0] > box[1]).any():
             return Found(np.full_like(points, np.nan), np.full(len(points), np.inf))
-        root = _cube(*box)
-        return _in_parts(surface, root, True, points, polish, start, tolerance, progress)
-    feet, lower = start.copy(), np.zeros(len(points))
+        return _in_parts(surface, _Cube.around(*box), points, known, descents, tolerance, progress)
+    feet, lower = known.feet.copy(), np.zeros(len(points))
     rows = np.arange(len(points))
     half = 0.0
     for _ in range(_GROWTHS):
         if not len(rows):
             break
-        root = _cube(points[rows].min(axis=0), points[rows].max(axis=0))
-        known = np.linalg.norm(points[rows] - feet[rows], axis=1)
-        size = 1.0 + 2 * float(root.size[0])
-        half = max(4 * half, size, 1.1 * float(np.nanmax(known, initial=0.0)))
-        root = Cells(root.corners - half, root.size + 2 * half)
-        found = _in_parts(
-            surface, root, False, points[rows], polish, feet[rows], tolerance, progress
-        )
-        feet[rows], lower[rows] = found.feet, found.lower
-        distance = np.linalg.norm(points[rows] - found.feet, axis=1)
+        x = points[rows]
+        root = _Cube.around(x.min(axis=0), x.max(axis=0))
+        away = np.linalg.norm(x - feet[rows], axis=1)
+        half = max(4 * half, 1.0 + 4 * root.half, 1.1 * float(np.nanmax(away, initial=0.0)))
+        root = _Cube(root.centre, root.half + half)
+        so_far = Known(feet[rows], known.near[rows])
+        found = _in_parts(surface, root, x, so_far, descents, tolerance, progress)
+        # Beyond the cube there may be more.
+        to_walls = root.half - np.abs(x - root.centre).max(axis=1)
+        feet[rows], lower[rows] = found.feet, np.minimum(found.lower, to_walls)
+        distance = np.linalg.norm(x - found.feet, axis=1)
         rows = rows[~(distance <= half)]
     return Found(feet, lower)
 
@@ -93,166 +146,187 @@ def _box(surface: LevelSet) -> tuple[FloatArray, FloatArray] | None:
     return (lower, upper) if np.isfinite([lower, upper]).all() else None
 
 
-def _cube(lower: FloatArray, upper: FloatArray) -> Cells:
-    size = float((upper - lower).max()) * (1 + 1e-6) + 1e-12 * float(np.abs([lower, upper]).max())
-    size = max(size, 1e-30)
-    return Cells((0.5 * (lower + upper) - 0.5 * size)[None], np.full(3, size))
-
-
 def _in_parts(
-    surface: LevelSet, root: Cells, whole: bool, points: FloatArray, polish: Polish,
-    start: FloatArray, tolerance: float, progress: Callable[[str], None],
+    surface: LevelSet, root: _Cube, points: FloatArray, known: Known, descents: Descents,
+    tolerance: Tolerance, progress: Callable[[str], None],
 ) -> Found:  # fmt: skip
-    """`whole`: whether all of the surface is in the root."""
+    """The nearest points in a cube, for so many points at a time."""
     proofs = CellProofs(surface)
-    cells = _split(proofs, root, _COARSE, progress)
+    most = _most(surface, len(points), tolerance.is_proved)
+    enough = min(max(_FEWEST, int(_EACH * len(points))), _MOST, most)
+    if surface.field.has_sheets:
+        enough = _FEWEST_ON_SHEETS
+    cells = _split(proofs, root, enough, progress)
     parts: list[Found] = []
     for first in range(0, max(len(points), 1), _AT_ONCE):
         rows = slice(first, first + _AT_ONCE)
-        job = _Search(proofs, cells, points[rows], polish, start[rows].copy(), tolerance)
+        at_most = most if tolerance.is_proved else 0
+        job = _Search(
+            proofs, cells, points[rows], known.some(rows), descents, tolerance.length, at_most
+        )
         parts.append(job.run(progress))
-    found = Found(*(np.concatenate([getattr(p, k) for p in parts]) for k in ("feet", "lower")))
-    if not whole:
-        to_walls = np.minimum(points - root.corners, root.corners + root.size - points).min(axis=1)
-        found.lower = np.minimum(found.lower, to_walls)
-    return found
+    return Found(*(np.concatenate([getattr(p, k) for p in parts]) for k in ("feet", "lower")))
+
+
+def _most(surface: LevelSet, points: int, is_proved: bool) -> int:
+    """How many cells there may be."""
+    if surface.field.has_sheets:
+        return _MOST_ON_SHEETS
+    most = min(max(_MOST, points // 2), _MOST_TO_PROVE) if is_proved else _MOST
+    return int(most * (_DEAR if surface.field.has_detail else 1.0))
 
 
 def _split(
-    proofs: CellProofs, root: Cells, most: int, progress: Callable[[str], None]
+    proofs: CellProofs, root: _Cube, enough: int, progress: Callable[[str], None]
 ) -> SurfaceCells:
-    """Cells of one size, split from the root until there are many."""
-    kept = proofs.kept(root)
+    """Cells of the root, split until there are enough: in each round the larger half of those where
+    the surface may be more than one sheet, and the others by how much it may bend."""
+    cells = proofs.kept(root.centre[None], np.array([root.half]))
     for _ in range(_FINEST):
-        if not 0 < len(kept) <= most:
+        if not 0 < len(cells) < enough:
             break
-        kept = proofs.kept(_halves(kept))
-        progress(f"distances: {len(kept):,} cells")
-    return kept
+        size = np.where(cells.is_sheet, 0.25 * cells.thickness, cells.half)
+        cells = _halved(proofs, cells, size >= np.median(size))
+        progress(f"distances: {len(cells):,} cells")
+    return cells
 
 
-def _halves(cells: SurfaceCells) -> Cells:
-    half = float(cells.half[0])
-    corners = cells.centre - half
-    return Cells(corners, np.full(3, 2 * half)).split()
+def _halved(proofs: CellProofs, cells: SurfaceCells, which: BoolArray) -> SurfaceCells:
+    """The cells, those of a mask (n,) cut in eight."""
+    half = 0.5 * cells.half[which]
+    centre = cells.centre[which, None] + half[:, None, None] * _CORNERS
+    parts = proofs.kept(centre.reshape(-1, 3), np.repeat(half, 8))
+    return SurfaceCells.joined([cells.some(~which), parts])
 
 
 class _Search:
     """The search for some points, from cells that hold all of the surface.
 
     feet: (n, 3) the nearest points so far, or NaN. free: (n,) within these radii about them none is
-    nearer. lower: (n,) proved bounds of distances. is_open: (n,) whether these may be raised.
-    tried: (n, 3) where the last challenge began.
-    done: cells that are split no more. finest: those that may be.
+    nearer. lower: (n,) proved bounds of distances. most: cells are split while they are not more.
     """
 
     def __init__(
-        self, proofs: CellProofs, cells: SurfaceCells, points: FloatArray, polish: Polish,
-        feet: FloatArray, tolerance: float,
+        self, proofs: CellProofs, cells: SurfaceCells, points: FloatArray, known: Known,
+        descents: Descents, tolerance: float, most: int,
     ) -> None:  # fmt: skip
-        self.proofs, self.points, self.polish = proofs, points, polish
+        self.proofs, self.cells, self.points, self.descents = proofs, cells, points, descents
         self.backend = choose_backend("double")
-        self.finest, self.done = cells, list[SurfaceCells]()
-        self.feet, self.free = feet, np.zeros(len(points))
-        self.lower, self.is_open = np.zeros(len(points)), np.ones(len(points), np.bool_)
-        self.tolerance, self.tried = tolerance, np.full_like(points, FAR)
-        most = _MOST_ON_SHEETS if proofs.surface.field.has_sheets else _MOST
-        share = _DEAR if proofs.surface.field.has_detail else 1.0
-        self.most = int(share * min(max(_FEWEST, _EACH * len(points)), most))
+        self.known, self.feet, self.free = known, known.feet.copy(), np.zeros(len(points))
+        self.lower, self.tolerance = np.zeros(len(points)), tolerance
+        self.most = most
 
     def run(self, progress: Callable[[str], None]) -> Found:
         """What is found."""
+        if not len(self.points):
+            return Found(self.feet, self.lower)
         has_sheets = self.proofs.surface.field.has_sheets
+        if len(self.cells):
+            self._search_cells(has_sheets, progress)
+        else:
+            self.lower[:] = np.inf
         if not has_sheets:
-            self._descend(np.arange(len(self.points)), self.points)
-        self._improve(self._tree())
-        for _ in range(_FINEST):
-            wanted = self._bounded(self._tree())
-            count = int(wanted.sum())
-            if not count or sum(map(len, self.done)) + 4 * count > self.most:
-                break
-            self.done.append(self.finest.some(~wanted))
-            self.finest = self.proofs.kept(_halves(self.finest.some(wanted)))
-            progress(
-                f"distances: {len(self.finest):,} cells for {int(self.is_open.sum()):,} points"
-            )
-            self._improve(self._tree())
-        # With sheets they would be as dear as all else, and triangles that are known say enough.
-        known = has_sheets and not np.isnan(self.feet).any()
-        for challenge in range(1, (0 if known else _CHALLENGES) + 1):
-            self._improve(self._tree(), challenge)
-        self._bounded(self._tree())
+            # Where sheets meet or cross within a cell, one may have no foot there; and a promise
+            # that does not hold may have left out cells.
+            rows = np.flatnonzero(self._is_open() | np.isnan(self.feet[:, 0]))
+            rows = rows[self.known.near[rows] < _NEARER * self._distance(rows)]
+            self._descend(rows, self.points[rows])
         return Found(self.feet, self.lower)
 
-    def _tree(self) -> CellTree | None:
-        cells = SurfaceCells.joined([*self.done, self.finest])
-        return CellTree.of(self.backend, cells) if len(cells) else None
+    def _search_cells(self, has_sheets: bool, progress: Callable[[str], None]) -> None:
+        """First from the foot of the cell where the surface seems nearest, then from those of other
+        parts that may be nearer. If some may still be, and there are not too many cells, those
+        cells are split, and so on."""
+        tree = CellTree.of(self.backend, self.cells)
+        tried = self._first(tree)
+        if not has_sheets:
+            self._leave_boundary()
+        rows = np.arange(len(self.points))
+        for _ in range(_FINEST):
+            marks = self._challenge(tree, rows, tried[rows])
+            rows = np.flatnonzero(self._is_open())
+            count = int(marks.sum())
+            if not count or not len(rows) or len(self.cells) + 4 * count > self.most:
+                break
+            self.cells = _halved(self.proofs, self.cells, marks)
+            progress(f"distances: {len(self.cells):,} cells for {len(rows):,} points")
+            tree = CellTree.of(self.backend, self.cells)
 
-    def _distance(self, rows: IntArray) -> FloatArray:
+    def _is_open(self) -> BoolArray:
+        """Whether it is not proved that no point is nearer than the best."""
+        return self.lower < self._distance(slice(None)) - self.tolerance
+
+    def _distance(self, rows: IntArray | slice) -> FloatArray:
         """Of the best feet so far; FAR where there is none."""
         away = np.linalg.norm(self.points[rows] - self.feet[rows], axis=1)
         return np.where(np.isnan(away), FAR, away)
 
-    def _of_rows(self, rows: IntArray) -> tuple[Any, ...]:
-        """Points, their best feet, radii about these and the distances, on the backend."""
-        backend, feet = self.backend, self.feet[rows]
-        return (
-            upload_vectors(backend, self.points[rows]),
-            upload_vectors(backend, np.where(np.isnan(feet), FAR, feet)),
-            aligned(backend, self.free[rows]), aligned(backend, self._distance(rows)),
-        )  # fmt: skip
+    def _is_boundary(self, rows: IntArray | slice) -> BoolArray:
+        """Whether the best is what was known."""
+        return (self.feet[rows] == self.known.feet[rows]).all(axis=1)
 
-    def _improve(self, tree: CellTree | None, challenge: int = 0) -> None:
-        """To nearer points from the nearest feet of cells that are nearer than the best. challenge:
-        from those of parts of the surface that were not tried yet, even if they are a little
-        farther; its number, from 1."""
-        rows = np.flatnonzero(self.is_open)
-        if tree is None or not len(rows):
-            return
-        before = self._distance(rows)
-        x, y, free, distance = self._of_rows(rows)
-        tried, apart, limit = upload_vectors(self.backend, self.tried[rows]), 0 * free, distance
-        if challenge:
-            some = free > 0 if challenge == 1 else self.backend.Bool(True)
-            apart = dr.select(some, 2 * _APART, self.backend.Float(0))
-            limit = limit + dr.minimum(0.1 * limit, 2 * self._cell())
-        first = bool((before == FAR).all())
-        square, foot = tree.nearest_foot(x, (y, tried), apart, limit, unbounded=first)
-        dr.eval(square, foot)
-        there, start = np.sqrt(to_numpy(square)), to_numpy(foot)
-        some = np.isfinite(there)
-        rows, before, there, start = rows[some], before[some], there[some], start[some]
-        if challenge:
-            self.tried[rows] = start
-        nearer = there < before
-        self.feet[rows[nearer]], self.free[rows[nearer]] = start[nearer], 0
-        self._descend(rows, start)
+    def _first(self, tree: CellTree) -> FloatArray:
+        """To the nearest points from the feet that seem nearest, which are returned (n, 3)."""
+        limit = aligned(self.backend, self._distance(slice(None)))
+        start = to_numpy(tree.nearest(upload_vectors(self.backend, self.points), limit))
+        rows = np.flatnonzero(start[:, 0] < 0.5 * FAR)
+        self._descend(rows, start[rows])
+        return start
+
+    def _challenge(self, tree: CellTree, rows: IntArray, first: FloatArray) -> BoolArray:
+        """To nearer points from the feet of other parts of the surface that may be nearer, one
+        after the other.
+
+        first: (k, 3) feet that were tried. Returns which cells may hold points that are nearer than
+        the best, of these points.
+        """
+        marks = dr.zeros(self.backend.Bool, len(self.cells))
+        second = np.full_like(first, FAR)
+        for _ in range(_CHALLENGES):
+            if not len(rows):
+                break
+            start = self._nearer(tree, rows, (first, second), marks)
+            some = start[:, 0] < 0.5 * FAR
+            rows, first, second = rows[some], second[some], start[some]
+            self._descend(rows, start[some])
+        return to_numpy(marks)
+
+    def _nearer(
+        self, tree: CellTree, rows: IntArray, others: tuple[FloatArray, ...], marks: Any
+    ) -> FloatArray:
+        """`CellTree.nearer` for some points; raises their lower bounds."""
+        backend, feet = self.backend, self.feet[rows]
+        best = Best(
+            upload_vectors(backend, np.where(np.isnan(feet), FAR, feet)),
+            aligned(backend, self._distance(rows)), aligned(backend, self.free[rows]),
+            aligned(backend, np.where(self._is_boundary(rows), _APART_FROM_BOUNDARY, 1.0)),
+        )  # fmt: skip
+        x = upload_vectors(backend, self.points[rows])
+        tried = tuple(upload_vectors(backend, one) for one in others)
+        tolerance = dr.opaque(backend.Float, self.tolerance)
+        lower, foot = tree.nearer(x, best, tried, tolerance, marks)
+        size = np.abs(self.points[rows]).max(axis=1)
+        proved = to_numpy(lower) * (1 - 1e-12) - 1e-15 * size
+        self.lower[rows] = np.maximum(proved, self.lower[rows])
+        return to_numpy(foot)
+
+    def _leave_boundary(self) -> None:
+        """From the boundary of the surface, where that is the nearest."""
+        rows = np.flatnonzero(self._is_boundary(slice(None)))
+        distance = self._distance(rows)
+        rows, distance = rows[distance > 0], distance[distance > 0]
+        aside = np.minimum(0.25 * distance, _ASIDE * self.tolerance)
+        x = self.points[rows]
+        self._take(rows, *self.descents.leave_boundary(x, self.feet[rows], aside))
 
     def _descend(self, rows: IntArray, start: FloatArray) -> None:
-        """To nearer points from places (k, 3), if there are any."""
-        better, free = self.polish(self.points[rows], start)
-        away = np.linalg.norm(self.points[rows] - better, axis=1)
-        nearer = away < self._distance(rows)
-        self.feet[rows[nearer]], self.free[rows[nearer]] = better[nearer], free[nearer]
+        """To nearer points from places (k, 3), points of the surface or the points themselves."""
+        x = self.points[rows]
+        on_surface = (start != x).any(axis=1, keepdims=True)
+        self._take(rows, np.where(on_surface, start, np.nan), np.zeros(len(rows)))
+        self._take(rows, *self.descents.polish(x, start))
 
-    def _cell(self) -> float:
-        """The length of an edge of the finest cells."""
-        return 2 * min(float(part.half[0]) for part in [*self.done, self.finest] if len(part))
-
-    def _bounded(self, tree: CellTree | None) -> BoolArray:
-        """Raise the lower bounds. Returns which of the finest cells may hold a point that is nearer
-        than the best."""
-        rows = np.flatnonzero(self.is_open)
-        if tree is None:  # no surface
-            self.lower[:], self.is_open[:] = np.inf, False
-        if tree is None or not len(rows):
-            return np.zeros(len(self.finest), np.bool_)
-        x, y, free, distance = self._of_rows(rows)
-        count = sum(map(len, self.done)) + len(self.finest)
-        marks = dr.zeros(self.backend.Bool, count)
-        tolerance = dr.opaque(self.backend.Float, self.tolerance)
-        lower = to_numpy(tree.mark(x, y, free, distance, tolerance, marks))
-        self.is_open[rows] = lower < to_numpy(distance) - self.tolerance
-        size = np.abs(self.points[rows]).max(axis=1)
-        self.lower[rows] = np.maximum(lower * (1 - 1e-12) - 1e-15 * size, 0)
-        return to_numpy(marks)[count - len(self.finest) :]
+    def _take(self, rows: IntArray, feet: FloatArray, free: FloatArray) -> None:
+        """Points of the surface (k, 3) or NaN, and their radii, where they are nearer."""
+        nearer = np.linalg.norm(self.points[rows] - feet, axis=1) < self._distance(rows)
+        self.feet[rows[nearer]], self.free[rows[nearer]] = feet[nearer], free[nearer]

@@ -104,9 +104,9 @@ def closest_points(
     """The closest points (n, 3) of a level set to `points` (n, 3), as far as a search finds them.
 
     Of the winding number of a closed mesh they are exact: the nearest of the triangles that are the
-    level, cut where others pass through them. Of other fields the surface is enclosed in cells that
-    are split where a nearer point may be (`distance_bounds`), and descents from the points of the
-    surface that cells know lead to places where no neighbour is nearer. The curve in which the
+    level, cut where others pass through them. Of other fields the surface is enclosed in cells, and
+    descents from the points of the surface that cells know lead to places where no neighbour is
+    nearer; `distance_bounds` also splits cells where a nearer point may be. The curve in which the
     level sets of a field end counts as part of them, such as the vertices and edges of a solid
     angle, and so does the rim at which the field's domain cuts them. NaN, with a RuntimeWarning
     that counts them, where no surface is found.
@@ -147,24 +147,25 @@ def distance_bounds(
     is a ball in which no point of the surface is nearer (`closest._Points`). The least distance
     of what is left is `lower`. Cells are split where that is less than `upper` by more than 1e-6
     of the size of the surface, up to about half as many cells as there are points, but at least
-    40,000: so a few points are proved to that tolerance, of many those for which the balls suffice.
+    60,000: so a few points are proved to that tolerance, of many those for which the balls suffice.
     What is not proved: that `upper` is the distance where `lower` is less; it is the least of
     several descents, from the point and from feet of cells in different places.
 
     Raises:
         TypeError, ValueError: as `signed_distance`.
     """
-    found = _found("distance_bounds", field, points, level, precision, progress)
+    found = _found("distance_bounds", field, points, level, precision, progress, is_proved=True)
     return DistanceBounds(found.feet, found.distance, found.lower)
 
 
 def _found(
     name: str, field: Field, points: Any, level: Any, precision: Precision,
-    progress: Callable[[str], None] | None,
+    progress: Callable[[str], None] | None, *, is_proved: bool = False,
 ) -> Closest:  # fmt: skip
     backend = choose_backend(precision)
     surface = _surface(field, level)
-    found = find_closest(backend, surface, _levels(backend, surface), points, progress or _silent)
+    levels = _levels(backend, surface)
+    found = find_closest(backend, surface, levels, points, progress or _silent, is_proved=is_proved)
     _warn(name, found)
     return found
 

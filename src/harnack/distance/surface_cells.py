@@ -1,8 +1,8 @@
-"""What is proved about the level set in cells: that it is not there, or that it lies in a slab."""
+"""What is known of the level set in cells: that it is not there, or a slab that it lies in, and
+points of it."""
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +14,7 @@ from harnack.backend.extrema import clamp, fmin
 from harnack.backend.lengths import length
 from harnack.distance.batches import in_batches
 from harnack.distance.cell_tree import FAR, SurfaceCells
+from harnack.distance.rim import RimDescent
 from harnack.enclosures import Curvature, HarmonicBall
 from harnack.fields.clearance import distance_below
 from harnack.tracer import Status
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from harnack.backend import Mask, Real, Vec3
-    from harnack.cells import Cells
     from harnack.enclosures.promises import Promise
     from harnack.fields.field import Field, Sample
     from harnack.tracer import LevelSet
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 __all__ = ["CellProofs", "remainder"]
 
 _STEPS = 6
+# The radius of the ball around a cube of half size 1.
+_WITHIN = 3**0.5 * (1 + 1e-9)
 # A foot is on the level up to this share of its cell.
 _CLOSE = 1e-7
 # Rays through a cell of a field with sheets.
@@ -70,58 +72,67 @@ def _of_promise(known: Promise, value: Real, radius: Real) -> Real:
 
 @dataclass
 class CellProofs:
-    """Cells of a level set, looked at in double precision.
-
-    cells: how many were looked at so far.
-    """
+    """Cells of a level set, looked at in double precision."""
 
     surface: LevelSet
-    looked_at: int = dataclasses.field(default=0, init=False)
 
     def __post_init__(self) -> None:
         self._backend = choose_backend("double")
         self._prepared = self.surface.prepare(self._backend)
         self._levels = self._prepared.levels
         self._volume = _domain(self.surface)
+        self._rim = None
+        if self._volume is not None and not self.surface.field.has_sheets:
+            volume = self._volume.prepare(self._backend)
+            self._rim = RimDescent(self._backend, self._field, self._levels, volume)
 
     @property
     def _field(self) -> Field:
         return self._prepared.field
 
-    def kept(self, cells: Cells) -> SurfaceCells:
-        """Of cubes those that are not proved empty, with what is known of them."""
-        self.looked_at += len(cells.corners)
-        centre, half = cells.centres, 0.5 * float(cells.size[0])
-        radius = dr.opaque(self._backend.Float, cells.half_diagonal * (1 + 1e-9))
+    def kept(self, centre: FloatArray, half: FloatArray) -> SurfaceCells:
+        """Of cubes (n, 3), half the length of an edge (n,), those that are not proved empty, with
+        what is known of them."""
+        radius = _WITHIN * half
         inside, start = np.ones(len(centre), np.bool_), centre
+        away: FloatArray = np.zeros(len(centre))
         if self._volume is not None:
             inside = self._volume.contains_points(centre)
-            away, start = self._at(centre, self._pulled_inside)
-            some = inside | (away <= cells.half_diagonal * (1 + 1e-9))
-            centre, inside, start = centre[some], inside[some], start[some]
-        n = len(centre)
-        result = SurfaceCells(
-            centre, np.full(n, half), np.full((n, 3), FAR), np.tile([0.0, 0.0, 1.0], (n, 1)),
-            np.zeros(n), np.full(n, FAR),
-        )  # fmt: skip
-        kept = np.ones(n, np.bool_)
+            away, start = self._at(self._pulled_inside, centre)
+            some = inside | (away <= radius)
+            centre, half, radius = centre[some], half[some], radius[some]
+            inside, start, away = inside[some], start[some], away[some]
+        cells = SurfaceCells.unknown(centre, half)
         # Nothing is promised about places outside the domain.
-        empty, result.normal[inside], result.offset[inside], result.thickness[inside] = self._at(
-            centre[inside], lambda p: self._slab(p, radius)
+        empty, cells.normal[inside], cells.offset[inside], cells.thickness[inside] = self._at(
+            self._slab, centre[inside], radius[inside]
         )
+        kept = np.ones(len(cells), np.bool_)
         kept[inside] = empty == 0
-        result, start = result.some(kept), start[kept]
-        find = self._hit if self.surface.field.has_sheets else self._foot
-        (foot,) = self._at(start, lambda p: (find(p, radius),))
-        if self._volume is not None and len(foot):
-            foot[~self._volume.contains_points(np.where(foot < FAR, foot, 0))] = FAR
-        result.foot[:] = foot
-        return result
+        cells, start, radius = cells.some(kept), start[kept], radius[kept]
+        cells.foot[:], cells.normal[:], cells.spread[:] = self._at(
+            self._disk, start, radius, cells.normal
+        )
+        self._outside(cells.foot)
+        if self._rim is not None and len(cells):
+            cut = np.flatnonzero(np.abs(away[kept]) <= radius)
+            cells.rim[cut], cells.rim_curvature[cut] = self._at(
+                self._on_rim, start[cut], radius[cut]
+            )
+            self._outside(cells.rim)
+        return cells
 
     def _at(
-        self, points: FloatArray, compute: Callable[[Vec3], tuple[Any, ...]]
+        self, compute: Callable[..., tuple[Any, ...]], points: FloatArray, *others: FloatArray
     ) -> tuple[Any, ...]:
-        return in_batches(self._backend, compute, points)
+        """others: vectors (n, 3), or numbers (n,) that come as vectors of equal components."""
+        vectors = (np.tile(one[:, None], 3) if one.ndim == 1 else one for one in others)
+        return in_batches(self._backend, compute, points, *vectors)
+
+    def _outside(self, feet: FloatArray) -> None:
+        """Put feet (n, 3) that lie outside the domain far away."""
+        if self._volume is not None and len(feet):
+            feet[~self._volume.contains_points(np.where(feet < FAR, feet, 0))] = FAR
 
     def _pulled_inside(self, p: Vec3) -> tuple[Real, Vec3]:
         """How far p is from the domain, at least, and p or a place near it on the boundary."""
@@ -130,9 +141,9 @@ class CellProofs:
         normal = self._volume.outward_normal(p)
         return away, dr.select(away > 0, p - self._backend.Array3f(away) * normal, p)
 
-    def _slab(self, p: Vec3, radius: Real) -> tuple[Real | Vec3, ...]:
+    def _slab(self, p: Vec3, radii: Vec3) -> tuple[Real | Vec3, ...]:
         """Whether there is no level in the ball (1 or 0); the slab that the level lies in."""
-        real, vector = self._backend.Float, self._backend.Array3f
+        real, vector, radius = self._backend.Float, self._backend.Array3f, radii.x
         sample = self._field.evaluate(p)
         free = real(0)
         if sample.promises:
@@ -145,11 +156,35 @@ class CellProofs:
         elif self._levels.period is not None:  # no second level reaches into the ball
             known &= dr.fma(steep, radius, rest) < self._levels.period - dr.abs(above)
         slope = dr.select(known, steep, 1)
-        normal = dr.select(known, sample.gradient / slope, vector(0, 0, 1))
+        normal = dr.select(known, sample.gradient / slope, vector(0, 0, 0))
         offset = dr.select(known, -above / slope, 0)
         thickness = dr.select(known, rest / slope, FAR)
         empty = (free > radius) | (known & (dr.abs(offset) > radius + thickness))
         return dr.select(empty, real(1), 0), normal, offset, thickness
+
+    def _disk(self, p: Vec3, radii: Vec3, normal: Vec3) -> tuple[Vec3, Vec3, Real]:
+        """A foot near p, the normal of a plane that is nearly the surface there, and how far about
+        the foot: up to the curve that the surface ends in."""
+        radius = radii.x
+        if self.surface.field.has_sheets:
+            return self._hit(p, radius), normal, self._backend.Float(0)
+        foot = self._foot(p, radius)
+        found = foot.x < 0.5 * FAR
+        at = dr.select(found, foot, p)
+        gradient = self._field.evaluate(at).gradient
+        n = gradient / length(gradient)
+        is_plane = found & ~(dr.squared_norm(normal) > 0) & dr.isfinite(dr.squared_norm(n))
+        spread, boundary = 2 * radius, self._field.closest_on_boundary(at)
+        if boundary is not None:
+            spread = fmin(spread, length(boundary - at))
+        return foot, dr.select(is_plane, n, normal), dr.select(found, spread, 0)
+
+    def _on_rim(self, p: Vec3, radii: Vec3) -> tuple[Vec3, Real]:
+        """A point of the rim near p, and the rim's curvature."""
+        assert self._rim is not None
+        y, curvature = self._rim.closest(p, p)
+        near = length(y - p) < 2 * radii.x
+        return dr.select(near, y, self._backend.Array3f(FAR)), dr.select(near, curvature, 0)
 
     def _foot(self, p: Vec3, radius: Real) -> Vec3:
         """Where Newton's method leads from the centre, if that is near."""
