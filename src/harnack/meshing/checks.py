@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import Any, Never, cast
 
 import numpy as np
 
+from harnack.backend import FloatArray
 from harnack.meshing.tetrahedra import IntArray, edge_keys
 
 __all__ = [
+    "LocalError",
     "MeshingError",
     "TooLargeError",
     "boundary_edges",
@@ -21,6 +23,14 @@ __all__ = [
 
 class MeshingError(ValueError):
     """A level set that could not be meshed; the message says why and what to do."""
+
+
+class LocalError(MeshingError):
+    """A check that failed in known places (k, 3), so that smaller cells there may be enough."""
+
+    def __init__(self, message: str, places: FloatArray) -> None:
+        super().__init__(message)
+        self.places = places
 
 
 class TooLargeError(MeshingError):
@@ -50,31 +60,42 @@ def euler_characteristic(faces: IntArray) -> int:
     return int(surface.euler_number)
 
 
-def check_manifold(faces: IntArray) -> None:
+def check_manifold(faces: IntArray, vertices: FloatArray | None = None) -> None:
     """Raise unless every edge has one or two faces, which run it in opposite directions, and the
     faces around every vertex are joined by edges.
 
+    vertices: (n, 3), to say where not.
+
     Raises:
-        MeshingError: otherwise.
+        MeshingError: otherwise; a LocalError, given vertices.
     """
+
+    def fail(message: str, where: IntArray) -> Never:
+        if vertices is None:
+            raise MeshingError(message)
+        raise LocalError(message, vertices[where])
+
     edges, count = directed_edges(faces), int(faces.max(initial=-1)) + 1
     _, index, uses = np.unique(edge_keys(edges, count), return_inverse=True, return_counts=True)
     if (uses > 2).any():
-        raise MeshingError(
+        fail(
             f"{(uses > 2).sum()} edges of the mesh have more than two faces: the level set crosses "
-            "itself, or cells are too large for it; choose a smaller `spacing`, or another level"
+            "itself, or cells are too large for it; choose a smaller `spacing`, or another level",
+            np.unique(edges[uses[index] > 2]),
         )
     ways = np.zeros(len(uses), np.int64)
     np.add.at(ways, index, np.where(edges[:, 0] < edges[:, 1], 1, -1))
     if ((uses == 2) & (ways != 0)).any():
-        raise MeshingError(
+        fail(
             "neighbouring faces of the mesh do not agree on its two sides: cells are too large for "
-            "this level set; choose a smaller `spacing`"
+            "this level set; choose a smaller `spacing`",
+            np.unique(edges[((uses == 2) & (ways != 0))[index]]),
         )
     if _fans(faces, index, uses)[0] > len(np.unique(faces)):
-        raise MeshingError(
+        fail(
             "sheets of the mesh touch in a point: cells are too large for this level set; choose a "
-            "smaller `spacing`, or another level"
+            "smaller `spacing`, or another level",
+            singular_vertices(faces),
         )
 
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
 from harnack.fields import Field
-from harnack.meshing.checks import MeshingError
+from harnack.meshing.checks import LocalError, MeshingError
 from harnack.meshing.points import PointSet
 from harnack.meshing.samples import LevelFunction
 from harnack.meshing.tetrahedra import IntArray, Tetrahedra
@@ -110,10 +110,12 @@ def triangles_of(
     on = points.is_on[tets.corners]
     least = np.where(on, np.iinfo(np.int64).max, side).min(axis=1)
     most = np.where(on, np.iinfo(np.int64).min, side).max(axis=1)
-    if (most - least > 1)[~on.all(axis=1)].any():
-        raise MeshingError(
+    double = (most - least > 1) & ~on.all(axis=1)
+    if double.any():
+        raise LocalError(
             "two sheets of the level set pass between corners of one tetrahedron: choose a smaller "
-            "`spacing`"
+            "`spacing`",
+            _mean(points.points, tets.corners[double]),
         )
     cut = np.flatnonzero(~on.all(axis=1) & (most > least))
     roots, place = _roots(function, points, tets, crossings, cut)
@@ -182,13 +184,16 @@ def _sides(points: PointSet, tets: Tetrahedra, crossings: Crossings) -> IntArray
     for i, j in itertools.permutations(range(4), 2):
         some = rows[(first == i) & ~on[:, j]]
         side[some, j] = between(i, j, some)
+    wrong = np.zeros(len(rows), np.bool_)
     for i, j in _ALL:
         some = rows[~on[:, i] & ~on[:, j]]
-        if (side[some, j] - side[some, i] != between(i, j, some)).any():
-            raise MeshingError(
-                "crossings of the level set do not agree around a triangle: the curve passes "
-                "through it; choose a smaller `spacing`"
-            )
+        wrong[some] |= side[some, j] - side[some, i] != between(i, j, some)
+    if wrong.any():
+        raise LocalError(
+            "crossings of the level set do not agree around a triangle: the curve passes "
+            "through it; choose a smaller `spacing`",
+            _mean(points.points, tets.corners[wrong]),
+        )
     return side
 
 
