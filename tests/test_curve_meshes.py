@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 
 import harnack as hk
@@ -15,6 +16,7 @@ from harnack.geometry import shapes
 from harnack.meshing import checks
 from harnack.meshing.flips import least_angles
 from harnack.meshing.intersections import intersecting_faces
+from harnack.meshing.relaxation import relaxed
 from harnack.meshing.samples import LevelFunction
 from tests.oracles.oracle import CurveOracle
 from tests.oracles.triangle_pairs import intersecting_pairs
@@ -78,15 +80,40 @@ def test_surfaces_of_curves_end_at_the_curve(name: str) -> None:
     facts = mesh.metadata["harnack"]
     assert facts["isotopy_far"] >= 0.95
     assert 0.4 < facts["isotopy"] < facts["isotopy_far"]
-    # Triangles beside the rim may be as thin as its edges force them to be.
-    on_rim = np.zeros(len(mesh.vertices), bool)
-    on_rim[facts["boundary"]] = True
-    inner = ~on_rim[mesh.faces].any(axis=1)
-    angles = np.degrees(least_angles(mesh.vertices, mesh.faces))
-    assert np.percentile(angles[inner], 5) >= 25
+    assert fifth_percentile_of_angles(mesh) >= 27
     slope = hk.SolidAngle(loops).gradient(mesh.triangles_center, precision="double")
     turned = (slope * np.cross(*edge_vectors(mesh))).sum(axis=1) <= 0
     assert turned.mean() < 1e-3  # only between a long edge and the chain beside it
+
+
+def fifth_percentile_of_angles(mesh: Any) -> float:
+    """In degrees, of least angles of all triangles."""
+    return float(np.percentile(np.degrees(least_angles(mesh.vertices, mesh.faces)), 5))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CURVES)
+def test_angles_at_the_default_tolerance(name: str) -> None:
+    """24 degrees in the coil, whose rim has edges four times as long as those beside it, before
+    vertices of thin triangles were relaxed; without that, this fails."""
+    assert fifth_percentile_of_angles(hk.mesh(hk.SolidAngle(loops_of(name)))) >= 26.5
+
+
+def test_relaxed_triangles_have_larger_angles_and_the_same_rim() -> None:
+    """Of a disc with random vertices; what is moved stays on the plane and turns no triangle."""
+    rng = np.random.default_rng(0)
+    disc = shapes.wavy_polygon(24, amplitude=0.0)
+    x = np.concatenate([disc, np.column_stack([*rng.uniform(-0.6, 0.6, (2, 60)), np.zeros(60)])])
+    faces = Delaunay(x[:, :2]).simplices.astype(np.int64)
+    flat = LevelFunction(hk.Plane((0.0, 0.0, 1.0)), 0.0)
+    moved = relaxed(flat, x, faces, 1.0, None)
+    before, after = (least_angles(y, faces) for y in (x, moved))
+    assert (moved[: len(disc)] == disc).all()
+    assert np.abs(moved[:, 2]).max() < 1e-12
+    corner = moved[faces]
+    assert (np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])[:, 2] > 0).all()
+    assert after.min() >= before.min()
+    assert np.percentile(after, 5) > 1.5 * np.percentile(before, 5)
 
 
 def edge_vectors(mesh: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -124,8 +151,7 @@ def test_mesh_and_surface_are_within_the_tolerance(name: str, tolerance: float, 
     facts = mesh.metadata["harnack"]
     assert facts["evaluations"] < 300_000
     assert len(mesh.faces) < 25_000
-    angles = np.degrees(least_angles(mesh.vertices, mesh.faces))
-    assert np.percentile(angles, 5) >= 25
+    assert fifth_percentile_of_angles(mesh) >= 25
     reach = tolerance * float(np.ptp(mesh.bounds, axis=0).max())
     points = np.asarray(mesh.sample(max(hits, 5000), seed=0))
     seen = CurveOracle(loops)(points)
@@ -221,8 +247,7 @@ def test_long_edges_of_a_coil_need_to_be_integrated() -> None:
 
 
 def test_wrapping_alone_would_be_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without integration a mesh of the coil in large cells fails its checks, and says so, unless
-    cells are made smaller where it fails: then it is right."""
+    """Without integration a mesh of the coil in large cells fails its checks, and says so."""
     field, spacing = hk.SolidAngle(loops_of("coil")), 0.16
     monkeypatch.setattr(spanned_module(), "_MOST_LOCAL", 0)
     mesh = hk.mesh(field, spacing=spacing, tolerance=0.05)
@@ -231,8 +256,6 @@ def test_wrapping_alone_would_be_noticed(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(marching, "_integrated", lambda field, p, q, wrapped, period: wrapped)
     with pytest.raises(hk.MeshingError, match="spacing"):
         hk.mesh(field, spacing=spacing, tolerance=0.05)
-    monkeypatch.setattr(spanned_module(), "_MOST_LOCAL", 4)
-    check_surface(hk.mesh(field, spacing=spacing, tolerance=0.05), loops_of("coil"), 1)
 
 
 def test_reaches_are_proved() -> None:

@@ -13,6 +13,7 @@ from harnack.backend import BoolArray, FloatArray
 from harnack.meshing.checks import boundary_edges, directed_edges
 from harnack.meshing.flips import flipped, without_slivers
 from harnack.meshing.points import newton
+from harnack.meshing.relaxation import relaxed
 from harnack.meshing.samples import LevelFunction
 from harnack.meshing.tetrahedra import IntArray, edge_keys
 
@@ -113,6 +114,9 @@ def improved(
     fixed[boundary_edges(faces)] = True
     faces = without_slivers(function, vertices, faces, fixed, 2 * tolerance)
     vertices, faces = refined(function, vertices, faces, tolerance, walls, report)
+    for _ in range(2):
+        faces = flipped(function, vertices, faces, tolerance)
+        vertices = relaxed(function, vertices, faces, tolerance, walls)
     return vertices, flipped(function, vertices, faces, tolerance)
 
 
