@@ -8,7 +8,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import FloatArray, choose_backend, to_numpy, to_vector3
-from harnack.meshing.tetrahedra import IntArray, edge_keys
+from harnack.meshing.edges import Edges, IntArray, directed_edges
 from harnack.tree import build_hierarchy
 from harnack.tree.triangles import NO_TRIANGLE, Frame, TriangleRays, triangle_records
 
@@ -32,8 +32,7 @@ def edges_through(vertices: FloatArray, of: IntArray, through: IntArray) -> int:
     """
     if not len(of) or not len(through):
         return 0
-    count = len(vertices)
-    pairs = _edges(of, count)
+    pairs = Edges.of(directed_edges(of)).ends
     corners = vertices[through]
     lower, upper = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
     pairs = pairs[_overlaps(vertices[pairs], lower, upper)]
@@ -54,13 +53,6 @@ def edges_through(vertices: FloatArray, of: IntArray, through: IntArray) -> int:
     found = dr.select(number != NO_TRIANGLE, t, dr.inf)
     dr.eval(found)
     return int(np.isfinite(to_numpy(found)).sum())
-
-
-def _edges(faces: IntArray, count: int) -> IntArray:
-    """(k, 2): all edges, each once, the lower index first."""
-    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    keys = np.unique(edge_keys(ends, count))
-    return np.column_stack([keys // count, keys % count])
 
 
 def _overlaps(ends: FloatArray, lower: FloatArray, upper: FloatArray) -> BoolArray:

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
+from harnack.meshing.edges import IntArray
+from harnack.meshing.rows import dots, lengths
 from harnack.meshing.samples import LevelFunction
-from harnack.meshing.tetrahedra import IntArray
 
 __all__ = ["intersecting_faces", "turned_faces"]
 
@@ -27,7 +28,7 @@ def turned_faces(function: LevelFunction, vertices: FloatArray, faces: IntArray)
     corner = vertices[faces]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     slope = function.at(corner.mean(axis=1)).gradient
-    return np.flatnonzero((normal * slope).sum(axis=1) <= 0)
+    return np.flatnonzero(dots(normal, slope) <= 0)
 
 
 def intersecting_faces(vertices: FloatArray, faces: IntArray) -> IntArray:
@@ -60,7 +61,7 @@ def _near_pairs(corner: FloatArray) -> list[IntArray]:
     searching: Any = scipy.spatial
     lower, upper = corner.min(axis=1), corner.max(axis=1)
     centre = 0.5 * (lower + upper)
-    radius = 0.5 * np.linalg.norm(upper - lower, axis=1)
+    radius = 0.5 * lengths(upper - lower)
     octave = np.floor(np.log2(np.maximum(radius, 1e-300)))
     groups = [np.flatnonzero(octave == one) for one in np.unique(octave)]
     trees = [searching.cKDTree(centre[rows]) for rows in groups]
@@ -85,7 +86,7 @@ def _is_beside(one: FloatArray, other: FloatArray) -> BoolArray:
     normal = np.cross(one[:, 1] - one[:, 0], one[:, 2] - one[:, 0])
     rise = other - one[:, :1]
     height = np.einsum("nij,nj->ni", rise, normal)
-    slack = 1e-12 * np.linalg.norm(rise, axis=2).max(axis=1) * np.linalg.norm(normal, axis=1)
+    slack = 1e-12 * np.linalg.norm(rise, axis=2).max(axis=1) * lengths(normal)
     return (height.min(axis=1) >= -slack) | (height.max(axis=1) <= slack)
 
 

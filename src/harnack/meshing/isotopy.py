@@ -49,9 +49,9 @@ from typing import Any
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
+from harnack.meshing.edges import IntArray
 from harnack.meshing.points import Boundary, PointSet
 from harnack.meshing.samples import LevelFunction
-from harnack.meshing.tetrahedra import IntArray
 
 __all__ = ["Isotopy", "isotopy_of"]
 

@@ -21,9 +21,11 @@ import numpy as np
 from harnack.backend import BoolArray, FloatArray
 from harnack.fields import Field
 from harnack.meshing.checks import LocalError, MeshingError
+from harnack.meshing.edges import IntArray
 from harnack.meshing.points import PointSet
+from harnack.meshing.rows import dots, lengths
 from harnack.meshing.samples import LevelFunction
-from harnack.meshing.tetrahedra import IntArray, Tetrahedra
+from harnack.meshing.tetrahedra import Tetrahedra
 
 __all__ = ["Crossings", "crossings_of", "is_cut", "triangles_of"]
 
@@ -65,7 +67,7 @@ def crossings_of(function: LevelFunction, points: PointSet, tets: Tetrahedra) ->
         return Crossings(count, change, int(off.sum()), 0)
     period = function.period
     change -= period * np.round(change / period)
-    span = np.linalg.norm(points.points[a] - points.points[b], axis=1)
+    span = lengths(points.points[a] - points.points[b])
     reach = points.samples.reach
     unsure = np.flatnonzero(off & (reach[a] + reach[b] < span * (1 + 1e-9)))
     if len(unsure):
@@ -146,7 +148,7 @@ def triangles_of(
     faces, rise = (np.concatenate(column) for column in zip(*parts, strict=True))
     corner = vertices[faces]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    turned = (normal * rise).sum(axis=1) < 0
+    turned = dots(normal, rise) < 0
     faces[turned] = faces[turned][:, ::-1]
     return vertices, faces
 
@@ -163,7 +165,7 @@ def _mean(points: FloatArray, index: IntArray) -> FloatArray:
 def _halves(vertices: FloatArray, ring: list[IntArray]) -> tuple[IntArray, IntArray]:
     """A quadrilateral cut along its shorter diagonal."""
     a, b, c, d = ring
-    one, other = (np.linalg.norm(vertices[x] - vertices[y], axis=1) for x, y in ((a, c), (b, d)))
+    one, other = (lengths(vertices[x] - vertices[y]) for x, y in ((a, c), (b, d)))
     longer = (one > other)[:, None]
     first = np.where(longer, np.stack([a, b, d], axis=1), np.stack([a, b, c], axis=1))
     second = np.where(longer, np.stack([b, c, d], axis=1), np.stack([a, c, d], axis=1))

@@ -6,8 +6,8 @@ import numpy as np
 
 from harnack.backend import FloatArray
 from harnack.meshing.checks import TooLargeError
+from harnack.meshing.edges import IntArray
 from harnack.meshing.samples import LevelFunction
-from harnack.meshing.tetrahedra import IntArray
 
 __all__ = ["check_size"]
 

@@ -9,7 +9,6 @@ one triangle or quadrilateral, and signs at its corners alone say how.
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -17,21 +16,22 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
 from harnack.meshing.checks import MeshingError, singular_vertices
+from harnack.meshing.edges import IntArray
 from harnack.meshing.isotopy import Isotopy, isotopy_of
 from harnack.meshing.lattice.cells import Lattice, distinct_rows
 from harnack.meshing.lattice.estimates import check_size
 from harnack.meshing.marching import crossings_of, is_cut, triangles_of
 from harnack.meshing.points import Boundary, PointSet, newton
-from harnack.meshing.refinement import refined, smoothed
+from harnack.meshing.refining.refinement import refined, smoothed
+from harnack.meshing.rows import lengths
 from harnack.meshing.samples import LevelFunction, Samples
-from harnack.meshing.tetrahedra import IntArray, Tetrahedra, edge_keys
+from harnack.meshing.tetrahedra import Tetrahedra
 
 __all__ = ["Surface", "closed_surface", "open_surface"]
 
 # Points so near to the level, in parts of the length of a cell, are moved onto it.
 _SNAPPED = 0.25
 _MOST_ROUNDS = 20
-_PAIRS = tuple(itertools.combinations(range(4), 2))
 
 
 @dataclass(frozen=True)
@@ -137,11 +137,12 @@ class _Inside(LevelFunction):
 
     def at(self, points: FloatArray) -> Samples:
         samples = self.function.at(points)
-        depth = np.minimum(points - self.lattice.lower, self.lattice.upper - points)
-        return dataclasses.replace(
-            samples,
-            value=np.where((depth < 1.5 * self.lattice.size).any(axis=1), 0.0, samples.value),
-        )
+        lower = self.lattice.lower + 1.5 * self.lattice.size
+        upper = self.lattice.upper - 1.5 * self.lattice.size
+        is_inside = np.ones(len(points), np.bool_)
+        for x, low, high in zip(points.T, lower, upper, strict=True):
+            is_inside &= (x >= low) & (x <= high)
+        return dataclasses.replace(samples, value=np.where(is_inside, samples.value, 0.0))
 
 
 def _wall_faces(
@@ -236,8 +237,8 @@ def _snapped(
     longest = np.full(len(near), 0.5 * _SNAPPED * size)
     moved = newton(function, points[near], samples.some(near), longest, walls, steps=4)
     there = function.at(moved)
-    apart = np.linalg.norm(moved - points[near], axis=1)
-    steep = np.linalg.norm(there.gradient, axis=1)
+    apart = lengths(moved - points[near])
+    steep = lengths(there.gradient)
     good = np.abs(there.value) < 1e-9 * np.maximum(steep * size, 1e-300)
     good &= apart < 1.2 * _SNAPPED * size
     rows = near[good]
@@ -255,9 +256,4 @@ def _cut_tetrahedra(
     up = (value[corners] > 0) & ~on
     down = ~up & ~on
     rows = np.flatnonzero((up.any(axis=1) & down.any(axis=1)) | (on.sum(axis=1) >= 3))
-    corners = corners[rows]
-    pairs = np.concatenate([corners[:, pair] for pair in _PAIRS])
-    keys, index = np.unique(edge_keys(pairs, len(points)), return_inverse=True)
-    edges = index.reshape(len(_PAIRS), -1).T
-    ends = np.column_stack([keys // len(points), keys % len(points)])
-    return rows, Tetrahedra(points, corners, ends, edges)
+    return rows, Tetrahedra.of(points, corners[rows])

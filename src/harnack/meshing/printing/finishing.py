@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from harnack.backend import FloatArray
-from harnack.meshing.checks import MeshingError, boundary_edges, euler_characteristic
+from harnack.meshing.checks import MeshingError, euler_characteristic
+from harnack.meshing.edges import boundary_edges
 from harnack.meshing.lattice import Surface
 from harnack.meshing.printing.manifolds import manifold_of, surface_of
 from harnack.meshing.samples import LevelFunction
@@ -91,7 +92,7 @@ def simplified(surface: Surface, tolerance: float) -> tuple[Surface, dict[str, A
 
 
 def finished(surface: Surface, facts: dict[str, Any], is_closed: bool) -> trimesh.Trimesh:
-    """The mesh, with what is known of it in its metadata.
+    """The mesh, which is a manifold (`check_manifold`), with what is known of it in its metadata.
 
     Raises:
         MeshingError: it ought to be closed and to have a positive volume, and is not.
@@ -99,17 +100,19 @@ def finished(surface: Surface, facts: dict[str, Any], is_closed: bool) -> trimes
     import trimesh
 
     made = trimesh.Trimesh(surface.vertices, surface.faces, process=False, validate=False)
+    boundary = boundary_edges(surface.faces)
     if is_closed:
-        if not (made.is_watertight and made.is_winding_consistent and made.volume > 0):
+        volume = float(made.volume)
+        if len(boundary) or not volume > 0:
             raise MeshingError(
                 "the part did not close, or is inside out: choose a smaller `spacing`"
             )
-        facts = {**facts, "volume": float(made.volume)}
+        facts = {**facts, "volume": volume}
     made.metadata["harnack"] = {
         "proved": 0,
         "integrated": 0,
         **facts,
         "euler_characteristic": euler_characteristic(surface.faces),
-        "boundary": boundary_edges(surface.faces),
+        "boundary": boundary,
     }
     return made

@@ -16,21 +16,17 @@ from harnack.backend import FloatArray
 from harnack.cells import Cells
 from harnack.fields import SolidAngle
 from harnack.geometry.net_loops import net_loops
-from harnack.meshing.checks import (
-    LocalError,
-    MeshingError,
-    boundary_edges,
-    check_manifold,
-)
+from harnack.meshing.checks import LocalError, MeshingError, check_manifold
+from harnack.meshing.edges import IntArray, boundary_edges, edge_keys
 from harnack.meshing.intersections import intersecting_faces, turned_faces
 from harnack.meshing.isotopy import Isotopy, isotopy_of
 from harnack.meshing.lattice import check_size
 from harnack.meshing.marching import Crossings, crossings_of, is_cut, triangles_of
 from harnack.meshing.points import Boundary, Places, PointSet, box_cells, place_points
-from harnack.meshing.refinement import improved, refined, smoothed
+from harnack.meshing.refining.refinement import improved, refined, smoothed
 from harnack.meshing.samples import LevelFunction
 from harnack.meshing.spanned.rims import whole_edges
-from harnack.meshing.tetrahedra import IntArray, Tetrahedra, delaunay, edge_keys
+from harnack.meshing.tetrahedra import Tetrahedra, delaunay
 
 __all__ = ["Spanned", "spanned_surface"]
 

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.checks import boundary_edges
-from harnack.meshing.flips import least_angles
+from harnack.meshing.edges import IntArray, boundary_edges
 from harnack.meshing.points import newton
+from harnack.meshing.refining.flips import least_angles
+from harnack.meshing.rows import dots, lengths
 from harnack.meshing.samples import LevelFunction
-from harnack.meshing.tetrahedra import IntArray
 
 __all__ = ["relaxed"]
 
@@ -109,7 +109,7 @@ def _best_places(
     """Where each vertex is best (k, 3), and the least angle around it there (k,)."""
     here, a, b = (vertices[stars.corners[:, k]] for k in range(3))
     normal = np.cross(a - here, b - here)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
+    normal /= np.maximum(lengths(normal), 1e-300)[:, None]
     middle = 0.5 * (a + b)
     # Where the triangle over the opposite edge has equal sides.
     apex = middle + np.sqrt(0.75) * np.cross(normal, b - a)
@@ -127,7 +127,7 @@ def _best_places(
             better = least > found
             best[better], found[better] = x[better], least[better]
     # Onto the surface only the best of them, which changes little: the aims are beside it.
-    span = np.linalg.norm(best - start, axis=1) + 1e-300
+    span = lengths(best - start) + 1e-300
     best = newton(function, best, function.at(best), 2 * span, walls, steps=4)
     return best, _least_at(best, stars, a, b, normal)
 
@@ -141,10 +141,10 @@ def _least_at(
     """
     apex = x[stars.owner]
     cross = np.cross(a - apex, b - apex)
-    size = np.linalg.norm(cross, axis=1)
+    size = lengths(cross)
     corner = np.stack([apex, a, b], axis=1)
     angles = least_angles(corner.reshape(-1, 3), np.arange(3 * len(a)).reshape(-1, 3))
-    facing = (cross * normal).sum(axis=1) > _FACING * size
+    facing = dots(cross, normal) > _FACING * size
     return stars.least(np.where(facing, angles, -1.0))
 
 
@@ -178,11 +178,11 @@ def _is_near(
     corner[:, 0] = there[stars.owner[pairs]]
     samples = function.at(corner.mean(axis=1))
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    size = np.linalg.norm(normal, axis=1) * np.linalg.norm(samples.gradient, axis=1)
-    good = (normal * samples.gradient).sum(axis=1) > _FACING * size
+    size = lengths(normal) * lengths(samples.gradient)
+    good = dots(normal, samples.gradient) > _FACING * size
     good &= samples.distance <= tolerance
     off = np.zeros(len(stars.centres), np.int64)
     np.add.at(off, stars.owner[pairs[~good]], 1)
-    length = np.linalg.norm(there[rows] - vertices[stars.centres[rows]], axis=1)
+    length = lengths(there[rows] - vertices[stars.centres[rows]])
     on = function.at(there[rows]).distance <= 1e-7 * np.maximum(length, 0.1 * tolerance)
     return on & (off[rows] == 0)

@@ -12,9 +12,9 @@ from __future__ import annotations
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.checks import directed_edges
+from harnack.meshing.edges import IntArray, directed_edges, edge_keys
+from harnack.meshing.rows import dots, lengths
 from harnack.meshing.samples import LevelFunction
-from harnack.meshing.tetrahedra import IntArray, edge_keys
 
 __all__ = ["flipped", "least_angles", "without_slivers"]
 
@@ -117,7 +117,7 @@ def least_angles(vertices: FloatArray, faces: IntArray) -> FloatArray:
     corner = vertices[faces]
     side = np.stack([corner[:, (k + 2) % 3] - corner[:, (k + 1) % 3] for k in range(3)], axis=1)
     square = (side * side).sum(axis=2)
-    twice_area = np.linalg.norm(np.cross(side[:, 0], side[:, 1]), axis=1)
+    twice_area = lengths(np.cross(side[:, 0], side[:, 1]))
     # The least angle is opposite the shortest side: tan = 2 area/(b . c).
     shortest = square.argmin(axis=1)
     rest = 0.5 * (square.sum(axis=1) - 2 * square[np.arange(len(faces)), shortest])
@@ -145,8 +145,8 @@ def without_slivers(
         if gone[row]:
             continue
         corner = vertices[faces[row]]
-        lengths = np.linalg.norm(np.roll(corner, -1, axis=0) - corner, axis=1)
-        k = int(lengths.argmin())
+        sides = lengths(np.roll(corner, -1, axis=0) - corner)
+        k = int(sides.argmin())
         ends = int(faces[row, k]), int(faces[row, (k + 1) % 3])
         for kept, lost in (ends, ends[::-1]):
             if fixed[lost]:
@@ -177,7 +177,7 @@ def _is_good(
     corner = vertices[new]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     samples = function.at(corner.mean(axis=1))
-    size = np.linalg.norm(normal, axis=1) * np.linalg.norm(samples.gradient, axis=1)
-    facing = (normal * samples.gradient).sum(axis=1) > _STILL_FACING * size
+    size = lengths(normal) * lengths(samples.gradient)
+    facing = dots(normal, samples.gradient) > _STILL_FACING * size
     near = samples.distance <= tolerance
     return bool((facing & near & (least_angles(vertices, new) > _SLIVER)).all())
