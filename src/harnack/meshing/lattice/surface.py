@@ -20,6 +20,7 @@ from harnack.meshing.edges import IntArray
 from harnack.meshing.isotopy import Isotopy, isotopy_of
 from harnack.meshing.lattice.cells import Lattice, distinct_rows
 from harnack.meshing.lattice.estimates import check_size
+from harnack.meshing.lattice.missed import check_nothing_missed
 from harnack.meshing.marching import crossings_of, is_cut, triangles_of
 from harnack.meshing.points import Boundary, PointSet, newton
 from harnack.meshing.refining.refinement import refined, smoothed
@@ -74,6 +75,7 @@ def open_surface(
     samples = _sampled(function, points)
     first = _marched(function, points, samples, corners, nowhere, nowhere, lattice, walls)
     vertices, faces = first.vertices, first.faces
+    _check_nothing_missed(function, points, samples, corners, first, faces, lattice, walls)
     if not len(faces):
         raise MeshingError("the level set is empty: no cell of the box holds the level")
     check_size(function, vertices, faces, tolerance)
@@ -113,6 +115,8 @@ def closed_surface(
     is_on_wall[: len(points)] = is_wall
     is_cap = is_on_wall[faces].any(axis=1)
     rest, caps = faces[~is_cap], [faces[is_cap], _wall_faces(points, samples, corners, is_wall)]
+    inner = lattice.lower + 2 * lattice.size, lattice.upper - 2 * lattice.size
+    _check_nothing_missed(function, points, samples, corners, first, faces, lattice, inner)
     # What ends at the outermost cells is moved and cut, its ends are not.
     if len(rest):
         check_size(function, vertices, rest, tolerance)
@@ -122,6 +126,25 @@ def closed_surface(
         vertices = smoothed(function, vertices, rest, None)
     faces = np.concatenate([rest, *caps])
     return Surface.of(vertices, faces) if len(faces) else Surface(np.zeros((0, 3)), faces)
+
+
+def _check_nothing_missed(
+    function: LevelFunction,
+    points: FloatArray,
+    samples: Samples,
+    corners: IntArray,
+    first: _First,
+    faces: IntArray,
+    lattice: Lattice,
+    box: tuple[FloatArray, FloatArray],
+) -> None:
+    # Tetrahedra with corners on both sides; those with corners on the level may have no face.
+    side = np.where(first.points.is_on, 0.0, np.sign(first.points.samples.value))[corners]
+    is_beside = np.zeros(len(points), np.bool_)
+    is_beside[corners[(side.min(axis=1) < 0) & (side.max(axis=1) > 0)]] = True
+    surface = first.vertices, faces
+    size = float(lattice.size.max())
+    check_nothing_missed(function, points, samples, is_beside, surface, size, box)
 
 
 @dataclass
