@@ -23,7 +23,7 @@ __all__ = ["SolidMesh", "mesh_solid", "region_of"]
 # Cells across a solid, if nothing is asked for.
 _ACROSS = 24
 # How many sizes of cells are tried, and what each is of the one before.
-_MOST_ATTEMPTS = 3
+_MOST_ATTEMPTS = 2
 _SMALLER = 0.6
 # Room around what has an extent, as a part of its size.
 _MARGIN = 0.01
