@@ -86,7 +86,10 @@ def mesh(
     Returns:
         A trimesh.Trimesh. Vertices of a curve come first, in order, bit by bit, and its edges are
         the rim. `metadata["harnack"]` has level, spacing, evaluations, the Euler characteristic,
-        boundary: indices (k, 2) of edges of one face, and
+        boundary: indices (k, 2) of edges of one face,
+        creases: how many edges have faces more than 30 degrees apart: a function with kinks, such
+            as |x| or max(f, g), has them where its level set does. That these are within the
+            tolerance is checked at middles of edges and triangles; nothing is proved there; and
         proved, integrated: how many changes along edges of tetrahedra are proved to be differences
             of wrapped values, and how many were integrated;
         isotopy, isotopy_far: the shares of tetrahedra on which the first triangles are proved to
