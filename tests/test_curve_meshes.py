@@ -140,6 +140,8 @@ def test_topology_does_not_depend_on_place_or_spacing(name: str, seed: int) -> N
         ("wavy", 2e-3, 1500),
         pytest.param("wavy", 1e-3, 20_000, marks=pytest.mark.slow),
         pytest.param("trefoil", 1e-3, 20_000, marks=pytest.mark.slow),
+        pytest.param("Hopf link", 1e-3, 20_000, marks=pytest.mark.slow),
+        pytest.param("coil", 1e-3, 20_000, marks=pytest.mark.slow),
     ],
 )
 def test_mesh_and_surface_are_within_the_tolerance(name: str, tolerance: float, hits: int) -> None:
@@ -149,7 +151,7 @@ def test_mesh_and_surface_are_within_the_tolerance(name: str, tolerance: float, 
     field = hk.SolidAngle(loops)
     mesh = hk.mesh(field, tolerance=tolerance)
     facts = mesh.metadata["harnack"]
-    assert facts["evaluations"] < 300_000
+    assert facts["evaluations"] < (1_500_000 if name == "coil" else 300_000)
     assert len(mesh.faces) < 25_000
     assert fifth_percentile_of_angles(mesh) >= 25
     reach = tolerance * float(np.ptp(mesh.bounds, axis=0).max())
