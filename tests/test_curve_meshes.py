@@ -176,12 +176,14 @@ def distances(mesh: Any, points: np.ndarray) -> np.ndarray:
     """From points to the triangles of a mesh, one by one."""
     from scipy.spatial import cKDTree
 
-    tree = cKDTree(mesh.triangles_center)
-    reach = float(np.linalg.norm(mesh.triangles - mesh.triangles_center[:, None], axis=2).max())
+    radius = np.linalg.norm(mesh.triangles - mesh.triangles_center[:, None], axis=2).max(axis=1)
+    is_long = radius > 4 * np.median(radius)  # few, beside long edges of a curve: tried for all
+    small, long = mesh.triangles[~is_long], mesh.triangles[is_long]
+    tree = cKDTree(small.mean(axis=1))
     near = tree.query(points)[0]
     out = np.full(len(points), np.inf)
-    for k, (p, r) in enumerate(zip(points, near + 2 * reach, strict=True)):
-        triangles = mesh.triangles[tree.query_ball_point(p, r)]
+    for k, (p, r) in enumerate(zip(points, near + 2 * radius[~is_long].max(), strict=True)):
+        triangles = np.concatenate([small[tree.query_ball_point(p, r)], long])
         out[k] = np.sqrt(squares_to_triangles(triangles, p).min())
     return out
 
