@@ -56,7 +56,7 @@ from harnack.meshing.samples import LevelFunction
 __all__ = ["Isotopy", "isotopy_of"]
 
 Walls = tuple[FloatArray, FloatArray] | None
-_HALVINGS = 3
+_HALVINGS = 5
 _TRIALS = 20
 _UNKNOWN = 1e200
 # Tetrahedra that are looked at before all are.
