@@ -8,12 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial import Delaunay
+from scipy.spatial.transform import Rotation
 
 import harnack as hk
 from harnack.geometry import shapes
 from harnack.meshing import checks
-from harnack.meshing.flips import least_angles
 from harnack.meshing.intersections import intersecting_faces
+from harnack.meshing.refining.flips import least_angles
+from harnack.meshing.refining.relaxation import relaxed
 from harnack.meshing.samples import LevelFunction
 from tests.oracles.oracle import CurveOracle
 from tests.oracles.triangle_pairs import intersecting_pairs
@@ -77,15 +80,40 @@ def test_surfaces_of_curves_end_at_the_curve(name: str) -> None:
     facts = mesh.metadata["harnack"]
     assert facts["isotopy_far"] >= 0.95
     assert 0.4 < facts["isotopy"] < facts["isotopy_far"]
-    # Triangles beside the rim may be as thin as its edges force them to be.
-    on_rim = np.zeros(len(mesh.vertices), bool)
-    on_rim[facts["boundary"]] = True
-    inner = ~on_rim[mesh.faces].any(axis=1)
-    angles = np.degrees(least_angles(mesh.vertices, mesh.faces))
-    assert np.percentile(angles[inner], 5) >= 25
+    assert fifth_percentile_of_angles(mesh) >= 27
     slope = hk.SolidAngle(loops).gradient(mesh.triangles_center, precision="double")
     turned = (slope * np.cross(*edge_vectors(mesh))).sum(axis=1) <= 0
     assert turned.mean() < 1e-3  # only between a long edge and the chain beside it
+
+
+def fifth_percentile_of_angles(mesh: Any) -> float:
+    """In degrees, of least angles of all triangles."""
+    return float(np.percentile(np.degrees(least_angles(mesh.vertices, mesh.faces)), 5))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CURVES)
+def test_angles_at_the_default_tolerance(name: str) -> None:
+    """24 degrees in the coil, whose rim has edges four times as long as those beside it, before
+    vertices of thin triangles were relaxed; without that, this fails."""
+    assert fifth_percentile_of_angles(hk.mesh(hk.SolidAngle(loops_of(name)))) >= 26.5
+
+
+def test_relaxed_triangles_have_larger_angles_and_the_same_rim() -> None:
+    """Of a disc with random vertices; what is moved stays on the plane and turns no triangle."""
+    rng = np.random.default_rng(0)
+    disc = shapes.wavy_polygon(24, amplitude=0.0)
+    x = np.concatenate([disc, np.column_stack([*rng.uniform(-0.6, 0.6, (2, 60)), np.zeros(60)])])
+    faces = Delaunay(x[:, :2]).simplices.astype(np.int64)
+    flat = LevelFunction(hk.Plane((0.0, 0.0, 1.0)), 0.0)
+    moved = relaxed(flat, x, faces, 1.0, None)
+    before, after = (least_angles(y, faces) for y in (x, moved))
+    assert (moved[: len(disc)] == disc).all()
+    assert np.abs(moved[:, 2]).max() < 1e-12
+    corner = moved[faces]
+    assert (np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])[:, 2] > 0).all()
+    assert after.min() >= before.min()
+    assert np.percentile(after, 5) > 1.5 * np.percentile(before, 5)
 
 
 def edge_vectors(mesh: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -95,21 +123,15 @@ def edge_vectors(mesh: Any) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(1, 6))
-@pytest.mark.parametrize("name", ["wavy", "trefoil", "Hopf link", "three holes"])
-def test_topology_does_not_depend_on_seed_or_spacing(name: str, seed: int) -> None:
-    loops, expected = loops_of(name), CURVES[name][1]
-    for spacing in (None, 0.16, 0.07):
+@pytest.mark.parametrize("name", CURVES)
+def test_topology_does_not_depend_on_place_or_spacing(name: str, seed: int) -> None:
+    """Each seed turns and moves the curve, so that other edges of tetrahedra cross it."""
+    rng = np.random.default_rng(seed)
+    turn, move = Rotation.random(random_state=rng).as_matrix(), rng.uniform(-0.5, 0.5, 3)
+    loops = [loop @ turn.T + move for loop in loops_of(name)]
+    for spacing in (None, 0.16, 0.09):
         mesh = hk.mesh(hk.SolidAngle(loops), spacing=spacing, seed=seed, tolerance=4e-3)
-        check_surface(mesh, loops, expected)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("seed", "spacing"), [(1, None), (2, 0.11), (3, 0.09)])
-@pytest.mark.parametrize("name", ["T(2,5)", "T(3,4)", "Borromean rings", "figure-eight", "coil"])
-def test_topology_of_larger_curves(name: str, seed: int, spacing: float | None) -> None:
-    loops, expected = loops_of(name), CURVES[name][1]
-    mesh = hk.mesh(hk.SolidAngle(loops), spacing=spacing, seed=seed, tolerance=4e-3)
-    check_surface(mesh, loops, expected)
+        check_surface(mesh, loops, CURVES[name][1])
 
 
 @pytest.mark.parametrize(
@@ -118,6 +140,8 @@ def test_topology_of_larger_curves(name: str, seed: int, spacing: float | None) 
         ("wavy", 2e-3, 1500),
         pytest.param("wavy", 1e-3, 20_000, marks=pytest.mark.slow),
         pytest.param("trefoil", 1e-3, 20_000, marks=pytest.mark.slow),
+        pytest.param("Hopf link", 1e-3, 20_000, marks=pytest.mark.slow),
+        pytest.param("coil", 1e-3, 20_000, marks=pytest.mark.slow),
     ],
 )
 def test_mesh_and_surface_are_within_the_tolerance(name: str, tolerance: float, hits: int) -> None:
@@ -127,10 +151,9 @@ def test_mesh_and_surface_are_within_the_tolerance(name: str, tolerance: float, 
     field = hk.SolidAngle(loops)
     mesh = hk.mesh(field, tolerance=tolerance)
     facts = mesh.metadata["harnack"]
-    assert facts["evaluations"] < 300_000
+    assert facts["evaluations"] < (1_500_000 if name == "coil" else 300_000)
     assert len(mesh.faces) < 25_000
-    angles = np.degrees(least_angles(mesh.vertices, mesh.faces))
-    assert np.percentile(angles, 5) >= 25
+    assert fifth_percentile_of_angles(mesh) >= 25
     reach = tolerance * float(np.ptp(mesh.bounds, axis=0).max())
     points = np.asarray(mesh.sample(max(hits, 5000), seed=0))
     seen = CurveOracle(loops)(points)
@@ -153,12 +176,14 @@ def distances(mesh: Any, points: np.ndarray) -> np.ndarray:
     """From points to the triangles of a mesh, one by one."""
     from scipy.spatial import cKDTree
 
-    tree = cKDTree(mesh.triangles_center)
-    reach = float(np.linalg.norm(mesh.triangles - mesh.triangles_center[:, None], axis=2).max())
+    radius = np.linalg.norm(mesh.triangles - mesh.triangles_center[:, None], axis=2).max(axis=1)
+    is_long = radius > 4 * np.median(radius)  # few, beside long edges of a curve: tried for all
+    small, long = mesh.triangles[~is_long], mesh.triangles[is_long]
+    tree = cKDTree(small.mean(axis=1))
     near = tree.query(points)[0]
     out = np.full(len(points), np.inf)
-    for k, (p, r) in enumerate(zip(points, near + 2 * reach, strict=True)):
-        triangles = mesh.triangles[tree.query_ball_point(p, r)]
+    for k, (p, r) in enumerate(zip(points, near + 2 * radius[~is_long].max(), strict=True)):
+        triangles = np.concatenate([small[tree.query_ball_point(p, r)], long])
         out[k] = np.sqrt(squares_to_triangles(triangles, p).min())
     return out
 
@@ -180,9 +205,27 @@ def squares_to_triangles(t: np.ndarray, p: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("spacing", [0.4, 0.25])
-def test_a_coil_in_cells_that_are_too_large_is_never_wrong(spacing: float) -> None:
+def test_cells_that_are_too_large_for_a_coil_are_made_smaller_where_checks_fail(
+    spacing: float,
+) -> None:
+    said: list[str] = []
+    field = hk.SolidAngle(loops_of("coil"))
+    mesh = hk.mesh(field, spacing=spacing, tolerance=0.02, progress=said.append)
+    assert any("places fail: smaller cells there" in text for text in said)
+    assert mesh.metadata["harnack"]["spacing"] == spacing
+    check_surface(mesh, loops_of("coil"), 1)
+
+
+def test_a_coil_in_cells_that_are_too_large_raises_if_they_stay(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(spanned_module(), "_MOST_LOCAL", 0)
     with pytest.raises(hk.MeshingError, match="smaller `spacing`"):
-        hk.mesh(hk.SolidAngle(loops_of("coil")), spacing=spacing, tolerance=0.02)
+        hk.mesh(hk.SolidAngle(loops_of("coil")), spacing=0.4, tolerance=0.02)
+
+
+def spanned_module() -> Any:
+    return sys.modules["harnack.meshing.spanned.surface"]
 
 
 def test_long_edges_of_a_coil_need_to_be_integrated() -> None:
@@ -210,6 +253,7 @@ def test_long_edges_of_a_coil_need_to_be_integrated() -> None:
 def test_wrapping_alone_would_be_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without integration a mesh of the coil in large cells fails its checks, and says so."""
     field, spacing = hk.SolidAngle(loops_of("coil")), 0.16
+    monkeypatch.setattr(spanned_module(), "_MOST_LOCAL", 0)
     mesh = hk.mesh(field, spacing=spacing, tolerance=0.05)
     assert mesh.metadata["harnack"]["euler_characteristic"] == 1
     marching = sys.modules["harnack.meshing.marching"]

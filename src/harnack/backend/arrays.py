@@ -184,7 +184,9 @@ def finite_vectors(vectors: Any, name: str) -> FloatArray:
     """
     values = real_array(vectors, name, type_error=TypeError).astype(np.float64, copy=False)
     check_vectors(values, name)
-    _check_rows(~np.isfinite(values).all(axis=1), "NaN or infinite", name)
+    finite = np.isfinite(values)
+    if not finite.all():
+        _check_rows(~finite.all(axis=1), "NaN or infinite", name)
     return values
 
 

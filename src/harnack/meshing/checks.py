@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import Any, Never, cast
 
 import numpy as np
 
-from harnack.meshing.tetrahedra import IntArray, edge_keys
+from harnack.backend import FloatArray
+from harnack.meshing.edges import Edges, IntArray, directed_edges
 
 __all__ = [
+    "LocalError",
     "MeshingError",
     "TooLargeError",
-    "boundary_edges",
     "check_manifold",
-    "directed_edges",
     "euler_characteristic",
     "singular_vertices",
 ]
@@ -23,68 +23,70 @@ class MeshingError(ValueError):
     """A level set that could not be meshed; the message says why and what to do."""
 
 
+class LocalError(MeshingError):
+    """A check that failed in known places (k, 3), so that smaller cells there may be enough."""
+
+    def __init__(self, message: str, places: FloatArray) -> None:
+        super().__init__(message)
+        self.places = places
+
+
 class TooLargeError(MeshingError):
     """A mesh that would be so large that it was not begun."""
 
 
-def directed_edges(faces: IntArray) -> IntArray:
-    """(3m, 2): the edges of faces (m, 3), as they are run: all first ones (corners 0 and 1), then
-    all second and all third ones."""
-    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-
-
-def boundary_edges(faces: IntArray) -> IntArray:
-    """(k, 2): edges of one face only, as it runs them."""
-    edges = directed_edges(faces)
-    count = int(faces.max(initial=-1)) + 1
-    _, index, uses = np.unique(edge_keys(edges, count), return_inverse=True, return_counts=True)
-    return edges[uses[index] == 1]
-
-
 def euler_characteristic(faces: IntArray) -> int:
     """Vertices in use, less edges, and faces."""
-    import trimesh  # here: half a second that few need
-
-    nowhere = np.zeros((int(faces.max(initial=-1)) + 1, 3))
-    surface: Any = trimesh.Trimesh(nowhere, faces, process=False, validate=False)
-    return int(surface.euler_number)
+    vertices = int(np.count_nonzero(np.bincount(faces.ravel())))
+    return vertices - len(Edges.of(directed_edges(faces)).ends) + len(faces)
 
 
-def check_manifold(faces: IntArray) -> None:
+def check_manifold(faces: IntArray, vertices: FloatArray | None = None) -> None:
     """Raise unless every edge has one or two faces, which run it in opposite directions, and the
     faces around every vertex are joined by edges.
 
+    vertices: (n, 3), to say where not.
+
     Raises:
-        MeshingError: otherwise.
+        MeshingError: otherwise; a LocalError, given vertices.
     """
-    edges, count = directed_edges(faces), int(faces.max(initial=-1)) + 1
-    _, index, uses = np.unique(edge_keys(edges, count), return_inverse=True, return_counts=True)
+
+    def fail(message: str, where: IntArray) -> Never:
+        if vertices is None:
+            raise MeshingError(message)
+        raise LocalError(message, vertices[where])
+
+    pairs = directed_edges(faces)
+    edges = Edges.of(pairs)
+    index, uses = edges.index, edges.uses
     if (uses > 2).any():
-        raise MeshingError(
+        fail(
             f"{(uses > 2).sum()} edges of the mesh have more than two faces: the level set crosses "
-            "itself, or cells are too large for it; choose a smaller `spacing`, or another level"
+            "itself, or cells are too large for it; choose a smaller `spacing`, or another level",
+            np.unique(pairs[uses[index] > 2]),
         )
-    ways = np.zeros(len(uses), np.int64)
-    np.add.at(ways, index, np.where(edges[:, 0] < edges[:, 1], 1, -1))
+    ways = np.bincount(index, np.where(pairs[:, 0] < pairs[:, 1], 1, -1), minlength=len(uses))
     if ((uses == 2) & (ways != 0)).any():
-        raise MeshingError(
+        fail(
             "neighbouring faces of the mesh do not agree on its two sides: cells are too large for "
-            "this level set; choose a smaller `spacing`"
+            "this level set; choose a smaller `spacing`",
+            np.unique(pairs[((uses == 2) & (ways != 0))[index]]),
         )
-    if _fans(faces, index, uses)[0] > len(np.unique(faces)):
-        raise MeshingError(
+    if _fans(faces, index, uses)[0] > np.count_nonzero(np.bincount(faces.ravel())):
+        fail(
             "sheets of the mesh touch in a point: cells are too large for this level set; choose a "
-            "smaller `spacing`, or another level"
+            "smaller `spacing`, or another level",
+            singular_vertices(faces),
         )
 
 
 def singular_vertices(faces: IntArray) -> IntArray:
     """Vertices, by index, at which faces (m, 3) are not a manifold: those of edges with more than
     two faces, and those that have more than one fan of faces."""
-    edges, count = directed_edges(faces), int(faces.max(initial=-1)) + 1
-    _, index, uses = np.unique(edge_keys(edges, count), return_inverse=True, return_counts=True)
-    many = np.unique(edges[uses[index] > 2])
-    _, fan = _fans(faces, index, uses)
+    pairs, count = directed_edges(faces), int(faces.max(initial=-1)) + 1
+    edges = Edges.of(pairs)
+    many = np.unique(pairs[edges.uses[edges.index] > 2])
+    _, fan = _fans(faces, edges.index, edges.uses)
     # Each fan once, at its vertex.
     _, first = np.unique(fan, return_index=True)
     fans = np.bincount(faces.ravel()[first], minlength=count)

@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
+from harnack.meshing.edges import IntArray
 from harnack.meshing.predicates import SignArray, sides_of_lines, sides_of_planes
+from harnack.meshing.rows import dots, lengths
 from harnack.meshing.samples import LevelFunction
-from harnack.meshing.tetrahedra import IntArray
 
 __all__ = ["intersecting_faces", "turned_faces"]
 
@@ -31,7 +32,7 @@ def turned_faces(function: LevelFunction, vertices: FloatArray, faces: IntArray)
     corner = vertices[faces]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     slope = function.at(corner.mean(axis=1)).gradient
-    return np.flatnonzero((normal * slope).sum(axis=1) <= 0)
+    return np.flatnonzero(dots(normal, slope) <= 0)
 
 
 def intersecting_faces(
@@ -76,7 +77,7 @@ def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
     ends = lower[chosen].min(axis=0), upper[chosen].max(axis=0)
     near = (lower <= ends[1]).all(axis=1) & (upper >= ends[0]).all(axis=1)
     centre = 0.5 * (lower + upper)
-    radius = 0.5 * np.linalg.norm(upper - lower, axis=1)
+    radius = 0.5 * lengths(upper - lower)
     octave = np.floor(np.log2(np.maximum(radius, 1e-300)))
     groups = [np.flatnonzero(near & (octave == one)) for one in np.unique(octave[near])]
     trees = [searching.cKDTree(centre[rows]) for rows in groups]

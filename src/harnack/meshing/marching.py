@@ -20,10 +20,12 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
 from harnack.fields import Field
-from harnack.meshing.checks import MeshingError
+from harnack.meshing.checks import LocalError, MeshingError
+from harnack.meshing.edges import IntArray
 from harnack.meshing.points import PointSet
+from harnack.meshing.rows import dots, lengths
 from harnack.meshing.samples import LevelFunction
-from harnack.meshing.tetrahedra import IntArray, Tetrahedra
+from harnack.meshing.tetrahedra import Tetrahedra
 
 __all__ = ["Crossings", "crossings_of", "is_cut", "triangles_of"]
 
@@ -65,7 +67,7 @@ def crossings_of(function: LevelFunction, points: PointSet, tets: Tetrahedra) ->
         return Crossings(count, change, int(off.sum()), 0)
     period = function.period
     change -= period * np.round(change / period)
-    span = np.linalg.norm(points.points[a] - points.points[b], axis=1)
+    span = lengths(points.points[a] - points.points[b])
     reach = points.samples.reach
     unsure = np.flatnonzero(off & (reach[a] + reach[b] < span * (1 + 1e-9)))
     if len(unsure):
@@ -110,10 +112,12 @@ def triangles_of(
     on = points.is_on[tets.corners]
     least = np.where(on, np.iinfo(np.int64).max, side).min(axis=1)
     most = np.where(on, np.iinfo(np.int64).min, side).max(axis=1)
-    if (most - least > 1)[~on.all(axis=1)].any():
-        raise MeshingError(
+    double = (most - least > 1) & ~on.all(axis=1)
+    if double.any():
+        raise LocalError(
             "two sheets of the level set pass between corners of one tetrahedron: choose a smaller "
-            "`spacing`"
+            "`spacing`",
+            _mean(points.points, tets.corners[double]),
         )
     cut = np.flatnonzero(~on.all(axis=1) & (most > least))
     roots, place = _roots(function, points, tets, crossings, cut)
@@ -144,7 +148,7 @@ def triangles_of(
     faces, rise = (np.concatenate(column) for column in zip(*parts, strict=True))
     corner = vertices[faces]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    turned = (normal * rise).sum(axis=1) < 0
+    turned = dots(normal, rise) < 0
     faces[turned] = faces[turned][:, ::-1]
     return vertices, faces
 
@@ -161,7 +165,7 @@ def _mean(points: FloatArray, index: IntArray) -> FloatArray:
 def _halves(vertices: FloatArray, ring: list[IntArray]) -> tuple[IntArray, IntArray]:
     """A quadrilateral cut along its shorter diagonal."""
     a, b, c, d = ring
-    one, other = (np.linalg.norm(vertices[x] - vertices[y], axis=1) for x, y in ((a, c), (b, d)))
+    one, other = (lengths(vertices[x] - vertices[y]) for x, y in ((a, c), (b, d)))
     longer = (one > other)[:, None]
     first = np.where(longer, np.stack([a, b, d], axis=1), np.stack([a, b, c], axis=1))
     second = np.where(longer, np.stack([b, c, d], axis=1), np.stack([a, c, d], axis=1))
@@ -182,13 +186,16 @@ def _sides(points: PointSet, tets: Tetrahedra, crossings: Crossings) -> IntArray
     for i, j in itertools.permutations(range(4), 2):
         some = rows[(first == i) & ~on[:, j]]
         side[some, j] = between(i, j, some)
+    wrong = np.zeros(len(rows), np.bool_)
     for i, j in _ALL:
         some = rows[~on[:, i] & ~on[:, j]]
-        if (side[some, j] - side[some, i] != between(i, j, some)).any():
-            raise MeshingError(
-                "crossings of the level set do not agree around a triangle: the curve passes "
-                "through it; choose a smaller `spacing`"
-            )
+        wrong[some] |= side[some, j] - side[some, i] != between(i, j, some)
+    if wrong.any():
+        raise LocalError(
+            "crossings of the level set do not agree around a triangle: the curve passes "
+            "through it; choose a smaller `spacing`",
+            _mean(points.points, tets.corners[wrong]),
+        )
     return side
 
 

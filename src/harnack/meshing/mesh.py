@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
@@ -11,18 +10,8 @@ import numpy as np
 
 from harnack.fields import Field, Solid, SolidAngle
 from harnack.geometry import Box, Intersection, Volume
-from harnack.geometry.net_loops import net_loops
-from harnack.meshing.checks import (
-    MeshingError,
-    TooLargeError,
-    boundary_edges,
-    check_manifold,
-)
-from harnack.meshing.intersections import intersecting_faces, turned_faces
-from harnack.meshing.isotopy import Isotopy, isotopy_of
-from harnack.meshing.lattice import Lattice, Surface, check_size, open_surface
-from harnack.meshing.marching import Crossings, crossings_of, is_cut, triangles_of
-from harnack.meshing.points import Boundary, Places, PointSet, box_cells, place_points
+from harnack.meshing.checks import MeshingError, TooLargeError, check_manifold
+from harnack.meshing.lattice import Lattice, Surface, open_surface
 from harnack.meshing.printing.clipping import cut_by
 from harnack.meshing.printing.finishing import (
     check_options,
@@ -34,10 +23,8 @@ from harnack.meshing.printing.finishing import (
 from harnack.meshing.printing.regions import Sheet
 from harnack.meshing.printing.solids import mesh_solid, region_of
 from harnack.meshing.printing.thickening import thickened
-from harnack.meshing.refinement import improved, refined, smoothed
-from harnack.meshing.rims import whole_edges
 from harnack.meshing.samples import LevelFunction
-from harnack.meshing.tetrahedra import IntArray, Tetrahedra, delaunay, edge_keys
+from harnack.meshing.spanned import spanned_surface
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -45,23 +32,15 @@ if TYPE_CHECKING:
     import trimesh
 
     from harnack.backend import FloatArray
-    from harnack.cells import Cells
 
 __all__ = ["mesh"]
 
 # Cells across the level set, if nothing is asked for; curves have their own length besides.
 _ACROSS = 24
 _MOST_ATTEMPTS = 4
-# Edges of a curve that are longer than so many cells are cut.
-_LONGEST = 2.5
 # Room around what has an extent, and around a curve whose surface has none, as a part of the size.
 _MARGIN = 0.01
 _ROOM = 0.05
-# How often edges of a curve that are too near to others are halved.
-_MOST_CUTS = 4
-# How often points of flat tetrahedra, which spoil the proof of isotopy, are taken out.
-_MOST_REMOVALS = 3
-_FEW = 200
 
 
 def mesh(
@@ -107,7 +86,10 @@ def mesh(
     Returns:
         A trimesh.Trimesh. Vertices of a curve come first, in order, bit by bit, and its edges are
         the rim. `metadata["harnack"]` has level, spacing, evaluations, the Euler characteristic,
-        boundary: indices (k, 2) of edges of one face, and
+        boundary: indices (k, 2) of edges of one face,
+        creases: how many edges have faces more than 30 degrees apart: a function with kinks, such
+            as |x| or max(f, g), has them where its level set does. That these are within the
+            tolerance is checked at middles of edges and triangles; nothing is proved there; and
         proved, integrated: how many changes along edges of tetrahedra are proved to be differences
             of wrapped values, and how many were integrated;
         isotopy, isotopy_far: the shares of tetrahedra on which the first triangles are proved to
@@ -297,8 +279,9 @@ def _spanned(
     """The level set of an angle, which ends at its curve."""
     function = LevelFunction(field, level)
     ends = box.lower, box.upper
-    walls = ends if box.has_walls else None
-    made = _embedded(function, spacing, attempts, ends, walls, seed, tolerance, report)
+    made = spanned_surface(
+        function, spacing, attempts, ends, box.has_walls, seed, tolerance, report
+    )
     facts = {
         "spacing": made.spacing,
         "evaluations": function.evaluations,
@@ -380,186 +363,5 @@ def _common_bounds(volume: Volume | None) -> tuple[FloatArray, FloatArray]:
     return lower, upper
 
 
-@dataclass(frozen=True)
-class _Surface:
-    """Triangles, and how they were found. turned: faces turned over."""
-
-    vertices: FloatArray
-    faces: IntArray
-    curve: Boundary
-    spacing: float
-    crossings: Crossings
-    isotopy: Isotopy
-    turned: int = 0
-
-
-def _embedded(
-    function: LevelFunction,
-    spacing: float,
-    attempts: int,
-    box: tuple[FloatArray, FloatArray],
-    walls: tuple[FloatArray, FloatArray] | None,
-    seed: int,
-    tolerance: float,
-    report: Callable[[str], None],
-) -> _Surface:
-    """Triangles within the tolerance, none of which pass through others; where some do, or are
-    turned over, cells are made smaller and all is done again."""
-    finer: tuple[Places, ...] = ()
-    best: _Surface | None = None
-    crossing = np.zeros(0, np.int64)
-    for attempt in range(_MOST_ATTEMPTS):
-        first = _first_mesh(function, spacing, attempts, box, walls, seed, finer, report)
-        spacing = first.spacing
-        faces = first.faces
-        check_size(function, first.vertices, faces, tolerance)
-        vertices = smoothed(function, first.vertices, faces, walls)
-        vertices, faces = refined(function, vertices, faces, tolerance, walls, report)
-        vertices, faces = improved(function, vertices, faces, tolerance, walls, report)
-        turned = turned_faces(function, vertices, faces)
-        if isinstance(function.field, SolidAngle):
-            kept = sum(map(len, net_loops(function.field.loops)))
-            vertices, faces = whole_edges(
-                function, vertices, faces, kept, len(first.curve.points), tolerance
-            )
-        check_manifold(faces)
-        crossing = intersecting_faces(vertices, faces)
-        if not len(crossing) and (best is None or len(turned) < best.turned):
-            best = dataclasses.replace(first, vertices=vertices, faces=faces, turned=len(turned))
-        bad = np.union1d(crossing, turned)
-        if not len(bad):
-            break
-        if attempt < _MOST_ATTEMPTS - 1:
-            report(f"{len(bad)} triangles fail: smaller cells there")
-            finer = (*finer, Places(vertices[faces[bad]].mean(axis=1), spacing))
-    if best is None:
-        raise MeshingError(
-            f"{len(crossing)} triangles pass through others, in cells as small as "
-            f"{spacing / 2 ** len(finer):.3g}: choose a smaller `tolerance` or `spacing`"
-        )
-    return best
-
-
-def _first_mesh(
-    function: LevelFunction,
-    spacing: float,
-    attempts: int,
-    box: tuple[FloatArray, FloatArray],
-    walls: tuple[FloatArray, FloatArray] | None,
-    seed: int,
-    finer: tuple[Places, ...],
-    report: Callable[[str], None],
-) -> _Surface:
-    """Triangles in cells of that spacing, or where that fails of smaller ones."""
-    loops = net_loops(function.field.loops) if isinstance(function.field, SolidAngle) else ()
-    curve = (
-        Boundary.of(loops, _LONGEST * spacing) if loops else Boundary(np.zeros((0, 3)), _NO_EDGES)
-    )
-    for k, places in enumerate(finer):  # balls on long edges leave no room for points
-        curve = curve.split_near(places, spacing * 0.5**k)
-    margin = 0.5 * spacing if walls is None else 0.0
-    root = box_cells(box[0] - margin, box[1] + margin, spacing, exact=walls is not None)
-    report(f"cells of {spacing:.3g}")
-    try:
-        curve, points, tets = _filled(function, root, curve, walls, seed, finer)
-        report(f"{len(points.points):,} points, {len(tets.corners):,} tetrahedra")
-        surface = _in_tetrahedra(function, points, tets, curve, spacing, walls)
-        for _ in range(_MOST_REMOVALS):
-            # Beside a curve all is never proved, and little is gained.
-            if len(curve.edges) or not 0 < len(surface.isotopy.open_far) < _FEW:
-                break
-            points = _without_slivers(points, surface.isotopy.open_far, walls)
-            try:
-                tets = delaunay(points.points)
-                other = _in_tetrahedra(function, points, tets, curve, spacing, walls)
-            except MeshingError:  # of fewer points; the first surface passed all checks
-                break
-            if len(other.isotopy.open_far) < len(surface.isotopy.open_far):
-                surface = other
-    except MeshingError:
-        if attempts == 1:
-            raise
-        return _first_mesh(function, 0.6 * spacing, attempts - 1, box, walls, seed, finer, report)
-    return surface
-
-
-def _in_tetrahedra(
-    function: LevelFunction,
-    points: PointSet,
-    tets: Tetrahedra,
-    curve: Boundary,
-    spacing: float,
-    walls: tuple[FloatArray, FloatArray] | None,
-) -> _Surface:
-    """Triangles in tetrahedra, checked, and what is proved about them."""
-    crossings = crossings_of(function, points, tets)
-    vertices, faces = triangles_of(function, points, tets, crossings)
-    if not len(faces):
-        raise MeshingError("the level set is empty: no cell of the box holds the level")
-    check_manifold(faces)
-    if len(curve.edges):
-        _check_boundary(vertices, faces, curve, walls)
-    cut = is_cut(points, tets, crossings)
-    isotopy = isotopy_of(function, points, tets.corners, cut, faces, curve, spacing, walls)
-    return _Surface(vertices, faces, curve, spacing, crossings, isotopy)
-
-
-def _without_slivers(
-    points: PointSet,
-    corners: IntArray,
-    walls: tuple[FloatArray, FloatArray] | None,
-) -> PointSet:
-    """Points but for one of each of some tetrahedra with corners (k, 4), which is on no wall."""
-    count = np.bincount(corners.ravel(), minlength=len(points.points))
-    if walls is not None:
-        x = points.points
-        count[((x <= walls[0]) | (x >= walls[1])).any(axis=1)] = 0
-    often = count[corners]
-    worst = corners[np.arange(len(corners)), often.argmax(axis=1)]
-    return points.without(np.unique(worst[often.max(axis=1) > 0]))
-
-
-def _filled(
-    function: LevelFunction,
-    root: tuple[Cells, int],
-    curve: Boundary,
-    walls: tuple[FloatArray, FloatArray] | None,
-    seed: int,
-    finer: tuple[Places, ...],
-) -> tuple[Boundary, PointSet, Tetrahedra]:
-    """Tetrahedra that have all edges of the curve, which is cut where others are too near."""
-    for _ in range(_MOST_CUTS):
-        points = place_points(function, root, curve, walls, seed, finer)
-        tets = delaunay(points.points)
-        has_edge = tets.has_edges(curve.edges)
-        if has_edge.all():
-            return curve, points, tets
-        curve = curve.split(~has_edge)
-    raise MeshingError("edges of the curve are too near to others: choose a smaller `spacing`")
-
-
 def _silent(text: str) -> None:
     """Tells nobody."""
-
-
-_NO_EDGES = np.zeros((0, 2), np.int64)
-
-
-def _check_boundary(
-    vertices: FloatArray,
-    faces: IntArray,
-    curve: Boundary,
-    walls: tuple[FloatArray, FloatArray] | None,
-) -> None:
-    edges = boundary_edges(faces)
-    count = max(int(faces.max()) + 1, len(curve.points))
-    if walls is not None:  # where the surface ends as well
-        slack = 1e-9 * (walls[1] - walls[0])
-        near = np.minimum(np.abs(vertices - walls[0]), np.abs(vertices - walls[1]))
-        on = np.asarray((near <= slack).any(axis=1))
-        edges = edges[~on[edges].all(axis=1)]
-    if not np.array_equal(np.sort(edge_keys(edges, count)), np.sort(edge_keys(curve.edges, count))):
-        raise MeshingError(
-            "the mesh does not end at the curve: cells are too large for it; choose a smaller "
-            "`spacing`"
-        )

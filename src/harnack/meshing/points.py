@@ -16,8 +16,9 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
 from harnack.cells import Cells, Octree, octree
+from harnack.meshing.edges import IntArray
+from harnack.meshing.rows import dots, lengths
 from harnack.meshing.samples import LevelFunction, Samples
-from harnack.meshing.tetrahedra import IntArray
 
 __all__ = ["Boundary", "Places", "PointSet", "box_cells", "place_points"]
 
@@ -26,6 +27,8 @@ _JITTER = 1e-3  # no five points on a sphere
 _SNAPPED = 0.3  # points so near to the level are moved onto it
 _FREE = 0.45  # of points around the curve
 _MOST_CELLS = 4_000_000
+# A step of Newton's method that is so short is the last: parts of the longest one.
+_CONVERGED = 1e-9
 _CORNERS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
 
 
@@ -90,7 +93,7 @@ class Boundary:
         curve = self
         while True:
             ends = curve.points[curve.edges]
-            half = 0.5 * np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+            half = 0.5 * lengths(ends[:, 1] - ends[:, 0])
             which = (2 * half > longest) & places.meet(ends.mean(axis=1), half)
             if not which.any():
                 return curve
@@ -105,11 +108,6 @@ class PointSet:
     points: FloatArray
     is_on: BoolArray
     samples: Samples
-
-    def without(self, rows: IntArray) -> PointSet:
-        """All points but those."""
-        kept = np.delete(np.arange(len(self.points)), rows)
-        return PointSet(self.points[kept], self.is_on[kept], self.samples.some(kept))
 
 
 def box_cells(
@@ -216,7 +214,7 @@ def _is_far(points: FloatArray, free: FloatArray, boundary: Boundary) -> BoolArr
 
     searching: Any = scipy.spatial
     a, b = (boundary.points[boundary.edges[:, k]] for k in (0, 1))
-    middle, half = 0.5 * (a + b), 0.5 * np.linalg.norm(b - a, axis=1)
+    middle, half = 0.5 * (a + b), 0.5 * lengths(b - a)
     near = np.full(len(points), np.inf)
     is_far = np.ones(len(points), np.bool_)
     # Curves may have edges of any lengths: those of one size at a time.
@@ -255,8 +253,8 @@ def _snapped(
     near = np.flatnonzero(samples.distance < _SNAPPED * size)
     moved = newton(function, points[near], samples.some(near), 0.25 * size[near], walls)
     there = function.at(moved)
-    apart = np.linalg.norm(moved - points[near], axis=1)
-    steep = np.linalg.norm(there.gradient, axis=1)
+    apart = lengths(moved - points[near])
+    steep = lengths(there.gradient)
     good = np.abs(there.value) < 1e-9 * np.maximum(steep * size[near], 1e-300)
     good &= (apart < 1.5 * _SNAPPED * size[near]) & _is_far(moved, free[near], boundary)
     rows = near[good]
@@ -274,16 +272,19 @@ def newton(
     steps: int = 5,
 ) -> FloatArray:
     """Points (n, 3) after steps of Newton's method along the gradient towards the level, each no
-    longer than `longest` (n,). On walls they stay on them."""
-    x = points
+    longer than `longest` (n,). On walls they stay on them. Points are left alone after a step that
+    was so short that the next one, of its square, would be lost in rounding."""
+    x, rows = points.copy(), np.arange(len(points))
     for k in range(steps):
-        g = samples.gradient if walls is None else samples.gradient * _off_walls(x, walls)
-        square = (g * g).sum(axis=1)
+        here = x[rows]
+        g = samples.gradient if walls is None else samples.gradient * _off_walls(here, walls)
+        square = dots(g, g)
         move = -(samples.value / np.maximum(square, 1e-300))[:, None] * g
-        length = np.linalg.norm(move, axis=1)
-        x = x + move * np.minimum(1, longest / np.maximum(length, 1e-300))[:, None]
-        if walls is not None:
-            x = np.clip(x, *walls)
-        if k < steps - 1:
-            samples = function.at(x)
+        length = lengths(move)
+        there = here + move * np.minimum(1, longest[rows] / np.maximum(length, 1e-300))[:, None]
+        x[rows] = there if walls is None else np.clip(there, *walls)
+        rows = rows[length > _CONVERGED * longest[rows]]
+        if k == steps - 1 or not len(rows):
+            break
+        samples = function.at(x[rows])
     return x

@@ -20,16 +20,16 @@ from harnack.geometry.singular import singular_loops, weld_vertices
 from harnack.meshing.checks import (
     MeshingError,
     check_manifold,
-    directed_edges,
     euler_characteristic,
     singular_vertices,
 )
+from harnack.meshing.edges import Edges, IntArray, directed_edges
 from harnack.meshing.intersections import intersecting_faces
 from harnack.meshing.marching import crossings_of, triangles_of
 from harnack.meshing.points import Boundary, Places, box_cells, place_points
-from harnack.meshing.refinement import improved, refined, smoothed
+from harnack.meshing.refining.refinement import improved, refined, smoothed
 from harnack.meshing.samples import LevelFunction
-from harnack.meshing.tetrahedra import IntArray, delaunay, edge_keys
+from harnack.meshing.tetrahedra import delaunay
 
 if TYPE_CHECKING:
     import trimesh
@@ -174,27 +174,27 @@ def _open_edges(faces: IntArray) -> IntArray:
     Raises:
         MeshError: an edge of more than two faces, or of two that run it the same way.
     """
-    edges, count = directed_edges(faces), int(faces.max()) + 1
-    keys = edge_keys(edges, count)
-    found, index, uses = np.unique(keys, return_inverse=True, return_counts=True)
+    pairs = directed_edges(faces)
+    edges = Edges.of(pairs)
+    index, uses = edges.index, edges.uses
     several = np.flatnonzero(uses > 2)
     if len(several):
-        a, b = divmod(int(found[several[0]]), count)
+        a, b = edges.ends[several[0]].tolist()
         raise MeshError(
             f"{len(several):,} edges have more than two faces, the first of them between vertices "
             f"{a} and {b}: such a mesh has no two sides there; remove faces, or draw it with "
             "WindingNumber, which needs no repair"
         )
-    sign = np.bincount(index, np.where(edges[:, 0] < edges[:, 1], 1, -1), minlength=len(found))
+    sign = np.bincount(index, np.where(pairs[:, 0] < pairs[:, 1], 1, -1), minlength=len(uses))
     turned = np.flatnonzero((uses == 2) & (sign != 0))
     if len(turned):
-        a, b = divmod(int(found[turned[0]]), count)
+        a, b = edges.ends[turned[0]].tolist()
         raise MeshError(
             f"the faces at {len(turned):,} edges do not agree which side is outside, the first of "
             f"them between vertices {a} and {b}: reverse some faces, for instance by "
             "trimesh.repair.fix_winding(mesh)"
         )
-    return edges[uses[index] == 1]
+    return pairs[uses[index] == 1]
 
 
 def _patches(

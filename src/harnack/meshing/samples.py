@@ -15,6 +15,7 @@ from harnack.backend.lengths import length
 from harnack.enclosures import Gaps, Slopes, TargetLevels, choose_proofs, longest_step
 from harnack.fields.clearance import distance_below
 from harnack.fields.points import in_batches
+from harnack.meshing.rows import lengths
 
 if TYPE_CHECKING:
     from harnack.backend import Real, Vec3
@@ -51,7 +52,7 @@ class Samples:
     @property
     def distance(self) -> FloatArray:
         """(n,) to the level, by the slope: |f - level|/|gradient|."""
-        steep = np.linalg.norm(self.gradient, axis=1)
+        steep = lengths(self.gradient)
         return np.abs(self.value) / np.maximum(steep, 1e-300)
 
 

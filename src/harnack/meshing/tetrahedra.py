@@ -7,13 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from harnack.backend import BoolArray, FloatArray
+from harnack.meshing.edges import Edges, IntArray, edge_keys
 
-__all__ = ["IntArray", "Tetrahedra", "delaunay", "edge_keys"]
-
-IntArray = npt.NDArray[np.int64]
+__all__ = ["Tetrahedra", "delaunay"]
 
 _PAIRS = tuple(itertools.combinations(range(4), 2))
 
@@ -30,6 +28,12 @@ class Tetrahedra:
     ends: IntArray
     edges: IntArray
 
+    @classmethod
+    def of(cls, points: FloatArray, corners: IntArray) -> Tetrahedra:
+        """With their edges numbered."""
+        edges = Edges.of(np.concatenate([corners[:, pair] for pair in _PAIRS]))
+        return cls(points, corners, edges.ends, edges.index.reshape(len(_PAIRS), -1).T)
+
     def edge_between(self, i: int, j: int, rows: IntArray) -> tuple[IntArray, IntArray]:
         """For tetrahedra `rows`, the edge between corners i and j, and its direction: 1 if it leads
         from i to j, else -1."""
@@ -40,11 +44,6 @@ class Tetrahedra:
         """(k,) whether there are edges between pairs (k, 2) of points."""
         n = len(self.points)
         return np.isin(edge_keys(pairs, n), edge_keys(self.ends, n))
-
-
-def edge_keys(pairs: IntArray, count: int) -> IntArray:
-    """One number for each pair (k, 2) of `count` points, the same in either order."""
-    return pairs.min(axis=1) * count + pairs.max(axis=1)
 
 
 def delaunay(points: FloatArray) -> Tetrahedra:
@@ -65,7 +64,4 @@ def delaunay(points: FloatArray) -> Tetrahedra:
     together = np.concatenate([points - middle, 20 * size * around])
     corners: IntArray = qhull.Delaunay(together).simplices.astype(np.int64)
     corners = corners[(corners < n).all(axis=1)]
-    pairs = np.concatenate([corners[:, pair] for pair in _PAIRS])
-    keys, index = np.unique(edge_keys(pairs, n), return_inverse=True)
-    edges = index.reshape(len(_PAIRS), -1).T
-    return Tetrahedra(points, corners, np.column_stack([keys // n, keys % n]), edges)
+    return Tetrahedra.of(points, corners)

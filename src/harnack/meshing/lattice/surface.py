@@ -9,7 +9,6 @@ one triangle or quadrilateral, and signs at its corners alone say how.
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -17,21 +16,23 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
 from harnack.meshing.checks import MeshingError, singular_vertices
+from harnack.meshing.edges import IntArray
 from harnack.meshing.isotopy import Isotopy, isotopy_of
 from harnack.meshing.lattice.cells import Lattice, distinct_rows
 from harnack.meshing.lattice.estimates import check_size
+from harnack.meshing.lattice.missed import check_nothing_missed
 from harnack.meshing.marching import crossings_of, is_cut, triangles_of
 from harnack.meshing.points import Boundary, PointSet, newton
-from harnack.meshing.refinement import refined, smoothed
+from harnack.meshing.refining.refinement import refined, smoothed
+from harnack.meshing.rows import lengths
 from harnack.meshing.samples import LevelFunction, Samples
-from harnack.meshing.tetrahedra import IntArray, Tetrahedra, edge_keys
+from harnack.meshing.tetrahedra import Tetrahedra
 
 __all__ = ["Surface", "closed_surface", "open_surface"]
 
 # Points so near to the level, in parts of the length of a cell, are moved onto it.
 _SNAPPED = 0.25
 _MOST_ROUNDS = 20
-_PAIRS = tuple(itertools.combinations(range(4), 2))
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,7 @@ def open_surface(
     samples = _sampled(function, points)
     first = _marched(function, points, samples, corners, nowhere, nowhere, lattice, walls)
     vertices, faces = first.vertices, first.faces
+    _check_nothing_missed(function, points, samples, corners, first, faces, lattice, walls)
     if not len(faces):
         raise MeshingError("the level set is empty: no cell of the box holds the level")
     check_size(function, vertices, faces, tolerance)
@@ -113,6 +115,8 @@ def closed_surface(
     is_on_wall[: len(points)] = is_wall
     is_cap = is_on_wall[faces].any(axis=1)
     rest, caps = faces[~is_cap], [faces[is_cap], _wall_faces(points, samples, corners, is_wall)]
+    inner = lattice.lower + 2 * lattice.size, lattice.upper - 2 * lattice.size
+    _check_nothing_missed(function, points, samples, corners, first, faces, lattice, inner)
     # What ends at the outermost cells is moved and cut, its ends are not.
     if len(rest):
         check_size(function, vertices, rest, tolerance)
@@ -122,6 +126,25 @@ def closed_surface(
         vertices = smoothed(function, vertices, rest, None)
     faces = np.concatenate([rest, *caps])
     return Surface.of(vertices, faces) if len(faces) else Surface(np.zeros((0, 3)), faces)
+
+
+def _check_nothing_missed(
+    function: LevelFunction,
+    points: FloatArray,
+    samples: Samples,
+    corners: IntArray,
+    first: _First,
+    faces: IntArray,
+    lattice: Lattice,
+    box: tuple[FloatArray, FloatArray],
+) -> None:
+    # Tetrahedra with corners on both sides; those with corners on the level may have no face.
+    side = np.where(first.points.is_on, 0.0, np.sign(first.points.samples.value))[corners]
+    is_beside = np.zeros(len(points), np.bool_)
+    is_beside[corners[(side.min(axis=1) < 0) & (side.max(axis=1) > 0)]] = True
+    surface = first.vertices, faces
+    size = float(lattice.size.max())
+    check_nothing_missed(function, points, samples, is_beside, surface, size, box)
 
 
 @dataclass
@@ -137,11 +160,12 @@ class _Inside(LevelFunction):
 
     def at(self, points: FloatArray) -> Samples:
         samples = self.function.at(points)
-        depth = np.minimum(points - self.lattice.lower, self.lattice.upper - points)
-        return dataclasses.replace(
-            samples,
-            value=np.where((depth < 1.5 * self.lattice.size).any(axis=1), 0.0, samples.value),
-        )
+        lower = self.lattice.lower + 1.5 * self.lattice.size
+        upper = self.lattice.upper - 1.5 * self.lattice.size
+        is_inside = np.ones(len(points), np.bool_)
+        for x, low, high in zip(points.T, lower, upper, strict=True):
+            is_inside &= (x >= low) & (x <= high)
+        return dataclasses.replace(samples, value=np.where(is_inside, samples.value, 0.0))
 
 
 def _wall_faces(
@@ -236,8 +260,8 @@ def _snapped(
     longest = np.full(len(near), 0.5 * _SNAPPED * size)
     moved = newton(function, points[near], samples.some(near), longest, walls, steps=4)
     there = function.at(moved)
-    apart = np.linalg.norm(moved - points[near], axis=1)
-    steep = np.linalg.norm(there.gradient, axis=1)
+    apart = lengths(moved - points[near])
+    steep = lengths(there.gradient)
     good = np.abs(there.value) < 1e-9 * np.maximum(steep * size, 1e-300)
     good &= apart < 1.2 * _SNAPPED * size
     rows = near[good]
@@ -255,9 +279,4 @@ def _cut_tetrahedra(
     up = (value[corners] > 0) & ~on
     down = ~up & ~on
     rows = np.flatnonzero((up.any(axis=1) & down.any(axis=1)) | (on.sum(axis=1) >= 3))
-    corners = corners[rows]
-    pairs = np.concatenate([corners[:, pair] for pair in _PAIRS])
-    keys, index = np.unique(edge_keys(pairs, len(points)), return_inverse=True)
-    edges = index.reshape(len(_PAIRS), -1).T
-    ends = np.column_stack([keys // len(points), keys % len(points)])
-    return rows, Tetrahedra(points, corners, ends, edges)
+    return rows, Tetrahedra.of(points, corners[rows])

@@ -8,9 +8,9 @@ import numpy as np
 
 from harnack.backend import FloatArray
 from harnack.geometry import Ball, Box, ConvexHull, HalfSpace, Intersection, Volume
-from harnack.meshing.checks import MeshingError, boundary_edges
+from harnack.meshing.checks import MeshingError
+from harnack.meshing.edges import IntArray, boundary_edges, edge_keys
 from harnack.meshing.lattice import Surface
-from harnack.meshing.tetrahedra import IntArray, edge_keys
 
 __all__ = ["cut_by"]
 

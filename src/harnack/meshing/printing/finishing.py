@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from harnack.backend import FloatArray
-from harnack.meshing.checks import MeshingError, boundary_edges, euler_characteristic
+from harnack.meshing.checks import MeshingError, euler_characteristic
+from harnack.meshing.edges import Edges, IntArray, boundary_edges, directed_edges
 from harnack.meshing.lattice import Surface
 from harnack.meshing.printing.manifolds import manifold_of, surface_of
+from harnack.meshing.rows import dots, lengths
 from harnack.meshing.samples import LevelFunction
 
 if TYPE_CHECKING:
@@ -20,6 +22,9 @@ if TYPE_CHECKING:
     from harnack.fields import Field
 
 __all__ = ["check_options", "finished", "largest_part", "normals_of", "simplified"]
+
+# The cosine of the angle between normals from which on an edge is a crease.
+_CREASE = math.cos(math.radians(30))
 
 
 def check_options(tolerance: Any, spacing: Any, thickness: Any, seed: Any) -> None:
@@ -91,7 +96,7 @@ def simplified(surface: Surface, tolerance: float) -> tuple[Surface, dict[str, A
 
 
 def finished(surface: Surface, facts: dict[str, Any], is_closed: bool) -> trimesh.Trimesh:
-    """The mesh, with what is known of it in its metadata.
+    """The mesh, which is a manifold (`check_manifold`), with what is known of it in its metadata.
 
     Raises:
         MeshingError: it ought to be closed and to have a positive volume, and is not.
@@ -99,17 +104,36 @@ def finished(surface: Surface, facts: dict[str, Any], is_closed: bool) -> trimes
     import trimesh
 
     made = trimesh.Trimesh(surface.vertices, surface.faces, process=False, validate=False)
+    boundary = boundary_edges(surface.faces)
     if is_closed:
-        if not (made.is_watertight and made.is_winding_consistent and made.volume > 0):
+        volume = float(made.volume)
+        if len(boundary) or not volume > 0:
             raise MeshingError(
                 "the part did not close, or is inside out: choose a smaller `spacing`"
             )
-        facts = {**facts, "volume": float(made.volume)}
+        facts = {**facts, "volume": volume}
     made.metadata["harnack"] = {
         "proved": 0,
         "integrated": 0,
         **facts,
         "euler_characteristic": euler_characteristic(surface.faces),
-        "boundary": boundary_edges(surface.faces),
+        "boundary": boundary,
+        "creases": _creases(surface),
     }
     return made
+
+
+def _creases(surface: Surface) -> int:
+    """How many edges two faces meet at whose normals are more than 30 degrees apart."""
+    normals = _unit_normals(surface.vertices, surface.faces)
+    edges = Edges.of(directed_edges(surface.faces))
+    order = np.argsort(edges.index, kind="stable")
+    pairs = order[(edges.uses == 2)[edges.index[order]]].reshape(-1, 2) % len(surface.faces)
+    return int((dots(normals[pairs[:, 0]], normals[pairs[:, 1]]) < _CREASE).sum())
+
+
+def _unit_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
+    """(m, 3) of faces; 0 for those without an area."""
+    corner = vertices[faces]
+    cross = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    return cross / np.maximum(lengths(cross), 1e-300)[:, None]

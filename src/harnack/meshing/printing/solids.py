@@ -14,7 +14,7 @@ from harnack.fields import Field, Solid
 from harnack.fields.solids.region import solid as solid_of
 from harnack.geometry import Box, Intersection, Volume
 from harnack.meshing.checks import MeshingError
-from harnack.meshing.lattice import Surface
+from harnack.meshing.lattice import MissedError, Surface
 from harnack.meshing.printing.manifolds import surface_of, volume_manifold
 from harnack.meshing.printing.regions import RegionMesher, Sheet, is_smooth
 
@@ -22,6 +22,9 @@ __all__ = ["SolidMesh", "mesh_solid", "region_of"]
 
 # Cells across a solid, if nothing is asked for.
 _ACROSS = 24
+# How many sizes of cells are tried, and what each is of the one before.
+_MOST_ATTEMPTS = 2
+_SMALLER = 0.6
 # Room around what has an extent, as a part of its size.
 _MARGIN = 0.01
 
@@ -92,18 +95,36 @@ def mesh_solid(
     size = float((upper - lower).max())
     cells = size / _ACROSS if spacing is None else spacing
     error = 0.5 * tolerance * size
-    mesher = RegionMesher(lower, upper, error, cells, sheets(error, cells), report)
-    if volume is None and is_smooth(solid):
-        made, _ = mesher.smooth(solid, level)
-    else:
-        whole = mesher.below(solid, level)
-        report("putting the parts together")
-        if volume is None:
-            volume = Box(_point(lower), _point(upper))
-        made = _on_box(surface_of(whole ^ volume_manifold(volume, lower, upper, error)), volume)
+    attempts = _MOST_ATTEMPTS if spacing is None else 1
+    while True:
+        mesher = RegionMesher(lower, upper, error, cells, sheets(error, cells), report)
+        try:
+            made = _put_together(mesher, solid, level, volume)
+            break
+        except MissedError:
+            attempts -= 1
+            if not attempts:
+                raise
+            cells *= _SMALLER
+            report(f"parts were missed: cells of {cells:.3g}")
     if not len(made.faces):
         raise MeshingError("the solid is empty: no point of the box is inside")
     return SolidMesh(made, cells, mesher.evaluations, mesher.levels, size)
+
+
+def _put_together(
+    mesher: RegionMesher, solid: Solid, level: float, volume: Volume | None
+) -> Surface:
+    """The boundary of the solid in the volume."""
+    if volume is None and is_smooth(solid):
+        return mesher.smooth(solid, level)[0]
+    lower, upper = mesher.lower, mesher.upper
+    whole = mesher.below(solid, level)
+    mesher.report("putting the parts together")
+    if volume is None:
+        volume = Box(_point(lower), _point(upper))
+    cut = volume_manifold(volume, lower, upper, mesher.tolerance)
+    return _on_box(surface_of(whole ^ cut), volume)
 
 
 def _bounds(solid: Solid, level: float, volume: Volume | None) -> tuple[FloatArray, FloatArray]:

@@ -15,12 +15,11 @@ from typing import Any
 import numpy as np
 
 from harnack.backend import FloatArray
-from harnack.meshing.checks import MeshingError, boundary_edges, directed_edges
+from harnack.meshing.checks import MeshingError
+from harnack.meshing.edges import boundary_edges, directed_edges, distinct, edge_keys
 from harnack.meshing.intersections import intersecting_faces
 from harnack.meshing.lattice import Surface
-from harnack.meshing.lattice.cells import distinct
 from harnack.meshing.printing.manifolds import surface_of
-from harnack.meshing.tetrahedra import edge_keys
 
 __all__ = ["thickened"]
 

@@ -10,11 +10,12 @@ from collections.abc import Callable
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.checks import boundary_edges, directed_edges
-from harnack.meshing.flips import flipped, without_slivers
+from harnack.meshing.edges import Edges, IntArray, boundary_edges, directed_edges
 from harnack.meshing.points import newton
+from harnack.meshing.refining.flips import flipped, without_slivers
+from harnack.meshing.refining.relaxation import relaxed
+from harnack.meshing.rows import dots, lengths
 from harnack.meshing.samples import LevelFunction
-from harnack.meshing.tetrahedra import IntArray, edge_keys
 
 __all__ = ["improved", "refined", "smoothed"]
 
@@ -40,7 +41,7 @@ def refined(
         if walls is not None:  # the rim lies in them, and so do the middles of its edges
             is_rim = np.zeros_like(is_rim)
         middle = 0.5 * (vertices[ends[:, 0]] + vertices[ends[:, 1]])
-        span = np.linalg.norm(vertices[ends[:, 0]] - vertices[ends[:, 1]], axis=1)
+        span = lengths(vertices[ends[:, 0]] - vertices[ends[:, 1]])
         samples = function.at(middle)
         bulge = samples.distance
         marked = bulge > tolerance
@@ -64,11 +65,8 @@ def refined(
 def _edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
     """All edges (k, 2), those of each face (m, 3) (that of corners 0 and 1 first), and whether they
     belong to one face only."""
-    pairs = directed_edges(faces)
-    count = int(faces.max()) + 1
-    keys, index, uses = np.unique(edge_keys(pairs, count), return_inverse=True, return_counts=True)
-    ends = np.column_stack([keys // count, keys % count])
-    return ends, index.reshape(3, -1).T, uses == 1
+    edges = Edges.of(directed_edges(faces))
+    return edges.ends, edges.index.reshape(3, -1).T, edges.uses == 1
 
 
 def _split(vertices: FloatArray, faces: IntArray, middle: IntArray) -> IntArray:
@@ -87,8 +85,8 @@ def _split(vertices: FloatArray, faces: IntArray, middle: IntArray) -> IntArray:
         two = (number == 2) & ~cut[:, k]
         # The edge from a to b is whole; y and z are the middles of the others.
         (a, b, c), y, z = faces[two][:, order].T, middle[two, order[1]], middle[two, order[2]]
-        first = np.linalg.norm(vertices[a] - vertices[y], axis=1)
-        second = np.linalg.norm(vertices[b] - vertices[z], axis=1)
+        first = lengths(vertices[a] - vertices[y])
+        second = lengths(vertices[b] - vertices[z])
         shorter = (first < second)[:, None]
         parts.append(np.stack([z, y, c], axis=1))
         parts.append(np.where(shorter, np.stack([a, b, y], 1), np.stack([a, b, z], 1)))
@@ -113,6 +111,9 @@ def improved(
     fixed[boundary_edges(faces)] = True
     faces = without_slivers(function, vertices, faces, fixed, 2 * tolerance)
     vertices, faces = refined(function, vertices, faces, tolerance, walls, report)
+    for _ in range(2):
+        faces = flipped(function, vertices, faces, tolerance)
+        vertices = relaxed(function, vertices, faces, tolerance, walls)
     return vertices, flipped(function, vertices, faces, tolerance)
 
 
@@ -143,11 +144,11 @@ def smoothed(
         aim = 0.5 * (vertices + sums / count[:, None])
         start = function.at(aim[rows])
         # No farther than neighbours are: beside the curve gradients turn.
-        span = np.linalg.norm(aim[rows] - vertices[rows], axis=1) + 1e-300
+        span = lengths(aim[rows] - vertices[rows]) + 1e-300
         there = vertices.copy()
         there[rows] = newton(function, aim[rows], start, 2 * span, walls)
         after = function.at(there[rows])
-        worse = after.distance > 1e-7 * size + 1e-12 * np.linalg.norm(there[rows], axis=1)
+        worse = after.distance > 1e-7 * size + 1e-12 * lengths(there[rows])
         there[rows[worse]] = vertices[rows[worse]]
         vertices = _unfolded(vertices, there, faces)
     return vertices
@@ -160,9 +161,7 @@ def _unfolded(before: FloatArray, after: FloatArray, faces: IntArray) -> FloatAr
         normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
         old = before[faces]
         was = np.cross(old[:, 1] - old[:, 0], old[:, 2] - old[:, 0])
-        turned = (normal * was).sum(axis=1) <= 0.3 * np.linalg.norm(
-            normal, axis=1
-        ) * np.linalg.norm(was, axis=1)
+        turned = dots(normal, was) <= 0.3 * lengths(normal) * lengths(was)
         if not turned.any():
             return after
         after = after.copy()

@@ -12,9 +12,9 @@ from __future__ import annotations
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.checks import directed_edges
+from harnack.meshing.edges import IntArray, boundary_edges, directed_edges, distinct, edge_keys
+from harnack.meshing.rows import dots, lengths
 from harnack.meshing.samples import LevelFunction
-from harnack.meshing.tetrahedra import IntArray, edge_keys
 
 __all__ = ["flipped", "least_angles", "without_slivers"]
 
@@ -41,17 +41,20 @@ def flipped(
         surface, by the slope there.
     """
     refused = np.zeros(0, np.int64)
+    rim = edge_keys(boundary_edges(faces), len(vertices))
     for _ in range(_MOST_ROUNDS):
         pairs, quads = _quadrilaterals(faces)
         a, b, c, d = quads.T
-        before = np.maximum(_cosine(vertices, a, b, c), _cosine(vertices, b, a, d))
+        before = least_angles(vertices, faces)[pairs].min(axis=1)
         new = np.stack([np.stack([c, d, b], axis=1), np.stack([d, c, a], axis=1)], axis=1)
-        after = np.maximum(*(_cosine(vertices, *new[:, k].T) for k in (0, 1)))
-        gain = before - after
+        after = np.minimum(*(least_angles(vertices, new[:, k]) for k in (0, 1)))
+        gain = np.cos(before) - np.cos(after)
         count = len(vertices)
         key = edge_keys(quads[:, 2:], count)
-        taken = np.unique(edge_keys(directed_edges(faces), count))
-        good = (gain > _GAIN) & ~np.isin(key, taken) & ~np.isin(key, refused)
+        good = gain > _GAIN
+        good[good] = ~np.isin(key[good], refused)
+        taken = distinct(edge_keys(quads[:, :2], count))
+        good[good] = ~_holds(taken, key[good]) & ~np.isin(key[good], rim)
         rows = _independent(np.flatnonzero(good), gain, pairs, key, len(faces))
         if not len(rows):
             break
@@ -107,17 +110,18 @@ def _is_near(
     return near & facing
 
 
-def _cosine(vertices: FloatArray, a: IntArray, b: IntArray, c: IntArray) -> FloatArray:
-    """(k,) of the least angle of triangles."""
-    return np.cos(least_angles(vertices, np.stack([a, b, c], axis=1)))
+def _holds(numbers: IntArray, wanted: IntArray) -> BoolArray:
+    """(k,) whether numbers in order (n,) hold those wanted (k,)."""
+    place = np.searchsorted(numbers, wanted)
+    return numbers[np.minimum(place, len(numbers) - 1)] == wanted if len(numbers) else place < 0
 
 
 def least_angles(vertices: FloatArray, faces: IntArray) -> FloatArray:
     """(m,) of triangles, in radians; 0 for one without an area."""
     corner = vertices[faces]
     side = np.stack([corner[:, (k + 2) % 3] - corner[:, (k + 1) % 3] for k in range(3)], axis=1)
-    square = (side * side).sum(axis=2)
-    twice_area = np.linalg.norm(np.cross(side[:, 0], side[:, 1]), axis=1)
+    square = np.einsum("ijk,ijk->ij", side, side)
+    twice_area = lengths(np.cross(side[:, 0], side[:, 1]))
     # The least angle is opposite the shortest side: tan = 2 area/(b . c).
     shortest = square.argmin(axis=1)
     rest = 0.5 * (square.sum(axis=1) - 2 * square[np.arange(len(faces)), shortest])
@@ -145,8 +149,8 @@ def without_slivers(
         if gone[row]:
             continue
         corner = vertices[faces[row]]
-        lengths = np.linalg.norm(np.roll(corner, -1, axis=0) - corner, axis=1)
-        k = int(lengths.argmin())
+        sides = lengths(np.roll(corner, -1, axis=0) - corner)
+        k = int(sides.argmin())
         ends = int(faces[row, k]), int(faces[row, (k + 1) % 3])
         for kept, lost in (ends, ends[::-1]):
             if fixed[lost]:
@@ -177,7 +181,7 @@ def _is_good(
     corner = vertices[new]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     samples = function.at(corner.mean(axis=1))
-    size = np.linalg.norm(normal, axis=1) * np.linalg.norm(samples.gradient, axis=1)
-    facing = (normal * samples.gradient).sum(axis=1) > _STILL_FACING * size
+    size = lengths(normal) * lengths(samples.gradient)
+    facing = dots(normal, samples.gradient) > _STILL_FACING * size
     near = samples.distance <= tolerance
     return bool((facing & near & (least_angles(vertices, new) > _SLIVER)).all())

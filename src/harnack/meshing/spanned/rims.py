@@ -12,10 +12,9 @@ from __future__ import annotations
 import numpy as np
 
 from harnack.backend import FloatArray
-from harnack.meshing.checks import boundary_edges
+from harnack.meshing.edges import IntArray, boundary_edges
 from harnack.meshing.points import newton
 from harnack.meshing.samples import LevelFunction
-from harnack.meshing.tetrahedra import IntArray
 
 __all__ = ["whole_edges"]
 

@@ -1,0 +1,72 @@
+"""Edges of triangles and tetrahedra, each once, by numbers that stand for pairs of points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+__all__ = ["Edges", "IntArray", "boundary_edges", "directed_edges", "distinct", "edge_keys"]
+
+IntArray = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Edges:
+    """ends: (k, 2) of all edges, the lower index first, in order. index: (n,) which edge each of
+    the pairs given is. uses: (k,) how many of them each is."""
+
+    ends: IntArray
+    index: IntArray
+    uses: IntArray
+
+    @classmethod
+    def of(cls, pairs: IntArray) -> Edges:
+        """The edges that pairs (n, 2) of points are, in either order."""
+        count = int(pairs.max(initial=-1)) + 1
+        keys, index, uses = _numbered(edge_keys(pairs, count))
+        return cls(np.stack(np.divmod(keys, max(count, 1)), axis=1), index, uses)
+
+
+def edge_keys(pairs: IntArray, count: int) -> IntArray:
+    """One number for each pair (k, 2) of `count` points, the same in either order."""
+    one, other = pairs.T
+    return np.minimum(one, other) * count + np.maximum(one, other)
+
+
+def directed_edges(faces: IntArray) -> IntArray:
+    """(3m, 2): the edges of faces (m, 3), as they are run: all first ones (corners 0 and 1), then
+    all second and all third ones."""
+    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+
+
+def boundary_edges(faces: IntArray) -> IntArray:
+    """(k, 2): edges of one face only, as it runs them."""
+    pairs = directed_edges(faces)
+    edges = Edges.of(pairs)
+    return pairs[edges.uses[edges.index] == 1]
+
+
+def distinct(keys: IntArray) -> IntArray:
+    """The numbers (n,), each once and in order: several times as fast as `np.unique`."""
+    keys = np.sort(keys)
+    return keys[np.flatnonzero(np.diff(keys, prepend=keys[:1] - 1))]
+
+
+def _numbered(keys: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    """Numbers (n,) that are not negative, each once and in order (k,), for each given one its place
+    among them (n,), and how often each was given (k,): `np.unique`, at a third of its time."""
+    bits = len(keys).bit_length()
+    if int(keys.max(initial=0)) >> (62 - bits):
+        order = np.argsort(keys, kind="stable")
+        ordered = keys[order]
+    else:  # numbers and places in one word, since sorting is far faster than `argsort`
+        both = np.sort((keys << bits) | np.arange(len(keys)))
+        order, ordered = both & ((1 << bits) - 1), both >> bits
+    is_first = np.ones(len(keys), np.bool_)
+    is_first[1:] = ordered[1:] != ordered[:-1]
+    index = np.empty(len(keys), np.int64)
+    index[order] = np.cumsum(is_first) - 1
+    start = np.flatnonzero(is_first)
+    return ordered[start], index, np.diff(start, append=len(keys))

@@ -1,0 +1,217 @@
+"""Triangles of an angle's level set that end at its curve, in Delaunay's tetrahedra.
+
+Where a check fails, and it is known where, cells are made smaller there alone and all is done
+again; where that does not help, or it is not known where, cells are made smaller everywhere.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from harnack.backend import FloatArray
+from harnack.cells import Cells
+from harnack.fields import SolidAngle
+from harnack.geometry.net_loops import net_loops
+from harnack.meshing.checks import LocalError, MeshingError, check_manifold
+from harnack.meshing.edges import IntArray, boundary_edges, edge_keys
+from harnack.meshing.intersections import intersecting_faces, turned_faces
+from harnack.meshing.isotopy import Isotopy, isotopy_of
+from harnack.meshing.lattice import check_size
+from harnack.meshing.marching import Crossings, crossings_of, is_cut, triangles_of
+from harnack.meshing.points import Boundary, Places, PointSet, box_cells, place_points
+from harnack.meshing.refining.refinement import improved, refined, smoothed
+from harnack.meshing.samples import LevelFunction
+from harnack.meshing.spanned.rims import whole_edges
+from harnack.meshing.tetrahedra import Tetrahedra, delaunay
+
+__all__ = ["Spanned", "spanned_surface"]
+
+# How often all is done again because finished triangles fail.
+_MOST_ATTEMPTS = 4
+# How often cells are made smaller where the first triangles fail, before they are everywhere.
+_MOST_LOCAL = 4
+# Edges of a curve that are longer than so many cells are cut.
+_LONGEST = 2.5
+# How often edges of a curve that are too near to others are halved.
+_MOST_CUTS = 4
+# Of smaller cells everywhere.
+_SMALLER = 0.6
+
+
+@dataclass(frozen=True)
+class Spanned:
+    """Triangles, and how they were found.
+
+    vertices: (n, 3). faces: (m, 3). curve: what they end on, cut as it was. spacing: of cells.
+    finer: where cells were smaller. crossings: of the edges of tetrahedra. isotopy: what is proved.
+    turned: how many faces are turned over.
+    """
+
+    vertices: FloatArray
+    faces: IntArray
+    curve: Boundary
+    spacing: float
+    finer: tuple[Places, ...]
+    crossings: Crossings
+    isotopy: Isotopy
+    turned: int = 0
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What is to be filled, with what. lower, upper: (3,) the box. walls: the same, where the
+    surface may end there, or None."""
+
+    function: LevelFunction
+    lower: FloatArray
+    upper: FloatArray
+    walls: tuple[FloatArray, FloatArray] | None
+    seed: int
+    report: Callable[[str], None]
+
+
+def spanned_surface(
+    function: LevelFunction,
+    spacing: float,
+    attempts: int,
+    box: tuple[FloatArray, FloatArray],
+    has_walls: bool,
+    seed: int,
+    tolerance: float,
+    report: Callable[[str], None],
+) -> Spanned:
+    """Triangles within the tolerance, none of which pass through others; where some do, or are
+    turned over, cells are made smaller and all is done again.
+
+    attempts: how many spacings are tried, each smaller than the one before. box: to be filled.
+        has_walls: whether the surface may end at the box's faces. tolerance: a length.
+
+    Raises:
+        MeshingError: it could not be done.
+    """
+    task = _Task(function, *box, box if has_walls else None, seed, report)
+    walls = task.walls
+    finer: tuple[Places, ...] = ()
+    best: Spanned | None = None
+    crossing = np.zeros(0, np.int64)
+    for attempt in range(_MOST_ATTEMPTS):
+        first = _first_surface(task, spacing, attempts, finer)
+        spacing, finer = first.spacing, first.finer
+        faces = first.faces
+        check_size(function, first.vertices, faces, tolerance)
+        vertices = smoothed(function, first.vertices, faces, walls)
+        vertices, faces = refined(function, vertices, faces, tolerance, walls, report)
+        vertices, faces = improved(function, vertices, faces, tolerance, walls, report)
+        turned = turned_faces(function, vertices, faces)
+        kept = sum(map(len, _loops(function)))
+        vertices, faces = whole_edges(
+            function, vertices, faces, kept, len(first.curve.points), tolerance
+        )
+        check_manifold(faces)
+        crossing = intersecting_faces(vertices, faces)
+        if not len(crossing) and (best is None or len(turned) < best.turned):
+            best = dataclasses.replace(first, vertices=vertices, faces=faces, turned=len(turned))
+        bad = np.union1d(crossing, turned)
+        if not len(bad):
+            break
+        if attempt < _MOST_ATTEMPTS - 1:
+            report(f"{len(bad)} triangles fail: smaller cells there")
+            finer = (*finer, Places(vertices[faces[bad]].mean(axis=1), spacing))
+    if best is None:
+        raise MeshingError(
+            f"{len(crossing)} triangles pass through others, in cells as small as "
+            f"{spacing / 2 ** len(finer):.3g}: choose a smaller `tolerance` or `spacing`"
+        )
+    return best
+
+
+def _loops(function: LevelFunction) -> tuple[FloatArray, ...]:
+    assert isinstance(function.field, SolidAngle)
+    return net_loops(function.field.loops)
+
+
+def _first_surface(
+    task: _Task, spacing: float, attempts: int, finer: tuple[Places, ...]
+) -> Spanned:
+    """Triangles in cells of that spacing, smaller where they have to be; or where that fails, in
+    smaller ones everywhere."""
+    task.report(f"cells of {spacing:.3g}")
+    local = finer
+    try:
+        for trial in range(_MOST_LOCAL):
+            try:
+                return _in_cells(task, spacing, local)
+            except LocalError as error:
+                task.report(f"{len(error.places)} places fail: smaller cells there")
+                local = (*local, Places(error.places, spacing * 0.5**trial))
+        return _in_cells(task, spacing, local)
+    except MeshingError:
+        if attempts == 1:
+            raise
+    return _first_surface(task, _SMALLER * spacing, attempts - 1, finer)
+
+
+def _in_cells(task: _Task, spacing: float, finer: tuple[Places, ...]) -> Spanned:
+    """Triangles in cells of that spacing, split in some places, with what is proved of them.
+
+    Raises:
+        MeshingError: checks that fail, or edges of the curve that are in no tetrahedron.
+    """
+    function, walls = task.function, task.walls
+    curve = Boundary.of(_loops(function), _LONGEST * spacing)
+    for k, places in enumerate(finer):  # balls on long edges leave no room for points
+        curve = curve.split_near(places, spacing * 0.5**k)
+    margin = 0.5 * spacing if walls is None else 0.0
+    root = box_cells(task.lower - margin, task.upper + margin, spacing, exact=walls is not None)
+    curve, points, tets = _filled(task, root, curve, finer)
+    task.report(f"{len(points.points):,} points, {len(tets.corners):,} tetrahedra")
+    crossings = crossings_of(function, points, tets)
+    vertices, faces = triangles_of(function, points, tets, crossings)
+    if not len(faces):
+        raise MeshingError("the level set is empty: no cell of the box holds the level")
+    check_manifold(faces, vertices)
+    _check_boundary(vertices, faces, curve, walls)
+    cut = is_cut(points, tets, crossings)
+    isotopy = isotopy_of(function, points, tets.corners, cut, faces, curve, spacing, walls)
+    return Spanned(vertices, faces, curve, spacing, finer, crossings, isotopy)
+
+
+def _filled(
+    task: _Task, root: tuple[Cells, int], curve: Boundary, finer: tuple[Places, ...]
+) -> tuple[Boundary, PointSet, Tetrahedra]:
+    """Tetrahedra that have all edges of the curve, which is cut where others are too near."""
+    for _ in range(_MOST_CUTS):
+        points = place_points(task.function, root, curve, task.walls, task.seed, finer)
+        tets = delaunay(points.points)
+        has_edge = tets.has_edges(curve.edges)
+        if has_edge.all():
+            return curve, points, tets
+        curve = curve.split(~has_edge)
+    raise MeshingError("edges of the curve are too near to others: choose a smaller `spacing`")
+
+
+def _check_boundary(
+    vertices: FloatArray,
+    faces: IntArray,
+    curve: Boundary,
+    walls: tuple[FloatArray, FloatArray] | None,
+) -> None:
+    edges = boundary_edges(faces)
+    count = max(int(faces.max()) + 1, len(curve.points))
+    if walls is not None:  # where the surface ends as well
+        slack = 1e-9 * (walls[1] - walls[0])
+        near = np.minimum(np.abs(vertices - walls[0]), np.abs(vertices - walls[1]))
+        on = np.asarray((near <= slack).any(axis=1))
+        edges = edges[~on[edges].all(axis=1)]
+    wrong = np.setxor1d(edge_keys(edges, count), edge_keys(curve.edges, count))
+    if len(wrong):
+        ends = np.stack(np.divmod(wrong, count), axis=1)
+        raise LocalError(
+            "the mesh does not end at the curve: cells are too large for it; choose a smaller "
+            "`spacing`",
+            vertices[ends].mean(axis=1),
+        )
