@@ -97,7 +97,7 @@ def find_crossings(
         if now.sheets is None:
             after = march.advance(prepared.field, path, end, now.now)
         else:
-            walk = tracer.interval(now.sheets)
+            walk = tracer.next(now.sheets)
             there = _Walk(None, walk, now.count)
             after, sheet = tracer.end_of(walk)
         contact = after.contact

@@ -15,6 +15,7 @@ from harnack.fields.sheets import NO_SHEET
 from harnack.tracer.contact import Hysteresis
 from harnack.tracer.march import March, MarchState
 from harnack.tracer.parts import PartTracer
+from harnack.tracer.queue import PlainTracer, RayTracer, trace_queued
 from harnack.tracer.stretches import SheetTracer
 from harnack.tracer.tolerance import PreparedTolerance, Status
 
@@ -74,6 +75,8 @@ class PreparedLevelSet:
     volume: what holds the surface. region: where the field may be looked at, only for rays that
         look for crossings; it is all of space, or larger than `volume`. Both None for all of space.
     occupied: cells outside of which there is no level; None where none are known.
+    queued: whether rays are traced at once, by few lanes that share a queue, so that its methods
+        can not be called while a kernel is being recorded.
     """
 
     backend: Backend
@@ -87,6 +90,7 @@ class PreparedLevelSet:
     confirm: bool = False
     region: Volume | None = None
     occupied: UniformGrid | None = None
+    queued: bool = False
 
     def sample(self, p: Vec3) -> Sample:
         """The field at p."""
@@ -211,8 +215,15 @@ class PreparedLevelSet:
         march, path, start, end, state = self.ready(
             o, d, t_min, t_max, active, crosses=self.confirm
         )
-        if self.field.has_sheets:
-            return SheetTracer(march, self.field, path, start, end).run(state)
-        if self.field.has_parts:
-            return PartTracer(march, self.field, path, start, end, any_hit).run(state)
-        return march.advance(self.field, path, end, state), self.backend.UInt32(NO_SHEET)
+
+        def tracer(path: Path, start: Real, end: Real) -> RayTracer:
+            here = replace(march, last=end)
+            if self.field.has_sheets:
+                return SheetTracer(here, self.field, path, start, end)
+            if self.field.has_parts:
+                return PartTracer(here, self.field, path, start, end, any_hit)
+            return PlainTracer(here, self.field, path, end)
+
+        if self.queued and march.hysteresis is None:
+            return trace_queued(tracer, path, start, end, state)
+        return tracer(path, start, end).run(state)

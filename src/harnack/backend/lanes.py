@@ -1,0 +1,136 @@
+"""Work on the lanes that need it: what is computed is evaluated, and lanes that are idle are left.
+
+A recorded loop follows the rays of one packet until the last of them has ended, and whatever lanes
+are masked costs as much as the others. Where arrays may be evaluated, outside of any recording,
+`on_some` gathers the lanes of a mask, and in `while_queued` a lane that has finished a ray fetches
+the next. Both give what would be computed for each lane by itself, in any order of lanes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import drjit as dr
+
+from harnack.backend.loops import State, leaves_of, record_of, while_active
+
+if TYPE_CHECKING:
+    from harnack.backend.arrays import Mask
+
+Lanes = TypeVar("Lanes")
+Result = TypeVar("Result")
+
+# Lanes that share a queue: so many for each thread of a processor, and on a GPU in all.
+_OF_A_THREAD, _OF_GPU = 1024, 1 << 17
+
+
+def gathered(record: Lanes, rows: Any) -> Lanes:
+    """Some lanes of a record. What is the same in all lanes stays one number."""
+
+    def some(leaf: Any) -> Any:
+        return leaf if dr.width(leaf) == 1 else dr.gather(type(leaf), leaf, rows)
+
+    return record_of(record, map(some, leaves_of(record)))
+
+
+def on_some(
+    mask: Mask, compute: Callable[[Lanes], Result], lanes: Lanes, elsewhere: Result
+) -> Result:
+    """What `compute` makes of a record's lanes where `mask` is set, `elsewhere` on the others.
+
+    All lanes are evaluated first. `elsewhere` is a record like the result.
+    """
+    width = dr.width(mask)
+    dr.eval(mask, *leaves_of(lanes), *leaves_of(elsewhere))
+    rows = dr.compress(mask)
+    if len(rows) == width:
+        return compute(lanes)
+    if not len(rows):
+        return elsewhere
+    return _scattered(elsewhere, compute(gathered(lanes, rows)), rows, width)
+
+
+def while_queued(
+    start: State, body: Callable[[State], State], result: Callable[[State], Result], label: str
+) -> Result:
+    """What `result` makes of each lane after `while_active(start, body, label)`, evaluated.
+
+    Far fewer lanes run the loop than `start` has: one whose ray has ended writes the result and
+    fetches the next ray from a queue, so that none waits for the slowest ray of its packet.
+
+    body: must know of its lane by the state alone, and hold nothing that differs between lanes.
+    """
+    active = start.active
+    width = max(dr.width(leaf) for leaf in leaves_of(start))
+    index = dr.uint32_array_t(type(active))
+    dr.eval(*leaves_of(start))
+    rows = dr.compress(_wide(active, width, index))
+    done = [_wide(leaf, width, index) for leaf in leaves_of(result(start))]
+    if len(rows):
+        dr.make_opaque(done, rows)
+        _run_queue(start, body, result, rows, done, label)
+        dr.eval(done)
+    return record_of(result(start), iter(done))
+
+
+@dataclass(frozen=True)
+class _Lane:
+    """row: in the queue, of the ray that the lane follows. ray: its state."""
+
+    row: Any
+    ray: Any
+
+    @property
+    def active(self) -> Mask:
+        return self.ray.active
+
+
+def _run_queue(
+    start: Any, body: Callable[[Any], Any], result: Callable[[Any], Any],
+    rows: Any, done: list[Any], label: str,
+) -> None:  # fmt: skip
+    """rows: of the rays in `start` that are to be run. done: arrays that take their results."""
+    index, count = type(rows), dr.opaque(type(rows), len(rows))
+    threads = dr.thread_count() if dr.backend_v(rows) == dr.JitBackend.LLVM else 0
+    at_once = min(len(rows), _OF_A_THREAD * threads or _OF_GPU)
+    taken, first = dr.full(index, at_once, 1), dr.arange(index, at_once)
+    dr.make_opaque(taken, first)
+
+    def fetched(row: Any, wanted: Mask) -> Any:
+        which = dr.gather(index, rows, row, wanted)
+
+        def of_ray(leaf: Any) -> Any:
+            return leaf if dr.width(leaf) == 1 else dr.gather(type(leaf), leaf, which, wanted)
+
+        return record_of(start, map(of_ray, leaves_of(start)))
+
+    def one_step(lane: _Lane) -> _Lane:
+        now = body(lane.ray)
+        ended = lane.active & ~now.active
+        which = dr.gather(index, rows, lane.row, ended)
+        for target, value in zip(done, leaves_of(result(now)), strict=True):
+            dr.scatter(target, value, which, ended)
+        row = dr.select(ended, dr.scatter_inc(taken, index(0), ended), lane.row)
+        again = ended & (row < count)
+        both = zip(leaves_of(fetched(row, again)), leaves_of(now), strict=True)
+        return _Lane(row, record_of(now, (dr.select(again, *pair) for pair in both)))
+
+    while_active(_Lane(first, fetched(first, first < count)), one_step, label)
+
+
+def _scattered(everywhere: Result, some: Result, rows: Any, width: int) -> Result:
+    """A record with other values on some lanes, evaluated."""
+    targets = [_wide(leaf, width, type(rows)) for leaf in leaves_of(everywhere)]
+    values = [*leaves_of(some)]
+    dr.eval(values)
+    for target, value in zip(targets, values, strict=True):
+        dr.scatter(target, value, rows)
+    dr.eval(targets)
+    return record_of(everywhere, iter(targets))
+
+
+def _wide(leaf: Any, width: int, index: Any) -> Any:
+    """A copy of an array in which lanes may differ."""
+    return dr.gather(type(leaf), leaf, dr.arange(index, width) * (dr.width(leaf) > 1))
