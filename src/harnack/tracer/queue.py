@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 from harnack.backend.lanes import while_queued
-from harnack.backend.loops import while_active
 from harnack.fields.look import Path
 from harnack.fields.sheets import NO_SHEET
 
