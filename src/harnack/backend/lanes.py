@@ -26,6 +26,26 @@ Result = TypeVar("Result")
 _OF_A_THREAD, _OF_GPU = 1024, 1 << 17
 
 
+def rows_of(mask: Mask) -> tuple[Any, int]:
+    """Indices of the lanes where a mask is set, and how many these are.
+
+    A single one is named twice: Dr.Jit compiles kernels of their own for arrays of one number.
+    """
+    rows = dr.compress(mask)
+    count = len(rows)
+    if count == 1:
+        rows = dr.zeros(type(rows), 2) + dr.opaque(type(rows), int(rows[0]))
+        dr.eval(rows)
+    return rows, count
+
+
+def wide(record: Lanes, width: int, index: Any) -> Lanes:
+    """A copy of a record in which all lanes may differ, evaluated. index: the type of lanes."""
+    copies = [_wide(leaf, width, index) for leaf in leaves_of(record)]
+    dr.make_opaque(copies)
+    return record_of(record, iter(copies))
+
+
 def gathered(record: Lanes, rows: Any) -> Lanes:
     """Some lanes of a record. What is the same in all lanes stays one number."""
 
@@ -40,16 +60,21 @@ def on_some(
 ) -> Result:
     """What `compute` makes of a record's lanes where `mask` is set, `elsewhere` on the others.
 
-    All lanes are evaluated first. `elsewhere` is a record like the result.
+    All lanes are evaluated first and last, so that kernels do not depend on how many there are.
+    `elsewhere` is a record like the result.
     """
     width = dr.width(mask)
     dr.eval(mask, *leaves_of(lanes), *leaves_of(elsewhere))
-    rows = dr.compress(mask)
-    if len(rows) == width:
-        return compute(lanes)
-    if not len(rows):
-        return elsewhere
-    return _scattered(elsewhere, compute(gathered(lanes, rows)), rows, width)
+    rows, count = rows_of(mask)
+    result = wide(elsewhere, width, type(rows))
+    if not count:
+        return result
+    targets, values = [*leaves_of(result)], [*leaves_of(compute(gathered(lanes, rows)))]
+    dr.eval(values)
+    for target, value in zip(targets, values, strict=True):
+        dr.scatter(target, value, rows)
+    dr.eval(targets)
+    return record_of(result, iter(targets))
 
 
 def while_queued(
@@ -62,17 +87,14 @@ def while_queued(
 
     body: must know of its lane by the state alone, and hold nothing that differs between lanes.
     """
-    active = start.active
-    width = max(dr.width(leaf) for leaf in leaves_of(start))
-    index = dr.uint32_array_t(type(active))
     dr.eval(*leaves_of(start))
-    rows = dr.compress(_wide(active, width, index))
-    done = [_wide(leaf, width, index) for leaf in leaves_of(result(start))]
-    if len(rows):
-        dr.make_opaque(done, rows)
-        _run_queue(start, body, result, rows, done, label)
-        dr.eval(done)
-    return record_of(result(start), iter(done))
+    width = max(dr.width(leaf) for leaf in leaves_of(start))
+    active = dr.full(type(start.active), True, width) & start.active
+    rows, count = rows_of(active)
+    done = wide(result(start), width, type(rows))
+    if count:
+        _run_queue(start, body, result, rows, count, [*leaves_of(done)], label)
+    return done
 
 
 @dataclass(frozen=True)
@@ -89,10 +111,10 @@ class _Lane:
 
 def _run_queue(
     start: Any, body: Callable[[Any], Any], result: Callable[[Any], Any],
-    rows: Any, done: list[Any], label: str,
+    rows: Any, total: int, done: list[Any], label: str,
 ) -> None:  # fmt: skip
-    """rows: of the rays in `start` that are to be run. done: arrays that take their results."""
-    index, count = type(rows), dr.opaque(type(rows), len(rows))
+    """rows: of the `total` rays in `start` that are to be run. done: where their results go."""
+    index, count = type(rows), dr.opaque(type(rows), total)
     threads = dr.thread_count() if dr.backend_v(rows) == dr.JitBackend.LLVM else 0
     at_once = min(len(rows), _OF_A_THREAD * threads or _OF_GPU)
     taken, first = dr.full(index, at_once, 1), dr.arange(index, at_once)
@@ -118,19 +140,8 @@ def _run_queue(
         return _Lane(row, record_of(now, (dr.select(again, *pair) for pair in both)))
 
     while_active(_Lane(first, fetched(first, first < count)), one_step, label)
-
-
-def _scattered(everywhere: Result, some: Result, rows: Any, width: int) -> Result:
-    """A record with other values on some lanes, evaluated."""
-    targets = [_wide(leaf, width, type(rows)) for leaf in leaves_of(everywhere)]
-    values = [*leaves_of(some)]
-    dr.eval(values)
-    for target, value in zip(targets, values, strict=True):
-        dr.scatter(target, value, rows)
-    dr.eval(targets)
-    return record_of(everywhere, iter(targets))
+    dr.eval(done)
 
 
 def _wide(leaf: Any, width: int, index: Any) -> Any:
-    """A copy of an array in which lanes may differ."""
     return dr.gather(type(leaf), leaf, dr.arange(index, width) * (dr.width(leaf) > 1))

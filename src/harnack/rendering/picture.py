@@ -33,7 +33,6 @@ from harnack.rendering.mitsuba.plugins import register
 from harnack.rendering.mitsuba.scene_files import load_dictionary, load_scene_file
 from harnack.rendering.pictures.exposure import expose
 from harnack.rendering.pictures.images import check_picture_path, tone_mapped, write_image
-from harnack.rendering.pictures.pixels import stratified
 from harnack.rendering.pictures.shaded import shaded
 from harnack.rendering.pictures.views import VIEWS, look
 from harnack.rendering.studio.camera import Camera
@@ -78,7 +77,7 @@ def render(
         "status" and "depth".
     size: (width, height) in pixels, by default (800, 600) or the scene's own.
     spp: samples a pixel of a color picture, by default 64 or the scene's own, and of the edges
-        of a shaded one, by default 9. Some samplers round it up.
+        of a shaded one, by default 9.
     antialias: of shaded pictures, which pixels get all their samples: "edges", the default, those
         that differ from a neighbour; "cones" also those that a surface covers in part, found by
         a cone around each pixel. Wires thinner than a pixel then stay lines. It looks at fields
@@ -235,7 +234,6 @@ def _radiance(
     spp = asked.spp or check_spp(
         int(sensor.sampler().sample_count()), source=", which the scene's sampler asks for"
     )
-    spp = stratified(spp) if in_studio else spp
     return expose(mi, scene, sensor, tracer, spp=spp, seed=asked.seed, advance=advance)
 
 

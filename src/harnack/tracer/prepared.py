@@ -143,7 +143,8 @@ class PreparedLevelSet:
         """
         backend, real = self.backend, self.backend.Float
         path = Path(backend.Array3f(o), backend.Array3f(d), self.proofs)
-        start, end = self.clip(path.origin, path.direction, real(t_min), real(t_max))
+        t_min, t_max = real(t_min), dr.select(active, real(t_max), real(t_min))
+        start, end = self.clip(path.origin, path.direction, t_min, t_max)
         has_detail = self.field.has_detail or self.field.has_sheets
         hysteresis = None
         if crosses:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
-from harnack.backend.lanes import gathered
+from harnack.backend.lanes import gathered, rows_of, wide
 from harnack.backend.loops import leaves_of
 from harnack.rendering.mitsuba.clear import transmittance
 from harnack.rendering.mitsuba.interaction import connecting_ray, leaving_ray
@@ -159,30 +159,34 @@ class PathTracer:
             spread=mi.Bool(False),
             spread_before=mi.Bool(False),
         )
-        going_on = mi.Bool(active) & dr.full(mi.Bool, True, width)
-        dr.eval(found.light, found.valid, found.lost, going_on, *leaves_of(paths))
-        depth = 0
+        paths = wide(paths, width, mi.UInt32)
+        dr.make_opaque(found.light, found.valid, found.lost)
+        going_on, depth = mi.Bool(active) & dr.full(mi.Bool, True, width), 0
         while True:
-            rows = dr.compress(going_on)
-            if not len(rows):
+            rows, count = rows_of(going_on)
+            if not count:
                 return found
-            if len(rows) < dr.width(paths.number):
-                paths = gathered(paths, rows)
-            paths, going_on = self._vertex(world, paths, sampler, depth, found)
+            paths = gathered(paths, rows)
+            # No number is a literal, so that all vertices run the same kernels.
+            dr.make_opaque(*leaves_of(paths))
+            active = dr.arange(mi.UInt32, len(rows)) < dr.opaque(mi.UInt32, count)
+            paths, going_on = self._vertex(world, paths, active, sampler, depth, found)
             depth += 1
 
     def _vertex(
-        self, world: World, paths: _Paths, sampler: SobolSampler, depth: int, found: Radiance
-    ) -> tuple[_Paths, Mask]:
+        self, world: World, paths: _Paths, exist: Mask, sampler: SobolSampler, depth: int,
+        found: Radiance,
+    ) -> tuple[_Paths, Mask]:  # fmt: skip
         """Finds the next vertex of paths, collects its light, and samples where to go on. Returns
         the paths behind it, and which of them go on."""
         mi, here = self.mi, dr.opaque(self.mi.UInt32, depth)
         before = paths.previous.interaction(mi)
-        si, met = world.intersect(paths.ray, before, mi.Bool(True))
+        si, met = world.intersect(paths.ray, before, exist)
         numbers = sampler.at_vertex(here, paths.number)
         left = transmittance(mi, world.carriers, before, si, paths.ray.d)
         paths = replace(paths, throughput=paths.throughput * left)
-        light = self._emitted(world.scene, paths, si, ~met.lost & self._shows_emitters(here))
+        shows = exist & ~met.lost & self._shows_emitters(here)
+        light = self._emitted(world.scene, paths, si, shows)
         shown = paths.throughput * mi.Spectrum(self.lost_colour.eval(si, met.lost))
         light += dr.select(met.lost, shown, 0)
         active = si.is_valid() & (here + 1 < self._deepest)
@@ -220,7 +224,7 @@ class PathTracer:
         blocked = world.occluded(connection.ray, connection.active)
         light += dr.select(connection.active & ~blocked, connection.light, 0)
         # Each path has a place of its own, so that the order of sums is fixed.
-        dr.scatter_add(found.light, light, paths.number, mode=dr.ReduceMode.NoConflicts)
+        dr.scatter_add(found.light, light, paths.number, exist, mode=dr.ReduceMode.NoConflicts)
         dr.eval(found.light)
         return behind, active
 
