@@ -34,15 +34,19 @@ def rows_of(mask: Mask) -> tuple[Any, int]:
     rows = dr.compress(mask)
     count = len(rows)
     if count == 1:
-        rows = dr.zeros(type(rows), 2) + dr.opaque(type(rows), int(rows[0]))
-        dr.eval(rows)
+        rows = dr.full(type(rows), int(rows[0]), 2)
+        dr.make_opaque(rows)
     return rows, count
 
 
 def wide(record: Lanes, width: int, index: Any) -> Lanes:
-    """A copy of a record in which all lanes may differ, evaluated. index: the type of lanes."""
-    copies = [_wide(leaf, width, index) for leaf in leaves_of(record)]
-    dr.make_opaque(copies)
+    """A copy of a record in which all lanes may differ, evaluated. index: the type of lanes.
+
+    Each array gets memory of its own, even where two are equal: kernels differ by what they share.
+    """
+    with dr.scoped_set_flag(dr.JitFlag.ValueNumbering, False):
+        copies = [_wide(leaf, width, index) for leaf in leaves_of(record)]
+        dr.make_opaque(copies)
     return record_of(record, iter(copies))
 
 
@@ -117,8 +121,9 @@ def _run_queue(
     index, count = type(rows), dr.opaque(type(rows), total)
     threads = dr.thread_count() if dr.backend_v(rows) == dr.JitBackend.LLVM else 0
     at_once = min(len(rows), _OF_A_THREAD * threads or _OF_GPU)
-    taken, first = dr.full(index, at_once, 1), dr.arange(index, at_once)
-    dr.make_opaque(taken, first)
+    with dr.scoped_set_flag(dr.JitFlag.ValueNumbering, False):  # or others get this memory
+        taken, first = dr.full(index, at_once, 1), dr.arange(index, at_once)
+        dr.make_opaque(taken, first)
 
     def fetched(row: Any, wanted: Mask) -> Any:
         which = dr.gather(index, rows, row, wanted)

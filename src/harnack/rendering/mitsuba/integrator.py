@@ -167,9 +167,9 @@ class PathTracer:
             if not count:
                 return found
             paths = gathered(paths, rows)
-            # No number is a literal, so that all vertices run the same kernels.
-            dr.make_opaque(*leaves_of(paths))
             active = dr.arange(mi.UInt32, len(rows)) < dr.opaque(mi.UInt32, count)
+            # No number is a literal, so that all vertices run the same kernels.
+            dr.make_opaque(active, *leaves_of(paths))
             paths, going_on = self._vertex(world, paths, active, sampler, depth, found)
             depth += 1
 
