@@ -34,19 +34,13 @@ def rows_of(mask: Mask) -> tuple[Any, int]:
     rows = dr.compress(mask)
     count = len(rows)
     if count == 1:
-        rows = dr.full(type(rows), int(rows[0]), 2)
-        dr.make_opaque(rows)
+        rows = _own(lambda: dr.full(type(rows), int(rows[0]), 2))
     return rows, count
 
 
 def wide(record: Lanes, width: int, index: Any) -> Lanes:
-    """A copy of a record in which all lanes may differ, evaluated. index: the type of lanes.
-
-    Each array gets memory of its own, even where two are equal: kernels differ by what they share.
-    """
-    with dr.scoped_set_flag(dr.JitFlag.ValueNumbering, False):
-        copies = [_wide(leaf, width, index) for leaf in leaves_of(record)]
-        dr.make_opaque(copies)
+    """A copy of a record in which all lanes may differ, evaluated. index: the type of lanes."""
+    copies = _own(lambda: [_wide(leaf, width, index) for leaf in leaves_of(record)])
     return record_of(record, iter(copies))
 
 
@@ -72,12 +66,14 @@ def on_some(
     rows, count = rows_of(mask)
     result = wide(elsewhere, width, type(rows))
     if not count:
+        _as_after_a_loop(rows)
         return result
     targets, values = [*leaves_of(result)], [*leaves_of(compute(gathered(lanes, rows)))]
     dr.eval(values)
     for target, value in zip(targets, values, strict=True):
         dr.scatter(target, value, rows)
     dr.eval(targets)
+    _as_after_a_loop(rows)
     return record_of(result, iter(targets))
 
 
@@ -98,6 +94,7 @@ def while_queued(
     done = wide(result(start), width, type(rows))
     if count:
         _run_queue(start, body, result, rows, count, [*leaves_of(done)], label)
+    _as_after_a_loop(rows)
     return done
 
 
@@ -121,9 +118,7 @@ def _run_queue(
     index, count = type(rows), dr.opaque(type(rows), total)
     threads = dr.thread_count() if dr.backend_v(rows) == dr.JitBackend.LLVM else 0
     at_once = min(len(rows), _OF_A_THREAD * threads or _OF_GPU)
-    with dr.scoped_set_flag(dr.JitFlag.ValueNumbering, False):  # or others get this memory
-        taken, first = dr.full(index, at_once, 1), dr.arange(index, at_once)
-        dr.make_opaque(taken, first)
+    taken, first = _own(lambda: [dr.full(index, at_once, 1), dr.arange(index, at_once)])
 
     def fetched(row: Any, wanted: Mask) -> Any:
         which = dr.gather(index, rows, row, wanted)
@@ -146,6 +141,24 @@ def _run_queue(
 
     while_active(_Lane(first, fetched(first, first < count)), one_step, label)
     dr.eval(done)
+
+
+def _as_after_a_loop(array: Any) -> None:
+    """Begin a new scope, as loops do: Dr.Jit looks for equal numbers in one scope only, so that
+    what follows would be another kernel where there was nothing to do."""
+    dr.detail.new_scope(dr.backend_v(array))
+
+
+def _own(make: Callable[[], Any]) -> Any:
+    """What is made, evaluated, in memory of its own.
+
+    Dr.Jit keeps equal arrays once, and kernels differ by what they share: those for as many lanes
+    as another array has by chance would be compiled anew.
+    """
+    with dr.scoped_set_flag(dr.JitFlag.ValueNumbering, False):
+        made = make()
+        dr.make_opaque(made)
+    return made
 
 
 def _wide(leaf: Any, width: int, index: Any) -> Any:

@@ -10,8 +10,8 @@ import drjit as dr
 
 from harnack.backend.loops import while_active
 from harnack.fields.sheets import NO_SHEET
-from harnack.tracer.stretches import SheetTracer, SheetWalk
 from harnack.tracer.tolerance import Status
+from harnack.tracer.walks.stretches import SheetTracer, SheetWalk
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
