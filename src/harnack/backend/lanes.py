@@ -115,7 +115,8 @@ def _run_queue(
     rows: Any, total: int, done: list[Any], label: str,
 ) -> None:  # fmt: skip
     """rows: of the `total` rays in `start` that are to be run. done: where their results go."""
-    index, count = type(rows), dr.opaque(type(rows), total)
+    index: Any = type(rows)
+    count = dr.opaque(index, total)
     threads = dr.thread_count() if dr.backend_v(rows) == dr.JitBackend.LLVM else 0
     at_once = min(len(rows), _OF_A_THREAD * threads or _OF_GPU)
     taken, first = _own(lambda: [dr.full(index, at_once, 1), dr.arange(index, at_once)])

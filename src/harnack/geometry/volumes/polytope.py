@@ -177,8 +177,11 @@ class Polytope(Volume):
             return t0, t1
 
         lanes = dr.zeros(backend.Float, dr.width(o, d, t_min, t_max))
-        # What is empty stays empty: a packet of such rays needs no more planes.
-        return emptied(*table.fold((lanes + t_min, lanes + t_max), step, lambda t0, t1: t0 < t1))
+
+        def holds(t0: Real, t1: Real) -> Mask:  # what is empty stays empty
+            return t0 < t1
+
+        return emptied(*table.fold((lanes + t_min, lanes + t_max), step, holds))
 
     def contains(self, p: Vec3) -> Mask:
         backend = backend_of(p)

@@ -61,8 +61,9 @@ class World:
             ours = replace(dr.select(event, met, ours), evaluations=evaluations)
             whose = dr.select(event, shape, whose)
             limit = dr.select(event, met.t, limit)
-        event = ours.met | ours.lost
-        si = preliminary.compute_surface_interaction(ray, mi.RayFlags.All, active & ~event)
+        event: Mask = ours.met | ours.lost
+        others = active & ~event
+        si = preliminary.compute_surface_interaction(ray, mi.RayFlags.All, others)
         first = replace(self._of_scene(si, active), evaluations=ours.evaluations)
         si = dr.select(event, surface_interaction(mi, ours, ray, whose), si)
         return si, dr.select(event, ours, first)
