@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import drjit as dr
 
@@ -115,7 +115,7 @@ def _run_queue(
     rows: Any, total: int, done: list[Any], label: str,
 ) -> None:  # fmt: skip
     """rows: of the `total` rays in `start` that are to be run. done: where their results go."""
-    index: Any = type(rows)
+    index = cast("Any", type(rows))
     count = dr.opaque(index, total)
     threads = dr.thread_count() if dr.backend_v(rows) == dr.JitBackend.LLVM else 0
     at_once = min(len(rows), _OF_A_THREAD * threads or _OF_GPU)

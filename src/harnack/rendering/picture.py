@@ -34,8 +34,10 @@ from harnack.rendering.mitsuba.scene_files import load_dictionary, load_scene_fi
 from harnack.rendering.pictures.exposure import expose
 from harnack.rendering.pictures.images import check_picture_path, tone_mapped, write_image
 from harnack.rendering.pictures.shaded import shaded
+from harnack.rendering.pictures.shown import Picture
 from harnack.rendering.pictures.views import VIEWS, look
 from harnack.rendering.studio.camera import Camera
+from harnack.rendering.studio.lighting import CUT_OUT
 from harnack.rendering.studio.materials import Material, material_of
 from harnack.rendering.studio.stage import StudioObject, studio
 from harnack.tracer import LevelSet, level_set
@@ -44,7 +46,7 @@ ShowMode = Literal["color", "shaded", "normal", "evaluations", "status", "depth"
 # Modes with ground and lights, and what they send out.
 _LIT = {"color": "light paths", "shaded": "rays"}
 _EDGE_SPP = 9
-_OF_STUDIO = ("material", "camera", "backdrop")
+_OF_STUDIO = ("material", "camera", "backdrop", "up")
 _OWN = ("show", "size", "spp", "antialias", *_OF_STUDIO, "max_depth", "seed", "progress")
 Image = npt.NDArray[Any]
 Advance = Callable[[float], None]
@@ -60,13 +62,14 @@ def render(
     spp: int | None = None,
     antialias: str | None = None,
     material: MaterialLike | Sequence[MaterialLike] | None = None,
-    camera: Camera | None = None,
+    camera: Camera | tuple[float, float, float] | None = None,
     backdrop: str | None = None,
+    up: str | tuple[float, float, float] | None = None,
     max_depth: int | None = None,
     seed: int = 0,
     progress: bool = True,
     **settings: Any,
-) -> Image:
+) -> Picture:
     """Draw fields or a Mitsuba scene, and write the picture to `path` if there is one.
 
     what: a field, a `LevelSet` or a list of them, drawn in the studio; or a Mitsuba scene, its
@@ -90,8 +93,12 @@ def render(
 
     material: a name of `MATERIALS`, a `Material` or a BSDF dictionary; a list, one for each
         surface.
-    camera: where the stage is seen from.
-    backdrop: "light" or "dark".
+    camera: where the stage is seen from, a `Camera`, or (x, y, z) in the surfaces' coordinates.
+    backdrop: "light" or "dark", with a floor; "white", with nothing but the surfaces; or
+        "transparent", the same with alpha in PNG and EXR files and as a fourth number, by which
+        the first three are multiplied.
+    up: what is up, "x", "y", "z", "-x", ... or a direction in the surfaces' coordinates; by
+        default z.
     settings: of the surfaces, as `harnack.level_set` takes them: level, clip, solid, ...; those
         of a `LevelSet` are replaced. Without a tolerance, a field gets one that suits its size.
 
@@ -102,8 +109,9 @@ def render(
     tinted glass takes some of it away by the law of Beer and Lambert. Shaded pictures look straight
     through it and leave out caustics, blur, and reflections of anything but the sky.
 
-    Returns the numbers: (h, w, 3) linear sRGB radiance; (h, w, 3) normals; or (h, w), of which
-    depths are in units of the (first) surface's coordinates.
+    Returns the numbers: (h, w, 3) linear sRGB radiance, or (h, w, 4) with alpha where the backdrop
+    is transparent or the film of a scene has it; (h, w, 3) normals; or (h, w), of which depths are
+    in units of the (first) surface's coordinates. Notebooks show them as the picture they make.
 
     A ray that runs out of steps is drawn magenta, and a warning says how many there were.
 
@@ -114,14 +122,14 @@ def render(
     target = None if path is None else check_picture_path(path)
     asked = checked_request(
         show=show, size=size, spp=spp, max_depth=max_depth, seed=seed, camera=camera,
-        antialias=antialias,
+        antialias=antialias, backdrop=backdrop,
     )  # fmt: skip
     mi = register()
     in_studio = isinstance(what, Field | LevelSet | list | tuple)
     if in_studio:
-        scene, unit = _staged(mi, what, asked, material, backdrop or "light", settings)
+        scene, unit = _staged(mi, what, asked, material, up, settings)
     else:
-        of_studio = dict(zip(_OF_STUDIO, (material, camera, backdrop), strict=True))
+        of_studio = dict(zip(_OF_STUDIO, (material, camera, backdrop, up), strict=True))
         refuse_studio_settings({**of_studio, **settings})
         scene, unit = _loaded(mi, what, asked.size), 1.0
         check_memory(asked.show, *map(int, scene.sensors()[0].film().crop_size()))
@@ -135,15 +143,18 @@ def render(
             else:
                 image, lost = _radiance(mi, scene, asked, in_studio, advance)
         _warn_of(lost, _LIT[show])
-        drawn = tone_mapped(image)
+        on_white = in_studio and asked.backdrop == "white"
+        drawn = tone_mapped(image, on_white)
+        if on_white:
+            image = image[..., :3] + (1 - image[..., 3:])
     if target is not None:
         exact = target.suffix.lower() == ".exr"
         write_image(mi, target, image.astype(np.float32, copy=False) if exact else drawn)
-    return image
+    return Picture.of(image, drawn)
 
 
 def _staged(
-    mi: Any, what: Any, asked: Request, material: Any, backdrop: str, settings: Mapping[str, Any]
+    mi: Any, what: Any, asked: Request, material: Any, up: Any, settings: Mapping[str, Any]
 ) -> tuple[Any, float]:
     """The scene of fields and level sets in the studio, and the length in it of their unit."""
     check_settings(settings, _OWN)
@@ -151,7 +162,7 @@ def _staged(
     check_memory(asked.show, *size)
     made = studio(
         mi, _exhibits(what, material, settings), size=size, camera=asked.camera,
-        backdrop=backdrop, bare=asked.show not in _LIT,
+        backdrop=asked.backdrop, up=up or "z", bare=asked.show not in _LIT,
     )  # fmt: skip
     return mi.load_dict(made.scene, parallel=False), made.unit
 
@@ -234,16 +245,29 @@ def _radiance(
     spp = asked.spp or check_spp(
         int(sensor.sampler().sample_count()), source=", which the scene's sampler asks for"
     )
-    return expose(mi, scene, sensor, tracer, spp=spp, seed=asked.seed, advance=advance)
+    image, lost = expose(mi, scene, sensor, tracer, spp=spp, seed=asked.seed, advance=advance)
+    return _with_wanted_alpha(mi, sensor, image, asked, in_studio), lost
 
 
 def _shaded(
     mi: Any, scene: Any, asked: Request, in_studio: bool, advance: Advance
 ) -> tuple[Image, int]:
     sensor, spp, cones = scene.sensors()[0], asked.spp or _EDGE_SPP, asked.antialias == "cones"
-    return shaded(
-        mi, scene, sensor, spp=spp, on_floor=in_studio, cones=cones, advance=advance
+    cut_out = in_studio and asked.backdrop in CUT_OUT
+    image, lost = shaded(
+        mi, scene, sensor, spp=spp, on_floor=in_studio and not cut_out, cut_out=cut_out,
+        cones=cones, advance=advance,
     )  # fmt: skip
+    return _with_wanted_alpha(mi, sensor, image, asked, in_studio), lost
+
+
+def _with_wanted_alpha(
+    mi: Any, sensor: Any, image: Image, asked: Request, in_studio: bool
+) -> Image:
+    """The picture (h, w, 4) as it is, or without alpha if none is asked for."""
+    of_film = mi.has_flag(sensor.film().flags(), mi.FilmFlags.Alpha)
+    wanted = asked.backdrop in CUT_OUT if in_studio else of_film
+    return image if wanted else np.ascontiguousarray(image[..., :3])
 
 
 @contextmanager

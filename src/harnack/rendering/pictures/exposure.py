@@ -37,13 +37,14 @@ def expose(
     seed: int,
     advance: Callable[[float], None],
 ) -> tuple[npt.NDArray[np.float32], int]:
-    """Linear sRGB radiance (h, w, 3), and how many paths ran out of steps.
+    """Linear sRGB radiance and, last, the part that something covers (h, w, 4); and how many
+    paths ran out of steps.
 
-    spp: samples a pixel, at least; some samplers only know squares and the like.
+    spp: samples a pixel.
     advance: told what part of the picture has been finished since the last call.
     """
     width, height = (int(n) for n in sensor.film().crop_size())
-    image = np.empty((width * height, 3), dtype=np.float32)
+    image = np.empty((width * height, 4), dtype=np.float32)
     lost = 0
     for start, stop in bands(width * height, max(1, _PATHS_A_BAND // spp)):
         lane = dr.arange(mi.UInt32, (stop - start) * spp)
@@ -56,10 +57,11 @@ def expose(
         dr.eval(ray, weight)
         found = tracer.trace(scene, sampler, ray, mi.Bool(True))
         colour = as_rgb(mi, found.light * weight, ray.wavelengths)
-        image[start:stop] = to_numpy(mean_of_blocks(colour, spp))
+        covered = dr.select(found.valid, mi.Float(1), 0)
+        image[start:stop] = to_numpy(mean_of_blocks(mi.Vector4f(*colour, covered), spp))
         lost += int(dr.count(found.lost)[0])
         advance((stop - start) / (width * height))
-    return image.reshape(height, width, 3), lost
+    return image.reshape(height, width, 4), lost
 
 
 def _mixed(seed: int) -> int:

@@ -15,10 +15,11 @@ import numpy.typing as npt
 
 
 def exr_bytes(image: npt.NDArray[np.floating[Any]]) -> bytes:
-    """An OpenEXR file of an image (h, w) with channel Y or (h, w, 3) with R, G and B."""
+    """An OpenEXR file of an image (h, w) with channel Y, (h, w, 3) with R, G and B, or (h, w, 4)
+    with A as well, by which these are multiplied."""
     import OpenEXR  # here, since most pictures do without
 
-    name = {2: "Y", 3: "RGB"}[image.ndim]
+    name = "Y" if image.ndim == 2 else {3: "RGB", 4: "RGBA"}[image.shape[-1]]
     header: dict[str, Any] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     channels = {name: np.ascontiguousarray(image, dtype=np.float32)}
     # Before version 3.5, which needs Python 3.11, it writes to named files only.
