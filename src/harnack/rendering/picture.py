@@ -31,15 +31,15 @@ from harnack.rendering.arguments import (
 from harnack.rendering.mitsuba.integrator import PathTracer
 from harnack.rendering.mitsuba.plugins import register
 from harnack.rendering.mitsuba.scene_files import load_dictionary, load_scene_file
+from harnack.rendering.pictures.backdrop import behind
 from harnack.rendering.pictures.exposure import expose
 from harnack.rendering.pictures.images import check_picture_path, tone_mapped, write_image
 from harnack.rendering.pictures.shaded import shaded
 from harnack.rendering.pictures.shown import Picture
 from harnack.rendering.pictures.views import VIEWS, look
 from harnack.rendering.studio.camera import Camera
-from harnack.rendering.studio.lighting import CUT_OUT
 from harnack.rendering.studio.materials import Material, material_of
-from harnack.rendering.studio.stage import StudioObject, studio
+from harnack.rendering.studio.stage import Studio, StudioObject, studio
 from harnack.tracer import LevelSet, level_set
 
 ShowMode = Literal["color", "shaded", "normal", "evaluations", "status", "depth"]
@@ -127,26 +127,21 @@ def render(
     mi = register()
     in_studio = isinstance(what, Field | LevelSet | list | tuple)
     if in_studio:
-        scene, unit = _staged(mi, what, asked, material, up, settings)
+        stage, scene = _staged(mi, what, asked, material, up, settings)
     else:
         of_studio = dict(zip(_OF_STUDIO, (material, camera, backdrop, up), strict=True))
         refuse_studio_settings({**of_studio, **settings})
-        scene, unit = _loaded(mi, what, asked.size), 1.0
+        stage, scene = None, _loaded(mi, what, asked.size)
         check_memory(asked.show, *map(int, scene.sensors()[0].film().crop_size()))
     if show in VIEWS:
-        view = look(mi, scene, scene.sensors()[0], unit)
+        view = look(mi, scene, scene.sensors()[0], 1.0 if stage is None else stage.unit)
         image, drawn = VIEWS[show].numbers(view), VIEWS[show].picture(view)
     else:
         with _bar(progress) as advance:
-            if show == "shaded":
-                image, lost = _shaded(mi, scene, asked, in_studio, advance)
-            else:
-                image, lost = _radiance(mi, scene, asked, in_studio, advance)
+            drawing = _shaded if show == "shaded" else _radiance
+            image, lost = drawing(mi, scene, asked, stage, advance)
         _warn_of(lost, _LIT[show])
-        on_white = in_studio and asked.backdrop == "white"
-        drawn = tone_mapped(image, on_white)
-        if on_white:
-            image = image[..., :3] + (1 - image[..., 3:])
+        image, drawn = _before_backdrop(mi, scene.sensors()[0], image, stage, show)
     if target is not None:
         exact = target.suffix.lower() == ".exr"
         write_image(mi, target, image.astype(np.float32, copy=False) if exact else drawn)
@@ -155,8 +150,8 @@ def render(
 
 def _staged(
     mi: Any, what: Any, asked: Request, material: Any, up: Any, settings: Mapping[str, Any]
-) -> tuple[Any, float]:
-    """The scene of fields and level sets in the studio, and the length in it of their unit."""
+) -> tuple[Studio, Any]:
+    """Fields and level sets in the studio, and the scene of it."""
     check_settings(settings, _OWN)
     size = asked.size or (800, 600)
     check_memory(asked.show, *size)
@@ -164,7 +159,7 @@ def _staged(
         mi, _exhibits(what, material, settings), size=size, camera=asked.camera,
         backdrop=asked.backdrop, up=up or "z", bare=asked.show not in _LIT,
     )  # fmt: skip
-    return mi.load_dict(made.scene, parallel=False), made.unit
+    return made, mi.load_dict(made.scene, parallel=False)
 
 
 def _exhibits(what: Any, materials: Any, settings: Mapping[str, Any]) -> list[StudioObject]:
@@ -238,36 +233,42 @@ def _warn_of(lost: int, what: str) -> None:
 
 
 def _radiance(
-    mi: Any, scene: Any, asked: Request, in_studio: bool, advance: Advance
+    mi: Any, scene: Any, asked: Request, stage: Studio | None, advance: Advance
 ) -> tuple[Image, int]:
+    del stage
     sensor = scene.sensors()[0]
     tracer = _tracer(mi, scene, asked.max_depth)
     spp = asked.spp or check_spp(
         int(sensor.sampler().sample_count()), source=", which the scene's sampler asks for"
     )
-    image, lost = expose(mi, scene, sensor, tracer, spp=spp, seed=asked.seed, advance=advance)
-    return _with_wanted_alpha(mi, sensor, image, asked, in_studio), lost
+    return expose(mi, scene, sensor, tracer, spp=spp, seed=asked.seed, advance=advance)
 
 
 def _shaded(
-    mi: Any, scene: Any, asked: Request, in_studio: bool, advance: Advance
+    mi: Any, scene: Any, asked: Request, stage: Studio | None, advance: Advance
 ) -> tuple[Image, int]:
     sensor, spp, cones = scene.sensors()[0], asked.spp or _EDGE_SPP, asked.antialias == "cones"
-    cut_out = in_studio and asked.backdrop in CUT_OUT
-    image, lost = shaded(
-        mi, scene, sensor, spp=spp, on_floor=in_studio and not cut_out, cut_out=cut_out,
-        cones=cones, advance=advance,
+    return shaded(
+        mi, scene, sensor, spp=spp, on_floor=stage is not None and stage.has_ground,
+        cut_out=stage is not None, cones=cones, advance=advance,
     )  # fmt: skip
-    return _with_wanted_alpha(mi, sensor, image, asked, in_studio), lost
 
 
-def _with_wanted_alpha(
-    mi: Any, sensor: Any, image: Image, asked: Request, in_studio: bool
-) -> Image:
-    """The picture (h, w, 4) as it is, or without alpha if none is asked for."""
-    of_film = mi.has_flag(sensor.film().flags(), mi.FilmFlags.Alpha)
-    wanted = asked.backdrop in CUT_OUT if in_studio else of_film
-    return image if wanted else np.ascontiguousarray(image[..., :3])
+def _before_backdrop(
+    mi: Any, sensor: Any, image: Image, stage: Studio | None, show: str
+) -> tuple[Image, npt.NDArray[np.uint8]]:
+    """The numbers of a picture, given as light and the part that is covered, and its pixels."""
+    if stage is None:
+        has_alpha = mi.has_flag(sensor.film().flags(), mi.FilmFlags.Alpha)
+        image = image if has_alpha else np.ascontiguousarray(image[..., :3])
+        return image, tone_mapped(image)
+    if stage.backdrop == "transparent":
+        return image, tone_mapped(image)
+    light, free = image[..., :3], 1 - image[..., 3:]
+    if stage.backdrop == "white":
+        return light + free, tone_mapped(image, on_white=True)
+    image = light + free * behind(mi, sensor, stage, show)
+    return image, tone_mapped(image)
 
 
 @contextmanager

@@ -26,10 +26,22 @@ BACKDROPS = (*_GROUNDS, *CUT_OUT)
 _ENVIRONMENT_SIZE = (64, 128)
 
 
+def reflectance_of(backdrop: str) -> FloatArray:
+    """Of the ground, (3,)."""
+    return np.array(_GROUNDS[backdrop])
+
+
+def far_ground(backdrop: str, azimuth: float) -> FloatArray:
+    """Radiance (3,) of the ground far from the stage, which the environment alone lights."""
+    image = environment(azimuth)
+    z = np.cos(math.pi * (np.arange(len(image)) + 0.5) / len(image))
+    weight = np.clip(z, 0, None) * np.sqrt(1 - z * z)  # of rows, by the cosine
+    mean = np.average(image.mean(axis=1), axis=0, weights=weight)
+    return reflectance_of(backdrop) * mean
+
+
 def ground(mi: Any, backdrop: str) -> dict[str, Any]:
-    """A wide floor; none where the surfaces are cut out."""
-    if backdrop in CUT_OUT:
-        return {}
+    """A wide floor."""
     floor = mi.ScalarTransform4f().translate([0, 0, FLOOR]).scale(100)
     colour = {"type": "rgb", "value": list(_GROUNDS[backdrop])}
     return {

@@ -17,7 +17,7 @@ from harnack.backend import FloatArray
 from harnack.rendering.mitsuba.shapes import shape
 from harnack.rendering.mitsuba.variant import mitsuba_backend
 from harnack.rendering.studio.camera import Camera, Pose
-from harnack.rendering.studio.lighting import CUT_OUT, ground, lights
+from harnack.rendering.studio.lighting import CUT_OUT, FLOOR, ground, lights
 from harnack.rendering.studio.upright import upright
 from harnack.rendering.surfaces.framing import check_size, visible_points
 from harnack.rendering.surfaces.placement import Placement
@@ -48,10 +48,17 @@ class StudioObject:
 
 @dataclass(frozen=True)
 class Studio:
-    """A scene dictionary, and the length in it of a unit of the surfaces' coordinates."""
+    """A scene dictionary, and what a picture of it needs besides.
+
+    unit: the length in it of a unit of the surfaces' coordinates. backdrop: its name. azimuth: of
+        the camera. has_ground: whether the surfaces stand on a floor.
+    """
 
     scene: dict[str, Any]
     unit: float
+    backdrop: str
+    azimuth: float
+    has_ground: bool
 
 
 def studio(
@@ -81,7 +88,7 @@ def studio(
         "integrator": {
             "type": "harnack_path",
             "clamp": _CLAMP,
-            "hide_emitters": backdrop in CUT_OUT,
+            "hide_emitters": True,
         },
         "sensor": _sensor(mi, pose, size),
     }
@@ -94,9 +101,12 @@ def studio(
         scene[f"surface{k}"] = shape(
             surface, bsdf=bsdf, to_world=placement.matrix, tint=one.material.tint
         )
+    has_ground = not bare and backdrop not in CUT_OUT and pose.origin[2] > FLOOR
+    if has_ground:  # from below, it would hide everything
+        scene |= ground(mi, backdrop)
     if not bare:
-        scene |= {**ground(mi, backdrop), **lights(mi, pose.azimuth)}
-    return Studio(scene, placement.scale)
+        scene |= lights(mi, pose.azimuth)
+    return Studio(scene, placement.scale, backdrop, pose.azimuth, has_ground)
 
 
 def _corners(ends: FloatArray) -> FloatArray:
