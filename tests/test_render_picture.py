@@ -16,8 +16,7 @@ import harnack as hk
 from harnack.geometry import shapes
 from harnack.rendering import MATERIALS, SHOW_MODES, Camera, Material, picture, register, render
 from harnack.rendering.pictures.colormap import viridis
-from harnack.rendering.pictures.exr import exr_bytes
-from harnack.rendering.pictures.images import tone_mapped
+from harnack.rendering.pictures.images import exr_bytes, tone_mapped
 from harnack.rendering.studio.stage import on_ground
 
 mi = register()

@@ -56,7 +56,10 @@ def _render(options: Any) -> int:
     if options.scene in SCENES:
         _draw_scene(SCENES[options.scene], target, options, {**settings, **_of_surfaces(options)})
     elif kind == ".xml":
-        own = {**_of_surfaces(options), "level": options.level, "material": options.material}
+        own = {
+            **_of_surfaces(options), "level": options.level, "material": options.material,
+            "up": options.up,
+        }  # fmt: skip
         given = [name for name, value in own.items() if value is not None]
         if given:
             raise ValueError(f"{', '.join(given)} of a Mitsuba scene: set in its own file")

@@ -115,8 +115,9 @@ def _corners(ends: FloatArray) -> FloatArray:
     return np.array(list(itertools.product(*ends.T)))
 
 
-def on_ground(points: FloatArray, turned: FloatArray) -> Placement:
+def on_ground(points: FloatArray, turned: FloatArray | None = None) -> Placement:
     """Turns points (n, 3), scales them to half a diagonal of 1 and puts them on the ground."""
+    turned = np.eye(3) if turned is None else turned
     points = points @ turned.T
     lower, upper = points.min(axis=0), points.max(axis=0)
     scale = 2.0 / max(float(np.linalg.norm(upper - lower)), 1e-30)
