@@ -101,7 +101,7 @@ def png_bytes(mi: Any, image: npt.NDArray[np.uint8]) -> bytes:
 def exr_bytes(image: npt.NDArray[np.floating[Any]]) -> bytes:
     """An OpenEXR file of an image (h, w) with channel Y, (h, w, 3) with R, G and B, or (h, w, 4)
     with A as well, by which these are multiplied."""
-    # Mitsuba writes them too, but waits for ever where Dr.Jit has a single thread (OpenEXR 2.5 hands
+    # Mitsuba writes them too, but waits for ever where Dr.Jit has one thread (OpenEXR 2.5 hands
     # its work to a pool without threads).
     import OpenEXR  # here, since most pictures do without
 
