@@ -22,6 +22,7 @@ from .hart import hart
 from .inclusion import inclusion
 from .laplacian import laplacian
 from .meshes import meshes
+from .pictures import pictures
 from .povray import compare_with_povray, has_povray
 from .rays import RULES, WIDTH, Row, machine, measure, published
 from .scenes import others, polygons
@@ -31,7 +32,7 @@ from .winding import throughput
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 SECTIONS = (
     "rays", "convergence", "winding", "agreement", "versions", "inclusion", "laplacian", "hart",
-    "povray", "antialiasing", "baselines", "formulas", "meshes", "distances",
+    "povray", "antialiasing", "baselines", "formulas", "meshes", "distances", "pictures",
 )  # fmt: skip
 
 
@@ -75,6 +76,7 @@ def main() -> None:
         "distances": distances,
         "formulas": formulas,
         "meshes": meshes,
+        "pictures": pictures,
         "povray": compare_with_povray,
         "winding": lambda: _winding(arguments.bunny, arguments.out.with_name("growth.png")),
     }

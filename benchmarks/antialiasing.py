@@ -12,12 +12,9 @@ import numpy as np
 import harnack as hk
 from harnack.gallery import SCENES
 from harnack.geometry import shapes
-from harnack.rendering import Camera, register, render
+from harnack.rendering import Camera, render
 from harnack.rendering.pictures.images import tone_mapped
 from harnack.rendering.pictures.pixels import grid_offsets
-from harnack.rendering.pictures.shaded import shaded
-from harnack.rendering.studio.materials import material_of
-from harnack.rendering.studio.stage import StudioObject, studio
 
 _SIZE = (320, 240)
 _REFERENCE, _ROUNDS = 100, 3
@@ -65,10 +62,9 @@ def _many_rays(surfaces: list[hk.LevelSet], material: str, camera: Camera) -> np
     """
     side = math.isqrt(len(grid_offsets(_REFERENCE)))
     large = (side * _SIZE[0], side * _SIZE[1])
-    mi = register()
-    objects = [StudioObject(one, material_of(material)) for one in surfaces]
-    scene = mi.load_dict(studio(mi, objects, size=large, camera=camera).scene, parallel=False)
-    image, _ = shaded(mi, scene, scene.sensors()[0], spp=1, on_floor=True, advance=lambda _: None)
+    image = render(
+        surfaces, show="shaded", size=large, material=material, camera=camera, spp=1, progress=False
+    )
     return image.reshape(_SIZE[1], side, _SIZE[0], side, 3).mean(axis=(1, 3))
 
 

@@ -42,7 +42,7 @@ class View:
         """That frames points (n, 3), as the studio's camera does."""
         camera = Camera() if camera is None else camera
         eye, _ = camera.fit(np.asarray(points, np.float64), size)
-        return cls(eye, np.stack(camera.frame()), camera.fov, size)
+        return cls(eye, np.stack(camera.frame()), camera.angle, size)
 
     @property
     def _scale(self) -> float:

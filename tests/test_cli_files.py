@@ -235,7 +235,7 @@ def test_gltf_and_obj_are_y_up_and_other_formats_z_up(tmp_path):
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", ["--boundary", "--as", "dipole"],
          "--boundary takes faces as curves, which contradicts --as dipole"),
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", ["--level", "0"], "level 0 "),
-        ("a.xml", "<scene/>", ["--up", "y"], "--up is for surface files"),
+        ("a.xml", "<scene/>", ["--up", "y"], "up of a Mitsuba scene: set in its own file"),
         ("trefoil", None, ["--as", "loops"], "--as is for surface files"),
     ],
 )  # fmt: skip

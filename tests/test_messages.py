@@ -34,8 +34,8 @@ def draw(**settings: Any) -> Any:
 @pytest.mark.parametrize(
     ("settings", "complaint"),
     [
-        ({"camera": (3, 3, 3)}, r"Camera, not a tuple .*Camera\(azimuth=45, elevation=35.26\)"),
-        ({"camera": "top"}, r"camera must be a harnack.rendering.Camera.*Camera\(azimuth=-50"),
+        ({"camera": (3, 3)}, r"the \(x, y, z\) where it stands, not a tuple \(3, 3\)"),
+        ({"camera": "top"}, r"camera must be a harnack.Camera.*Camera\(azimuth=-50"),
         ({"background": "dark"}, r"no setting 'background'.*; did you mean \"backdrop\"\?$"),
         ({"levle": 3.0}, r"no setting 'levle'; there are show, .*; did you mean \"level\"\?$"),
         ({"colour": "red"}, r"no setting 'colour'; there are .* material, .* confirm$"),

@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
 from harnack.backend import FloatArray
 from harnack.fields import (
     Blobs,
@@ -31,19 +29,12 @@ from harnack.files import (
     read_surface,
 )
 from harnack.files.surfaces import ReadAs, Surface
+from harnack.rendering.studio.upright import UP_AXES, upright
 
 __all__ = ["UP_AXES", "Axis", "OpenedSurface", "open_surface"]
 
 Axis = Literal["x", "y", "z"]
 
-# Rotations that turn the named axis to z. From y, the front of a glTF model (z) turns to -y,
-# which is where the studio's camera stands.
-_UPRIGHT: dict[str, FloatArray] = {
-    "x": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
-    "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
-    "z": np.eye(3),
-}
-UP_AXES: tuple[str, ...] = tuple(_UPRIGHT)
 _Y_UP_BY_STANDARD = (".glb", ".gltf")
 _Y_UP_BY_HABIT = (".obj",)
 # Where `read_loops` itself takes the boundary of faces.
@@ -91,7 +82,7 @@ def open_surface(
         raise ValueError(f'boundary=True takes faces as curves, which contradicts as_="{as_}"')
     if normals not in (None, "estimate"):
         raise ValueError(f'normals must be "estimate" or None, not {normals!r}')
-    if up not in (None, *_UPRIGHT):
+    if up not in (None, *UP_AXES):
         raise ValueError(f"up must be one of {', '.join(UP_AXES)} or None, not {up!r}")
     surface = _read(path, as_, boundary)
     if normals is not None and not isinstance(surface, Cloud):
@@ -102,7 +93,7 @@ def open_surface(
     is_curve = isinstance(surface, ClosedCurves)
     axis, why = (up, "as asked") if up is not None else _usual_up(path, is_curve=is_curve)
     try:
-        field = _field(surface, normals, _UPRIGHT[axis])
+        field = _field(surface, normals, upright(axis))
     except ValueError as error:
         raise FileFormatError(f"{path}: {error}") from error
     show, material = ("color", "two-tone") if is_curve else ("shaded", "eggshell")

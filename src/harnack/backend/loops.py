@@ -31,32 +31,33 @@ def while_active(state: State, body: Callable[[State], State], label: str) -> St
     """
 
     def running(*leaves: Any) -> Mask:
-        return _record(state, iter(leaves)).active
+        return record_of(state, iter(leaves)).active
 
     def step(*leaves: Any) -> tuple[Any, ...]:
-        return tuple(_leaves(body(_record(state, iter(leaves)))))
+        return tuple(leaves_of(body(record_of(state, iter(leaves)))))
 
     try:
-        leaves = dr.while_loop(tuple(_leaves(state)), running, step, label=label)
+        leaves = dr.while_loop(tuple(leaves_of(state)), running, step, label=label)
     except RuntimeError as error:  # Dr.Jit wraps what the body raises
         raise (error.__cause__ or error) from None
-    return _record(state, iter(leaves))
+    return record_of(state, iter(leaves))
 
 
-def _leaves(record: Any) -> Iterator[Any]:
+def leaves_of(record: Any) -> Iterator[Any]:
+    """The arrays of a record of arrays and records, in order; None is left out."""
     for value in _entries(record):
         if dataclasses.is_dataclass(value):
-            yield from _leaves(value)
+            yield from leaves_of(value)
         elif value is not None:
             yield value
 
 
-def _record(like: Any, leaves: Iterator[Any]) -> Any:
+def record_of(like: Any, leaves: Iterator[Any]) -> Any:
     """The leaves as a record like another one."""
     values: list[Any] = []
     for value in _entries(like):
         if dataclasses.is_dataclass(value):
-            values.append(_record(value, leaves))
+            values.append(record_of(value, leaves))
         else:
             values.append(None if value is None else next(leaves))
     return type(like)(*values)

@@ -12,10 +12,12 @@ from harnack._version import __version__
 from harnack.choices import did_you_mean
 from harnack.cli.mesh_files import MESH_FILES
 from harnack.cli.messages import printable
+from harnack.enclosures.proofs import BOUNDS
 from harnack.files.surfaces import SURFACE_FILES
 from harnack.opening import UP_AXES
 from harnack.rendering import MATERIALS, SHOW_MODES
 from harnack.rendering.arguments import ANTIALIASING, MAX_SIDE, MAX_SPP
+from harnack.rendering.studio.lighting import BACKDROPS
 
 # Of what was typed, this much is repeated in messages.
 _SHOWN = 60
@@ -23,6 +25,11 @@ _SHOWN = 60
 
 class _Parser(argparse.ArgumentParser):
     """Says what is wrong in one line, and which option an unknown one may have meant."""
+
+    def __init__(self, *args: Any, **settings: Any) -> None:
+        super().__init__(*args, **settings)
+        # argparse takes -1 for a number and would take -0.3:0.3 and -1,0,0 for options.
+        self._negative_number_matcher = re.compile(r"-[\d.]")
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{printable(f'{self.prog}: error: {message}')} (see {self.prog} --help)\n")
@@ -99,10 +106,8 @@ def _add_render(commands: Any) -> None:
         "--confirm", action="store_true",
         help="a ray hits only where the field changes sign, not where it comes near and turns back",
     )  # fmt: skip
-    for name, what in (("azimuth", "is turned"), ("elevation", "looks down")):
-        one.add_argument(
-            f"--{name}", type=_angle, metavar="DEG", help=f"how far the camera {what}, in degrees"
-        )
+    _add_surface(one)
+    _add_view(one)
     file = one.add_argument_group("surface files")
     _add_choice(
         file, "--as", ("winding", "dipole", "loops", "polygons"),
@@ -115,11 +120,49 @@ def _add_render(commands: Any) -> None:
         "--boundary", action="store_true", help="take the boundary of a file's faces as the curves"
     )
     _add_choice(file, "--normals", ("estimate",), "estimate the normals of a point cloud")
-    _add_choice(
-        file, "--up", UP_AXES,
-        "the file's axis that points up (y for .glb, .gltf and surfaces in .obj, else z)",
-    )  # fmt: skip
     _add_quality(one)
+
+
+def _add_surface(one: Any) -> None:
+    group = one.add_argument_group("what of a surface is drawn")
+    group.add_argument(
+        "--solid", type=_ends, metavar="LOW:HIGH",
+        help="the solid where the function is between two values; one may be left out: :0",
+    )  # fmt: skip
+    _add_clip(group)
+    _add_choice(
+        group, "--bound", BOUNDS, "the proof that steps are made by (the longest of all that apply)"
+    )
+
+
+def _add_clip(group: Any) -> None:
+    clip = group.add_mutually_exclusive_group()
+    clip.add_argument(
+        "--box", type=_six_numbers, metavar="X,Y,Z,X,Y,Z", help="cut by a box between two corners"
+    )
+    clip.add_argument("--ball", type=_four_numbers, metavar="X,Y,Z,R", help="cut by a ball")
+
+
+def _add_view(one: Any) -> None:
+    group = one.add_argument_group("camera and backdrop")
+    for name, what in (("azimuth", "is turned"), ("elevation", "looks down")):
+        group.add_argument(
+            f"--{name}", type=_angle, metavar="DEG", help=f"how far the camera {what}, in degrees"
+        )
+    group.add_argument("--fov", type=_angle, metavar="DEG", help="its angle of view (26)")
+    group.add_argument(
+        "--zoom", type=_positive, metavar="FACTOR", help="closer than what frames the surface (1)"
+    )
+    for name, what in (("position", "where it stands"), ("target", "what it looks at")):
+        group.add_argument(
+            f"--{name}", type=_three_numbers, metavar="X,Y,Z",
+            help=f"{what}, in the surface's coordinates",
+        )  # fmt: skip
+    _add_choice(group, "--backdrop", BACKDROPS, "what is behind the surface (light)")
+    _add_choice(
+        group, "--up", UP_AXES,
+        "the axis that points up (of files .glb, .gltf and surfaces in .obj y, else z)",
+    )  # fmt: skip
 
 
 def _add_mesh(commands: Any) -> None:
@@ -149,11 +192,7 @@ def _add_mesh(commands: Any) -> None:
         "--thickness", type=_positive, metavar="LENGTH",
         help="a closed part so thick, in the scene's unit, half on each side of the surface",
     )  # fmt: skip
-    clip = one.add_mutually_exclusive_group()
-    clip.add_argument(
-        "--box", type=_six_numbers, metavar="X,Y,Z,X,Y,Z", help="cut by a box between two corners"
-    )
-    clip.add_argument("--ball", type=_four_numbers, metavar="X,Y,Z,R", help="cut by a ball")
+    _add_clip(one)
     one.add_argument(
         "--simplify", action="store_true", help="fewer triangles of closed parts, as exact"
     )
@@ -233,6 +272,10 @@ def _ends(text: str) -> tuple[float, float]:
     if not ends[0] < ends[1] or all(map(math.isinf, ends)):
         raise argparse.ArgumentTypeError(f"{_shown(text)}: the first value must be the lower one")
     return ends
+
+
+def _three_numbers(text: str) -> tuple[float, ...]:
+    return _numbers(text, 3)
 
 
 def _six_numbers(text: str) -> tuple[float, ...]:

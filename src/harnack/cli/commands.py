@@ -46,18 +46,23 @@ def _render(options: Any) -> int:
         settings["show"] = options.show
     if options.antialias is not None:
         settings["antialias"] = options.antialias
-    if options.azimuth is not None or options.elevation is not None:
+    if any(value is not None for value in _view(options).values()):
         settings["camera"] = _camera(options)
+    if options.backdrop is not None:
+        settings["backdrop"] = options.backdrop
     kind = source.suffix.lower()
     if options.scene in SCENES or kind == ".xml":
         _refuse_file_options(options)
     if options.scene in SCENES:
         _draw_scene(SCENES[options.scene], target, options, {**settings, **_of_surfaces(options)})
     elif kind == ".xml":
-        if options.level is not None or options.material is not None or options.confirm:
-            raise ValueError(
-                "level, material and confirm of a Mitsuba scene are set in its own file"
-            )
+        own = {
+            **_of_surfaces(options), "level": options.level, "material": options.material,
+            "up": options.up,
+        }  # fmt: skip
+        given = [name for name, value in own.items() if value is not None]
+        if given:
+            raise ValueError(f"{', '.join(given)} of a Mitsuba scene: set in its own file")
         render(str(source), target, **settings)
     else:
         _draw_file(source, target, options, {**settings, **_of_surfaces(options)})
@@ -67,7 +72,22 @@ def _render(options: Any) -> int:
 
 def _of_surfaces(options: Any) -> dict[str, Any]:
     """Settings of the surfaces drawn that were asked for."""
-    return {"confirm": True} if options.confirm else {}
+    asked = {
+        "confirm": True if options.confirm else None, "bound": options.bound,
+        "solid": options.solid, "clip": _clip(options),
+    }  # fmt: skip
+    return {name: value for name, value in asked.items() if value is not None}
+
+
+def _clip(options: Any) -> Box | Ball | None:
+    """The volume that a surface is cut by."""
+    if options.box is not None:
+        x0, y0, z0, x1, y1, z1 = options.box
+        return Box((x0, y0, z0), (x1, y1, z1))
+    if options.ball is not None:
+        x, y, z, radius = options.ball
+        return Ball((x, y, z), radius)
+    return None
 
 
 def _check_source(name: str) -> None:
@@ -89,17 +109,22 @@ def _say(text: str) -> None:
     Console(highlight=False, soft_wrap=True, markup=False, emoji=False).print(printable(text))
 
 
+def _view(options: Any) -> dict[str, Any]:
+    """What was asked of the camera; None for what was not."""
+    names = ("azimuth", "elevation", "fov", "zoom", "position", "target")
+    return {name: getattr(options, name) for name in names}
+
+
 def _camera(options: Any) -> Camera:
-    """The camera asked for; angles that were not given stay those of the scene or the studio."""
+    """The camera asked for; what was not given stays that of the scene or the studio."""
     usual = SCENES[options.scene].camera if options.scene in SCENES else Camera()
-    angles = {"azimuth": options.azimuth, "elevation": options.elevation}
-    return replace(usual, **{name: value for name, value in angles.items() if value is not None})
+    asked = _view(options).items()
+    return replace(usual, **{name: value for name, value in asked if value is not None})
 
 
 def _refuse_file_options(options: Any) -> None:
     given = {
         "--as": options.as_, "--boundary": options.boundary, "--normals": options.normals,
-        "--up": options.up,
     }  # fmt: skip
     for name, value in given.items():
         if value:
@@ -123,11 +148,15 @@ def _draw_file(source: Path, target: Path, options: Any, settings: dict[str, Any
 def _draw_scene(scene: Scene, target: Path, options: Any, settings: dict[str, Any]) -> None:
     if options.material is not None:
         settings["material"] = options.material
+    if options.up is not None:
+        settings["up"] = options.up
+    surfaces = scene.surfaces() if options.level is not None or options.solid is not None else []
     if options.level is not None:
-        surfaces = scene.surfaces()
-        if len(surfaces) != 1 or surfaces[0].solid is not None:
+        if len(surfaces) != 1 or (surfaces[0].solid is not None and options.solid is None):
             raise ValueError(f"scene {scene.name} has levels of its own; --level does not apply")
         settings["level"] = options.level
+    if options.solid is not None and len(surfaces) != 1:
+        raise ValueError(f"scene {scene.name} has several surfaces; --solid does not apply")
     scene.render(target, **settings)
 
 
@@ -148,12 +177,9 @@ def _mesh(options: Any) -> int:
         settings.pop("solid", None)
     if settings.get("solid") is not None and options.level is None:
         settings.pop("level", None)
-    if options.box is not None:
-        x0, y0, z0, x1, y1, z1 = options.box
-        settings["clip"] = Box((x0, y0, z0), (x1, y1, z1))
-    elif options.ball is not None:
-        x, y, z, radius = options.ball
-        settings["clip"] = Ball((x, y, z), radius)
+    clip = _clip(options)
+    if clip is not None:
+        settings["clip"] = clip
     settings |= {"simplify": options.simplify, "largest": options.largest}
     if options.quiet:
         made = mesh(field, **settings)

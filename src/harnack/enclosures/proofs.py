@@ -47,6 +47,7 @@ _NAMED: dict[str, tuple[type[Enclosure], ...]] = {
     "laplacian": (GreenBall, Cone),
     "lipschitz": (Cone,),
 }
+BOUNDS = tuple(sorted(_NAMED))
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from harnack.rendering.arguments import SHOW_MODES
 from harnack.rendering.mitsuba.plugins import register, register_surfaces
 from harnack.rendering.mitsuba.shapes import shape
 from harnack.rendering.picture import render
+from harnack.rendering.pictures.shown import Picture
 from harnack.rendering.studio.camera import Camera
 from harnack.rendering.studio.materials import MATERIALS, Material
 from harnack.rendering.surfaces.extent import UnboundedSurfaceError
@@ -15,6 +16,7 @@ __all__ = [
     "SHOW_MODES",
     "Camera",
     "Material",
+    "Picture",
     "UnboundedSurfaceError",
     "register",
     "register_surfaces",

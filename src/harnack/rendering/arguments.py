@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import inspect
 import math
 import operator
@@ -14,6 +13,7 @@ from typing import Any
 from harnack.choices import did_you_mean
 from harnack.rendering.pictures.views import VIEWS
 from harnack.rendering.studio.camera import Camera
+from harnack.rendering.studio.lighting import BACKDROPS
 from harnack.tracer import level_set
 
 __all__ = [
@@ -22,6 +22,7 @@ __all__ = [
     "MAX_SPP",
     "SHOW_MODES",
     "Request",
+    "check_backdrop",
     "check_camera",
     "check_integer",
     "check_memory",
@@ -54,6 +55,7 @@ class Request:
     max_depth: int | None
     seed: int
     camera: Camera
+    backdrop: str
     antialias: str | None = None
 
 
@@ -65,6 +67,7 @@ def checked_request(
     max_depth: Any,
     seed: Any,
     camera: Any,
+    backdrop: Any,
     antialias: Any = None,
 ) -> Request:
     """What was asked for.
@@ -81,6 +84,7 @@ def checked_request(
         None if max_depth is None else check_integer("max_depth", max_depth),
         check_integer("seed", seed),
         Camera() if camera is None else check_camera(camera),
+        "light" if backdrop is None else check_backdrop(backdrop),
         antialias,
     )
 
@@ -154,21 +158,31 @@ def check_integer(name: str, number: Any) -> int:
 
 
 def check_camera(camera: Any) -> Camera:
-    """A camera; for a position, say which one looks from there."""
+    """A camera, or one at a position (x, y, z)."""
     if isinstance(camera, Camera):
         return camera
-    example = "Camera(azimuth=-50, elevation=28)"
-    with contextlib.suppress(TypeError, ValueError):
+    try:
         x, y, z = (float(c) for c in camera)
-        azimuth, elevation = math.atan2(y, x), math.atan2(z, math.hypot(x, y))
-        example = (
-            f"Camera(azimuth={math.degrees(azimuth):.4g}, elevation={math.degrees(elevation):.4g})"
-            ", which looks from that side and frames the surface by itself"
+    except (TypeError, ValueError):
+        raise TypeError(
+            "camera must be a harnack.Camera, such as Camera(azimuth=-50, elevation=28), or the "
+            f"(x, y, z) where it stands, not a {type(camera).__name__} {camera!r}"
+        ) from None
+    return Camera(position=(x, y, z))
+
+
+def check_backdrop(backdrop: Any) -> str:
+    """What is behind the surfaces.
+
+    Raises:
+        ValueError: unknown.
+    """
+    if not isinstance(backdrop, str) or backdrop not in BACKDROPS:
+        raise ValueError(
+            f"backdrop must be one of {', '.join(BACKDROPS)}, not {backdrop!r}"
+            f"{did_you_mean(backdrop, BACKDROPS)}"
         )
-    raise TypeError(
-        "camera must be a harnack.rendering.Camera, not a "
-        f"{type(camera).__name__} {camera!r}: give harnack.rendering.{example}"
-    )
+    return backdrop
 
 
 def check_settings(settings: Mapping[str, Any], own: Sequence[str]) -> None:

@@ -31,21 +31,22 @@ from harnack.rendering.arguments import (
 from harnack.rendering.mitsuba.integrator import PathTracer
 from harnack.rendering.mitsuba.plugins import register
 from harnack.rendering.mitsuba.scene_files import load_dictionary, load_scene_file
+from harnack.rendering.pictures.backdrop import behind
 from harnack.rendering.pictures.exposure import expose
 from harnack.rendering.pictures.images import check_picture_path, tone_mapped, write_image
-from harnack.rendering.pictures.pixels import stratified
 from harnack.rendering.pictures.shaded import shaded
+from harnack.rendering.pictures.shown import Picture
 from harnack.rendering.pictures.views import VIEWS, look
 from harnack.rendering.studio.camera import Camera
 from harnack.rendering.studio.materials import Material, material_of
-from harnack.rendering.studio.stage import StudioObject, studio
+from harnack.rendering.studio.stage import Studio, StudioObject, studio
 from harnack.tracer import LevelSet, level_set
 
 ShowMode = Literal["color", "shaded", "normal", "evaluations", "status", "depth"]
 # Modes with ground and lights, and what they send out.
 _LIT = {"color": "light paths", "shaded": "rays"}
 _EDGE_SPP = 9
-_OF_STUDIO = ("material", "camera", "backdrop")
+_OF_STUDIO = ("material", "camera", "backdrop", "up")
 _OWN = ("show", "size", "spp", "antialias", *_OF_STUDIO, "max_depth", "seed", "progress")
 Image = npt.NDArray[Any]
 Advance = Callable[[float], None]
@@ -61,13 +62,14 @@ def render(
     spp: int | None = None,
     antialias: str | None = None,
     material: MaterialLike | Sequence[MaterialLike] | None = None,
-    camera: Camera | None = None,
+    camera: Camera | tuple[float, float, float] | None = None,
     backdrop: str | None = None,
+    up: str | tuple[float, float, float] | None = None,
     max_depth: int | None = None,
     seed: int = 0,
     progress: bool = True,
     **settings: Any,
-) -> Image:
+) -> Picture:
     """Draw fields or a Mitsuba scene, and write the picture to `path` if there is one.
 
     what: a field, a `LevelSet` or a list of them, drawn in the studio; or a Mitsuba scene, its
@@ -78,7 +80,7 @@ def render(
         "status" and "depth".
     size: (width, height) in pixels, by default (800, 600) or the scene's own.
     spp: samples a pixel of a color picture, by default 64 or the scene's own, and of the edges
-        of a shaded one, by default 9. Some samplers round it up.
+        of a shaded one, by default 9.
     antialias: of shaded pictures, which pixels get all their samples: "edges", the default, those
         that differ from a neighbour; "cones" also those that a surface covers in part, found by
         a cone around each pixel. Wires thinner than a pixel then stay lines. It looks at fields
@@ -91,8 +93,12 @@ def render(
 
     material: a name of `MATERIALS`, a `Material` or a BSDF dictionary; a list, one for each
         surface.
-    camera: where the stage is seen from.
-    backdrop: "light" or "dark".
+    camera: where the stage is seen from, a `Camera`, or (x, y, z) in the surfaces' coordinates.
+    backdrop: "light" or "dark", with a floor; "white", with nothing but the surfaces; or
+        "transparent", the same with alpha in PNG and EXR files and as a fourth number, by which
+        the first three are multiplied.
+    up: what is up, "x", "y", "z", "-x", ... or a direction in the surfaces' coordinates; by
+        default z.
     settings: of the surfaces, as `harnack.level_set` takes them: level, clip, solid, ...; those
         of a `LevelSet` are replaced. Without a tolerance, a field gets one that suits its size.
 
@@ -103,8 +109,9 @@ def render(
     tinted glass takes some of it away by the law of Beer and Lambert. Shaded pictures look straight
     through it and leave out caustics, blur, and reflections of anything but the sky.
 
-    Returns the numbers: (h, w, 3) linear sRGB radiance; (h, w, 3) normals; or (h, w), of which
-    depths are in units of the (first) surface's coordinates.
+    Returns the numbers: (h, w, 3) linear sRGB radiance, or (h, w, 4) with alpha where the backdrop
+    is transparent or the film of a scene has it; (h, w, 3) normals; or (h, w), of which depths are
+    in units of the (first) surface's coordinates. Notebooks show them as the picture they make.
 
     A ray that runs out of steps is drawn magenta, and a warning says how many there were.
 
@@ -115,46 +122,44 @@ def render(
     target = None if path is None else check_picture_path(path)
     asked = checked_request(
         show=show, size=size, spp=spp, max_depth=max_depth, seed=seed, camera=camera,
-        antialias=antialias,
+        antialias=antialias, backdrop=backdrop,
     )  # fmt: skip
     mi = register()
     in_studio = isinstance(what, Field | LevelSet | list | tuple)
     if in_studio:
-        scene, unit = _staged(mi, what, asked, material, backdrop or "light", settings)
+        stage, scene = _staged(mi, what, asked, material, up, settings)
     else:
-        of_studio = dict(zip(_OF_STUDIO, (material, camera, backdrop), strict=True))
+        of_studio = dict(zip(_OF_STUDIO, (material, camera, backdrop, up), strict=True))
         refuse_studio_settings({**of_studio, **settings})
-        scene, unit = _loaded(mi, what, asked.size), 1.0
+        stage, scene = None, _loaded(mi, what, asked.size)
         check_memory(asked.show, *map(int, scene.sensors()[0].film().crop_size()))
     if show in VIEWS:
-        view = look(mi, scene, scene.sensors()[0], unit)
+        view = look(mi, scene, scene.sensors()[0], 1.0 if stage is None else stage.unit)
         image, drawn = VIEWS[show].numbers(view), VIEWS[show].picture(view)
     else:
         with _bar(progress) as advance:
-            if show == "shaded":
-                image, lost = _shaded(mi, scene, asked, in_studio, advance)
-            else:
-                image, lost = _radiance(mi, scene, asked, in_studio, advance)
+            drawing = _shaded if show == "shaded" else _radiance
+            image, lost = drawing(mi, scene, asked, stage, advance)
         _warn_of(lost, _LIT[show])
-        drawn = tone_mapped(image)
+        image, drawn = _before_backdrop(mi, scene.sensors()[0], image, stage, show)
     if target is not None:
         exact = target.suffix.lower() == ".exr"
         write_image(mi, target, image.astype(np.float32, copy=False) if exact else drawn)
-    return image
+    return Picture.of(image, drawn)
 
 
 def _staged(
-    mi: Any, what: Any, asked: Request, material: Any, backdrop: str, settings: Mapping[str, Any]
-) -> tuple[Any, float]:
-    """The scene of fields and level sets in the studio, and the length in it of their unit."""
+    mi: Any, what: Any, asked: Request, material: Any, up: Any, settings: Mapping[str, Any]
+) -> tuple[Studio, Any]:
+    """Fields and level sets in the studio, and the scene of it."""
     check_settings(settings, _OWN)
     size = asked.size or (800, 600)
     check_memory(asked.show, *size)
     made = studio(
         mi, _exhibits(what, material, settings), size=size, camera=asked.camera,
-        backdrop=backdrop, bare=asked.show not in _LIT,
+        backdrop=asked.backdrop, up=up or "z", bare=asked.show not in _LIT,
     )  # fmt: skip
-    return mi.load_dict(made.scene, parallel=False), made.unit
+    return made, mi.load_dict(made.scene, parallel=False)
 
 
 def _exhibits(what: Any, materials: Any, settings: Mapping[str, Any]) -> list[StudioObject]:
@@ -228,24 +233,42 @@ def _warn_of(lost: int, what: str) -> None:
 
 
 def _radiance(
-    mi: Any, scene: Any, asked: Request, in_studio: bool, advance: Advance
+    mi: Any, scene: Any, asked: Request, stage: Studio | None, advance: Advance
 ) -> tuple[Image, int]:
+    del stage
     sensor = scene.sensors()[0]
     tracer = _tracer(mi, scene, asked.max_depth)
     spp = asked.spp or check_spp(
         int(sensor.sampler().sample_count()), source=", which the scene's sampler asks for"
     )
-    spp = stratified(spp) if in_studio else spp
     return expose(mi, scene, sensor, tracer, spp=spp, seed=asked.seed, advance=advance)
 
 
 def _shaded(
-    mi: Any, scene: Any, asked: Request, in_studio: bool, advance: Advance
+    mi: Any, scene: Any, asked: Request, stage: Studio | None, advance: Advance
 ) -> tuple[Image, int]:
     sensor, spp, cones = scene.sensors()[0], asked.spp or _EDGE_SPP, asked.antialias == "cones"
     return shaded(
-        mi, scene, sensor, spp=spp, on_floor=in_studio, cones=cones, advance=advance
+        mi, scene, sensor, spp=spp, on_floor=stage is not None and stage.has_ground,
+        cut_out=stage is not None, cones=cones, advance=advance,
     )  # fmt: skip
+
+
+def _before_backdrop(
+    mi: Any, sensor: Any, image: Image, stage: Studio | None, show: str
+) -> tuple[Image, npt.NDArray[np.uint8]]:
+    """The numbers of a picture, given as light and the part that is covered, and its pixels."""
+    if stage is None:
+        has_alpha = mi.has_flag(sensor.film().flags(), mi.FilmFlags.Alpha)
+        image = image if has_alpha else np.ascontiguousarray(image[..., :3])
+        return image, tone_mapped(image)
+    if stage.backdrop == "transparent":
+        return image, tone_mapped(image)
+    light, free = image[..., :3], 1 - image[..., 3:]
+    if stage.backdrop == "white":
+        return light + free, tone_mapped(image, on_white=True)
+    image = light + free * behind(mi, sensor, stage, show)
+    return image, tone_mapped(image)
 
 
 @contextmanager

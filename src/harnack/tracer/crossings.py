@@ -10,8 +10,8 @@ import drjit as dr
 
 from harnack.backend.loops import while_active
 from harnack.fields.sheets import NO_SHEET
-from harnack.tracer.stretches import SheetTracer, SheetWalk
 from harnack.tracer.tolerance import Status
+from harnack.tracer.walks.stretches import SheetTracer, SheetWalk
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
@@ -97,7 +97,7 @@ def find_crossings(
         if now.sheets is None:
             after = march.advance(prepared.field, path, end, now.now)
         else:
-            walk = tracer.interval(now.sheets)
+            walk = tracer.next(now.sheets)
             there = _Walk(None, walk, now.count)
             after, sheet = tracer.end_of(walk)
         contact = after.contact

@@ -172,150 +172,159 @@ class March:
         miss, with the step that the value behind the sheet allows from there. With `hysteresis`
         `value` is then that behind the sheet.
         """
-        real, size = self.backend.Float, largest_component(path.origin)
-        is_smooth = ahead is None and not field.has_detail
 
         def body(now: MarchState) -> MarchState:
-            t = now.base + now.step
-            if ahead is not None:  # the crossing exactly
-                t = dr.select(now.step >= end - now.base, end, t)
-            if now.contact is not None:
-                t = dr.select(now.step >= end - now.base, end, t)
-            at_end = None if ahead is None else t == end
-
-            # Look there.
-            has_detail = field.has_detail and now.detail is not None
-            seen = field.at_detail(now.detail) if has_detail else field
-            unproved = now.step - now.reach
-            candidate = fmin(now.candidate, end - t)
-            look = seen.look(path, t, candidate, fmax(unproved, real(0)))
-            sample, gradient_norm = look.sample, length(look.sample.gradient)
-            gaps = self.levels.gaps(sample.value)
-            if self.cover is not None:
-                gaps = gaps.less(self.cover * t * gradient_norm)
-            total_error = value_error(sample, gradient_norm, size + t)
-
-            # Is all up to there proved free, and is the sample fine enough to say so?
-            steepness = fmax(gradient_norm - sample.gradient_error, real(0))
-            if look.slope_error is not None:  # the gradient is at least as long as its shadow
-                steepness = fmax(dr.abs(look.slope) - look.slope_error, steepness)
-            within = self.tolerance.in_value(steepness, t)
-            knows_gradient = (sample.gradient_error <= gradient_norm) | (steepness > 0)
-            if self.hysteresis is not None:
-                within = self.hysteresis.within(within)
-            # Where not even the gradient is known, rounding makes no hits.
-            rounding = dr.select(knows_gradient, total_error - sample.truncation, 0)
-            is_near = self._is_near(
-                gaps.smaller, within, total_error, rounding, sample, gradient_norm, size + t
-            )
-            excess = fmax(gaps.smaller + total_error - within, real(0))
-            band, may_pass = within, is_near
-            if self.hysteresis is not None and now.contact is not None:
-                # In contact all that rounding does to f counts, or a ray would stick in a crease.
-                band = self.hysteresis.band(within, total_error - sample.truncation)
-                gaps = self.hysteresis.gaps(now.contact, sample.value, gaps, band)
-                within = CLOSER * within
-                may_pass &= ~now.contact.is_touching
-                if self.levels.period is not None:  # the value alone tells its side of a level
-                    may_pass = self.backend.Bool(False)
-            accepted = now.step <= now.reach
-            if self.overstep > 1:
-                knows_side = may_pass | (gaps.smaller > total_error)
-                accepted |= knows_side & any_covers(look.back, gaps.less(total_error), unproved)
-            too_coarse, finer, coarser = self.backend.Bool(False), now.detail, now.detail
-            if has_detail:
-                deciding = self._deciding_gap(sample.value, ahead, at_end)
-                detail = fmax(now.detail, field.coarsest_detail)
-                finer, too_coarse = _finer(detail, deciding, total_error, sample.truncation, within)
-                coarser = _coarser(detail, gaps.smaller, sample.truncation, field.coarsest_detail)
-            accepted &= ~too_coarse & dr.isfinite(total_error)  # what is not known is not free
-            next_detail = now.detail
-            if has_detail:
-                kept = dr.select(accepted, coarser, now.detail)
-                next_detail = dr.select(too_coarse, finer, kept)
-
-            # Is it a hit, or a sheet?
-            hit, gaps_ahead, sheet = accepted & is_near, gaps, None
-            if ahead is not None:
-                sheet = compare_with_sheet(
-                    ahead, accepted & at_end, sample.value, total_error, self.levels
-                )
-                gaps_ahead = sheet.gaps
-
-            # Or a crossing?
-            aims, contact, value = gaps_ahead, now.contact, sample.value
-            if self.hysteresis is not None and now.contact is not None:
-                before = now.base, now.value, dr.dot(now.gradient, path.direction), now.gradient
-                last = t == end if sheet is None else (t == end) & ~sheet.has_crossing
-                there = Accepted(
-                    t, value, sample.gradient, look.slope, before, total_error, is_near, band, last
-                )
-                contact, hit = self.hysteresis.update(now.contact, accepted, there)
-                if ahead is not None and sheet is not None:
-                    # What was crossed before the sheet comes first: the sheet is looked at again.
-                    passed = sheet.at_crossing & ~hit
-                    contact, jumps = self.hysteresis.jump(
-                        contact, passed, there, ahead, path.direction
-                    )
-                    sheet = replace(sheet, at_crossing=passed, is_hit=jumps)
-                    value = value + dr.select(passed, ahead.jump, 0)
-                after = contact, value, self.levels.gaps(value), band
-                gaps_ahead, aims = self.hysteresis.gaps(*after), self.hysteresis.gaps(*after, AIM)
-
-            # How far to go from there.
-            spent = _WIDENING * gaps.smaller
-            if self.cover is not None:
-                gaps_ahead = gaps_ahead.less(spent)
-            forward = longest_step(look.ahead, gaps_ahead.less(total_error))
-            if self.cover is not None:
-                widening = fmax(self.cover * gradient_norm, float(dr.smallest(real)))
-                away = dr.select(gaps.down <= gaps.up, look.slope, -look.slope)
-                for_ever = (forward == dr.inf) & (away >= widening)
-                forward = dr.select(for_ever, forward, fmin(forward, spent / widening))
-            forward = dr.select(gaps_ahead.smaller > total_error, forward, 0)
-            proved = forward
-            trial = self._trial(forward, look, aims, now, path, is_smooth)
-            if self.occupied is not None:  # what follows is proved to be free, too
-                free_to = dr.select(accepted, t + forward, self.last)
-                free_to = self.occupied.free_until(path.origin, path.direction, free_to, self.last)
-                forward = fmax(forward, dr.select(free_to >= self.last, dr.inf, free_to - t))
-                trial = fmax(trial, forward)
-            base = dr.select(accepted, t, now.base)
-            step = dr.select(accepted, trial, dr.select(too_coarse, now.step, now.reach))
-            reach = dr.select(accepted, forward, now.reach)
-            # After a step of zero enclosures are asked for a third of the length: bisection.
-            shorter = dr.select(dr.isfinite(candidate), candidate / 3, 1 + 16 * (size + t))
-            tried = dr.select(proved > 0, look.growth * proved, shorter)
-            if now.contact is not None and contact is not None:  # off the surface, all lies ahead
-                leaves = now.contact.is_touching & ~contact.is_touching
-                tried = dr.select(leaves | hit, end - t, tried)
-            free = base + reach >= end
-            if self.hysteresis is not None and contact is not None:  # a contact may end at the end
-                undecided = contact.is_touching & self.hysteresis.is_free_after
-                free &= ~(accepted & undecided & (t < end))
-            if sheet is not None:
-                free = dr.select(sheet.has_crossing, sheet.at_crossing, free)
-            evaluations = now.evaluations + 1
-            status = self._status(hit, free)
-            gradient = dr.select(accepted, sample.gradient, now.gradient)
-            if sheet is not None:
-                status, gradient = sheet.mark(status, gradient)
-            return MarchState(
-                base=base,
-                step=fmin(step, end - base),
-                reach=reach,
-                candidate=dr.select(accepted, tried, now.candidate),
-                value=dr.select(accepted, value, now.value),
-                gradient=gradient,
-                excess=dr.select(accepted, excess, now.excess),
-                evaluations=evaluations,
-                detail=next_detail,
-                status=status,
-                active=now.active & ~(hit | free | (evaluations >= self.max_steps)),
-                contact=contact,
-            )
+            return self.next_trial(field, path, end, now, ahead)
 
         return while_active(state, body, "harnack")
+
+    def next_trial(
+        self,
+        field: Field,
+        path: Path,
+        end: Real,
+        now: MarchState,
+        ahead: Crossing | None = None,
+    ) -> MarchState:
+        """One look more at rays on their way, from `base`: see `advance`."""
+        real, size = self.backend.Float, largest_component(path.origin)
+        is_smooth = ahead is None and not field.has_detail
+        t = now.base + now.step
+        if ahead is not None:  # the crossing exactly
+            t = dr.select(now.step >= end - now.base, end, t)
+        if now.contact is not None:
+            t = dr.select(now.step >= end - now.base, end, t)
+        at_end = None if ahead is None else t == end
+
+        # Look there.
+        has_detail = field.has_detail and now.detail is not None
+        seen = field.at_detail(now.detail) if has_detail else field
+        unproved = now.step - now.reach
+        candidate = fmin(now.candidate, end - t)
+        look = seen.look(path, t, candidate, fmax(unproved, real(0)))
+        sample, gradient_norm = look.sample, length(look.sample.gradient)
+        gaps = self.levels.gaps(sample.value)
+        if self.cover is not None:
+            gaps = gaps.less(self.cover * t * gradient_norm)
+        total_error = value_error(sample, gradient_norm, size + t)
+
+        # Is all up to there proved free, and is the sample fine enough to say so?
+        steepness = fmax(gradient_norm - sample.gradient_error, real(0))
+        if look.slope_error is not None:  # the gradient is at least as long as its shadow
+            steepness = fmax(dr.abs(look.slope) - look.slope_error, steepness)
+        within = self.tolerance.in_value(steepness, t)
+        knows_gradient = (sample.gradient_error <= gradient_norm) | (steepness > 0)
+        if self.hysteresis is not None:
+            within = self.hysteresis.within(within)
+        # Where not even the gradient is known, rounding makes no hits.
+        rounding = dr.select(knows_gradient, total_error - sample.truncation, 0)
+        is_near = self._is_near(
+            gaps.smaller, within, total_error, rounding, sample, gradient_norm, size + t
+        )
+        excess = fmax(gaps.smaller + total_error - within, real(0))
+        band, may_pass = within, is_near
+        if self.hysteresis is not None and now.contact is not None:
+            # In contact all that rounding does to f counts, or a ray would stick in a crease.
+            band = self.hysteresis.band(within, total_error - sample.truncation)
+            gaps = self.hysteresis.gaps(now.contact, sample.value, gaps, band)
+            within = CLOSER * within
+            may_pass &= ~now.contact.is_touching
+            if self.levels.period is not None:  # the value alone tells its side of a level
+                may_pass = self.backend.Bool(False)
+        accepted = now.step <= now.reach
+        if self.overstep > 1:
+            knows_side = may_pass | (gaps.smaller > total_error)
+            accepted |= knows_side & any_covers(look.back, gaps.less(total_error), unproved)
+        too_coarse, finer, coarser = self.backend.Bool(False), now.detail, now.detail
+        if has_detail:
+            deciding = self._deciding_gap(sample.value, ahead, at_end)
+            detail = fmax(now.detail, field.coarsest_detail)
+            finer, too_coarse = _finer(detail, deciding, total_error, sample.truncation, within)
+            coarser = _coarser(detail, gaps.smaller, sample.truncation, field.coarsest_detail)
+        accepted &= ~too_coarse & dr.isfinite(total_error)  # what is not known is not free
+        next_detail = now.detail
+        if has_detail:
+            kept = dr.select(accepted, coarser, now.detail)
+            next_detail = dr.select(too_coarse, finer, kept)
+
+        # Is it a hit, or a sheet?
+        hit, gaps_ahead, sheet = accepted & is_near, gaps, None
+        if ahead is not None:
+            sheet = compare_with_sheet(
+                ahead, accepted & at_end, sample.value, total_error, self.levels
+            )
+            gaps_ahead = sheet.gaps
+
+        # Or a crossing?
+        aims, contact, value = gaps_ahead, now.contact, sample.value
+        if self.hysteresis is not None and now.contact is not None:
+            before = now.base, now.value, dr.dot(now.gradient, path.direction), now.gradient
+            last = t == end if sheet is None else (t == end) & ~sheet.has_crossing
+            there = Accepted(
+                t, value, sample.gradient, look.slope, before, total_error, is_near, band, last
+            )
+            contact, hit = self.hysteresis.update(now.contact, accepted, there)
+            if ahead is not None and sheet is not None:
+                # What was crossed before the sheet comes first: the sheet is looked at again.
+                passed = sheet.at_crossing & ~hit
+                contact, jumps = self.hysteresis.jump(contact, passed, there, ahead, path.direction)
+                sheet = replace(sheet, at_crossing=passed, is_hit=jumps)
+                value = value + dr.select(passed, ahead.jump, 0)
+            after = contact, value, self.levels.gaps(value), band
+            gaps_ahead, aims = self.hysteresis.gaps(*after), self.hysteresis.gaps(*after, AIM)
+
+        # How far to go from there.
+        spent = _WIDENING * gaps.smaller
+        if self.cover is not None:
+            gaps_ahead = gaps_ahead.less(spent)
+        forward = longest_step(look.ahead, gaps_ahead.less(total_error))
+        if self.cover is not None:
+            widening = fmax(self.cover * gradient_norm, float(dr.smallest(real)))
+            away = dr.select(gaps.down <= gaps.up, look.slope, -look.slope)
+            for_ever = (forward == dr.inf) & (away >= widening)
+            forward = dr.select(for_ever, forward, fmin(forward, spent / widening))
+        forward = dr.select(gaps_ahead.smaller > total_error, forward, 0)
+        proved = forward
+        trial = self._trial(forward, look, aims, now, path, is_smooth)
+        if self.occupied is not None:  # what follows is proved to be free, too
+            free_to = dr.select(accepted, t + forward, self.last)
+            free_to = self.occupied.free_until(path.origin, path.direction, free_to, self.last)
+            forward = fmax(forward, dr.select(free_to >= self.last, dr.inf, free_to - t))
+            trial = fmax(trial, forward)
+        base = dr.select(accepted, t, now.base)
+        step = dr.select(accepted, trial, dr.select(too_coarse, now.step, now.reach))
+        reach = dr.select(accepted, forward, now.reach)
+        # After a step of zero enclosures are asked for a third of the length: bisection.
+        shorter = dr.select(dr.isfinite(candidate), candidate / 3, 1 + 16 * (size + t))
+        tried = dr.select(proved > 0, look.growth * proved, shorter)
+        if now.contact is not None and contact is not None:  # off the surface, all lies ahead
+            leaves = now.contact.is_touching & ~contact.is_touching
+            tried = dr.select(leaves | hit, end - t, tried)
+        free = base + reach >= end
+        if self.hysteresis is not None and contact is not None:  # a contact may end at the end
+            undecided = contact.is_touching & self.hysteresis.is_free_after
+            free &= ~(accepted & undecided & (t < end))
+        if sheet is not None:
+            free = dr.select(sheet.has_crossing, sheet.at_crossing, free)
+        evaluations = now.evaluations + 1
+        status = self._status(hit, free)
+        gradient = dr.select(accepted, sample.gradient, now.gradient)
+        if sheet is not None:
+            status, gradient = sheet.mark(status, gradient)
+        return MarchState(
+            base=base,
+            step=fmin(step, end - base),
+            reach=reach,
+            candidate=dr.select(accepted, tried, now.candidate),
+            value=dr.select(accepted, value, now.value),
+            gradient=gradient,
+            excess=dr.select(accepted, excess, now.excess),
+            evaluations=evaluations,
+            detail=next_detail,
+            status=status,
+            active=now.active & ~(hit | free | (evaluations >= self.max_steps)),
+            contact=contact,
+        )
 
     def _is_near(
         self,

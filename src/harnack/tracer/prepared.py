@@ -14,9 +14,10 @@ from harnack.fields.parts import NO_PART
 from harnack.fields.sheets import NO_SHEET
 from harnack.tracer.contact import Hysteresis
 from harnack.tracer.march import March, MarchState
-from harnack.tracer.parts import PartTracer
-from harnack.tracer.stretches import SheetTracer
 from harnack.tracer.tolerance import PreparedTolerance, Status
+from harnack.tracer.walks.parts import PartTracer
+from harnack.tracer.walks.queue import PlainTracer, RayTracer, trace_queued
+from harnack.tracer.walks.stretches import SheetTracer
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -74,6 +75,8 @@ class PreparedLevelSet:
     volume: what holds the surface. region: where the field may be looked at, only for rays that
         look for crossings; it is all of space, or larger than `volume`. Both None for all of space.
     occupied: cells outside of which there is no level; None where none are known.
+    queued: whether rays are traced at once, by few lanes that share a queue, so that its methods
+        can not be called while a kernel is being recorded.
     """
 
     backend: Backend
@@ -87,6 +90,7 @@ class PreparedLevelSet:
     confirm: bool = False
     region: Volume | None = None
     occupied: UniformGrid | None = None
+    queued: bool = False
 
     def sample(self, p: Vec3) -> Sample:
         """The field at p."""
@@ -139,7 +143,8 @@ class PreparedLevelSet:
         """
         backend, real = self.backend, self.backend.Float
         path = Path(backend.Array3f(o), backend.Array3f(d), self.proofs)
-        start, end = self.clip(path.origin, path.direction, real(t_min), real(t_max))
+        t_min, t_max = real(t_min), dr.select(active, real(t_max), real(t_min))
+        start, end = self.clip(path.origin, path.direction, t_min, t_max)
         has_detail = self.field.has_detail or self.field.has_sheets
         hysteresis = None
         if crosses:
@@ -211,8 +216,15 @@ class PreparedLevelSet:
         march, path, start, end, state = self.ready(
             o, d, t_min, t_max, active, crosses=self.confirm
         )
-        if self.field.has_sheets:
-            return SheetTracer(march, self.field, path, start, end).run(state)
-        if self.field.has_parts:
-            return PartTracer(march, self.field, path, start, end, any_hit).run(state)
-        return march.advance(self.field, path, end, state), self.backend.UInt32(NO_SHEET)
+
+        def tracer(path: Path, start: Real, end: Real) -> RayTracer:
+            here = replace(march, last=end)
+            if self.field.has_sheets:
+                return SheetTracer(here, self.field, path, start, end)
+            if self.field.has_parts:
+                return PartTracer(here, self.field, path, start, end, any_hit)
+            return PlainTracer(here, self.field, path, end)
+
+        if self.queued and march.hysteresis is None:
+            return trace_queued(tracer, path, start, end, state)
+        return tracer(path, start, end).run(state)

@@ -21,6 +21,9 @@ MAX_PLANES = 2048
 FLATNESS = 1e-6
 """Points thinner than this part of their size get the hull of a flat or straight set."""
 
+_SPREAD = 24
+"""Planes that rays are clipped to first."""
+
 THIN_PADDING = 1e-6
 """Half-thickness, as a part of the size, given to the hull of a flat or straight set."""
 
@@ -58,6 +61,7 @@ class ConvexHull(Polytope):
             raise ValueError("a convex hull needs at least two different points")
         centred = (x - 0.5 * (lower + upper)) / size
         normals, is_thin = _hull_normals(centred)
+        normals = _spread_first(normals)
         padding = (THIN_PADDING if is_thin else 1e-12) * size
         padding += 4.0 * sys.float_info.epsilon * float(np.abs(x).max())
         offsets = _support(x, normals) + padding
@@ -118,6 +122,17 @@ def _facet_normals(x: FloatArray) -> FloatArray | None:
     except scipy.spatial.QhullError:
         return None
     return equations[:, :-1]
+
+
+def _spread_first(normals: FloatArray) -> FloatArray:
+    """The same normals, the first of which lie far from each other: what misses the hull misses
+    a few of those planes."""
+    order, left = [0], np.full(len(normals), np.inf)
+    for _ in range(min(len(normals), _SPREAD) - 1):
+        left = np.minimum(left, 1.0 - normals @ normals[order[-1]])
+        order.append(int(np.argmax(left)))
+    rest = np.setdiff1d(np.arange(len(normals)), order)
+    return normals[np.concatenate([order, rest]).astype(np.intp)]
 
 
 def _without_duplicates(normals: FloatArray) -> FloatArray:

@@ -70,8 +70,16 @@ class Planes:
         reach = dr.opaque(backend.Float, _reach(rows))
         return cls(backend, filled, aligned(backend, filled.ravel()), length, reach)
 
-    def fold(self, state: State, step: Callable[[State, Vec3, Real], State]) -> State:
-        """state = step(state, n, h) for every plane."""
+    def fold(
+        self,
+        state: State,
+        step: Callable[[State, Vec3, Real], State],
+        goes_on: Callable[..., Mask] | None = None,
+    ) -> State:
+        """state = step(state, n, h) for every plane.
+
+        goes_on: whether the planes that are left can still change what is made of a state.
+        """
         index = self.backend.UInt32
         if self.buffer is None or len(self.rows) <= MAX_UNROLLED:
             for k in range(len(self.rows)):
@@ -86,10 +94,13 @@ class Planes:
                 after = step(after, self.backend.Array3f(row.x, row.y, row.z), row.w)
             return (k + _CHUNK, *after)
 
+        def wanted(*inner: Any) -> Mask:
+            return self.backend.Bool(True) if goes_on is None else goes_on(*inner)
+
         loop: Any = dr.while_loop  # its overloads do not know run-time array types
         result: Any = loop(
             state=(index(0), *state),
-            cond=lambda k, *_: k < self.length,  # pyright: ignore
+            cond=lambda k, *inner: (k < self.length) & wanted(*inner),  # pyright: ignore
             body=body,
             label="planes",
         )
@@ -166,7 +177,11 @@ class Polytope(Volume):
             return t0, t1
 
         lanes = dr.zeros(backend.Float, dr.width(o, d, t_min, t_max))
-        return emptied(*table.fold((lanes + t_min, lanes + t_max), step))
+
+        def holds(t0: Real, t1: Real) -> Mask:  # what is empty stays empty
+            return t0 < t1
+
+        return emptied(*table.fold((lanes + t_min, lanes + t_max), step, holds))
 
     def contains(self, p: Vec3) -> Mask:
         backend = backend_of(p)

@@ -5,15 +5,20 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
-from harnack.backend import Mask, Real  # needed at run time: Dr.Jit reads annotations of _Path
+from harnack.backend.lanes import gathered, rows_of, wide
+from harnack.backend.loops import leaves_of
 from harnack.rendering.mitsuba.clear import transmittance
 from harnack.rendering.mitsuba.interaction import connecting_ray, leaving_ray
+from harnack.rendering.mitsuba.sobol import SobolSampler
 from harnack.rendering.mitsuba.variant import load_mitsuba
 from harnack.rendering.mitsuba.world import World
+
+if TYPE_CHECKING:
+    from harnack.backend import Mask, Real
 
 PLUGIN = "harnack_path"
 INTEGRATOR = "HarnackPath"
@@ -23,30 +28,73 @@ LOST_COLOUR = (1.0, 0.0, 1.0)
 _UNLIMITED = 2**32 - 1
 
 
-@dataclass
-class _Path:
-    """What a path remembers from one vertex to the next.
+@dataclass(frozen=True)
+class _Vertex:
+    """What is remembered of a path's last vertex: where it lies, how the surface faces there, and
+    whose it is. Not valid before the first."""
 
-    previous, pdf, delta: the last vertex and how it sampled the ray, for the weights of lights
-        that the ray finds.
+    position: Any
+    normal: Any
+    shape: Any
+    is_valid: Mask
+
+    @classmethod
+    def none(cls, mi: Any) -> _Vertex:
+        """No vertex: the path comes from the camera."""
+        zero = dr.zeros(mi.SurfaceInteraction3f)
+        return cls(zero.p, zero.n, zero.shape, mi.Bool(False))
+
+    @classmethod
+    def of(cls, si: Any) -> _Vertex:
+        """Of an interaction."""
+        return cls(si.p, si.n, si.shape, si.is_valid())
+
+    def interaction(self, mi: Any) -> Any:
+        """As an interaction, of which nothing else is known."""
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        si.p, si.n, si.shape = self.position, self.normal, self.shape
+        si.t = dr.select(self.is_valid, mi.Float(0), dr.inf)
+        return si
+
+
+@dataclass(frozen=True)
+class _Paths:
+    """Paths on their way, and what each remembers.
+
+    number: of the path among all. previous, pdf, delta: the last vertex and how it sampled the ray,
+        for the weights of lights that the ray finds.
     eta: product of relative refractive indices; keeps Russian roulette from ending paths in glass.
     spread, spread_before: whether a rough surface has scattered the path up to the last vertex,
         and up to the one before that.
     """
 
+    number: Any
     ray: Any
-    radiance: Any
     throughput: Any
     eta: Real
-    depth: Any
-    previous: Any
+    previous: _Vertex
     pdf: Real
     delta: Mask
     spread: Mask
     spread_before: Mask
-    lost: Mask
-    valid: Mask
+
+
+@dataclass(frozen=True)
+class _Connection:
+    """Light that a vertex scatters along the path, if nothing lies on the ray to its emitter."""
+
+    ray: Any
+    light: Any
     active: Mask
+
+
+@dataclass
+class Radiance:
+    """What paths have found: radiance, whether they met a surface, whether a ray got lost."""
+
+    light: Any
+    valid: Mask
+    lost: Mask
 
 
 class PathTracer:
@@ -89,88 +137,108 @@ class PathTracer:
         """The same with another longest path."""
         return PathTracer(self.mi, max_depth, self.rr_depth, self.hide_emitters, self.clamp)
 
-    def trace(self, scene: Any, sampler: Any, ray: Any, active: Mask) -> tuple[Any, Mask, Mask]:
-        """Radiance along rays, whether they met a surface, whether a ray of the path got lost."""
-        mi, world = self.mi, World.of(self.mi, scene)
-        start = _Path(
+    def trace(self, scene: Any, sampler: SobolSampler, ray: Any, active: Mask) -> Radiance:
+        """What paths find that begin with camera rays, one for each of the sampler's lanes.
+
+        Paths go on vertex by vertex, all together, and those that have ended are left out: what
+        each part of a vertex needs is evaluated for the paths that need it (`backend.lanes`).
+        """
+        mi, world = self.mi, World.of(self.mi, scene, queued=True)
+        width = dr.width(sampler.index)
+        found = Radiance(
+            dr.zeros(mi.Spectrum, width), dr.zeros(mi.Bool, width), dr.zeros(mi.Bool, width)
+        )
+        paths = _Paths(
+            number=dr.arange(mi.UInt32, width),
             ray=mi.Ray3f(dr.detach(ray)),
-            radiance=mi.Spectrum(0),
             throughput=mi.Spectrum(1),
             eta=mi.Float(1),
-            depth=mi.UInt32(0),
-            previous=dr.zeros(mi.SurfaceInteraction3f),
+            previous=_Vertex.none(mi),
             pdf=mi.Float(1),
             delta=mi.Bool(True),
             spread=mi.Bool(False),
             spread_before=mi.Bool(False),
-            lost=mi.Bool(False),
-            valid=mi.Bool(False),
-            active=mi.Bool(active),
         )
+        paths = wide(paths, width, mi.UInt32)
+        dr.make_opaque(found.light, found.valid, found.lost)
+        going_on, depth = mi.Bool(active) & dr.full(mi.Bool, True, width), 0
+        while True:
+            rows, count = rows_of(going_on)
+            if not count:
+                return found
+            paths = gathered(paths, rows)
+            active = dr.arange(mi.UInt32, len(rows)) < dr.opaque(mi.UInt32, count)
+            # No number is a literal, so that all vertices run the same kernels.
+            dr.make_opaque(active, *leaves_of(paths))
+            paths, going_on = self._vertex(world, paths, active, sampler, depth, found)
+            depth += 1
 
-        def body(path: _Path, sampler: Any) -> tuple[_Path, Any]:
-            return self._vertex(world, path, sampler), sampler
-
-        def running(path: _Path, sampler: Any) -> Mask:
-            del sampler
-            return path.active
-
-        path, _ = dr.while_loop((start, sampler), running, body, label="harnack path")
-        return path.radiance, path.valid, path.lost
-
-    def _vertex(self, world: World, path: _Path, sampler: Any) -> _Path:
-        """Finds the next vertex of paths, collects its light and samples where to go on."""
-        mi = self.mi
-        si, met = world.intersect(path.ray, path.previous, path.active)
-        clearance, lost = met.clearance, met.lost
-        left = transmittance(mi, world.carriers, path.previous, si, path.ray.d)
-        path = replace(path, throughput=path.throughput * left)
-        radiance = path.radiance + self._emitted(world.scene, path, si, path.active & ~lost)
-        shown = path.throughput * mi.Spectrum(self.lost_colour.eval(si, lost))
-        radiance += dr.select(path.active & lost, shown, 0)
-        active = path.active & si.is_valid() & (path.depth + 1 < self._deepest)
+    def _vertex(
+        self, world: World, paths: _Paths, exist: Mask, sampler: SobolSampler, depth: int,
+        found: Radiance,
+    ) -> tuple[_Paths, Mask]:  # fmt: skip
+        """Finds the next vertex of paths, collects its light, and samples where to go on. Returns
+        the paths behind it, and which of them go on."""
+        mi, here = self.mi, dr.opaque(self.mi.UInt32, depth)
+        before = paths.previous.interaction(mi)
+        si, met = world.intersect(paths.ray, before, exist)
+        numbers = sampler.at_vertex(here, paths.number)
+        left = transmittance(mi, world.carriers, before, si, paths.ray.d)
+        paths = replace(paths, throughput=paths.throughput * left)
+        shows = exist & ~met.lost & self._shows_emitters(here)
+        light = self._emitted(world.scene, paths, si, shows)
+        shown = paths.throughput * mi.Spectrum(self.lost_colour.eval(si, met.lost))
+        light += dr.select(met.lost, shown, 0)
+        active = si.is_valid() & (here + 1 < self._deepest)
         bsdf = si.bsdf()
-        radiance += self._lit(world, path, si, clearance, bsdf, sampler, active)
+        connection = self._connection(world, paths, si, met.clearance, numbers, active)
 
         sample, weight = bsdf.sample(
-            mi.BSDFContext(), si, sampler.next_1d(active), sampler.next_2d(active), active
+            mi.BSDFContext(), si, numbers.next_1d(), numbers.next_2d(), active
         )
         delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
-        throughput = path.throughput * weight
-        eta = path.eta * sample.eta
+        throughput = paths.throughput * weight
+        eta = paths.eta * sample.eta
         brightest = dr.max(throughput)
         active &= brightest > 0
         # Russian roulette, without the factor eta^-2 that radiance takes on in glass.
         keep = dr.minimum(brightest * eta * eta, 0.95)
-        gamble = path.depth + 1 >= self._first_gamble
-        active &= ~gamble | (sampler.next_1d(active) < keep)
-        throughput = dr.select(gamble, throughput / keep, throughput)
-        return _Path(
-            ray=leaving_ray(mi, si, clearance, si.to_world(sample.wo)),
-            radiance=radiance,
-            throughput=throughput,
+        gamble = here + 1 >= self._first_gamble
+        active &= ~gamble | (numbers.next_1d() < keep)
+        behind = _Paths(
+            number=paths.number,
+            ray=leaving_ray(mi, si, met.clearance, si.to_world(sample.wo)),
+            throughput=dr.select(gamble, throughput / keep, throughput),
             eta=eta,
-            depth=path.depth + 1,
-            previous=si,
+            previous=_Vertex.of(si),
             pdf=sample.pdf,
             delta=delta,
-            spread=path.spread | ~delta,
-            spread_before=path.spread,
-            lost=path.lost | (path.active & lost),
-            valid=path.valid | ((path.depth == 0) & (si.is_valid() | lost)),
-            active=active,
+            spread=paths.spread | ~delta,
+            spread_before=paths.spread,
         )
+        first = (here == 0) & (si.is_valid() | met.lost)
+        dr.scatter(found.valid, mi.Bool(True), paths.number, first)
+        dr.scatter(found.lost, mi.Bool(True), paths.number, met.lost)
+        # One kernel: what vertices are like is not computed again.
+        dr.eval(active, light, found.valid, found.lost, *leaves_of(behind), *leaves_of(connection))
+        blocked = world.occluded(connection.ray, connection.active)
+        light += dr.select(connection.active & ~blocked, connection.light, 0)
+        # Each path has a place of its own, so that the order of sums is fixed.
+        dr.scatter_add(found.light, light, paths.number, exist, mode=dr.ReduceMode.NoConflicts)
+        dr.eval(found.light)
+        return behind, active
 
-    def _emitted(self, scene: Any, path: _Path, si: Any, active: Mask) -> Any:
+    def _shows_emitters(self, depth: Any) -> Mask:
+        return (depth > 0) if self.hide_emitters else self.mi.Bool(True)
+
+    def _emitted(self, scene: Any, paths: _Paths, si: Any, active: Mask) -> Any:
         """Light that a vertex, or the environment behind no vertex, sends along the ray."""
-        mi = self.mi
-        if self.hide_emitters:
-            active = active & (path.depth > 0)
-        found = mi.DirectionSample3f(scene, si, path.previous)
-        other = scene.pdf_emitter_direction(path.previous, found, active & ~path.delta)
-        weight = _power_heuristic(path.pdf, other)
-        light = path.throughput * weight * found.emitter.eval(si, active)
-        return dr.select(active, self._limited(light, path.spread_before), 0)
+        mi, before = self.mi, paths.previous.interaction(self.mi)
+        found = mi.DirectionSample3f(scene, si, before)
+        other = scene.pdf_emitter_direction(before, found, active & ~paths.delta)
+        weight = _power_heuristic(paths.pdf, other)
+        light = paths.throughput * weight * found.emitter.eval(si, active)
+        return dr.select(active, self._limited(light, paths.spread_before), 0)
 
     def _limited(self, light: Any, indirect: Mask) -> Any:
         """Light, dimmed to at most `clamp` in every channel where it is indirect."""
@@ -179,29 +247,20 @@ class PathTracer:
         excess = dr.max(light) / self._brightest
         return dr.select(indirect & (excess > 1), light / excess, light)
 
-    def _lit(
-        self,
-        world: World,
-        path: _Path,
-        si: Any,
-        clearance: Real,
-        bsdf: Any,
-        sampler: Any,
+    def _connection(
+        self, world: World, paths: _Paths, si: Any, clearance: Real, numbers: SobolSampler,
         active: Mask,
-    ) -> Any:
-        """Light that a vertex scatters along the ray from a sampled point of an emitter."""
-        mi = self.mi
+    ) -> _Connection:  # fmt: skip
+        """To a sampled point of an emitter, with the light scattered if nothing is between."""
+        mi, bsdf = self.mi, si.bsdf()
         active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        light, weight = world.scene.sample_emitter_direction(
-            si, sampler.next_2d(active), False, active
-        )
+        light, weight = world.scene.sample_emitter_direction(si, numbers.next_2d(), False, active)
         active &= light.pdf > 0
         scattered, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(light.d), active)
         active &= dr.max(scattered) > 0
-        active &= ~world.occluded(connecting_ray(mi, si, clearance, light.p), active)
         share = dr.select(light.delta, 1, _power_heuristic(light.pdf, pdf))
-        found = path.throughput * scattered * weight * share
-        return dr.select(active, self._limited(found, path.spread), 0)
+        found = self._limited(paths.throughput * scattered * weight * share, paths.spread)
+        return _Connection(connecting_ray(mi, si, clearance, light.p), found, active)
 
 
 def _power_heuristic(a: Real, b: Real) -> Real:
@@ -209,6 +268,15 @@ def _power_heuristic(a: Real, b: Real) -> Real:
     a, b = a * a, b * b
     weight = a / (a + b)
     return dr.select(dr.isfinite(weight), weight, 0)
+
+
+def _own_sampler(mi: Any, sampler: Any) -> SobolSampler:
+    """One seeded by a sampler of Mitsuba's, whose lanes are the samples of pixel after pixel."""
+    width, spp = sampler.wavefront_size(), max(int(sampler.sample_count()), 1)
+    lane = dr.arange(mi.UInt32, width)
+    seed = mi.UInt32(dr.gather(mi.Float, sampler.next_1d(), mi.UInt32(0)) * 2.0**24)
+    samples = dr.opaque(mi.UInt32, spp)
+    return SobolSampler(mi, lane // samples, lane % samples, seed, dr.opaque(mi.UInt32, 0))
 
 
 @functools.cache
@@ -236,9 +304,9 @@ def integrator_class(variant: str) -> Any:
             self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Mask = True
         ) -> tuple[Any, Mask, list[Any]]:
             del medium
-            radiance, valid, lost = self.tracer.trace(scene, sampler, ray, active)
-            dr.scatter_add(self.lost, mi.UInt32(1), mi.UInt32(0), lost)
-            return radiance, valid, []
+            found = self.tracer.trace(scene, _own_sampler(mi, sampler), ray, active)
+            self.lost = self.lost + dr.count(found.lost)
+            return found.light, found.valid, []
 
         def take_lost(self) -> int:
             """How many paths ran out of steps since the last call."""

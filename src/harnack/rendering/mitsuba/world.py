@@ -12,6 +12,7 @@ from harnack.rendering.mitsuba.carrier import is_carrier
 from harnack.rendering.mitsuba.interaction import surface_interaction
 from harnack.rendering.mitsuba.variant import mitsuba_backend
 from harnack.rendering.surfaces.encounter import SurfaceHit
+from harnack.rendering.surfaces.placement import PlacedSurface
 
 
 @dataclass(frozen=True)
@@ -22,10 +23,19 @@ class World:
     scene: Any
     carriers: tuple[Any, ...]
 
+    queued: bool = False
+
     @classmethod
-    def of(cls, mi: Any, scene: Any) -> World:
-        """Finds the carriers in a scene."""
-        return cls(mi, scene, tuple(s for s in scene.shapes() if is_carrier(s)))
+    def of(cls, mi: Any, scene: Any, *, queued: bool = False) -> World:
+        """Finds the carriers in a scene.
+
+        queued: whether rays are traced at once, which is faster where they differ in length, and
+            cannot be done while a kernel is being recorded.
+        """
+        return cls(mi, scene, tuple(s for s in scene.shapes() if is_carrier(s)), queued)
+
+    def _placed(self, carrier: Any) -> PlacedSurface:
+        return carrier.placed.queued() if self.queued else carrier.placed
 
     def intersect(self, ray: Any, start: Any, active: Mask) -> tuple[Any, SurfaceHit]:
         """The first thing that rays meet, as interaction and as encounter.
@@ -36,20 +46,27 @@ class World:
         there) the interaction is not valid.
         """
         mi = self.mi
-        si = self.scene.ray_intersect(ray, mi.RayFlags.All, False, active)
-        first = self._of_scene(si, active)
-        limit = dr.minimum(si.t, ray.maxt)
+        preliminary = self.scene.ray_intersect_preliminary(ray, active=active)
+        limit = dr.minimum(preliminary.t, ray.maxt)
+        if self.queued:
+            dr.eval(preliminary, limit)
+        ours, whose = self.nothing(dr.zeros(mi.SurfaceInteraction3f)), dr.zeros(mi.ShapePtr)
         for carrier in self.carriers:
             shape = mi.ShapePtr(carrier)
             side = dr.sign(dr.dot(start.n, ray.d))
             leaves = dr.select(start.is_valid() & (start.shape == shape), side, 0)
-            met = carrier.placed.meet(ray.o, ray.d, limit, active, leaves)
-            evaluations = first.evaluations + met.evaluations
+            met = self._placed(carrier).meet(ray.o, ray.d, limit, active, leaves)
+            evaluations = ours.evaluations + met.evaluations
             event = met.met | met.lost
-            si = dr.select(event, surface_interaction(mi, met, ray, shape), si)
-            first = replace(dr.select(event, met, first), evaluations=evaluations)
+            ours = replace(dr.select(event, met, ours), evaluations=evaluations)
+            whose = dr.select(event, shape, whose)
             limit = dr.select(event, met.t, limit)
-        return si, first
+        event: Mask = ours.met | ours.lost
+        others = active & ~event
+        si = preliminary.compute_surface_interaction(ray, mi.RayFlags.All, others)
+        first = replace(self._of_scene(si, active), evaluations=ours.evaluations)
+        si = dr.select(event, surface_interaction(mi, ours, ray, whose), si)
+        return si, dr.select(event, ours, first)
 
     def nothing(self, si: Any) -> SurfaceHit:
         """What rays have met before they are traced, given as many interactions that are none."""
@@ -73,5 +90,5 @@ class World:
         """Whether anything lies on the rays. What is not proved free counts as lying there."""
         blocked = self.scene.ray_test(ray, active)
         for carrier in self.carriers:
-            blocked |= carrier.placed.occludes(ray.o, ray.d, ray.maxt, active & ~blocked)
+            blocked |= self._placed(carrier).occludes(ray.o, ray.d, ray.maxt, active & ~blocked)
         return blocked

@@ -16,10 +16,11 @@ import numpy.typing as npt
 
 from harnack.backend import to_numpy
 from harnack.rendering.mitsuba.integrator import PathTracer
-from harnack.rendering.pictures.pixels import bands, film_places, stratified
+from harnack.rendering.mitsuba.sobol import SobolSampler
+from harnack.rendering.pictures.pixels import bands, film_places
 
 # Paths of one band: about a second or two on a CPU, and Ctrl-C works between bands.
-_PATHS_A_BAND = 2**18
+_PATHS_A_BAND = 2**20
 # The pixel's filter: samples are drawn from a Gaussian of this standard deviation, in pixels,
 # cut at two pixels from its middle (Ernst et al. 2006, filter importance sampling).
 _FILTER_DEVIATION = 0.45
@@ -36,37 +37,36 @@ def expose(
     seed: int,
     advance: Callable[[float], None],
 ) -> tuple[npt.NDArray[np.float32], int]:
-    """Linear sRGB radiance (h, w, 3), and how many paths ran out of steps.
+    """Linear sRGB radiance and, last, the part that something covers (h, w, 4); and how many
+    paths ran out of steps.
 
-    spp: samples a pixel, at least; some samplers only know squares and the like.
+    spp: samples a pixel.
     advance: told what part of the picture has been finished since the last call.
     """
     width, height = (int(n) for n in sensor.film().crop_size())
-    sampler = sensor.sampler().clone()
-    # Multi-jittering rounds up to a whole grid by itself, but warns of it.
-    sampler.set_sample_count(stratified(spp) if "Multijitter" in str(sampler) else spp)
-    spp = int(sampler.sample_count())
-    sampler.set_samples_per_wavefront(spp)
-    image = np.empty((width * height, 3), dtype=np.float32)
+    image = np.empty((width * height, 4), dtype=np.float32)
     lost = 0
-    for band, (start, stop) in enumerate(bands(width * height, max(1, _PATHS_A_BAND // spp))):
-        sampler.seed(_mixed(seed, band), (stop - start) * spp)
-        pixel = dr.arange(mi.UInt32, (stop - start) * spp) // dr.opaque(mi.UInt32, spp)
-        pixel += dr.opaque(mi.UInt32, start)
+    for start, stop in bands(width * height, max(1, _PATHS_A_BAND // spp)):
+        lane = dr.arange(mi.UInt32, (stop - start) * spp)
+        samples = dr.opaque(mi.UInt32, spp)
+        pixel = lane // samples + dr.opaque(mi.UInt32, start)
+        zero, own = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, _mixed(seed))
+        sampler = SobolSampler(mi, pixel, lane % samples, own, zero)
         place = film_places(mi, pixel, _in_pixel(mi, sampler.next_2d()), (width, height))
         ray, weight = _camera_ray(mi, sensor, sampler, place)
-        radiance, _, got_lost = tracer.trace(scene, sampler, ray, mi.Bool(True))
-        colour = as_rgb(mi, radiance * weight, ray.wavelengths)
-        dr.eval(colour, got_lost)  # one kernel; sums would otherwise each start their own
-        image[start:stop] = to_numpy(mean_of_blocks(colour, spp))
-        lost += int(dr.count(got_lost)[0])
+        dr.eval(ray, weight)
+        found = tracer.trace(scene, sampler, ray, mi.Bool(True))
+        colour = as_rgb(mi, found.light * weight, ray.wavelengths)
+        covered = dr.select(found.valid, mi.Float(1), 0)
+        image[start:stop] = to_numpy(mean_of_blocks(mi.Vector4f(*colour, covered), spp))
+        lost += int(dr.count(found.lost)[0])
         advance((stop - start) / (width * height))
-    return image.reshape(height, width, 3), lost
+    return image.reshape(height, width, 4), lost
 
 
-def _mixed(seed: int, band: int) -> int:
-    """A seed for the band: neighbouring seeds share none."""
-    return int(np.random.SeedSequence((seed % 2**63, band)).generate_state(1)[0])
+def _mixed(seed: int) -> int:
+    """32 bits of any whole number: neighbouring seeds have nothing in common."""
+    return int(np.random.SeedSequence(seed % 2**63).generate_state(1)[0])
 
 
 def _in_pixel(mi: Any, sample: Any) -> Any:

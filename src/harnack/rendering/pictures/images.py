@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 
+from harnack.backend import FloatArray
 from harnack.files.writing import check_writable, write_atomically
-from harnack.rendering.pictures.exr import exr_bytes
 
 FloatImage = npt.NDArray[np.float32]
 
@@ -38,20 +39,41 @@ def check_picture_path(path: Any) -> Path:
     return path
 
 
-def tone_mapped(radiance: FloatImage) -> npt.NDArray[np.uint8]:
-    """Linear sRGB radiance as 8-bit sRGB: a smooth shoulder, then the transfer function."""
-    shown = np.empty(radiance.shape, dtype=np.uint8)
-    for start in range(0, len(radiance), _ROWS_AT_ONCE):  # float64 is many times the picture
+def tone_mapped(image: FloatImage, on_white: bool = False) -> npt.NDArray[np.uint8]:
+    """Linear sRGB radiance as 8-bit sRGB: a smooth shoulder, then the transfer function.
+
+    Of an image (h, w, 4) the last number is the part that is covered, by which the others are
+    multiplied. It stays, and the others are divided by it, as PNG wants it; or, `on_white`, the
+    rest of each pixel becomes white and three numbers are left.
+    """
+    if not on_white or image.ndim < 3 or image.shape[-1] < 4:
+        shown = np.empty(image.shape, dtype=np.uint8)
+    else:
+        shown = np.empty((*image.shape[:2], 3), dtype=np.uint8)
+    for start in range(0, len(image), _ROWS_AT_ONCE):  # float64 is many times the picture
         rows = slice(start, start + _ROWS_AT_ONCE)
-        shown[rows] = _tone_mapped(radiance[rows])
+        shown[rows] = _tone_mapped(image[rows].astype(np.float64), on_white)
     return shown
 
 
-def _tone_mapped(radiance: FloatImage) -> npt.NDArray[np.uint8]:
-    x = np.clip(np.nan_to_num(radiance, nan=0.0, posinf=1e6), 0.0, None).astype(np.float64)
+def _tone_mapped(image: FloatArray, on_white: bool) -> npt.NDArray[np.uint8]:
+    if image.ndim < 3 or image.shape[-1] < 4:
+        return as_bytes(_transferred(_shouldered(image)))
+    alpha = np.clip(image[..., 3:], 0.0, 1.0)
+    light = _shouldered(image[..., :3] / np.where(alpha > 0, alpha, 1.0))
+    if on_white:
+        return as_bytes(_transferred(alpha * light + (1.0 - alpha)))
+    return as_bytes(np.concatenate([_transferred(light), alpha], axis=-1))
+
+
+def _shouldered(radiance: FloatArray) -> FloatArray:
+    x = np.clip(np.nan_to_num(radiance, nan=0.0, posinf=1e6), 0.0, None)
     room = 1.0 - _SHOULDER
-    x = np.where(x <= _SHOULDER, x, 1.0 - room * np.exp(-(x - _SHOULDER) / room))
-    return as_bytes(np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055))
+    return np.where(x <= _SHOULDER, x, 1.0 - room * np.exp(-(x - _SHOULDER) / room))
+
+
+def _transferred(x: FloatArray) -> FloatArray:
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
 
 
 def as_bytes(image: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.uint8]:
@@ -60,12 +82,34 @@ def as_bytes(image: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.uint8]:
 
 
 def write_image(mi: Any, path: Path, image: npt.NDArray[Any]) -> None:
-    """Write (h, w) or (h, w, 3) floats as EXR or bytes as PNG; no half-written file is left."""
+    """Write (h, w), (h, w, 3) or (h, w, 4) floats as EXR or bytes as PNG, all or nothing."""
     with write_atomically(path) as partial:
         if path.suffix.lower() == ".exr":
             partial.write_bytes(exr_bytes(image))
         else:
-            # Through memory: Mitsuba's own files do not say why they cannot be written.
-            packed = mi.MemoryStream()
-            mi.Bitmap(np.ascontiguousarray(image)).write(packed, mi.Bitmap.FileFormat.PNG)
-            partial.write_bytes(packed.raw_buffer())
+            partial.write_bytes(png_bytes(mi, image))
+
+
+def png_bytes(mi: Any, image: npt.NDArray[np.uint8]) -> bytes:
+    """A PNG file of bytes (h, w), (h, w, 3) or (h, w, 4) with alpha."""
+    # Through memory: Mitsuba's own files do not say why they cannot be written.
+    packed = mi.MemoryStream()
+    mi.Bitmap(np.ascontiguousarray(image)).write(packed, mi.Bitmap.FileFormat.PNG)
+    return packed.raw_buffer()
+
+
+def exr_bytes(image: npt.NDArray[np.floating[Any]]) -> bytes:
+    """An OpenEXR file of an image (h, w) with channel Y, (h, w, 3) with R, G and B, or (h, w, 4)
+    with A as well, by which these are multiplied."""
+    # Mitsuba writes them too, but waits for ever where Dr.Jit has one thread (OpenEXR 2.5 hands
+    # its work to a pool without threads).
+    import OpenEXR  # here, since most pictures do without
+
+    name = "Y" if image.ndim == 2 else {3: "RGB", 4: "RGBA"}[image.shape[-1]]
+    header: dict[str, Any] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    channels = {name: np.ascontiguousarray(image, dtype=np.float32)}
+    # Before version 3.5, which needs Python 3.11, it writes to named files only.
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "picture.exr")
+        OpenEXR.File(header, channels).write(str(path))
+        return path.read_bytes()

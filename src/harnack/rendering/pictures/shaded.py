@@ -51,6 +51,7 @@ class _Seen:
 
     light: shone by an emitter or the environment and reflected by clear matter, or magenta for
         lost. through: what clear matter leaves of the light from what is met.
+    covered: whether there is anything at all, and not the environment alone.
     """
 
     position: Any
@@ -63,11 +64,12 @@ class _Seen:
     glossy: Any
     met: Any
     lost: Any
+    covered: Any
 
     @classmethod
     def nothing(cls, mi: Any, count: int) -> _Seen:
         """Room for as many pixels, to scatter to."""
-        vectors, colours, masks = (mi.Vector3f,) * 3, (mi.Color3f,) * 3, (mi.Bool,) * 3
+        vectors, colours, masks = (mi.Vector3f,) * 3, (mi.Color3f,) * 3, (mi.Bool,) * 4
         kinds = (*vectors, mi.Float, *colours, *masks)
         return cls(*(dr.zeros(kind, count) for kind in kinds))
 
@@ -79,13 +81,16 @@ def shaded(
     *,
     spp: int,
     on_floor: bool,
+    cut_out: bool = False,
     cones: bool = False,
     advance: Callable[[float], None],
 ) -> tuple[npt.NDArray[np.float32], int]:
-    """Linear sRGB radiance (h, w, 3), and how many rays ran out of steps.
+    """Linear sRGB radiance and, last, the part that something covers (h, w, 4); and how many rays
+    ran out of steps.
 
     spp: rays of a pixel on an edge, at least; 1 for one ray a pixel everywhere.
     on_floor: whether the scene is a studio's, whose floor shows shadows.
+    cut_out: whether to leave out the light of what is behind everything.
     cones: whether cones find pixels to draw again, besides the edges in the picture.
     advance: told what part of the picture has been finished since the last call.
 
@@ -98,7 +103,7 @@ def shaded(
             f"shaded pictures know red, green and blue, and the Mitsuba variant is {mi.variant()}: "
             'set one such as "llvm_ad_rgb", or draw in color'
         )
-    painter = _Painter(mi, World.of(mi, scene), sensor, on_floor=on_floor)
+    painter = _Painter(mi, World.of(mi, scene), sensor, on_floor=on_floor, cut_out=cut_out)
     finder = Finder(mi, painter.world) if cones else None
     count = painter.size[0] * painter.size[1]
     order = in_tiles(painter.size)
@@ -112,9 +117,9 @@ def shaded(
         advance(_FIRST * (stop - start) / count)
     sky = visible_sky(mi, seen.position, seen.normal, seen.width, painter.size)
     dr.eval(sky)
-    image = to_numpy(painter.paint(seen, sky)).reshape(*painter.size[::-1], 3)
+    image = to_numpy(painter.paint(seen, sky)).reshape(*painter.size[::-1], 4)
     lost = int(dr.count(seen.lost)[0])
-    again = _edges(image).ravel()
+    again = _edges(image[..., :3] + (1 - image[..., 3:])).ravel()
     if finder is not None:
         for start, stop in bands(count, _RAYS_A_BAND):
             pixel = uploaded(mi, order[start:stop])
@@ -125,11 +130,11 @@ def shaded(
     offsets = grid_offsets(spp)
     traced = (offsets == _MIDDLE).all(axis=1)  # what a pixel's first ray has seen
     rest, share = offsets[~traced], float(traced.mean())
-    for start, stop in bands(len(edges), _RAYS_A_BAND // max(1, len(rest))):
+    for start, stop in bands(len(edges), max(1, _RAYS_A_BAND // max(1, len(rest)))):
         chosen = edges[start:stop]
         colour, gone = painter.refine(chosen, rest, seen.position, sky)
-        first = image.reshape(-1, 3)[chosen]
-        image.reshape(-1, 3)[chosen] = colour + share * (first - colour)
+        first = image.reshape(-1, 4)[chosen]
+        image.reshape(-1, 4)[chosen] = colour + share * (first - colour)
         lost += gone
         advance((1 - _FIRST) * (stop - start) / len(edges))
     return image, lost
@@ -138,8 +143,10 @@ def shaded(
 class _Painter:
     """A sensor in a world, and its light."""
 
-    def __init__(self, mi: Any, world: World, sensor: Any, *, on_floor: bool) -> None:
-        self.mi, self.world, self.sensor = mi, world, sensor
+    def __init__(
+        self, mi: Any, world: World, sensor: Any, *, on_floor: bool, cut_out: bool
+    ) -> None:
+        self.mi, self.world, self.sensor, self.cut_out = mi, world, sensor, cut_out
         width, height = (int(n) for n in sensor.film().crop_size())
         self.size = (width, height)
         matrix = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
@@ -163,6 +170,9 @@ class _Painter:
         shone = si.emitter(scene).eval(si, ~lost) * weight
         light = as_rgb(mi, sight.throughput * shone + weight * sight.gathered, ray.wavelengths)
         light = dr.select(lost, mi.Color3f(LOST_COLOUR), light)
+        covered = met | lost | (sight.boundaries > 1)  # what is clear covers, too
+        if self.cut_out:
+            light = dr.select(covered, light, 0)
         through = as_rgb(mi, sight.throughput, ray.wavelengths)
         d = sight.ray.d
         normal = mi.Vector3f(dr.mulsign(mi.Vector3f(si.n), -dr.dot(si.n, d)))
@@ -171,7 +181,9 @@ class _Painter:
         flags = si.bsdf().flags()
         glossy = mi.has_flag(flags, mi.BSDFFlags.Glossy) | mi.has_flag(flags, mi.BSDFFlags.Delta)
         position = dr.select(met, mi.Vector3f(si.p), dr.nan)
-        return _Seen(position, normal, -d, width, colour, light, through, glossy, met, lost)
+        return _Seen(
+            position, normal, -d, width, colour, light, through, glossy, met, lost, covered
+        )
 
     def ray(self, pixel: Any, offset: Any) -> tuple[Any, Any]:
         """Rays with differentials through places in pixels, and what their light is weighted by."""
@@ -197,18 +209,19 @@ class _Painter:
         return found
 
     def paint(self, seen: _Seen, sky: Any) -> Any:
-        """Radiance towards the eye."""
+        """Radiance towards the eye, and whether there is anything."""
         key = 1.0
         if self.floor is not None:
             key, above = self.floor.at(seen.position)
             sky = dr.minimum(sky, above)
         lit = self.light.on(seen.colour, seen.normal, seen.eye, seen.glossy, sky, key)
-        return dr.select(seen.met, seen.through * lit, 0) + seen.light
+        light = dr.select(seen.met, seen.through * lit, 0) + seen.light
+        return self.mi.Vector4f(*light, dr.select(seen.covered, self.mi.Float(1), 0))
 
     def refine(
         self, chosen: Any, offsets: Any, position: Any, sky: Any
     ) -> tuple[npt.NDArray[np.float32], int]:
-        """Means (n, 3) of samples in chosen pixels, and how many of them were lost."""
+        """Means (n, 4) of samples in chosen pixels, and how many of them were lost."""
         mi, spp = self.mi, len(offsets)
         lane = dr.arange(mi.UInt32, len(chosen) * spp)
         many = dr.opaque(mi.UInt32, spp)

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from harnack.backend import FloatArray
-from harnack.choices import did_you_mean
 
 # Radiances of the environment, linear sRGB: at the horizon, overhead, and of a soft strip of
 # light behind the stage that draws edges and gives metal something to reflect.
@@ -19,24 +18,32 @@ _KEY = (4.7, 4.5, 4.25)
 # The height of the floor: a hair below what stands on it.
 FLOOR = -0.002
 # Reflectance of the ground.
-_BACKDROPS = {"light": (0.74, 0.73, 0.715), "dark": (0.055, 0.058, 0.065)}
+_GROUNDS = {"light": (0.74, 0.73, 0.715), "dark": (0.055, 0.058, 0.065)}
+# Backdrops without a ground: what is behind the surfaces is cut out of the picture.
+CUT_OUT = ("white", "transparent")
+BACKDROPS = (*_GROUNDS, *CUT_OUT)
 # (height, width) of the environment's bitmap.
 _ENVIRONMENT_SIZE = (64, 128)
 
 
-def ground(mi: Any, backdrop: str) -> dict[str, Any]:
-    """A wide floor.
+def reflectance_of(backdrop: str) -> FloatArray:
+    """Of the ground, (3,)."""
+    return np.array(_GROUNDS[backdrop])
 
-    Raises:
-        ValueError: unknown backdrop.
-    """
-    if backdrop not in _BACKDROPS:
-        raise ValueError(
-            f"backdrop must be one of {', '.join(_BACKDROPS)}, not {backdrop!r}"
-            f"{did_you_mean(backdrop, _BACKDROPS)}"
-        )
+
+def far_ground(backdrop: str, azimuth: float) -> FloatArray:
+    """Radiance (3,) of the ground far from the stage, which the environment alone lights."""
+    image = environment(azimuth)
+    z = np.cos(math.pi * (np.arange(len(image)) + 0.5) / len(image))
+    weight = np.clip(z, 0, None) * np.sqrt(1 - z * z)  # of rows, by the cosine
+    mean = np.average(image.mean(axis=1), axis=0, weights=weight)
+    return reflectance_of(backdrop) * mean
+
+
+def ground(mi: Any, backdrop: str) -> dict[str, Any]:
+    """A wide floor."""
     floor = mi.ScalarTransform4f().translate([0, 0, FLOOR]).scale(100)
-    colour = {"type": "rgb", "value": list(_BACKDROPS[backdrop])}
+    colour = {"type": "rgb", "value": list(_GROUNDS[backdrop])}
     return {
         "ground": {
             "type": "disk",

@@ -16,8 +16,9 @@ import numpy as np
 from harnack.backend import FloatArray
 from harnack.rendering.mitsuba.shapes import shape
 from harnack.rendering.mitsuba.variant import mitsuba_backend
-from harnack.rendering.studio.camera import Camera
-from harnack.rendering.studio.lighting import ground, lights
+from harnack.rendering.studio.camera import Camera, Pose
+from harnack.rendering.studio.lighting import CUT_OUT, FLOOR, ground, lights
+from harnack.rendering.studio.upright import upright
 from harnack.rendering.surfaces.framing import check_size, visible_points
 from harnack.rendering.surfaces.placement import Placement
 from harnack.tracer import LevelSet, Tolerance
@@ -47,10 +48,17 @@ class StudioObject:
 
 @dataclass(frozen=True)
 class Studio:
-    """A scene dictionary, and the length in it of a unit of the surfaces' coordinates."""
+    """A scene dictionary, and what a picture of it needs besides.
+
+    unit: the length in it of a unit of the surfaces' coordinates. backdrop: its name. azimuth: of
+        the camera. has_ground: whether the surfaces stand on a floor.
+    """
 
     scene: dict[str, Any]
     unit: float
+    backdrop: str
+    azimuth: float
+    has_ground: bool
 
 
 def studio(
@@ -60,10 +68,12 @@ def studio(
     size: tuple[int, int],
     camera: Camera,
     backdrop: str = "light",
+    up: Any = "z",
     bare: bool = False,
 ) -> Studio:
     """Surfaces on the stage, seen in a picture of (width, height) pixels.
 
+    up: the direction of the surfaces' coordinates that is up on the stage, as `upright` takes it.
     bare: only surfaces and camera, without ground and lights.
     """
     backend = mitsuba_backend(mi)
@@ -71,11 +81,16 @@ def studio(
         points = np.concatenate([visible_points(one.surface, backend) for one in exhibits])
     else:
         points = _corners(np.array(camera.box.bounds()))
-    placement = on_ground(points)
+    placement = on_ground(points, upright(up))
+    pose = camera.pose(placement.apply(points), size, placement.apply)
     scene: dict[str, Any] = {
         "type": "scene",
-        "integrator": {"type": "harnack_path", "clamp": _CLAMP},
-        "sensor": _sensor(mi, camera, placement.apply(points), size),
+        "integrator": {
+            "type": "harnack_path",
+            "clamp": _CLAMP,
+            "hide_emitters": True,
+        },
+        "sensor": _sensor(mi, pose, size),
     }
     for k, one in enumerate(exhibits):
         surface = one.surface
@@ -86,9 +101,12 @@ def studio(
         scene[f"surface{k}"] = shape(
             surface, bsdf=bsdf, to_world=placement.matrix, tint=one.material.tint
         )
+    has_ground = not bare and backdrop not in CUT_OUT and pose.origin[2] > FLOOR
+    if has_ground:  # from below, it would hide everything
+        scene |= ground(mi, backdrop)
     if not bare:
-        scene |= {**ground(mi, backdrop), **lights(mi, camera.azimuth)}
-    return Studio(scene, placement.scale)
+        scene |= lights(mi, pose.azimuth)
+    return Studio(scene, placement.scale, backdrop, pose.azimuth, has_ground)
 
 
 def _corners(ends: FloatArray) -> FloatArray:
@@ -97,23 +115,23 @@ def _corners(ends: FloatArray) -> FloatArray:
     return np.array(list(itertools.product(*ends.T)))
 
 
-def on_ground(points: FloatArray) -> Placement:
-    """Scales points (n, 3) to half a diagonal of 1 and puts them on the ground."""
+def on_ground(points: FloatArray, turned: FloatArray | None = None) -> Placement:
+    """Turns points (n, 3), scales them to half a diagonal of 1 and puts them on the ground."""
+    turned = np.eye(3) if turned is None else turned
+    points = points @ turned.T
     lower, upper = points.min(axis=0), points.max(axis=0)
     scale = 2.0 / max(float(np.linalg.norm(upper - lower)), 1e-30)
     foot = np.array([*(lower + upper)[:2] / 2, lower[2]])
-    return Placement(scale, np.eye(3), -scale * foot)
+    return Placement(scale, turned, -scale * foot)
 
 
-def _sensor(mi: Any, camera: Camera, points: FloatArray, size: tuple[int, int]) -> dict[str, Any]:
-    origin, target = camera.fit(points, size)
-    _, up, _ = camera.frame()
+def _sensor(mi: Any, pose: Pose, size: tuple[int, int]) -> dict[str, Any]:
     look = mi.ScalarTransform4f().look_at(
-        origin=origin.tolist(), target=target.tolist(), up=up.tolist()
+        origin=pose.origin.tolist(), target=pose.target.tolist(), up=pose.up.tolist()
     )
     return {
         "type": "perspective",
-        "fov": camera.fov,
+        "fov": pose.fov,
         "fov_axis": "larger",
         "near_clip": 1e-3,
         "to_world": look,

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 
 from harnack.backend import Mask, Real, Vec3  # at run time: Dr.Jit reads SurfaceHit's annotations
+from harnack.backend.lanes import on_some
 from harnack.backend.lengths import length as norm
 from harnack.fields.look import Sample
 from harnack.tracer import Status
@@ -69,8 +70,46 @@ def meet_surface(
 
     A hit on a sheet of a field that jumps is where it is, and faces the side of larger values.
     """
-    vector = prepared.backend.Array3f
     trace = prepared.first_hit(o, d, 0, t_max, active)
+    if not prepared.queued:
+        return _described(prepared, _Ended(o, d, trace))
+    return on_some(
+        trace.status == int(Status.HIT),
+        lambda ended: _described(prepared, ended),
+        _Ended(o, d, trace),
+        _no_hit(prepared, trace),
+    )
+
+
+@dataclass(frozen=True)
+class _Ended:
+    """Rays, and where they ended."""
+
+    o: Vec3
+    d: Vec3
+    trace: MarchResult
+
+
+def _no_hit(prepared: PreparedLevelSet, trace: MarchResult) -> SurfaceHit:
+    """What rays that hit nothing have met."""
+    backend = prepared.backend
+    zero, vector, none = backend.Float(0), backend.Array3f(0), backend.Bool(False)
+    return SurfaceHit(
+        t=trace.t,
+        met=none,
+        lost=trace.status == int(Status.OUT_OF_STEPS),
+        position=vector,
+        normal=vector,
+        clearance=zero,
+        value=zero,
+        evaluations=trace.evaluations,
+        mended=none,
+    )
+
+
+def _described(prepared: PreparedLevelSet, ended: _Ended) -> SurfaceHit:
+    """What is where rays ended."""
+    vector, o, d, trace = prepared.backend.Array3f, ended.o, ended.d, ended.trace
     prepared = prepared.of_hit(trace)
     met = trace.status == int(Status.HIT)
     smooth = met & ~trace.on_sheet if prepared.field.has_sheets else met

@@ -103,6 +103,12 @@ class PlacedSurface:
         scale = dr.opaque(backend.Float, placement.scale)
         return cls(prepared, solid, scale, rows, vector(placement.translation))
 
+    def queued(self) -> PlacedSurface:
+        """The same, whose rays are traced at once (`PreparedLevelSet.queued`)."""
+        prepared = replace(self.prepared, queued=True)
+        solid = None if self.solid is None else replace(self.solid, prepared=prepared)
+        return replace(self, prepared=prepared, solid=solid)
+
     def meet(self, o: Vec3, d: Vec3, t_max: Real, active: Mask, leaves: Real = 0.0) -> SurfaceHit:
         """Where rays of the world, |d| = 1, first meet it, in coordinates of the world.
 

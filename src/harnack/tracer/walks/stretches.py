@@ -92,8 +92,7 @@ class SheetTracer:
 
         The walk begins just before `start`, so that a sheet on the very start is looked at.
         """
-        outer = while_active(self.begin(state), self.interval, "harnack intervals")
-        return self.end_of(outer)
+        return self.end_of(while_active(self.begin(state), self.next, "harnack intervals"))
 
     def begin(self, state: MarchState) -> SheetWalk:
         """Rays at their start."""
@@ -114,7 +113,7 @@ class SheetTracer:
         sheet = dr.select(on_sheet, named, count(NO_SHEET))
         return dataclasses.replace(end, status=status), sheet
 
-    def interval(self, outer: SheetWalk) -> SheetWalk:
+    def next(self, outer: SheetWalk) -> SheetWalk:
         """One interval: to the next crossing or the end of the ray, or to a hit."""
         count = self.backend.UInt32
         o, d = self.path.origin, self.path.direction

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class _Walk:
+class PartWalk:
     """Where rays are among parts, and the nearest end of a march so far.
 
     enter, box: of the box entered last. t: of the first hit, or the end of the ray; or to where a
@@ -68,8 +68,13 @@ class PartTracer:
         the ray is free of every part whose box it entered before the hit, and all others come
         behind. A ray that is out of steps in a part is proved free up to where it entered that.
         """
+        walk = while_active(self.begin(state), self.next, "harnack parts")
+        return self.end_of(walk)
+
+    def begin(self, state: MarchState) -> PartWalk:
+        """Rays before the first box."""
         real, count = self.march.backend.Float, self.march.backend.UInt32
-        walk = _Walk(
+        return PartWalk(
             enter=real(-1),
             box=count(NO_PART),
             t=real(self.end),
@@ -81,9 +86,13 @@ class PartTracer:
             part=count(NO_PART),
             active=state.active,
         )
-        walk = while_active(walk, self._next, "harnack parts")
+
+    def end_of(self, walk: PartWalk) -> tuple[MarchState, Any]:
+        """The state of rays, and the index of the part that each hit, NO_PART for none."""
+        backend = self.march.backend
+        before = MarchState.at(backend, self.start, self.end, walk.active, has_detail=False)
         end = dataclasses.replace(
-            state,
+            before,
             base=walk.t,
             value=walk.value,
             gradient=walk.gradient,
@@ -94,7 +103,7 @@ class PartTracer:
         )
         return end, walk.part
 
-    def _next(self, walk: _Walk) -> _Walk:
+    def next(self, walk: PartWalk) -> PartWalk:
         """One part more: the next whose box is entered before the first hit so far."""
         backend, path = self.march.backend, self.path
         after = PartEntry(walk.enter, walk.enter, walk.box)
@@ -114,7 +123,7 @@ class PartTracer:
         ended = hit | lost
         looked = active & (ended | (walk.part == NO_PART))
         goes_on = active & ~ended if self.any_hit else active & ~lost
-        return _Walk(
+        return PartWalk(
             enter=entry.enter,
             box=entry.part,
             t=dr.select(hit, now.base, dr.select(lost, near, walk.t)),

@@ -1,0 +1,133 @@
+"""Rays that share lanes by a queue end as rays that are followed one by one do, bit by bit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+
+import harnack as hk
+from harnack.backend import choose_backend, to_numpy, to_vector3
+from harnack.backend.arrays import aligned
+from harnack.backend.lanes import on_some, while_queued
+from harnack.geometry.mesh_shapes import icosphere
+
+
+def cut_sphere() -> hk.LevelSet:
+    vertices, faces = icosphere(2)
+    return hk.level_set(hk.WindingNumber(vertices, faces[np.arange(len(faces)) % 7 > 0]))
+
+
+def saddle() -> hk.LevelSet:
+    t = np.linspace(0, 2 * np.pi, 48, endpoint=False)
+    return hk.level_set(hk.SolidAngle(np.column_stack([np.cos(t), np.sin(t), 0.4 * np.cos(2 * t)])))
+
+
+def parts() -> hk.LevelSet:
+    from harnack.gallery import SCENES
+
+    return SCENES["exoskeleton"].surfaces()[0]
+
+
+CASES: dict[str, Callable[[], hk.LevelSet]] = {
+    "curve": saddle,
+    "domain": lambda: hk.level_set(hk.Gyroid(1.0, domain=hk.Ball(radius=1.0))),
+    "sheets": cut_sphere,
+    "parts": parts,
+    "confirmed": lambda: hk.level_set(hk.Gyroid(1.0, domain=hk.Ball(radius=1.0)), confirm=True),
+    "few steps": lambda: replace(saddle(), max_steps=3),
+}
+
+
+@pytest.mark.parametrize("precision", ["single", "double"])
+@pytest.mark.parametrize("name", CASES)
+def test_a_queue_changes_no_bit(name: str, precision: Any) -> None:
+    backend = choose_backend(precision)
+    prepared = CASES[name]().prepare(backend)
+    rng = np.random.default_rng(4)
+    n = 3000 if name != "parts" else 1000
+    o = rng.normal(size=(n, 3)) * 1.3
+    d = rng.normal(size=(n, 3)) * 0.3 - o
+    d /= np.linalg.norm(d, axis=1)[:, None]
+    active = rng.random(n) < 0.9
+    ends = rng.uniform(0.5, 4, n)
+
+    def ended(queued: bool) -> list[np.ndarray]:
+        one = replace(prepared, queued=queued)
+        rays = to_vector3(backend, o), to_vector3(backend, d)
+        wanted = backend.Float(aligned(backend, active.astype(float))) > 0
+        hit = one.first_hit(*rays, 0, aligned(backend, ends), wanted)
+        blocked = one.occluded(*rays, 0, aligned(backend, ends), wanted)
+        found = [hit.t, hit.value, hit.gradient, hit.evaluations, hit.status, hit.sheet, blocked]
+        found += [] if hit.part is None else [hit.part]
+        dr.eval(found)
+        return [np.broadcast_to(to_numpy(x), (n, *to_numpy(x).shape[1:])) for x in found]
+
+    one_by_one, queued = ended(False), ended(True)
+    some = one_by_one[4]
+    assert (some == int(hk.Status.HIT)).sum() > n // 20
+    assert (some[~active] == int(hk.Status.MISS)).all()
+    if name == "few steps":
+        assert (some == int(hk.Status.OUT_OF_STEPS)).any()
+    for a, b in zip(one_by_one, queued, strict=True):
+        # What a ray that missed saw last is of no meaning, but no other lane may write it.
+        np.testing.assert_array_equal(a[active], b[active])
+
+
+@dataclass(frozen=True)
+class _Count:
+    """Down from a number to zero."""
+
+    left: Any
+    steps: Any
+    active: Any
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 50_000])
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_each_lane_of_a_queue_is_followed_to_its_end(n: int, share: float) -> None:
+    backend = choose_backend("single")
+    rng = np.random.default_rng(n)
+    numbers, active = rng.integers(1, 200, n), rng.random(n) < share
+    start = _Count(
+        backend.UInt32(numbers.astype(np.uint32)),
+        backend.UInt32(0),
+        backend.Bool(active),
+    )
+
+    def down(now: _Count) -> _Count:
+        return _Count(now.left - 1, now.steps + 2, now.active & (now.left > 1))
+
+    end = while_queued(start, down, lambda now: now, "count")
+    np.testing.assert_array_equal(to_numpy(end.left), np.where(active, 0, numbers))
+    np.testing.assert_array_equal(to_numpy(end.steps), np.where(active, 2 * numbers, 0))
+    assert not to_numpy(end.active)[active].any()
+
+
+@pytest.mark.parametrize("n", [1, 2, 1000])
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_only_some_lanes_are_computed(n: int, share: float) -> None:
+    backend = choose_backend("single")
+    rng = np.random.default_rng(n)
+    x, mask = rng.normal(size=n).astype(np.float32), rng.random(n) < share
+    widths: list[int] = []
+
+    @dataclass(frozen=True)
+    class Pair:
+        a: Any
+        b: Any
+
+    def double(pair: Pair) -> Pair:
+        widths.append(dr.width(pair.a))
+        return Pair(2 * pair.a, pair.b + 1)
+
+    lanes = Pair(backend.Float(x), backend.Float(3))
+    made = on_some(backend.Bool(mask), double, lanes, Pair(backend.Float(-1), backend.Float(-2)))
+    np.testing.assert_array_equal(to_numpy(made.a), np.where(mask, 2 * x, -1))
+    np.testing.assert_array_equal(to_numpy(made.b), np.where(mask, 4, -2))
+    # One number counts as the same in all lanes.
+    assert widths == ([min(max(mask.sum(), 2), n)] if mask.any() else [])

@@ -1,0 +1,226 @@
+"""What is seen from where, and before which backdrop."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import harnack as hk
+from harnack.cli import main
+from harnack.geometry import shapes
+from harnack.rendering.studio.upright import upright
+
+FIELD = hk.SolidAngle(shapes.wavy_polygon(24))
+GYROID = hk.Gyroid(1.0, domain=hk.Ball(radius=1.0))
+
+
+def draw(what: Any = FIELD, **settings: Any) -> Any:
+    return hk.render(what, **{"size": (64, 48), "spp": 4, "progress": False, **settings})
+
+
+def seen(camera: Any, **settings: Any) -> np.ndarray:
+    return draw(camera=camera, show="status", **settings) == hk.Status.HIT
+
+
+def middle(mask: np.ndarray) -> np.ndarray:
+    return np.argwhere(mask).mean(axis=0)[::-1]
+
+
+@pytest.mark.parametrize(
+    "position", [(3.0, 3.0, 3.0), (0.3, -4.0, 0.1), (0.0, 0.0, 5.0), (1, 2, -9)]
+)
+def test_a_position_is_where_the_camera_stands(position: tuple[float, float, float]) -> None:
+    """The nearest depth is that of the nearest point; and the surface is in the picture, whole."""
+    depth = draw(camera=position, show="depth", size=(96, 72))
+    distance = np.linalg.norm(np.array(position) - hk.closest_points(FIELD, [position])[0])
+    assert depth.min() == pytest.approx(distance, abs=0.03 * distance)
+    hit = np.isfinite(depth)
+    assert hit.any()
+    assert not any(side.any() for side in (hit[0], hit[-1], hit[:, 0], hit[:, -1]))
+    assert max(np.ptp(np.argwhere(hit), axis=0) / (72, 96)) > 0.6
+
+
+def test_a_target_is_in_the_middle() -> None:
+    box = hk.Box((-1, -1, -1), (1, 1, 1))
+    from_left = hk.Camera(azimuth=-90, elevation=0, box=box, target=(-1.0, 0.0, 0.0), distance=6.0)
+    from_right = hk.Camera(azimuth=-90, elevation=0, box=box, target=(1.0, 0.0, 0.0), distance=6.0)
+    left, right = middle(seen(from_left)), middle(seen(from_right))
+    assert left[0] > 36  # the surface lies to the right of what is looked at
+    assert right[0] < 28
+    straight = hk.Camera(azimuth=-90, elevation=0, target=(0.0, 0.0, 0.0))
+    assert middle(seen(straight)) == pytest.approx([31.5, 23.5], abs=3)
+
+
+def test_a_distance_is_that_from_the_target() -> None:
+    camera = hk.Camera(azimuth=30, elevation=40, target=(0.0, 0.0, 0.0), distance=5.0)
+    a, e = math.radians(30), math.radians(40)
+    place = 5 * np.array([math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)])
+    np.testing.assert_array_equal(
+        draw(camera=camera, show="depth"),
+        draw(camera=hk.Camera(position=tuple(place), target=(0.0, 0.0, 0.0)), show="depth"),
+    )
+
+
+def test_a_fixed_angle_of_view_sees_less_from_nearer() -> None:
+    near, far = (seen(hk.Camera(position=(0, -d, 0.0), fov=40)).sum() for d in (4.0, 8.0))
+    assert near > 3 * far
+
+
+@pytest.mark.parametrize(
+    ("settings", "what"),
+    [
+        ({"position": (1, 2)}, "position"),
+        ({"target": (1, 2, math.nan)}, "target"),
+        ({"distance": 0}, "distance"),
+        ({"position": (1, 2, 3), "distance": 2.0}, "position or a distance"),
+        ({"position": (1, 2, 3), "target": (1, 2, 3)}, "same point"),
+        ({"azimuth": math.inf}, "azimuth"),
+    ],
+)
+def test_cameras_that_cannot_be(settings: dict[str, Any], what: str) -> None:
+    with pytest.raises(ValueError, match=what):
+        hk.Camera(**settings)
+
+
+@pytest.mark.parametrize("camera", ["front", (1, 2), 3, {"position": (1, 2, 3)}])
+def test_what_is_no_camera_is_refused(camera: Any) -> None:
+    with pytest.raises(TypeError, match=r"Camera\(azimuth"):
+        draw(camera=camera)
+
+
+@pytest.mark.parametrize(
+    "up", ["x", "y", "z", "-x", "-y", "-z", (1, 2, -3), (0, 0, -2), (0, 0, 1e-9)]
+)
+def test_up_is_turned_to_z_and_lengths_are_kept(up: Any) -> None:
+    turn = upright(up)
+    way = up
+    if isinstance(up, str):
+        way = (-1 if up[0] == "-" else 1) * np.eye(3)["xyz".index(up[-1])]
+    np.testing.assert_allclose(turn @ way / np.linalg.norm(way), [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(turn) == pytest.approx(1)
+
+
+def test_up_turns_the_picture() -> None:
+    """A surface turned by hand looks as one that is turned by the stage."""
+    turned = hk.SolidAngle(shapes.wavy_polygon(24) @ upright("x").T)
+    a, b = draw(turned, show="depth"), draw(up="x", show="depth")
+    both = np.isfinite(a) & np.isfinite(b)
+    assert (np.isfinite(a) != np.isfinite(b)).mean() < 0.01
+    np.testing.assert_allclose(a[both], b[both], rtol=1e-3)
+
+
+@pytest.mark.parametrize("up", ["w", "--x", (0, 0, 0), (1, 2)])
+def test_what_is_no_direction_is_refused(up: Any) -> None:
+    with pytest.raises(ValueError, match="up"):
+        draw(up=up)
+
+
+@pytest.mark.parametrize("show", ["color", "shaded"])
+def test_white_is_white_and_transparent_is_as_much_as_is_covered(show: str, tmp_path: Path) -> None:
+    from PIL import Image
+
+    white = draw(show=show, backdrop="white", path=tmp_path / "white.png")
+    clear = draw(show=show, backdrop="transparent", path=tmp_path / "clear.png")
+    assert white.shape == (48, 64, 3)
+    assert clear.shape == (48, 64, 4)
+    hit = draw(show="status") == hk.Status.HIT
+    alpha = clear[..., 3]
+    assert alpha.min() == 0
+    assert alpha.max() == 1
+    assert np.abs(alpha - hit).mean() < 0.05
+    free = alpha == 0
+    assert (clear[free] == 0).all()
+    np.testing.assert_array_equal(white[free], 1)
+    np.testing.assert_allclose(white, clear[..., :3] + (1 - alpha[..., None]), atol=1e-6)
+    on_white, with_alpha = Image.open(tmp_path / "white.png"), Image.open(tmp_path / "clear.png")
+    assert (on_white.mode, with_alpha.mode) == ("RGB", "RGBA")
+    assert (np.asarray(on_white)[free] == 255).all()
+    np.testing.assert_array_equal(np.asarray(with_alpha)[..., 3] == 0, np.round(alpha * 255) == 0)
+
+
+def test_exr_files_keep_alpha(tmp_path: Path) -> None:
+    import OpenEXR
+
+    image = draw(backdrop="transparent", show="shaded", path=tmp_path / "a.exr")
+    with OpenEXR.File(str(tmp_path / "a.exr")) as file:
+        np.testing.assert_array_equal(file.channels()["RGBA"].pixels, image)
+
+
+def test_the_alpha_of_a_film_is_kept() -> None:
+    film = {"type": "hdrfilm", "width": 32, "height": 24, "pixel_format": "rgba"}
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "harnack_path"},
+        "light": {"type": "directional", "direction": [0, 0, -1]},
+        "sensor": {"type": "orthographic", "film": film},
+        "surface": hk.rendering.shape(GYROID),
+    }
+    image = hk.render(scene, spp=4, progress=False)
+    assert image.shape == (24, 32, 4)
+    assert 0 < image[..., 3].mean() < 1
+    film["pixel_format"] = "rgb"
+    assert hk.render(scene, spp=4, progress=False).shape == (24, 32, 3)
+
+
+# Not in color at 0 degrees: there the light on the ground itself ends within a few pixels.
+@pytest.mark.parametrize("backdrop", ["light", "dark"])
+@pytest.mark.parametrize(
+    ("show", "elevation"),
+    [("color", 4.0), ("color", -20.0), ("shaded", 4.0), ("shaded", 0.0), ("shaded", -20.0)],
+)
+def test_there_is_no_edge_behind_the_surface(show: str, backdrop: str, elevation: float) -> None:
+    camera = hk.Camera(elevation=elevation, zoom=0.4)
+    image = draw(show=show, backdrop=backdrop, camera=camera, size=(96, 72), spp=64)
+    column = image[:, :12].mean(axis=(1, 2))  # left of the surface, from the wall to the ground
+    assert np.abs(np.diff(column)).max() < 0.12 * column.max()
+    assert column.min() > 1e-3
+
+
+def test_pictures_show_themselves() -> None:
+    image = draw(show="shaded")
+    assert image._repr_png_().startswith(b"\x89PNG")
+    assert image.shown.shape == (48, 64, 3)
+    assert image.to_pil().size == (64, 48)
+    for made in (image[:, :, 0], image + 1, image.mean(axis=0), np.sqrt(image)):
+        assert type(made) is np.ndarray
+    assert isinstance(image.mean(), np.floating)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["gyroid", "--solid", "-0.3:0.3", "--ball", "0,0,0,3", "--backdrop", "white"],
+        ["trefoil", "--position", "-5,5,2", "--target", "0,0,0", "--backdrop", "transparent"],
+        ["polygon", "--box", "-1,-1,-1,0,1,1", "--bound", "slope", "--zoom", "0.9", "--fov", "40"],
+        ["trefoil", "--up", "x", "--level", "2pi"],
+    ],
+)
+def test_options_of_the_command(arguments: list[str], tmp_path: Path) -> None:
+    target = tmp_path / "a.png"
+    small = ["--show", "shaded", "--size", "32x24", "--spp", "1", "--quiet", "-o", str(target)]
+    assert main(["render", *arguments, *small]) == 0
+    assert target.stat().st_size > 300
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["trefoil", "--backdrop", "whit"], 'did you mean "white"'),
+        (["trefoil", "--bound", "slop"], 'did you mean "slope"'),
+        (["trefoil", "--position", "1,2"], "3 numbers"),
+        (["trefoil", "--solid", "0:1"], "real-valued"),
+        (["letters", "--zoom", "-1"], "positive"),
+    ],
+)
+def test_options_that_cannot_be(
+    arguments: list[str], complaint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with contextlib.suppress(SystemExit):
+        assert main(["render", *arguments, "--quiet"]) != 0
+    assert complaint in capsys.readouterr().err.replace("\n", " ")
