@@ -20,7 +20,7 @@ from harnack.rendering.mitsuba.sobol import SobolSampler
 from harnack.rendering.pictures.pixels import bands, film_places
 
 # Paths of one band: about a second or two on a CPU, and Ctrl-C works between bands.
-_PATHS_A_BAND = 2**20
+_PATHS_A_BAND = 2**21
 # The pixel's filter: samples are drawn from a Gaussian of this standard deviation, in pixels,
 # cut at two pixels from its middle (Ernst et al. 2006, filter importance sampling).
 _FILTER_DEVIATION = 0.45
