@@ -108,7 +108,7 @@ from harnack.fields import (
 )
 from harnack.geometry import Ball, Box, Circle, ConvexHull, HalfSpace, Intersection
 from harnack.meshing import MeshingError, mesh, repair
-from harnack.rendering import Camera, render
+from harnack.rendering import Camera, animate, render
 from harnack.tracer import AllHits, Hits, LevelSet, Status, Tolerance, level_set, trace
 
 __all__ = [
@@ -190,6 +190,7 @@ __all__ = [
     "__version__",
     "absolute",
     "acos",
+    "animate",
     "asin",
     "atan",
     "backend",

@@ -64,6 +64,7 @@ def _parsers() -> tuple[_Parser, dict[str, _Parser]]:
     whole.add_argument("--version", action="version", version=f"harnack {__version__}")
     commands = whole.add_subparsers(required=True, metavar="COMMAND", dest="command")
     _add_render(commands)
+    _add_turntable(commands)
     _add_mesh(commands)
     _add_repair(commands)
     many = commands.add_parser("gallery", help="draw or list the named scenes")
@@ -83,10 +84,37 @@ def _add_render(commands: Any) -> None:
         f"Surface files are {', '.join(SURFACE_FILES)}: meshes with any defects, point clouds, "
         "and curves; what a file was taken for is printed.",
     )  # fmt: skip
+    one.add_argument("-o", "--output", metavar="FILE", help="picture, .png or .exr (SCENE.png)")
+    _add_drawn(one, "meshes and clouds, else color")
+    _add_choice(
+        one, "--antialias", ANTIALIASING,
+        "which pixels of a shaded picture get all samples: edges in the picture, or also what "
+        "cones around pixels find, wires thinner than a pixel (edges)",
+    )  # fmt: skip
+
+
+def _add_turntable(commands: Any) -> None:
+    one = commands.add_parser(
+        "turntable", help="a film around a surface",
+        description="Draw a film in which the camera goes around a gallery scene or the surface of "
+        "a file.",
+    )  # fmt: skip
+    one.add_argument("-o", "--output", metavar="FILE", help="film, .gif or .mp4 (SCENE.gif)")
+    one.add_argument("--frames", type=_samples, metavar="N", default=48, help="pictures (48)")
+    one.add_argument(
+        "--fps", type=_positive, metavar="N", default=24.0, help="pictures a second (24)"
+    )
+    one.add_argument(
+        "--turn", type=_angle, metavar="DEG", default=360.0, help="how far it goes around (360)"
+    )
+    _add_drawn(one, "all")
+
+
+def _add_drawn(one: Any, shaded: str) -> None:
+    """What is drawn, how, and seen from where. shaded: what is drawn so unless asked otherwise."""
     one.add_argument(
         "scene", metavar="SCENE", help="a name from `harnack gallery --list`, or a file"
     )
-    one.add_argument("-o", "--output", metavar="FILE", help="picture, .png or .exr (SCENE.png)")
     one.add_argument(
         "--level", type=parse_level,
         help="level to draw (1/2 for meshes, 2pi for curves); pi is understood: 2pi, pi/2",
@@ -95,12 +123,7 @@ def _add_render(commands: Any) -> None:
     _add_choice(
         one, "--show", SHOW_MODES,
         "what to draw: color follows light paths, shaded lights first hits by a formula, "
-        "without noise (shaded for meshes and clouds, else color)",
-    )  # fmt: skip
-    _add_choice(
-        one, "--antialias", ANTIALIASING,
-        "which pixels of a shaded picture get all samples: edges in the picture, or also what "
-        "cones around pixels find, wires thinner than a pixel (edges)",
+        f"without noise (shaded for {shaded})",
     )  # fmt: skip
     one.add_argument(
         "--confirm", action="store_true",

@@ -22,7 +22,8 @@ from harnack.geometry import Ball, Box
 from harnack.geometry.singular import weld_vertices
 from harnack.meshing import mesh, repair
 from harnack.opening import open_surface
-from harnack.rendering import Camera, render
+from harnack.rendering import Camera, animate, render
+from harnack.rendering.film import check_film_path
 from harnack.rendering.pictures.images import check_picture_path
 
 _DEMO_SIZE = (480, 360)
@@ -35,39 +36,71 @@ def _quality(options: Any) -> dict[str, Any]:
 
 
 def _render(options: Any) -> int:
-    source = Path(options.scene)
-    if options.scene not in SCENES:
-        _check_source(options.scene)
+    source = _source(options)
     if options.output == "":
         raise ValueError("-o is empty: name the picture to write, such as a.png")
     target = check_picture_path(options.output or f"{source.stem or 'picture'}.png")
-    settings = _quality(options)
-    if options.show is not None:
-        settings["show"] = options.show
+    if options.scene not in SCENES and source.suffix.lower() == ".xml":
+        what, settings = _mitsuba_scene(options)
+    else:
+        what, settings = _drawn(options, source)
     if options.antialias is not None:
         settings["antialias"] = options.antialias
-    if any(value is not None for value in _view(options).values()):
-        settings["camera"] = _camera(options)
-    if options.backdrop is not None:
-        settings["backdrop"] = options.backdrop
-    kind = source.suffix.lower()
-    if options.scene in SCENES or kind == ".xml":
-        _refuse_file_options(options)
-    if options.scene in SCENES:
-        _draw_scene(SCENES[options.scene], target, options, {**settings, **_of_surfaces(options)})
-    elif kind == ".xml":
-        own = {
-            **_of_surfaces(options), "level": options.level, "material": options.material,
-            "up": options.up,
-        }  # fmt: skip
-        given = [name for name, value in own.items() if value is not None]
-        if given:
-            raise ValueError(f"{', '.join(given)} of a Mitsuba scene: set in its own file")
-        render(str(source), target, **settings)
-    else:
-        _draw_file(source, target, options, {**settings, **_of_surfaces(options)})
+    render(what, target, **settings)
     _say(f"wrote {target}")
     return 0
+
+
+def _turntable(options: Any) -> int:
+    """A film around a surface."""
+    source = _source(options)
+    if options.output == "":
+        raise ValueError("-o is empty: name the film to write, such as a.gif")
+    target = check_film_path(options.output or f"{source.stem or 'turntable'}.gif")
+    if source.suffix.lower() == ".xml":
+        raise ValueError("a turntable is of a scene of the gallery or a surface file")
+    what, settings = _drawn(options, source)
+    film: dict[str, Any] = {
+        "size": (320, 240), **settings, "show": options.show or "shaded",
+        "frames": options.frames, "fps": options.fps, "turn": options.turn,
+    }  # fmt: skip
+    animate(what, target, **film)
+    _say(f"wrote {target}")
+    return 0
+
+
+def _source(options: Any) -> Path:
+    """The file to draw, or the name of a scene."""
+    if options.scene not in SCENES:
+        _check_source(options.scene)
+    return Path(options.scene)
+
+
+def _drawn(options: Any, source: Path) -> tuple[Any, dict[str, Any]]:
+    """Surfaces of a scene or a file, and the settings of their picture."""
+    chosen = {name: getattr(options, name) for name in ("show", "backdrop", "up", "material")}
+    settings = {name: value for name, value in chosen.items() if value is not None}
+    settings |= {**_quality(options), **_of_surfaces(options)}
+    if any(value is not None for value in _view(options).values()):
+        settings["camera"] = _camera(options)
+    if options.scene in SCENES:
+        _refuse_file_options(options)
+        return _of_scene(SCENES[options.scene], options, settings)
+    return _of_file(source, options, settings)
+
+
+def _mitsuba_scene(options: Any) -> tuple[str, dict[str, Any]]:
+    """A scene that has everything of its own."""
+    _refuse_file_options(options)
+    given = {
+        **_of_surfaces(options), **_view(options), "level": options.level, "up": options.up,
+        "material": options.material, "backdrop": options.backdrop,
+    }  # fmt: skip
+    wrong = [name for name, value in given.items() if value is not None]
+    if wrong:
+        raise ValueError(f"{', '.join(wrong)} of a Mitsuba scene: set in its own file")
+    show = {} if options.show is None else {"show": options.show}
+    return options.scene, {**_quality(options), **show}
 
 
 def _of_surfaces(options: Any) -> dict[str, Any]:
@@ -131,9 +164,10 @@ def _refuse_file_options(options: Any) -> None:
             raise ValueError(f"{name} is for surface files ({', '.join(SURFACE_FILES)}) only")
 
 
-def _draw_file(source: Path, target: Path, options: Any, settings: dict[str, Any]) -> None:
+def _of_file(source: Path, options: Any, settings: dict[str, Any]) -> tuple[Field, dict[str, Any]]:
+    up = settings.pop("up", None)
     opened = open_surface(
-        source, as_=options.as_, boundary=options.boundary, normals=options.normals, up=options.up
+        source, as_=options.as_, boundary=options.boundary, normals=options.normals, up=up
     )
     facts = ", ".join(f"{key}: {value}" for key, value in opened.field.describe().items())
     _say(f"{source}: {in_options(opened.said)}")
@@ -141,23 +175,19 @@ def _draw_file(source: Path, target: Path, options: Any, settings: dict[str, Any
     if options.show is None and opened.show != "color":
         settings["show"] = opened.show
         _say(f"drawn {opened.show}; --show color follows light paths, in minutes")
-    material = options.material or opened.material
-    render(opened.field, target, level=options.level, material=material, **settings)
+    usual = {"level": options.level, "material": opened.material}
+    return opened.field, {**usual, **settings}
 
 
-def _draw_scene(scene: Scene, target: Path, options: Any, settings: dict[str, Any]) -> None:
-    if options.material is not None:
-        settings["material"] = options.material
-    if options.up is not None:
-        settings["up"] = options.up
-    surfaces = scene.surfaces() if options.level is not None or options.solid is not None else []
+def _of_scene(scene: Scene, options: Any, settings: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+    surfaces = scene.surfaces()
     if options.level is not None:
         if len(surfaces) != 1 or (surfaces[0].solid is not None and options.solid is None):
             raise ValueError(f"scene {scene.name} has levels of its own; --level does not apply")
         settings["level"] = options.level
     if options.solid is not None and len(surfaces) != 1:
         raise ValueError(f"scene {scene.name} has several surfaces; --solid does not apply")
-    scene.render(target, **settings)
+    return surfaces, {**scene.settings(len(surfaces)), **settings}
 
 
 def _mesh(options: Any) -> int:
@@ -297,6 +327,13 @@ def _doctor(options: Any) -> int:
 
 
 COMMANDS: Mapping[str, Callable[[Any], int]] = MappingProxyType(
-    {"render": _render, "mesh": _mesh, "repair": _repair, "gallery": _gallery, "doctor": _doctor}
+    {
+        "render": _render,
+        "turntable": _turntable,
+        "mesh": _mesh,
+        "repair": _repair,
+        "gallery": _gallery,
+        "doctor": _doctor,
+    }
 )
 """By name."""

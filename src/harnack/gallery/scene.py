@@ -34,8 +34,9 @@ class Scene:
     def render(self, path: Any = None, **settings: Any) -> Any:
         """The picture, as `harnack.rendering` makes it; settings override the scene's own."""
         surfaces = self.surfaces()
-        names = self.materials * len(surfaces) if len(self.materials) == 1 else self.materials
-        chosen: dict[str, Any] = {
-            "material": list(names), "camera": self.camera, "show": self.show, **settings,
-        }  # fmt: skip
-        return render(surfaces, path, **chosen)
+        return render(surfaces, path, **{**self.settings(len(surfaces)), **settings})
+
+    def settings(self, count: int) -> dict[str, Any]:
+        """How `count` surfaces are drawn, as `render` takes it."""
+        names = self.materials * count if len(self.materials) == 1 else self.materials
+        return {"material": list(names), "camera": self.camera, "show": self.show}

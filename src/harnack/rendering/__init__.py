@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from harnack.rendering.arguments import SHOW_MODES
+from harnack.rendering.film import animate
 from harnack.rendering.mitsuba.plugins import register, register_surfaces
 from harnack.rendering.mitsuba.shapes import shape
 from harnack.rendering.picture import render
@@ -18,6 +19,7 @@ __all__ = [
     "Material",
     "Picture",
     "UnboundedSurfaceError",
+    "animate",
     "register",
     "register_surfaces",
     "render",

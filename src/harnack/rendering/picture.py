@@ -162,6 +162,12 @@ def _staged(
     return made, mi.load_dict(made.scene, parallel=False)
 
 
+def surfaces_of(what: Any, **settings: Any) -> list[LevelSet]:
+    """The surfaces that `render` draws of fields and level sets, with settings of surfaces."""
+    check_settings(settings, _OWN)
+    return [one.surface for one in _exhibits(what, None, settings)]
+
+
 def _exhibits(what: Any, materials: Any, settings: Mapping[str, Any]) -> list[StudioObject]:
     given: list[Any] = [what] if isinstance(what, Field | LevelSet) else list(what)
     if not given:

@@ -1,0 +1,144 @@
+"""Films: one frame for all pictures, nothing compiled from one to the next, all or nothing."""
+
+from __future__ import annotations
+
+import builtins
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+from PIL import Image, ImageSequence
+
+import harnack as hk
+from harnack.cli import main
+from harnack.geometry import shapes
+
+FIELD = hk.SolidAngle(shapes.wavy_polygon(24))
+SMALL: dict[str, Any] = {"size": (48, 36), "spp": 1, "progress": False}
+
+
+def pictures(path: Path) -> list[np.ndarray]:
+    with Image.open(path) as film:
+        return [np.asarray(one.convert("RGB")).astype(int) for one in ImageSequence.Iterator(film)]
+
+
+def orange(picture: np.ndarray) -> np.ndarray:
+    return np.abs(picture[..., 0] - picture[..., 2]) > 40
+
+
+def test_a_turntable_goes_around_once(tmp_path: Path) -> None:
+    hk.animate(FIELD, tmp_path / "a.gif", turn=360, frames=6, **SMALL)
+    film = pictures(tmp_path / "a.gif")
+    assert len(film) == 6
+    assert film[0].shape == (36, 48, 3)
+    # The polygon has three waves: a third of a turn later it looks the same, but for the light.
+    shown = [orange(one) for one in film]
+    assert (shown[0] != shown[1]).mean() > 0.05
+    assert (shown[0] != shown[2]).mean() < 0.02
+    assert (shown[0] != shown[4]).mean() < 0.02
+    for one in shown:  # whole, in each picture
+        assert one.any()
+        assert not one[[0, -1]].any()
+
+
+def test_the_frame_stays_while_a_surface_grows(tmp_path: Path) -> None:
+    """Balls of radii 1 to 2 are drawn of that size, and not each as large as the picture."""
+    hk.animate(lambda s: hk.Sphere(1 + s), tmp_path / "a.gif", frames=3, show="normal", **SMALL)
+    background = pictures(tmp_path / "a.gif")[0][0, 0]
+    areas = [(np.abs(one - background).sum(axis=-1) > 30).sum() for one in
+             pictures(tmp_path / "a.gif")]  # fmt: skip
+    assert areas[1] / areas[0] == pytest.approx(2.25, rel=0.15)
+    assert areas[2] / areas[0] == pytest.approx(4, rel=0.15)
+
+
+def test_every_setting_may_move(tmp_path: Path) -> None:
+    hk.animate(
+        FIELD, tmp_path / "a.gif", frames=3, level=lambda s: 3 + 6 * s, camera=hk.Camera(zoom=0.8),
+        material=lambda s: ("copper", "clay", "gold")[round(2 * s)], **SMALL,
+    )  # fmt: skip
+    a, b, c = pictures(tmp_path / "a.gif")
+    assert np.abs(a - b).mean() > 2
+    assert np.abs(b - c).mean() > 2
+    path = [(4.0, -4.0, 2.0), (2.0, -5.0, 3.0)]
+    hk.animate(FIELD, tmp_path / "b.gif", frames=2, camera=lambda s: path[round(s)], **SMALL)
+    hk.render(FIELD, tmp_path / "b.png", camera=path[1], show="shaded", **SMALL)
+    last = np.asarray(Image.open(tmp_path / "b.png")).astype(int)
+    assert np.abs(pictures(tmp_path / "b.gif")[1] - last).mean() < 4  # of colors, a GIF has 256
+
+
+@pytest.mark.parametrize("show", ["shaded", pytest.param("color", marks=pytest.mark.slow)])
+def test_nothing_is_compiled_after_the_second_picture(show: str, tmp_path: Path) -> None:
+    counts: list[int] = []
+
+    def moved(s: float) -> hk.Field:
+        kernels = dr.kernel_history((dr.KernelType.JIT,))
+        counts.append(sum(not one["cache_hit"] or one["cache_disk"] for one in kernels))
+        vertices = shapes.wavy_polygon(24) * (1 + np.random.default_rng(round(99 * s)).random())
+        return hk.SolidAngle(vertices)
+
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        hk.animate(moved, tmp_path / "a.gif", frames=3, turn=40, show=show, **SMALL)
+        dr.kernel_history_clear()
+        hk.animate(moved, tmp_path / "a.gif", frames=4, turn=50, show=show, **SMALL)
+        kernels = dr.kernel_history((dr.KernelType.JIT,))
+    assert sum(not one["cache_hit"] or one["cache_disk"] for one in kernels) == 0
+
+
+def test_a_film_in_mp4(tmp_path: Path) -> None:
+    av = pytest.importorskip("av")
+    hk.animate(
+        FIELD, tmp_path / "a.mp4", frames=5, fps=12.5, turn=90, **{**SMALL, "size": (49, 37)}
+    )
+    with av.open(str(tmp_path / "a.mp4")) as film:
+        frames = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
+        assert float(film.streams.video[0].average_rate) == 12.5
+    assert len(frames) == 5
+    assert frames[0].shape == (36, 48, 3)
+    assert np.abs(frames[0].astype(int) - frames[4]).mean() > 3
+
+
+@pytest.mark.parametrize(
+    ("settings", "complaint"),
+    [
+        ({"path": "a.avi"}, r"\.gif or \.mp4"),
+        ({"frames": 0}, "frames must be from 1"),
+        ({"fps": 0}, "fps"),
+        ({"fps": float("nan")}, "fps"),
+        ({"turn": float("inf")}, "turn"),
+        ({"material": "golf"}, "gold"),
+        ({"path": "a.mp4", "backdrop": "transparent"}, "no alpha"),
+        ({"path": "a.mp4", "size": (1, 20)}, "at least 2 pixels"),
+    ],
+)
+def test_films_that_cannot_be(settings: dict[str, Any], complaint: str, tmp_path: Path) -> None:
+    target = tmp_path / settings.pop("path", "a.gif")
+    with pytest.raises(ValueError, match=complaint):
+        hk.animate(FIELD, target, **{**SMALL, "frames": 2, **settings})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_missing_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    usual = builtins.__import__
+
+    def without(name: str, *rest: Any) -> Any:
+        if name in ("av", "PIL"):
+            raise ModuleNotFoundError(name)
+        return usual(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    for name in ("a.gif", "a.mp4"):
+        with pytest.raises(ModuleNotFoundError, match=r"harnack\[film\]"):
+            hk.animate(FIELD, tmp_path / name, frames=2, **SMALL)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    target = tmp_path / "a.gif"
+    arguments = ["--frames", "3", "--size", "32x24", "--spp", "1", "--quiet", "--backdrop", "white"]
+    assert main(["turntable", "trefoil", "-o", str(target), *arguments]) == 0
+    assert "wrote" in capsys.readouterr().out
+    assert len(pictures(target)) == 3
+    assert (pictures(target)[0][0, 0] == 255).all()
+    assert main(["turntable", "trefoil", "-o", str(tmp_path / "a.txt")]) != 0
