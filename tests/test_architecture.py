@@ -61,7 +61,16 @@ FIELD_ROOMS = (
 # Families do not know each other. A new one is added above and in docs/architecture.md.
 FAMILIES = FIELD_ROOMS[FIELD_ROOMS.index("multipoles") + 1 :]
 # Within `rendering`.
-RENDERING_ROOMS = ("surfaces", "mitsuba", "studio", "pictures", "arguments", "picture", "film")
+RENDERING_ROOMS = (
+    "surfaces",
+    "mitsuba",
+    "studio",
+    "pictures",
+    "arguments",
+    "exhibits",
+    "picture",
+    "film",
+)
 # Files of one folder, `__init__` left out.
 MOST_FILES = 13
 FREE = ("__init__", "__main__", "testing")  # at the top: may import from any room

@@ -182,6 +182,31 @@ def test_there_is_no_edge_behind_the_surface(show: str, backdrop: str, elevation
     assert column.min() > 1e-3
 
 
+def test_a_tube_is_drawn_around_the_curve() -> None:
+    """It sticks out of the surface by its radius, and follows circles."""
+    bare = np.isfinite(draw(show="depth"))
+    thick = np.isfinite(draw(show="depth", boundary=0.1))
+    assert thick.sum() > 1.05 * bare.sum()
+    ring = hk.SolidAngle(hk.Circle(1.0, (0, 0, 0), (0, 0, 1)))
+    camera = hk.Camera(elevation=90, box=hk.Box((-1.2, -1.2, -0.2), (1.2, 1.2, 0.2)))
+    areas = [
+        np.isfinite(draw(ring, show="depth", camera=camera, size=(96, 96), **rim)).sum()
+        for rim in ({}, {"boundary": 0.1})
+    ]
+    assert areas[1] / areas[0] == pytest.approx(1.1**2, rel=0.03)
+
+
+@pytest.mark.parametrize("radius", [0, -1, math.nan, math.inf, "wide", True])
+def test_a_tube_needs_a_radius(radius: Any) -> None:
+    with pytest.raises(ValueError, match="boundary is the radius"):
+        draw(boundary=radius)
+
+
+def test_a_tube_needs_a_curve() -> None:
+    with pytest.raises(ValueError, match="ends at a curve"):
+        draw(GYROID, boundary=0.1)
+
+
 def test_pictures_show_themselves() -> None:
     image = draw(show="shaded")
     assert image._repr_png_().startswith(b"\x89PNG")
@@ -198,7 +223,7 @@ def test_pictures_show_themselves() -> None:
         ["gyroid", "--solid", "-0.3:0.3", "--ball", "0,0,0,3", "--backdrop", "white"],
         ["trefoil", "--position", "-5,5,2", "--target", "0,0,0", "--backdrop", "transparent"],
         ["polygon", "--box", "-1,-1,-1,0,1,1", "--bound", "slope", "--zoom", "0.9", "--fov", "40"],
-        ["trefoil", "--up", "x", "--level", "2pi"],
+        ["trefoil", "--up", "x", "--level", "2pi", "--boundary-tube", "0.1"],
     ],
 )
 def test_options_of_the_command(arguments: list[str], tmp_path: Path) -> None:

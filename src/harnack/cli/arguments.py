@@ -153,6 +153,10 @@ def _add_surface(one: Any) -> None:
         help="the solid where the function is between two values; one may be left out: :0",
     )  # fmt: skip
     _add_clip(group)
+    group.add_argument(
+        "--boundary-tube", type=_positive, metavar="RADIUS",
+        help="draw a tube around the curve at which it ends",
+    )  # fmt: skip
     _add_choice(
         group, "--bound", BOUNDS, "the proof that steps are made by (the longest of all that apply)"
     )

@@ -107,7 +107,7 @@ def _of_surfaces(options: Any) -> dict[str, Any]:
     """Settings of the surfaces drawn that were asked for."""
     asked = {
         "confirm": True if options.confirm else None, "bound": options.bound,
-        "solid": options.solid, "clip": _clip(options),
+        "solid": options.solid, "clip": _clip(options), "boundary": options.boundary_tube,
     }  # fmt: skip
     return {name: value for name, value in asked.items() if value is not None}
 

@@ -294,6 +294,11 @@ class Field(abc.ABC):
         number. Distances ask for it."""
         return None
 
+    @property
+    def boundary_curves(self) -> tuple[FloatArray, ...]:
+        """Closed curves (n, 3) at which level sets end; the first point is not repeated."""
+        return ()
+
     def describe(self) -> dict[str, Any]:
         """What a person would want to know about the choices this field made by itself."""
         return {}

@@ -23,11 +23,11 @@ from harnack.fields import Field
 from harnack.rendering.arguments import (
     Request,
     check_memory,
-    check_settings,
     check_spp,
     checked_request,
     refuse_studio_settings,
 )
+from harnack.rendering.exhibits import OF_STUDIO, MaterialLike, exhibits
 from harnack.rendering.mitsuba.integrator import PathTracer
 from harnack.rendering.mitsuba.plugins import register
 from harnack.rendering.mitsuba.scene_files import load_dictionary, load_scene_file
@@ -38,19 +38,15 @@ from harnack.rendering.pictures.shaded import shaded
 from harnack.rendering.pictures.shown import Picture
 from harnack.rendering.pictures.views import VIEWS, look
 from harnack.rendering.studio.camera import Camera
-from harnack.rendering.studio.materials import Material, material_of
-from harnack.rendering.studio.stage import Studio, StudioObject, studio
-from harnack.tracer import LevelSet, level_set
+from harnack.rendering.studio.stage import Studio, studio
+from harnack.tracer import LevelSet
 
 ShowMode = Literal["color", "shaded", "normal", "evaluations", "status", "depth"]
 # Modes with ground and lights, and what they send out.
 _LIT = {"color": "light paths", "shaded": "rays"}
 _EDGE_SPP = 9
-_OF_STUDIO = ("material", "camera", "backdrop", "up")
-_OWN = ("show", "size", "spp", "antialias", *_OF_STUDIO, "max_depth", "seed", "progress")
 Image = npt.NDArray[Any]
 Advance = Callable[[float], None]
-MaterialLike = str | Material | Mapping[str, Any]
 
 
 def render(
@@ -65,6 +61,7 @@ def render(
     camera: Camera | tuple[float, float, float] | None = None,
     backdrop: str | None = None,
     up: str | tuple[float, float, float] | None = None,
+    boundary: float | None = None,
     max_depth: int | None = None,
     seed: int = 0,
     progress: bool = True,
@@ -99,6 +96,8 @@ def render(
         the first three are multiplied.
     up: what is up, "x", "y", "z", "-x", ... or a direction in the surfaces' coordinates; by
         default z.
+    boundary: the radius, in the surfaces' coordinates, of a golden tube around the curves at which
+        surfaces end (`Field.boundary_curves`).
     settings: of the surfaces, as `harnack.level_set` takes them: level, clip, solid, ...; those
         of a `LevelSet` are replaced. Without a tolerance, a field gets one that suits its size.
 
@@ -127,9 +126,10 @@ def render(
     mi = register()
     in_studio = isinstance(what, Field | LevelSet | list | tuple)
     if in_studio:
-        stage, scene = _staged(mi, what, asked, material, up, settings)
+        stage, scene = _staged(mi, what, asked, material, up, boundary, settings)
     else:
-        of_studio = dict(zip(_OF_STUDIO, (material, camera, backdrop, up), strict=True))
+        given = material, camera, backdrop, up, boundary
+        of_studio = dict(zip(OF_STUDIO, given, strict=True))
         refuse_studio_settings({**of_studio, **settings})
         stage, scene = None, _loaded(mi, what, asked.size)
         check_memory(asked.show, *map(int, scene.sensors()[0].film().crop_size()))
@@ -149,56 +149,17 @@ def render(
 
 
 def _staged(
-    mi: Any, what: Any, asked: Request, material: Any, up: Any, settings: Mapping[str, Any]
-) -> tuple[Studio, Any]:
+    mi: Any, what: Any, asked: Request, material: Any, up: Any, boundary: Any,
+    settings: Mapping[str, Any],
+) -> tuple[Studio, Any]:  # fmt: skip
     """Fields and level sets in the studio, and the scene of it."""
-    check_settings(settings, _OWN)
     size = asked.size or (800, 600)
     check_memory(asked.show, *size)
     made = studio(
-        mi, _exhibits(what, material, settings), size=size, camera=asked.camera,
+        mi, exhibits(what, material, boundary, settings), size=size, camera=asked.camera,
         backdrop=asked.backdrop, up=up or "z", bare=asked.show not in _LIT,
     )  # fmt: skip
     return made, mi.load_dict(made.scene, parallel=False)
-
-
-def surfaces_of(what: Any, **settings: Any) -> list[LevelSet]:
-    """The surfaces that `render` draws of fields and level sets, with settings of surfaces."""
-    check_settings(settings, _OWN)
-    return [one.surface for one in _exhibits(what, None, settings)]
-
-
-def _exhibits(what: Any, materials: Any, settings: Mapping[str, Any]) -> list[StudioObject]:
-    given: list[Any] = [what] if isinstance(what, Field | LevelSet) else list(what)
-    if not given:
-        raise ValueError("there is nothing to draw: give at least one field")
-    for one in given:
-        if not isinstance(one, Field | LevelSet):
-            raise TypeError(f"a list to draw holds fields and level sets, not {one!r}")
-    listed: bool = isinstance(materials, list | tuple)
-    names: list[Any] = [*materials] if listed else [materials] * len(given)
-    if len(names) != len(given):
-        several = f" or {len(given)}, one for each surface" if len(given) > 1 else ""
-        raise ValueError(f"give one material{several}, not {len(names)}")
-    fitted = "tolerance" not in settings
-    return [
-        StudioObject(_surface(one, settings), material_of(name), fitted and isinstance(one, Field))
-        for one, name in zip(given, names, strict=True)
-    ]
-
-
-def _surface(one: Field | LevelSet, settings: Mapping[str, Any]) -> LevelSet:
-    if isinstance(one, Field):
-        return level_set(one, **settings)
-    if not settings:
-        return one
-    own: dict[str, Any] = {
-        "clip": one.clip, "tolerance": one.tolerance, "max_steps": one.max_steps,
-        "bound": one.bound, "overstep": one.overstep, "confirm": one.confirm,
-    }  # fmt: skip
-    if "level" not in settings and "solid" not in settings:
-        own |= {"level": one.levels} if one.solid is None else {"solid": one.solid}
-    return level_set(one.field, **{**own, **settings})
 
 
 def _loaded(mi: Any, what: Any, size: tuple[int, int] | None) -> Any:

@@ -50,6 +50,8 @@ _PERIOD = 4 * math.pi
 _NARROW = 1e-9 * _PERIOD
 # Cells times vertices that an extent looks at, at most.
 _MOST_PAIRS = 3_000_000
+# Of polygons that stand for circles where a boundary is drawn.
+_SIDES = 256
 
 
 class SolidAngle(UploadedField["_CurveBuffers"]):
@@ -118,6 +120,10 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
     def _is_empty(self) -> bool:
         """Whether nothing is left of the curves."""
         return not self._net and not self._net_circles
+
+    @property
+    def boundary_curves(self) -> tuple[FloatArray, ...]:
+        return (*self._net, *(one.polygon(_SIDES) for one in self._net_circles))
 
     def _points_around(self) -> FloatArray:
         """Points (n, 3) whose convex hull holds the curves: vertices, and polygons around circles;

@@ -1,0 +1,85 @@
+"""What `render` is given, as surfaces on the stage of the studio."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from harnack.fields import Field, Tube
+from harnack.rendering.arguments import check_settings
+from harnack.rendering.studio.materials import Material, material_of
+from harnack.rendering.studio.stage import StudioObject
+from harnack.tracer import LevelSet, level_set
+
+OF_STUDIO = ("material", "camera", "backdrop", "up", "boundary")
+_OWN = ("show", "size", "spp", "antialias", *OF_STUDIO, "max_depth", "seed", "progress")
+# What tubes around the ends of surfaces are made of.
+_RIM = "gold"
+
+MaterialLike = str | Material | Mapping[str, Any]
+
+
+def surfaces_of(what: Any, boundary: float | None = None, **settings: Any) -> list[LevelSet]:
+    """The surfaces that `render` draws of fields and level sets, with settings of surfaces."""
+    return [one.surface for one in exhibits(what, None, boundary, settings)]
+
+
+def exhibits(
+    what: Any, materials: Any, boundary: float | None, settings: Mapping[str, Any]
+) -> list[StudioObject]:
+    """Fields and level sets as they stand on the stage, and tubes around where they end.
+
+    Raises:
+        TypeError, ValueError: there is nothing to draw, or something wrong with what is asked for.
+    """
+    check_settings(settings, _OWN)
+    given: list[Any] = [what] if isinstance(what, Field | LevelSet) else list(what)
+    if not given:
+        raise ValueError("there is nothing to draw: give at least one field")
+    for one in given:
+        if not isinstance(one, Field | LevelSet):
+            raise TypeError(f"a list to draw holds fields and level sets, not {one!r}")
+    listed: bool = isinstance(materials, list | tuple)
+    names: list[Any] = [*materials] if listed else [materials] * len(given)
+    if len(names) != len(given):
+        several = f" or {len(given)}, one for each surface" if len(given) > 1 else ""
+        raise ValueError(f"give one material{several}, not {len(names)}")
+    fitted = "tolerance" not in settings
+    made = [
+        StudioObject(_surface(one, settings), material_of(name), fitted and isinstance(one, Field))
+        for one, name in zip(given, names, strict=True)
+    ]
+    return made if boundary is None else made + _rims(made, boundary)
+
+
+def _rims(made: list[StudioObject], radius: Any) -> list[StudioObject]:
+    """Tubes around the curves at which surfaces end."""
+    if isinstance(radius, bool) or not isinstance(radius, int | float) or not 0 < radius < math.inf:
+        raise ValueError(f"boundary is the radius of a tube, such as 0.03, not {radius!r}")
+    rims: list[StudioObject] = []
+    for one in made:
+        curves = one.surface.field.boundary_curves
+        if curves:
+            closed = [np.vstack([curve, curve[:1]]) for curve in curves]
+            tube = level_set(Tube.around(closed, float(radius)), clip=one.surface.clip)
+            rims.append(StudioObject(tube, material_of(_RIM), fitted=True))
+    if not rims:
+        raise ValueError("boundary: none of these surfaces ends at a curve")
+    return rims
+
+
+def _surface(one: Field | LevelSet, settings: Mapping[str, Any]) -> LevelSet:
+    if isinstance(one, Field):
+        return level_set(one, **settings)
+    if not settings:
+        return one
+    own: dict[str, Any] = {
+        "clip": one.clip, "tolerance": one.tolerance, "max_steps": one.max_steps,
+        "bound": one.bound, "overstep": one.overstep, "confirm": one.confirm,
+    }  # fmt: skip
+    if "level" not in settings and "solid" not in settings:
+        own |= {"level": one.levels} if one.solid is None else {"solid": one.solid}
+    return level_set(one.field, **{**own, **settings})
