@@ -68,6 +68,39 @@ def test_every_setting_may_move(tmp_path: Path) -> None:
     assert np.abs(pictures(tmp_path / "b.gif")[1] - last).mean() < 4  # of colors, a GIF has 256
 
 
+def area(picture: np.ndarray) -> int:
+    return int((np.abs(picture - picture[0, 0]).sum(axis=-1) > 30).sum())
+
+
+def test_the_camera_comes_closer(tmp_path: Path) -> None:
+    normal = SMALL | {"show": "normal", "frames": 3}
+    hk.animate(FIELD, tmp_path / "a.gif", camera=lambda s: hk.Camera(zoom=0.4 + 0.4 * s), **normal)
+    areas = [area(one) for one in pictures(tmp_path / "a.gif")]
+    assert areas[2] / areas[0] == pytest.approx(4, rel=0.3)
+
+
+@pytest.mark.parametrize("camera", [(4.0, -6.0, 5.0), hk.Camera(distance=8.0)])
+def test_a_camera_that_has_a_place_goes_around_too(camera: Any, tmp_path: Path) -> None:
+    still = SMALL | {"frames": 4, "turn": 360}
+    hk.animate(FIELD, tmp_path / "a.gif", camera=camera, **still)
+    film = pictures(tmp_path / "a.gif")
+    assert len(film) == 4
+    assert min(np.abs(film[0] - one).mean() for one in film[1:]) > 2
+    assert not any(orange(one)[[0, -1]].any() for one in film)
+    hk.render(FIELD, tmp_path / "a.png", camera=camera, show="shaded", **SMALL)
+    alone = orange(np.asarray(Image.open(tmp_path / "a.png")).astype(int))
+    assert orange(film[0]).sum() > 0.6 * alone.sum()
+
+
+def test_what_is_up_may_change(tmp_path: Path) -> None:
+    what = [hk.Torus(1, 0.2), hk.Sphere(0.1)]
+    wide = SMALL | {"size": (120, 30), "frames": 4, "show": "normal"}
+    hk.animate(what, tmp_path / "a.gif", up=lambda s: "z" if s < 0.5 else "x", **wide)
+    for one in pictures(tmp_path / "a.gif"):
+        rim = np.abs(one[[0, -1]] - one[0, 0]).sum(axis=-1)
+        assert (rim < 30).all()
+
+
 @pytest.mark.parametrize("show", ["shaded", pytest.param("color", marks=pytest.mark.slow)])
 def test_nothing_is_compiled_after_the_second_picture(show: str, tmp_path: Path) -> None:
     counts: list[int] = []
@@ -117,6 +150,12 @@ def test_films_that_cannot_be(settings: dict[str, Any], complaint: str, tmp_path
     with pytest.raises(ValueError, match=complaint):
         hk.animate(FIELD, target, **{**SMALL, "frames": 2, **settings})
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("settings", [{"turn": "360"}, {"fps": "24"}, {"fps": None}])
+def test_what_is_no_number_is_named(settings: dict[str, Any], tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match=f"{next(iter(settings))} must be a number"):
+        hk.animate(FIELD, tmp_path / "a.gif", **SMALL, **settings)
 
 
 def test_what_is_missing_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

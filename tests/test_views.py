@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import math
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +15,11 @@ import pytest
 import harnack as hk
 from harnack.cli import main
 from harnack.geometry import shapes
+from harnack.rendering import register
 from harnack.rendering.studio.upright import upright
 
 FIELD = hk.SolidAngle(shapes.wavy_polygon(24))
+mi = register()
 GYROID = hk.Gyroid(1.0, domain=hk.Ball(radius=1.0))
 
 
@@ -80,6 +84,7 @@ def test_a_fixed_angle_of_view_sees_less_from_nearer() -> None:
         ({"position": (1, 2, 3), "distance": 2.0}, "position or a distance"),
         ({"position": (1, 2, 3), "target": (1, 2, 3)}, "same point"),
         ({"azimuth": math.inf}, "azimuth"),
+        ({"box": hk.Box((1, 1, 1), (1, 1, 1))}, "larger than a point"),
     ],
 )
 def test_cameras_that_cannot_be(settings: dict[str, Any], what: str) -> None:
@@ -87,7 +92,15 @@ def test_cameras_that_cannot_be(settings: dict[str, Any], what: str) -> None:
         hk.Camera(**settings)
 
 
-@pytest.mark.parametrize("camera", ["front", (1, 2), 3, {"position": (1, 2, 3)}])
+@pytest.mark.parametrize(
+    "settings", [{"fov": "40"}, {"azimuth": "x"}, {"zoom": [1]}, {"distance": True}]
+)
+def test_what_is_no_number_is_named(settings: dict[str, Any]) -> None:
+    with pytest.raises(TypeError, match=f"{next(iter(settings))} of a camera must be a number"):
+        hk.Camera(**settings)
+
+
+@pytest.mark.parametrize("camera", ["front", "123", (1, 2), 3, {"position": (1, 2, 3)}])
 def test_what_is_no_camera_is_refused(camera: Any) -> None:
     with pytest.raises(TypeError, match=r"Camera\(azimuth"):
         draw(camera=camera)
@@ -115,7 +128,7 @@ def test_up_turns_the_picture() -> None:
     np.testing.assert_allclose(a[both], b[both], rtol=1e-3)
 
 
-@pytest.mark.parametrize("up", ["w", "--x", (0, 0, 0), (1, 2)])
+@pytest.mark.parametrize("up", ["w", "", "--x", (0, 0, 0), (1, 2)])
 def test_what_is_no_direction_is_refused(up: Any) -> None:
     with pytest.raises(ValueError, match="up"):
         draw(up=up)
@@ -142,6 +155,99 @@ def test_white_is_white_and_transparent_is_as_much_as_is_covered(show: str, tmp_
     assert (on_white.mode, with_alpha.mode) == ("RGB", "RGBA")
     assert (np.asarray(on_white)[free] == 255).all()
     np.testing.assert_array_equal(np.asarray(with_alpha)[..., 3] == 0, np.round(alpha * 255) == 0)
+
+
+TORUS = hk.Torus(1, 0.3)
+
+
+@pytest.mark.parametrize("show", ["color", "shaded"])
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"camera": hk.Camera(elevation=-90)},
+        {"camera": (0.0, 0.0, -5.0)},
+        {"camera": hk.Camera(zoom=0.1)},
+        {"size": (20, 100)},
+    ],
+)
+def test_the_lamp_is_not_in_the_picture(show: str, settings: dict[str, Any]) -> None:
+    alpha = draw(TORUS, show=show, backdrop="transparent", **settings)[..., 3]
+    hit = draw(TORUS, show="status", **settings) == hk.Status.HIT
+    assert hit.any()
+    near = np.zeros_like(hit)
+    rows, columns = np.nonzero(hit)
+    for y, x in zip(rows, columns, strict=True):
+        near[max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3] = True
+    assert (alpha[~near] == 0).all()
+
+
+def test_lights_are_hidden_from_the_camera_alone() -> None:
+    """The lamp, a ball that both its sides of shine, still lights what is behind it."""
+    lamp = {
+        "type": "sphere", "center": [0, 0, 0.5], "radius": 0.2,
+        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 5.0}},
+    }  # fmt: skip
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "harnack_path", "hide_emitters": True},
+        "sensor": {
+            "type": "orthographic",
+            "to_world": mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0]),
+            "film": {"type": "hdrfilm", "width": 24, "height": 24},
+        },
+        "lamp": lamp,
+        "floor": {"type": "rectangle"},
+    }
+    hidden = hk.render(scene, spp=64, progress=False)
+    middle = hidden[10:14, 10:14].mean()
+    assert 0.2 < middle < 4  # the floor under the lamp
+    assert middle > hidden[0, 0].mean()
+    scene["integrator"]["hide_emitters"] = False
+    assert hk.render(scene, spp=64, progress=False)[11:13, 11:13].mean() > 4.9
+
+
+@pytest.mark.parametrize(("depth", "light"), [(0, 0.0), (1, 1.0), (-1, 1.0)])
+def test_a_path_of_no_edge_sees_nothing(depth: int, light: float) -> None:
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "harnack_path", "max_depth": depth},
+        "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}},
+        "sky": {"type": "constant"},
+    }
+    np.testing.assert_allclose(hk.render(scene, spp=4, progress=False), light, atol=1e-6)
+
+
+def test_the_depth_of_another_integrator_is_taken() -> None:
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 1},
+        "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8}},
+        "sky": {"type": "constant"},
+        "ball": {"type": "sphere", "center": [0, 0, 5], "radius": 9},
+    }
+    assert hk.render(scene, spp=4, progress=False).max() == 0
+
+
+@pytest.mark.parametrize("show", ["color", "shaded"])
+@pytest.mark.parametrize("far", [50.0, 1e3, 4e3])
+def test_a_surface_seen_from_far_away_is_as_large(show: str, far: float) -> None:
+    """The camera frames it: a picture from farther away is a picture with less perspective."""
+    camera = hk.Camera(azimuth=0, elevation=0, distance=far)
+    alpha = draw(hk.Sphere(1.0), show=show, camera=camera, backdrop="transparent")[..., 3]
+    assert alpha.mean() == pytest.approx(math.pi / 4 * 0.86**2 * 0.75, rel=0.06)
+
+
+def test_a_camera_too_far_away_is_refused() -> None:
+    with pytest.raises(ValueError, match="single precision"):
+        draw(hk.Sphere(1.0), camera=(1e5, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    "settings", [{"position": (5.0, 0, 2)}, {"position": (5.0, 0, 2), "fov": 40}, {"distance": 6}]
+)
+def test_zoom_comes_closer_from_any_place(settings: dict[str, Any]) -> None:
+    one, two = (seen(hk.Camera(zoom=zoom, **settings)).sum() for zoom in (0.5, 1.0))
+    assert two / one == pytest.approx(4, rel=0.25)
 
 
 def test_exr_files_keep_alpha(tmp_path: Path) -> None:
@@ -215,6 +321,12 @@ def test_pictures_show_themselves() -> None:
     for made in (image[:, :, 0], image + 1, image.mean(axis=0), np.sqrt(image)):
         assert type(made) is np.ndarray
     assert isinstance(image.mean(), np.floating)
+    assert not hasattr(image[0], "shown")
+    for same in (image.copy(), copy.copy(image), copy.deepcopy(image)):
+        np.testing.assert_array_equal(same.shown, image.shown)
+    sent = pickle.loads(pickle.dumps(image))
+    np.testing.assert_array_equal(sent, image)
+    np.testing.assert_array_equal(sent.shown, image.shown)
 
 
 @pytest.mark.parametrize(
@@ -241,6 +353,7 @@ def test_options_of_the_command(arguments: list[str], tmp_path: Path) -> None:
         (["trefoil", "--position", "1,2"], "3 numbers"),
         (["trefoil", "--solid", "0:1"], "real-valued"),
         (["letters", "--zoom", "-1"], "positive"),
+        (["trefoil", "--position", "1,2,3", "--distance", "2"], "position or a distance"),
     ],
 )
 def test_options_that_cannot_be(

@@ -185,6 +185,9 @@ def _add_view(one: Any) -> None:
             f"--{name}", type=_three_numbers, metavar="X,Y,Z",
             help=f"{what}, in the surface's coordinates",
         )  # fmt: skip
+    group.add_argument(
+        "--distance", type=_positive, metavar="LENGTH", help="how far it is from its target"
+    )
     _add_choice(group, "--backdrop", BACKDROPS, "what is behind the surface (light)")
     _add_choice(
         group, "--up", UP_AXES,
@@ -252,7 +255,9 @@ def _add_repair(commands: Any) -> None:
 
 
 def _add_quality(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--size", type=parse_size, metavar="WxH", help="pixels (800x600)")
+    parser.add_argument(
+        "--size", type=parse_size, metavar="WxH", help="pixels (800x600; of films 320x240)"
+    )
     parser.add_argument(
         "--spp", type=_samples, metavar="N",
         help="samples a pixel (64; 9 at edges of shaded pictures)",

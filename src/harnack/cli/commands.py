@@ -144,7 +144,7 @@ def _say(text: str) -> None:
 
 def _view(options: Any) -> dict[str, Any]:
     """What was asked of the camera; None for what was not."""
-    names = ("azimuth", "elevation", "fov", "zoom", "position", "target")
+    names = ("azimuth", "elevation", "fov", "zoom", "position", "target", "distance")
     return {name: getattr(options, name) for name in names}
 
 

@@ -162,7 +162,7 @@ def check_camera(camera: Any) -> Camera:
     if isinstance(camera, Camera):
         return camera
     try:
-        x, y, z = (float(c) for c in camera)
+        x, y, z = (float(c) for c in (() if isinstance(camera, str) else camera))
     except (TypeError, ValueError):
         raise TypeError(
             "camera must be a harnack.Camera, such as Camera(azimuth=-50, elevation=28), or the "

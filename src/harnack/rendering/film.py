@@ -60,15 +60,15 @@ def animate(
         hk.animate(lambda s: hk.Morph(a, b, gap=0.2, w=0.2 * s), "morph.mp4")
         hk.animate(field, "levels.gif", level=lambda s: 1 + 4 * s)
 
-    what: what `render` draws in its studio. It, the camera and every setting may be a function of
+    what: what `render` draws in its studio. It, the camera and settings may be functions of
         s, which goes from 0 in the first picture to 1 in the last; with a `turn` of 360 degrees,
         to just before 1, so that the film can be repeated.
     path: .gif (Pillow) or .mp4 (PyAV: `pip install harnack[film]`).
     frames: number of pictures. fps: pictures a second; those of a GIF last whole hundredths.
     turn: degrees that the camera goes around during the film.
-    camera: as `render` takes it. One that does not say where it stands or what it frames gets one
-        place of the target and one distance for all pictures, such that all is always in view.
-    settings: of `render`.
+    camera: as `render` takes it. What it does not say (target, distance, angle of view) is the same
+        for all pictures, and such that all is always in view. It goes around its target.
+    settings: of `render`; `size` and `show` are the same for all pictures.
 
     Raises what `render` raises; ValueError for no or too many frames, and for another file type;
     ModuleNotFoundError where Pillow or PyAV is missing. Nothing is written unless all is.
@@ -77,10 +77,9 @@ def animate(
     count = check_integer("frames", frames)
     if not 1 <= count <= _MOST_FRAMES:
         raise ValueError(f"frames must be from 1 to {_MOST_FRAMES:,}, not {count}")
+    fps, turn = _number("fps", fps), _number("turn", turn)
     if not 0 < fps <= 240:
         raise ValueError(f"fps must be more than 0 and at most 240, not {fps}")
-    if not math.isfinite(turn):
-        raise ValueError(f"turn must be a finite number of degrees, not {turn}")
     size = check_size(size)
     with write_atomically(target) as partial, _encoder(partial, size, fps) as add:
         repeats = turn != 0 and turn % 360 == 0
@@ -110,6 +109,14 @@ def check_film_path(path: str | os.PathLike[str]) -> Path:
     return target
 
 
+def _number(name: str, value: Any) -> float:
+    if isinstance(value, bool | str) or not isinstance(value, int | float):
+        raise TypeError(f"{name} must be a number, not {value!r}")
+    if not math.isfinite(value):
+        raise ValueError(f"{name} must be a finite number, not {value}")
+    return float(value)
+
+
 def _at(value: Any, s: float) -> Any:
     """A setting at a moment. Fields and materials that can be called are what they are."""
     return value(s) if callable(value) and not isinstance(value, type) else value
@@ -126,42 +133,48 @@ def _told(moments: list[Any], shown: bool) -> Iterator[Any]:
 def _cameras(
     moments: list[dict[str, Any]], turns: FloatArray, size: tuple[int, int]
 ) -> list[Camera]:
-    """The camera of each picture. Those that frame the surface share a box, a target and a
-    distance."""
+    """The camera of each picture: one box, target, distance and angle of view for all, but for what
+    they say themselves."""
     asked = [moment.get("camera") for moment in moments]
     cameras = [Camera() if one is None else check_camera(one) for one in asked]
-    turned = [
-        replace(one, azimuth=one.azimuth + turn) if one.position is None else one
-        for one, turn in zip(cameras, turns.tolist(), strict=True)
-    ]
-    if all(one.position is not None for one in turned):
-        return turned
-    boxes = [np.array(one.box.bounds()) for one in turned if one.box is not None]
+    ups = [moment.get("up") for moment in moments]
+    stand = [upright("z" if up is None else up) for up in ups]
+    boxes = [np.array(one.box.bounds()) for one in cameras if one.box is not None]
     points = np.concatenate(boxes or [_points(moments)])
-    box = Box(_three(points.min(axis=0)), _three(points.max(axis=0)))
+    ends = np.array([points.min(axis=0), points.max(axis=0)])
     if boxes:
-        points = np.array(np.meshgrid(*np.array(box.bounds()).T)).reshape(3, -1).T
-    middle = _three(points.min(axis=0) / 2 + points.max(axis=0) / 2)
-    turn_up = upright(moments[0].get("up") or "z")
-
-    def stood(local: FloatArray) -> FloatArray:
-        return local @ turn_up.T
-
-    framed = [replace(one, box=box, target=one.target or middle) for one in turned]
-    distances = [
-        float(np.linalg.norm(np.subtract(pose.origin, pose.target)))
-        for pose in (
-            replace(one, distance=None).pose(stood(points), size, stood)
-            for one in framed
-            if one.position is None
-        )
+        points = np.array(np.meshgrid(*ends.T)).reshape(3, -1).T
+    box, middle = Box(*map(_three, ends)), _three(ends.mean(axis=0))
+    framed = [
+        _turned(replace(one, box=box, target=one.target or middle), turn, way)
+        for one, turn, way in zip(cameras, turns.tolist(), stand, strict=True)
     ]
-    farthest = max(distances)
+    free = [one.position is None and one.distance is None for one in framed]
+    poses = [
+        replace(one, zoom=1.0).pose(points @ way.T, size, lambda local, way=way: local @ way.T)
+        for one, way in zip(framed, stand, strict=True)
+    ]
+    away = [float(np.linalg.norm(pose.origin - pose.target)) for pose in poses]
+    farthest = max((one for one, is_free in zip(away, free, strict=True) if is_free), default=1.0)
+    widest = max(
+        (p.fov for p, is_free in zip(poses, free, strict=True) if not is_free), default=1.0
+    )
     return [
-        one if one.position is not None
-        else replace(one, distance=one.distance or farthest, fov=one.angle)
-        for one in framed
+        replace(one, distance=farthest / one.zoom, fov=one.angle, zoom=1.0) if is_free
+        else replace(one, fov=widest if one.fov is None else one.fov)
+        for one, is_free in zip(framed, free, strict=True)
     ]  # fmt: skip
+
+
+def _turned(camera: Camera, turn: float, stand: FloatArray) -> Camera:
+    """The camera after it has gone around its target. stand: (3, 3), turns what is up to z."""
+    if camera.position is None:
+        return replace(camera, azimuth=camera.azimuth + turn)
+    c, s = math.cos(math.radians(turn)), math.sin(math.radians(turn))
+    around = stand.T @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ stand
+    target = np.array(camera.target)
+    place = target + around @ (np.array(camera.position) - target)
+    return replace(camera, position=_three(place))
 
 
 def _points(moments: list[dict[str, Any]]) -> FloatArray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import warnings
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
@@ -157,7 +158,7 @@ def _staged(
     check_memory(asked.show, *size)
     made = studio(
         mi, exhibits(what, material, boundary, settings), size=size, camera=asked.camera,
-        backdrop=asked.backdrop, up=up or "z", bare=asked.show not in _LIT,
+        backdrop=asked.backdrop, up="z" if up is None else up, bare=asked.show not in _LIT,
     )  # fmt: skip
     return made, mi.load_dict(made.scene, parallel=False)
 
@@ -188,7 +189,10 @@ def _loaded(mi: Any, what: Any, size: tuple[int, int] | None) -> Any:
 def _tracer(mi: Any, scene: Any, max_depth: int | None) -> PathTracer:
     own = getattr(scene.integrator(), "tracer", None)
     if not isinstance(own, PathTracer):
-        return PathTracer(mi, 12 if max_depth is None else max_depth)
+        # Mitsuba's own integrators tell their settings in words alone.
+        said = re.search(r"max_depth = (\d+)", str(scene.integrator()))
+        usual = 12 if said is None else int(said[1])
+        own = PathTracer(mi, -1 if usual >= 2**31 else usual)
     return own if max_depth is None else own.with_depth(max_depth)
 
 

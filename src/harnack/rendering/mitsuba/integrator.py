@@ -181,11 +181,14 @@ class PathTracer:
         the paths behind it, and which of them go on."""
         mi, here = self.mi, dr.opaque(self.mi.UInt32, depth)
         before = paths.previous.interaction(mi)
-        si, met = world.intersect(paths.ray, before, exist)
+        hidden = (here == 0) if self.hide_emitters else None
+        si, met = world.intersect(paths.ray, before, exist, hidden)
         numbers = sampler.at_vertex(here, paths.number)
         left = transmittance(mi, world.carriers, before, si, paths.ray.d)
         paths = replace(paths, throughput=paths.throughput * left)
-        shows = exist & ~met.lost & self._shows_emitters(here)
+        shows = exist & ~met.lost & (here < self._deepest)
+        if hidden is not None:
+            shows &= ~hidden
         light = self._emitted(world.scene, paths, si, shows)
         shown = paths.throughput * mi.Spectrum(self.lost_colour.eval(si, met.lost))
         light += dr.select(met.lost, shown, 0)
@@ -227,9 +230,6 @@ class PathTracer:
         dr.scatter_add(found.light, light, paths.number, exist, mode=dr.ReduceMode.NoConflicts)
         dr.eval(found.light)
         return behind, active
-
-    def _shows_emitters(self, depth: Any) -> Mask:
-        return (depth > 0) if self.hide_emitters else self.mi.Bool(True)
 
     def _emitted(self, scene: Any, paths: _Paths, si: Any, active: Mask) -> Any:
         """Light that a vertex, or the environment behind no vertex, sends along the ray."""

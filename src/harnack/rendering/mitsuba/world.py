@@ -37,16 +37,21 @@ class World:
     def _placed(self, carrier: Any) -> PlacedSurface:
         return carrier.placed.queued() if self.queued else carrier.placed
 
-    def intersect(self, ray: Any, start: Any, active: Mask) -> tuple[Any, SurfaceHit]:
+    def intersect(
+        self, ray: Any, start: Any, active: Mask, hidden: Mask | None = None
+    ) -> tuple[Any, SurfaceHit]:
         """The first thing that rays meet, as interaction and as encounter.
 
         start: the interaction that rays leave, not valid for rays that come from a camera.
+        hidden: rays that do not see shapes that shine; None for none.
 
         Where the encounter is lost (the ray ran out of steps before anything that is known to be
         there) the interaction is not valid.
         """
         mi = self.mi
         preliminary = self.scene.ray_intersect_preliminary(ray, active=active)
+        if hidden is not None:
+            preliminary = self._behind_lights(ray, preliminary, active & hidden)
         limit = dr.minimum(preliminary.t, ray.maxt)
         if self.queued:
             dr.eval(preliminary, limit)
@@ -67,6 +72,30 @@ class World:
         first = replace(self._of_scene(si, active), evaluations=ours.evaluations)
         si = dr.select(event, surface_interaction(mi, ours, ray, whose), si)
         return si, dr.select(event, ours, first)
+
+    def _behind_lights(self, ray: Any, first: Any, active: Mask) -> Any:
+        """What rays meet of the scene behind the shapes that shine."""
+        mi = self.mi
+
+        def shines(found: Any, active: Mask) -> Mask:
+            return active & found.is_valid() & found.shape.is_emitter()
+
+        def on(found: Any, active: Mask) -> tuple[Any, Mask]:
+            past = found.t * (1 + mi.math.RayEpsilon) + mi.math.RayEpsilon
+            rest = mi.Ray3f(ray)
+            rest.o = dr.fma(mi.Vector3f(past), ray.d, ray.o)
+            rest.maxt = ray.maxt - past
+            after = self.scene.ray_intersect_preliminary(rest, active=active)
+            after.t += past
+            return dr.select(active, after, found), shines(after, active)
+
+        def running(found: Any, active: Mask) -> Mask:
+            del found
+            return active
+
+        loop: Any = dr.while_loop
+        found, _ = loop((first, shines(first, active)), running, on, label="behind lights")
+        return found
 
     def nothing(self, si: Any) -> SurfaceHit:
         """What rays have met before they are traced, given as many interactions that are none."""

@@ -151,7 +151,7 @@ class _Painter:
         self.size = (width, height)
         matrix = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
         self.light = Light.of(matrix)
-        self.through = Through(world, self.light)
+        self.through = Through(world, self.light, hides_lights=cut_out)
         self.floor = Floor.of(world, self.light) if on_floor else None
 
     def look(self, pixel: Any, offset: Any) -> _Seen:

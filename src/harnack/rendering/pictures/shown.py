@@ -26,6 +26,16 @@ class Picture(np.ndarray[Any, np.dtype[Any]]):
         picture._shown = shown
         return picture
 
+    def __array_finalize__(self, array: Any) -> None:
+        if isinstance(array, Picture) and array.shape == self.shape:  # a copy
+            self._shown = array._shown
+
+    def __reduce__(self) -> Any:
+        return _restored, (np.asarray(self), self._shown)
+
+    def __deepcopy__(self, memo: Any) -> Picture:
+        return self.copy()
+
     def __array_wrap__(self, array: Any, context: Any = None, return_scalar: bool = False) -> Any:
         return array[()] if return_scalar else np.asarray(array)
 
@@ -37,10 +47,12 @@ class Picture(np.ndarray[Any, np.dtype[Any]]):
         """The pixels that are shown: sRGB in bytes, (h, w, 3), or (h, w, 4) with alpha.
 
         Raises:
-            ValueError: this array was computed from that of a picture.
+            AttributeError: this array was computed from that of a picture.
         """
         if self._shown is None:
-            raise ValueError("only what `render` returned has pixels to show, not what it became")
+            raise AttributeError(
+                "only what `render` returned has pixels to show, not what it became"
+            )
         return self._shown
 
     def to_pil(self) -> Any:
@@ -60,3 +72,7 @@ class Picture(np.ndarray[Any, np.dtype[Any]]):
     def _repr_png_(self) -> bytes | None:
         """For notebooks."""
         return None if self._shown is None else png_bytes(load_mitsuba(), self._shown)
+
+
+def _restored(numbers: npt.NDArray[Any], shown: npt.NDArray[np.uint8] | None) -> Picture:
+    return numbers.view(Picture) if shown is None else Picture.of(numbers, shown)

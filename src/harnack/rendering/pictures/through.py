@@ -46,11 +46,13 @@ class Sight:
 class Through:
     """Rays through the clear matter of a world.
 
-    indices: of refraction, of each carrier that is clear.
+    indices: of refraction, of each carrier that is clear. hides_lights: whether shapes that shine
+        are not seen.
     """
 
-    def __init__(self, world: World, light: Light) -> None:
+    def __init__(self, world: World, light: Light, *, hides_lights: bool = False) -> None:
         self.world, self.light = world, light
+        self.hidden = world.mi.Bool(True) if hides_lights else None
         mi = world.mi
         found = ((carrier, index_of(mi, carrier)) for carrier in world.carriers)
         self.indices = tuple((carrier, index) for carrier, index in found if index is not None)
@@ -65,7 +67,7 @@ class Through:
         )  # fmt: skip
         if not self.indices:
             start = dr.zeros(mi.SurfaceInteraction3f)
-            sight.si, sight.first = world.intersect(ray, start, mi.Bool(True))
+            sight.si, sight.first = world.intersect(ray, start, mi.Bool(True), self.hidden)
             return sight
 
         def running(sight: Sight) -> Mask:
@@ -86,7 +88,7 @@ class Through:
     def _on(self, sight: Sight) -> Sight:
         """The next thing that rays meet and, where it is clear, the way behind it."""
         mi, world, d = self.world.mi, self.world, sight.ray.d
-        si, first = world.intersect(sight.ray, sight.si, sight.active)
+        si, first = world.intersect(sight.ray, sight.si, sight.active, self.hidden)
         throughput = sight.throughput * transmittance(mi, world.carriers, sight.si, si, d)
         boundaries = sight.boundaries + 1
         clear = self._is_clear(si) & first.met & (boundaries <= _MOST)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -32,7 +32,8 @@ class Camera:
         90 is +y, elevation 90 is straight from above.
     fov: the larger of the horizontal and vertical angle of view, in degrees. By default 26, or, of
         a camera with a position or a distance, what frames the surface from there.
-    zoom: 1 frames the surface tightly with a margin; more comes closer.
+    zoom: 1 frames the surface tightly with a margin; more comes closer or, of a camera with a
+        position or a distance, makes the angle of view smaller.
     box: framed in place of what is to be seen, in the coordinates of the surfaces; it stands on the
         ground. The pictures of a film, in which surfaces change, then fit each other, and nothing
         has to be traced to find the frame.
@@ -53,6 +54,10 @@ class Camera:
     distance: float | None = None
 
     def __post_init__(self) -> None:
+        for name in ("azimuth", "elevation", "fov", "zoom", "distance"):
+            number = getattr(self, name)
+            if number is not None and (isinstance(number, bool | str) or not _is_number(number)):
+                raise TypeError(f"{name} of a camera must be a number, not {number!r}")
         if self.fov is not None and not 0 < self.fov < 170:
             raise ValueError(f"fov must lie between 0 and 170 degrees, not {self.fov}")
         if not 0 < self.zoom < math.inf:
@@ -65,6 +70,8 @@ class Camera:
             raise TypeError(f"box must be a harnack.Box, not {type(self.box).__name__}")
         if self.box is not None and not np.isfinite(self.box.bounds()).all():
             raise ValueError("box must be finite")
+        if self.box is not None and not np.ptp(self.box.bounds(), axis=0).any():
+            raise ValueError(f"box must be larger than a point, and this one is not: {self.box}")
         for name in ("position", "target"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, checked_point(getattr(self, name), name))
@@ -121,7 +128,10 @@ class Camera:
             away = origin - target
             length = float(np.linalg.norm(away))
             if not length > 0:
-                raise ValueError(f"position {self.position} is in the middle of what is seen")
+                raise ValueError(
+                    f"position {self.position} is in the middle of what is seen: say where to look "
+                    "with target=(x, y, z)"
+                )
             azimuth = math.degrees(math.atan2(away[1], away[0]))
             elevation = math.degrees(math.asin(max(-1.0, min(1.0, away[2] / length))))
             turned = replace(self, azimuth=azimuth, elevation=elevation, position=None)
@@ -139,15 +149,20 @@ class Camera:
             length = max(float((a / s + z).max()) for a, s in zip((x, y), slopes, strict=True))
             length = max(length / self.zoom, 1e-3)
         elif self.fov is None:
-            room = length - z
-            shape = [max(size) / side for side in size]
-            wide = [
-                float((a / np.maximum(room, 1e-9)).max()) * k
-                for a, k in zip((x, y), shape, strict=True)
-            ]
-            fov = 2 * math.degrees(math.atan(max(*wide, 1e-4) / _FILLED / self.zoom))
-            fov = _AMONG if room.min() <= 0 else min(fov, _WIDEST)
+            fov = self._framing(np.array([x, y]), length - z, size)
+        else:
+            fov = 2 * math.degrees(math.atan(math.tan(math.radians(fov) / 2) / self.zoom))
         return Pose(target + length * back, target, up, fov, turned.azimuth)
+
+    def _framing(self, across: FloatArray, room: FloatArray, size: tuple[int, int]) -> float:
+        """The angle of view, in degrees, in which all points are that lie as far as `across` (2, n)
+        from the middle, to the right and upwards, and `room` (n,) before the camera."""
+        if room.min() <= 0:
+            return _AMONG
+        shape = max(size) / np.array(size)
+        wide = (across / room).max(axis=1) * shape
+        fov = 2 * math.degrees(math.atan(max(float(wide.max()), 1e-4) / _FILLED / self.zoom))
+        return min(fov, _WIDEST)
 
     @property
     def angle(self) -> float:
@@ -158,6 +173,14 @@ class Camera:
         """Of the edges of the part of the picture to fill, to the right and upwards."""
         slope = math.tan(math.radians(self.angle) / 2) * _FILLED / max(size)
         return slope * size[0], slope * size[1]
+
+
+def _is_number(value: Any) -> bool:
+    try:
+        float(value)
+    except (TypeError, ValueError):
+        return False
+    return True
 
 
 @dataclass(frozen=True)

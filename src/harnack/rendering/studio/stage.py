@@ -32,6 +32,9 @@ if TYPE_CHECKING:
 _TOLERANCE, _OF_PARTS = 1e-4, 1e-5
 # Light of one path, where white is 1.
 _CLAMP = 2.0
+# How far before the stage rays begin, and how far behind it they end.
+_NEAR, _FAR = 60.0, 1e4
+_FARTHEST = 5e3
 
 
 @dataclass(frozen=True)
@@ -126,6 +129,13 @@ def on_ground(points: FloatArray, turned: FloatArray | None = None) -> Placement
 
 
 def _sensor(mi: Any, pose: Pose, size: tuple[int, int]) -> dict[str, Any]:
+    # Rays begin near the stage, however far the camera is: their origins are rounded.
+    away = float(np.linalg.norm(pose.origin))
+    if away > _FARTHEST:
+        raise ValueError(
+            f"the camera is {away:,.0f} times as far away as the surface is large; pictures are "
+            f"computed in single precision, which reaches to {_FARTHEST:,.0f} times"
+        )
     look = mi.ScalarTransform4f().look_at(
         origin=pose.origin.tolist(), target=pose.target.tolist(), up=pose.up.tolist()
     )
@@ -133,7 +143,8 @@ def _sensor(mi: Any, pose: Pose, size: tuple[int, int]) -> dict[str, Any]:
         "type": "perspective",
         "fov": pose.fov,
         "fov_axis": "larger",
-        "near_clip": 1e-3,
+        "near_clip": max(1e-3, away - _NEAR),
+        "far_clip": away + _FAR,
         "to_world": look,
         "film": {
             "type": "hdrfilm",

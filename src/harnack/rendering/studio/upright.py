@@ -33,10 +33,10 @@ def upright(up: Any) -> FloatArray:
         over = np.diag([1.0, -1.0, -1.0]) if up.startswith("-") else np.eye(3)
         return over @ _UPRIGHT[axis]
     way = np.array(checked_point(up, "up"))
-    length = float(np.linalg.norm(way))
-    if not length > 0:
+    if not way.any():
         raise ValueError("up must be a vector that is not zero")
-    way, z = way / length, np.array([0.0, 0.0, 1.0])
+    way, z = way / float(np.abs(way).max()), np.array([0.0, 0.0, 1.0])
+    way = way / float(np.linalg.norm(way))
     # Turned the shortest way, about the axis at right angles to both.
     across = np.cross(way, z)
     if float(np.linalg.norm(across)) < 1e-12:
