@@ -32,8 +32,9 @@ if TYPE_CHECKING:
 _TOLERANCE, _OF_PARTS = 1e-4, 1e-5
 # Light of one path, where white is 1.
 _CLAMP = 2.0
-# How far before the stage rays begin, and how far behind it they end.
-_NEAR, _FAR = 60.0, 1e4
+# Rays begin at most twice _NEAR before the stage. Clip distances are literals of kernels: as whole
+# multiples they are the same for almost all cameras, whose pictures so share their kernels.
+_NEAR, _FAR = 60.0, 2e4
 _FARTHEST = 5e3
 
 
@@ -143,8 +144,8 @@ def _sensor(mi: Any, pose: Pose, size: tuple[int, int]) -> dict[str, Any]:
         "type": "perspective",
         "fov": pose.fov,
         "fov_axis": "larger",
-        "near_clip": max(1e-3, away - _NEAR),
-        "far_clip": away + _FAR,
+        "near_clip": max(1e-3, _NEAR * (away // _NEAR - 1)),
+        "far_clip": _FAR,
         "to_world": look,
         "film": {
             "type": "hdrfilm",
