@@ -13,7 +13,7 @@ import numpy as np
 import harnack as hk
 from harnack.rendering import Camera, register
 from harnack.rendering.mitsuba.integrator import PathTracer
-from harnack.rendering.pictures.exposure import expose
+from harnack.rendering.pictures.light_paths.exposure import expose
 from harnack.rendering.studio.materials import material_of
 from harnack.rendering.studio.stage import StudioObject, studio
 
@@ -80,7 +80,7 @@ def _radiance(mi: Any, scene: Any, clamp: float | None = None) -> Callable[[], n
 
     def draw() -> np.ndarray:
         sensor = scene.sensors()[0]
-        image, _ = expose(mi, scene, sensor, tracer, spp=_SPP, seed=0, advance=lambda _: None)
+        image = expose(mi, scene, sensor, tracer, spp=_SPP, seed=0, advance=lambda _: None).image
         return image[..., :3]
 
     return draw

@@ -81,7 +81,7 @@ def test_the_same_seed_draws_the_same_picture() -> None:
 
 def test_bands_leave_no_seam(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = draw(spp=64)
-    monkeypatch.setattr("harnack.rendering.pictures.exposure._PATHS_A_BAND", 64 * 50)
+    monkeypatch.setattr("harnack.rendering.picture.PATHS_A_BAND", 64 * 50)
     bands = draw(spp=64)
     np.testing.assert_array_equal(whole, bands)
 

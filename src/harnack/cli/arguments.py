@@ -144,6 +144,10 @@ def _add_drawn(one: Any, shaded: str) -> None:
     )
     _add_choice(file, "--normals", ("estimate",), "estimate the normals of a point cloud")
     _add_quality(one)
+    one.add_argument(
+        "--denoise", action="store_true",
+        help="take the noise out of a color picture (needs pip install 'harnack[denoise]')",
+    )  # fmt: skip
 
 
 def _add_surface(one: Any) -> None:

@@ -35,6 +35,10 @@ def _quality(options: Any) -> dict[str, Any]:
     return {**chosen, "seed": options.seed, "progress": not options.quiet}
 
 
+def _noise(options: Any) -> dict[str, Any]:
+    return {"denoise": True} if options.denoise else {}
+
+
 def _render(options: Any) -> int:
     source = _source(options)
     if options.output == "":
@@ -80,7 +84,7 @@ def _drawn(options: Any, source: Path) -> tuple[Any, dict[str, Any]]:
     """Surfaces of a scene or a file, and the settings of their picture."""
     chosen = {name: getattr(options, name) for name in ("show", "backdrop", "up", "material")}
     settings = {name: value for name, value in chosen.items() if value is not None}
-    settings |= {**_quality(options), **_of_surfaces(options)}
+    settings |= {**_quality(options), **_noise(options), **_of_surfaces(options)}
     if any(value is not None for value in _view(options).values()):
         settings["camera"] = _camera(options)
     if options.scene in SCENES:
@@ -100,7 +104,7 @@ def _mitsuba_scene(options: Any) -> tuple[str, dict[str, Any]]:
     if wrong:
         raise ValueError(f"{', '.join(wrong)} of a Mitsuba scene: set in its own file")
     show = {} if options.show is None else {"show": options.show}
-    return options.scene, {**_quality(options), **show}
+    return options.scene, {**_quality(options), **_noise(options), **show}
 
 
 def _of_surfaces(options: Any) -> dict[str, Any]:

@@ -57,6 +57,7 @@ class Request:
     camera: Camera
     backdrop: str
     antialias: str | None = None
+    denoise: bool = False
 
 
 def checked_request(
@@ -69,6 +70,7 @@ def checked_request(
     camera: Any,
     backdrop: Any,
     antialias: Any = None,
+    denoise: Any = False,
 ) -> Request:
     """What was asked for.
 
@@ -77,6 +79,10 @@ def checked_request(
     """
     check_show(show)
     check_antialias(antialias, show, spp)
+    if not isinstance(denoise, bool):
+        raise TypeError(f"denoise must be True or False, not {denoise!r}")
+    if denoise and show != "color":
+        raise ValueError(f'denoise is of pictures with show="color", not show="{show}"')
     return Request(
         show,
         None if size is None else check_size(size),
@@ -86,6 +92,7 @@ def checked_request(
         Camera() if camera is None else check_camera(camera),
         "light" if backdrop is None else check_backdrop(backdrop),
         antialias,
+        denoise,
     )
 
 

@@ -33,8 +33,10 @@ from harnack.rendering.mitsuba.integrator import PathTracer
 from harnack.rendering.mitsuba.plugins import register
 from harnack.rendering.mitsuba.scene_files import load_dictionary, load_scene_file
 from harnack.rendering.pictures.backdrop import behind
-from harnack.rendering.pictures.exposure import expose
 from harnack.rendering.pictures.images import check_picture_path, tone_mapped, write_image
+from harnack.rendering.pictures.light_paths.denoising import denoised, load_denoiser
+from harnack.rendering.pictures.light_paths.exposure import PATHS_A_BAND, expose
+from harnack.rendering.pictures.light_paths.pace import SHORT, pace_of
 from harnack.rendering.pictures.shaded import shaded
 from harnack.rendering.pictures.shown import Picture
 from harnack.rendering.pictures.views import VIEWS, look
@@ -48,6 +50,7 @@ _LIT = {"color": "light paths", "shaded": "rays"}
 _EDGE_SPP = 9
 Image = npt.NDArray[Any]
 Advance = Callable[[float], None]
+Draw = Callable[[Advance], tuple[Image, int]]
 
 
 def render(
@@ -65,6 +68,7 @@ def render(
     boundary: float | None = None,
     max_depth: int | None = None,
     seed: int = 0,
+    denoise: bool = False,
     progress: bool = True,
     **settings: Any,
 ) -> Picture:
@@ -86,6 +90,10 @@ def render(
         winding numbers of meshes.
     max_depth: longest light path in edges, -1 for no limit; by default 12 or the scene's own.
     seed: another seed, other noise; the same seed, the same picture.
+    denoise: whether a neural network (Open Image Denoise; `pip install harnack[denoise]`) takes the
+        noise out of a color picture. It guesses: do not read numbers off such a picture.
+    progress: whether a bar on stderr shows how far the picture is, and a line before it how long a
+        long one will take.
 
     In the studio only:
 
@@ -122,8 +130,10 @@ def render(
     target = None if path is None else check_picture_path(path)
     asked = checked_request(
         show=show, size=size, spp=spp, max_depth=max_depth, seed=seed, camera=camera,
-        antialias=antialias, backdrop=backdrop,
+        antialias=antialias, backdrop=backdrop, denoise=denoise,
     )  # fmt: skip
+    if asked.denoise:
+        load_denoiser()
     mi = register()
     in_studio = isinstance(what, Field | LevelSet | list | tuple)
     if in_studio:
@@ -138,9 +148,9 @@ def render(
         view = look(mi, scene, scene.sensors()[0], 1.0 if stage is None else stage.unit)
         image, drawn = VIEWS[show].numbers(view), VIEWS[show].picture(view)
     else:
+        draw = (_shaded if show == "shaded" else _radiance)(mi, scene, asked, stage, progress)
         with _bar(progress) as advance:
-            drawing = _shaded if show == "shaded" else _radiance
-            image, lost = drawing(mi, scene, asked, stage, advance)
+            image, lost = draw(advance)
         _warn_of(lost, _LIT[show])
         image, drawn = _before_backdrop(mi, scene.sensors()[0], image, stage, show)
     if target is not None:
@@ -203,26 +213,43 @@ def _warn_of(lost: int, what: str) -> None:
         )
 
 
-def _radiance(
-    mi: Any, scene: Any, asked: Request, stage: Studio | None, advance: Advance
-) -> tuple[Image, int]:
+def _radiance(mi: Any, scene: Any, asked: Request, stage: Studio | None, progress: bool) -> Draw:
     del stage
     sensor = scene.sensors()[0]
     tracer = _tracer(mi, scene, asked.max_depth)
     spp = asked.spp or check_spp(
         int(sensor.sampler().sample_count()), source=", which the scene's sampler asks for"
     )
-    return expose(mi, scene, sensor, tracer, spp=spp, seed=asked.seed, advance=advance)
+    paths_a_band = PATHS_A_BAND
+    if progress:
+        pace = pace_of(mi, scene, sensor, tracer, spp=spp, features=asked.denoise)
+        paths_a_band = pace.paths_a_band
+        if pace.picture > SHORT:
+            Console(stderr=True, highlight=False).print(
+                f"this picture will take about {pace}, with {spp} samples a pixel"
+            )
+
+    def draw(advance: Advance) -> tuple[Image, int]:
+        found = expose(
+            mi, scene, sensor, tracer, spp=spp, seed=asked.seed, advance=advance,
+            features=asked.denoise, paths_a_band=paths_a_band,
+        )  # fmt: skip
+        return denoised(found) if asked.denoise else found.image, found.lost
+
+    return draw
 
 
-def _shaded(
-    mi: Any, scene: Any, asked: Request, stage: Studio | None, advance: Advance
-) -> tuple[Image, int]:
+def _shaded(mi: Any, scene: Any, asked: Request, stage: Studio | None, progress: bool) -> Draw:
+    del progress
     sensor, spp, cones = scene.sensors()[0], asked.spp or _EDGE_SPP, asked.antialias == "cones"
-    return shaded(
-        mi, scene, sensor, spp=spp, on_floor=stage is not None and stage.has_ground,
-        cut_out=stage is not None, cones=cones, advance=advance,
-    )  # fmt: skip
+
+    def draw(advance: Advance) -> tuple[Image, int]:
+        return shaded(
+            mi, scene, sensor, spp=spp, on_floor=stage is not None and stage.has_ground,
+            cut_out=stage is not None, cones=cones, advance=advance,
+        )  # fmt: skip
+
+    return draw
 
 
 def _before_backdrop(

@@ -89,12 +89,34 @@ class _Connection:
 
 
 @dataclass
+class Features:
+    """What paths meet first: the part of light that it reflects, in (0, 1), and its unit normal.
+    Both are 0 where they meet nothing."""
+
+    albedo: Any
+    normal: Any
+
+    def note(self, mi: Any, si: Any, numbers: Any, active: Mask) -> None:
+        """Keep those of interactions, at the numbers of their paths."""
+        bsdf, straight = si.bsdf(), mi.SurfaceInteraction3f(si)
+        straight.wi = mi.Vector3f(0, 0, dr.mulsign(mi.Float(1), si.wi.z))
+        albedo = bsdf.eval_diffuse_reflectance(straight, active)
+        # Mirrors reflect all at once straight on, in their hue; what is clear has no color.
+        albedo = albedo / dr.maximum(1, dr.max(albedo))
+        albedo = dr.select(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth), albedo, 1)
+        dr.scatter(self.albedo, mi.Spectrum(albedo), numbers, active)
+        dr.scatter(self.normal, mi.Vector3f(si.sh_frame.n), numbers, active)
+
+
+@dataclass
 class Radiance:
-    """What paths have found: radiance, whether they met a surface, whether a ray got lost."""
+    """What paths have found: radiance, whether they met a surface, whether a ray got lost; and
+    features of what they met first, if they were asked for."""
 
     light: Any
     valid: Mask
     lost: Mask
+    features: Features | None = None
 
 
 class PathTracer:
@@ -137,7 +159,9 @@ class PathTracer:
         """The same with another longest path."""
         return PathTracer(self.mi, max_depth, self.rr_depth, self.hide_emitters, self.clamp)
 
-    def trace(self, scene: Any, sampler: SobolSampler, ray: Any, active: Mask) -> Radiance:
+    def trace(
+        self, scene: Any, sampler: SobolSampler, ray: Any, active: Mask, features: bool = False
+    ) -> Radiance:
         """What paths find that begin with camera rays, one for each of the sampler's lanes.
 
         Paths go on vertex by vertex, all together, and those that have ended are left out: what
@@ -148,6 +172,9 @@ class PathTracer:
         found = Radiance(
             dr.zeros(mi.Spectrum, width), dr.zeros(mi.Bool, width), dr.zeros(mi.Bool, width)
         )
+        if features:
+            found.features = Features(dr.zeros(mi.Spectrum, width), dr.zeros(mi.Vector3f, width))
+            dr.make_opaque(found.features.albedo, found.features.normal)
         paths = _Paths(
             number=dr.arange(mi.UInt32, width),
             ray=mi.Ray3f(dr.detach(ray)),
@@ -222,8 +249,11 @@ class PathTracer:
         first = (here == 0) & (si.is_valid() | met.lost)
         dr.scatter(found.valid, mi.Bool(True), paths.number, first)
         dr.scatter(found.lost, mi.Bool(True), paths.number, met.lost)
+        if found.features is not None:
+            found.features.note(mi, si, paths.number, first & si.is_valid())
         # One kernel: what vertices are like is not computed again.
-        dr.eval(active, light, found.valid, found.lost, *leaves_of(behind), *leaves_of(connection))
+        noted = (found.valid, found.lost, found.features)
+        dr.eval(active, light, noted, *leaves_of(behind), *leaves_of(connection))
         blocked = world.occluded(connection.ray, connection.active)
         light += dr.select(connection.active & ~blocked, connection.light, 0)
         # Each path has a place of its own, so that the order of sums is fixed.

@@ -21,9 +21,9 @@ from harnack.rendering.mitsuba.integrator import LOST_COLOUR
 from harnack.rendering.mitsuba.variant import mitsuba_backend
 from harnack.rendering.mitsuba.world import World
 from harnack.rendering.pictures.cones import Finder
-from harnack.rendering.pictures.exposure import as_rgb, mean_of_blocks
 from harnack.rendering.pictures.floor import Floor
 from harnack.rendering.pictures.images import tone_mapped
+from harnack.rendering.pictures.light_paths.exposure import as_rgb, mean_of_blocks
 from harnack.rendering.pictures.occlusion import visible_sky
 from harnack.rendering.pictures.pixels import (
     bands,

@@ -8,6 +8,7 @@ same seed gives the same picture.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -15,16 +16,30 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import to_numpy
-from harnack.rendering.mitsuba.integrator import PathTracer
+from harnack.rendering.mitsuba.integrator import PathTracer, Radiance
 from harnack.rendering.mitsuba.sobol import SobolSampler
 from harnack.rendering.pictures.pixels import bands, film_places
 
-# Paths of one band: about a second or two on a CPU, and Ctrl-C works between bands.
-_PATHS_A_BAND = 2**21
+# Paths of one band at most: about two seconds on a CPU. Ctrl-C works between bands.
+PATHS_A_BAND = 2**21
 # The pixel's filter: samples are drawn from a Gaussian of this standard deviation, in pixels,
 # cut at two pixels from its middle (Ernst et al. 2006, filter importance sampling).
 _FILTER_DEVIATION = 0.45
 _FILTER_REACH = 2.0
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """Radiance of all pixels of a sensor.
+
+    image: linear sRGB and, last, the part that something covers (h, w, 4). lost: how many paths ran
+    out of steps. albedo, normal: means (h, w, 3) of what is met first, if they were asked for.
+    """
+
+    image: npt.NDArray[np.float32]
+    lost: int
+    albedo: npt.NDArray[np.float32] | None = None
+    normal: npt.NDArray[np.float32] | None = None
 
 
 def expose(
@@ -36,32 +51,49 @@ def expose(
     spp: int,
     seed: int,
     advance: Callable[[float], None],
-) -> tuple[npt.NDArray[np.float32], int]:
-    """Linear sRGB radiance and, last, the part that something covers (h, w, 4); and how many
-    paths ran out of steps.
+    features: bool = False,
+    paths_a_band: int = PATHS_A_BAND,
+) -> Exposure:
+    """All pixels, each with `spp` samples.
 
-    spp: samples a pixel.
     advance: told what part of the picture has been finished since the last call.
+    features: whether to find albedos and normals too.
     """
     width, height = (int(n) for n in sensor.film().crop_size())
-    image = np.empty((width * height, 4), dtype=np.float32)
+    image = np.empty((width * height, 10 if features else 4), dtype=np.float32)
     lost = 0
-    for start, stop in bands(width * height, max(1, _PATHS_A_BAND // spp)):
+    for start, stop in bands(width * height, max(1, paths_a_band // spp)):
         lane = dr.arange(mi.UInt32, (stop - start) * spp)
         samples = dr.opaque(mi.UInt32, spp)
-        pixel = lane // samples + dr.opaque(mi.UInt32, start)
-        zero, own = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, _mixed(seed))
-        sampler = SobolSampler(mi, pixel, lane % samples, own, zero)
-        place = film_places(mi, pixel, _in_pixel(mi, sampler.next_2d()), (width, height))
-        ray, weight = _camera_ray(mi, sensor, sampler, place)
-        dr.eval(ray, weight)
-        found = tracer.trace(scene, sampler, ray, mi.Bool(True))
-        colour = as_rgb(mi, found.light * weight, ray.wavelengths)
+        pixel, sample = lane // samples + dr.opaque(mi.UInt32, start), lane % samples
+        found, waves = follow(mi, scene, sensor, tracer, pixel, sample, seed, features)
         covered = dr.select(found.valid, mi.Float(1), 0)
-        image[start:stop] = to_numpy(mean_of_blocks(mi.Vector4f(*colour, covered), spp))
+        means = [mi.Vector4f(*as_rgb(mi, found.light, waves), covered)]
+        if found.features is not None:
+            means += [as_rgb(mi, found.features.albedo, waves), found.features.normal]
+        means = [to_numpy(mean_of_blocks(one, spp)) for one in means]
+        image[start:stop] = np.concatenate(means, axis=1)
         lost += int(dr.count(found.lost)[0])
         advance((stop - start) / (width * height))
-    return image.reshape(height, width, 4), lost
+    image = image.reshape(height, width, -1)
+    if not features:
+        return Exposure(image, lost)
+    return Exposure(image[..., :4], lost, image[..., 4:7], image[..., 7:])
+
+
+def follow(
+    mi: Any, scene: Any, sensor: Any, tracer: PathTracer, pixel: Any, sample: Any, seed: int,
+    features: bool,
+) -> tuple[Radiance, Any]:  # fmt: skip
+    """What paths through samples of pixels find, as the sensor weighs it, and its wavelengths."""
+    width, height = (int(n) for n in sensor.film().crop_size())
+    zero, own = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, _mixed(seed))
+    sampler = SobolSampler(mi, pixel, sample, own, zero)
+    place = film_places(mi, pixel, _in_pixel(mi, sampler.next_2d()), (width, height))
+    ray, weight = _camera_ray(mi, sensor, sampler, place)
+    dr.eval(ray, weight)
+    found = tracer.trace(scene, sampler, ray, mi.Bool(True), features)
+    return replace(found, light=found.light * weight), ray.wavelengths
 
 
 def _mixed(seed: int) -> int:
