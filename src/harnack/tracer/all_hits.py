@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 class AllHits:
     """The first k crossings of n rays with the level set, in order: `trace(..., all_hits=k)`.
 
-    As NumPy arrays; if the rays were Dr.Jit arrays, as Dr.Jit arrays, in which (n, k) is flat:
-    crossing j of ray i is at i k + j.
+    As NumPy arrays, or as tensors if the rays were; if they were Dr.Jit arrays, as Dr.Jit arrays,
+    in which (n, k) is flat: crossing j of ray i is at i k + j.
 
     t: (n, k) ray parameter of the crossing, inf where a ray has fewer. It lies between two points
         that were looked at, with f on different sides of the level, where the cubic through their
