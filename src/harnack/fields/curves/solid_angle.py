@@ -73,7 +73,8 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
     longer steps' price: on wavy polygons and knots they take 1.4 to 2 times as many evaluations.
 
     certificate: how the lift is bounded on a ball. "auto" takes "planar" where its hypothesis is
-    checked to hold, "convex" where that does, else "edges".
+    checked to hold, "convex" where that does, else "edges"; if loops are Dr.Jit arrays it takes
+    "edges" in any case, so that curves that are moved step by step do not change kernels.
 
     - "edges" holds for **every** curve: |grad f| and the bound of second derivatives say how far f
       moves (`swept_ball`).
@@ -135,6 +136,8 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
 
     def _choose(self, asked: CertificateName) -> Literal["edges", "planar", "range"]:
         if asked == "auto":
+            if self._movable:
+                return "edges"
             if self._region is not None or (self._net_circles and not self._net):
                 return "planar"
             return "range" if self.convex_position else "edges"
