@@ -114,8 +114,8 @@ def test_a_step_of_an_optimisation_compiles_no_kernel(wanted: str, level: float)
         if wanted == "value":
             loss = dr.square(dr.sin(curve.value(points) / 4))
         else:
-            # `own` is a literal, which must not become a part of kernels.
-            hits = hk.trace(curve, backend.Array3f(0, 0, 3), d, level=own)
+            # What is literal must not become a part of kernels: `own`, and where rays start.
+            hits = hk.trace(curve, backend.Array3f(0, 0.01 * k, 3), d, level=own)
             loss = dr.select(hits.hit, dr.square(hits.t), 0)
         dr.backward(dr.sum(loss))
         assert np.abs(to_numpy(vertices.grad)).max() > 0

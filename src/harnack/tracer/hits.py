@@ -11,6 +11,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import backend_of, choose_backend, to_float, to_numpy, to_vector3
+from harnack.backend.arrays import as_data
 from harnack.backend.lengths import largest_component, unit
 from harnack.backend.lengths import length as norm
 from harnack.backend.tensors import is_tensor, numbers_of, tensor_of, vectors_of
@@ -225,8 +226,8 @@ def _of_tensors(
 def _rays(
     backend: Backend, origins: Any, directions: Any, t_min: Any, t_max: Any
 ) -> tuple[Vec3, Vec3, Real, Real]:
-    o = to_vector3(backend, origins, "origins")
-    d = to_vector3(backend, directions, "directions")
+    o = as_data(to_vector3(backend, origins, "origins"))
+    d = as_data(to_vector3(backend, directions, "directions"))
     near, far = to_float(backend, t_min, "t_min"), to_float(backend, t_max, "t_max")
     widths = {"origins": o, "directions": d, "t_min": near, "t_max": far}
     lengths = {name: dr.width(array) for name, array in widths.items()}

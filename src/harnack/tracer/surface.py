@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
-from harnack.backend import backend_of
+from harnack.backend import backend_of, to_float
+from harnack.backend.arrays import as_data
 from harnack.backend.tensors import is_tensor, numbers_of
 from harnack.enclosures import Choice, Proofs, TargetLevels, choose_proofs
 from harnack.geometry import Intersection
@@ -98,7 +99,7 @@ class LevelSet:
         occupied = self.field.occupied(self.numbers) if many and not crosses else None
         if crosses or self.confirm:
             region = _common([self.field.domain, self.clip])
-        levels = tuple(_as_data(backend, level) for level in self.levels)
+        levels = tuple(as_data(to_float(backend, level, "level")) for level in self.levels)
         return PreparedLevelSet(
             backend,
             self.field.for_levels(self.numbers).prepare(backend),
@@ -165,12 +166,6 @@ def level_set(
     return LevelSet(
         field, asked, clip, tolerance, max_steps, choose_proofs(bound), overstep, solid, confirm
     )
-
-
-def _as_data(backend: Backend, level: Any) -> Real:
-    """A level as a kernel parameter, so that another one compiles nothing, with its derivative."""
-    number = dr.opaque(backend.Float, _number(level))
-    return dr.replace_grad(number, backend.Float(level)) if dr.grad_enabled(level) else number
 
 
 def _common(parts: Sequence[Volume | None]) -> Volume | None:
