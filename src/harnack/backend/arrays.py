@@ -221,10 +221,13 @@ def to_float(backend: Backend, values: Any, name: str = "values") -> Real:
 
 
 def gather_vectors(backend: Backend, vectors: Vec3, index: Index) -> Vec3:
-    """The vectors at an index in each lane. A component that is one number for all lanes stays one:
-    of a gather from it, Dr.Jit would write derivatives beyond its end."""
+    """The vectors, of any precision, at an index in each lane. A component that is one number for
+    all lanes stays one: of a gather from it, Dr.Jit would write derivatives beyond its end."""
     return backend.Array3f(
-        *(one if dr.width(one) == 1 else dr.gather(backend.Float, one, index) for one in vectors)
+        *(
+            one if dr.width(one) == 1 else dr.gather(backend.Float, one, index)
+            for one in backend.Array3f(vectors)
+        )
     )
 
 

@@ -37,8 +37,10 @@ def vectors_of(tensor: Any, name: str = "vectors", error: type[Exception] = Valu
     check_vectors(tensor, name, error, transposed=TRANSPOSE)
     numbers = numbers_of(tensor, name)
     backend = backend_of(numbers)
-    first = 3 * dr.arange(backend.UInt32, tensor.shape[0])
-    return backend.Array3f(*(dr.gather(backend.Float, numbers, first + k) for k in range(3)))
+    count = 3 * tensor.shape[0]
+    places = (dr.arange(backend.UInt32, k, count, 3) for k in range(3 if count else 0))
+    rows = [dr.gather(backend.Float, numbers, place) for place in places]
+    return backend.Array3f(*rows) if rows else dr.zeros(backend.Array3f, 0)
 
 
 def numbers_of(tensor: Any, name: str = "values") -> Real:
