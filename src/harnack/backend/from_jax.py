@@ -59,14 +59,14 @@ def wrap_for_jax(
         leaves: list[Any] = jax.tree.leaves(args)
         if _is_traced(jax, (args, cotangents)):
             shapes = [
-                jax.ShapeDtypeStruct(one.shape, one.dtype) for one in leaves if _is_float(one)
+                jax.ShapeDtypeStruct(one.shape, one.dtype) for one in leaves if _is_float(jax, one)
             ]
             found = iter(_called_back(jax, pull_back, shapes, args, cotangents))
         else:
             found = iter(pull_back(args, cotangents))
         # JAX has a type of its own for derivatives with respect to integers.
         gradients = [
-            next(found) if _is_float(one) else np.zeros(np.shape(one), jax.dtypes.float0)
+            next(found) if _is_float(jax, one) else np.zeros(np.shape(one), jax.dtypes.float0)
             for one in leaves
         ]
         return jax.tree.unflatten(jax.tree.structure(args), gradients)
@@ -110,8 +110,8 @@ def _called_back(jax: Any, compute: Callable[..., Any], shapes: Any, *args: Any)
     return jax.pure_callback(on_host, shapes, *args, vmap_method="sequential")
 
 
-def _is_float(array: Any) -> bool:
-    return np.result_type(array).kind == "f"
+def _is_float(jax: Any, array: Any) -> bool:
+    return jax.numpy.issubdtype(jax.numpy.result_type(array), jax.numpy.floating)
 
 
 def _tensor(array: Any) -> Any:
