@@ -2,9 +2,10 @@
 PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.setup-stamp
+FRAMEWORKS := torch==2.13.0 jax==0.10.2 jaxlib==0.10.2
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo parts test test-slow lint format images bench figures clean
+.PHONY: help setup demo parts test test-slow test-frameworks lint format images bench figures clean
 
 help:
 	@echo "make setup      install everything into .venv"
@@ -12,6 +13,7 @@ help:
 	@echo "make parts      make parts to print into out/"
 	@echo "make test       run the quick tests"
 	@echo "make test-slow  run the slow tests"
+	@echo "make test-frameworks  install PyTorch and JAX into .venv and test derivatives to and from them"
 	@echo "make lint       check style and types"
 	@echo "make format     apply the style"
 	@echo "make images     render the pictures of the README into docs/images"
@@ -39,6 +41,12 @@ test: $(STAMP)
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -q -n auto -m slow
+
+# Exact versions, so that pip takes a file for processors alone where one is offered.
+test-frameworks: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(FRAMEWORKS)
+	$(BIN)/python -c "import torch, jax"
+	$(BIN)/python -m pytest -q -m "slow or not slow" tests/test_frameworks.py
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -27,6 +27,7 @@ from harnack.arithmetic import (
     tan,
     tanh,
 )
+from harnack.backend.from_jax import wrap_for_jax
 from harnack.distance import (
     Curvatures,
     DistanceBounds,
@@ -226,4 +227,5 @@ __all__ = [
     "testing",
     "trace",
     "union",
+    "wrap_for_jax",
 ]

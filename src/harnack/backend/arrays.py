@@ -220,6 +220,30 @@ def to_float(backend: Backend, values: Any, name: str = "values") -> Real:
     return aligned(backend, cast)
 
 
+def gather_vectors(backend: Backend, vectors: Vec3, index: Index) -> Vec3:
+    """The vectors, of any precision, at an index in each lane. A component that is one number for
+    all lanes stays one: of a gather from it, Dr.Jit would write derivatives beyond its end."""
+    return backend.Array3f(
+        *(
+            one if dr.width(one) == 1 else dr.gather(backend.Float, one, index)
+            for one in backend.Array3f(vectors)
+        )
+    )
+
+
+def as_data(array: Any) -> Any:
+    """The same numbers, with their derivatives; literals as kernel parameters, so that others in
+    their place do not compile another kernel."""
+    kind = _type_of(array)
+    if dr.depth_v(kind) > 1:
+        return kind(*map(as_data, array))
+    if array.state != dr.VarState.Literal:
+        return array
+    data = dr.detach(kind(array))
+    dr.make_opaque(data)
+    return dr.replace_grad(data, array) if dr.grad_enabled(array) else data
+
+
 def _check_same_backend(backend: Backend, array: Any, name: str) -> None:
     try:
         own = backend_of(array)

@@ -12,6 +12,7 @@ import drjit as dr
 
 from harnack.backend import FloatArray, backend_of
 from harnack.backend.extrema import fmax
+from harnack.backend.tensors import takes_tensors
 from harnack.fields.field import Field
 from harnack.fields.points import at_points
 
@@ -98,6 +99,7 @@ class BatchedField(Field):
             at = self.values_at(dr.detach(p), 1)
         return at.value + dr.dot(at.gradient, p - dr.detach(p))
 
+    @takes_tensors
     def value(self, points: Any, *, precision: Precision = "single") -> Any:
         if dr.is_array_v(type(points)):
             if dr.grad_enabled(points):
@@ -105,6 +107,7 @@ class BatchedField(Field):
             return self.values_at(points, 0).value
         return self._at(points, precision, 0, lambda at: (at.value,))[0]
 
+    @takes_tensors
     def gradient(self, points: Any, *, precision: Precision = "single") -> Any:
         if dr.is_array_v(type(points)):
             if dr.grad_enabled(points):

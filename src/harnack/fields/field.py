@@ -17,6 +17,7 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
+from harnack.backend.tensors import takes_tensors
 from harnack.enclosures import (
     BoundedLaplacian,
     Curvature,
@@ -229,11 +230,13 @@ class Field(abc.ABC):
         """
         return self.evaluate(p).value
 
+    @takes_tensors
     def value(self, points: Any, *, precision: Precision = "single") -> Any:
         """f at points (n, 3): (n,); at a single point (3,): a number.
 
-        A Dr.Jit 3-vector gives a Dr.Jit array, with derivatives with respect to whatever has them
-        enabled: the points and the field's parameters. Of an angle-valued field up to its period.
+        A Dr.Jit 3-vector gives a Dr.Jit array, and a tensor (n, 3) one of shape (n,), with
+        derivatives with respect to whatever has them enabled: the points and the field's
+        parameters. Of an angle-valued field up to its period.
 
         Raises TypeError or ValueError for other shapes, NaN or infinity.
         """
@@ -243,11 +246,13 @@ class Field(abc.ABC):
             return self.evaluate(points).value
         return self._samples_at(points, precision, lambda sample: sample.value)
 
+    @takes_tensors
     def gradient(self, points: Any, *, precision: Precision = "single") -> Any:
         """The gradients of f at points (n, 3): (n, 3); at a single point (3,): (3,).
 
-        A Dr.Jit 3-vector gives a Dr.Jit 3-vector, with derivatives with respect to the points if
-        they have them enabled and the field defines `hessian`. Raises as `value`.
+        A Dr.Jit 3-vector gives a Dr.Jit 3-vector, and a tensor (n, 3) one of this shape, with
+        derivatives with respect to the points if they have them enabled and the field defines
+        `hessian`. Raises as `value`.
         """
         if not dr.is_array_v(type(points)):
             return self._samples_at(points, precision, lambda sample: sample.gradient)

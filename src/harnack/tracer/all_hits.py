@@ -10,6 +10,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import to_numpy
+from harnack.backend.arrays import gather_vectors
 from harnack.backend.lengths import length as norm
 from harnack.tracer.crossings import find_crossings
 from harnack.tracer.derivatives import attach, wants_derivatives
@@ -25,8 +26,8 @@ if TYPE_CHECKING:
 class AllHits:
     """The first k crossings of n rays with the level set, in order: `trace(..., all_hits=k)`.
 
-    As NumPy arrays; if the rays were Dr.Jit arrays, as Dr.Jit arrays, in which (n, k) is flat:
-    crossing j of ray i is at i k + j.
+    As NumPy arrays, or as tensors if the rays were; if they were Dr.Jit arrays, as Dr.Jit arrays,
+    in which (n, k) is flat: crossing j of ray i is at i k + j.
 
     t: (n, k) ray parameter of the crossing, inf where a ray has fewer. It lies between two points
         that were looked at, with f on different sides of the level, where the cubic through their
@@ -99,8 +100,7 @@ def trace_all(
         normal = dr.select(length > 0, found.gradient / length, 0)
         dr.eval(*vars(found).values(), normal)
     ray = dr.arange(backend.UInt32, dr.width(found.t)) // k
-    o = o if dr.width(o) == 1 else dr.gather(backend.Array3f, o, ray)
-    d = d if dr.width(d) == 1 else dr.gather(backend.Array3f, d, ray)
+    o, d = gather_vectors(backend, o, ray), gather_vectors(backend, d, ray)
     t = found.t
     if differentiable and wants_derivatives(prepared, o, d):
         with dr.suspend_grad():

@@ -1,17 +1,20 @@
-"""`trace`: rays and a field in, a list of hits out. NumPy in, NumPy out; Dr.Jit stays Dr.Jit."""
+"""`trace`: rays and a field in, a list of hits out. NumPy in, NumPy out; Dr.Jit stays Dr.Jit, and
+tensors stay tensors."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any, cast, overload
 
 import drjit as dr
 import numpy as np
 
 from harnack.backend import backend_of, choose_backend, to_float, to_numpy, to_vector3
+from harnack.backend.arrays import as_data
 from harnack.backend.lengths import largest_component, unit
 from harnack.backend.lengths import length as norm
+from harnack.backend.tensors import is_tensor, numbers_of, tensor_of, vectors_of
 from harnack.tracer.all_hits import (
     AllHits,
     check_all_hits,
@@ -35,7 +38,7 @@ _MANY = 4096
 
 @dataclass(frozen=True)
 class Hits:
-    """The ends of n rays, as NumPy arrays or, if the rays were Dr.Jit arrays, as Dr.Jit arrays.
+    """The ends of n rays, as NumPy arrays or, if the rays were Dr.Jit arrays or tensors, as these.
 
     t: (n,) ray parameter of the hit, inf for a miss; for a ray that ran out of steps, how far
         it is proved free. A hit is within tolerance of the first root, mostly before it. One that
@@ -131,7 +134,8 @@ def trace(
     """First hits of rays with a level set of a field; no hit is ever missed.
 
     field: what to trace; or a `LevelSet`, which then holds all the settings.
-    origins, directions: (n, 3) array-likes (one of them may be (1, 3)), or Dr.Jit 3-vectors.
+    origins, directions: (n, 3) array-likes or Dr.Jit tensors (one of them may be (1, 3)), or
+        Dr.Jit 3-vectors.
         Directions need not be unit; t counts multiples of the *unit* direction, so it is a
         length.
     level: level or levels; None for the field's default. May be a Dr.Jit number.
@@ -155,8 +159,8 @@ def trace(
         precision about 1e-5 of the size of the coordinates: whatever swings less than that to one
         side may be no crossing. `max_steps` is for all of the ray.
 
-    With Dr.Jit input, t, position and normal carry derivatives with respect to whatever had
-    them enabled: rays, level, vertices of the field (implicit differentiation at the hit).
+    With Dr.Jit rays, t and position carry derivatives with respect to whatever had them enabled:
+    rays, level, vertices of the field (implicit differentiation at the hit). The rest does not.
 
     Raises ValueError or TypeError for shapes that do not match, NaN, directions of length zero,
     an empty or negative interval, or a level that no surface has.
@@ -170,6 +174,8 @@ def trace(
         )
     )  # fmt: skip
     k = None if all_hits is None else check_all_hits(all_hits, surface)
+    if any(is_tensor(a) for a in (origins, directions)):
+        return _of_tensors(surface, origins, directions, t_min, t_max, precision, k)
     given = [a for a in (origins, directions) if dr.is_array_v(type(a))]
     if given and precision is not None:
         raise ValueError("precision follows Dr.Jit rays; give it only with NumPy ones")
@@ -191,11 +197,37 @@ def trace(
     return hits if given else _as_numpy(hits, max(dr.width(o), dr.width(d), dr.width(near)))
 
 
+def _of_tensors(
+    surface: LevelSet,
+    origins: Any,
+    directions: Any,
+    t_min: Any,
+    t_max: Any,
+    precision: Precision | None,
+    k: int | None,
+) -> Any:
+    """What `trace` gives for rays of which some are tensors, as tensors of the shapes of `Hits`, or
+    of `AllHits` for k crossings a ray."""
+    rays = {"origins": origins, "directions": directions}
+    vectors = [vectors_of(a, name) if is_tensor(a) else a for name, a in rays.items()]
+    ends = {"t_min": t_min, "t_max": t_max}
+    near, far = (numbers_of(a, name) if is_tensor(a) else a for name, a in ends.items())
+    hits = trace(
+        surface, *vectors, t_min=near, t_max=far, precision=precision, all_hits=cast("int", k)
+    )
+    n = dr.width(hits.status)
+    if k is None:
+        return Hits(*(tensor_of(value, (n,)) for value in vars(hits).values()))
+    of_rays = {"count", "end", "status", "evaluations"}
+    shapes = {name: (n,) if name in of_rays else (n, k) for name in vars(hits)}
+    return AllHits(*(tensor_of(getattr(hits, name), shape) for name, shape in shapes.items()))
+
+
 def _rays(
     backend: Backend, origins: Any, directions: Any, t_min: Any, t_max: Any
 ) -> tuple[Vec3, Vec3, Real, Real]:
-    o = to_vector3(backend, origins, "origins")
-    d = to_vector3(backend, directions, "directions")
+    o = as_data(to_vector3(backend, origins, "origins"))
+    d = as_data(to_vector3(backend, directions, "directions"))
     near, far = to_float(backend, t_min, "t_min"), to_float(backend, t_max, "t_max")
     widths = {"origins": o, "directions": d, "t_min": near, "t_max": far}
     lengths = {name: dr.width(array) for name, array in widths.items()}

@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
+from harnack.backend import backend_of, to_float
+from harnack.backend.arrays import as_data
+from harnack.backend.tensors import is_tensor, numbers_of
 from harnack.enclosures import Choice, Proofs, TargetLevels, choose_proofs
 from harnack.geometry import Intersection
 from harnack.tracer.prepared import PreparedLevelSet
@@ -26,7 +29,7 @@ if TYPE_CHECKING:
 class LevelSet:
     """A surface: where a field takes one of some levels, and how closely to trace it.
 
-    levels: None for the field's default, a number, several, or Dr.Jit numbers.
+    levels: None for the field's default, a number, several, or Dr.Jit numbers or a tensor of them.
     clip: a volume to cut the surface with, besides the field's own domain.
     confirm: whether a ray hits only where f really changes sign about the level: where it passes
         to the other side, by at least half the tolerance. One that comes within the tolerance and
@@ -96,10 +99,7 @@ class LevelSet:
         occupied = self.field.occupied(self.numbers) if many and not crosses else None
         if crosses or self.confirm:
             region = _common([self.field.domain, self.clip])
-        levels = tuple(
-            level if dr.is_array_v(type(level)) else dr.opaque(backend.Float, float(level))
-            for level in self.levels
-        )
+        levels = tuple(as_data(to_float(backend, level, "level")) for level in self.levels)
         return PreparedLevelSet(
             backend,
             self.field.for_levels(self.numbers).prepare(backend),
@@ -177,6 +177,11 @@ def _common(parts: Sequence[Volume | None]) -> Volume | None:
 
 
 def _as_levels(level: Any) -> tuple[Any, ...]:
+    if is_tensor(level):
+        numbers = numbers_of(level, "level")
+        backend = backend_of(numbers)
+        each = map(backend.UInt32, range(dr.width(numbers)))
+        return tuple(dr.gather(backend.Float, numbers, k) for k in each)
     if isinstance(level, Sequence) and not isinstance(level, str):
         if not level:
             raise ValueError("level: give at least one")

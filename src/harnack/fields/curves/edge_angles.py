@@ -12,6 +12,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import to_vector3
+from harnack.backend.arrays import gather_vectors
 from harnack.fields.edges.edge_sums import inner_product, spinor
 
 if TYPE_CHECKING:
@@ -36,15 +37,9 @@ def _loop_angle(backend: Backend, vertices: Vec3, x: Vec3) -> Real:
     lane = dr.arange(backend.UInt32, points * edges)
     point, edge = lane // edges, lane % edges
     following = dr.select(edge + 1 == edges, 0, edge + 1)
-    here = _gather(backend, x, point)
-    a = _gather(backend, vertices, edge) - here
-    b = _gather(backend, vertices, following) - here
+    here = gather_vectors(backend, x, point)
+    a = gather_vectors(backend, vertices, edge) - here
+    b = gather_vectors(backend, vertices, following) - here
     # The phase of a vertex's spinor is arbitrary; it enters its two edges with opposite signs.
     re, im = inner_product(spinor(a)[2], spinor(b)[2])
     return dr.block_sum(2 * dr.atan2(im, re), edges)
-
-
-def _gather(backend: Backend, source: Vec3, index: Any) -> Vec3:
-    if dr.width(source) == 1:
-        return backend.Array3f(source)
-    return dr.gather(backend.Array3f, source, index)

@@ -13,6 +13,8 @@ import numpy as np
 
 from harnack.backend import FloatArray, backend_of, choose_backend, to_numpy
 from harnack.backend.extrema import fmin
+from harnack.backend.tensors import is_tensor, vectors_of
+from harnack.cells import wrapped_points
 from harnack.choices import did_you_mean
 from harnack.enclosures import HarmonicBall, LineLipschitz
 from harnack.fields.clearance import tight_extent
@@ -36,7 +38,7 @@ from harnack.fields.sums import (
 from harnack.fields.unit_coordinates import UnitCoordinates, UploadedField, epsilon_at, placed
 from harnack.geometry import Circle, ConvexHull, is_convex_position, total_length
 from harnack.geometry.circles import net_circles
-from harnack.geometry.curves import Loops, validate_curves
+from harnack.geometry.curves import CurveShapeError, Loops, validate_curves
 from harnack.geometry.net_loops import net_loops, uncancelled_edges
 
 if TYPE_CHECKING:
@@ -58,9 +60,9 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
     """The signed solid angle of closed curves, in steradians, with period 4 pi (paper, Eq. 10).
 
     loops: one (n, 3) array-like of vertices, n >= 3, a `Circle`, or a list of these. Every loop is
-    closed by itself. Orientation matters: a hole runs against its outer loop. A Dr.Jit 3-vector of
-    n lanes is one loop whose vertices hits can be differentiated by. Circles are exact, and cost
-    about as much as nine vertices.
+    closed by itself. Orientation matters: a hole runs against its outer loop. A loop may be a
+    Dr.Jit 3-vector of n lanes or a tensor (n, 3): hits and values can be differentiated by its
+    vertices. Circles are exact, and cost about as much as nine vertices.
 
     Edges that are run there and back, by one loop or by two neighbours, are taken out before
     anything is computed (`net_loops`): f does not see them. If none is left, f is 0 everywhere,
@@ -71,7 +73,8 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
     longer steps' price: on wavy polygons and knots they take 1.4 to 2 times as many evaluations.
 
     certificate: how the lift is bounded on a ball. "auto" takes "planar" where its hypothesis is
-    checked to hold, "convex" where that does, else "edges".
+    checked to hold, "convex" where that does, else "edges"; if loops are Dr.Jit arrays it takes
+    "edges" in any case, so that curves that are moved step by step do not change kernels.
 
     - "edges" holds for **every** curve: |grad f| and the bound of second derivatives say how far f
       moves (`swept_ball`).
@@ -94,12 +97,10 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
 
     def __init__(self, loops: Any, *, certificate: CertificateName = "auto") -> None:
         super().__init__()
-        vertices = loops if _is_drjit(loops) else None
         self.loops: Loops
         self.circles: tuple[Circle, ...]
-        curves = to_numpy(loops) if vertices is not None else loops
+        curves, self._movable = _movable_loops(loops)
         self.loops, self.circles = validate_curves(curves)
-        self.vertices: Vec3 | None = vertices
         self._net: Loops = net_loops(self.loops) if self.loops else ()
         self._net_circles = net_circles(self.circles)
         is_circle = not self._net and len(self._net_circles) == 1
@@ -135,6 +136,8 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
 
     def _choose(self, asked: CertificateName) -> Literal["edges", "planar", "range"]:
         if asked == "auto":
+            if self._movable:
+                return "edges"
             if self._region is not None or (self._net_circles and not self._net):
                 return "planar"
             return "range" if self.convex_position else "edges"
@@ -324,12 +327,12 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         return nearest * on.size + on.centre
 
     def parameters(self) -> tuple[Any, ...]:
-        return () if self.vertices is None else (self.vertices,)
+        return tuple(one for one in self._movable if _is_drjit(one))
 
     def differentiable_value(self, p: Vec3) -> Real:
         backend = backend_of(p)
         # Vertices that can be moved one by one are all there: moved, edges cancel no longer.
-        loops = (self.vertices,) if self.vertices is not None else self._net
+        loops = self._movable or self._net
         angle = differentiable_angle(backend, loops, p)
         on = self._on(p)
         if on.circles is None:
@@ -388,7 +391,10 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         if self._is_empty:
             return ConvexHull.of(points)  # holds what there is: nothing
         if self.convex_position and nearest > 2 * math.pi * (1 - 1e-9):
-            return ConvexHull.of(points).padded(1e-4 * self._size)
+            slack = 1e-4 * self._size
+            if self._movable:  # as many planes as below: curves that are moved share a kernel
+                return wrapped_points(points, slack)
+            return ConvexHull.of(points).padded(slack)
         length = sum(one.length for one in self._net_circles)
         length += total_length(self._net) if self._net else 0.0
         reach = 1.0001 * length / math.sqrt(nearest * (_PERIOD - nearest))
@@ -491,6 +497,19 @@ def _along_curves(
         return tuple(sum(several) for several in zip(*found, strict=True))
 
     return known_along(line, sums.gradient, sums.distance, rates)
+
+
+def _movable_loops(loops: Any) -> tuple[Any, tuple[Any, ...]]:
+    """Curves as `validate_curves` takes them; and, if some are Dr.Jit arrays, all loops, these as
+    3-vectors."""
+    several = isinstance(loops, list | tuple)
+    parts: list[Any] = [*loops] if several else [loops]
+    if not any(map(_is_drjit, parts)):
+        return loops, ()
+    parts = [vectors_of(one, "a loop", CurveShapeError) if is_tensor(one) else one for one in parts]
+    curves = [to_numpy(one) if _is_drjit(one) else one for one in parts]
+    movable = tuple(one for one in parts if not isinstance(one, Circle))
+    return curves if several else curves[0], movable
 
 
 def _is_drjit(value: Any) -> bool:
