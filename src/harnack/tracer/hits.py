@@ -84,6 +84,7 @@ def trace(
     max_steps: int = 2000,
     bound: Choice = None,
     clip: Volume | None = None,
+    section: Volume | None = None,
     overstep: float | None = None,
     precision: Precision | None = None,
     confirm: bool = False,
@@ -104,6 +105,7 @@ def trace(
     max_steps: int = 2000,
     bound: Choice = None,
     clip: Volume | None = None,
+    section: Volume | None = None,
     overstep: float | None = None,
     precision: Precision | None = None,
     confirm: bool = False,
@@ -123,6 +125,7 @@ def trace(
     max_steps: int = 2000,
     bound: Choice = None,
     clip: Volume | None = None,
+    section: Volume | None = None,
     overstep: float | None = None,
     precision: Precision | None = None,
     confirm: bool = False,
@@ -141,6 +144,7 @@ def trace(
         size of the coordinates.
     bound: which proofs to use: None for all that pay; "classic" for the published rule, "slope",
         "caps", "curvature", "lipschitz"; or classes of enclosures, such as `harnack.Caps`.
+    clip, section: volumes that the surface is cut by; what lies outside of one is not there.
     precision: "single" or "double" for NumPy input; Dr.Jit input keeps its own.
 
     confirm: a hit counts only where f really changes sign: a ray that comes within the tolerance
@@ -165,7 +169,7 @@ def trace(
         field
         if isinstance(field, LevelSet)
         else level_set(
-            field, level, clip=clip, tolerance=tolerance,
+            field, level, clip=clip, section=section, tolerance=tolerance,
             max_steps=max_steps, bound=bound, overstep=overstep, confirm=confirm,
         )
     )  # fmt: skip

@@ -75,6 +75,7 @@ class PreparedLevelSet:
     volume: what holds the surface. region: where the field may be looked at, only for rays that
         look for crossings; it is all of space, or larger than `volume`. Both None for all of space.
     occupied: cells outside of which there is no level; None where none are known.
+    section: of the volume, that by which the surface is opened; None for none.
     queued: whether rays are traced at once, by few lanes that share a queue, so that its methods
         can not be called while a kernel is being recorded.
     """
@@ -90,6 +91,7 @@ class PreparedLevelSet:
     confirm: bool = False
     region: Volume | None = None
     occupied: UniformGrid | None = None
+    section: Volume | None = None
     queued: bool = False
 
     def sample(self, p: Vec3) -> Sample:

@@ -28,6 +28,8 @@ class LevelSet:
 
     levels: None for the field's default, a number, several, or Dr.Jit numbers.
     clip: a volume to cut the surface with, besides the field's own domain.
+    section: another one, that opens the surface to be looked into: the faces of a solid on it may
+        have a material of their own.
     confirm: whether a ray hits only where f really changes sign about the level: where it passes
         to the other side, by at least half the tolerance. One that comes within the tolerance and
         turns back (a graze) goes on.
@@ -46,6 +48,7 @@ class LevelSet:
     overstep: float = 1.4
     solid: tuple[float, float] | None = None
     confirm: bool = False
+    section: Volume | None = None
 
     def __post_init__(self) -> None:
         if operator.index(self.max_steps) < 1:
@@ -80,9 +83,16 @@ class LevelSet:
         return tuple(_number(level) for level in self.levels)
 
     @property
+    def cut(self) -> Volume | None:
+        """What it is cut by besides the field's own domain: clip and section together."""
+        return _common([self.clip, self.section])
+
+    @property
     def volume(self) -> Volume | None:
-        """What rays are clipped to: domain, proved extent and clip together; None for all space."""
-        return _common([self.field.domain, self.field.extent(self.numbers), self.clip])
+        """What rays are clipped to: domain, proved extent, clip and section together; None for all
+        space."""
+        extent = self.field.extent(self.numbers)
+        return _common([self.field.domain, extent, self.clip, self.section])
 
     def prepare(
         self, backend: Backend, *, crosses: bool = False, many: bool = True
@@ -95,7 +105,7 @@ class LevelSet:
         volume, region = self.volume, None
         occupied = self.field.occupied(self.numbers) if many and not crosses else None
         if crosses or self.confirm:
-            region = _common([self.field.domain, self.clip])
+            region = _common([self.field.domain, self.clip, self.section])
         levels = tuple(
             level if dr.is_array_v(type(level)) else dr.opaque(backend.Float, float(level))
             for level in self.levels
@@ -112,6 +122,7 @@ class LevelSet:
             self.confirm,
             None if region is None else region.prepare(backend),
             None if occupied is None else occupied.upload(backend),
+            section=None if self.section is None else self.section.prepare(backend),
         )
 
 
@@ -126,6 +137,7 @@ def level_set(
     overstep: float | None = None,
     solid: tuple[float, float] | None = None,
     confirm: bool = False,
+    section: Volume | None = None,
 ) -> LevelSet:
     """A `LevelSet` from what users write: a level or several, a tolerance, a bound's name.
 
@@ -150,11 +162,12 @@ def level_set(
                 "high may end at a sheet, with no level there; draw its level set without solid"
             )
         level = [end for end in (low, high) if math.isfinite(end)]
-    if clip is not None and not callable(getattr(clip, "bounds", None)):
-        raise TypeError(
-            "clip must be a volume, such as harnack.Ball((0, 0, 0), 1) or harnack.Box(lower, "
-            f"upper), not {clip!r}"
-        )
+    for name, volume in (("clip", clip), ("section", section)):
+        if volume is not None and not callable(getattr(volume, "bounds", None)):
+            raise TypeError(
+                f"{name} must be a volume, such as harnack.Ball((0, 0, 0), 1), harnack.Box(lower, "
+                f"upper) or harnack.HalfSpace(normal, offset), not {volume!r}"
+            )
     asked = _as_levels(field.default_level if level is None else level)
     for one in asked:
         if not math.isfinite(_number(one)):
@@ -164,8 +177,9 @@ def level_set(
         tolerance = Tolerance(_as_number(tolerance, "tolerance must be a length or a Tolerance"))
     overstep = field.overstep if overstep is None else overstep
     return LevelSet(
-        field, asked, clip, tolerance, max_steps, choose_proofs(bound), overstep, solid, confirm
-    )
+        field, asked, clip, tolerance, max_steps, choose_proofs(bound), overstep, solid, confirm,
+        section,
+    )  # fmt: skip
 
 
 def _common(parts: Sequence[Volume | None]) -> Volume | None:

@@ -2,7 +2,8 @@
 
 The boundary consists of level sets inside the volume and of caps on the volume's own boundary.
 A ray meets a cap where it enters the volume at a point of the solid, or leaves it at one without
-having met a level before. Volumes are convex, so a ray enters and leaves at most once.
+having met a level before. Volumes are convex, so a ray enters and leaves at most once. A cap lies
+on the section if it is the section that ends the ray's part in the volume there.
 """
 
 from __future__ import annotations
@@ -73,8 +74,12 @@ class Solid:
             cap = facing(self.prepared.volume.outward_normal(position), d, outwards)
             normal = dr.select(slipped, normal, cap)
         clearance = zero + CLEARANCE * self.prepared.tolerance.distance
+        cut = met.cut
+        if self.prepared.section is not None:
+            first, last = self.prepared.section.clip(o, d, zero, t_max)
+            cut = dr.select(leaving, last <= end, entering & (first >= start))
         crossed = replace(
-            met, t=t, met=capped, position=position, normal=normal, clearance=clearance
+            met, t=t, met=capped, position=position, normal=normal, clearance=clearance, cut=cut
         )
         return dr.select(capped, crossed, met)
 
