@@ -157,6 +157,7 @@ def _add_surface(one: Any) -> None:
     _add_choice(
         group, "--cut-material", sorted(MATERIALS), "what the faces of a solid on its section are"
     )
+    group.add_argument("--largest", action="store_true", help="only the largest connected part")
     group.add_argument(
         "--boundary-tube", type=_positive, metavar="RADIUS",
         help="draw a tube around the curve at which it ends",

@@ -106,12 +106,8 @@ def mesh(
         ValueError: options out of range, or that contradict each other.
     """
     report = progress or _silent
-    for name, given in (("clip", clip), ("section", section)):
-        if given is not None and not isinstance(given, Volume):
-            raise TypeError(
-                f"{name} must be a volume, such as harnack.Box or harnack.Ball, not "
-                f"{type(given).__name__}"
-            )
+    _check_volume("clip", clip)
+    _check_volume("section", section)
     check_options(tolerance, spacing, thickness, seed)
     field = _checked(field)
     if solid is None and isinstance(field, Solid) and thickness is None:
@@ -148,6 +144,12 @@ def mesh(
         facts |= more
     check_manifold(made.faces)
     return finished(made, facts, is_closed)
+
+
+def _check_volume(name: str, given: Any) -> None:
+    if given is not None and not isinstance(given, Volume):
+        kind = type(given).__name__
+        raise TypeError(f"{name} must be a volume, such as harnack.Box or harnack.Ball, not {kind}")
 
 
 def _checked(field: Any) -> Field:

@@ -107,7 +107,7 @@ def _with_settings(one: Field | LevelSet, settings: Mapping[str, Any]) -> LevelS
     own: dict[str, Any] = {
         "clip": one.clip, "tolerance": one.tolerance, "max_steps": one.max_steps,
         "bound": one.bound, "overstep": one.overstep, "confirm": one.confirm,
-        "section": one.section,
+        "section": one.section, "largest": one.largest or False,
     }  # fmt: skip
     if "level" not in settings and "solid" not in settings:
         own |= {"level": one.levels} if one.solid is None else {"solid": one.solid}

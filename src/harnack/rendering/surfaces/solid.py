@@ -41,7 +41,7 @@ class Solid:
     def _holds(self, p: Vec3) -> Mask:
         """Whether points of the volume belong to the solid."""
         f = self.prepared.sample(p).value
-        return (f >= self.low) & (f <= self.high)
+        return (f >= self.low) & (f <= self.high) & self.prepared.counts(p)
 
     def meet(self, o: Vec3, d: Vec3, t_max: Real, active: Mask, leaves: Real = 0.0) -> SurfaceHit:
         """Where rays o + t d, |d| = 1, 0 <= t <= t_max, first cross the boundary of the solid.
