@@ -23,10 +23,10 @@ MORE = {
 }
 
 
-def harmonic(l, m, u):
+def harmonic(degree, m, u):
     """Y_lm at unit vectors (n, 3), made of SciPy's complex ones."""
     polar, azimuth = np.arccos(np.clip(u[:, 2], -1, 1)), np.arctan2(u[:, 1], u[:, 0])
-    whole = sph_harm_y(l, abs(m), polar, azimuth) * (-1.0) ** m
+    whole = sph_harm_y(degree, abs(m), polar, azimuth) * (-1.0) ** m
     part = whole.real if m >= 0 else whole.imag
     return part if m == 0 else math.sqrt(2) * part
 
@@ -35,7 +35,7 @@ def radius_less_length(field, x):
     """(n,) r - s |Y| or r - s (+-Y) at points (n, 3): negative in the lobes."""
     r = np.linalg.norm(x, axis=1)
     u = x / np.maximum(r, 1e-300)[:, None]
-    y = sum(c * harmonic(l, m, u) for (l, m), c in field.weights.items())
+    y = sum(c * harmonic(*key, u) for key, c in field.weights.items())
     return r - field.scale * {"both": abs(y), "positive": y, "negative": -y}[field.part]
 
 
@@ -44,7 +44,7 @@ def lobe(field, x):
     thin what is outside of them is."""
     r = np.linalg.norm(x, axis=1)
     u = x / np.maximum(r, 1e-300)[:, None]
-    y = sum(c * harmonic(l, m, u) for (l, m), c in field.weights.items())
+    y = sum(c * harmonic(*key, u) for key, c in field.weights.items())
     return np.where(radius_less_length(field, x) < 0, np.sign(y), 0)
 
 

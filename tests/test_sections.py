@@ -73,7 +73,8 @@ def test_faces_of_a_solid_on_its_section_are_told_from_all_others():
     x, is_met, cut = to_numpy(met.position), to_numpy(met.met), to_numpy(met.cut)
     on_plane = np.abs(x @ NORMAL - OFFSET) < 1e-6
     elsewhere = (np.abs(np.linalg.norm(x, axis=1) - 1) < 1e-3) | (np.abs(x[:, 0] + 0.5) < 1e-6)
-    assert is_met[1500:].all() and 500 < cut.sum() < 2000
+    assert is_met[1500:].all()
+    assert 500 < cut.sum() < 2000
     np.testing.assert_array_equal(cut & is_met, cut)
     np.testing.assert_array_equal(cut[is_met & ~(on_plane & elsewhere)],
                                   on_plane[is_met & ~(on_plane & elsewhere)])  # fmt: skip
@@ -92,7 +93,8 @@ def test_pictures_show_faces_in_their_own_material():
     own = hk.render(hk.Sphere(1.0), section=cut, cut_material="porcelain", **settings)
     np.testing.assert_array_equal(plain, own)
     middle = red[15, 20]
-    assert middle[0] > 3 * middle[1] and plain[15, 20, 1] > 3 * middle[1]
+    assert middle[0] > 3 * middle[1]
+    assert plain[15, 20, 1] > 3 * middle[1]
     behind = {**settings, "camera": hk.Camera(azimuth=90, elevation=0)}
     seen = hk.render(hk.Sphere(1.0), section=cut, cut_material="plastic", **behind)
     assert seen[15, 20, 1] > 0.5 * seen[15, 20, 0]
@@ -121,7 +123,8 @@ def test_meshes_are_cut_by_sections_too():
 def test_sections_of_the_command_line():
     options = parse(["render", "gyroid", "--section", "0,-3,4,0.5", "--cut-material", "clay"])
     cut = _section(options)
-    assert cut is not None and options.cut_material == "clay"
+    assert cut is not None
+    assert options.cut_material == "clay"
     np.testing.assert_allclose([*cut.normal, cut.offset], [0, -0.6, 0.8, 0.5])
     assert parse(["mesh", "gyroid", "--section", "0,0,1"]).section == (0, 0, 1, 0)
     for wrong in ("0,0,0", "1,2", "1,2,3,4,5"):

@@ -109,7 +109,8 @@ def _of_surfaces(options: Any) -> dict[str, Any]:
     asked = {
         "confirm": True if options.confirm else None, "bound": options.bound,
         "solid": options.solid, "clip": _clip(options), "section": _section(options),
-        "largest": True if options.largest else None, "cut_material": options.cut_material, "boundary": options.boundary_tube,
+        "largest": True if options.largest else None, "cut_material": options.cut_material,
+        "boundary": options.boundary_tube,
     }  # fmt: skip
     return {name: value for name, value in asked.items() if value is not None}
 

@@ -40,8 +40,9 @@ def largest_cells(
     over cells whose centre is in the volume. The volume of a solid is h^3 for each centre in it.
 
     Cells are left out that are proved to have nothing of the level set, as their balls are within
-    the clearance of their centre, or of the volume, as its signed distance says. Of solids, those
-    without a level all of which is in the solid are kept. The rest: see `largest_component`.
+    the clearance of their centre (or, where that is outside of the field's domain, of a point at
+    its boundary), or of the volume, as its signed distance says. Of solids, those without a level
+    all of which is in the solid are kept. The rest: see `largest_component`.
 
     Raises:
         ValueError: the volume is not bounded.
@@ -65,24 +66,27 @@ def _made(
     field: Field, levels: tuple[float, ...], volume: Volume, solid: _Ends | None, across: int
 ) -> OccupiedCells:
     beyond = _distance_beyond(volume)
+    into_domain = _into_domain(field)
     samples = _samples(field, levels)
     to_levels = clearance_of(field, levels, "double")
 
     def clearance(points: FloatArray) -> FloatArray:
-        free = beyond(points)
-        rest = (free <= 0) & _knows(field, points)
-        free = np.maximum(free, 0.0)
+        free = np.maximum(beyond(points), 0.0)
+        asked, moved = into_domain(points)
+        known = np.isfinite(moved)
+        if not known.any():
+            return free
+        length = to_levels(asked[known]) - moved[known]
         if solid is not None:
-            rest[rest] = ~_within(solid, samples(points[rest])[2])
-        if rest.any():
-            free[rest] = to_levels(points[rest])
+            length[_within(solid, samples(asked[known])[2])] = 0.0
+        free[known] = np.maximum(free[known], length)
         return free
 
     lower, upper = (np.array(end, np.float64) for end in volume.bounds())
     cells = OccupiedCells.of(lower, upper, clearance, across)
 
     def size(centres: FloatArray) -> FloatArray:
-        inside = (beyond(centres) <= 0) & _knows(field, centres)
+        inside = (beyond(centres) <= 0) & (into_domain(centres)[1] == 0)
         gap, slope, value = (np.zeros(len(centres)) for _ in range(3))
         if inside.any():
             gap[inside], slope[inside], value[inside] = samples(centres[inside])
@@ -98,11 +102,32 @@ def _within(solid: _Ends, values: FloatArray) -> BoolArray:
     return (values >= solid[0]) & (values <= solid[1])
 
 
-def _knows(field: Field, points: FloatArray) -> BoolArray:
-    """Whether the field may be asked at points: what is promised need only hold in the domain."""
-    if field.domain is None or field.is_entire:
-        return np.ones(len(points), np.bool_)
-    return field.domain.contains_points(points)
+def _into_domain(field: Field) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
+    """For points (n, 3), others where the field may be asked, and how far they are off, (n,),
+    infinite where none was found: what a field promises need only hold in its domain. A set that
+    is c away from the one is c less that distance away from the other."""
+    domain = None if field.is_entire else field.domain
+    backend = choose_backend("double")
+    prepared = None if domain is None else domain.prepare(backend)
+
+    def into(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        moved = np.zeros(len(points))
+        if domain is None or prepared is None:
+            return points, moved
+        outside = ~domain.contains_points(points)
+        if not outside.any():
+            return points, moved
+        x = points[outside]
+        p = to_vector3(backend, x)
+        far = (1 + 1e-9) * to_numpy(prepared.signed_distance(p)) + 1e-12 * np.abs(x).max()
+        y = x - far[:, None] * to_numpy(prepared.outward_normal(p))
+        asked = points.copy()
+        asked[outside] = y
+        length = 1.000001 * np.linalg.norm(x - y, axis=1)
+        moved[outside] = np.where(domain.contains_points(y), length, np.inf)
+        return asked, moved
+
+    return into
 
 
 def _distance_beyond(volume: Volume) -> Callable[[FloatArray], FloatArray]:

@@ -68,9 +68,9 @@ class Lobes(Field):
         2 W + 2 c q T' + q^2 T",   and   |2 c q T' + q^2 T"| <= q N A sqrt(4 c^2 + q^2 N^2)
 
     (Cauchy and Schwarz), at most N^2 A for N >= 2 and 2 A/sqrt(3) for N = 1. Those of r^3 are in
-    [0, 6 r], those of r^4 in [0, 12 r^2]. So those of f along a segment are bounded on both sides by
-    how far its ends are from the origin. The gradient is continuous, 0 at the origin, so that this
-    holds of segments through it as well.
+    [0, 6 r], those of r^4 in [0, 12 r^2]. So those of f along a segment are bounded on both sides
+    by how far its ends are from the origin. The gradient is continuous, 0 at the origin, so that
+    this holds of segments through it as well.
 
     Raises:
         ValueError: l, m, scale or part out of range; no direction with that sign.
