@@ -120,6 +120,8 @@ REAL: dict[str, Field] = {
     "Y 2,0": hk.SphericalHarmonic(2, 0),
     "Y 5,3": hk.SphericalHarmonic(5, 3),
     "Y 12,-7, large": hk.SphericalHarmonic(12, -7, radius=50.0),
+    "lobes 3,2": hk.Lobes(3, 2),
+    "lobes 2,1, positive": hk.Lobes(2, 1, part="positive", scale=20.0),
     "Eq. 8": hk.HarmonicPolynomial({(2, 1, 0): 1, (0, 1, 2): -1}),
     "polynomial off centre": hk.HarmonicPolynomial(
         {(2, 1, 0): 1, (0, 1, 2): -1, (1, 0, 0): 0.3, (0, 0, 0): 0.1, (1, 1, 1): 0.5},

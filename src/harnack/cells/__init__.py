@@ -1,5 +1,6 @@
 """Cells that may hold a level set, found by leaving out those that are proved empty."""
 
+from harnack.cells.components import largest_component
 from harnack.cells.occupied import OccupiedCells
 from harnack.cells.octree import (
     Cells,
@@ -17,6 +18,7 @@ __all__ = [
     "OccupiedCells",
     "Octree",
     "carve",
+    "largest_component",
     "octree",
     "union",
     "wrapped_points",

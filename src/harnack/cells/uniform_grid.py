@@ -108,15 +108,18 @@ class UniformGrid:
 
         return dr.while_loop((start, active), running, body, label="empty cells")[0]
 
+    def resolves(self, o: Vec3, end: Real) -> Mask:
+        """Whether rounding leaves points of rays up to `end` in their cells or close to them."""
+        rounding = 4 * self.backend.epsilon * (largest_component(o) + end)
+        return (rounding < _ROUNDING * self.size) & dr.all(dr.isfinite(o))
+
     def free_until(self, o: Vec3, d: Vec3, t: Real, end: Real) -> Real:
         """A place up to which rays o + t d, |d| = 1, stay in empty cells from t on, at most `end`.
 
         It is t itself where coordinates are so large that rounding might lead into another cell:
         a point is off by at most four roundings of the largest number in it.
         """
-        rounding = 4 * self.backend.epsilon * (largest_component(o) + end)
-        known = (rounding < _ROUNDING * self.size) & dr.all(dr.isfinite(o))
-        length = dr.select(known, end - t, 0)
+        length = dr.select(self.resolves(o, end), end - t, 0)
         run = self.run(dr.fma(type(o)(t), d, o), d, length)
         return dr.select(length > 0, fmin(t + run, end), t)
 

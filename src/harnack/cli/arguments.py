@@ -157,6 +157,11 @@ def _add_surface(one: Any) -> None:
         help="the solid where the function is between two values; one may be left out: :0",
     )  # fmt: skip
     _add_clip(group)
+    _add_section(group)
+    _add_choice(
+        group, "--cut-material", sorted(MATERIALS), "what the faces of a solid on its section are"
+    )
+    group.add_argument("--largest", action="store_true", help="only the largest connected part")
     group.add_argument(
         "--boundary-tube", type=_positive, metavar="RADIUS",
         help="draw a tube around the curve at which it ends",
@@ -172,6 +177,14 @@ def _add_clip(group: Any) -> None:
         "--box", type=_six_numbers, metavar="X,Y,Z,X,Y,Z", help="cut by a box between two corners"
     )
     clip.add_argument("--ball", type=_four_numbers, metavar="X,Y,Z,R", help="cut by a ball")
+
+
+def _add_section(group: Any) -> None:
+    group.add_argument(
+        "--section", type=_plane, metavar="X,Y,Z[,OFFSET]",
+        help="leave out what lies beyond a plane, on the side that the vector X,Y,Z points to, at "
+        "a distance from the origin (0)",
+    )  # fmt: skip
 
 
 def _add_view(one: Any) -> None:
@@ -227,6 +240,7 @@ def _add_mesh(commands: Any) -> None:
         help="a closed part so thick, in the scene's unit, half on each side of the surface",
     )  # fmt: skip
     _add_clip(one)
+    _add_section(one)
     one.add_argument(
         "--simplify", action="store_true", help="fewer triangles of closed parts, as exact"
     )
@@ -320,6 +334,14 @@ def _six_numbers(text: str) -> tuple[float, ...]:
 
 def _four_numbers(text: str) -> tuple[float, ...]:
     return _numbers(text, 4)
+
+
+def _plane(text: str) -> tuple[float, ...]:
+    """ "0,0,1" as (0, 0, 1, 0); a fourth number is the distance from the origin."""
+    plane = _numbers(text, 4 if text.count(",") == 3 else 3)
+    if not any(plane[:3]):
+        raise argparse.ArgumentTypeError(f"{_shown(text)}: the vector must not be zero")
+    return plane if len(plane) == 4 else (*plane, 0.0)
 
 
 def _numbers(text: str, count: int) -> tuple[float, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +19,7 @@ from harnack.cli.messages import in_options, printable
 from harnack.fields import Field
 from harnack.files.surfaces import SURFACE_FILES, Mesh, read_surface
 from harnack.gallery import SCENES, Scene
-from harnack.geometry import Ball, Box
+from harnack.geometry import Ball, Box, HalfSpace
 from harnack.geometry.singular import weld_vertices
 from harnack.meshing import mesh, repair
 from harnack.opening import open_surface
@@ -111,7 +112,9 @@ def _of_surfaces(options: Any) -> dict[str, Any]:
     """Settings of the surfaces drawn that were asked for."""
     asked = {
         "confirm": True if options.confirm else None, "bound": options.bound,
-        "solid": options.solid, "clip": _clip(options), "boundary": options.boundary_tube,
+        "solid": options.solid, "clip": _clip(options), "section": _section(options),
+        "largest": True if options.largest else None, "cut_material": options.cut_material,
+        "boundary": options.boundary_tube,
     }  # fmt: skip
     return {name: value for name, value in asked.items() if value is not None}
 
@@ -125,6 +128,15 @@ def _clip(options: Any) -> Box | Ball | None:
         x, y, z, radius = options.ball
         return Ball((x, y, z), radius)
     return None
+
+
+def _section(options: Any) -> HalfSpace | None:
+    """The half-space that is left where a surface is opened."""
+    if options.section is None:
+        return None
+    *normal, offset = options.section
+    x, y, z = normal
+    return HalfSpace((x, y, z), offset * math.hypot(x, y, z))
 
 
 def _check_source(name: str) -> None:
@@ -214,6 +226,7 @@ def _mesh(options: Any) -> int:
     clip = _clip(options)
     if clip is not None:
         settings["clip"] = clip
+    settings["section"] = _section(options)
     settings |= {"simplify": options.simplify, "largest": options.largest}
     if options.quiet:
         made = mesh(field, **settings)

@@ -235,4 +235,4 @@ class CellProofs:
 
 
 def _domain(surface: LevelSet) -> Any:
-    return surface.field.domain if surface.clip is None else surface.volume
+    return surface.field.domain if surface.cut is None else surface.volume

@@ -21,6 +21,7 @@ from harnack.fields.plane.height_field import HeightField
 from harnack.fields.plane.level_curves import LevelCurves
 from harnack.fields.plane.riemann_surface import RiemannSurface
 from harnack.fields.polynomials.hyperspherical import HypersphericalHarmonic
+from harnack.fields.polynomials.lobes import Lobes
 from harnack.fields.polynomials.polynomial import HarmonicPolynomial, SphericalHarmonic
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.fields.solids.combined import intersection, union
@@ -78,6 +79,7 @@ __all__ = [
     "LevelCurves",
     "LineLipschitz",
     "Lipschitz",
+    "Lobes",
     "Molecule",
     "Morph",
     "Noise",

@@ -15,6 +15,7 @@ from harnack.fields import (
     Gyroid,
     HarmonicPolynomial,
     HypersphericalHarmonic,
+    Lobes,
     Product,
     SchwarzD,
     SchwarzP,
@@ -73,6 +74,15 @@ def _harmonic(field: Field) -> list[LevelSet]:
 def _on_the_sphere(field: HypersphericalHarmonic, level: float) -> list[LevelSet]:
     """Both levels of a function of S^3, whole: nothing is clipped."""
     return [level_set(field, [-level, level], tolerance=DRAWN)]
+
+
+def _lobes() -> list[LevelSet]:
+    """Those where the function is positive, and where it is negative."""
+    lobes = Lobes(3, 2)
+    return [
+        level_set(part, solid=(-math.inf, 0.0), tolerance=DRAWN)
+        for part in (lobes.positive, lobes.negative)
+    ]
 
 
 def _quartic() -> list[LevelSet]:
@@ -180,6 +190,13 @@ HARMONICS = (
         "a hyperspherical harmonic of degree 6 (j = 4, m = 3)",
         lambda: _on_the_sphere(HypersphericalHarmonic(6, 4, 3), 0.3),
         camera=Camera(elevation=48),
+    ),
+    Scene(
+        "orbital",
+        "lobes of a spherical harmonic, l = 3, m = 2, and their signs",
+        _lobes,
+        ("plastic", "porcelain"),
+        demo_spp=36,
     ),
 )
 

@@ -50,6 +50,7 @@ def mesh(
     tolerance: float = 1e-3,
     spacing: float | None = None,
     clip: Volume | None = None,
+    section: Volume | None = None,
     solid: tuple[float, float] | bool | None = None,
     thickness: float | None = None,
     simplify: bool = False,
@@ -72,6 +73,7 @@ def mesh(
         nearer to each other are told apart where that is noticed; else a MeshingError says so.
     clip: a volume, needed where the level set has no extent. The surface ends at its boundary; a
         solid is closed there. None for the field's domain.
+    section: another one, such as a `HalfSpace`, besides the clip or the domain.
     solid: the closed surface of the points where low <= f <= high, given as (low, high); one of
         them may be infinite, as in `level_set` and `render`. For an angle-valued field, those
         between the two levels. None is True for a `Solid`, whose inside is f <= level; False for
@@ -104,8 +106,10 @@ def mesh(
         ValueError: options out of range, or that contradict each other.
     """
     report = progress or _silent
+    _check_volume("clip", clip)
+    _check_volume("section", section)
     check_options(tolerance, spacing, thickness, seed)
-    field = _checked(field, clip)
+    field = _checked(field)
     if solid is None and isinstance(field, Solid) and thickness is None:
         solid = True
     if solid and thickness is not None:
@@ -116,10 +120,14 @@ def mesh(
     share = 0.5 * tolerance if simplify else tolerance
     facts: dict[str, Any]
     if solid:
-        made, size, facts = _solid(field, level, solid, clip, share, spacing, seed, report)
+        made, size, facts = _solid(
+            field, level, solid, _volume(field, clip, section), share, spacing, seed, report
+        )
     else:
         level = field.default_level if level is None else float(level)
-        made, size, facts = _surface(field, level, clip, share, spacing, seed, report)
+        made, size, facts = _surface(
+            field, level, _volume(field, clip, section), share, spacing, seed, report
+        )
         if largest:
             made = largest_part(made)
         if thickness is not None:
@@ -138,17 +146,19 @@ def mesh(
     return finished(made, facts, is_closed)
 
 
-def _checked(field: Any, clip: Any) -> Field:
+def _check_volume(name: str, given: Any) -> None:
+    if given is not None and not isinstance(given, Volume):
+        kind = type(given).__name__
+        raise TypeError(f"{name} must be a volume, such as harnack.Box or harnack.Ball, not {kind}")
+
+
+def _checked(field: Any) -> Field:
     if not isinstance(field, Field):
         raise TypeError(f"mesh needs a field, not {type(field).__name__}")
     if field.has_parts or field.has_sheets:
         raise TypeError(
             f"{type(field).__name__} is not one continuous function: mesh its parts, or the "
             "solid angle of its boundary"
-        )
-    if clip is not None and not isinstance(clip, Volume):
-        raise TypeError(
-            f"clip must be a volume, such as harnack.Box or harnack.Ball, not {type(clip).__name__}"
         )
     if isinstance(field, SolidAngle):
         if field.circles:
@@ -161,18 +171,22 @@ def _checked(field: Any, clip: Any) -> Field:
     return field
 
 
-def _volume(field: Field, clip: Volume | None) -> Volume | None:
-    """What the level sets are cut by: the clip, and the domain where the field ends there."""
-    if clip is None or field.domain is None:
-        return clip or field.domain
-    return clip if field.is_entire or clip == field.domain else Intersection((clip, field.domain))
+def _volume(field: Field, clip: Volume | None, section: Volume | None) -> Volume | None:
+    """What the level sets are cut by: the clip, the domain where the field ends there or there is
+    no clip, and the section."""
+    ends = field.domain is not None and not (field.is_entire and clip is not None)
+    parts = dict.fromkeys((clip, field.domain if ends else None, section))
+    kept = [one for one in parts if one is not None]
+    if len(kept) < 2:
+        return kept[0] if kept else None
+    return Intersection(kept)
 
 
 def _solid(
     field: Field,
     level: float | None,
     solid: Any,
-    clip: Volume | None,
+    volume: Volume | None,
     tolerance: float,
     spacing: float | None,
     seed: int,
@@ -184,7 +198,7 @@ def _solid(
 
     def sheets(error: float, cells: float) -> Sheet:
         def sheet(angle: SolidAngle, value: float) -> Surface:
-            angle = cast("SolidAngle", _checked(angle, None))
+            angle = cast("SolidAngle", _checked(angle))
             box = _box(angle, value, None)
             made, facts = _spanned(angle, value, box, error, cells, 1, seed, report)
             evaluations[0] += facts["evaluations"]
@@ -192,7 +206,7 @@ def _solid(
 
         return sheet
 
-    made = mesh_solid(region, at, _volume(field, clip), tolerance, spacing, sheets, report)
+    made = mesh_solid(region, at, volume, tolerance, spacing, sheets, report)
     facts = {
         "level": at,
         "solid": solid,
@@ -206,7 +220,7 @@ def _solid(
 def _surface(
     field: Field,
     level: float,
-    clip: Volume | None,
+    volume: Volume | None,
     tolerance: float,
     spacing: float | None,
     seed: int,
@@ -214,7 +228,6 @@ def _surface(
 ) -> tuple[Surface, float, dict[str, Any]]:
     """A level set, its size, and what is known of it."""
     field.check_levels((level,))
-    volume = _volume(field, clip)
     box = _box(field, level, volume)
     size = float((box.upper - box.lower).max())
     cells = size / _ACROSS if spacing is None else float(spacing)

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from harnack.fields import Field, Tube
+from harnack.fields import Field, Solid, Tube
 from harnack.rendering.arguments import check_settings
 from harnack.rendering.studio.materials import Material, material_of
 from harnack.rendering.studio.stage import StudioObject
 from harnack.tracer import LevelSet, level_set
 
-OF_STUDIO = ("material", "camera", "backdrop", "up", "boundary")
+OF_STUDIO = ("material", "camera", "backdrop", "up", "boundary", "cut_material")
 _OWN = ("show", "size", "spp", "antialias", *OF_STUDIO, "max_depth", "seed", "progress")
 # What tubes around the ends of surfaces are made of.
 _RIM = "gold"
@@ -24,13 +25,15 @@ MaterialLike = str | Material | Mapping[str, Any]
 
 def surfaces_of(what: Any, boundary: float | None = None, **settings: Any) -> list[LevelSet]:
     """The surfaces that `render` draws of fields and level sets, with settings of surfaces."""
-    return [one.surface for one in exhibits(what, None, boundary, settings)]
+    return [one.surface for one in exhibits(what, None, boundary, None, settings)]
 
 
 def exhibits(
-    what: Any, materials: Any, boundary: float | None, settings: Mapping[str, Any]
+    what: Any, materials: Any, boundary: float | None, cut: Any, settings: Mapping[str, Any]
 ) -> list[StudioObject]:
     """Fields and level sets as they stand on the stage, and tubes around where they end.
+
+    cut: the material of the faces of solids on their section; None for their own.
 
     Raises:
         TypeError, ValueError: there is nothing to draw, or something wrong with what is asked for.
@@ -52,7 +55,23 @@ def exhibits(
         StudioObject(_surface(one, settings), material_of(name), fitted and isinstance(one, Field))
         for one, name in zip(given, names, strict=True)
     ]
+    if cut is not None:
+        made = _with_faces(made, material_of(cut))
     return made if boundary is None else made + _rims(made, boundary)
+
+
+def _with_faces(made: list[StudioObject], material: Material) -> list[StudioObject]:
+    """The same, with a material for the faces of solids on their sections."""
+    if not any(one.surface.section and one.surface.solid for one in made):
+        raise ValueError(
+            "cut_material is of the faces of a solid on its section: give "
+            "section=harnack.HalfSpace(normal, offset) as well and, of what is no harnack.Solid, "
+            "solid=(low, high)"
+        )
+    return [
+        replace(one, cut=material) if one.surface.section and one.surface.solid else one
+        for one in made
+    ]
 
 
 def _rims(made: list[StudioObject], radius: Any) -> list[StudioObject]:
@@ -64,7 +83,7 @@ def _rims(made: list[StudioObject], radius: Any) -> list[StudioObject]:
         curves = one.surface.field.boundary_curves
         if curves:
             closed = [np.vstack([curve, curve[:1]]) for curve in curves]
-            tube = level_set(Tube.around(closed, float(radius)), clip=one.surface.clip)
+            tube = level_set(Tube.around(closed, float(radius)), clip=one.surface.cut)
             rims.append(StudioObject(tube, material_of(_RIM), fitted=True))
     if not rims:
         raise ValueError("boundary: none of these surfaces ends at a curve")
@@ -72,6 +91,15 @@ def _rims(made: list[StudioObject], radius: Any) -> list[StudioObject]:
 
 
 def _surface(one: Field | LevelSet, settings: Mapping[str, Any]) -> LevelSet:
+    """A surface with settings. A `Solid` that is opened by a section is drawn with its inside."""
+    made = _with_settings(one, settings)
+    opened = isinstance(made.field, Solid) and made.section is not None and made.solid is None
+    if not opened or len(made.levels) != 1:
+        return made
+    return replace(made, solid=(-math.inf, made.numbers[0]))
+
+
+def _with_settings(one: Field | LevelSet, settings: Mapping[str, Any]) -> LevelSet:
     if isinstance(one, Field):
         return level_set(one, **settings)
     if not settings:
@@ -79,6 +107,7 @@ def _surface(one: Field | LevelSet, settings: Mapping[str, Any]) -> LevelSet:
     own: dict[str, Any] = {
         "clip": one.clip, "tolerance": one.tolerance, "max_steps": one.max_steps,
         "bound": one.bound, "overstep": one.overstep, "confirm": one.confirm,
+        "section": one.section, "largest": one.largest or False,
     }  # fmt: skip
     if "level" not in settings and "solid" not in settings:
         own |= {"level": one.levels} if one.solid is None else {"solid": one.solid}

@@ -193,7 +193,17 @@ def _points(moments: list[dict[str, Any]]) -> FloatArray:
 
 
 # Settings that do not change where a surface is.
-_OF_PICTURES = ("camera", "material", "backdrop", "up", "spp", "antialias", "max_depth", "seed")
+_OF_PICTURES = (
+    "camera",
+    "material",
+    "cut_material",
+    "backdrop",
+    "up",
+    "spp",
+    "antialias",
+    "max_depth",
+    "seed",
+)
 
 
 def _three(point: FloatArray) -> tuple[float, float, float]:

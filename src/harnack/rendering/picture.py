@@ -66,6 +66,7 @@ def render(
     backdrop: str | None = None,
     up: str | tuple[float, float, float] | None = None,
     boundary: float | None = None,
+    cut_material: MaterialLike | None = None,
     max_depth: int | None = None,
     seed: int = 0,
     denoise: bool = False,
@@ -107,8 +108,10 @@ def render(
         default z.
     boundary: the radius, in the surfaces' coordinates, of a golden tube around the curves at which
         surfaces end (`Field.boundary_curves`).
-    settings: of the surfaces, as `harnack.level_set` takes them: level, clip, solid, ...; those
-        of a `LevelSet` are replaced. Without a tolerance, a field gets one that suits its size.
+    cut_material: what the faces of opaque solids on their `section` are made of.
+    settings: of the surfaces, as `harnack.level_set` takes them: level, clip, section, solid, ...;
+        those of a `LevelSet` are replaced. A `Solid` with a section is drawn as one, with faces
+        where it is cut. Without a tolerance, a field gets one that suits its size.
 
     In shaded pictures, the side of larger values of an open surface in one color is darker, and
     what spans the gaps of a mesh is amber, or teal on warm colors.
@@ -137,9 +140,9 @@ def render(
     mi = register()
     in_studio = isinstance(what, Field | LevelSet | list | tuple)
     if in_studio:
-        stage, scene = _staged(mi, what, asked, material, up, boundary, settings)
+        stage, scene = _staged(mi, what, asked, material, up, boundary, cut_material, settings)
     else:
-        given = material, camera, backdrop, up, boundary
+        given = material, camera, backdrop, up, boundary, cut_material
         of_studio = dict(zip(OF_STUDIO, given, strict=True))
         refuse_studio_settings({**of_studio, **settings})
         stage, scene = None, _loaded(mi, what, asked.size)
@@ -161,13 +164,13 @@ def render(
 
 def _staged(
     mi: Any, what: Any, asked: Request, material: Any, up: Any, boundary: Any,
-    settings: Mapping[str, Any],
+    cut: Any, settings: Mapping[str, Any],
 ) -> tuple[Studio, Any]:  # fmt: skip
     """Fields and level sets in the studio, and the scene of it."""
     size = asked.size or (800, 600)
     check_memory(asked.show, *size)
     made = studio(
-        mi, exhibits(what, material, boundary, settings), size=size, camera=asked.camera,
+        mi, exhibits(what, material, boundary, cut, settings), size=size, camera=asked.camera,
         backdrop=asked.backdrop, up="z" if up is None else up, bare=asked.show not in _LIT,
     )  # fmt: skip
     return made, mi.load_dict(made.scene, parallel=False)

@@ -87,6 +87,8 @@ def trace(
     max_steps: int = 2000,
     bound: Choice = None,
     clip: Volume | None = None,
+    section: Volume | None = None,
+    largest: bool | int = False,
     overstep: float | None = None,
     precision: Precision | None = None,
     confirm: bool = False,
@@ -107,6 +109,8 @@ def trace(
     max_steps: int = 2000,
     bound: Choice = None,
     clip: Volume | None = None,
+    section: Volume | None = None,
+    largest: bool | int = False,
     overstep: float | None = None,
     precision: Precision | None = None,
     confirm: bool = False,
@@ -126,6 +130,8 @@ def trace(
     max_steps: int = 2000,
     bound: Choice = None,
     clip: Volume | None = None,
+    section: Volume | None = None,
+    largest: bool | int = False,
     overstep: float | None = None,
     precision: Precision | None = None,
     confirm: bool = False,
@@ -145,6 +151,10 @@ def trace(
         size of the coordinates.
     bound: which proofs to use: None for all that pay; "classic" for the published rule, "slope",
         "caps", "curvature", "lipschitz"; or classes of enclosures, such as `harnack.Caps`.
+    clip, section: volumes that the surface is cut by; what lies outside of one is not there.
+    largest: of the surface in the domain and the clip, only its largest component, as far as
+        components are separated by cells proved empty: 128 along the longest side, or so many. Rays
+        that start so far away that rounding is more than a part of a cell are out of steps.
     precision: "single" or "double" for NumPy input; Dr.Jit input keeps its own.
 
     confirm: a hit counts only where f really changes sign: a ray that comes within the tolerance
@@ -169,8 +179,9 @@ def trace(
         field
         if isinstance(field, LevelSet)
         else level_set(
-            field, level, clip=clip, tolerance=tolerance,
-            max_steps=max_steps, bound=bound, overstep=overstep, confirm=confirm,
+            field, level, clip=clip, section=section, largest=largest,
+            tolerance=tolerance, max_steps=max_steps, bound=bound, overstep=overstep,
+            confirm=confirm,
         )
     )  # fmt: skip
     k = None if all_hits is None else check_all_hits(all_hits, surface)

@@ -117,6 +117,7 @@ class March:
     cover: for cones that end where they come near a level: their radius per unit of t (`covers`).
     occupied: cells outside of which there is no level, not even behind a sheet, for rays that end
         where they reach one; and `last`, where these rays end.
+    is_part: whether there may be levels outside of these cells that do not count.
     """
 
     backend: Backend
@@ -128,6 +129,7 @@ class March:
     cover: Real | None = None
     occupied: UniformGrid | None = None
     last: Real = 0.0
+    is_part: bool = False
 
     def advance(
         self,
@@ -166,6 +168,10 @@ class March:
 
         With `occupied` what follows a proved step is passed as well, as far as it lies in cells
         that hold no level (`UniformGrid.run` has the proof): a union of free intervals is free.
+
+        With `is_part` the levels elsewhere are those of other parts of the surface. Proved steps
+        end in cells that count, and so do trials: one that would not is not made. So no hit lies
+        elsewhere, and what is passed elsewhere does not count.
 
         ahead: of a field with sheets, the crossing at `end`, on lanes where there is one. Those
         lanes look at that point as well. Accepted there, they hit the sheet or have passed it: a
@@ -291,6 +297,9 @@ class March:
             free_to = self.occupied.free_until(path.origin, path.direction, free_to, self.last)
             forward = fmax(forward, dr.select(free_to >= self.last, dr.inf, free_to - t))
             trial = fmax(trial, forward)
+            if self.is_part:
+                there = path.point(t + fmin(trial, end - t))
+                trial = dr.select(self.occupied.cell(there).free > 0, forward, trial)
         base = dr.select(accepted, t, now.base)
         step = dr.select(accepted, trial, dr.select(too_coarse, now.step, now.reach))
         reach = dr.select(accepted, forward, now.reach)

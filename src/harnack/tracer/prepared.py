@@ -75,6 +75,8 @@ class PreparedLevelSet:
     volume: what holds the surface. region: where the field may be looked at, only for rays that
         look for crossings; it is all of space, or larger than `volume`. Both None for all of space.
     occupied: cells outside of which there is no level; None where none are known.
+    is_part: whether the levels outside of `occupied` do not count, where there may be some.
+    section: of the volume, that by which the surface is opened; None for none.
     queued: whether rays are traced at once, by few lanes that share a queue, so that its methods
         can not be called while a kernel is being recorded.
     """
@@ -90,6 +92,8 @@ class PreparedLevelSet:
     confirm: bool = False
     region: Volume | None = None
     occupied: UniformGrid | None = None
+    is_part: bool = False
+    section: Volume | None = None
     queued: bool = False
 
     def sample(self, p: Vec3) -> Sample:
@@ -102,6 +106,12 @@ class PreparedLevelSet:
             return self
         part = dr.select(hit.part == NO_PART, self.backend.UInt32(0), hit.part)
         return replace(self, field=self.field.part_at(part))
+
+    def counts(self, p: Vec3) -> Mask:
+        """Whether points are where levels count."""
+        if self.occupied is None or not self.is_part:
+            return self.backend.Bool(True)
+        return self.occupied.cell(p).free == 0
 
     def clip(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real) -> tuple[Real, Real]:
         """The part of [t_min, t_max] that can hold the surface; empty unless start < end."""
@@ -156,6 +166,12 @@ class PreparedLevelSet:
             if not self.field.has_sheets:  # a sheet on the start must be looked at
                 start = occupied.free_until(path.origin, path.direction, start, end)
         state = MarchState.at(backend, start, end, active, has_detail=has_detail, crosses=crosses)
+        if occupied is not None and self.is_part:
+            # Where rounding leaves open in which cell a point is, nothing is said.
+            lost = state.active & ~occupied.resolves(path.origin, end)
+            out = backend.UInt32(int(Status.OUT_OF_STEPS))
+            status = dr.select(lost, out, state.status)
+            state = replace(state, active=state.active & ~lost, status=status)
         march = March(
             backend,
             self.levels,
@@ -165,6 +181,7 @@ class PreparedLevelSet:
             hysteresis,
             occupied=occupied,
             last=end,
+            is_part=self.is_part,
         )
         return march, path, real(start), real(end), state
 

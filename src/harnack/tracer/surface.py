@@ -16,6 +16,7 @@ from harnack.backend.arrays import as_data
 from harnack.backend.tensors import is_tensor, numbers_of
 from harnack.enclosures import Choice, Proofs, TargetLevels, choose_proofs
 from harnack.geometry import Intersection
+from harnack.tracer.largest import checked_largest, largest_cells
 from harnack.tracer.prepared import PreparedLevelSet
 from harnack.tracer.tolerance import Tolerance
 
@@ -24,6 +25,11 @@ if TYPE_CHECKING:
     from harnack.fields.field import Field
     from harnack.geometry import Volume
 
+_FIRST_HITS = (
+    "largest is of first hits: neither of all_hits and confirm, nor of pictures with "
+    'antialias="cones"'
+)
+
 
 @dataclass(frozen=True)
 class LevelSet:
@@ -31,6 +37,11 @@ class LevelSet:
 
     levels: None for the field's default, a number, several, or Dr.Jit numbers or a tensor of them.
     clip: a volume to cut the surface with, besides the field's own domain.
+    section: another one, that opens the surface to be looked into: the faces of a solid on it may
+        have a material of their own.
+    largest: 0, or how many cells along the longest side of its box to tell components apart by:
+        then only the largest component is there (`largest_cells`), of what the domain and the clip
+        leave. Those that are not separated by cells proved empty count as one.
     confirm: whether a ray hits only where f really changes sign about the level: where it passes
         to the other side, by at least half the tolerance. One that comes within the tolerance and
         turns back (a graze) goes on.
@@ -49,6 +60,8 @@ class LevelSet:
     overstep: float = 1.4
     solid: tuple[float, float] | None = None
     confirm: bool = False
+    section: Volume | None = None
+    largest: int = 0
 
     def __post_init__(self) -> None:
         if operator.index(self.max_steps) < 1:
@@ -59,6 +72,13 @@ class LevelSet:
             raise ValueError("a field with sheets must be real-valued: its period must be None")
         if self.confirm:
             self.check_crossings("confirm")
+        if self.largest and (self.field.has_sheets or self.field.has_parts):
+            raise ValueError(
+                f"largest is of one continuous function, and this {type(self.field).__name__} "
+                "jumps or has parts"
+            )
+        if self.largest and self.confirm:
+            raise ValueError(_FIRST_HITS)
 
     def check_crossings(self, setting: str) -> None:
         """Raise ValueError for several levels of a field with sheets: a jump may cross more than
@@ -83,9 +103,16 @@ class LevelSet:
         return tuple(_number(level) for level in self.levels)
 
     @property
+    def cut(self) -> Volume | None:
+        """What it is cut by besides the field's own domain: clip and section together."""
+        return _common([self.clip, self.section])
+
+    @property
     def volume(self) -> Volume | None:
-        """What rays are clipped to: domain, proved extent and clip together; None for all space."""
-        return _common([self.field.domain, self.field.extent(self.numbers), self.clip])
+        """What rays are clipped to: domain, proved extent, clip and section together; None for all
+        space."""
+        extent = self.field.extent(self.numbers)
+        return _common([self.field.domain, extent, self.clip, self.section])
 
     def prepare(
         self, backend: Backend, *, crosses: bool = False, many: bool = True
@@ -95,10 +122,17 @@ class LevelSet:
         crosses: whether rays will look for crossings. many: whether there will be so many rays that
             it pays to look for cells without the level first.
         """
+        if self.largest and crosses:
+            raise ValueError(_FIRST_HITS)
         volume, region = self.volume, None
-        occupied = self.field.occupied(self.numbers) if many and not crosses else None
+        if self.largest:
+            whole = _common([self.field.domain, self.field.extent(self.numbers), self.clip])
+            given = self.field, self.numbers, whole, self.solid, self.largest
+            occupied = largest_cells(*given)
+        else:
+            occupied = self.field.occupied(self.numbers) if many and not crosses else None
         if crosses or self.confirm:
-            region = _common([self.field.domain, self.clip])
+            region = _common([self.field.domain, self.clip, self.section])
         levels = tuple(as_data(to_float(backend, level, "level")) for level in self.levels)
         return PreparedLevelSet(
             backend,
@@ -112,6 +146,8 @@ class LevelSet:
             self.confirm,
             None if region is None else region.prepare(backend),
             None if occupied is None else occupied.upload(backend),
+            is_part=self.largest > 0,
+            section=None if self.section is None else self.section.prepare(backend),
         )
 
 
@@ -126,8 +162,13 @@ def level_set(
     overstep: float | None = None,
     solid: tuple[float, float] | None = None,
     confirm: bool = False,
+    section: Volume | None = None,
+    largest: bool | int = False,
 ) -> LevelSet:
     """A `LevelSet` from what users write: a level or several, a tolerance, a bound's name.
+
+    largest: True for the largest component alone, told from others by 128 cells along the longest
+        side, or by so many.
 
     Raises ValueError for a level that is not a finite number or that the field cannot have.
     """
@@ -150,11 +191,12 @@ def level_set(
                 "high may end at a sheet, with no level there; draw its level set without solid"
             )
         level = [end for end in (low, high) if math.isfinite(end)]
-    if clip is not None and not callable(getattr(clip, "bounds", None)):
-        raise TypeError(
-            "clip must be a volume, such as harnack.Ball((0, 0, 0), 1) or harnack.Box(lower, "
-            f"upper), not {clip!r}"
-        )
+    for name, volume in (("clip", clip), ("section", section)):
+        if volume is not None and not callable(getattr(volume, "bounds", None)):
+            raise TypeError(
+                f"{name} must be a volume, such as harnack.Ball((0, 0, 0), 1), harnack.Box(lower, "
+                f"upper) or harnack.HalfSpace(normal, offset), not {volume!r}"
+            )
     asked = _as_levels(field.default_level if level is None else level)
     for one in asked:
         if not math.isfinite(_number(one)):
@@ -164,8 +206,9 @@ def level_set(
         tolerance = Tolerance(_as_number(tolerance, "tolerance must be a length or a Tolerance"))
     overstep = field.overstep if overstep is None else overstep
     return LevelSet(
-        field, asked, clip, tolerance, max_steps, choose_proofs(bound), overstep, solid, confirm
-    )
+        field, asked, clip, tolerance, max_steps, choose_proofs(bound), overstep, solid, confirm,
+        section, checked_largest(largest),
+    )  # fmt: skip
 
 
 def _common(parts: Sequence[Volume | None]) -> Volume | None:

@@ -47,7 +47,7 @@ class MeshSurface:
         """Of the winding number of a mesh that nothing clips; else None. Of a mesh that is not
         closed, those triangles that are proved to belong to the surface as a whole."""
         mesh = surface.field.mesh_of_sheets()
-        if mesh is None or surface.clip is not None or surface.field.domain is not None:
+        if mesh is None or surface.cut is not None or surface.field.domain is not None:
             return None
         vertices, faces, is_closed = mesh
         low, high = vertices[faces].min(axis=(0, 1)), vertices[faces].max(axis=(0, 1))

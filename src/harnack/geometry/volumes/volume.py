@@ -26,7 +26,16 @@ class Volume(abc.ABC):
     coordinates involved (about 1e-6 of the distance to the ray's origin in single precision).
 
     Methods that take Dr.Jit arrays can be called while a loop is being recorded.
+
+    `a & b` is what two volumes have in common, which is convex as well.
     """
+
+    def __and__(self, other: object) -> Volume:
+        from harnack.geometry.volumes.primitives import Intersection
+
+        if not isinstance(other, Volume):
+            return NotImplemented
+        return Intersection((*_parts(self), *_parts(other)))
 
     @abc.abstractmethod
     def clip(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real) -> tuple[Real, Real]:
@@ -67,6 +76,12 @@ class Volume(abc.ABC):
         """
         del backend
         return self
+
+
+def _parts(volume: Volume) -> tuple[Volume, ...]:
+    """The volumes that an intersection is made of; of another volume, itself."""
+    parts: tuple[Volume, ...] | None = getattr(volume, "volumes", None)
+    return (volume,) if parts is None else parts
 
 
 def rounding(backend: Backend) -> float:

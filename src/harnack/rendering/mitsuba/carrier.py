@@ -26,10 +26,13 @@ if TYPE_CHECKING:
 PLUGIN = "harnack"
 
 
-def from_properties(mi: Any, props: Any, surface: LevelSet, tint: Any = None) -> Any:
+def from_properties(
+    mi: Any, props: Any, surface: LevelSet, tint: Any = None, cut_bsdf: Any = None
+) -> Any:
     """The shape of a surface with the `to_world` and the BSDF that a plug-in's properties hold.
 
     tint: of a solid, what is left of light after one unit of length in it, in the world.
+    cut_bsdf: of the faces of a solid on its section; None for that of the rest.
 
     Raises:
         ValueError: as `shape`; or the properties hold an emitter or a medium.
@@ -42,7 +45,7 @@ def from_properties(mi: Any, props: Any, surface: LevelSet, tint: Any = None) ->
     placement = Placement.identity()
     if "to_world" in props:
         placement = Placement.of(as_matrix(props["to_world"]))
-    made = _carrier_class(mi.variant())(props, surface, placement, tint)
+    made = _carrier_class(mi.variant())(props, surface, placement, tint, cut_bsdf)
     if made.emitter() is not None or made.is_medium_transition():
         raise ValueError("surfaces that are traced can neither emit light nor bound a medium")
     return made
@@ -63,12 +66,16 @@ def _carrier_class(variant: str) -> Any:
     class Carrier(mi.Mesh):
         """A mesh that no ray meets, with the surface that it stands for."""
 
-        def __init__(self, props: Any, surface: LevelSet, placement: Placement, tint: Any) -> None:
+        def __init__(
+            self, props: Any, surface: LevelSet, placement: Placement, tint: Any, cut_bsdf: Any
+        ) -> None:
             ends = box_of(surface)
             mi.Mesh.__init__(self, PLUGIN, 2, 2, props=props)
             self.surface = surface
             self.placement = placement
             self.tint = tint_of(mi, tint)
+            # What is met on the section counts as a shape of its own, which no ray meets either.
+            self.cut_face = None if cut_bsdf is None else _bearer(mi, cut_bsdf)
             self.placed = PlacedSurface.of(surface, placement, mitsuba_backend(mi))
             params = mi.traverse(self)
             corners = np.concatenate(placement.world_bounds(ends))
@@ -80,6 +87,13 @@ def _carrier_class(variant: str) -> Any:
             return f"HarnackSurface[field = {self.surface.field!r}, bsdf = {self.bsdf()}]"
 
     return Carrier
+
+
+def _bearer(mi: Any, bsdf: Any) -> Any:
+    """A mesh that is in no scene, to have a BSDF."""
+    props = mi.Properties()
+    props["bsdf"] = bsdf
+    return mi.Mesh(PLUGIN, 1, 1, props=props)
 
 
 def is_carrier(shape: Any) -> bool:

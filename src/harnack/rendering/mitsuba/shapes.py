@@ -22,6 +22,7 @@ def shape(
     bsdf: Mapping[str, Any] | Any = None,
     to_world: npt.ArrayLike | Any = None,
     tint: Sequence[float] | None = None,
+    cut_bsdf: Mapping[str, Any] | Any = None,
     **settings: Any,
 ) -> Any:
     """A Mitsuba shape of a field's level set, for a scene dictionary or a scene.
@@ -38,6 +39,7 @@ def shape(
     to_world: matrix (4, 4) or Mitsuba transform of moves, turns and one scale for all axes.
     tint: of a solid of glass, what is left of red, green and blue light after one unit of length
         in it, in the world: (1, 1, 1) for clear (Beer and Lambert).
+    cut_bsdf: of the faces on the `section` of an opaque solid; by default that of the rest.
     settings: as `harnack.level_set` takes them: level, clip, tolerance, solid, ... Glass needs a
         `solid`.
 
@@ -54,7 +56,25 @@ def shape(
     props["bsdf"] = as_bsdf(mi, bsdf)
     if to_world is not None:
         props["to_world"] = mi.ScalarTransform4f(as_matrix(to_world))
-    return from_properties(mi, props, surface, tint)
+    return from_properties(mi, props, surface, tint, _of_cut(mi, surface, props["bsdf"], cut_bsdf))
+
+
+def _of_cut(mi: Any, surface: LevelSet, bsdf: Any, cut_bsdf: Any) -> Any:
+    """The BSDF of the faces on a section; None for that of the rest."""
+    if cut_bsdf is None:
+        return None
+    if surface.solid is None or surface.section is None:
+        raise ValueError(
+            "faces of a cut are those of a solid on its section: give solid=(low, high) and "
+            "section=harnack.HalfSpace(normal, offset) as well"
+        )
+    made = as_bsdf(mi, cut_bsdf)
+    for one in (bsdf, made):
+        if mi.has_flag(one.flags(), mi.BSDFFlags.Transmission):
+            raise ValueError(
+                "the faces of a cut have a material of their own on opaque solids only"
+            )
+    return made
 
 
 def as_bsdf(mi: Any, bsdf: Any) -> Any:

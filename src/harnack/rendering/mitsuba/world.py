@@ -59,12 +59,17 @@ class World:
         for carrier in self.carriers:
             shape = mi.ShapePtr(carrier)
             side = dr.sign(dr.dot(start.n, ray.d))
-            leaves = dr.select(start.is_valid() & (start.shape == shape), side, 0)
+            own = start.shape == shape
+            if carrier.cut_face is not None:
+                own |= start.shape == mi.ShapePtr(carrier.cut_face)
+            leaves = dr.select(start.is_valid() & own, side, 0)
             met = self._placed(carrier).meet(ray.o, ray.d, limit, active, leaves)
             evaluations = ours.evaluations + met.evaluations
             event = met.met | met.lost
             ours = replace(dr.select(event, met, ours), evaluations=evaluations)
             whose = dr.select(event, shape, whose)
+            if carrier.cut_face is not None:
+                whose = dr.select(event & met.cut, mi.ShapePtr(carrier.cut_face), whose)
             limit = dr.select(event, met.t, limit)
         event: Mask = ours.met | ours.lost
         others = active & ~event
@@ -113,6 +118,7 @@ class World:
             value=mi.Float(0),
             evaluations=mi.UInt32(0),
             mended=mi.Bool(False),
+            cut=mi.Bool(False),
         )
 
     def occluded(self, ray: Any, active: Mask) -> Mask:

@@ -43,11 +43,13 @@ class StudioObject:
     """A surface on the stage.
 
     fitted: whether to give it a tolerance that suits its size in place of its own.
+    cut: the material of the faces on the section of a solid; None for that of the rest.
     """
 
     surface: LevelSet
     material: Material
     fitted: bool = False
+    cut: Material | None = None
 
 
 @dataclass(frozen=True)
@@ -102,8 +104,9 @@ def studio(
             close = _OF_PARTS if surface.field.has_parts else _TOLERANCE
             surface = replace(surface, tolerance=Tolerance(close / placement.scale))
         bsdf = one.material.bsdf(solid=surface.solid is not None)
+        cut = None if one.cut is None else one.cut.bsdf(solid=True)
         scene[f"surface{k}"] = shape(
-            surface, bsdf=bsdf, to_world=placement.matrix, tint=one.material.tint
+            surface, bsdf=bsdf, to_world=placement.matrix, tint=one.material.tint, cut_bsdf=cut
         )
     has_ground = not bare and backdrop not in CUT_OUT and pose.origin[2] > FLOOR
     if has_ground:  # from below, it would hide everything

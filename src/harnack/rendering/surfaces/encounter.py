@@ -42,6 +42,7 @@ class SurfaceHit:
     value: of the field, close to the surface or, of a sheet, just before it; of no meaning where
         nothing is met.
     evaluations: of the field.
+    cut: it is a face of a solid on its section.
     mended: of a field with sheets, met between them: there the surface spans what they leave open.
     """
 
@@ -54,6 +55,7 @@ class SurfaceHit:
     value: Real
     evaluations: Any
     mended: Mask
+    cut: Mask
 
 
 def meet_surface(
@@ -104,6 +106,7 @@ def _no_hit(prepared: PreparedLevelSet, trace: MarchResult) -> SurfaceHit:
         value=zero,
         evaluations=trace.evaluations,
         mended=none,
+        cut=none,
     )
 
 
@@ -143,6 +146,7 @@ def _described(prepared: PreparedLevelSet, ended: _Ended) -> SurfaceHit:
         value=sample.value,
         evaluations=trace.evaluations + dr.select(smooth, prepared.backend.UInt32(1), 0),
         mended=smooth & prepared.field.has_sheets,
+        cut=prepared.backend.Bool(False),
     )
     if not prepared.field.has_sheets:
         return encounter

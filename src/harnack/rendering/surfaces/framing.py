@@ -50,7 +50,7 @@ def visible_points(surface: LevelSet, backend: Backend) -> FloatArray:
 
     if prepared is surface.field:  # it may have changed in place
         return found()
-    settings = (surface.numbers, surface.clip, surface.solid, surface.max_steps)
+    settings = (surface.numbers, surface.cut, surface.solid, surface.largest, surface.max_steps)
     return _POINTS.get(prepared, (*settings, surface.bound, surface.overstep), found)
 
 

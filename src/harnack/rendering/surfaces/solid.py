@@ -2,7 +2,8 @@
 
 The boundary consists of level sets inside the volume and of caps on the volume's own boundary.
 A ray meets a cap where it enters the volume at a point of the solid, or leaves it at one without
-having met a level before. Volumes are convex, so a ray enters and leaves at most once.
+having met a level before. Volumes are convex, so a ray enters and leaves at most once. A cap lies
+on the section if it is the section that ends the ray's part in the volume there.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ class Solid:
     def _holds(self, p: Vec3) -> Mask:
         """Whether points of the volume belong to the solid."""
         f = self.prepared.sample(p).value
-        return (f >= self.low) & (f <= self.high)
+        return (f >= self.low) & (f <= self.high) & self.prepared.counts(p)
 
     def meet(self, o: Vec3, d: Vec3, t_max: Real, active: Mask, leaves: Real = 0.0) -> SurfaceHit:
         """Where rays o + t d, |d| = 1, 0 <= t <= t_max, first cross the boundary of the solid.
@@ -73,8 +74,12 @@ class Solid:
             cap = facing(self.prepared.volume.outward_normal(position), d, outwards)
             normal = dr.select(slipped, normal, cap)
         clearance = zero + CLEARANCE * self.prepared.tolerance.distance
+        cut = met.cut
+        if self.prepared.section is not None:
+            first, last = self.prepared.section.clip(o, d, zero, t_max)
+            cut = dr.select(leaving, last <= end, entering & (first >= start))
         crossed = replace(
-            met, t=t, met=capped, position=position, normal=normal, clearance=clearance
+            met, t=t, met=capped, position=position, normal=normal, clearance=clearance, cut=cut
         )
         return dr.select(capped, crossed, met)
 

@@ -1,0 +1,178 @@
+"""Cells around the largest component of a level set, or of a solid."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, TypeAlias
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import FloatArray, choose_backend, to_numpy, to_vector3
+from harnack.backend.lengths import length
+from harnack.cells import OccupiedCells, largest_component
+from harnack.enclosures import TargetLevels
+from harnack.fields.clearance import clearance_of
+from harnack.fields.kept import KeptWithFields
+
+if TYPE_CHECKING:
+    from harnack.backend import BoolArray
+    from harnack.fields.field import Field
+    from harnack.geometry import Volume
+
+__all__ = ["CELLS_ACROSS", "largest_cells"]
+
+# Cells along the longest side of the box around a surface, if nothing else is asked for.
+CELLS_ACROSS = 128
+
+_Ends: TypeAlias = tuple[float, float]
+_CELLS: KeptWithFields[OccupiedCells] = KeptWithFields()
+
+
+def largest_cells(
+    field: Field, levels: tuple[float, ...], volume: Volume | None, solid: _Ends | None, across: int
+) -> OccupiedCells:
+    """Cells that hold one component of a level set in a volume, and no others that could be told
+    from it; those of the largest area or, of a solid {low <= f <= high}, of the largest volume.
+
+    Area is estimated from one sample a cell, of side h: the integral of |grad f| over values of f,
+    with a tent of width h for Dirac's delta, is the sum of h^2 max(0, 1 - |f - level|/(h |grad f|))
+    over cells whose centre is in the volume. The volume of a solid is h^3 for each centre in it.
+
+    Cells are left out that are proved to have nothing of the level set, as their balls are within
+    the clearance of their centre (or, where that is outside of the field's domain, of a point at
+    its boundary), or of the volume, as its signed distance says. Of solids, those without a level
+    all of which is in the solid are kept. The rest: see `largest_component`.
+
+    Raises:
+        ValueError: the volume is not bounded.
+    """
+    ends = None if volume is None else np.array(volume.bounds(), np.float64)
+    if volume is None or ends is None or not np.isfinite(ends).all():
+        raise ValueError(
+            "largest needs a surface with bounds: give it a clip, such as "
+            "clip=harnack.Ball((0, 0, 0), 1)"
+        )
+
+    def made() -> OccupiedCells:
+        return _made(field.for_levels(levels), levels, volume, solid, across)
+
+    if field.parameters():  # they may change in place
+        return made()
+    return _CELLS.get(field, (levels, volume, solid, across), made)
+
+
+def _made(
+    field: Field, levels: tuple[float, ...], volume: Volume, solid: _Ends | None, across: int
+) -> OccupiedCells:
+    beyond = _distance_beyond(volume)
+    into_domain = _into_domain(field)
+    samples = _samples(field, levels)
+    to_levels = clearance_of(field, levels, "double")
+
+    def clearance(points: FloatArray) -> FloatArray:
+        free = np.maximum(beyond(points), 0.0)
+        asked, moved = into_domain(points)
+        known = np.isfinite(moved)
+        if not known.any():
+            return free
+        length = to_levels(asked[known]) - moved[known]
+        if solid is not None:
+            length[_within(solid, samples(asked[known])[2])] = 0.0
+        free[known] = np.maximum(free[known], length)
+        return free
+
+    lower, upper = (np.array(end, np.float64) for end in volume.bounds())
+    cells = OccupiedCells.of(lower, upper, clearance, across)
+
+    def size(centres: FloatArray) -> FloatArray:
+        inside = (beyond(centres) <= 0) & (into_domain(centres)[1] == 0)
+        gap, slope, value = (np.zeros(len(centres)) for _ in range(3))
+        if inside.any():
+            gap[inside], slope[inside], value[inside] = samples(centres[inside])
+        if solid is not None:
+            return np.where(inside & _within(solid, value), cells.cell**3, 0.0)
+        share = gap / np.maximum(cells.cell * slope, 1e-300)
+        return np.where(inside, cells.cell**2 * np.maximum(1 - share, 0), 0.0)
+
+    return largest_component(cells, size)
+
+
+def _within(solid: _Ends, values: FloatArray) -> BoolArray:
+    return (values >= solid[0]) & (values <= solid[1])
+
+
+def _into_domain(field: Field) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
+    """For points (n, 3), others where the field may be asked, and how far they are off, (n,),
+    infinite where none was found: what a field promises need only hold in its domain. A set that
+    is c away from the one is c less that distance away from the other."""
+    domain = None if field.is_entire else field.domain
+    backend = choose_backend("double")
+    prepared = None if domain is None else domain.prepare(backend)
+
+    def into(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        moved = np.zeros(len(points))
+        if domain is None or prepared is None:
+            return points, moved
+        outside = ~domain.contains_points(points)
+        if not outside.any():
+            return points, moved
+        x = points[outside]
+        p = to_vector3(backend, x)
+        far = (1 + 1e-9) * to_numpy(prepared.signed_distance(p)) + 1e-12 * np.abs(x).max()
+        y = x - far[:, None] * to_numpy(prepared.outward_normal(p))
+        asked = points.copy()
+        asked[outside] = y
+        length = 1.000001 * np.linalg.norm(x - y, axis=1)
+        moved[outside] = np.where(domain.contains_points(y), length, np.inf)
+        return asked, moved
+
+    return into
+
+
+def _distance_beyond(volume: Volume) -> Callable[[FloatArray], FloatArray]:
+    """For points (n, 3), a lower bound of their distances from the volume, negative inside."""
+    backend = choose_backend("double")
+    prepared = volume.prepare(backend)
+
+    def beyond(points: FloatArray) -> FloatArray:
+        distance = to_numpy(prepared.signed_distance(to_vector3(backend, points)))
+        rounding = 64 * float(np.finfo(np.float64).eps) * (1 + float(np.abs(points).max()))
+        return np.broadcast_to(distance, len(points)) - rounding
+
+    return beyond
+
+
+def _samples(
+    field: Field, levels: tuple[float, ...]
+) -> Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]:
+    """For points (n, 3): how far values are from a level, the lengths of gradients, and values."""
+    backend = choose_backend("double")
+    prepared = field.prepare(backend)
+    targets = TargetLevels(tuple(dr.opaque(backend.Float, level) for level in levels), field.period)
+
+    def samples(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        if not len(points):
+            return np.zeros(0), np.zeros(0), np.zeros(0)
+        seen = prepared.evaluate(to_vector3(backend, points))
+        found = (targets.gaps(seen.value).smaller, length(seen.gradient), seen.value)
+        gap, slope, value = (np.broadcast_to(to_numpy(one), len(points)) for one in found)
+        return gap, slope, value
+
+    return samples
+
+
+def checked_largest(largest: object) -> int:
+    """Cells across, 0 for all components.
+
+    Raises:
+        TypeError, ValueError: neither a truth value nor a number of cells.
+    """
+    if isinstance(largest, bool):
+        return CELLS_ACROSS if largest else 0
+    if not isinstance(largest, int) or not 8 <= largest <= 512:
+        raise ValueError(
+            "largest is True, or how many cells to tell components apart by along the longest "
+            f"side, from 8 to 512, not {largest!r}"
+        )
+    return largest

@@ -1,0 +1,132 @@
+"""Surfaces opened by a section: what is left, faces of solids there, and what these are made of."""
+
+import math
+
+import numpy as np
+import pytest
+
+import harnack as hk
+from harnack.backend import choose_backend, to_numpy, to_vector3
+from harnack.cli.arguments import parse
+from harnack.cli.commands import _section  # pyright: ignore[reportPrivateUsage]
+from harnack.rendering import shape
+from harnack.rendering.surfaces.placement import PlacedSurface, Placement
+
+NORMAL, OFFSET = np.array([0.6, 0.0, 0.8]), 0.2
+HALF = hk.HalfSpace((0.6, 0.0, 0.8), OFFSET)
+
+
+def _rays(n, seed):
+    """Rays (n, 3) from a sphere of radius 3 to points of the unit ball's surroundings."""
+    rng = np.random.default_rng(seed)
+    o = rng.normal(size=(n, 3))
+    o *= 3 / np.linalg.norm(o, axis=1)[:, None]
+    d = rng.uniform(-1, 1, (n, 3)) - o
+    return o, d / np.linalg.norm(d, axis=1)[:, None]
+
+
+def test_volumes_have_something_in_common():
+    box, ball = hk.Box((-1, -1, -1), (1, 1, 1)), hk.Ball(radius=1.2)
+    both = box & HALF
+    assert both == hk.Intersection((box, HALF))
+    assert (both & ball) == hk.Intersection((box, HALF, ball)) == (box & (HALF & ball))
+    points = np.random.default_rng(0).uniform(-1.5, 1.5, (500, 3))
+    inside = box.contains_points(points) & HALF.contains_points(points)
+    np.testing.assert_array_equal(both.contains_points(points), inside)
+    with pytest.raises(TypeError):
+        _ = box & 3  # pyright: ignore
+    with pytest.raises(TypeError, match="section must be a volume"):
+        hk.level_set(hk.Sphere(1.0), section=3.0)  # pyright: ignore
+
+
+@pytest.mark.parametrize("precision", ["single", "double"])
+def test_what_lies_beyond_a_section_is_not_hit(precision):
+    o, d = _rays(2000, 3)
+    hits = hk.trace(hk.Sphere(1.0), o, d, section=HALF, tolerance=1e-5, precision=precision)
+    b = (o * d).sum(axis=1)
+    square = b * b - (o * o).sum(axis=1) + 1
+    t = np.full(len(o), np.inf)
+    for sign in (1, -1):
+        root = -b + sign * np.sqrt(np.maximum(square, 0))
+        there = (square > 0) & ((o + root[:, None] * d) @ NORMAL <= OFFSET)
+        t = np.where(there, root, t)
+    decided = np.abs(square) > 1e-3
+    for root in (-b - np.sqrt(np.abs(square)), -b + np.sqrt(np.abs(square))):
+        decided &= np.abs((o + root[:, None] * d) @ NORMAL - OFFSET) > 1e-3
+    assert decided.sum() > 1500
+    np.testing.assert_array_equal(hits.hit[decided], np.isfinite(t[decided]))
+    both = decided & hits.hit
+    np.testing.assert_allclose(hits.t[both], t[both], atol=1e-3)
+
+
+def test_faces_of_a_solid_on_its_section_are_told_from_all_others():
+    backend = choose_backend("double")
+    surface = hk.level_set(
+        hk.Sphere(1.0), solid=(-math.inf, 0.0), clip=hk.HalfSpace((-1, 0, 0), 0.5), section=HALF
+    )
+    placed = PlacedSurface.of(surface, Placement.identity(), backend)
+    o, d = _rays(3000, 4)
+    o[1500:] = 0.3 * o[1500:] / np.linalg.norm(o[1500:], axis=1)[:, None] - [0.1, 0, 0]  # inside
+    met = placed.meet(
+        to_vector3(backend, o), to_vector3(backend, d), backend.Float(1e3), backend.Bool(True)
+    )
+    x, is_met, cut = to_numpy(met.position), to_numpy(met.met), to_numpy(met.cut)
+    on_plane = np.abs(x @ NORMAL - OFFSET) < 1e-6
+    elsewhere = (np.abs(np.linalg.norm(x, axis=1) - 1) < 1e-3) | (np.abs(x[:, 0] + 0.5) < 1e-6)
+    assert is_met[1500:].all()
+    assert 500 < cut.sum() < 2000
+    np.testing.assert_array_equal(cut & is_met, cut)
+    np.testing.assert_array_equal(cut[is_met & ~(on_plane & elsewhere)],
+                                  on_plane[is_met & ~(on_plane & elsewhere)])  # fmt: skip
+    assert (on_plane | elsewhere)[is_met].all()
+    np.testing.assert_allclose(
+        to_numpy(met.normal)[cut], np.tile(NORMAL, (cut.sum(), 1)), atol=0.01
+    )
+
+
+def test_pictures_show_faces_in_their_own_material():
+    settings = {"size": (40, 30), "show": "shaded", "spp": 1, "progress": False,
+                "camera": hk.Camera(azimuth=-90, elevation=0), "material": "porcelain"}  # fmt: skip
+    cut = hk.HalfSpace((0, -1, 0), 0.0)
+    plain = hk.render(hk.Sphere(1.0), section=cut, **settings)
+    red = hk.render(hk.Sphere(1.0), section=cut, cut_material="plastic", **settings)
+    own = hk.render(hk.Sphere(1.0), section=cut, cut_material="porcelain", **settings)
+    np.testing.assert_array_equal(plain, own)
+    middle = red[15, 20]
+    assert middle[0] > 3 * middle[1]
+    assert plain[15, 20, 1] > 3 * middle[1]
+    behind = {**settings, "camera": hk.Camera(azimuth=90, elevation=0)}
+    seen = hk.render(hk.Sphere(1.0), section=cut, cut_material="plastic", **behind)
+    assert seen[15, 20, 1] > 0.5 * seen[15, 20, 0]
+
+
+def test_wrong_faces_are_refused():
+    cut, small = hk.HalfSpace((0, 0, 1), 0.0), {"size": (8, 6), "progress": False}
+    with pytest.raises(ValueError, match="section=harnack"):
+        hk.render(hk.Sphere(1.0), cut_material="gold", **small)
+    with pytest.raises(ValueError, match="opaque"):
+        hk.render(hk.Sphere(1.0), material="glass", section=cut, cut_material="gold", **small)
+    with pytest.raises(ValueError, match="solid on its section"):
+        shape(hk.Sphere(1.0), section=cut, cut_bsdf={"type": "diffuse"})
+
+
+def test_meshes_are_cut_by_sections_too():
+    half = hk.mesh(hk.Sphere(1.0), section=hk.HalfSpace((0, 0, 1), 0.0), tolerance=5e-3)
+    assert half.is_watertight
+    assert half.volume == pytest.approx(2 / 3 * math.pi, rel=0.02)
+    gyroid = hk.Gyroid(1.0, domain=hk.Ball(radius=0.5))
+    piece = hk.mesh(gyroid, section=hk.HalfSpace((1, 0, 0), 0.0), tolerance=1e-2)
+    assert piece.bounds[1, 0] <= 1e-9
+    assert np.linalg.norm(piece.vertices, axis=1).max() <= 0.5 + 1e-6
+
+
+def test_sections_of_the_command_line():
+    options = parse(["render", "gyroid", "--section", "0,-3,4,0.5", "--cut-material", "clay"])
+    cut = _section(options)
+    assert cut is not None
+    assert options.cut_material == "clay"
+    np.testing.assert_allclose([*cut.normal, cut.offset], [0, -0.6, 0.8, 0.5])
+    assert parse(["mesh", "gyroid", "--section", "0,0,1"]).section == (0, 0, 1, 0)
+    for wrong in ("0,0,0", "1,2", "1,2,3,4,5"):
+        with pytest.raises(SystemExit):
+            parse(["render", "gyroid", "--section", wrong])
