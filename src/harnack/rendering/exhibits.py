@@ -12,10 +12,14 @@ from harnack.fields import Field, Tube
 from harnack.rendering.arguments import check_settings
 from harnack.rendering.studio.materials import Material, material_of
 from harnack.rendering.studio.stage import StudioObject
+from harnack.rendering.surfaces.isolines import Isolines
 from harnack.tracer import LevelSet, level_set
 
-OF_STUDIO = ("material", "camera", "backdrop", "up", "boundary")
-_OWN = ("show", "size", "spp", "antialias", *OF_STUDIO, "max_depth", "seed", "progress")
+OF_STUDIO = ("material", "camera", "backdrop", "up", "boundary", "isolines")
+_OWN = (
+    "show", "size", "spp", "antialias", *OF_STUDIO, "of", "value_range", "colorbar", "max_depth",
+    "seed", "progress",
+)  # fmt: skip
 # What tubes around the ends of surfaces are made of.
 _RIM = "gold"
 
@@ -28,9 +32,14 @@ def surfaces_of(what: Any, boundary: float | None = None, **settings: Any) -> li
 
 
 def exhibits(
-    what: Any, materials: Any, boundary: float | None, settings: Mapping[str, Any]
+    what: Any,
+    materials: Any,
+    boundary: float | None,
+    settings: Mapping[str, Any],
+    isolines: tuple[Isolines, ...] = (),
 ) -> list[StudioObject]:
-    """Fields and level sets as they stand on the stage, and tubes around where they end.
+    """Fields and level sets as they stand on the stage, with lines on them, and tubes around where
+    they end.
 
     Raises:
         TypeError, ValueError: there is nothing to draw, or something wrong with what is asked for.
@@ -49,7 +58,9 @@ def exhibits(
         raise ValueError(f"give one material{several}, not {len(names)}")
     fitted = "tolerance" not in settings
     made = [
-        StudioObject(_surface(one, settings), material_of(name), fitted and isinstance(one, Field))
+        StudioObject(
+            _surface(one, settings), material_of(name), fitted and isinstance(one, Field), isolines
+        )
         for one, name in zip(given, names, strict=True)
     ]
     return made if boundary is None else made + _rims(made, boundary)

@@ -9,14 +9,17 @@ and traces what they carry.
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from harnack.backend import aligned
 from harnack.rendering.mitsuba.clear import tint_of
+from harnack.rendering.mitsuba.lined import with_lines
 from harnack.rendering.mitsuba.variant import load_mitsuba, mitsuba_backend
 from harnack.rendering.surfaces.extent import box_of
+from harnack.rendering.surfaces.isolines import Isolines
 from harnack.rendering.surfaces.placement import PlacedSurface, Placement
 from harnack.tracer import LevelSet
 
@@ -26,10 +29,13 @@ if TYPE_CHECKING:
 PLUGIN = "harnack"
 
 
-def from_properties(mi: Any, props: Any, surface: LevelSet, tint: Any = None) -> Any:
+def from_properties(
+    mi: Any, props: Any, surface: LevelSet, tint: Any = None, isolines: Sequence[Isolines] = ()
+) -> Any:
     """The shape of a surface with the `to_world` and the BSDF that a plug-in's properties hold.
 
     tint: of a solid, what is left of light after one unit of length in it, in the world.
+    isolines: drawn on it.
 
     Raises:
         ValueError: as `shape`; or the properties hold an emitter or a medium.
@@ -42,7 +48,15 @@ def from_properties(mi: Any, props: Any, surface: LevelSet, tint: Any = None) ->
     placement = Placement.identity()
     if "to_world" in props:
         placement = Placement.of(as_matrix(props["to_world"]))
-    made = _carrier_class(mi.variant())(props, surface, placement, tint)
+    for one in isolines:
+        if one.function is surface.field and surface.solid is None:
+            raise ValueError(
+                f"isolines of {surface.field!r} on its own level set: it is constant there. Draw "
+                "those of another function, or a solid, whose caps show them"
+            )
+    if isolines:
+        props["bsdf"] = with_lines(mi, props["bsdf"], [one.colour for one in isolines])
+    made = _carrier_class(mi.variant())(props, surface, placement, tint, isolines)
     if made.emitter() is not None or made.is_medium_transition():
         raise ValueError("surfaces that are traced can neither emit light nor bound a medium")
     return made
@@ -63,16 +77,20 @@ def _carrier_class(variant: str) -> Any:
     class Carrier(mi.Mesh):
         """A mesh that no ray meets, with the surface that it stands for."""
 
-        def __init__(self, props: Any, surface: LevelSet, placement: Placement, tint: Any) -> None:
+        def __init__(
+            self, props: Any, surface: LevelSet, placement: Placement, tint: Any,
+            isolines: Sequence[Isolines],
+        ) -> None:  # fmt: skip
             ends = box_of(surface)
             mi.Mesh.__init__(self, PLUGIN, 2, 2, props=props)
             self.surface = surface
             self.placement = placement
             self.tint = tint_of(mi, tint)
-            self.placed = PlacedSurface.of(surface, placement, mitsuba_backend(mi))
+            backend, size = mitsuba_backend(mi), float(np.linalg.norm(np.diff(ends, axis=0)))
+            self.placed = PlacedSurface.of(surface, placement, backend, isolines, size)
             params = mi.traverse(self)
             corners = np.concatenate(placement.world_bounds(ends))
-            params["vertex_positions"] = aligned(mitsuba_backend(mi), corners)
+            params["vertex_positions"] = aligned(backend, corners)
             params["faces"] = mi.UInt32([0, 0, 0, 1, 1, 1])
             params.update()
 

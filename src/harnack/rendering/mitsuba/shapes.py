@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 from harnack.rendering.mitsuba.carrier import as_matrix, from_properties
 from harnack.rendering.mitsuba.plugins import register
 from harnack.rendering.mitsuba.scene_files import load_dictionary
+from harnack.rendering.surfaces.isolines import Isolines, checked_isolines
 from harnack.tracer import LevelSet, level_set
 
 if TYPE_CHECKING:
@@ -22,6 +23,7 @@ def shape(
     bsdf: Mapping[str, Any] | Any = None,
     to_world: npt.ArrayLike | Any = None,
     tint: Sequence[float] | None = None,
+    isolines: Isolines | Sequence[Isolines] | None = None,
     **settings: Any,
 ) -> Any:
     """A Mitsuba shape of a field's level set, for a scene dictionary or a scene.
@@ -38,6 +40,7 @@ def shape(
     to_world: matrix (4, 4) or Mitsuba transform of moves, turns and one scale for all axes.
     tint: of a solid of glass, what is left of red, green and blue light after one unit of length
         in it, in the world: (1, 1, 1) for clear (Beer and Lambert).
+    isolines: `harnack.Isolines` to draw on it, or several; later ones cover earlier ones.
     settings: as `harnack.level_set` takes them: level, clip, tolerance, solid, ... Glass needs a
         `solid`.
 
@@ -54,7 +57,7 @@ def shape(
     props["bsdf"] = as_bsdf(mi, bsdf)
     if to_world is not None:
         props["to_world"] = mi.ScalarTransform4f(as_matrix(to_world))
-    return from_properties(mi, props, surface, tint)
+    return from_properties(mi, props, surface, tint, checked_isolines(isolines))
 
 
 def as_bsdf(mi: Any, bsdf: Any) -> Any:

@@ -113,6 +113,7 @@ class World:
             value=mi.Float(0),
             evaluations=mi.UInt32(0),
             mended=mi.Bool(False),
+            line=mi.UInt32(0),
         )
 
     def occluded(self, ray: Any, active: Mask) -> Mask:

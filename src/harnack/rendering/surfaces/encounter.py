@@ -43,6 +43,7 @@ class SurfaceHit:
         nothing is met.
     evaluations: of the field.
     mended: of a field with sheets, met between them: there the surface spans what they leave open.
+    line: the number of the isoline drawn there, counted from 1; 0 for none.
     """
 
     t: Real
@@ -54,6 +55,7 @@ class SurfaceHit:
     value: Real
     evaluations: Any
     mended: Mask
+    line: Any
 
 
 def meet_surface(
@@ -104,6 +106,7 @@ def _no_hit(prepared: PreparedLevelSet, trace: MarchResult) -> SurfaceHit:
         value=zero,
         evaluations=trace.evaluations,
         mended=none,
+        line=backend.UInt32(0),
     )
 
 
@@ -143,6 +146,7 @@ def _described(prepared: PreparedLevelSet, ended: _Ended) -> SurfaceHit:
         value=sample.value,
         evaluations=trace.evaluations + dr.select(smooth, prepared.backend.UInt32(1), 0),
         mended=smooth & prepared.field.has_sheets,
+        line=prepared.backend.UInt32(0),
     )
     if not prepared.field.has_sheets:
         return encounter
