@@ -11,7 +11,10 @@ from the level be q(x) of degree n there, to leading order (2 at maxima, minima 
 no more vanishes). Along a ray from the point q = c r^n, and |grad_T g| <= n |q|_max / r, where
 |q|_max is the largest |q| at the distance r (Kellogg 1928): in directions in which |q| is within a
 factor k of that, the line ends before r = k n/2 width. So a maximum at a level is a dot, as wide as
-two lines, and lines that cross at a saddle are joined by a fillet of that size.
+two lines, and lines that cross at a saddle are joined by a fillet of that size. Around a maximum
+that is a little higher, with g - level = (R^2 - r^2)/2 at the distance r, the line is where
+|r^2 - R^2| < width r, which is r < width/2 + sqrt(width^2/4 + R^2) <= R + width: at most half a
+width too far.
 """
 
 from __future__ import annotations
