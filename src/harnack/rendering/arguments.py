@@ -119,8 +119,8 @@ def check_function(of: Any, show: str) -> Field | None:
         return None
     if of is None:
         raise ValueError(
-            'show="value" needs of=, the function whose values are shown on the surface: a field, '
-            '"x", "y", "z", or a function of x, y and z'
+            'show="value" needs the function whose values are shown on the surface, such as '
+            'of="z", another field, or a function of x, y and z'
         )
     return function_of(of)
 

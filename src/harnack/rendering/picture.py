@@ -160,7 +160,8 @@ def render(
         placement = Placement.identity() if stage is None else stage.placement
         view = look(mi, scene, scene.sensors()[0], placement, asked.function)
         image = VIEWS[show].numbers(view)
-        shown = drawn(show, view, asked.value_range, asked.colorbar)
+        named = asked.colorbar is True and isinstance(of, str)
+        shown = drawn(show, view, asked.value_range, str(of) if named else asked.colorbar)
     else:
         with _bar(progress) as advance:
             drawing = _shaded if show == "shaded" else _radiance

@@ -15,8 +15,8 @@ from harnack.rendering.pictures.scales.colormap import hues, viridis
 Numbers = npt.NDArray[np.floating[Any]]
 # Steps between ticks, as parts of a power of ten.
 _NICE = (1.0, 2.0, 5.0, 10.0)
-# Numbers smaller or larger than these are written with an exponent.
-_SMALL, _LARGE = 1e-4, 1e6
+# Where ticks are closer than this, or numbers as large, they are written with an exponent.
+_SMALL, _LARGE = 1e-5, 1e7
 # Periods up to so many times pi have ticks at parts of it.
 _MOST_PI = 16
 
@@ -55,12 +55,15 @@ class Scale:
         if 0 < turns <= _MOST_PI and math.isclose(period, turns * math.pi, rel_tol=1e-6):
             return _parts_of_turns(turns, most)
         if not self.high > self.low:
-            return [(self.low, _written(self.low, abs(self.low)))]
+            return [(self.low, f"{self.low:.4g}")]
         step = _step((self.high - self.low) / max(most - 1, 1))
         first, last = math.ceil(self.low / step - 1e-9), math.floor(self.high / step + 1e-9)
         if last - first < 1:  # no room for two nice numbers
-            return [(end, f"{end:.4g}") for end in (self.low, self.high)]
-        return [(k * step, _written(k * step, step)) for k in range(first, last + 1)]
+            largest = max(abs(self.low), abs(self.high))
+            digits = 2 + max(2, math.ceil(math.log10(largest / (self.high - self.low))))
+            return [(end, f"{end:.{digits}g}") for end in (self.low, self.high)]
+        largest = max(abs(first), abs(last)) * step
+        return [(k * step, _written(k * step, step, largest)) for k in range(first, last + 1)]
 
 
 def _step(least: float) -> float:
@@ -69,16 +72,19 @@ def _step(least: float) -> float:
     return next(part * power for part in _NICE if part * power >= least * (1 - 1e-9))
 
 
-def _written(number: float, step: float) -> str:
-    """A multiple of a nice step, with the digits that it needs."""
-    number += 0.0  # no -0
+def _written(number: float, step: float, largest: float) -> str:
+    """A multiple of a nice step, with the digits that it needs.
+
+    largest: of all that are written.
+    """
     if number == 0:
         return "0"
-    if not _SMALL <= max(abs(number), step) < _LARGE or step < _SMALL / 10:
-        digits = max(0, math.floor(math.log10(abs(number)) + 1e-9) - math.floor(math.log10(step)))
-        mantissa, exponent = f"{number:.{digits}e}".split("e")
-        return f"{mantissa}e{int(exponent)}"
-    return f"{number:.{max(0, -math.floor(math.log10(step) + 1e-9))}f}"
+    below = math.floor(math.log10(step) + 1e-9)  # the place of the last digit
+    if step >= _SMALL and largest < _LARGE:
+        return f"{number:.{max(0, -below)}f}"
+    digits = max(0, math.floor(math.log10(abs(number)) + 1e-9) - below)
+    mantissa, exponent = f"{number:.{digits}e}".split("e")
+    return f"{mantissa.rstrip('0').rstrip('.') if '.' in mantissa else mantissa}e{int(exponent)}"
 
 
 def _parts_of_turns(turns: int, most: int) -> list[tuple[float, str]]:
