@@ -16,7 +16,7 @@ help:
 	@echo "make test-frameworks  install PyTorch and JAX into .venv and test derivatives to and from them"
 	@echo "make lint       check style and types"
 	@echo "make format     apply the style"
-	@echo "make images     render the pictures of the README into docs/images"
+	@echo "make images     render the pictures of README and docs into docs/images"
 	@echo "make bench      run the benchmarks; they write their tables into the docs"
 	@echo "make figures    remake the paper's figures, measured, into docs/figures.md"
 	@echo "make clean      remove .venv, out/ and caches"
@@ -59,6 +59,7 @@ format: $(STAMP)
 
 images: $(STAMP)
 	$(BIN)/harnack gallery --demo -o docs/images
+	$(BIN)/python scripts/view_images.py docs/images
 
 bench: $(STAMP)
 	$(BIN)/python -m pip install --quiet --editable '.[bench]'

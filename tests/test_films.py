@@ -152,6 +152,23 @@ def test_films_that_cannot_be(settings: dict[str, Any], complaint: str, tmp_path
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("name", ["size", "show"])
+def test_what_is_the_same_for_all_pictures_is_no_function(name: str, tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match=f"{name} is the same for all pictures of a film"):
+        hk.animate(FIELD, tmp_path / "a.gif", **{**SMALL, name: lambda s: s})
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["a.gif", "a.mp4"])
+def test_films_have_room_for_colour_bars(name: str, tmp_path: Path) -> None:
+    settings = {"frames": 2, "show": "value", "of": "z", "colorbar": True}
+    hk.animate(FIELD, tmp_path / name, turn=90, **{**SMALL, **settings})
+    av = pytest.importorskip("av")
+    with av.open(str(tmp_path / name)) as film:
+        frame = next(film.decode(video=0)).to_ndarray(format="rgb24")
+    assert frame.shape[1] > SMALL["size"][0] + 10
+
+
 @pytest.mark.parametrize("settings", [{"turn": "360"}, {"fps": "24"}, {"fps": None}])
 def test_what_is_no_number_is_named(settings: dict[str, Any], tmp_path: Path) -> None:
     with pytest.raises(TypeError, match=f"{next(iter(settings))} must be a number"):

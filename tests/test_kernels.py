@@ -154,9 +154,30 @@ def cut(k: int) -> hk.geometry.Volume:
     return hk.Intersection([hk.Ball((0.01 * k, 0, 0), 1 + 0.1 * k), box])
 
 
+def lines(k: int) -> list[hk.Isolines]:
+    """At other levels, of other widths and colours."""
+    levels = np.random.default_rng(k).normal(size=3 + k)
+    colour = (0.04 * k, 1 - 0.04 * k, 0.5)
+    return [
+        hk.Isolines("z", levels, width=0.01 + 0.001 * k, color=colour),
+        hk.Isolines(knot(k), spacing=np.pi / (1 + k), color="white"),
+        hk.Isolines("x", spacing=0.1 + 0.01 * k),
+    ]
+
+
+def test_other_isolines_compile_no_kernel() -> None:
+    def picture(k: int) -> int:
+        return drawn(HARMONIC, k, "shaded", level=0.2, clip=cut(k), isolines=lines(k))
+
+    picture(0), picture(1)
+    assert [picture(k) for k in range(2, 5)] == [0] * 3
+
+
 PICTURES: dict[str, Callable[[int], int]] = {
     **{
-        show: lambda k, show=show: drawn(knot(k), k, show, level=6 - 0.02 * k)
+        show: lambda k, show=show: drawn(
+            knot(k), k, show, level=6 - 0.02 * k, of=knot(k + 1) if show == "value" else None
+        )
         for show in hk.rendering.SHOW_MODES
     },
     "clipped": lambda k: drawn(HARMONIC, k, "color", level=0.1 + 0.01 * k, clip=cut(k)),
@@ -170,6 +191,7 @@ PICTURES: dict[str, Callable[[int], int]] = {
     "mesh": lambda k: drawn(cut_sphere(k), k, "shaded"),
     "tree": lambda k: drawn(tree(k), k, "shaded"),
     "cloud": lambda k: drawn(cloud(k), k, "shaded", level=6 - 0.06 * k),
+    "isolines": lambda k: drawn(HARMONIC, k, "color", level=0.2, clip=cut(k), isolines=lines(k)),
     "two": lambda k: drawn([knot(k), cut_sphere(k)], k, "color"),
 }
 

@@ -15,8 +15,8 @@ import pytest
 import harnack as hk
 from harnack.geometry import shapes
 from harnack.rendering import MATERIALS, SHOW_MODES, Camera, Material, picture, register, render
-from harnack.rendering.pictures.colormap import viridis
 from harnack.rendering.pictures.images import exr_bytes, tone_mapped
+from harnack.rendering.pictures.scales.colormap import viridis
 from harnack.rendering.studio.stage import on_ground
 
 mi = register()
@@ -88,7 +88,7 @@ def test_bands_leave_no_seam(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("show", SHOW_MODES)
 def test_every_mode_makes_numbers_and_a_picture(show: str, tmp_path: Path) -> None:
-    image = draw(path=tmp_path / "a.png", show=show)
+    image = draw(path=tmp_path / "a.png", show=show, of="x" if show == "value" else None)
     assert image.shape[:2] == (30, 40)
     drawn = read(tmp_path / "a.png")
     assert drawn.shape == (30, 40, 3)

@@ -336,6 +336,8 @@ def test_pictures_show_themselves() -> None:
         ["trefoil", "--position", "-5,5,2", "--target", "0,0,0", "--backdrop", "transparent"],
         ["polygon", "--box", "-1,-1,-1,0,1,1", "--bound", "slope", "--zoom", "0.9", "--fov", "40"],
         ["trefoil", "--up", "x", "--level", "2pi", "--boundary-tube", "0.1"],
+        ["gyroid", "--up", "-x", "--backdrop", "white,steelblue"],
+        ["trefoil", "--isolines", "z:0.2", "--isolines-width", "0.02", "--isolines-color", "#fff"],
     ],
 )
 def test_options_of_the_command(arguments: list[str], tmp_path: Path) -> None:
@@ -345,10 +347,40 @@ def test_options_of_the_command(arguments: list[str], tmp_path: Path) -> None:
     assert target.stat().st_size > 300
 
 
+def test_values_with_a_bar_from_the_command_line(tmp_path: Path) -> None:
+    asked = ["--show", "value", "--of", "z", "--value-range", "-1:1", "--colorbar"]
+    small = ["--size", "32x24", "--quiet", "-o", str(tmp_path / "a.png")]
+    assert main(["render", "trefoil", *asked, *small]) == 0
+    assert np.array(mi.Bitmap(str(tmp_path / "a.png"))).shape[1] > 50
+
+
+@pytest.mark.parametrize("up", ["-x", "-y", "-z"])
+def test_axes_with_a_minus_turn_files_from_the_command_line(up: str, tmp_path: Path) -> None:
+    """As a field that is turned by hand."""
+    curve = np.array([[0.0, 0, 0], [1, 0, 0], [1, 2, 0], [0, 2, 3]])
+    lines = [*(f"v {x} {y} {z}" for x, y, z in curve.tolist()), "l 1 2 3 4 1"]
+    (tmp_path / "a.obj").write_text("\n".join(lines))
+    small = ["--show", "depth", "--size", "32x24", "--quiet", "-o", str(tmp_path / "a.exr")]
+    assert main(["render", str(tmp_path / "a.obj"), "--up", up, *small]) == 0
+    turned = hk.SolidAngle(curve @ upright(up).T)
+    expected = hk.render(turned, show="depth", size=(32, 24), progress=False)
+    found = np.array(mi.Bitmap(str(tmp_path / "a.exr"))).reshape(24, 32)
+    met = np.isfinite(expected)
+    assert met.any()
+    np.testing.assert_allclose(found[met], expected[met], rtol=1e-3)
+
+
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
         (["trefoil", "--backdrop", "whit"], 'did you mean "white"'),
+        (["trefoil", "--backdrop", "white,steelbleu"], 'did you mean "steelblue"'),
+        (["trefoil", "--backdrop", "missing.png"], "missing.png: there is no such file"),
+        (["trefoil", "--up", "w"], "x, y, z, -x, -y, -z"),
+        (["trefoil", "--isolines", "w:1"], "an axis and a spacing as z:0.1"),
+        (["trefoil", "--isolines", "z:0"], "positive"),
+        (["trefoil", "--isolines-color", "red"], "color of isolines that are not there"),
+        (["trefoil", "--show", "value"], "such as --of z"),
         (["trefoil", "--bound", "slop"], 'did you mean "slope"'),
         (["trefoil", "--position", "1,2"], "3 numbers"),
         (["trefoil", "--solid", "0:1"], "real-valued"),

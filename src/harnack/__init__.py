@@ -110,7 +110,7 @@ from harnack.fields import (
 )
 from harnack.geometry import Ball, Box, Circle, ConvexHull, HalfSpace, Intersection
 from harnack.meshing import MeshingError, mesh, repair
-from harnack.rendering import Camera, animate, render
+from harnack.rendering import Camera, Isolines, animate, render
 from harnack.tracer import AllHits, Hits, LevelSet, Status, Tolerance, level_set, trace
 
 __all__ = [
@@ -154,6 +154,7 @@ __all__ = [
     "Hits",
     "HypersphericalHarmonic",
     "Intersection",
+    "Isolines",
     "Julia",
     "LevelCurves",
     "LevelSet",

@@ -33,7 +33,7 @@ from harnack.rendering.studio.upright import UP_AXES, upright
 
 __all__ = ["UP_AXES", "Axis", "OpenedSurface", "open_surface"]
 
-Axis = Literal["x", "y", "z"]
+Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 _Y_UP_BY_STANDARD = (".glb", ".gltf")
 _Y_UP_BY_HABIT = (".obj",)

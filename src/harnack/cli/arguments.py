@@ -17,10 +17,12 @@ from harnack.files.surfaces import SURFACE_FILES
 from harnack.opening import UP_AXES
 from harnack.rendering import MATERIALS, SHOW_MODES
 from harnack.rendering.arguments import ANTIALIASING, MAX_SIDE, MAX_SPP
-from harnack.rendering.studio.lighting import BACKDROPS
+from harnack.rendering.studio.backdrops import IMAGE_FILES, checked_backdrop
+from harnack.rendering.surfaces.colours import colour_of
 
 # Of what was typed, this much is repeated in messages.
 _SHOWN = 60
+AXES = ("x", "y", "z")
 
 
 class _Parser(argparse.ArgumentParser):
@@ -28,8 +30,9 @@ class _Parser(argparse.ArgumentParser):
 
     def __init__(self, *args: Any, **settings: Any) -> None:
         super().__init__(*args, **settings)
-        # argparse takes -1 for a number and would take -0.3:0.3 and -1,0,0 for options.
-        self._negative_number_matcher = re.compile(r"-[\d.]")
+        # argparse takes -1 for a number and would take -0.3:0.3, -1,0,0 and the axis -x for
+        # options.
+        self._negative_number_matcher = re.compile(r"-([\d.]|[xyz]$)")
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{printable(f'{self.prog}: error: {message}')} (see {self.prog} --help)\n")
@@ -130,6 +133,7 @@ def _add_drawn(one: Any, shaded: str) -> None:
         help="a ray hits only where the field changes sign, not where it comes near and turns back",
     )  # fmt: skip
     _add_surface(one)
+    _add_lines(one)
     _add_view(one)
     file = one.add_argument_group("surface files")
     _add_choice(
@@ -171,6 +175,29 @@ def _add_surface(one: Any) -> None:
     )
 
 
+def _add_lines(one: Any) -> None:
+    group = one.add_argument_group("lines and values on the surface")
+    group.add_argument(
+        "--isolines", type=_isolines, metavar="AXIS:SPACING",
+        help="lines where a coordinate is a multiple of the spacing, such as z:0.1",
+    )  # fmt: skip
+    group.add_argument(
+        "--isolines-width", type=_positive, metavar="LENGTH",
+        help="how wide they are, in the surface's coordinates (0.4 percent of its size)",
+    )  # fmt: skip
+    group.add_argument(
+        "--isolines-color", type=_color, metavar="COLOR", help="a name or #rrggbb (black)"
+    )
+    _add_choice(group, "--of", AXES, "the coordinate that --show value shows")
+    group.add_argument(
+        "--value-range", type=_ends, metavar="LOW:HIGH",
+        help="of the colors of values, depths or evaluations (what is seen)",
+    )  # fmt: skip
+    group.add_argument(
+        "--colorbar", action="store_true", help="put a bar with numbers beside such a picture"
+    )
+
+
 def _add_clip(group: Any) -> None:
     clip = group.add_mutually_exclusive_group()
     clip.add_argument(
@@ -205,7 +232,12 @@ def _add_view(one: Any) -> None:
     group.add_argument(
         "--distance", type=_positive, metavar="LENGTH", help="how far it is from its target"
     )
-    _add_choice(group, "--backdrop", BACKDROPS, "what is behind the surface (light)")
+    group.add_argument(
+        "--backdrop", type=_backdrop, metavar="BACKDROP",
+        help="what is behind the surface: light, dark, transparent, a color such as white or "
+        "#334455, two from bottom to top such as white,steelblue, or an image "
+        f"({', '.join(IMAGE_FILES)}) (light)",
+    )  # fmt: skip
     _add_choice(
         group, "--up", UP_AXES,
         "the axis that points up (of files .glb, .gltf and surfaces in .obj y, else z)",
@@ -322,6 +354,34 @@ def _ends(text: str) -> tuple[float, float]:
     if not ends[0] < ends[1] or all(map(math.isinf, ends)):
         raise argparse.ArgumentTypeError(f"{_shown(text)}: the first value must be the lower one")
     return ends
+
+
+def _isolines(text: str) -> tuple[str, float]:
+    """ "z:0.1" as ("z", 0.1)."""
+    axis, _, spacing = text.partition(":")
+    if axis not in AXES:
+        raise argparse.ArgumentTypeError(f"{_shown(text)}: write an axis and a spacing as z:0.1")
+    return axis, _positive(spacing)
+
+
+def _color(text: str) -> str:
+    try:
+        colour_of(text, "a color")
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    return text
+
+
+def _backdrop(text: str) -> Any:
+    """What `render` takes: a name, colours with a comma, or an image's file."""
+    parts = [part.strip() for part in text.split(",")]
+    is_file = text.lower().endswith(IMAGE_FILES)
+    given: Any = text if is_file or len(parts) != 2 else tuple(parts)
+    try:
+        checked_backdrop(given)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    return given
 
 
 def _three_numbers(text: str) -> tuple[float, ...]:

@@ -23,7 +23,7 @@ from harnack.geometry import Ball, Box, HalfSpace
 from harnack.geometry.singular import weld_vertices
 from harnack.meshing import mesh, repair
 from harnack.opening import open_surface
-from harnack.rendering import Camera, animate, render
+from harnack.rendering import Camera, Isolines, animate, render
 from harnack.rendering.film import check_film_path
 from harnack.rendering.pictures.images import check_picture_path
 
@@ -83,9 +83,10 @@ def _source(options: Any) -> Path:
 
 def _drawn(options: Any, source: Path) -> tuple[Any, dict[str, Any]]:
     """Surfaces of a scene or a file, and the settings of their picture."""
-    chosen = {name: getattr(options, name) for name in ("show", "backdrop", "up", "material")}
+    names = ("show", "backdrop", "up", "material", "of", "value_range", "colorbar")
+    chosen = {name: getattr(options, name) for name in names}
     settings = {name: value for name, value in chosen.items() if value is not None}
-    settings |= {**_quality(options), **_noise(options), **_of_surfaces(options)}
+    settings |= {**_lines(options), **_quality(options), **_noise(options), **_of_surfaces(options)}
     if any(value is not None for value in _view(options).values()):
         settings["camera"] = _camera(options)
     if options.scene in SCENES:
@@ -99,13 +100,14 @@ def _mitsuba_scene(options: Any) -> tuple[str, dict[str, Any]]:
     _refuse_file_options(options)
     given = {
         **_of_surfaces(options), **_view(options), "level": options.level, "up": options.up,
-        "material": options.material, "backdrop": options.backdrop,
+        "material": options.material, "backdrop": options.backdrop, **_lines(options),
     }  # fmt: skip
     wrong = [name for name, value in given.items() if value is not None]
     if wrong:
         raise ValueError(f"{', '.join(wrong)} of a Mitsuba scene: set in its own file")
-    show = {} if options.show is None else {"show": options.show}
-    return options.scene, {**_quality(options), **_noise(options), **show}
+    names = ("show", "of", "value_range", "colorbar")
+    shown = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
+    return options.scene, {**_quality(options), **_noise(options), **shown}
 
 
 def _of_surfaces(options: Any) -> dict[str, Any]:
@@ -117,6 +119,18 @@ def _of_surfaces(options: Any) -> dict[str, Any]:
         "boundary": options.boundary_tube,
     }  # fmt: skip
     return {name: value for name, value in asked.items() if value is not None}
+
+
+def _lines(options: Any) -> dict[str, Any]:
+    """Isolines, if they were asked for."""
+    asked = {"width": options.isolines_width, "color": options.isolines_color}
+    style = {name: value for name, value in asked.items() if value is not None}
+    if options.isolines is None:
+        if style:
+            raise ValueError(f"{' and '.join(style)} of isolines that are not there: --isolines")
+        return {}
+    axis, spacing = options.isolines
+    return {"isolines": Isolines(axis, spacing=spacing, **style)}
 
 
 def _clip(options: Any) -> Box | Ball | None:

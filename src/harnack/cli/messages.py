@@ -7,7 +7,7 @@ import re
 from harnack.rendering import UnboundedSurfaceError
 
 # Python's arguments as messages write them, and the options they are on the command line.
-_OPTIONS = re.compile(r'\b(as_|normals|show|material|up)="([\w-]+)"')
+_OPTIONS = re.compile(r'\b(as_|normals|show|material|up|of)="([\w-]+)"')
 
 
 def error_line(error: Exception) -> str:

@@ -11,11 +11,13 @@ from harnack.rendering.pictures.shown import Picture
 from harnack.rendering.studio.camera import Camera
 from harnack.rendering.studio.materials import MATERIALS, Material
 from harnack.rendering.surfaces.extent import UnboundedSurfaceError
+from harnack.rendering.surfaces.isolines import Isolines
 
 __all__ = [
     "MATERIALS",
     "SHOW_MODES",
     "Camera",
+    "Isolines",
     "Material",
     "Picture",
     "UnboundedSurfaceError",

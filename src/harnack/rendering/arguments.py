@@ -11,9 +11,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from harnack.choices import did_you_mean
-from harnack.rendering.pictures.views import VIEWS
+from harnack.fields import Field
+from harnack.rendering.pictures.scales.bar import require_pillow
+from harnack.rendering.pictures.views import SCALED, VIEWS
+from harnack.rendering.studio.backdrops import Backdrop, Ground, checked_backdrop
 from harnack.rendering.studio.camera import Camera
-from harnack.rendering.studio.lighting import BACKDROPS
+from harnack.rendering.surfaces.isolines import Isolines, checked_isolines, function_of
 from harnack.tracer import level_set
 
 __all__ = [
@@ -22,7 +25,6 @@ __all__ = [
     "MAX_SPP",
     "SHOW_MODES",
     "Request",
-    "check_backdrop",
     "check_camera",
     "check_integer",
     "check_memory",
@@ -55,9 +57,13 @@ class Request:
     max_depth: int | None
     seed: int
     camera: Camera
-    backdrop: str
-    antialias: str | None = None
-    denoise: bool = False
+    backdrop: Backdrop
+    antialias: str | None
+    isolines: tuple[Isolines, ...]
+    function: Field | None
+    value_range: tuple[float, float] | None
+    colorbar: bool | str
+    denoise: bool
 
 
 def checked_request(
@@ -69,8 +75,12 @@ def checked_request(
     seed: Any,
     camera: Any,
     backdrop: Any,
-    antialias: Any = None,
-    denoise: Any = False,
+    antialias: Any,
+    isolines: Any,
+    of: Any,
+    value_range: Any,
+    colorbar: Any,
+    denoise: Any,
 ) -> Request:
     """What was asked for.
 
@@ -90,10 +100,65 @@ def checked_request(
         None if max_depth is None else check_integer("max_depth", max_depth),
         check_integer("seed", seed),
         Camera() if camera is None else check_camera(camera),
-        "light" if backdrop is None else check_backdrop(backdrop),
+        Ground("light") if backdrop is None else checked_backdrop(backdrop),
         antialias,
+        check_isolines(isolines, show),
+        check_function(of, show),
+        None if value_range is None else check_value_range(value_range, show),
+        check_colorbar(colorbar, show),
         denoise,
     )
+
+
+def check_isolines(isolines: Any, show: str) -> tuple[Isolines, ...]:
+    """Isolines as a tuple; ValueError for pictures that have none."""
+    lines = checked_isolines(isolines)
+    if lines and show in VIEWS:
+        raise ValueError(f'isolines are of pictures with show="color" or "shaded", not "{show}"')
+    return lines
+
+
+def check_function(of: Any, show: str) -> Field | None:
+    """The function of which values are shown; ValueError where there is none, or no use for it."""
+    if show != "value":
+        if of is not None:
+            raise ValueError(f'of is the function of pictures with show="value", not "{show}"')
+        return None
+    if of is None:
+        raise ValueError(
+            'show="value" needs the function whose values are shown on the surface, such as '
+            'of="z", another field, or a function of x, y and z'
+        )
+    return function_of(of)
+
+
+def check_value_range(value_range: Any, show: str) -> tuple[float, float]:
+    """The numbers at the ends of a scale; ValueError for pictures that have none."""
+    _check_scaled("value_range", show)
+    wrong = f"value_range must be (low, high), two finite numbers in order, not {value_range!r}"
+    try:
+        low, high = (float(end) for end in value_range)
+    except (TypeError, ValueError):
+        raise TypeError(wrong) from None
+    if not -math.inf < low < high < math.inf:
+        raise ValueError(wrong)
+    return low, high
+
+
+def check_colorbar(colorbar: Any, show: str) -> bool | str:
+    """Whether there is to be a bar, or its title; ValueError for pictures that have none."""
+    if not isinstance(colorbar, bool | str):
+        raise TypeError(f"colorbar must be True, False or the bar's title, not {colorbar!r}")
+    if colorbar:
+        _check_scaled("colorbar", show)
+        require_pillow()
+    return colorbar
+
+
+def _check_scaled(setting: str, show: str) -> None:
+    if show not in SCALED:
+        known = " or ".join(f'"{name}"' for name in SCALED)
+        raise ValueError(f'{setting} is of pictures with show={known}, not "{show}"')
 
 
 def check_show(show: Any) -> None:
@@ -176,20 +241,6 @@ def check_camera(camera: Any) -> Camera:
             f"(x, y, z) where it stands, not a {type(camera).__name__} {camera!r}"
         ) from None
     return Camera(position=(x, y, z))
-
-
-def check_backdrop(backdrop: Any) -> str:
-    """What is behind the surfaces.
-
-    Raises:
-        ValueError: unknown.
-    """
-    if not isinstance(backdrop, str) or backdrop not in BACKDROPS:
-        raise ValueError(
-            f"backdrop must be one of {', '.join(BACKDROPS)}, not {backdrop!r}"
-            f"{did_you_mean(backdrop, BACKDROPS)}"
-        )
-    return backdrop
 
 
 def check_settings(settings: Mapping[str, Any], own: Sequence[str]) -> None:

@@ -13,10 +13,14 @@ from harnack.fields import Field, Solid, Tube
 from harnack.rendering.arguments import check_settings
 from harnack.rendering.studio.materials import Material, material_of
 from harnack.rendering.studio.stage import StudioObject
+from harnack.rendering.surfaces.isolines import Isolines
 from harnack.tracer import LevelSet, level_set
 
-OF_STUDIO = ("material", "camera", "backdrop", "up", "boundary", "cut_material")
-_OWN = ("show", "size", "spp", "antialias", *OF_STUDIO, "max_depth", "seed", "progress")
+OF_STUDIO = ("material", "camera", "backdrop", "up", "boundary", "cut_material", "isolines")
+_OWN = (
+    "show", "size", "spp", "antialias", *OF_STUDIO, "of", "value_range", "colorbar", "max_depth",
+    "seed", "denoise", "progress",
+)  # fmt: skip
 # What tubes around the ends of surfaces are made of.
 _RIM = "gold"
 
@@ -25,13 +29,20 @@ MaterialLike = str | Material | Mapping[str, Any]
 
 def surfaces_of(what: Any, boundary: float | None = None, **settings: Any) -> list[LevelSet]:
     """The surfaces that `render` draws of fields and level sets, with settings of surfaces."""
-    return [one.surface for one in exhibits(what, None, boundary, None, settings)]
+    return [one.surface for one in exhibits(what, None, boundary, settings)]
 
 
 def exhibits(
-    what: Any, materials: Any, boundary: float | None, cut: Any, settings: Mapping[str, Any]
+    what: Any,
+    materials: Any,
+    boundary: float | None,
+    settings: Mapping[str, Any],
+    *,
+    cut: Any = None,
+    isolines: tuple[Isolines, ...] = (),
 ) -> list[StudioObject]:
-    """Fields and level sets as they stand on the stage, and tubes around where they end.
+    """Fields and level sets as they stand on the stage, with lines on them, and tubes around where
+    they end.
 
     cut: the material of the faces of solids on their section; None for their own.
 
@@ -52,7 +63,12 @@ def exhibits(
         raise ValueError(f"give one material{several}, not {len(names)}")
     fitted = "tolerance" not in settings
     made = [
-        StudioObject(_surface(one, settings), material_of(name), fitted and isinstance(one, Field))
+        StudioObject(
+            _surface(one, settings),
+            material_of(name),
+            fitted and isinstance(one, Field),
+            isolines=isolines,
+        )  # fmt: skip
         for one, name in zip(given, names, strict=True)
     ]
     if cut is not None:

@@ -80,6 +80,12 @@ def animate(
     fps, turn = _number("fps", fps), _number("turn", turn)
     if not 0 < fps <= 240:
         raise ValueError(f"fps must be more than 0 and at most 240, not {fps}")
+    for name, value in (("size", size), ("show", show)):
+        if callable(value):
+            raise TypeError(
+                f"{name} is the same for all pictures of a film, and no function of s: give it as "
+                "render takes it"
+            )
     size = check_size(size)
     with write_atomically(target) as partial, _encoder(partial, size, fps) as add:
         repeats = turn != 0 and turn % 360 == 0
@@ -194,16 +200,9 @@ def _points(moments: list[dict[str, Any]]) -> FloatArray:
 
 # Settings that do not change where a surface is.
 _OF_PICTURES = (
-    "camera",
-    "material",
-    "cut_material",
-    "backdrop",
-    "up",
-    "spp",
-    "antialias",
-    "max_depth",
-    "seed",
-)
+    "camera", "material", "cut_material", "backdrop", "up", "spp", "antialias", "isolines", "of",
+    "value_range", "colorbar", "max_depth", "seed", "denoise",
+)  # fmt: skip
 
 
 def _three(point: FloatArray) -> tuple[float, float, float]:
@@ -256,17 +255,20 @@ def _mp4(path: Path, size: tuple[int, int], fps: float) -> Generator[Callable[[P
         ) from None
     library = cast("Any", av)
     # H.264 has pairs of pixels.
-    width, height = (side - side % 2 for side in size)
-    if not (width and height):
+    if min(size) < 2:
         raise ValueError(f"a film in .mp4 has sides of at least 2 pixels, not {size}")
     with library.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
-        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        stream.pix_fmt = "yuv420p"
         stream.options = {"crf": "16"}
 
         def add(pixels: Pixels) -> None:
             if pixels.shape[-1] == 4:
                 raise ValueError("films in .mp4 have no alpha: choose another backdrop, or a .gif")
+            height, width = (side - side % 2 for side in pixels.shape[:2])
+            if not stream.codec_context.is_open:
+                stream.width, stream.height = width, height
+            height, width = stream.height, stream.width
             frame = library.VideoFrame.from_ndarray(
                 np.ascontiguousarray(pixels[:height, :width]), format="rgb24"
             )

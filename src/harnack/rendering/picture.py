@@ -32,19 +32,22 @@ from harnack.rendering.exhibits import OF_STUDIO, MaterialLike, exhibits
 from harnack.rendering.mitsuba.integrator import PathTracer
 from harnack.rendering.mitsuba.plugins import register
 from harnack.rendering.mitsuba.scene_files import load_dictionary, load_scene_file
-from harnack.rendering.pictures.backdrop import behind
+from harnack.rendering.pictures.backdrop import flat, wall
 from harnack.rendering.pictures.images import check_picture_path, tone_mapped, write_image
 from harnack.rendering.pictures.light_paths.denoising import denoised, load_denoiser
 from harnack.rendering.pictures.light_paths.exposure import PATHS_A_BAND, expose
 from harnack.rendering.pictures.light_paths.pace import SHORT, pace_of
 from harnack.rendering.pictures.shaded import shaded
 from harnack.rendering.pictures.shown import Picture
-from harnack.rendering.pictures.views import VIEWS, look
+from harnack.rendering.pictures.views import VIEWS, drawn, look
+from harnack.rendering.studio.backdrops import Ground
 from harnack.rendering.studio.camera import Camera
 from harnack.rendering.studio.stage import Studio, studio
+from harnack.rendering.surfaces.isolines import Isolines
+from harnack.rendering.surfaces.placement import Placement
 from harnack.tracer import LevelSet
 
-ShowMode = Literal["color", "shaded", "normal", "evaluations", "status", "depth"]
+ShowMode = Literal["color", "shaded", "normal", "evaluations", "status", "depth", "value"]
 # Modes with ground and lights, and what they send out.
 _LIT = {"color": "light paths", "shaded": "rays"}
 _EDGE_SPP = 9
@@ -63,10 +66,14 @@ def render(
     antialias: str | None = None,
     material: MaterialLike | Sequence[MaterialLike] | None = None,
     camera: Camera | tuple[float, float, float] | None = None,
-    backdrop: str | None = None,
+    backdrop: Any = None,
     up: str | tuple[float, float, float] | None = None,
     boundary: float | None = None,
     cut_material: MaterialLike | None = None,
+    isolines: Isolines | Sequence[Isolines] | None = None,
+    of: Any = None,
+    value_range: tuple[float, float] | None = None,
+    colorbar: bool | str = False,
     max_depth: int | None = None,
     seed: int = 0,
     denoise: bool = False,
@@ -80,7 +87,7 @@ def render(
     path: .png (8-bit sRGB, tone mapped) or .exr (the numbers).
     show: "color" follows light paths; "shaded" lights first hits by a formula, in seconds and
         without noise; or what one ray a pixel found: "normal", "evaluations" (of the fields),
-        "status" and "depth".
+        "status" and "depth", or "value", that of another function.
     size: (width, height) in pixels, by default (800, 600) or the scene's own.
     spp: samples a pixel of a color picture, by default 64 or the scene's own, and of the edges
         of a shaded one, by default 9.
@@ -89,6 +96,13 @@ def render(
         a cone around each pixel. Wires thinner than a pixel then stay lines. It looks at fields
         about twice as often, goes by |f - level| / |grad f|, and takes no fields that jump, such as
         winding numbers of meshes.
+    of: the function of which show="value" shows values on the surface: a field, "x", "y", "z", or
+        a function of three coordinates. All are those of the surface or, of a scene, of the world.
+    value_range: (low, high) of the colors of values, depths or evaluations, by default what is
+        seen; the same for all pictures of a series.
+    colorbar: whether to put a bar with numbers to the right of these pictures, which makes what
+        is written and shown wider, or the bar's title. The numbers returned stay the same. Needs
+        Pillow, which `pip install harnack[film]` brings.
     max_depth: longest light path in edges, -1 for no limit; by default 12 or the scene's own.
     seed: another seed, other noise; the same seed, the same picture.
     denoise: whether a neural network (Open Image Denoise; `pip install harnack[denoise]`) takes the
@@ -101,14 +115,18 @@ def render(
     material: a name of `MATERIALS`, a `Material` or a BSDF dictionary; a list, one for each
         surface.
     camera: where the stage is seen from, a `Camera`, or (x, y, z) in the surfaces' coordinates.
-    backdrop: "light" or "dark", with a floor; "white", with nothing but the surfaces; or
-        "transparent", the same with alpha in PNG and EXR files and as a fourth number, by which
-        the first three are multiplied.
+    backdrop: "light" or "dark", with a floor. Or nothing but the surfaces before a color, by its
+        name in CSS such as "white", "#rrggbb" or as three numbers of sRGB; before (bottom, top),
+        two colors; before an image, by its file (.png, .jpg, .exr) or as an array (h, w, 3) of
+        bytes or of linear numbers, scaled to cover the picture. Or "transparent", the same with
+        alpha in PNG and EXR files and as a fourth number, by which the first three are multiplied.
     up: what is up, "x", "y", "z", "-x", ... or a direction in the surfaces' coordinates; by
         default z.
     boundary: the radius, in the surfaces' coordinates, of a golden tube around the curves at which
         surfaces end (`Field.boundary_curves`).
     cut_material: what the faces of opaque solids on their `section` are made of.
+    isolines: lines on the surfaces, of heights or of another function, where `show` is "color" or
+        "shaded": an `Isolines` or several.
     settings: of the surfaces, as `harnack.level_set` takes them: level, clip, section, solid, ...;
         those of a `LevelSet` are replaced. A `Solid` with a section is drawn as one, with faces
         where it is cut. Without a tolerance, a field gets one that suits its size.
@@ -122,7 +140,8 @@ def render(
 
     Returns the numbers: (h, w, 3) linear sRGB radiance, or (h, w, 4) with alpha where the backdrop
     is transparent or the film of a scene has it; (h, w, 3) normals; or (h, w), of which depths are
-    in units of the (first) surface's coordinates. Notebooks show them as the picture they make.
+    in units of the (first) surface's coordinates, and values NaN where nothing is met. Notebooks
+    show them as the picture they make.
 
     A ray that runs out of steps is drawn magenta, and a warning says how many there were.
 
@@ -133,33 +152,39 @@ def render(
     target = None if path is None else check_picture_path(path)
     asked = checked_request(
         show=show, size=size, spp=spp, max_depth=max_depth, seed=seed, camera=camera,
-        antialias=antialias, backdrop=backdrop, denoise=denoise,
+        antialias=antialias, backdrop=backdrop, isolines=isolines, of=of, value_range=value_range,
+        colorbar=colorbar, denoise=denoise,
     )  # fmt: skip
     if asked.denoise:
         load_denoiser()
+    if target is not None and asked.colorbar and target.suffix.lower() == ".exr":
+        raise ValueError(f"{target}: EXR files hold the numbers; a color bar is drawn in .png")
     mi = register()
     in_studio = isinstance(what, Field | LevelSet | list | tuple)
     if in_studio:
         stage, scene = _staged(mi, what, asked, material, up, boundary, cut_material, settings)
     else:
-        given = material, camera, backdrop, up, boundary, cut_material
+        given = material, camera, backdrop, up, boundary, cut_material, isolines
         of_studio = dict(zip(OF_STUDIO, given, strict=True))
         refuse_studio_settings({**of_studio, **settings})
         stage, scene = None, _loaded(mi, what, asked.size)
         check_memory(asked.show, *map(int, scene.sensors()[0].film().crop_size()))
     if show in VIEWS:
-        view = look(mi, scene, scene.sensors()[0], 1.0 if stage is None else stage.unit)
-        image, drawn = VIEWS[show].numbers(view), VIEWS[show].picture(view)
+        placement = Placement.identity() if stage is None else stage.placement
+        view = look(mi, scene, scene.sensors()[0], placement, asked.function)
+        image = VIEWS[show].numbers(view)
+        named = asked.colorbar is True and isinstance(of, str)
+        shown = drawn(show, view, asked.value_range, str(of) if named else asked.colorbar)
     else:
         draw = (_shaded if show == "shaded" else _radiance)(mi, scene, asked, stage, progress)
         with _bar(progress) as advance:
             image, lost = draw(advance)
         _warn_of(lost, _LIT[show])
-        image, drawn = _before_backdrop(mi, scene.sensors()[0], image, stage, show)
+        image, shown = _before_backdrop(mi, scene.sensors()[0], image, stage, show)
     if target is not None:
         exact = target.suffix.lower() == ".exr"
-        write_image(mi, target, image.astype(np.float32, copy=False) if exact else drawn)
-    return Picture.of(image, drawn)
+        write_image(mi, target, image.astype(np.float32, copy=False) if exact else shown)
+    return Picture.of(image, shown)
 
 
 def _staged(
@@ -170,8 +195,9 @@ def _staged(
     size = asked.size or (800, 600)
     check_memory(asked.show, *size)
     made = studio(
-        mi, exhibits(what, material, boundary, cut, settings), size=size, camera=asked.camera,
-        backdrop=asked.backdrop, up="z" if up is None else up, bare=asked.show not in _LIT,
+        mi, exhibits(what, material, boundary, settings, cut=cut, isolines=asked.isolines),
+        size=size, camera=asked.camera, backdrop=asked.backdrop, up="z" if up is None else up,
+        bare=asked.show not in _LIT,
     )  # fmt: skip
     return made, mi.load_dict(made.scene, parallel=False)
 
@@ -263,13 +289,14 @@ def _before_backdrop(
         has_alpha = mi.has_flag(sensor.film().flags(), mi.FilmFlags.Alpha)
         image = image if has_alpha else np.ascontiguousarray(image[..., :3])
         return image, tone_mapped(image)
-    if stage.backdrop == "transparent":
+    if stage.backdrop is None:
         return image, tone_mapped(image)
     light, free = image[..., :3], 1 - image[..., 3:]
-    if stage.backdrop == "white":
-        return light + free, tone_mapped(image, on_white=True)
-    image = light + free * behind(mi, sensor, stage, show)
-    return image, tone_mapped(image)
+    if isinstance(stage.backdrop, Ground):
+        image = light + free * wall(mi, sensor, stage.backdrop, stage.azimuth, show)
+        return image, tone_mapped(image)
+    behind = flat(mi, stage.backdrop, (image.shape[1], image.shape[0]))
+    return light + free * behind, tone_mapped(image, behind)
 
 
 @contextmanager

@@ -9,14 +9,17 @@ and traces what they carry.
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from harnack.backend import aligned
 from harnack.rendering.mitsuba.clear import tint_of
+from harnack.rendering.mitsuba.lined import with_lines
 from harnack.rendering.mitsuba.variant import load_mitsuba, mitsuba_backend
 from harnack.rendering.surfaces.extent import box_of
+from harnack.rendering.surfaces.isolines import Isolines
 from harnack.rendering.surfaces.placement import PlacedSurface, Placement
 from harnack.tracer import LevelSet
 
@@ -27,12 +30,18 @@ PLUGIN = "harnack"
 
 
 def from_properties(
-    mi: Any, props: Any, surface: LevelSet, tint: Any = None, cut_bsdf: Any = None
+    mi: Any,
+    props: Any,
+    surface: LevelSet,
+    tint: Any = None,
+    cut_bsdf: Any = None,
+    isolines: Sequence[Isolines] = (),
 ) -> Any:
     """The shape of a surface with the `to_world` and the BSDF that a plug-in's properties hold.
 
     tint: of a solid, what is left of light after one unit of length in it, in the world.
     cut_bsdf: of the faces of a solid on its section; None for that of the rest.
+    isolines: drawn on it.
 
     Raises:
         ValueError: as `shape`; or the properties hold an emitter or a medium.
@@ -45,7 +54,17 @@ def from_properties(
     placement = Placement.identity()
     if "to_world" in props:
         placement = Placement.of(as_matrix(props["to_world"]))
-    made = _carrier_class(mi.variant())(props, surface, placement, tint, cut_bsdf)
+    for one in isolines:
+        if one.function is surface.field and surface.solid is None:
+            raise ValueError(
+                f"isolines of {surface.field!r} on its own level set: it is constant there. Draw "
+                "those of another function, or a solid, whose caps show them"
+            )
+    if isolines:
+        colours = [one.colour for one in isolines]
+        props["bsdf"] = with_lines(mi, props["bsdf"], colours)
+        cut_bsdf = None if cut_bsdf is None else with_lines(mi, cut_bsdf, colours)
+    made = _carrier_class(mi.variant())(props, surface, placement, tint, cut_bsdf, isolines)
     if made.emitter() is not None or made.is_medium_transition():
         raise ValueError("surfaces that are traced can neither emit light nor bound a medium")
     return made
@@ -67,8 +86,9 @@ def _carrier_class(variant: str) -> Any:
         """A mesh that no ray meets, with the surface that it stands for."""
 
         def __init__(
-            self, props: Any, surface: LevelSet, placement: Placement, tint: Any, cut_bsdf: Any
-        ) -> None:
+            self, props: Any, surface: LevelSet, placement: Placement, tint: Any, cut_bsdf: Any,
+            isolines: Sequence[Isolines],
+        ) -> None:  # fmt: skip
             ends = box_of(surface)
             mi.Mesh.__init__(self, PLUGIN, 2, 2, props=props)
             self.surface = surface
@@ -76,10 +96,11 @@ def _carrier_class(variant: str) -> Any:
             self.tint = tint_of(mi, tint)
             # What is met on the section counts as a shape of its own, which no ray meets either.
             self.cut_face = None if cut_bsdf is None else _bearer(mi, cut_bsdf)
-            self.placed = PlacedSurface.of(surface, placement, mitsuba_backend(mi))
+            backend, size = mitsuba_backend(mi), float(np.linalg.norm(np.diff(ends, axis=0)))
+            self.placed = PlacedSurface.of(surface, placement, backend, isolines, size)
             params = mi.traverse(self)
             corners = np.concatenate(placement.world_bounds(ends))
-            params["vertex_positions"] = aligned(mitsuba_backend(mi), corners)
+            params["vertex_positions"] = aligned(backend, corners)
             params["faces"] = mi.UInt32([0, 0, 0, 1, 1, 1])
             params.update()
 

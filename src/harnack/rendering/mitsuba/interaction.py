@@ -15,7 +15,8 @@ def surface_interaction(mi: Any, met: SurfaceHit, ray: Any, shape: Any) -> Any:
     """The SurfaceInteraction3f of a ray with one of our surfaces, valid where `met.met`.
 
     shape: ShapePtr of the carrier, whose BSDF is asked. Texture coordinates are x and y of the
-    position in the world: a level set has no parametrisation of its own.
+    position in the world: a level set has no parametrisation of its own. The index of the primitive
+    is the number of the isoline that is drawn there, which `lined` looks at.
     """
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.t = dr.select(met.met, met.t, dr.inf)
@@ -24,6 +25,7 @@ def surface_interaction(mi: Any, met: SurfaceHit, ray: Any, shape: Any) -> Any:
     si.sh_frame = mi.Frame3f(mi.Vector3f(met.normal))
     si.dp_du, si.dp_dv = si.sh_frame.s, si.sh_frame.t
     si.uv = mi.Point2f(si.p.x, si.p.y)
+    si.prim_index = met.line
     si.time = ray.time
     si.wavelengths = ray.wavelengths
     si.shape = dr.select(met.met, shape, dr.zeros(mi.ShapePtr))

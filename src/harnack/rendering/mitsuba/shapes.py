@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 from harnack.rendering.mitsuba.carrier import as_matrix, from_properties
 from harnack.rendering.mitsuba.plugins import register
 from harnack.rendering.mitsuba.scene_files import load_dictionary
+from harnack.rendering.surfaces.isolines import Isolines, checked_isolines
 from harnack.tracer import LevelSet, level_set
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ def shape(
     to_world: npt.ArrayLike | Any = None,
     tint: Sequence[float] | None = None,
     cut_bsdf: Mapping[str, Any] | Any = None,
+    isolines: Isolines | Sequence[Isolines] | None = None,
     **settings: Any,
 ) -> Any:
     """A Mitsuba shape of a field's level set, for a scene dictionary or a scene.
@@ -40,6 +42,7 @@ def shape(
     tint: of a solid of glass, what is left of red, green and blue light after one unit of length
         in it, in the world: (1, 1, 1) for clear (Beer and Lambert).
     cut_bsdf: of the faces on the `section` of an opaque solid; by default that of the rest.
+    isolines: `harnack.Isolines` to draw on it, or several; later ones cover earlier ones.
     settings: as `harnack.level_set` takes them: level, clip, tolerance, solid, ... Glass needs a
         `solid`.
 
@@ -56,7 +59,8 @@ def shape(
     props["bsdf"] = as_bsdf(mi, bsdf)
     if to_world is not None:
         props["to_world"] = mi.ScalarTransform4f(as_matrix(to_world))
-    return from_properties(mi, props, surface, tint, _of_cut(mi, surface, props["bsdf"], cut_bsdf))
+    of_cut = _of_cut(mi, surface, props["bsdf"], cut_bsdf)
+    return from_properties(mi, props, surface, tint, of_cut, checked_isolines(isolines))
 
 
 def _of_cut(mi: Any, surface: LevelSet, bsdf: Any, cut_bsdf: Any) -> Any:

@@ -119,6 +119,7 @@ class World:
             evaluations=mi.UInt32(0),
             mended=mi.Bool(False),
             cut=mi.Bool(False),
+            line=mi.UInt32(0),
         )
 
     def occluded(self, ray: Any, active: Mask) -> Mask:

@@ -39,31 +39,32 @@ def check_picture_path(path: Any) -> Path:
     return path
 
 
-def tone_mapped(image: FloatImage, on_white: bool = False) -> npt.NDArray[np.uint8]:
+def tone_mapped(image: FloatImage, behind: FloatImage | None = None) -> npt.NDArray[np.uint8]:
     """Linear sRGB radiance as 8-bit sRGB: a smooth shoulder, then the transfer function.
 
     Of an image (h, w, 4) the last number is the part that is covered, by which the others are
-    multiplied. It stays, and the others are divided by it, as PNG wants it; or, `on_white`, the
-    rest of each pixel becomes white and three numbers are left.
+    multiplied. It stays, and the others are divided by it, as PNG wants it; or the rest of each
+    pixel becomes what is `behind`, linear sRGB (h, w, 3) without a shoulder, and three numbers are
+    left.
     """
-    if not on_white or image.ndim < 3 or image.shape[-1] < 4:
-        shown = np.empty(image.shape, dtype=np.uint8)
-    else:
-        shown = np.empty((*image.shape[:2], 3), dtype=np.uint8)
+    shape = image.shape if behind is None else behind.shape
+    shown = np.empty(shape, dtype=np.uint8)
     for start in range(0, len(image), _ROWS_AT_ONCE):  # float64 is many times the picture
         rows = slice(start, start + _ROWS_AT_ONCE)
-        shown[rows] = _tone_mapped(image[rows].astype(np.float64), on_white)
+        shown[rows] = _tone_mapped(
+            image[rows].astype(np.float64), None if behind is None else behind[rows]
+        )
     return shown
 
 
-def _tone_mapped(image: FloatArray, on_white: bool) -> npt.NDArray[np.uint8]:
+def _tone_mapped(image: FloatArray, behind: FloatImage | None) -> npt.NDArray[np.uint8]:
     if image.ndim < 3 or image.shape[-1] < 4:
-        return as_bytes(_transferred(_shouldered(image)))
+        return as_bytes(transferred(_shouldered(image)))
     alpha = np.clip(image[..., 3:], 0.0, 1.0)
     light = _shouldered(image[..., :3] / np.where(alpha > 0, alpha, 1.0))
-    if on_white:
-        return as_bytes(_transferred(alpha * light + (1.0 - alpha)))
-    return as_bytes(np.concatenate([_transferred(light), alpha], axis=-1))
+    if behind is not None:
+        return as_bytes(transferred(alpha * light + (1.0 - alpha) * behind))
+    return as_bytes(np.concatenate([transferred(light), alpha], axis=-1))
 
 
 def _shouldered(radiance: FloatArray) -> FloatArray:
@@ -72,7 +73,8 @@ def _shouldered(radiance: FloatArray) -> FloatArray:
     return np.where(x <= _SHOULDER, x, 1.0 - room * np.exp(-(x - _SHOULDER) / room))
 
 
-def _transferred(x: FloatArray) -> FloatArray:
+def transferred(x: FloatArray) -> FloatArray:
+    """Linear sRGB in [0, 1] as sRGB."""
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
 
 

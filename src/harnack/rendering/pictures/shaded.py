@@ -1,9 +1,10 @@
 """Shaded pictures: one ray a pixel, more where the picture has edges, and no noise.
 
 The rays through the middles of all pixels are traced first. Pixels that differ visibly from a
-neighbour are then drawn again as the mean of a fixed grid of samples: outlines are smooth, and
-the inside of a surface costs one ray a pixel. Cones find more pixels to draw again, if asked for:
-those that a surface covers in part, though no ray through a middle tells.
+neighbour are then drawn again as the mean of a fixed grid of samples, and so are those that the
+edge of an isoline may pass through: outlines are smooth, lines thinner than a pixel have no gaps,
+and the inside of a surface costs one ray a pixel. Cones find more pixels to draw again, if asked
+for: those that a surface covers in part, though no ray through a middle tells.
 """
 
 from __future__ import annotations
@@ -52,6 +53,7 @@ class _Seen:
     light: shone by an emitter or the environment and reflected by clear matter, or magenta for
         lost. through: what clear matter leaves of the light from what is met.
     covered: whether there is anything at all, and not the environment alone.
+    lined: whether the edge of an isoline may pass through the pixel.
     """
 
     position: Any
@@ -65,11 +67,12 @@ class _Seen:
     met: Any
     lost: Any
     covered: Any
+    lined: Any
 
     @classmethod
     def nothing(cls, mi: Any, count: int) -> _Seen:
         """Room for as many pixels, to scatter to."""
-        vectors, colours, masks = (mi.Vector3f,) * 3, (mi.Color3f,) * 3, (mi.Bool,) * 4
+        vectors, colours, masks = (mi.Vector3f,) * 3, (mi.Color3f,) * 3, (mi.Bool,) * 5
         kinds = (*vectors, mi.Float, *colours, *masks)
         return cls(*(dr.zeros(kind, count) for kind in kinds))
 
@@ -120,6 +123,7 @@ def shaded(
     image = to_numpy(painter.paint(seen, sky)).reshape(*painter.size[::-1], 4)
     lost = int(dr.count(seen.lost)[0])
     again = _edges(image[..., :3] + (1 - image[..., 3:])).ravel()
+    again |= to_numpy(seen.lined)
     if finder is not None:
         for start, stop in bands(count, _RAYS_A_BAND):
             pixel = uploaded(mi, order[start:stop])
@@ -165,8 +169,11 @@ class _Painter:
         inside, open_surface = si.wi.z > 0, self._is_open(si)
         colour, other = (self._reflectance(si, side) * weight for side in (1, -1))
         colour, other = (as_rgb(mi, c, ray.wavelengths) for c in (colour, other))
-        colour, other = reflectance(colour), reflectance(other)
-        colour = of_mended(of_side(colour, other, inside & open_surface), first.mended)
+        painted = first.line > 0
+        colour, other = reflectance(colour, painted), reflectance(other, painted)
+        plain = ~painted  # lines have their own colour
+        colour = of_side(colour, other, inside & open_surface & plain)
+        colour = of_mended(colour, first.mended & plain)
         shone = si.emitter(scene).eval(si, ~lost) * weight
         light = as_rgb(mi, sight.throughput * shone + weight * sight.gathered, ray.wavelengths)
         light = dr.select(lost, mi.Color3f(LOST_COLOUR), light)
@@ -180,10 +187,33 @@ class _Painter:
         width = dr.norm(ray.o_x + t * ray.d_x - ray.o - t * ray.d)
         flags = si.bsdf().flags()
         glossy = mi.has_flag(flags, mi.BSDFFlags.Glossy) | mi.has_flag(flags, mi.BSDFFlags.Delta)
+        glossy &= plain
+        lined = met & self._has_line_near(si, ray, d, t)
         position = dr.select(met, mi.Vector3f(si.p), dr.nan)
         return _Seen(
-            position, normal, -d, width, colour, light, through, glossy, met, lost, covered
+            position, normal, -d, width, colour, light, through, glossy, met, lost, covered, lined
         )
+
+    def _has_line_near(self, si: Any, ray: Any, d: Any, t: Any) -> Any:
+        """Whether the edge of an isoline may pass through the pixel of a ray with differentials.
+
+        d: in which the ray arrives, t: after that way. What neighbouring rays would meet of the
+        tangent plane is laid along d.
+        """
+        mi, near = self.mi, self.mi.Bool(False)
+        normal = mi.Vector3f(si.n)
+        facing = dr.dot(normal, d)
+
+        def to_neighbour(o: Any, along: Any) -> Any:
+            way = o + t * along - ray.o - t * ray.d
+            return way - d * (dr.dot(way, normal) / facing)
+
+        across, down = to_neighbour(ray.o_x, ray.d_x), to_neighbour(ray.o_y, ray.d_y)
+        for carrier in self.world.carriers:
+            if carrier.placed.lines:
+                found = carrier.placed.has_line_near(si.p, normal, across, down)
+                near |= (si.shape == mi.ShapePtr(carrier)) & found
+        return near
 
     def ray(self, pixel: Any, offset: Any) -> tuple[Any, Any]:
         """Rays with differentials through places in pixels, and what their light is weighted by."""

@@ -79,12 +79,16 @@ class Light:
         return radiance + dr.select(glossy, gloss, 0)
 
 
-def reflectance(colour: Any) -> Any:
-    """What a surface is drawn in, from the reflectance that its BSDF reports straight on."""
+def reflectance(colour: Any, painted: Any) -> Any:
+    """What a surface is drawn in, from the reflectance that its BSDF reports straight on.
+
+    painted: mask of lines, which are of that reflectance, and black where it is 0.
+    """
+    own = colour
     top = dr.max(colour)
     metal = dr.square(colour / top) * _METAL  # what is seen in a mirror has met it more than once
     colour = dr.select(top > 1, metal, colour)
-    return dr.select(top > 0, colour, _like(colour, _CLEAR))
+    return dr.select(painted, own, dr.select(top > 0, colour, _like(colour, _CLEAR)))
 
 
 def of_side(colour: Any, other: Any, inside: Any) -> Any:

@@ -91,7 +91,7 @@ class Through:
         si, first = world.intersect(sight.ray, sight.si, sight.active, self.hidden)
         throughput = sight.throughput * transmittance(mi, world.carriers, sight.si, si, d)
         boundaries = sight.boundaries + 1
-        clear = self._is_clear(si) & first.met & (boundaries <= _MOST)
+        clear = self._is_clear(si) & (first.line == 0) & first.met & (boundaries <= _MOST)
         index = mi.Float(1)
         for carrier, own in self.indices:
             index = dr.select(si.shape == mi.ShapePtr(carrier), own, index)

@@ -1,4 +1,5 @@
-"""Pictures of what the tracer did: normals, evaluations, status, depth. One ray a pixel.
+"""Pictures of what the tracer did and found: normals, evaluations, status, depth, and values of
+another function on the surface. One ray a pixel.
 
 All of them are exact, not averaged: the ray goes through the middle of the pixel.
 """
@@ -6,7 +7,7 @@ All of them are exact, not averaged: the ray goes through the middle of the pixe
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -14,11 +15,15 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import to_numpy
+from harnack.fields import Field
 from harnack.rendering.mitsuba.integrator import LOST_COLOUR
 from harnack.rendering.mitsuba.world import World
-from harnack.rendering.pictures.colormap import viridis
 from harnack.rendering.pictures.images import as_bytes
 from harnack.rendering.pictures.pixels import bands, film_places, in_tiles, uploaded
+from harnack.rendering.pictures.scales.bar import with_bar
+from harnack.rendering.pictures.scales.colormap import greys, viridis
+from harnack.rendering.pictures.scales.scale import Scale
+from harnack.rendering.surfaces.placement import Placement
 from harnack.tracer import Status
 
 FloatArray = npt.NDArray[np.floating[Any]]
@@ -42,21 +47,31 @@ class View:
     normal: (h, w, 3) unit, zero where nothing is met; of a level set it points to larger values.
     evaluations: (h, w) of all the scene's fields.
     status: (h, w) a `Status`; shapes of Mitsuba count as hits.
+    value: (h, w) of a function where something is met, NaN elsewhere; None if none was asked for.
+    period: of that function, if it is angle-valued.
     """
 
     depth: FloatArray
     normal: FloatArray
     evaluations: npt.NDArray[np.int64]
     status: npt.NDArray[np.int64]
+    value: FloatArray | None = None
+    period: float | None = None
 
 
-def look(mi: Any, scene: Any, sensor: Any, unit: float = 1.0) -> View:
-    """What a sensor sees first. unit: of depths, in lengths of the scene."""
+def look(
+    mi: Any, scene: Any, sensor: Any, placement: Placement, function: Field | None = None
+) -> View:
+    """What a sensor sees first.
+
+    placement: of the surfaces, in whose coordinates depths are given. function: of the same
+    coordinates, to be evaluated at what is met.
+    """
     width, height = (int(n) for n in sensor.film().crop_size())
     world = World.of(mi, scene)
     order = in_tiles((width, height))
     parts = [
-        _look_at(mi, world, sensor, uploaded(mi, order[start:stop]))
+        _look_at(mi, world, sensor, uploaded(mi, order[start:stop]), placement, function)
         for start, stop in bands(width * height, _RAYS_A_BAND)
     ]
 
@@ -65,12 +80,17 @@ def look(mi: Any, scene: Any, sensor: Any, unit: float = 1.0) -> View:
         image.reshape(height * width, *column[0].shape[1:])[order] = np.concatenate(column)
         return image
 
-    depth, normal, evaluations, status = (by_rows(one) for one in zip(*parts, strict=True))
-    return View(depth / unit, normal, evaluations, status)
+    depth, normal, evaluations, status, *value = map(by_rows, zip(*parts, strict=True))
+    view = View(depth / placement.scale, normal, evaluations, status)
+    if function is None:
+        return view
+    return replace(view, value=value[0], period=function.period)
 
 
-def _look_at(mi: Any, world: World, sensor: Any, pixel: Any) -> tuple[Any, ...]:
-    """Depth, normal, evaluations and status of pixels, counted by rows."""
+def _look_at(
+    mi: Any, world: World, sensor: Any, pixel: Any, placement: Placement, function: Field | None
+) -> tuple[Any, ...]:
+    """Depth, normal, evaluations and status of pixels, counted by rows; and values, if any."""
     width, height = (int(n) for n in sensor.film().crop_size())
     count = dr.width(pixel)
     place = film_places(mi, pixel, mi.Vector2f(0.5), (width, height))
@@ -87,30 +107,18 @@ def _look_at(mi: Any, world: World, sensor: Any, pixel: Any) -> tuple[Any, ...]:
     status = np.where(met, int(Status.HIT), int(Status.MISS))
     status = np.where(lost, int(Status.OUT_OF_STEPS), status)
     normal = np.where(met[:, None], numbers(first.normal), 0)
-    return numbers(first.t), normal, numbers(first.evaluations).astype(np.int64), status
+    found = numbers(first.t), normal, numbers(first.evaluations).astype(np.int64), status
+    if function is None:
+        return found
+    value = np.full(count, np.nan, dtype=np.float32)
+    if met.any():
+        value[met] = function.value(placement.undo(numbers(first.position)[met]))
+    return *found, value
 
 
 def normal_picture(view: View) -> npt.NDArray[np.uint8]:
     """x, y, z from [-1, 1] as red, green, blue."""
-    met = (view.status == int(Status.HIT))[..., None]
-    return _with_lost(view, np.where(met, 0.5 + 0.5 * view.normal, _BACKGROUND))
-
-
-def depth_picture(view: View) -> npt.NDArray[np.uint8]:
-    """Near is bright, far is dark."""
-    met = view.status == int(Status.HIT)
-    if not met.any():
-        return _with_lost(view, np.broadcast_to(_BACKGROUND, (*view.depth.shape, 3)))
-    near, far = view.depth[met].min(), view.depth[met].max()
-    level = (far - np.where(met, view.depth, far)) / max(far - near, 1e-6 * far, 1e-30)
-    grey = np.where(met, 0.25 + 0.75 * level, 0.0)[..., None]
-    return _with_lost(view, np.where(met[..., None], grey, _BACKGROUND))
-
-
-def evaluations_picture(view: View) -> npt.NDArray[np.uint8]:
-    """Zero is dark blue; the 99.5th percentile, and all above it, is yellow."""
-    top = max(float(np.percentile(view.evaluations, 99.5)), 1.0)
-    return _with_lost(view, viridis(view.evaluations / top))
+    return _of_surfaces(view, 0.5 + 0.5 * view.normal)
 
 
 def status_picture(view: View) -> npt.NDArray[np.uint8]:
@@ -121,6 +129,53 @@ def status_picture(view: View) -> npt.NDArray[np.uint8]:
     return as_bytes(picture)
 
 
+def scaled_picture(view: View, numbers: FloatArray, scale: Scale) -> npt.NDArray[np.uint8]:
+    """Numbers of what is met as the colours of a scale."""
+    return _of_surfaces(view, scale.colours(numbers))
+
+
+def evaluations_picture(view: View, scale: Scale) -> npt.NDArray[np.uint8]:
+    """Evaluations as the colours of a scale, of rays that miss as well."""
+    return _with_lost(view, scale.colours(view.evaluations.astype(np.float64)))
+
+
+def depth_scale(view: View) -> Scale:
+    """Near is bright, far is dark."""
+    return Scale(*_range(view, view.depth), "depth", greys)
+
+
+def evaluations_scale(view: View) -> Scale:
+    """Zero is dark blue; the 99.5th percentile, and all above it, is yellow."""
+    top = max(float(np.percentile(view.evaluations, 99.5)), 1.0)
+    return Scale(0.0, top, "evaluations")
+
+
+def value_scale(view: View) -> Scale:
+    """From the least value that is seen, dark blue, to the greatest, yellow; angles as hues."""
+    if view.period is not None:
+        return Scale.cyclic(view.period, "value")
+    return Scale(*_range(view, value_of(view)), "value")
+
+
+def value_of(view: View) -> FloatArray:
+    """Of the function that was asked for."""
+    if view.value is None:
+        raise ValueError("values of no function were looked at")
+    return view.value
+
+
+def _range(view: View, numbers: FloatArray) -> tuple[float, float]:
+    """The least and the greatest finite number of what is met; (0, 1) where there is none."""
+    found = numbers[(view.status == int(Status.HIT)) & np.isfinite(numbers)]
+    return (float(found.min()), float(found.max())) if found.size else (0.0, 1.0)
+
+
+def _of_surfaces(view: View, picture: FloatArray) -> npt.NDArray[np.uint8]:
+    """Colours where something is met, before the background."""
+    met = (view.status == int(Status.HIT))[..., None]
+    return _with_lost(view, np.where(met, picture, _BACKGROUND))
+
+
 def _with_lost(view: View, picture: FloatArray) -> npt.NDArray[np.uint8]:
     lost = (view.status == int(Status.OUT_OF_STEPS))[..., None]
     return as_bytes(np.where(lost, LOST_COLOUR, picture))
@@ -128,15 +183,49 @@ def _with_lost(view: View, picture: FloatArray) -> npt.NDArray[np.uint8]:
 
 @dataclass(frozen=True)
 class Show:
-    """What to take from a view as numbers, and how to draw it."""
+    """What to take from a view as numbers, and how to draw it.
+
+    scale: of numbers that have one, which `picture` draws them by; None for others.
+    """
 
     numbers: Callable[[View], Any]
-    picture: Callable[[View], npt.NDArray[np.uint8]]
+    picture: Callable[[View, Any], npt.NDArray[np.uint8]]
+    scale: Callable[[View], Scale] | None = None
 
 
 VIEWS = {
-    "normal": Show(lambda view: view.normal, normal_picture),
-    "evaluations": Show(lambda view: view.evaluations, evaluations_picture),
-    "status": Show(lambda view: view.status, status_picture),
-    "depth": Show(lambda view: view.depth, depth_picture),
+    "normal": Show(lambda view: view.normal, lambda view, _: normal_picture(view)),
+    "evaluations": Show(lambda view: view.evaluations, evaluations_picture, evaluations_scale),
+    "status": Show(lambda view: view.status, lambda view, _: status_picture(view)),
+    "depth": Show(
+        lambda view: view.depth,
+        lambda view, scale: scaled_picture(view, view.depth, scale),
+        depth_scale,
+    ),
+    "value": Show(
+        value_of, lambda view, scale: scaled_picture(view, value_of(view), scale), value_scale
+    ),
 }
+SCALED = tuple(name for name, show in VIEWS.items() if show.scale is not None)
+"""Pictures of numbers that have a scale."""
+
+
+def drawn(
+    show: str, view: View, value_range: tuple[float, float] | None, bar: str | bool
+) -> npt.NDArray[np.uint8]:
+    """The pixels of a view.
+
+    value_range: of the scale, in place of what is seen. bar: whether to put a colour bar beside
+    it, or what to write over that.
+    """
+    one = VIEWS[show]
+    scale = None if one.scale is None else one.scale(view)
+    if scale is None:
+        return one.picture(view, None)
+    if value_range is not None:
+        map_of = viridis if scale.period is not None else scale.colours_of
+        scale = Scale(*value_range, scale.name, map_of)
+    if isinstance(bar, str):
+        scale = replace(scale, name=bar)
+    picture = one.picture(view, scale)
+    return with_bar(picture, scale) if bar else picture

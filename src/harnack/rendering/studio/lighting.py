@@ -17,18 +17,16 @@ _STRIP = np.array([0.70, 0.66, 0.60])
 _KEY = (4.7, 4.5, 4.25)
 # The height of the floor: a hair below what stands on it.
 FLOOR = -0.002
-# Reflectance of the ground.
-_GROUNDS = {"light": (0.74, 0.73, 0.715), "dark": (0.055, 0.058, 0.065)}
-# Backdrops without a ground: what is behind the surfaces is cut out of the picture.
-CUT_OUT = ("white", "transparent")
-BACKDROPS = (*_GROUNDS, *CUT_OUT)
+# Reflectance of the ground, by the backdrop's name. Without a ground, what is behind the surfaces
+# is cut out of the picture.
+GROUNDS = {"light": (0.74, 0.73, 0.715), "dark": (0.055, 0.058, 0.065)}
 # (height, width) of the environment's bitmap.
 _ENVIRONMENT_SIZE = (64, 128)
 
 
 def reflectance_of(backdrop: str) -> FloatArray:
     """Of the ground, (3,)."""
-    return np.array(_GROUNDS[backdrop])
+    return np.array(GROUNDS[backdrop])
 
 
 def far_ground(backdrop: str, azimuth: float) -> FloatArray:
@@ -43,7 +41,7 @@ def far_ground(backdrop: str, azimuth: float) -> FloatArray:
 def ground(mi: Any, backdrop: str) -> dict[str, Any]:
     """A wide floor."""
     floor = mi.ScalarTransform4f().translate([0, 0, FLOOR]).scale(100)
-    colour = {"type": "rgb", "value": list(_GROUNDS[backdrop])}
+    colour = {"type": "rgb", "value": list(GROUNDS[backdrop])}
     return {
         "ground": {
             "type": "disk",

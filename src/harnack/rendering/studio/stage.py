@@ -16,10 +16,12 @@ import numpy as np
 from harnack.backend import FloatArray
 from harnack.rendering.mitsuba.shapes import shape
 from harnack.rendering.mitsuba.variant import mitsuba_backend
+from harnack.rendering.studio.backdrops import Backdrop, Ground
 from harnack.rendering.studio.camera import Camera, Pose
-from harnack.rendering.studio.lighting import CUT_OUT, FLOOR, ground, lights
+from harnack.rendering.studio.lighting import FLOOR, ground, lights
 from harnack.rendering.studio.upright import upright
 from harnack.rendering.surfaces.framing import check_size, visible_points
+from harnack.rendering.surfaces.isolines import Isolines
 from harnack.rendering.surfaces.placement import Placement
 from harnack.tracer import LevelSet, Tolerance
 
@@ -36,6 +38,7 @@ _CLAMP = 2.0
 # multiples they are the same for almost all cameras, whose pictures so share their kernels.
 _NEAR, _FAR = 60.0, 2e4
 _FARTHEST = 5e3
+_LIGHT = Ground("light")
 
 
 @dataclass(frozen=True)
@@ -44,25 +47,27 @@ class StudioObject:
 
     fitted: whether to give it a tolerance that suits its size in place of its own.
     cut: the material of the faces on the section of a solid; None for that of the rest.
+    isolines: drawn on it.
     """
 
     surface: LevelSet
     material: Material
     fitted: bool = False
     cut: Material | None = None
+    isolines: tuple[Isolines, ...] = ()
 
 
 @dataclass(frozen=True)
 class Studio:
     """A scene dictionary, and what a picture of it needs besides.
 
-    unit: the length in it of a unit of the surfaces' coordinates. backdrop: its name. azimuth: of
-        the camera. has_ground: whether the surfaces stand on a floor.
+    placement: of the surfaces in it. backdrop: as asked for. azimuth: of the camera. has_ground:
+        whether the surfaces stand on a floor.
     """
 
     scene: dict[str, Any]
-    unit: float
-    backdrop: str
+    placement: Placement
+    backdrop: Backdrop
     azimuth: float
     has_ground: bool
 
@@ -73,7 +78,7 @@ def studio(
     *,
     size: tuple[int, int],
     camera: Camera,
-    backdrop: str = "light",
+    backdrop: Backdrop = _LIGHT,
     up: Any = "z",
     bare: bool = False,
 ) -> Studio:
@@ -106,14 +111,16 @@ def studio(
         bsdf = one.material.bsdf(solid=surface.solid is not None)
         cut = None if one.cut is None else one.cut.bsdf(solid=True)
         scene[f"surface{k}"] = shape(
-            surface, bsdf=bsdf, to_world=placement.matrix, tint=one.material.tint, cut_bsdf=cut
-        )
-    has_ground = not bare and backdrop not in CUT_OUT and pose.origin[2] > FLOOR
-    if has_ground:  # from below, it would hide everything
-        scene |= ground(mi, backdrop)
+            surface, bsdf=bsdf, to_world=placement.matrix, tint=one.material.tint, cut_bsdf=cut,
+            isolines=one.isolines,
+        )  # fmt: skip
+    has_ground = False
     if not bare:
         scene |= lights(mi, pose.azimuth)
-    return Studio(scene, placement.scale, backdrop, pose.azimuth, has_ground)
+        if isinstance(backdrop, Ground) and pose.origin[2] > FLOOR:
+            has_ground = True  # from below, it would hide everything
+            scene |= ground(mi, backdrop.name)
+    return Studio(scene, placement, backdrop, pose.azimuth, has_ground)
 
 
 def _corners(ends: FloatArray) -> FloatArray:

@@ -16,7 +16,7 @@ _UPRIGHT: dict[str, FloatArray] = {
     "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
     "z": np.eye(3),
 }
-UP_AXES: tuple[str, ...] = tuple(_UPRIGHT)
+UP_AXES: tuple[str, ...] = (*_UPRIGHT, *("-" + axis for axis in _UPRIGHT))
 
 
 def upright(up: Any) -> FloatArray:
@@ -26,10 +26,9 @@ def upright(up: Any) -> FloatArray:
         TypeError, ValueError: neither.
     """
     if isinstance(up, str):
+        if up not in UP_AXES:
+            raise ValueError(f"up must be one of {', '.join(UP_AXES)} or a vector, not {up!r}")
         axis = up.removeprefix("-")
-        if axis not in _UPRIGHT or up.startswith("--"):
-            known = (*UP_AXES, *("-" + axis for axis in UP_AXES))
-            raise ValueError(f"up must be one of {', '.join(known)} or a vector, not {up!r}")
         over = np.diag([1.0, -1.0, -1.0]) if up.startswith("-") else np.eye(3)
         return over @ _UPRIGHT[axis]
     way = np.array(checked_point(up, "up"))

@@ -44,6 +44,7 @@ class SurfaceHit:
     evaluations: of the field.
     cut: it is a face of a solid on its section.
     mended: of a field with sheets, met between them: there the surface spans what they leave open.
+    line: the number of the isoline drawn there, counted from 1; 0 for none.
     """
 
     t: Real
@@ -56,6 +57,7 @@ class SurfaceHit:
     evaluations: Any
     mended: Mask
     cut: Mask
+    line: Any
 
 
 def meet_surface(
@@ -107,6 +109,7 @@ def _no_hit(prepared: PreparedLevelSet, trace: MarchResult) -> SurfaceHit:
         evaluations=trace.evaluations,
         mended=none,
         cut=none,
+        line=backend.UInt32(0),
     )
 
 
@@ -147,6 +150,7 @@ def _described(prepared: PreparedLevelSet, ended: _Ended) -> SurfaceHit:
         evaluations=trace.evaluations + dr.select(smooth, prepared.backend.UInt32(1), 0),
         mended=smooth & prepared.field.has_sheets,
         cut=prepared.backend.Bool(False),
+        line=prepared.backend.UInt32(0),
     )
     if not prepared.field.has_sheets:
         return encounter

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -11,12 +12,14 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray
+from harnack.backend.lanes import on_some
 from harnack.rendering.surfaces.encounter import SurfaceHit, meet_surface
+from harnack.rendering.surfaces.isolines import Isolines, PreparedIsolines, line_at
 from harnack.rendering.surfaces.solid import Solid
 from harnack.tracer.covers import Cones
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.backend import Backend, Index, Mask, Real, Vec3
     from harnack.tracer import LevelSet, PreparedLevelSet
 
 
@@ -71,6 +74,12 @@ class Placement:
         turned: FloatArray = np.matmul(local, np.transpose(self.rotation))
         return self.scale * turned + self.translation
 
+    def undo(self, points: npt.ArrayLike) -> FloatArray:
+        """Points (n, 3) of the world, in the surface's coordinates."""
+        world: FloatArray = np.asarray(points, dtype=np.float64)
+        local: FloatArray = np.matmul(world - self.translation, self.rotation)
+        return local / self.scale
+
     def world_bounds(self, ends: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Lower and upper corner, (3,) each, of a box in the world that holds a box (2, 3)."""
         corners = self.apply(list(itertools.product(*ends.T.tolist())))
@@ -78,10 +87,25 @@ class Placement:
 
 
 @dataclass(frozen=True)
+class _Spot:
+    """Where a surface is met, and how it faces there."""
+
+    position: Vec3
+    normal: Vec3
+
+
+@dataclass(frozen=True)
+class _Number:
+    """Of an isoline."""
+
+    line: Index
+
+
+@dataclass(frozen=True)
 class PlacedSurface:
     """A level set or solid on a backend, to be met by rays of the world.
 
-    rows: of the rotation; all numbers are kernel parameters.
+    rows: of the rotation; all numbers are kernel parameters. lines: drawn on it.
     """
 
     prepared: PreparedLevelSet
@@ -89,10 +113,14 @@ class PlacedSurface:
     scale: Real
     rows: tuple[Vec3, Vec3, Vec3]
     translation: Vec3
+    lines: tuple[PreparedIsolines, ...] = ()
 
     @classmethod
-    def of(cls, surface: LevelSet, placement: Placement, backend: Backend) -> PlacedSurface:
-        """Everything uploaded."""
+    def of(
+        cls, surface: LevelSet, placement: Placement, backend: Backend,
+        isolines: Sequence[Isolines] = (), size: float = 1.0,
+    ) -> PlacedSurface:  # fmt: skip
+        """Everything uploaded. size: diagonal of the surface's box, for the width of lines."""
 
         def vector(numbers: FloatArray) -> Vec3:
             return backend.Array3f(*(dr.opaque(backend.Float, float(x)) for x in numbers))
@@ -101,7 +129,8 @@ class PlacedSurface:
         solid = None if surface.solid is None else Solid.of(surface, prepared)
         rows = tuple(vector(row) for row in placement.rotation)
         scale = dr.opaque(backend.Float, placement.scale)
-        return cls(prepared, solid, scale, rows, vector(placement.translation))
+        lines = tuple(one.prepare(backend, size) for one in isolines)
+        return cls(prepared, solid, scale, rows, vector(placement.translation), lines)
 
     def queued(self) -> PlacedSurface:
         """The same, whose rays are traced at once (`PreparedLevelSet.queued`)."""
@@ -120,6 +149,8 @@ class PlacedSurface:
             met = self.solid.meet(o, d, t_max, active, leaves)
         else:
             met = meet_surface(self.prepared, o, d, t_max, active)
+        if self.lines:
+            met = replace(met, line=self._line(met))
         position = self.scale * self._to_world(met.position) + self.translation
         return replace(
             met,
@@ -128,6 +159,32 @@ class PlacedSurface:
             normal=self._to_world(met.normal),
             clearance=self.scale * met.clearance,
         )
+
+    def _line(self, met: SurfaceHit) -> Index:
+        """The number of the line at hits in the surface's coordinates."""
+        index = self.prepared.backend.UInt32
+
+        def numbers(spot: _Spot) -> _Number:
+            return _Number(line_at(self.lines, spot.position, spot.normal, index))
+
+        spot, none = _Spot(met.position, met.normal), _Number(index(0))
+        if self.prepared.queued:
+            return on_some(met.met, numbers, spot, none).line
+        return dr.select(met.met, numbers(spot).line, 0)
+
+    def has_line_near(self, position: Vec3, normal: Vec3, across: Vec3, down: Vec3) -> Mask:
+        """Whether the edge of a line passes near points of the surface, in the world.
+
+        across, down: how far it is to the points that neighbouring pixels show.
+        """
+        vector = self.prepared.backend.Array3f
+        p = self._to_local(vector(position) - self.translation) / self.scale
+        n = self._to_local(vector(normal))
+        u, v = (self._to_local(vector(one)) / self.scale for one in (across, down))
+        near = self.prepared.backend.Bool(False)
+        for one in self.lines:
+            near |= one.pass_near(p, n, u, v)
+        return near
 
     def occludes(self, o: Vec3, d: Vec3, t_max: Real, active: Mask) -> Mask:
         """Whether it lies on rays of the world; what is not proved free counts as lying there."""

@@ -1,0 +1,34 @@
+"""Pictures of docs/pictures.md with lines, scales and backdrops: `make images` makes them."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import harnack as hk
+
+
+def main(folder: Path) -> None:
+    """Draw all of them into a folder."""
+    shaded: dict[str, Any] = {"show": "shaded", "size": (400, 300)}
+    net = [
+        hk.Isolines("z", spacing=0.1, width=0.012),
+        hk.Isolines(
+            lambda x, y, z: (3 * x * x * y - y**3) / 2, spacing=0.1, width=0.012, color="white"
+        ),
+    ]
+    graph = hk.HeightField(lambda x, y: (x**3 - 3 * x * y * y) / 2, domain=hk.Ball())
+    hk.render(graph, folder / "view-conjugates.png", isolines=net, material="plastic", **shaded)
+    trefoil = hk.SolidAngle(hk.geometry.shapes.torus_knot(2, 3, 60))
+    heights = hk.Isolines("z", spacing=0.2, color="white")
+    sky = ("white", "steelblue")
+    hk.render(trefoil, folder / "view-heights.png", isolines=heights, backdrop=sky, **shaded)
+    gyroid = hk.Gyroid(1.0, domain=hk.Ball(radius=1.0))
+    walls: dict[str, Any] = {"solid": (-0.3, 0.3), "size": (400, 300), "colorbar": True}
+    hk.render(gyroid, folder / "view-value.png", show="value", of="z", **walls)
+    hk.render(gyroid, folder / "view-evaluations.png", show="evaluations", **walls)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,0 +1,1 @@
+"""Numbers as colours, and the bars that explain them."""

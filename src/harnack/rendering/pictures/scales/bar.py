@@ -1,0 +1,63 @@
+"""A bar of colours beside a picture, with ticks at nice numbers."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from harnack.rendering.pictures.scales.scale import Scale
+
+Pixels = npt.NDArray[np.uint8]
+
+# Heights of letters and bar, and the bar's width, as parts of the picture's height; and the least
+# height of letters, in pixels.
+_LETTERS, _BAR, _WIDTH, _LEAST = 1 / 28, 0.78, 1 / 22, 10
+_BEHIND, _INK = (26, 26, 28), (226, 226, 226)
+
+
+def require_pillow() -> tuple[Any, Any, Any]:
+    """Pillow's images, drawings and typefaces.
+
+    Raises:
+        ModuleNotFoundError: it is not installed.
+    """
+    try:
+        from PIL import Image, ImageDraw, ImageFont
+    except ModuleNotFoundError:
+        raise ModuleNotFoundError(
+            "a color bar needs Pillow: pip install 'harnack[film]', or leave colorbar away"
+        ) from None
+    return Image, ImageDraw, ImageFont
+
+
+def with_bar(pixels: Pixels, scale: Scale) -> Pixels:
+    """A picture (h, w, 3) with the bar of its scale to the right: (h, w + more, 3)."""
+    images, drawings, typefaces = require_pillow()
+    height = len(pixels)
+    letters = max(_LEAST, round(_LETTERS * height))
+    font = typefaces.load_default(letters)
+    length = max(2, min(round(_BAR * height), height - 4 * letters))
+    thick, gap = max(3, round(_WIDTH * height)), max(2, letters // 2)
+    ticks = scale.ticks(max(2, min(6, length // (2 * letters))))
+    room = max(font.getlength(text) for _, text in ticks)
+    wide = max(thick + gap + room, font.getlength(scale.name))
+    strip = images.new("RGB", (math.ceil(wide) + 2 * letters, height), _BEHIND)
+    top = (height - length + letters) // 2
+    draw = drawings.Draw(strip)
+    draw.text((letters, max(0, top - gap)), scale.name, font=font, fill=_INK, anchor="ls")
+    values = scale.high - (np.arange(length) + 0.5) / length * (scale.high - scale.low)
+    if scale.period is not None:  # the upper end is the lower one
+        values = np.minimum(values, np.nextafter(scale.high, scale.low))
+    column = (scale.colours(values) * 255 + 0.5).astype(np.uint8)
+    for row, colour in enumerate(column):
+        draw.line([(letters, top + row), (letters + thick - 1, top + row)], fill=tuple(colour))
+    for value, text in ticks:
+        part = (value - scale.low) / (scale.high - scale.low) if scale.high > scale.low else 0.5
+        y = top + round((1 - part) * (length - 1))
+        right = letters + thick
+        draw.line([(right, y), (right + gap // 2, y)], fill=_INK)
+        draw.text((right + gap, y), text, font=font, fill=_INK, anchor="lm")
+    return np.concatenate([pixels, np.asarray(strip, dtype=np.uint8)], axis=1)

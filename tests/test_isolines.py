@@ -1,0 +1,249 @@
+"""Lines on surfaces where another function takes given values: where they are, and how wide."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import harnack as hk
+from harnack.backend import choose_backend, to_numpy
+from harnack.backend.arrays import upload_vectors
+from harnack.rendering import register, shape
+from harnack.rendering.surfaces.isolines import line_at
+from harnack.tracer import Status
+
+mi = register()
+BACKEND = choose_backend("double")
+SMALL: dict[str, Any] = {"size": (64, 48), "progress": False}
+CIRCLE = hk.SolidAngle(hk.geometry.shapes.wavy_polygon(24))
+
+
+def covered(lines: hk.Isolines, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    prepared = lines.prepare(BACKEND, size=1.0)
+    p, n = upload_vectors(BACKEND, points), upload_vectors(BACKEND, normals)
+    return np.broadcast_to(to_numpy(prepared.cover(p, n)), len(points))
+
+
+def on_sphere(count: int) -> np.ndarray:
+    points = np.random.default_rng(0).normal(size=(count, 3))
+    return points / np.linalg.norm(points, axis=1, keepdims=True)
+
+
+def around_cylinder(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points of the cylinder of radius 1 around the z-axis with |z| < 2, and normals."""
+    rng = np.random.default_rng(0)
+    angle, z = rng.uniform(0, 2 * np.pi, count), rng.uniform(-2, 2, count)
+    normals = np.column_stack([np.cos(angle), np.sin(angle), 0 * z])
+    return normals + z[:, None] * np.array([0.0, 0.0, 1.0]), normals
+
+
+def check_distances(lines: hk.Isolines, points: Any, normals: Any, away: Any, width: float) -> None:
+    """That lines are where points are less than half the width away from them."""
+    on = covered(lines, points, normals)
+    assert 0.002 < on.mean() < 0.9
+    assert on[away < 0.48 * width].all()
+    assert not on[away > 0.52 * width].any()
+
+
+def test_contour_lines_of_a_sphere_are_as_wide_at_its_equator_as_near_its_poles() -> None:
+    points, levels, width = on_sphere(100_000), [0.0, 0.5, -0.9], 0.02
+    latitude = np.arcsin(points[:, 2])
+    away = np.abs(latitude[:, None] - np.arcsin(levels)).min(axis=1)
+    check_distances(hk.Isolines("z", levels, width=width), points, points, away, width)
+
+
+def test_width_does_not_depend_on_how_steep_the_function_is() -> None:
+    points, normals = around_cylinder(100_000)
+    width = 0.02
+    lines = hk.Isolines(lambda x, y, z: hk.exp(3 * z), np.exp([-3.0, 0.0, 4.5]), width=width)
+    away = np.abs(points[:, 2:] - np.array([-1.0, 0.0, 1.5])).min(axis=1)
+    check_distances(lines, points, normals, away, width)
+
+
+def test_spacing_is_lines_at_its_multiples() -> None:
+    points, normals = around_cylinder(20_000)
+    away = np.abs(points[:, 2] - 0.3 * np.round(points[:, 2] / 0.3))
+    check_distances(hk.Isolines("z", spacing=0.3, width=0.04), points, normals, away, 0.04)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 63, 64, 200])
+def test_the_nearest_of_many_levels_is_found(count: int) -> None:
+    points, normals = around_cylinder(20_000)
+    levels = np.random.default_rng(count).uniform(-2, 2, count)
+    away = np.abs(points[:, 2:] - levels).min(axis=1)
+    width = 0.4 / count
+    check_distances(hk.Isolines("z", levels, width=width), points, normals, away, width)
+
+
+class Turn(hk.Field):
+    """The angle around the z-axis, from -pi to pi, jumping where it is passed."""
+
+    period = 2 * np.pi
+
+    def evaluate(self, p: Any) -> hk.Sample:
+        import drjit as dr
+
+        square = p.x * p.x + p.y * p.y
+        return hk.Sample(dr.atan2(p.y, p.x), type(p)(-p.y, p.x, 0) / square, ())
+
+
+@pytest.mark.parametrize(
+    ("settings", "angles"),
+    [
+        ({"levels": [np.pi]}, [np.pi]),
+        ({"levels": [3.1, 0.5]}, [3.1, 0.5]),
+        ({"levels": -3.1}, [-3.1]),
+        ({"levels": [3.1 + 4 * np.pi]}, [3.1]),
+        ({"levels": [0.0]}, [0.0]),
+        ({"spacing": np.pi / 3}, np.arange(6) * np.pi / 3),
+        ({}, np.arange(12) * np.pi / 6),
+    ],
+)
+def test_isolines_of_angles_are_right_where_these_jump(
+    settings: dict[str, Any], angles: Any
+) -> None:
+    points, normals = around_cylinder(50_000)
+    angle = np.arctan2(points[:, 1], points[:, 0])
+    apart = angle[:, None] - np.asarray(angles)
+    away = np.abs(np.angle(np.exp(1j * apart))).min(axis=1)
+    check_distances(hk.Isolines(Turn(), width=0.03, **settings), points, normals, away, 0.03)
+
+
+def test_a_spacing_that_does_not_divide_the_period_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"period 6\.28319.*does not divide"):
+        hk.Isolines(Turn(), spacing=1.0)
+
+
+def test_lines_near_a_maximum_reach_at_most_half_a_width_too_far() -> None:
+    points = on_sphere(400_000)
+    width = 0.05
+    away = np.arccos(np.clip(points[:, 2], -1, 1))  # from the pole
+    for below in (-0.1 * width**2, 0.0, 0.1 * width**2, width**2):
+        on = covered(hk.Isolines("z", [1 - below], width=width), points, points)
+        line = np.arccos(min(1 - below, 1))
+        assert away[on].max() < line + 1.02 * width
+
+
+def test_a_function_that_is_constant_on_the_surface_has_no_lines() -> None:
+    points = on_sphere(50_000)
+    lines = hk.Isolines(hk.Sphere(1.0), [0.0], width=0.1)
+    single = choose_backend("single")
+    p = upload_vectors(single, points)
+    assert not to_numpy(lines.prepare(single, 1.0).cover(p, p)).any()
+
+
+def test_the_last_of_several_lines_covers_the_others() -> None:
+    points, normals = around_cylinder(5000)
+    lines = [hk.Isolines("z", [0.0], width=1.0), hk.Isolines("x", [0.0], width=0.5)]
+    p, n = upload_vectors(BACKEND, points), upload_vectors(BACKEND, normals)
+    prepared = tuple(one.prepare(BACKEND, 1.0) for one in lines)
+    number = to_numpy(line_at(prepared, p, n, BACKEND.UInt32))
+    first, second = (covered(one, points, normals) for one in lines)
+    assert (first & second).any()
+    np.testing.assert_array_equal(number, np.where(second, 2, np.where(first, 1, 0)))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "settings", "message"),
+    [
+        (("w",), {"spacing": 1}, 'must be "x", "y" or "z"'),
+        ((3,), {"spacing": 1}, 'must be "x", "y" or "z"'),
+        (("z",), {}, "say which isolines"),
+        (("z", [0]), {"spacing": 1}, "either levels or a spacing"),
+        (("z", []), {}, "at least one"),
+        (("z", [np.nan]), {}, "finite"),
+        (("z", "high"), {}, "must be numbers"),
+        (("z",), {"spacing": -1}, "spacing of isolines must be positive"),
+        (("z", 0), {"width": 0}, "width of isolines must be positive"),
+        (("z", 0), {"color": "blak"}, 'did you mean "black"'),
+    ],
+)
+def test_what_is_wrong_is_said(arguments: Any, settings: dict[str, Any], message: str) -> None:
+    with pytest.raises((ValueError, TypeError), match=message):
+        hk.Isolines(*arguments, **settings)
+
+
+def test_pictures_refuse_isolines_that_make_no_sense() -> None:
+    lines = hk.Isolines("z", spacing=0.1)
+    with pytest.raises(TypeError, match=r"must be harnack\.Isolines"):
+        hk.render(CIRCLE, show="shaded", isolines="z", **SMALL)
+    with pytest.raises(ValueError, match='isolines are of pictures with show="color"'):
+        hk.render(CIRCLE, show="depth", isolines=lines, **SMALL)
+    with pytest.raises(ValueError, match="on its own level set: it is constant there"):
+        hk.render(CIRCLE, show="shaded", isolines=hk.Isolines(CIRCLE), **SMALL)
+    with pytest.raises(ValueError, match="isolines: a Mitsuba scene is drawn as it is"):
+        hk.render({"type": "scene"}, isolines=lines, **SMALL)
+
+
+def seen(what: Any, isolines: Any, show: str, **settings: Any) -> np.ndarray:
+    asked = {"backdrop": "white", "spp": 16, **SMALL, **settings}
+    return hk.render(what, show=show, isolines=isolines, **asked).shown.astype(int)
+
+
+@pytest.mark.parametrize("show", ["color", "shaded"])
+def test_lines_have_their_colours(show: str) -> None:
+    plain = seen(hk.Sphere(1.0), None, show, material="clay")
+    width = 0.3
+    lines = [hk.Isolines("z", [0.0], width=width, color="blue")]
+    image = seen(hk.Sphere(1.0), lines, show, material="clay")
+    changed = np.abs(image - plain).max(axis=-1) > 25
+    status = hk.render(hk.Sphere(1.0), show="status", **SMALL)
+    on = changed & (status == Status.HIT)
+    assert 0.1 < on.sum() / (status == Status.HIT).sum() < 0.25  # the band has 0.15 of the sphere
+    red, green, blue = np.median(image[on], axis=0)
+    assert blue > 2 * max(red, green, 1)
+
+
+def test_lines_thinner_than_a_pixel_have_no_gaps_in_shaded_pictures() -> None:
+    camera = hk.Camera(elevation=0)
+    settings = {"material": "porcelain", "camera": camera, "size": (120, 90)}
+    plain = seen(hk.Sphere(1.0), None, "shaded", **settings)
+    lines = hk.Isolines("z", [0.013], width=0.012)  # 0.43 pixels
+    dark = (plain - seen(hk.Sphere(1.0), lines, "shaded", **settings)).mean(axis=-1)
+    columns = dark[:, 30:90].sum(axis=0)
+    expected = 0.43 * 200
+    assert columns.min() > 0.4 * expected
+    assert columns.max() < 2.0 * expected
+
+
+def test_caps_of_solids_show_isolines_of_their_own_function() -> None:
+    camera = hk.Camera(elevation=89)
+    box = hk.Box((-2, -2, -2), (2, 2, 0))
+    settings = {"solid": (-np.inf, 0.0), "clip": box, "camera": camera, "material": "clay"}
+    field = hk.Sphere(1.0)
+    plain = seen(field, None, "shaded", **settings)
+    levels = field.value(np.array([[0.5, 0.0, 0.0]]))
+    image = seen(field, hk.Isolines(field, levels, width=0.1), "shaded", **settings)
+    y, x = np.nonzero((plain - image).max(axis=-1) > 60)
+    radius = np.hypot(x - x.mean(), y - y.mean())
+    assert len(radius) > 30
+    assert radius.std() < 0.12 * radius.mean()
+
+
+def test_lines_on_glass_are_opaque_in_shaded_pictures() -> None:
+    settings = {"solid": (-np.inf, 0.0), "material": "glass"}
+    lines = hk.Isolines("z", [0.0], width=0.3, color="black")
+    plain = seen(hk.Sphere(1.0), None, "shaded", **settings)
+    image = seen(hk.Sphere(1.0), lines, "shaded", **settings)
+    assert ((image.max(axis=-1) < 40) & (plain.min(axis=-1) > 60)).sum() > 50
+
+
+def test_shapes_of_mitsuba_scenes_have_lines_in_their_own_coordinates() -> None:
+    turned = mi.ScalarTransform4f().translate([5, 0, 0]).rotate([0, 1, 0], 90).scale(2)
+
+    def scene(isolines: Any) -> Any:
+        bsdf = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.8}}
+        ball = shape(hk.Sphere(1.0), bsdf=bsdf, to_world=turned, isolines=isolines)
+        look = mi.ScalarTransform4f().look_at([5, -9, 0], [5, 0, 0], [0, 0, 1])
+        film = {"type": "hdrfilm", "width": 64, "height": 48}
+        sensor = {"type": "perspective", "fov": 40, "to_world": look, "film": film}
+        light = {"type": "constant"}
+        return {"type": "scene", "light": light, "ball": ball, "sensor": sensor}
+
+    plain = hk.render(scene(None), show="shaded", progress=False)
+    image = hk.render(scene(hk.Isolines("z", [0.0], width=0.3)), show="shaded", progress=False)
+    y, x = np.nonzero(np.asarray(plain - image).max(axis=-1) > 0.2)
+    assert abs(x.mean() - 31.5) < 1
+    assert np.ptp(y) > 4 * np.ptp(x)  # z of the ball lies along x of the world
