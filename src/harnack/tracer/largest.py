@@ -83,7 +83,7 @@ def _made(
         return free
 
     lower, upper = (np.array(end, np.float64) for end in volume.bounds())
-    cells = OccupiedCells.of(lower, upper, clearance, across)
+    cells = OccupiedCells.of(lower, upper, clearance, across).thinned(clearance)
 
     def size(centres: FloatArray) -> FloatArray:
         inside = (beyond(centres) <= 0) & (into_domain(centres)[1] == 0)
