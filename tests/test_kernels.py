@@ -101,17 +101,16 @@ def test_curves_around_a_circle_have_hulls_of_all_kinds() -> None:
 
 
 @pytest.mark.parametrize("wanted", ["value", "trace"])
-@pytest.mark.parametrize(("level", "rise"), [(2 * np.pi, 0.0), (5.0, 0.01)])
-def test_a_step_of_an_optimisation_compiles_no_kernel(
-    wanted: str, level: float, rise: float
-) -> None:
+@pytest.mark.parametrize("level", [None, 5.0])
+def test_a_step_of_an_optimisation_compiles_no_kernel(wanted: str, level: float | None) -> None:
     """Other proofs would hold of each of the curves, and hulls have other numbers of planes."""
     backend = choose_backend()
     towards = 0.3 * np.random.default_rng(0).normal(size=(40, 3))
     points, d = (to_vector3(backend, v) for v in (towards, towards - [0, 0, 3]))
 
     def step(k: int) -> None:
-        vertices, own = to_vector3(backend, around_a_circle(k)), backend.Float(level + rise * k)
+        vertices = to_vector3(backend, around_a_circle(k))
+        own = None if level is None else backend.Float(level + 0.01 * k)
         dr.enable_grad(vertices, own)
         curve = hk.SolidAngle(vertices)
         if wanted == "value":
@@ -122,7 +121,7 @@ def test_a_step_of_an_optimisation_compiles_no_kernel(
             loss = dr.select(hits.hit, dr.square(hits.t), 0)
         dr.backward(dr.sum(loss))
         assert np.abs(to_numpy(vertices.grad)).max() > 0
-        assert (float(own.grad[0]) != 0) == (wanted == "trace")
+        assert own is None or (float(own.grad[0]) != 0) == (wanted == "trace")
 
     dr.flush_kernel_cache()  # what other tests have compiled
     step(0), step(1)
