@@ -201,6 +201,7 @@ def test_a_loss_in_another_framework(target: str) -> None:
     np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["trace", "value"])
 def test_a_step_compiles_nothing_after_the_first_two(name: str) -> None:
     """Vertices leave a plane, and then the convex position; batches begin anywhere in memory."""

@@ -90,25 +90,27 @@ def around_a_circle(k: int) -> np.ndarray:
     """Vertices first in a plane, then in convex position, then in no position at all."""
     t = np.linspace(0, 2 * np.pi, 30, endpoint=False)
     circle = np.column_stack([np.cos(t), np.sin(t), 0 * t])
-    return circle + 0.01 * k**2 * np.random.default_rng(k).normal(size=circle.shape)
+    return circle + 0.002 * k**2 * np.random.default_rng(k).normal(size=circle.shape)
 
 
 def test_curves_around_a_circle_have_hulls_of_all_kinds() -> None:
     curves = [hk.SolidAngle(around_a_circle(k)) for k in range(10)]
-    assert {one.certificate for one in curves} == {"planar", "range", "edges"}
+    assert [one.certificate for one in curves[:2]] == ["planar", "range"]
+    assert curves[-1].certificate == "edges"
     assert len({len(one.extent((2 * np.pi,)).planes()) for one in curves}) > 2
 
 
 @pytest.mark.parametrize("wanted", ["value", "trace"])
-@pytest.mark.parametrize("level", [2 * np.pi, 5.0])
-def test_a_step_of_an_optimisation_compiles_no_kernel(wanted: str, level: float) -> None:
+@pytest.mark.parametrize("level", [None, 5.0])
+def test_a_step_of_an_optimisation_compiles_no_kernel(wanted: str, level: float | None) -> None:
     """Other proofs would hold of each of the curves, and hulls have other numbers of planes."""
     backend = choose_backend()
     towards = 0.3 * np.random.default_rng(0).normal(size=(40, 3))
     points, d = (to_vector3(backend, v) for v in (towards, towards - [0, 0, 3]))
 
     def step(k: int) -> None:
-        vertices, own = to_vector3(backend, around_a_circle(k)), backend.Float(level + 0.01 * k)
+        vertices = to_vector3(backend, around_a_circle(k))
+        own = None if level is None else backend.Float(level + 0.01 * k)
         dr.enable_grad(vertices, own)
         curve = hk.SolidAngle(vertices)
         if wanted == "value":
@@ -119,8 +121,9 @@ def test_a_step_of_an_optimisation_compiles_no_kernel(wanted: str, level: float)
             loss = dr.select(hits.hit, dr.square(hits.t), 0)
         dr.backward(dr.sum(loss))
         assert np.abs(to_numpy(vertices.grad)).max() > 0
-        assert (float(own.grad[0]) != 0) == (wanted == "trace")
+        assert own is None or (float(own.grad[0]) != 0) == (wanted == "trace")
 
+    dr.flush_kernel_cache()  # what other tests have compiled
     step(0), step(1)
     assert [compiled(lambda k=k: step(k)) for k in range(2, 10)] == [0] * 8
 

@@ -14,7 +14,6 @@ import numpy as np
 from harnack.backend import FloatArray, backend_of, choose_backend, to_numpy
 from harnack.backend.extrema import fmin
 from harnack.backend.tensors import is_tensor, vectors_of
-from harnack.cells import wrapped_points
 from harnack.choices import did_you_mean
 from harnack.enclosures import HarmonicBall, LineLipschitz
 from harnack.fields.clearance import tight_extent
@@ -390,11 +389,10 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
             return None
         if self._is_empty:
             return ConvexHull.of(points)  # holds what there is: nothing
-        if self.convex_position and nearest > 2 * math.pi * (1 - 1e-9):
-            slack = 1e-4 * self._size
-            if self._movable:  # as many planes as below: curves that are moved share a kernel
-                return wrapped_points(points, slack)
-            return ConvexHull.of(points).padded(slack)
+        # Curves that are moved step by step share kernels: their extent is found in one way.
+        in_hull = self.convex_position and nearest > 2 * math.pi * (1 - 1e-9)
+        if in_hull and not self._movable:
+            return ConvexHull.of(points).padded(1e-4 * self._size)
         length = sum(one.length for one in self._net_circles)
         length += total_length(self._net) if self._net else 0.0
         reach = 1.0001 * length / math.sqrt(nearest * (_PERIOD - nearest))
