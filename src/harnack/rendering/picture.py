@@ -5,20 +5,11 @@ from __future__ import annotations
 import os
 import re
 import warnings
-from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, cast
 
 import numpy as np
 import numpy.typing as npt
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    TaskProgressColumn,
-    TextColumn,
-    TimeRemainingColumn,
-)
 
 from harnack.fields import Field
 from harnack.rendering.arguments import (
@@ -38,6 +29,7 @@ from harnack.rendering.pictures.images import check_picture_path, tone_mapped, w
 from harnack.rendering.pictures.shaded import shaded
 from harnack.rendering.pictures.shown import Picture
 from harnack.rendering.pictures.views import VIEWS, look
+from harnack.rendering.progress import Advance, progress_bar
 from harnack.rendering.studio.camera import Camera
 from harnack.rendering.studio.stage import Studio, studio
 from harnack.tracer import LevelSet
@@ -47,7 +39,6 @@ ShowMode = Literal["color", "shaded", "normal", "evaluations", "status", "depth"
 _LIT = {"color": "light paths", "shaded": "rays"}
 _EDGE_SPP = 9
 Image = npt.NDArray[Any]
-Advance = Callable[[float], None]
 
 
 def render(
@@ -138,7 +129,7 @@ def render(
         view = look(mi, scene, scene.sensors()[0], 1.0 if stage is None else stage.unit)
         image, drawn = VIEWS[show].numbers(view), VIEWS[show].picture(view)
     else:
-        with _bar(progress) as advance:
+        with progress_bar("rendering", progress) as advance:
             drawing = _shaded if show == "shaded" else _radiance
             image, lost = drawing(mi, scene, asked, stage, advance)
         _warn_of(lost, _LIT[show])
@@ -240,13 +231,3 @@ def _before_backdrop(
         return light + free, tone_mapped(image, on_white=True)
     image = light + free * behind(mi, sensor, stage, show)
     return image, tone_mapped(image)
-
-
-@contextmanager
-def _bar(shown: bool) -> Generator[Advance]:
-    """A progress bar on stderr; what it yields is told what part has been finished."""
-    columns = (TextColumn("rendering"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, disable=not shown, transient=True) as bar:
-        task = bar.add_task("", total=1.0)
-        yield lambda part: bar.advance(task, part)
