@@ -85,14 +85,21 @@ def test_errors_are_listed() -> None:
     )
     expected = (
         "Does it.\n\n**Raises**\n\n``ValueError``\n    not that,\n    nor this.\n"
-        "``OSError``\n    none."
+        "``OSError``\n    no file."
     )
     assert rendered(text) == expected
 
 
+def test_what_is_returned_may_have_entries_and_paragraphs() -> None:
+    text = "Returns:\n    One with\n    size: how large\n        it is.\n\n    More of it."
+    assert rendered(text) == (
+        "**Returns**\n\nOne with\n\n``size``\n    how large\n    it is.\n\nMore of it."
+    )
+
+
 def test_lists_and_formulas_are_kept() -> None:
     assert rendered("Of:\n- one\n  thing\n- two\n\n    x_i = |y|") == (
-        "Of:\n\n- one\n  thing\n- two\n\n::\n\n    x_i = |y|"
+        "Of:\n\n- one\n  thing\n- two\n\n.. code-block:: text\n\n    x_i = |y|"
     )
 
 

@@ -11,6 +11,7 @@ import inspect
 import re
 from collections.abc import Container, Iterator
 from contextlib import suppress
+from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
 
@@ -19,6 +20,7 @@ import harnack
 _SECTION = re.compile(r"(Returns|Raises|Yields):$")
 _ENTRY = re.compile(r"(\w+(?:, \w+)*): ?(.*)$")
 _ERROR = re.compile(r"[A-Z]\w+$")
+_RETURNED = re.compile(r"[a-z]\w*$")
 _BULLET = re.compile(r"- ")
 # Where another entry may begin within a line.
 _ANOTHER = re.compile(r"(?<=\.) (?=\w+: )")
@@ -62,14 +64,19 @@ def names_of(thing: Any) -> frozenset[str]:
 
 def converted(lines: list[str], names: Container[str]) -> Iterator[str]:
     """The docstring in reStructuredText."""
+    inside = None  # what the entries of a section may be, where one has begun
     for is_blank, group in groupby(lines, key=lambda line: not line.strip()):
         block = list(group)
         if is_blank:
             yield ""
-        elif block[0].startswith("    "):
-            yield from _literal(block)
-        else:
+        elif not block[0].startswith("    "):
+            section = _SECTION.match(block[0])
+            inside = section and _entries_of(section[1])
             yield from _block(block, names)
+        elif inside:
+            yield from _block(_indented(block), inside)
+        else:
+            yield from _literal(block)
 
 
 def _block(lines: list[str], names: Container[str]) -> Iterator[str]:
@@ -82,11 +89,12 @@ def _block(lines: list[str], names: Container[str]) -> Iterator[str]:
         if section:
             body = _indented(rest)
             yield from ("", f"**{section[1]}**", "")
-            yield from _block(body, _Errors() if section[1] == "Raises" else names)
+            yield from _block(body, _entries_of(section[1]))
             yield ""
             kind = ""
         elif entry and all(name in names for name in entry[1].split(", ")):
-            text = [entry[2], *_indented(rest), *_plain(rest, names)]
+            hanging = _indented(rest)
+            text = [entry[2], *(hanging or _plain(rest, names))]
             if kind != "entry":
                 yield ""
             yield ", ".join(f"``{name}``" for name in entry[1].split(", "))
@@ -123,11 +131,19 @@ def _apart(lines: list[str], names: Container[str]) -> Iterator[str]:
         yield start
 
 
-class _Errors:
-    """The names that stand for entries in a section "Raises:"."""
+@dataclass(frozen=True)
+class _Named:
+    """All names of a form, as a container."""
+
+    form: re.Pattern[str]
 
     def __contains__(self, name: str) -> bool:
-        return bool(_ERROR.match(name))
+        return bool(self.form.match(name))
+
+
+def _entries_of(section: str) -> Container[str]:
+    """The names that stand for entries in a section: errors are classes, others are not."""
+    return _Named(_ERROR if section == "Raises" else _RETURNED)
 
 
 def _indented(rest: list[str]) -> list[str]:
@@ -154,7 +170,8 @@ def _nested(text: list[str]) -> Iterator[str]:
 
 
 def _literal(lines: list[str]) -> Iterator[str]:
-    yield from ("::", "", *lines, "")
+    language = "python" if any("hk." in line or "harnack." in line for line in lines) else "text"
+    yield from (f".. code-block:: {language}", "", *lines, "")
 
 
 def inline(text: str) -> str:

@@ -19,12 +19,17 @@ _LOG = logging.getLogger(__name__)
 
 
 class ExampleScripts(SphinxDirective):
-    """Each script: its docstring, its picture and its code."""
+    """Each script that is named: its docstring, its picture and its code."""
+
+    has_content = True
 
     def run(self) -> list[nodes.Node]:
         docs = Path(self.get_source_info()[0]).parent
         found: list[nodes.Node] = []
-        for script in sorted(SCRIPTS.glob("*.py")):
+        scripts = [SCRIPTS / f"{name}.py" for name in self.content]
+        for script in set(SCRIPTS.glob("*.py")) - set(scripts):
+            _LOG.warning("%s is not named by the page of examples", script.name)
+        for script in scripts:
             self.env.note_dependency(str(script))
             source = script.read_text(encoding="utf-8")
             summary, _, text = (ast.get_docstring(ast.parse(source)) or "").partition("\n")
