@@ -53,6 +53,7 @@ nb_merge_streams = True
 nb_output_stderr = "remove"  # progress, on slow machines
 
 autodoc_typehints = "signature"
+autodoc_type_aliases = {name: name for name in ("BoolArray", "FloatArray", "IntArray", "Point")}
 autodoc_preserve_defaults = True
 autodoc_member_order = "bysource"
 # A method without a docstring of its own is explained once, where it is declared.
@@ -69,7 +70,7 @@ html_css_files = ["site.css"]
 copybutton_exclude = ".linenos, .gp, .go"
 
 CONTENTS = {
-    "First steps": ["docs/gallery", "docs/examples", "docs/notebooks/*", "docs/platforms"],
+    "First steps": ["docs/notebooks/*", "docs/examples", "docs/gallery", "docs/platforms"],
     "Guides": [
         "docs/pictures",
         "docs/meshes",
