@@ -32,7 +32,7 @@ class SceneGallery(SphinxDirective):
                 continue
             command = f"harnack render {scene.name} -o {scene.name}.png"
             entries.append(
-                f"::::{{figure}} {picture}\n:alt: {scene.title}\n:target: {picture}\n\n"
+                f"::::{{figure}} {picture}\n:alt: {scene.title}\n:width: 100%\n\n"
                 f"**{scene.name}**: {scene.title}\n\n`{command}`\n::::\n"
             )
         return self.parse_text_to_nodes(
