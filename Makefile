@@ -5,7 +5,8 @@ STAMP := .venv/.setup-stamp
 FRAMEWORKS := torch==2.13.0 jax==0.10.2 jaxlib==0.10.2
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo parts test test-slow test-frameworks lint format images bench figures clean
+.PHONY: help setup demo parts test test-slow test-frameworks lint format site site-pictures images
+.PHONY: bench figures clean
 
 help:
 	@echo "make setup      install everything into .venv"
@@ -16,6 +17,7 @@ help:
 	@echo "make test-frameworks  install PyTorch and JAX into .venv and test derivatives to and from them"
 	@echo "make lint       check style and types"
 	@echo "make format     apply the style"
+	@echo "make site       build the documentation into site/; a warning is an error"
 	@echo "make images     render the pictures of README and docs into docs/images"
 	@echo "make bench      run the benchmarks; they write their tables into the docs"
 	@echo "make figures    remake the paper's figures, measured, into docs/figures.md"
@@ -61,6 +63,14 @@ images: $(STAMP)
 	$(BIN)/harnack gallery --demo -o docs/images
 	$(BIN)/python scripts/view_images.py docs/images
 
+# Notebooks are run while the site is built.
+site: $(STAMP)
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet -c scripts/site -d out/site . site
+
+# Those that are missing; delete one to have it made anew.
+site-pictures: $(STAMP)
+	$(BIN)/python scripts/site/pictures.py
+
 bench: $(STAMP)
 	$(BIN)/python -m pip install --quiet --editable '.[bench]'
 	$(BIN)/python -m benchmarks
@@ -70,5 +80,5 @@ figures: $(STAMP)
 	$(BIN)/python -m figures
 
 clean:
-	rm -rf .venv out build dist .hypothesis .pytest_cache .ruff_cache
+	rm -rf .venv out site build dist .hypothesis .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

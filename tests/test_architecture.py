@@ -68,6 +68,7 @@ RENDERING_ROOMS = (
     "pictures",
     "arguments",
     "exhibits",
+    "progress",
     "picture",
     "film",
 )

@@ -312,8 +312,9 @@ def _repair(options: Any) -> int:
 def _gallery(options: Any) -> int:
     console = Console()
     if options.list:
-        for scene in SCENES.values():
-            console.print(f"[bold]{scene.name:16}[/]{scene.title}", highlight=False)
+        width = max(map(len, SCENES)) + 2
+        for name, scene in SCENES.items():
+            console.print(f"[bold]{name:{width}}[/]{scene.title}", highlight=False, soft_wrap=True)
         return 0
     for name in options.names:
         if name not in SCENES:

@@ -98,6 +98,7 @@ def mesh(
             have the topology of the level set (`meshing.isotopy`), of all and of those farther than
             1.5 times the spacing from the curve;
         turned: triangles of an angle, smaller than the tolerance, that are turned over.
+
         Solids and thick surfaces have more: see `docs/printing.md`.
 
     Raises:

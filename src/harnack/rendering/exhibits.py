@@ -68,7 +68,7 @@ def exhibits(
             material_of(name),
             fitted and isinstance(one, Field),
             isolines=isolines,
-        )  # fmt: skip
+        )
         for one, name in zip(given, names, strict=True)
     ]
     if cut is not None:

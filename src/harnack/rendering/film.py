@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import replace
 from fractions import Fraction
@@ -13,14 +13,6 @@ from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeRemainingColumn,
-)
 
 from harnack.backend import FloatArray
 from harnack.files.writing import check_writable, write_atomically
@@ -30,6 +22,7 @@ from harnack.rendering.exhibits import surfaces_of
 from harnack.rendering.mitsuba.plugins import register
 from harnack.rendering.mitsuba.variant import mitsuba_backend
 from harnack.rendering.picture import render
+from harnack.rendering.progress import progress_bar
 from harnack.rendering.studio.camera import Camera
 from harnack.rendering.studio.upright import upright
 from harnack.rendering.surfaces.framing import visible_points
@@ -93,12 +86,12 @@ def animate(
         given = {"what": what, "camera": camera, **settings}
         moments = [{name: _at(value, s) for name, value in given.items()} for s in steps.tolist()]
         cameras = _cameras(moments, turn * steps, size)
-        for moment, one in _told(list(zip(moments, cameras, strict=True)), progress):
-            picture = render(
-                moment.pop("what"), size=size, show=show, progress=False,
-                **{**moment, "camera": one},
-            )  # fmt: skip
-            add(picture.shown)
+        with progress_bar("film", progress) as advance:
+            for moment, one in zip(moments, cameras, strict=True):
+                frame: dict[str, Any] = {**moment, "camera": one}
+                picture = render(frame.pop("what"), size=size, show=show, progress=False, **frame)
+                add(picture.shown)
+                advance(1 / count)
 
 
 def check_film_path(path: str | os.PathLike[str]) -> Path:
@@ -126,14 +119,6 @@ def _number(name: str, value: Any) -> float:
 def _at(value: Any, s: float) -> Any:
     """A setting at a moment. Fields and materials that can be called are what they are."""
     return value(s) if callable(value) and not isinstance(value, type) else value
-
-
-def _told(moments: list[Any], shown: bool) -> Iterator[Any]:
-    """The moments, with a progress bar on stderr."""
-    columns = (TextColumn("film"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, disable=not shown, transient=True) as bar:
-        yield from bar.track(moments)
 
 
 def _cameras(

@@ -5,20 +5,12 @@ from __future__ import annotations
 import os
 import re
 import warnings
-from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, cast
 
 import numpy as np
 import numpy.typing as npt
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    TaskProgressColumn,
-    TextColumn,
-    TimeRemainingColumn,
-)
 
 from harnack.fields import Field
 from harnack.rendering.arguments import (
@@ -40,6 +32,7 @@ from harnack.rendering.pictures.light_paths.pace import SHORT, pace_of
 from harnack.rendering.pictures.shaded import shaded
 from harnack.rendering.pictures.shown import Picture
 from harnack.rendering.pictures.views import VIEWS, drawn, look
+from harnack.rendering.progress import Advance, progress_bar
 from harnack.rendering.studio.backdrops import Ground
 from harnack.rendering.studio.camera import Camera
 from harnack.rendering.studio.stage import Studio, studio
@@ -52,7 +45,6 @@ ShowMode = Literal["color", "shaded", "normal", "evaluations", "status", "depth"
 _LIT = {"color": "light paths", "shaded": "rays"}
 _EDGE_SPP = 9
 Image = npt.NDArray[Any]
-Advance = Callable[[float], None]
 Draw = Callable[[Advance], tuple[Image, int]]
 
 
@@ -177,7 +169,7 @@ def render(
         shown = drawn(show, view, asked.value_range, str(of) if named else asked.colorbar)
     else:
         draw = (_shaded if show == "shaded" else _radiance)(mi, scene, asked, stage, progress)
-        with _bar(progress) as advance:
+        with progress_bar("rendering", progress) as advance:
             image, lost = draw(advance)
         _warn_of(lost, _LIT[show])
         image, shown = _before_backdrop(mi, scene.sensors()[0], image, stage, show)
@@ -297,13 +289,3 @@ def _before_backdrop(
         return image, tone_mapped(image)
     behind = flat(mi, stage.backdrop, (image.shape[1], image.shape[0]))
     return light + free * behind, tone_mapped(image, behind)
-
-
-@contextmanager
-def _bar(shown: bool) -> Generator[Advance]:
-    """A progress bar on stderr; what it yields is told what part has been finished."""
-    columns = (TextColumn("rendering"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, disable=not shown, transient=True) as bar:
-        task = bar.add_task("", total=1.0)
-        yield lambda part: bar.advance(task, part)
