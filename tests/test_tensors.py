@@ -50,6 +50,18 @@ def test_tensors_are_traced_as_numpy_arrays_are(settings: dict[str, Any]) -> Non
             np.testing.assert_allclose(got.numpy(), value, atol=2e-4, err_msg=name)
 
 
+def test_levels_may_be_tensors_one_by_one() -> None:
+    rays = tensor(EYE[None]), tensor(AWAY)
+    levels = tensor(5.0), tensor(2 * np.pi)
+    dr.enable_grad(levels[1])
+    found = hk.trace(hk.SolidAngle(LOOP), *rays, level=[*levels])
+    expected = hk.trace(hk.SolidAngle(LOOP), *rays, level=tensor([5.0, 2 * np.pi]))
+    np.testing.assert_allclose(found.t.numpy(), expected.t.numpy(), atol=1e-3)
+    dr.backward(dr.sum(dr.select(found.hit, found.t, 0)))
+    assert levels[1].grad.shape == ()
+    assert abs(levels[1].grad.numpy()) > 0
+
+
 def test_no_rays_give_tensors_of_no_rays() -> None:
     none = dr.zeros(dr.tensor_t(BACKEND.Float), (0, 3))
     hits = hk.trace(hk.SolidAngle(LOOP), none, none)

@@ -27,9 +27,9 @@ def wrap_for_jax(
 
     What `drjit.wrap(source="torch", target="drjit")` is for PyTorch; Dr.Jit has nothing for JAX.
 
-    function: must be pure. It is called with a Dr.Jit tensor for each array among its arguments,
-        of the same shape and precision, and returns Dr.Jit arrays or tensors, in tuples, lists and
-        dictionaries if it likes; 3-vectors become arrays (n, 3).
+    function: must be pure. It is called with a Dr.Jit tensor for each array or number among its
+        arguments, of the shape and precision that it has in JAX, and returns Dr.Jit arrays or
+        tensors, in tuples, lists and dictionaries if it likes; 3-vectors become arrays (n, 3).
     result: only for use inside `jax.jit`: a JAX function of the same arguments whose result has
         the shapes and types of `function`'s. Only these are looked at.
 
@@ -40,10 +40,8 @@ def wrap_for_jax(
     Raises ImportError where JAX is not installed.
     """
     jax: Any = importlib.import_module("jax")
-    run, pull_back = (
-        functools.partial(_run, jax, function),
-        functools.partial(_pull_back, jax, function),
-    )
+    run = functools.partial(_run, jax, function)
+    pull_back = functools.partial(_pull_back, jax, function)
 
     def call(*args: Any) -> Any:
         if not _is_traced(jax, args):
@@ -71,9 +69,14 @@ def wrap_for_jax(
         ]
         return jax.tree.unflatten(jax.tree.structure(args), gradients)
 
-    wrapped: Any = jax.custom_vjp(call)
-    wrapped.defvjp(forward, backward)
-    return cast("Callable[..., Any]", functools.wraps(function)(wrapped))
+    differentiable: Any = jax.custom_vjp(call)
+    differentiable.defvjp(forward, backward)
+
+    @functools.wraps(function)
+    def wrapped(*args: Any) -> Any:
+        return differentiable(*jax.tree.map(jax.numpy.asarray, args))
+
+    return wrapped
 
 
 def _run(jax: Any, function: Callable[..., Any], *args: Any) -> Any:
@@ -89,7 +92,7 @@ def _pull_back(jax: Any, function: Callable[..., Any], args: Any, cotangents: An
     outputs = [_as_tensor(one) for one in jax.tree.leaves(function(*inputs))]
     for output, cotangent in zip(outputs, jax.tree.leaves(cotangents), strict=True):
         if dr.grad_enabled(output):
-            dr.set_grad(output, _tensor(cotangent))
+            dr.accum_grad(output, _tensor(cotangent))  # one may be there twice, or be an input
             dr.enqueue(dr.ADMode.Backward, output)
     dr.traverse(dr.ADMode.Backward)
     return [dr.grad(one).jax() for one in jax.tree.leaves(inputs) if dr.is_float_v(one)]

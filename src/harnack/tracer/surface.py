@@ -228,7 +228,9 @@ def _as_levels(level: Any) -> tuple[Any, ...]:
     if isinstance(level, Sequence) and not isinstance(level, str):
         if not level:
             raise ValueError("level: give at least one")
-        return tuple(level)  # type: ignore[arg-type]
+        several: list[Any] = [*level]
+        parts = [_as_levels(one) if is_tensor(one) else (one,) for one in several]
+        return tuple(one for part in parts for one in part)
     return (level,)
 
 
