@@ -33,6 +33,7 @@ FloatArray = npt.NDArray[np.floating[Any]]
 _RAYS_A_BAND = 2**20
 _BACKGROUND = (0.10, 0.10, 0.11)
 _UNKNOWN = (0.45, 0.45, 0.45)
+_IDENTITY = Placement.identity()
 _STATUS_COLOURS = {
     Status.MISS: _BACKGROUND,
     Status.HIT: (0.93, 0.93, 0.90),
@@ -62,7 +63,11 @@ class View:
 
 
 def look(
-    mi: Any, scene: Any, sensor: Any, placement: Placement, function: Field | None = None
+    mi: Any,
+    scene: Any,
+    sensor: Any,
+    placement: Placement = _IDENTITY,
+    function: Field | None = None,
 ) -> View:
     """What a sensor sees first.
 
