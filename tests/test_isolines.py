@@ -230,6 +230,23 @@ def test_lines_on_glass_are_opaque_in_shaded_pictures() -> None:
     assert ((image.max(axis=-1) < 40) & (plain.min(axis=-1) > 60)).sum() > 50
 
 
+def test_of_several_surfaces_those_that_a_function_is_constant_on_have_no_lines() -> None:
+    other = hk.Torus(1.0, 0.4)
+    plain = seen([CIRCLE, other], None, "shaded")
+    image = seen([CIRCLE, other], hk.Isolines(CIRCLE, width=0.05), "shaded")
+    assert (np.abs(image - plain).max(axis=-1) > 25).sum() > 10
+
+
+def test_there_are_no_lines_where_the_function_is_not_defined() -> None:
+    points, normals = around_cylinder(5000)
+    half = hk.expression(lambda x, y, z: z, domain=hk.HalfSpace((1, 0, 0), 0))
+    on = covered(hk.Isolines(half, spacing=0.5, width=0.1), points, normals)
+    everywhere = covered(hk.Isolines("z", spacing=0.5, width=0.1), points, normals)
+    inside = half.domain.contains_points(points)
+    assert 0.3 < inside.mean() < 0.7
+    np.testing.assert_array_equal(on, everywhere & inside)
+
+
 def test_shapes_of_mitsuba_scenes_have_lines_in_their_own_coordinates() -> None:
     turned = mi.ScalarTransform4f().translate([5, 0, 0]).rotate([0, 1, 0], 90).scale(2)
 

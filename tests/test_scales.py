@@ -39,6 +39,14 @@ def test_values_are_those_of_the_function_on_the_surface() -> None:
     np.testing.assert_allclose(angle[met], KNOT.value(points), atol=1e-4)
 
 
+def test_where_the_function_is_not_defined_there_is_no_value() -> None:
+    lower = hk.expression(lambda x, y, z: x, domain=hk.Box((-2, -2, -2), (2, 2, 0)))
+    z, x = np.asarray(values("z")), values(lower)
+    met = np.isfinite(z)
+    np.testing.assert_array_equal(np.isfinite(x)[met], z[met] < 1e-4)
+    assert (x.shown[met & (z > 1e-4)] == 115).all()
+
+
 def test_values_do_not_depend_on_where_the_surface_stands() -> None:
     moved = values("x", hk.level_set(SPHERE.moved((5, 0, 0))), up="-y")
     assert np.nanmin(moved) > 4

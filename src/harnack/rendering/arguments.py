@@ -16,7 +16,8 @@ from harnack.rendering.pictures.scales.bar import require_pillow
 from harnack.rendering.pictures.views import SCALED, VIEWS
 from harnack.rendering.studio.backdrops import Backdrop, Ground, checked_backdrop
 from harnack.rendering.studio.camera import Camera
-from harnack.rendering.surfaces.isolines import Isolines, checked_isolines, function_of
+from harnack.rendering.surfaces.functions import function_of
+from harnack.rendering.surfaces.isolines import Isolines, checked_isolines
 from harnack.tracer import level_set
 
 __all__ = [
@@ -43,7 +44,7 @@ MAX_SPP = 1_000_000
 # Of the path tracer's counters.
 _MAX_INTEGER = 2**31 - 1
 # Bytes a pixel at the peak, measured at 2048 x 2048 and 4096 x 4096, rounded up.
-_BYTES = {"color": 50, "shaded": 280}
+_BYTES = {"color": 50, "shaded": 280, "value": 190}
 _BYTES_OF_VIEWS = 130
 
 

@@ -62,15 +62,13 @@ def exhibits(
         several = f" or {len(given)}, one for each surface" if len(given) > 1 else ""
         raise ValueError(f"give one material{several}, not {len(names)}")
     fitted = "tolerance" not in settings
-    made = [
-        StudioObject(
-            _surface(one, settings),
-            material_of(name),
-            fitted and isinstance(one, Field),
-            isolines=isolines,
-        )
-        for one, name in zip(given, names, strict=True)
-    ]
+    made: list[StudioObject] = []
+    for one, name in zip(given, names, strict=True):
+        surface = _surface(one, settings)
+        own = surface.solid is None and len(given) > 1  # then it is meant for the others
+        lines = tuple(line for line in isolines if not (own and line.function is surface.field))
+        material, fits = material_of(name), fitted and isinstance(one, Field)
+        made.append(StudioObject(surface, material, fits, isolines=lines))
     if cut is not None:
         made = _with_faces(made, material_of(cut))
     return made if boundary is None else made + _rims(made, boundary)

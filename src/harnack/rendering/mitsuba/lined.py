@@ -82,8 +82,16 @@ def _lined_class(variant: str) -> Any:
                 lambda part, here: part.eval_diffuse_reflectance(si, here), si, active
             )
 
+        def eval_null_transmission(self, si: Any, active: Mask = True) -> Any:
+            return self._chosen(
+                lambda part, here: part.eval_null_transmission(si, here), si, active
+            )
+
         def traverse(self, callback: Any) -> None:
             self.base.traverse(callback)
+
+        def parameters_changed(self, keys: Any) -> None:
+            self.base.parameters_changed(keys)
 
         def to_string(self) -> str:
             return f"Lined[{self.base}, lines = {len(self.paints)}]"

@@ -23,6 +23,7 @@ from harnack.rendering.pictures.pixels import bands, film_places, in_tiles, uplo
 from harnack.rendering.pictures.scales.bar import with_bar
 from harnack.rendering.pictures.scales.colormap import greys, viridis
 from harnack.rendering.pictures.scales.scale import Scale
+from harnack.rendering.surfaces.functions import defined_in
 from harnack.rendering.surfaces.placement import Placement
 from harnack.tracer import Status
 
@@ -31,6 +32,8 @@ FloatArray = npt.NDArray[np.floating[Any]]
 # Ctrl-C works between bands.
 _RAYS_A_BAND = 2**20
 _BACKGROUND = (0.10, 0.10, 0.11)
+_UNKNOWN = (0.45, 0.45, 0.45)
+_IDENTITY = Placement.identity()
 _STATUS_COLOURS = {
     Status.MISS: _BACKGROUND,
     Status.HIT: (0.93, 0.93, 0.90),
@@ -60,7 +63,11 @@ class View:
 
 
 def look(
-    mi: Any, scene: Any, sensor: Any, placement: Placement, function: Field | None = None
+    mi: Any,
+    scene: Any,
+    sensor: Any,
+    placement: Placement = _IDENTITY,
+    function: Field | None = None,
 ) -> View:
     """What a sensor sees first.
 
@@ -112,8 +119,15 @@ def _look_at(
         return found
     value = np.full(count, np.nan, dtype=np.float32)
     if met.any():
-        value[met] = function.value(placement.undo(numbers(first.position)[met]))
+        value[met] = _values(function, placement.undo(numbers(first.position)[met]))
     return *found, value
+
+
+def _values(function: Field, points: FloatArray) -> FloatArray:
+    """Values at points (n, 3), NaN where the function is not defined."""
+    values: FloatArray = function.value(points)
+    volume = defined_in(function, float(np.ptp(points, axis=0).max()))
+    return values if volume is None else np.where(volume.contains_points(points), values, np.nan)
 
 
 def normal_picture(view: View) -> npt.NDArray[np.uint8]:
@@ -130,8 +144,9 @@ def status_picture(view: View) -> npt.NDArray[np.uint8]:
 
 
 def scaled_picture(view: View, numbers: FloatArray, scale: Scale) -> npt.NDArray[np.uint8]:
-    """Numbers of what is met as the colours of a scale."""
-    return _of_surfaces(view, scale.colours(numbers))
+    """Numbers of what is met as the colours of a scale; grey where there is none."""
+    known = ~np.isnan(numbers)[..., None]
+    return _of_surfaces(view, np.where(known, scale.colours(numbers), _UNKNOWN))
 
 
 def evaluations_picture(view: View, scale: Scale) -> npt.NDArray[np.uint8]:

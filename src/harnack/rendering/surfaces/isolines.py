@@ -20,7 +20,6 @@ width too far.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, cast
 
@@ -29,12 +28,13 @@ import numpy as np
 
 from harnack.backend import aligned
 from harnack.backend.lengths import length as norm
-from harnack.choices import did_you_mean
-from harnack.fields import Field, expression
+from harnack.fields import Field
 from harnack.rendering.surfaces.colours import Colour, colour_of
+from harnack.rendering.surfaces.functions import defined_in, function_of
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Index, Mask, Real, Vec3
+    from harnack.geometry import Volume
 
 # The width of a line unless one is given, as a part of the diagonal of the surface's box.
 _USUAL_WIDTH = 0.004
@@ -45,38 +45,6 @@ _ROUNDING = 1e-4
 _USUAL_LINES = 12
 # Tables of levels have at least so many entries: kernels depend on how often that can be halved.
 _ENTRIES = 64
-_COORDINATES: dict[str, Callable[[Any, Any, Any], Any]] = {
-    "x": lambda x, y, z: x,
-    "y": lambda x, y, z: y,
-    "z": lambda x, y, z: z,
-}
-
-
-def function_of(given: Any, what: str = "of") -> Field:
-    """A function on space: a field, "x", "y" or "z", or a Python function of three coordinates.
-
-    Raises:
-        TypeError, ValueError: none of these, or a field that is many functions.
-    """
-    if isinstance(given, str):
-        if given not in _COORDINATES:
-            raise ValueError(
-                f'{what} must be "x", "y" or "z", a field, or a function of x, y and z, not '
-                f"{given!r}{did_you_mean(given, _COORDINATES)}"
-            )
-        return expression(_COORDINATES[given])
-    if isinstance(given, Field):
-        if given.has_parts:
-            raise ValueError(
-                f"{what} must be one function on space, and this {type(given).__name__} has one "
-                "for each part"
-            )
-        return given
-    if not callable(given):
-        raise TypeError(
-            f'{what} must be "x", "y" or "z", a field, or a function of x, y and z, not {given!r}'
-        )
-    return expression(cast("Callable[[Any, Any, Any], Any]", given))
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +56,8 @@ class Isolines:
 
     of: the function: "x", "y" or "z", which gives contour lines of height; a `Field`; or a Python
         function of x, y and z as `harnack.expression` takes it. All are in the coordinates of the
-        surface, wherever it stands.
+        surface, wherever it stands. There are no lines where the field is not defined: outside of
+        its `domain`, unless it `is_entire`.
     levels: the values, or one; those of angle-valued fields count up to their period.
     spacing: in place of levels, lines at all whole multiples of it. It must divide the period of an
         angle-valued field, which has 12 lines if neither is given.
@@ -142,8 +111,10 @@ class Isolines:
         """Everything uploaded. size: diagonal of the surface's box, for the usual width."""
         width = _USUAL_WIDTH * size if self.width is None else self.width
         step, period = self._step(), self.function.period
+        volume = defined_in(self.function, size)
         return PreparedIsolines(
             self.function.prepare(backend),
+            None if volume is None else volume.prepare(backend),
             dr.opaque(backend.Float, 0.5 * width),
             None if step is None else dr.opaque(backend.Float, step),
             None if step is not None else aligned(backend, _table(self.levels, period)),
@@ -207,10 +178,12 @@ def checked_isolines(given: Any) -> tuple[Isolines, ...]:
 class PreparedIsolines:
     """Isolines on a backend; all that a person changes is data.
 
-    spacing: of lines at its multiples, or levels: a table for those at given ones.
+    volume: where the function is defined; None for all of space. spacing: of lines at its
+        multiples, or levels: a table for those at given ones.
     """
 
     function: Field
+    volume: Volume | None
     half_width: Real
     spacing: Real | None
     levels: Real | None
@@ -236,6 +209,8 @@ class PreparedIsolines:
         gradient = sample.gradient
         along = gradient - dr.dot(gradient, normal) * normal
         counts = norm(along) > _ROUNDING * norm(gradient)
+        if self.volume is not None:
+            counts &= self.volume.contains(p)
         return self._gap(sample.value), dr.select(counts, along, 0)
 
     def _gap(self, g: Real) -> Real:
