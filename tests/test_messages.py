@@ -38,7 +38,7 @@ def draw(**settings: Any) -> Any:
         ({"camera": "top"}, r"camera must be a harnack.Camera.*Camera\(azimuth=-50"),
         ({"background": "dark"}, r"no setting 'background'.*; did you mean \"backdrop\"\?$"),
         ({"levle": 3.0}, r"no setting 'levle'; there are show, .*; did you mean \"level\"\?$"),
-        ({"colour": "red"}, r"no setting 'colour'; there are .* material, .* section$"),
+        ({"colour": "red"}, r"no setting 'colour'; there are .* material, .* largest$"),
         ({"clip": (0, 0, 0)}, r"clip must be a volume, such as harnack.Ball"),
         ({"level": "2pi"}, r"level must be a number, .* not '2pi'"),
         ({"level": [1.0, "a"]}, r"level must be a number, .* not 'a'"),

@@ -39,7 +39,7 @@ from harnack.rendering.pictures.shaded import shaded
 from harnack.rendering.pictures.shown import Picture
 from harnack.rendering.pictures.views import VIEWS, look
 from harnack.rendering.studio.camera import Camera
-from harnack.rendering.studio.stage import Studio, studio
+from harnack.rendering.studio.stage import Studio, StudioObject, studio
 from harnack.tracer import LevelSet
 
 ShowMode = Literal["color", "shaded", "normal", "evaluations", "status", "depth"]
@@ -64,6 +64,7 @@ def render(
     up: str | tuple[float, float, float] | None = None,
     boundary: float | None = None,
     cut_material: MaterialLike | None = None,
+    thickness: float | None = None,
     max_depth: int | None = None,
     seed: int = 0,
     progress: bool = True,
@@ -101,6 +102,8 @@ def render(
     boundary: the radius, in the surfaces' coordinates, of a golden tube around the curves at which
         surfaces end (`Field.boundary_curves`).
     cut_material: what the faces of opaque solids on their `section` are made of.
+    thickness: draws surfaces as sheets so thick, in their own coordinates: the closed meshes that
+        `harnack.mesh` makes with this thickness, whose triangles are seen from close by.
     settings: of the surfaces, as `harnack.level_set` takes them: level, clip, section, solid, ...;
         those of a `LevelSet` are replaced. A `Solid` with a section is drawn as one, with faces
         where it is cut. Without a tolerance, a field gets one that suits its size.
@@ -130,9 +133,12 @@ def render(
     mi = register()
     in_studio = isinstance(what, Field | LevelSet | list | tuple)
     if in_studio:
-        stage, scene = _staged(mi, what, asked, material, up, boundary, cut_material, settings)
+        on_stage = exhibits(
+            what, material, settings, boundary=boundary, cut=cut_material, thickness=thickness
+        )
+        stage, scene = _staged(mi, asked, on_stage, up)
     else:
-        given = material, camera, backdrop, up, boundary, cut_material
+        given = material, camera, backdrop, up, boundary, cut_material, thickness
         of_studio = dict(zip(OF_STUDIO, given, strict=True))
         refuse_studio_settings({**of_studio, **settings})
         stage, scene = None, _loaded(mi, what, asked.size)
@@ -152,16 +158,13 @@ def render(
     return Picture.of(image, drawn)
 
 
-def _staged(
-    mi: Any, what: Any, asked: Request, material: Any, up: Any, boundary: Any,
-    cut: Any, settings: Mapping[str, Any],
-) -> tuple[Studio, Any]:  # fmt: skip
-    """Fields and level sets in the studio, and the scene of it."""
+def _staged(mi: Any, asked: Request, drawn: list[StudioObject], up: Any) -> tuple[Studio, Any]:
+    """What is drawn, in the studio, and the scene of it."""
     size = asked.size or (800, 600)
     check_memory(asked.show, *size)
     made = studio(
-        mi, exhibits(what, material, boundary, cut, settings), size=size, camera=asked.camera,
-        backdrop=asked.backdrop, up="z" if up is None else up, bare=asked.show not in _LIT,
+        mi, drawn, size=size, camera=asked.camera, backdrop=asked.backdrop,
+        up="z" if up is None else up, bare=asked.show not in _LIT,
     )  # fmt: skip
     return made, mi.load_dict(made.scene, parallel=False)
 
