@@ -191,6 +191,17 @@ PICTURES: dict[str, Callable[[int], int]] = {
         HARMONIC, k, "shaded", solid=(-np.inf, 0.1 + 0.01 * k), clip=cut(k), material="amber"
     ),
     "wall": lambda k: drawn(HARMONIC, k, "shaded", solid=(-0.1 - 0.01 * k, 0.2), clip=cut(k)),
+    "section": lambda k: drawn(
+        HARMONIC,
+        k,
+        "shaded",
+        solid=(-np.inf, 0.1 + 0.01 * k),
+        cut_material="gold",
+        section=hk.HalfSpace((0.02 * k, -1, 0.3), 0.01 * k),
+    ),
+    "largest": lambda k: drawn(
+        HARMONIC, k, "shaded", level=0.1 + 0.01 * k, largest=24 + k, clip=cut(k)
+    ),
     "mesh": lambda k: drawn(cut_sphere(k), k, "shaded"),
     "tree": lambda k: drawn(tree(k), k, "shaded"),
     "cloud": lambda k: drawn(cloud(k), k, "shaded", level=6 - 0.06 * k),

@@ -130,3 +130,16 @@ def test_sections_of_the_command_line():
     for wrong in ("0,0,0", "1,2", "1,2,3,4,5"):
         with pytest.raises(SystemExit):
             parse(["render", "gyroid", "--section", wrong])
+
+
+def test_a_surface_is_drawn_as_a_thick_sheet():
+    """A square seen along its plane is nothing to be seen of, a sheet of it a bar."""
+    square = hk.SolidAngle([[0.5, 0.5, 0], [-0.5, 0.5, 0], [-0.5, -0.5, 0], [0.5, -0.5, 0]])
+    camera = hk.Camera(azimuth=0, elevation=0, box=hk.Box((-1, -1, -0.5), (1, 1, 0.5)))
+    settings = {"show": "depth", "size": (40, 20), "progress": False, "spp": 1, "camera": camera}
+    thin = hk.render(square, **settings)
+    thick = hk.render(square, thickness=0.2, boundary=0.02, **settings)
+    assert np.isfinite(thick).sum() > np.isfinite(thin).sum() + 10
+    with pytest.raises(ValueError, match="thick already"):
+        hk.render(hk.Sphere(1.0), solid=(-math.inf, 0.0), thickness=0.1, **settings)
+    assert parse(["render", "trefoil", "--thickness", "0.1"]).thickness == 0.1

@@ -167,6 +167,10 @@ def _add_surface(one: Any) -> None:
     )
     group.add_argument("--largest", action="store_true", help="only the largest connected part")
     group.add_argument(
+        "--thickness", type=_positive, metavar="LENGTH",
+        help="draw it as a sheet so thick, half on each side, by a mesh",
+    )  # fmt: skip
+    group.add_argument(
         "--boundary-tube", type=_positive, metavar="RADIUS",
         help="draw a tube around the curve at which it ends",
     )  # fmt: skip

@@ -9,14 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from harnack.fields import Field, Solid, Tube
+from harnack.fields import Field, Solid, Tube, WindingNumber
+from harnack.meshing import mesh
 from harnack.rendering.arguments import check_settings
 from harnack.rendering.studio.materials import Material, material_of
 from harnack.rendering.studio.stage import StudioObject
 from harnack.rendering.surfaces.isolines import Isolines
 from harnack.tracer import LevelSet, level_set
 
-OF_STUDIO = ("material", "camera", "backdrop", "up", "boundary", "cut_material", "isolines")
+OF_STUDIO = (
+    "material", "camera", "backdrop", "up", "boundary", "cut_material", "isolines", "thickness",
+)  # fmt: skip
 _OWN = (
     "show", "size", "spp", "antialias", *OF_STUDIO, "of", "value_range", "colorbar", "max_depth",
     "seed", "denoise", "progress",
@@ -27,24 +30,30 @@ _RIM = "gold"
 MaterialLike = str | Material | Mapping[str, Any]
 
 
-def surfaces_of(what: Any, boundary: float | None = None, **settings: Any) -> list[LevelSet]:
+def surfaces_of(
+    what: Any, boundary: float | None = None, thickness: float | None = None, **settings: Any
+) -> list[LevelSet]:
     """The surfaces that `render` draws of fields and level sets, with settings of surfaces."""
-    return [one.surface for one in exhibits(what, None, boundary, settings)]
+    drawn = exhibits(what, None, settings, boundary=boundary, thickness=thickness)
+    return [one.surface for one in drawn]
 
 
 def exhibits(
     what: Any,
     materials: Any,
-    boundary: float | None,
     settings: Mapping[str, Any],
     *,
+    boundary: float | None = None,
     cut: Any = None,
     isolines: tuple[Isolines, ...] = (),
+    thickness: float | None = None,
 ) -> list[StudioObject]:
     """Fields and level sets as they stand on the stage, with lines on them, and tubes around where
     they end.
 
+    boundary: the radius of these tubes; None for no tubes.
     cut: the material of the faces of solids on their section; None for their own.
+    thickness: of sheets to draw in place of surfaces; None for the surfaces.
 
     Raises:
         TypeError, ValueError: there is nothing to draw, or something wrong with what is asked for.
@@ -69,9 +78,26 @@ def exhibits(
         lines = tuple(line for line in isolines if not (own and line.function is surface.field))
         material, fits = material_of(name), fitted and isinstance(one, Field)
         made.append(StudioObject(surface, material, fits, isolines=lines))
+    rims = [] if boundary is None else _rims(made, boundary)
+    if thickness is not None:
+        made = [replace(one, surface=_thick(one.surface, thickness)) for one in made]
     if cut is not None:
         made = _with_faces(made, material_of(cut))
-    return made if boundary is None else made + _rims(made, boundary)
+    return made + rims
+
+
+def _thick(surface: LevelSet, thickness: float) -> LevelSet:
+    """The closed mesh that `mesh` makes of a surface with a thickness, as a surface."""
+    if surface.solid is not None or len(surface.levels) != 1:
+        raise ValueError("thickness is of one level of a field: a solid is thick already")
+    if surface.largest:
+        raise ValueError("thickness and largest: mesh the surface by hk.mesh(..., largest=True)")
+    made = mesh(
+        surface.field, surface.numbers[0], clip=surface.clip, section=surface.section,
+        thickness=thickness,
+    )  # fmt: skip
+    field = WindingNumber(made.vertices, made.faces)
+    return level_set(field, tolerance=surface.tolerance, max_steps=surface.max_steps)
 
 
 def _with_faces(made: list[StudioObject], material: Material) -> list[StudioObject]:

@@ -35,7 +35,7 @@ from harnack.rendering.pictures.views import VIEWS, drawn, look
 from harnack.rendering.progress import Advance, progress_bar
 from harnack.rendering.studio.backdrops import Ground
 from harnack.rendering.studio.camera import Camera
-from harnack.rendering.studio.stage import Studio, studio
+from harnack.rendering.studio.stage import Studio, StudioObject, studio
 from harnack.rendering.surfaces.isolines import Isolines
 from harnack.rendering.surfaces.placement import Placement
 from harnack.tracer import LevelSet
@@ -44,6 +44,7 @@ ShowMode = Literal["color", "shaded", "normal", "evaluations", "status", "depth"
 # Modes with ground and lights, and what they send out.
 _LIT = {"color": "light paths", "shaded": "rays"}
 _EDGE_SPP = 9
+_SIZE = (800, 600)
 Image = npt.NDArray[Any]
 Draw = Callable[[Advance], tuple[Image, int]]
 
@@ -63,6 +64,7 @@ def render(
     boundary: float | None = None,
     cut_material: MaterialLike | None = None,
     isolines: Isolines | Sequence[Isolines] | None = None,
+    thickness: float | None = None,
     of: Any = None,
     value_range: tuple[float, float] | None = None,
     colorbar: bool | str = False,
@@ -119,6 +121,8 @@ def render(
     cut_material: what the faces of opaque solids on their `section` are made of.
     isolines: lines on the surfaces, of heights or of another function, where `show` is "color" or
         "shaded": an `Isolines` or several.
+    thickness: draws surfaces as sheets so thick, in their own coordinates: the closed meshes that
+        `harnack.mesh` makes with this thickness, whose triangles are seen from close by.
     settings: of the surfaces, as `harnack.level_set` takes them: level, clip, section, solid, ...;
         those of a `LevelSet` are replaced. A `Solid` with a section is drawn as one, with faces
         where it is cut. Without a tolerance, a field gets one that suits its size.
@@ -154,9 +158,14 @@ def render(
     mi = register()
     in_studio = isinstance(what, Field | LevelSet | list | tuple)
     if in_studio:
-        stage, scene = _staged(mi, what, asked, material, up, boundary, cut_material, settings)
+        check_memory(asked.show, *(asked.size or _SIZE))
+        on_stage = exhibits(
+            what, material, settings, boundary=boundary, cut=cut_material,
+            isolines=asked.isolines, thickness=thickness,
+        )  # fmt: skip
+        stage, scene = _staged(mi, asked, on_stage, up)
     else:
-        given = material, camera, backdrop, up, boundary, cut_material, isolines
+        given = material, camera, backdrop, up, boundary, cut_material, isolines, thickness
         of_studio = dict(zip(OF_STUDIO, given, strict=True))
         refuse_studio_settings({**of_studio, **settings})
         stage, scene = None, _loaded(mi, what, asked.size)
@@ -179,17 +188,11 @@ def render(
     return Picture.of(image, shown)
 
 
-def _staged(
-    mi: Any, what: Any, asked: Request, material: Any, up: Any, boundary: Any,
-    cut: Any, settings: Mapping[str, Any],
-) -> tuple[Studio, Any]:  # fmt: skip
-    """Fields and level sets in the studio, and the scene of it."""
-    size = asked.size or (800, 600)
-    check_memory(asked.show, *size)
+def _staged(mi: Any, asked: Request, drawn: list[StudioObject], up: Any) -> tuple[Studio, Any]:
+    """What is drawn, in the studio, and the scene of it."""
     made = studio(
-        mi, exhibits(what, material, boundary, settings, cut=cut, isolines=asked.isolines),
-        size=size, camera=asked.camera, backdrop=asked.backdrop, up="z" if up is None else up,
-        bare=asked.show not in _LIT,
+        mi, drawn, size=asked.size or _SIZE, camera=asked.camera, backdrop=asked.backdrop,
+        up="z" if up is None else up, bare=asked.show not in _LIT,
     )  # fmt: skip
     return made, mi.load_dict(made.scene, parallel=False)
 

@@ -24,6 +24,9 @@ __all__ = ["CELLS_ACROSS", "largest_cells"]
 
 # Cells along the longest side of the box around a surface, if nothing else is asked for.
 CELLS_ACROSS = 128
+# Centres so many cells away from the surface, to first order, are far from it; cells are useless if
+# more than this share of them is.
+_FAR, _MOST_FAR = 4.0, 0.5
 
 _Ends: TypeAlias = tuple[float, float]
 _CELLS: KeptWithFields[OccupiedCells] = KeptWithFields()
@@ -39,13 +42,15 @@ def largest_cells(
     with a tent of width h for Dirac's delta, is the sum of h^2 max(0, 1 - |f - level|/(h |grad f|))
     over cells whose centre is in the volume. The volume of a solid is h^3 for each centre in it.
 
-    Cells are left out that are proved to have nothing of the level set, as their balls are within
-    the clearance of their centre (or, where that is outside of the field's domain, of a point at
-    its boundary), or of the volume, as its signed distance says. Of solids, those without a level
-    all of which is in the solid are kept. The rest: see `largest_component`.
+    A cell is left out if it, or each of its eight halves, is proved to have nothing of the level
+    set, as its ball is within the clearance of its centre (or, where that is outside of the field's
+    domain, of a point at its boundary), or nothing of the volume, as its signed distance says. Of
+    solids, those without a level all of which is in the solid are kept. For the rest of the proof
+    see `largest_component`.
 
     Raises:
-        ValueError: the volume is not bounded.
+        ValueError: the volume is not bounded; or most of the cells that could not be proved empty
+            are far from the surface, so that the groups would say nothing.
     """
     ends = None if volume is None else np.array(volume.bounds(), np.float64)
     if volume is None or ends is None or not np.isfinite(ends).all():
@@ -90,9 +95,18 @@ def _made(
         gap, slope, value = (np.zeros(len(centres)) for _ in range(3))
         if inside.any():
             gap[inside], slope[inside], value[inside] = samples(centres[inside])
+        share = gap / np.maximum(cells.cell * slope, 1e-300)
+        far = inside & (share > _FAR)
+        if solid is not None:
+            far &= ~_within(solid, value)
+        if far.sum() > _MOST_FAR * len(far):
+            raise ValueError(
+                f"largest: too little is proved of this {type(field).__name__} off rays to tell "
+                f"components apart by {across} cells across; give a larger number of them, or "
+                "mesh it with largest=True"
+            )
         if solid is not None:
             return np.where(inside & _within(solid, value), cells.cell**3, 0.0)
-        share = gap / np.maximum(cells.cell * slope, 1e-300)
         return np.where(inside, cells.cell**2 * np.maximum(1 - share, 0), 0.0)
 
     return largest_component(cells, size)
