@@ -70,5 +70,5 @@ figures: $(STAMP)
 	$(BIN)/python -m figures
 
 clean:
-	rm -rf .venv out site build dist .hypothesis .pytest_cache .ruff_cache
+	rm -rf .venv out site jupyter_execute build dist .hypothesis .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
