@@ -14,6 +14,7 @@ import trimesh
 
 from harnack.cli import main
 from harnack.fields import DipolePotential, SolidAngle, WindingNumber
+from harnack.gallery import SCENES
 from harnack.geometry import shapes
 from harnack.geometry.mesh_shapes import icosphere
 from harnack.opening import open_surface
@@ -266,3 +267,11 @@ def test_where_a_picture_goes_is_checked_before_the_file_is_read(tmp_path, capsy
     with pytest.raises(SystemExit):
         main(["render", str(missing), "--azimuth", "inf"])
     assert "finite number of degrees" in capsys.readouterr().err
+
+
+def test_the_gallery_lists_a_scene_a_line_however_narrow_the_window(capsys, monkeypatch) -> None:
+    monkeypatch.setenv("COLUMNS", "40")
+    assert main(["gallery", "--list"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == len(SCENES)
+    assert "hyperspherical-sextic  a hyperspherical harmonic of degree 6 (j = 4, m = 3)" in lines

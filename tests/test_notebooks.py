@@ -8,7 +8,8 @@ import nbclient
 import nbformat
 import pytest
 
-NOTEBOOKS = sorted((Path(__file__).resolve().parent.parent / "docs/notebooks").glob("*.ipynb"))
+ROOT = Path(__file__).resolve().parent.parent
+NOTEBOOKS = sorted((ROOT / "docs/notebooks").glob("*.ipynb"))
 
 
 def test_there_are_notebooks_without_outputs() -> None:
@@ -20,7 +21,11 @@ def test_there_are_notebooks_without_outputs() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_runs_and_shows_its_pictures(path: Path) -> None:
+def test_a_notebook_runs_and_shows_its_pictures(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The kernel of the site: this Python, whatever kernels the user has.
+    monkeypatch.setenv("JUPYTER_PATH", str(ROOT / "scripts/site/jupyter"))
     notebook = nbformat.read(path, as_version=4)
     nbclient.NotebookClient(notebook, timeout=300, kernel_name="python3").execute()
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]

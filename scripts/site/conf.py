@@ -81,6 +81,7 @@ CONTENTS = {
         "docs/circles",
         "docs/polygon-meshes",
         "docs/morph",
+        "docs/frameworks",
         "docs/cookbook",
     ],
     "Reference": [
