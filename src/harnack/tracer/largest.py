@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable
 from typing import TYPE_CHECKING, TypeAlias
 
-import drjit as dr
 import numpy as np
 
 from harnack.backend import FloatArray, choose_backend, to_numpy, to_vector3
-from harnack.backend.lengths import length
 from harnack.cells import OccupiedCells, largest_component
-from harnack.enclosures import TargetLevels
 from harnack.fields.clearance import clearance_of
 from harnack.fields.kept import KeptWithFields
 
@@ -32,12 +30,9 @@ _CELLS: KeptWithFields[OccupiedCells] = KeptWithFields()
 def largest_cells(
     field: Field, levels: tuple[float, ...], volume: Volume | None, solid: _Ends | None, across: int
 ) -> OccupiedCells:
-    """Cells that hold one component of a level set in a volume, and no others that could be told
-    from it; those of the largest area or, of a solid {low <= f <= high}, of the largest volume.
-
-    Area is estimated from one sample a cell, of side h: the integral of |grad f| over values of f,
-    with a tent of width h for Dirac's delta, is the sum of h^2 max(0, 1 - |f - level|/(h |grad f|))
-    over cells whose centre is in the volume. The volume of a solid is h^3 for each centre in it.
+    """Cells that hold one component of a level set in a volume, or of a solid {low <= f <= high},
+    and no others that could be told from it: those of the component that casts the largest shadows
+    along x, y and z, taken together (see `largest_component`).
 
     Cells are left out that are proved to have nothing of the level set, as their balls are within
     the clearance of their centre (or, where that is outside of the field's domain, of a point at
@@ -67,7 +62,7 @@ def _made(
 ) -> OccupiedCells:
     beyond = _distance_beyond(volume)
     into_domain = _into_domain(field)
-    samples = _samples(field, levels)
+    within = None if solid is None else _within(field, solid)
     to_levels = clearance_of(field, levels, "double")
 
     def clearance(points: FloatArray) -> FloatArray:
@@ -77,29 +72,15 @@ def _made(
         if not known.any():
             return free
         length = to_levels(asked[known]) - moved[known]
-        if solid is not None:
-            length[_within(solid, samples(asked[known])[2])] = 0.0
+        if within is not None:
+            length[within(asked[known])] = 0.0
         free[known] = np.maximum(free[known], length)
         return free
 
     lower, upper = (np.array(end, np.float64) for end in volume.bounds())
-    cells = OccupiedCells.of(lower, upper, clearance, across).thinned(clearance)
-
-    def size(centres: FloatArray) -> FloatArray:
-        inside = (beyond(centres) <= 0) & (into_domain(centres)[1] == 0)
-        gap, slope, value = (np.zeros(len(centres)) for _ in range(3))
-        if inside.any():
-            gap[inside], slope[inside], value[inside] = samples(centres[inside])
-        if solid is not None:
-            return np.where(inside & _within(solid, value), cells.cell**3, 0.0)
-        share = gap / np.maximum(cells.cell * slope, 1e-300)
-        return np.where(inside, cells.cell**2 * np.maximum(1 - share, 0), 0.0)
-
-    return largest_component(cells, size)
-
-
-def _within(solid: _Ends, values: FloatArray) -> BoolArray:
-    return (values >= solid[0]) & (values <= solid[1])
+    if (lower > upper).any() or (lower == upper).all():  # rays do not meet a single point
+        return OccupiedCells.none()
+    return largest_component(OccupiedCells.of(lower, upper, clearance, across).thinned(clearance))
 
 
 def _into_domain(field: Field) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
@@ -143,36 +124,35 @@ def _distance_beyond(volume: Volume) -> Callable[[FloatArray], FloatArray]:
     return beyond
 
 
-def _samples(
-    field: Field, levels: tuple[float, ...]
-) -> Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]:
-    """For points (n, 3): how far values are from a level, the lengths of gradients, and values."""
+def _within(field: Field, solid: _Ends) -> Callable[[FloatArray], BoolArray]:
+    """For points (n, 3), whether low <= f <= high."""
     backend = choose_backend("double")
     prepared = field.prepare(backend)
-    targets = TargetLevels(tuple(dr.opaque(backend.Float, level) for level in levels), field.period)
 
-    def samples(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        if not len(points):
-            return np.zeros(0), np.zeros(0), np.zeros(0)
-        seen = prepared.evaluate(to_vector3(backend, points))
-        found = (targets.gaps(seen.value).smaller, length(seen.gradient), seen.value)
-        gap, slope, value = (np.broadcast_to(to_numpy(one), len(points)) for one in found)
-        return gap, slope, value
+    def within(points: FloatArray) -> BoolArray:
+        value = to_numpy(prepared.evaluate(to_vector3(backend, points)).value)
+        return np.broadcast_to((value >= solid[0]) & (value <= solid[1]), len(points))
 
-    return samples
+    return within
 
 
 def checked_largest(largest: object) -> int:
     """Cells across, 0 for all components.
 
     Raises:
-        TypeError, ValueError: neither a truth value nor a number of cells.
+        TypeError: neither a truth value nor a whole number.
+        ValueError: fewer cells than 8, or more than 512.
     """
-    if isinstance(largest, bool):
+    wrong = (
+        "largest is True, or how many cells to tell components apart by along the longest side, "
+        f"from 8 to 512, not {largest!r}"
+    )
+    if isinstance(largest, bool | np.bool_):
         return CELLS_ACROSS if largest else 0
-    if not isinstance(largest, int) or not 8 <= largest <= 512:
-        raise ValueError(
-            "largest is True, or how many cells to tell components apart by along the longest "
-            f"side, from 8 to 512, not {largest!r}"
-        )
-    return largest
+    try:
+        across = operator.index(largest)  # pyright: ignore[reportArgumentType]
+    except TypeError:
+        raise TypeError(wrong) from None
+    if across and not 8 <= across <= 512:
+        raise ValueError(wrong)
+    return across
