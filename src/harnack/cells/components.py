@@ -30,8 +30,9 @@ def largest_component(cells: OccupiedCells) -> OccupiedCells:
     be of areas, or of volumes, only if as many cells were left around each piece of a surface: but
     more are left where its function vanishes to a higher order, and as few around both sides of a
     plate that is thinner than a cell as around one. Shadows are the same for all of these, but for
-    the cells at their rims: those are wider, by several cells, where a function vanishes to a higher
-    order, so that coarse cells may choose a smaller component for it. Of equal ones, the first along z, y and x is the largest.
+    the cells at their rims: those are more, by several, where a function vanishes to a higher
+    order, so that coarse cells may choose a smaller component for it. Of equal shadows, the first
+    along z, y and x is the largest.
 
     Proof that no component of the set is cut in two. All of the set lies in cells that are not
     empty, as closed cubes. A connected part of it cannot be covered by two unions of such cubes
