@@ -33,8 +33,11 @@ class OccupiedCells(GridLayout):
         """A grid over a box that holds the set, with about so many cells along its longest side.
 
         Outside of the box there is nothing, so a cell at its faces is empty outwards as well.
+        There are fewer cells where they would be smaller than the spacing of single precision.
         """
-        cell = short_length(float((upper - lower).max()) / across)
+        reach = np.abs([lower, upper]).max().astype(np.float32)
+        cell = max(float((upper - lower).max()) / across, float(np.spacing(reach)))
+        cell = short_length(cell)
         # Room for rounding the corner down, and for the margin beyond what the set may reach.
         room = (_MARGIN + 1e-3) * cell
         origin = np.nextafter((lower - room).astype(np.float32), np.float32(-np.inf))
@@ -50,6 +53,17 @@ class OccupiedCells(GridLayout):
         x, y, z = np.round((cells.corners - origin) / cell).astype(np.int64).T
         empty[z, y, x] = False
         return cls(origin, cell, (nx, ny, nz), distances_to_full(empty))
+
+    @classmethod
+    def none(cls) -> OccupiedCells:
+        """A grid around the empty set: one cell, and all is empty."""
+        return cls(np.zeros(3), 1.0, (1, 1, 1), distances_to_full(np.ones((1, 1, 1), np.bool_)))
+
+    def centres(self) -> FloatArray:
+        """Of the cells that are not empty, (n, 3)."""
+        x, y, z = self.shape
+        places = np.argwhere((self.free == 0).reshape(z, y, x))[:, ::-1]
+        return self.origin + self.cell * (places + 0.5)
 
     def thinned(self, clearance: Clearance) -> OccupiedCells:
         """The same grid without cells whose eight halves are proved empty, as far beyond the faces

@@ -20,7 +20,15 @@ from harnack.geometry.meshes import (
     without_zero_area_faces,
     zero_area_faces,
 )
-from harnack.geometry.volumes import Ball, Box, ConvexHull, HalfSpace, Intersection, Volume
+from harnack.geometry.volumes import (
+    Ball,
+    Box,
+    ConvexHull,
+    HalfSpace,
+    Intersection,
+    Volume,
+    check_volume,
+)
 
 __all__ = [
     "Ball",
@@ -34,6 +42,7 @@ __all__ = [
     "MeshError",
     "Volume",
     "bounding_box",
+    "check_volume",
     "edges",
     "estimate_areas",
     "estimate_normals",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from harnack.fields import Field, Solid, SolidAngle
-from harnack.geometry import Box, Intersection, Volume
+from harnack.geometry import Box, Intersection, Volume, check_volume
 from harnack.meshing.checks import MeshingError, TooLargeError, check_manifold
 from harnack.meshing.lattice import Lattice, Surface, open_surface
 from harnack.meshing.printing.clipping import cut_by
@@ -107,8 +107,8 @@ def mesh(
         ValueError: options out of range, or that contradict each other.
     """
     report = progress or _silent
-    _check_volume("clip", clip)
-    _check_volume("section", section)
+    check_volume(clip, "clip")
+    check_volume(section, "section")
     check_options(tolerance, spacing, thickness, seed)
     field = _checked(field)
     if solid is None and isinstance(field, Solid) and thickness is None:
@@ -145,12 +145,6 @@ def mesh(
         facts |= more
     check_manifold(made.faces)
     return finished(made, facts, is_closed)
-
-
-def _check_volume(name: str, given: Any) -> None:
-    if given is not None and not isinstance(given, Volume):
-        kind = type(given).__name__
-        raise TypeError(f"{name} must be a volume, such as harnack.Box or harnack.Ball, not {kind}")
 
 
 def _checked(field: Any) -> Field:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -35,12 +36,9 @@ _CELLS: KeptWithFields[OccupiedCells] = KeptWithFields()
 def largest_cells(
     field: Field, levels: tuple[float, ...], volume: Volume | None, solid: _Ends | None, across: int
 ) -> OccupiedCells:
-    """Cells that hold one component of a level set in a volume, and no others that could be told
-    from it; those of the largest area or, of a solid {low <= f <= high}, of the largest volume.
-
-    Area is estimated from one sample a cell, of side h: the integral of |grad f| over values of f,
-    with a tent of width h for Dirac's delta, is the sum of h^2 max(0, 1 - |f - level|/(h |grad f|))
-    over cells whose centre is in the volume. The volume of a solid is h^3 for each centre in it.
+    """Cells that hold one component of a level set in a volume, or of a solid {low <= f <= high},
+    and no others that could be told from it: those of the component that casts the largest shadows
+    along x, y and z, taken together (see `largest_component`).
 
     A cell is left out if it, or each of its eight halves, is proved to have nothing of the level
     set, as its ball is within the clearance of its centre (or, where that is outside of the field's
@@ -72,7 +70,7 @@ def _made(
 ) -> OccupiedCells:
     beyond = _distance_beyond(volume)
     into_domain = _into_domain(field)
-    samples = _samples(field, levels)
+    within = None if solid is None else _within(field, solid)
     to_levels = clearance_of(field, levels, "double")
 
     def clearance(points: FloatArray) -> FloatArray:
@@ -82,38 +80,38 @@ def _made(
         if not known.any():
             return free
         length = to_levels(asked[known]) - moved[known]
-        if solid is not None:
-            length[_within(solid, samples(asked[known])[2])] = 0.0
+        if within is not None:
+            length[within(asked[known])] = 0.0
         free[known] = np.maximum(free[known], length)
         return free
 
     lower, upper = (np.array(end, np.float64) for end in volume.bounds())
+    if (lower > upper).any() or (lower == upper).all():  # rays do not meet a single point
+        return OccupiedCells.none()
     cells = OccupiedCells.of(lower, upper, clearance, across).thinned(clearance)
-
-    def size(centres: FloatArray) -> FloatArray:
-        inside = (beyond(centres) <= 0) & (into_domain(centres)[1] == 0)
-        gap, slope, value = (np.zeros(len(centres)) for _ in range(3))
-        if inside.any():
-            gap[inside], slope[inside], value[inside] = samples(centres[inside])
-        share = gap / np.maximum(cells.cell * slope, 1e-300)
-        far = inside & (share > _FAR)
-        if solid is not None:
-            far &= ~_within(solid, value)
-        if far.sum() > _MOST_FAR * len(far):
-            raise ValueError(
-                f"largest: too little is proved of this {type(field).__name__} off rays to tell "
-                f"components apart by {across} cells across; give a larger number of them, or "
-                "mesh it with largest=True"
-            )
-        if solid is not None:
-            return np.where(inside & _within(solid, value), cells.cell**3, 0.0)
-        return np.where(inside, cells.cell**2 * np.maximum(1 - share, 0), 0.0)
-
-    return largest_component(cells, size)
+    _check_proved(field, levels, solid, cells)
+    return largest_component(cells)
 
 
-def _within(solid: _Ends, values: FloatArray) -> BoolArray:
-    return (values >= solid[0]) & (values <= solid[1])
+def _check_proved(
+    field: Field, levels: tuple[float, ...], solid: _Ends | None, cells: OccupiedCells
+) -> None:
+    """Raise ValueError if most cells that are left are far from the surface."""
+    centres = cells.centres()
+    if field.domain is not None:
+        centres = centres[field.domain.contains_points(centres)]
+    if not len(centres):
+        return
+    gap, slope, value = _samples(field, levels)(centres)
+    far = gap > _FAR * cells.cell * slope
+    if solid is not None:
+        far &= ~((value >= solid[0]) & (value <= solid[1]))
+    if far.sum() > _MOST_FAR * len(far):
+        raise ValueError(
+            f"largest: too little is proved of this {type(field).__name__} off rays to tell "
+            f"components apart by {round(max(cells.shape))} cells across; give a larger number of "
+            "them, or mesh it with largest=True"
+        )
 
 
 def _into_domain(field: Field) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
@@ -166,8 +164,6 @@ def _samples(
     targets = TargetLevels(tuple(dr.opaque(backend.Float, level) for level in levels), field.period)
 
     def samples(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        if not len(points):
-            return np.zeros(0), np.zeros(0), np.zeros(0)
         seen = prepared.evaluate(to_vector3(backend, points))
         found = (targets.gaps(seen.value).smaller, length(seen.gradient), seen.value)
         gap, slope, value = (np.broadcast_to(to_numpy(one), len(points)) for one in found)
@@ -176,17 +172,35 @@ def _samples(
     return samples
 
 
+def _within(field: Field, solid: _Ends) -> Callable[[FloatArray], BoolArray]:
+    """For points (n, 3), whether low <= f <= high."""
+    backend = choose_backend("double")
+    prepared = field.prepare(backend)
+
+    def within(points: FloatArray) -> BoolArray:
+        value = to_numpy(prepared.evaluate(to_vector3(backend, points)).value)
+        return np.broadcast_to((value >= solid[0]) & (value <= solid[1]), len(points))
+
+    return within
+
+
 def checked_largest(largest: object) -> int:
     """Cells across, 0 for all components.
 
     Raises:
-        TypeError, ValueError: neither a truth value nor a number of cells.
+        TypeError: neither a truth value nor a whole number.
+        ValueError: fewer cells than 8, or more than 512.
     """
-    if isinstance(largest, bool):
+    wrong = (
+        "largest is True, or how many cells to tell components apart by along the longest side, "
+        f"from 8 to 512, not {largest!r}"
+    )
+    if isinstance(largest, bool | np.bool_):
         return CELLS_ACROSS if largest else 0
-    if not isinstance(largest, int) or not 8 <= largest <= 512:
-        raise ValueError(
-            "largest is True, or how many cells to tell components apart by along the longest "
-            f"side, from 8 to 512, not {largest!r}"
-        )
-    return largest
+    try:
+        across = operator.index(largest)  # pyright: ignore[reportArgumentType]
+    except TypeError:
+        raise TypeError(wrong) from None
+    if across and not 8 <= across <= 512:
+        raise ValueError(wrong)
+    return across

@@ -113,6 +113,12 @@ class PreparedLevelSet:
             return self.backend.Bool(True)
         return self.occupied.cell(p).free == 0
 
+    def resolves(self, o: Vec3, end: Real) -> Mask:
+        """Whether rounding leaves open nowhere on rays up to `end` whether levels count there."""
+        if self.occupied is None or not self.is_part:
+            return self.backend.Bool(True)
+        return self.occupied.resolves(o, end)
+
     def clip(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real) -> tuple[Real, Real]:
         """The part of [t_min, t_max] that can hold the surface; empty unless start < end."""
         if self.volume is None:
@@ -168,7 +174,7 @@ class PreparedLevelSet:
         state = MarchState.at(backend, start, end, active, has_detail=has_detail, crosses=crosses)
         if occupied is not None and self.is_part:
             # Where rounding leaves open in which cell a point is, nothing is said.
-            lost = state.active & ~occupied.resolves(path.origin, end)
+            lost = state.active & ~self.resolves(path.origin, end)
             out = backend.UInt32(int(Status.OUT_OF_STEPS))
             status = dr.select(lost, out, state.status)
             state = replace(state, active=state.active & ~lost, status=status)

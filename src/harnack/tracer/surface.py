@@ -15,7 +15,7 @@ from harnack.backend import backend_of, to_float
 from harnack.backend.arrays import as_data
 from harnack.backend.tensors import is_tensor, numbers_of
 from harnack.enclosures import Choice, Proofs, TargetLevels, choose_proofs
-from harnack.geometry import Intersection
+from harnack.geometry import Intersection, check_volume
 from harnack.tracer.largest import checked_largest, largest_cells
 from harnack.tracer.prepared import PreparedLevelSet
 from harnack.tracer.tolerance import Tolerance
@@ -39,9 +39,10 @@ class LevelSet:
     clip: a volume to cut the surface with, besides the field's own domain.
     section: another one, that opens the surface to be looked into: the faces of a solid on it may
         have a material of their own.
-    largest: 0, or how many cells along the longest side of its box to tell components apart by:
-        then only the largest component is there (`largest_cells`), of what the domain and the clip
-        leave. Those that are not separated by cells proved empty count as one.
+    largest: 0, or how many cells along the longest side of its box to tell components apart by;
+        True for 128, which becomes that number. Then only one component is there, of what the
+        domain and the clip leave: the one whose shadows along x, y and z, added, are the largest
+        (`largest_cells`). Those that are not separated by cells proved empty count as one.
     confirm: whether a ray hits only where f really changes sign about the level: where it passes
         to the other side, by at least half the tolerance. One that comes within the tolerance and
         turns back (a graze) goes on.
@@ -64,6 +65,9 @@ class LevelSet:
     largest: int = 0
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "largest", checked_largest(self.largest))
+        for name in ("clip", "section"):
+            check_volume(getattr(self, name), name)
         if operator.index(self.max_steps) < 1:
             raise ValueError(f"max_steps must be at least 1, not {self.max_steps}")
         if not 1 <= _as_number(self.overstep, "overstep must be a number in [1, 2)") < 2:
@@ -167,8 +171,8 @@ def level_set(
 ) -> LevelSet:
     """A `LevelSet` from what users write: a level or several, a tolerance, a bound's name.
 
-    largest: True for the largest component alone, told from others by 128 cells along the longest
-        side, or by so many.
+    largest: True for the largest component alone, by its shadows along x, y and z, told from
+        others by 128 cells along the longest side, or by so many.
 
     Raises ValueError for a level that is not a finite number or that the field cannot have.
     """
@@ -191,12 +195,6 @@ def level_set(
                 "high may end at a sheet, with no level there; draw its level set without solid"
             )
         level = [end for end in (low, high) if math.isfinite(end)]
-    for name, volume in (("clip", clip), ("section", section)):
-        if volume is not None and not callable(getattr(volume, "bounds", None)):
-            raise TypeError(
-                f"{name} must be a volume, such as harnack.Ball((0, 0, 0), 1), harnack.Box(lower, "
-                f"upper) or harnack.HalfSpace(normal, offset), not {volume!r}"
-            )
     asked = _as_levels(field.default_level if level is None else level)
     for one in asked:
         if not math.isfinite(_number(one)):
@@ -207,7 +205,7 @@ def level_set(
     overstep = field.overstep if overstep is None else overstep
     return LevelSet(
         field, asked, clip, tolerance, max_steps, choose_proofs(bound), overstep, solid, confirm,
-        section, checked_largest(largest),
+        section, largest,
     )  # fmt: skip
 
 

@@ -19,6 +19,7 @@ from harnack.geometry.volumes.volume import (
     Volume,
     as_points,
     checked_distance,
+    checked_number,
     checked_point,
     emptied,
     rounding,
@@ -142,12 +143,17 @@ class HalfSpace(Polytope):
 
     def __post_init__(self) -> None:
         normal = np.array(checked_point(self.normal, "the normal of a half-space"))
-        length = float(np.linalg.norm(normal))
-        if length == 0.0:
+        size = float(np.abs(normal).max())
+        if size == 0.0:
             raise ValueError("the normal of a half-space must not be zero")
-        offset = float(self.offset) / length
+        normal /= size  # so that squares neither overflow nor vanish
+        length = float(np.linalg.norm(normal))
+        offset = checked_number(self.offset, "the offset of a half-space") / size / length
         if not np.isfinite(offset):
-            raise ValueError(f"the offset of a half-space must be finite, not {self.offset!r}")
+            raise ValueError(
+                f"the offset of a half-space must be finite, not {self.offset!r}, and so must its "
+                f"ratio to the length of the normal {self.normal!r}"
+            )
         x, y, z = (float(v) for v in normal / length)
         object.__setattr__(self, "normal", (x, y, z))
         object.__setattr__(self, "offset", offset)
@@ -158,7 +164,7 @@ class HalfSpace(Polytope):
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         lower, upper = np.full(3, -np.inf), np.full(3, np.inf)
         for k, n in enumerate(self.normal):
-            if abs(n) == 1.0:  # only then is the half-space bounded along an axis
+            if n and not any(np.delete(self.normal, k)):  # only an axis bounds it
                 (upper if n > 0 else lower)[k] = n * self.offset
         return lower, upper
 

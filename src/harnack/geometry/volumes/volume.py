@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import drjit as dr
 import numpy as np
@@ -106,7 +106,9 @@ def checked_point(value: Iterable[float], name: str, *, finite: bool = True) -> 
         ValueError: not three numbers, NaN, or infinite where it must not be.
     """
     try:
-        numbers = tuple(float(v) for v in value)
+        if isinstance(value, str | bytes):
+            raise TypeError
+        numbers = tuple(checked_number(v, name) for v in value)
     except TypeError:
         raise ValueError(f"{name} must be three numbers, not {value!r}") from None
     if len(numbers) != 3 or any(np.isnan(numbers)):
@@ -114,6 +116,27 @@ def checked_point(value: Iterable[float], name: str, *, finite: bool = True) -> 
     if finite and not all(np.isfinite(numbers)):
         raise ValueError(f"{name} must be finite, not {numbers}")
     return numbers
+
+
+def checked_number(value: Any, name: str) -> float:
+    """A number as a float.
+
+    Raises:
+        TypeError: it is none.
+    """
+    try:
+        return float("none" if isinstance(value, str | bytes) else value)
+    except (TypeError, ValueError):
+        raise TypeError(f"{name} must be a number, not {value!r}") from None
+
+
+def check_volume(given: object, name: str) -> None:
+    """Raise TypeError for what is neither a volume nor None."""
+    if given is not None and not isinstance(given, Volume):
+        raise TypeError(
+            f"{name} must be a volume, such as harnack.Ball((0, 0, 0), 1), harnack.Box(lower, "
+            f"upper) or harnack.HalfSpace(normal, offset), not {given!r}"
+        )
 
 
 def checked_distance(distance: float) -> float:

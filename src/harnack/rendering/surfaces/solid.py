@@ -56,9 +56,10 @@ class Solid:
         start, end = self.prepared.clip(o, d, zero, t_max)
         through = active & (start < end)
         start = dr.select(through, start, 0)
-        within = through & self._holds(self._at(o, d, start))
+        known = self.prepared.resolves(o, end)  # other rays are lost among the levels
+        within = through & known & self._holds(self._at(o, d, start))
         inside = within & (start <= 0)
-        slipped = active & (((leaves < 0) & ~inside) | ((leaves > 0) & inside))
+        slipped = active & known & (((leaves < 0) & ~inside) | ((leaves > 0) & inside))
         entering = within & ~inside & ~slipped
         met = self._meet_levels(o, d, t_max, active & ~entering & ~slipped)
         met = replace(
@@ -88,7 +89,8 @@ class Solid:
         start, end = self.prepared.clip(o, d, self.prepared.backend.Float(0), t_max)
         through = active & (start < end)
         start = dr.select(through, start, 0)
-        within = through & self._holds(self._at(o, d, start))
+        known = self.prepared.resolves(o, end)
+        within = through & known & self._holds(self._at(o, d, start))
         capped = within & ((start > 0) | (end < t_max))
         return capped | self.prepared.occluded(o, d, 0, t_max, active & ~capped)
 
