@@ -198,3 +198,16 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert len(pictures(target)) == 3
     assert (pictures(target)[0][0, 0] == 255).all()
     assert main(["turntable", "trefoil", "-o", str(tmp_path / "a.txt")]) != 0
+
+
+def test_transparent_films_keep_their_colors(tmp_path: Path) -> None:
+    """Found by a user: they had a hundred colors a frame, and bands."""
+    hk.animate(
+        hk.Sphere(1.0), tmp_path / "a.gif", backdrop="transparent", frames=1, size=(96, 72),
+        turn=90, progress=False,
+    )  # fmt: skip
+    with Image.open(tmp_path / "a.gif") as film:
+        frame = np.array(film.convert("RGBA"))
+    opaque = frame[..., 3] > 0
+    assert 0.1 < opaque.mean() < 0.9
+    assert len(np.unique(frame[opaque][:, :3], axis=0)) > 150

@@ -1,6 +1,7 @@
 """Lobes of spherical harmonics: what they promise, and first hits against an oracle of SciPy's."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -180,3 +181,33 @@ def test_rays_down_the_axis_end_at_the_origin():
 def test_what_makes_no_lobes_is_refused(make, said):
     with pytest.raises(ValueError, match=said):
         make()
+
+
+@pytest.mark.parametrize("precision", ["single", "double"])
+def test_scales_that_a_precision_has_no_room_for_are_refused(precision: str) -> None:
+    """Found by an attack: at 1e-24 the first hit was missed in single precision."""
+    o, d = [[0, 0, 1.0]], [[0, 0, -1.0]]
+    for lobes in (hk.Lobes(2, 0, scale=1e-70), hk.Lobes.combined({(2, 0): 1e70})):
+        with pytest.raises(ValueError, match="another unit of length"):
+            hk.trace(lobes, o, d, precision=precision)
+    small = hk.Lobes(2, 0, scale=1e-5)
+    reach = small.extent_radius()
+    hits = hk.trace(small, [[0, 0, 3 * reach]], d, tolerance=1e-4 * reach, precision=precision)
+    assert hits.t[0] == pytest.approx(2 * reach, rel=1e-3)
+
+
+def test_second_derivatives_at_the_origin_are_numbers() -> None:
+    for lobes in (hk.Lobes(2, 1), hk.Lobes(2, 1).positive):
+        assert np.isfinite(lobes.hessian([[0, 0, 0]])).all()
+
+
+@pytest.mark.parametrize("scale", ["2", None, 1j, True])
+def test_scales_are_numbers(scale: Any) -> None:
+    with pytest.raises(TypeError, match="scale of lobes must be a number"):
+        hk.Lobes(2, 0, scale=scale)
+
+
+@pytest.mark.parametrize("key", [2, "20", (2.5, 0), (True, 0), (1, 2, 3)])
+def test_harmonics_are_named_by_two_whole_numbers(key: Any) -> None:
+    with pytest.raises(TypeError, match="two whole numbers"):
+        hk.Lobes.combined({key: 1.0})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 from typing import Any
@@ -293,3 +294,18 @@ def test_what_first_rays_have_seen_is_not_traced_again(monkeypatch: pytest.Monke
     again = drawn(shape(Sphere()), spp=9)
     assert set(counts) == {8, 9}
     np.testing.assert_allclose(image, again, atol=2e-5)
+
+
+def test_solids_have_the_color_of_their_outside_without_being_asked() -> None:
+    """Found by a user: the outside of a `Solid` was tinted like the inside of an open surface."""
+    small = {"material": "gold", "show": "shaded", "size": (40, 30), "progress": False}
+    plain = hk.render(hk.Sphere(1.0), **small)
+    asked = hk.render(hk.Sphere(1.0), solid=(-math.inf, 0), **small)
+    np.testing.assert_allclose(plain[15, 20], asked[15, 20], rtol=2e-2)
+
+
+def test_solids_may_be_of_glass() -> None:
+    small = {"show": "shaded", "size": (40, 30), "progress": False}
+    glass = hk.render(hk.Sphere(1.0), material="cobalt", **small)
+    asked = hk.render(hk.Sphere(1.0), material="cobalt", solid=(-math.inf, 0), **small)
+    np.testing.assert_array_equal(glass, asked)

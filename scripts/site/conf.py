@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -112,6 +113,18 @@ def add_index(app: Any, error: Exception | None) -> None:
         shutil.copyfile(Path(app.outdir, f"{root_doc}.html"), Path(app.outdir, "index.html"))
 
 
+def name_aliases(
+    app: Any, what: str, name: str, thing: Any, options: Any, signature: str, returned: str
+) -> tuple[str, str]:
+    """Write names of types as they are: Sphinx writes how it keeps those that are joined by |."""
+    plain = (
+        re.sub(r"TypeAliasForwardRef\('(\w+)'\)", r"\1", text or "") or text
+        for text in (signature, returned)
+    )
+    return next(plain), next(plain)
+
+
 def setup(app: Any) -> None:
+    app.connect("autodoc-process-signature", name_aliases)
     app.connect("source-read", add_contents)
     app.connect("build-finished", add_index)

@@ -27,7 +27,6 @@ from harnack.geometry.volumes import (
     HalfSpace,
     Intersection,
     Volume,
-    check_volume,
 )
 
 __all__ = [
@@ -42,7 +41,6 @@ __all__ = [
     "MeshError",
     "Volume",
     "bounding_box",
-    "check_volume",
     "edges",
     "estimate_areas",
     "estimate_normals",

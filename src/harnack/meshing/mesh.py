@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from harnack.fields import Field, Solid, SolidAngle
-from harnack.geometry import Box, Intersection, Volume, check_volume
+from harnack.geometry import Box, Intersection, Volume
+from harnack.geometry.volumes import check_volume
 from harnack.meshing.checks import MeshingError, TooLargeError, check_manifold
 from harnack.meshing.lattice import Lattice, Surface, open_surface
 from harnack.meshing.printing.clipping import cut_by

@@ -14,7 +14,7 @@ from harnack.choices import did_you_mean
 from harnack.fields import Field
 from harnack.rendering.pictures.scales.bar import require_pillow
 from harnack.rendering.pictures.views import SCALED, VIEWS
-from harnack.rendering.studio.backdrops import Backdrop, Ground, checked_backdrop
+from harnack.rendering.studio.backdrops import Backdrop, Gradient, Ground, checked_backdrop
 from harnack.rendering.studio.camera import Camera
 from harnack.rendering.surfaces.functions import function_of
 from harnack.rendering.surfaces.isolines import Isolines, checked_isolines
@@ -101,7 +101,7 @@ def checked_request(
         None if max_depth is None else check_integer("max_depth", max_depth),
         check_integer("seed", seed),
         Camera() if camera is None else check_camera(camera),
-        Ground("light") if backdrop is None else checked_backdrop(backdrop),
+        check_behind(backdrop, show),
         antialias,
         check_isolines(isolines, show),
         check_function(of, show),
@@ -153,7 +153,29 @@ def check_colorbar(colorbar: Any, show: str) -> bool | str:
     if colorbar:
         _check_scaled("colorbar", show)
         require_pillow()
+    if isinstance(colorbar, str) and not (colorbar.isascii() and colorbar.isprintable()):
+        raise ValueError(
+            f"the title of a color bar is written in plain ASCII letters, not {colorbar!r}: its "
+            "typeface has no others"
+        )
     return colorbar
+
+
+def check_behind(backdrop: Any, show: str) -> Backdrop:
+    """What is behind the surfaces; of pictures of numbers, one color.
+
+    Raises:
+        TypeError, ValueError: no backdrop, or none of such pictures.
+    """
+    if backdrop is None:
+        return Ground("light")
+    behind = checked_backdrop(backdrop)
+    if show in VIEWS and not (isinstance(behind, Gradient) and behind.bottom == behind.top):
+        raise ValueError(
+            f'behind a picture with show="{show}" is one color, such as backdrop="white", '
+            f"not {backdrop!r}"
+        )
+    return behind
 
 
 def _check_scaled(setting: str, show: str) -> None:

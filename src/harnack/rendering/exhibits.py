@@ -73,10 +73,11 @@ def exhibits(
     fitted = "tolerance" not in settings
     made: list[StudioObject] = []
     for one, name in zip(given, names, strict=True):
-        surface = _surface(one, settings)
+        material = material_of(name)
+        surface = _surface(one, settings, material.transparent)
         own = surface.solid is None and len(given) > 1  # then it is meant for the others
         lines = tuple(line for line in isolines if not (own and line.function is surface.field))
-        material, fits = material_of(name), fitted and isinstance(one, Field)
+        fits = fitted and isinstance(one, Field)
         made.append(StudioObject(surface, material, fits, isolines=lines))
     rims = [] if boundary is None else _rims(made, boundary)
     if thickness is not None:
@@ -130,10 +131,12 @@ def _rims(made: list[StudioObject], radius: Any) -> list[StudioObject]:
     return rims
 
 
-def _surface(one: Field | LevelSet, settings: Mapping[str, Any]) -> LevelSet:
-    """A surface with settings. A `Solid` that is opened by a section is drawn with its inside."""
+def _surface(one: Field | LevelSet, settings: Mapping[str, Any], clear: bool) -> LevelSet:
+    """A surface with settings. A `Solid` is drawn with its inside where that is seen: it is opened
+    by a section, or clear."""
     made = _with_settings(one, settings)
-    opened = isinstance(made.field, Solid) and made.section is not None and made.solid is None
+    opened = isinstance(made.field, Solid) and made.solid is None
+    opened &= clear or made.section is not None
     if not opened or len(made.levels) != 1:
         return made
     return replace(made, solid=(-math.inf, made.numbers[0]))

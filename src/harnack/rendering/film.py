@@ -31,6 +31,8 @@ from harnack.tracer import LevelSet
 FILM_FILES = (".gif", ".mp4")
 _SIZE = (320, 240)
 _MOST_FRAMES = 10_000
+# The color of a GIF that is none, behind all others.
+_CLEAR = 255
 Pixels = npt.NDArray[np.uint8]
 
 
@@ -217,11 +219,13 @@ def _gif(path: Path, fps: float) -> Generator[Callable[[Pixels], None]]:
     pictures: list[Any] = []
 
     def add(pixels: Pixels) -> None:
-        picture = Image.fromarray(pixels)
+        opaque = Image.fromarray(np.ascontiguousarray(pixels[..., :3]))
+        chosen = opaque.quantize(_CLEAR, method=Image.Quantize.MEDIANCUT)
         if pixels.shape[-1] == 4:  # a GIF knows nothing between clear and opaque
-            pictures.append(picture)
-        else:
-            pictures.append(picture.quantize(256, method=Image.Quantize.MEDIANCUT))
+            clear = Image.fromarray(np.where(pixels[..., 3] < 128, np.uint8(255), np.uint8(0)))
+            chosen.paste(_CLEAR, mask=clear)
+            chosen.info["transparency"] = _CLEAR
+        pictures.append(chosen)
 
     yield add
     duration = 10 * max(2, round(100 / fps))

@@ -6,6 +6,7 @@ import os
 import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Literal, cast
 
 import numpy as np
@@ -33,7 +34,7 @@ from harnack.rendering.pictures.shaded import shaded
 from harnack.rendering.pictures.shown import Picture
 from harnack.rendering.pictures.views import VIEWS, drawn, look
 from harnack.rendering.progress import Advance, progress_bar
-from harnack.rendering.studio.backdrops import Ground
+from harnack.rendering.studio.backdrops import Gradient, Ground
 from harnack.rendering.studio.camera import Camera
 from harnack.rendering.studio.stage import Studio, StudioObject, studio
 from harnack.rendering.surfaces.isolines import Isolines
@@ -173,6 +174,8 @@ def render(
     if show in VIEWS:
         placement = Placement.identity() if stage is None else stage.placement
         view = look(mi, scene, scene.sensors()[0], placement, asked.function)
+        if isinstance(asked.backdrop, Gradient):
+            view = replace(view, background=asked.backdrop.bottom)
         image = VIEWS[show].numbers(view)
         named = asked.colorbar is True and isinstance(of, str)
         shown = drawn(show, view, asked.value_range, str(of) if named else asked.colorbar)

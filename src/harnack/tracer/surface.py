@@ -15,7 +15,8 @@ from harnack.backend import backend_of, to_float
 from harnack.backend.arrays import as_data
 from harnack.backend.tensors import is_tensor, numbers_of
 from harnack.enclosures import Choice, Proofs, TargetLevels, choose_proofs
-from harnack.geometry import Intersection, check_volume
+from harnack.geometry import Intersection
+from harnack.geometry.volumes import check_volume
 from harnack.tracer.largest import checked_largest, largest_cells
 from harnack.tracer.prepared import PreparedLevelSet
 from harnack.tracer.tolerance import Tolerance

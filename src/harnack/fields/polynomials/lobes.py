@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import numbers
 import operator
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Literal, cast
@@ -18,7 +19,6 @@ from harnack.fields.look import Look, lengthened
 from harnack.fields.polynomials.harmonic_rounding import HarmonicRounding
 from harnack.fields.polynomials.solid_harmonics import (
     LARGEST_DEGREE,
-    Weights,
     evaluate,
     hessian,
 )
@@ -36,6 +36,8 @@ Part = Literal["both", "positive", "negative"]
 _PARTS: tuple[Part, ...] = ("both", "positive", "negative")
 # Promised ends are moved out by this much of their distance for the roundings of float32.
 _ROUNDING = 1e-5
+# Scales and harmonics from 1/this to this have fourth powers that a precision has room for.
+_REACH = {"single": 1e6, "double": 1e60}
 # Of a bound of second derivatives, where all else is 0.
 _SMALLEST = 1e-20
 
@@ -80,7 +82,6 @@ class Lobes(Field):
     overstep = 1.6
 
     def __init__(self, l: int, m: int, *, scale: float = 1.0, part: Part = "both") -> None:  # noqa: E741
-        l, m = operator.index(l), operator.index(m)  # noqa: E741
         self._fill({(l, m): 1.0}, scale, part)
 
     @classmethod
@@ -89,16 +90,17 @@ class Lobes(Field):
     ) -> Lobes:
         """The lobes of a sum of real spherical harmonics, {(l, m): c} for the sum of c Y_lm."""
         made = cls.__new__(cls)
-        made._fill(dict(weights), scale, part)
+        made._fill(weights, scale, part)
         return made
 
-    def _fill(self, weights: Weights, scale: float, part: Part) -> None:
+    def _fill(self, weights: Any, scale: Any, part: Part) -> None:
         self.weights = _checked(weights)
+        scale = _number(scale, "the scale of lobes")
         if not 0.0 < scale < math.inf:
             raise ValueError(f"the scale of lobes must be positive and finite, not {scale!r}")
         if part not in _PARTS:
             raise ValueError(f"part must be one of {', '.join(_PARTS)}, not {part!r}")
-        self.scale, self.part = float(scale), part
+        self.scale, self.part = scale, part
         self._s: Any = self.scale
         (first, *others) = self.weights
         if others:
@@ -137,6 +139,13 @@ class Lobes(Field):
         return self.scale * ends[self.part]
 
     def prepare(self, backend: Backend) -> Field:
+        reach, most = _REACH[backend.precision], max(map(abs, self.value_range))
+        if not (1 / reach <= self.scale <= reach and 1 / reach <= most <= reach):
+            raise ValueError(
+                f"lobes in {backend.precision} precision need a scale and a largest |Y| from "
+                f"{1 / reach:.0e} to {reach:.0e}, not {self.scale:.3g} and {most:.3g}: choose "
+                "another unit of length"
+            )
         other = copy.copy(self)
         other._s = dr.opaque(backend.Float, self.scale)
         return other
@@ -248,9 +257,12 @@ class Lobes(Field):
         return r * r * (off + 8 * unit * r), r * (slope + 2 * off + 24 * unit * r)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """Rows of the Hessian of f; see `_of_power`."""
+        """Rows of the Hessian of f; see `_of_power`. At the origin it depends on the direction from
+        which one comes: it is that of the direction z there."""
         distance = length(p)
-        r, u = distance / self._s, p / distance
+        at_origin = distance == 0
+        u = dr.select(at_origin, type(p)(0, 0, 1), p / dr.select(at_origin, 1, distance))
+        r = distance / self._s
         sign, share = -1.0 if self.part == "negative" else 1.0, 1 / dr.square(self._s)
         rows: list[Any] = []
         if self.part == "both":
@@ -291,22 +303,45 @@ class Lobes(Field):
         return {"degree": self.degree, "lobes": self.part, "longest": self.extent_radius()}
 
 
-def _checked(weights: Weights) -> dict[tuple[int, int], float]:
+def _checked(weights: Any) -> dict[tuple[int, int], float]:
     """The coefficients that are not zero.
 
     Raises:
-        ValueError: there is none, or one of no harmonic.
+        TypeError: a key is no pair of whole numbers, or a coefficient no number.
+        ValueError: there is no coefficient, or one of no harmonic.
     """
+    if not isinstance(weights, Mapping):
+        raise TypeError(f"weights must be {{(l, m): coefficient}}, not {weights!r}")
     kept: dict[tuple[int, int], float] = {}
-    for (l, m), weight in weights.items():  # noqa: E741
+    for key, weight in cast("Mapping[Any, Any]", weights).items():
+        l, m = _degree_and_order(key)  # noqa: E741
         if not 0 <= l <= LARGEST_DEGREE:
             raise ValueError(f"the degree l must be 0 to {LARGEST_DEGREE}, not {l}")
         if abs(m) > l:
             raise ValueError(f"the order m must be -l to l, here -{l} to {l}, not {m}")
-        if not math.isfinite(weight):
+        number = _number(weight, f"the coefficient of Y_{l},{m}")
+        if not math.isfinite(number):
             raise ValueError(f"the coefficient of Y_{l},{m} must be a finite number, not {weight}")
-        if weight != 0:
-            kept[l, m] = float(weight)
+        if number != 0:
+            kept[l, m] = number
     if not kept:
         raise ValueError("lobes need a coefficient that is not zero")
     return kept
+
+
+def _degree_and_order(key: Any) -> tuple[int, int]:
+    try:
+        l, m = key  # noqa: E741
+        if isinstance(key, str) or isinstance(l, bool) or isinstance(m, bool):
+            raise TypeError
+        return operator.index(l), operator.index(m)
+    except (TypeError, ValueError):
+        raise TypeError(
+            f"a harmonic is named by two whole numbers, degree and order (l, m), not {key!r}"
+        ) from None
+
+
+def _number(value: Any, name: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, numbers.Real):
+        raise TypeError(f"{name} must be a number, not {value!r}")
+    return float(value)

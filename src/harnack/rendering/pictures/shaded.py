@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import aligned, to_numpy
+from harnack.fields import Solid
 from harnack.rendering.mitsuba.integrator import LOST_COLOUR
 from harnack.rendering.mitsuba.variant import mitsuba_backend
 from harnack.rendering.mitsuba.world import World
@@ -234,7 +235,8 @@ class _Painter:
         """Whether it is one of our surfaces, and has an inside to be looked at."""
         found = self.mi.Bool(False)
         for carrier in self.world.carriers:
-            if carrier.surface.solid is None:
+            surface = carrier.surface
+            if surface.solid is None and not isinstance(surface.field, Solid):
                 found |= si.shape == self.mi.ShapePtr(carrier)
         return found
 

@@ -23,6 +23,7 @@ from harnack.rendering.pictures.pixels import bands, film_places, in_tiles, uplo
 from harnack.rendering.pictures.scales.bar import with_bar
 from harnack.rendering.pictures.scales.colormap import greys, viridis
 from harnack.rendering.pictures.scales.scale import Scale
+from harnack.rendering.surfaces.colours import Colour
 from harnack.rendering.surfaces.functions import defined_in
 from harnack.rendering.surfaces.placement import Placement
 from harnack.tracer import Status
@@ -35,7 +36,6 @@ _BACKGROUND = (0.10, 0.10, 0.11)
 _UNKNOWN = (0.45, 0.45, 0.45)
 _IDENTITY = Placement.identity()
 _STATUS_COLOURS = {
-    Status.MISS: _BACKGROUND,
     Status.HIT: (0.93, 0.93, 0.90),
     Status.OUT_OF_STEPS: LOST_COLOUR,
 }
@@ -52,6 +52,7 @@ class View:
     status: (h, w) a `Status`; shapes of Mitsuba count as hits.
     value: (h, w) of a function where something is met, NaN elsewhere; None if none was asked for.
     period: of that function, if it is angle-valued.
+    background: sRGB in [0, 1], of pictures where nothing is met.
     """
 
     depth: FloatArray
@@ -60,6 +61,7 @@ class View:
     status: npt.NDArray[np.int64]
     value: FloatArray | None = None
     period: float | None = None
+    background: Colour = _BACKGROUND
 
 
 def look(
@@ -138,7 +140,7 @@ def normal_picture(view: View) -> npt.NDArray[np.uint8]:
 def status_picture(view: View) -> npt.NDArray[np.uint8]:
     """Misses dark, hits white, out of steps magenta."""
     picture = np.zeros((*view.status.shape, 3))
-    for status, colour in _STATUS_COLOURS.items():
+    for status, colour in {Status.MISS: view.background, **_STATUS_COLOURS}.items():
         picture[view.status == int(status)] = colour
     return as_bytes(picture)
 
@@ -188,7 +190,7 @@ def _range(view: View, numbers: FloatArray) -> tuple[float, float]:
 def _of_surfaces(view: View, picture: FloatArray) -> npt.NDArray[np.uint8]:
     """Colours where something is met, before the background."""
     met = (view.status == int(Status.HIT))[..., None]
-    return _with_lost(view, np.where(met, picture, _BACKGROUND))
+    return _with_lost(view, np.where(met, picture, view.background))
 
 
 def _with_lost(view: View, picture: FloatArray) -> npt.NDArray[np.uint8]:
@@ -243,4 +245,4 @@ def drawn(
     if isinstance(bar, str):
         scale = replace(scale, name=bar)
     picture = one.picture(view, scale)
-    return with_bar(picture, scale) if bar else picture
+    return with_bar(picture, scale, view.background) if bar else picture

@@ -9,13 +9,14 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.rendering.pictures.scales.scale import Scale
+from harnack.rendering.surfaces.colours import Colour
 
 Pixels = npt.NDArray[np.uint8]
 
 # Heights of letters and bar, and the bar's width, as parts of the picture's height; and the least
 # height of letters, in pixels.
 _LETTERS, _BAR, _WIDTH, _LEAST = 1 / 28, 0.78, 1 / 22, 10
-_BEHIND, _INK = (26, 26, 28), (226, 226, 226)
+_ON_DARK, _ON_LIGHT = (226, 226, 226), (26, 26, 28)
 
 
 def require_pillow() -> tuple[Any, Any, Any]:
@@ -33,8 +34,13 @@ def require_pillow() -> tuple[Any, Any, Any]:
     return Image, ImageDraw, ImageFont
 
 
-def with_bar(pixels: Pixels, scale: Scale) -> Pixels:
-    """A picture (h, w, 3) with the bar of its scale to the right: (h, w + more, 3)."""
+def with_bar(pixels: Pixels, scale: Scale, background: Colour) -> Pixels:
+    """A picture (h, w, 3) with the bar of its scale to the right: (h, w + more, 3).
+
+    background: behind the bar, sRGB in [0, 1].
+    """
+    behind = tuple(round(255 * part) for part in background)
+    ink = _ON_LIGHT if sum(background) > 1.5 else _ON_DARK
     images, drawings, typefaces = require_pillow()
     height = len(pixels)
     letters = max(_LEAST, round(_LETTERS * height))
@@ -44,10 +50,10 @@ def with_bar(pixels: Pixels, scale: Scale) -> Pixels:
     ticks = scale.ticks(max(2, min(6, length // (2 * letters))))
     room = max(font.getlength(text) for _, text in ticks)
     wide = max(thick + gap + room, font.getlength(scale.name))
-    strip = images.new("RGB", (math.ceil(wide) + 2 * letters, height), _BEHIND)
+    strip = images.new("RGB", (math.ceil(wide) + 2 * letters, height), behind)
     top = (height - length + letters) // 2
     draw = drawings.Draw(strip)
-    draw.text((letters, max(0, top - gap)), scale.name, font=font, fill=_INK, anchor="ls")
+    draw.text((letters, max(0, top - gap)), scale.name, font=font, fill=ink, anchor="ls")
     values = scale.high - (np.arange(length) + 0.5) / length * (scale.high - scale.low)
     if scale.period is not None:  # the upper end is the lower one
         values = np.minimum(values, np.nextafter(scale.high, scale.low))
@@ -58,6 +64,6 @@ def with_bar(pixels: Pixels, scale: Scale) -> Pixels:
         part = (value - scale.low) / (scale.high - scale.low) if scale.high > scale.low else 0.5
         y = top + round((1 - part) * (length - 1))
         right = letters + thick
-        draw.line([(right, y), (right + gap // 2, y)], fill=_INK)
-        draw.text((right + gap, y), text, font=font, fill=_INK, anchor="lm")
+        draw.line([(right, y), (right + gap // 2, y)], fill=ink)
+        draw.text((right + gap, y), text, font=font, fill=ink, anchor="lm")
     return np.concatenate([pixels, np.asarray(strip, dtype=np.uint8)], axis=1)

@@ -57,13 +57,20 @@ class Scale:
         if not self.high > self.low:
             return [(self.low, f"{self.low:.4g}")]
         step = _step((self.high - self.low) / max(most - 1, 1))
-        first, last = math.ceil(self.low / step - 1e-9), math.floor(self.high / step + 1e-9)
+        first, last = self._multiples(step)
+        if last - first < 1:  # one more than asked for, if that brings two
+            step = _step((self.high - self.low) / max(most + 1, 3))
+            first, last = self._multiples(step)
         if last - first < 1:  # no room for two nice numbers
             largest = max(abs(self.low), abs(self.high))
             digits = 2 + max(2, math.ceil(math.log10(largest / (self.high - self.low))))
             return [(end, f"{end:.{digits}g}") for end in (self.low, self.high)]
         largest = max(abs(first), abs(last)) * step
         return [(k * step, _written(k * step, step, largest)) for k in range(first, last + 1)]
+
+    def _multiples(self, step: float) -> tuple[int, int]:
+        """The first and the last multiple of a step in the range."""
+        return math.ceil(self.low / step - 1e-9), math.floor(self.high / step + 1e-9)
 
 
 def _step(least: float) -> float:
