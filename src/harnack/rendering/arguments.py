@@ -13,7 +13,7 @@ from typing import Any
 from harnack.choices import did_you_mean
 from harnack.fields import Field
 from harnack.rendering.pictures.scales.bar import require_pillow
-from harnack.rendering.pictures.views import SCALED, VIEWS
+from harnack.rendering.pictures.views import GROUND_OF_VIEWS, SCALED, VIEWS
 from harnack.rendering.studio.backdrops import Backdrop, Gradient, Ground, checked_backdrop
 from harnack.rendering.studio.camera import Camera
 from harnack.rendering.surfaces.functions import function_of
@@ -170,6 +170,8 @@ def check_behind(backdrop: Any, show: str) -> Backdrop:
     if backdrop is None:
         return Ground("light")
     behind = checked_backdrop(backdrop)
+    if show in VIEWS and isinstance(behind, Ground):
+        return Gradient(*(GROUND_OF_VIEWS[behind.name],) * 2)
     if show in VIEWS and not (isinstance(behind, Gradient) and behind.bottom == behind.top):
         raise ValueError(
             f'behind a picture with show="{show}" is one color, such as backdrop="white", '

@@ -33,6 +33,8 @@ FloatArray = npt.NDArray[np.floating[Any]]
 # Ctrl-C works between bands.
 _RAYS_A_BAND = 2**20
 _BACKGROUND = (0.10, 0.10, 0.11)
+GROUND_OF_VIEWS = {"dark": _BACKGROUND, "light": (0.90, 0.90, 0.89)}
+"""What is behind views before the studio's backdrops, which are no single color."""
 _UNKNOWN = (0.45, 0.45, 0.45)
 _IDENTITY = Placement.identity()
 _STATUS_COLOURS = {
