@@ -157,7 +157,8 @@ def test_a_bar_changes_no_number_and_no_pixel_of_the_picture(
 
 def test_bars_show_the_colours_of_their_numbers() -> None:
     scale = Scale(-1.0, 3.0, "it")
-    strip = with_bar(np.zeros((400, 5, 3), dtype=np.uint8), scale)[:, 5:].astype(int)
+    dark = (26 / 255, 26 / 255, 28 / 255)
+    strip = with_bar(np.zeros((400, 5, 3), dtype=np.uint8), scale, dark)[:, 5:].astype(int)
     column = strip[:, 14 + 16]  # right of the title
     inside = np.flatnonzero(np.abs(column - (26, 26, 28)).max(axis=1) > 8)
     inside = np.arange(inside[0], inside[-1] + 1)
