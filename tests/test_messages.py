@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,9 @@ def draw(**settings: Any) -> Any:
         ({"solid": 3}, r"solid must be \(low, high\), two numbers, not 3"),
         ({"tolerance": "x"}, r"tolerance must be a length or a Tolerance, not 'x'"),
         ({"material": 5}, r"a material is a name, .* not 5; there are two-tone"),
+        ({"material": [0.5]}, r"a material is a name, a color, .* not 0.5; there are two"),
+        ({"colour": "red"}, r"no setting 'colour'; .*; did you mean \"material\"\?$"),
+        ({"filename": "a.png"}, r"no setting .*; did you mean \"path\", the second argument\?$"),
         ({"size": 5}, r"size must be \(width, height\) in pixels, .* not 5"),
         ({"size": (3.5, 2)}, r"size must be .* not \(3.5, 2\)"),
         ({"size": "800x600"}, r"size must be .* not '800x600'"),
@@ -63,6 +67,9 @@ def test_a_wrong_kind_of_argument_is_named(settings: dict[str, Any], complaint: 
     ("settings", "complaint"),
     [
         ({"material": "goldd"}, r"unknown material 'goldd'; .*; did you mean \"gold\"\?$"),
+        ({"material": "tomatoe"}, r"unknown material 'tomatoe'; .*; did you mean \"tomato\"\?$"),
+        ({"material": (0.5, 0.5, 2.0)}, r"unknown material \(0.5, 0.5, 2.0\); .* from 0 to 1$"),
+        ({"up": "Y"}, r"up must be one of .* not 'Y'; did you mean \"y\"\?$"),
         ({"show": "normals"}, r"show must be one of .*; did you mean \"normal\"\?$"),
         ({"backdrop": "drak"}, r"backdrop must be one of .*; did you mean \"dark\"\?$"),
         ({"bound": "Slop"}, r"unknown bound 'Slop'.*; did you mean \"slope\"\?$"),
@@ -82,6 +89,22 @@ def test_a_picture_larger_than_memory_is_refused(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr("harnack.rendering.arguments._memory", lambda: 1e9)
     with pytest.raises(ValueError, match=r"needs about 75 GB of memory, .* has 1: choose a sm"):
         draw(size=(16384, 16384), show="shaded")
+
+
+@pytest.mark.parametrize(
+    ("make", "complaint"),
+    [
+        (lambda: hk.SphericalHarmonic(2.5, 1), r"two whole numbers, .* not \(2.5, 1\)"),  # pyright: ignore[reportArgumentType]
+        (lambda: hk.HarmonicPolynomial("x"), r"such as \{\(2, 1, 0\): 1, .* not by 'x'"),  # pyright: ignore[reportArgumentType]
+        (lambda: hk.Gyroid("a"), "edge length of the cell must be a number, not 'a'"),  # pyright: ignore[reportArgumentType]
+        (lambda: hk.expression(lambda x, y: x), r"must take three .* takes \(x, y\)"),  # pyright: ignore
+    ],
+)
+def test_fields_of_wrong_things_say_what_they_want(
+    make: Callable[[], object], complaint: str
+) -> None:
+    with pytest.raises(TypeError, match=complaint):
+        make()
 
 
 def test_methods_and_certificates_that_there_are_not() -> None:
@@ -144,7 +167,7 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str]:
     [
         (["render", "trefoyl"], 1, r"'trefoyl' is no scene: .*; did you mean \"trefoil\"\?"),
         (["gallery", "Trefoyl"], 1, r"no scene is named .*; did you mean \"trefoil\"\?"),
-        (["render", "polygon", "--material", "goldd"], 2, r"--material: 'goldd' .* \"gold\"\?"),
+        (["render", "polygon", "--material", "goldd"], 2, r"--material: unknown .* \"gold\"\?"),
         (["render", "polygon", "--show", "normals"], 2, r"--show: 'normals' .* \"normal\"\?"),
         (["render", "a.obj", "--as", "dipol"], 2, r"--as: 'dipol' is none of .* \"dipole\"\?"),
         (["render", "polygon", "--elevaton", "3"], 2, r"no option '--elevaton'; .*--elevation"),

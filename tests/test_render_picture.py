@@ -159,6 +159,10 @@ def test_materials_are_told_apart_and_one_may_be_given_for_each_surface() -> Non
     pair = [hk.level_set(GYROID, level) for level in (-0.5, 0.5)]
     gold, mixed = draw(pair, material="gold"), draw(pair, material=["gold", "porcelain"])
     assert np.abs(gold - mixed).mean() > 0.01
+    red, same = draw(pair, material="red"), draw(pair, material=(1, 0, 0))
+    np.testing.assert_array_equal(red, same)
+    np.testing.assert_array_equal(red, draw(pair, material="#f00"))
+    assert (red[..., 0] > 2 * red[..., 2]).mean() > 0.1
     own = draw(pair, material=Material({"type": "diffuse"}))
     dictionary = draw(pair, material={"type": "twosided", "nested": {"type": "diffuse"}})
     np.testing.assert_allclose(own, dictionary, atol=1e-6)

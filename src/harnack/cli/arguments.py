@@ -18,6 +18,7 @@ from harnack.opening import UP_AXES
 from harnack.rendering import MATERIALS, SHOW_MODES
 from harnack.rendering.arguments import ANTIALIASING, MAX_SIDE, MAX_SPP
 from harnack.rendering.studio.backdrops import IMAGE_FILES, checked_backdrop
+from harnack.rendering.studio.materials import material_of
 from harnack.rendering.surfaces.colours import colour_of
 
 # Of what was typed, this much is repeated in messages.
@@ -122,7 +123,10 @@ def _add_drawn(one: Any, shaded: str) -> None:
         "--level", type=parse_level,
         help="level to draw (1/2 for meshes, 2pi for curves); pi is understood: 2pi, pi/2",
     )  # fmt: skip
-    _add_choice(one, "--material", sorted(MATERIALS), "what it is made of")
+    one.add_argument(
+        "--material", type=_material, metavar="NAME",
+        help=f"what it is made of: {', '.join(MATERIALS)}, or a color by name or #rrggbb",
+    )  # fmt: skip
     _add_choice(
         one, "--show", SHOW_MODES,
         "what to draw: color follows light paths, shaded lights first hits by a formula, "
@@ -162,9 +166,10 @@ def _add_surface(one: Any) -> None:
     )  # fmt: skip
     _add_clip(group)
     _add_section(group)
-    _add_choice(
-        group, "--cut-material", sorted(MATERIALS), "what the faces of a solid on its section are"
-    )
+    group.add_argument(
+        "--cut-material", type=_material, metavar="NAME",
+        help="what the faces of a solid on its section are made of",
+    )  # fmt: skip
     group.add_argument("--largest", action="store_true", help="only the largest connected part")
     group.add_argument(
         "--thickness", type=_positive, metavar="LENGTH",
@@ -366,6 +371,14 @@ def _isolines(text: str) -> tuple[str, float]:
     if axis not in AXES:
         raise argparse.ArgumentTypeError(f"{_shown(text)}: write an axis and a spacing as z:0.1")
     return axis, _positive(spacing)
+
+
+def _material(text: str) -> str:
+    try:
+        material_of(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    return text
 
 
 def _color(text: str) -> str:

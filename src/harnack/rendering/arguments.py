@@ -43,6 +43,13 @@ MAX_SIDE = 16384
 MAX_SPP = 1_000_000
 # Of the path tracer's counters.
 _MAX_INTEGER = 2**31 - 1
+# What other programs call settings, and their names here.
+_CALLED_ELSEWHERE = {
+    "color": '"material"', "colour": '"material"', "bsdf": '"material"', "samples": '"spp"',
+    "resolution": '"size"', "width": '"size"', "height": '"size"',
+    "filename": '"path", the second argument', "output": '"path", the second argument',
+    "file": '"path", the second argument',
+}  # fmt: skip
 # Bytes a pixel at the peak, measured at 2048 x 2048 and 4096 x 4096, rounded up.
 _BYTES = {"color": 50, "shaded": 280, "value": 190}
 _BYTES_OF_VIEWS = 130
@@ -273,9 +280,11 @@ def check_settings(settings: Mapping[str, Any], own: Sequence[str]) -> None:
     of_surface = [name for name in inspect.signature(level_set).parameters if name != "field"]
     for name in settings:
         if name not in of_surface:
+            ours = _CALLED_ELSEWHERE.get(name.lower())
+            hint = did_you_mean(name, (*own, *of_surface))
             raise TypeError(
                 f"there is no setting {name!r}; there are {', '.join(own)} and, of surfaces, "
-                f"{', '.join(of_surface)}{did_you_mean(name, (*own, *of_surface))}"
+                f"{', '.join(of_surface)}{hint if ours is None else f'; did you mean {ours}?'}"
             )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from harnack.meshing import mesh
 from harnack.rendering.arguments import check_settings
 from harnack.rendering.studio.materials import Material, material_of
 from harnack.rendering.studio.stage import StudioObject
+from harnack.rendering.surfaces.colours import Colour
 from harnack.rendering.surfaces.isolines import Isolines
 from harnack.tracer import LevelSet, level_set
 
@@ -27,7 +29,12 @@ _OWN = (
 # What tubes around the ends of surfaces are made of.
 _RIM = "gold"
 
-MaterialLike = str | Material | Mapping[str, Any]
+MaterialLike = str | Colour | Material | Mapping[str, Any]
+
+
+def _is_color(given: Any) -> bool:
+    """Whether a list holds numbers, and not materials."""
+    return len(given) == 3 and all(isinstance(one, Real) for one in given)
 
 
 def surfaces_of(
@@ -65,7 +72,7 @@ def exhibits(
     for one in given:
         if not isinstance(one, Field | LevelSet):
             raise TypeError(f"a list to draw holds fields and level sets, not {one!r}")
-    listed: bool = isinstance(materials, list | tuple)
+    listed = isinstance(materials, list | tuple) and not _is_color(materials)
     names: list[Any] = [*materials] if listed else [materials] * len(given)
     if len(names) != len(given):
         several = f" or {len(given)}, one for each surface" if len(given) > 1 else ""

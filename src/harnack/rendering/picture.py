@@ -107,8 +107,8 @@ def render(
 
     In the studio only:
 
-    material: a name of `MATERIALS`, a `Material` or a BSDF dictionary; a list, one for each
-        surface.
+    material: a name of `MATERIALS`, a color as for the backdrop, a `Material` or a BSDF dictionary;
+        a list, one for each surface.
     camera: where the stage is seen from, a `Camera`, or (x, y, z) in the surfaces' coordinates.
     backdrop: "light" or "dark", with a floor. Or nothing but the surfaces before a color, by its
         name in CSS such as "white", "#rrggbb" or as three numbers of sRGB; before (bottom, top),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -61,6 +62,7 @@ def expression(
     """
     if not callable(function):
         raise TypeError(f"function must be callable with x, y, z, not {function!r}")
+    _check_arguments(function)
     if domain is not None and not callable(getattr(domain, "bounds", None)):
         raise TypeError(f"domain must be a volume, such as harnack.Ball(), not {domain!r}")
     if not math.isfinite(level):
@@ -69,3 +71,18 @@ def expression(
     point = probe()
     as_jet(made.formula(*point), point[0], "expression")
     return made
+
+
+def _check_arguments(function: Callable[..., Any]) -> None:
+    """Raise TypeError for what does not take three coordinates."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):  # of what is not written in Python nothing may be known
+        return
+    try:
+        signature.bind(0.0, 0.0, 0.0)
+    except TypeError:
+        raise TypeError(
+            "function must take three coordinates, such as lambda x, y, z: x * y - z; this one "
+            f"takes {signature}"
+        ) from None

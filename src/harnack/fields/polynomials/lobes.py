@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import math
 import numbers
-import operator
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Literal, cast
 
@@ -19,6 +18,7 @@ from harnack.fields.look import Look, lengthened
 from harnack.fields.polynomials.harmonic_rounding import HarmonicRounding
 from harnack.fields.polynomials.solid_harmonics import (
     LARGEST_DEGREE,
+    degree_and_order,
     evaluate,
     hessian,
 )
@@ -314,7 +314,7 @@ def _checked(weights: Any) -> dict[tuple[int, int], float]:
         raise TypeError(f"weights must be {{(l, m): coefficient}}, not {weights!r}")
     kept: dict[tuple[int, int], float] = {}
     for key, weight in cast("Mapping[Any, Any]", weights).items():
-        l, m = _degree_and_order(key)  # noqa: E741
+        l, m = degree_and_order(key)  # noqa: E741
         if not 0 <= l <= LARGEST_DEGREE:
             raise ValueError(f"the degree l must be 0 to {LARGEST_DEGREE}, not {l}")
         if abs(m) > l:
@@ -327,18 +327,6 @@ def _checked(weights: Any) -> dict[tuple[int, int], float]:
     if not kept:
         raise ValueError("lobes need a coefficient that is not zero")
     return kept
-
-
-def _degree_and_order(key: Any) -> tuple[int, int]:
-    try:
-        l, m = key  # noqa: E741
-        if isinstance(key, str) or isinstance(l, bool) or isinstance(m, bool):
-            raise TypeError
-        return operator.index(l), operator.index(m)
-    except (TypeError, ValueError):
-        raise TypeError(
-            f"a harmonic is named by two whole numbers, degree and order (l, m), not {key!r}"
-        ) from None
 
 
 def _number(value: Any, name: str) -> float:

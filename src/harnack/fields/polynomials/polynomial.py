@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+import numbers
 import operator
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import numpy as np
@@ -17,6 +18,7 @@ from harnack.fields.polynomials.harmonic_promises import HarmonicPromises
 from harnack.fields.polynomials.solid_harmonics import (
     LARGEST_DEGREE,
     Weights,
+    degree_and_order,
     evaluate,
     from_monomials,
     hessian,
@@ -109,7 +111,7 @@ class SphericalHarmonic(_SolidHarmonics):
     """
 
     def __init__(self, l: int, m: int, *, radius: float = 1.0) -> None:  # noqa: E741
-        l, m = operator.index(l), operator.index(m)  # noqa: E741
+        l, m = degree_and_order((l, m))  # noqa: E741
         if not 0 <= l <= LARGEST_DEGREE:
             raise ValueError(f"the degree l must be 0 to {LARGEST_DEGREE}, not {l}")
         if abs(m) > l:
@@ -135,6 +137,7 @@ class HarmonicPolynomial(_SolidHarmonics):
     Raises:
         ValueError: the polynomial is not harmonic (the message shows its Laplacian), its degree is
             above 12, a coefficient is not finite, or the domain is unbounded.
+        TypeError: coefficients is no dictionary.
     """
 
     def __init__(
@@ -159,23 +162,26 @@ def _turned(three: Sequence[Any], n: int) -> tuple[Any, Any, Any]:
     return three[n % 3], three[(n + 1) % 3], three[(n + 2) % 3]
 
 
-def _checked(
-    coefficients: Mapping[tuple[int, int, int], float],
-) -> dict[tuple[int, int, int], float]:
+def _checked(given: Any) -> dict[tuple[int, int, int], float]:
     """The coefficients that are not zero.
 
     Raises:
-        ValueError: they make no harmonic polynomial.
+        TypeError, ValueError: they make no harmonic polynomial.
     """
+    if not isinstance(given, Mapping):
+        raise TypeError(
+            "a harmonic polynomial is given by its coefficients, such as {(2, 1, 0): 1, "
+            f"(0, 1, 2): -1}} for x^2 y - y z^2, not by {given!r}"
+        )
     checked: dict[tuple[int, int, int], float] = {}
-    for powers, value in coefficients.items():
+    for powers, value in cast("Mapping[Any, Any]", given).items():
         try:
             i, j, k = (operator.index(n) for n in powers)
         except (TypeError, ValueError):
             raise ValueError(f"{powers!r} is no exponent (i, j, k) of x^i y^j z^k") from None
         if min(i, j, k) < 0:
             raise ValueError(f"exponents must not be negative: {powers!r}")
-        if not math.isfinite(value):
+        if not (isinstance(value, numbers.Real) and math.isfinite(value)):
             raise ValueError(f"the coefficient of {powers!r} is {value!r}, not a finite number")
         if i + j + k > LARGEST_DEGREE:
             raise ValueError(

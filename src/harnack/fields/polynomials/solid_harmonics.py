@@ -10,6 +10,7 @@ three digits. Arithmetic only, so one code serves Dr.Jit arrays, NumPy arrays an
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeAlias
 
@@ -19,6 +20,23 @@ LARGEST_DEGREE = 12
 
 Weights: TypeAlias = Mapping[tuple[int, int], float]  #: (l, m) -> coefficient of r^l Y_lm
 Monomials: TypeAlias = Mapping[tuple[int, int, int], float]  #: (i, j, k) -> that of x^i y^j z^k
+
+
+def degree_and_order(key: Any) -> tuple[int, int]:
+    """The degree l and the order m that a pair names.
+
+    Raises:
+        TypeError: it is no pair of whole numbers.
+    """
+    try:
+        l, m = key  # noqa: E741
+        if isinstance(key, str) or isinstance(l, bool) or isinstance(m, bool):
+            raise TypeError
+        return operator.index(l), operator.index(m)
+    except (TypeError, ValueError):
+        raise TypeError(
+            f"a harmonic is named by two whole numbers, degree and order (l, m), not {key!r}"
+        ) from None
 
 
 def normalisation(l: int, m: int) -> float:  # noqa: E741

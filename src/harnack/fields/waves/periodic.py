@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import numbers
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -173,10 +174,13 @@ class EigenfunctionSum(Field):
         }
 
 
-def _wavenumber(cell: float) -> float:
-    if not 0 < cell < math.inf:
+def _wavenumber(cell: Any) -> float:
+    if not isinstance(cell, numbers.Real):
+        raise TypeError(f"the edge length of the cell must be a number, not {cell!r}")
+    edge = float(cell)
+    if not 0 < edge < math.inf:
         raise ValueError(f"the edge length of the cell must be positive, not {cell!r}")
-    return 2 * math.pi / cell
+    return 2 * math.pi / edge
 
 
 class _CubicSurface(EigenfunctionSum):

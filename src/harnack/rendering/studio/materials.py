@@ -7,9 +7,12 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 from harnack.choices import did_you_mean
+from harnack.rendering.surfaces.colours import NAMED_COLOURS, Colour, colour_of, linear
 
 Dictionary = dict[str, Any]
-Colour = tuple[float, float, float]
+
+# How rough a surface is that only a colour is given of: between porcelain and eggshell.
+_PAINT = 0.2
 
 
 def _rgb(colour: Colour) -> Dictionary:
@@ -102,11 +105,11 @@ MATERIALS: Mapping[str, Material] = {
 
 
 def material_of(wanted: Any) -> Material:
-    """A material from its name, or from a BSDF dictionary used as it stands.
+    """A material from its name, from a colour, or from a BSDF dictionary used as it stands.
 
     Raises:
         TypeError: it is none of these.
-        ValueError: there is no material of that name.
+        ValueError: there is no material or colour of that name.
     """
     if wanted is None:
         return MATERIALS["two-tone"]
@@ -114,14 +117,18 @@ def material_of(wanted: Any) -> Material:
         return wanted
     if isinstance(wanted, Mapping):
         return Material(dict(cast("Mapping[str, Any]", wanted)), two_sided=False)
-    if not isinstance(wanted, str):
+    if isinstance(wanted, str) and wanted in MATERIALS:
+        return MATERIALS[wanted]
+    try:
+        return Material(_glazed(linear(colour_of(wanted, "material")), _PAINT))
+    except TypeError:
         raise TypeError(
-            f"a material is a name, a Material or a BSDF dictionary, not {wanted!r}; there are "
-            f"{', '.join(MATERIALS)}"
-        )
-    if wanted not in MATERIALS:
+            f"a material is a name, a color, a Material or a BSDF dictionary, not {wanted!r}; "
+            f"there are {', '.join(MATERIALS)}"
+        ) from None
+    except ValueError:
         raise ValueError(
-            f"unknown material {wanted!r}; there are {', '.join(MATERIALS)}"
-            f"{did_you_mean(wanted, MATERIALS)}"
-        )
-    return MATERIALS[wanted]
+            f"unknown material {wanted!r}; there are {', '.join(MATERIALS)}, and colors, by a "
+            f'name of CSS, "#rrggbb" or three numbers from 0 to 1'
+            f"{did_you_mean(wanted, (*MATERIALS, *NAMED_COLOURS))}"
+        ) from None

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from harnack.backend import FloatArray
+from harnack.choices import did_you_mean
 from harnack.geometry.volumes.volume import checked_point
 
 # Rotations that turn the named axis to z. From y, the front of a glTF model (z) turns to -y,
@@ -27,7 +28,10 @@ def upright(up: Any) -> FloatArray:
     """
     if isinstance(up, str):
         if up not in UP_AXES:
-            raise ValueError(f"up must be one of {', '.join(UP_AXES)} or a vector, not {up!r}")
+            raise ValueError(
+                f"up must be one of {', '.join(UP_AXES)} or a vector, not {up!r}"
+                f"{did_you_mean(up, UP_AXES)}"
+            )
         axis = up.removeprefix("-")
         over = np.diag([1.0, -1.0, -1.0]) if up.startswith("-") else np.eye(3)
         return over @ _UPRIGHT[axis]
