@@ -54,7 +54,7 @@ def test_numpy_and_plain_operators_mean_the_same() -> None:
     ("function", "error", "message"),
     [
         (3, TypeError, "must be callable"),
-        (lambda x, y: x, TypeError, "positional argument"),
+        (lambda x, y: x, TypeError, "must take three coordinates"),
         (lambda x, y, z: math.sin(x), TypeError, "use harnack.sin"),
         (lambda x, y, z: x if x > 0 else y, TypeError, ""),
         (lambda x, y, z: np.arctan2(x, y), TypeError, "has no proved ranges"),
@@ -67,6 +67,80 @@ def test_mistakes_are_told_when_the_field_is_made(
 ) -> None:
     with pytest.raises(error, match=message):
         hk.expression(function)
+
+
+@pytest.mark.parametrize(
+    ("text", "function"),
+    [
+        ("x^2 + y^2 = 1 + sin(2*z)", lambda x, y, z: x**2 + y**2 - (1 + np.sin(2 * z))),
+        ("-x^2*y", lambda x, y, z: -(x**2) * y),
+        ("2^-x + e^y - pi*z", lambda x, y, z: 2.0**-x + np.exp(y) - np.pi * z),
+        ("max(x, min(y, z)) = norm(x, y, z)/2",
+         lambda x, y, z: np.maximum(x, np.minimum(y, z)) - np.sqrt(x * x + y * y + z * z) / 2),
+        ("(x+2)^0.5 / (3 + abs(y))\n - log(2 + z)", lambda x, y, z:
+         np.sqrt(x + 2) / (3 + np.abs(y)) - np.log(2 + z)),
+        ("x^3^2/8 - y^2^3", lambda x, y, z: x**9 / 8 - y**8),
+        (" + ".join(["x*y"] * 150), lambda x, y, z: 150 * x * y),
+    ],
+)  # fmt: skip
+def test_formulas_may_be_texts(text: str, function: Any) -> None:
+    found = hk.expression(text).value(POINTS, precision="double")
+    np.testing.assert_allclose(found, function(*POINTS.T), rtol=1e-13, atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("2x", r"a \* missing at '2x'"),
+        ("x y", r"a \* missing at 'x y'"),
+        ("x(y + 1)", r"a \* missing after 'x'"),
+        ("x^2 + yy", "'yy' is unknown, there are x, y, z"),
+        ("sine(x)", r"no known function, .*; did you mean \"sin\"\?"),
+        ("max(x)", "max takes 2 arguments, not 1"),
+        ("norm(x)", "norm takes 2 or 3 arguments, not 1"),
+        ("sin(x=1)", "is amiss"),
+        ("x == 1", "one = between"),
+        ("x < 1", "one = between"),
+        ("x = y = z", "more than one = sign"),
+        ("(x", "bracket is amiss"),
+        ("", "is amiss"),
+        ("x # y", "'#' has no meaning"),
+        ("x\u00b2", "has no meaning"),
+        ("'x'", "has no meaning"),
+        ("1j*x", "no real number"),
+        ("True", "'True'|True is no real number"),
+        ("x if y else z", "not understood"),
+        ("lambda: x", "is amiss|has no meaning"),
+        ("x % 2", "has no meaning"),
+        ("x // 2", "the operators are"),
+        ("x.real", "not understood"),
+        ("(x).__class__", "not understood"),
+        ("__import__('os')", "has no meaning|no known function"),
+        ("9^9^9^9^9", "too large, or not real"),
+        ("(-1)^0.5 * x", "too large, or not real"),
+        ("1e999*x", "too large"),
+        ("1" * 400 + "*x", "too large"),
+        ("x/0", "divides by zero"),
+        ("x" + "+x" * 300, "more than 200 operations"),
+        ("-" * 500 + "x", "more than 200|is amiss"),
+        ("(" * 1000 + "x" + ")" * 1000, "amiss|more than"),
+        ("x+" * 3000 + "x", "at most 4,000 characters"),
+    ],
+)
+def test_what_is_no_formula_is_said_and_never_run(text: str, complaint: str) -> None:
+    with pytest.raises(ValueError, match=complaint):
+        hk.expression(text)
+
+
+def test_formulas_of_texts_are_traced_like_functions() -> None:
+    text = hk.expression("(x^2 + 9/4*y^2 + z^2 - 1)^3 = x^2*z^3 + 9/80*y^2*z^3")
+    code = hk.expression(
+        lambda x, y, z: (x**2 + 9 / 4 * y**2 + z**2 - 1) ** 3 - (x**2 * z**3 + 9 / 80 * y**2 * z**3)
+    )
+    o, d = np.tile([[0.1, -3, 0.2]], (50, 1)), POINTS[:50] - [0.1, -3, 0.2]
+    one, other = (hk.trace(f, o, d, clip=hk.Ball(radius=2)) for f in (text, code))
+    np.testing.assert_array_equal(one.t, other.t)
+    assert np.isfinite(one.t).sum() > 20
 
 
 def test_domain_and_level_are_checked() -> None:

@@ -13,6 +13,7 @@ from harnack.choices import did_you_mean
 from harnack.cli.mesh_files import MESH_FILES
 from harnack.cli.messages import printable
 from harnack.enclosures.proofs import BOUNDS
+from harnack.fields.expressions.text import TextFormula
 from harnack.files.surfaces import SURFACE_FILES
 from harnack.opening import UP_AXES
 from harnack.rendering import MATERIALS, SHOW_MODES
@@ -23,7 +24,6 @@ from harnack.rendering.surfaces.colours import colour_of
 
 # Of what was typed, this much is repeated in messages.
 _SHOWN = 60
-AXES = ("x", "y", "z")
 
 
 class _Parser(argparse.ArgumentParser):
@@ -84,7 +84,8 @@ def _parsers() -> tuple[_Parser, dict[str, _Parser]]:
 def _add_render(commands: Any) -> None:
     one = commands.add_parser(
         "render", help="draw one picture",
-        description="Draw a gallery scene, the surface of a file, or a Mitsuba scene (.xml). "
+        description="Draw a gallery scene, the surface of a file, a formula, or a Mitsuba scene "
+        "(.xml). A formula is written as 'x^2 + y^2 = 1 + sin(2*z)'; --ball or --box cuts it. "
         f"Surface files are {', '.join(SURFACE_FILES)}: meshes with any defects, point clouds, "
         "and curves; what a file was taken for is printed.",
     )  # fmt: skip
@@ -117,7 +118,9 @@ def _add_turntable(commands: Any) -> None:
 def _add_drawn(one: Any, shaded: str) -> None:
     """What is drawn, how, and seen from where. shaded: what is drawn so unless asked otherwise."""
     one.add_argument(
-        "scene", metavar="SCENE", help="a name from `harnack gallery --list`, or a file"
+        "scene",
+        metavar="SCENE",
+        help="a name from `harnack gallery --list`, a file, or a formula of x, y and z",
     )
     one.add_argument(
         "--level", type=parse_level,
@@ -187,8 +190,8 @@ def _add_surface(one: Any) -> None:
 def _add_lines(one: Any) -> None:
     group = one.add_argument_group("lines and values on the surface")
     group.add_argument(
-        "--isolines", type=_isolines, metavar="AXIS:SPACING",
-        help="lines where a coordinate is a multiple of the spacing, such as z:0.1",
+        "--isolines", type=_isolines, metavar="FORMULA:SPACING",
+        help="lines where a coordinate or a formula is a multiple of the spacing, as z:0.1, x*y:1",
     )  # fmt: skip
     group.add_argument(
         "--isolines-width", type=_positive, metavar="LENGTH",
@@ -197,7 +200,10 @@ def _add_lines(one: Any) -> None:
     group.add_argument(
         "--isolines-color", type=_color, metavar="COLOR", help="a name or #rrggbb (black)"
     )
-    _add_choice(group, "--of", AXES, "the coordinate that --show value shows")
+    group.add_argument(
+        "--of", type=_formula, metavar="FORMULA",
+        help="the coordinate or the formula of x, y and z that --show value shows",
+    )  # fmt: skip
     group.add_argument(
         "--value-range", type=_ends, metavar="LOW:HIGH",
         help="of the colors of values, depths or evaluations (what is seen)",
@@ -261,7 +267,9 @@ def _add_mesh(commands: Any) -> None:
         "are closed, with caps where they are cut; --thickness makes a closed part of a surface.",
     )  # fmt: skip
     one.add_argument(
-        "scene", metavar="SCENE", help="a name from `harnack gallery --list`, or a file of curves"
+        "scene",
+        metavar="SCENE",
+        help="a name from `harnack gallery --list`, a file of curves, or a formula of x, y and z",
     )
     one.add_argument("-o", "--output", metavar="FILE", help=f"{', '.join(MESH_FILES)} (SCENE.stl)")
     one.add_argument("--level", type=parse_level, help="as for render")
@@ -367,10 +375,20 @@ def _ends(text: str) -> tuple[float, float]:
 
 def _isolines(text: str) -> tuple[str, float]:
     """ "z:0.1" as ("z", 0.1)."""
-    axis, _, spacing = text.partition(":")
-    if axis not in AXES:
-        raise argparse.ArgumentTypeError(f"{_shown(text)}: write an axis and a spacing as z:0.1")
-    return axis, _positive(spacing)
+    formula, colon, spacing = text.rpartition(":")
+    if not colon:
+        raise argparse.ArgumentTypeError(
+            f"{_shown(text)}: write a coordinate or a formula, and a spacing, as z:0.1"
+        )
+    return _formula(formula), _positive(spacing)
+
+
+def _formula(text: str) -> str:
+    try:
+        TextFormula.read(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    return text
 
 
 def _material(text: str) -> str:

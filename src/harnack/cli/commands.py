@@ -16,7 +16,8 @@ from harnack.backend import doctor
 from harnack.choices import did_you_mean
 from harnack.cli.mesh_files import check_mesh_path, write_mesh
 from harnack.cli.messages import in_options, printable
-from harnack.fields import Field
+from harnack.fields import Field, expression
+from harnack.fields.expressions.text import looks_like_formula
 from harnack.files.surfaces import SURFACE_FILES, Mesh, read_surface
 from harnack.gallery import SCENES, Scene
 from harnack.geometry import Ball, Box, HalfSpace
@@ -75,10 +76,17 @@ def _turntable(options: Any) -> int:
 
 
 def _source(options: Any) -> Path:
-    """The file to draw, or the name of a scene."""
+    """The file to draw, or the name of a scene; of a formula, a name for its picture."""
+    if _is_formula(options.scene):
+        return Path("formula")
     if options.scene not in SCENES:
         _check_source(options.scene)
     return Path(options.scene)
+
+
+def _is_formula(name: str) -> bool:
+    is_file = Path(name).suffix.lower() in (*SURFACE_FILES, ".xml")
+    return name not in SCENES and not is_file and looks_like_formula(name)
 
 
 def _drawn(options: Any, source: Path) -> tuple[Any, dict[str, Any]]:
@@ -92,6 +100,9 @@ def _drawn(options: Any, source: Path) -> tuple[Any, dict[str, Any]]:
     if options.scene in SCENES:
         _refuse_file_options(options)
         return _of_scene(SCENES[options.scene], options, settings)
+    if _is_formula(options.scene):
+        _refuse_file_options(options)
+        return expression(options.scene), {"level": options.level, **settings}
     return _of_file(source, options, settings)
 
 
@@ -162,7 +173,8 @@ def _check_source(name: str) -> None:
     if Path(name).suffix.lower() not in (*SURFACE_FILES, ".xml"):
         raise ValueError(
             f"{name!r} is no scene: give a name from `harnack gallery --list`, a surface "
-            f"file ({', '.join(SURFACE_FILES)}) or a Mitsuba scene (.xml)"
+            f"file ({', '.join(SURFACE_FILES)}), a Mitsuba scene (.xml) or a formula such as "
+            '"x^2 + y^2 + z^2 = 1"'
             f"{did_you_mean(name, SCENES)}"
         )
 
@@ -222,7 +234,7 @@ def _of_scene(scene: Scene, options: Any, settings: dict[str, Any]) -> tuple[Any
 
 def _mesh(options: Any) -> int:
     """Triangles of a scene's surface, or of that of a file with curves."""
-    source = Path(options.scene)
+    source = _source(options)
     if options.output == "":
         raise ValueError("-o is empty: name the file to write, such as a.stl")
     target = check_mesh_path(options.output or f"{source.stem or 'surface'}.stl")
@@ -267,8 +279,9 @@ def _mesh(options: Any) -> int:
 
 def _meshed(options: Any, source: Path) -> tuple[Field, dict[str, Any]]:
     """The field of a scene or a file, and what the scene says of its surface."""
+    if _is_formula(options.scene):
+        return expression(options.scene), {}
     if options.scene not in SCENES:
-        _check_source(options.scene)
         opened = open_surface(source)
         _say(f"{source}: {in_options(opened.said)}")
         return opened.field, {}

@@ -22,8 +22,9 @@ def printable(text: str) -> str:
 
 def _explanation(error: Exception) -> str:
     if isinstance(error, UnboundedSurfaceError):
-        usual = f"; choose another --level, such as {level_text(error.usual)}"
-        return error.reason + (usual if error.usual is not None else "")
+        if error.usual is not None:
+            return f"{error.reason}; choose another --level, such as {level_text(error.usual)}"
+        return f"{error.reason}; cut it, such as by --ball 0,0,0,2"
     if isinstance(error, MemoryError):
         return f"there is not enough memory: choose a smaller --size ({error})"
     return in_options(str(error))

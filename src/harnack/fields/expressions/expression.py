@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from harnack.fields.expressions.text import TextFormula
 from harnack.fields.formula import Formula, as_jet, probe
 
 if TYPE_CHECKING:
@@ -37,7 +38,7 @@ class Expression(Formula):
 
 
 def expression(
-    function: Callable[[Any, Any, Any], Any],
+    function: Callable[[Any, Any, Any], Any] | str,
     *,
     domain: Volume | None = None,
     level: float = 0.0,
@@ -47,7 +48,8 @@ def expression(
 
     function: of three coordinates, written with + - * / **, abs, and the functions `harnack.sin`,
         `cos`, `tan`, `exp`, `log`, `sqrt`, `tanh`, `atan`, `asin`, `acos`, `sinh`, `cosh`,
-        `maximum`, `minimum`, `norm`; NumPy's of the same names do too.
+        `maximum`, `minimum`, `norm`; NumPy's of the same names do too. Or a text, such as
+        "x^2 + y^2 = 1 + sin(2*z)", with `max` and `min`; an equation means left - right.
     domain: the volume to draw it in, such as `harnack.Ball()`; None for all of space.
     level: the one drawn when none is asked for.
     is_convex: a promise of yours that the function is convex, as quadrics and norms are: steps
@@ -58,10 +60,15 @@ def expression(
     Raises:
         TypeError: function cannot be called with three coordinates, or uses what has no proved
             ranges; domain is no volume.
-        ValueError: level is not finite.
+        ValueError: level is not finite; a text is no formula.
     """
+    if isinstance(function, str):
+        function = TextFormula.read(function)
     if not callable(function):
-        raise TypeError(f"function must be callable with x, y, z, not {function!r}")
+        raise TypeError(
+            "function must be callable, such as lambda x, y, z: x * y - z, or a text, such as "
+            f'"x * y = z", not {function!r}'
+        )
     _check_arguments(function)
     if domain is not None and not callable(getattr(domain, "bounds", None)):
         raise TypeError(f"domain must be a volume, such as harnack.Ball(), not {domain!r}")

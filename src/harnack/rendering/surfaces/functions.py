@@ -5,35 +5,28 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, cast
 
-from harnack.choices import did_you_mean
 from harnack.fields import Field, expression
 
 if TYPE_CHECKING:
     from harnack.geometry import Volume
 
-_COORDINATES: dict[str, Callable[[Any, Any, Any], Any]] = {
-    "x": lambda x, y, z: x,
-    "y": lambda x, y, z: y,
-    "z": lambda x, y, z: z,
-}
 # A surface that is cut by the function's own domain reaches beyond it by rounding, a part of its
 # size.
 _ROUNDING = 1e-5
 
 
 def function_of(given: Any, what: str = "of") -> Field:
-    """A function on space: a field, "x", "y" or "z", or a Python function of three coordinates.
+    """A function on space: a field, or what `harnack.expression` takes: a function of three
+    coordinates, or a text such as "z".
 
     Raises:
         TypeError, ValueError: none of these, or a field that is many functions.
     """
     if isinstance(given, str):
-        if given not in _COORDINATES:
-            raise ValueError(
-                f'{what} must be "x", "y" or "z", a field, or a function of x, y and z, not '
-                f"{given!r}{did_you_mean(given, _COORDINATES)}"
-            )
-        return expression(_COORDINATES[given])
+        try:
+            return expression(given)
+        except ValueError as error:
+            raise ValueError(f"{what}: {error}") from None
     if isinstance(given, Field):
         if given.has_parts:
             raise ValueError(
@@ -43,7 +36,8 @@ def function_of(given: Any, what: str = "of") -> Field:
         return given
     if not callable(given):
         raise TypeError(
-            f'{what} must be "x", "y" or "z", a field, or a function of x, y and z, not {given!r}'
+            f'{what} must be a text such as "z" or "x*y", a field, or a function of x, y and z, '
+            f"not {given!r}"
         )
     return expression(cast("Callable[[Any, Any, Any], Any]", given))
 

@@ -1,0 +1,197 @@
+"""Formulas written as text, such as "x^2 + y^2 + z^2 = 1"."""
+
+from __future__ import annotations
+
+import ast
+import math
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+from harnack import arithmetic
+from harnack.choices import did_you_mean
+
+_COORDINATES = ("x", "y", "z")
+_CONSTANTS: Mapping[str, float] = MappingProxyType({"pi": math.pi, "e": math.e})
+_FUNCTIONS: Mapping[str, Callable[..., Any]] = MappingProxyType(
+    {
+        **{name: getattr(arithmetic, name) for name in (
+            "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "exp", "log",
+            "sqrt", "norm",
+        )},
+        "abs": arithmetic.absolute, "max": arithmetic.maximum, "min": arithmetic.minimum,
+    }
+)  # fmt: skip
+# How many arguments functions take that do not take one: at least, at most.
+_SEVERAL = {"max": (2, 2), "min": (2, 2), "norm": (2, 3)}
+_OPERATORS: Mapping[type[ast.operator], Callable[[Any, Any], Any]] = MappingProxyType(
+    {
+        ast.Add: lambda a, b: a + b,
+        ast.Sub: lambda a, b: a - b,
+        ast.Mult: lambda a, b: a * b,
+        ast.Div: lambda a, b: a / b,
+    }
+)
+# Characters, and operations within operations: Python's own depth of calls is some 1000.
+_LONGEST, _DEEPEST = 4000, 200
+
+
+@dataclass(frozen=True)
+class TextFormula:
+    """f(x, y, z) of a text, that is called as any function of three coordinates.
+
+    text: with + - * / ^ (or **), brackets, numbers, x, y, z, pi, e and the functions above. An
+        equation "left = right" means left - right. It is read as a tree and never run as Python,
+        so that a text from anywhere does no harm.
+    """
+
+    text: str
+    tree: ast.expr
+
+    @classmethod
+    def read(cls, text: str) -> TextFormula:
+        """The formula of a text.
+
+        Raises:
+            ValueError: the text is no formula, saying where and what is wrong.
+        """
+        if len(text) > _LONGEST:
+            raise ValueError(f"a formula has at most {_LONGEST:,} characters, not {len(text):,}")
+        strange = re.search(r"[^A-Za-z0-9_\s.,+*/^()=<>!-]", text)
+        if strange:
+            raise _wrong(text, f"{strange[0]!r} has no meaning here")
+        sides = [cls._side(text, side) for side in re.split(r"(?<![<>=!])=(?!=)", text)]
+        if len(sides) > 2:
+            raise _wrong(text, "more than one = sign")
+        tree = sides[0] if len(sides) == 1 else ast.BinOp(sides[0], ast.Sub(), sides[1])
+        made = cls(text, tree)
+        _check(text, tree)
+        return made
+
+    @staticmethod
+    def _side(text: str, side: str) -> ast.expr:
+        try:
+            return ast.parse(" ".join(side.replace("^", "**").split()), mode="eval").body
+        except (SyntaxError, ValueError, RecursionError, MemoryError):
+            pass
+        missing = re.search(r"[0-9.)]\s*[A-Za-z(]|[xyz)]\s+[A-Za-z0-9(]", side)
+        hint = f"is a * missing at {missing[0]!r}" if missing else "an operator or bracket is amiss"
+        raise _wrong(text, hint)
+
+    def __call__(self, x: Any, y: Any, z: Any) -> Any:
+        try:
+            return _value(self.tree, {"x": x, "y": y, "z": z, **_CONSTANTS})
+        except ZeroDivisionError:
+            raise _wrong(self.text, "it divides by zero") from None
+        except OverflowError:
+            raise _wrong(self.text, "a number in it is too large, or not real") from None
+
+    def __repr__(self) -> str:
+        return self.text
+
+
+def looks_like_formula(text: str) -> bool:
+    """Whether a text that names nothing else is meant as a formula: an equation, or with powers."""
+    return any(sign in text for sign in ("=", "^", "**"))
+
+
+def _wrong(text: str, why: str) -> ValueError:
+    shown = text if len(text) <= 80 else text[:77] + "..."
+    return ValueError(
+        f'{shown!r} is no formula in x, y and z: {why}; write it as in "x^2 + y^2 = 1 + sin(2*z)"'
+    )
+
+
+def _check(text: str, node: ast.expr, depth: int = 0) -> None:
+    """Raise ValueError for anything in a tree that is not allowed, or no function."""
+    if depth > _DEEPEST:
+        raise _wrong(text, f"more than {_DEEPEST} operations are within each other")
+    if isinstance(node, ast.BinOp):
+        if not isinstance(node.op, ast.Pow) and type(node.op) not in _OPERATORS:
+            raise _wrong(text, "the operators are + - * / ^")
+        _check(text, node.left, depth + 1)
+        _check(text, node.right, depth + 1)
+    elif isinstance(node, ast.UnaryOp):
+        if not isinstance(node.op, ast.USub | ast.UAdd):
+            raise _wrong(text, "the signs are + and -")
+        _check(text, node.operand, depth + 1)
+    elif isinstance(node, ast.Name):
+        known = (*_COORDINATES, *_CONSTANTS)
+        if node.id not in known:
+            raise _wrong(
+                text,
+                f"{node.id!r} is unknown, there are {', '.join(known)} and {', '.join(_FUNCTIONS)}"
+                f"{did_you_mean(node.id, _FUNCTIONS)}",
+            )
+    elif isinstance(node, ast.Constant):
+        value = node.value
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise _wrong(text, f"{value!r} is no real number")
+        if not math.isfinite(_as_float(text, value)):
+            raise _wrong(text, "a number is too large")
+    elif isinstance(node, ast.Call):
+        _check_call(text, node, depth + 1)
+    elif isinstance(node, ast.Compare):
+        raise _wrong(text, "an equation has one = between its two sides")
+    else:
+        raise _wrong(text, f"{ast.unparse(node)!r} is not understood")
+
+
+def _as_float(text: str, value: float) -> float:
+    try:
+        return float(value)
+    except OverflowError:
+        raise _wrong(text, "a number is too large") from None
+
+
+def _check_call(text: str, node: ast.Call, depth: int) -> None:
+    name = node.func.id if isinstance(node.func, ast.Name) else ast.unparse(node.func)
+    if name in (*_COORDINATES, *_CONSTANTS) or not isinstance(node.func, ast.Name):
+        raise _wrong(text, f"is a * missing after {name!r}")
+    if name not in _FUNCTIONS:
+        known = ", ".join(_FUNCTIONS)
+        hint = did_you_mean(name, _FUNCTIONS)
+        raise _wrong(text, f"{name!r} is no known function, there are {known}{hint}")
+    least, most = _SEVERAL.get(name, (1, 1))
+    if node.keywords or not least <= len(node.args) <= most:
+        count = f"{least}" if least == most else f"{least} or {most}"
+        plural = "s" if most > 1 else ""
+        raise _wrong(text, f"{name} takes {count} argument{plural}, not {len(node.args)}")
+    for one in node.args:
+        _check(text, one, depth)
+
+
+def _value(node: ast.expr, names: Mapping[str, Any]) -> Any:
+    """The value of a tree that was checked."""
+    match node:
+        case ast.BinOp(left, ast.Pow(), right):
+            base, exponent = _value(left, names), _value(right, names)
+            return _power(base, exponent)
+        case ast.BinOp(left, op, right):
+            return _OPERATORS[type(op)](_value(left, names), _value(right, names))
+        case ast.UnaryOp(ast.USub(), operand):
+            return -_value(operand, names)
+        case ast.UnaryOp(_, operand):
+            return _value(operand, names)
+        case ast.Name(name):
+            return names[name]
+        case ast.Constant(value):
+            return float(value)  # pyright: ignore
+        case ast.Call(ast.Name(name), arguments):
+            return _FUNCTIONS[name](*(_value(one, names) for one in arguments))
+        case _:
+            raise AssertionError(f"{node} was checked")
+
+
+def _power(base: Any, exponent: Any) -> Any:
+    """base^exponent, whole exponents as such: they are powers of negative numbers, too."""
+    if isinstance(exponent, float) and exponent.is_integer():
+        exponent = int(exponent) if abs(exponent) < 2**31 else exponent
+    if isinstance(base, float) and isinstance(exponent, int | float):
+        result: Any = base ** float(exponent)
+        if isinstance(result, complex):
+            raise OverflowError
+        return result
+    return base**exponent
