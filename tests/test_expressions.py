@@ -166,6 +166,13 @@ def test_where_a_formula_is_not_defined_nothing_is_claimed() -> None:
     assert hits.t[1] == pytest.approx(3.0, abs=1e-3)
 
 
+def test_promises_without_a_radius_are_no_broken_ones() -> None:
+    # Of one of the points tried, beside f = 0, no Lipschitz constant is known.
+    box = hk.Box((-1, -1, -1), (1, 1, 1))
+    field = hk.expression("sin(3*x)*cos(2*y) + exp(-z*z) - 0.4 + 0.3*z^3", domain=box)
+    check_field(field)
+
+
 def test_a_false_claim_of_convexity_is_found() -> None:
     check_field(hk.expression(lambda x, y, z: x * x + 2 * y * y + z * z - 1, is_convex=True))
     saddle = hk.expression(lambda x, y, z: x * x - y * y + z, is_convex=True)

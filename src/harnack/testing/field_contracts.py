@@ -190,11 +190,11 @@ def _check_promise(
             beyond = np.maximum(known.lower[:, None] - value, value - known.upper[:, None])
             excess = beyond - rounding
         elif isinstance(known, Lipschitz):
-            excess = np.abs(moved) - known.constant[:, None] * t - rounding
+            excess = np.abs(moved) - _constants(known, t) * t - rounding
         else:
             assert isinstance(known, Curvature)
             slope = np.einsum("nk,nk->n", look.gradient, d)[:, None]
-            bent = np.abs(moved - slope * t) - 0.5 * known.constant[:, None] * t * t
+            bent = np.abs(moved - slope * t) - 0.5 * _constants(known, t) * t * t
             excess = bent - rounding - look.gradient_error[:, None] * t
         worst = excess.argmax(axis=1)
         rows = np.arange(len(points))
@@ -212,6 +212,12 @@ def _way_out(field: Field, points: FloatArray, d: FloatArray) -> FloatArray:
     ends = field.domain.prepare(backend).clip(o, way, backend.Float(0), backend.Float(np.inf))
     end = np.broadcast_to(to_numpy(ends[1]), (len(points),))
     return np.maximum(end * (1 - 1e-9) - 1e-12 * np.abs(points).max(axis=1), 0)
+
+
+def _constants(known: Lipschitz | Curvature, t: FloatArray) -> FloatArray:
+    """The constants (n, m) that hold at distances t (n, m): an infinite one, which is of no use, says
+    nothing of the point itself."""
+    return np.where(t > 0, known.constant[:, None], 0.0)
 
 
 def _beyond_ball(
