@@ -99,3 +99,13 @@ def test_cells_of_an_octree_fill_the_box_and_keep_the_set() -> None:
     hull = carve(lower, upper, clearance, 10_000, 4).wrapped(0.0)
     assert hull.contains_points(on).all()
     assert not len(carve(lower, upper, lambda x: np.full(len(x), 9.0), 100, 3).corners)
+
+
+def test_closed_meshes_are_turned_outwards() -> None:
+    for text in ("x^2 + y^2 + z^2 = 1", "1 = x^2 + y^2 + z^2"):
+        ball = hk.expression(text, domain=hk.Ball(radius=1.5))
+        made = hk.mesh(ball, tolerance=1e-2)
+        assert made.is_watertight
+        assert made.volume == pytest.approx(4 / 3 * np.pi, rel=0.02)
+        outwards = np.einsum("nk,nk->n", made.face_normals, made.triangles_center)
+        assert (outwards > 0).all()

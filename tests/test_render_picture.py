@@ -163,9 +163,40 @@ def test_materials_are_told_apart_and_one_may_be_given_for_each_surface() -> Non
     np.testing.assert_array_equal(red, same)
     np.testing.assert_array_equal(red, draw(pair, material="#f00"))
     assert (red[..., 0] > 2 * red[..., 2]).mean() > 0.1
+    black = draw(pair, material="black", show="shaded", backdrop="white")
+    assert 0.02 < black[black.max(axis=-1) < 0.9].mean() < 0.3
     own = draw(pair, material=Material({"type": "diffuse"}))
     dictionary = draw(pair, material={"type": "twosided", "nested": {"type": "diffuse"}})
     np.testing.assert_allclose(own, dictionary, atol=1e-6)
+
+
+def test_levels_of_one_field_may_have_materials_of_their_own() -> None:
+    levels, names = [-0.5, 0.5], ["red", "blue"]
+    one = draw(GYROID, level=levels, material=names, show="shaded", tolerance=1e-4)
+    pair = [hk.level_set(GYROID, level, tolerance=1e-4) for level in levels]
+    np.testing.assert_array_equal(one, draw(pair, material=names, show="shaded"))
+    with pytest.raises(ValueError, match=r"a surface is drawn twice.*level=\[a, b\]"):
+        draw([GYROID, GYROID], level=levels, material=names)
+    with pytest.raises(ValueError, match="give one material or 2, one for each level, not 3"):
+        draw(GYROID, level=levels, material=["red", "blue", "gold"])
+
+
+def test_parts_of_one_surface_may_be_drawn_as_several() -> None:
+    halves = [hk.Box((0, -1, -1), (1, 1, 1)), hk.Box((-1, -1, -1), (0, 1, 1))]
+    parts = [hk.level_set(hk.Sphere(0.9), clip=half) for half in halves]
+    image = draw(parts, material=["red", "blue"], show="shaded")
+    assert (image[..., 0] > 2 * image[..., 2]).any()
+    assert (image[..., 2] > 2 * image[..., 0]).any()
+
+
+def test_tubes_around_boundaries_have_a_material() -> None:
+    gold = draw(POLYGON, boundary=0.1, show="shaded")
+    same = draw(POLYGON, boundary=0.1, boundary_material="gold", show="shaded")
+    np.testing.assert_array_equal(gold, same)
+    blue = draw(POLYGON, boundary=0.1, boundary_material="blue", show="shaded")
+    assert ((blue[..., 2] > 2 * blue[..., 0]) & (gold[..., 0] > gold[..., 2])).mean() > 0.005
+    with pytest.raises(ValueError, match="boundary_material is of tubes: give their radius"):
+        draw(POLYGON, boundary_material="gold")
 
 
 def test_camera_and_backdrop_change_the_picture() -> None:

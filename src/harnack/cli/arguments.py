@@ -182,6 +182,9 @@ def _add_surface(one: Any) -> None:
         "--boundary-tube", type=_positive, metavar="RADIUS",
         help="draw a tube around the curve at which it ends",
     )  # fmt: skip
+    group.add_argument(
+        "--boundary-material", type=_material, metavar="NAME", help="what it is made of (gold)"
+    )
     _add_choice(
         group, "--bound", BOUNDS, "the proof that steps are made by (the longest of all that apply)"
     )

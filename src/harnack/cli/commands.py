@@ -127,7 +127,8 @@ def _of_surfaces(options: Any) -> dict[str, Any]:
         "confirm": True if options.confirm else None, "bound": options.bound,
         "solid": options.solid, "clip": _clip(options), "section": _section(options),
         "largest": True if options.largest else None, "cut_material": options.cut_material,
-        "boundary": options.boundary_tube, "thickness": options.thickness,
+        "boundary": options.boundary_tube, "boundary_material": options.boundary_material,
+        "thickness": options.thickness,
     }  # fmt: skip
     return {name: value for name, value in asked.items() if value is not None}
 

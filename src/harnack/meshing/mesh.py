@@ -88,7 +88,9 @@ def mesh(
 
     Returns:
         A trimesh.Trimesh. Vertices of a curve come first, in order, bit by bit, and its edges are
-        the rim. `metadata["harnack"]` has level, spacing, evaluations, the Euler characteristic,
+        the rim. Without a rim, faces are turned outwards: the volume is positive; else they
+        are turned towards larger values. `metadata["harnack"]` has level, spacing, evaluations,
+        the Euler characteristic,
         boundary: indices (k, 2) of edges of one face,
         creases: how many edges have faces more than 30 degrees apart: a function with kinks, such
             as |x| or max(f, g), has them where its level set does. That these are within the

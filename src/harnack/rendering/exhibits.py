@@ -20,7 +20,8 @@ from harnack.rendering.surfaces.isolines import Isolines
 from harnack.tracer import LevelSet, level_set
 
 OF_STUDIO = (
-    "material", "camera", "backdrop", "up", "boundary", "cut_material", "isolines", "thickness",
+    "material", "camera", "backdrop", "up", "boundary", "boundary_material", "cut_material",
+    "isolines", "thickness",
 )  # fmt: skip
 _OWN = (
     "show", "size", "spp", "antialias", *OF_STUDIO, "of", "value_range", "colorbar", "max_depth",
@@ -51,6 +52,7 @@ def exhibits(
     settings: Mapping[str, Any],
     *,
     boundary: float | None = None,
+    boundary_material: Any = None,
     cut: Any = None,
     isolines: tuple[Isolines, ...] = (),
     thickness: float | None = None,
@@ -58,7 +60,7 @@ def exhibits(
     """Fields and level sets as they stand on the stage, with lines on them, and tubes around where
     they end.
 
-    boundary: the radius of these tubes; None for no tubes.
+    boundary: the radius of these tubes; None for no tubes. boundary_material: golden if None.
     cut: the material of the faces of solids on their section; None for their own.
     thickness: of sheets to draw in place of surfaces; None for the surfaces.
 
@@ -74,19 +76,29 @@ def exhibits(
             raise TypeError(f"a list to draw holds fields and level sets, not {one!r}")
     listed = isinstance(materials, list | tuple) and not _is_color(materials)
     names: list[Any] = [*materials] if listed else [materials] * len(given)
-    if len(names) != len(given):
-        several = f" or {len(given)}, one for each surface" if len(given) > 1 else ""
-        raise ValueError(f"give one material{several}, not {len(names)}")
+    drawn: list[tuple[Any, Mapping[str, Any]]] = [(one, settings) for one in given]
+    several = settings.get("level")
+    levels: list[Any] = [*several] if isinstance(several, list | tuple) else []
+    if len(given) == 1 and listed and len(names) == len(levels):
+        drawn = [(given[0], {**settings, "level": level}) for level in levels]
+    if len(names) != len(drawn):
+        count = max(len(given), len(levels))
+        each = f" or {count}, one for each {'surface' if len(given) > 1 else 'level'}"
+        raise ValueError(f"give one material{each if count > 1 else ''}, not {len(names)}")
     fitted = "tolerance" not in settings
     made: list[StudioObject] = []
-    for one, name in zip(given, names, strict=True):
+    for (one, own_settings), name in zip(drawn, names, strict=True):
         material = material_of(name)
-        surface = _surface(one, settings, material.transparent)
+        surface = _surface(one, own_settings, material.transparent)
         own = surface.solid is None and len(given) > 1  # then it is meant for the others
         lines = tuple(line for line in isolines if not (own and line.function is surface.field))
         fits = fitted and isinstance(one, Field)
         made.append(StudioObject(surface, material, fits, isolines=lines))
-    rims = [] if boundary is None else _rims(made, boundary)
+    _refuse_doubles([one.surface for one in made])
+    if boundary is None and boundary_material is not None:
+        raise ValueError("boundary_material is of tubes: give their radius as well, boundary=0.03")
+    rim = material_of(_RIM if boundary_material is None else boundary_material)
+    rims = [] if boundary is None else _rims(made, boundary, rim)
     if thickness is not None:
         made = [replace(one, surface=_thick(one.surface, thickness)) for one in made]
     if cut is not None:
@@ -122,17 +134,38 @@ def _with_faces(made: list[StudioObject], material: Material) -> list[StudioObje
     ]
 
 
-def _rims(made: list[StudioObject], radius: Any) -> list[StudioObject]:
+def _refuse_doubles(surfaces: list[LevelSet]) -> None:
+    """Raise ValueError for one surface that is there twice: which is seen would be an accident."""
+    for k, one in enumerate(surfaces):
+        for other in surfaces[:k]:
+            same = _is_cut_alike(one, other) and one.solid == other.solid
+            if same and set(one.numbers) & set(other.numbers):
+                raise ValueError(
+                    "a surface is drawn twice: levels are those of every field. Give one field "
+                    "with level=[a, b] and material=[one, two], or harnack.level_set(field, a) for "
+                    "each"
+                )
+
+
+def _is_cut_alike(one: LevelSet, other: LevelSet) -> bool:
+    """Whether both are of the same field, in the same volume."""
+    same = one.field is other.field
+    return same and one.clip == other.clip and one.section == other.section
+
+
+def _rims(made: list[StudioObject], radius: Any, material: Material) -> list[StudioObject]:
     """Tubes around the curves at which surfaces end."""
     if isinstance(radius, bool) or not isinstance(radius, int | float) or not 0 < radius < math.inf:
         raise ValueError(f"boundary is the radius of a tube, such as 0.03, not {radius!r}")
     rims: list[StudioObject] = []
-    for one in made:
+    for k, one in enumerate(made):
         curves = one.surface.field.boundary_curves
+        if any(_is_cut_alike(one.surface, other.surface) for other in made[:k]):
+            continue  # another level of the same
         if curves:
             closed = [np.vstack([curve, curve[:1]]) for curve in curves]
             tube = level_set(Tube.around(closed, float(radius)), clip=one.surface.cut)
-            rims.append(StudioObject(tube, material_of(_RIM), fitted=True))
+            rims.append(StudioObject(tube, material, fitted=True))
     if not rims:
         raise ValueError("boundary: none of these surfaces ends at a curve")
     return rims

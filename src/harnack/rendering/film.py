@@ -187,8 +187,8 @@ def _points(moments: list[dict[str, Any]]) -> FloatArray:
 
 # Settings that do not change where a surface is.
 _OF_PICTURES = (
-    "camera", "material", "cut_material", "backdrop", "up", "spp", "antialias", "isolines", "of",
-    "value_range", "colorbar", "max_depth", "seed", "denoise",
+    "camera", "material", "boundary_material", "cut_material", "backdrop", "up", "spp", "antialias",
+    "isolines", "of", "value_range", "colorbar", "max_depth", "seed", "denoise",
 )  # fmt: skip
 
 

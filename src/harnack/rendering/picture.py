@@ -63,6 +63,7 @@ def render(
     backdrop: Any = None,
     up: str | tuple[float, float, float] | None = None,
     boundary: float | None = None,
+    boundary_material: MaterialLike | None = None,
     cut_material: MaterialLike | None = None,
     isolines: Isolines | Sequence[Isolines] | None = None,
     thickness: float | None = None,
@@ -108,7 +109,7 @@ def render(
     In the studio only:
 
     material: a name of `MATERIALS`, a color as for the backdrop, a `Material` or a BSDF dictionary;
-        a list, one for each surface.
+        a list, one for each surface or, of one field, for each level.
     camera: where the stage is seen from, a `Camera`, or (x, y, z) in the surfaces' coordinates.
     backdrop: "light" or "dark", with a floor. Or nothing but the surfaces before a color, by its
         name in CSS such as "white", "#rrggbb" or as three numbers of sRGB; before (bottom, top),
@@ -117,8 +118,8 @@ def render(
         alpha in PNG and EXR files and as a fourth number, by which the first three are multiplied.
     up: what is up, "x", "y", "z", "-x", ... or a direction in the surfaces' coordinates; by
         default z.
-    boundary: the radius, in the surfaces' coordinates, of a golden tube around the curves at which
-        surfaces end (`Field.boundary_curves`).
+    boundary: the radius, in the surfaces' coordinates, of a tube around the curves at which
+        surfaces end (`Field.boundary_curves`). boundary_material: its material, by default "gold".
     cut_material: what the faces of opaque solids on their `section` are made of.
     isolines: lines on the surfaces, of heights or of another function, where `show` is "color" or
         "shaded": an `Isolines` or several.
@@ -161,12 +162,15 @@ def render(
     if in_studio:
         check_memory(asked.show, *(asked.size or _SIZE))
         on_stage = exhibits(
-            what, material, settings, boundary=boundary, cut=cut_material,
-            isolines=asked.isolines, thickness=thickness,
+            what, material, settings, boundary=boundary, boundary_material=boundary_material,
+            cut=cut_material, isolines=asked.isolines, thickness=thickness,
         )  # fmt: skip
         stage, scene = _staged(mi, asked, on_stage, up)
     else:
-        given = material, camera, backdrop, up, boundary, cut_material, isolines, thickness
+        given = (
+            material, camera, backdrop, up, boundary, boundary_material, cut_material, isolines,
+            thickness,
+        )  # fmt: skip
         of_studio = dict(zip(OF_STUDIO, given, strict=True))
         refuse_studio_settings({**of_studio, **settings})
         stage, scene = None, _loaded(mi, what, asked.size)

@@ -215,8 +215,8 @@ def _way_out(field: Field, points: FloatArray, d: FloatArray) -> FloatArray:
 
 
 def _constants(known: Lipschitz | Curvature, t: FloatArray) -> FloatArray:
-    """The constants (n, m) that hold at distances t (n, m): an infinite one, which is of no use, says
-    nothing of the point itself."""
+    """The constants (n, m) that hold at distances t (n, m): an infinite one, which is of no use,
+    says nothing of the point itself."""
     return np.where(t > 0, known.constant[:, None], 0.0)
 
 

@@ -97,6 +97,7 @@ def simplified(surface: Surface, tolerance: float) -> tuple[Surface, dict[str, A
 
 def finished(surface: Surface, facts: dict[str, Any], is_closed: bool) -> trimesh.Trimesh:
     """The mesh, which is a manifold (`check_manifold`), with what is known of it in its metadata.
+    Without a rim it is turned so that its volume is positive.
 
     Raises:
         MeshingError: it ought to be closed and to have a positive volume, and is not.
@@ -112,6 +113,8 @@ def finished(surface: Surface, facts: dict[str, Any], is_closed: bool) -> trimes
                 "the part did not close, or is inside out: choose a smaller `spacing`"
             )
         facts = {**facts, "volume": volume}
+    elif not len(boundary) and made.volume < 0:  # f is larger inside
+        made.invert()
     made.metadata["harnack"] = {
         "proved": 0,
         "integrated": 0,

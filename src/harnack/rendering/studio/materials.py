@@ -11,8 +11,9 @@ from harnack.rendering.surfaces.colours import NAMED_COLOURS, Colour, colour_of,
 
 Dictionary = dict[str, Any]
 
-# How rough a surface is that only a colour is given of: between porcelain and eggshell.
-_PAINT = 0.2
+# How rough a surface is that only a colour is given of: between porcelain and eggshell. No paint
+# reflects all light, or none.
+_PAINT, _BLACK, _WHITE = 0.2, 0.005, 0.9
 
 
 def _rgb(colour: Colour) -> Dictionary:
@@ -84,6 +85,11 @@ def _tinted(tint: Colour, index: float = 1.5) -> Material:
     return Material(glass, transparent=True, tint=tint)
 
 
+def _painted(colour: Colour) -> Material:
+    red, green, blue = (max(_WHITE * part, _BLACK) for part in colour)
+    return Material(_glazed((red, green, blue), _PAINT))
+
+
 MATERIALS: Mapping[str, Material] = {
     "two-tone": Material(_glazed((0.80, 0.255, 0.11), 0.22), _glazed((0.07, 0.25, 0.40), 0.22)),
     "eggshell": Material(_glazed((0.66, 0.13, 0.06), 0.3), _glazed((0.80, 0.74, 0.64), 0.3)),
@@ -120,7 +126,7 @@ def material_of(wanted: Any) -> Material:
     if isinstance(wanted, str) and wanted in MATERIALS:
         return MATERIALS[wanted]
     try:
-        return Material(_glazed(linear(colour_of(wanted, "material")), _PAINT))
+        return _painted(linear(colour_of(wanted, "material")))
     except TypeError:
         raise TypeError(
             f"a material is a name, a color, a Material or a BSDF dictionary, not {wanted!r}; "
