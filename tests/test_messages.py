@@ -15,12 +15,14 @@ import harnack as hk
 from harnack.choices import did_you_mean
 from harnack.cli import main
 from harnack.cli.messages import error_line, level_text, printable
+from harnack.files import FileFormatError
 from harnack.geometry import shapes
 from harnack.geometry.mesh_shapes import icosphere
 from harnack.opening import open_surface
-from harnack.rendering import MATERIALS, UnboundedSurfaceError
+from harnack.rendering import MATERIALS, UnboundedSurfaceError, shape
 
 POLYGON = hk.SolidAngle(shapes.wavy_polygon(12))
+KNOT, RAY = shapes.torus_knot(2, 3, 12), ([[0, 0, 3]], [[0, 0, -1]])
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0.3\nv 0 1 0\nf 1 2 3 4\n"
 SMALL = ["--size", "8x8", "--show", "normal", "--quiet"]
 
@@ -94,6 +96,21 @@ def test_a_picture_larger_than_memory_is_refused(monkeypatch: pytest.MonkeyPatch
 @pytest.mark.parametrize(
     ("make", "complaint"),
     [
+        (lambda: hk.trace(KNOT, *RAY), r"field is needed.*curve, take harnack.SolidAngle"),  # pyright: ignore
+        (lambda: hk.trace(hk.Gyroid, *RAY), r"the class Gyroid itself.* Gyroid\(...\)"),  # pyright: ignore
+        (lambda: hk.signed_distance(icosphere(1), [[0, 0, 1]]), "needed, .* not of type"),  # pyright: ignore
+        (lambda: hk.mesh(abs), "a function: of a formula, take harnack.expression"),  # pyright: ignore
+        (lambda: hk.render("x^2 + y^2 = 1"), "no such file; of a formula, take"),
+        (lambda: hk.render([KNOT]), "level sets, not what is of type ndarray: of points"),
+        (lambda: hk.trace(hk.Gyroid(1.0, domain="ball"), *RAY), "domain of a Gyroid must be a"),  # pyright: ignore
+        (lambda: hk.Ball(2), r"about the origin, write Ball\(radius=2\)"),  # pyright: ignore
+        (lambda: hk.Ball(radius="2"), "radius of a ball must be a number, not '2'"),  # pyright: ignore
+        (lambda: shapes.torus_knot("2", 3, 60), "p of a torus knot must be a whole number"),  # pyright: ignore
+        (lambda: hk.Isolines("z", levels="0.1"), "levels of isolines must be numbers"),
+        (lambda: hk.mesh(POLYGON, thickness="0.1"), "thickness must be a number"),  # pyright: ignore
+        (lambda: hk.expression(lambda x, y, z: x == y), "write left - right"),
+        (lambda: shape(POLYGON, material="gold"), "has a bsdf, and no material"),
+        (lambda: shape(POLYGON, bsdf="gold"), r"MATERIALS\['gold'\].front, not str"),
         (lambda: hk.SphericalHarmonic(2.5, 1), r"two whole numbers, .* not \(2.5, 1\)"),  # pyright: ignore[reportArgumentType]
         (lambda: hk.HarmonicPolynomial("x"), r"such as \{\(2, 1, 0\): 1, .* not by 'x'"),  # pyright: ignore[reportArgumentType]
         (lambda: hk.Gyroid("a"), "edge length of the cell must be a number, not 'a'"),  # pyright: ignore[reportArgumentType]
@@ -103,8 +120,20 @@ def test_a_picture_larger_than_memory_is_refused(monkeypatch: pytest.MonkeyPatch
 def test_fields_of_wrong_things_say_what_they_want(
     make: Callable[[], object], complaint: str
 ) -> None:
-    with pytest.raises(TypeError, match=complaint):
+    with pytest.raises((TypeError, FileFormatError), match=complaint):
         make()
+
+
+def test_what_cannot_be_seen_or_drawn_is_said(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="clip and section have no room in common with it"):
+        draw(clip=hk.Ball((5, 5, 5), 1.0))
+    with pytest.raises(ValueError, match="at s = 0 of the film, the surface of level 0 reaches"):
+        hk.animate(POLYGON, tmp_path / "a.gif", level=lambda s: s, frames=3, size=(16, 12))
+    with pytest.raises(ValueError, match=r"its Laplacian is 4, not 0"):
+        hk.HarmonicPolynomial({(2, 0, 0): 1, (0, 2, 0): 1})
+    with pytest.raises(ValueError, match=r"rotated\(degrees, axis\), such as rotated\(30"):
+        hk.Sphere(1.0).rotated("x", 30)  # pyright: ignore
+    assert not list(tmp_path.iterdir())
 
 
 def test_methods_and_certificates_that_there_are_not() -> None:

@@ -210,7 +210,9 @@ class Operators(abc.ABC):
     __bool__ = __lt__ = __le__ = __gt__ = __ge__ = _undecided
 
     def __eq__(self, other: object) -> bool:
-        return self._undecided(other)
+        raise TypeError(
+            "a formula is a number and no comparison: for left == right, write left - right"
+        )
 
     __hash__ = object.__hash__
 

@@ -14,6 +14,7 @@ from harnack.backend.extrema import fmax, fmin
 from harnack.distance.batches import in_batches
 from harnack.distance.tangent import TangentPlane
 from harnack.fields.batch import BatchedField
+from harnack.fields.field import check_is_field
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -73,6 +74,7 @@ def curvature(field: Field, points: Any, *, precision: Precision = "double") -> 
         NotImplementedError: the field has no second derivatives.
         TypeError, ValueError: points that are not an (n, 3) array of finite numbers.
     """
+    check_is_field(field)
     backend = choose_backend(precision)
     if not isinstance(field, BatchedField):
         prepared = field.prepare(backend)

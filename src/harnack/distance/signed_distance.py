@@ -17,7 +17,7 @@ from harnack.distance.closest import Closest, find_closest
 from harnack.distance.estimates import first_order, second_order
 from harnack.enclosures import TargetLevels
 from harnack.fields.clearance import distance_below
-from harnack.fields.field import Field
+from harnack.fields.field import Field, check_is_field
 from harnack.tracer import level_set
 
 if TYPE_CHECKING:
@@ -175,6 +175,7 @@ def _silent(message: str) -> None:
 
 
 def _surface(field: Field, level: Any) -> LevelSet:
+    check_is_field(field)
     if field.has_sheets and type(field).distance_to_sheets is Field.distance_to_sheets:
         raise NotImplementedError(
             f"{type(field).__name__} has sheets but does not say how far they are: define its "

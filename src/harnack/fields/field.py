@@ -10,6 +10,7 @@ from __future__ import annotations
 import abc
 import copy
 import functools
+import inspect
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar, cast
 
@@ -30,6 +31,7 @@ from harnack.fields.look import Look, Path, Sample, lengthened
 from harnack.fields.parts import NO_PART, PartEntry
 from harnack.fields.points import at_points
 from harnack.fields.sheets import NO_SHEET, Crossing, NearestSheet
+from harnack.geometry.volumes.volume import check_volume
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, IntArray, Mask, Precision, Real, Vec3
@@ -453,3 +455,30 @@ def check_in_range(
             raise ValueError(
                 f"no surface has level {level:g}: {what} stays within [{low:.6g}, {high:.6g}]"
             )
+
+
+def check_is_field(given: Any) -> None:
+    """Raise TypeError for what is no field, or one whose domain is no volume."""
+    if not isinstance(given, Field):
+        raise TypeError(
+            f"a harnack field is needed, such as harnack.Gyroid(1.0), not {instead_of_field(given)}"
+        )
+    check_volume(given.domain, f"the domain of a {type(given).__name__}")
+
+
+def instead_of_field(given: Any) -> str:
+    """What a thing is that is no field, and how to make a field of it."""
+    kind, name = type(given).__name__, getattr(given, "__name__", "")
+    if inspect.isclass(given) and issubclass(given, Field):
+        return f"the class {name} itself: make one of it, {name}(...)"
+    if hasattr(given, "vertices") and hasattr(given, "faces"):
+        return f"a {kind}: of a mesh, take harnack.WindingNumber(mesh.vertices, mesh.faces)"
+    if isinstance(given, str):
+        return f"{given[:80]!r}: of a formula, take harnack.expression(text)"
+    if isinstance(given, np.ndarray | list | tuple):
+        return (
+            f"of type {kind}: of points (n, 3) of a closed curve, take harnack.SolidAngle(points)"
+        )
+    if callable(given):
+        return "a function: of a formula, take harnack.expression(function)"
+    return f"of type {kind}"

@@ -7,7 +7,7 @@ means something.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -16,12 +16,19 @@ from harnack.backend.numbers import FloatArray
 Route = Literal["outside", "axis"]
 
 
+def _check_whole(name: str, number: Any) -> None:
+    """Raise TypeError for what is no whole number."""
+    if not isinstance(number, int | np.integer):
+        raise TypeError(f"{name} must be a whole number, not {number!r}")
+
+
 def _angles(n: int, least: int) -> FloatArray:
     """n angles that divide the full turn.
 
     Raises:
-        ValueError: fewer than `least`.
+        ValueError: fewer than `least`. TypeError: no whole number.
     """
+    _check_whole("the number of vertices of a curve", n)
     if n < least:
         raise ValueError(f"this curve needs at least {least} vertices, not {n}")
     return 2.0 * np.pi * np.arange(n) / n
@@ -46,7 +53,10 @@ def torus_knot(
 
     Raises:
         ValueError: p and q have a common divisor, which would be a link.
+        TypeError: they are no whole numbers.
     """
+    _check_whole("p of a torus knot", p)
+    _check_whole("q of a torus knot", q)
     if np.gcd(p, q) != 1:
         raise ValueError(f"p and q of a torus knot must have no common divisor, not {p} and {q}")
     t = _angles(n, 3)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from harnack.fields import Field, Solid, SolidAngle
+from harnack.fields.field import check_is_field
 from harnack.geometry import Box, Intersection, Volume
 from harnack.geometry.volumes import check_volume
 from harnack.meshing.checks import MeshingError, TooLargeError, check_manifold
@@ -150,9 +151,8 @@ def mesh(
     return finished(made, facts, is_closed)
 
 
-def _checked(field: Any) -> Field:
-    if not isinstance(field, Field):
-        raise TypeError(f"mesh needs a field, not {type(field).__name__}")
+def _checked(field: Field) -> Field:
+    check_is_field(field)
     if field.has_parts or field.has_sheets:
         raise TypeError(
             f"{type(field).__name__} is not one continuous function: mesh its parts, or the "

@@ -48,7 +48,11 @@ _CALLED_ELSEWHERE = {
     "color": '"material"', "colour": '"material"', "bsdf": '"material"', "samples": '"spp"',
     "resolution": '"size"', "width": '"size"', "height": '"size"',
     "filename": '"path", the second argument', "output": '"path", the second argument',
-    "file": '"path", the second argument',
+    "file": '"path", the second argument', "title": '"colorbar"', "domain": '"clip"',
+    **dict.fromkeys(
+        ("azimuth", "elevation", "fov", "zoom", "position", "target", "distance"),
+        "camera=harnack.Camera(...), which has it",
+    ),
 }  # fmt: skip
 # Bytes a pixel at the peak, measured at 2048 x 2048 and 4096 x 4096, rounded up.
 _BYTES = {"color": 50, "shaded": 280, "value": 190}

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from harnack.fields import Field, Solid, Tube, WindingNumber
+from harnack.fields.field import instead_of_field
 from harnack.meshing import mesh
 from harnack.rendering.arguments import check_settings
 from harnack.rendering.studio.materials import Material, material_of
@@ -68,12 +69,14 @@ def exhibits(
         TypeError, ValueError: there is nothing to draw, or something wrong with what is asked for.
     """
     check_settings(settings, _OWN)
-    given: list[Any] = [what] if isinstance(what, Field | LevelSet) else list(what)
+    given: list[Any] = [*what] if isinstance(what, list | tuple) else [what]
     if not given:
         raise ValueError("there is nothing to draw: give at least one field")
     for one in given:
         if not isinstance(one, Field | LevelSet):
-            raise TypeError(f"a list to draw holds fields and level sets, not {one!r}")
+            raise TypeError(
+                f"what is drawn are fields and level sets, not what is {instead_of_field(one)}"
+            )
     listed = isinstance(materials, list | tuple) and not _is_color(materials)
     names: list[Any] = [*materials] if listed else [materials] * len(given)
     drawn: list[tuple[Any, Mapping[str, Any]]] = [(one, settings) for one in given]

@@ -25,8 +25,8 @@ from harnack.rendering.picture import render
 from harnack.rendering.progress import progress_bar
 from harnack.rendering.studio.camera import Camera
 from harnack.rendering.studio.upright import upright
+from harnack.rendering.surfaces.extent import UnboundedSurfaceError
 from harnack.rendering.surfaces.framing import visible_points
-from harnack.tracer import LevelSet
 
 FILM_FILES = (".gif", ".mp4")
 _SIZE = (320, 240)
@@ -87,7 +87,7 @@ def animate(
         steps = np.arange(count) / max(count if repeats else count - 1, 1)
         given = {"what": what, "camera": camera, **settings}
         moments = [{name: _at(value, s) for name, value in given.items()} for s in steps.tolist()]
-        cameras = _cameras(moments, turn * steps, size)
+        cameras = _cameras(moments, steps, turn, size)
         with progress_bar("film", progress) as advance:
             for moment, one in zip(moments, cameras, strict=True):
                 frame: dict[str, Any] = {**moment, "camera": one}
@@ -124,7 +124,7 @@ def _at(value: Any, s: float) -> Any:
 
 
 def _cameras(
-    moments: list[dict[str, Any]], turns: FloatArray, size: tuple[int, int]
+    moments: list[dict[str, Any]], steps: FloatArray, turn: float, size: tuple[int, int]
 ) -> list[Camera]:
     """The camera of each picture: one box, target, distance and angle of view for all, but for what
     they say themselves."""
@@ -133,14 +133,14 @@ def _cameras(
     ups = [moment.get("up") for moment in moments]
     stand = [upright("z" if up is None else up) for up in ups]
     boxes = [np.array(one.box.bounds()) for one in cameras if one.box is not None]
-    points = np.concatenate(boxes or [_points(moments)])
+    points = np.concatenate(boxes or [_points(moments, steps)])
     ends = np.array([points.min(axis=0), points.max(axis=0)])
     if boxes:
         points = np.array(np.meshgrid(*ends.T)).reshape(3, -1).T
     box, middle = Box(*map(_three, ends)), _three(ends.mean(axis=0))
     framed = [
-        _turned(replace(one, box=box, target=one.target or middle), turn, way)
-        for one, turn, way in zip(cameras, turns.tolist(), stand, strict=True)
+        _turned(replace(one, box=box, target=one.target or middle), turn * s, way)
+        for one, s, way in zip(cameras, steps.tolist(), stand, strict=True)
     ]
     free = [one.position is None and one.distance is None for one in framed]
     poses = [
@@ -170,18 +170,20 @@ def _turned(camera: Camera, turn: float, stand: FloatArray) -> Camera:
     return replace(camera, position=_three(place))
 
 
-def _points(moments: list[dict[str, Any]]) -> FloatArray:
+def _points(moments: list[dict[str, Any]], steps: FloatArray) -> FloatArray:
     """Points (n, 3) of all that is seen in a film."""
     backend = mitsuba_backend(register())
     seen: list[FloatArray] = []
     last: Any = None
-    for moment in moments:
+    for moment, s in zip(moments, steps.tolist(), strict=True):
         rest = {name: value for name, value in moment.items() if name not in _OF_PICTURES}
         if last is not None and all(rest[name] is last[name] for name in rest):
             continue  # the same surfaces
         last = rest
-        surfaces: list[LevelSet] = surfaces_of(**rest)
-        seen += [visible_points(one, backend) for one in surfaces]
+        try:
+            seen += [visible_points(one, backend) for one in surfaces_of(**rest)]
+        except UnboundedSurfaceError as error:
+            raise ValueError(f"at s = {s:g} of the film, {error}") from None
     return np.concatenate(seen)
 
 

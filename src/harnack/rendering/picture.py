@@ -14,6 +14,7 @@ import numpy.typing as npt
 from rich.console import Console
 
 from harnack.fields import Field
+from harnack.fields.field import instead_of_field
 from harnack.rendering.arguments import (
     Request,
     check_memory,
@@ -216,7 +217,7 @@ def _loaded(mi: Any, what: Any, size: tuple[int, int] | None) -> Any:
     else:
         raise TypeError(
             "draw a field, a LevelSet, a list of them, or a Mitsuba scene, its dictionary or the "
-            f"path of its file, not {what!r}"
+            f"path of its file, not what is {instead_of_field(what)}"
         )
     if not scene.sensors():
         raise ValueError("the scene has no sensor to look through")

@@ -15,6 +15,7 @@ from harnack.backend import backend_of, to_float
 from harnack.backend.arrays import as_data
 from harnack.backend.tensors import is_tensor, numbers_of
 from harnack.enclosures import Choice, Proofs, TargetLevels, choose_proofs
+from harnack.fields.field import check_is_field
 from harnack.geometry import Intersection
 from harnack.geometry.volumes import check_volume
 from harnack.tracer.largest import checked_largest, largest_cells
@@ -175,8 +176,10 @@ def level_set(
     largest: True for the largest component alone, by its shadows along x, y and z, told from
         others by 128 cells along the longest side, or by so many.
 
-    Raises ValueError for a level that is not a finite number or that the field cannot have.
+    Raises ValueError for a level that is not a finite number or that the field cannot have, and
+    TypeError for what is no field.
     """
+    check_is_field(field)
     if solid is not None:
         if level is not None:
             raise ValueError("give either level or solid: the ends of a solid are its levels")

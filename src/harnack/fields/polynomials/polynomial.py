@@ -194,15 +194,15 @@ def _checked(given: Any) -> dict[tuple[int, int, int], float]:
         raise ValueError("a harmonic polynomial needs a coefficient that is not zero")
     rest, worst = laplacian(checked)
     if worst > 1e-9:
-        shown = " + ".join(f"{c:g} {_monomial(powers)}" for powers, c in sorted(rest.items()))
+        terms = [f"{c:g} {_monomial(powers)}".strip() for powers, c in sorted(rest.items())]
+        shown = " + ".join(terms)
         raise ValueError(f"the polynomial is not harmonic: its Laplacian is {shown}, not 0")
     return checked
 
 
 def _monomial(powers: tuple[int, int, int]) -> str:
     named = zip("xyz", powers, strict=True)
-    shown = " ".join(name if n == 1 else f"{name}^{n}" for name, n in named if n)
-    return shown or "1"
+    return " ".join(name if n == 1 else f"{name}^{n}" for name, n in named if n)
 
 
 def _enclosing_radius(domain: Volume) -> float:

@@ -92,7 +92,10 @@ class Affine(Map):
             unit = np.asarray(axis, dtype=np.float64)
             size = np.linalg.norm(unit) if unit.shape == (3,) else 0.0
             if not (np.isfinite(size) and size > 0):
-                raise ValueError(f"axis must be a vector (3,) that is not zero, not {axis!r}")
+                raise ValueError(
+                    "axis must be a vector (3,) that is not zero, or one of x, y, z, not "
+                    f'{axis!r}: write rotated(degrees, axis), such as rotated(30, "x")'
+                )
             unit = unit / size
         angle = math.radians(float(degrees))
         k = np.cross(np.eye(3), unit)  # k v = unit x v

@@ -15,7 +15,7 @@ from harnack.backend import backend_of
 from harnack.backend.extrema import fmax, fmin
 from harnack.backend.lengths import length
 from harnack.enclosures import Curvature, Enclosure, Gaps
-from harnack.fields.field import Field
+from harnack.fields.field import Field, check_is_field
 from harnack.fields.formula import Formula, as_data, is_jet
 from harnack.fields.look import Look, Path, Sample
 from harnack.fields.solids.affine import without_balls
@@ -49,10 +49,7 @@ def solid(
     given = [one for one in (below, above, between, around) if one is not None]
     if len(given) != 1:
         raise ValueError("give exactly one of below=, above=, between=, around=")
-    if not isinstance(field, Field):  # pyright: ignore[reportUnnecessaryIsInstance]
-        raise TypeError(
-            f"field must be a harnack field, such as harnack.Gyroid(1.0), not {field!r}"
-        )
+    check_is_field(field)
     if field.has_sheets:
         raise ValueError(
             f"{type(field).__name__} jumps across sheets: values on both sides of a level may meet "

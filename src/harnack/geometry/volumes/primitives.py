@@ -37,10 +37,16 @@ class Ball(Volume):
     _numbers: Any = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
+        if isinstance(self.center, int | float):
+            raise TypeError(
+                f"a ball is given as Ball(center, radius): for one about the origin, write "
+                f"Ball(radius={self.center!r})"
+            )
         object.__setattr__(self, "center", checked_point(self.center, "the center of a ball"))
-        if not 0.0 < self.radius < np.inf:
+        radius = checked_number(self.radius, "the radius of a ball")
+        if not 0.0 < radius < np.inf:
             raise ValueError(f"the radius of a ball must be positive, not {self.radius!r}")
-        object.__setattr__(self, "radius", float(self.radius))
+        object.__setattr__(self, "radius", radius)
 
     def _on(self, backend: Backend) -> tuple[Vec3, Real]:
         if self._numbers is not None and backend_of(self._numbers[0]) == backend:

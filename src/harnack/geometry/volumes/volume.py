@@ -111,9 +111,9 @@ def checked_point(value: Iterable[float], name: str, *, finite: bool = True) -> 
         numbers = tuple(checked_number(v, name) for v in value)
     except TypeError:
         raise ValueError(f"{name} must be three numbers, not {value!r}") from None
-    if len(numbers) != 3 or any(np.isnan(numbers)):
+    if len(numbers) != 3:
         raise ValueError(f"{name} must be three numbers, not {numbers}")
-    if finite and not all(np.isfinite(numbers)):
+    if any(np.isnan(numbers)) or (finite and not all(np.isfinite(numbers))):
         raise ValueError(f"{name} must be finite, not {numbers}")
     return numbers
 

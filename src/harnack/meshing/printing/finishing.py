@@ -42,7 +42,7 @@ def check_options(tolerance: Any, spacing: Any, thickness: Any, seed: Any) -> No
 
 def _number(value: Any, name: str) -> float:
     try:
-        return float(value)
+        return float("none" if isinstance(value, str) else value)
     except (TypeError, ValueError):
         raise TypeError(f"{name} must be a number, not {value!r}") from None
 

@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from harnack.fields.expressions.text import looks_like_formula
 from harnack.files.file_format import MAX_BYTES, Place, read_bytes
 from harnack.files.surfaces import SURFACE_FILES
 
@@ -64,6 +65,10 @@ def check_scene_file(path: Path) -> None:
         raise Place(path).error(
             "this is a surface file, not a Mitsuba scene (.xml): draw the field that "
             "harnack.opening.open_surface(path).field makes of it"
+        )
+    if looks_like_formula(str(path)) and not path.exists():
+        raise Place(path).error(
+            "there is no such file; of a formula, take the field harnack.expression(text)"
         )
     if not path.suffix and not path.exists():
         raise Place(path).error(

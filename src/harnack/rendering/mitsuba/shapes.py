@@ -54,6 +54,8 @@ def shape(
         if settings:
             raise ValueError(f"{', '.join(settings)}: a LevelSet holds its settings already")
     else:
+        if "material" in settings:
+            raise TypeError("a shape has a bsdf, and no material: that is of harnack.render")
         surface = level_set(surface, **settings)
     props = mi.Properties()
     props["bsdf"] = as_bsdf(mi, bsdf)
@@ -89,5 +91,8 @@ def as_bsdf(mi: Any, bsdf: Any) -> Any:
     if isinstance(bsdf, Mapping):
         made = load_dictionary(mi, cast("Mapping[str, Any]", bsdf))
     if not isinstance(made, mi.BSDF):
-        raise TypeError(f"bsdf must be a BSDF or its dictionary, not {type(made).__name__}")
+        raise TypeError(
+            "bsdf must be a BSDF or its dictionary, such as harnack.rendering.MATERIALS['gold']"
+            f".front, not {type(made).__name__}"
+        )
     return made

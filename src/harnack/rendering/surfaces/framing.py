@@ -69,6 +69,11 @@ def _found(surface: LevelSet, backend: Backend, ends: FloatArray) -> FloatArray:
     lower, upper = ends
     points = _probe(surface, backend, lower, upper, _GRID)
     if len(points) == 0:
+        if (lower > upper).any():
+            raise ValueError(
+                "nothing is to be seen of this surface: its domain, clip and section have no room "
+                "in common with it"
+            )
         raise ValueError(
             "nothing is to be seen of this surface: no ray of a grid on the sides of its box "
             f"{_point(ends[0])} to {_point(ends[1])} meets it; "

@@ -147,7 +147,7 @@ def _positive(value: Any, name: str) -> float:
 
 def _numbers(levels: Any) -> tuple[float, ...]:
     try:
-        given = np.atleast_1d(np.asarray(levels, dtype=np.float64))
+        given = np.atleast_1d(np.asarray("none" if isinstance(levels, str) else levels, float))
     except (TypeError, ValueError):
         raise TypeError(f"levels of isolines must be numbers, not {levels!r}") from None
     if given.ndim != 1 or not given.size or not np.isfinite(given).all():

@@ -33,7 +33,7 @@ def finite(value: Any, name: str) -> float:
         ValueError: it is none.
     """
     try:
-        number = float(value)
+        number = float("none" if isinstance(value, str) else value)
     except (TypeError, ValueError):
         raise ValueError(f"{name} must be a number, not {value!r}") from None
     if not math.isfinite(number):
