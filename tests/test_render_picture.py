@@ -241,7 +241,7 @@ def test_surfaces_stand_on_the_ground() -> None:
         ({"backdrop": "plaid"}, "backdrop must be"),
         ({"level": math.nan}, "finite"),
         ({"what": []}, "nothing to draw"),
-        ({"what": [3]}, "holds fields"),
+        ({"what": [3]}, "what is drawn are fields"),
         ({"what": 3}, "draw a field"),
         ({"what": {"type": "scene"}}, "no sensor"),
         ({"what": {"type": "scene"}, "level": 3.0}, "as it is"),

@@ -171,6 +171,21 @@ def test_bars_show_the_colours_of_their_numbers() -> None:
     np.testing.assert_allclose(ticks, np.linspace(0, len(inside) - 1, 5), atol=1)
 
 
+@pytest.mark.parametrize("passed", [(False, True), (True, False), (True, True)])
+def test_ends_of_bars_are_points_where_numbers_lie_beyond(passed: tuple[bool, bool]) -> None:
+    scale = Scale(-1.0, 3.0, "it")
+    numbers = np.array([-1.0 - passed[0], 0.0, 3.0 + passed[1]])
+    assert scale.passed_by(numbers).passed == passed
+    assert scale.passed_by(numbers.clip(-1, 3)).passed == (False, False)
+    assert Scale.cyclic(1.0, "it").passed_by(numbers).passed == (False, False)
+    black = np.zeros((400, 5, 3), dtype=np.uint8)
+    plain, pointed = (
+        with_bar(black, one, (0, 0, 0))[50:, 5 + 14 : 5 + 14 + 18].max(axis=(1, 2)) > 8
+        for one in (scale, scale.passed_by(numbers))
+    )
+    assert bool(np.flatnonzero(pointed)[-1] > np.flatnonzero(plain)[-1]) == passed[0]
+
+
 @pytest.mark.parametrize("size", [(1, 1), (8, 6), (3, 40)])
 def test_the_smallest_pictures_have_bars(size: tuple[int, int]) -> None:
     picture = hk.render(SPHERE, show="depth", colorbar=True, size=size, progress=False)
@@ -181,7 +196,7 @@ def test_the_smallest_pictures_have_bars(size: tuple[int, int]) -> None:
     ("settings", "message"),
     [
         ({"show": "value"}, "needs the function"),
-        ({"show": "value", "of": "height"}, 'must be "x", "y" or "z"'),
+        ({"show": "value", "of": "height"}, "of: 'height' is no formula"),
         ({"show": "depth", "of": "z"}, 'of is the function of pictures with show="value"'),
         ({"show": "color", "colorbar": True}, 'colorbar is of pictures with show="evaluations"'),
         ({"show": "normal", "value_range": (0, 1)}, "value_range is of pictures with"),

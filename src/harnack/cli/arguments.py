@@ -212,7 +212,11 @@ def _add_lines(one: Any) -> None:
         help="of the colors of values, depths or evaluations (what is seen)",
     )  # fmt: skip
     group.add_argument(
-        "--colorbar", action="store_true", help="put a bar with numbers beside such a picture"
+        "--colorbar", action="store_const", const=True,
+        help="put a bar with numbers beside such a picture",
+    )  # fmt: skip
+    group.add_argument(
+        "--colorbar-title", dest="colorbar", metavar="TITLE", help="the same, under a title"
     )
 
 

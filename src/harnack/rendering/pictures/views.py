@@ -247,4 +247,10 @@ def drawn(
     if isinstance(bar, str):
         scale = replace(scale, name=bar)
     picture = one.picture(view, scale)
-    return with_bar(picture, scale, view.background) if bar else picture
+    if not bar:
+        return picture
+    numbers = np.asarray(one.numbers(view), dtype=np.float64)
+    if show != "evaluations":  # which rays that miss have, too
+        numbers = numbers[view.status == int(Status.HIT)]
+    scale = scale.passed_by(numbers[np.isfinite(numbers)])
+    return with_bar(picture, scale, view.background)

@@ -37,6 +37,7 @@ def require_pillow() -> tuple[Any, Any, Any]:
 def with_bar(pixels: Pixels, scale: Scale, background: Colour) -> Pixels:
     """A picture (h, w, 3) with the bar of its scale to the right: (h, w + more, 3).
 
+    An end of the bar is a point where the picture has numbers beyond it.
     background: behind the bar, sRGB in [0, 1].
     """
     behind = tuple(round(255 * part) for part in background)
@@ -53,13 +54,21 @@ def with_bar(pixels: Pixels, scale: Scale, background: Colour) -> Pixels:
     strip = images.new("RGB", (math.ceil(wide) + 2 * letters, height), behind)
     top = (height - length + letters) // 2
     draw = drawings.Draw(strip)
-    draw.text((letters, max(0, top - gap)), scale.name, font=font, fill=ink, anchor="ls")
+    point = gap if any(scale.passed) else 0  # its height
+    title = max(0, top - gap - point)
+    draw.text((letters, title), scale.name, font=font, fill=ink, anchor="ls")
     values = scale.high - (np.arange(length) + 0.5) / length * (scale.high - scale.low)
     if scale.period is not None:  # the upper end is the lower one
         values = np.minimum(values, np.nextafter(scale.high, scale.low))
     column = (scale.colours(values) * 255 + 0.5).astype(np.uint8)
     for row, colour in enumerate(column):
         draw.line([(letters, top + row), (letters + thick - 1, top + row)], fill=tuple(colour))
+    for is_passed, row, away, colour in zip(
+        scale.passed, (top + length, top - 1), (point, -point), (column[-1], column[0]), strict=True
+    ):
+        if is_passed:
+            ends = [(letters, row), (letters + thick - 1, row), (letters + thick // 2, row + away)]
+            draw.polygon(ends, fill=tuple(colour))
     for value, text in ticks:
         part = (value - scale.low) / (scale.high - scale.low) if scale.high > scale.low else 0.5
         y = top + round((1 - part) * (length - 1))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,7 @@ class Scale:
 
     name: of what is shown, on colour bars.
     period: of numbers that count modulo `high` - `low` = period; None for others.
+    passed: whether numbers that are shown lie below `low`, and above `high`.
     """
 
     low: float
@@ -34,11 +35,20 @@ class Scale:
     name: str
     colours_of: Callable[[Numbers], npt.NDArray[np.float64]] = viridis
     period: float | None = None
+    passed: tuple[bool, bool] = (False, False)
 
     @classmethod
     def cyclic(cls, period: float, name: str) -> Scale:
         """Of numbers that count modulo a period: its ends have one colour."""
         return cls(0.0, period, name, hues, period)
+
+    def passed_by(self, numbers: Numbers) -> Scale:
+        """The same, for the bar of a picture that shows these."""
+        if self.period is not None or not numbers.size:
+            return self
+        slack = 1e-6 * max(abs(self.low), abs(self.high))
+        below, above = numbers.min() < self.low - slack, numbers.max() > self.high + slack
+        return replace(self, passed=(bool(below), bool(above)))
 
     def colours(self, numbers: Numbers) -> npt.NDArray[np.float64]:
         """Colours (..., 3) in sRGB, in [0, 1]."""
