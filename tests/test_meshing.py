@@ -51,7 +51,7 @@ def test_closed_surfaces_are_watertight() -> None:
         (hk.SolidAngle(shapes.wavy_polygon(12)), {"tolerance": 0.0}, "tolerance"),
         (hk.SolidAngle(shapes.wavy_polygon(12)), {"spacing": -1.0}, "spacing"),
         (hk.SolidAngle(hk.Circle(1.0)), {}, "circle.polygon"),
-        ("curve", {}, "needs a field"),
+        ("curve", {}, "a harnack field is needed"),
     ],
 )
 def test_what_cannot_be_meshed_is_refused(field: Any, arguments: Any, message: str) -> None:

@@ -12,8 +12,12 @@ import trimesh
 import harnack as hk
 from harnack.cli import main
 from harnack.geometry import MeshError
-from harnack.geometry.mesh_shapes import icosphere
-from harnack.meshing.repair import _collapsed  # pyright: ignore[reportPrivateUsage]
+from harnack.geometry.mesh_shapes import icosphere, remove_faces, torus_mesh
+from harnack.meshing.repair import (  # pyright: ignore[reportPrivateUsage]
+    _collapsed,
+    _missing_triangles,
+    _open_edges,
+)
 from tests.oracles.triangle_pairs import intersecting_pairs
 
 AXES = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, -0.6, -0.8))
@@ -199,3 +203,47 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert sorted(tmp_path.iterdir()) == [source, target]
     assert main(["repair", str(source), "-o", str(tmp_path / "a.txt")]) == 1
     assert "extension of a mesh" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_meshes_that_lack_single_triangles_get_them_back() -> None:
+    vertices, faces = torus_mesh(1.0, 0.35, 24, 24)
+    rest = remove_faces(faces, 0.1, seed=1)
+    given = trimesh.Trimesh(vertices, rest, process=False)
+    made = hk.repair(given)
+    assert made.faces[: len(rest)].tobytes() == given.faces.tobytes()
+    assert made.is_watertight
+    assert made.is_winding_consistent
+    assert made.euler_number == 0
+    assert made.volume == pytest.approx(trimesh.Trimesh(vertices, faces).volume, rel=2e-3)
+    assert not len(intersecting_pairs(np.asarray(made.vertices), np.asarray(made.faces)))
+    facts = made.metadata["harnack"]
+    assert facts["patches"] == len(made.faces) - len(rest)
+    assert facts["missing"] > 50
+    assert facts["refined"]
+
+
+def test_missing_triangles_are_those_that_stand_in_no_other() -> None:
+    whole = trimesh.Trimesh(*icosphere(2), process=False)
+    faces = np.asarray(whole.faces)[2:]
+    lost = {tuple(sorted(face)) for face in np.asarray(whole.faces)[:2].tolist()}
+    found = missing(whole.vertices, faces)
+    assert {tuple(sorted(face)) for face in found.tolist()} == lost
+    closed = trimesh.Trimesh(whole.vertices, np.concatenate([faces, found]), process=False)
+    assert closed.is_winding_consistent
+    middle = whole.vertices[whole.faces[0]].mean(axis=0)
+    spike = [0.8 * middle, 1.3 * middle, 1.3 * middle + 0.01 * whole.vertices[whole.faces[0][0]]]
+    n = len(whole.vertices)
+    more = np.concatenate([faces, [[n, n + 1, n + 2]]])
+    found = missing(np.concatenate([whole.vertices, spike]), more)
+    assert {tuple(sorted(face)) for face in found.tolist()} == lost - {
+        tuple(sorted(whole.faces[0]))
+    }
+
+
+def test_a_lone_triangle_is_not_covered_by_itself() -> None:
+    assert not len(missing(np.eye(3), np.array([[0, 1, 2]])))
+
+
+def missing(vertices: Any, faces: Any) -> Any:
+    return _missing_triangles(np.asarray(vertices), faces, _open_edges(faces))

@@ -8,6 +8,7 @@ in it, and joined to the mesh by index.
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -27,7 +28,7 @@ from harnack.meshing.edges import Edges, IntArray, directed_edges
 from harnack.meshing.intersections import intersecting_faces
 from harnack.meshing.marching import crossings_of, triangles_of
 from harnack.meshing.points import Boundary, Places, box_cells, place_points
-from harnack.meshing.refining.refinement import improved, refined, smoothed
+from harnack.meshing.refining.refinement import far_places, improved, refined, smoothed
 from harnack.meshing.samples import LevelFunction
 from harnack.meshing.tetrahedra import delaunay
 
@@ -43,7 +44,7 @@ _LEVEL = 2 * math.pi
 _ACROSS = 24
 _ATTEMPTS = 6
 # How often edges of holes that are too near to others are halved for the tetrahedra.
-_MOST_CUTS = 5
+_MOST_CUTS = 12
 # How often patches that meet the mesh are made again, of smaller cells.
 _MOST_MET = 1
 # How far w may be from 1/2, modulo 1, at vertices of patches.
@@ -60,6 +61,10 @@ def repair(
 ) -> trimesh.Trimesh:
     """The mesh with patches over its holes, where its winding number is 1/2 modulo 1.
 
+    If that cannot be meshed, for which holes at one corner are the usual reason, holes of three
+    edges get their triangle, where it passes through no other, and patches are those of the mesh
+    with them.
+
     mesh: anything with `vertices` (n, 3) and `faces` (m, 3): every edge has one or two faces, which
         agree on its two sides.
     tolerance: how far triangles of the patches may be from the surface, as a part of the size of
@@ -74,9 +79,10 @@ def repair(
         order; vertices inside of patches and their faces follow. Every edge has two faces, which
         agree, and no patch meets another triangle but at the edges and corners that they share.
         `metadata["harnack"]` has holes (loops of edges that were open), patches (triangles added),
-        refined (whether they are within the tolerance: they stay as the cells cut them if finer
-        ones would pass through each other, however small cells are made there), spacing,
-        evaluations and the Euler characteristic. A closed mesh gets nothing added.
+        missing (how many of these are the triangles of holes of three edges), refined (whether
+        they are within the tolerance: they stay as the cells cut them if finer ones would pass
+        through each other, however small cells are made there), spacing, evaluations and the Euler
+        characteristic. A closed mesh gets nothing added.
 
     Raises:
         MeshError: a ValueError, for a mesh that is not as said above; the message says where.
@@ -93,11 +99,47 @@ def repair(
     vertices, faces = _checked(mesh)
     edges = _open_edges(faces)
     if not len(edges):
-        return _joined(vertices, faces, _Patches(vertices[:0], faces[:0], True, 0.0, 0), 0)
+        nothing = _Patches(vertices[:0], faces[:0], True, 0.0, 0)
+        return _joined(vertices, faces, nothing, len(faces))
+    asked = _Asked(len(faces), tolerance, spacing, seed, report)
+    try:
+        return _repaired(vertices, faces, edges, asked)
+    except MeshingError:
+        missing = _missing_triangles(vertices, faces, edges)
+        if not len(missing):
+            raise
+    report(f"once more, with triangles in {len(missing):,} holes of three edges")
+    together = np.concatenate([faces, missing])
+    return _repaired(vertices, together, _open_edges(together), asked)
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What `repair` was asked for. given: how many faces there were."""
+
+    given: int
+    tolerance: float
+    spacing: float | None
+    seed: int
+    report: Callable[[str], None]
+
+
+def _repaired(
+    vertices: FloatArray, faces: IntArray, edges: IntArray, asked: _Asked
+) -> trimesh.Trimesh:
+    """The mesh with patches that end at its open edges; cells are made smaller where checks fail.
+
+    Raises:
+        MeshingError: as `repair`.
+    """
+    if not len(edges):
+        nothing = _Patches(vertices[:0], faces[:0], True, 0.0, 0)
+        return _joined(vertices, faces, nothing, asked.given)
     loops = singular_loops(edges, np.ones(len(edges), np.int64))
     function = LevelFunction(SolidAngle([vertices[loop] for loop in loops]), _LEVEL)
     size = float(np.ptp(vertices[np.unique(edges)], axis=0).max())
-    cell = size / _ACROSS if spacing is None else float(spacing)
+    cell = size / _ACROSS if asked.spacing is None else float(asked.spacing)
+    report, tolerance = asked.report, asked.tolerance * size
     finer: tuple[Places, ...] = ()
     times_met = 0
     for attempt in range(_ATTEMPTS):
@@ -105,14 +147,18 @@ def repair(
         report(f"cells of {cell:.3g}" + ", smaller in places" * bool(finer))
         try:
             patches = _patches(
-                function, vertices, edges, cell, finer, tolerance * size, seed, last, report
+                function, vertices, edges, cell, finer, tolerance, asked.seed, last, report
             )
-            result = _joined(vertices, faces, patches, len(loops))
+            result = _joined(vertices, faces, patches, asked.given)
             _check(vertices, faces, result, report)
         except _LocalError as error:
             times_met += isinstance(error, _MetError)
             if last or times_met > _MOST_MET:
-                raise
+                place = ", ".join(f"{c:.4g}" for c in error.points[0])
+                raise MeshingError(
+                    f"{error} (cells were {cell:.3g} wide, and smaller in {len(error.points)} "
+                    f"places, such as near ({place}))"
+                ) from None
             report(f"{error} ({len(error.points)} places)")
             finer = (*finer, Places(error.points, 2 * cell * 0.5 ** len(finer)))
         else:
@@ -195,6 +241,32 @@ def _open_edges(faces: IntArray) -> IntArray:
             "trimesh.repair.fix_winding(mesh)"
         )
     return pairs[uses[index] == 1]
+
+
+def _missing_triangles(vertices: FloatArray, faces: IntArray, edges: IntArray) -> IntArray:
+    """The triangles (k, 3) that holes of three edges lack, where these pass through no others.
+
+    edges: (n, 2) open ones, as the faces run them.
+    """
+    leads: dict[int, set[int]] = defaultdict(set)
+    for a, b in edges.tolist():
+        leads[a].add(b)
+    there = {tuple(sorted(face)) for face in faces.tolist()}
+    found: list[tuple[int, int, int]] = []
+    for a, b in edges.tolist():
+        for c in leads[b]:
+            if a in leads[c] and tuple(sorted((a, b, c))) not in there and b in leads[a]:
+                found.append((a, c, b))
+                for one, other in ((a, b), (b, c), (c, a)):
+                    leads[one].discard(other)
+                break
+    made = np.array(found, np.int64).reshape(-1, 3)
+    corners = vertices[made]
+    made = made[np.linalg.norm(_normals(corners), axis=1) > 0]
+    together = np.concatenate([faces, made])
+    is_made = np.arange(len(together)) >= len(faces)
+    met = np.setdiff1d(intersecting_faces(vertices, together, is_made), np.arange(len(faces)))
+    return np.delete(made, met - len(faces), axis=0)
 
 
 def _patches(
@@ -280,6 +352,13 @@ def _finished(
         report(way)
         finer, split = (x if way == "refining alone" else smoothed(function, x, faces, None)), faces
         finer, split = refined(function, finer, split, 0.5 * tolerance, None, report)
+        far = far_places(function, finer, split, 0.5 * tolerance)
+        if len(far):  # the patch takes another way than the surface, or connects two of its sheets
+            raise _LocalError(
+                f"{len(far):,} triangles of patches do not come near the surface, however they are "
+                "cut: subdivide the mesh there, or choose a smaller `spacing`",
+                far,
+            )
         if way == "improving":
             finer, split = improved(function, finer, split, 0.5 * tolerance, None, report)
         elif way == "smoothing":
@@ -347,18 +426,20 @@ def _check_rim(x: FloatArray, faces: IntArray, boundary: Boundary) -> None:
 
 
 def _joined(
-    vertices: FloatArray, faces: IntArray, patches: _Patches, holes: int
+    vertices: FloatArray, faces: IntArray, patches: _Patches, given: int
 ) -> trimesh.Trimesh:
-    """The mesh and its patches."""
+    """The mesh and its patches. given: how many of the faces were there before."""
     import trimesh
 
+    edges = _open_edges(faces[:given])
     together = np.concatenate([faces, patches.faces])
     result = trimesh.Trimesh(
         np.concatenate([vertices, patches.vertices]), together, process=False, validate=False
     )
     result.metadata["harnack"] = {
-        "holes": holes,
-        "patches": len(patches.faces),
+        "holes": len(singular_loops(edges, np.ones(len(edges), np.int64))) if len(edges) else 0,
+        "patches": len(together) - given,
+        "missing": len(faces) - given,
         "refined": patches.is_fine,
         "spacing": patches.spacing,
         "evaluations": patches.evaluations,

@@ -6,6 +6,7 @@ Vertices and edges of the boundary stay as they are.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,9 +16,9 @@ from harnack.meshing.points import newton
 from harnack.meshing.refining.flips import flipped, without_slivers
 from harnack.meshing.refining.relaxation import relaxed
 from harnack.meshing.rows import dots, lengths
-from harnack.meshing.samples import LevelFunction
+from harnack.meshing.samples import LevelFunction, Samples
 
-__all__ = ["improved", "refined", "smoothed"]
+__all__ = ["far_places", "improved", "refined", "smoothed"]
 
 Walls = tuple[FloatArray, FloatArray] | None
 # Edges shorter than this part of the tolerance are never cut.
@@ -37,29 +38,65 @@ def refined(
     but those of the boundary, and the centres of all faces, are within `tolerance` of it."""
     for round_number in range(_MOST_ROUNDS):
         report(f"refining, round {round_number + 1}: {len(faces):,} triangles")
+        far = _Far.of(function, vertices, faces, tolerance, walls)
+        marked = far.marked
+        if not marked.any():
+            break
+        samples, reach = far.samples.some(marked), 0.5 * far.span[marked]
+        moved = newton(function, far.middle[marked], samples, reach, walls)
+        place = np.full(len(marked), -1, np.int64)
+        place[marked] = len(vertices) + np.arange(int(marked.sum()))
+        vertices = np.concatenate([vertices, moved])
+        faces = _split(vertices, faces, place[far.edges])
+    return vertices, faces
+
+
+def far_places(
+    function: LevelFunction, vertices: FloatArray, faces: IntArray, tolerance: float
+) -> FloatArray:
+    """Middles (k, 3) of the edges that `refined` would still cut."""
+    far = _Far.of(function, vertices, faces, tolerance, None)
+    return far.middle[far.marked]
+
+
+@dataclass(frozen=True)
+class _Far:
+    """Edges and which of them are to be cut.
+
+    edges: (m, 3) of the faces. middle: (k, 3), span: (k,) and marked: (k,) of edges.
+    samples: at the middles.
+    """
+
+    edges: IntArray
+    middle: FloatArray
+    span: FloatArray
+    samples: Samples
+    marked: BoolArray
+
+    @classmethod
+    def of(
+        cls,
+        function: LevelFunction,
+        vertices: FloatArray,
+        faces: IntArray,
+        tolerance: float,
+        walls: Walls,
+    ) -> _Far:
+        """Those whose middle, or the centre of a face beside them, is beyond the tolerance."""
         ends, edges, is_rim = _edges(faces)
         if walls is not None:  # the rim lies in them, and so do the middles of its edges
             is_rim = np.zeros_like(is_rim)
         middle = 0.5 * (vertices[ends[:, 0]] + vertices[ends[:, 1]])
         span = lengths(vertices[ends[:, 0]] - vertices[ends[:, 1]])
         samples = function.at(middle)
-        bulge = samples.distance
-        marked = bulge > tolerance
-        centre = function.at(vertices[faces].mean(axis=1))
-        off = centre.distance > tolerance
+        marked = samples.distance > tolerance
+        off = function.at(vertices[faces].mean(axis=1)).distance > tolerance
         # Of a face that is off, the longest edge that may be cut.
         free = np.where(is_rim[edges], 0.0, span[edges])
         worst = edges[np.arange(len(faces)), free.argmax(axis=1)]
         marked[worst[off]] = True
         marked &= ~is_rim & (span > _SHORTEST * tolerance)
-        if not marked.any():
-            break
-        moved = newton(function, middle[marked], samples.some(marked), 0.5 * span[marked], walls)
-        place = np.full(len(ends), -1, np.int64)
-        place[marked] = len(vertices) + np.arange(int(marked.sum()))
-        vertices = np.concatenate([vertices, moved])
-        faces = _split(vertices, faces, place[edges])
-    return vertices, faces
+        return cls(edges, middle, span, samples, marked)
 
 
 def _edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
