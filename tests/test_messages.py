@@ -129,6 +129,9 @@ def test_what_cannot_be_seen_or_drawn_is_said(tmp_path: Path) -> None:
         draw(clip=hk.Ball((5, 5, 5), 1.0))
     with pytest.raises(ValueError, match="at s = 0 of the film, the surface of level 0 reaches"):
         hk.animate(POLYGON, tmp_path / "a.gif", level=lambda s: s, frames=3, size=(16, 12))
+    ball = hk.Gyroid(1.0, domain=hk.Ball())
+    with pytest.raises(UnboundedSurfaceError, match="does not end at that field's domain"):
+        hk.render(hk.solid(ball, below=0), size=(8, 8))
     with pytest.raises(ValueError, match=r"its Laplacian is 4, not 0"):
         hk.HarmonicPolynomial({(2, 0, 0): 1, (0, 2, 0): 1})
     with pytest.raises(ValueError, match=r"rotated\(degrees, axis\), such as rotated\(30"):

@@ -145,7 +145,8 @@ def _bounds(solid: Solid, level: float, volume: Volume | None) -> tuple[FloatArr
         lower, upper = np.maximum(lower, low), np.minimum(upper, high)
     if not (np.isfinite(lower).all() and np.isfinite(upper).all()):
         raise MeshingError(
-            f"{type(solid).__name__} does not say where it ends: give clip=harnack.Box(lower, "
+            f"{type(solid).__name__} does not say where it ends (a solid does not end at the "
+            "domain of the field it is made of): give clip=harnack.Box(lower, "
             "upper) or harnack.Ball(center, radius)"
         )
     if not (lower < upper).all():

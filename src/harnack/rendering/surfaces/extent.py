@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from harnack.backend import FloatArray
+from harnack.fields import Solid
 
 if TYPE_CHECKING:
     from harnack.tracer import LevelSet
@@ -53,6 +54,8 @@ def _unbounded(surface: LevelSet) -> UnboundedSurfaceError:
             f" (far away, an angle comes near the multiples of its period, {field.period:g}, "
             "and this is one)"
         )
+    if isinstance(field, Solid):
+        reason += " (a solid made of a field does not end at that field's domain)"
     usual = field.default_level
     is_other = usual not in levels and field.extent((usual,)) is not None
     return UnboundedSurfaceError(reason, usual if is_other else None)
