@@ -584,7 +584,7 @@ def test_walls() -> None:
         (lambda: SphericalHarmonic(3, 1, radius=0.0), "radius of a ball must be positive"),
         (
             lambda: HarmonicPolynomial({(2, 0, 0): 1, (0, 1, 1): 3, (0, 3, 0): 1}),
-            r"not harmonic: its Laplacian is 2 1 \+ 6 y, not 0",
+            r"not harmonic: its Laplacian is 2 \+ 6 y, not 0",
         ),
         (lambda: HarmonicPolynomial({(2, 0, 0): 1, (0, 2, 0): -1.001}), "its Laplacian is"),
         (lambda: HarmonicPolynomial({}), "needs a coefficient"),

@@ -148,8 +148,8 @@ def test_the_last_of_several_lines_covers_the_others() -> None:
 @pytest.mark.parametrize(
     ("arguments", "settings", "message"),
     [
-        (("w",), {"spacing": 1}, 'must be "x", "y" or "z"'),
-        ((3,), {"spacing": 1}, 'must be "x", "y" or "z"'),
+        (("w",), {"spacing": 1}, "isolines are drawn: 'w' is no formula"),
+        ((3,), {"spacing": 1}, 'must be a text such as "z" or'),
         (("z",), {}, "say which isolines"),
         (("z", [0]), {"spacing": 1}, "either levels or a spacing"),
         (("z", []), {}, "at least one"),

@@ -101,9 +101,10 @@ def test_a_picture_larger_than_memory_is_refused(monkeypatch: pytest.MonkeyPatch
         (lambda: hk.signed_distance(icosphere(1), [[0, 0, 1]]), "needed, .* not of type"),  # pyright: ignore
         (lambda: hk.mesh(abs), "a function: of a formula, take harnack.expression"),  # pyright: ignore
         (lambda: hk.render("x^2 + y^2 = 1"), "no such file; of a formula, take"),
+        (lambda: hk.mesh(hk.level_set(POLYGON)), "of|a LevelSet: take its .field"),  # pyright: ignore
+        (lambda: hk.render([[POLYGON]]), "give one at a time, or to harnack.render one flat list"),
         (lambda: hk.render([KNOT]), "level sets, not what is of type ndarray: of points"),
         (lambda: hk.trace(hk.Gyroid(1.0, domain="ball"), *RAY), "domain of a Gyroid must be a"),  # pyright: ignore
-        (lambda: hk.Ball(2), r"about the origin, write Ball\(radius=2\)"),  # pyright: ignore
         (lambda: hk.Ball(radius="2"), "radius of a ball must be a number, not '2'"),  # pyright: ignore
         (lambda: shapes.torus_knot("2", 3, 60), "p of a torus knot must be a whole number"),  # pyright: ignore
         (lambda: hk.Isolines("z", levels="0.1"), "levels of isolines must be numbers"),
@@ -129,6 +130,8 @@ def test_what_cannot_be_seen_or_drawn_is_said(tmp_path: Path) -> None:
         draw(clip=hk.Ball((5, 5, 5), 1.0))
     with pytest.raises(ValueError, match="at s = 0 of the film, the surface of level 0 reaches"):
         hk.animate(POLYGON, tmp_path / "a.gif", level=lambda s: s, frames=3, size=(16, 12))
+    with pytest.raises(ValueError, match=r"about the origin, write Ball\(radius=2\)"):
+        hk.Ball(2)  # pyright: ignore
     ball = hk.Gyroid(1.0, domain=hk.Ball())
     with pytest.raises(UnboundedSurfaceError, match="does not end at that field's domain"):
         hk.render(hk.solid(ball, below=0), size=(8, 8))

@@ -162,6 +162,7 @@ def test_materials_are_told_apart_and_one_may_be_given_for_each_surface() -> Non
     red, same = draw(pair, material="red"), draw(pair, material=(1, 0, 0))
     np.testing.assert_array_equal(red, same)
     np.testing.assert_array_equal(red, draw(pair, material="#f00"))
+    np.testing.assert_array_equal(gold, draw(pair, material="Gold"))
     assert (red[..., 0] > 2 * red[..., 2]).mean() > 0.1
     black = draw(pair, material="black", show="shaded", backdrop="white")
     assert 0.02 < black[black.max(axis=-1) < 0.9].mean() < 0.3
@@ -177,6 +178,13 @@ def test_levels_of_one_field_may_have_materials_of_their_own() -> None:
     np.testing.assert_array_equal(one, draw(pair, material=names, show="shaded"))
     with pytest.raises(ValueError, match=r"a surface is drawn twice.*level=\[a, b\]"):
         draw([GYROID, GYROID], level=levels, material=names)
+    turn = POLYGON.period
+    with pytest.raises(ValueError, match="a surface is drawn twice"):
+        draw(POLYGON, level=[1.0, 1.0 + turn], material=names)
+    with pytest.raises(ValueError, match="give one material, not 0"):
+        draw(GYROID, material=[])
+    array = draw(GYROID, level=np.array(levels), material=names, show="shaded", tolerance=1e-4)
+    np.testing.assert_array_equal(one, array)
     with pytest.raises(ValueError, match="give one material or 2, one for each level, not 3"):
         draw(GYROID, level=levels, material=["red", "blue", "gold"])
 
@@ -195,6 +203,8 @@ def test_tubes_around_boundaries_have_a_material() -> None:
     np.testing.assert_array_equal(gold, same)
     blue = draw(POLYGON, boundary=0.1, boundary_material="blue", show="shaded")
     assert ((blue[..., 2] > 2 * blue[..., 0]) & (gold[..., 0] > gold[..., 2])).mean() > 0.005
+    with pytest.raises(ValueError, match="boundary_material: tubes have no inside"):
+        draw(POLYGON, boundary=np.float32(0.1), boundary_material="glass")
     with pytest.raises(ValueError, match="boundary_material is of tubes: give their radius"):
         draw(POLYGON, boundary_material="gold")
 

@@ -223,6 +223,16 @@ def test_meshes_that_lack_single_triangles_get_them_back() -> None:
     assert facts["refined"]
 
 
+def test_points_are_moved_in_another_way_where_a_change_is_not_known() -> None:
+    box = trimesh.creation.box().subdivide().subdivide()
+    rng = np.random.default_rng(628030259)
+    count = int(len(box.faces) * rng.uniform(0.05, 0.15))
+    gone = rng.choice(len(box.faces), count, replace=False)
+    made = hk.repair(trimesh.Trimesh(box.vertices, np.delete(box.faces, gone, 0), process=False))
+    assert made.is_watertight
+    assert made.euler_number == 2
+
+
 def test_missing_triangles_are_those_that_stand_in_no_other() -> None:
     whole = trimesh.Trimesh(*icosphere(2), process=False)
     faces = np.asarray(whole.faces)[2:]

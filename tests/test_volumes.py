@@ -357,7 +357,7 @@ def test_flat_and_straight_sets_get_thin_hulls():
         (lambda: Ball(3.0), "center of a ball must be three numbers"),
         (lambda: Ball((0, 0, np.inf)), "center of a ball must be finite"),
         (lambda: Box((0, 0, 0), (1, -1, 1)), "lower <= upper"),
-        (lambda: Box((0, 0, np.nan), (1, 1, 1)), "lower corner of a box must be three numbers"),
+        (lambda: Box((0, 0, np.nan), (1, 1, 1)), "lower corner of a box must be finite"),
         (lambda: Box((np.inf, 0, 0), (np.inf, 1, 1)), "lower <= upper"),
         (lambda: HalfSpace((0, 0, 0), 1.0), "must not be zero"),
         (lambda: HalfSpace((0, 0, 1), np.inf), "offset of a half-space must be finite"),

@@ -469,6 +469,11 @@ def check_is_field(given: Any) -> None:
 def instead_of_field(given: Any) -> str:
     """What a thing is that is no field, and how to make a field of it."""
     kind, name = type(given).__name__, getattr(given, "__name__", "")
+    if isinstance(getattr(given, "field", None), Field):
+        return f"a {kind}: take its .field, and give its level and clip beside it"
+    parts: list[Any] = [*given] if type(given) in (list, tuple) else []
+    if any(isinstance(one, Field) for one in parts):
+        return f"a {kind} of fields: give one at a time, or to harnack.render one flat list"
     if inspect.isclass(given) and issubclass(given, Field):
         return f"the class {name} itself: make one of it, {name}(...)"
     if hasattr(given, "vertices") and hasattr(given, "faces"):

@@ -20,6 +20,7 @@ from harnack.geometry import MeshError, validate_mesh
 from harnack.geometry.singular import singular_loops, weld_vertices
 from harnack.meshing.checks import (
     MeshingError,
+    TooLargeError,
     check_manifold,
     euler_characteristic,
     singular_vertices,
@@ -104,13 +105,19 @@ def repair(
     asked = _Asked(len(faces), tolerance, spacing, seed, report)
     try:
         return _repaired(vertices, faces, edges, asked)
-    except MeshingError:
+    except MeshingError as error:
         missing = _missing_triangles(vertices, faces, edges)
         if not len(missing):
             raise
+        first = error
     report(f"once more, with triangles in {len(missing):,} holes of three edges")
     together = np.concatenate([faces, missing])
-    return _repaired(vertices, together, _open_edges(together), asked)
+    try:
+        return _repaired(vertices, together, _open_edges(together), asked)
+    except MeshingError as error:
+        raise MeshingError(
+            f"{first}; and with triangles in {len(missing):,} holes of three edges: {error}"
+        ) from error
 
 
 @dataclass(frozen=True)
@@ -141,13 +148,13 @@ def _repaired(
     cell = size / _ACROSS if asked.spacing is None else float(asked.spacing)
     report, tolerance = asked.report, asked.tolerance * size
     finer: tuple[Places, ...] = ()
-    times_met = 0
+    times_met, seed = 0, asked.seed
     for attempt in range(_ATTEMPTS):
         last = attempt == _ATTEMPTS - 1
         report(f"cells of {cell:.3g}" + ", smaller in places" * bool(finer))
         try:
             patches = _patches(
-                function, vertices, edges, cell, finer, tolerance, asked.seed, last, report
+                function, vertices, edges, cell, finer, tolerance, seed, last, report
             )
             result = _joined(vertices, faces, patches, asked.given)
             _check(vertices, faces, result, report)
@@ -161,6 +168,13 @@ def _repaired(
                 ) from None
             report(f"{error} ({len(error.points)} places)")
             finer = (*finer, Places(error.points, 2 * cell * 0.5 ** len(finer)))
+        except TooLargeError:
+            raise
+        except MeshingError as error:  # a point lies where the function is known too badly
+            if last:
+                raise
+            report(f"{error}; once more, with points moved at random in another way")
+            seed += 1
         else:
             return result
     raise AssertionError("unreachable: the last attempt returns or raises")

@@ -152,7 +152,7 @@ def check_value_range(value_range: Any, show: str) -> tuple[float, float]:
         low, high = (float(end) for end in value_range)
     except (TypeError, ValueError):
         raise TypeError(wrong) from None
-    if not -math.inf < low < high < math.inf:
+    if not (low < high and math.isfinite(high - low)):
         raise ValueError(wrong)
     return low, high
 

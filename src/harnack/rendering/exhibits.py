@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from numbers import Real
 from typing import Any
@@ -80,9 +80,9 @@ def exhibits(
     listed = isinstance(materials, list | tuple) and not _is_color(materials)
     names: list[Any] = [*materials] if listed else [materials] * len(given)
     drawn: list[tuple[Any, Mapping[str, Any]]] = [(one, settings) for one in given]
-    several = settings.get("level")
-    levels: list[Any] = [*several] if isinstance(several, list | tuple) else []
-    if len(given) == 1 and listed and len(names) == len(levels):
+    several: Any = settings.get("level")
+    levels: list[Any] = [*several] if isinstance(several, Sequence | np.ndarray) else []
+    if len(given) == 1 and listed and len(names) == len(levels) > 1:
         drawn = [(given[0], {**settings, "level": level}) for level in levels]
     if len(names) != len(drawn):
         count = max(len(given), len(levels))
@@ -101,6 +101,8 @@ def exhibits(
     if boundary is None and boundary_material is not None:
         raise ValueError("boundary_material is of tubes: give their radius as well, boundary=0.03")
     rim = material_of(_RIM if boundary_material is None else boundary_material)
+    if rim.transparent:
+        raise ValueError("boundary_material: tubes have no inside, so light cannot pass through")
     rims = [] if boundary is None else _rims(made, boundary, rim)
     if thickness is not None:
         made = [replace(one, surface=_thick(one.surface, thickness)) for one in made]
@@ -142,12 +144,23 @@ def _refuse_doubles(surfaces: list[LevelSet]) -> None:
     for k, one in enumerate(surfaces):
         for other in surfaces[:k]:
             same = _is_cut_alike(one, other) and one.solid == other.solid
-            if same and set(one.numbers) & set(other.numbers):
+            if same and _shared_levels(one, other):
                 raise ValueError(
-                    "a surface is drawn twice: levels are those of every field. Give one field "
+                    "a surface is drawn twice, and which is seen would be an accident. If levels "
+                    "were meant for one field each: they are those of every field. Give one field "
                     "with level=[a, b] and material=[one, two], or harnack.level_set(field, a) for "
                     "each"
                 )
+
+
+def _shared_levels(one: LevelSet, other: LevelSet) -> bool:
+    """Whether two level sets of a field share a level, modulo its period."""
+    period = one.field.period
+    apart = np.subtract.outer(one.numbers, other.numbers)
+    if period is not None:
+        apart -= period * np.round(apart / period)
+    largest = max(1.0, *(abs(level) for level in (*one.numbers, *other.numbers)))
+    return bool((np.abs(apart) <= 1e-9 * largest).any())
 
 
 def _is_cut_alike(one: LevelSet, other: LevelSet) -> bool:
@@ -158,7 +171,7 @@ def _is_cut_alike(one: LevelSet, other: LevelSet) -> bool:
 
 def _rims(made: list[StudioObject], radius: Any, material: Material) -> list[StudioObject]:
     """Tubes around the curves at which surfaces end."""
-    if isinstance(radius, bool) or not isinstance(radius, int | float) or not 0 < radius < math.inf:
+    if isinstance(radius, bool) or not isinstance(radius, Real) or not 0 < float(radius) < math.inf:
         raise ValueError(f"boundary is the radius of a tube, such as 0.03, not {radius!r}")
     rims: list[StudioObject] = []
     for k, one in enumerate(made):

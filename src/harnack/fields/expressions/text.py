@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import ast
+import functools
 import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
+
+import numpy as np
 
 from harnack import arithmetic
 from harnack.choices import did_you_mean
@@ -21,11 +24,13 @@ _FUNCTIONS: Mapping[str, Callable[..., Any]] = MappingProxyType(
             "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "exp", "log",
             "sqrt", "norm",
         )},
-        "abs": arithmetic.absolute, "max": arithmetic.maximum, "min": arithmetic.minimum,
+        "ln": arithmetic.log, "abs": arithmetic.absolute,
+        "max": lambda *several: functools.reduce(arithmetic.maximum, several),
+        "min": lambda *several: functools.reduce(arithmetic.minimum, several),
     }
 )  # fmt: skip
 # How many arguments functions take that do not take one: at least, at most.
-_SEVERAL = {"max": (2, 2), "min": (2, 2), "norm": (2, 3)}
+_SEVERAL = {"max": (2, 99), "min": (2, 99), "norm": (2, 3)}
 _OPERATORS: Mapping[type[ast.operator], Callable[[Any, Any], Any]] = MappingProxyType(
     {
         ast.Add: lambda a, b: a + b,
@@ -59,7 +64,7 @@ class TextFormula:
         """
         if len(text) > _LONGEST:
             raise ValueError(f"a formula has at most {_LONGEST:,} characters, not {len(text):,}")
-        strange = re.search(r"[^A-Za-z0-9_\s.,+*/^()=<>!-]", text)
+        strange = re.search(r"[^A-Za-z0-9\s.,+*/^()=<>!-]|\b0[xob]", text, re.IGNORECASE)
         if strange:
             raise _wrong(text, f"{strange[0]!r} has no meaning here")
         sides = [cls._side(text, side) for side in re.split(r"(?<![<>=!])=(?!=)", text)]
@@ -76,13 +81,17 @@ class TextFormula:
             return ast.parse(" ".join(side.replace("^", "**").split()), mode="eval").body
         except (SyntaxError, ValueError, RecursionError, MemoryError):
             pass
-        missing = re.search(r"[0-9.)]\s*[A-Za-z(]|[xyz)]\s+[A-Za-z0-9(]", side)
+        bare = re.search(rf"\b({'|'.join(_FUNCTIONS)})\s+[A-Za-z0-9]", side)
+        if bare:
+            raise _wrong(text, f"the argument of {bare[1]} stands in brackets")
+        missing = re.search(r"[0-9)]\s*[A-Za-z(]|[xyz)]\s+[A-Za-z0-9(]", side)
         hint = f"is a * missing at {missing[0]!r}" if missing else "an operator or bracket is amiss"
         raise _wrong(text, hint)
 
     def __call__(self, x: Any, y: Any, z: Any) -> Any:
         try:
-            return _value(self.tree, {"x": x, "y": y, "z": z, **_CONSTANTS})
+            with np.errstate(all="ignore"):  # of constants; what comes of it is refused
+                return _value(self.tree, {"x": x, "y": y, "z": z, **_CONSTANTS})
         except ZeroDivisionError:
             raise _wrong(self.text, "it divides by zero") from None
         except OverflowError:
@@ -123,7 +132,7 @@ def _check(text: str, node: ast.expr, depth: int = 0) -> None:
             raise _wrong(
                 text,
                 f"{node.id!r} is unknown, there are {', '.join(known)} and {', '.join(_FUNCTIONS)}"
-                f"{did_you_mean(node.id, _FUNCTIONS)}",
+                f"{did_you_mean(node.id, (*known, *_FUNCTIONS))}",
             )
     elif isinstance(node, ast.Constant):
         value = node.value
@@ -156,7 +165,7 @@ def _check_call(text: str, node: ast.Call, depth: int) -> None:
         raise _wrong(text, f"{name!r} is no known function, there are {known}{hint}")
     least, most = _SEVERAL.get(name, (1, 1))
     if node.keywords or not least <= len(node.args) <= most:
-        count = f"{least}" if least == most else f"{least} or {most}"
+        count = f"{least} or {most}" if least < most < 9 else f"{least}{' or more' * (most > 9)}"
         plural = "s" if most > 1 else ""
         raise _wrong(text, f"{name} takes {count} argument{plural}, not {len(node.args)}")
     for one in node.args:
@@ -164,7 +173,18 @@ def _check_call(text: str, node: ast.Call, depth: int) -> None:
 
 
 def _value(node: ast.expr, names: Mapping[str, Any]) -> Any:
-    """The value of a tree that was checked."""
+    """The value of a tree that was checked.
+
+    Raises:
+        OverflowError: a part of constants is no finite number.
+    """
+    value = _computed(node, names)
+    if isinstance(value, float) and not math.isfinite(value):
+        raise OverflowError
+    return value
+
+
+def _computed(node: ast.expr, names: Mapping[str, Any]) -> Any:
     match node:
         case ast.BinOp(left, ast.Pow(), right):
             base, exponent = _value(left, names), _value(right, names)

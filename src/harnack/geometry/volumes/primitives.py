@@ -38,9 +38,9 @@ class Ball(Volume):
 
     def __post_init__(self) -> None:
         if isinstance(self.center, int | float):
-            raise TypeError(
-                f"a ball is given as Ball(center, radius): for one about the origin, write "
-                f"Ball(radius={self.center!r})"
+            raise ValueError(
+                f"the center of a ball must be three numbers, not {self.center!r}: for one about "
+                f"the origin, write Ball(radius={self.center!r})"
             )
         object.__setattr__(self, "center", checked_point(self.center, "the center of a ball"))
         radius = checked_number(self.radius, "the radius of a ball")

@@ -123,8 +123,8 @@ def material_of(wanted: Any) -> Material:
         return wanted
     if isinstance(wanted, Mapping):
         return Material(dict(cast("Mapping[str, Any]", wanted)), two_sided=False)
-    if isinstance(wanted, str) and wanted in MATERIALS:
-        return MATERIALS[wanted]
+    if isinstance(wanted, str) and wanted.strip().lower() in MATERIALS:
+        return MATERIALS[wanted.strip().lower()]
     try:
         return _painted(linear(colour_of(wanted, "material")))
     except TypeError:

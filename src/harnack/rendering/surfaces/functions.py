@@ -26,7 +26,7 @@ def function_of(given: Any, what: str = "of") -> Field:
         try:
             return expression(given)
         except ValueError as error:
-            raise ValueError(f"{what}: {error}") from None
+            raise ValueError(f"{what.rstrip(',')}: {error}") from None
     if isinstance(given, Field):
         if given.has_parts:
             raise ValueError(
