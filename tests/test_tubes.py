@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from typing import Any
 
 import numpy as np
@@ -75,3 +76,36 @@ def test_what_is_no_bundle_of_tubes() -> None:
         hk.Tube.around([[[0, 0, 0], [1, 0, 0]], [[0, 0, 1.0]]], 0.1)
     with pytest.raises(ValueError, match="polyline 1 of a tube"):
         hk.Tube.around([[[0, 0, 0], [1, 0, 0]], [[0, 0.0]]], 0.1)
+
+
+def _in_unbounded_solids() -> dict[str, tuple[Any, float]]:
+    """Solids without bounds that hold a tube, and where a ray down at (.3, .02) meets it first."""
+    tube, plane = hk.Tube([[-1, 0, 0], [1, 0, 0]], 0.1), hk.Plane((0, 0, 1), -0.5)
+    bent = hk.Tube.bezier([[-1, 0, 0], [-0.3, 0, 0], [0.3, 0, 0], [1, 0, 0]], 0.1)
+    many = hk.Tube.around([[[x, 0, 0], [x + 0.1, 0, 0]] for x in np.arange(-5, 5, 0.1)], 0.1)
+    top, wide = 2 - math.sqrt(0.1**2 - 0.02**2), 2 - math.sqrt(0.15**2 - 0.02**2)
+    return {
+        "union": (tube | plane, top),
+        "Bezier curve": (bent | plane, top),
+        "groups": (many | plane, top),
+        "grown": ((tube | plane).grown(0.05), wide),
+        "moved and scaled": ((tube.scaled(0.5) | plane).scaled(2), top),
+        "complements": (~(~tube & ~plane), top),
+        "difference": (hk.Plane((0, 0, 1), 1.0) - tube.moved((0, 0, 0.95)), 1.0 + 0.05 + 0.098),
+        "without a plane": (tube, top),
+    }
+
+
+@pytest.mark.parametrize("precision", ["single", "double"])
+@pytest.mark.parametrize("name", _in_unbounded_solids())
+def test_tubes_are_seen_in_solids_without_bounds(name: str, precision: Any) -> None:
+    """The infinite length looked ahead, times a slope of 0, hid them: 0 inf is no number."""
+    solid, t = _in_unbounded_solids()[name]
+    o, d = [[0.3, 0.02, 2.0]], [[0.0, 0.0, -1.0]]
+    cut = {"clip": hk.HalfSpace((1, 0, 0), 5.0)}
+    for options in ({}, {"confirm": True}, {"all_hits": 4}, cut, {"t_max": 100.0}):
+        found = hk.trace(solid, o, d, precision=precision, **options)
+        assert float(np.ravel(found.t)[0]) == pytest.approx(t, abs=2e-4), options
+    misses = hk.trace(solid, o, [[0.0, 0.1, 1.0]], precision=precision)
+    assert misses.status[0] == hk.Status.MISS
+    assert misses.evaluations[0] < 10

@@ -63,6 +63,7 @@ class Arc(Enclosure):
         down = first_root(gaps.down, -self.slopes.low * rate, self.curvature)
         half = 0.5 * _ROUND_DOWN * fmin(up, down)
         known = (up >= 0) & (down >= 0) & (self.curvature >= 0)  # and not NaN
+        known &= dr.isfinite(total)  # its square does not overflow
         ends = half >= _PI_BELOW  # once around
         s, k = sincos(dr.select(ends, 0, half))
         left = dr.fma(c, k, -self.offset * s)

@@ -52,16 +52,19 @@ class Cusp(Enclosure):
         towards = dr.select(self.is_positive, gaps.down, gaps.up)
         away = dr.select(self.is_positive, gaps.up, gaps.down)
         room = self.height - fmax(self.distance - towards, 0)
+        together = room + self.distance + towards + self.fall + self.speed
+        room = dr.select(together == together, room, 0)  # what is not a number proves nothing
         best = 0 * self.height
         for part in _PARTS:
             share = fmax(part * room / self.constant, 0)
             radius = dr.power(share, 1 / self.power) * _ROUND_DOWN
-            radius = fmin(self.inside, radius)
+            radius = dr.select(dr.isfinite(share) & (radius >= 0), fmin(radius, self.inside), 0)
             chord = (radius - self.across) * (radius + self.across)
             leaves = self.foot + dr.sqrt(fmax(chord, 0))
             leaves = dr.select(self.speed > 0, leaves / self.speed, dr.inf)
             length = dr.select(self.fall > 0, (1 - part) * room / self.fall, dr.inf)
             length = fmin(leaves, length)
             start = self.across * self.across + self.foot * self.foot < radius * radius
-            best = fmax(dr.select(start & (room > 0) & (chord > 0), length, 0), best)
+            known = start & (room > 0) & (chord > 0) & dr.isfinite(chord)  # squares may overflow
+            best = fmax(dr.select(known, length, 0), best)
         return dr.select(away == dr.inf, best * _ROUND_DOWN, 0)

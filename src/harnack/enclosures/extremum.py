@@ -113,7 +113,14 @@ class Stretched(Enclosure):
 
     def _gaps(self, gaps: Gaps) -> Gaps:
         share = _ROUND_DOWN / self.factor
-        return Gaps(gaps.down * share, gaps.up * share, gaps.is_one_sided)
+        down, up = _scaled(gaps.down, share), _scaled(gaps.up, share)
+        return Gaps(down, up, gaps.is_one_sided)
+
+
+def _scaled(gap: Real, share: Real) -> Real:
+    """The gap times a positive number; a level stays one, however far away it comes to lie."""
+    largest = type(gap)(dr.largest(type(gap)))
+    return dr.select(gap == dr.inf, gap, fmin(largest, gap * share))
 
 
 _ROUND_DOWN = 1.0 - 1e-6

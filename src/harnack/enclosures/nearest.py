@@ -65,7 +65,7 @@ class Nearest(Enclosure):
         length = fmin(
             first_root(away + 2 * self.distance, -self.nearest.opening.low, self.bend), length
         )
-        known = length >= 0
+        known = (length >= 0) & (self.distance >= 0)
         for sheet in self.sheets:
             gap = fmax(towards + sheet.beyond, 0)
             one = first_root(gap, -sheet.opening.low, self.bend)

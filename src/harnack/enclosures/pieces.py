@@ -100,13 +100,14 @@ class Pieces(Enclosure):
         by_line = dr.select(most > 0, left / most, dr.select(most <= 0, dr.inf, 0))
         by_line = dr.select(left > 0, by_line, 0)
         by_parabola = first_root(left, slope, bend)
-        reach = fmin(length, fmax(by_parabola, by_line) * _ROUND_DOWN)
+        reach = fmin(fmax(by_parabola, by_line) * _ROUND_DOWN, length)
         # Rises and falls may cancel: their rounding counts, not that of their sum.
         unit = 4 * float(dr.epsilon(type(left)))
         bent, straight = 0.5 * length * length * bend, slope * length
         by_parabola = (bent + straight) + unit * (dr.abs(bent) + dr.abs(straight))
         risen = fmin(by_parabola, most * length + unit * dr.abs(most * length))
-        return dr.fma(bend, length, slope), reach, left - risen
+        slope = dr.fma(bend, length, slope)
+        return dr.fma(0.25 * unit, dr.abs(slope), slope), reach, left - risen
 
 
 class OnePiece(Pieces, abc.ABC):

@@ -349,6 +349,9 @@ class Folded(Enclosure):
             around = self.period - 2 * size + gaps.down
             upwards = dr.select(has_below, fmin(around, upwards), upwards)
         downwards = dr.select(has_below, fmin(gaps.down, downwards), downwards)
+        # What is not a number proves nothing.
+        known = (gaps.down >= 0) & (gaps.up >= 0) & (size >= 0)
+        upwards, downwards = (dr.select(known, one, dr.nan) for one in (upwards, downwards))
         positive = self.offset >= 0
         return Gaps(
             dr.select(positive, downwards, upwards), dr.select(positive, upwards, downwards)

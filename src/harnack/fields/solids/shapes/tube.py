@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, cast
 
@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from harnack.backend import FloatArray, backend_of
 from harnack.backend.extrema import clamp, fmax, fmin
+from harnack.backend.lengths import largest_component
 from harnack.backend.numbers import check_finite, check_size, check_vectors, real_array
 from harnack.backend.records import Records
 from harnack.enclosures import Enclosure, Gaps, Lipschitz, Pieces
@@ -29,8 +30,10 @@ if TYPE_CHECKING:
 _MOST_SEGMENTS = 1_000_000
 # Segments in a group, and how many there are at least where groups are made.
 _GROUP, _MANY = 8, 64
-# Where the broken line bends, in parts of the length looked ahead.
-_KNOTS = (0.125, 0.25, 0.5, 1.0)
+# Where the broken line bends before its end, in parts of the length looked ahead.
+_KNOTS = (0.125, 0.25, 0.5)
+# The length of which these are parts where there is no end: so many times the size of everything.
+_FAR = 8.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,6 +165,8 @@ class Tube(Solid):
         object.__setattr__(made, "_records", Records.upload(backend, rows))
         object.__setattr__(made, "_groups", groups)
         object.__setattr__(made, "_radius", dr.opaque(backend.Float, self.radius))
+        size = float(np.abs(self.points).max()) + self.radius
+        object.__setattr__(made, "_size", dr.opaque(backend.Float, size))
         return made
 
     def evaluate(self, p: Vec3) -> Sample:
@@ -176,7 +181,11 @@ class Tube(Solid):
         p = path.point(t)
         if Pieces not in path.proofs.kinds:
             return path.look(self.evaluate(p))
-        knots = tuple(one * ahead for one in _KNOTS)
+        if not hasattr(self, "_records"):
+            return self.prepare(backend_of(p)).look(path, t, ahead, ahead)
+        far = _FAR * (largest_component(p) + self._number("_size"))
+        length = dr.select(dr.isfinite(ahead), ahead, far)
+        knots = (*(one * length for one in _KNOTS), ahead)
         sample, distance, lows = self._seen(p, path.direction, knots)
         slope = dr.dot(sample.gradient, path.direction)
         most = fmin(slope + sample.gradient_error, 1.0)
@@ -201,12 +210,8 @@ class Tube(Solid):
             # The vector is off by a few roundings of what it is made of.
             off = 8 * unit * (dr.norm(from_start) + dr.norm(side))
             if direction is not None:
-                slope = dr.dot(away, direction) / distance
-                slope = fmax(slope - off / distance * 2, -1)
-                lows = [
-                    fmin(low, dr.fma(knot, slope, distance - off) - 4 * unit * (distance + knot))
-                    for low, knot in zip(lows, knots, strict=True)
-                ]
+                slope = dr.dot(away, direction) / distance - off / distance * 2
+                lows = _lowered(lows, knots, distance - off, slope, 4 * unit * distance, unit)
             nearer = distance < nearest
             return (
                 dr.select(nearer, distance, nearest),
@@ -280,11 +285,9 @@ def _by_groups(
         found = list(state)
         if direction is not None:
             off = 8 * unit * (dr.norm(p) + distance + row[3])
-            slope = fmax(dr.dot(away, direction) / distance - 2 * off / distance, -1)
-            for k, knot in enumerate(knots):
-                low = dr.fma(knot, slope, distance - row[3] - off) - 4 * unit * (distance + knot)
-                low = dr.select(is_near, dr.inf, low)
-                found[5 + k] = fmin(low, found[5 + k])
+            slope = dr.dot(away, direction) / distance - 2 * off / distance
+            start = dr.select(is_near, dr.inf, distance - row[3] - off)
+            found[5:] = _lowered(found[5:], knots, start, slope, 4 * unit * distance, unit)
 
         def each(j: Any, *inner: Any) -> tuple[Any, ...]:
             return j + 1, *body(records.row(i * _GROUP + j), inner)
@@ -303,6 +306,27 @@ def _by_groups(
     return dr.while_loop((index, *start), more_groups, visit, label="tube by groups")[1:]
 
 
+def _lowered(
+    lows: Sequence[Real],
+    knots: tuple[Real, ...],
+    start: Real,
+    slope: Real,
+    rounding: Real,
+    unit: float,
+) -> list[Real]:
+    """The least of `lows` and of what a tangent is at the knots, of which the last may be infinite.
+
+    start: the tangent at 0, known up to `rounding`. slope: of the tangent, at least -1; if it is
+        none, as on the segment itself, the tangent falls as fast as any.
+    A slope is lowered by four roundings for that of the product with a knot. It is never 0, so
+    that at infinity the tangent is infinite, of the slope's sign, and never 0 times infinity.
+    """
+    slope = fmax(slope, -1) - 4 * unit
+    slope = dr.select(slope == 0, -unit, slope)
+    start = start - rounding
+    return [fmin(dr.fma(knot, slope, start), low) for low, knot in zip(lows, knots, strict=True)]
+
+
 @dataclass(frozen=True)
 class TubeAhead(Enclosure):
     """The distance from a set of segments along a path.
@@ -313,9 +337,12 @@ class TubeAhead(Enclosure):
     Proof. The distance from one segment is a convex function of s, so it lies above its tangent at
     s = 0 (Hart 1996, theorem 4). The least of all tangents is a concave function, which lies above
     the chord between two of its points: so F lies above the broken line through 0 and the lows at
-    the knots. From above, the distance from the polyline is at most that from the nearest point c,
+    the knots. The last knot may be infinite: if the low there is -inf, nothing is known beyond the
+    knot before; if it is +inf, no tangent falls, and F never comes below the low before.
+
+    From above, the distance from the polyline is at most that from the nearest point c,
     sqrt(D^2 + 2 D m s + s^2), with D the distance and m its slope; so F reaches g first where s^2 +
-    2 D m s = g^2 + 2 D g.
+    2 D m s = g^2 + 2 D g. Where these squares overflow, as a distance it does not before s = g.
     """
 
     distance: Real
@@ -328,12 +355,13 @@ class TubeAhead(Enclosure):
         right = gaps.up * (gaps.up + 2 * self.distance)
         root = dr.sqrt(fmax(dr.fma(across, across, right), 0))
         up = dr.select(across > 0, right / (across + root), root - across)
-        up = dr.select(gaps.up == dr.inf, dr.inf, up)
+        # Squares of large numbers overflow: a distance rises by 1 per unit of length at most.
+        up = dr.select(dr.isfinite(right) & dr.isfinite(root), up, gaps.up)
         total, start, low = 0 * self.distance, 0 * self.distance, 0 * self.distance
         free = gaps.down >= 0  # and not NaN
         for knot, next_low in zip(self.knots, self.lows, strict=True):
             is_clear = next_low >= -gaps.down
-            part = (gaps.down + low) / (low - next_low) * (knot - start)
+            part = fmax((gaps.down + low) / (low - next_low) * (knot - start), 0)
             reached = dr.select(is_clear, knot, fmin(start + part, knot))
             total = dr.select(free, reached, total)
             free &= is_clear

@@ -1,0 +1,235 @@
+"""What enclosures prove where numbers are infinite, not numbers, denormal or huge: never too much.
+
+Two oracles that know no proof by name. (1) Double precision has room for the squares and quotients
+of all numbers of single precision: the same formula of the same numbers must not prove a longer
+step in single than in double, beyond rounding. (2) What is not a number may be anything, so it
+proves no longer step than any number in its place.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import pkgutil
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+from drjit.llvm.ad import Float, Float64
+
+import harnack
+from harnack.arithmetic import Interval
+from harnack.enclosures import Ball, Enclosure, Gaps, Slopes, any_covers, longest_step
+from harnack.enclosures.arc import Arc
+from harnack.enclosures.balls.bounded_laplacian import GreenBall
+from harnack.enclosures.cusp import Cusp
+from harnack.enclosures.extremum import Greatest, Negated, Part, Stretched
+from harnack.enclosures.literature import (
+    AffineBand,
+    Band,
+    BottomUpLinear,
+    BottomUpQuadratic,
+    IntervalRange,
+    Mixed,
+)  # fmt: skip
+from harnack.enclosures.nearest import Nearest, Sheet
+from harnack.enclosures.parabola import Cone, Parabola, Taylor
+from harnack.enclosures.pieces import LinearTaylor, OnePiece, Pieces, QuadraticTaylor, Segment
+from harnack.enclosures.restriction import Piece
+from harnack.enclosures.tangent import Tangent
+from harnack.fields.blobs.blobs import _After  # pyright: ignore[reportPrivateUsage]
+from harnack.fields.blobs.largest import LargestAlong
+from harnack.fields.solids.region import Folded
+from harnack.fields.solids.shapes.tube import TubeAhead
+
+SIZES = [0.0, 1e-12, 1e-4, 0.3, 1.0, 7.0, 1e5, 1e12, 1e25, np.inf]
+NUMBERS = SIZES + [-one for one in SIZES]
+
+SIGNS = [1.0, -1.0]
+
+Draw = Callable[[list[float]], Any]
+
+
+def sizes(draw: Draw) -> Any:
+    return draw(SIZES)
+
+
+def slopes(draw: Draw) -> Slopes:
+    one, other = draw(NUMBERS), draw(NUMBERS)
+    return Slopes(dr.minimum(one, other), dr.maximum(one, other))
+
+
+def rising(draw: Draw, count: int) -> list[Any]:
+    made = [draw(SIZES[1:])]
+    for _ in range(count - 1):
+        made.append(dr.maximum(made[-1], draw(SIZES[1:])))
+    return made
+
+
+def parts(draw: Draw, count: int) -> tuple[Piece, ...]:
+    made: list[Piece] = []
+    for length in rising(draw, count):
+        bend = slopes(draw)
+        made.append(Piece(length, slopes(draw), bend.low, bend.high))
+    return tuple(made)
+
+
+def ball(kind: Any) -> Callable[[Draw], list[Enclosure]]:
+    def make(draw: Draw) -> list[Enclosure]:
+        made: list[Enclosure] = []
+        for dimension in (2, 3, 4):
+            for below, above in ((True, True), (True, False), (False, True)):
+                if kind.applies(dimension, below, above):
+                    ends = (sizes(draw) if one else None for one in (below, above))
+                    made.append(kind(sizes(draw), *ends, dimension, slopes(draw)))
+        return made
+
+    return make
+
+
+def tube(draw: Draw) -> TubeAhead:
+    """Tangents of which the least counts, at knots of which the last may be infinite."""
+    length = draw([1e-12, 1e-4, 1.0, 1e12])
+    knots = (*(k * length for k in (0.125, 0.25, 0.5)), draw([1e13, 1e25, np.inf]))
+    fall, delay = draw([-1.0, -0.3, 1e-12, 1.0, np.nan]), sizes(draw)
+    lows = tuple(dr.minimum(0.5 * k, fall * k + delay) for k in knots)
+    return TubeAhead(sizes(draw), draw([-1.0, -0.3, 0.0, 1e-12, 1.0]), knots, lows)
+
+
+def cone(draw: Draw) -> Cone:
+    constant = sizes(draw)
+    return Cone(Slopes(-constant, constant), 0.0, 0.0, sizes(draw))
+
+
+def parabola(kind: Any) -> Callable[[Draw], Enclosure]:
+    def make(draw: Draw) -> Enclosure:
+        bend = slopes(draw)
+        return kind(slopes(draw), bend.low, bend.high, sizes(draw))
+
+    return make
+
+
+def band(kind: Any) -> Callable[[Draw], Enclosure]:
+    def make(draw: Draw) -> Enclosure:
+        offsets = slopes(draw)
+        return kind(Interval(offsets.low, offsets.high), slopes(draw), sizes(draw))
+
+    return make
+
+
+def nearest(draw: Draw) -> Nearest:
+    sheets = tuple(Sheet(slopes(draw), draw(NUMBERS)) for _ in range(2))
+    return Nearest(sheets, sheets[0], sizes(draw), draw(SIGNS) > 0, sizes(draw), sizes(draw))
+
+
+def cusp(draw: Draw) -> Cusp:
+    one = [draw(NUMBERS) if k in (0, 1, 2) else sizes(draw) for k in range(9)]
+    return Cusp(*one, draw(SIGNS) > 0)  # type: ignore[call-arg]
+
+
+def greatest(draw: Draw) -> Greatest:
+    inner = (parabola(Parabola)(draw), tube(draw))
+    return Greatest(tuple(Part(low := sizes(draw), low, (one,)) for one in inner))
+
+
+MAKERS: dict[type[Enclosure], Callable[[Draw], Any]] = {
+    Parabola: parabola(Parabola),
+    Cone: cone,
+    Taylor: parabola(Taylor),
+    BottomUpQuadratic: parabola(BottomUpQuadratic),
+    BottomUpLinear: parabola(BottomUpLinear),
+    Pieces: lambda draw: Pieces(slopes(draw), parts(draw, 3)),
+    QuadraticTaylor: lambda draw: QuadraticTaylor(slopes(draw), parts(draw, 1)),
+    LinearTaylor: lambda draw: LinearTaylor(slopes(draw), parts(draw, 1)),
+    Segment: lambda draw: Segment(slopes(draw), parts(draw, 1)),
+    Mixed: lambda draw: Mixed((parabola(Parabola)(draw), cone(draw))),
+    Band: band(Band),
+    AffineBand: band(AffineBand),
+    IntervalRange: band(IntervalRange),
+    Tangent: lambda draw: Tangent(slopes(draw)),
+    GreenBall: lambda draw: GreenBall(
+        sizes(draw), sizes(draw), sizes(draw), draw(NUMBERS), sizes(draw), slopes(draw)
+    ),
+    Arc: lambda draw: Arc(slopes(draw), sizes(draw), draw(NUMBERS), 1 + sizes(draw)),
+    Nearest: nearest,
+    Cusp: cusp,
+    Greatest: greatest,
+    Negated: lambda draw: Negated(tube(draw)),
+    Stretched: lambda draw: Stretched(parabola(Parabola)(draw), sizes(draw), sizes(draw)),
+    Folded: lambda draw: Folded(parabola(Parabola)(draw), draw(NUMBERS), 1.0),
+    TubeAhead: tube,
+    _After: lambda draw: _After(sizes(draw), parabola(Parabola)(draw)),
+} | {getattr(harnack, name): ball(getattr(harnack, name)) for name in ("Classic", "Slope", "Caps")}
+# It asks the others, group by group, and holds no numbers of its own but those of a kernel.
+ASKS_OTHERS = {LargestAlong}
+
+
+def all_kinds() -> Iterator[type[Enclosure]]:
+    for module in pkgutil.walk_packages(harnack.__path__, "harnack."):
+        if not module.name.endswith("__main__"):
+            importlib.import_module(module.name)
+    waiting: list[type[Enclosure]] = [Enclosure]
+    while waiting:
+        kind = waiting.pop()
+        waiting += kind.__subclasses__()
+        own = kind.__module__.startswith("harnack.") and kind not in (Ball, OnePiece)
+        if own and not inspect.isabstract(kind):
+            yield kind
+
+
+def test_every_enclosure_is_tried() -> None:
+    assert set(all_kinds()) - ASKS_OTHERS == set(MAKERS)
+
+
+class Numbers:
+    """The same numbers of a list in both precisions; those of one draw may be replaced."""
+
+    def __init__(self, real: Any, lanes: int, replaced: int = -1, by: float = np.nan) -> None:
+        self.real, self.lanes, self.rng = real, lanes, np.random.default_rng(0)
+        self.count, self.replaced, self.by, self.lists = 0, replaced, by, []
+
+    def __call__(self, values: list[float]) -> Any:
+        drawn = self.rng.choice(np.array(values, np.float32), self.lanes)
+        if self.count == self.replaced:
+            drawn[:] = self.by
+        self.count += 1
+        self.lists.append(values)
+        return self.real(drawn.astype(np.float32 if self.real is Float else np.float64))
+
+
+def answers(kind: type[Enclosure], draw: Numbers) -> tuple[np.ndarray, np.ndarray]:
+    """Steps of enclosures of a kind, and whether they cover a length."""
+    gaps, length = Gaps(sizes(draw), sizes(draw)), sizes(draw)
+    made = MAKERS[kind](draw)
+    many: list[Any] = made if isinstance(made, list) else [made]
+    steps = [np.asarray(longest_step((one,), gaps)) for one in many]
+    covered = [np.array(any_covers((one,), gaps, length)) for one in many]
+    return np.concatenate(steps), np.concatenate(covered)
+
+
+@pytest.mark.parametrize("kind", MAKERS, ids=lambda kind: kind.__name__)
+def test_no_longer_step_than_in_double_precision(kind: type[Enclosure]) -> None:
+    single, _ = answers(kind, Numbers(Float, 60_000))
+    double, _ = answers(kind, Numbers(Float64, 60_000))
+    assert not np.isnan(single).any()
+    longest = np.where(double > 3e38, np.inf, double)  # beyond single precision's end
+    too_long = single > longest * (1 + 1e-2) + 1e-30
+    assert not too_long.any(), np.flatnonzero(too_long)
+
+
+@pytest.mark.parametrize("kind", MAKERS, ids=lambda kind: kind.__name__)
+def test_what_is_not_a_number_proves_nothing(kind: type[Enclosure]) -> None:
+    first = Numbers(Float, 1500)
+    answers(kind, first)
+    for k, values in enumerate(first.lists):
+        steps, covered = answers(kind, Numbers(Float, 1500, k))
+        if values is SIGNS:
+            continue
+        for value in (one for one in values if abs(one) < 1e9):
+            other_steps, other_covered = answers(kind, Numbers(Float, 1500, k, value))
+            too_long = steps > 3 * other_steps  # solvers differ by their own inaccuracy
+            bad = covered & ~other_covered
+            assert not too_long.any(), (k, value)
+            assert not bad.any(), (k, value)
