@@ -287,3 +287,55 @@ def test_a_union_reaches_as_far_as_its_parts() -> None:
 def test_mistakes_are_refused(make: Any, error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         make()
+
+
+def reach(solid: hk.Field, axis: int) -> float:
+    """How far a solid about the origin goes along an axis."""
+    o = 20.0 * np.eye(3)[axis]
+    return float(20.0 - hk.trace(solid, [o], [-o], precision="double", tolerance=1e-7).t[0])
+
+
+def test_f_is_measured_in_the_units_of_each_map_in_turn() -> None:
+    """A map that makes all lengths grow alike multiplies f; in a row, the others hid that."""
+    ball = hk.Sphere(1)
+    stretched = ball.scaled((1, 1, 2)).scaled(2).grown(0.5)  # |x/2| - 1 <= 0.25
+    assert reach(stretched, 0) == pytest.approx(2.5, abs=1e-5)
+    assert reach(stretched, 2) == pytest.approx(5.0, abs=1e-5)
+    other = ball.scaled(2).rotated(90, "x").scaled((1, 1, 2)).grown(0.5)
+    assert reach(other, 0) == pytest.approx(2.5, abs=1e-5)
+    # Neither of two maps makes all lengths grow alike, though both together do.
+    both = ball.scaled((1, 1, 2)).scaled((2, 2, 1)).grown(0.5)
+    assert reach(both, 0) == pytest.approx(3.0, abs=1e-5)
+    for solid, value in ((stretched, 0.5), (other, 0.5), (both, 0.5)):
+        _, high = solid.extent((0.0,)).bounds()  # type: ignore[union-attr]
+        assert high[0] >= reach(solid, 0) - 1e-5
+        assert high[2] >= reach(solid, 2) - 1e-5
+        assert solid.value([[0.0, 0.0, 0.0]])[0] < -value
+    assert reach(ball.grown(0.5).scaled(2), 0) == pytest.approx(3.0, abs=1e-5)
+
+
+def test_second_derivatives_of_walls() -> None:
+    """They raised a TypeError, of an option that was right."""
+    walls = hk.solid(hk.Gyroid(0.5), between=(-0.4, 0.4))
+    x, h = np.array([[0.11, 0.07, -0.03], [-0.2, 0.1, 0.05]]), 1e-4
+    for solid in (walls, walls.moved((0.1, 0.2, 0.3)), walls & hk.Sphere(2)):
+        exact = solid.hessian(x, precision="double")
+        for k in range(3):
+            step = h * np.eye(3)[k]
+            ahead, behind = (solid.gradient(x + s * step, precision="double") for s in (1, -1))
+            np.testing.assert_allclose(
+                exact[:, k], (ahead - behind) / (2 * h), rtol=1e-5, atol=1e-3
+            )
+    with pytest.raises(NotImplementedError, match="Tube gives no second derivatives"):
+        hk.Tube([[0, 0, 0], [1, 0, 0]], 0.1).hessian(x, precision="double")
+
+
+def test_numbers_of_numpy_are_numbers() -> None:
+    wave = hk.PlaneWave(np.float64(1.0), tuple(np.array([1.0, 2.0, 3.0])))  # type: ignore[arg-type]
+    same = hk.EigenfunctionSum([hk.PlaneWave(1.0, (1.0, 2.0, 3.0))])
+    x = [[0.1, 0.2, 0.3]]
+    assert hk.EigenfunctionSum([wave]).value(x) == same.value(x)
+    tapered = hk.Sphere(1).tapered((np.float64(0), np.int64(1)), (np.int64(2), np.float32(0.5)))
+    assert tapered.value(x) == hk.Sphere(1).tapered((0, 1), (2, 0.5)).value(x)
+    with pytest.raises(ValueError, match="finite numbers"):
+        hk.Sphere(1).tapered(("a", 1), (2, 0.5))  # type: ignore[arg-type]

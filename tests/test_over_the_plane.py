@@ -142,3 +142,17 @@ def test_errors_say_what_is_wrong() -> None:
         hk.HeightField(lambda x, y: x + y, domain=hk.HalfSpace((0, 0, 1), 0.0))
     with pytest.raises(TypeError, match="functions of plain"):
         hk.HeightField(lambda x, y: math.sin(x))
+
+
+@pytest.mark.parametrize("field", [hk.LevelCurves("log", "imag"), hk.RiemannSurface("log")])
+def test_walls_of_entire_fields_go_beyond_where_they_are_drawn(field: hk.Field) -> None:
+    """Angle-valued ones were cut to it: values said inside where rays missed."""
+    walls = hk.solid(field, around=(0, 0.3))
+    assert walls.domain is None
+    o, d, s = np.array([5.0, 5.0, 0.1]), np.array([0.0, -1.0, 0.0]), np.linspace(0, 5, 5001)
+    inside = walls.value(o + s[:, None] * d, precision="double") < 0
+    first = s[np.argmax(inside)]
+    assert inside.any()
+    assert first > 2
+    assert hk.trace(walls, [o], [d]).t[0] == pytest.approx(first, abs=2e-3)
+    assert hk.trace(walls & hk.Cuboid((8, 8, 8)), [o], [d]).t[0] == pytest.approx(first, abs=2e-3)

@@ -274,6 +274,7 @@ class Field(abc.ABC):
 
         return at_points(points, kernel, precision)[0]
 
+    @_of_points
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         """Rows of the symmetric matrix of second derivatives at p, in f per length squared.
 

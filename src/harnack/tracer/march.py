@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from harnack.cells.uniform_grid import UniformGrid
     from harnack.enclosures import Gaps, TargetLevels
     from harnack.fields.field import Field
-    from harnack.fields.look import Look, Path, Sample
+    from harnack.fields.look import Look, Path
 
 # A coarse sample is repeated at higher detail where a level is closer in value than this many times
 # its total error, to make truncation this part of that distance, or of what truncation may be
@@ -41,6 +41,9 @@ _COARSEN = 0.2
 _AIM, _AIM_BY_SLOPE = 0.999, 0.99
 # How far from the surface rounding may leave a point that is a hit: see `March._is_near`.
 _LARGEST_UNCERTAINTY = 1 / 16
+# Where rays without an end are given up as misses, as a power of the largest number: squares of
+# what lies beyond overflow.
+_FARTHEST = 0.47
 # Of the gap to the cover of a cone, what the cone may widen by in a step.
 _WIDENING = 0.1
 # A repeated sample is closer by these factors at least and at most.
@@ -225,7 +228,7 @@ class March:
         # Where not even the gradient is known, rounding makes no hits.
         rounding = dr.select(knows_gradient, total_error - sample.truncation, 0)
         is_near = self._is_near(
-            gaps.smaller, within, total_error, rounding, sample, gradient_norm, size + t
+            gaps.smaller, within, total_error, rounding, look, gradient_norm, size + t
         )
         excess = fmax(gaps.smaller + total_error - within, real(0))
         band, may_pass = within, is_near
@@ -309,7 +312,8 @@ class March:
         if now.contact is not None and contact is not None:  # off the surface, all lies ahead
             leaves = now.contact.is_touching & ~contact.is_touching
             tried = dr.select(leaves | hit, end - t, tried)
-        free = base + reach >= end
+        farthest = float(dr.largest(real)) ** _FARTHEST
+        free = base + reach >= dr.select(end == dr.inf, farthest, end)
         if self.hysteresis is not None and contact is not None:  # a contact may end at the end
             undecided = contact.is_touching & self.hysteresis.is_free_after
             free &= ~(accepted & undecided & (t < end))
@@ -341,23 +345,27 @@ class March:
         within: Real,
         total_error: Real,
         rounding: Real,
-        sample: Sample,
+        look: Look,
         gradient_norm: Real,
         size: Real,
     ) -> Mask:
         """Whether a level is near enough in value for a hit; see `advance`.
 
         within: how near the tolerance asks it to be. rounding: what it may have done to f.
-        A point is no hit if it leaves the
-        distance to the surface uncertain by more than a sixteenth of the size of the coordinates
-        or, if that is larger, of the radius on which f is known to be smooth.
+        A point is no hit if it leaves the distance to the surface uncertain by more than a
+        sixteenth of the size of the coordinates or, if that is larger, of the radius on which f is
+        known to be smooth; nor if rounding alone makes it one and leaves the length of the ray
+        uncertain by more than that size: such a ray is parallel to the surface up to rounding.
         """
+        sample = look.sample
         near = gap <= fmax(within - sample.truncation, 2 * rounding)
         for promise in sample.known:
             radius = promise.radius
             if not isinstance(promise, LineLipschitz):
                 size = fmax(dr.select(dr.isfinite(radius), radius, 0), size)
-        return near & (gap + total_error - within <= _LARGEST_UNCERTAINTY * gradient_norm * size)
+        excess = gap + total_error - within
+        crosses = (gap <= within - sample.truncation) | (excess <= dr.abs(look.slope) * size)
+        return near & crosses & (excess <= _LARGEST_UNCERTAINTY * gradient_norm * size)
 
     def _trial(
         self, forward: Real, look: Look, gaps: Gaps, now: MarchState, path: Path, is_smooth: bool

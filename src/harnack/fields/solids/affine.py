@@ -41,10 +41,13 @@ class Affine(Map):
     """u -> matrix u + offset, in double precision.
 
     matrix: (3, 3), rows, not singular. offset: (3,).
+    factor: by which f is multiplied. Of one map it is that by which all lengths grow, if they grow
+        alike, else 1; of several in turn it is the product of theirs.
     """
 
     matrix: tuple[tuple[float, ...], ...]
     offset: tuple[float, ...]
+    factor: float
 
     @classmethod
     def of_arrays(cls, matrix: npt.ArrayLike, offset: npt.ArrayLike = (0.0, 0.0, 0.0)) -> Affine:
@@ -62,7 +65,8 @@ class Affine(Map):
                 f"the matrix is singular (singular values {sizes[0]:g} to {sizes[-1]:g}): it would "
                 "flatten the solid"
             )
-        return cls(tuple(tuple(float(v) for v in row) for row in m), tuple(float(v) for v in b))
+        rows = tuple(tuple(float(v) for v in row) for row in m)
+        return cls(rows, tuple(float(v) for v in b), _similarity(m) or 1.0)
 
     @classmethod
     def of_matrix(cls, matrix: npt.ArrayLike) -> Affine:
@@ -116,7 +120,7 @@ class Affine(Map):
             m, b = np.array(self.matrix), np.array(self.offset)
             inner = solid.map
             total = Affine.of_arrays(m @ np.array(inner.matrix), m @ np.array(inner.offset) + b)
-            return AffineImage(solid.inner, total)
+            return AffineImage(solid.inner, replace(total, factor=self.factor * inner.factor))
         return AffineImage(solid, self)
 
     @property
@@ -127,10 +131,7 @@ class Affine(Map):
     @property
     def similarity(self) -> float | None:
         """The factor by which all lengths grow; None if they do not grow alike."""
-        m = np.array(self.matrix)
-        factor = abs(float(np.linalg.det(m))) ** (1 / 3)
-        grown = np.abs(m.T @ m - factor**2 * np.eye(3)).max()
-        return factor if grown <= 1e-14 * factor**2 else None
+        return _similarity(np.array(self.matrix))
 
     def volume(self, volume: Volume | None) -> Volume | None:
         """A volume that holds the image of another one; None if that has no bounds."""
@@ -152,6 +153,13 @@ class Affine(Map):
         return ConvexHull.of(image).padded(1e-12 * float(np.abs(image).max()))
 
 
+def _similarity(m: FloatArray) -> float | None:
+    """The factor by which a matrix makes all lengths grow; None if they do not grow alike."""
+    factor = abs(float(np.linalg.det(m))) ** (1 / 3)
+    grown = np.abs(m.T @ m - factor**2 * np.eye(3)).max()
+    return factor if grown <= 1e-14 * factor**2 else None
+
+
 @dataclass(frozen=True, eq=False)
 class AffineImage(Derived):
     """A solid under an affine map.
@@ -159,7 +167,7 @@ class AffineImage(Derived):
     Proof. A ray o + t d is the image of the straight path M^-1 (o - b) + t M^-1 d, on which the
     solid is looked at; it is passed at the speed |M^-1 d| (`Stretched`). Coordinates there are
     rounded by a few units of the sum of the sizes that they are summed from, which enters the error
-    of the value. Where all lengths grow by one factor, f is multiplied by it.
+    of the value. f is multiplied by the factor of the map.
     """
 
     inner: Solid
@@ -186,7 +194,7 @@ class AffineImage(Derived):
         return cast("Any", self)._numbers
 
     def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
-        own = level / (self.map.similarity or 1.0)
+        own = level / self.map.factor
         return self.map.volume(self.inner.hull(own, above=above))
 
     def prepare(self, backend: Backend) -> Solid:
@@ -330,7 +338,7 @@ class _AffineNumbers:
             tuple(tuple(float(v) for v in row) for row in inverse),
             change.offset,
             stretch,
-            float(change.similarity or 1.0),
+            change.factor,
             float(np.abs(change.offset).max()),
         )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 import copy
 import math
+import numbers
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -147,17 +148,15 @@ class Taper(Bend):
     def __post_init__(self) -> None:
         axis_index(self.axis)
         try:
-            numbers = (*self.start, *self.end)
+            given = (*self.start, *self.end)
         except TypeError:
-            numbers = ()
-        if len(numbers) != 4:
+            given = ()
+        if len(given) != 4:
             raise ValueError(
                 "start and end must be (coordinate, scale), two numbers each, "
                 f"not {self.start!r} and {self.end!r}"
             )
-        if not all(isinstance(one, float | int) for one in numbers):
-            return
-        if not all(math.isfinite(one) for one in numbers):
+        if not all(isinstance(one, numbers.Real) and math.isfinite(one) for one in given):
             raise ValueError("start and end must be (coordinate, scale), finite numbers")
         if not self.start[0] < self.end[0]:
             raise ValueError(f"start must lie before end: {self.start[0]} < {self.end[0]} is wrong")

@@ -134,13 +134,16 @@ class Region(Derived):
 def bounded_side(
     field: Field, levels: tuple[float, ...], is_inside: Callable[[float], bool]
 ) -> Volume | None:
-    """A volume that holds all points inside, if there is one; the field's domain where not.
+    """A volume that holds all points inside, if there is one; where not, the domain outside of
+    which the field is not known.
 
     Proof. Level sets lie in `extent`, which is convex; if it has bounds, what is outside of it is
     connected and meets no level, so that one point tells on which side all of it is.
     """
     extent = field.extent(levels)
-    if extent is None or field.domain is not None:
+    if field.is_entire and extent is field.domain:  # where it is drawn, and no bound of its levels
+        return None
+    if extent is None or (field.domain is not None and not field.is_entire):
         return field.domain
     low, high = extent.bounds()
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
@@ -283,6 +286,11 @@ class Near(Derived):
     def differentiable_value(self, p: Vec3) -> Real:
         offset = self._offset(self.inner.differentiable_value(p))
         return dr.abs(offset) - self.half_width
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        below = self._offset(self.inner.evaluate(p).value) < 0
+        x, y, z = (dr.select(below, -row, row) for row in self.inner.hessian(p))
+        return x, y, z
 
     def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
         look = self.inner.look(path, t, ahead, back)

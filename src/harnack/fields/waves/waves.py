@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -81,15 +81,15 @@ Term = Product | PlaneWave
 
 
 def checked_terms(terms: Iterable[Term]) -> tuple[Term, ...]:
-    """The terms as a tuple.
+    """The terms as a tuple, of Python numbers.
 
     Raises:
         ValueError, TypeError: there is no term, or one will not do; the message names the first.
     """
-    checked = tuple(terms)
-    if not checked:
+    given, checked = tuple(terms), list[Term]()
+    if not given:
         raise ValueError("a sum needs at least one term")
-    for n, term in enumerate(checked):
+    for n, term in enumerate(given):
         if isinstance(term, PlaneWave):
             numbers: Sequence[float] = (term.amplitude, *term.wave_vector, term.phase)
             if len(numbers) != 5:
@@ -100,7 +100,12 @@ def checked_terms(terms: Iterable[Term]) -> tuple[Term, ...]:
             raise TypeError(f"term {n} must be a Product or a PlaneWave, not {term!r}")
         if not all(math.isfinite(v) for v in numbers):
             raise ValueError(f"term {n} holds numbers that are not finite: {term}")
-    return checked
+        if isinstance(term, PlaneWave):
+            amplitude, x, y, z, phase = (float(v) for v in numbers)
+            checked.append(PlaneWave(amplitude, (x, y, z), phase))
+        else:
+            checked.append(replace(term, amplitude=float(term.amplitude)))
+    return tuple(checked)
 
 
 class _FactorRates:

@@ -179,7 +179,7 @@ class RegionMesher:
             self, lower=own.min(axis=0), upper=own.max(axis=0), tolerance=self.tolerance / scale,
             spacing=self.spacing / scale, evaluations=0, levels=0,
         )  # fmt: skip
-        made = local.below(solid.inner, level / (solid.map.similarity or 1.0))
+        made = local.below(solid.inner, level / solid.map.factor)
         self.evaluations += local.evaluations
         self.levels += local.levels
         return made.transform(np.column_stack([matrix, offset]))
