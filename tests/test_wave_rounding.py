@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import drjit as dr
 import numpy as np
 import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy
-from harnack.backend.sines import sincos
+from harnack.backend.sines import largest_angle, sincos
 from harnack.enclosures import Curvature
 from harnack.fields import PlaneWave, Product, cosine, sine
 from harnack.testing.walks import look_at
@@ -107,3 +110,56 @@ def test_taylor_with_a_rounded_gradient_holds(name: str) -> None:
         room = 0.5 * promise.constant * t * t + rounded.error
         room += moved_point * (steep + field.curvature * t)
         assert (np.abs(true.value - said) <= room).all()
+
+
+@pytest.mark.parametrize("precision", ["single", "double"])
+def test_sines_are_right_as_far_as_they_are_known_and_no_numbers_beyond(precision: Any) -> None:
+    """In double precision they were wrong from some 10^9 on: a gyroid had values of 1e122 there."""
+    backend = choose_backend(precision)
+    real, kind = backend.Float, backend.dtype
+    rng, most = np.random.default_rng(0), largest_angle(real)
+    near_zeros = np.round(rng.uniform(-1, 1, 20_000) * most / math.pi) * math.pi
+    x = np.concatenate([rng.uniform(-most, most, 20_000), near_zeros]).astype(kind)
+    x = x[np.abs(x) <= most]
+    s, c = sincos(real(x))
+    unit = np.finfo(kind).eps / 2
+    for found, right in (
+        (s, np.sin(x.astype(np.longdouble))),
+        (c, np.cos(x.astype(np.longdouble))),
+    ):
+        assert np.abs(found.numpy() - right).max() <= 2 * unit
+    assert np.isnan(np.asarray(sincos(real([2.0 * most, -1e3 * most, np.inf])))).all()
+
+
+@pytest.mark.parametrize(
+    ("precision", "far", "status"),
+    [
+        ("single", 1e3, hk.Status.HIT), ("single", 1e8, hk.Status.OUT_OF_STEPS),
+        ("double", 1e9, hk.Status.HIT), ("double", 1e12, hk.Status.HIT),
+        ("double", 1e16, hk.Status.OUT_OF_STEPS),
+    ],
+)  # fmt: skip
+def test_gyroids_far_from_the_origin_are_right_or_not_known(
+    precision: Any, far: float, status: hk.Status
+) -> None:
+    rng = np.random.default_rng(1)
+    centre = far * np.array([1.0, -1.0, 0.5])
+    gyroid = hk.Gyroid(1.0, domain=hk.Ball(tuple(centre), 100.0))
+    o, d = centre + rng.normal(size=(100, 3)), rng.normal(size=(100, 3))
+    for field in (gyroid, hk.solid(hk.Gyroid(1.0), between=(-0.3, 0.3))):
+        assert (hk.trace(field, o, d, precision=precision).status == status).all()
+    x = o.astype(np.float32) if precision == "single" else o
+    values = gyroid.value(x, precision=precision)
+    if status == hk.Status.HIT:
+        angles = [2 * np.pi * x.astype(np.longdouble)[:, k] for k in range(3)]
+        sines, cosines = np.sin(angles), np.cos(angles)
+        right = sum(sines[k] * cosines[(k + 1) % 3] for k in range(3))
+        assert np.abs(values - right).max() < 20 * np.finfo(x.dtype).eps * far
+    else:
+        assert np.isnan(values).all()
+
+
+def test_formulas_know_sines_of_large_angles_in_double_precision() -> None:
+    f, x = hk.expression("sin(x)"), np.array([2.0, 7e6, 1e9, 1e12, 1e14])
+    points = np.column_stack([x, 0 * x, 0 * x])
+    np.testing.assert_allclose(f.value(points, precision="double"), np.sin(x), atol=1e-15)

@@ -17,7 +17,7 @@ import numpy as np
 
 from harnack.arithmetic.interval import ONE, ZERO, Interval, select, unit_of
 from harnack.backend.extrema import clamp, fmax, fmin
-from harnack.backend.sines import sincos
+from harnack.backend.sines import largest_angle, sincos
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real
@@ -147,20 +147,20 @@ def _sine_and_cosine(x: Interval) -> tuple[Interval, Interval]:
 
     Proof. Both are monotone between the multiples of pi/2 at which they are 1 or -1: the range is
     that of the ends, and of such points inside. Which are inside is asked of an interval widened by
-    the rounding of the question; if one is counted wrongly, it is that near to an end. Beyond 10^6
-    sines are not known to rounding: there the range is [-1, 1].
+    the rounding of the question; if one is counted wrongly, it is that near to an end. Beyond
+    `largest_angle` sines are not known: there the range is [-1, 1].
     """
-    unit = unit_of(x.low)
+    unit, most = unit_of(x.low), largest_angle(type(x.low))
     s0, c0 = sincos(x.low)
     if x.low is x.high:
-        wide = dr.abs(x.low) > 1e6
+        wide = dr.abs(x.low) > most
         s, c = (Interval(one, one).widened(4 * unit, 4 * unit) for one in (s0, c0))
         return _unit_range(s, wide), _unit_range(c, wide)
     s1, c1 = sincos(x.high)
     turn = 1 / (2 * math.pi)
     slack = 8 * unit * (fmax(dr.abs(x.low), dr.abs(x.high)) + 1) * turn
     low, high = x.low * turn - slack, x.high * turn + slack
-    wide = ~(fmax(dr.abs(x.low), dr.abs(x.high)) <= 1e6) | ~(high - low < 1)
+    wide = ~(fmax(dr.abs(x.low), dr.abs(x.high)) <= most) | ~(high - low < 1)
 
     def passes(phase: float) -> Mask:
         return dr.floor(high - phase) > dr.floor(low - phase)
