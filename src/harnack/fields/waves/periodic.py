@@ -129,6 +129,10 @@ class EigenfunctionSum(Field):
         x, y, z = (type(p)(*row) for row in hessian_of_terms(self.terms, p))
         return x, y, z
 
+    def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
+        del sample
+        return self._rounding.derivative_errors(p)
+
     def slope_change(self, p: Vec3, radius: Real) -> Real:
         """As no second derivative exceeds `curvature`, nor does the norm of the Hessian."""
         return 0 * p.x + radius * (self.curvature * (1 + _ROUNDING))

@@ -10,7 +10,9 @@ Everything is to first order in u, as in `harmonic_rounding`. A sine or cosine i
 - The angle of a plane wave is off by 5u sum |k_i x_i| + 2u |phase|.
 - A product of n factors is off by n times that of a sine, by u for each product with a factor and
   2u for an amplitude other than 1; a partial sum by u of its size.
-- A derivative along one axis carries the frequency as well: 2u more.
+- A derivative along one axis carries the frequency as well: 2u more; a second derivative 6u.
+  Of an entry i, j of the Hessian the error is at most d |k_i| |k_j|, which as a matrix has the
+  norm d |k|^2.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import drjit as dr
 
@@ -29,6 +31,8 @@ if TYPE_CHECKING:
 
 _SINE = 2.0
 
+Share: TypeAlias = tuple[float, float, float, float]
+
 
 @dataclass(frozen=True)
 class WaveRounding:
@@ -37,35 +41,42 @@ class WaveRounding:
     move: (x, y, z) by how much of each coordinate rounding moves the point for all terms alike.
     value, gradient: (constant, x, y, z), the rest of the rounding: the constant plus those times
         the sizes of the coordinates.
+    slopes, hessian: the same, of all that is done to the gradient and the Hessian at the point
+        that was given: no part of it is a move.
     """
 
     move: tuple[float, float, float]
-    value: tuple[float, float, float, float]
-    gradient: tuple[float, float, float, float]
+    value: Share
+    gradient: Share
+    slopes: Share
+    hessian: Share
 
     @classmethod
     def of(cls, terms: Sequence[Term]) -> WaveRounding:
         """What the operations of `evaluate_terms` add up to."""
         common = [_common(terms, axis) for axis in range(3)]
-        value, gradient = [0.0] * 4, [0.0] * 4
-        sizes, slopes = 0.0, 0.0
+        value, gradient, alone, second = ([0.0] * 4 for _ in range(4))
+        sizes, slopes, bends = 0.0, 0.0, 0.0
         for n, term in enumerate(terms):
             size, vector = abs(term.amplitude), _vector(term)
             steep = math.sqrt(sum(k * k for k in vector))
-            sizes, slopes = sizes + size, slopes + size * steep
+            bend = size * steep * steep
+            sizes, slopes, bends = sizes + size, slopes + size * steep, bends + bend
             angle, per_axis, operations = _of_term(term, common)
-            partial = (sizes, slopes) if n else (0.0, 0.0)  # the first is added to 0
+            _, all_per_axis, _ = _of_term(term, (None, None, None))
+            partial = (sizes, slopes, bends) if n else (0.0, 0.0, 0.0)  # the first is added to 0
             value[0] += size * (angle + operations) + partial[0]
             gradient[0] += size * steep * (angle + operations + 2) + partial[1]
+            second[0] += bend * (angle + operations + 6) + partial[2]
             for axis in range(3):
                 value[axis + 1] += size * per_axis[axis]
                 gradient[axis + 1] += size * steep * per_axis[axis]
+                alone[axis + 1] += size * steep * all_per_axis[axis]
+                second[axis + 1] += bend * all_per_axis[axis]
+        alone[0] = gradient[0]
         moves = [0.0 if k is None else _rounded(k) for k in common]
-        return cls(
-            (moves[0], moves[1], moves[2]),
-            (value[0], value[1], value[2], value[3]),
-            (gradient[0], gradient[1], gradient[2], gradient[3]),
-        )
+        a, b, c, d = ((s[0], s[1], s[2], s[3]) for s in (value, gradient, alone, second))
+        return cls((moves[0], moves[1], moves[2]), a, b, c, d)
 
     def errors(self, p: Vec3, gradient: Vec3) -> tuple[Real, Real]:
         """Errors of value and gradient at p; the latter once the point is moved as `move` says."""
@@ -79,6 +90,16 @@ class WaveRounding:
                 slope = slope + self.gradient[axis + 1] * size[axis]
         unit = float(dr.epsilon(type(p.x)))
         return unit * (value + 0 * p.x), unit * (slope + 0 * p.x)
+
+    def derivative_errors(self, p: Vec3) -> tuple[Real, Real]:
+        """Errors of gradient and Hessian at p itself."""
+        unit = float(dr.epsilon(type(p.x)))
+
+        def at(share: Share) -> Real:
+            far = (one * dr.abs(x) for one, x in zip(share[1:], p, strict=True))
+            return unit * (share[0] + sum(far, 0 * p.x))
+
+        return at(self.slopes), at(self.hessian)
 
 
 def _vector(term: Term) -> tuple[float, ...]:
