@@ -58,7 +58,7 @@ _OF_SOLIDS = frozenset(
     ("moved", "rotated", "scaled", "transformed", "twisted", "tapered", "grown", "blended")
 )
 # A detail at which nothing is left out.
-_EVERYTHING = 1e9
+NO_TRUNCATION = 1e9
 
 _HOW = (
     "return harnack.Sample(value, gradient, known), with a Dr.Jit number, a Dr.Jit 3-vector and a "
@@ -227,10 +227,17 @@ class Field(abc.ABC):
     def differentiable_value(self, p: Vec3) -> Real:
         """f(p) as an expression that Dr.Jit can differentiate in p and in the field's parameters.
 
-        Only used at known hits, to attach derivatives. Override it where `evaluate` runs a
-        recorded loop, which reverse mode cannot pass.
+        In p it is of first order: the value, with the gradient as its derivative, so that no
+        derivative passes `evaluate`, which may run a recorded loop, and so that it is the gradient
+        that the field states where the formula of f has ties. A field with parameters overrides
+        it where `evaluate` cannot be differentiated in both modes.
         """
-        return self.evaluate(p).value
+        if any(dr.grad_enabled(one) for one in self.parameters()):
+            return self.evaluate(p).value
+        at = dr.detach(p)
+        with dr.suspend_grad():
+            sample = self.evaluate(at)
+        return dr.replace_grad(sample.value, dr.dot(sample.gradient, p - at))
 
     @takes_tensors
     def value(self, points: Any, *, precision: Precision = "single") -> Any:
@@ -336,7 +343,7 @@ class Field(abc.ABC):
         if not self.has_detail:
             return self
         closely = copy.copy(self)
-        closely.evaluate = self.at_detail(backend.Float(_EVERYTHING)).evaluate
+        closely.evaluate = self.at_detail(backend.Float(NO_TRUNCATION)).evaluate
         return closely
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:

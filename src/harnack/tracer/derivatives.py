@@ -11,12 +11,14 @@ on a plane, n . (o + t d) = const, whatever the level: dt = -(n . (do + t dd))/(
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
 from harnack.backend.lengths import length as norm
 from harnack.enclosures import TargetLevels
+from harnack.fields.field import NO_TRUNCATION
 from harnack.tracer.tolerance import Status
 
 if TYPE_CHECKING:
@@ -62,6 +64,10 @@ def attach(
     with dr.suspend_grad():
         at = dr.select(hit, t, 0)
         here, along = dr.detach(o), dr.detach(d)
+        if prepared.field.has_detail:
+            # Truncation would be as large as the tolerance, and differ from point to point.
+            detail = dr.select(hit, backend.Float(NO_TRUNCATION), 0)
+            prepared = replace(prepared, field=prepared.field.at_detail(detail))
         for _ in range(_POLISH):
             x = dr.fma(backend.Array3f(at), along, here)
             sample = prepared.sample(x)
@@ -77,8 +83,11 @@ def attach(
         length = norm(sample.gradient)
         normal = dr.select(hit & (length > 0), sample.gradient / length, normal)
         dr.eval(at, x, slope, normal)
-    value = prepared.field.differentiable_value(dr.fma(backend.Array3f(at), d, o))
-    change = value - dr.detach(value)
+    moving = dr.fma(backend.Array3f(at), d, o)
+    change = dr.dot(sample.gradient, moving - x)
+    if any(dr.grad_enabled(one) for one in prepared.field.parameters()):
+        value = prepared.field.differentiable_value(moving)
+        change = value - dr.detach(value)
     change = change - _change_of_nearest(prepared, sample.value)
     usable = hit & (slope != 0)
     moved = at - dr.select(usable, change / slope, 0)

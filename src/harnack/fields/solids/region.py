@@ -114,9 +114,6 @@ class Region(Derived):
     def evaluate(self, p: Vec3) -> Sample:
         return self.inner.evaluate(p)
 
-    def differentiable_value(self, p: Vec3) -> Real:
-        return self.inner.differentiable_value(p)
-
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         return self.inner.hessian(p)
 
@@ -279,10 +276,6 @@ class Near(Derived):
 
     def evaluate(self, p: Vec3) -> Sample:
         return self._folded(self.inner.evaluate(p))[0]
-
-    def differentiable_value(self, p: Vec3) -> Real:
-        offset = self._offset(self.inner.differentiable_value(p))
-        return dr.abs(offset) - self.half_width
 
     def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
         look = self.inner.look(path, t, ahead, back)
