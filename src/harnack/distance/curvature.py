@@ -11,6 +11,7 @@ import numpy as np
 
 from harnack.backend import FloatArray, choose_backend
 from harnack.backend.extrema import fmax, fmin
+from harnack.backend.numbers import refuse_derivatives
 from harnack.distance.batches import in_batches
 from harnack.distance.tangent import TangentPlane
 from harnack.fields.batch import BatchedField
@@ -75,6 +76,7 @@ def curvature(field: Field, points: Any, *, precision: Precision = "double") -> 
         TypeError, ValueError: points that are not an (n, 3) array of finite numbers.
     """
     check_is_field(field)
+    refuse_derivatives(f"the curvature of {type(field).__name__}", field)
     backend = choose_backend(precision)
     if not isinstance(field, BatchedField):
         prepared = field.prepare(backend)

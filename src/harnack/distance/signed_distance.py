@@ -11,6 +11,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import FloatArray, choose_backend
+from harnack.backend.numbers import refuse_derivatives
 from harnack.choices import did_you_mean
 from harnack.distance.batches import in_batches
 from harnack.distance.closest import Closest, find_closest
@@ -176,6 +177,7 @@ def _silent(message: str) -> None:
 
 def _surface(field: Field, level: Any) -> LevelSet:
     check_is_field(field)
+    refuse_derivatives(f"the distance from a level set of {type(field).__name__}", field, level)
     if field.has_sheets and type(field).distance_to_sheets is Field.distance_to_sheets:
         raise NotImplementedError(
             f"{type(field).__name__} has sheets but does not say how far they are: define its "

@@ -18,6 +18,7 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
+from harnack.backend.numbers import refuse_derivatives
 from harnack.backend.tensors import takes_tensors
 from harnack.enclosures import (
     BoundedLaplacian,
@@ -34,6 +35,8 @@ from harnack.fields.sheets import NO_SHEET, Crossing, NearestSheet
 from harnack.geometry.volumes.volume import check_volume
 
 if TYPE_CHECKING:
+    from typing import Self
+
     from harnack.backend import Backend, FloatArray, IntArray, Mask, Precision, Real, Vec3
     from harnack.cells import OccupiedCells
     from harnack.geometry import Volume
@@ -72,6 +75,7 @@ def _of_points(hessian: Callable[[Any, Vec3], Any]) -> Callable[..., Any]:
     @functools.wraps(hessian)
     def general(self: Any, p: Any, *, precision: Precision = "single") -> Any:
         if dr.is_array_v(type(p)):
+            refuse_derivatives(f"the Hessian of {type(self).__name__}", p, self.parameters())
             return hessian(self, p)
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Vec3, Vec3, Vec3]:
@@ -102,6 +106,8 @@ def _checked(evaluate: Callable[[Any, Vec3], Sample]) -> Callable[[Any, Vec3], S
         gradient: Any = sample.gradient
         if not dr.is_array_v(type(gradient)) or dr.size_v(type(gradient)) != 3:
             raise TypeError(f"{name}: Sample.gradient is {_named(gradient)}, no 3-vector: {_HOW}")
+        if type(self).parameters is Field.parameters and not dr.grad_enabled(p):
+            refuse_derivatives(type(self).__name__, sample.value)
         return sample
 
     return checked
@@ -151,6 +157,12 @@ class Field(abc.ABC):
 
     coarsest_detail: float = 1.0
     """What detail 0 amounts to, as a detail in (0, 1]: see `at_detail`."""
+
+    def __new__(cls, *given: Any, **named: Any) -> Self:
+        """Refuses parameters with derivatives, unless the class says that it has `parameters`."""
+        if cls.parameters is Field.parameters:
+            refuse_derivatives(cls.__name__, given, named)
+        return super().__new__(cls)
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         """Has what `evaluate` returns checked, and `hessian` take NumPy arrays too."""
@@ -221,8 +233,19 @@ class Field(abc.ABC):
         del levels
 
     def parameters(self) -> tuple[Any, ...]:
-        """Dr.Jit arrays that the value depends on and that may carry derivatives."""
+        """Dr.Jit arrays that the value depends on and that may carry derivatives.
+
+        A class that does not define this method is given none: its constructor refuses them.
+        """
         return ()
+
+    def check_parameters(self) -> None:
+        """Raise NotImplementedError for derivatives by parameters that the field does not name, as
+        by what its formula refers to: they would be dropped."""
+        if type(self).parameters is Field.parameters:
+            kind = type(self)
+            is_own = not kind.__module__.startswith("harnack.")
+            refuse_derivatives(kind.__name__, vars(self), kind.evaluate if is_own else None)
 
     def differentiable_value(self, p: Vec3) -> Real:
         """f(p) as an expression that Dr.Jit can differentiate in p and in the field's parameters.
@@ -234,6 +257,7 @@ class Field(abc.ABC):
         """
         if any(dr.grad_enabled(one) for one in self.parameters()):
             return self.evaluate(p).value
+        self.check_parameters()
         at = dr.detach(p)
         with dr.suspend_grad():
             sample = self.evaluate(at)
@@ -250,6 +274,7 @@ class Field(abc.ABC):
         Raises TypeError or ValueError for other shapes, NaN or infinity.
         """
         if dr.is_array_v(type(points)):
+            self.check_parameters()
             if any(dr.grad_enabled(one) for one in (points, *self.parameters())):
                 return self.differentiable_value(points)
             return self.evaluate(points).value
@@ -261,10 +286,13 @@ class Field(abc.ABC):
 
         A Dr.Jit 3-vector gives a Dr.Jit 3-vector, and a tensor (n, 3) one of this shape, with
         derivatives with respect to the points if they have them enabled and the field defines
-        `hessian`. Raises as `value`.
+        `hessian`. Raises as `value`, and NotImplementedError if parameters of the field have
+        derivatives enabled.
         """
         if not dr.is_array_v(type(points)):
             return self._samples_at(points, precision, lambda sample: sample.gradient)
+        self.check_parameters()
+        refuse_derivatives(f"the gradient of {type(self).__name__}", self.parameters())
         if not dr.grad_enabled(points):
             return self.evaluate(points).gradient
         with dr.suspend_grad():

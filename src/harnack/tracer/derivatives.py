@@ -36,6 +36,7 @@ def wants_derivatives(prepared: PreparedLevelSet, o: Vec3, d: Vec3) -> bool:
         NotImplementedError: parameters of a field with sheets have. They move the sheets, and
             the derivative of that is not known here; zero would be wrong.
     """
+    prepared.field.check_parameters()
     parameters = prepared.field.parameters()
     of_field = any(dr.grad_enabled(p) for p in parameters)
     if of_field and prepared.field.has_sheets:
@@ -46,6 +47,33 @@ def wants_derivatives(prepared: PreparedLevelSet, o: Vec3, d: Vec3) -> bool:
         )
     rest: list[Any] = [o, d, *prepared.levels.values]
     return of_field or any(dr.grad_enabled(p) for p in rest)
+
+
+class _Undifferentiated(dr.CustomOp):
+    """The identity, whose derivative is not known: reverse mode raises. Forward mode, which goes
+    from parameters to all that depends on them, wanted or not, gives NaN."""
+
+    def eval(self, value: Any, what: str, sources: list[Any]) -> Any:
+        del sources
+        self._what = what
+        return value
+
+    def forward(self) -> None:
+        self.set_grad_out(self.grad_out() + dr.nan)
+
+    def backward(self) -> None:
+        if dr.any(self.grad_out() != 0, axis=None):  # zero where a result is there and not used
+            raise NotImplementedError(
+                f"{self._what} of hits cannot be differentiated, only t and position can: detach "
+                "it where it is used (drjit.detach)"
+            )
+
+
+def refuse_derivative(prepared: PreparedLevelSet, o: Vec3, d: Vec3, what: str, value: Any) -> Any:
+    """A result of a trace that depends on what has derivatives enabled, but has none itself: that
+    is said when one is asked for (`_Undifferentiated`), since zero would be wrong."""
+    sources = [o, d, *prepared.levels.values, *prepared.field.parameters()]
+    return dr.custom(_Undifferentiated, value, what, sources)
 
 
 def attach(

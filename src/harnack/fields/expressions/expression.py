@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from harnack.backend.numbers import refuse_derivatives
 from harnack.fields.expressions.text import TextFormula
 from harnack.fields.formula import Formula, as_jet, probe
 
@@ -60,6 +61,7 @@ def expression(
     Raises:
         TypeError: function cannot be called with three coordinates, or uses what has no proved
             ranges; domain is no volume.
+        NotImplementedError: function uses numbers with derivatives enabled.
         ValueError: level is not finite; a text is no formula.
     """
     if isinstance(function, str):
@@ -76,7 +78,7 @@ def expression(
         raise ValueError(f"level must be finite, not {level!r}")
     made = Expression(function, domain, default_level=level, is_convex=is_convex)
     point = probe()
-    as_jet(made.formula(*point), point[0], "expression")
+    refuse_derivatives("an expression", as_jet(made.formula(*point), point[0], "expression"))
     return made
 
 
