@@ -9,7 +9,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import FloatArray
-from harnack.backend.numbers import LARGEST, refuse_derivatives
+from harnack.backend.numbers import LARGEST
 from harnack.fields import points as field_points
 
 if TYPE_CHECKING:
@@ -36,7 +36,6 @@ def in_batches(
         TypeError, ValueError: points that are not an (n, 3) array of finite numbers of at most
             1e100.
     """
-    refuse_derivatives("what is searched for from points", points)
     _check_size(points)
     with np.errstate(over="ignore"):
         rounded = (one.astype(backend.dtype, copy=False) for one in others)

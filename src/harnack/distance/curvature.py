@@ -11,7 +11,7 @@ import numpy as np
 
 from harnack.backend import FloatArray, choose_backend
 from harnack.backend.extrema import fmax, fmin
-from harnack.backend.numbers import refuse_derivatives
+from harnack.backend.numbers import refuses_derivatives
 from harnack.distance.batches import in_batches
 from harnack.distance.tangent import TangentPlane
 from harnack.fields.batch import BatchedField
@@ -55,6 +55,7 @@ class Curvatures:
     gaussian_error: FloatArray
 
 
+@refuses_derivatives
 def curvature(field: Field, points: Any, *, precision: Precision = "double") -> Curvatures:
     """Mean and Gaussian curvature of the level sets of a field through points (n, 3).
 
@@ -76,7 +77,6 @@ def curvature(field: Field, points: Any, *, precision: Precision = "double") -> 
         TypeError, ValueError: points that are not an (n, 3) array of finite numbers.
     """
     check_is_field(field)
-    refuse_derivatives(f"the curvature of {type(field).__name__}", field)
     backend = choose_backend(precision)
     if not isinstance(field, BatchedField):
         prepared = field.prepare(backend)

@@ -11,7 +11,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import FloatArray, choose_backend
-from harnack.backend.numbers import refuse_derivatives
+from harnack.backend.numbers import refuses_derivatives
 from harnack.choices import did_you_mean
 from harnack.distance.batches import in_batches
 from harnack.distance.closest import Closest, find_closest
@@ -32,6 +32,7 @@ Method = Literal["first", "second", "newton", "lower"]
 _CLOSE = 1e-15
 
 
+@refuses_derivatives
 def signed_distance(
     field: Field,
     points: Any,
@@ -94,6 +95,7 @@ def signed_distance(
     return result
 
 
+@refuses_derivatives
 def closest_points(
     field: Field,
     points: Any,
@@ -133,6 +135,7 @@ class DistanceBounds:
     lower: FloatArray
 
 
+@refuses_derivatives
 def distance_bounds(
     field: Field,
     points: Any,
@@ -177,7 +180,6 @@ def _silent(message: str) -> None:
 
 def _surface(field: Field, level: Any) -> LevelSet:
     check_is_field(field)
-    refuse_derivatives(f"the distance from a level set of {type(field).__name__}", field, level)
     if field.has_sheets and type(field).distance_to_sheets is Field.distance_to_sheets:
         raise NotImplementedError(
             f"{type(field).__name__} has sheets but does not say how far they are: define its "

@@ -18,7 +18,7 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend.numbers import refuse_derivatives
+from harnack.backend.numbers import refuse_derivatives, refuses_derivatives
 from harnack.backend.tensors import takes_tensors
 from harnack.enclosures import (
     BoundedLaplacian,
@@ -165,8 +165,13 @@ class Field(abc.ABC):
         return super().__new__(cls)
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Has what `evaluate` returns checked, and `hessian` take NumPy arrays too."""
+        """Has what `evaluate` returns checked, `hessian` take NumPy arrays too, and other ways to
+        make a field refuse derivatives as the constructor does."""
         super().__init_subclass__(**kwargs)
+        for name, own in list(vars(cls).items()):
+            if isinstance(own, classmethod) and not name.startswith("_"):
+                checked_maker = refuses_derivatives(cast("Any", own).__func__)
+                setattr(cls, name, classmethod(checked_maker))
         if "evaluate" in vars(cls):
             checked = _checked(cls.evaluate)
             cls.evaluate = checked  # pyright: ignore[reportAttributeAccessIssue]

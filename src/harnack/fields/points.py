@@ -46,7 +46,7 @@ def at_points(
         results = kernel(backend, dr.gather(backend.Array3f, x, order))
         return tuple(_back_in_place(one, order, dr.width(x)) for one in results)
 
-    refuse_derivatives("what is computed at points in batches", points)
+    refuse_derivatives("what NumPy's arrays are given of", points)
     given = np.asarray(points)
     if given.shape == (3,):
         return tuple(one[0] for one in in_batches(backend, visit, given[None]))
@@ -70,7 +70,6 @@ def in_batches(
         TypeError, ValueError: points that are no (n, 3) array of finite numbers.
     """
     on_device = dr.is_array_v(cast("Any", type(points)))
-    refuse_derivatives("what is computed at points in batches", points)
     vectors = (
         to_vector3(backend, points, "points") if on_device else finite_vectors(points, "points")
     )

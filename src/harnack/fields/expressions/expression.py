@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from harnack.backend.numbers import refuse_derivatives
+from harnack.backend.numbers import refuse_derivatives, refuses_derivatives
 from harnack.fields.expressions.text import TextFormula
 from harnack.fields.formula import Formula, as_jet, probe
 
@@ -38,6 +38,7 @@ class Expression(Formula):
         return self
 
 
+@refuses_derivatives
 def expression(
     function: Callable[[Any, Any, Any], Any] | str,
     *,

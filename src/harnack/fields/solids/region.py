@@ -14,6 +14,7 @@ from harnack.arithmetic import Interval, Jet
 from harnack.backend import backend_of
 from harnack.backend.extrema import fmax, fmin
 from harnack.backend.lengths import length
+from harnack.backend.numbers import refuses_derivatives
 from harnack.enclosures import Curvature, Enclosure, Gaps
 from harnack.fields.field import Field, check_is_field
 from harnack.fields.formula import Formula, as_data, is_jet
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from harnack.geometry import Volume
 
 
+@refuses_derivatives
 def solid(
     field: Field,
     *,
