@@ -76,7 +76,8 @@ class Formula(Field):
         beside = self.sample_alone(away)
         better = beside.gradient_error < 0.5 * sample.gradient_error
         gradient = dr.select(better, beside.gradient, sample.gradient)
-        doubt = sample.gradient_error + length(gradient - sample.gradient)
+        doubt = sample.gradient_error
+        doubt = dr.select(better, doubt + length(beside.gradient - sample.gradient), doubt)
         return dataclasses.replace(sample, gradient=gradient, gradient_error=doubt)
 
     def sample_alone(self, p: Vec3) -> Sample:

@@ -22,11 +22,12 @@ from harnack.fields.field import NO_TRUNCATION
 from harnack.tracer.tolerance import Status
 
 if TYPE_CHECKING:
-    from harnack.backend import Real, Vec3
+    from harnack.backend import Mask, Real, Vec3
     from harnack.tracer.prepared import MarchResult, PreparedLevelSet
 
-# Newton steps from the tolerance to rounding before the derivative is taken.
-_POLISH = 4
+# Newton steps from the tolerance to rounding before the derivative is taken; of sums over trees,
+# which are summed up one by one for it.
+_POLISH, _POLISH_OF_SUMS = 4, 3
 
 
 def wants_derivatives(prepared: PreparedLevelSet, o: Vec3, d: Vec3) -> bool:
@@ -92,11 +93,13 @@ def attach(
     with dr.suspend_grad():
         at = dr.select(hit, t, 0)
         here, along = dr.detach(o), dr.detach(d)
+        steps = _POLISH
         if prepared.field.has_detail:
-            # Truncation would be as large as the tolerance, and differ from point to point.
+            # Truncation is as large as the tolerance, and its derivative may be much larger.
+            steps = _POLISH_OF_SUMS
             detail = dr.select(hit, backend.Float(NO_TRUNCATION), 0)
             prepared = replace(prepared, field=prepared.field.at_detail(detail))
-        for _ in range(_POLISH):
+        for _ in range(steps):
             x = dr.fma(backend.Array3f(at), along, here)
             sample = prepared.sample(x)
             miss = prepared.levels.to_nearest(sample.value)
@@ -117,9 +120,7 @@ def attach(
         value = prepared.field.differentiable_value(moving)
         change = value - dr.detach(value)
     change = change - _change_of_nearest(prepared, sample.value)
-    usable = hit & (slope != 0)
-    moved = at - dr.select(usable, change / slope, 0)
-    return dr.select(hit, moved, t), normal
+    return dr.select(hit, _moved(at, change, slope, hit), t), normal
 
 
 def _on_plane(prepared: PreparedLevelSet, o: Vec3, d: Vec3, end: MarchResult) -> Real:
@@ -129,7 +130,13 @@ def _on_plane(prepared: PreparedLevelSet, o: Vec3, d: Vec3, end: MarchResult) ->
         slope = dr.dot(end.gradient, dr.detach(d))
     x = dr.fma(prepared.backend.Array3f(at), d, o)
     change = dr.dot(end.gradient, x - dr.detach(x))
-    return end.t - dr.select(end.on_sheet & (slope != 0), change / slope, 0)
+    return _moved(end.t, change, slope, end.on_sheet)
+
+
+def _moved(t: Real, change: Real, slope: Real, where: Mask) -> Real:
+    """t with the derivative of -change/slope; where the slope is 0, so that t has none, it is
+    infinite or NaN."""
+    return dr.replace_grad(t, -change * dr.select(where, 1 / slope, 0))
 
 
 def _change_of_nearest(prepared: PreparedLevelSet, f: Real) -> Real:
