@@ -18,6 +18,7 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
+from harnack.backend.arrays import as_data
 from harnack.backend.numbers import refuse_derivatives, refuses_derivatives
 from harnack.backend.tensors import takes_tensors
 from harnack.enclosures import (
@@ -266,7 +267,8 @@ class Field(abc.ABC):
         at = dr.detach(p)
         with dr.suspend_grad():
             sample = self.evaluate(at)
-        return dr.replace_grad(sample.value, dr.dot(sample.gradient, p - at))
+        gradient = as_data(sample.gradient)  # of a literal 0, Dr.Jit has no derivative at all
+        return dr.replace_grad(sample.value, dr.dot(gradient, p - at))
 
     @takes_tensors
     def value(self, points: Any, *, precision: Precision = "single") -> Any:

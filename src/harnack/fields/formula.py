@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 
 from harnack.arithmetic import Interval, Jet
+from harnack.arithmetic.dual import Dual
 from harnack.arithmetic.operators import Operators
 from harnack.backend import choose_backend
 from harnack.backend.extrema import fmin
@@ -33,8 +34,11 @@ if TYPE_CHECKING:
 
 # Radii of the balls on which a Lipschitz constant is promised, in multiples of |f|/|grad f|.
 _RADII, _LARGEST_RADIUS = (0.25, 1.0, 4.0), 1e12
-# Beside a tie is where the rounding of coordinates and value, times this, leads in this direction.
-_BESIDE, _ASIDE = 64.0, (0.8, 0.5, 0.33)
+# Beside a tie is where the rounding of coordinates and value, times this, leads; the direction, a
+# unit vector or 0, is turned by another, so that it is along no tie.
+_BESIDE, _ASIDE = 64.0, (0.31, 0.19, 0.13)
+# A gradient that is known to so many roundings is no tie.
+_TIE = 1024.0
 
 
 class Formula(Field):
@@ -65,20 +69,29 @@ class Formula(Field):
 
         At ties of a formula, such as max(x, 0) at x = 0, the range of the gradient has all slopes
         beside p, and more where terms of several ties are added, as on the faces of `corner`. Its
-        middle is the gradient of no point. A few roundings away, in one direction for all points,
-        there is no tie. Where the range there is no narrower than half of that at p, it is wide by
-        rounding, and the middle is kept.
+        middle is the gradient of no point, if mostly across the tie. A few roundings away in about
+        its direction, values decide between them (`Dual`).
 
         Proof of the error. The gradient at p lies within `gradient_error` of the middle.
         """
+        epsilon = float(dr.epsilon(type(p.x)))
+        middle, doubt = sample.gradient, sample.gradient_error
+        steep = length(middle)
+        way = dr.select(steep > 0, middle / steep, 0) + type(p)(*_ASIDE)
         size = largest_component(p) + dr.abs(sample.value)
-        away = p + type(p)(*_ASIDE) * (_BESIDE * float(dr.epsilon(type(size))) * size)
-        beside = self.sample_alone(away)
-        better = beside.gradient_error < 0.5 * sample.gradient_error
-        gradient = dr.select(better, beside.gradient, sample.gradient)
-        doubt = sample.gradient_error
-        doubt = dr.select(better, doubt + length(beside.gradient - sample.gradient), doubt)
-        return dataclasses.replace(sample, gradient=gradient, gradient_error=doubt)
+        size = dr.select(size > 0, size, 1)
+        away = Dual.at_point(p + way * (_BESIDE * epsilon * size))
+        try:
+            beside = away[0].of(self.formula(*away))
+        except TypeError:  # a formula of ranges alone, as of noise
+            return sample
+        one_side = type(p)(*(0 * p.x + one for one in beside.first))
+        is_tie = (doubt > _TIE * epsilon * steep) & dr.all(dr.isfinite(one_side))
+        return dataclasses.replace(
+            sample,
+            gradient=dr.select(is_tie, one_side, middle),
+            gradient_error=dr.select(is_tie, doubt + length(one_side - middle), doubt),
+        )
 
     def sample_alone(self, p: Vec3) -> Sample:
         """Value and gradient, without promises that a look along a path has no use for."""
