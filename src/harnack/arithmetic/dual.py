@@ -6,6 +6,8 @@ A dual number has the slopes of one side, as each comparison is decided by the v
 
 from __future__ import annotations
 
+import operator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
@@ -37,29 +39,40 @@ class Dual(Operators):
         return Dual(cast("Any", type(self.value))(x), (0.0, 0.0, 0.0))
 
     def sum(self, other: Dual) -> Dual:
-        return Dual(self.value + other.value, _each(lambda a, b: a + b, self.first, other.first))
+        return Dual(self.value + other.value, _each(operator.add, self.first, other.first))
 
     def product(self, other: Dual) -> Dual:
         x, y = self.value, other.value
-        return Dual(x * y, _each(lambda a, b: a * y + x * b, self.first, other.first))
+
+        def rule(a: Any, b: Any) -> Any:
+            return a * y + x * b
+
+        return Dual(x * y, _each(rule, self.first, other.first))
 
     def __neg__(self) -> Dual:
-        return Dual(-self.value, _each(lambda a: -a, self.first))
+        return Dual(-self.value, _each(operator.neg, self.first))
 
     def apply(self, function: Function) -> Dual:
         """A function of this one. Where this one is constant, so is that, also at a pole of the
         slope, as that of the root in a norm of zeros."""
         slope = function.ranges(Interval.exactly(self.value))[1].middle
         real = cast("Any", type(self.value))
-        first = _each(lambda a: dr.select(real(a) == 0, 0, a * slope), self.first)
-        return Dual(function.plain(self.value), first)
+
+        def rule(a: Any) -> Any:
+            return dr.select(real(a) == 0, 0, a * slope)
+
+        return Dual(function.plain(self.value), _each(rule, self.first))
 
     def larger(self, other: Dual) -> Dual:
         is_own = self.value > other.value
-        first = _each(lambda a, b: dr.select(is_own, a, b), self.first, other.first)
-        return Dual(dr.select(is_own, self.value, other.value), first)
+
+        def rule(a: Any, b: Any) -> Any:
+            return dr.select(is_own, a, b)
+
+        value = dr.select(is_own, self.value, other.value)
+        return Dual(value, _each(rule, self.first, other.first))
 
 
-def _each(function: Any, *partials: _Partials) -> _Partials:
+def _each(function: Callable[..., Any], *partials: _Partials) -> _Partials:
     x, y, z = (function(*of_axis) for of_axis in zip(*partials, strict=True))
     return x, y, z
