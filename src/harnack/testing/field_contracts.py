@@ -43,9 +43,9 @@ def check_field(
     the gradient is that of the value; f is harmonic where a ball of dimension 2 or 3 says so;
     `differentiable_value` is the value and has this gradient; `hessian`, where there is one, is
     symmetric, the derivative of the gradient and, of a harmonic f, without trace; the lift of f
-    keeps each promise (`HarmonicBall`, `Lipschitz`, `Curvature`) on the way to random points of its ball, or
-    for the last two to where that leaves the domain; enclosures along paths, of a field that gives
-    its own (`check_looks`), hold;
+    keeps each promise (`HarmonicBall`, `Lipschitz`, `Curvature`) on the way to random points of its
+    ball, or for the last two to where that leaves the domain; enclosures along paths, of a field
+    that gives its own (`check_looks`), hold;
     some step is possible at most points; no level set leaves its `extent`. Jumps across sheets
     are taken out on the way, and values may move between neighbouring points by `Sample.error`
     besides, as they do where a tree takes other clusters as wholes.
