@@ -530,6 +530,7 @@ class Broken(Field):
     of: Field
     change: Callable[[Any, Sample], Sample]
     differentiable: float = 0.0
+    slope: float = 1.0
     around: hk.Ball | None = None
 
     def __post_init__(self) -> None:
@@ -544,7 +545,8 @@ class Broken(Field):
         return self.around or self.of.extent(levels)
 
     def differentiable_value(self, p: Any) -> Any:
-        return self.of.evaluate(p).value + self.differentiable
+        value = super().differentiable_value(p)
+        return dr.replace_grad(value + self.differentiable, self.slope * value)
 
 
 def changed(sample: Sample, **new: Any) -> Sample:
@@ -681,6 +683,10 @@ BROKEN: dict[str, tuple[Field, str]] = {
     "differentiable value": (
         Broken(POLYNOMIAL, lambda p, s: s, differentiable=1e-3),
         "differentiable_value",
+    ),
+    "differentiable value that is a constant": (
+        Broken(POLYNOMIAL, lambda p, s: s, slope=0.0),
+        "differentiable_value does not have the gradient",
     ),
     "extent too small": (
         Broken(COIL, lambda p, s: s, around=hk.Ball(radius=0.5)),

@@ -11,7 +11,7 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend
-from harnack.geometry import shapes
+from harnack.geometry import mesh_shapes, shapes
 
 DOUBLE = choose_backend("double")
 LOOP = shapes.wavy_polygon(12)
@@ -211,3 +211,133 @@ def test_the_value_of_t_is_polished_to_rounding() -> None:
     dr.enable_grad(origin)
     hits = hk.trace(hk.SolidAngle(LOOP), origin, vector(d), tolerance=1e-3)
     np.testing.assert_allclose(numpy(hits.t), solve(hk.SolidAngle(LOOP), o, d, LEVEL), atol=1e-9)
+
+
+# Flat faces, edges and ties of formulas.
+
+TALL, CAN = hk.Cuboid((0.5, 0.5, 2.0)), hk.Cylinder(0.4, 1.4)
+SOLIDS: dict[str, hk.Solid] = {
+    "union, moved and rotated": (TALL | CAN.rotated(70, "x")).moved((0.1, 0.2, 0)).rotated(20),
+    "cuboid": TALL,
+    "cylinder": CAN,
+    "difference": TALL - CAN.rotated(50, (1, 1, 0)),
+    "intersection": TALL & CAN.moved((0.2, 0, 0.1)),
+    "grown": CAN.grown(0.1),
+}
+
+
+def rays_at(size: float, n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    o = rng.normal(size=(n, 3))
+    o *= 4 / np.linalg.norm(o, axis=1, keepdims=True)
+    return o, rng.uniform(-size, size, (n, 3)) - o
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        one if one.startswith("union") else pytest.param(one, marks=pytest.mark.slow)
+        for one in SOLIDS
+    ],
+)
+def test_hits_on_faces_and_edges_of_solids(name: str) -> None:
+    """By rays and by the level, in reverse mode: extrema tie at every hit of a flat face."""
+    solid = SOLIDS[name]
+    o, d = rays_at(0.6, 400, 4)
+    motion = np.random.default_rng(5).normal(size=o.shape)
+    h = 1e-6
+
+    def at(s: float, level: float) -> hk.Hits:
+        start = o + s * motion
+        return hk.trace(solid, start, d, level=level, precision="double", tolerance=1e-13)
+
+    ends = [at(h, 0.0), at(-h, 0.0), at(0.0, h), at(0.0, -h)]
+    moved, lifted = ((a.t - b.t) / (2 * h) for a, b in (ends[:2], ends[2:]))
+    # Where both ends of a difference lie on one face, which is not seen from its edge.
+    normals = np.array([one.normal for one in ends])
+    unit = d / np.linalg.norm(d, axis=1, keepdims=True)
+    good = np.all([one.hit for one in ends], axis=0) & (np.ptp(normals, axis=0) < 1e-5).all(axis=1)
+    good &= np.abs((normals[0] * unit).sum(axis=1)) > 0.1
+    assert good.sum() > 100
+    origin, level = vector(o), DOUBLE.Float(np.zeros(len(o)))
+    dr.enable_grad(origin)
+    hits = hk.trace(solid, origin, vector(d))
+    dr.backward(dr.sum(dr.select(hits.hit, hits.t, 0)))
+    found = (numpy(dr.grad(origin)) * motion).sum(axis=1)
+    np.testing.assert_allclose(found[good], moved[good], rtol=1e-5, atol=1e-5)
+    level = DOUBLE.Float(0)
+    dr.enable_grad(level)
+    dr.set_grad(level, 1)
+    found = numpy(dr.forward_to(hk.trace(solid, vector(o), vector(d), level=level).t))
+    np.testing.assert_allclose(found[good], lifted[good], rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("precision", ["single", "double"])
+def test_gradients_at_ties_are_those_of_one_side(precision: str) -> None:
+    tolerance = 1e-5 if precision == "single" else 1e-13
+    found = TALL.gradient([[0.1, 0.2, 2], [0.5, 0.2, 1], [0.1, 0.2, -2]], precision=precision)
+    np.testing.assert_allclose(found, [[0, 0, 1], [1, 0, 0], [0, 0, -1]], atol=tolerance)
+    # Edges, corners, planes of symmetry, the middle: some face of those that meet there.
+    tied = [[0.5, 0.5, 1], [0.5, 0.5, 2], [0.2, 0.2, 0], [0, 0, 0], [0, 0, 0.5], [0.5, 0, 2]]
+    found = np.abs(TALL.gradient(tied, precision=precision))
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=tolerance)
+    diamond = hk.expression(lambda x, y, z: abs(x) + abs(y) + abs(z))
+    found = np.abs(diamond.gradient([[0, 0, 0], [0, 0.3, 0], [1, 0, 2]], precision=precision))
+    np.testing.assert_allclose(found, 1, atol=tolerance)
+    np.testing.assert_allclose(np.linalg.norm(hk.Sphere(1.0).gradient([0, 0, 0])), 1, atol=1e-5)
+
+
+# Fields whose evaluation is a loop, a tree or a look at sheets.
+
+
+def test_hits_of_clouds_are_those_of_the_whole_sum() -> None:
+    """t, and its derivative in reverse mode, against a sum over all points."""
+    x = mesh_shapes.icosphere(3)[0]
+    areas = np.full(len(x), 4 * math.pi / len(x))
+    o, d = rays_at(0.6, 60, 1)
+    origin = vector(o)
+    dr.enable_grad(origin)
+    hits = hk.trace(hk.DipolePotential(x, x, areas), origin, vector(d), level=0.5)
+    dr.backward(dr.sum(dr.select(hits.hit, hits.t, 0)))
+    hit = np.array(hits.hit)
+    assert hit.sum() > 20
+    away = numpy(dr.detach(hits.position))[hit][:, None] - x
+    r, along = np.linalg.norm(away, axis=2)[..., None], (away * x).sum(axis=2)[..., None]
+    share = areas[:, None]
+    value = np.abs((along / r**3 * share).sum(axis=(1, 2)))
+    np.testing.assert_allclose(value, 0.5, atol=1e-10)
+    gradient = ((x / r**3 - 3 * along / r**5 * away) * share).sum(axis=1)
+    unit = (d / np.linalg.norm(d, axis=1, keepdims=True))[hit]
+    expected = -gradient / (gradient * unit).sum(axis=1, keepdims=True)
+    np.testing.assert_allclose(numpy(dr.grad(origin))[hit], expected, rtol=1e-9, atol=1e-9)
+
+
+OF_LOOPS: dict[str, tuple[Callable[[], hk.Field], float]] = {
+    "Julia set": (lambda: hk.Julia(), 0.0),
+    "closed mesh": (lambda: hk.WindingNumber(*mesh_shapes.icosphere(1)), 0.5),
+    "mesh by tree": (lambda: hk.WindingNumber(*mesh_shapes.icosphere(2), method="tree"), 0.5),
+    "cloud of spheres": (lambda: hk.Blobs(LOOP, 0.5), 1.0),
+}
+
+
+@pytest.mark.parametrize("name", OF_LOOPS)
+def test_reverse_mode_passes_every_field(name: str) -> None:
+    """Hits, and values at points, whose derivatives are those of the normal and the gradient."""
+    make, level = OF_LOOPS[name]
+    field = make()
+    o, d = rays_at(0.5, 40, 2)
+    origin = vector(o)
+    dr.enable_grad(origin)
+    hits = hk.trace(field, origin, vector(d), level=level)
+    dr.backward(dr.sum(dr.select(hits.hit, hits.t, 0)))
+    hit, normal = np.array(hits.hit), numpy(dr.detach(hits.normal))
+    assert hit.sum() > 8
+    unit = d / np.linalg.norm(d, axis=1, keepdims=True)
+    slope = (normal * unit).sum(axis=1, keepdims=True)
+    expected = (-normal[hit]) / slope[hit]
+    np.testing.assert_allclose(numpy(dr.grad(origin))[hit], expected, rtol=1e-9, atol=1e-9)
+    points = vector(0.6 * o)
+    dr.enable_grad(points)
+    dr.backward(dr.sum(field.value(points)))
+    expected = field.gradient(0.6 * o, precision="double")
+    np.testing.assert_allclose(numpy(dr.grad(points)), expected, rtol=1e-9, atol=1e-12)

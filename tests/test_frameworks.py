@@ -274,3 +274,26 @@ def test_code_of_the_page_runs(block: str, tmp_path: Path) -> None:
 
 def test_the_page_has_code() -> None:
     assert len(PAGE) == 4
+
+
+@pytest.mark.parametrize("framework", ["torch", "jax"])
+@pytest.mark.parametrize(
+    "made",
+    [
+        lambda r: hk.expression(lambda x, y, z: x * x + y * y + z * z - r.array),
+        lambda r: hk.Blobs(r * POINTS.astype(np.float32), 0.5),
+    ],
+    ids=["expression", "blobs"],
+)
+def test_fields_of_learned_numbers_are_refused(framework: str, made: Any) -> None:
+    def first_hits(r: Any) -> Any:
+        return hk.trace(made(r), POINTS + np.array([0, 0, 3.0]), [[0, 0, -1.0]]).t
+
+    def differentiated() -> Any:
+        if framework == "torch":
+            r = torch.ones(1, requires_grad=True)
+            return dr.wrap(source="torch", target="drjit")(first_hits)(r)
+        return jax.vjp(hk.wrap_for_jax(first_hits), jax.numpy.ones(1))
+
+    with pytest.raises(NotImplementedError, match="which carry derivatives"):
+        differentiated()

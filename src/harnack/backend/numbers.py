@@ -6,10 +6,17 @@ between curves, meshes and clouds, are checked where those are.
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+import dataclasses
+import functools
+import inspect
+from collections.abc import Callable
+from typing import Any, TypeAlias, TypeVar, cast
 
+import drjit as dr
 import numpy as np
 import numpy.typing as npt
+
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 FloatArray: TypeAlias = npt.NDArray[np.float64]
 IntArray: TypeAlias = npt.NDArray[np.int64]
@@ -37,6 +44,7 @@ def real_array(
     ragged, other: what messages say, behind `name`, of rows of different lengths and of what is no
         real number.
     """
+    refuse_derivatives(name, values)
     try:
         array = np.asarray(values)
     except (ValueError, OverflowError):
@@ -92,3 +100,73 @@ def vector_text(row: FloatArray) -> str:
 def and_more(count: int) -> str:
     """What a message about the first of `count` entries says of the others."""
     return f" (and {count - 1:,} more)" if count > 1 else ""
+
+
+def refuse_derivatives(name: str, *values: Any) -> None:
+    """That nothing carries derivatives, where they would be dropped.
+
+    Raises:
+        NotImplementedError: something does (`carries_derivatives`). The message starts with `name`.
+    """
+    if carries_derivatives(values):
+        raise NotImplementedError(
+            f"{name} cannot be differentiated by these numbers, which carry derivatives: detach "
+            "them, as drjit.detach and torch.Tensor.detach do (known are derivatives by rays, "
+            "levels, points, and the vertices of a SolidAngle)"
+        )
+
+
+def refuses_derivatives(function: Function) -> Function:
+    """The same function, which refuses arguments that carry derivatives (`refuse_derivatives`):
+    for those that make other numbers of them."""
+
+    @functools.wraps(function)
+    def checked(*given: Any, **named: Any) -> Any:
+        refuse_derivatives(function.__qualname__, given, named)
+        return function(*given, **named)
+
+    return cast("Function", checked)
+
+
+def carries_derivatives(value: Any) -> bool:
+    """Whether a value is, or holds, an array with derivatives enabled: one of Dr.Jit or of PyTorch,
+    in containers, in what functions refer to, and in attributes of fields, of what can be called,
+    and of dataclasses."""
+    return _carries(value, set())
+
+
+_PLAIN = frozenset((str, bytes, bool, int, float, complex, np.ndarray, np.float64, type(None)))
+# Functions of these packages refer to no numbers of the caller's.
+_KNOWN_PACKAGES = frozenset(("harnack", "drjit", "numpy", "math"))
+
+
+def _carries(value: Any, seen: set[int]) -> bool:
+    kind = cast("Any", type(value))
+    if kind in _PLAIN or isinstance(value, type):
+        return False
+    if dr.is_array_v(kind):
+        return bool(dr.is_diff_v(kind) and dr.grad_enabled(value))
+    if getattr(value, "requires_grad", False) is True:
+        return True
+    if id(value) in seen:
+        return False
+    seen.add(id(value))
+    return any(_carries(one, seen) for one in _held(value))
+
+
+def _held(value: Any) -> list[Any]:
+    """What a value holds, as far as it is looked into."""
+    if isinstance(value, list | tuple | set | frozenset):
+        return list(cast("Any", value))
+    if isinstance(value, dict):
+        return list(cast("Any", value).values())
+    if inspect.isfunction(value):
+        if str(value.__module__).partition(".")[0] in _KNOWN_PACKAGES and not value.__closure__:
+            return []
+        found, named = inspect.getclosurevars(value), value.__kwdefaults__ or {}
+        others = found.globals.values(), named.values(), value.__defaults__ or ()
+        return [*found.nonlocals.values(), *(one for group in others for one in group)]
+    if inspect.ismethod(value):
+        return [value.__func__, value.__self__]
+    is_known = dataclasses.is_dataclass(value) or callable(value) or hasattr(value, "parameters")
+    return [*getattr(value, "__dict__", {}).values()] if is_known else []

@@ -11,6 +11,7 @@ import numpy as np
 
 from harnack.backend import FloatArray, choose_backend
 from harnack.backend.extrema import fmax, fmin
+from harnack.backend.numbers import refuses_derivatives
 from harnack.distance.batches import in_batches
 from harnack.distance.tangent import TangentPlane
 from harnack.fields.batch import BatchedField
@@ -54,6 +55,7 @@ class Curvatures:
     gaussian_error: FloatArray
 
 
+@refuses_derivatives
 def curvature(field: Field, points: Any, *, precision: Precision = "double") -> Curvatures:
     """Mean and Gaussian curvature of the level sets of a field through points (n, 3).
 

@@ -14,6 +14,7 @@ from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy
 from harnack.backend.arrays import finite_vectors, upload_vectors
 from harnack.backend.extrema import fmax
 from harnack.backend.loops import while_active
+from harnack.backend.numbers import refuses_derivatives
 from harnack.choices import did_you_mean
 from harnack.distance.tangent import Eigen, TangentPlane
 
@@ -38,6 +39,7 @@ _TURN, _PART = math.cos(math.radians(40)), 0.5
 _MOST_STEPS = 100_000
 
 
+@refuses_derivatives
 def curvature_lines(
     field: Field,
     seeds: Any,

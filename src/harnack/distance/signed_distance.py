@@ -11,6 +11,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import FloatArray, choose_backend
+from harnack.backend.numbers import refuses_derivatives
 from harnack.choices import did_you_mean
 from harnack.distance.batches import in_batches
 from harnack.distance.closest import Closest, find_closest
@@ -31,6 +32,7 @@ Method = Literal["first", "second", "newton", "lower"]
 _CLOSE = 1e-15
 
 
+@refuses_derivatives
 def signed_distance(
     field: Field,
     points: Any,
@@ -93,6 +95,7 @@ def signed_distance(
     return result
 
 
+@refuses_derivatives
 def closest_points(
     field: Field,
     points: Any,
@@ -132,6 +135,7 @@ class DistanceBounds:
     lower: FloatArray
 
 
+@refuses_derivatives
 def distance_bounds(
     field: Field,
     points: Any,

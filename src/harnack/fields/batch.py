@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 
 from harnack.backend import FloatArray, backend_of
+from harnack.backend.arrays import as_data
 from harnack.backend.extrema import fmax
 from harnack.backend.tensors import takes_tensors
 from harnack.fields.field import Field
@@ -97,7 +98,8 @@ class BatchedField(Field):
         """f to first order about p: its value and, in reverse and forward mode, its gradient."""
         with dr.suspend_grad():
             at = self.values_at(dr.detach(p), 1)
-        return at.value + dr.dot(at.gradient, p - dr.detach(p))
+        # Of a literal 0, as a closed mesh has it, Dr.Jit has no derivative at all.
+        return dr.replace_grad(at.value, dr.dot(as_data(at.gradient), p - dr.detach(p)))
 
     @takes_tensors
     def value(self, points: Any, *, precision: Precision = "single") -> Any:

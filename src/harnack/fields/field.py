@@ -18,6 +18,8 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
+from harnack.backend.arrays import as_data
+from harnack.backend.numbers import refuse_derivatives, refuses_derivatives
 from harnack.backend.tensors import takes_tensors
 from harnack.enclosures import (
     BoundedLaplacian,
@@ -34,6 +36,8 @@ from harnack.fields.sheets import NO_SHEET, Crossing, NearestSheet
 from harnack.geometry.volumes.volume import check_volume
 
 if TYPE_CHECKING:
+    from typing import Self
+
     from harnack.backend import Backend, FloatArray, IntArray, Mask, Precision, Real, Vec3
     from harnack.cells import OccupiedCells
     from harnack.geometry import Volume
@@ -58,7 +62,7 @@ _OF_SOLIDS = frozenset(
     ("moved", "rotated", "scaled", "transformed", "twisted", "tapered", "grown", "blended")
 )
 # A detail at which nothing is left out.
-_EVERYTHING = 1e9
+NO_TRUNCATION = 1e9
 
 _HOW = (
     "return harnack.Sample(value, gradient, known), with a Dr.Jit number, a Dr.Jit 3-vector and a "
@@ -72,6 +76,7 @@ def _of_points(hessian: Callable[[Any, Vec3], Any]) -> Callable[..., Any]:
     @functools.wraps(hessian)
     def general(self: Any, p: Any, *, precision: Precision = "single") -> Any:
         if dr.is_array_v(type(p)):
+            refuse_derivatives(f"the Hessian of {type(self).__name__}", p, self.parameters())
             return hessian(self, p)
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Vec3, Vec3, Vec3]:
@@ -102,6 +107,8 @@ def _checked(evaluate: Callable[[Any, Vec3], Sample]) -> Callable[[Any, Vec3], S
         gradient: Any = sample.gradient
         if not dr.is_array_v(type(gradient)) or dr.size_v(type(gradient)) != 3:
             raise TypeError(f"{name}: Sample.gradient is {_named(gradient)}, no 3-vector: {_HOW}")
+        if type(self).parameters is Field.parameters and not dr.grad_enabled(p):
+            refuse_derivatives(type(self).__name__, sample.value)
         return sample
 
     return checked
@@ -152,9 +159,20 @@ class Field(abc.ABC):
     coarsest_detail: float = 1.0
     """What detail 0 amounts to, as a detail in (0, 1]: see `at_detail`."""
 
+    def __new__(cls, *given: Any, **named: Any) -> Self:
+        """Refuses parameters with derivatives, unless the class says that it has `parameters`."""
+        if cls.parameters is Field.parameters:
+            refuse_derivatives(cls.__name__, given, named)
+        return super().__new__(cls)
+
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Has what `evaluate` returns checked, and `hessian` take NumPy arrays too."""
+        """Has what `evaluate` returns checked, `hessian` take NumPy arrays too, and other ways to
+        make a field refuse derivatives as the constructor does."""
         super().__init_subclass__(**kwargs)
+        for name, own in list(vars(cls).items()):
+            if isinstance(own, classmethod) and not name.startswith("_"):
+                checked_maker = refuses_derivatives(cast("Any", own).__func__)
+                setattr(cls, name, classmethod(checked_maker))
         if "evaluate" in vars(cls):
             checked = _checked(cls.evaluate)
             cls.evaluate = checked  # pyright: ignore[reportAttributeAccessIssue]
@@ -221,16 +239,36 @@ class Field(abc.ABC):
         del levels
 
     def parameters(self) -> tuple[Any, ...]:
-        """Dr.Jit arrays that the value depends on and that may carry derivatives."""
+        """Dr.Jit arrays that the value depends on and that may carry derivatives.
+
+        A class that does not define this method is given none: its constructor refuses them.
+        """
         return ()
+
+    def check_parameters(self) -> None:
+        """Raise NotImplementedError for derivatives by parameters that the field does not name, as
+        by what its formula refers to: they would be dropped."""
+        if type(self).parameters is Field.parameters:
+            kind = type(self)
+            is_own = not kind.__module__.startswith("harnack.")
+            refuse_derivatives(kind.__name__, vars(self), kind.evaluate if is_own else None)
 
     def differentiable_value(self, p: Vec3) -> Real:
         """f(p) as an expression that Dr.Jit can differentiate in p and in the field's parameters.
 
-        Only used at known hits, to attach derivatives. Override it where `evaluate` runs a
-        recorded loop, which reverse mode cannot pass.
+        In p it is of first order: the value, with the gradient as its derivative, so that no
+        derivative passes `evaluate`, which may run a recorded loop, and so that it is the gradient
+        that the field states where the formula of f has ties. A field with parameters overrides
+        it where `evaluate` cannot be differentiated in both modes.
         """
-        return self.evaluate(p).value
+        if any(dr.grad_enabled(one) for one in self.parameters()):
+            return self.evaluate(p).value
+        self.check_parameters()
+        at = dr.detach(p)
+        with dr.suspend_grad():
+            sample = self.evaluate(at)
+        gradient = as_data(sample.gradient)  # of a literal 0, Dr.Jit has no derivative at all
+        return dr.replace_grad(sample.value, dr.dot(gradient, p - at))
 
     @takes_tensors
     def value(self, points: Any, *, precision: Precision = "single") -> Any:
@@ -243,6 +281,7 @@ class Field(abc.ABC):
         Raises TypeError or ValueError for other shapes, NaN or infinity.
         """
         if dr.is_array_v(type(points)):
+            self.check_parameters()
             if any(dr.grad_enabled(one) for one in (points, *self.parameters())):
                 return self.differentiable_value(points)
             return self.evaluate(points).value
@@ -254,10 +293,13 @@ class Field(abc.ABC):
 
         A Dr.Jit 3-vector gives a Dr.Jit 3-vector, and a tensor (n, 3) one of this shape, with
         derivatives with respect to the points if they have them enabled and the field defines
-        `hessian`. Raises as `value`.
+        `hessian`. Raises as `value`, and NotImplementedError if parameters of the field have
+        derivatives enabled.
         """
         if not dr.is_array_v(type(points)):
             return self._samples_at(points, precision, lambda sample: sample.gradient)
+        self.check_parameters()
+        refuse_derivatives(f"the gradient of {type(self).__name__}", self.parameters())
         if not dr.grad_enabled(points):
             return self.evaluate(points).gradient
         with dr.suspend_grad():
@@ -337,7 +379,7 @@ class Field(abc.ABC):
         if not self.has_detail:
             return self
         closely = copy.copy(self)
-        closely.evaluate = self.at_detail(backend.Float(_EVERYTHING)).evaluate
+        closely.evaluate = self.at_detail(backend.Float(NO_TRUNCATION)).evaluate
         return closely
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:

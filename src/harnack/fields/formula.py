@@ -18,9 +18,11 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 
 from harnack.arithmetic import Interval, Jet
+from harnack.arithmetic.dual import Dual
 from harnack.arithmetic.operators import Operators
 from harnack.backend import choose_backend
 from harnack.backend.extrema import fmin
+from harnack.backend.lengths import largest_component, length
 from harnack.enclosures import Lipschitz, Piece, Slopes, Tangent
 from harnack.fields.field import Field
 from harnack.fields.look import Look, Path, Sample
@@ -32,6 +34,11 @@ if TYPE_CHECKING:
 
 # Radii of the balls on which a Lipschitz constant is promised, in multiples of |f|/|grad f|.
 _RADII, _LARGEST_RADIUS = (0.25, 1.0, 4.0), 1e12
+# Beside a tie is where the rounding of coordinates and value, times this, leads; the direction, a
+# unit vector or 0, is turned by another, so that it is along no tie.
+_BESIDE, _ASIDE = 64.0, (0.31, 0.19, 0.13)
+# A gradient that is known to so many roundings is no tie.
+_TIE = 1024.0
 
 
 class Formula(Field):
@@ -54,8 +61,37 @@ class Formula(Field):
         coordinates: x * radius, for Dr.Jit's own operators refuse jets."""
 
     def evaluate(self, p: Vec3) -> Sample:
-        sample = self.sample_alone(p)
+        sample = self._one_sided(p, self.sample_alone(p))
         return dataclasses.replace(sample, weaker=self._lipschitz_near(p, sample))
+
+    def _one_sided(self, p: Vec3, sample: Sample) -> Sample:
+        """The sample with a gradient that f has close by, where at p it is a range.
+
+        At ties of a formula, such as max(x, 0) at x = 0, the range of the gradient has all slopes
+        beside p, and more where terms of several ties are added, as on the faces of `corner`. Its
+        middle is the gradient of no point, if mostly across the tie. A few roundings away in about
+        its direction, values decide between them (`Dual`).
+
+        Proof of the error. The gradient at p lies within `gradient_error` of the middle.
+        """
+        epsilon = float(dr.epsilon(type(p.x)))
+        middle, doubt = sample.gradient, sample.gradient_error
+        steep = length(middle)
+        way = dr.select(steep > 0, middle / steep, 0) + type(p)(*_ASIDE)
+        size = largest_component(p) + dr.abs(sample.value)
+        size = dr.select(size > 0, size, 1)
+        away = Dual.at_point(p + way * (_BESIDE * epsilon * size))
+        try:
+            beside = away[0].of(self.formula(*away))
+        except TypeError:  # a formula of ranges alone, as of noise
+            return sample
+        one_side = type(p)(*(0 * p.x + one for one in beside.first))
+        is_tie = (doubt > _TIE * epsilon * steep) & dr.all(dr.isfinite(one_side))
+        return dataclasses.replace(
+            sample,
+            gradient=dr.select(is_tie, one_side, middle),
+            gradient_error=dr.select(is_tie, doubt + length(one_side - middle), doubt),
+        )
 
     def sample_alone(self, p: Vec3) -> Sample:
         """Value and gradient, without promises that a look along a path has no use for."""
@@ -86,9 +122,6 @@ class Formula(Field):
     def promises(self, p: Vec3) -> tuple[Promise, ...]:
         """What holds in every direction from p: a Lipschitz constant, where one is known."""
         return () if self.lipschitz is None else (Lipschitz(0 * p.x + self.lipschitz),)
-
-    def differentiable_value(self, p: Vec3) -> Real:
-        return 0 * p.x + self.formula(p.x, p.y, p.z)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         jet = self._jet(Jet.at_point(p, order=2), p.x)

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.backend.arrays import aligned_integers, finite_vectors, upload_vectors
+from harnack.backend.numbers import refuse_derivatives
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Precision, Vec3
@@ -45,6 +46,7 @@ def at_points(
         results = kernel(backend, dr.gather(backend.Array3f, x, order))
         return tuple(_back_in_place(one, order, dr.width(x)) for one in results)
 
+    refuse_derivatives("what NumPy's arrays are given of", points)
     given = np.asarray(points)
     if given.shape == (3,):
         return tuple(one[0] for one in in_batches(backend, visit, given[None]))

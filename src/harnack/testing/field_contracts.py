@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import drjit as dr
 import numpy as np
 
 from harnack.backend import FloatArray, choose_backend, to_numpy, to_vector3
@@ -40,11 +41,11 @@ def check_field(
 
     Checked: values and gradients are numbers, alike in both precisions within `Sample.error`;
     the gradient is that of the value; f is harmonic where a ball of dimension 2 or 3 says so;
-    `differentiable_value` is the value; `hessian`, where there is one, is symmetric, the
-    derivative of the gradient and, of a harmonic f, without trace; the lift of f keeps each
-    promise (`HarmonicBall`, `Lipschitz`, `Curvature`) on the way to random points of its ball, or
-    for the last two to where that leaves the domain; enclosures along paths, of a field that gives
-    its own (`check_looks`), hold;
+    `differentiable_value` is the value and has this gradient; `hessian`, where there is one, is
+    symmetric, the derivative of the gradient and, of a harmonic f, without trace; the lift of f
+    keeps each promise (`HarmonicBall`, `Lipschitz`, `Curvature`) on the way to random points of its
+    ball, or for the last two to where that leaves the domain; enclosures along paths, of a field
+    that gives its own (`check_looks`), hold;
     some step is possible at most points; no level set leaves its `extent`. Jumps across sheets
     are taken out on the way, and values may move between neighbouring points by `Sample.error`
     besides, as they do where a tree takes other clusters as wholes.
@@ -145,12 +146,21 @@ def _check_rounding(field: Field, points: FloatArray) -> None:
 def _check_differentiable_value(field: Field, points: FloatArray, look: FieldValues) -> None:
     backend = choose_backend("double")
     prepared = field.prepare(backend)
-    value = prepared.differentiable_value(to_vector3(backend, points, "points"))
+    x = to_vector3(backend, points, "points")
+    dr.enable_grad(x)
+    value = prepared.differentiable_value(x)
+    dr.backward(dr.sum(value), dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+    dr.eval(value, x.grad)
     off = np.abs(to_numpy(value) - look.value)
     if field.period is not None:
         off = np.abs(off - field.period * np.round(off / field.period))
     good = off <= 1e-9 * (1 + np.abs(look.value)) + 2 * look.error
     require(good, "differentiable_value is not the value", points, off)
+    off = np.linalg.norm(to_numpy(x.grad) - look.gradient, axis=1)
+    size = np.linalg.norm(look.gradient, axis=1)
+    good = off <= 1e-6 * size + 2 * look.gradient_error
+    message = "differentiable_value does not have the gradient as its derivative, in reverse mode"
+    require(good, message, points, off)
 
 
 def _check_promise(

@@ -13,7 +13,7 @@ from harnack.backend import to_numpy
 from harnack.backend.arrays import gather_vectors
 from harnack.backend.lengths import length as norm
 from harnack.tracer.crossings import find_crossings
-from harnack.tracer.derivatives import attach, wants_derivatives
+from harnack.tracer.derivatives import attach, refuse_derivative, wants_derivatives
 from harnack.tracer.prepared import MarchResult
 from harnack.tracer.tolerance import Status
 
@@ -101,17 +101,19 @@ def trace_all(
         dr.eval(*vars(found).values(), normal)
     ray = dr.arange(backend.UInt32, dr.width(found.t)) // k
     o, d = gather_vectors(backend, o, ray), gather_vectors(backend, d, ray)
-    t = found.t
+    t, end = found.t, found.end
     if differentiable and wants_derivatives(prepared, o, d):
         with dr.suspend_grad():
             status = dr.select(is_found, backend.UInt32(int(Status.HIT)), int(Status.MISS))
             none = dr.zeros(backend.Float, dr.width(t))
             ends = MarchResult(t, none, found.gradient, none, none, status, found.sheet, found.side)
         t, normal = attach(prepared, o, d, ends, normal)
+        normal = refuse_derivative(prepared, o, d, "normal", normal)
+        end = refuse_derivative(prepared, o, d, "end", end)
     position = dr.select(dr.isfinite(t), dr.fma(backend.Array3f(t), d, o), dr.nan)
     side = backend.Int32(found.side)
     sheet = dr.reinterpret_array(backend.Int32, found.sheet)  # NO_SHEET becomes -1
-    of_rays = found.count, found.end, found.status, found.evaluations
+    of_rays = found.count, end, found.status, found.evaluations
     hits = AllHits(t, position, normal, sheet, side, *of_rays)
     dr.eval(*vars(hits).values())
     return hits

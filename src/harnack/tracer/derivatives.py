@@ -11,20 +11,23 @@ on a plane, n . (o + t d) = const, whatever the level: dt = -(n . (do + t dd))/(
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
 from harnack.backend.lengths import length as norm
 from harnack.enclosures import TargetLevels
+from harnack.fields.field import NO_TRUNCATION
 from harnack.tracer.tolerance import Status
 
 if TYPE_CHECKING:
-    from harnack.backend import Real, Vec3
+    from harnack.backend import Mask, Real, Vec3
     from harnack.tracer.prepared import MarchResult, PreparedLevelSet
 
-# Newton steps from the tolerance to rounding before the derivative is taken.
-_POLISH = 4
+# Newton steps from the tolerance to rounding before the derivative is taken; of sums over trees,
+# which are summed up one by one for it.
+_POLISH, _POLISH_OF_SUMS = 4, 3
 
 
 def wants_derivatives(prepared: PreparedLevelSet, o: Vec3, d: Vec3) -> bool:
@@ -34,6 +37,7 @@ def wants_derivatives(prepared: PreparedLevelSet, o: Vec3, d: Vec3) -> bool:
         NotImplementedError: parameters of a field with sheets have. They move the sheets, and
             the derivative of that is not known here; zero would be wrong.
     """
+    prepared.field.check_parameters()
     parameters = prepared.field.parameters()
     of_field = any(dr.grad_enabled(p) for p in parameters)
     if of_field and prepared.field.has_sheets:
@@ -44,6 +48,33 @@ def wants_derivatives(prepared: PreparedLevelSet, o: Vec3, d: Vec3) -> bool:
         )
     rest: list[Any] = [o, d, *prepared.levels.values]
     return of_field or any(dr.grad_enabled(p) for p in rest)
+
+
+class _Undifferentiated(dr.CustomOp):
+    """The identity, whose derivative is not known: reverse mode raises. Forward mode, which goes
+    from parameters to all that depends on them, wanted or not, gives NaN."""
+
+    def eval(self, value: Any, what: str, sources: list[Any]) -> Any:
+        del sources
+        self._what = what
+        return value
+
+    def forward(self) -> None:
+        self.set_grad_out(self.grad_out() + dr.nan)
+
+    def backward(self) -> None:
+        if dr.any(self.grad_out() != 0, axis=None):  # zero where a result is there and not used
+            raise NotImplementedError(
+                f"{self._what} of hits cannot be differentiated, only t and position can: detach "
+                "it where it is used (drjit.detach)"
+            )
+
+
+def refuse_derivative(prepared: PreparedLevelSet, o: Vec3, d: Vec3, what: str, value: Any) -> Any:
+    """A result of a trace that depends on what has derivatives enabled, but has none itself: that
+    is said when one is asked for (`_Undifferentiated`), since zero would be wrong."""
+    sources = [o, d, *prepared.levels.values, *prepared.field.parameters()]
+    return dr.custom(_Undifferentiated, value, what, sources)
 
 
 def attach(
@@ -62,7 +93,13 @@ def attach(
     with dr.suspend_grad():
         at = dr.select(hit, t, 0)
         here, along = dr.detach(o), dr.detach(d)
-        for _ in range(_POLISH):
+        steps = _POLISH
+        if prepared.field.has_detail:
+            # Truncation is as large as the tolerance, and its derivative may be much larger.
+            steps = _POLISH_OF_SUMS
+            detail = dr.select(hit, backend.Float(NO_TRUNCATION), 0)
+            prepared = replace(prepared, field=prepared.field.at_detail(detail))
+        for _ in range(steps):
             x = dr.fma(backend.Array3f(at), along, here)
             sample = prepared.sample(x)
             miss = prepared.levels.to_nearest(sample.value)
@@ -77,12 +114,13 @@ def attach(
         length = norm(sample.gradient)
         normal = dr.select(hit & (length > 0), sample.gradient / length, normal)
         dr.eval(at, x, slope, normal)
-    value = prepared.field.differentiable_value(dr.fma(backend.Array3f(at), d, o))
-    change = value - dr.detach(value)
+    moving = dr.fma(backend.Array3f(at), d, o)
+    change = dr.dot(sample.gradient, moving - x)
+    if any(dr.grad_enabled(one) for one in prepared.field.parameters()):
+        value = prepared.field.differentiable_value(moving)
+        change = value - dr.detach(value)
     change = change - _change_of_nearest(prepared, sample.value)
-    usable = hit & (slope != 0)
-    moved = at - dr.select(usable, change / slope, 0)
-    return dr.select(hit, moved, t), normal
+    return dr.select(hit, _moved(at, change, slope, hit), t), normal
 
 
 def _on_plane(prepared: PreparedLevelSet, o: Vec3, d: Vec3, end: MarchResult) -> Real:
@@ -92,7 +130,13 @@ def _on_plane(prepared: PreparedLevelSet, o: Vec3, d: Vec3, end: MarchResult) ->
         slope = dr.dot(end.gradient, dr.detach(d))
     x = dr.fma(prepared.backend.Array3f(at), d, o)
     change = dr.dot(end.gradient, x - dr.detach(x))
-    return end.t - dr.select(end.on_sheet & (slope != 0), change / slope, 0)
+    return _moved(end.t, change, slope, end.on_sheet)
+
+
+def _moved(t: Real, change: Real, slope: Real, where: Mask) -> Real:
+    """t with the derivative of -change/slope; where the slope is 0, so that t has none, it is
+    infinite or NaN."""
+    return dr.replace_grad(t, -change * dr.select(where, 1 / slope, 0))
 
 
 def _change_of_nearest(prepared: PreparedLevelSet, f: Real) -> Real:

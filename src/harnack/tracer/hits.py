@@ -22,7 +22,7 @@ from harnack.tracer.all_hits import (
     no_crossings,
     trace_all,
 )
-from harnack.tracer.derivatives import attach, wants_derivatives
+from harnack.tracer.derivatives import attach, refuse_derivative, wants_derivatives
 from harnack.tracer.surface import LevelSet, level_set
 from harnack.tracer.tolerance import Status, Tolerance
 
@@ -170,7 +170,9 @@ def trace(
         side may be no crossing. `max_steps` is for all of the ray.
 
     With Dr.Jit rays, t and position carry derivatives with respect to whatever had them enabled:
-    rays, level, vertices of the field (implicit differentiation at the hit). The rest does not.
+    rays, level, vertices of a `SolidAngle` (implicit differentiation at the hit). The other results
+    have none: in reverse mode, using theirs raises NotImplementedError; in forward mode they are
+    NaN. Fields made of other numbers with derivatives enabled are refused.
 
     Raises ValueError or TypeError for shapes that do not match, NaN, directions of length zero,
     an empty or negative interval, or a level that no surface has.
@@ -290,12 +292,15 @@ def _trace(
             sheet = dr.reinterpret_array(backend.Int32, end.part)
         smooth = hit & ~end.on_sheet
         uncertainty = dr.select(smooth & (end.excess > 0), end.excess / length, 0)
-    t = end.t
+    t, value = end.t, end.value
     if differentiable and wants_derivatives(prepared, o, d):
         t, normal = attach(prepared, o, d, end, normal)
+        normal, value, uncertainty = (
+            refuse_derivative(prepared, o, d, name, one)
+            for name, one in (("normal", normal), ("value", value), ("uncertainty", uncertainty))
+        )
     position = dr.select(dr.isfinite(t), dr.fma(backend.Array3f(t), d, o), dr.nan)
-    outcome = end.value, end.evaluations, end.status, sheet, uncertainty
-    hits = Hits(t, position, normal, *outcome)
+    hits = Hits(t, position, normal, value, end.evaluations, end.status, sheet, uncertainty)
     dr.eval(*vars(hits).values())
     return hits
 

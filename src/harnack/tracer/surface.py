@@ -13,6 +13,7 @@ import drjit as dr
 
 from harnack.backend import backend_of, to_float
 from harnack.backend.arrays import as_data
+from harnack.backend.numbers import refuse_derivatives
 from harnack.backend.tensors import is_tensor, numbers_of
 from harnack.enclosures import Choice, Proofs, TargetLevels, choose_proofs
 from harnack.fields.field import check_is_field
@@ -246,6 +247,7 @@ def _ends(solid: Any) -> tuple[float, float]:
 
 
 def _as_number(number: Any, wrong: str) -> float:
+    refuse_derivatives("a level or setting that is no Dr.Jit number", number)
     try:
         return float("nothing" if isinstance(number, str) else number)
     except (TypeError, ValueError):

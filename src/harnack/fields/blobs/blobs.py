@@ -207,12 +207,6 @@ class Blobs(Formula):
         vector = on.backend.Array3f
         return vector(xx, xy, xz), vector(xy, yy, yz), vector(xz, yz, zz)
 
-    def differentiable_value(self, p: Vec3) -> Real:
-        with dr.suspend_grad():
-            at = dr.detach(p)
-            sample = self.evaluate(at)
-        return sample.value + dr.dot(sample.gradient, p - at)
-
     def _prepared(self, p: Vec3) -> _BlobData:
         return self._prepared_for(backend_of(p))
 

@@ -128,12 +128,6 @@ class HRBF(Formula):
 
         return summed(term, x, backend.Float(0), over(records))
 
-    def differentiable_value(self, p: Vec3) -> Real:
-        with dr.suspend_grad():
-            at = dr.detach(p)
-            sample = self.evaluate(at)
-        return sample.value + dr.dot(sample.gradient, p - at)
-
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         backend, records = self._prepared_for(backend_of(p))
         pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))

@@ -114,13 +114,6 @@ class FaceCurve(Field):
         del ahead, back
         return path.look(self._sample(path.point(t), path.direction))
 
-    def differentiable_value(self, p: Vec3) -> Real:
-        """To first order in p: no derivative passes the loop over the edges."""
-        with dr.suspend_grad():
-            here = dr.detach(p)
-            sample = self.evaluate(here)
-        return sample.value + dr.dot(sample.gradient, p - here)
-
     def _sample(self, p: Vec3, direction: Vec3 | None) -> Sample:
         face = self.face
         backend, x, rounding = face.backend, face.unit(p), face.rounding

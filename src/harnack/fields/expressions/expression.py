@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from harnack.backend.numbers import refuse_derivatives, refuses_derivatives
 from harnack.fields.expressions.text import TextFormula
 from harnack.fields.formula import Formula, as_jet, probe
 
@@ -37,6 +38,7 @@ class Expression(Formula):
         return self
 
 
+@refuses_derivatives
 def expression(
     function: Callable[[Any, Any, Any], Any] | str,
     *,
@@ -60,6 +62,7 @@ def expression(
     Raises:
         TypeError: function cannot be called with three coordinates, or uses what has no proved
             ranges; domain is no volume.
+        NotImplementedError: function uses numbers with derivatives enabled.
         ValueError: level is not finite; a text is no formula.
     """
     if isinstance(function, str):
@@ -76,7 +79,7 @@ def expression(
         raise ValueError(f"level must be finite, not {level!r}")
     made = Expression(function, domain, default_level=level, is_convex=is_convex)
     point = probe()
-    as_jet(made.formula(*point), point[0], "expression")
+    refuse_derivatives("an expression", as_jet(made.formula(*point), point[0], "expression"))
     return made
 
 

@@ -12,6 +12,7 @@ import drjit as dr
 
 from harnack.backend import backend_of
 from harnack.backend.extrema import fmax, fmin
+from harnack.backend.numbers import refuse_derivatives
 from harnack.backend.sines import sincos
 
 if TYPE_CHECKING:
@@ -66,6 +67,7 @@ class BranchPoint:
     value: complex = 0.0
 
     def __post_init__(self) -> None:
+        refuse_derivatives("a BranchPoint", vars(self))
         object.__setattr__(self, "at", _finite(self.at, "the place of a branch point"))
         object.__setattr__(self, "value", _finite(self.value, "the value at a branch point"))
         if self.power is None:

@@ -282,9 +282,6 @@ class RiemannSurface(Field):
         vector = cast("Any", type(p))
         return vector(xx, xy, zero), vector(xy, -xx, zero), vector(zero, zero, zero)
 
-    def differentiable_value(self, p: Vec3) -> Real:
-        return self._place(p).value
-
     def describe(self) -> dict[str, Any]:
         return {
             "branches": self.branches.count,

@@ -288,14 +288,6 @@ class HypersphericalHarmonic(Field):
         ]
         return Look(sample, (forward, *around), (backward, *behind), slope)
 
-    def differentiable_value(self, p: Vec3) -> Real:
-        s = 1 / (1 + dr.squared_norm(p))
-        y, w = 2 * s * p, 1 - 2 * s
-        value = 0 * p.x
-        for one in self._orders:
-            value = value + gegenbauer(one.n, one.k, w) * evaluate(one.weights, y.x, y.y, y.z)[0]
-        return value
-
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         """Rows of the Hessian: f is harmonic on S^3 and not in space, so it has a trace.
 

@@ -28,7 +28,7 @@ from harnack.fields.polynomials.sphere_range import BallRange, range_of_harmonic
 from harnack.geometry.volumes import Ball
 
 if TYPE_CHECKING:
-    from harnack.backend import Real, Vec3
+    from harnack.backend import Vec3
     from harnack.geometry.volumes import Volume
 
 __all__ = ["HarmonicPolynomial", "SphericalHarmonic"]
@@ -79,10 +79,6 @@ class _SolidHarmonics(Field):
         rows = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
         x, y, z = _turned([type(p)(*_turned(row, k)) for row in rows], k)
         return x, y, z
-
-    def differentiable_value(self, p: Vec3) -> Real:
-        s = self._local(p)
-        return evaluate(self._weights, s.x, s.y, s.z)[0]
 
     def check_levels(self, levels: tuple[float, ...]) -> None:
         check_in_range(levels, self.value_range, "in its domain the function")

@@ -209,10 +209,6 @@ class AffineImage(Derived):
         local = type(p)(*self.numbers.local(p.x, p.y, p.z))
         return self._image(self.inner.evaluate(local), self._size(p, 0.0))
 
-    def differentiable_value(self, p: Vec3) -> Real:
-        local = type(p)(*self.numbers.local(p.x, p.y, p.z))
-        return self.inner.differentiable_value(local) * self.numbers.factor
-
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         numbers = self.numbers
         rows = self.inner.hessian(type(p)(*numbers.local(p.x, p.y, p.z)))

@@ -121,13 +121,6 @@ class Combined(Solid):
         samples = [one.evaluate(p) for one in self.parts]
         return self._joined(samples, largest_component(p))[0]
 
-    def differentiable_value(self, p: Vec3) -> Real:
-        values = [one.differentiable_value(p) for one in self.parts]
-        total = values[0]
-        for one in values[1:]:
-            total = fmin(total, one) if self.is_union else fmax(total, one)
-        return total
-
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         best: Any = None
         rows: Any = None
@@ -282,9 +275,6 @@ class Complement(Derived):
     def evaluate(self, p: Vec3) -> Sample:
         return negated_sample(self.inner.evaluate(p))
 
-    def differentiable_value(self, p: Vec3) -> Real:
-        return -self.inner.differentiable_value(p)
-
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         x, y, z = self.inner.hessian(p)
         return -x, -y, -z
@@ -371,9 +361,6 @@ class Offset(Derived):
             known=tuple(moved(one) for one in sample.known),
             weaker=tuple(moved(one) for one in sample.weaker),
         )
-
-    def differentiable_value(self, p: Vec3) -> Real:
-        return self.inner.differentiable_value(p) - self.distance
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         return self.inner.hessian(p)

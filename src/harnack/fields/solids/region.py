@@ -14,6 +14,7 @@ from harnack.arithmetic import Interval, Jet
 from harnack.backend import backend_of
 from harnack.backend.extrema import fmax, fmin
 from harnack.backend.lengths import length
+from harnack.backend.numbers import refuses_derivatives
 from harnack.enclosures import Curvature, Enclosure, Gaps
 from harnack.fields.field import Field, check_is_field
 from harnack.fields.formula import Formula, as_data, is_jet
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from harnack.geometry import Volume
 
 
+@refuses_derivatives
 def solid(
     field: Field,
     *,
@@ -113,9 +115,6 @@ class Region(Derived):
 
     def evaluate(self, p: Vec3) -> Sample:
         return self.inner.evaluate(p)
-
-    def differentiable_value(self, p: Vec3) -> Real:
-        return self.inner.differentiable_value(p)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         return self.inner.hessian(p)
@@ -282,10 +281,6 @@ class Near(Derived):
 
     def evaluate(self, p: Vec3) -> Sample:
         return self._folded(self.inner.evaluate(p))[0]
-
-    def differentiable_value(self, p: Vec3) -> Real:
-        offset = self._offset(self.inner.differentiable_value(p))
-        return dr.abs(offset) - self.half_width
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         below = self._offset(self.inner.evaluate(p).value) < 0

@@ -7,6 +7,7 @@ import copy
 import functools
 from typing import TYPE_CHECKING, Any
 
+from harnack.backend.numbers import refuses_derivatives
 from harnack.fields.field import Field
 from harnack.fields.formula import Formula
 
@@ -117,6 +118,7 @@ class Solid(Field):
 
         return Complement(self)
 
+    @refuses_derivatives
     def blended(
         self, other: Solid, radius: float, *, power: float = 2.0, intersect: bool = False
     ) -> Solid:
@@ -134,6 +136,7 @@ class Solid(Field):
 
         return Blend((self, other), radius, power, not intersect)
 
+    @refuses_derivatives
     def grown(self, distance: float) -> Solid:
         """The points where f <= distance: larger by that length, or smaller if it is negative,
         where f is a distance."""
@@ -143,12 +146,14 @@ class Solid(Field):
 
     # Maps of space. Those that bend are for solids with a formula.
 
+    @refuses_derivatives
     def moved(self, offset: Sequence[float]) -> Solid:
         """The solid, moved by a vector (x, y, z)."""
         from harnack.fields.solids.affine import Affine
 
         return self._mapped(Affine.translation(offset))
 
+    @refuses_derivatives
     def rotated(self, degrees: float, axis: str | Sequence[float] = "z") -> Solid:
         """The solid, turned by so many degrees about an axis through the origin, anticlockwise as
         seen from its end. axis: "x", "y", "z" or a vector (3,)."""
@@ -156,6 +161,7 @@ class Solid(Field):
 
         return self._mapped(Affine.rotation(degrees, axis))
 
+    @refuses_derivatives
     def scaled(self, factors: float | Sequence[float]) -> Solid:
         """The solid, made so many times as large about the origin, along all axes or along each.
 
@@ -165,18 +171,21 @@ class Solid(Field):
 
         return self._mapped(Affine.scaling(factors))
 
+    @refuses_derivatives
     def transformed(self, matrix: npt.ArrayLike) -> Solid:
         """The solid under a linear or an affine map: matrix (3, 3), (3, 4) or (4, 4)."""
         from harnack.fields.solids.affine import Affine
 
         return self._mapped(Affine.of_matrix(matrix))
 
+    @refuses_derivatives
     def twisted(self, rate: float, axis: str = "z") -> Solid:
         """The solid, turned about an axis by `rate` radians for each unit of length along it."""
         from harnack.fields.solids.bends import Twist
 
         return self._mapped(Twist(float(rate), axis))
 
+    @refuses_derivatives
     def tapered(
         self, start: tuple[float, float], end: tuple[float, float], axis: str = "z"
     ) -> Solid:

@@ -23,7 +23,7 @@ from harnack.geometry.volumes import Box
 if TYPE_CHECKING:
     from typing import Self
 
-    from harnack.backend import Backend, FloatArray, Real, Vec3
+    from harnack.backend import Backend, FloatArray, Vec3
     from harnack.geometry.volumes import Volume
 
 __all__ = ["Displacement", "FourierSeries"]
@@ -249,13 +249,6 @@ class FourierSeries(Field):
         length = dr.norm(on.backend.Array3f(*moved))
         slope_error = unit * dr.fma(on.curvature, length, on.rounding[1])
         return Sample(value, gradient, on.curvatures(p), error, slope_error)
-
-    def differentiable_value(self, p: Vec3) -> Real:
-        """The value with its gradient attached, as Dr.Jit cannot differentiate a recorded loop."""
-        with dr.suspend_grad():
-            at = dr.detach(p)
-            value, gradient = self._on(at).value(at)
-        return value + dr.dot(gradient, p - at)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         """Rows of the Hessian of the series."""

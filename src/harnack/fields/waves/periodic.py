@@ -121,9 +121,6 @@ class EigenfunctionSum(Field):
         error += fmax(slope_error * self._extension.radius - self._slack * epsilon, 0)
         return Sample(value, gradient, known, error, weaker=weaker)
 
-    def differentiable_value(self, p: Vec3) -> Real:
-        return evaluate_terms(self.terms, p)[0]
-
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         """Rows of the Hessian; its trace is that of the sum's Laplacian, not zero."""
         x, y, z = (type(p)(*row) for row in hessian_of_terms(self.terms, p))

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from harnack.backend.numbers import refuses_derivatives
 from harnack.backend.sines import sincos
 
 if TYPE_CHECKING:
@@ -38,11 +39,13 @@ class Factor:
             raise ValueError("a factor of frequency 0 is a constant: multiply the amplitude by it")
 
 
+@refuses_derivatives
 def sine(frequency: float = 1.0, phase: float = 0.0) -> Factor:
     """sin(frequency * coordinate + phase); frequency in radians per unit length."""
     return Factor(float(frequency), float(phase), False)
 
 
+@refuses_derivatives
 def cosine(frequency: float = 1.0, phase: float = 0.0) -> Factor:
     """cos(frequency * coordinate + phase); frequency in radians per unit length."""
     return Factor(float(frequency), float(phase), True)

@@ -10,9 +10,11 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend.numbers import check_vectors, real_array
+from harnack.backend.numbers import check_vectors, real_array, refuse_derivatives
 
 if TYPE_CHECKING:
+    from typing import Self
+
     from harnack.backend import Backend, BoolArray, FloatArray, Mask, Real, Vec3
 
 Point: TypeAlias = tuple[float, float, float]
@@ -29,6 +31,11 @@ class Volume(abc.ABC):
 
     `a & b` is what two volumes have in common, which is convex as well.
     """
+
+    def __new__(cls, *given: Any, **named: Any) -> Self:
+        """Refuses numbers with derivatives, which would be dropped."""
+        refuse_derivatives(cls.__name__, given, named)
+        return super().__new__(cls)
 
     def __and__(self, other: object) -> Volume:
         from harnack.geometry.volumes.primitives import Intersection

@@ -172,10 +172,6 @@ class Tube(Solid):
     def evaluate(self, p: Vec3) -> Sample:
         return self._seen(p, None, ())[0]
 
-    def differentiable_value(self, p: Vec3) -> Real:
-        sample = self.evaluate(dr.detach(p))
-        return dr.dot(sample.gradient, p - dr.detach(p)) + sample.value
-
     def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
         del back
         p = path.point(t)

@@ -134,10 +134,6 @@ class _Segment(Field):
         known: tuple[Promise, ...] = (Lipschitz(backend.Float(1)), Curvature(1 / r, r))
         return Sample(distance - row[3], gradient, known, error, doubt)
 
-    def differentiable_value(self, p: Vec3) -> Real:
-        sample = self.evaluate(dr.detach(p))
-        return dr.dot(sample.gradient, p - dr.detach(p)) + sample.value
-
 
 def _checked_segments(segments: Any, points: FloatArray) -> IntArray:
     array = real_array(segments, "the segments of tubes")
