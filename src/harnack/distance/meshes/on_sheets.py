@@ -36,6 +36,8 @@ _CORNERS = (
     (-0.634, 0.533, -1.521),
 )
 _EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (0, 2), (1, 3))
+# In these lengths: how far about y f is looked at, where rounding of y does little to it.
+_WIDER = 64.0
 # Of the way to a sheet: so far f is looked at before it.
 _BEFORE = 0.98
 
@@ -119,8 +121,7 @@ class SheetSearch:
         seen = self.surface.first_hit(o, way, real(0), short * length, active)
         met = active & (seen.status == int(Status.HIT))
         # To first order any level is near where the gradient has no bound, as at the sheet's rim.
-        is_smooth = met & (seen.sheet == NO_SHEET)
-        met &= ~is_smooth | takes_level(self.surface, y, short, is_smooth)
+        met &= takes_level(self.surface, y, _WIDER * short, met)
         return met, seen.sheet, dr.fma(vector(seen.t), way, o)
 
     def _following(self, x: Vec3) -> Next:
