@@ -523,6 +523,19 @@ def test_levels_inside_a_step_are_seen_without_a_reference() -> None:
         check_steps(AlongX(), TooLong, count=4000)
 
 
+class LineCharge(Field):
+    """3 - log r about the z axis: above 1 within e^2 of it, harmonic in the plane."""
+
+    default_level = 2.5
+    domain = hk.Ball(radius=2.0)
+
+    def evaluate(self, p: Any) -> Sample:
+        square = p.x * p.x + p.y * p.y
+        ball = HarmonicBall(dr.sqrt(square), 1.0, math.inf, 2)
+        gradient = type(p)(-p.x / square, -p.y / square, 0.0)
+        return Sample(3 - 0.5 * dr.log(square), gradient, (ball,))
+
+
 @dataclasses.dataclass
 class Broken(Field):
     """Another field, with something wrong."""
@@ -700,6 +713,34 @@ def test_broken_promises_are_seen(name: str) -> None:
     field, message = BROKEN[name]
     with pytest.raises(BrokenPromiseError, match=message):
         check_field(field, count=400)
+
+
+# Promises that are attained, wrong by 5 %: field, kind of promise, and what is multiplied.
+BY_5_PERCENT: dict[str, Field] = {
+    "radius of a line charge": Broken(LineCharge(), only(HarmonicBall, radius=1.05)),
+    "radius of a line charge, by half": Broken(LineCharge(), only(HarmonicBall, radius=1.5)),
+    "radius of charges": Broken(OWN["charges"], only(HarmonicBall, radius=1.05)),
+    "radius of charges, by a fifth": Broken(OWN["charges"], only(HarmonicBall, radius=1.2)),
+    "radius of an angle": Broken(OWN["azimuth"], only(HarmonicBall, radius=1.05)),
+    "range of an angle": Broken(OWN["azimuth"], narrower(0.95)),
+    "slope of a plane": Broken(OWN["plane"], only(Lipschitz, constant=0.95)),
+    "slope of a gyroid": Broken(GYROID, only(Lipschitz, constant=0.95)),
+    "second derivatives of a gyroid": Broken(GYROID, only(Curvature, constant=0.95)),
+    "slope of P": Broken(REAL["P"], only(Lipschitz, constant=0.95)),
+    "second derivatives of P": Broken(REAL["P"], only(Curvature, constant=0.95)),
+    "slope of D": Broken(REAL["D"], only(Lipschitz, constant=0.95)),
+    "range of Y 5,3": Broken(POLYNOMIAL, narrower(0.95)),
+}
+
+
+@pytest.mark.parametrize("name", BY_5_PERCENT)
+def test_promises_wrong_by_5_percent_are_found(name: str) -> None:
+    with pytest.raises(BrokenPromiseError, match="f leaves what is promised here"):
+        check_field(BY_5_PERCENT[name])
+
+
+def test_a_line_charge_keeps_its_promise() -> None:
+    check_field(LineCharge())
 
 
 def test_failure_names_the_point() -> None:

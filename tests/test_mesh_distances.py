@@ -419,3 +419,28 @@ def test_no_answer_is_below_the_lower_bound() -> None:
                     lower = hk.signed_distance(field, x, method="lower", precision=precision)
                     slack = 1e-14 if precision == "double" else 1e-5
                     assert (found >= np.abs(lower) - slack).all()
+
+
+# Two triangles above one another; the level .2 meets the rim of the larger alone, but modulo 1
+# that of the smaller too.
+TWO = hk.WindingNumber(
+    [[-4, -3, 0], [4, -3, 0], [0, 5, 0], [-0.3, -0.3, 0.5], [0.3, -0.3, 0.5], [0, 0.4, 0.5]],
+    [[0, 1, 2], [3, 4, 5]],
+)
+
+
+def test_a_rim_that_the_level_meets_modulo_one_alone_is_none_of_the_surface() -> None:
+    found = hk.distance_bounds(TWO, [[0, -0.6, 0.6]], level=0.2)
+    assert found.lower[0] <= found.upper[0]
+    assert found.upper[0] == pytest.approx(0.6)
+    rng = np.random.default_rng(0)
+    x = rng.uniform([-1, -1, 0], [1, 1, 1.2], (24, 3))
+    found = hk.distance_bounds(TWO, x, level=0.2)
+    u = rng.normal(size=(24, 2000, 3))
+    u /= np.linalg.norm(u, axis=2, keepdims=True)
+    # w is seen on both sides of the level about every foot, and on one within the lower bound.
+    for at, radius, both in ((found.feet, 1e-7, True), (x, 0.999 * found.lower[:, None], False)):
+        share = radius * rng.random((24, 2000)) ** (1 / 3)
+        q = (at[:, None] + share[..., None] * u).reshape(-1, 3)
+        above = (TWO.value(q, precision="double") > 0.2).reshape(24, 2000)
+        assert ((above.any(axis=1) & ~above.all(axis=1)) == both).all()

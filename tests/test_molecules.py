@@ -66,7 +66,38 @@ def test_one_model_and_one_conformation(tmp_path: Path) -> None:
     found = read_molecule(written(tmp_path, "b.ent", text + "\n".join(lines[:1]) + "\nENDMDL\n"))
     np.testing.assert_allclose(found.positions, [[0, 0, 0]])
     assert "first of 2 models" in found.said
-    assert "1 of unknown elements left out" in found.said
+    assert "1 alternatives, 1 of unknown elements left out" in found.said
+
+
+def test_atoms_of_one_name_all_count(tmp_path: Path) -> None:
+    """As Open Babel writes them: six atoms C in one residue UNL."""
+    lines = [
+        f"HETATM{k:>5d}  C   UNL     1    {1.4 * k:8.3f}   0.000   0.000  1.00  0.00{'C':>12s}"
+        for k in range(1, 7)
+    ]
+    found = read_molecule(written(tmp_path, "a.pdb", "\n".join([*lines, "END", ""])))
+    np.testing.assert_allclose(found.positions[:, 0], 1.4 * np.arange(1, 7))
+    assert found.said == "6 atoms (6 C)"
+    ended = read_molecule(written(tmp_path, "b.pdb", "\n".join([*lines, "END", *lines[:2], ""])))
+    assert ended.said == "6 atoms (6 C); 2 behind the line END left out"
+    many = [CIF.splitlines()[-2].replace("1.0", f"{k}.0") for k in range(6)]
+    head = "\n".join(CIF.splitlines()[:-2])
+    read = read_molecule(written(tmp_path, "a.cif", "\n".join([head, *many, ""])))
+    assert read.said == "6 atoms (6 C)"
+
+
+def test_alternatives_are_what_the_file_marks(tmp_path: Path) -> None:
+    """Of SER A or THR B in one place SER counts; atoms of altLoc B alone and unmarked ones do."""
+    atoms = [("CA", " ", "SER"), ("CB", "A", "SER"), ("OG", "A", "SER"), ("CB", "B", "THR"),
+             ("CG2", "B", "THR"), ("CA", " ", "SER")]  # fmt: skip
+    text = "".join(
+        f"ATOM  {k + 1:>5d}  {name:<3s}{mark}{residue} A   1    {k:8.3f}   0.000   0.000"
+        f"  1.00  0.00{name[0]:>12s}\n"
+        for k, (name, mark, residue) in enumerate(atoms)
+    )
+    found = read_molecule(written(tmp_path, "a.pdb", text))
+    np.testing.assert_allclose(np.sort(found.positions[:, 0]), [0, 1, 2, 5])
+    assert found.said.endswith("; 2 alternatives left out")
 
 
 @pytest.mark.parametrize(

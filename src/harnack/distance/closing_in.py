@@ -12,14 +12,17 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 
 from harnack.backend.basis import across
-from harnack.backend.extrema import fmin
+from harnack.backend.extrema import fmax, fmin
+from harnack.backend.lengths import largest_component
+from harnack.distance.meshes.on_sheets import takes_level
+from harnack.fields.sheets import NO_SHEET
 from harnack.tracer import Status
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
-    from harnack.tracer.prepared import PreparedLevelSet
+    from harnack.tracer.prepared import MarchResult, PreparedLevelSet
 
-__all__ = ["close_in", "nearer_along"]
+__all__ = ["close_in"]
 
 _MOST_RAYS = 600
 # Rays of a turn, which all have to fail before the next turn is narrower: those to where planes
@@ -32,18 +35,8 @@ _WIDEST, _CLOSER = 1.0, 0.25
 _AROUND = 128
 # Planes whose normals are closer than this, as the sine of an angle, count as the same.
 _APART = 1e-3
-
-
-def nearer_along(surface: PreparedLevelSet, x: Vec3, way: Vec3, limit: Real) -> Vec3:
-    """Where rays from x along `way` first meet the surface before `limit`; NaN where they do
-    not, or the way is zero or no number."""
-    real, vector = surface.backend.Float, surface.backend.Array3f
-    length = dr.norm(way)
-    usable = (length > 0) & dr.isfinite(length)
-    d = dr.select(usable, way / length, vector(0, 0, 1))
-    seen = surface.first_hit(x, d, real(0), real(limit), usable)
-    hit = usable & (seen.status == int(Status.HIT))
-    return dr.select(hit, dr.fma(vector(seen.t), d, x), vector(dr.nan))
+# In epsilons, of coordinates: so far about a hit f is looked at on both sides of the level.
+_ABOUT = 1024.0
 
 
 @dataclass(frozen=True)
@@ -144,7 +137,8 @@ def close_in(surface: PreparedLevelSet, x: Vec3, foot: Vec3) -> Vec3:
     the best becomes the best. If all of a turn fail, the next turns are narrower, down to an angle
     of sqrt(epsilon). A compass alone is slow along creases; so each hit adds the plane that touches
     the surface there, and a turn begins with rays to the nearest points where these planes meet.
-    Every point taken is a first hit, hence one of the surface, whatever led there.
+    Every point taken is a first hit that f takes the level about (`takes_level`), hence one of the
+    surface, whatever led there.
     """
     backend = surface.backend
     real, vector, count = backend.Float, backend.Array3f, backend.UInt32
@@ -167,12 +161,14 @@ def close_in(surface: PreparedLevelSet, x: Vec3, foot: Vec3) -> Vec3:
         seen = surface.first_hit(x, dr.select(usable, way, d), real(0), end, usable)
         hit = usable & (seen.status == int(Status.HIT))
         nearer = hit & (seen.t < t * (1 - 8 * backend.epsilon))
+        there = dr.fma(vector(seen.t), way, x)
+        nearer &= _is_on_surface(surface, there, seen, nearer)
         normal = dr.normalize(seen.gradient)
         touches = hit & dr.isfinite(dr.squared_norm(normal))
         touching = _TouchingPlane(normal, dr.dot(normal, way) * seen.t)
         planes = planes.with_(touching, touches, touches & nearer)
         d, t = dr.select(nearer, way, d), dr.select(nearer, seen.t, t)
-        foot = dr.select(nearer, dr.fma(vector(seen.t), way, x), foot)
+        foot = dr.select(nearer, there, foot)
         failed = dr.select(nearer | around, count(0), failed + 1)
         spent = failed == _MEETINGS + _TILTED
         narrower = dr.select(spent, _CLOSER * step, step)
@@ -190,6 +186,14 @@ def close_in(surface: PreparedLevelSet, x: Vec3, foot: Vec3) -> Vec3:
         *3 * (vector(0), real(0)),
     )  # fmt: skip
     return dr.while_loop(start, more, body, label="closing in")[2]
+
+
+def _is_on_surface(surface: PreparedLevelSet, y: Vec3, hit: MarchResult, active: Mask) -> Mask:
+    """Whether hits y are on a sheet, or f takes the level about them: beside the rim of a sheet,
+    where its gradient has no bound, rays are within the tolerance of any level to first order."""
+    is_smooth = active & (hit.sheet == NO_SHEET)
+    radius = _ABOUT * surface.backend.epsilon * fmax(largest_component(y), hit.t)
+    return ~is_smooth | takes_level(surface, y, radius, is_smooth)
 
 
 def _tilted(d: Vec3, step: Real, angle: Real) -> Vec3:

@@ -17,6 +17,7 @@ from harnack.files.file_format import FileFormatError, Place, read_bytes
 
 PDB_FILES, CIF_FILES = (".pdb", ".ent"), (".cif", ".mmcif")
 MOLECULE_FILES = (*PDB_FILES, *CIF_FILES)
+_ATOM_LINES = ("ATOM", "HETA")
 _MOST_NAMED = 6
 
 
@@ -34,11 +35,14 @@ class Atoms:
 
 
 def read_molecule(path: str | os.PathLike[str]) -> Atoms:
-    """The atoms of a molecule's file (.pdb, .ent, .cif, .mmcif): of its first model and of the
-    first of alternative conformations, water and hydrogen as far as the file has them.
+    """The atoms of a molecule's file (.pdb, .ent, .cif, .mmcif): of its first model, all but
+    alternatives, water and hydrogen as far as the file has them.
 
-    Radii are gemmi's van der Waals radii of the elements (C 1.7, N 1.55, O 1.52, S 1.8, H 1.2).
-    Atoms of an unknown element are left out, which `said` tells.
+    Alternatives are atoms that the file marks as such (altLoc in .pdb, label_alt_id in .cif): of
+    each atom the first counts, and of several residues in one place the first. Atoms without the
+    mark all count, whatever their names. Radii are gemmi's van der Waals radii of the elements
+    (C 1.7, N 1.55, O 1.52, S 1.8, H 1.2). `said` tells what was left out: atoms of other models,
+    alternatives, unknown elements, and what follows the line END.
 
     Raises:
         FileFormatError: unreadable, malformed, another format, no atoms in it.
@@ -56,7 +60,8 @@ def atoms_in(path: Path, data: bytes) -> Atoms:
         raise place.error("this is binary data, not the text that its extension announces")
     text = data.decode("utf-8", "replace")
     try:
-        if path.suffix.lower() in CIF_FILES:
+        is_cif = path.suffix.lower() in CIF_FILES
+        if is_cif:
             structure = gemmi.make_structure_from_block(gemmi.cif.read_string(text).sole_block())
         else:
             _check_coordinates(path, text)
@@ -66,8 +71,8 @@ def atoms_in(path: Path, data: bytes) -> Atoms:
     except (RuntimeError, ValueError, IndexError, UnicodeError) as error:
         first = " ".join(str(error).split())
         raise place.error(f"the molecule cannot be read ({first})") from None
-    structure.remove_alternative_conformations()
-    found = [site.atom for site in structure[0].all()] if len(structure) else []
+    sizes = [model.count_atom_sites() for model in structure]
+    found = _without_alternatives(structure[0]) if sizes else []
     known = [atom for atom in found if atom.element.atomic_number > 0]
     if not known:
         raise place.error(
@@ -80,7 +85,33 @@ def atoms_in(path: Path, data: bytes) -> Atoms:
         raise place.error(f"atom {known[wrong[0]].serial} has coordinates that are not finite")
     radii = np.array([round(atom.element.vdw_r, 6) for atom in known], dtype=np.float64)
     elements = tuple(atom.element.name for atom in known)
-    return Atoms(positions, radii, elements, _said(elements, len(found) - len(known), structure))
+    left_out = {
+        "alternatives": sizes[0] - len(found),
+        "of unknown elements": len(found) - len(known),
+        "behind the line END": 0 if is_cif else _atom_lines(text) - sum(sizes),
+    }
+    return Atoms(positions, radii, elements, _said(elements, left_out, len(structure)))
+
+
+def _without_alternatives(model: Any) -> list[Any]:
+    """The atoms of a model, and of those that are marked as alternatives the first of each name in
+    the first residue of each place."""
+    residues: dict[tuple[str, str], str] = {}
+    marks: dict[tuple[str, str, str], str] = {}
+    found: list[Any] = []
+    for site in model.all():
+        atom, residue = site.atom, site.residue
+        if atom.has_altloc():
+            place = (site.chain.name, str(residue.seqid))
+            is_first = residues.setdefault(place, residue.name) == residue.name
+            if not is_first or marks.setdefault((*place, atom.name), atom.altloc) != atom.altloc:
+                continue
+        found.append(atom)
+    return found
+
+
+def _atom_lines(text: str) -> int:
+    return sum(line[:4].upper() in _ATOM_LINES for line in text.splitlines())
 
 
 def _check_coordinates(path: Path, text: str) -> None:
@@ -92,7 +123,7 @@ def _check_coordinates(path: Path, text: str) -> None:
         FileFormatError: naming the first line where they are not.
     """
     for number, line in enumerate(text.splitlines(), start=1):
-        if line[:4].upper() not in ("ATOM", "HETA"):
+        if line[:4].upper() not in _ATOM_LINES:
             continue
         try:
             finite = all(math.isfinite(float(line[k : k + 8])) for k in (30, 38, 46))
@@ -104,12 +135,11 @@ def _check_coordinates(path: Path, text: str) -> None:
             )
 
 
-def _said(elements: tuple[str, ...], left_out: int, structure: Any) -> str:
+def _said(elements: tuple[str, ...], left_out: dict[str, int], models: int) -> str:
     common = Counter(elements).most_common(_MOST_NAMED)
     names = ", ".join(f"{count:,} {name}" for name, count in common)
     said = f"{len(elements):,} atoms ({names}{', ...' if len(set(elements)) > len(common) else ''})"
-    if len(structure) > 1:
-        said += f", the first of {len(structure)} models"
-    if left_out:
-        said += f"; {left_out:,} of unknown elements left out"
-    return said
+    if models > 1:
+        said += f", the first of {models} models"
+    parts = [f"{number:,} {what}" for what, number in left_out.items() if number]
+    return f"{said}; {', '.join(parts)} left out" if parts else said

@@ -59,6 +59,9 @@ def look_at(field: Field, points: FloatArray, precision: Precision = "double") -
     """The field at points (n, 3), all numbers of its promises as float64 arrays (n,)."""
     n = len(points)
     sample = _sample(field, points, precision)
+    numbers_known = [list(vars(one).values()) for one in sample.promises]
+    # At once, or each would be computed by a kernel of its own.
+    dr.eval(sample.value, sample.gradient, sample.error, sample.gradient_error, numbers_known)
 
     def on_host(one: Promise) -> Promise:
         numbers: dict[str, Any] = {

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import drjit as dr
 
 from harnack.backend.extrema import fmax, fmin
-from harnack.fields.sheets import NO_SHEET, NearestSheet
+from harnack.fields.sheets import NO_SHEET, Crossing, NearestSheet
 from harnack.tracer import Status
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from harnack.fields.field import Field
     from harnack.tracer.prepared import PreparedLevelSet
 
-__all__ = ["SheetSearch"]
+__all__ = ["SheetSearch", "takes_level"]
 
 # Half the length of a ray through a point of a sheet, in epsilons of coordinates.
 _SHORT = 32.0
@@ -35,7 +35,11 @@ _CORNERS = (
     (1.243, 1.088, 0.520),
     (-0.634, 0.533, -1.521),
 )
-_EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
+_EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (0, 2), (1, 3))
+# In these lengths: how far about y f is looked at, where rounding of y does little to it.
+_WIDER = 64.0
+# Of the way to a sheet: so far f is looked at before it.
+_BEFORE = 0.98
 
 Next: TypeAlias = "Callable[[tuple[Any, Any], Any, Any], NearestSheet]"
 
@@ -116,6 +120,8 @@ class SheetSearch:
         way, length = (end - start) / dr.norm(end - start), dr.norm(end - start)
         seen = self.surface.first_hit(o, way, real(0), short * length, active)
         met = active & (seen.status == int(Status.HIT))
+        # To first order any level is near where the gradient has no bound, as at the sheet's rim.
+        met &= takes_level(self.surface, y, _WIDER * short, met)
         return met, seen.sheet, dr.fma(vector(seen.t), way, o)
 
     def _following(self, x: Vec3) -> Next:
@@ -142,6 +148,40 @@ class SheetSearch:
             return found
 
         return told
+
+
+def takes_level(surface: PreparedLevelSet, y: Vec3, radius: Real, active: Mask) -> Mask:
+    """Whether f is seen on both sides of a level about y, no farther than 1.74 radii away.
+
+    f is looked at in the corners of a tetrahedron and, on its edges, just before a sheet. Where two
+    of these places are on different sides of a level, the surface lies on the way between them:
+    f passes the level on it steadily, or by a jump. That needs no gradient, which has no bound at
+    the rims of sheets: f takes all values between those on both sides of the sheet there, and no
+    others.
+    """
+    backend, field = surface.backend, surface.field.without_truncation(surface.backend)
+    real, index, vector = backend.Float, backend.UInt32, backend.Array3f
+    nowhere = vector(0)
+
+    def body(k: Any, low: Real, high: Real, active: Mask) -> tuple[Any, ...]:
+        start, end = _probe(vector, k + 1, nowhere)
+        o = dr.fma(vector(radius), start, y)
+        length = dr.norm(end - start)
+        way, reach = (end - start) / length, radius * length
+        behind = Crossing(real(0), index(NO_SHEET), real(0), nowhere)
+        t = real(field.next_crossing(o, way, behind, reach, active).t)
+        inside = dr.select(t < reach, t, 0.5 * reach)
+        for share in (real(0), _BEFORE * inside):
+            value = real(field.evaluate(dr.fma(vector(share), way, o)).value)
+            low, high = fmin(low, value), fmax(high, value)
+        return k + 1, low, high, active & (k + 1 < len(_EDGES))
+
+    def more(*state: Any) -> Mask:
+        return state[-1]
+
+    start = index(0), real(dr.inf), real(-dr.inf), backend.Bool(active)
+    _, low, high, _ = dr.while_loop(start, more, body, label="sides of a level")
+    return (low < high) & (surface.levels.gaps(low).up < high - low)
 
 
 def _parts(near: NearestSheet) -> tuple[Any, ...]:

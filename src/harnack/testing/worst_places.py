@@ -1,0 +1,222 @@
+"""The places where a promise is broken most, searched and not sampled.
+
+A promise that is wrong by a few percent is broken only near what makes it: beside a singularity
+that lies just inside the ball, or in the one direction in which a range is attained. Random places
+miss that. So places climb: pairs of a point p and a place y that the promise made at p speaks of
+move at random, farther as long as they succeed, to where the promise is closer to being broken.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from harnack.backend import BoolArray, FloatArray
+from harnack.enclosures import BoundedLaplacian, Curvature, HarmonicBall, Lipschitz
+from harnack.testing.failures import require
+from harnack.testing.walks import FieldValues, look_at, movements, random_directions
+
+if TYPE_CHECKING:
+    from harnack.fields.field import Field
+
+__all__ = ["search_worst_places"]
+
+# Pairs that climb: at most, and of the points given; how many moves each tries in a round, and
+# rounds. Where f is known along a way only, which costs as many looks as it has samples, fewer.
+_MOST_PAIRS, _PAIRS_OF_POINTS = 48, 0.25
+_MOVES, _ROUNDS, _WALKED = 8, 36, 2
+# Of the radius: how near places come to the border of the ball.
+_BORDER = 1 - 1e-6
+# Sizes of moves, in radii: the first, the least, and what success and failure make of them.
+_FIRST, _LEAST, _FARTHER, _SHORTER = 0.25, 1e-9, 1.6, 0.6
+# Of the coordinates: radii below this are left out, for rounding moves places in them.
+_SMALLEST = 1e-6
+# Places looked at on the way to one, where f is known along it only: searching, and to be sure.
+_ON_THE_WAY, _SURE = 24, 600
+# What a ratio may be above one for rounding, and rounding of the values.
+_ALLOWED, _ROUNDING = 1e-6, 1e-9
+# Of the radius: the spacing of differences of gradients.
+_SPACING = 1e-3
+
+
+@dataclass(frozen=True)
+class _Pairs:
+    """Points p (n, 3) and places p + reach * w, |w| < 1, and how near the promise is to being
+    broken there, (n,): above one it is."""
+
+    p: FloatArray
+    w: FloatArray
+    reach: FloatArray
+    ratio: FloatArray
+
+    def best_of(self, others: _Pairs) -> tuple[_Pairs, BoolArray]:
+        """Each of these n, or the best of its m others of n * m; and whether that is another."""
+        n = len(self.p)
+        m = len(others.p) // n
+        which = np.arange(n) * m + others.ratio.reshape(n, m).argmax(axis=1)
+        better = others.ratio[which] > self.ratio
+        rows = better[:, None]
+        return _Pairs(
+            np.where(rows, others.p[which], self.p),
+            np.where(rows, others.w[which], self.w),
+            np.where(better, others.reach[which], self.reach),
+            np.where(better, others.ratio[which], self.ratio),
+        ), better
+
+
+def search_worst_places(
+    field: Field, points: FloatArray, look: FieldValues, number: int, rng: np.random.Generator
+) -> None:
+    """Search for places that break a promise, the one of that number in `Sample.promises`.
+
+    points: (n, 3), and `look` the field there. The climb begins at those with the smallest radius
+    and at others, towards the border along the gradient, against it, and in random directions.
+
+    Raises:
+        BrokenPromiseError: naming the point and the place of the worst pair.
+    """
+    search = _Search(field, number, 2 * float(np.ptp(points, axis=0).max()) + 1e-300)
+    part = _WALKED if search.is_walked else 1
+    pairs = min(max(int(_PAIRS_OF_POINTS * len(points)), 6), _MOST_PAIRS) // part
+    moves_each = _MOVES // part
+    order = np.argsort(np.broadcast_to(look.known[number].radius, len(points)), kind="stable")
+    rows = np.concatenate([order[: pairs // 3], rng.choice(len(points), pairs)])[:pairs]
+    steepest = look.gradient[rows]
+    length = np.linalg.norm(steepest, axis=1, keepdims=True)
+    steepest = np.where(length > 0, steepest / np.maximum(length, 1e-300), [1.0, 0.0, 0.0])
+    turn = np.arange(pairs)[:, None] % 3
+    along = np.where(turn == 1, -1, 1) * steepest
+    ways = np.where(turn == 2, random_directions(rng, pairs), along)
+    found = search.pairs(points[rows], ways * rng.uniform(0.3, 1, (pairs, 1)))
+    size = np.full(pairs, _FIRST)
+    for _ in range(_ROUNDS // part):
+        step = np.repeat(size, moves_each)[:, None]
+        p, w = (np.repeat(one, moves_each, axis=0) for one in (found.p, found.w))
+        reach = np.repeat(found.reach, moves_each)[:, None]
+        # Half of the moves keep the point, a quarter of them the place.
+        kind = np.arange(len(p))[:, None] % 4
+        moves = kind >= 2
+        way = rng.normal(size=p.shape) * step * 10 ** rng.uniform(-1, 0, (len(p), 1))
+        shift = np.where(moves, rng.normal(size=p.shape) * step, 0)
+        near = w - np.where(kind == 3, shift, 0) + np.where(kind == 3, 0, way)
+        found, better = found.best_of(search.pairs(p + reach * shift, near))
+        size = np.where(better, np.minimum(_FARTHER * size, 1), _SHORTER * size)
+        size = np.where(size < _LEAST, _FIRST, size)
+    worst = found.ratio > 1 + _ALLOWED
+    if worst.any():
+        found = search.pairs(found.p[worst], found.w[worst], samples=_SURE)
+        there = found.p + found.reach[:, None] * found.w
+        good = ~(found.ratio > 1 + _ALLOWED)
+        name = type(look.known[number]).__name__
+        message = f"{name}: f leaves what is promised here, by this factor"
+        require(good, message, found.p, found.ratio, there)
+
+
+@dataclass(frozen=True)
+class _Search:
+    """What is asked of pairs. longest: that is looked at of a radius without an end."""
+
+    field: Field
+    number: int
+    longest: float
+
+    @property
+    def is_walked(self) -> bool:
+        """Whether how f moves is known along a way only, jumps taken out."""
+        return self.field.period is not None or self.field.has_sheets
+
+    def pairs(self, p: FloatArray, w: FloatArray, samples: int = _ON_THE_WAY) -> _Pairs:
+        """The pairs of points (n, 3) and shares of their radii, cut to the ball."""
+        length = np.linalg.norm(w, axis=1, keepdims=True)
+        w = w * np.minimum(1, _BORDER / np.maximum(length, 1e-300))
+        ratio, reach = np.full(len(p), -np.inf), np.full(len(p), 1.0)
+        rows = np.flatnonzero(self._within(p))
+        if len(rows):
+            look = look_at(self.field, p[rows])
+            known = look.known[self.number]
+            reach[rows] = np.minimum(known.radius, self.longest)
+            y = p + reach[:, None] * w
+            usable = reach[rows] > _SMALLEST * np.abs(p[rows]).max(axis=1)
+            if not isinstance(known, HarmonicBall | BoundedLaplacian):
+                usable &= self._within(y[rows])
+            rows, look = rows[usable], look.at(usable)
+            if len(rows):
+                ratio[rows] = self._ratio(look, p[rows], w[rows], reach[rows], samples)
+        return _Pairs(p, w, reach, np.where(np.isnan(ratio), -np.inf, ratio))
+
+    def _within(self, p: FloatArray) -> BoolArray:
+        inside = np.asarray(np.isfinite(p).all(axis=1))
+        if self.field.domain is not None:
+            inside &= self.field.domain.contains_points(np.nan_to_num(p))
+        return inside
+
+    def _ratio(
+        self, look: FieldValues, p: FloatArray, w: FloatArray, reach: FloatArray, samples: int
+    ) -> FloatArray:
+        known, y = look.known[self.number], p + reach[:, None] * w
+        there = look_at(self.field, y)
+        moved = there.value - look.value
+        if self.is_walked:
+            moved = self._lift(p, y, samples)
+        error = look.error + there.error
+        error = error + _ROUNDING * (np.abs(look.value) + (self.field.period or 0) + np.abs(moved))
+        distance = reach * np.linalg.norm(w, axis=1)
+        with np.errstate(all="ignore"):
+            if isinstance(known, Lipschitz):
+                return (np.abs(moved) - error) / (known.constant * distance)
+            if isinstance(known, Curvature):
+                straight = np.einsum("nk,nk->n", look.gradient, y - p)
+                bent = np.abs(moved - straight) - error - look.gradient_error * distance
+                return bent / (0.5 * known.constant * distance**2)
+            if not isinstance(known, HarmonicBall | BoundedLaplacian):
+                return np.full(len(p), -np.inf)
+            below, above = look.value - known.lower + error, known.upper - look.value + error
+            ratio = np.maximum(moved / above, -moved / below)
+            free = reach - distance
+            if isinstance(known, HarmonicBall):
+                gap = np.minimum(below + moved, above - moved)
+                return np.fmax(ratio, _slope_ratio(known, there, free, gap))
+            return np.fmax(ratio, self._laplacian_ratio(known, y, there, _SPACING * free))
+
+    def _lift(self, p: FloatArray, y: FloatArray, samples: int) -> FloatArray:
+        """How far the continuous lift moves from p to y (n,)."""
+        way = y - p
+        length = np.linalg.norm(way, axis=1)
+        d = way / np.maximum(length, 1e-300)[:, None]
+        # Denser towards the border, where singularities may lie.
+        share = 1 - np.linspace(1, 0, samples) ** 2
+        return movements(self.field, p, d, length[:, None] * share).moved[:, -1]
+
+    def _laplacian_ratio(
+        self, known: BoundedLaplacian, y: FloatArray, there: FieldValues, h: FloatArray
+    ) -> FloatArray:
+        """One more than by how much the Laplacian at y (n, 3) leaves its ends, in their size."""
+        fine, wide = np.zeros(len(y)), np.zeros(len(y))
+        rounding = 4 * there.gradient_error / h
+        for axis in range(3):
+            for node, weight, wider in ((1, 1.0, 0.0), (2, 0.0, 0.5)):
+                way = (node * h)[:, None] * np.eye(3)[axis]
+                rate = look_at(self.field, y + way).gradient - look_at(self.field, y - way).gradient
+                fine += weight * rate[:, axis] / (2 * h)
+                wide += wider * rate[:, axis] / (2 * h)
+        size = np.linalg.norm(there.gradient, axis=1)
+        rounding += 1e-11 * size * (1 + np.abs(y).max(axis=1) / h) / h + np.abs(fine - wide)
+        off = np.maximum(known.laplacian_lower - fine, fine - known.laplacian_upper) - rounding
+        scale = np.abs(known.laplacian_lower) + np.abs(known.laplacian_upper) + 1e-300
+        return 1 + off / scale
+
+
+def _slope_ratio(
+    known: HarmonicBall, there: FieldValues, free: FloatArray, gap: FloatArray
+) -> FloatArray:
+    """|grad f| at places of a ball, as a share of what a harmonic function allows there that is
+    `gap` away from the nearer end of its range.
+
+    Proof. At y, `free` from the border, f - lower is positive and harmonic on B(y, free), so that
+    by Harnack's inequality |grad f(y)| <= n (f(y) - lower)/free; likewise upper - f. Where a
+    singularity lies in the ball, the left side grows faster than the right one beside it.
+    """
+    slope = np.maximum(np.linalg.norm(there.gradient, axis=1) - there.gradient_error, 0)
+    return np.where(gap > 0, slope * free / (known.dimension * gap), -np.inf)
