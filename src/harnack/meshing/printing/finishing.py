@@ -27,7 +27,7 @@ __all__ = ["check_options", "finished", "largest_part", "normals_of", "simplifie
 _CREASE = math.cos(math.radians(30))
 
 
-def check_options(tolerance: Any, spacing: Any, thickness: Any, seed: Any) -> None:
+def check_options(tolerance: Any, spacing: Any, thickness: Any, seed: Any, most: Any) -> None:
     """Raise ValueError or TypeError for numbers out of range."""
     if not 0 < _number(tolerance, "tolerance") < 0.5:
         raise ValueError(
@@ -38,6 +38,8 @@ def check_options(tolerance: Any, spacing: Any, thickness: Any, seed: Any) -> No
             raise ValueError(f"{name} must be a positive length, not {value!r}")
     if operator.index(seed) < 0:
         raise ValueError(f"seed must not be negative, not {seed}")
+    if operator.index(most) < 1:
+        raise ValueError(f"max_triangles must be positive, not {most}")
 
 
 def _number(value: Any, name: str) -> float:
