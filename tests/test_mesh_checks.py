@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 
 import harnack as hk
+from harnack.cli.mesh_files import write_mesh
 from harnack.meshing.checks import (
     LocalError,
     MeshingError,
@@ -56,6 +58,28 @@ def test_faces_through_each_other_are_found():
     x[0, 0] = math.nan
     with pytest.raises(MeshingError, match="no numbers"):
         check_apart(x, _FACES)
+
+
+@pytest.mark.parametrize("kind", ["stl", "ply", "obj", "glb"])
+def test_edges_shorter_than_single_precision_do_not_open_a_file(tmp_path: Path, kind: str):
+    # A vertex 5e-11 from another, in the middle of an edge's two faces, as booleans leave them.
+    x = np.array(_BALL.vertices, np.float64)
+    a, b = (int(v) for v in _BALL.edges_unique[0])
+    beside = [f for f in range(len(_FACES)) if {a, b} <= set(_FACES[f].tolist())]
+    new, rest = len(x), np.delete(_FACES, beside, axis=0)
+    halves = [np.where(_FACES[f] == old, new, _FACES[f]) for f in beside for old in (a, b)]
+    middle = x[a] + 5e-11 * (x[b] - x[a])
+    made = trimesh.Trimesh(
+        np.concatenate([x, [middle]]), np.concatenate([rest, halves]), process=False
+    )
+    assert made.is_watertight
+    path = tmp_path / f"a.{kind}"
+    write_mesh(made, path)
+    read = trimesh.load(path, force="mesh")
+    read.merge_vertices(merge_tex=True, merge_norm=True)
+    assert read.is_watertight
+    assert len(read.faces) == len(_FACES)
+    check_apart(np.array(read.vertices, np.float64), np.array(read.faces, np.int64))
 
 
 @pytest.mark.slow
