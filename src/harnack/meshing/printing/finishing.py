@@ -100,6 +100,8 @@ def simplified(surface: Surface, tolerance: float) -> tuple[Surface, dict[str, A
     made = surface_of(manifold_of(surface).simplify(tolerance))
     if not len(made.faces):
         raise MeshingError("the part is thinner than the tolerance: choose a smaller `tolerance`")
+    if len(made.faces) > len(surface.faces):
+        made = surface
     return made, {"triangles_before_simplification": len(surface.faces)}
 
 
