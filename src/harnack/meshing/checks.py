@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
-from typing import Any, Never, cast
+from typing import TYPE_CHECKING, Any, Never, cast
 
 import numpy as np
+import numpy.typing as npt
 
 from harnack.backend import FloatArray
-from harnack.meshing.edges import Edges, IntArray, directed_edges
+from harnack.meshing.edges import Edges, IntArray, boundary_edges, directed_edges
+from harnack.meshing.intersections import intersecting_faces
+from harnack.meshing.rows import lengths
+
+if TYPE_CHECKING:
+    from harnack.geometry import Volume
+    from harnack.meshing.samples import LevelFunction
 
 __all__ = [
     "LocalError",
     "MeshingError",
     "TooLargeError",
+    "check_apart",
+    "check_count",
+    "check_inside",
     "check_manifold",
+    "check_near_level",
     "euler_characteristic",
     "singular_vertices",
 ]
@@ -78,6 +89,104 @@ def check_manifold(faces: IntArray, vertices: FloatArray | None = None) -> None:
             "smaller `spacing`, or another level",
             singular_vertices(faces),
         )
+
+
+def check_apart(vertices: FloatArray, faces: IntArray) -> None:
+    """Raise if a vertex is no point, or if faces pass through each other or lie on each other;
+    decided exactly.
+
+    Raises:
+        MeshingError: so; a LocalError with the centres of these faces.
+    """
+    if not np.isfinite(vertices).all():
+        raise MeshingError("vertices of the mesh are no numbers: choose another level or `clip`")
+    crossing = intersecting_faces(vertices, faces)
+    if len(crossing):
+        places = vertices[faces[crossing]].mean(axis=1)
+        raise LocalError(
+            f"{len(crossing):,} of {len(faces):,} triangles pass through each other, such as near "
+            f"{_point(places[0])}: choose a smaller `spacing` or a larger `tolerance`",
+            places,
+        )
+
+
+def check_count(expected: float, most: int) -> None:
+    """Raise TooLargeError if more triangles are expected than may be made."""
+    if expected > most:
+        raise TooLargeError(
+            f"the mesh takes about {expected:.2g} triangles, and max_triangles is {most:,}: choose "
+            "a larger `tolerance` or `spacing`, a smaller `clip`, or a larger max_triangles"
+        )
+
+
+def check_inside(vertices: FloatArray, volume: Volume, slack: float) -> None:
+    """Raise if a vertex lies outside of a volume's bounds by more than `slack`."""
+    lower, upper = (np.array(end, np.float64) for end in volume.bounds())
+    out = ((vertices < lower - slack) | (vertices > upper + slack)).any(axis=1)
+    if out.any():
+        raise MeshingError(
+            f"{out.sum():,} vertices of the mesh lie outside of what was asked for, such as "
+            f"{_point(vertices[out][0])}: choose a smaller `spacing`"
+        )
+
+
+def check_near_level(
+    function: LevelFunction,
+    vertices: FloatArray,
+    faces: IntArray,
+    tolerance: float,
+    volume: Volume | None,
+) -> None:
+    """Raise unless vertices and centres of faces are within `tolerance` of the level, by looks at
+    the function.
+
+    A point is, if the slope says so, |f|/|grad f| <= tolerance; or if f changes its sign between
+    points that are as far from it, along the normal of the face and along the axes, for then a
+    continuous f has its level between them. On the volume's boundary a solid is cut: to be outside
+    of it counts as a positive sign. The rim of an angle is its curve, where it has no value; and
+    triangles smaller than half of the tolerance are as near as their corners.
+
+    Raises:
+        LocalError: with the points that are not.
+    """
+    corner = vertices[faces]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    longest = np.stack([lengths(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
+    large = longest > 0.5 * tolerance
+    is_checked = np.ones(len(vertices), np.bool_)
+    if function.period is not None:
+        is_checked[boundary_edges(faces)] = False
+    mean = np.zeros_like(vertices)
+    for k in range(3):
+        np.add.at(mean, faces[:, k], normal)
+    points = np.concatenate([vertices[is_checked], corner[large].mean(axis=1)])
+    ways = np.concatenate([mean[is_checked], normal[large]])
+    ways /= np.maximum(lengths(ways), 1e-300)[:, None]
+    far = np.flatnonzero(~(function.at(points).distance <= tolerance))
+    for axis in (None, *np.eye(3)):
+        if not len(far):
+            return
+        step = tolerance * (ways[far] if axis is None else axis)
+        one, other = (_is_positive(function, points[far] + s * step, volume) for s in (1, -1))
+        far = far[one == other]
+    if len(far):
+        raise LocalError(
+            f"{len(far):,} of {len(points):,} vertices and centres of triangles are farther than "
+            f"the tolerance, {tolerance:.3g}, from the level, such as {_point(points[far][0])}: "
+            "choose a smaller `spacing` or a larger `tolerance`",
+            points[far],
+        )
+
+
+def _is_positive(
+    function: LevelFunction, points: FloatArray, volume: Volume | None
+) -> npt.NDArray[np.bool_]:
+    above = ~(function.at(points).value <= 0)
+    return above if volume is None else above | ~volume.contains_points(points)
+
+
+def _point(x: FloatArray) -> str:
+    return "(" + ", ".join(f"{c:.4g}" for c in x) + ")"
 
 
 def singular_vertices(faces: IntArray) -> IntArray:

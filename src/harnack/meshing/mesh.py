@@ -12,7 +12,14 @@ from harnack.fields import Field, Solid, SolidAngle
 from harnack.fields.field import check_is_field
 from harnack.geometry import Box, Intersection, Volume
 from harnack.geometry.volumes import check_volume
-from harnack.meshing.checks import MeshingError, TooLargeError, check_manifold
+from harnack.meshing.checks import (
+    MeshingError,
+    TooLargeError,
+    check_apart,
+    check_inside,
+    check_manifold,
+    check_near_level,
+)
 from harnack.meshing.lattice import Lattice, Surface, open_surface
 from harnack.meshing.printing.clipping import cut_by
 from harnack.meshing.printing.finishing import (
@@ -25,7 +32,7 @@ from harnack.meshing.printing.finishing import (
 from harnack.meshing.printing.regions import Sheet
 from harnack.meshing.printing.solids import mesh_solid, region_of
 from harnack.meshing.printing.thickening import thickened
-from harnack.meshing.samples import LevelFunction
+from harnack.meshing.samples import MOST_FACES, LevelFunction
 from harnack.meshing.spanned import spanned_surface
 
 if TYPE_CHECKING:
@@ -58,6 +65,7 @@ def mesh(
     simplify: bool = False,
     largest: bool = False,
     seed: int = 0,
+    max_triangles: int = MOST_FACES,
     progress: Callable[[str], None] | None = None,
 ) -> trimesh.Trimesh:
     """Triangles of a level set, or the closed surface of a solid.
@@ -85,7 +93,14 @@ def mesh(
         the tolerance is for this, half for all else.
     largest: keep the connected part with the largest area alone.
     seed: of the small random moves that keep points in general position.
+    max_triangles: of one level set, before anything is simplified; what would take more is not
+        begun or given up, with a MeshingError. Cells are limited with them, to two millions.
     progress: told what is being done.
+
+    What is returned has been checked, all of it: every edge has two faces, or one at a rim, no two
+    triangles pass through each other, vertices and centres of triangles are within the tolerance of
+    the level by looks at the field, and inside the bounds of the clip (of a thick part, the surface
+    that it is made of). Else a MeshingError is raised.
 
     Returns:
         A trimesh.Trimesh. Vertices of a curve come first, in order, bit by bit, and its edges are
@@ -113,7 +128,7 @@ def mesh(
     report = progress or _silent
     check_volume(clip, "clip")
     check_volume(section, "section")
-    check_options(tolerance, spacing, thickness, seed)
+    check_options(tolerance, spacing, thickness, seed, max_triangles)
     field = _checked(field)
     if solid is None and isinstance(field, Solid) and thickness is None:
         solid = True
@@ -124,17 +139,20 @@ def mesh(
         raise ValueError("simplify is for closed meshes: give solid or thickness as well")
     share = 0.5 * tolerance if simplify else tolerance
     facts: dict[str, Any]
+    volume = _volume(field, clip, section)
+    region = None
     if solid:
-        made, size, facts = _solid(
-            field, level, solid, _volume(field, clip, section), share, spacing, seed, report
-        )
+        region = region_of(field, solid, level)
+        made, size, facts = _solid(*region, volume, share, spacing, seed, max_triangles, report)
+        facts["solid"] = solid
     else:
         level = field.default_level if level is None else float(level)
         made, size, facts = _surface(
-            field, level, _volume(field, clip, section), share, spacing, seed, report
+            field, level, volume, share, spacing, seed, max_triangles, report
         )
         if largest:
             made = largest_part(made)
+        _check_level(LevelFunction(field, level), made, tolerance * size, volume)
         if thickness is not None:
             report("thickening")
             made, more = thickened(
@@ -147,8 +165,21 @@ def mesh(
         report("simplifying")
         made, more = simplified(made, 0.5 * share * size)
         facts |= more
+    report("checking")
+    if region is not None:
+        _check_level(LevelFunction(*region), made, tolerance * size, volume)
     check_manifold(made.faces)
+    check_apart(made.vertices, made.faces)
     return finished(made, facts, is_closed)
+
+
+def _check_level(
+    function: LevelFunction, made: Surface, tolerance: float, volume: Volume | None
+) -> None:
+    """Raise unless a surface is within the tolerance of the level, and inside the volume."""
+    if volume is not None:
+        check_inside(made.vertices, volume, tolerance)
+    check_near_level(function, made.vertices, made.faces, tolerance, volume)
 
 
 def _checked(field: Field) -> Field:
@@ -181,33 +212,31 @@ def _volume(field: Field, clip: Volume | None, section: Volume | None) -> Volume
 
 
 def _solid(
-    field: Field,
-    level: float | None,
-    solid: Any,
+    region: Solid,
+    at: float,
     volume: Volume | None,
     tolerance: float,
     spacing: float | None,
     seed: int,
+    most_faces: int,
     report: Callable[[str], None],
 ) -> tuple[Surface, float, dict[str, Any]]:
     """The closed surface of a solid, its size, and what is known of it."""
-    region, at = region_of(field, solid, level)
     evaluations = [0]
 
     def sheets(error: float, cells: float) -> Sheet:
         def sheet(angle: SolidAngle, value: float) -> Surface:
             angle = cast("SolidAngle", _checked(angle))
             box = _box(angle, value, None)
-            made, facts = _spanned(angle, value, box, error, cells, 1, seed, report)
+            made, facts = _spanned(angle, value, box, error, cells, 1, seed, most_faces, report)
             evaluations[0] += facts["evaluations"]
             return made
 
         return sheet
 
-    made = mesh_solid(region, at, volume, tolerance, spacing, sheets, report)
+    made = mesh_solid(region, at, volume, tolerance, spacing, sheets, most_faces, report)
     facts = {
         "level": at,
-        "solid": solid,
         "spacing": made.spacing,
         "evaluations": made.evaluations + evaluations[0],
         "level_sets": made.levels,
@@ -222,6 +251,7 @@ def _surface(
     tolerance: float,
     spacing: float | None,
     seed: int,
+    most_faces: int,
     report: Callable[[str], None],
 ) -> tuple[Surface, float, dict[str, Any]]:
     """A level set, its size, and what is known of it."""
@@ -232,9 +262,11 @@ def _surface(
     attempts = 1 if spacing is not None else _MOST_ATTEMPTS
     if isinstance(field, SolidAngle):
         made, facts = _spanned(field, level, box, 0.5 * tolerance * size, cells, attempts, seed,
-                               report)  # fmt: skip
+                               most_faces, report)  # fmt: skip
     else:
-        made, facts = _filling(field, level, box, 0.5 * tolerance * size, cells, attempts, report)
+        made, facts = _filling(
+            field, level, box, 0.5 * tolerance * size, cells, attempts, most_faces, report
+        )
     if volume is not None and not (isinstance(volume, Box) and box.has_walls):
         made = cut_by(made, volume)
         if not len(made.faces):
@@ -249,16 +281,19 @@ def _filling(
     tolerance: float,
     spacing: float,
     attempts: int,
+    most_faces: int,
     report: Callable[[str], None],
 ) -> tuple[Surface, dict[str, Any]]:
     """The level set of a real-valued field in a box, in cells of a lattice."""
-    function = LevelFunction(field, level)
+    function = LevelFunction(field, level, most_faces=most_faces)
     while True:
         report(f"cells of {spacing:.3g}")
         try:
             lattice = Lattice.filling(box.lower, box.upper, spacing)
             made, isotopy = open_surface(function, lattice, tolerance, report)
             check_manifold(made.faces)
+            check_near_level(function, made.vertices, made.faces, 2 * tolerance, None)
+            check_apart(made.vertices, made.faces)
             break
         except TooLargeError:
             raise
@@ -285,10 +320,11 @@ def _spanned(
     spacing: float,
     attempts: int,
     seed: int,
+    most_faces: int,
     report: Callable[[str], None],
 ) -> tuple[Surface, dict[str, Any]]:
     """The level set of an angle, which ends at its curve."""
-    function = LevelFunction(field, level)
+    function = LevelFunction(field, level, most_faces=most_faces)
     ends = box.lower, box.upper
     made = spanned_surface(
         function, spacing, attempts, ends, box.has_walls, seed, tolerance, report

@@ -21,7 +21,10 @@ if TYPE_CHECKING:
     from harnack.backend import Real, Vec3
     from harnack.fields import Field
 
-__all__ = ["LevelFunction", "Samples"]
+__all__ = ["MOST_FACES", "LevelFunction", "Samples"]
+
+MOST_FACES = 2_000_000
+"""Triangles of a level set, unless a person chooses otherwise."""
 
 _PROOFS = choose_proofs("curvature")
 
@@ -60,11 +63,13 @@ class Samples:
 class LevelFunction:
     """f - level, in double precision.
 
+    most_faces: no more triangles may be made of it.
     evaluations: of f so far, in points.
     """
 
     field: Field
     level: float
+    most_faces: int = dataclasses.field(default=MOST_FACES, kw_only=True)
     evaluations: int = dataclasses.field(default=0, init=False)
 
     def __post_init__(self) -> None:

@@ -78,15 +78,18 @@ class Lattice:
         """(n,) whether points lie on the box."""
         return ((coordinates == 0) | (coordinates == 2 * self.counts)).any(axis=1)
 
-    def cells_not_empty(self, clearance: Clearance) -> IntArray:
+    def cells_not_empty(self, clearance: Clearance, most_faces: int) -> IntArray:
         """(n, 3) indices of the cells that are not proved empty, by octrees over blocks of them.
+
+        most_faces: triangles that may be made; a cell makes about three.
 
         Raises:
             MeshingError: there are too many.
         """
         # A surface across the box, at the least, meets so many cells.
-        if (least := float(np.prod(np.sort(self.counts)[:2].astype(float)))) > MOST_CELLS:
-            raise too_large(least)
+        most = min(MOST_CELLS, most_faces)
+        if (least := float(np.prod(np.sort(self.counts)[:2].astype(float)))) > most:
+            raise too_large(least, most)
         halvings = 0
         while halvings < 3 and (self.counts >= 2 ** (halvings + 2)).all():
             halvings += 1
@@ -98,13 +101,13 @@ class Lattice:
         edges = self.size * 2**halvings
         root = Cells(self.lower + grid.reshape(-1, 3) * edges, edges)
         root = root.some(~root.proved_empty(clearance))
-        leaves = octree(root, clearance, 8 * MOST_CELLS, halvings).leaves
+        leaves = octree(root, clearance, 8 * most, halvings).leaves
         if not len(leaves.corners):
             return np.zeros((0, 3), np.int64)
         rounds = round(math.log2(edges[0] / leaves.size[0]))
         expected = len(leaves.corners) * 4 ** (halvings - rounds)
-        if expected > MOST_CELLS or rounds < halvings:
-            raise too_large(expected)
+        if expected > most or rounds < halvings:
+            raise too_large(expected, most)
         index = np.rint((leaves.corners - self.lower) / self.size).astype(np.int64)
         return index[(index < self.counts).all(axis=1)]
 
@@ -158,12 +161,12 @@ def distinct_rows(rows: IntArray) -> IntArray:
     return _key_rows(distinct(_keys(rows, shape)), shape)
 
 
-def too_large(cells: float) -> TooLargeError:
+def too_large(cells: float, most: int) -> TooLargeError:
     """The error about so many cells."""
     return TooLargeError(
         f"about {cells:.1e} cells hold the surface, which makes some {3 * cells:.0e} triangles; "
-        f"at most {MOST_CELLS:,} cells are made: choose a larger `spacing` or `tolerance`, or a "
-        "smaller `clip`"
+        f"at most {most:,} cells are made (max_triangles, and never more than {MOST_CELLS:,}): "
+        "choose a larger `spacing` or `tolerance`, or a smaller `clip`"
     )
 
 

@@ -11,13 +11,11 @@ from harnack.meshing.samples import LevelFunction
 
 __all__ = ["check_size"]
 
-_MOST_FACES = 6_000_000
-
 
 def check_size(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, tolerance: float
 ) -> None:
-    """Raise if the triangles that refinement would make of these are more than six millions.
+    """Raise if the triangles that refinement would make of these are more than the function allows.
 
     How far the middle of a triangle is from the surface falls with its area: one that is k times
     the tolerance away takes about k others. Looked at is one triangle in several.
@@ -41,9 +39,10 @@ def check_size(
     middle = at.distance
     ratio = middle.reshape(-1, 3).max(axis=1) / tolerance
     expected = float(np.maximum(1.0, ratio).mean()) * len(faces)
-    if expected > _MOST_FACES:
-        enough = expected / _MOST_FACES
+    most = function.most_faces
+    if expected > most:
+        enough = expected / most
         raise TooLargeError(
-            f"the tolerance takes about {expected:.1e} triangles, and at most {_MOST_FACES:,} are "
-            f"made: choose a `tolerance` {enough:.2g} times as large"
+            f"the tolerance takes about {expected:.1e} triangles, and max_triangles is {most:,}: "
+            f"choose a `tolerance` {enough:.2g} times as large, or a larger max_triangles"
         )

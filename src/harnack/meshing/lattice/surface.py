@@ -67,7 +67,7 @@ def open_surface(
         MeshingError: no cell is cut, or there are too many.
     """
     walls = lattice.lower, lattice.upper
-    cells = lattice.cells_not_empty(function.clearance)
+    cells = lattice.cells_not_empty(function.clearance, function.most_faces)
     coordinates, corners = lattice.tetrahedra(cells)
     points = lattice.points(coordinates)
     report(f"{len(points):,} points, {len(corners):,} tetrahedra")
@@ -100,7 +100,7 @@ def closed_surface(
     Raises:
         MeshingError: too many cells.
     """
-    cells = lattice.cells_not_empty(function.clearance)
+    cells = lattice.cells_not_empty(function.clearance, function.most_faces)
     outer = lattice.outer_cells()
     outer = outer[function.values(lattice.points(2 * outer + 1)) <= 0]
     coordinates, corners = lattice.tetrahedra(distinct_rows(np.concatenate([cells, outer])))
@@ -121,7 +121,9 @@ def closed_surface(
     if len(rest):
         check_size(function, vertices, rest, tolerance)
         vertices = smoothed(function, vertices, rest, None)
-        inside = _Inside(function.field, function.level, function, lattice)
+        inside = _Inside(
+            function.field, function.level, function, lattice, most_faces=function.most_faces
+        )
         vertices, rest = refined(inside, vertices, rest, tolerance, None, report)
         vertices = smoothed(function, vertices, rest, None)
     faces = np.concatenate([rest, *caps])

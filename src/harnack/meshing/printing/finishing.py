@@ -9,8 +9,14 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from harnack.backend import FloatArray
-from harnack.meshing.checks import MeshingError, euler_characteristic
+from harnack.meshing.checks import (
+    MeshingError,
+    check_apart,
+    check_manifold,
+    euler_characteristic,
+)
 from harnack.meshing.edges import Edges, IntArray, boundary_edges, directed_edges
+from harnack.meshing.intersections import intersecting_faces
 from harnack.meshing.lattice import Surface
 from harnack.meshing.printing.manifolds import manifold_of, surface_of
 from harnack.meshing.rows import dots, lengths
@@ -21,13 +27,13 @@ if TYPE_CHECKING:
 
     from harnack.fields import Field
 
-__all__ = ["check_options", "finished", "largest_part", "normals_of", "simplified"]
+__all__ = ["check_options", "finished", "largest_part", "normals_of", "simplified", "snapped"]
 
 # The cosine of the angle between normals from which on an edge is a crease.
 _CREASE = math.cos(math.radians(30))
 
 
-def check_options(tolerance: Any, spacing: Any, thickness: Any, seed: Any) -> None:
+def check_options(tolerance: Any, spacing: Any, thickness: Any, seed: Any, most: Any) -> None:
     """Raise ValueError or TypeError for numbers out of range."""
     if not 0 < _number(tolerance, "tolerance") < 0.5:
         raise ValueError(
@@ -38,6 +44,8 @@ def check_options(tolerance: Any, spacing: Any, thickness: Any, seed: Any) -> No
             raise ValueError(f"{name} must be a positive length, not {value!r}")
     if operator.index(seed) < 0:
         raise ValueError(f"seed must not be negative, not {seed}")
+    if operator.index(most) < 1:
+        raise ValueError(f"max_triangles must be positive, not {most}")
 
 
 def _number(value: Any, name: str) -> float:
@@ -92,7 +100,35 @@ def simplified(surface: Surface, tolerance: float) -> tuple[Surface, dict[str, A
     made = surface_of(manifold_of(surface).simplify(tolerance))
     if not len(made.faces):
         raise MeshingError("the part is thinner than the tolerance: choose a smaller `tolerance`")
+    if len(made.faces) > len(surface.faces):
+        made = surface
     return made, {"triangles_before_simplification": len(surface.faces)}
+
+
+def snapped(surface: Surface) -> Surface:
+    """A closed surface with vertices in single precision, which is what files hold. Edges whose
+    ends are then one point are contracted.
+
+    Raises:
+        MeshingError: sheets touch, or triangles pass through each other, in single precision.
+    """
+    x = surface.vertices.astype(np.float32).astype(np.float64)
+    _, first, place = np.unique(x, axis=0, return_index=True, return_inverse=True)
+    faces = first[place.reshape(-1)][surface.faces]
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    made = Surface.of(x, faces)
+    try:
+        if len(first) < len(x):
+            check_manifold(made.faces)
+        # What is repaired may have passed through itself before.
+        if not len(intersecting_faces(surface.vertices, surface.faces)):
+            check_apart(made.vertices, made.faces)
+    except MeshingError as error:
+        raise MeshingError(
+            f"in single precision, which is what files hold, {error}; or move it nearer to the "
+            "origin"
+        ) from error
+    return made
 
 
 def finished(surface: Surface, facts: dict[str, Any], is_closed: bool) -> trimesh.Trimesh:

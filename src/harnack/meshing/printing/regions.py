@@ -45,7 +45,7 @@ class RegionMesher:
     """Meshes solids in a box from `lower` to `upper`, (3,) each.
 
     tolerance: a length, of the middles of edges and faces. spacing: of cells, at most.
-    sheet: meshes surfaces that end at a curve.
+    sheet: meshes surfaces that end at a curve. most_faces: of each level set.
     evaluations, levels: of fields, in points, and how many level sets were meshed so far.
     """
 
@@ -54,6 +54,7 @@ class RegionMesher:
     tolerance: float
     spacing: float
     sheet: Sheet
+    most_faces: int
     report: Callable[[str], None]
     evaluations: int = 0
     levels: int = 0
@@ -103,7 +104,7 @@ class RegionMesher:
                 return Surface(np.zeros((0, 3)), np.zeros((0, 3), np.int64)), is_whole
         size = float((upper - lower).max())
         spacing = min(self.spacing, size / 8)
-        function = _WithinDomain(_entire(field), level)
+        function = _WithinDomain(_entire(field), level, most_faces=self.most_faces)
         self.report(f"level {level:g} of {type(field).__name__} in cells of {spacing:.3g}")
         lattice = Lattice.filling(lower, upper, spacing, layers=2)
         made = closed_surface(function, lattice, self.tolerance, self.report)

@@ -81,12 +81,13 @@ def mesh_solid(
     tolerance: float,
     spacing: float | None,
     sheets: Callable[[float, float], Sheet],
+    most_faces: int,
     report: Callable[[str], None],
 ) -> SolidMesh:
     """The boundary of the points of a volume where a solid's function is at most `level`.
 
     volume: None for all of space. tolerance: a part of the size. sheets: given a tolerance and a
-    spacing, both lengths, how to mesh the level sets of an angle.
+    spacing, both lengths, how to mesh the level sets of an angle. most_faces: of a level set.
 
     Raises:
         MeshingError: it has no bounds; it is empty; a part cannot be meshed.
@@ -97,7 +98,7 @@ def mesh_solid(
     error = 0.5 * tolerance * size
     attempts = _MOST_ATTEMPTS if spacing is None else 1
     while True:
-        mesher = RegionMesher(lower, upper, error, cells, sheets(error, cells), report)
+        mesher = RegionMesher(lower, upper, error, cells, sheets(error, cells), most_faces, report)
         try:
             made = _put_together(mesher, solid, level, volume)
             break

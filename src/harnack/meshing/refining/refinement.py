@@ -5,12 +5,14 @@ Vertices and edges of the boundary stay as they are.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
+from harnack.meshing.checks import check_count
 from harnack.meshing.edges import Edges, IntArray, boundary_edges, directed_edges
 from harnack.meshing.points import newton
 from harnack.meshing.refining.flips import flipped, without_slivers
@@ -24,6 +26,9 @@ Walls = tuple[FloatArray, FloatArray] | None
 # Edges shorter than this part of the tolerance are never cut.
 _SHORTEST = 0.5
 _MOST_ROUNDS = 12
+# Edges to be cut become more at first, and then fewer. If they are so many times as many as they
+# were, they run away: the surface bends within any triangle, as around each dipole of a cloud.
+_RUNS_AWAY = 3
 
 
 def refined(
@@ -35,13 +40,26 @@ def refined(
     report: Callable[[str], None],
 ) -> tuple[FloatArray, IntArray]:
     """Cut edges at their middles, and move these onto the surface, until the middles of all edges
-    but those of the boundary, and the centres of all faces, are within `tolerance` of it."""
+    but those of the boundary, and the centres of all faces, are within `tolerance` of it; or until
+    that is seen not to succeed, which whoever asks for it has to check (`check_near_level`).
+
+    Raises:
+        TooLargeError: it takes more triangles than the function allows.
+    """
+    least, before = math.inf, 0
     for round_number in range(_MOST_ROUNDS):
         report(f"refining, round {round_number + 1}: {len(faces):,} triangles")
         far = _Far.of(function, vertices, faces, tolerance, walls)
         marked = far.marked
         if not marked.any():
             break
+        count = int(marked.sum())
+        if count > _RUNS_AWAY * least:
+            break
+        least = min(least, count) if count < before else least
+        before = count
+        # Every edge that is cut makes one more triangle on each side.
+        check_count(len(faces) + 2 * count, function.most_faces)
         samples, reach = far.samples.some(marked), 0.5 * far.span[marked]
         moved = newton(function, far.middle[marked], samples, reach, walls)
         place = np.full(len(marked), -1, np.int64)
