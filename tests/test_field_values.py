@@ -156,3 +156,21 @@ def test_hits_carry_derivatives_backwards(name: str) -> None:
     assert smooth.sum() > 10
     off = np.abs(to_numpy(dr.grad(start))[:, 0] - rate)[smooth]
     assert np.quantile(off, 0.9) < 1e-3
+
+
+def test_fields_print_as_they_were_made() -> None:
+    """They printed as <... at 0x...>, or with all their numbers."""
+    assert repr(hk.Gyroid(0.5, domain=hk.Ball())).startswith("Gyroid(cell=0.5, domain=Ball(")
+    assert repr(hk.SphericalHarmonic(3, 1)) == "SphericalHarmonic(l=3, m=1)"
+    cut = hk.Sphere(1.0) - hk.Torus(0.8, 0.2)
+    assert repr(cut).startswith("Combined(parts=(Sphere(), <Complement>")
+    assert repr(hk.Tube([[0, 0, 0], [1, 0, 0]], 0.1)) == "Tube(points=<array 2 x 3>, radius=0.1)"
+    many = (
+        hk.SolidAngle(wavy_polygon(64)), hk.WindingNumber(*icosphere(2)), cut.twisted(1.0),
+        hk.expression(lambda x, y, z: x + y - z), hk.LevelCurves("log", "imag"),
+        hk.Blobs([[0, 0, 0]], 1.0), hk.RiemannSurface("sqrt"), cut.moved((1, 2, 3)) | hk.Plane(),
+    )  # fmt: skip
+    for field in many:
+        assert "0x" not in repr(field)
+        assert len(repr(field)) < 200
+        assert "0x" not in repr(hk.level_set(field).field)

@@ -427,3 +427,19 @@ def test_titles_of_bars_are_plain() -> None:
 @pytest.mark.parametrize(("low", "high"), [(-0.953, 0.9999), (-0.7767, 0.9999)])
 def test_small_bars_have_nice_numbers(low: float, high: float) -> None:
     assert [text for _, text in Scale(low, high, "z").ticks(4)] == ["-0.5", "0", "0.5"]
+
+
+def test_a_camera_has_a_position_or_angles() -> None:
+    """The angles were ignored."""
+    for name in ("azimuth", "elevation", "distance"):
+        with pytest.raises(ValueError, match=f"a position or its {name}, not both"):
+            hk.Camera(position=(1, 2, 3), **{name: 10.0})
+    assert hk.Camera().angles == (-50.0, 28.0)
+    assert hk.Camera(elevation=10.0).angles == (-50.0, 10.0)
+
+
+def test_the_command_alone_shows_its_help(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main([])
+    assert ended.value.code == 2
+    assert "draw one picture" in capsys.readouterr().err

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias, TypeVar, cast
 
 import drjit as dr
@@ -24,6 +24,9 @@ BoolArray: TypeAlias = npt.NDArray[np.bool_]
 
 TRANSPOSE = "; transpose it"
 """Advice of `check_vectors` where an array (3, n) surely holds n vectors."""
+
+# Entries of a list, and letters of a value, that `short_text` writes.
+_MOST_SHOWN, _LONGEST = 4, 60
 
 LARGEST = 1e100
 """Coordinates beyond this are refused: their squares would overflow soon."""
@@ -170,3 +173,30 @@ def _held(value: Any) -> list[Any]:
         return [value.__func__, value.__self__]
     is_known = dataclasses.is_dataclass(value) or callable(value) or hasattr(value, "parameters")
     return [*getattr(value, "__dict__", {}).values()] if is_known else []
+
+
+def short_text(value: Any) -> str:
+    """A value as a line has room for it: arrays by their shapes, long lists by their lengths."""
+    if isinstance(value, float | np.floating):
+        return f"{float(value):.6g}"
+    if isinstance(value, np.ndarray):
+        shape = cast("npt.NDArray[Any]", value).shape
+        return f"<array {' x '.join(map(str, shape))}>"
+    if isinstance(value, tuple | list):
+        entries = cast("Sequence[Any]", value)
+        if len(entries) > _MOST_SHOWN:
+            return f"<{len(entries)} entries>"
+        comma = "," if len(entries) == 1 else ""
+        return f"({', '.join(map(short_text, entries))}{comma})"
+    if dr.is_array_v(cast("Any", type(value))):
+        return f"<{type(value).__name__}>"
+    text = repr(value)
+    if len(text) <= _LONGEST and " at 0x" not in text and "\n" not in text:
+        return text
+    return f"<{getattr(value, '__name__', type(value).__name__)}>"
+
+
+def is_same(a: Any, b: Any) -> bool:
+    """Whether two values are one, or equal numbers, texts or tuples of these."""
+    plain = int | float | str | tuple
+    return a is b or (isinstance(a, plain) and isinstance(b, plain) and bool(np.all(a == b)))

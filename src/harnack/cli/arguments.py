@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import re
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NoReturn
 
@@ -49,6 +50,9 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     Ends the process with exit code 2 for wrong usage.
     """
     whole, commands = _parsers()
+    if not (sys.argv[1:] if arguments is None else arguments):
+        whole.print_help(sys.stderr)
+        whole.exit(2)
     found, rest = whole.parse_known_args(arguments)
     if rest:
         command: _Parser = commands[found.command]

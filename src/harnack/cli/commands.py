@@ -194,8 +194,10 @@ def _view(options: Any) -> dict[str, Any]:
 def _camera(options: Any) -> Camera:
     """The camera asked for; what was not given stays that of the scene or the studio."""
     usual = SCENES[options.scene].camera if options.scene in SCENES else Camera()
-    asked = _view(options).items()
-    return replace(usual, **{name: value for name, value in asked if value is not None})
+    asked = {name: value for name, value in _view(options).items() if value is not None}
+    if "position" in asked:  # in place of where the scene's own stands
+        usual = replace(usual, azimuth=None, elevation=None, distance=None)
+    return replace(usual, **asked)
 
 
 def _refuse_file_options(options: Any) -> None:

@@ -20,7 +20,12 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend.arrays import as_data
-from harnack.backend.numbers import refuse_derivatives, refuses_derivatives
+from harnack.backend.numbers import (
+    is_same,
+    refuse_derivatives,
+    refuses_derivatives,
+    short_text,
+)
 from harnack.backend.tensors import takes_tensors
 from harnack.enclosures import (
     BoundedLaplacian,
@@ -183,6 +188,8 @@ class Field(abc.ABC):
         """Has what `evaluate` returns checked, `hessian` take NumPy arrays too, and other ways to
         make a field refuse derivatives as the constructor does."""
         super().__init_subclass__(**kwargs)
+        if "__repr__" not in vars(cls):  # a dataclass would write out all numbers
+            cls.__repr__ = Field.__repr__
         for name, own in list(vars(cls).items()):
             if isinstance(own, classmethod) and not name.startswith("_"):
                 checked_maker = refuses_derivatives(cast("Any", own).__func__)
@@ -195,6 +202,17 @@ class Field(abc.ABC):
         if "hessian" in vars(cls):
             general = _of_points(cls.hessian)
             cls.hessian = general  # pyright: ignore[reportAttributeAccessIssue]
+
+    def __repr__(self) -> str:
+        """The field as it was made, as far as it remembers, with arrays by their shapes."""
+        given = inspect.signature(type(self).__init__).parameters
+        own = {key.removeprefix("_"): value for key, value in vars(self).items()}
+        said = [
+            f"{key}={short_text(own[key])}"
+            for key, one in given.items()
+            if key in own and not is_same(own[key], one.default)
+        ]
+        return f"{type(self).__name__}({', '.join(said)})"
 
     def __getattr__(self, name: str) -> Any:
         """Says of what a field would have to be a solid for."""

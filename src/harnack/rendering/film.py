@@ -162,7 +162,7 @@ def _cameras(
 def _turned(camera: Camera, turn: float, stand: FloatArray) -> Camera:
     """The camera after it has gone around its target. stand: (3, 3), turns what is up to z."""
     if camera.position is None:
-        return replace(camera, azimuth=camera.azimuth + turn)
+        return replace(camera, azimuth=camera.angles[0] + turn)
     c, s = math.cos(math.radians(turn)), math.sin(math.radians(turn))
     around = stand.T @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ stand
     target = np.array(camera.target)

@@ -20,6 +20,7 @@ _FILLED = 0.86
 # The angle of view of a camera that chooses its distance, and of one that is among what it sees;
 # and how wide one may become to see all from where it stands.
 _USUAL, _AMONG, _WIDEST = 26.0, 60.0, 120.0
+_AZIMUTH, _ELEVATION = -50.0, 28.0
 
 Point = tuple[float, float, float]
 
@@ -29,7 +30,7 @@ class Camera:
     """A view of the stage.
 
     azimuth, elevation: of the direction the camera looks from, in degrees; azimuth 0 is +x and
-        90 is +y, elevation 90 is straight from above.
+        90 is +y, elevation 90 is straight from above. By default -50 and 28.
     fov: the larger of the horizontal and vertical angle of view, in degrees. By default 26, or, of
         a camera with a position or a distance, what frames the surface from there.
     zoom: 1 frames the surface tightly with a margin; more comes closer or, of a camera with a
@@ -44,8 +45,8 @@ class Camera:
     distance: from the target, in the same unit; by default what frames the surface.
     """
 
-    azimuth: float = -50.0
-    elevation: float = 28.0
+    azimuth: float | None = None
+    elevation: float | None = None
     fov: float | None = None
     zoom: float = 1.0
     box: Box | None = None
@@ -62,9 +63,9 @@ class Camera:
             raise ValueError(f"fov must lie between 0 and 170 degrees, not {self.fov}")
         if not 0 < self.zoom < math.inf:
             raise ValueError(f"zoom must be positive, not {self.zoom}")
-        if not math.isfinite(self.azimuth):
+        if self.azimuth is not None and not math.isfinite(self.azimuth):
             raise ValueError(f"azimuth must be a finite number of degrees, not {self.azimuth}")
-        if not abs(self.elevation) <= 90:
+        if self.elevation is not None and not abs(self.elevation) <= 90:
             raise ValueError(f"elevation must lie within -90 and 90 degrees, not {self.elevation}")
         if self.box is not None and not isinstance(cast("object", self.box), Box):
             raise TypeError(f"box must be a harnack.Box, not {type(self.box).__name__}")
@@ -77,14 +78,23 @@ class Camera:
                 object.__setattr__(self, name, checked_point(getattr(self, name), name))
         if self.distance is not None and not 0 < self.distance < math.inf:
             raise ValueError(f"distance must be positive, not {self.distance}")
-        if self.position is not None and self.distance is not None:
-            raise ValueError("a camera has a position or a distance, not both")
+        for name in ("azimuth", "elevation", "distance"):
+            if self.position is not None and getattr(self, name) is not None:
+                raise ValueError(f"a camera has a position or its {name}, not both")
         if self.position is not None and self.position == self.target:
             raise ValueError(f"position and target are the same point, {self.position}")
 
+    @property
+    def angles(self) -> tuple[float, float]:
+        """Azimuth and elevation, in degrees, of a camera without a position."""
+        return (
+            _AZIMUTH if self.azimuth is None else self.azimuth,
+            _ELEVATION if self.elevation is None else self.elevation,
+        )
+
     def frame(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Unit vectors of the world: to the right, up, and back to the camera."""
-        a, e = math.radians(self.azimuth), math.radians(self.elevation)
+        a, e = map(math.radians, self.angles)
         back = np.array([math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)])
         right = np.array([-math.sin(a), math.cos(a), 0.0])
         return right, np.cross(back, right), back
@@ -120,7 +130,7 @@ class Camera:
         """
         if self.position is None and self.target is None and self.distance is None:
             origin, target = self.fit(points, size)
-            return Pose(origin, target, self.frame()[1], self.angle, self.azimuth)
+            return Pose(origin, target, self.frame()[1], self.angle, self.angles[0])
         middle = (points.min(axis=0) + points.max(axis=0)) / 2
         target = middle if self.target is None else to_world(np.array([self.target]))[0]
         if self.position is not None:
@@ -152,7 +162,7 @@ class Camera:
             fov = self._framing(np.array([x, y]), length - z, size)
         else:
             fov = 2 * math.degrees(math.atan(math.tan(math.radians(fov) / 2) / self.zoom))
-        return Pose(target + length * back, target, up, fov, turned.azimuth)
+        return Pose(target + length * back, target, up, fov, turned.angles[0])
 
     def _framing(self, across: FloatArray, room: FloatArray, size: tuple[int, int]) -> float:
         """The angle of view, in degrees, in which all points are that lie as far as `across` (2, n)
