@@ -163,7 +163,7 @@ def test_fields_print_as_they_were_made() -> None:
     assert repr(hk.Gyroid(0.5, domain=hk.Ball())).startswith("Gyroid(cell=0.5, domain=Ball(")
     assert repr(hk.SphericalHarmonic(3, 1)) == "SphericalHarmonic(l=3, m=1)"
     cut = hk.Sphere(1.0) - hk.Torus(0.8, 0.2)
-    assert repr(cut).startswith("Combined(parts=(Sphere(), <Complement>")
+    assert repr(cut).startswith("Combined(parts=(Sphere(), Complement(")
     assert repr(hk.Tube([[0, 0, 0], [1, 0, 0]], 0.1)) == "Tube(points=<array 2 x 3>, radius=0.1)"
     many = (
         hk.SolidAngle(wavy_polygon(64)), hk.WindingNumber(*icosphere(2)), cut.twisted(1.0),

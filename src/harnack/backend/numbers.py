@@ -177,8 +177,8 @@ def _held(value: Any) -> list[Any]:
 
 def short_text(value: Any) -> str:
     """A value as a line has room for it: arrays by their shapes, long lists by their lengths."""
-    if isinstance(value, float | np.floating):
-        return f"{float(value):.6g}"
+    if isinstance(value, float):  # of NumPy too
+        return f"{value:.6g}"
     if isinstance(value, np.ndarray):
         shape = cast("npt.NDArray[Any]", value).shape
         return f"<array {' x '.join(map(str, shape))}>"
@@ -198,5 +198,5 @@ def short_text(value: Any) -> str:
 
 def is_same(a: Any, b: Any) -> bool:
     """Whether two values are one, or equal numbers, texts or tuples of these."""
-    plain = int | float | str | tuple
+    plain = (int, float, str, tuple)
     return a is b or (isinstance(a, plain) and isinstance(b, plain) and bool(np.all(a == b)))

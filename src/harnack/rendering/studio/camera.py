@@ -80,7 +80,7 @@ class Camera:
             raise ValueError(f"distance must be positive, not {self.distance}")
         for name in ("azimuth", "elevation", "distance"):
             if self.position is not None and getattr(self, name) is not None:
-                raise ValueError(f"a camera has a position or its {name}, not both")
+                raise ValueError(f"a camera has a position or {name}, not both")
         if self.position is not None and self.position == self.target:
             raise ValueError(f"position and target are the same point, {self.position}")
 
