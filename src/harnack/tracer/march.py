@@ -42,8 +42,9 @@ _AIM, _AIM_BY_SLOPE = 0.999, 0.99
 # How far from the surface rounding may leave a point that is a hit: see `March._is_near`.
 _LARGEST_UNCERTAINTY = 1 / 16
 # Where rays without an end are given up as misses, as a power of the largest number: squares of
-# what lies beyond overflow.
-_FARTHEST = 0.47
+# what lies beyond overflow. In small units, as of solids that are scaled, they overflow before:
+# rays are given up there, too, but not before another power.
+_FARTHEST, _FAR = 0.47, 0.3
 # Of the gap to the cover of a cone, what the cone may widen by in a step.
 _WIDENING = 0.1
 # A repeated sample is closer by these factors at least and at most.
@@ -169,6 +170,9 @@ class March:
         t: a tenth of the gap is left to that, and no step is longer than the cone takes to widen
         by so much, unless the level is never met and f leaves it faster than the cone widens.
 
+        Rays without an end are given up as misses at `_FARTHEST`, or where f overflows: at a point
+        beyond `_FAR` that a proved step leads to, of at least a quarter of the way.
+
         With `occupied` what follows a proved step is passed as well, as far as it lies in cells
         that hold no level (`UniformGrid.run` has the proof): a union of free intervals is free.
 
@@ -241,6 +245,7 @@ class March:
             if self.levels.period is not None:  # the value alone tells its side of a level
                 may_pass = self.backend.Bool(False)
         accepted = now.step <= now.reach
+        leaps = accepted & (4 * now.step >= t)
         if self.overstep > 1:
             knows_side = may_pass | (gaps.smaller > total_error)
             accepted |= knows_side & any_covers(look.back, gaps.less(total_error), unproved)
@@ -312,8 +317,9 @@ class March:
         if now.contact is not None and contact is not None:  # off the surface, all lies ahead
             leaves = now.contact.is_touching & ~contact.is_touching
             tried = dr.select(leaves | hit, end - t, tried)
-        farthest = float(dr.largest(real)) ** _FARTHEST
+        farthest, far = (float(dr.largest(real)) ** power for power in (_FARTHEST, _FAR))
         free = base + reach >= dr.select(end == dr.inf, farthest, end)
+        free |= (end == dr.inf) & (t > far) & leaps & ~dr.isfinite(total_error)
         if self.hysteresis is not None and contact is not None:  # a contact may end at the end
             undecided = contact.is_touching & self.hysteresis.is_free_after
             free &= ~(accepted & undecided & (t < end))
