@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+import warnings
 from typing import Any
 
 import numpy as np
@@ -221,3 +223,42 @@ def test_a_twisted_ellipsoid_takes_less_than_six_looks() -> None:
                     tolerance=hk.Tolerance(value=1e-3, distance=1e-12))  # fmt: skip
     assert hits.evaluations.mean() < 6
     assert (hits.status != hk.Status.OUT_OF_STEPS).all()
+
+
+def test_a_formula_that_compiles_for_long_says_so_before() -> None:
+    """A network of 16 by 16 took minutes to compile on a busy machine, without a word."""
+    rng = np.random.default_rng(0)
+
+    def network(widths: tuple[int, ...]) -> Any:
+        sizes = (3, *widths, 1)
+        layers = [rng.normal(size=(m, n)) for n, m in itertools.pairwise(sizes)]
+
+        def function(*values: Any) -> Any:
+            for k, weights in enumerate(layers):
+                if k:
+                    values = tuple(hk.tanh(v) for v in values)
+                values = tuple(
+                    sum((float(w) * v for w, v in zip(row, values, strict=True)), start=0.0)
+                    for row in weights
+                )
+            return values[0]
+
+        return lambda x, y, z: function(x, y, z)
+
+    with pytest.warns(UserWarning, match="100,8.. operations.* 31 s to compile.*Long formulas"):
+        hk.expression(network((16, 16)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        hk.expression(network((8, 8)))
+        hk.expression(lambda x, y, z: (x**2 + y**2 + z**2 - 1) ** 3 - x**2 * z**3)
+
+
+def test_scalars_of_numpy_are_numbers_in_samples_and_promises() -> None:
+    class Height(hk.Field):
+        domain = hk.Ball()
+
+        def evaluate(self, p: Any) -> hk.Sample:
+            known = (hk.Lipschitz(np.float64(1.001)), hk.Curvature(np.float64(0.0), np.float32(9)))
+            return hk.Sample(p.z, type(p)(0, 0, 1), known, np.float64(1e-6))
+
+    assert hk.trace(Height(), [[0, 0, 0.5]], [[0, 0, -1]]).t[0] == pytest.approx(0.5, abs=2e-4)

@@ -431,3 +431,70 @@ def test_integrators_that_cannot_see_our_surfaces_are_named_in_a_warning() -> No
         mi.render(scene({"type": "moment", "nested": ours}, shape(Sphere())), spp=1)
         mi.render(scene(path, theirs), spp=1)
         render(scene(path, shape(Sphere())), spp=1, progress=False)
+
+
+def drawn_by(integrator: dict[str, Any], member: Any, **members: Any) -> Any:
+    film = {**sensor(size=8), "sampler": {"type": "independent", "sample_count": 4}}
+    scene = {"integrator": integrator, "sensor": film, "lamp": lamp(), "shape": member, **members}
+    return mi.load_dict({"type": "scene", **scene})
+
+
+def test_integrators_are_followed_left_to_mitsuba_or_refused_by_name() -> None:
+    """`direct`, `aov` and `volpath` were replaced by paths without a word."""
+    theirs, ours = {"type": "sphere"}, shape(Sphere())
+    quiet: dict[str, Any] = {"spp": 4, "progress": False}
+    channels = {"type": "aov", "aovs": "d:depth,n:sh_normal", "image": {"type": "path"}}
+    found = render(drawn_by(channels, theirs), **quiet)
+    assert found.shape[-1] in (7, 8)
+    assert found[4, 4, -4] == pytest.approx(3.3, abs=0.2)  # the depth of the sphere
+    assert found.shown.shape[-1] in (3, 4)
+    with pytest.raises(ValueError, match="denoise: Mitsuba draws this scene"):
+        render(drawn_by(channels, theirs), denoise=True, **quiet)
+    inside = {"type": "aov", "aovs": "d:depth", "image": {"type": "harnack_path"}}
+    with pytest.raises(ValueError, match=r"1 of .*level sets.*AOVIntegrator asks for"):
+        render(drawn_by(inside, ours), **quiet)
+    with pytest.warns(UserWarning, match="AOVIntegrator draws nothing"):
+        mi.render(drawn_by(inside, ours), spp=1)
+    moments = {"type": "moment", "nested": {"type": "harnack_path"}}
+    assert render(drawn_by(moments, ours), **quiet).shape[-1] > 4
+    fog = {"type": "cube", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}
+    with pytest.raises(ValueError, match="light in its media"):
+        render(drawn_by({"type": "volpath"}, ours, fog=fog), **quiet)
+    render(drawn_by({"type": "volpath"}, theirs, fog=fog), **quiet)
+    with pytest.warns(UserWarning, match="follows no light in media"):
+        render(drawn_by({"type": "harnack_path"}, ours, fog=fog), **quiet)
+    for kind in ("ptracer", "prb"):
+        with pytest.raises(ValueError, match="level sets of harnack"):
+            render(drawn_by({"type": kind}, ours), **quiet)
+
+
+def test_direct_light_is_that_of_paths_of_two_edges_and_hidden_lamps_stay_hidden() -> None:
+    white = {"type": "constant"}
+    direct, two = (
+        render(drawn_by(one, shape(Sphere()), sky=white), spp=4, progress=False)
+        for one in ({"type": "direct"}, {"type": "harnack_path", "max_depth": 2})
+    )
+    np.testing.assert_array_equal(direct, two)
+    for kind in ("path", "direct", "volpath"):
+        hidden = drawn_by({"type": kind, "hide_emitters": True}, shape(Sphere()), sky=white)
+        assert render(hidden, spp=4, progress=False)[0, 0].max() == 0.0
+
+
+def test_attributes_of_vertices_are_refused_on_level_sets(tmp_path: Any) -> None:
+    """They were black."""
+    colors = {"type": "mesh_attribute", "name": "vertex_color"}
+    with pytest.raises(ValueError, match="mesh_attribute belongs to vertices"):
+        shape(Sphere(), bsdf={"type": "diffuse", "reflectance": colors})
+
+
+def test_channels_of_mitsuba_are_written_with_their_names(tmp_path: Any) -> None:
+    import OpenEXR
+
+    channels = {"type": "aov", "aovs": "d:depth", "image": {"type": "path"}}
+    found = render(
+        drawn_by(channels, {"type": "sphere"}), tmp_path / "a.exr", spp=4, progress=False
+    )
+    with OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True) as file:
+        written = file.channels()
+        assert "d.T" in written
+        np.testing.assert_array_equal(written["d.T"].pixels, found[..., -1])

@@ -163,3 +163,21 @@ def test_formulas_know_sines_of_large_angles_in_double_precision() -> None:
     f, x = hk.expression("sin(x)"), np.array([2.0, 7e6, 1e9, 1e12, 1e14])
     points = np.column_stack([x, 0 * x, 0 * x])
     np.testing.assert_allclose(f.value(points, precision="double"), np.sin(x), atol=1e-15)
+
+
+@pytest.mark.parametrize(("precision", "far"), [("single", 2e6), ("double", 1e15)])
+def test_formulas_of_angles_that_are_not_known_have_no_value(precision: Any, far: float) -> None:
+    """The middle of their range looked like the value 0."""
+    f = hk.expression("sin(x) + y")
+    assert np.isnan(f.value([[far, 0.5, 0.0]], precision=precision)).all()
+    o, d = np.array([[far, 0.0, 0.0]] * 3), np.eye(3)
+    found = hk.trace(f, o, d, precision=precision, clip=hk.Ball((far, 0.0, 0.0), 10.0))
+    assert (found.status == hk.Status.OUT_OF_STEPS).all()
+
+
+def test_gradients_of_large_angles_are_not_taken_beside_the_point() -> None:
+    """As if they were at a tie: they were off by 35 where rounding is 0.1."""
+    x = np.random.default_rng(0).uniform(-100, 100, (3000, 3)).astype(np.float32)
+    f = hk.expression("sin(30*x) + cos(20*y)*z")
+    off = f.gradient(x, precision="single") - f.gradient(x, precision="double")
+    assert np.abs(off).max() < 0.5

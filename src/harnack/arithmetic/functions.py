@@ -148,14 +148,20 @@ def _sine_and_cosine(x: Interval) -> tuple[Interval, Interval]:
     Proof. Both are monotone between the multiples of pi/2 at which they are 1 or -1: the range is
     that of the ends, and of such points inside. Which are inside is asked of an interval widened by
     the rounding of the question; if one is counted wrongly, it is that near to an end. Beyond
-    `largest_angle` sines are not known: there the range is [-1, 1].
+    `largest_angle` sines are not known: on pieces the range is [-1, 1] there; at a point it has no
+    ends, as a value is half way between them, and 0 would look like one.
     """
     unit, most = unit_of(x.low), largest_angle(type(x.low))
     s0, c0 = sincos(x.low)
     if x.low is x.high:
-        wide = dr.abs(x.low) > most
-        s, c = (Interval(one, one).widened(4 * unit, 4 * unit) for one in (s0, c0))
-        return _unit_range(s, wide), _unit_range(c, wide)
+        known = dr.abs(x.low) <= most
+
+        def at_point(one: Real) -> Interval:
+            plain = Interval(one, one).widened(4 * unit, 4 * unit)
+            low = dr.select(known, fmax(plain.low, -1), -dr.inf)
+            return Interval(low, dr.select(known, fmin(plain.high, 1), dr.inf))
+
+        return at_point(s0), at_point(c0)
     s1, c1 = sincos(x.high)
     turn = 1 / (2 * math.pi)
     slack = 8 * unit * (fmax(dr.abs(x.low), dr.abs(x.high)) + 1) * turn

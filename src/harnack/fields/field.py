@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import abc
 import copy
+import dataclasses
 import functools
 import inspect
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
 
 import drjit as dr
 import numpy as np
@@ -64,6 +65,7 @@ _OF_SOLIDS = frozenset(
 # A detail at which nothing is left out.
 NO_TRUNCATION = 1e9
 
+_R = TypeVar("_R", bound="Sample | Promise")
 _HOW = (
     "return harnack.Sample(value, gradient, known), with a Dr.Jit number, a Dr.Jit 3-vector and a "
     "tuple of promises, such as (harnack.Lipschitz(1.0),) if |grad f| <= 1"
@@ -109,9 +111,21 @@ def _checked(evaluate: Callable[[Any, Vec3], Sample]) -> Callable[[Any, Vec3], S
             raise TypeError(f"{name}: Sample.gradient is {_named(gradient)}, no 3-vector: {_HOW}")
         if type(self).parameters is Field.parameters and not dr.grad_enabled(p):
             refuse_derivatives(type(self).__name__, sample.value)
-        return sample
+        return dataclasses.replace(
+            _plain(sample),
+            known=tuple(_plain(one) for one in sample.known),
+            weaker=tuple(_plain(one) for one in sample.weaker),
+        )
 
     return checked
+
+
+def _plain(record: _R) -> _R:
+    """A record whose scalars of NumPy are Python's: Dr.Jit takes no others."""
+    scalars: dict[str, Any] = {
+        key: one.item() for key, one in vars(record).items() if isinstance(one, np.generic)
+    }
+    return dataclasses.replace(record, **scalars) if scalars else record
 
 
 def _named(value: Any) -> str:

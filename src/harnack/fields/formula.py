@@ -72,7 +72,9 @@ class Formula(Field):
         middle is the gradient of no point, if mostly across the tie. A few roundings away in about
         its direction, values decide between them (`Dual`).
 
-        Proof of the error. The gradient at p lies within `gradient_error` of the middle.
+        Proof of the error. The gradient at p lies within `gradient_error` of the middle. One that
+        is farther off is no gradient of a tie at p, but f turns that much on the way to where it
+        was taken, as a sine of a large angle does: there the middle is kept.
         """
         epsilon = float(dr.epsilon(type(p.x)))
         middle, doubt = sample.gradient, sample.gradient_error
@@ -86,11 +88,12 @@ class Formula(Field):
         except TypeError:  # a formula of ranges alone, as of noise
             return sample
         one_side = type(p)(*(0 * p.x + one for one in beside.first))
-        is_tie = (doubt > _TIE * epsilon * steep) & dr.all(dr.isfinite(one_side))
+        off = length(one_side - middle)
+        is_tie = (doubt > _TIE * epsilon * steep) & (off <= 2 * doubt) & dr.isfinite(off)
         return dataclasses.replace(
             sample,
             gradient=dr.select(is_tie, one_side, middle),
-            gradient_error=dr.select(is_tie, doubt + length(one_side - middle), doubt),
+            gradient_error=dr.select(is_tie, doubt + off, doubt),
         )
 
     def sample_alone(self, p: Vec3) -> Sample:
@@ -128,6 +131,10 @@ class Formula(Field):
         xx, xy, xz, yy, yz, zz = (0 * p.x + one.middle for one in jet.second)
         vector = cast("Any", type(p))
         return vector(xx, xy, xz), vector(xy, yy, yz), vector(xz, yz, zz)
+
+    def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
+        """That of the Hessian is what its ranges say: rounding, and ties of a formula."""
+        return sample.gradient_error, hessian_error(self._jet(Jet.at_point(p, order=2), p.x), p.x)
 
     def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
         """The sample, and the enclosures that its ranges prove; looking back nothing is proved."""
@@ -173,6 +180,13 @@ class Formula(Field):
 def probe() -> tuple[Jet, Jet, Jet]:
     """Coordinates of some point, to try a formula on when it is made."""
     return Jet.at_point(choose_backend("double").Array3f(0.1, 0.2, 0.3))
+
+
+def hessian_error(jet: Jet, like: Real) -> Real:
+    """How far a Hessian may be from the middles of its ranges at a point: no matrix has a spectral
+    norm above the sum of the sizes of its entries."""
+    xx, xy, xz, yy, yz, zz = (one.radius for one in jet.second)
+    return 0 * like + xx + yy + zz + 2 * (xy + xz + yz)
 
 
 def is_jet(x: Any, name: str) -> bool:

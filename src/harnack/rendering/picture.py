@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -26,6 +25,7 @@ from harnack.rendering.exhibits import OF_STUDIO, MaterialLike, exhibits
 from harnack.rendering.mitsuba.integrator import PathTracer
 from harnack.rendering.mitsuba.plugins import register
 from harnack.rendering.mitsuba.scene_files import load_dictionary, load_scene_file
+from harnack.rendering.mitsuba.stock import stand_in
 from harnack.rendering.pictures.backdrop import flat, wall
 from harnack.rendering.pictures.images import check_picture_path, tone_mapped, write_image
 from harnack.rendering.pictures.light_paths.denoising import denoised, load_denoiser
@@ -47,6 +47,7 @@ ShowMode = Literal["color", "shaded", "normal", "evaluations", "status", "depth"
 _LIT = {"color": "light paths", "shaded": "rays"}
 _EDGE_SPP = 9
 _SIZE = (800, 600)
+_IN_AOV = (".R", ".G", ".B", ".A")
 Image = npt.NDArray[Any]
 Draw = Callable[[Advance], tuple[Image, int]]
 
@@ -176,6 +177,8 @@ def render(
         refuse_studio_settings({**of_studio, **settings})
         stage, scene = None, _loaded(mi, what, asked.size)
         check_memory(asked.show, *map(int, scene.sensors()[0].film().crop_size()))
+    names: list[str] | None = None
+    tracer = stand_in(mi, scene) if show == "color" else None
     if show in VIEWS:
         placement = Placement.identity() if stage is None else stage.placement
         view = look(mi, scene, scene.sensors()[0], placement, asked.function)
@@ -184,15 +187,21 @@ def render(
         image = VIEWS[show].numbers(view)
         named = asked.colorbar is True and isinstance(of, str)
         shown = drawn(show, view, asked.value_range, str(of) if named else asked.colorbar)
+    elif show == "color" and tracer is None:
+        image, shown, names = _by_mitsuba(mi, scene, asked)
     else:
-        draw = (_shaded if show == "shaded" else _radiance)(mi, scene, asked, stage, progress)
+        draw = (
+            _shaded(mi, scene, asked, stage)
+            if tracer is None
+            else _radiance(mi, scene, asked, tracer, progress)
+        )
         with progress_bar("rendering", progress) as advance:
             image, lost = draw(advance)
         _warn_of(lost, _LIT[show])
         image, shown = _before_backdrop(mi, scene.sensors()[0], image, stage, show)
     if target is not None:
         exact = target.suffix.lower() == ".exr"
-        write_image(mi, target, image.astype(np.float32, copy=False) if exact else shown)
+        write_image(mi, target, image if exact else shown, names)
     return Picture.of(image, shown)
 
 
@@ -228,14 +237,20 @@ def _loaded(mi: Any, what: Any, size: tuple[int, int] | None) -> Any:
     return scene
 
 
-def _tracer(mi: Any, scene: Any, max_depth: int | None) -> PathTracer:
-    own = getattr(scene.integrator(), "tracer", None)
-    if not isinstance(own, PathTracer):
-        # Mitsuba's own integrators tell their settings in words alone.
-        said = re.search(r"max_depth = (\d+)", str(scene.integrator()))
-        usual = 12 if said is None else int(said[1])
-        own = PathTracer(mi, -1 if usual >= 2**31 else usual)
-    return own if max_depth is None else own.with_depth(max_depth)
+def _by_mitsuba(
+    mi: Any, scene: Any, asked: Request
+) -> tuple[Image, npt.NDArray[np.uint8], list[str]]:
+    """The numbers (h, w, n) of a scene without our surfaces, with all channels of its own
+    integrator, the pixels of the first of them, and the names of all."""
+    for name, given in (("max_depth", asked.max_depth is not None), ("denoise", asked.denoise)):
+        if given:
+            raise ValueError(f"{name}: Mitsuba draws this scene, by an integrator of its own")
+    image = np.array(mi.render(scene, spp=asked.spp or 0, seed=asked.seed))
+    # Pictures inside an `aov` are the first channels, and come once.
+    names = [name for name in scene.integrator().aov_names() if name[-2:] not in _IN_AOV]
+    basic = image.shape[-1] - len(names)
+    names = [*{1: "Y", 2: "YA"}.get(basic, "RGBA"[:basic]), *names]
+    return image, tone_mapped(image[..., :basic] if basic >= 3 else image[..., 0]), names
 
 
 def _warn_of(lost: int, what: str) -> None:
@@ -245,10 +260,10 @@ def _warn_of(lost: int, what: str) -> None:
         )
 
 
-def _radiance(mi: Any, scene: Any, asked: Request, stage: Studio | None, progress: bool) -> Draw:
-    del stage
+def _radiance(mi: Any, scene: Any, asked: Request, tracer: PathTracer, progress: bool) -> Draw:
     sensor = scene.sensors()[0]
-    tracer = _tracer(mi, scene, asked.max_depth)
+    if asked.max_depth is not None:
+        tracer = tracer.with_depth(asked.max_depth)
     spp = asked.spp or check_spp(
         int(sensor.sampler().sample_count()), source=", which the scene's sampler asks for"
     )
@@ -271,8 +286,7 @@ def _radiance(mi: Any, scene: Any, asked: Request, stage: Studio | None, progres
     return draw
 
 
-def _shaded(mi: Any, scene: Any, asked: Request, stage: Studio | None, progress: bool) -> Draw:
-    del progress
+def _shaded(mi: Any, scene: Any, asked: Request, stage: Studio | None) -> Draw:
     sensor, spp, cones = scene.sensors()[0], asked.spp or _EDGE_SPP, asked.antialias == "cones"
 
     def draw(advance: Advance) -> tuple[Image, int]:

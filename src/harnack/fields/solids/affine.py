@@ -11,6 +11,7 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
+from harnack.arithmetic import Jet
 from harnack.backend.extrema import fmax
 from harnack.backend.lengths import largest_component, length
 from harnack.enclosures import (
@@ -21,9 +22,9 @@ from harnack.enclosures import (
     Promise,
     Stretched,
 )
-from harnack.fields.formula import prepared_numbers
+from harnack.fields.formula import as_jet, hessian_error, prepared_numbers
 from harnack.fields.look import Look, Path, Sample
-from harnack.fields.solids.solid import Derived, Solid
+from harnack.fields.solids.solid import Derived, Shape, Solid
 from harnack.geometry import Ball, ConvexHull
 
 if TYPE_CHECKING:
@@ -216,6 +217,21 @@ class AffineImage(Derived):
         own = [numbers.pulled(type(p)(*(columns[j][k] for j in range(3)))) for k in range(3)]
         x, y, z = (one * numbers.factor for one in own)
         return x, y, z
+
+    def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
+        """Of a formula, by its ranges. Of another field, its own errors at the local coordinates:
+        what the rounding of those does to its derivatives is not known, nor in these."""
+        del sample
+        numbers = self.numbers
+        local = type(p)(*numbers.local(p.x, p.y, p.z))
+        slope, bend = self.inner.derivative_errors(local, self.inner.evaluate(local))
+        slope = slope * numbers.stretch * numbers.factor
+        if not isinstance(self.inner, Shape):
+            return slope, bend * numbers.stretch * numbers.stretch * numbers.factor
+        coordinates = Jet.at_point(p, order=2)
+        jet = as_jet(self.formula(*coordinates), coordinates[0], type(self.inner).__name__)
+        # The gradient is the middle of no range (`Formula.evaluate`): both are added.
+        return slope + sum(one.radius for one in jet.first), hessian_error(jet, p.x)
 
     def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
         numbers, vector = self.numbers, cast("Any", type(path.origin))

@@ -134,6 +134,25 @@ class Combined(Solid):
             best = dr.select(chosen, value, best)
         return rows
 
+    def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
+        """The largest of the parts that may be the one whose derivatives are taken. Where rounding
+        leaves open which of two that is, nothing is known: derivatives jump there."""
+        size = largest_component(p)
+        sign = -1.0 if self.is_union else 1.0
+        whole = value_error(sample, length(sample.gradient), size)
+        near, slopes, bends = 0 * p.x, 0 * p.x, 0 * p.x
+        for one in self.parts:
+            own = one.evaluate(p)
+            doubt = value_error(own, length(own.gradient), size)
+            is_open = ~(sign * (sample.value - own.value) > doubt + whole)
+            near = near + dr.select(is_open, 1.0, 0.0)
+            slope, bend = one.derivative_errors(p, own)
+            # What is no number is kept: it bounds nothing.
+            slopes = dr.select(is_open & ~(slope <= slopes), slope, slopes)
+            bends = dr.select(is_open & ~(bend <= bends), bend, bends)
+        is_one = near <= 1
+        return dr.select(is_one, slopes, dr.inf), dr.select(is_one, bends, dr.inf)
+
     def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
         """Looks at every part; what they prove together is `Greatest`."""
         looks = [one.look(path, t, ahead, back) for one in self.parts]

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 
     import numpy.typing as npt
 
-    from harnack.backend import Backend, Real
+    from harnack.backend import Backend, Real, Vec3
+    from harnack.fields.look import Sample
     from harnack.fields.solids.maps import Map
     from harnack.geometry import Volume
 
@@ -224,6 +225,11 @@ class Derived(Solid):
         other = copy.copy(self)
         object.__setattr__(other, "inner", inner)
         return other
+
+    def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
+        """Those of the inner field, whose derivatives these are but for their sign."""
+        del sample
+        return self.inner.derivative_errors(p, self.inner.evaluate(p))
 
 
 class Shape(Formula, Solid):

@@ -64,6 +64,11 @@ def from_properties(
         colours = [one.colour for one in isolines]
         props["bsdf"] = with_lines(mi, props["bsdf"], colours)
         cut_bsdf = None if cut_bsdf is None else with_lines(mi, cut_bsdf, colours)
+    if "MeshAttribute" in str(props.get("bsdf", "")) + str(cut_bsdf):
+        raise ValueError(
+            "a mesh_attribute belongs to vertices or faces, which a level set has not: take a "
+            "texture of uv, which are x and y in the world, or draw the mesh of harnack.mesh(field)"
+        )
     made = _carrier_class(mi.variant())(props, surface, placement, tint, cut_bsdf, isolines)
     if made.emitter() is not None or made.is_medium_transition():
         raise ValueError("surfaces that are traced can neither emit light nor bound a medium")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -83,11 +84,15 @@ def as_bytes(image: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.uint8]:
     return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
 
-def write_image(mi: Any, path: Path, image: npt.NDArray[Any]) -> None:
-    """Write (h, w), (h, w, 3) or (h, w, 4) floats as EXR or bytes as PNG, all or nothing."""
+def write_image(
+    mi: Any, path: Path, image: npt.NDArray[Any], names: Sequence[str] | None = None
+) -> None:
+    """Write (h, w), (h, w, 3) or (h, w, 4) floats as EXR or bytes as PNG, all or nothing.
+
+    names: of the channels of an EXR file, if they are others than Y, RGB or RGBA."""
     with write_atomically(path) as partial:
         if path.suffix.lower() == ".exr":
-            partial.write_bytes(exr_bytes(image))
+            partial.write_bytes(exr_bytes(image, names))
         else:
             partial.write_bytes(png_bytes(mi, image))
 
@@ -100,16 +105,20 @@ def png_bytes(mi: Any, image: npt.NDArray[np.uint8]) -> bytes:
     return packed.raw_buffer()
 
 
-def exr_bytes(image: npt.NDArray[np.floating[Any]]) -> bytes:
+def exr_bytes(image: npt.NDArray[np.floating[Any]], names: Sequence[str] | None = None) -> bytes:
     """An OpenEXR file of an image (h, w) with channel Y, (h, w, 3) with R, G and B, or (h, w, 4)
-    with A as well, by which these are multiplied."""
+    with A as well, by which these are multiplied; or with channels of these names."""
     # Mitsuba writes them too, but waits for ever where Dr.Jit has one thread (OpenEXR 2.5 hands
     # its work to a pool without threads).
     import OpenEXR  # here, since most pictures do without
 
-    name = "Y" if image.ndim == 2 else {3: "RGB", 4: "RGBA"}[image.shape[-1]]
+    numbers = np.asarray(image, dtype=np.float32)
     header: dict[str, Any] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    channels = {name: np.ascontiguousarray(image, dtype=np.float32)}
+    if names is None:
+        name = "Y" if image.ndim == 2 else {3: "RGB", 4: "RGBA"}[image.shape[-1]]
+        channels = {name: np.ascontiguousarray(numbers)}
+    else:
+        channels = {name: np.ascontiguousarray(numbers[..., k]) for k, name in enumerate(names)}
     # Before version 3.5, which needs Python 3.11, it writes to named files only.
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "picture.exr")
