@@ -337,5 +337,15 @@ def test_numbers_of_numpy_are_numbers() -> None:
     assert hk.EigenfunctionSum([wave]).value(x) == same.value(x)
     tapered = hk.Sphere(1).tapered((np.float64(0), np.int64(1)), (np.int64(2), np.float32(0.5)))
     assert tapered.value(x) == hk.Sphere(1).tapered((0, 1), (2, 0.5)).value(x)
+    ball = hk.Sphere(1)
+    blend = ball.blended(ball.moved((1, 0, 0)), np.float32(0.5), power=np.int64(2))
+    assert blend.value(x) == ball.blended(ball.moved((1, 0, 0)), 0.5).value(x)
+    noise = hk.FractalNoise(octaves=np.int64(2), seed=np.int32(1))  # type: ignore[arg-type]
+    assert noise.value(x) == hk.FractalNoise(octaves=2, seed=1).value(x)
+    assert hk.Julia(iterations=np.int64(5)).iterations == 5  # type: ignore[arg-type]
+    ray = [[3, 0, 0]], [[-1, 0, 0]]
+    for overstep in (np.float32(1.25), np.float64(1.25), np.int64(1)):
+        hits = hk.trace(ball, *ray, overstep=overstep)  # type: ignore[arg-type]
+        assert hits.t == hk.trace(ball, *ray, overstep=float(overstep)).t
     with pytest.raises(ValueError, match="finite numbers"):
         hk.Sphere(1).tapered(("a", 1), (2, 0.5))  # type: ignore[arg-type]

@@ -27,6 +27,14 @@ def test_rays_parallel_to_a_surface_are_no_hits_at_the_end_of_the_numbers(precis
     assert (slanted.status != hk.Status.HIT).all()
 
 
+def test_what_is_not_known_far_away_proves_no_miss() -> None:
+    """Angles so large are no numbers in single precision."""
+    d = [[1.0, 0.3, 0.02], [0.3, -1.0, 0.3]]
+    sine = hk.expression("sin(x)")
+    waves = hk.trace(sine, [[1e13, 1e13, 1e13]], d, t_min=1e13, precision="single")
+    assert (waves.status == hk.Status.OUT_OF_STEPS).all()
+
+
 @pytest.mark.parametrize("precision", ["single", "double"])
 def test_a_cone_without_bounds_proves_its_misses(precision: Any) -> None:
     rng = np.random.default_rng(0)

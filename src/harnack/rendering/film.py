@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import numbers
 import os
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
@@ -111,7 +112,7 @@ def check_film_path(path: str | os.PathLike[str]) -> Path:
 
 
 def _number(name: str, value: Any) -> float:
-    if isinstance(value, bool | str) or not isinstance(value, int | float):
+    if isinstance(value, bool | str) or not isinstance(value, numbers.Real):
         raise TypeError(f"{name} must be a number, not {value!r}")
     if not math.isfinite(value):
         raise ValueError(f"{name} must be a finite number, not {value}")

@@ -73,8 +73,10 @@ class LevelSet:
             check_volume(getattr(self, name), name)
         if operator.index(self.max_steps) < 1:
             raise ValueError(f"max_steps must be at least 1, not {self.max_steps}")
-        if not 1 <= _as_number(self.overstep, "overstep must be a number in [1, 2)") < 2:
+        overstep = _as_number(self.overstep, "overstep must be a number in [1, 2)")
+        if not 1 <= overstep < 2:
             raise ValueError(f"overstep must lie in [1, 2), not {self.overstep}")
+        object.__setattr__(self, "overstep", overstep)  # NumPy's would ask Dr.Jit for numbers
         if self.field.has_sheets and self.field.period is not None:
             raise ValueError("a field with sheets must be real-valued: its period must be None")
         if self.confirm:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import numbers
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -33,7 +34,7 @@ class Blend(Shape):
 
     def __post_init__(self) -> None:
         for name, least, value in (("radius", 0.0, self.radius), ("power", 1.0, self.power)):
-            good = isinstance(value, int | float) and math.isfinite(value) and value >= least
+            good = isinstance(value, numbers.Real) and least <= float(value) < math.inf
             if not good or value == 0:
                 bound = "above 0" if least == 0.0 else f"of at least {least:g}"
                 raise ValueError(f"{name} must be a number {bound}, not {value!r}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from typing import Any
 
 from harnack.geometry import Ball, Box, Volume
@@ -38,6 +39,22 @@ def finite(value: Any, name: str) -> float:
         raise ValueError(f"{name} must be a number, not {value!r}") from None
     if not math.isfinite(number):
         raise ValueError(f"{name} must be finite, not {value!r}")
+    return number
+
+
+def whole(value: Any, name: str, least: int, most: int) -> int:
+    """An integer from `least` to `most`.
+
+    Raises:
+        ValueError: it is none.
+    """
+    try:
+        number = operator.index(value)
+    except TypeError:
+        number = least - 1
+    if not least <= number <= most:
+        end = f"2^{n} - 1" if (n := most.bit_length()) >= 32 else str(most)
+        raise ValueError(f"{name} must be an integer from {least} to {end}, not {value!r}")
     return number
 
 

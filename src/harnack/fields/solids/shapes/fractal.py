@@ -13,7 +13,7 @@ from harnack.backend import backend_of
 from harnack.backend.extrema import fmax
 from harnack.enclosures import Curvature, Lipschitz
 from harnack.fields.formula import Formula, is_jet, prepared_numbers
-from harnack.fields.solids.shapes.checks import finite, positive
+from harnack.fields.solids.shapes.checks import finite, positive, whole
 from harnack.fields.solids.shapes.noise import CONSTANTS, CORNERS, Fade, cell_noise, lattice_vector
 from harnack.fields.solids.solid import Shape
 
@@ -45,11 +45,8 @@ class FractalNoise(Shape):
     fade: Fade = "quintic"
 
     def __post_init__(self) -> None:
-        count, seed = cast("Any", self.octaves), cast("Any", self.seed)
-        if not isinstance(count, int) or not 1 <= count <= 24:
-            raise ValueError(f"octaves must be an integer from 1 to 24, not {count!r}")
-        if not isinstance(seed, int) or not 0 <= seed < 2**32:
-            raise ValueError(f"the seed must be an integer from 0 to 2^32 - 1, not {seed!r}")
+        object.__setattr__(self, "octaves", whole(self.octaves, "octaves", 1, 24))
+        object.__setattr__(self, "seed", whole(self.seed, "the seed", 0, 2**32 - 1))
         if self.fade not in CONSTANTS:
             raise ValueError(f'the fade must be "quintic" or "cubic", not {self.fade!r}')
         object.__setattr__(self, "beta", finite(self.beta, "beta of noise"))

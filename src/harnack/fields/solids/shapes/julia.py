@@ -13,7 +13,7 @@ import drjit as dr
 from harnack.backend.extrema import clamp, fmax, fmin
 from harnack.enclosures import Lipschitz
 from harnack.fields.look import Sample
-from harnack.fields.solids.shapes.checks import ball_around, finite
+from harnack.fields.solids.shapes.checks import ball_around, finite, whole
 from harnack.fields.solids.solid import Solid
 
 if TYPE_CHECKING:
@@ -71,11 +71,8 @@ class Julia(Solid):
         if not math.hypot(*c) <= 10.0:
             raise ValueError(f"c of a Julia set must be no longer than 10, not {self.c!r}")
         object.__setattr__(self, "c", c)
-        count = cast("Any", self.iterations)
-        if not isinstance(count, int) or not 1 <= count <= 60:
-            raise ValueError(
-                f"the iterations of a Julia set must be an integer from 1 to 60, not {count!r}"
-            )
+        count = whole(self.iterations, "the iterations of a Julia set", 1, 60)
+        object.__setattr__(self, "iterations", count)
         object.__setattr__(self, "slice", finite(self.slice, "the slice of a Julia set"))
 
     @property
