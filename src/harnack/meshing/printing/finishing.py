@@ -1,10 +1,10 @@
-"""The last steps of a mesh: its largest part, fewer triangles, what is said of it."""
+"""The last steps of a mesh: fewer triangles, single precision, what is said of it."""
 
 from __future__ import annotations
 
 import math
 import operator
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from harnack.fields import Field
 
-__all__ = ["check_options", "finished", "largest_part", "normals_of", "simplified", "snapped"]
+__all__ = ["check_options", "finished", "normals_of", "simplified", "snapped"]
 
 # The cosine of the angle between normals from which on an edge is a crease.
 _CREASE = math.cos(math.radians(30))
@@ -73,22 +73,6 @@ def normals_of(field: Field, level: float, surface: Surface) -> FloatArray:
         good[np.unique(boundary_edges(surface.faces))] = False
     chosen: FloatArray = np.where(good[:, None], slope, mean)
     return chosen
-
-
-def largest_part(surface: Surface) -> Surface:
-    """The connected part with the largest area."""
-    import scipy.sparse  # here: half a second that few need
-    import scipy.sparse.csgraph as csgraph_module
-
-    sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
-    faces, n = surface.faces, len(surface.vertices)
-    rows, columns = np.concatenate([faces[:, :2], faces[:, 1:]]).T
-    joined = sparse.coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(n, n))
-    part = np.asarray(csgraph.connected_components(joined, directed=False)[1])[faces[:, 0]]
-    corner = surface.vertices[faces]
-    cross = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    areas = np.bincount(part, np.linalg.norm(cross, axis=1))
-    return Surface.of(surface.vertices, faces[part == areas.argmax()])
 
 
 def simplified(surface: Surface, tolerance: float) -> tuple[Surface, dict[str, Any]]:
