@@ -19,6 +19,7 @@ from harnack.meshing import checks
 from harnack.meshing.intersections import intersecting_faces
 from harnack.meshing.lattice import Lattice, Surface
 from harnack.meshing.printing import bodies, thickening
+from tests.oracles.mesh_files import read_closed
 
 BOX = hk.Box((-1, -1, -1), (1, 1, 1))
 KNOT = shapes.torus_knot(2, 3, 64)
@@ -403,10 +404,7 @@ def test_files_of_every_format_are_closed_when_read_again(kind: str, tmp_path: P
     command += ["--box=-.3,-.3,-.3,.3,.3,.3", "-o", str(path)]
     assert main(command) == 0
     assert [one.name for one in tmp_path.iterdir()] == [path.name]
-    again: Any = trimesh.load(path, force="mesh")
-    again.merge_vertices()
-    assert again.is_watertight
-    assert again.volume > 0
+    again = read_closed(path)
     np.testing.assert_allclose(again.bounds, [[-3] * 3, [3] * 3], atol=1e-5)
 
 
@@ -431,6 +429,8 @@ def test_formats_whose_packages_lack_are_refused_early(
         (["--solid", "1:0"], "lower one"),
         (["--ball", "1,2"], "4 numbers"),
         (["--thickness", "0"], "positive"),
+        (["--max-triangles", "1000"], "--max-triangles"),
+        (["--max-triangles", "0"], "--max-triangles must be positive"),
         (["--box=0,0,0,1,1,1", "--ball=0,0,0,1"], "not allowed"),
     ],
 )

@@ -104,8 +104,9 @@ def mesh(
     that it is made of). Else a MeshingError is raised.
 
     Returns:
-        A trimesh.Trimesh. Vertices of a curve come first, in order, bit by bit, and its edges are
-        the rim. Without a rim, faces are turned outwards: the volume is positive; else they
+        A trimesh.Trimesh; if it is closed, `export` writes closed files, in single precision, or
+        raises a MeshingError. Vertices of a curve come first, in order, bit by bit, and its edges
+        are the rim. Without a rim, faces are turned outwards: the volume is positive; else they
         are turned towards larger values. `metadata["harnack"]` has level, spacing, evaluations,
         the Euler characteristic,
         boundary: indices (k, 2) of edges of one face,
