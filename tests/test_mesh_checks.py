@@ -19,7 +19,9 @@ from harnack.meshing.checks import (
     check_inside,
     check_near_level,
 )
+from harnack.meshing.printing.closed_mesh import ClosedMesh
 from harnack.meshing.samples import LevelFunction
+from tests.oracles.mesh_files import read_closed
 
 _BALL = trimesh.creation.icosphere(subdivisions=3)
 _FACES = np.asarray(_BALL.faces, np.int64)
@@ -60,7 +62,7 @@ def test_faces_through_each_other_are_found():
         check_apart(x, _FACES)
 
 
-@pytest.mark.parametrize("kind", ["stl", "ply", "obj", "glb"])
+@pytest.mark.parametrize("kind", ["stl", "ply", "obj", "glb", "3mf", "off"])
 def test_edges_shorter_than_single_precision_do_not_open_a_file(tmp_path: Path, kind: str):
     # A vertex 5e-11 from another, in the middle of an edge's two faces, as booleans leave them.
     x = np.array(_BALL.vertices, np.float64)
@@ -74,12 +76,70 @@ def test_edges_shorter_than_single_precision_do_not_open_a_file(tmp_path: Path, 
     )
     assert made.is_watertight
     path = tmp_path / f"a.{kind}"
-    write_mesh(made, path)
-    read = trimesh.load(path, force="mesh")
-    read.merge_vertices(merge_tex=True, merge_norm=True)
-    assert read.is_watertight
-    assert len(read.faces) == len(_FACES)
-    check_apart(np.array(read.vertices, np.float64), np.array(read.faces, np.int64))
+    ClosedMesh.of(made).export(path)
+    assert len(read_closed(path).faces) == len(_FACES)
+
+
+_CUBE = hk.Cuboid((0.5,) * 3)
+_CARVED = hk.Sphere(1.0) - hk.Cuboid((0.5, 0.5, 2.0))
+
+
+@pytest.mark.parametrize(
+    ("part", "message"),
+    [
+        (_CARVED.scaled(1e-5), r"2e-05 long.*scale it \(apply_scale\)"),
+        (hk.Torus(0.8, 0.3).moved((1e6, 0, 0)), r"up to 1e\+06 from the origin.*move it"),
+        ((hk.Torus(0.8, 0.3) | hk.Cuboid((0.2, 0.2, 1.0))).moved((1e6, 0, 0)), "move it to the"),
+        (_CUBE.moved((-0.5, -0.5, 0)) | _CUBE.moved((0.5, 0.5, 0)), r"parts touch.*near \(0, 0,"),
+        (_CUBE.moved((-0.5,) * 3) | _CUBE.moved((0.5,) * 3), r"parts touch.*near \(0, 0, 0\)"),
+    ],
+    ids=["tiny", "far", "union far", "touching in an edge", "touching in a point"],
+)
+def test_what_is_closed_in_memory_and_not_in_a_file_is_not_written(
+    part: hk.Solid, message: str, tmp_path: Path
+):
+    made = hk.mesh(part, tolerance=2e-2)
+    assert made.is_watertight
+    for one in (made, made.copy()):
+        with pytest.raises(hk.MeshingError, match=message):
+            one.export(tmp_path / "a.stl")
+    with pytest.raises(hk.MeshingError, match=message):
+        write_mesh(made, tmp_path / "a.stl")
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_was_refused_is_right_once_it_is_moved_and_scaled(tmp_path: Path):
+    made = hk.mesh(hk.Torus(0.8, 0.3).moved((1e6, 0, 0)), tolerance=2e-2)
+    made.apply_translation((-1e6, 0, 0))
+    made.apply_scale(1e20)
+    with pytest.raises(hk.MeshingError, match=r"up to 6.9e\+10.*scale it"):
+        made.export(tmp_path / "a.ply")
+    made.apply_scale(1e-23)
+    made.visual.face_colors = np.arange(len(made.faces))[:, None] % 256 * [1, 0, 0, 0] + [
+        0, 0, 0, 255]  # fmt: skip
+    made.export(tmp_path / "a.ply")
+    read = read_closed(tmp_path / "a.ply")
+    assert read.volume == pytest.approx(2 * math.pi**2 * 0.8 * 0.09e-9, rel=5e-2)
+    assert (read.visual.face_colors == made.visual.face_colors).all()
+    assert "harnack" in made.metadata
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3, 1e10])
+def test_slivers_that_turn_over_in_single_precision_are_left_out(scale: float, tmp_path: Path):
+    """A vertex in the middle of a face, 1e-9 from one of its edges: rounded, it lies beyond it."""
+    x = np.array(_BALL.vertices, np.float64)
+    corner = x[_FACES]
+    rng = np.random.default_rng(1)
+    share = rng.uniform(0.2, 0.8, (len(_FACES), 1))
+    inwards = 1e-9 * (corner.mean(axis=1) - corner[:, 0])
+    new = corner[:, 0] + share * (corner[:, 1] - corner[:, 0]) + inwards
+    n = len(x) + np.arange(len(_FACES))
+    parts = [np.column_stack([_FACES[:, k], _FACES[:, (k + 1) % 3], n]) for k in range(3)]
+    made = ClosedMesh(scale * np.concatenate([x, new]), np.concatenate(parts), process=False)
+    check_apart(np.array(made.vertices), np.array(made.faces))
+    path = tmp_path / "a.stl"
+    made.export(path)
+    assert read_closed(path).volume == pytest.approx(made.volume, rel=1e-5)
 
 
 @pytest.mark.slow

@@ -17,8 +17,9 @@ from harnack.cli import main
 from harnack.geometry import shapes
 from harnack.meshing import checks
 from harnack.meshing.intersections import intersecting_faces
-from harnack.meshing.lattice import Lattice
-from harnack.meshing.printing import thickening
+from harnack.meshing.lattice import Lattice, Surface
+from harnack.meshing.printing import bodies, thickening
+from tests.oracles.mesh_files import read_closed
 
 BOX = hk.Box((-1, -1, -1), (1, 1, 1))
 KNOT = shapes.torus_knot(2, 3, 64)
@@ -300,6 +301,49 @@ def test_the_largest_part_is_kept() -> None:
     assert mesh.volume == pytest.approx(4 / 3 * math.pi * 0.125, rel=1e-2)
 
 
+@pytest.mark.parametrize(
+    ("part", "arguments", "volume"),
+    [
+        (hk.Sphere(1.0) - hk.Sphere(0.5), {}, 4 / 3 * math.pi * (1 - 0.125)),
+        (~hk.Sphere(0.8), {"clip": BOX}, 8 - 4 / 3 * math.pi * 0.512),
+        (hk.Sphere(0.8), {"thickness": 0.2}, 4 / 3 * math.pi * (0.9**3 - 0.7**3)),
+    ],
+    ids=["hollow ball", "box with a hole", "thick sphere"],
+)
+def test_the_largest_part_keeps_its_cavities(part: Any, arguments: Any, volume: float) -> None:
+    mesh = hk.mesh(part, largest=True, tolerance=2e-2, **arguments)
+    assert is_part(mesh)
+    assert mesh.volume == pytest.approx(volume, rel=2e-2)
+
+
+def test_cavities_belong_to_the_innermost_shell_around_them() -> None:
+    """A ball in the cavity of another one has a cavity itself; beside them lies a ball which is
+    smaller than the outer shell and larger than what that bounds."""
+    ball = trimesh.creation.icosphere(2)
+    unit = Surface(np.array(ball.vertices), np.array(ball.faces, np.int64))
+    shells = [(1.0, 0.0, False), (0.8, 0.0, True), (0.6, 0.0, False), (0.2, 0.0, True)]
+
+    def nested(*rows: tuple[float, float, bool]) -> Surface:
+        moved = [r * unit.vertices + np.array([x, 0, 0]) for r, x, _ in rows]
+        faces = [unit.faces[:, ::-1] if inwards else unit.faces for _, _, inwards in rows]
+        n = len(unit.vertices)
+        return Surface(np.concatenate(moved), np.concatenate(
+            [one + k * n for k, one in enumerate(faces)]))  # fmt: skip
+
+    def kept(surface: Surface) -> float:
+        body = bodies.largest_body(surface)
+        return float(trimesh.Trimesh(body.vertices, body.faces, process=False).volume)
+
+    whole = float(ball.volume)
+    assert kept(nested(*shells)) == pytest.approx((1 - 0.8**3) * whole)
+    assert kept(nested(*shells, (0.9, 2.0, False))) == pytest.approx(0.9**3 * whole)
+    assert kept(nested((0.7, 0.0, True), *shells[2:], (0.75, 0.0, False))) == pytest.approx(
+        (0.6**3 - 0.2**3) * whole
+    )
+    with pytest.raises(hk.MeshingError, match="inside out"):
+        kept(nested((1.0, 0.0, True)))
+
+
 class Holed(hk.Shape):
     """A sphere that is no number beside its centre."""
 
@@ -360,10 +404,7 @@ def test_files_of_every_format_are_closed_when_read_again(kind: str, tmp_path: P
     command += ["--box=-.3,-.3,-.3,.3,.3,.3", "-o", str(path)]
     assert main(command) == 0
     assert [one.name for one in tmp_path.iterdir()] == [path.name]
-    again: Any = trimesh.load(path, force="mesh")
-    again.merge_vertices()
-    assert again.is_watertight
-    assert again.volume > 0
+    again = read_closed(path)
     np.testing.assert_allclose(again.bounds, [[-3] * 3, [3] * 3], atol=1e-5)
 
 
@@ -388,6 +429,8 @@ def test_formats_whose_packages_lack_are_refused_early(
         (["--solid", "1:0"], "lower one"),
         (["--ball", "1,2"], "4 numbers"),
         (["--thickness", "0"], "positive"),
+        (["--max-triangles", "1000"], "--max-triangles"),
+        (["--max-triangles", "0"], "--max-triangles must be positive"),
         (["--box=0,0,0,1,1,1", "--ball=0,0,0,1"], "not allowed"),
     ],
 )

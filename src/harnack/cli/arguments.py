@@ -16,6 +16,7 @@ from harnack.cli.messages import printable
 from harnack.enclosures.proofs import BOUNDS
 from harnack.fields.expressions.text import TextFormula
 from harnack.files.surfaces import SURFACE_FILES
+from harnack.meshing.samples import MOST_FACES
 from harnack.opening import UP_AXES
 from harnack.rendering import MATERIALS, SHOW_MODES
 from harnack.rendering.arguments import ANTIALIASING, MAX_SIDE, MAX_SPP
@@ -305,6 +306,11 @@ def _add_mesh(commands: Any) -> None:
         "--simplify", action="store_true", help="fewer triangles of closed parts, as exact"
     )
     one.add_argument("--largest", action="store_true", help="only the largest connected part")
+    one.add_argument(
+        "--max-triangles", type=int, metavar="COUNT",
+        help="of a surface, before anything is simplified: what would take more is not begun or "
+        f"given up ({MOST_FACES:,})",
+    )  # fmt: skip
     one.add_argument(
         "--scale", type=_positive, metavar="FACTOR",
         help="multiply all lengths at the end: millimetres for one unit of the scene (1)",

@@ -242,7 +242,7 @@ def _mesh(options: Any) -> int:
         raise ValueError("-o is empty: name the file to write, such as a.stl")
     target = check_mesh_path(options.output or f"{source.stem or 'surface'}.stl")
     field, settings = _meshed(options, source)
-    for name in ("tolerance", "spacing", "solid", "thickness"):
+    for name in ("tolerance", "spacing", "solid", "thickness", "max_triangles"):
         value = getattr(options, name)
         if value is not None:
             settings[name] = value

@@ -7,11 +7,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from harnack.files.writing import check_writable, write_atomically
-from harnack.meshing.lattice import Surface
-from harnack.meshing.printing.finishing import snapped
 
 if TYPE_CHECKING:
     import trimesh
@@ -50,25 +46,20 @@ def check_mesh_path(path: str | os.PathLike[str]) -> Path:
 def write_mesh(mesh: trimesh.Trimesh, path: str | os.PathLike[str]) -> None:
     """Write a mesh in the format that the name ends in; if that fails no file is left.
 
-    Closed meshes are closed in the file as well: see `snapped`.
+    Closed meshes are closed in the file as well: see `ClosedMesh`.
 
     3MF has millimetres as its unit, which is written there; the other formats have none.
 
     Raises:
         ValueError, ImportError, OSError: as `check_mesh_path`.
-        MeshingError: a closed mesh that is not closed in single precision.
+        MeshingError: as `ClosedMesh.export`.
     """
+    from harnack.meshing.printing.closed_mesh import ClosedMesh  # here: trimesh takes a second
+
     target = check_mesh_path(path)
     kind = target.suffix.lower()[1:]
-    plain = mesh.copy()
-    if plain.is_watertight:
-        closed = snapped(Surface(plain.vertices.view(np.ndarray), plain.faces.view(np.ndarray)))
-        plain = type(mesh)(closed.vertices, closed.faces, process=False, validate=False)
-    # Formats that keep metadata know no arrays.
-    plain.metadata.clear()
+    plain = ClosedMesh.of(mesh)
     if kind == "3mf":
         plain.units = "millimeters"
     with write_atomically(target) as partial:
-        # Decimals of numbers in text: single precision has nine digits.
-        digits = {"digits": 16} if kind == "obj" else {}
-        plain.export(partial, file_type=kind, **digits)
+        plain.export(partial, file_type=kind)

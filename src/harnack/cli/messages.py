@@ -9,6 +9,11 @@ from harnack.rendering import UnboundedSurfaceError
 # Python's arguments as messages write them, and the options they are on the command line.
 _OPTIONS = re.compile(r'\b(as_|normals|show|material|up|of)="([\w-]+)"')
 
+_WORDS = {
+    "boundary=True": "--boundary", "up= ": "--up ", "max_triangles": "--max-triangles",
+    " (apply_translation), or scale it (apply_scale)": ", or scale it (--scale)",
+}  # fmt: skip
+
 
 def error_line(error: Exception) -> str:
     """'error: ...' for an exception, printable and on one line."""
@@ -33,7 +38,9 @@ def _explanation(error: Exception) -> str:
 def in_options(text: str) -> str:
     """A message of the library, with options of the command line for arguments of Python."""
     text = _OPTIONS.sub(lambda found: f"--{found[1].rstrip('_')} {found[2]}", text)
-    return text.replace("boundary=True", "--boundary").replace("up= ", "--up ")
+    for written, option in _WORDS.items():
+        text = text.replace(written, option)
+    return text
 
 
 def level_text(level: float | None) -> str:

@@ -21,11 +21,11 @@ from harnack.meshing.checks import (
     check_near_level,
 )
 from harnack.meshing.lattice import Lattice, Surface, open_surface
+from harnack.meshing.printing.bodies import largest_body, largest_part
 from harnack.meshing.printing.clipping import cut_by
 from harnack.meshing.printing.finishing import (
     check_options,
     finished,
-    largest_part,
     normals_of,
     simplified,
 )
@@ -91,7 +91,8 @@ def mesh(
     thickness: makes a closed part so thick, in the field's unit, of a surface: half on each side.
     simplify: leave out vertices that are not needed within the tolerance, of closed meshes: half of
         the tolerance is for this, half for all else.
-    largest: keep the connected part with the largest area alone.
+    largest: keep one connected part alone: of a surface that with the largest area, of a closed
+        mesh that with the largest volume, whose cavities stay.
     seed: of the small random moves that keep points in general position.
     max_triangles: of one level set, before anything is simplified; what would take more is not
         begun or given up, with a MeshingError. Cells are limited with them, to two millions.
@@ -103,8 +104,9 @@ def mesh(
     that it is made of). Else a MeshingError is raised.
 
     Returns:
-        A trimesh.Trimesh. Vertices of a curve come first, in order, bit by bit, and its edges are
-        the rim. Without a rim, faces are turned outwards: the volume is positive; else they
+        A trimesh.Trimesh; if it is closed, `export` writes closed files, in single precision, or
+        raises a MeshingError. Vertices of a curve come first, in order, bit by bit, and its edges
+        are the rim. Without a rim, faces are turned outwards: the volume is positive; else they
         are turned towards larger values. `metadata["harnack"]` has level, spacing, evaluations,
         the Euler characteristic,
         boundary: indices (k, 2) of edges of one face,
@@ -159,8 +161,8 @@ def mesh(
                 made, normals_of(field, level, made), float(thickness), 0.5 * share * size
             )
             facts |= more
-    if largest:
-        made = largest_part(made)
+    if largest and is_closed:
+        made = largest_body(made)
     if simplify:
         report("simplifying")
         made, more = simplified(made, 0.5 * share * size)

@@ -443,11 +443,11 @@ def _joined(
     vertices: FloatArray, faces: IntArray, patches: _Patches, given: int
 ) -> trimesh.Trimesh:
     """The mesh and its patches. given: how many of the faces were there before."""
-    import trimesh
+    from harnack.meshing.printing.closed_mesh import ClosedMesh  # here: trimesh takes a second
 
     edges = _open_edges(faces[:given])
     together = np.concatenate([faces, patches.faces])
-    result = trimesh.Trimesh(
+    result = ClosedMesh(
         np.concatenate([vertices, patches.vertices]), together, process=False, validate=False
     )
     result.metadata["harnack"] = {

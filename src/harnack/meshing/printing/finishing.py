@@ -1,22 +1,19 @@
-"""The last steps of a mesh: its largest part, fewer triangles, what is said of it."""
+"""The last steps of a mesh: fewer triangles, what is said of it."""
 
 from __future__ import annotations
 
 import math
 import operator
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from harnack.backend import FloatArray
 from harnack.meshing.checks import (
     MeshingError,
-    check_apart,
-    check_manifold,
     euler_characteristic,
 )
 from harnack.meshing.edges import Edges, IntArray, boundary_edges, directed_edges
-from harnack.meshing.intersections import intersecting_faces
 from harnack.meshing.lattice import Surface
 from harnack.meshing.printing.manifolds import manifold_of, surface_of
 from harnack.meshing.rows import dots, lengths
@@ -27,7 +24,7 @@ if TYPE_CHECKING:
 
     from harnack.fields import Field
 
-__all__ = ["check_options", "finished", "largest_part", "normals_of", "simplified", "snapped"]
+__all__ = ["check_options", "finished", "normals_of", "simplified"]
 
 # The cosine of the angle between normals from which on an edge is a crease.
 _CREASE = math.cos(math.radians(30))
@@ -75,22 +72,6 @@ def normals_of(field: Field, level: float, surface: Surface) -> FloatArray:
     return chosen
 
 
-def largest_part(surface: Surface) -> Surface:
-    """The connected part with the largest area."""
-    import scipy.sparse  # here: half a second that few need
-    import scipy.sparse.csgraph as csgraph_module
-
-    sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
-    faces, n = surface.faces, len(surface.vertices)
-    rows, columns = np.concatenate([faces[:, :2], faces[:, 1:]]).T
-    joined = sparse.coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(n, n))
-    part = np.asarray(csgraph.connected_components(joined, directed=False)[1])[faces[:, 0]]
-    corner = surface.vertices[faces]
-    cross = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    areas = np.bincount(part, np.linalg.norm(cross, axis=1))
-    return Surface.of(surface.vertices, faces[part == areas.argmax()])
-
-
 def simplified(surface: Surface, tolerance: float) -> tuple[Surface, dict[str, Any]]:
     """A closed surface with fewer triangles, all within `tolerance` of where they were.
 
@@ -105,32 +86,6 @@ def simplified(surface: Surface, tolerance: float) -> tuple[Surface, dict[str, A
     return made, {"triangles_before_simplification": len(surface.faces)}
 
 
-def snapped(surface: Surface) -> Surface:
-    """A closed surface with vertices in single precision, which is what files hold. Edges whose
-    ends are then one point are contracted.
-
-    Raises:
-        MeshingError: sheets touch, or triangles pass through each other, in single precision.
-    """
-    x = surface.vertices.astype(np.float32).astype(np.float64)
-    _, first, place = np.unique(x, axis=0, return_index=True, return_inverse=True)
-    faces = first[place.reshape(-1)][surface.faces]
-    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
-    made = Surface.of(x, faces)
-    try:
-        if len(first) < len(x):
-            check_manifold(made.faces)
-        # What is repaired may have passed through itself before.
-        if not len(intersecting_faces(surface.vertices, surface.faces)):
-            check_apart(made.vertices, made.faces)
-    except MeshingError as error:
-        raise MeshingError(
-            f"in single precision, which is what files hold, {error}; or move it nearer to the "
-            "origin"
-        ) from error
-    return made
-
-
 def finished(surface: Surface, facts: dict[str, Any], is_closed: bool) -> trimesh.Trimesh:
     """The mesh, which is a manifold (`check_manifold`), with what is known of it in its metadata.
     Without a rim it is turned so that its volume is positive.
@@ -138,9 +93,9 @@ def finished(surface: Surface, facts: dict[str, Any], is_closed: bool) -> trimes
     Raises:
         MeshingError: it ought to be closed and to have a positive volume, and is not.
     """
-    import trimesh
+    from harnack.meshing.printing.closed_mesh import ClosedMesh  # here: trimesh takes a second
 
-    made = trimesh.Trimesh(surface.vertices, surface.faces, process=False, validate=False)
+    made = ClosedMesh(surface.vertices, surface.faces, process=False, validate=False)
     boundary = boundary_edges(surface.faces)
     if is_closed:
         volume = float(made.volume)
