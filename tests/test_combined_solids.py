@@ -349,3 +349,17 @@ def test_numbers_of_numpy_are_numbers() -> None:
         assert hits.t == hk.trace(ball, *ray, overstep=float(overstep)).t
     with pytest.raises(ValueError, match="finite numbers"):
         hk.Sphere(1).tapered(("a", 1), (2, 0.5))  # type: ignore[arg-type]
+
+
+def test_a_ray_through_a_crease_is_a_hit_where_its_gradients_say_how_near_the_surface_is() -> None:
+    """A path of the gallery's `carved` was out of steps: in a crease, where the gradient is a range
+    as long as its middle, rounding was larger than what was left of the gap."""
+    carved = (hk.Sphere(1.0) - hk.Torus(0.85, 0.28)).twisted(1.5, "x")
+    carved = carved.blended(hk.Torus(1.15, 0.12), 0.15)
+    foot = np.array([0.34748355, -0.65605646, -0.66996707])
+    rng = np.random.default_rng(0)
+    d = np.array([0.0982, 0.9464, 0.3076]) + 0.02 * rng.normal(size=(5000, 3))
+    d /= np.linalg.norm(d, axis=1)[:, None]
+    o = foot + 3e-6 * rng.normal(size=(5000, 3)) - 2.148 * d
+    found = hk.trace(carved, o, d, tolerance=2e-4)
+    assert found.hit.all()

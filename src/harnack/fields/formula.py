@@ -98,7 +98,9 @@ class Formula(Field):
 
     def sample_alone(self, p: Vec3) -> Sample:
         """Value and gradient, without promises that a look along a path has no use for."""
-        jet = self._jet(Jet.at_point(p), p.x)
+        return self._sample_of(self._jet(Jet.at_point(p), p.x), p)
+
+    def _sample_of(self, jet: Jet, p: Vec3) -> Sample:
         zero = 0 * p.x
         gradient = type(p)(*(zero + one.middle for one in jet.first))
         doubt = zero
@@ -140,7 +142,8 @@ class Formula(Field):
         """The sample, and the enclosures that its ranges prove; looking back nothing is proved."""
         del back
         p = path.point(t)
-        sample = self.sample_alone(p)
+        jet = self._jet(Jet.at_point(p), p.x)
+        sample = self._sample_of(jet, p)
         slope, slope_error = self._slope(p, path.direction)
         slopes = Slopes.around(slope, slope_error)
         function = self.restricted(p, path.direction)
@@ -150,7 +153,8 @@ class Formula(Field):
         growth = max(one.growth for one in enclosures)
         if self.is_convex and Tangent in path.proofs.kinds:
             enclosures = (*enclosures, Tangent(slopes))
-        return Look(sample, enclosures, (), slope, growth, slope_error)
+        least = dr.norm(type(p)(*(0 * p.x + one.smallest for one in jet.first)))
+        return Look(sample, enclosures, (), slope, growth, slope_error, least)
 
     def _slope(self, p: Vec3, direction: Vec3) -> tuple[Real, Real]:
         """The derivative along a direction, and how far off it may be: in a crease, where the

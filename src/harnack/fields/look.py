@@ -105,6 +105,8 @@ class Look:
     slope_error: how far off `slope` may be, where that is known to be less than
         `Sample.gradient_error`: on a crease the gradient is a range, and the derivative along a ray
         that runs in the crease may still be a number. None where nothing better is known.
+    least_gradient: a length that |grad f| is known to have at least, where that may be more than
+        `Sample.gradient_error` leaves of it, as on a crease; None where nothing better is known.
     """
 
     sample: Sample
@@ -113,6 +115,7 @@ class Look:
     slope: Real
     growth: float = 2.0
     slope_error: Real | None = None
+    least_gradient: Real | None = None
 
     @property
     def slope_doubt(self) -> Real:

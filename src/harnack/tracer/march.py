@@ -221,6 +221,8 @@ class March:
         steepness = fmax(gradient_norm - sample.gradient_error, real(0))
         if look.slope_error is not None:  # the gradient is at least as long as its shadow
             steepness = fmax(dr.abs(look.slope) - look.slope_error, steepness)
+        if look.least_gradient is not None:
+            steepness = fmax(look.least_gradient, steepness)
         within = self.tolerance.in_value(steepness, t)
         knows_gradient = (sample.gradient_error <= gradient_norm) | (steepness > 0)
         if self.hysteresis is not None:
