@@ -142,6 +142,68 @@ def test_slivers_that_turn_over_in_single_precision_are_left_out(scale: float, t
     assert read_closed(path).volume == pytest.approx(made.volume, rel=1e-5)
 
 
+_GYROID = hk.Gyroid(5.0)
+_WALLS = hk.solid(_GYROID, between=(-0.3, 0.3))
+
+
+def test_solids_know_the_waves_they_are_made_of():
+    wave = 5 / math.sqrt(2)  # sin x cos y is two waves along diagonals
+    below = hk.solid(_GYROID, below=0.0)
+    for part, expected in [
+        (_GYROID, wave),
+        (hk.SchwarzP(5.0), 5.0),
+        (_WALLS, wave),
+        (~_WALLS, wave),
+        (_WALLS.grown(0.1), wave),
+        (_WALLS.moved((1, 2, 3)).rotated(30, "x").scaled((1.0, 2.0, 0.5)), 0.5 * wave),
+        (_WALLS & hk.Sphere(1.0) | hk.solid(hk.SchwarzP(2.0), below=0.0), 2.0),
+        (below.twisted(0.1), wave),
+        (below.tapered((0, 1.0), (1, 0.5)), 0.5 * wave),
+        (below.blended(hk.Sphere(1.0), 0.1), wave),
+        (hk.EigenfunctionSum([hk.PlaneWave(1.0, (1, 0, 0)), hk.PlaneWave(1e-9, (90, 0, 0))]),
+         2 * math.pi),
+        (hk.FourierSeries(np.eye(4)[3].reshape(4, 1, 1), hk.Box((0, 0, 0), (3, 1, 1))), 2.0),
+    ]:  # fmt: skip
+        assert part.wavelength == pytest.approx(expected, rel=1e-5)
+    assert (hk.Sphere(1.0) | hk.Torus(0.8, 0.3)).wavelength is None
+
+
+def _volume(part: hk.Solid, half: tuple[float, float, float], step: float) -> float:
+    """By the middles of cells within a box."""
+    axes = [np.arange(-h + 0.5 * step, h, step) for h in half]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    return float((part.value(points) < 0).sum()) * step**3
+
+
+@pytest.mark.parametrize(
+    ("part", "half", "bodies"),
+    [
+        (hk.solid(hk.SchwarzP(1.0), between=(-0.3, 0.3)) & hk.Cylinder(0.6, 6.0),
+         (0.6, 0.6, 6.0), 1),
+        (_WALLS.scaled(0.1) & hk.Cylinder(0.3, 3.0), (0.3, 0.3, 3.0), 1),
+        pytest.param(_WALLS & hk.Cylinder(20.0, 20.0), (20.0,) * 3, None, marks=pytest.mark.slow),
+    ],
+    ids=["Schwarz P", "gyroid", "gyroid of 40 mm"],
+)  # fmt: skip
+def test_cells_are_as_small_as_a_lattice_needs(
+    part: hk.Solid, half: tuple[float, float, float], bodies: int | None
+):
+    """A 24th of these parts is a third of a cell or half of it, where walls are missed, or found
+    in pieces, the wrong volume and all."""
+    made = hk.mesh(part, tolerance=4e-3)
+    assert made.is_watertight
+    assert made.metadata["harnack"]["spacing"] < part.wavelength / 4.999
+    assert made.volume == pytest.approx(_volume(part, half, half[2] / 150), rel=2e-2)
+    assert bodies is None or made.body_count == bodies
+
+
+def test_a_spacing_that_is_asked_for_is_not_changed_for_waves():
+    part = hk.solid(hk.SchwarzP(1.0), below=0.0) & hk.Cuboid((0.3, 0.3, 3.0))
+    assert hk.mesh(part, spacing=0.25, tolerance=2e-2).metadata["harnack"]["spacing"] == 0.25
+    with pytest.raises(TooLargeError, match="max_triangles"):
+        hk.mesh(part, tolerance=2e-2, max_triangles=500)
+
+
 @pytest.mark.slow
 def test_a_cloud_by_dipoles_is_right_or_raises():
     points, index = trimesh.sample.sample_surface(_BALL, 300, seed=1)

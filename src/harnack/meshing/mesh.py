@@ -32,7 +32,7 @@ from harnack.meshing.printing.finishing import (
 from harnack.meshing.printing.regions import Sheet
 from harnack.meshing.printing.solids import mesh_solid, region_of
 from harnack.meshing.printing.thickening import thickened
-from harnack.meshing.samples import MOST_FACES, LevelFunction
+from harnack.meshing.samples import CELLS_PER_WAVE, MOST_FACES, LevelFunction
 from harnack.meshing.spanned import spanned_surface
 
 if TYPE_CHECKING:
@@ -79,7 +79,8 @@ def mesh(
     level: None for the field's default.
     tolerance: how far triangles may be from the surface, as a part of the size of the level set's
         box (its longest side), sampled and not proved.
-    spacing: of cells before anything is refined, in the field's unit; None chooses. Sheets that are
+    spacing: of cells before anything is refined, in the field's unit; None chooses a 24th of the
+        longest side, and of waves (`Field.wavelength`) a fifth of theirs at the most. Sheets that are
         nearer to each other are told apart where that is noticed; else a MeshingError says so.
     clip: a volume, needed where the level set has no extent. The surface ends at its boundary; a
         solid is closed there. None for the field's domain.
@@ -261,6 +262,8 @@ def _surface(
     box = _box(field, level, volume)
     size = float((box.upper - box.lower).max())
     cells = size / _ACROSS if spacing is None else float(spacing)
+    if spacing is None and field.wavelength is not None:
+        cells = min(cells, field.wavelength / CELLS_PER_WAVE)
     attempts = 1 if spacing is not None else _MOST_ATTEMPTS
     if isinstance(field, SolidAngle):
         made, facts = _spanned(field, level, box, 0.5 * tolerance * size, cells, attempts, seed,

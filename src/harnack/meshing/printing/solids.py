@@ -17,6 +17,7 @@ from harnack.meshing.checks import MeshingError
 from harnack.meshing.lattice import MissedError, Surface
 from harnack.meshing.printing.manifolds import surface_of, volume_manifold
 from harnack.meshing.printing.regions import RegionMesher, Sheet, is_smooth
+from harnack.meshing.samples import CELLS_PER_WAVE
 
 __all__ = ["SolidMesh", "mesh_solid", "region_of"]
 
@@ -97,8 +98,11 @@ def mesh_solid(
     cells = size / _ACROSS if spacing is None else spacing
     error = 0.5 * tolerance * size
     attempts = _MOST_ATTEMPTS if spacing is None else 1
+    per_wave = CELLS_PER_WAVE if spacing is None else None
     while True:
-        mesher = RegionMesher(lower, upper, error, cells, sheets(error, cells), most_faces, report)
+        mesher = RegionMesher(
+            lower, upper, error, cells, per_wave, sheets(error, cells), most_faces, report
+        )
         try:
             made = _put_together(mesher, solid, level, volume)
             break
@@ -107,10 +111,11 @@ def mesh_solid(
             if not attempts:
                 raise
             cells *= _SMALLER
+            per_wave = CELLS_PER_WAVE / _SMALLER
             report(f"parts were missed: cells of {cells:.3g}")
     if not len(made.faces):
         raise MeshingError("the solid is empty: no point of the box is inside")
-    return SolidMesh(made, cells, mesher.evaluations, mesher.levels, size)
+    return SolidMesh(made, min(cells, mesher.finest), mesher.evaluations, mesher.levels, size)
 
 
 def _put_together(
