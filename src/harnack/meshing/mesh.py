@@ -80,8 +80,8 @@ def mesh(
     tolerance: how far triangles may be from the surface, as a part of the size of the level set's
         box (its longest side), sampled and not proved.
     spacing: of cells before anything is refined, in the field's unit; None chooses a 24th of the
-        longest side, and of waves (`Field.wavelength`) a fifth of theirs at the most. Sheets that are
-        nearer to each other are told apart where that is noticed; else a MeshingError says so.
+        longest side, and of waves (`Field.wavelength`) a fifth of theirs at the most. Sheets that
+        are nearer to each other are told apart where that is noticed; else a MeshingError says so.
     clip: a volume, needed where the level set has no extent. The surface ends at its boundary; a
         solid is closed there. None for the field's domain.
     section: another one, such as a `HalfSpace`, besides the clip or the domain.
