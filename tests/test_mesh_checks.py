@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,9 @@ from harnack.meshing.checks import (
     check_inside,
     check_near_level,
 )
+from harnack.meshing.lattice import Surface
 from harnack.meshing.printing.closed_mesh import ClosedMesh
+from harnack.meshing.printing.finishing import simplified
 from harnack.meshing.samples import LevelFunction
 from tests.oracles.mesh_files import read_closed
 
@@ -140,6 +143,38 @@ def test_slivers_that_turn_over_in_single_precision_are_left_out(scale: float, t
     path = tmp_path / "a.stl"
     made.export(path)
     assert read_closed(path).volume == pytest.approx(made.volume, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("field", "settings"),
+    [
+        (hk.Gyroid(1.0), {"solid": (-0.3, 0.3), "clip": hk.Box((-0.3,) * 3, (0.3,) * 3)}),
+        (_CARVED, {}),
+    ],
+    ids=["walls", "carved"],
+)
+def test_simplified_meshes_have_no_more_triangles_than_without(
+    field: hk.Field, settings: dict[str, Any]
+):
+    """They were made within half of the tolerance first, which took more than was left out."""
+    plain = hk.mesh(field, tolerance=8e-3, **settings)
+    fewer = hk.mesh(field, tolerance=8e-3, simplify=True, **settings)
+    assert fewer.is_watertight
+    facts = fewer.metadata["harnack"]
+    assert facts["triangles_before_simplification"] == len(plain.faces)
+    most = len(plain.faces) if "solid" in settings else 0.8 * len(plain.faces)
+    assert len(fewer.faces) <= most
+    assert fewer.volume == pytest.approx(plain.volume, rel=2e-2)
+
+
+def test_simplification_keeps_what_no_simpler_mesh_passes_the_check_for():
+    ball = Surface(np.array(_BALL.vertices), _FACES)
+
+    def never(surface: Surface) -> None:
+        raise MeshingError("no")
+
+    assert simplified(ball, 0.1, never)[0] is ball
+    assert len(simplified(ball, 0.1, lambda surface: None)[0].faces) < len(_FACES)
 
 
 _GYROID = hk.Gyroid(5.0)

@@ -90,8 +90,8 @@ def mesh(
         between the two levels. None is True for a `Solid`, whose inside is f <= level; False for
         its surface alone, open where it is cut.
     thickness: makes a closed part so thick, in the field's unit, of a surface: half on each side.
-    simplify: leave out vertices that are not needed within the tolerance, of closed meshes: half of
-        the tolerance is for this, half for all else.
+    simplify: leave out vertices that are not needed within the tolerance, of closed meshes: of the
+        mesh that is made without it, whose middles of edges are within half of the tolerance.
     largest: keep one connected part alone: of a surface that with the largest area, of a closed
         mesh that with the largest volume, whose cavities stay.
     seed: of the small random moves that keep points in general position.
@@ -140,18 +140,17 @@ def mesh(
     is_closed = bool(solid) or thickness is not None
     if simplify and not is_closed:
         raise ValueError("simplify is for closed meshes: give solid or thickness as well")
-    share = 0.5 * tolerance if simplify else tolerance
     facts: dict[str, Any]
     volume = _volume(field, clip, section)
     region = None
     if solid:
         region = region_of(field, solid, level)
-        made, size, facts = _solid(*region, volume, share, spacing, seed, max_triangles, report)
+        made, size, facts = _solid(*region, volume, tolerance, spacing, seed, max_triangles, report)
         facts["solid"] = solid
     else:
         level = field.default_level if level is None else float(level)
         made, size, facts = _surface(
-            field, level, volume, share, spacing, seed, max_triangles, report
+            field, level, volume, tolerance, spacing, seed, max_triangles, report
         )
         if largest:
             made = largest_part(made)
@@ -159,20 +158,24 @@ def mesh(
         if thickness is not None:
             report("thickening")
             made, more = thickened(
-                made, normals_of(field, level, made), float(thickness), 0.5 * share * size
+                made, normals_of(field, level, made), float(thickness), 0.5 * tolerance * size
             )
             facts |= more
     if largest and is_closed:
         made = largest_body(made)
+
+    def check(one: Surface) -> None:
+        if region is not None:
+            _check_level(LevelFunction(*region), one, tolerance * size, volume)
+        check_manifold(one.faces)
+        check_apart(one.vertices, one.faces)
+
+    report("checking")
+    check(made)
     if simplify:
         report("simplifying")
-        made, more = simplified(made, 0.5 * share * size)
+        made, more = simplified(made, tolerance * size, check)
         facts |= more
-    report("checking")
-    if region is not None:
-        _check_level(LevelFunction(*region), made, tolerance * size, volume)
-    check_manifold(made.faces)
-    check_apart(made.vertices, made.faces)
     return finished(made, facts, is_closed)
 
 
