@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,9 @@ from harnack.meshing.checks import (
     check_inside,
     check_near_level,
 )
+from harnack.meshing.lattice import Surface
 from harnack.meshing.printing.closed_mesh import ClosedMesh
+from harnack.meshing.printing.finishing import simplified
 from harnack.meshing.samples import LevelFunction
 from tests.oracles.mesh_files import read_closed
 
@@ -140,6 +143,102 @@ def test_slivers_that_turn_over_in_single_precision_are_left_out(scale: float, t
     path = tmp_path / "a.stl"
     made.export(path)
     assert read_closed(path).volume == pytest.approx(made.volume, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("field", "settings"),
+    [
+        (hk.Gyroid(1.0), {"solid": (-0.3, 0.3), "clip": hk.Box((-0.3,) * 3, (0.3,) * 3)}),
+        (_CARVED, {}),
+    ],
+    ids=["walls", "carved"],
+)
+def test_simplified_meshes_have_no_more_triangles_than_without(
+    field: hk.Field, settings: dict[str, Any]
+):
+    """They were made within half of the tolerance first, which took more than was left out."""
+    plain = hk.mesh(field, tolerance=8e-3, **settings)
+    fewer = hk.mesh(field, tolerance=8e-3, simplify=True, **settings)
+    assert fewer.is_watertight
+    facts = fewer.metadata["harnack"]
+    assert facts["triangles_before_simplification"] == len(plain.faces)
+    most = len(plain.faces) if "solid" in settings else 0.8 * len(plain.faces)
+    assert len(fewer.faces) <= most
+    assert fewer.volume == pytest.approx(plain.volume, rel=2e-2)
+
+
+def test_simplification_keeps_what_no_simpler_mesh_passes_the_check_for():
+    ball = Surface(np.array(_BALL.vertices), _FACES)
+
+    def never(surface: Surface) -> None:
+        raise MeshingError("no")
+
+    assert simplified(ball, 0.1, never)[0] is ball
+    assert len(simplified(ball, 0.1, lambda surface: None)[0].faces) < len(_FACES)
+
+
+_GYROID = hk.Gyroid(5.0)
+_WALLS = hk.solid(_GYROID, between=(-0.3, 0.3))
+
+
+def test_solids_know_the_waves_they_are_made_of():
+    wave = 5 / math.sqrt(2)  # sin x cos y is two waves along diagonals
+    below = hk.solid(_GYROID, below=0.0)
+    for part, expected in [
+        (_GYROID, wave),
+        (hk.SchwarzP(5.0), 5.0),
+        (_WALLS, wave),
+        (~_WALLS, wave),
+        (_WALLS.grown(0.1), wave),
+        (_WALLS.moved((1, 2, 3)).rotated(30, "x").scaled((1.0, 2.0, 0.5)), 0.5 * wave),
+        (_WALLS & hk.Sphere(1.0) | hk.solid(hk.SchwarzP(2.0), below=0.0), 2.0),
+        (below.twisted(0.1), wave),
+        (below.tapered((0, 1.0), (1, 0.5)), 0.5 * wave),
+        (below.blended(hk.Sphere(1.0), 0.1), wave),
+        (hk.EigenfunctionSum([hk.PlaneWave(1.0, (1, 0, 0)), hk.PlaneWave(1e-9, (90, 0, 0))]),
+         2 * math.pi),
+        (hk.FourierSeries(np.eye(4)[3].reshape(4, 1, 1), hk.Box((0, 0, 0), (3, 1, 1))), 2.0),
+    ]:  # fmt: skip
+        assert part.wavelength == pytest.approx(expected, rel=1e-5)
+    assert (hk.Sphere(1.0) | hk.Torus(0.8, 0.3)).wavelength is None
+
+
+def _volume(part: hk.Solid, half: tuple[float, float, float], step: float) -> float:
+    """By the middles of cells within a box."""
+    axes = [np.arange(-h + 0.5 * step, h, step) for h in half]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    return float((part.value(points) < 0).sum()) * step**3
+
+
+@pytest.mark.parametrize(
+    ("part", "half", "bodies"),
+    [
+        (hk.solid(hk.SchwarzP(1.0), between=(-0.3, 0.3)) & hk.Cylinder(0.6, 6.0),
+         (0.6, 0.6, 6.0), 1),
+        (_WALLS.scaled(0.1) & hk.Cylinder(0.3, 3.0), (0.3, 0.3, 3.0), 1),
+        pytest.param(_WALLS & hk.Cylinder(20.0, 20.0), (20.0,) * 3, None, marks=pytest.mark.slow),
+    ],
+    ids=["Schwarz P", "gyroid", "gyroid of 40 mm"],
+)  # fmt: skip
+def test_cells_are_as_small_as_a_lattice_needs(
+    part: hk.Solid, half: tuple[float, float, float], bodies: int | None
+):
+    """A 24th of these parts is a third of a cell or half of it, where walls are missed, or found
+    in pieces, the wrong volume and all."""
+    made = hk.mesh(part, tolerance=2e-3 if bodies else 4e-3)
+    assert made.is_watertight
+    assert made.metadata["harnack"]["spacing"] < part.wavelength / 4.999
+    assert made.volume == pytest.approx(
+        _volume(part, half, half[2] / (400 if bodies else 150)), rel=2e-2
+    )
+    assert bodies is None or made.body_count == bodies
+
+
+def test_a_spacing_that_is_asked_for_is_not_changed_for_waves():
+    part = hk.solid(hk.SchwarzP(1.0), below=0.0) & hk.Cuboid((0.3, 0.3, 3.0))
+    assert hk.mesh(part, spacing=0.25, tolerance=2e-2).metadata["harnack"]["spacing"] == 0.25
+    with pytest.raises(TooLargeError, match="max_triangles"):
+        hk.mesh(part, tolerance=2e-2, max_triangles=500)
 
 
 @pytest.mark.slow

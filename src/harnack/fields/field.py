@@ -161,6 +161,10 @@ class Field(abc.ABC):
     """Whether f, and what it promises, is right in all of space, so that `domain` is only where it
     is drawn."""
 
+    wavelength: float | None = None
+    """Of waves, the shortest length in which they repeat that matters, where it is known: what
+    samples f in cells makes them smaller."""
+
     has_sheets: bool = False
     """Whether f jumps across sheets (see `harnack.fields.sheets`). Then `next_crossing` and
     `between` are needed, and what `evaluate` promises is about f with the jumps taken out."""

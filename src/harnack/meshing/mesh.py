@@ -32,7 +32,7 @@ from harnack.meshing.printing.finishing import (
 from harnack.meshing.printing.regions import Sheet
 from harnack.meshing.printing.solids import mesh_solid, region_of
 from harnack.meshing.printing.thickening import thickened
-from harnack.meshing.samples import MOST_FACES, LevelFunction
+from harnack.meshing.samples import CELLS_PER_WAVE, MOST_FACES, LevelFunction
 from harnack.meshing.spanned import spanned_surface
 
 if TYPE_CHECKING:
@@ -79,8 +79,9 @@ def mesh(
     level: None for the field's default.
     tolerance: how far triangles may be from the surface, as a part of the size of the level set's
         box (its longest side), sampled and not proved.
-    spacing: of cells before anything is refined, in the field's unit; None chooses. Sheets that are
-        nearer to each other are told apart where that is noticed; else a MeshingError says so.
+    spacing: of cells before anything is refined, in the field's unit; None chooses a 24th of the
+        longest side, and of waves (`Field.wavelength`) a fifth of theirs at the most. Sheets that
+        are nearer to each other are told apart where that is noticed; else a MeshingError says so.
     clip: a volume, needed where the level set has no extent. The surface ends at its boundary; a
         solid is closed there. None for the field's domain.
     section: another one, such as a `HalfSpace`, besides the clip or the domain.
@@ -89,8 +90,8 @@ def mesh(
         between the two levels. None is True for a `Solid`, whose inside is f <= level; False for
         its surface alone, open where it is cut.
     thickness: makes a closed part so thick, in the field's unit, of a surface: half on each side.
-    simplify: leave out vertices that are not needed within the tolerance, of closed meshes: half of
-        the tolerance is for this, half for all else.
+    simplify: leave out vertices that are not needed within the tolerance, of closed meshes: of the
+        mesh that is made without it, whose middles of edges are within half of the tolerance.
     largest: keep one connected part alone: of a surface that with the largest area, of a closed
         mesh that with the largest volume, whose cavities stay.
     seed: of the small random moves that keep points in general position.
@@ -139,18 +140,17 @@ def mesh(
     is_closed = bool(solid) or thickness is not None
     if simplify and not is_closed:
         raise ValueError("simplify is for closed meshes: give solid or thickness as well")
-    share = 0.5 * tolerance if simplify else tolerance
     facts: dict[str, Any]
     volume = _volume(field, clip, section)
     region = None
     if solid:
         region = region_of(field, solid, level)
-        made, size, facts = _solid(*region, volume, share, spacing, seed, max_triangles, report)
+        made, size, facts = _solid(*region, volume, tolerance, spacing, seed, max_triangles, report)
         facts["solid"] = solid
     else:
         level = field.default_level if level is None else float(level)
         made, size, facts = _surface(
-            field, level, volume, share, spacing, seed, max_triangles, report
+            field, level, volume, tolerance, spacing, seed, max_triangles, report
         )
         if largest:
             made = largest_part(made)
@@ -158,20 +158,24 @@ def mesh(
         if thickness is not None:
             report("thickening")
             made, more = thickened(
-                made, normals_of(field, level, made), float(thickness), 0.5 * share * size
+                made, normals_of(field, level, made), float(thickness), 0.5 * tolerance * size
             )
             facts |= more
     if largest and is_closed:
         made = largest_body(made)
+
+    def check(one: Surface) -> None:
+        if region is not None:
+            _check_level(LevelFunction(*region), one, tolerance * size, volume)
+        check_manifold(one.faces)
+        check_apart(one.vertices, one.faces)
+
+    report("checking")
+    check(made)
     if simplify:
         report("simplifying")
-        made, more = simplified(made, 0.5 * share * size)
+        made, more = simplified(made, tolerance * size, check)
         facts |= more
-    report("checking")
-    if region is not None:
-        _check_level(LevelFunction(*region), made, tolerance * size, volume)
-    check_manifold(made.faces)
-    check_apart(made.vertices, made.faces)
     return finished(made, facts, is_closed)
 
 
@@ -261,6 +265,8 @@ def _surface(
     box = _box(field, level, volume)
     size = float((box.upper - box.lower).max())
     cells = size / _ACROSS if spacing is None else float(spacing)
+    if spacing is None and field.wavelength is not None:
+        cells = min(cells, field.wavelength / CELLS_PER_WAVE)
     attempts = 1 if spacing is not None else _MOST_ATTEMPTS
     if isinstance(field, SolidAngle):
         made, facts = _spanned(field, level, box, 0.5 * tolerance * size, cells, attempts, seed,

@@ -21,10 +21,13 @@ if TYPE_CHECKING:
     from harnack.backend import Real, Vec3
     from harnack.fields import Field
 
-__all__ = ["MOST_FACES", "LevelFunction", "Samples"]
+__all__ = ["CELLS_PER_WAVE", "MOST_FACES", "LevelFunction", "Samples"]
 
 MOST_FACES = 2_000_000
 """Triangles of a level set, unless a person chooses otherwise."""
+
+CELLS_PER_WAVE = 5.0
+"""Cells along a wave (`Field.wavelength`), at the least, if nothing is asked for."""
 
 _PROOFS = choose_proofs("curvature")
 

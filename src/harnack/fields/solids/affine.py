@@ -188,6 +188,8 @@ class AffineImage(Derived):
         inner = self.inner.lipschitz
         lipschitz = None if inner is None else inner * numbers.stretch * numbers.factor
         object.__setattr__(self, "lipschitz", lipschitz)
+        own = self.inner.wavelength
+        object.__setattr__(self, "wavelength", None if own is None else own / numbers.stretch)
 
     @property
     def numbers(self) -> _AffineNumbers:

@@ -37,6 +37,12 @@ class Bend(Map):
         solid.formula(*probe())  # says early what has no formula
         return Bent(solid, self)
 
+    @property
+    def least(self) -> float:
+        """What lengths are multiplied by at the least, where that is not 1 or left to the place: a
+        twist presses waves together the more the farther from its axis."""
+        return 1.0
+
     @abc.abstractmethod
     def local(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
         """The point that is mapped to (x, y, z)."""
@@ -69,6 +75,8 @@ class Bent(Shape):
         if self.inner.domain is not None:
             domain = self.map.volume(self.inner.domain)
             object.__setattr__(self, "domain", domain)
+        waves = self.inner.wavelength
+        object.__setattr__(self, "wavelength", None if waves is None else waves * self.map.least)
 
     def promises(self, p: Vec3) -> tuple[Promise, ...]:
         """The Lipschitz constant of the solid times that of the map as far as a little away."""
@@ -164,6 +172,10 @@ class Taper(Bend):
             raise ValueError(f"scales must be positive, not {self.start[1]}, {self.end[1]}")
         for name in ("start", "end"):
             object.__setattr__(self, name, tuple(float(one) for one in getattr(self, name)))
+
+    @property
+    def least(self) -> float:
+        return min(1.0, self.start[1], self.end[1])
 
     def local(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
         u, v, w = _turned((x, y, z), self.axis)

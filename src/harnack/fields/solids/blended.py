@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from harnack.arithmetic.blends import blend_intersection, blend_union
 from harnack.fields.formula import as_data, probe
-from harnack.fields.solids.combined import union
+from harnack.fields.solids.combined import shortest_wave, union
 from harnack.fields.solids.solid import Shape, Solid, not_a_solid
 
 if TYPE_CHECKING:
@@ -47,6 +47,7 @@ class Blend(Shape):
         known = all(one is not None for one in constants)
         lipschitz = 2 ** (1 / self.power) * max(constants) * (1 + 1e-6) if known else None
         object.__setattr__(self, "lipschitz", lipschitz)
+        object.__setattr__(self, "wavelength", shortest_wave(self.parts))
         object.__setattr__(self, "domain", union(*self.parts).domain)
 
     def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -83,6 +83,7 @@ class Combined(Solid):
         object.__setattr__(self, "coarsest_detail", coarsest)
         # A part that proves nothing looking back would refuse all longer steps.
         object.__setattr__(self, "overstep", min(one.overstep for one in self.parts))
+        object.__setattr__(self, "wavelength", shortest_wave(self.parts))
         constants = [one.lipschitz for one in self.parts]
         known = all(one is not None for one in constants)
         object.__setattr__(self, "lipschitz", max(constants) if known else None)
@@ -232,6 +233,11 @@ class Combined(Solid):
             constant = fmax(0 * sample.value + own.constant, constant)
             radius = fmin(0 * sample.value + own.radius, radius)
         return (Lipschitz(constant, radius),)
+
+
+def shortest_wave(parts: Iterable[Solid]) -> float | None:
+    """The least `Field.wavelength` of several."""
+    return min((one.wavelength for one in parts if one.wavelength is not None), default=None)
 
 
 def lipschitz_of(sample: Sample) -> Lipschitz | None:

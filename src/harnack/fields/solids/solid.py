@@ -209,7 +209,7 @@ class Derived(Solid):
 
     def _take_over(self, *names: str) -> None:
         """Has these attributes of the inner field as well as what marching needs."""
-        for name in ("has_detail", "coarsest_detail", "overstep", *names):
+        for name in ("has_detail", "coarsest_detail", "overstep", "wavelength", *names):
             object.__setattr__(self, name, getattr(self.inner, name))
 
     def leaves(self, change: Callable[[Solid], Solid]) -> Solid:

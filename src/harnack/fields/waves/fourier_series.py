@@ -18,6 +18,7 @@ from harnack.fields.field import Field, Sample, check_in_range
 from harnack.fields.kept import prepared_once
 from harnack.fields.waves.cosine_series import CosineBounds, fit_cosines, midpoints
 from harnack.fields.waves.cosine_sums import CosineSums
+from harnack.fields.waves.waves import mean_wavelength
 from harnack.geometry.volumes import Box
 
 if TYPE_CHECKING:
@@ -97,6 +98,8 @@ class FourierSeries(Field):
         self._lower, upper = self._box.bounds()
         self._size = upper - self._lower
         self._bounds = CosineBounds.of(a, self._size)
+        waves = np.indices(a.shape).reshape(3, -1)[:, 1:].T * (math.pi / self._size)
+        self.wavelength = mean_wavelength(a.ravel()[1:], np.linalg.norm(waves, axis=1))
         self._rounding = _rounding(a, self._size)
         self._source: Function | FloatArray | None = None
         self._device: CosineSums | None = None

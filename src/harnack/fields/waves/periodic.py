@@ -24,6 +24,7 @@ from harnack.fields.waves.waves import (
     cosine,
     evaluate_terms,
     hessian_of_terms,
+    mean_wavelength,
     sine,
 )
 from harnack.geometry.volumes import Ball
@@ -81,6 +82,7 @@ class EigenfunctionSum(Field):
         self.terms = checked_terms(terms)
         self.waves = self._bounds()
         longest = 2 * math.pi / min(self.waves.wavenumbers)
+        self.wavelength = mean_wavelength(self.waves.amplitudes, self.waves.wavenumbers)
         self.domain = Ball(radius=longest) if domain is None else domain
         self._extension = ExtensionRange.best(self.waves)
         self._rounding = WaveRounding.of(self.terms)

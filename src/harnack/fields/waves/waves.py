@@ -243,6 +243,15 @@ class WaveBounds:
         )
 
 
+def mean_wavelength(amplitudes: npt.ArrayLike, wavenumbers: npt.ArrayLike) -> float:
+    """2 pi over the root of the mean square wavenumber, by amplitudes: of one wave its length, and
+    of a sum that of the waves which make its shape, not of the shortest, however small."""
+    sizes, numbers = np.abs(amplitudes), np.asarray(wavenumbers, np.float64)
+    largest = float(numbers.max())
+    mean = float((sizes * (numbers / largest) ** 2).sum() / sizes.sum())
+    return 2 * math.pi / (largest * math.sqrt(mean))
+
+
 def _plane_waves(term: Term) -> list[tuple[tuple[float, ...], complex]]:
     """(k, A) with term = sum of Re(A exp(i k . p)), k and -k written the same way.
 

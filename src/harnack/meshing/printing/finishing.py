@@ -20,6 +20,8 @@ from harnack.meshing.rows import dots, lengths
 from harnack.meshing.samples import LevelFunction
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     import trimesh
 
     from harnack.fields import Field
@@ -28,6 +30,8 @@ __all__ = ["check_options", "finished", "normals_of", "simplified"]
 
 # The cosine of the angle between normals from which on an edge is a crease.
 _CREASE = math.cos(math.radians(30))
+# What simplification may move a surface by, as parts of the tolerance.
+_SIMPLER = (0.4, 0.2, 0.1)
 
 
 def check_options(tolerance: Any, spacing: Any, thickness: Any, seed: Any, most: Any) -> None:
@@ -72,18 +76,27 @@ def normals_of(field: Field, level: float, surface: Surface) -> FloatArray:
     return chosen
 
 
-def simplified(surface: Surface, tolerance: float) -> tuple[Surface, dict[str, Any]]:
-    """A closed surface with fewer triangles, all within `tolerance` of where they were.
+def simplified(
+    surface: Surface, tolerance: float, check: Callable[[Surface], None]
+) -> tuple[Surface, dict[str, Any]]:
+    """A closed surface with fewer triangles, or as it is where that cannot be.
 
-    manifold3d's simplification: vertices are a part of those before, and the surface moves by less
-    than the tolerance.
+    manifold3d's simplification: vertices are a part of those before. It moves the surface by less
+    than a part of the tolerance, half of which is for all else, and what does not pass the check is
+    done with a smaller part.
     """
-    made = surface_of(manifold_of(surface).simplify(tolerance))
-    if not len(made.faces):
-        raise MeshingError("the part is thinner than the tolerance: choose a smaller `tolerance`")
-    if len(made.faces) > len(surface.faces):
-        made = surface
-    return made, {"triangles_before_simplification": len(surface.faces)}
+    facts = {"triangles_before_simplification": len(surface.faces)}
+    solid = manifold_of(surface)
+    for part in _SIMPLER:
+        made = surface_of(solid.simplify(part * tolerance))
+        if not 0 < len(made.faces) < len(surface.faces):
+            continue
+        try:
+            check(made)
+        except MeshingError:
+            continue
+        return made, facts
+    return surface, facts
 
 
 def finished(surface: Surface, facts: dict[str, Any], is_closed: bool) -> trimesh.Trimesh:

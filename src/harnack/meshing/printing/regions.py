@@ -45,19 +45,23 @@ class RegionMesher:
     """Meshes solids in a box from `lower` to `upper`, (3,) each.
 
     tolerance: a length, of the middles of edges and faces. spacing: of cells, at most.
+    per_wave: cells along a wave (`Field.wavelength`) at the least; None for as many as there are.
     sheet: meshes surfaces that end at a curve. most_faces: of each level set.
-    evaluations, levels: of fields, in points, and how many level sets were meshed so far.
+    evaluations, levels, finest: of fields, in points, how many level sets were meshed so far, and
+        the smallest spacing of these.
     """
 
     lower: FloatArray
     upper: FloatArray
     tolerance: float
     spacing: float
+    per_wave: float | None
     sheet: Sheet
     most_faces: int
     report: Callable[[str], None]
     evaluations: int = 0
     levels: int = 0
+    finest: float = math.inf
 
     def below(self, solid: Solid, level: float) -> Manifold:
         """The points of the box where a solid's function is at most `level`; what there is outside
@@ -104,6 +108,9 @@ class RegionMesher:
                 return Surface(np.zeros((0, 3)), np.zeros((0, 3), np.int64)), is_whole
         size = float((upper - lower).max())
         spacing = min(self.spacing, size / 8)
+        if self.per_wave is not None and field.wavelength is not None:
+            spacing = min(spacing, field.wavelength / self.per_wave)
+        self.finest = min(self.finest, spacing)
         function = _WithinDomain(_entire(field), level, most_faces=self.most_faces)
         self.report(f"level {level:g} of {type(field).__name__} in cells of {spacing:.3g}")
         lattice = Lattice.filling(lower, upper, spacing, layers=2)
@@ -179,10 +186,12 @@ class RegionMesher:
         local = dataclasses.replace(
             self, lower=own.min(axis=0), upper=own.max(axis=0), tolerance=self.tolerance / scale,
             spacing=self.spacing / scale, evaluations=0, levels=0,
+            finest=math.inf,
         )  # fmt: skip
         made = local.below(solid.inner, level / solid.map.factor)
         self.evaluations += local.evaluations
         self.levels += local.levels
+        self.finest = min(self.finest, local.finest * scale)
         return made.transform(np.column_stack([matrix, offset]))
 
 

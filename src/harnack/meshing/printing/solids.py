@@ -13,17 +13,18 @@ from harnack.backend import FloatArray
 from harnack.fields import Field, Solid
 from harnack.fields.solids.region import solid as solid_of
 from harnack.geometry import Box, Intersection, Volume
-from harnack.meshing.checks import MeshingError
+from harnack.meshing.checks import LocalError, MeshingError, check_near_level
 from harnack.meshing.lattice import MissedError, Surface
 from harnack.meshing.printing.manifolds import surface_of, volume_manifold
 from harnack.meshing.printing.regions import RegionMesher, Sheet, is_smooth
+from harnack.meshing.samples import CELLS_PER_WAVE, LevelFunction
 
 __all__ = ["SolidMesh", "mesh_solid", "region_of"]
 
 # Cells across a solid, if nothing is asked for.
 _ACROSS = 24
 # How many sizes of cells are tried, and what each is of the one before.
-_MOST_ATTEMPTS = 2
+_MOST_ATTEMPTS = 3
 _SMALLER = 0.6
 # Room around what has an extent, as a part of its size.
 _MARGIN = 0.01
@@ -97,20 +98,27 @@ def mesh_solid(
     cells = size / _ACROSS if spacing is None else spacing
     error = 0.5 * tolerance * size
     attempts = _MOST_ATTEMPTS if spacing is None else 1
+    per_wave = CELLS_PER_WAVE if spacing is None else None
     while True:
-        mesher = RegionMesher(lower, upper, error, cells, sheets(error, cells), most_faces, report)
+        mesher = RegionMesher(
+            lower, upper, error, cells, per_wave, sheets(error, cells), most_faces, report
+        )
         try:
             made = _put_together(mesher, solid, level, volume)
+            if attempts > 1:
+                function = LevelFunction(solid, level)
+                check_near_level(function, made.vertices, made.faces, 2 * error, volume)
             break
-        except MissedError:
+        except (MissedError, LocalError) as failed:
             attempts -= 1
             if not attempts:
                 raise
             cells *= _SMALLER
-            report(f"parts were missed: cells of {cells:.3g}")
+            per_wave = CELLS_PER_WAVE * size / (_ACROSS * cells)
+            report(f"{failed}: cells of {cells:.3g}")
     if not len(made.faces):
         raise MeshingError("the solid is empty: no point of the box is inside")
-    return SolidMesh(made, cells, mesher.evaluations, mesher.levels, size)
+    return SolidMesh(made, min(cells, mesher.finest), mesher.evaluations, mesher.levels, size)
 
 
 def _put_together(
