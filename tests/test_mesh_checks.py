@@ -82,6 +82,24 @@ def test_edges_shorter_than_single_precision_do_not_open_a_file(tmp_path: Path, 
     check_apart(np.array(read.vertices, np.float64), np.array(read.faces, np.int64))
 
 
+def test_thin_parts_are_made_finer_until_no_faces_pass_through_each_other():
+    made = hk.mesh(hk.Cylinder(0.01, 1.0), tolerance=4e-3)
+    assert made.is_watertight
+    check_apart(np.array(made.vertices), np.array(made.faces))
+    x = np.array(made.triangles_center)
+    assert (np.hypot(x[:, 0], x[:, 1]) <= 0.01 + 1e-9).all()
+
+
+def test_sharp_creases_are_found_and_not_cut_into_ever_smaller_triangles():
+    made = hk.mesh(hk.Cylinder(0.3, 1.0).moved((0.2, 0, 0)))
+    assert made.is_watertight
+    assert len(made.faces) < 10_000
+    x = np.concatenate([made.vertices, made.triangles_center]) - (0.2, 0, 0)
+    f = np.maximum(np.hypot(x[:, 0], x[:, 1]) - 0.3, np.abs(x[:, 2]) - 1)
+    assert np.abs(f).max() < 2.1e-3
+    assert abs(made.volume / (2 * math.pi * 0.09) - 1) < 3e-3
+
+
 @pytest.mark.slow
 def test_a_cloud_by_dipoles_is_right_or_raises():
     points, index = trimesh.sample.sample_surface(_BALL, 300, seed=1)

@@ -165,11 +165,12 @@ def mesh(
         report("simplifying")
         made, more = simplified(made, 0.5 * share * size)
         facts |= more
-    report("checking")
-    if region is not None:
-        _check_level(LevelFunction(*region), made, tolerance * size, volume)
-    check_manifold(made.faces)
-    check_apart(made.vertices, made.faces)
+    if region is None or simplify:  # else it was checked when it was made
+        report("checking")
+        if region is not None:
+            _check_level(LevelFunction(*region), made, tolerance * size, volume)
+        check_manifold(made.faces)
+        check_apart(made.vertices, made.faces)
     return finished(made, facts, is_closed)
 
 
@@ -234,7 +235,13 @@ def _solid(
 
         return sheet
 
-    made = mesh_solid(region, at, volume, tolerance, spacing, sheets, most_faces, report)
+    def check(made: Surface, size: float) -> None:
+        report("checking")
+        _check_level(LevelFunction(region, at), made, tolerance * size, volume)
+        check_manifold(made.faces, made.vertices)
+        check_apart(made.vertices, made.faces)
+
+    made = mesh_solid(region, at, volume, tolerance, spacing, sheets, most_faces, check, report)
     facts = {
         "level": at,
         "spacing": made.spacing,

@@ -13,7 +13,7 @@ from harnack.backend import FloatArray
 from harnack.fields import Field, Solid
 from harnack.fields.solids.region import solid as solid_of
 from harnack.geometry import Box, Intersection, Volume
-from harnack.meshing.checks import MeshingError
+from harnack.meshing.checks import LocalError, MeshingError
 from harnack.meshing.lattice import MissedError, Surface
 from harnack.meshing.printing.manifolds import surface_of, volume_manifold
 from harnack.meshing.printing.regions import RegionMesher, Sheet, is_smooth
@@ -82,12 +82,15 @@ def mesh_solid(
     spacing: float | None,
     sheets: Callable[[float, float], Sheet],
     most_faces: int,
+    check: Callable[[Surface, float], None],
     report: Callable[[str], None],
 ) -> SolidMesh:
     """The boundary of the points of a volume where a solid's function is at most `level`.
 
     volume: None for all of space. tolerance: a part of the size. sheets: given a tolerance and a
     spacing, both lengths, how to mesh the level sets of an angle. most_faces: of a level set.
+    check: of the surface, given the size; where it fails in known places, smaller cells are tried,
+        and half the tolerance: beside a thin part triangles within it may be anywhere.
 
     Raises:
         MeshingError: it has no bounds; it is empty; a part cannot be meshed.
@@ -101,15 +104,18 @@ def mesh_solid(
         mesher = RegionMesher(lower, upper, error, cells, sheets(error, cells), most_faces, report)
         try:
             made = _put_together(mesher, solid, level, volume)
+            if not len(made.faces):
+                raise MeshingError("the solid is empty: no point of the box is inside")
+            check(made, size)
             break
-        except MissedError:
+        except (MissedError, LocalError) as wrong:
             attempts -= 1
             if not attempts:
                 raise
             cells *= _SMALLER
-            report(f"parts were missed: cells of {cells:.3g}")
-    if not len(made.faces):
-        raise MeshingError("the solid is empty: no point of the box is inside")
+            if isinstance(wrong, LocalError):
+                error *= 0.5
+            report(f"{wrong}; so cells of {cells:.3g}")
     return SolidMesh(made, cells, mesher.evaluations, mesher.levels, size)
 
 
