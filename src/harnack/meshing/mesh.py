@@ -99,8 +99,8 @@ def mesh(
 
     What is returned has been checked, all of it: every edge has two faces, or one at a rim, no two
     triangles pass through each other, vertices and centres of triangles are within the tolerance of
-    the level by looks at the field, and inside the bounds of the clip (of a thick part, the surface
-    that it is made of). Else a MeshingError is raised.
+    the level by looks at the field, and inside the clip (of a thick part, the surface that it is
+    made of). Else a MeshingError is raised.
 
     Returns:
         A trimesh.Trimesh. Vertices of a curve come first, in order, bit by bit, and its edges are
