@@ -26,6 +26,8 @@ __all__ = ["far_places", "improved", "refined", "smoothed", "smoothed_within"]
 Walls = tuple[FloatArray, FloatArray] | None
 # Normals turn by so much across a crease, and by such a part of it at once.
 _BENT, _AT_ONCE = math.radians(20), 0.75
+# So near, in parts of the tolerance, a vertex counts as on the surface.
+_ON = 1e-5
 # So far from the middle, in parts of its edge, a crease may be.
 _BESIDE = 1.5
 # It is not looked for nearer to the ends than this, and by so many looks, twice.
@@ -85,7 +87,28 @@ def refined(
         fans = [np.stack([*ends, inner], axis=1) for ends in ((a, b), (b, c), (c, a))]
         whole = _split(vertices, faces[~cut_off], place[far.edges[~cut_off]])
         faces = np.concatenate([whole, *fans])
-    return vertices, faces
+    return _settled(function, vertices, faces, tolerance, walls), faces
+
+
+def _settled(
+    function: LevelFunction, vertices: FloatArray, faces: IntArray, tolerance: float, walls: Walls
+) -> FloatArray:
+    """With more steps for vertices that Newton's method has not yet brought onto the surface, as
+    beside the dipoles of a cloud, where slopes change within a step."""
+    samples = function.at(vertices)
+    is_off = samples.distance > _ON * tolerance
+    if walls is None:
+        is_off[boundary_edges(faces)] = False
+    rows = np.flatnonzero(is_off)
+    if not len(rows):
+        return vertices
+    longest = np.full(len(rows), 0.5 * tolerance)
+    there = newton(function, vertices[rows], samples.some(rows), longest, walls, steps=20)
+    good = np.abs(function.at(there).value) < np.abs(samples.value[rows])
+    good &= lengths(there - vertices[rows]) < tolerance
+    vertices = vertices.copy()
+    vertices[rows[good]] = there[good]
+    return vertices
 
 
 def _on_creases(
