@@ -52,6 +52,11 @@ def test_vertices_and_centres_are_looked_at():
     check_inside(x, hk.Ball((0, 0, 0), 2.0), 0.0)
     with pytest.raises(MeshingError, match="outside of what was asked for"):
         check_inside(x, hk.Box((-1, -1, -1), (1, 1, 0.5)), 0.1)
+    with pytest.raises(MeshingError, match="outside of what was asked for"):
+        check_inside(x, hk.HalfSpace((1, 1, 1), 1.0), 0.1)
+    check_inside(x, hk.Ball((0, 0, 0), 0.95), 0.1)
+    with pytest.raises(MeshingError, match="outside of what was asked for"):
+        check_inside(x, hk.Ball((0, 0, 0), 0.95), 0.01)
 
 
 def test_faces_through_each_other_are_found():
@@ -241,13 +246,35 @@ def test_a_spacing_that_is_asked_for_is_not_changed_for_waves():
         hk.mesh(part, tolerance=2e-2, max_triangles=500)
 
 
-@pytest.mark.slow
-def test_a_cloud_by_dipoles_is_right_or_raises():
-    points, index = trimesh.sample.sample_surface(_BALL, 300, seed=1)
-    field = hk.DipolePotential(points, _BALL.face_normals[index])
-    try:
-        made = hk.mesh(field, largest=True, tolerance=2e-3)
-    except hk.MeshingError:
-        return  # there is a hedgehog of lobes around the dipoles, of any size
+def test_thin_parts_are_made_finer_until_no_faces_pass_through_each_other():
+    made = hk.mesh(hk.Cylinder(0.01, 1.0), tolerance=4e-3)
     assert made.is_watertight
-    assert abs(made.volume / _BALL.volume - 1) < 0.1
+    check_apart(np.array(made.vertices), np.array(made.faces))
+    x = np.array(made.triangles_center)
+    assert (np.hypot(x[:, 0], x[:, 1]) <= 0.01 + 1e-9).all()
+
+
+def test_sharp_creases_are_found_and_not_cut_into_ever_smaller_triangles():
+    made = hk.mesh(hk.Cylinder(0.3, 1.0).moved((0.2, 0, 0)))
+    assert made.is_watertight
+    assert len(made.faces) < 10_000
+    x = np.concatenate([made.vertices, made.triangles_center]) - (0.2, 0, 0)
+    f = np.maximum(np.hypot(x[:, 0], x[:, 1]) - 0.3, np.abs(x[:, 2]) - 1)
+    assert np.abs(f).max() < 2.1e-3
+    assert abs(made.volume / (2 * math.pi * 0.09) - 1) < 3e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n", [300, 700])
+def test_a_cloud_by_dipoles_is_right(n: int):
+    points, index = trimesh.sample.sample_surface(_BALL, n, seed=n)
+    normals = np.asarray(_BALL.face_normals)[index]
+    field = hk.DipolePotential(points, normals, areas=np.full(n, _BALL.area / n), accuracy=8)
+    made = hk.mesh(field, largest=True, tolerance=2e-3)
+    assert made.is_watertight
+    assert abs(made.volume / _BALL.volume - 1) < 0.03
+    x = np.array(made.vertices)
+    r = points - x[:, None]
+    terms = (r * normals).sum(axis=2) / np.linalg.norm(r, axis=2) ** 3
+    direct = terms.sum(axis=1) * _BALL.area / n
+    assert np.abs(direct - field.default_level).max() < 1e-4 * 4 * math.pi

@@ -120,9 +120,8 @@ def check_count(expected: float, most: int) -> None:
 
 
 def check_inside(vertices: FloatArray, volume: Volume, slack: float) -> None:
-    """Raise if a vertex lies outside of a volume's bounds by more than `slack`."""
-    lower, upper = (np.array(end, np.float64) for end in volume.bounds())
-    out = ((vertices < lower - slack) | (vertices > upper + slack)).any(axis=1)
+    """Raise if a vertex lies outside of a volume padded by `slack`."""
+    out = ~volume.padded(slack).contains_points(vertices)
     if out.any():
         raise MeshingError(
             f"{out.sum():,} vertices of the mesh lie outside of what was asked for, such as "

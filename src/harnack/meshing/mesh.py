@@ -101,8 +101,8 @@ def mesh(
 
     What is returned has been checked, all of it: every edge has two faces, or one at a rim, no two
     triangles pass through each other, vertices and centres of triangles are within the tolerance of
-    the level by looks at the field, and inside the bounds of the clip (of a thick part, the surface
-    that it is made of). Else a MeshingError is raised.
+    the level by looks at the field, and inside the clip (of a thick part, the surface that it is
+    made of). Else a MeshingError is raised.
 
     Returns:
         A trimesh.Trimesh; if it is closed, `export` writes closed files, in single precision, or
@@ -170,8 +170,9 @@ def mesh(
         check_manifold(one.faces)
         check_apart(one.vertices, one.faces)
 
-    report("checking")
-    check(made)
+    if region is None:  # else it was checked when it was made
+        report("checking")
+        check(made)
     if simplify:
         report("simplifying")
         made, more = simplified(made, tolerance * size, check)
@@ -240,7 +241,13 @@ def _solid(
 
         return sheet
 
-    made = mesh_solid(region, at, volume, tolerance, spacing, sheets, most_faces, report)
+    def check(made: Surface, size: float) -> None:
+        report("checking")
+        _check_level(LevelFunction(region, at), made, tolerance * size, volume)
+        check_manifold(made.faces, made.vertices)
+        check_apart(made.vertices, made.faces)
+
+    made = mesh_solid(region, at, volume, tolerance, spacing, sheets, most_faces, check, report)
     facts = {
         "level": at,
         "spacing": made.spacing,

@@ -23,7 +23,7 @@ from harnack.meshing.lattice.estimates import check_size
 from harnack.meshing.lattice.missed import check_nothing_missed
 from harnack.meshing.marching import crossings_of, is_cut, triangles_of
 from harnack.meshing.points import Boundary, PointSet, newton
-from harnack.meshing.refining.refinement import refined, smoothed
+from harnack.meshing.refining.refinement import refined, smoothed, smoothed_within
 from harnack.meshing.rows import lengths
 from harnack.meshing.samples import LevelFunction, Samples
 from harnack.meshing.tetrahedra import Tetrahedra
@@ -84,7 +84,8 @@ def open_surface(
     isotopy = isotopy_of(function, first.points, corners, first.is_cut, faces, none, size, walls)
     vertices = smoothed(function, vertices, faces, walls)
     vertices, faces = refined(function, vertices, faces, tolerance, walls, report)
-    return Surface.of(smoothed(function, vertices, faces, walls), faces), isotopy
+    vertices = smoothed_within(function, vertices, faces, walls, tolerance)
+    return Surface.of(vertices, faces), isotopy
 
 
 def closed_surface(
@@ -125,7 +126,7 @@ def closed_surface(
             function.field, function.level, function, lattice, most_faces=function.most_faces
         )
         vertices, rest = refined(inside, vertices, rest, tolerance, None, report)
-        vertices = smoothed(function, vertices, rest, None)
+        vertices = smoothed_within(inside, vertices, rest, None, tolerance)
     faces = np.concatenate([rest, *caps])
     return Surface.of(vertices, faces) if len(faces) else Surface(np.zeros((0, 3)), faces)
 

@@ -13,11 +13,11 @@ from harnack.backend import FloatArray
 from harnack.fields import Field, Solid
 from harnack.fields.solids.region import solid as solid_of
 from harnack.geometry import Box, Intersection, Volume
-from harnack.meshing.checks import LocalError, MeshingError, check_near_level
+from harnack.meshing.checks import LocalError, MeshingError
 from harnack.meshing.lattice import MissedError, Surface
 from harnack.meshing.printing.manifolds import surface_of, volume_manifold
 from harnack.meshing.printing.regions import RegionMesher, Sheet, is_smooth
-from harnack.meshing.samples import CELLS_PER_WAVE, LevelFunction
+from harnack.meshing.samples import CELLS_PER_WAVE
 
 __all__ = ["SolidMesh", "mesh_solid", "region_of"]
 
@@ -83,12 +83,15 @@ def mesh_solid(
     spacing: float | None,
     sheets: Callable[[float, float], Sheet],
     most_faces: int,
+    check: Callable[[Surface, float], None],
     report: Callable[[str], None],
 ) -> SolidMesh:
     """The boundary of the points of a volume where a solid's function is at most `level`.
 
     volume: None for all of space. tolerance: a part of the size. sheets: given a tolerance and a
     spacing, both lengths, how to mesh the level sets of an angle. most_faces: of a level set.
+    check: of the surface, given the size; where it fails in known places, smaller cells are tried,
+        and half the tolerance: beside a thin part triangles within it may be anywhere.
 
     Raises:
         MeshingError: it has no bounds; it is empty; a part cannot be meshed.
@@ -105,19 +108,19 @@ def mesh_solid(
         )
         try:
             made = _put_together(mesher, solid, level, volume)
-            if attempts > 1:
-                function = LevelFunction(solid, level)
-                check_near_level(function, made.vertices, made.faces, 2 * error, volume)
+            if not len(made.faces):
+                raise MeshingError("the solid is empty: no point of the box is inside")
+            check(made, size)
             break
-        except (MissedError, LocalError) as failed:
+        except (MissedError, LocalError) as wrong:
             attempts -= 1
             if not attempts:
                 raise
             cells *= _SMALLER
             per_wave = CELLS_PER_WAVE * size / (_ACROSS * cells)
-            report(f"{failed}: cells of {cells:.3g}")
-    if not len(made.faces):
-        raise MeshingError("the solid is empty: no point of the box is inside")
+            if isinstance(wrong, LocalError):
+                error *= 0.5
+            report(f"{wrong}; so cells of {cells:.3g}")
     return SolidMesh(made, min(cells, mesher.finest), mesher.evaluations, mesher.levels, size)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -20,9 +21,20 @@ from harnack.meshing.refining.relaxation import relaxed
 from harnack.meshing.rows import dots, lengths
 from harnack.meshing.samples import LevelFunction, Samples
 
-__all__ = ["far_places", "improved", "refined", "smoothed"]
+__all__ = ["far_places", "improved", "refined", "smoothed", "smoothed_within"]
 
 Walls = tuple[FloatArray, FloatArray] | None
+# Normals turn by so much across a crease, and by such a part of it at once.
+_BENT, _AT_ONCE = math.radians(20), 0.75
+# So near, in parts of the tolerance, a vertex counts as on the surface.
+_ON = 1e-5
+# So far from the middle, in parts of its edge, a crease may be.
+_BESIDE = 1.5
+# It is not looked for nearer to the ends than this, and by so many looks, twice.
+_FROM_ENDS, _LOOKS = 0.05, 33
+# So far the level is looked for, in parts of the way to where tangent planes meet; and three of
+# them meet in a point if their normals have such a determinant.
+_BEYOND, _INDEPENDENT = 1.25, 0.1
 # Edges shorter than this part of the tolerance are never cut.
 _SHORTEST = 0.5
 _MOST_ROUNDS = 12
@@ -51,7 +63,7 @@ def refined(
         report(f"refining, round {round_number + 1}: {len(faces):,} triangles")
         far = _Far.of(function, vertices, faces, tolerance, walls)
         marked = far.marked
-        if not marked.any():
+        if not marked.any() and not far.cuts_off.any():
             break
         count = int(marked.sum())
         if count > _RUNS_AWAY * least:
@@ -62,11 +74,123 @@ def refined(
         check_count(len(faces) + 2 * count, function.most_faces)
         samples, reach = far.samples.some(marked), 0.5 * far.span[marked]
         moved = newton(function, far.middle[marked], samples, reach, walls)
+        moved = _on_creases(function, vertices, far.ends[marked], moved, walls)
         place = np.full(len(marked), -1, np.int64)
         place[marked] = len(vertices) + np.arange(int(marked.sum()))
         vertices = np.concatenate([vertices, moved])
-        faces = _split(vertices, faces, place[far.edges])
-    return vertices, faces
+        cut_off = far.cuts_off & ~marked[far.edges].any(axis=1)
+        inner = len(vertices) + np.arange(np.count_nonzero(cut_off))
+        vertices = np.concatenate(
+            [vertices, _corners_in(function, vertices, faces[cut_off], walls)]
+        )
+        a, b, c = faces[cut_off].T
+        fans = [np.stack([*ends, inner], axis=1) for ends in ((a, b), (b, c), (c, a))]
+        whole = _split(vertices, faces[~cut_off], place[far.edges[~cut_off]])
+        faces = np.concatenate([whole, *fans])
+    return _settled(function, vertices, faces, tolerance, walls), faces
+
+
+def _settled(
+    function: LevelFunction, vertices: FloatArray, faces: IntArray, tolerance: float, walls: Walls
+) -> FloatArray:
+    """With more steps for vertices that Newton's method has not yet brought onto the surface, as
+    beside the dipoles of a cloud, where slopes change within a step."""
+    samples = function.at(vertices)
+    is_off = samples.distance > _ON * tolerance
+    if walls is None:
+        is_off[boundary_edges(faces)] = False
+    rows = np.flatnonzero(is_off)
+    if not len(rows):
+        return vertices
+    longest = np.full(len(rows), 0.5 * tolerance)
+    there = newton(function, vertices[rows], samples.some(rows), longest, walls, steps=20)
+    good = np.abs(function.at(there).value) < np.abs(samples.value[rows])
+    good &= lengths(there - vertices[rows]) < tolerance
+    vertices = vertices.copy()
+    vertices[rows[good]] = there[good]
+    return vertices
+
+
+def _on_creases(
+    function: LevelFunction, vertices: FloatArray, ends: IntArray, moved: FloatArray, walls: Walls
+) -> FloatArray:
+    """Middles (k, 3) of edges, given by their vertices (k, 2), that were moved onto the surface;
+    where edges cut off a sharp crease, onto that instead.
+
+    Newton's method leads to one of the two sides of a crease, and an edge along the normal of that
+    side back to its end: cut there again and again, it stays as long as it is. The point nearest to
+    the middle in the tangent planes of both ends is on the crease, as far as its sides are flat
+    (Kobbelt et al. 2001); the level is taken on the way there. There is one if normals turn by 20
+    degrees or more, and nearly all of it between the moved middle and one of the ends; on a smooth
+    surface about half of it.
+    """
+    used, place = np.unique(ends, return_inverse=True)
+    slope = function.at(vertices[used]).gradient
+    at_ends = (slope / np.maximum(lengths(slope), 1e-300)[:, None])[place.reshape(-1, 2)]
+    here = function.at(moved).gradient
+    here = here / np.maximum(lengths(here), 1e-300)[:, None]
+    one, other = at_ends[:, 0], at_ends[:, 1]
+    cosine = dots(one, other)
+    turn = np.arccos(np.clip(np.minimum(dots(one, here), dots(other, here)), -1, 1))
+    whole = np.arccos(np.clip(cosine, -1, 1))
+    rows = np.flatnonzero((whole > _BENT) & (turn > _AT_ONCE * whole) & (1 - cosine**2 > 0.01))
+    if not len(rows):
+        return moved
+    one, other, cosine = one[rows], other[rows], cosine[rows]
+    a, b = (vertices[ends[rows, k]] for k in (0, 1))
+    middle, span = 0.5 * (a + b), lengths(b - a)
+    high, low = dots(one, a - middle), dots(other, b - middle)
+    share = np.stack([high - cosine * low, low - cosine * high]) / (1 - cosine**2)
+    way = share[0][:, None] * one + share[1][:, None] * other
+    there, good = _level_towards(function, middle, way, _BESIDE * span, walls)
+    good &= np.minimum(lengths(there - a), lengths(there - b)) > _FROM_ENDS * span
+    moved = moved.copy()
+    moved[rows[good]] = there[good]
+    return moved
+
+
+def _corners_in(
+    function: LevelFunction, vertices: FloatArray, faces: IntArray, walls: Walls
+) -> FloatArray:
+    """A point on the surface within each of some faces (k, 3) that cut off a corner: where the
+    tangent planes of its vertices meet, or near the centre."""
+    corner = vertices[faces]
+    centre = corner.mean(axis=1)
+    span = np.stack([lengths(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
+    moved = newton(function, centre, function.at(centre), 0.5 * span, walls)
+    slope = function.at(corner.reshape(-1, 3)).gradient
+    normal = (slope / np.maximum(lengths(slope), 1e-300)[:, None]).reshape(-1, 3, 3)
+    rows = np.flatnonzero(np.abs(np.linalg.det(normal)) > _INDEPENDENT)
+    away = (normal * (corner - centre[:, None])).sum(axis=2)
+    meet: Any = np.linalg.solve(normal[rows], away[rows][:, :, None])
+    way: FloatArray = meet[:, :, 0]
+    there, good = _level_towards(function, centre[rows], way, _BESIDE * span[rows], walls)
+    moved[rows[good]] = there[good]
+    return moved
+
+
+def _level_towards(
+    function: LevelFunction, start: FloatArray, way: FloatArray, most: FloatArray, walls: Walls
+) -> tuple[FloatArray, BoolArray]:
+    """Points on the level from `start` (k, 3) along `way`, a little beyond its end at most and no
+    farther than `most`; and whether the level is passed there."""
+    way = way * np.minimum(1, most / np.maximum(lengths(way), 1e-300))[:, None]
+    low, high = np.zeros(len(start)), np.full(len(start), _BEYOND)
+    good = np.ones(len(start), np.bool_)
+    parts = np.linspace(0, 1, _LOOKS)
+    for _ in range(2):
+        t = low[:, None] + (high - low)[:, None] * parts
+        x = start[:, None] + t[:, :, None] * way[:, None]
+        x = x if walls is None else np.clip(x, *walls)
+        is_above = (function.at(x.reshape(-1, 3)).value > 0).reshape(t.shape)
+        passes = is_above[:, 1:] != is_above[:, :-1]
+        good &= passes.any(axis=1)
+        first = passes.argmax(axis=1)[:, None]
+        low, high = (np.take_along_axis(t, first + k, axis=1)[:, 0] for k in (0, 1))
+    there = start + low[:, None] * way
+    there = there if walls is None else np.clip(there, *walls)
+    longest = 4 * (high - low) * lengths(way)
+    return newton(function, there, function.at(there), longest, walls), good
 
 
 def far_places(
@@ -81,15 +205,18 @@ def far_places(
 class _Far:
     """Edges and which of them are to be cut.
 
-    edges: (m, 3) of the faces. middle: (k, 3), span: (k,) and marked: (k,) of edges.
-    samples: at the middles.
+    edges: (m, 3) of the faces. ends: (k, 2) vertices, middle: (k, 3), span: (k,) and marked: (k,)
+        of edges.
+    samples: at the middles. cuts_off: (m,) faces whose centre alone is beyond, at a corner.
     """
 
     edges: IntArray
+    ends: IntArray
     middle: FloatArray
     span: FloatArray
     samples: Samples
     marked: BoolArray
+    cuts_off: BoolArray
 
     @classmethod
     def of(
@@ -109,12 +236,25 @@ class _Far:
         samples = function.at(middle)
         marked = samples.distance > tolerance
         off = function.at(vertices[faces].mean(axis=1)).distance > tolerance
+        off &= span[edges].max(axis=1) > _SHORTEST * tolerance
+        cuts_off = np.zeros(len(faces), np.bool_)
+        lone = np.flatnonzero(off & ~marked[edges].any(axis=1))
+        cuts_off[lone] = _turns(function, vertices[faces[lone]])
+        off &= ~cuts_off
         # Of a face that is off, the longest edge that may be cut.
         free = np.where(is_rim[edges], 0.0, span[edges])
         worst = edges[np.arange(len(faces)), free.argmax(axis=1)]
         marked[worst[off]] = True
         marked &= ~is_rim & (span > _SHORTEST * tolerance)
-        return cls(edges, middle, span, samples, marked)
+        return cls(edges, ends, middle, span, samples, marked, cuts_off)
+
+
+def _turns(function: LevelFunction, corner: FloatArray) -> BoolArray:
+    """Whether normals at the corners (k, 3, 3) of faces turn as across a crease."""
+    slope = function.at(corner.reshape(-1, 3)).gradient
+    normal = (slope / np.maximum(lengths(slope), 1e-300)[:, None]).reshape(-1, 3, 3)
+    between = [dots(normal[:, k], normal[:, k - 1]) for k in range(3)]
+    return np.min(between, axis=0) < math.cos(_BENT)
 
 
 def _edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
@@ -206,6 +346,33 @@ def smoothed(
         worse = after.distance > 1e-7 * size + 1e-12 * lengths(there[rows])
         there[rows[worse]] = vertices[rows[worse]]
         vertices = _unfolded(vertices, there, faces)
+    return vertices
+
+
+def smoothed_within(
+    function: LevelFunction,
+    vertices: FloatArray,
+    faces: IntArray,
+    walls: Walls,
+    tolerance: float,
+) -> FloatArray:
+    """As `smoothed`, but for vertices of faces whose middles of edges or centre would get farther
+    from the surface than `tolerance` by that, as beside a crease."""
+    after = smoothed(function, vertices, faces, walls)
+    for _ in range(8):
+        far = _Far.of(function, after, faces, tolerance, walls)
+        off = (far.samples.distance > tolerance)[far.edges].any(axis=1)
+        off |= function.at(after[faces].mean(axis=1)).distance > tolerance
+        back = np.zeros(len(vertices), np.bool_)
+        for _ in range(2):  # with neighbours, so that this ends soon
+            back[faces[off]] = True
+            off = back[faces].any(axis=1)
+        back = np.flatnonzero(back)
+        back = back[(after[back] != vertices[back]).any(axis=1)]
+        if not len(back):
+            return after
+        after = after.copy()
+        after[back] = vertices[back]
     return vertices
 
 
