@@ -162,8 +162,8 @@ def _corners_in(
     normal = (slope / np.maximum(lengths(slope), 1e-300)[:, None]).reshape(-1, 3, 3)
     rows = np.flatnonzero(np.abs(np.linalg.det(normal)) > _INDEPENDENT)
     away = (normal * (corner - centre[:, None])).sum(axis=2)
-    meet: Any = np.linalg.solve(normal[rows], away[rows][:, :, None])
-    way: FloatArray = meet[:, :, 0]
+    solve: Any = np.linalg.solve
+    way: FloatArray = solve(normal[rows], away[rows][:, :, None])[:, :, 0]
     there, good = _level_towards(function, centre[rows], way, _BESIDE * span[rows], walls)
     moved[rows[good]] = there[good]
     return moved
