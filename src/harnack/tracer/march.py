@@ -230,7 +230,7 @@ class March:
         # Where not even the gradient is known, rounding makes no hits.
         rounding = dr.select(knows_gradient, total_error - sample.truncation, 0)
         is_near = self._is_near(
-            gaps.smaller, within, total_error, rounding, look, gradient_norm, size + t
+            gaps.smaller, within, total_error, rounding, look, gradient_norm, size + t, end
         )
         excess = fmax(gaps.smaller + total_error - within, real(0))
         band, may_pass = within, is_near
@@ -350,14 +350,16 @@ class March:
         look: Look,
         gradient_norm: Real,
         size: Real,
+        end: Real,
     ) -> Mask:
         """Whether a level is near enough in value for a hit; see `advance`.
 
         within: how near the tolerance asks it to be. rounding: what it may have done to f.
         A point is no hit if it leaves the distance to the surface uncertain by more than a
         sixteenth of the size of the coordinates or, if that is larger, of the radius on which f is
-        known to be smooth; nor if rounding alone makes it one and leaves the length of the ray
-        uncertain by more than that size: such a ray is parallel to the surface up to rounding.
+        known to be smooth; nor, of a ray without an end, if rounding alone makes it one and leaves
+        the length of the ray uncertain by more than that size: far enough away rounding makes every
+        ray one that is parallel to the surface.
         """
         sample = look.sample
         near = gap <= fmax(within - sample.truncation, 2 * rounding)
@@ -366,7 +368,8 @@ class March:
             if not isinstance(promise, LineLipschitz):
                 size = fmax(dr.select(dr.isfinite(radius), radius, 0), size)
         excess = gap + total_error - within
-        crosses = (gap <= within - sample.truncation) | (excess <= dr.abs(look.slope) * size)
+        crosses = (gap <= within - sample.truncation) | (end < dr.inf)
+        crosses |= excess <= dr.abs(look.slope) * size
         return near & crosses & (excess <= _LARGEST_UNCERTAINTY * gradient_norm * size)
 
     def _trial(
