@@ -38,10 +38,11 @@ def sincos(x: Any) -> tuple[Any, Any]:
         sine = dr.fma(sine * square, rest, rest)
         cosine = dr.fma(cosine * square, square, dr.fma(square, -0.5, 1))
     # quarter modulo 4 is 0, 1, 2, 3 for (s, c), (c, -s), (-s, -c), (-c, s).
-    quadrant = quarter - 4 * dr.floor(0.25 * quarter)
-    is_odd = (quadrant == 1) | (quadrant == 3)
+    half = 0.5 * quarter
+    whole = dr.floor(half)
+    is_odd, is_late = whole != half, dr.floor(0.5 * whole) != 0.5 * whole
     s, c = dr.select(is_odd, cosine, sine), dr.select(is_odd, sine, cosine)
-    return dr.select(quadrant >= 2, -s, s), dr.select((quadrant == 1) | (quadrant == 2), -c, c)
+    return dr.select(is_late, -s, s), dr.select(is_late ^ is_odd, -c, c)
 
 
 def largest_angle(real: Any) -> float:
