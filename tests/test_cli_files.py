@@ -275,3 +275,19 @@ def test_the_gallery_lists_a_scene_a_line_however_narrow_the_window(capsys, monk
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == len(SCENES)
     assert "hyperspherical-sextic  a hyperspherical harmonic of degree 6 (j = 4, m = 3)" in lines
+
+
+def test_meshes_of_files_take_the_options_that_their_messages_name(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`harnack mesh cloud.xyz` recommended --normals, which it had not."""
+    points, target = icosphere(2)[0], str(tmp_path / "a.stl")
+    np.savetxt(tmp_path / "cloud.xyz", points * [1.0, 1.0, 2.0])
+    asked = ["mesh", str(tmp_path / "cloud.xyz"), "-o", target, "--tolerance", "0.02"]
+    assert main(asked) == 1
+    assert "--normals estimate" in capsys.readouterr().err
+    assert main([*asked, "--normals", "estimate", "--up", "y", "--largest"]) == 0
+    made = trimesh.load(target)
+    assert made.extents[1] > 1.5 * made.extents[2]  # what was z is y
+    assert main(["mesh", "gyroid", "-o", target, "--normals", "estimate"]) == 1
+    assert "--normals is for surface files" in capsys.readouterr().err

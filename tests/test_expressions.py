@@ -245,8 +245,10 @@ def test_a_formula_that_compiles_for_long_says_so_before() -> None:
 
         return lambda x, y, z: function(x, y, z)
 
-    with pytest.warns(UserWarning, match="100,8.. operations.* 31 s to compile.*Long formulas"):
+    with pytest.warns(UserWarning, match="operations.* [0-9]+ s to compile.*Long formulas"):
         hk.expression(network((16, 16)))
+    with pytest.warns(UserWarning, match="Long formulas"):
+        hk.HeightField(lambda x, y: network((16, 16))(x, y, 0.0 * x))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         hk.expression(network((8, 8)))

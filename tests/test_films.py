@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import builtins
+import re
 from pathlib import Path
 from typing import Any
 
@@ -211,3 +213,12 @@ def test_transparent_films_keep_their_colors(tmp_path: Path) -> None:
     opaque = frame[..., 3] > 0
     assert 0.1 < opaque.mean() < 0.9
     assert len(np.unique(frame[opaque][:, :3], axis=0)) > 150
+
+
+@pytest.mark.parametrize("ending", ["gif", "mp4"])
+def test_notebooks_show_a_film(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"a.{ending}"
+    film = hk.animate(hk.Sphere(1.0), path, frames=2, show="normal", **SMALL)
+    shown = film._repr_html_()
+    assert base64.b64decode(re.findall('base64,([^"]*)"', shown)[0]) == path.read_bytes()
+    assert shown.startswith("<img" if ending == "gif" else "<video")

@@ -147,6 +147,15 @@ def _add_drawn(one: Any, shaded: str) -> None:
     _add_surface(one)
     _add_lines(one)
     _add_view(one)
+    _add_file(one)
+    _add_quality(one)
+    one.add_argument(
+        "--denoise", action="store_true",
+        help="take the noise out of a color picture (needs pip install 'harnack[denoise]')",
+    )  # fmt: skip
+
+
+def _add_file(one: Any) -> Any:
     file = one.add_argument_group("surface files")
     _add_choice(
         file, "--as", ("winding", "dipole", "loops", "polygons"),
@@ -159,10 +168,13 @@ def _add_drawn(one: Any, shaded: str) -> None:
         "--boundary", action="store_true", help="take the boundary of a file's faces as the curves"
     )
     _add_choice(file, "--normals", ("estimate",), "estimate the normals of a point cloud")
-    _add_quality(one)
-    one.add_argument(
-        "--denoise", action="store_true",
-        help="take the noise out of a color picture (needs pip install 'harnack[denoise]')",
+    return file
+
+
+def _add_up(group: Any) -> None:
+    _add_choice(
+        group, "--up", UP_AXES,
+        "the axis that points up (of files .glb, .gltf and surfaces in .obj y, else z)",
     )  # fmt: skip
 
 
@@ -265,10 +277,7 @@ def _add_view(one: Any) -> None:
         "#334455, two from bottom to top such as white,steelblue, or an image "
         f"({', '.join(IMAGE_FILES)}) (light)",
     )  # fmt: skip
-    _add_choice(
-        group, "--up", UP_AXES,
-        "the axis that points up (of files .glb, .gltf and surfaces in .obj y, else z)",
-    )  # fmt: skip
+    _add_up(group)
 
 
 def _add_mesh(commands: Any) -> None:
@@ -315,6 +324,7 @@ def _add_mesh(commands: Any) -> None:
         "--scale", type=_positive, metavar="FACTOR",
         help="multiply all lengths at the end: millimetres for one unit of the scene (1)",
     )  # fmt: skip
+    _add_up(_add_file(one))
     one.add_argument("--quiet", action="store_true", help="do not say what is being done")
 
 

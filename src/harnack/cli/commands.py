@@ -282,10 +282,17 @@ def _mesh(options: Any) -> int:
 
 def _meshed(options: Any, source: Path) -> tuple[Field, dict[str, Any]]:
     """The field of a scene or a file, and what the scene says of its surface."""
+    if _is_formula(options.scene) or options.scene in SCENES:
+        _refuse_file_options(options)
+        if options.up is not None:
+            raise ValueError(f"--up is for surface files ({', '.join(SURFACE_FILES)}) only")
     if _is_formula(options.scene):
         return expression(options.scene), {}
     if options.scene not in SCENES:
-        opened = open_surface(source)
+        opened = open_surface(
+            source, as_=options.as_, boundary=options.boundary, normals=options.normals,
+            up=options.up,
+        )  # fmt: skip
         _say(f"{source}: {in_options(opened.said)}")
         return opened.field, {}
     surfaces = SCENES[options.scene].surfaces()

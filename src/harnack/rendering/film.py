@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import base64
+import html
 import math
 import numbers
 import os
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, cast
@@ -37,6 +39,25 @@ _CLEAR = 255
 Pixels = npt.NDArray[np.uint8]
 
 
+@dataclass(frozen=True)
+class Film:
+    """A film that was written. path: of its file. size: (width, height) of its pictures."""
+
+    path: Path
+    size: tuple[int, int]
+
+    def _repr_html_(self) -> str:
+        """For notebooks: the film itself, in the page."""
+        data = base64.b64encode(self.path.read_bytes()).decode()
+        width, height = self.size
+        size = f'width="{width}" height="{height}"'
+        if self.path.suffix.lower() == ".gif":
+            name = html.escape(self.path.name)
+            return f'<img {size} alt="{name}" src="data:image/gif;base64,{data}">'
+        source = f'<source src="data:video/mp4;base64,{data}" type="video/mp4">'
+        return f"<video {size} controls loop muted autoplay>{source}</video>"
+
+
 def animate(
     what: Any,
     path: str | os.PathLike[str],
@@ -49,8 +70,8 @@ def animate(
     show: str = "shaded",
     progress: bool = True,
     **settings: Any,
-) -> None:
-    """Draw a film and write it to `path`.
+) -> Film:
+    """Draw a film and write it to `path`; notebooks show what is returned.
 
         hk.animate(field, "turntable.gif", turn=360)
         hk.animate(lambda s: hk.Morph(a, b, gap=0.2, w=0.2 * s), "morph.mp4")
@@ -95,6 +116,7 @@ def animate(
                 picture = render(frame.pop("what"), size=size, show=show, progress=False, **frame)
                 add(picture.shown)
                 advance(1 / count)
+    return Film(target, size)
 
 
 def check_film_path(path: str | os.PathLike[str]) -> Path:

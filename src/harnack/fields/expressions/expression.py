@@ -4,22 +4,16 @@ from __future__ import annotations
 
 import inspect
 import math
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from harnack.arithmetic.operators import Operators
 from harnack.backend.numbers import refuse_derivatives, refuses_derivatives
 from harnack.fields.expressions.text import TextFormula
-from harnack.fields.formula import Formula, as_jet, probe
+from harnack.fields.formula import Formula, as_jet, probe, warn_of_price
 
 if TYPE_CHECKING:
     from harnack.geometry import Volume
-
-
-# Seconds of compilation from which on a warning comes before it.
-_LONG = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,9 +80,9 @@ def expression(
     if not math.isfinite(level):
         raise ValueError(f"level must be finite, not {level!r}")
     made = Expression(function, domain, default_level=level, is_convex=is_convex)
-    _warn_of_price(made)
     point = probe()
     refuse_derivatives("an expression", as_jet(made.formula(*point), point[0], "expression"))
+    warn_of_price(made)
     return made
 
 
@@ -105,60 +99,3 @@ def _check_arguments(function: Callable[..., Any]) -> None:
             "function must take three coordinates, such as lambda x, y, z: x * y - z; this one "
             f"takes {signature}"
         ) from None
-
-
-@dataclass(frozen=True, eq=False)
-class _Counted(Operators):
-    """A number that counts the operations of a kernel for the ranges of a formula.
-
-    Measured, for one piece of a path with its sample and slopes: see `_warn_of_price`.
-    """
-
-    tally: list[int]
-
-    def constant(self, x: Any) -> _Counted:
-        del x
-        return self
-
-    def sum(self, other: Any) -> _Counted:
-        del other
-        return self._spending(60)
-
-    def product(self, other: Any) -> _Counted:
-        del other
-        return self._spending(220)
-
-    def __neg__(self) -> _Counted:
-        return self
-
-    def apply(self, function: Any) -> _Counted:
-        del function
-        return self._spending(350)
-
-    def larger(self, other: Any) -> _Counted:
-        del other
-        return self._spending(350)
-
-    def _spending(self, operations: int) -> _Counted:
-        self.tally[0] += operations
-        return self
-
-
-def _warn_of_price(made: Expression) -> None:
-    """Warn where compiling takes long. LLVM took 0.9 s for 11,000 operations on an idle core, 2.7 s
-    for 32,000, 7.4 s for 53,000 and 30 s for 100,000: about as their number to the power 2.2."""
-    number = _Counted([0])
-    try:
-        made.formula(number, number, number)
-    except TypeError:  # what is wrong with it is said where it is tried
-        return
-    operations = number.tally[0]
-    seconds = 30 * (operations / 1e5) ** 2.2
-    if seconds > _LONG:
-        warnings.warn(
-            f"the ranges of this formula take about {operations:,} operations, which take about "
-            f"{seconds:.0f} s to compile on an idle core, once for each precision: a Field of your "
-            "own with a Lipschitz constant compiles in less than a second "
-            "(docs/implicit.md, Long formulas)",
-            stacklevel=4,
-        )

@@ -11,7 +11,7 @@ import numpy as np
 
 from harnack.arithmetic import Jet
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.fields.formula import Formula, as_jet, probe
+from harnack.fields.formula import Formula, as_jet, probe, warn_of_price
 from harnack.geometry.volumes import Box, Intersection
 
 if TYPE_CHECKING:
@@ -56,6 +56,7 @@ class HeightField(Formula):
             )
         point = probe()
         as_jet(self.formula(*point), point[0], "HeightField")
+        warn_of_price(self)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         return z - self.function(x, y)

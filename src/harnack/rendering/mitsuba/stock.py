@@ -105,7 +105,8 @@ def _with_settings(mi: Any, integrator: Any) -> PathTracer:
 def _sees_ours(integrator: Any) -> bool:
     """Whether all that it finds comes from our integrator inside it: moments of its light do, and
     channels of `aov` do not."""
-    return INTEGRATOR in str(integrator) and _kind(integrator) != _CHANNELS
+    words = str(integrator)
+    return INTEGRATOR in words and _CHANNELS not in words
 
 
 def _kind(integrator: Any) -> str:
