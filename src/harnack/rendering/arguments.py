@@ -12,7 +12,7 @@ from typing import Any
 
 from harnack.choices import did_you_mean
 from harnack.fields import Field
-from harnack.rendering.pictures.scales.bar import require_pillow
+from harnack.rendering.pictures.scales.bar import require_pillow, typeface_for
 from harnack.rendering.pictures.views import GROUND_OF_VIEWS, SCALED, VIEWS
 from harnack.rendering.studio.backdrops import Backdrop, Gradient, Ground, checked_backdrop
 from harnack.rendering.studio.camera import Camera
@@ -164,11 +164,10 @@ def check_colorbar(colorbar: Any, show: str) -> bool | str:
     if colorbar:
         _check_scaled("colorbar", show)
         require_pillow()
-    if isinstance(colorbar, str) and not (colorbar.isascii() and colorbar.isprintable()):
-        raise ValueError(
-            f"the title of a color bar is written in plain ASCII letters, not {colorbar!r}: its "
-            "typeface has no others"
-        )
+    if isinstance(colorbar, str):
+        if not colorbar.isprintable():
+            raise ValueError(f"the title of a color bar is one line of letters, not {colorbar!r}")
+        typeface_for(colorbar, 10)
     return colorbar
 
 

@@ -16,6 +16,12 @@ Pixels = npt.NDArray[np.uint8]
 # Heights of letters and bar, and the bar's width, as parts of the picture's height; and the least
 # height of letters, in pixels.
 _LETTERS, _BAR, _WIDTH, _LEAST = 1 / 28, 0.78, 1 / 22, 10
+# Files that Pillow finds by name where they are installed, and a letter that none of them has.
+_TYPEFACES = (
+    "DejaVuSans.ttf", "NotoSans-Regular.ttf", "FreeSans.ttf", "LiberationSans-Regular.ttf",
+    "arial.ttf", "Arial.ttf", "Arial Unicode.ttf", "segoeui.ttf",
+)  # fmt: skip
+_NO_LETTER = "\uffff"
 _ON_DARK, _ON_LIGHT = (226, 226, 226), (26, 26, 28)
 
 
@@ -34,6 +40,31 @@ def require_pillow() -> tuple[Any, Any, Any]:
     return Image, ImageDraw, ImageFont
 
 
+def typeface_for(text: str, size: int) -> Any:
+    """Pillow's own typeface, which has plain ASCII letters, or the first of this machine that has
+    all letters of a text.
+
+    Raises:
+        ValueError: none has them.
+    """
+    _, _, typefaces = require_pillow()
+    own = typefaces.load_default(size)
+    if text.isascii():
+        return own
+    for name in _TYPEFACES:
+        try:
+            one = typefaces.truetype(name, size)
+        except OSError:  # it is not installed
+            continue
+        none = bytes(one.getmask(_NO_LETTER))
+        if all(letter == " " or bytes(one.getmask(letter)) != none for letter in text):
+            return one
+    raise ValueError(
+        f"no typeface that was found here has all letters of {text!r}: install DejaVu Sans (Debian's "
+        "fonts-dejavu-core), or write the title in plain ASCII letters"
+    )
+
+
 def with_bar(pixels: Pixels, scale: Scale, background: Colour) -> Pixels:
     """A picture (h, w, 3) with the bar of its scale to the right: (h, w + more, 3).
 
@@ -42,10 +73,10 @@ def with_bar(pixels: Pixels, scale: Scale, background: Colour) -> Pixels:
     """
     behind = tuple(round(255 * part) for part in background)
     ink = _ON_LIGHT if sum(background) > 1.5 else _ON_DARK
-    images, drawings, typefaces = require_pillow()
+    images, drawings, _ = require_pillow()
     height = len(pixels)
     letters = max(_LEAST, round(_LETTERS * height))
-    font = typefaces.load_default(letters)
+    font = typeface_for(scale.name, letters)
     length = max(2, min(round(_BAR * height), height - 4 * letters))
     thick, gap = max(3, round(_WIDTH * height)), max(2, letters // 2)
     ticks = scale.ticks(max(2, min(6, length // (2 * letters))))
