@@ -430,7 +430,7 @@ def test_titles_of_bars_have_the_letters_of_some_typeface(monkeypatch: pytest.Mo
         )
         assert seen.shown.shape[1] > 40
     monkeypatch.setattr(bar, "_TYPEFACES", ())
-    with pytest.raises(ValueError, match="no typeface .* all letters of 'über 4π'"):
+    with pytest.raises(ValueError, match=r"no typeface .* all letters of 'über 4π'"):
         hk.render(hk.Sphere(1.0), show="depth", colorbar="über 4π")
     with pytest.raises(ValueError, match="one line of letters"):
         hk.render(hk.Sphere(1.0), show="depth", colorbar="a\nb")

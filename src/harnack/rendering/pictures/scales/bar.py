@@ -60,8 +60,8 @@ def typeface_for(text: str, size: int) -> Any:
         if all(letter == " " or bytes(one.getmask(letter)) != none for letter in text):
             return one
     raise ValueError(
-        f"no typeface that was found here has all letters of {text!r}: install DejaVu Sans (Debian's "
-        "fonts-dejavu-core), or write the title in plain ASCII letters"
+        f"no typeface that was found here has all letters of {text!r}: install DejaVu Sans "
+        "(Debian's fonts-dejavu-core), or write the title in plain ASCII letters"
     )
 
 
