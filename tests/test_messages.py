@@ -57,6 +57,7 @@ def draw(**settings: Any) -> Any:
         ({"spp": 2.5}, "spp must be an integer, not 2.5"),
         ({"seed": None}, "seed must be an integer, not None"),
         ({"max_depth": "x"}, "max_depth must be an integer, not 'x'"),
+        ({"max_depth": 3, "show": "shaded"}, 'max_depth is of pictures with show="color"'),
         ({"path": 3}, "path must name a picture"),
     ],
 )

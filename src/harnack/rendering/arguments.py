@@ -103,8 +103,9 @@ def checked_request(
     check_antialias(antialias, show, spp)
     if not isinstance(denoise, bool):
         raise TypeError(f"denoise must be True or False, not {denoise!r}")
-    if denoise and show != "color":
-        raise ValueError(f'denoise is of pictures with show="color", not show="{show}"')
+    for name, given in (("denoise", denoise), ("max_depth", max_depth is not None)):
+        if given and show != "color":
+            raise ValueError(f'{name} is of pictures with show="color", not show="{show}"')
     return Request(
         show,
         None if size is None else check_size(size),
