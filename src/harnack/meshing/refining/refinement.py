@@ -74,7 +74,8 @@ def refined(
         check_count(len(faces) + 2 * count, function.most_faces)
         samples, reach = far.samples.some(marked), 0.5 * far.span[marked]
         moved = newton(function, far.middle[marked], samples, reach, walls)
-        moved = _on_creases(function, vertices, far.ends[marked], moved, walls)
+        if function.field.has_creases:
+            moved = _on_creases(function, vertices, far.ends[marked], moved, walls)
         place = np.full(len(marked), -1, np.int64)
         place[marked] = len(vertices) + np.arange(int(marked.sum()))
         vertices = np.concatenate([vertices, moved])
@@ -87,7 +88,9 @@ def refined(
         fans = [np.stack([*ends, inner], axis=1) for ends in ((a, b), (b, c), (c, a))]
         whole = _split(vertices, faces[~cut_off], place[far.edges[~cut_off]])
         faces = np.concatenate([whole, *fans])
-    return _settled(function, vertices, faces, tolerance, walls), faces
+    if function.field.has_detail:
+        vertices = _settled(function, vertices, faces, tolerance, walls)
+    return vertices, faces
 
 
 def _settled(
@@ -239,7 +242,8 @@ class _Far:
         off &= span[edges].max(axis=1) > _SHORTEST * tolerance
         cuts_off = np.zeros(len(faces), np.bool_)
         lone = np.flatnonzero(off & ~marked[edges].any(axis=1))
-        cuts_off[lone] = _turns(function, vertices[faces[lone]])
+        if function.field.has_creases:
+            cuts_off[lone] = _turns(function, vertices[faces[lone]])
         off &= ~cuts_off
         # Of a face that is off, the longest edge that may be cut.
         free = np.where(is_rim[edges], 0.0, span[edges])

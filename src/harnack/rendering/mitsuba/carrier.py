@@ -64,7 +64,7 @@ def from_properties(
         colours = [one.colour for one in isolines]
         props["bsdf"] = with_lines(mi, props["bsdf"], colours)
         cut_bsdf = None if cut_bsdf is None else with_lines(mi, cut_bsdf, colours)
-    if "MeshAttribute" in str(props.get("bsdf", "")) + str(cut_bsdf):
+    if any("MeshAttribute" in _words(one) for one in (props.get("bsdf", None), cut_bsdf)):
         raise ValueError(
             "a mesh_attribute belongs to vertices or faces, which a level set has not: take a "
             "texture of uv, which are x and y in the world, or draw the mesh of harnack.mesh(field)"
@@ -73,6 +73,14 @@ def from_properties(
     if made.emitter() is not None or made.is_medium_transition():
         raise ValueError("surfaces that are traced can neither emit light nor bound a medium")
     return made
+
+
+def _words(bsdf: Any) -> str:
+    """What a BSDF says of itself; nothing, if it was written in Python without `to_string`."""
+    try:
+        return str(bsdf)
+    except RuntimeError:
+        return ""
 
 
 def as_matrix(transform: Any) -> FloatArray:
