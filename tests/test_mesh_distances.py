@@ -264,8 +264,8 @@ def test_messy_meshes(seed: int) -> None:
                             for part in np.array_split(x, 100)])  # fmt: skip
     found = np.abs(hk.signed_distance(field, x))
     assert (found >= np.abs(hk.signed_distance(field, x, method="lower"))).all()
-    # No foot that is no point of the surface: 1 in 20 was one, up to half the size too near, and hid
-    # 1 in 300 that is too far.
+    # No foot is off the surface: 1 in 20 was, up to half the size too near, which hid 1 in 300 that
+    # are too far.
     assert (found >= upper - 0.03).all()
     assert (found > upper * 1.01).mean() <= 0.018
     assert (found <= upper * 3).all()
