@@ -182,6 +182,28 @@ def seen(what: Any, isolines: Any, show: str, **settings: Any) -> np.ndarray:
     return hk.render(what, show=show, isolines=isolines, **asked).shown.astype(int)
 
 
+def test_pictures_of_values_have_isolines_and_smooth_edges() -> None:
+    """Numbers are those of one ray a pixel, whatever is drawn; edges are means of several."""
+    asked: dict[str, Any] = {"show": "value", "of": "x", "backdrop": "white", **SMALL}
+    lines = hk.Isolines("x", [0.0], width=0.15, color="black")
+    plain, lined = hk.render(CIRCLE, spp=1, **asked), hk.render(CIRCLE, isolines=lines, **asked)
+    np.testing.assert_array_equal(plain, np.asarray(lined))
+    on_line = (lined.shown < 60).all(axis=-1) & ~np.isnan(lined)
+    assert on_line.any()
+    assert np.abs(np.asarray(lined)[on_line]).max() < 0.1
+    beside = np.isnan(plain)  # pixels that a ray through the middle does not see covered
+    assert (plain.shown[beside] == 255).all()
+    smooth = beside & (hk.render(CIRCLE, **asked).shown < 255).any(axis=-1)
+    assert smooth.any()
+    # A line of half a pixel has no gaps.
+    thin = hk.Isolines("x", [0.0], width=0.02, color="black")
+    with_line, without = (hk.render(CIRCLE, isolines=one, **asked).shown for one in (thin, None))
+    step = np.nanmedian(np.abs(np.diff(plain, axis=1)))
+    crossed = np.abs(plain) < 0.4 * step
+    assert crossed.sum() > 10
+    assert (with_line[crossed] < without[crossed]).any(axis=-1).all()
+
+
 @pytest.mark.parametrize("show", ["color", "shaded"])
 def test_lines_have_their_colours(show: str) -> None:
     plain = seen(hk.Sphere(1.0), None, show, material="clay")

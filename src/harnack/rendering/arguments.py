@@ -38,6 +38,8 @@ __all__ = [
 ]
 
 SHOW_MODES: tuple[str, ...] = ("color", "shaded", *VIEWS)
+# Pictures that may have isolines.
+LINED = ("color", "shaded", "value")
 ANTIALIASING = ("edges", "cones")
 MAX_SIDE = 16384
 MAX_SPP = 1_000_000
@@ -55,7 +57,7 @@ _CALLED_ELSEWHERE = {
     ),
 }  # fmt: skip
 # Bytes a pixel at the peak, measured at 2048 x 2048 and 4096 x 4096, rounded up.
-_BYTES = {"color": 50, "shaded": 280, "value": 190}
+_BYTES = {"color": 50, "shaded": 280, "value": 240}
 _BYTES_OF_VIEWS = 130
 
 
@@ -126,8 +128,8 @@ def checked_request(
 def check_isolines(isolines: Any, show: str) -> tuple[Isolines, ...]:
     """Isolines as a tuple; ValueError for pictures that have none."""
     lines = checked_isolines(isolines)
-    if lines and show in VIEWS:
-        raise ValueError(f'isolines are of pictures with show="color" or "shaded", not "{show}"')
+    if lines and show not in LINED:
+        raise ValueError(f'isolines are of pictures with show={_either(LINED)}, not "{show}"')
     return lines
 
 
@@ -193,8 +195,11 @@ def check_behind(backdrop: Any, show: str) -> Backdrop:
 
 def _check_scaled(setting: str, show: str) -> None:
     if show not in SCALED:
-        known = " or ".join(f'"{name}"' for name in SCALED)
-        raise ValueError(f'{setting} is of pictures with show={known}, not "{show}"')
+        raise ValueError(f'{setting} is of pictures with show={_either(SCALED)}, not "{show}"')
+
+
+def _either(names: Sequence[str]) -> str:
+    return " or ".join(f'"{name}"' for name in names)
 
 
 def check_show(show: Any) -> None:

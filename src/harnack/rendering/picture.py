@@ -33,7 +33,7 @@ from harnack.rendering.pictures.light_paths.exposure import PATHS_A_BAND, expose
 from harnack.rendering.pictures.light_paths.pace import SHORT, pace_of
 from harnack.rendering.pictures.shaded import shaded
 from harnack.rendering.pictures.shown import Picture
-from harnack.rendering.pictures.views import VIEWS, drawn, look
+from harnack.rendering.pictures.views import VIEWS, Viewer, drawn
 from harnack.rendering.progress import Advance, progress_bar
 from harnack.rendering.studio.backdrops import Gradient, Ground
 from harnack.rendering.studio.camera import Camera
@@ -85,10 +85,11 @@ def render(
     path: .png (8-bit sRGB, tone mapped) or .exr (the numbers).
     show: "color" follows light paths; "shaded" lights first hits by a formula, in seconds and
         without noise; or what one ray a pixel found: "normal", "evaluations" (of the fields),
-        "status" and "depth", or "value", that of another function.
+        "status" and "depth", or "value", that of another function, whose edges are smoothed in
+        what is shown.
     size: (width, height) in pixels, by default (800, 600) or the scene's own.
     spp: samples a pixel of a color picture, by default 64 or the scene's own, and of the edges
-        of a shaded one, by default 9.
+        of one that is shaded or shows values, by default 9. Others have one ray a pixel.
     antialias: of shaded pictures, which pixels get all their samples: "edges", the default, those
         that differ from a neighbour; "cones" also those that a surface covers in part, found by
         a cone around each pixel. Wires thinner than a pixel then stay lines. It looks at fields
@@ -102,7 +103,8 @@ def render(
         is written and shown wider, or the bar's title. The numbers returned stay the same. Needs
         Pillow, which `pip install harnack[film]` brings.
     max_depth: longest light path in edges, -1 for no limit; by default 12 or the scene's own.
-    seed: another seed, other noise; the same seed, the same picture.
+    seed: another seed, other noise; the same seed, the same picture. Only color pictures have
+        noise.
     denoise: whether a neural network (Open Image Denoise; `pip install harnack[denoise]`) takes the
         noise out of a color picture. It guesses: do not read numbers off such a picture.
     progress: whether a bar on stderr shows how far the picture is, and a line before it how long a
@@ -123,8 +125,8 @@ def render(
     boundary: the radius, in the surfaces' coordinates, of a tube around the curves at which
         surfaces end (`Field.boundary_curves`). boundary_material: its material, by default "gold".
     cut_material: what the faces of opaque solids on their `section` are made of.
-    isolines: lines on the surfaces, of heights or of another function, where `show` is "color" or
-        "shaded": an `Isolines` or several.
+    isolines: lines on the surfaces, of heights or of another function, where `show` is "color",
+        "shaded" or "value": an `Isolines` or several.
     thickness: draws surfaces as sheets so thick, in their own coordinates: the closed meshes that
         `harnack.mesh` makes with this thickness, whose triangles are seen from close by.
     settings: of the surfaces, as `harnack.level_set` takes them: level, clip, section, solid, ...;
@@ -181,12 +183,13 @@ def render(
     tracer = stand_in(mi, scene) if show == "color" else None
     if show in VIEWS:
         placement = Placement.identity() if stage is None else stage.placement
-        view = look(mi, scene, scene.sensors()[0], placement, asked.function)
+        viewer = Viewer.of(mi, scene, scene.sensors()[0], placement, asked.function)
         if isinstance(asked.backdrop, Gradient):
-            view = replace(view, background=asked.backdrop.bottom)
+            viewer = replace(viewer, background=asked.backdrop.bottom)
+        view = viewer.look()
         image = VIEWS[show].numbers(view)
-        named = asked.colorbar is True and isinstance(of, str)
-        shown = drawn(show, view, asked.value_range, str(of) if named else asked.colorbar)
+        bar = str(of) if asked.colorbar is True and isinstance(of, str) else asked.colorbar
+        shown = drawn(show, viewer, view, asked.value_range, bar, asked.spp or _EDGE_SPP)
     elif show == "color" and tracer is None:
         image, shown, names = _by_mitsuba(mi, scene, asked)
     else:

@@ -101,6 +101,12 @@ def search_worst_places(
         way = rng.normal(size=p.shape) * step * 10 ** rng.uniform(-1, 0, (len(p), 1))
         shift = np.where(moves, rng.normal(size=p.shape) * step, 0)
         near = w - np.where(kind == 3, shift, 0) + np.where(kind == 3, 0, way)
+        # A promise of slopes or second derivatives is broken most between neighbors: a way that is
+        # turned and made shorter or longer, by a share of its length.
+        length = np.linalg.norm(w, axis=1, keepdims=True)
+        turned = (w + length * way) * 10 ** rng.uniform(-1, 0.5, (len(p), 1))
+        near = np.where(np.arange(len(p))[:, None] % 8 == 1, turned, near)
+        near = np.where(np.arange(len(p))[:, None] % 8 == 2, w + length * way, near)
         found, better = found.best_of(search.pairs(p + reach * shift, near))
         size = np.where(better, np.minimum(_FARTHER * size, 1), _SHORTER * size)
         size = np.where(size < _LEAST, _FIRST, size)

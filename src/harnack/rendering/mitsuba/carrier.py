@@ -111,6 +111,7 @@ def _carrier_class(variant: str) -> Any:
             self.cut_face = None if cut_bsdf is None else _bearer(mi, cut_bsdf)
             backend, size = mitsuba_backend(mi), float(np.linalg.norm(np.diff(ends, axis=0)))
             self.placed = PlacedSurface.of(surface, placement, backend, isolines, size)
+            self.line_colours = tuple(one.colour for one in isolines)
             params = mi.traverse(self)
             corners = np.concatenate(placement.world_bounds(ends))
             params["vertex_positions"] = aligned(backend, corners)

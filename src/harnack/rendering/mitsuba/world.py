@@ -122,6 +122,27 @@ class World:
             line=mi.UInt32(0),
         )
 
+    def has_line_near(self, si: Any, ray: Any, d: Any, t: Any) -> Mask:
+        """Whether the edge of an isoline may pass through the pixel of a ray with differentials.
+
+        d: in which the ray arrives, t: after that way. What neighbouring rays would meet of the
+        tangent plane is laid along d.
+        """
+        mi, near = self.mi, self.mi.Bool(False)
+        normal = mi.Vector3f(si.n)
+        facing = dr.dot(normal, d)
+
+        def to_neighbour(o: Any, along: Any) -> Any:
+            way = o + t * along - ray.o - t * ray.d
+            return way - d * (dr.dot(way, normal) / facing)
+
+        across, down = to_neighbour(ray.o_x, ray.d_x), to_neighbour(ray.o_y, ray.d_y)
+        for carrier in self.carriers:
+            if carrier.placed.lines:
+                found = carrier.placed.has_line_near(si.p, normal, across, down)
+                near |= (si.shape == mi.ShapePtr(carrier)) & found
+        return near
+
     def occluded(self, ray: Any, active: Mask) -> Mask:
         """Whether anything lies on the rays. What is not proved free counts as lying there."""
         blocked = self.scene.ray_test(ray, active)

@@ -79,6 +79,11 @@ def transferred(x: FloatArray) -> FloatArray:
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
 
 
+def linear_of(x: FloatArray) -> FloatArray:
+    """sRGB in [0, 1] as linear sRGB: the inverse of `transferred`."""
+    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
+
+
 def as_bytes(image: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.uint8]:
     """Numbers in [0, 1] as bytes."""
     return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)

@@ -7,12 +7,15 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from harnack.backend import FloatArray, IntArray
+from harnack.backend import BoolArray, FloatArray, IntArray
 from harnack.backend.arrays import aligned_integers
 from harnack.rendering.mitsuba.variant import mitsuba_backend
 
 _TILE = 4
+# Neighbours that differ by more than this, of 255, are an edge.
+_EDGE = 16
 
 
 def bands(pixels: int, step: int) -> Iterator[tuple[int, int]]:
@@ -65,3 +68,16 @@ def grid_offsets(count: int) -> FloatArray:
     x = (i + (j + 0.5) / rows) / columns
     y = (j + (i + 0.5) / columns) / rows
     return np.column_stack([x, y])
+
+
+def edges_of(picture: npt.NDArray[np.uint8]) -> BoolArray:
+    """Pixels (h, w) of a picture (h, w, 3) that differ visibly from one of four neighbours."""
+    shown = picture.astype(np.int64)
+    edge = np.zeros(shown.shape[:2], dtype=np.bool_)
+    across = (np.abs(np.diff(shown, axis=1)) > _EDGE).any(axis=-1)
+    down = (np.abs(np.diff(shown, axis=0)) > _EDGE).any(axis=-1)
+    edge[:, 1:] |= across
+    edge[:, :-1] |= across
+    edge[1:] |= down
+    edge[:-1] |= down
+    return edge

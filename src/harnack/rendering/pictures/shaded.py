@@ -29,6 +29,7 @@ from harnack.rendering.pictures.light_paths.exposure import as_rgb, mean_of_bloc
 from harnack.rendering.pictures.occlusion import visible_sky
 from harnack.rendering.pictures.pixels import (
     bands,
+    edges_of,
     film_places,
     grid_offsets,
     in_tiles,
@@ -41,8 +42,6 @@ from harnack.rendering.pictures.through import Through
 _RAYS_A_BAND = 2**17
 # Where in its pixel the first ray goes through.
 _MIDDLE = 0.5
-# Neighbours that differ by more than this, of 255, are an edge.
-_EDGE = 16
 # The share of the time that is spent on the first rays, as the progress bar guesses.
 _FIRST = 0.6
 
@@ -123,7 +122,7 @@ def shaded(
     dr.eval(sky)
     image = to_numpy(painter.paint(seen, sky)).reshape(*painter.size[::-1], 4)
     lost = int(dr.count(seen.lost)[0])
-    again = _edges(image[..., :3] + (1 - image[..., 3:])).ravel()
+    again = edges_of(tone_mapped(image[..., :3] + (1 - image[..., 3:]))).ravel()
     again |= to_numpy(seen.lined)
     if finder is not None:
         for start, stop in bands(count, _RAYS_A_BAND):
@@ -189,32 +188,11 @@ class _Painter:
         flags = si.bsdf().flags()
         glossy = mi.has_flag(flags, mi.BSDFFlags.Glossy) | mi.has_flag(flags, mi.BSDFFlags.Delta)
         glossy &= plain
-        lined = met & self._has_line_near(si, ray, d, t)
+        lined = met & self.world.has_line_near(si, ray, d, t)
         position = dr.select(met, mi.Vector3f(si.p), dr.nan)
         return _Seen(
             position, normal, -d, width, colour, light, through, glossy, met, lost, covered, lined
         )
-
-    def _has_line_near(self, si: Any, ray: Any, d: Any, t: Any) -> Any:
-        """Whether the edge of an isoline may pass through the pixel of a ray with differentials.
-
-        d: in which the ray arrives, t: after that way. What neighbouring rays would meet of the
-        tangent plane is laid along d.
-        """
-        mi, near = self.mi, self.mi.Bool(False)
-        normal = mi.Vector3f(si.n)
-        facing = dr.dot(normal, d)
-
-        def to_neighbour(o: Any, along: Any) -> Any:
-            way = o + t * along - ray.o - t * ray.d
-            return way - d * (dr.dot(way, normal) / facing)
-
-        across, down = to_neighbour(ray.o_x, ray.d_x), to_neighbour(ray.o_y, ray.d_y)
-        for carrier in self.world.carriers:
-            if carrier.placed.lines:
-                found = carrier.placed.has_line_near(si.p, normal, across, down)
-                near |= (si.shape == mi.ShapePtr(carrier)) & found
-        return near
 
     def ray(self, pixel: Any, offset: Any) -> tuple[Any, Any]:
         """Rays with differentials through places in pixels, and what their light is weighted by."""
@@ -278,16 +256,3 @@ class _Painter:
             nearest = dr.select(nearer, away, nearest)
             found = dr.select(nearer, dr.gather(mi.Float, sky, other), found)
         return found
-
-
-def _edges(image: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
-    """Pixels (h, w) that differ visibly from one of their four neighbours."""
-    shown = tone_mapped(image).astype(np.int64)
-    edge = np.zeros(shown.shape[:2], dtype=np.bool_)
-    across = (np.abs(np.diff(shown, axis=1)) > _EDGE).any(axis=-1)
-    down = (np.abs(np.diff(shown, axis=0)) > _EDGE).any(axis=-1)
-    edge[:, 1:] |= across
-    edge[:, :-1] |= across
-    edge[1:] |= down
-    edge[:-1] |= down
-    return edge

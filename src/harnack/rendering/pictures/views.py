@@ -1,7 +1,8 @@
 """Pictures of what the tracer did and found: normals, evaluations, status, depth, and values of
-another function on the surface. One ray a pixel.
+another function on the surface.
 
-All of them are exact, not averaged: the ray goes through the middle of the pixel.
+The numbers are exact, not averaged: those of one ray through the middle of each pixel. So are the
+pictures, but that of values: where it has edges, the colors of several rays are averaged.
 """
 
 from __future__ import annotations
@@ -14,12 +15,20 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend import to_numpy
+from harnack.backend import FloatArray, IntArray, aligned, to_numpy
 from harnack.fields import Field
 from harnack.rendering.mitsuba.integrator import LOST_COLOUR
+from harnack.rendering.mitsuba.variant import mitsuba_backend
 from harnack.rendering.mitsuba.world import World
-from harnack.rendering.pictures.images import as_bytes
-from harnack.rendering.pictures.pixels import bands, film_places, in_tiles, uploaded
+from harnack.rendering.pictures.images import as_bytes, linear_of, transferred
+from harnack.rendering.pictures.pixels import (
+    bands,
+    edges_of,
+    film_places,
+    grid_offsets,
+    in_tiles,
+    uploaded,
+)
 from harnack.rendering.pictures.scales.bar import with_bar
 from harnack.rendering.pictures.scales.colormap import greys, viridis
 from harnack.rendering.pictures.scales.scale import Scale
@@ -27,8 +36,6 @@ from harnack.rendering.surfaces.colours import Colour
 from harnack.rendering.surfaces.functions import defined_in
 from harnack.rendering.surfaces.placement import Placement
 from harnack.tracer import Status
-
-FloatArray = npt.NDArray[np.floating[Any]]
 
 # Ctrl-C works between bands.
 _RAYS_A_BAND = 2**20
@@ -52,6 +59,8 @@ class View:
     normal: (h, w, 3) unit, zero where nothing is met; of a level set it points to larger values.
     evaluations: (h, w) of all the scene's fields.
     status: (h, w) a `Status`; shapes of Mitsuba count as hits.
+    line: (h, w, 3) color in sRGB of the isoline that is met; NaN where none is.
+    lined: (h, w) whether the edge of an isoline may pass through the pixel.
     value: (h, w) of a function where something is met, NaN elsewhere; None if none was asked for.
     period: of that function, if it is angle-valued.
     background: sRGB in [0, 1], of pictures where nothing is met.
@@ -61,70 +70,134 @@ class View:
     normal: FloatArray
     evaluations: npt.NDArray[np.int64]
     status: npt.NDArray[np.int64]
+    line: FloatArray
+    lined: npt.NDArray[np.bool_]
     value: FloatArray | None = None
     period: float | None = None
     background: Colour = _BACKGROUND
 
 
-def look(
-    mi: Any,
-    scene: Any,
-    sensor: Any,
-    placement: Placement = _IDENTITY,
-    function: Field | None = None,
-) -> View:
-    """What a sensor sees first.
+@dataclass(frozen=True)
+class Viewer:
+    """A sensor in a world.
 
     placement: of the surfaces, in whose coordinates depths are given. function: of the same
-    coordinates, to be evaluated at what is met.
+    coordinates, to be evaluated at what is met; None for none.
     """
-    width, height = (int(n) for n in sensor.film().crop_size())
-    world = World.of(mi, scene)
-    order = in_tiles((width, height))
-    parts = [
-        _look_at(mi, world, sensor, uploaded(mi, order[start:stop]), placement, function)
-        for start, stop in bands(width * height, _RAYS_A_BAND)
-    ]
 
-    def by_rows(column: tuple[Any, ...]) -> Any:
-        image = np.empty((height, width, *column[0].shape[1:]), column[0].dtype)
-        image.reshape(height * width, *column[0].shape[1:])[order] = np.concatenate(column)
-        return image
+    mi: Any
+    world: World
+    sensor: Any
+    placement: Placement
+    function: Field | None
+    background: Colour = _BACKGROUND
 
-    depth, normal, evaluations, status, *value = map(by_rows, zip(*parts, strict=True))
-    view = View(depth / placement.scale, normal, evaluations, status)
-    if function is None:
-        return view
-    return replace(view, value=value[0], period=function.period)
+    @classmethod
+    def of(
+        cls,
+        mi: Any,
+        scene: Any,
+        sensor: Any,
+        placement: Placement = _IDENTITY,
+        function: Field | None = None,
+        background: Colour = _BACKGROUND,
+    ) -> Viewer:
+        """Of a loaded scene."""
+        return cls(mi, World.of(mi, scene), sensor, placement, function, background)
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+        width, height = (int(n) for n in self.sensor.film().crop_size())
+        return width, height
 
-def _look_at(
-    mi: Any, world: World, sensor: Any, pixel: Any, placement: Placement, function: Field | None
-) -> tuple[Any, ...]:
-    """Depth, normal, evaluations and status of pixels, counted by rows; and values, if any."""
-    width, height = (int(n) for n in sensor.film().crop_size())
-    count = dr.width(pixel)
-    place = film_places(mi, pixel, mi.Vector2f(0.5), (width, height))
-    ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, place, mi.Point2f(0.5))
-    none = dr.zeros(mi.SurfaceInteraction3f)
-    _, first = world.intersect(mi.Ray3f(ray), none, mi.Bool(True))
-    dr.eval(first)
+    def look(self) -> View:
+        """What the rays through the middles of all pixels meet first."""
+        width, height = self.size
+        order = in_tiles((width, height))
+        parts = [
+            self._look_at(uploaded(self.mi, order[start:stop]), self.mi.Vector2f(0.5))
+            for start, stop in bands(width * height, _RAYS_A_BAND)
+        ]
 
-    def numbers(values: Any) -> Any:
-        flat = to_numpy(values)
-        return np.broadcast_to(flat, (count, *flat.shape[1:]))
+        def by_rows(*column: Any) -> Any:
+            image = np.empty((height, width, *column[0].shape[1:]), column[0].dtype)
+            image.reshape(height * width, *column[0].shape[1:])[order] = np.concatenate(column)
+            return image
 
-    met, lost = numbers(first.met), numbers(first.lost)
-    status = np.where(met, int(Status.HIT), int(Status.MISS))
-    status = np.where(lost, int(Status.OUT_OF_STEPS), status)
-    normal = np.where(met[:, None], numbers(first.normal), 0)
-    found = numbers(first.t), normal, numbers(first.evaluations).astype(np.int64), status
-    if function is None:
+        return _each(by_rows, *parts)
+
+    def look_again(self, pixels: IntArray, offsets: FloatArray) -> View:
+        """What rays through places (m, 2) in each of n pixels, counted by rows, meet first: arrays
+        (n, m)."""
+        mi, count = self.mi, len(offsets)
+        pixel = uploaded(mi, np.repeat(pixels, count))
+        table = np.tile(offsets, (len(pixels), 1)).T
+        places = mi.Vector2f(*(aligned(mitsuba_backend(mi), one) for one in table))
+
+        def by_pixels(one: Any) -> Any:
+            return one.reshape(len(pixels), count, *one.shape[1:])
+
+        return _each(by_pixels, self._look_at(pixel, places))
+
+    def _look_at(self, pixel: Any, offset: Any) -> View:
+        """What rays through places in pixels, counted by rows, meet first: arrays (n,)."""
+        mi, count = self.mi, dr.width(pixel)
+        place = film_places(mi, pixel, offset, self.size)
+        ray, _ = self.sensor.sample_ray_differential(
+            self.sensor.shutter_open(), 0.5, place, mi.Point2f(0.5)
+        )
+        none = dr.zeros(mi.SurfaceInteraction3f)
+        si, first = self.world.intersect(mi.Ray3f(ray), none, mi.Bool(True))
+        lined, line = mi.Bool(False), mi.Vector3f(dr.nan)
+        if self.function is not None:
+            lined = first.met & self.world.has_line_near(si, ray, ray.d, first.t)
+            line = self._line_colour(si, first)
+        dr.eval(first, lined, line)
+
+        def numbers(values: Any) -> Any:
+            flat = to_numpy(values)
+            return np.broadcast_to(flat, (count, *flat.shape[1:]))
+
+        met, lost = numbers(first.met), numbers(first.lost)
+        status = np.where(met, int(Status.HIT), int(Status.MISS))
+        view = View(
+            depth=numbers(first.t) / self.placement.scale,
+            normal=np.where(met[:, None], numbers(first.normal), 0),
+            evaluations=numbers(first.evaluations).astype(np.int64),
+            status=np.where(lost, int(Status.OUT_OF_STEPS), status),
+            line=numbers(line),
+            lined=numbers(lined),
+            background=self.background,
+        )
+        if self.function is None:
+            return view
+        value = np.full(count, np.nan, dtype=np.float32)
+        if met.any():
+            value[met] = _values(self.function, self.placement.undo(numbers(first.position)[met]))
+        return replace(view, value=value, period=self.function.period)
+
+    def _line_colour(self, si: Any, first: Any) -> Any:
+        """sRGB of the line that is met; NaN where none is."""
+        mi = self.mi
+        found = mi.Vector3f(dr.nan)
+        for carrier in self.world.carriers:
+            own = first.met & (si.shape == mi.ShapePtr(carrier))
+            if carrier.cut_face is not None:
+                own |= first.met & (si.shape == mi.ShapePtr(carrier.cut_face))
+            for number, colour in enumerate(carrier.line_colours, start=1):
+                found = dr.select(own & (first.line == number), mi.Vector3f(*colour), found)
         return found
-    value = np.full(count, np.nan, dtype=np.float32)
-    if met.any():
-        value[met] = _values(function, placement.undo(numbers(first.position)[met]))
-    return *found, value
+
+
+def _each(change: Callable[..., Any], *views: View) -> View:
+    """A view whose arrays are made of those of the same name in others."""
+    arrays = {
+        name: change(*(getattr(view, name) for view in views))
+        for name, value in vars(views[0]).items()
+        if isinstance(value, np.ndarray)
+    }
+    return replace(views[0], **arrays)
 
 
 def _values(function: Field, points: FloatArray) -> FloatArray:
@@ -147,10 +220,16 @@ def status_picture(view: View) -> npt.NDArray[np.uint8]:
     return as_bytes(picture)
 
 
-def scaled_picture(view: View, numbers: FloatArray, scale: Scale) -> npt.NDArray[np.uint8]:
-    """Numbers of what is met as the colours of a scale; grey where there is none."""
-    known = ~np.isnan(numbers)[..., None]
-    return _of_surfaces(view, np.where(known, scale.colours(numbers), _UNKNOWN))
+def depth_picture(view: View, scale: Scale) -> npt.NDArray[np.uint8]:
+    """Depths of what is met as the colours of a scale."""
+    return _of_surfaces(view, scale.colours(view.depth))
+
+
+def value_picture(view: View, scale: Scale) -> npt.NDArray[np.uint8]:
+    """Values on what is met as the colours of a scale, grey where there is none; isolines on it."""
+    value = value_of(view)
+    picture = np.where(np.isnan(value)[..., None], _UNKNOWN, scale.colours(value))
+    return _of_surfaces(view, np.where(np.isnan(view.line), picture, view.line))
 
 
 def evaluations_picture(view: View, scale: Scale) -> npt.NDArray[np.uint8]:
@@ -205,11 +284,13 @@ class Show:
     """What to take from a view as numbers, and how to draw it.
 
     scale: of numbers that have one, which `picture` draws them by; None for others.
+    is_averaged: whether the picture, not the numbers, is that of several rays where it has edges.
     """
 
     numbers: Callable[[View], Any]
     picture: Callable[[View, Any], npt.NDArray[np.uint8]]
     scale: Callable[[View], Scale] | None = None
+    is_averaged: bool = False
 
 
 VIEWS = {
@@ -218,11 +299,14 @@ VIEWS = {
     "status": Show(lambda view: view.status, lambda view, _: status_picture(view)),
     "depth": Show(
         lambda view: view.depth,
-        lambda view, scale: scaled_picture(view, view.depth, scale),
+        depth_picture,
         depth_scale,
     ),
     "value": Show(
-        value_of, lambda view, scale: scaled_picture(view, value_of(view), scale), value_scale
+        value_of,
+        value_picture,
+        value_scale,
+        is_averaged=True,
     ),
 }
 SCALED = tuple(name for name, show in VIEWS.items() if show.scale is not None)
@@ -230,12 +314,17 @@ SCALED = tuple(name for name, show in VIEWS.items() if show.scale is not None)
 
 
 def drawn(
-    show: str, view: View, value_range: tuple[float, float] | None, bar: str | bool
+    show: str,
+    viewer: Viewer,
+    view: View,
+    value_range: tuple[float, float] | None,
+    bar: str | bool,
+    spp: int,
 ) -> npt.NDArray[np.uint8]:
-    """The pixels of a view.
+    """The pixels of what a viewer has seen.
 
     value_range: of the scale, in place of what is seen. bar: whether to put a colour bar beside
-    it, or what to write over that.
+    it, or what to write over that. spp: rays of a pixel on an edge, of pictures that are averaged.
     """
     one = VIEWS[show]
     scale = None if one.scale is None else one.scale(view)
@@ -247,6 +336,8 @@ def drawn(
     if isinstance(bar, str):
         scale = replace(scale, name=bar)
     picture = one.picture(view, scale)
+    if one.is_averaged and spp > 1:
+        _average(viewer, view, picture, lambda part: one.picture(part, scale), spp)
     if not bar:
         return picture
     numbers = np.asarray(one.numbers(view), dtype=np.float64)
@@ -254,3 +345,21 @@ def drawn(
         numbers = numbers[view.status == int(Status.HIT)]
     scale = scale.passed_by(numbers[np.isfinite(numbers)])
     return with_bar(picture, scale, view.background)
+
+
+def _average(
+    viewer: Viewer,
+    view: View,
+    picture: npt.NDArray[np.uint8],
+    colours: Callable[[View], npt.NDArray[np.uint8]],
+    spp: int,
+) -> None:
+    """Make pixels that differ visibly from a neighbour, or that the edge of an isoline may pass
+    through, the mean light of a grid of rays."""
+    order = in_tiles(viewer.size)
+    again = order[(edges_of(picture) | view.lined).ravel()[order]]
+    offsets = grid_offsets(spp)
+    for start, stop in bands(len(again), max(1, _RAYS_A_BAND // len(offsets))):
+        chosen = again[start:stop]
+        light = linear_of(colours(viewer.look_again(chosen, offsets)) / 255)
+        picture.reshape(-1, 3)[chosen] = as_bytes(transferred(light.mean(axis=1)))
