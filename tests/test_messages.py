@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import math
 import re
 from collections.abc import Callable
@@ -14,7 +15,8 @@ import pytest
 import harnack as hk
 from harnack.choices import did_you_mean
 from harnack.cli import main
-from harnack.cli.messages import error_line, level_text, printable
+from harnack.cli.arguments import parsers
+from harnack.cli.messages import OPTIONS, error_line, in_options, level_text, printable
 from harnack.files import FileFormatError
 from harnack.geometry import shapes
 from harnack.geometry.mesh_shapes import icosphere
@@ -301,6 +303,43 @@ def test_lines_are_printable() -> None:
     assert error_line(RuntimeError("two\n  lines")) == "error: two lines"
     assert "choose a smaller --size" in error_line(MemoryError("of 11 TiB"))
     assert error_line(ValueError('up= turns as_="loops"')) == "error: --up turns --as loops"
+
+
+def raised_messages() -> list[str]:
+    """What the library says when it raises, as far as that is written where it does; X stands for
+    what is put in."""
+    root = Path(hk.__file__).parent
+    trees = [ast.parse(path.read_text()) for path in root.rglob("*.py")]
+    raised = [node.exc for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Raise)]
+    parts = [part for one in raised if one is not None for part in ast.walk(one)]
+    formatted = [part.values for part in parts if isinstance(part, ast.JoinedStr)]
+    single = [[part] for part in parts if isinstance(part, ast.Constant)]
+    inside = {id(piece) for pieces in formatted for piece in pieces}
+    return [
+        "".join(str(one.value) if isinstance(one, ast.Constant) else "X" for one in pieces)
+        for pieces in (*formatted, *(one for one in single if id(one[0]) not in inside))
+    ]
+
+
+def test_the_command_line_names_its_options_and_not_arguments_of_python() -> None:
+    _, commands = parsers()
+    actions = [one for command in commands.values() for one in command._actions]
+    options = {option for one in actions for option in one.option_strings}
+    named = {one.dest for one in actions if one.option_strings}
+    assert {f"--{name.rstrip('_').replace('_', '-')}" for name in OPTIONS} <= options
+    python = re.compile(rf"(?<![(\w])({'|'.join(named)}|as_|solid|section|clip|box|ball)=\S")
+    only_in_python = "level=[a, b]"  # as no command can be given two fields
+    messages = raised_messages()
+    assert len(messages) > 500
+    for message in messages:
+        said = re.sub(r"\w+\([^()]*=[^()]*\)", "a call", in_options(message))
+        if only_in_python not in message:
+            assert not python.search(said), said
+    assert in_options('show="value" needs the function, such as of="z"') == (
+        "--show value needs the function, such as --of z"
+    )
+    said = in_options("give clip=harnack.Box(lower, upper) or harnack.Ball(center, radius)")
+    assert said == "give --box X,Y,Z,X,Y,Z or --ball X,Y,Z,RADIUS"
 
 
 @pytest.mark.parametrize(

@@ -50,7 +50,7 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
 
     Ends the process with exit code 2 for wrong usage.
     """
-    whole, commands = _parsers()
+    whole, commands = parsers()
     if not (sys.argv[1:] if arguments is None else arguments):
         whole.print_help(sys.stderr)
         whole.exit(2)
@@ -65,7 +65,7 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     return found
 
 
-def _parsers() -> tuple[_Parser, dict[str, _Parser]]:
+def parsers() -> tuple[_Parser, dict[str, _Parser]]:
     """The parser of the whole line, and those of what follows each command."""
     whole = _Parser(
         prog="harnack", description="Guaranteed ray tracing of harmonic and other surfaces."

@@ -6,13 +6,31 @@ import re
 
 from harnack.rendering import UnboundedSurfaceError
 
-# Python's arguments as messages write them, and the options they are on the command line.
-_OPTIONS = re.compile(r'\b(as_|normals|show|material|up|of)="([\w-]+)"')
-
-_WORDS = {
-    "boundary=True": "--boundary", "up= ": "--up ", "max_triangles": "--max-triangles",
+# Arguments of Python that are options of the command line.
+OPTIONS = (
+    "antialias", "as_", "bound", "boundary", "boundary_material", "colorbar", "confirm",
+    "cut_material", "denoise", "largest", "level", "material", "max_triangles", "normals", "of",
+    "seed", "show", "simplify", "size", "spacing", "spp", "thickness", "tolerance", "up",
+)  # fmt: skip
+# One of them with a value, as messages write it, that is not inside of a call.
+_ARGUMENT = re.compile(rf'(?<![(\w])({"|".join(OPTIONS)})=("[^"]*"|True\b|[\w.-]+)')
+# What is written otherwise. Longer phrases come before their parts.
+_PHRASES = {
+    "clip=harnack.Ball((0, 0, 0), 1)": "--ball 0,0,0,1",
+    "clip=harnack.Box(lower, upper)": "--box X,Y,Z,X,Y,Z",
+    "or harnack.Ball(center, radius)": "or --ball X,Y,Z,RADIUS",
+    "section=harnack.HalfSpace(normal, offset)": "--section X,Y,Z,OFFSET",
+    "target=(x, y, z)": "--target X,Y,Z",
+    "boundary=0.03": "--boundary-tube 0.03",
+    "solid=True": "--solid",
+    "solid=(-math.inf, level)": "--solid :LEVEL",
+    "solid=(-math.inf, 0.0)": "--solid :0",
+    "solid=(low, high)": "--solid LOW:HIGH",
+    'backdrop="white"': "--backdrop white",
+    "up= ": "--up ",
+    "max_triangles": "--max-triangles",
     " (apply_translation), or scale it (apply_scale)": ", or scale it (--scale)",
-}  # fmt: skip
+}
 
 
 def error_line(error: Exception) -> str:
@@ -37,10 +55,14 @@ def _explanation(error: Exception) -> str:
 
 def in_options(text: str) -> str:
     """A message of the library, with options of the command line for arguments of Python."""
-    text = _OPTIONS.sub(lambda found: f"--{found[1].rstrip('_')} {found[2]}", text)
-    for written, option in _WORDS.items():
+    for written, option in _PHRASES.items():
         text = text.replace(written, option)
-    return text
+    return _ARGUMENT.sub(lambda found: _option(*found.groups()), text)
+
+
+def _option(name: str, value: str) -> str:
+    option = f"--{name.rstrip('_').replace('_', '-')}"
+    return option if value == "True" else f"{option} {value.strip(chr(34))}"
 
 
 def level_text(level: float | None) -> str:
