@@ -499,3 +499,23 @@ def test_rows_have_frames() -> None:
     on_backend = across(hb.to_vector3(backend, d))
     for ours, theirs in zip((u, v), on_backend, strict=True):
         np.testing.assert_allclose(ours, hb.to_numpy(theirs), atol=1e-15)
+
+
+def test_names_are_imported_where_they_are_first_used() -> None:
+    """Importing the package imports no more than Dr.Jit, and every name there is can be had."""
+    code = """
+import sys
+import harnack as hk
+rooms = {name.split(".")[1] for name in sys.modules if name.startswith("harnack.")}
+print(sorted(rooms))
+assert all(getattr(hk, name) is not None for name in hk.__all__)
+assert set(hk.__all__) <= set(dir(hk))
+try:
+    hk.traec
+except AttributeError as error:
+    print(error)
+"""
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    rooms, missed = run.stdout.splitlines()
+    assert rooms == "['_version', 'backend', 'choices']"
+    assert missed == "module 'harnack' has no attribute 'traec'; did you mean \"trace\"?"

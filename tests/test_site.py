@@ -33,7 +33,9 @@ def documented() -> set[str]:
 
 def test_the_reference_has_every_public_name() -> None:
     modules = {"backend", "files", "geometry", "rendering", "testing"}
-    assert set(hk.__all__) - modules <= documented()
+    # Rooms whose public names are names of `harnack`.
+    rooms = {"arithmetic", "distance", "enclosures", "fields", "meshing", "tracer"}
+    assert set(hk.__all__) - modules - rooms <= documented()
     for module in modules:
         names = {
             name

@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from scipy import ndimage
 
 from harnack.cells.uniform_grid import distances_to_full
 
@@ -18,8 +17,6 @@ __all__ = ["largest_component"]
 
 # Cells that share a face, an edge or a corner are neighbours.
 _AROUND = np.ones((3, 3, 3), np.bool_)
-
-_label = cast("Any", ndimage).label  # untyped
 
 
 def largest_component(cells: OccupiedCells) -> OccupiedCells:
@@ -48,7 +45,9 @@ def largest_component(cells: OccupiedCells) -> OccupiedCells:
     full = (cells.free == 0).reshape(z, y, x)
     if not full.any():
         return cells
-    groups, count = _label(full, _AROUND)
+    from scipy import ndimage  # here: a third of a second that few need
+
+    groups, count = cast("Any", ndimage).label(full, _AROUND)
     group, places = groups[full], np.argwhere(full)
     sizes = sum(_shadows(group, np.delete(places, axis, 1), count) for axis in range(3))
     wanted = groups == 1 + int(np.argmax(sizes))

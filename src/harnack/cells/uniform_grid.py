@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import drjit as dr
 import numpy as np
-from scipy import ndimage
 
 from harnack.backend.arrays import aligned_integers
 from harnack.backend.extrema import clamp, fmin
@@ -22,7 +21,6 @@ __all__ = ["GridCell", "GridLayout", "UniformGrid", "distances_to_full", "short_
 # Of what is true beyond an empty cell, this part of a cell is left to the rounding of positions.
 _ROUNDING = 1 / 64
 
-_chessboard = cast("Any", ndimage).distance_transform_cdt  # untyped; its usual metric
 
 Layout = TypeVar("Layout", bound="GridLayout")
 
@@ -157,7 +155,10 @@ def distances_to_full(empty: BoolArray) -> IntArray:
     """`GridLayout.free` of cells (nz, ny, nx)."""
     if empty.all():
         return np.full(empty.size, max(empty.shape), np.int64)
-    return np.asarray(_chessboard(empty), dtype=np.int64).ravel()
+    from scipy import ndimage  # here: a third of a second that few need
+
+    chessboard: Any = cast("Any", ndimage).distance_transform_cdt  # by its usual metric
+    return np.asarray(chessboard(empty), dtype=np.int64).ravel()
 
 
 def short_length(size: float) -> float:

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import drjit as dr
 import numpy as np
-import scipy.linalg
 
 from harnack.arithmetic import Jet, sqrt
 from harnack.backend import FloatArray, backend_of
@@ -30,7 +29,6 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
     from harnack.geometry import Volume
 
-_solve = cast("Any", scipy.linalg).solve  # untyped
 
 # Points at most: the linear system has four unknowns for each of them.
 _MOST_POINTS = 5000
@@ -307,8 +305,10 @@ def _solved(points: FloatArray, normals: FloatArray) -> tuple[FloatArray, FloatA
     wanted = np.zeros((n, 4))
     wanted[:, 1:] = normals
     matrix = system.reshape(4 * n, 4 * n)
+    import scipy.linalg  # here: time that few need
+
     try:
-        found = _solve(matrix, wanted.ravel(), assume_a="gen")
+        found = cast("Any", scipy.linalg).solve(matrix, wanted.ravel(), assume_a="gen")
     except np.linalg.LinAlgError:
         found = np.full(4 * n, np.nan)
     missed = np.abs(matrix @ found - wanted.ravel()).max()

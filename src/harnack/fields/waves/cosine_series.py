@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from scipy import fft
 
 if TYPE_CHECKING:
     from harnack.backend import FloatArray
@@ -47,6 +46,8 @@ def fit_cosines(grid: FloatArray, terms: tuple[int, int, int]) -> FloatArray:
     part of the first terms is the best fit to them in mean square, since the cosines are orthogonal
     on the midpoints.
     """
+    from scipy import fft  # here: time that few need
+
     whole = np.asarray(cast("Any", fft).dctn(grid, type=2), dtype=np.float64) / grid.size
     kept = whole[: terms[0], : terms[1], : terms[2]].copy()
     for axis in range(3):
