@@ -182,3 +182,33 @@ def test_no_crossing_is_lost(solid: Any, o: Any, d: Any, roots: Any, precision: 
     assert all_hits.t[0, : len(roots)] == pytest.approx(roots, abs=off)
     confirmed = hk.trace(solid, [o], [d], confirm=True, precision=precision)
     assert confirmed.t[0] == pytest.approx(roots[0], abs=off)
+
+
+def test_the_rounding_of_one_part_makes_no_hit_inside_of_another() -> None:
+    """385,000 sizes away the twisted part is known to 6 of 4, the other is 3.85 to 1e-5: their
+    greatest is not zero, and was called a hit with an uncertainty of 1.5e-5."""
+    twisted = hk.solid(hk.expression("x*y*z - 0.089375"), below=0).twisted(1.3472932840911636)
+    hill = hk.solid(hk.expression("exp(-x^2 - y^2) - z - 0.644"), below=0)
+    solid = (twisted & ~hill).scaled(1e-5).moved((-1.080524678e-4, 2.767405466e-4, -4.17053243e-5))
+    o = [[-1.0094386616119177e-4, 2.895665143994727e-4, -5.2641241924609245e-5]]
+    hits = hk.trace(solid, o, [[0, 0, 1]], precision="single", tolerance=1e-9)
+    assert hits.status[0] == hk.Status.OUT_OF_STEPS
+
+
+@pytest.mark.parametrize("how", ["confirm", "all_hits"])
+def test_confirmed_hits_at_creases_lie_on_the_surface(how: str) -> None:
+    """The cubic between two points with a crease between them had its root anywhere: |f| was up to
+    500,000 tolerances. What changes sign is the level to within the tolerance."""
+    steep = hk.solid(hk.expression("x*y*z - 1"), below=0)
+    gentle = hk.solid(hk.expression("sin(x) + sin(y) + sin(z) - 1"), below=0)
+    rng = np.random.default_rng(0)
+    o, d = rng.uniform(-30, 30, (4000, 3)), rng.normal(size=(4000, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    settings: dict[str, Any] = {"tolerance": 1e-6, "precision": "double"}
+    settings |= {"confirm": True} if how == "confirm" else {"all_hits": 4}
+    hits = hk.trace(steep | gentle, o, d, **settings)
+    x = np.asarray(hits.position)[np.isfinite(hits.t)]
+    assert len(x) > 3000
+    value = (steep | gentle).value(x, precision="double")
+    slope = np.linalg.norm((steep | gentle).gradient(x, precision="double"), axis=1)
+    assert (np.abs(value) / slope).max() < 1.05e-6

@@ -14,13 +14,19 @@ from typing import TYPE_CHECKING
 import drjit as dr
 
 from harnack.backend.extrema import fmax, fmin
+from harnack.backend.lengths import largest_component, length
+from harnack.backend.loops import while_active
 from harnack.enclosures import Gaps, TargetLevels
+from harnack.fields.look import value_error
 
 if TYPE_CHECKING:
     from typing import Any
 
     from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.fields.field import Field
+    from harnack.fields.look import Path
     from harnack.fields.sheets import Crossing
+    from harnack.tracer.tolerance import PreparedTolerance
 
 # The tolerance is at least so many roundings of f, and at most this part of the distance in value
 # between two levels, so that there is no doubt which of them was reached.
@@ -51,17 +57,24 @@ class Contact:
     root: where f took the level last, between two points looked at where it is on different
         sides; where the contact began if it began beyond the level.
     gradient: of f at the root.
+    excess: by how much f at the root may be farther from the level than the tolerance allows, where
+        rounding leaves f less certain than that: it lies between the two points.
+    before, behind: the two points, or the root itself.
     """
 
     side: Real
     is_touching: Mask
     root: Real
     gradient: Vec3
+    excess: Real
+    before: Real
+    behind: Real
 
     @classmethod
     def none(cls, backend: Backend) -> Contact:
         """Before anything was looked at."""
-        return cls(backend.Float(0), backend.Bool(False), backend.Float(0), backend.Array3f(0))
+        zero = backend.Float(0)
+        return cls(zero, backend.Bool(False), zero, backend.Array3f(0), zero, zero, zero)
 
 
 @dataclass(frozen=True)
@@ -69,8 +82,10 @@ class Accepted:
     """A sample at an accepted point of a ray.
 
     t, value, gradient, slope: there. before: the same of the last accepted point, as (t, value,
-    slope, gradient). total_error: of the value. is_near: whether it would be a hit. band: the
-    tolerance in value (`Hysteresis.band`). is_end: whether the ray ends there.
+    slope, gradient). excess: by how much f at the two may be farther from a level than the
+    tolerance allows, where its rounding is more than that; 0 elsewhere. total_error: of the value.
+    is_near: whether it would be a hit. band: the tolerance in value (`Hysteresis.band`). is_end:
+    whether the ray ends there.
     """
 
     t: Real
@@ -78,6 +93,7 @@ class Accepted:
     gradient: Vec3
     slope: Real
     before: tuple[Real, Real, Real, Vec3]
+    excess: Real
     total_error: Real
     is_near: Mask
     band: Real
@@ -185,6 +201,9 @@ class Hysteresis:
         root = dr.select(passes, t + share * (seen.t - t), dr.select(begins, seen.t, now.root))
         at_root = dr.select(begins, seen.gradient, now.gradient)
         at_root = dr.select(passes, dr.lerp(gradient, seen.gradient, share), at_root)
+        excess = dr.select(passes | begins, seen.excess, now.excess)
+        before = dr.select(passes, t, dr.select(begins, seen.t, now.before))
+        behind = dr.select(passes | begins, seen.t, now.behind)
 
         # Is it well beyond, or has it left?
         is_first = (now.side == 0) & ~touching
@@ -200,6 +219,9 @@ class Hysteresis:
             dr.select(active, is_touching, touching),
             root,
             at_root,
+            excess,
+            before,
+            behind,
         ), crosses
 
     def jump(
@@ -227,6 +249,9 @@ class Hysteresis:
             dr.select(active, dr.abs(behind) <= seen.band, now.is_touching),
             dr.select(at_sheet, seen.t, now.root),
             dr.select(at_sheet, ahead.normal, now.gradient),
+            dr.select(at_sheet, 0, now.excess),
+            dr.select(at_sheet, seen.t, now.before),
+            dr.select(at_sheet, seen.t, now.behind),
         ), crosses
 
     def _side(self, now: Contact, seen: Accepted, x: Real) -> Real:
@@ -243,6 +268,57 @@ class Hysteresis:
         # Off all levels, that a ray was seen is all there is to know.
         known = (now.side != 0) | ~seen.is_near
         return dr.select(known, dr.select(above, type(x)(1), -1), 0)
+
+
+@dataclass(frozen=True)
+class _Settling:
+    """Roots on their way: f takes the level between before and behind."""
+
+    before: Real
+    behind: Real
+    t: Real
+    gradient: Vec3
+    looks: Any
+    active: Mask
+
+
+def settled(
+    field: Field, levels: TargetLevels, tolerance: PreparedTolerance, path: Path, found: Contact,
+    active: Mask,
+) -> tuple[Real, Vec3, Any]:  # fmt: skip
+    """The root of a crossing, the gradient of f there, and how often f was looked at.
+
+    Between two points with a crease between them f is no cubic. So f is looked at in the root, and
+    where it is farther from the level than the tolerance and its rounding, the two points are
+    brought together by bisection: f stays on different sides of the level at both.
+    """
+    side = -found.side
+    count = dr.uint32_array_t(type(found.root))
+    smallest = 4 * float(dr.epsilon(type(found.root)))
+
+    def body(now: _Settling) -> _Settling:
+        sample, size = field.evaluate(path.point(now.t)), largest_component(path.origin) + now.t
+        x, steepness = -levels.to_nearest(sample.value), length(sample.gradient)
+        near = dr.abs(x) <= fmax(
+            tolerance.in_value(steepness, now.t), value_error(sample, steepness, size)
+        )
+        is_before = side * x > 0
+        before = dr.select(is_before, now.t, now.before)
+        behind = dr.select(is_before, now.behind, now.t)
+        goes_on = ~near & (behind - before > smallest * size)
+        is_first = near & (now.looks == 0)
+        return _Settling(
+            before,
+            behind,
+            dr.select(goes_on, 0.5 * (before + behind), now.t),
+            dr.select(is_first, now.gradient, sample.gradient),
+            now.looks + 1,
+            now.active & goes_on,
+        )
+
+    begin = _Settling(found.before, found.behind, found.root, found.gradient, count(0), active)
+    end = while_active(begin, body, "harnack roots")
+    return end.t, end.gradient, end.looks
 
 
 def root_between(start: Real, end: Real, slope: Real, end_slope: Real) -> Any:

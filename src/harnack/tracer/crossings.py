@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
+from harnack.backend.arrays import gather_vectors
 from harnack.backend.loops import while_active
 from harnack.fields.sheets import NO_SHEET
+from harnack.tracer.contact import Contact
 from harnack.tracer.tolerance import Status
 from harnack.tracer.walks.stretches import SheetTracer, SheetWalk
 
@@ -88,8 +90,9 @@ def find_crossings(
     place = dr.arange(count, n) * k
     # Filled in from within the loop, so they must lie in memory before it is recorded.
     t, side = dr.full(real, dr.inf, n * k), dr.zeros(real, n * k)
+    before, behind = dr.zeros(real, n * k), dr.zeros(real, n * k)
     gradient, sheets = dr.zeros(vector, n * k), dr.full(count, NO_SHEET, n * k)
-    dr.make_opaque(t, side, gradient, sheets)
+    dr.make_opaque(t, side, before, behind, gradient, sheets)
     tracer = SheetTracer(march, prepared.field, path, start, end)
 
     def one(now: _Walk) -> _Walk:
@@ -106,6 +109,8 @@ def find_crossings(
         slot = place + now.count
         dr.scatter(t, contact.root, slot, found)
         dr.scatter(side, contact.side, slot, found)
+        dr.scatter(before, contact.before, slot, found)
+        dr.scatter(behind, contact.behind, slot, found)
         dr.scatter(gradient, contact.gradient, slot, found)
         if sheet is not None:
             dr.scatter(sheets, sheet, slot, found)
@@ -123,7 +128,10 @@ def find_crossings(
         begun = _Walk(None, tracer.begin(state), dr.zeros(count, n))
     walk = while_active(begun, one, "harnack crossings")
     last = walk.now
+    ray, none = dr.arange(count, n * k) // k, real(0)
+    roots = Contact(side, backend.Bool(False), t, gradient, none, before, behind)
+    origins, directions = gather_vectors(backend, o, ray), gather_vectors(backend, d, ray)
+    t, gradient, looks = prepared.settled(origins, directions, roots, dr.isfinite(t))
+    evaluations = last.evaluations + dr.block_reduce(dr.ReduceOp.Add, looks, k)
     followed = dr.select(last.status == int(Status.MISS), dr.inf, last.base)
-    return CrossingsFound(
-        t, gradient, sheets, side, walk.count, followed, last.evaluations, last.status
-    )
+    return CrossingsFound(t, gradient, sheets, side, walk.count, followed, evaluations, last.status)

@@ -271,8 +271,18 @@ class March:
         if self.hysteresis is not None and now.contact is not None:
             before = now.base, now.value, dr.dot(now.gradient, path.direction), now.gradient
             last = t == end if sheet is None else (t == end) & ~sheet.has_crossing
+            doubt = dr.select(total_error > within, fmax(excess, now.excess), 0)
             there = Accepted(
-                t, value, sample.gradient, look.slope, before, total_error, is_near, band, last
+                t,
+                value,
+                sample.gradient,
+                look.slope,
+                before,
+                doubt,
+                total_error,
+                is_near,
+                band,
+                last,
             )
             contact, hit = self.hysteresis.update(now.contact, accepted, there)
             if ahead is not None and sheet is not None:

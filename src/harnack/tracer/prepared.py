@@ -12,7 +12,7 @@ from harnack.backend.lengths import largest_component
 from harnack.fields.look import Path
 from harnack.fields.parts import NO_PART
 from harnack.fields.sheets import NO_SHEET
-from harnack.tracer.contact import Hysteresis
+from harnack.tracer.contact import Contact, Hysteresis, settled
 from harnack.tracer.march import March, MarchState
 from harnack.tracer.tolerance import PreparedTolerance, Status
 from harnack.tracer.walks.parts import PartTracer
@@ -137,18 +137,29 @@ class PreparedLevelSet:
         """The first hit of rays o + t d, |d| = 1, for t_min <= t <= t_max. Inactive rays miss."""
         end, sheet = self._march(o, d, t_min, t_max, active)
         t, gradient, excess, side = end.base, end.gradient, end.excess, None
-        if end.contact is not None:
+        contact, evaluations = end.contact, end.evaluations
+        if contact is not None:
             crossed = end.status == int(Status.HIT)
-            t = dr.select(crossed, end.contact.root, t)
-            gradient = dr.select(crossed, end.contact.gradient, gradient)
-            excess, side = dr.zeros(type(excess)), end.contact.side
+            root, at_root, looks = self.settled(o, d, contact, crossed)
+            t = dr.select(crossed, root, t)
+            gradient = dr.select(crossed, at_root, gradient)
+            evaluations = evaluations + looks
+            excess, side = dr.select(crossed, contact.excess, 0), contact.side
         t = dr.select(end.status == int(Status.MISS), dr.inf, t)
         part = None
         if self.field.has_parts:
             sheet, part = self.backend.UInt32(NO_SHEET), sheet
         return MarchResult(
-            t, end.value, gradient, excess, end.evaluations, end.status, sheet, side, part
+            t, end.value, gradient, excess, evaluations, end.status, sheet, side, part
         )
+
+    def settled(self, o: Vec3, d: Vec3, found: Contact, active: Mask) -> tuple[Real, Vec3, Any]:
+        """Roots of crossings, the gradients there, and how often f was looked at for them: as they
+        are where f has no creases."""
+        if self.field.has_sheets or not self.field.has_creases:
+            return found.root, found.gradient, dr.zeros(self.backend.UInt32, dr.width(found.root))
+        path = Path(self.backend.Array3f(o), self.backend.Array3f(d), self.proofs)
+        return settled(self.field, self.levels, self.tolerance, path, found, active)
 
     def ready(
         self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask, *, crosses: bool
