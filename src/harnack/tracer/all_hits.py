@@ -31,7 +31,8 @@ class AllHits:
 
     t: (n, k) ray parameter of the crossing, inf where a ray has fewer. It lies between two points
         that were looked at, with f on different sides of the level, where the cubic through their
-        values and slopes takes the level.
+        values and slopes takes the level or, if there is a crease between them, where bisection
+        finds it.
     position: (n, k, 3) point at t, NaN where there is none.
     normal: (n, k, 3) unit normal grad f/|grad f|, to the side of larger f; zero where there is
         none.

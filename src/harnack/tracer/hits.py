@@ -43,7 +43,8 @@ class Hits:
     t: (n,) ray parameter of the hit, inf for a miss; for a ray that ran out of steps, how far
         it is proved free. A hit is within tolerance of the first root, mostly before it. One that
         is confirmed is at a root: between two points that were looked at, with f on different
-        sides of the level, where the cubic through their values and slopes takes the level.
+        sides of the level, where the cubic through their values and slopes takes the level or, if
+        there is a crease between them, where bisection finds it.
     position: (n, 3) point at t, NaN for a miss.
     normal: (n, 3) unit normal grad f/|grad f|, or of the sheet that was hit, to its side of
         larger f; zero where there is no hit.
