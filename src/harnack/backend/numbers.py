@@ -135,32 +135,35 @@ def carries_derivatives(value: Any) -> bool:
     """Whether a value is, or holds, an array with derivatives enabled: one of Dr.Jit or of PyTorch,
     in containers, in what functions refer to, and in attributes of fields, of what can be called,
     and of dataclasses."""
-    return _carries(value, set())
+    seen: set[int] = set()
+    left: list[Any] = [value]
+    for one in left:  # which grows
+        kind = cast("Any", type(one))
+        if kind is tuple:  # most of what fields hold
+            left += [entry for entry in one if type(entry) not in _PLAIN]
+        elif kind in _PLAIN:
+            continue
+        elif dr.is_array_v(kind):
+            if dr.is_diff_v(kind) and dr.grad_enabled(one):
+                return True
+        elif getattr(one, "requires_grad", False) is True:
+            return True
+        elif id(one) not in seen and not isinstance(one, type):
+            seen.add(id(one))
+            left += _held(one)
+    return False
 
 
 _PLAIN = frozenset((str, bytes, bool, int, float, complex, np.ndarray, np.float64, type(None)))
+_GROUPS = (list, tuple, set, frozenset)
 # Functions of these packages refer to no numbers of the caller's.
 _KNOWN_PACKAGES = frozenset(("harnack", "drjit", "numpy", "math"))
 
 
-def _carries(value: Any, seen: set[int]) -> bool:
-    kind = cast("Any", type(value))
-    if kind in _PLAIN or isinstance(value, type):
-        return False
-    if dr.is_array_v(kind):
-        return bool(dr.is_diff_v(kind) and dr.grad_enabled(value))
-    if getattr(value, "requires_grad", False) is True:
-        return True
-    if id(value) in seen:
-        return False
-    seen.add(id(value))
-    return any(_carries(one, seen) for one in _held(value))
-
-
 def _held(value: Any) -> list[Any]:
     """What a value holds, as far as it is looked into."""
-    if isinstance(value, list | tuple | set | frozenset):
-        return list(cast("Any", value))
+    if isinstance(value, _GROUPS):
+        return [one for one in cast("Any", value) if type(one) not in _PLAIN]
     if isinstance(value, dict):
         return list(cast("Any", value).values())
     if inspect.isfunction(value):
