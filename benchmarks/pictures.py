@@ -13,7 +13,7 @@ import numpy as np
 import harnack as hk
 from harnack.rendering import Camera, register
 from harnack.rendering.mitsuba.integrator import PathTracer
-from harnack.rendering.pictures.light_paths.exposure import expose
+from harnack.rendering.pictures.light_paths import expose
 from harnack.rendering.studio.materials import material_of
 from harnack.rendering.studio.stage import StudioObject, studio
 

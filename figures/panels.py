@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 import harnack as hk
 from harnack.rendering.pictures.images import tone_mapped
-from harnack.rendering.pictures.scales.colormap import viridis
+from harnack.rendering.pictures.scales import viridis
 
 from .figure import Counts
 from .view import Pixels

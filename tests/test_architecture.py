@@ -34,7 +34,6 @@ ROOMS = (
 # Within `fields`: the interface, what families share, and the families.
 FIELD_ROOMS = (
     "sheets",
-    "parts",
     "points",
     "look",
     "field",

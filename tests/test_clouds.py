@@ -7,9 +7,8 @@ import pytest
 from scipy.spatial import Voronoi
 
 import harnack as hk
-from harnack.geometry import cloud_normals, clouds
-from harnack.geometry.cloud_normals import estimate_normals
-from harnack.geometry.clouds import CloudError, estimate_areas, validate_cloud
+from harnack.geometry import clouds
+from harnack.geometry.clouds import CloudError, estimate_areas, estimate_normals, validate_cloud
 from harnack.geometry.mesh_shapes import icosphere
 
 POINTS = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]
@@ -295,7 +294,7 @@ def test_signs_are_carried_along_any_tree():
     x, _ = icosphere(2)
     parent = np.maximum(np.arange(len(x)) - 1, 0)
     normals = x * np.where(rng().random(len(x)) < 0.5, -1.0, 1.0)[:, None]
-    sign = cloud_normals._carried_signs(x, normals, parent)
+    sign = clouds._carried_signs(x, normals, parent)
     for k in range(1, len(x)):
         edge = x[k] - x[k - 1]
         edge /= np.linalg.norm(edge)

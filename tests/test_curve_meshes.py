@@ -225,7 +225,7 @@ def test_a_coil_in_cells_that_are_too_large_raises_if_they_stay(
 
 
 def spanned_module() -> Any:
-    return sys.modules["harnack.meshing.spanned.surface"]
+    return sys.modules["harnack.meshing.spanned"]
 
 
 def test_long_edges_of_a_coil_need_to_be_integrated() -> None:

@@ -11,7 +11,13 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend
-from harnack.fields.solids.shapes.noise import CONSTANTS, CORNERS, cell_noise, fade, lattice_vector
+from harnack.fields.solids.shapes.fractal import (
+    CONSTANTS,
+    CORNERS,
+    cell_noise,
+    fade,
+    lattice_vector,
+)
 
 FADES = pytest.mark.parametrize("kind", ["cubic", "quintic"])
 ATTAINED = {"cubic": math.sqrt(19) / 2, "quintic": math.sqrt(499) / 8}

@@ -15,9 +15,9 @@ import harnack as hk
 from harnack.backend import Backend, backend_of, choose_backend, to_numpy, to_vector3
 from harnack.backend.numbers import FloatArray
 from harnack.fields.sheets import NO_SHEET
-from harnack.geometry.faces.clusters import polygon_patches
 from harnack.geometry.mesh_shapes import bumpy_sphere, icosphere
 from harnack.geometry.meshes import MeshError
+from harnack.geometry.polygon_meshes import polygon_patches
 from harnack.rendering import Camera
 from harnack.testing import check_field
 from harnack.tree.boxes import NO_BOX, BoxTree

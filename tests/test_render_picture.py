@@ -16,7 +16,7 @@ import harnack as hk
 from harnack.geometry import shapes
 from harnack.rendering import MATERIALS, SHOW_MODES, Camera, Material, picture, register, render
 from harnack.rendering.pictures.images import exr_bytes, tone_mapped
-from harnack.rendering.pictures.scales.colormap import viridis
+from harnack.rendering.pictures.scales import viridis
 from harnack.rendering.studio.stage import on_ground
 
 mi = register()

@@ -14,7 +14,8 @@ import pytest
 import harnack as hk
 from harnack.enclosures import Lipschitz
 from harnack.fields.field import Field, Sample
-from harnack.rendering import picture, register, render, shape
+from harnack.rendering import register, render, shape
+from harnack.rendering.pictures.views import Viewer
 
 mi = register()
 T = mi.ScalarTransform4f
@@ -250,7 +251,7 @@ def test_to_world_moves_turns_and_scales() -> None:
     to_world = T().translate([0.3, 0.2, -0.1]).rotate([0.6, 0.0, 0.8], 40).scale(0.8)
     grid = hk.Gyroid(1.0, domain=hk.Ball(radius=1.0))
     moved = shape(grid, to_world=to_world, solid=(-0.3, 0.3))
-    view = picture.look(mi, *_scene_and_sensor(moved))
+    view = Viewer.of(mi, *_scene_and_sensor(moved)).look()
     inverse = np.linalg.inv(np.array(to_world.matrix, dtype=float).reshape(4, 4))
     points = _positions(view) @ inverse[:3, :3].T + inverse[:3, 3]
     f = _gyroid(points)

@@ -19,8 +19,8 @@ from harnack.rendering import Camera, Material, register, render, shape
 from harnack.rendering.mitsuba.world import World
 from harnack.rendering.pictures import shaded
 from harnack.rendering.pictures.floor import Floor
-from harnack.rendering.pictures.occlusion import visible_sky
 from harnack.rendering.pictures.pixels import grid_offsets, in_tiles
+from harnack.rendering.pictures.shaded import visible_sky
 from harnack.rendering.pictures.shading import Light
 
 mi = register()

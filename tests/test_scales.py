@@ -12,9 +12,7 @@ import pytest
 import harnack as hk
 from harnack.rendering import register, shape
 from harnack.rendering.pictures.images import as_bytes
-from harnack.rendering.pictures.scales.bar import with_bar
-from harnack.rendering.pictures.scales.colormap import hues, viridis
-from harnack.rendering.pictures.scales.scale import Scale
+from harnack.rendering.pictures.scales import Scale, hues, viridis, with_bar
 
 mi = register()
 SMALL: dict[str, Any] = {"size": (64, 48), "progress": False}
@@ -23,7 +21,8 @@ KNOT = hk.SolidAngle(hk.geometry.shapes.wavy_polygon(24))
 
 
 def values(of: Any, what: Any = SPHERE, **settings: Any) -> Any:
-    return hk.render(what, show="value", of=of, **SMALL, **settings)
+    """One ray a pixel, so that each is the color of its number."""
+    return hk.render(what, show="value", of=of, spp=1, **SMALL, **settings)
 
 
 def test_values_are_those_of_the_function_on_the_surface() -> None:

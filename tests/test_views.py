@@ -17,8 +17,7 @@ import harnack as hk
 from harnack.cli import main
 from harnack.geometry import shapes
 from harnack.rendering import register
-from harnack.rendering.pictures.scales import bar
-from harnack.rendering.pictures.scales.scale import Scale
+from harnack.rendering.pictures.scales import Scale, bar
 from harnack.rendering.studio.upright import upright
 
 FIELD = hk.SolidAngle(shapes.wavy_polygon(24))

@@ -1,7 +1,6 @@
 """Cells that may hold a level set, found by leaving out those that are proved empty."""
 
-from harnack.cells.components import largest_component
-from harnack.cells.occupied import OccupiedCells
+from harnack.cells.components import OccupiedCells, largest_component
 from harnack.cells.octree import (
     Cells,
     Clearance,

@@ -14,7 +14,7 @@ from harnack.choices import did_you_mean
 from harnack.cli.mesh_files import MESH_FILES
 from harnack.cli.messages import printable
 from harnack.enclosures.proofs import BOUNDS
-from harnack.fields.expressions.text import TextFormula
+from harnack.fields.expressions import TextFormula
 from harnack.files.surfaces import SURFACE_FILES
 from harnack.meshing.samples import MOST_FACES
 from harnack.opening import UP_AXES

@@ -17,7 +17,7 @@ from harnack.choices import did_you_mean
 from harnack.cli.mesh_files import check_mesh_path, write_mesh
 from harnack.cli.messages import in_options, printable
 from harnack.fields import Field, expression
-from harnack.fields.expressions.text import looks_like_formula
+from harnack.fields.expressions import looks_like_formula
 from harnack.files.surfaces import SURFACE_FILES, Mesh, read_surface
 from harnack.gallery import SCENES, Scene
 from harnack.geometry import Ball, Box, HalfSpace

@@ -11,7 +11,7 @@ from harnack.fields.clouds.dipole import DipolePotential
 from harnack.fields.clouds.screened import ScreenedWindingNumber
 from harnack.fields.curves.polygon_mesh import PolygonMesh
 from harnack.fields.curves.solid_angle import SolidAngle
-from harnack.fields.expressions.expression import expression
+from harnack.fields.expressions import expression
 from harnack.fields.field import Field, Sample
 from harnack.fields.formula import Formula
 from harnack.fields.meshes.morph import Morph

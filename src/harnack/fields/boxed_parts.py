@@ -1,4 +1,4 @@
-"""Fields whose parts lie in boxes, and these boxes on a backend (see `harnack.fields.parts`)."""
+"""Fields whose parts lie in boxes, and these boxes on a backend (see `harnack.fields.sheets`)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from harnack.fields.field import Field
 from harnack.fields.kept import prepared_once
-from harnack.fields.parts import PartEntry
+from harnack.fields.sheets import PartEntry
 from harnack.fields.unit_coordinates import UnitCoordinates, placed, single
 from harnack.geometry import Box
 from harnack.tree.boxes import BoxTree

@@ -36,9 +36,8 @@ from harnack.enclosures import (
     Promise,
 )
 from harnack.fields.look import Look, Path, Sample, lengthened
-from harnack.fields.parts import NO_PART, PartEntry
 from harnack.fields.points import at_points
-from harnack.fields.sheets import NO_SHEET, Crossing, NearestSheet
+from harnack.fields.sheets import NO_PART, NO_SHEET, Crossing, NearestSheet, PartEntry
 from harnack.geometry.volumes.volume import check_volume
 
 if TYPE_CHECKING:
@@ -171,7 +170,7 @@ class Field(abc.ABC):
 
     has_parts: bool = False
     """Whether the surface is that of many level sets, each of a field of its own (see
-    `harnack.fields.parts`). Then `next_part` and `part_at` are needed."""
+    `harnack.fields.sheets`). Then `next_part` and `part_at` are needed."""
 
     has_creases: bool = False
     """Whether the gradient jumps somewhere, as it does where the surfaces of a union meet."""

@@ -7,7 +7,7 @@ import numpy as np
 from harnack.fields import PolygonMesh, Tubes
 from harnack.gallery.scene import Scene
 from harnack.geometry import mesh_shapes
-from harnack.geometry.faces.clusters import polygon_patches
+from harnack.geometry.polygon_meshes import polygon_patches
 from harnack.rendering import Camera
 from harnack.tracer import LevelSet, Tolerance, level_set
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from harnack.geometry import mesh_shapes, shapes
 from harnack.geometry.circles import Circle
-from harnack.geometry.cloud_normals import estimate_normals
-from harnack.geometry.clouds import CloudError, estimate_areas, validate_cloud
+from harnack.geometry.clouds import CloudError, estimate_areas, estimate_normals, validate_cloud
 from harnack.geometry.curves import (
     CurveError,
     bounding_box,

@@ -8,9 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray
-from harnack.meshing.edges import Edges, IntArray, boundary_edges, directed_edges
+from harnack.meshing.edges import Edges, IntArray, boundary_edges, directed_edges, lengths
 from harnack.meshing.intersections import intersecting_faces
-from harnack.meshing.rows import lengths
 
 if TYPE_CHECKING:
     from harnack.geometry import Volume

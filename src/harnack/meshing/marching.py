@@ -21,9 +21,8 @@ import numpy as np
 from harnack.backend import BoolArray, FloatArray
 from harnack.fields import Field
 from harnack.meshing.checks import LocalError, MeshingError
-from harnack.meshing.edges import IntArray
+from harnack.meshing.edges import IntArray, dots, lengths
 from harnack.meshing.points import PointSet
-from harnack.meshing.rows import dots, lengths
 from harnack.meshing.samples import LevelFunction
 from harnack.meshing.tetrahedra import Tetrahedra
 

@@ -16,8 +16,7 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
 from harnack.cells import Cells, Octree, octree
-from harnack.meshing.edges import IntArray
-from harnack.meshing.rows import dots, lengths
+from harnack.meshing.edges import IntArray, dots, lengths
 from harnack.meshing.samples import LevelFunction, Samples
 
 __all__ = ["Boundary", "Places", "PointSet", "box_cells", "place_points"]

@@ -15,7 +15,7 @@ from harnack.backend.lengths import length
 from harnack.enclosures import Gaps, Slopes, TargetLevels, choose_proofs, longest_step
 from harnack.fields.clearance import distance_below
 from harnack.fields.points import in_batches
-from harnack.meshing.rows import lengths
+from harnack.meshing.edges import lengths
 
 if TYPE_CHECKING:
     from harnack.backend import Real, Vec3

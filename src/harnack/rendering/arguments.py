@@ -12,7 +12,7 @@ from typing import Any
 
 from harnack.choices import did_you_mean
 from harnack.fields import Field
-from harnack.rendering.pictures.scales.bar import require_pillow, typeface_for
+from harnack.rendering.pictures.scales import require_pillow, typeface_for
 from harnack.rendering.pictures.views import GROUND_OF_VIEWS, SCALED, VIEWS
 from harnack.rendering.studio.backdrops import Backdrop, Gradient, Ground, checked_backdrop
 from harnack.rendering.studio.camera import Camera

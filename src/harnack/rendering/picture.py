@@ -28,9 +28,14 @@ from harnack.rendering.mitsuba.scene_files import load_dictionary, load_scene_fi
 from harnack.rendering.mitsuba.stock import stand_in
 from harnack.rendering.pictures.backdrop import flat, wall
 from harnack.rendering.pictures.images import check_picture_path, tone_mapped, write_image
-from harnack.rendering.pictures.light_paths.denoising import denoised, load_denoiser
-from harnack.rendering.pictures.light_paths.exposure import PATHS_A_BAND, expose
-from harnack.rendering.pictures.light_paths.pace import SHORT, pace_of
+from harnack.rendering.pictures.light_paths import (
+    PATHS_A_BAND,
+    SHORT,
+    denoised,
+    expose,
+    load_denoiser,
+    pace_of,
+)
 from harnack.rendering.pictures.shaded import shaded
 from harnack.rendering.pictures.shown import Picture
 from harnack.rendering.pictures.views import VIEWS, Viewer, drawn

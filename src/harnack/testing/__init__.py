@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from harnack.testing.bound_contracts import check_bound
 from harnack.testing.failures import BrokenPromiseError
-from harnack.testing.field_contracts import check_field
-from harnack.testing.look_contracts import check_looks
+from harnack.testing.field_contracts import check_field, check_looks
 from harnack.testing.scaled import scaled
 
 __all__ = ["BrokenPromiseError", "check_bound", "check_field", "check_looks", "scaled"]

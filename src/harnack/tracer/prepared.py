@@ -10,8 +10,7 @@ import drjit as dr
 from harnack.backend.extrema import fmax, fmin
 from harnack.backend.lengths import largest_component
 from harnack.fields.look import Path
-from harnack.fields.parts import NO_PART
-from harnack.fields.sheets import NO_SHEET
+from harnack.fields.sheets import NO_PART, NO_SHEET
 from harnack.tracer.contact import Contact, Hysteresis, settled
 from harnack.tracer.march import March, MarchState
 from harnack.tracer.tolerance import PreparedTolerance, Status

@@ -21,7 +21,7 @@ from harnack.fields.unit_coordinates import UnitCoordinates
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.geometry.faces.polygon_meshes import PolygonFaces
+    from harnack.geometry.polygon_meshes import PolygonFaces
 
 __all__ = ["PERIOD", "FaceCurve", "FaceCurves", "FaceHead"]
 

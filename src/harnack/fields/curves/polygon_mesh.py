@@ -1,24 +1,194 @@
-"""Meshes of polygons that need not be flat, each spanned by a level set of its solid angle."""
+"""Meshes of polygons that need not be flat, each spanned by a level set of its solid angle.
+
+Boxes proved to hold the surface of each face of a polygon mesh, all faces at once.
+
+In double precision, and done once for a mesh and its levels, before any ray.
+"""
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
 
-from harnack.backend import FloatArray, IntArray
+import drjit as dr
+import numpy as np
+
+from harnack.backend import BoolArray, FloatArray, IntArray, choose_backend, to_numpy, to_vector3
+from harnack.backend.arrays import aligned, aligned_integers
+from harnack.backend.extrema import fmin
 from harnack.fields.boxed_parts import BoxedField, BoxedParts
-from harnack.fields.curves.face_boxes import face_boxes
 from harnack.fields.curves.face_curves import PERIOD, FaceCurves
 from harnack.fields.curves.solid_angle import SolidAngle
+from harnack.fields.edges.edge import Edge
+from harnack.fields.edges.edge_sums import inner_product, spinor
 from harnack.fields.field import Field
-from harnack.geometry.faces.polygon_meshes import PolygonFaces, validate_polygons
+from harnack.geometry.polygon_meshes import PolygonFaces, validate_polygons
 from harnack.tree.boxes import MOST_BOXES
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Vec3
+    from harnack.backend import Backend, Real, Vec3
 
-__all__ = ["PolygonMesh"]
+__all__ = ["PolygonMesh", "face_boxes"]
+
+# All cells are split so many times, and those in which a box ends this many times altogether; in so
+# many rounds, as long as the pairs of edges and cells are not more than this.
+_COARSE, _FINEST, _ROUNDS, _MOST_PAIRS = 2, 7, 24, 30_000_000
+# Boxes are wider than proved by this part of the size of a face.
+_SLACK = 1e-4
+_CORNERS = np.array(list(itertools.product((0, 1), repeat=3)), dtype=np.float64)
+
+
+def face_boxes(faces: PolygonFaces, levels: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
+    """Lower and upper corners (m, 3) of boxes that hold the level sets of the faces' solid angles.
+
+    The 2 pi level of a face in convex position lies in its convex hull (paper, Theorem B.1), which
+    lies in the box of its vertices. Other surfaces lie in the isoperimetric box of
+    `SolidAngle.extent`, of which cells that are proved empty are cut away (`_are_empty`); what is
+    left is put in a box.
+    """
+    low, high = faces.boxes()
+    nearest = min(abs(math.remainder(level, PERIOD)) for level in levels)
+    size = 0.5 * np.linalg.norm(high - low, axis=1)[:, None]
+    in_hull = faces.in_convex_position & (nearest > 2 * math.pi * (1 - 1e-9))
+    reach = 1.0001 * faces.lengths()[:, None] / math.sqrt(nearest * (PERIOD - nearest))
+    lower = np.where(in_hull[:, None], low, low - reach)
+    upper = np.where(in_hull[:, None], high, high + reach)
+    carved = np.flatnonzero(~in_hull)
+    if carved.size:
+        lower[carved], upper[carved] = _carved(faces, carved, lower, upper, levels)
+    return lower - _SLACK * size, upper + _SLACK * size
+
+
+def _carved(
+    faces: PolygonFaces, carved: IntArray, lower: FloatArray, upper: FloatArray,
+    levels: tuple[float, ...],
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """Boxes of some faces, less the cells that are proved empty.
+
+    Only the cells in which a box ends can make it smaller, so only these are split further.
+    """
+    curves = FaceCurves.upload(choose_backend("double"), faces)
+    sides, pairs = upper - lower, 0
+    corners = np.bincount(faces.face_of_corner)
+    cells = _Cells(carved, lower[carved], np.zeros(len(carved), dtype=np.int64))
+    low, high = cells.boxes(sides)
+    for turn in range(_ROUNDS):
+        ends = cells.depth < _COARSE
+        if turn >= _COARSE:
+            place = np.searchsorted(carved, cells.face)
+            ends = cells.touch(low[place], high[place], sides) & (cells.depth < _FINEST)
+        pairs += 8 * int(corners[cells.face[ends]].sum())
+        if not ends.any() or pairs > _MOST_PAIRS:
+            break
+        parts = cells.taken(ends).split(sides)
+        size = parts.sizes(sides)
+        half = 0.5 * np.linalg.norm(size, axis=1)
+        empty = _are_empty(curves, parts.face, parts.corner + 0.5 * size, half, levels)
+        cells = cells.taken(~ends).joined(parts.taken(~empty))
+        low, high = cells.boxes(sides)
+    return low, high
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """Boxes within the boxes of faces: the face, the lower corner and how often it was split.
+
+    face: (k,) rising; every face that there was has a cell.
+    """
+
+    face: IntArray
+    corner: FloatArray
+    depth: IntArray
+
+    def sizes(self, sides: FloatArray) -> FloatArray:
+        """(k, 3), of cells in boxes with such sides (m, 3)."""
+        return sides[self.face] * (0.5**self.depth)[:, None]
+
+    def boxes(self, sides: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper corners of the boxes around the cells of each face."""
+        first = np.flatnonzero(np.diff(self.face, prepend=-1))
+        low = np.minimum.reduceat(self.corner, first)
+        return low, np.maximum.reduceat(self.corner + self.sizes(sides), first)
+
+    def touch(self, low: FloatArray, high: FloatArray, sides: FloatArray) -> BoolArray:
+        """(k,) whether a cell touches a side of the box from low to high (k, 3), to a part of its
+        size."""
+        size = self.sizes(sides)
+        at_low = self.corner < low + 0.25 * size
+        at_high: BoolArray = self.corner > high - 1.25 * size
+        return np.logical_or.reduce(at_low | at_high, axis=1)
+
+    def taken(self, chosen: BoolArray) -> _Cells:
+        """Some of them."""
+        return _Cells(self.face[chosen], self.corner[chosen], self.depth[chosen])
+
+    def split(self, sides: FloatArray) -> _Cells:
+        """Each cut in eight."""
+        depth = np.repeat(self.depth + 1, 8)
+        face = np.repeat(self.face, 8)
+        half = sides[face] * (0.5**depth)[:, None]
+        steps = np.tile(_CORNERS, (len(self.face), 1))
+        return _Cells(face, np.repeat(self.corner, 8, axis=0) + steps * half, depth)
+
+    def joined(self, others: _Cells) -> _Cells:
+        """These and others."""
+        face = np.concatenate([self.face, others.face])
+        order = np.argsort(face, kind="stable")
+        corner = np.concatenate([self.corner, others.corner])
+        return _Cells(face[order], corner[order], np.append(self.depth, others.depth)[order])
+
+
+def _are_empty(
+    curves: FaceCurves, face: IntArray, centres: FloatArray, half: FloatArray,
+    levels: tuple[float, ...],
+) -> BoolArray:  # fmt: skip
+    """Whether no level set of a face comes within `half` of points: (k,) faces, (k, 3), (k,).
+
+    Let h be `half`, less than the distance d_e to every edge e, of length 2a. A cell is empty if no
+    level lies in [f - S, f + S], where S bounds how far the lift moves within h. Two bounds, the
+    less of which counts:
+
+    - Walking by s, an edge's field is at most 2a/((d_e - s) sqrt((d_e - s)^2 + a^2))
+      (`SolidAngle`), whose integral is S = sum_e 2 [asinh(a/(d_e - h)) - asinh(a/d_e)].
+    - The second derivative along a line is at most 2 sum_e int rho^-3 over the edge, and that
+      integral at most 2a/((d_e - h)^2 sqrt((d_e - h)^2 + a^2)) (`LiftedEdge.bounds`): with the
+      slope here, S = |grad f| h + h^2 sum_e 2a/((d_e - h)^2 sqrt((d_e - h)^2 + a^2)).
+
+    A cell that holds a point of the curve is never empty.
+    """
+    backend = curves.heads.backend
+    real = backend.Float
+    index = aligned_integers(backend, face)
+    on = curves.face(index).face
+    x = (to_vector3(backend, centres) - on.centre) / on.size
+    h = aligned(backend, half) / on.size
+
+    def add(p: Vec3, q: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
+        zr, zi, slope, nearest, moved, bend = state
+        edge = Edge.between(p, q, inverse, x)
+        re, im = inner_product(spinor(edge.a)[2], spinor(edge.b)[2])
+        zr, zi = dr.fma(zr, re, -(zi * im)), dr.fma(zr, im, zi * re)
+        scale = dr.rcp(dr.abs(zr) + dr.abs(zi))
+        weight, c = edge.field()
+        distance, a = dr.sqrt(edge.square), 0.5 * dr.rsqrt(inverse)
+        rest = distance - h
+        moved = moved + 2 * (dr.asinh(a / rest) - dr.asinh(a / distance))
+        bend = bend + 2 * a / (rest * rest * dr.sqrt(rest * rest + a * a))
+        slope = dr.fma(type(slope)(weight), c, slope)
+        return zr * scale, zi * scale, slope, fmin(distance, nearest), moved, bend
+
+    start = (real(1), real(0), backend.Array3f(0), real(dr.inf), real(0), real(0))
+    zr, zi, slope, nearest, moved, bend = on.edges.for_each(add, start, "face boxes")
+    variation = fmin(moved, h * dr.fma(h, bend, dr.norm(slope)))
+    f, far, s = (to_numpy(one) for one in (2 * dr.atan2(zi, zr), nearest > 1.001 * h, variation))
+    gap = np.full(len(f), math.inf)
+    for level in levels:
+        apart = np.remainder(f - level + 0.5 * PERIOD, PERIOD) - 0.5 * PERIOD
+        gap = np.minimum(gap, np.abs(apart))
+    return far & (gap > s * (1 + 1e-9) + 1e-9)
+
 
 # Levels as near as this to a multiple of 4 pi are those of no surface with bounds.
 _NARROW = 1e-9 * PERIOD
@@ -36,7 +206,7 @@ class PolygonMesh(BoxedField["_MeshBuffers"]):
     to one side. The faces are separate surfaces that meet in their common edges: `Hits.sheet` is
     the index of the face that was hit, the normal is that of its surface, to the positive side.
     Each is traced alone, with the proofs of `SolidAngle`, so that a ray pays only for faces whose
-    boxes it enters (`harnack.fields.parts`). `face(k)` gives the solid angle of one.
+    boxes it enters (`harnack.fields.sheets`). `face(k)` gives the solid angle of one.
 
     Raises:
         MeshError: a ValueError, for what `geometry.validate_polygons` refuses.

@@ -1,13 +1,55 @@
-"""A slice of the sum of two solid angles in four dimensions, strictly between its ends."""
+"""A slice of the sum of two solid angles in four dimensions, strictly between its ends.
+
+Triangle meshes as oriented points: large triangles cut into pieces, small ones merged.
+
+The kernel of slices of four-dimensional solid angles: a Newton kernel seen from a height w.
+
+Kernel. 1/|X|^2 is harmonic in R^4. The solid angle of a flat solid A x {0} from (x, w) is
+U = w int_A dV/(r^2 + w^2)^2 with r = |y-x|; by the divergence theorem it is the integral over the
+boundary of A of -n.grad_y K, with
+
+    K(r, w) = (1/2) int_w^oo dv/(r^2 + v^2) = atan(r/w)/(2r),   pi/(4r) for w = 0.
+
+So each dipole -m.grad_y K is harmonic in (x, w) but at the dipole and below it. Here K is scaled by
+4/pi, such that it is 1/r for w = 0: sums over m = area n/(4 pi) are then U/pi^2, and for w = 0 the
+winding number. As -(1/r) d/dr (r^2+v^2)^-k = 2k (r^2+v^2)^-(k+1), with D^2 = r^2 + w^2, c = w/D,
+s = r/D,
+
+    psi_k = (2/pi) 2^k k! i_(k+1)/D^(2k+1),   i_k = D^(2k-1) int_w^oo dv/(r^2+v^2)^k,
+    i_k = (2k s^2 i_(k+1) + c)/(2k-1)   by parts: positive terms, which lose no digits.
+
+The last i_n = int_0^1 (sin(phi t)/sin phi)^(2n-2) dt phi/sin phi, cos phi = c, is a function of c
+that is analytic but for c <= -1: a polynomial on [0, 1].
+
+Bound. |d^m K[u_1, ..., u_m]| <= m!/D^(m+1) for unit vectors, as if 1/r were D away; attained for
+w = 0. Proof. Equal vectors u are the worst (Banach 1938). The m-th derivative of 1/|X|^2 along a
+line is (-1)^m m! U_m(cos)/|X|^(m+2) (Gegenbauer), so that, with x = D/sqrt(r^2 + v^2) and
+a = u.z/D, |a| <= s, that of K is +-m!/D^(m+1) times (2/pi) I,
+
+    I = int_0^1 U_m(a x) x^m (1 - s^2 x^2)^(-1/2) dx.
+
+For s = 1, that is w = 0, it is (pi/2) P_m(a), at most pi/2. For s < 1 the weight is that for s = 1
+times one that falls from 1, so that I is the same integral for s = 1 up to some b <= 1 (Bonnet).
+That is the largest for b = 1, or where U_m(a b) = 0 at an angle k pi/(m+1), k >= 1. Lobes between
+such angles alternate and grow with x, as x^m (1 - x^2)^(-1/2) does: the integral is at most its
+last lobe, which is the largest if it ends at b = 1, where it is below 0.4 for m <= 7 (quadrature in
+`tests/test_morph.py`).
+
+In four dimensions the gradient of n.grad_x K is at most 2 * 1.1855/D^3: its square is
+cos^2 (K''^2 + (dw K')^2) + sin^2 (K'/r)^2, cos the angle of n to z, and so at most the larger of
+two functions of c alone (maximum at w = r; the same tests).
+"""
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
+from numpy.polynomial import chebyshev, legendre
 
 from harnack.backend import backend_of
 from harnack.backend.extrema import fmax
@@ -15,10 +57,8 @@ from harnack.enclosures import HarmonicBall
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.clearance import occupied_cells, tight_extent
 from harnack.fields.field import Sample
-from harnack.fields.meshes.centroids import Centroids, centroids, piece_counts
-from harnack.fields.meshes.sliced_kernel import SlicedKernel
 from harnack.fields.multipoles.dipole_records import dipole_rows
-from harnack.fields.multipoles.radial_kernel import BALL, RadialSums
+from harnack.fields.multipoles.radial_kernel import BALL, Radial, RadialKernel, RadialSums
 from harnack.fields.multipoles.radial_tree import ClusteredDipoles, TreeSum
 from harnack.fields.points import at_points
 from harnack.fields.sums import SLOPE_ROUNDINGS, SUM_ROUNDING
@@ -33,9 +73,190 @@ from harnack.fields.unit_coordinates import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from harnack.backend import Backend, FloatArray, Precision, Real, Vec3
+    from harnack.backend import Backend, FloatArray, IntArray, Precision, Real, Vec3
     from harnack.cells import OccupiedCells
     from harnack.geometry import Volume
+
+GRADIENT = 1.1855
+"""Half the largest gradient of a dipole in four dimensions, times D^3: it serves for Q_2."""
+
+# Degrees of the polynomial for the last i_n in single and double precision: the singularity at
+# c = -1 makes coefficients fall as 5.8^-k.
+_DEGREES = {4: 12, 8: 22}
+
+
+class SlicedKernel(RadialKernel):
+    """(4/pi) K(r, w) on a backend, at a height w > 0."""
+
+    def __init__(self, backend: Backend, height: float) -> None:
+        self.height = dr.opaque(backend.Float, height)
+        self.height_square = dr.opaque(backend.Float, height * height)
+        self._degree = _DEGREES[np.dtype(backend.dtype).itemsize]
+
+    def at(self, distance: Real, inverse: Real, last: int) -> Radial:
+        del distance
+        c = self.height * inverse
+        s2 = dr.fma(-c, c, 1)
+        moment = _horner(dr.fma(2, c, -1), last_moment(last + 1, self._degree))
+        thetas = [_factor(last) * moment]
+        for k in range(last, 0, -1):
+            moment = dr.fma(2 * k * s2, moment, c) * (1 / (2 * k - 1))
+            thetas.insert(0, _factor(k - 1) * moment)
+        return Radial(inverse, thetas)
+
+    def bounds(self, distance: Real, last: int) -> list[Real]:
+        del distance
+        return [GRADIENT, *(1.0 for _ in range(3, last + 1))]
+
+    def growth(self, r: Real) -> Real:
+        del r
+        return 1.0
+
+    def accepting_distance(self, radius: FloatArray, accuracy: float) -> FloatArray:
+        return accuracy * radius + 1e-5
+
+
+@functools.cache
+def last_moment(n: int, degree: int) -> tuple[float, ...]:
+    """i_n as a polynomial in 2c - 1 on [-1, 1], coefficients from the constant on."""
+    t, weight = legendre.leggauss(48)
+    t, weight = 0.5 * (t + 1), 0.5 * weight
+
+    def moment(x: FloatArray) -> FloatArray:
+        phi = np.arccos(0.5 * (x + 1))[:, None]
+        ratio = np.sin(phi * t) / np.sin(phi)
+        return phi[:, 0] / np.sin(phi[:, 0]) * (ratio ** (2 * n - 2) @ weight)
+
+    nodes = chebyshev.chebpts1(2 * degree)
+    series = chebyshev.chebfit(nodes, moment(nodes), degree)
+    return tuple(float(one) for one in chebyshev.cheb2poly(series))
+
+
+def _horner(x: Real, coefficients: tuple[float, ...]) -> Real:
+    out: Real = coefficients[-1]
+    for one in coefficients[-2::-1]:
+        out = dr.fma(out, x, one)
+    return out
+
+
+def _factor(k: int) -> float:
+    """(2/pi) 2^k k!."""
+    return 2 / math.pi * 2.0**k * math.factorial(k)
+
+
+# Cells in which triangles are merged, and the longest edge of these, in the longest edge of pieces.
+_CELL = 0.54
+
+
+@dataclass(frozen=True)
+class Centroids:
+    """Points that stand for parts of triangles.
+
+    points: (n, 3) centroids. moments: (n, 3) area times normal, summed up.
+    farthest: no point of a triangle is farther from the point that stands for it.
+    spread: the largest integral of |d|^2 over the part that a point stands for, d the distance from
+        the point, over the length of its moment; slant: of the Frobenius norm of the sum of moment
+        times d, likewise.
+    """
+
+    points: FloatArray
+    moments: FloatArray
+    farthest: float
+    spread: float
+    slant: float
+
+
+def piece_counts(corners: FloatArray, longest: float) -> IntArray:
+    """In how many parts to cut each edge of triangles (m, 3, 3), so that none is longer: (m,)."""
+    return np.maximum(np.ceil(_longest_edges(corners) / longest), 1).astype(np.int64)
+
+
+def centroids(corners: FloatArray, longest: float) -> Centroids:
+    """Of triangles (m, 3, 3), cut in similar pieces with edges at most `longest`; of those much
+    smaller, one point for all in a cell that face the same way."""
+    small = _longest_edges(corners) <= _CELL * longest
+    parts = [
+        make(some, longest)
+        for make, some in ((_cut, corners[~small]), (_merged, corners[small]))
+        if len(some)
+    ]
+    return Centroids(
+        np.concatenate([one.points for one in parts]),
+        np.concatenate([one.moments for one in parts]),
+        max(one.farthest for one in parts),
+        max(one.spread for one in parts),
+        max(one.slant for one in parts),
+    )
+
+
+def _longest_edges(corners: FloatArray) -> FloatArray:
+    return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+
+
+def _farthest(corners: FloatArray, points: FloatArray) -> FloatArray:
+    """The largest distance of a corner (m, 3, 3) from points (m, 3): (m,)."""
+    return np.linalg.norm(corners - points[:, None], axis=2).max(axis=1)
+
+
+def _areas(corners: FloatArray) -> FloatArray:
+    """Area times normal, (m, 3)."""
+    a, b, c = np.moveaxis(corners, 1, 0)
+    return 0.5 * np.cross(b - a, c - a)
+
+
+def _mean_squares(corners: FloatArray) -> FloatArray:
+    """The mean square distance from the centroid over triangles: (m,)."""
+    return ((corners - np.roll(corners, 1, axis=1)) ** 2).sum(axis=(1, 2)) / 36
+
+
+def _cut(corners: FloatArray, longest: float) -> Centroids:
+    """Triangles cut in counts^2 similar pieces each: first moments vanish."""
+    counts = piece_counts(corners, longest)
+    points: list[FloatArray] = []
+    moments: list[FloatArray] = []
+    for count in np.unique(counts):
+        some = corners[counts == count]
+        a, b, c = np.moveaxis(some, 1, 0)
+        # Pieces that are turned as the triangle, and those that fill the gaps between them.
+        i, j = np.indices((count, count)).reshape(2, -1)
+        steps = [(i + j < count, 1 / 3), (i + j < count - 1, 2 / 3)]
+        u, v = (np.concatenate([k[one] + third for one, third in steps]) / count for k in (i, j))
+        middle = a[:, None] + u[:, None] * (b - a)[:, None] + v[:, None] * (c - a)[:, None]
+        points.append(middle.reshape(-1, 3))
+        moments.append(np.repeat(_areas(some) / count**2, count**2, axis=0))
+    spread = float((_mean_squares(corners) / counts**2).max())
+    farthest = float((_farthest(corners, corners.mean(axis=1)) / counts).max())
+    return Centroids(np.concatenate(points), np.concatenate(moments), farthest, spread, 0.0)
+
+
+def _merged(corners: FloatArray, longest: float) -> Centroids:
+    """One point for all triangles whose centroids are in a cell and whose normals have the same
+    largest component: their moments add up to at least 1/sqrt(3) of their area."""
+    moments, middles = _areas(corners), corners.mean(axis=1)
+    axis = np.abs(moments).argmax(axis=1)
+    side = np.take_along_axis(moments, axis[:, None], axis=1)[:, 0] > 0
+    cells = np.floor(middles / (_CELL * longest)).astype(np.int64)
+    keys = np.column_stack([cells, 2 * axis + side])
+    _, group = np.unique(keys, axis=0, return_inverse=True)
+    group = group.ravel()
+    area = np.linalg.norm(moments, axis=1)
+    points = _sums(group, area[:, None] * middles) / _sums(group, area[:, None])
+    d = middles - points[group]
+    total = _sums(group, moments)
+    length = np.linalg.norm(total, axis=1)
+    square = area * (_mean_squares(corners) + (d * d).sum(axis=1))
+    outer = np.einsum("ki,kj->kij", moments, d).reshape(-1, 9)
+    slant = np.linalg.norm(_sums(group, outer), axis=1)
+    spread = float((_sums(group, square[:, None])[:, 0] / length).max())
+    farthest = float(_farthest(corners, points[group]).max())
+    return Centroids(points, total, farthest, spread, float((slant / length).max()))
+
+
+def _sums(group: IntArray, values: FloatArray) -> FloatArray:
+    """Sums of rows (m, k) of the same group: (groups, k)."""
+    columns: list[FloatArray] = [np.bincount(group, one).astype(np.float64) for one in values.T]
+    return np.column_stack(columns)
+
 
 MOST_POINTS = 4_000_000
 """Points of the quadrature of both meshes together."""

@@ -4,6 +4,10 @@ Points of the lattice near the level set are moved onto it and become vertices, 
 slivers go (Labelle and Shewchuk 2007). Where sheets then touch in a vertex or an edge, points are
 put back until they do not. With none moved the surface is a manifold: every tetrahedron is cut by
 one triangle or quadrilateral, and signs at its corners alone say how.
+
+How many triangles a tolerance will take, before they are made.
+
+Whether parts of a level set were missed by a lattice: thin walls, knife edges, small islands.
 """
 
 from __future__ import annotations
@@ -11,24 +15,149 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, cast
 
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.checks import MeshingError, singular_vertices
-from harnack.meshing.edges import IntArray
+from harnack.meshing.checks import MeshingError, TooLargeError, singular_vertices
+from harnack.meshing.edges import IntArray, lengths
 from harnack.meshing.isotopy import Isotopy, isotopy_of
 from harnack.meshing.lattice.cells import Lattice, distinct_rows
-from harnack.meshing.lattice.estimates import check_size
-from harnack.meshing.lattice.missed import check_nothing_missed
 from harnack.meshing.marching import crossings_of, is_cut, triangles_of
 from harnack.meshing.points import Boundary, PointSet, newton
 from harnack.meshing.refining.refinement import refined, smoothed, smoothed_within
-from harnack.meshing.rows import lengths
 from harnack.meshing.samples import LevelFunction, Samples
 from harnack.meshing.tetrahedra import Tetrahedra
 
-__all__ = ["Surface", "closed_surface", "open_surface"]
+__all__ = [
+    "MissedError",
+    "Surface",
+    "check_nothing_missed",
+    "check_size",
+    "closed_surface",
+    "open_surface",
+]
+
+# Lengths in cells: how near the level seems to a point; how far it may be moved to it; how far what
+# is found has to be from all triangles, by their corners and centres, which are less than half a
+# cell from all that is on them; and from the faces of the box, beyond which there may be more.
+_NEAR, _FOUND, _APART, _DEEP = 1.0, 1.5, 0.75, 0.5
+# Points nearer than the first belong together; parts at least as long as the second are missed.
+_TOGETHER, _LONG = 1.0, 2.0
+# How near to the level, in cells, a point has to come by Newton's method.
+_ON = 1e-3
+
+
+class MissedError(MeshingError):
+    """A level set of which some parts lie between the points of a lattice."""
+
+
+def check_nothing_missed(
+    function: LevelFunction,
+    points: FloatArray,
+    samples: Samples,
+    is_beside: BoolArray,
+    surface: tuple[FloatArray, IntArray],
+    size: float,
+    box: tuple[FloatArray, FloatArray],
+) -> None:
+    """Raise if the level set has parts, two cells long or longer, away from its triangles.
+
+    Signs at the points of a lattice do not see a wall between two of them. Its sides are found from
+    there by Newton's method: what it ends at, on the level, should be near triangles. So many
+    points are a dense sample, and no proof. Islands smaller than a cell may be missed.
+
+    samples: at points (n, 3) of the lattice. is_beside: (n,) those of tetrahedra that are cut.
+        surface: vertices and faces. size: of a cell. box: where the level set counts.
+
+    Raises:
+        MissedError: with one of the places.
+    """
+    import scipy.spatial  # here: half a second that few need
+
+    searching: Any = scipy.spatial
+    rows = np.flatnonzero(~is_beside & (samples.distance < _NEAR * size))
+    if not len(rows):
+        return
+    start = points[rows]
+    step = np.full(len(rows), 0.5 * size)
+    x = newton(function, start, samples.some(rows), step, None)
+    found = function.at(x).distance < _ON * size
+    found &= lengths(x - start) < _FOUND * size
+    deep = _DEEP * size
+    found &= ((x >= box[0] + deep) & (x <= box[1] - deep)).all(axis=1)
+    x = x[found]
+    vertices, faces = surface
+    if len(faces) and len(x):
+        around = np.concatenate([vertices[np.unique(faces)], vertices[faces].mean(axis=1)])
+        x = x[searching.cKDTree(around).query(x)[0] > _APART * size]
+    part = _longest_part(x, _TOGETHER * size)
+    if len(part) and np.ptp(part, axis=0).max() >= _LONG * size:
+        a, b, c = part[0]
+        raise MissedError(
+            f"cells of {size:.3g} miss parts of the level set, such as that at ({a:.4g}, {b:.4g}, "
+            f"{c:.4g}), which are thinner or smaller: choose a smaller `spacing`, or for a wall or "
+            "an edge make the solid of smooth parts, such as hk.solid(f, between=(low, high)) or "
+            "hk.solid(f, below=0) & hk.solid(g, below=0)"
+        )
+
+
+def _longest_part(x: FloatArray, apart: float) -> FloatArray:
+    """Of points (n, 3) those of the longest chain of which neighbours are no farther apart."""
+    import scipy.sparse  # here: half a second that few need
+    import scipy.sparse.csgraph as csgraph_module
+    import scipy.spatial
+
+    sparse, csgraph, searching = (
+        cast("Any", one) for one in (scipy.sparse, csgraph_module, scipy.spatial)
+    )
+    if not len(x):
+        return x
+    one, other = searching.cKDTree(x).query_pairs(apart, output_type="ndarray").T
+    joined = sparse.coo_matrix((np.ones(len(one)), (one, other)), shape=(len(x), len(x)))
+    count, part = csgraph.connected_components(joined, directed=False)
+    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    np.minimum.at(low, part, x)
+    np.maximum.at(high, part, x)
+    return x[part == (high - low).max(axis=1).argmax()]
+
+
+def check_size(
+    function: LevelFunction, vertices: FloatArray, faces: IntArray, tolerance: float
+) -> None:
+    """Raise if the triangles that refinement would make of these are more than the function allows.
+
+    How far the middle of a triangle is from the surface falls with its area: one that is k times
+    the tolerance away takes about k others. Looked at is one triangle in several.
+
+    Raises:
+        MeshingError: the function has no slope between the vertices.
+        TooLargeError: with the estimate, and a tolerance that would do.
+    """
+    some = faces[:: max(1, len(faces) // 20_000)]
+    if not len(some):
+        return
+    corner = vertices[some]
+    at = function.at(0.5 * (corner + np.roll(corner, 1, axis=1)).reshape(-1, 3))
+    is_flat = (at.value != 0) & ~at.gradient.any(axis=1)
+    if is_flat.any():
+        raise MeshingError(
+            f"{type(function.field).__name__} is constant at {is_flat.sum():,} of "
+            f"{len(is_flat):,} middles of edges, so that it does not say how far the surface is: "
+            "choose a smaller `spacing`, or a function with a slope within a cell of its surface"
+        )
+    middle = at.distance
+    ratio = middle.reshape(-1, 3).max(axis=1) / tolerance
+    expected = float(np.maximum(1.0, ratio).mean()) * len(faces)
+    most = function.most_faces
+    if expected > most:
+        enough = expected / most
+        raise TooLargeError(
+            f"the tolerance takes about {expected:.1e} triangles, and max_triangles is {most:,}: "
+            f"choose a `tolerance` {enough:.2g} times as large, or a larger max_triangles"
+        )
+
 
 # Points so near to the level, in parts of the length of a cell, are moved onto it.
 _SNAPPED = 0.25

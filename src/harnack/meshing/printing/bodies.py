@@ -9,9 +9,8 @@ import numpy as np
 
 from harnack.backend import FloatArray
 from harnack.meshing.checks import MeshingError
-from harnack.meshing.edges import IntArray
+from harnack.meshing.edges import IntArray, dots, lengths
 from harnack.meshing.lattice import Surface
-from harnack.meshing.rows import dots, lengths
 
 __all__ = ["largest_body", "largest_part"]
 

@@ -13,10 +13,9 @@ from harnack.meshing.checks import (
     MeshingError,
     euler_characteristic,
 )
-from harnack.meshing.edges import Edges, IntArray, boundary_edges, directed_edges
+from harnack.meshing.edges import Edges, IntArray, boundary_edges, directed_edges, dots, lengths
 from harnack.meshing.lattice import Surface
 from harnack.meshing.printing.manifolds import manifold_of, surface_of
-from harnack.meshing.rows import dots, lengths
 from harnack.meshing.samples import LevelFunction
 
 if TYPE_CHECKING:

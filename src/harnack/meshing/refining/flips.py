@@ -12,8 +12,15 @@ from __future__ import annotations
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.edges import IntArray, boundary_edges, directed_edges, distinct, edge_keys
-from harnack.meshing.rows import dots, lengths
+from harnack.meshing.edges import (
+    IntArray,
+    boundary_edges,
+    directed_edges,
+    distinct,
+    dots,
+    edge_keys,
+    lengths,
+)
 from harnack.meshing.samples import LevelFunction
 
 __all__ = ["flipped", "least_angles", "without_slivers"]

@@ -14,11 +14,10 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
 from harnack.meshing.checks import check_count
-from harnack.meshing.edges import Edges, IntArray, boundary_edges, directed_edges
+from harnack.meshing.edges import Edges, IntArray, boundary_edges, directed_edges, dots, lengths
 from harnack.meshing.points import newton
 from harnack.meshing.refining.flips import flipped, without_slivers
 from harnack.meshing.refining.relaxation import relaxed
-from harnack.meshing.rows import dots, lengths
 from harnack.meshing.samples import LevelFunction, Samples
 
 __all__ = ["far_places", "improved", "refined", "smoothed", "smoothed_within"]

@@ -14,10 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.edges import IntArray, boundary_edges
+from harnack.meshing.edges import IntArray, boundary_edges, dots, lengths
 from harnack.meshing.points import newton
 from harnack.meshing.refining.flips import least_angles
-from harnack.meshing.rows import dots, lengths
 from harnack.meshing.samples import LevelFunction
 
 __all__ = ["relaxed"]

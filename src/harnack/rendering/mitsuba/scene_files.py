@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from harnack.fields.expressions.text import looks_like_formula
+from harnack.fields.expressions import looks_like_formula
 from harnack.files.file_format import MAX_BYTES, Place, read_bytes
 from harnack.files.surfaces import SURFACE_FILES
 

@@ -5,28 +5,33 @@ neighbour are then drawn again as the mean of a fixed grid of samples, and so ar
 edge of an isoline may pass through: outlines are smooth, lines thinner than a pixel have no gaps,
 and the inside of a surface costs one ray a pixel. Cones find more pixels to draw again, if asked
 for: those that a surface covers in part, though no ray through a middle tells.
+
+How much of the sky is hidden by what is near, from what the picture itself shows.
+
+Which pixels surfaces may cover in part: found by cones, so that no thin part is overlooked.
+
+The ray through the middle of a pixel misses what is thinner than the pixel more often than not, and
+so do those of its neighbours. The cone that holds the pixel does not.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend import aligned, to_numpy
+from harnack.backend import BoolArray, aligned, choose_backend, to_numpy
 from harnack.fields import Solid
 from harnack.rendering.mitsuba.integrator import LOST_COLOUR
 from harnack.rendering.mitsuba.variant import mitsuba_backend
 from harnack.rendering.mitsuba.world import World
-from harnack.rendering.pictures.cones import Finder
 from harnack.rendering.pictures.floor import Floor
 from harnack.rendering.pictures.images import tone_mapped
-from harnack.rendering.pictures.light_paths.exposure import as_rgb, mean_of_blocks
-from harnack.rendering.pictures.occlusion import visible_sky
+from harnack.rendering.pictures.light_paths import as_rgb, mean_of_blocks
 from harnack.rendering.pictures.pixels import (
     bands,
     edges_of,
@@ -37,6 +42,128 @@ from harnack.rendering.pictures.pixels import (
 )
 from harnack.rendering.pictures.shading import Light, of_mended, of_side, reflectance
 from harnack.rendering.pictures.through import Through
+from harnack.rendering.surfaces.placement import PlacedSurface
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Real, Vec3
+    from harnack.geometry import Volume
+
+
+class Finder:
+    """The surfaces of a world, to be met by cones.
+
+    Raises:
+        ValueError: a field that jumps, such as the winding number of a mesh: it is constant on both
+            sides of the surface, so that its values tell no distance.
+    """
+
+    def __init__(self, mi: Any, world: World) -> None:
+        self.mi = mi
+        self.placed = tuple(_prepared(mi, carrier) for carrier in world.carriers)
+
+    def find(self, ray: Any, position: Any) -> BoolArray:
+        """Whether the cones of pixels are covered in part before the points that rays see.
+
+        ray: through the middles, with differentials. position: seen; NaN where nothing is.
+        """
+        mi = self.mi
+        away = dr.norm(position - ray.o)
+        t = dr.select(dr.isfinite(away), away, dr.largest(mi.Float))
+        x, y = ray.d_x - ray.d, ray.d_y - ray.d
+        radius = 0.5 * dr.maximum(dr.norm(x + y), dr.norm(x - y))  # half the longer diagonal
+        found = dr.zeros(mi.Bool, dr.width(ray.d))
+        for placed, around in self.placed:
+            found |= placed.covers_in_part(ray.o, ray.d, radius, t, around)
+        found_there: BoolArray = to_numpy(found)
+        return found_there
+
+
+def _prepared(mi: Any, carrier: Any) -> tuple[PlacedSurface, Any]:
+    """A surface that can be looked at outside its extent, and balls in and around the extent."""
+    surface, backend = carrier.surface, mitsuba_backend(mi)
+    if surface.field.has_parts:
+        raise ValueError(
+            f'antialias="cones" takes a level set of one function, and {surface.field!r} has one '
+            'for each part. Leave antialias at "edges"'
+        )
+    if surface.field.has_sheets:
+        raise ValueError(
+            f'antialias="cones" takes fields without jumps, and {surface.field!r} jumps: its '
+            'values tell no distance. Leave antialias at "edges"'
+        )
+    placed = replace(carrier.placed, prepared=surface.prepare(backend, crosses=True))
+    return placed, balls_of(surface.volume, backend)
+
+
+def balls_of(volume: Volume | None, backend: Backend) -> tuple[Vec3, Real, Real] | None:
+    """The middle of a volume, and the radii about it of a ball in it and of one around it; None
+    where it has no end or no such ball was found."""
+    if volume is None:
+        return None
+    lower, upper = (np.asarray(end, dtype=np.float64) for end in volume.bounds())
+    if not np.isfinite(upper - lower).all():
+        return None
+    middle = (0.5 * (lower + upper)).tolist()
+    # Not half the box: other volumes have faces that lie nearer to its middle.
+    there = choose_backend("double").Array3f(*middle)
+    depth = -float(to_numpy(volume.signed_distance(there))[0]) * (1 - 1e-6)
+    if not depth > 0:
+        return None
+    size = 0.5 * float(np.linalg.norm(upper - lower))
+    numbers = [dr.opaque(backend.Float, x) for x in (*middle, depth, size)]
+    return backend.Array3f(*numbers[:3]), numbers[3], numbers[4]
+
+
+# Ways across the picture, and taps along each, up to this share of its larger side.
+_WAYS = 16
+_TAPS = 8
+_REACH = 0.16
+
+
+def visible_sky(mi: Any, position: Any, normal: Any, width: Any, size: tuple[int, int]) -> Any:
+    """The part of the hemisphere over each pixel's point that nothing near it hides, in [0, 1].
+
+    position: points seen by the pixels, counted by rows; NaN where nothing is seen.
+    normal: unit, towards the eye. width: of a pixel, there. size: (width, height) in pixels.
+
+    Along each way across the picture the highest point over the tangent plane, at elevation h,
+    hides sin^2 h of the light with a cosine (Bavoil and Sainz 2008), less so the farther away
+    it is. It sees only what the picture shows. The ways are the same everywhere: no noise.
+    """
+    columns, rows = size
+    count = columns * rows
+    index = dr.arange(mi.UInt32, count)
+    x, y = mi.Float(index % columns), mi.Float(index // columns)
+    reach = _REACH * max(size)
+    radius = reach * width
+
+    def tap(k: int, direction: Any) -> Any:
+        """The sine of the elevation of a tap, faded with its distance; 0 if nothing is there."""
+        far = 1.0 + reach * ((k + 0.5) / _TAPS) ** 2
+        u, v = x + far * direction.x, y + far * direction.y
+        inside = (u >= 0) & (v >= 0) & (u <= columns - 1) & (v <= rows - 1)
+        other = mi.UInt32(dr.fma(dr.round(v), columns, dr.round(u)))
+        way = dr.gather(mi.Vector3f, position, other, inside) - position
+        length = dr.norm(way)
+        fade = dr.maximum(1 - dr.square(length / radius), 0)
+        height = dr.dot(way, normal) / length - 0.06  # facets and rounding stay below that
+        return dr.select(inside & (height > 0), height * fade, 0)
+
+    def along(way: Any, hidden: Any) -> tuple[Any, Any]:
+        s, c = dr.sincos((mi.Float(way) + 0.5) * (dr.two_pi / _WAYS))
+        highest = mi.Float(0)
+        for k in range(_TAPS):
+            highest = dr.maximum(highest, tap(k, mi.Vector2f(c, s)))
+        return way + 1, hidden + dr.square(highest)
+
+    def more(way: Any, hidden: Any) -> Any:
+        del hidden
+        return way < _WAYS
+
+    start = (mi.UInt32(0), dr.zeros(mi.Float, count))
+    _, hidden = dr.while_loop(start, more, along, label="visible sky")
+    return 1 - hidden / _WAYS
+
 
 # Rays of one band.
 _RAYS_A_BAND = 2**17

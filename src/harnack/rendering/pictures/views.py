@@ -29,9 +29,7 @@ from harnack.rendering.pictures.pixels import (
     in_tiles,
     uploaded,
 )
-from harnack.rendering.pictures.scales.bar import with_bar
-from harnack.rendering.pictures.scales.colormap import greys, viridis
-from harnack.rendering.pictures.scales.scale import Scale
+from harnack.rendering.pictures.scales import Scale, greys, viridis, with_bar
 from harnack.rendering.surfaces.colours import Colour
 from harnack.rendering.surfaces.functions import defined_in
 from harnack.rendering.surfaces.placement import Placement

@@ -14,7 +14,7 @@ import drjit as dr
 
 from harnack.backend.extrema import fmax, fmin
 from harnack.backend.loops import while_active
-from harnack.fields.parts import NO_PART, PartEntry
+from harnack.fields.sheets import NO_PART, PartEntry
 from harnack.tracer.march import March, MarchState
 from harnack.tracer.tolerance import Status
 

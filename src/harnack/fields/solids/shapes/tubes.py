@@ -34,7 +34,7 @@ class Tubes(BoxedField["_TubeBuffers"]):
 
     points: (n, 3). segments: (m, 2) indices of points, counted from 0. radius: a number, or (m,).
 
-    Each segment is a part with rounded ends (`harnack.fields.parts`): a ray pays only for those
+    Each segment is a part with rounded ends (`harnack.fields.sheets`): a ray pays only for those
     whose boxes it enters, so that thousands cost little more than one, and `Hits.sheet` is the
     index of the segment. `level` makes all tubes thicker by so much. For one polyline, and for
     combinations with other solids, there is `Tube`.

@@ -3,10 +3,19 @@
 Each band of pixels gets all its samples at once, so that samplers can stratify them, and every
 pixel averages its own samples only. So there are no sums whose order threads could change: the
 same seed gives the same picture.
+
+How long a picture will take, told before it is begun.
+
+Noise taken out of pictures by Open Image Denoise, a neural network that runs on CPUs.
+
+It guesses: what comes out looks clean and is close to what more samples would have shown, but no
+number of it is a mean of samples any more.
 """
 
 from __future__ import annotations
 
+import importlib
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,7 +27,7 @@ import numpy.typing as npt
 from harnack.backend import to_numpy
 from harnack.rendering.mitsuba.integrator import PathTracer, Radiance
 from harnack.rendering.mitsuba.sobol import SobolSampler
-from harnack.rendering.pictures.pixels import bands, film_places
+from harnack.rendering.pictures.pixels import bands, film_places, uploaded
 
 # Paths of one band at most: about two seconds on a CPU. Ctrl-C works between bands.
 PATHS_A_BAND = 2**21
@@ -129,3 +138,98 @@ def as_rgb(mi: Any, radiance: Any, wavelengths: Any) -> Any:
 def mean_of_blocks(colour: Any, spp: int) -> Any:
     """The mean of each `spp` neighbouring lanes."""
     return type(colour)(*(dr.block_sum(channel, spp) / spp for channel in colour))
+
+
+# Paths that are tried: at first, how many times as many next, and no more than this part of all.
+_FIRST, _MORE, _PART = 2**12, 4, 1 / 16
+# So many times as long as the first can be told from what starting costs.
+_ENOUGH = 3.0
+# A picture that takes no longer is not told about, in seconds.
+SHORT = 15.0
+# Seconds between two moves of the progress bar, and the fewest paths of a band.
+_BAND, _FEWEST = 4.0, 2**14
+
+
+@dataclass(frozen=True)
+class Pace:
+    """Seconds for one path, and for all of a picture."""
+
+    path: float
+    picture: float
+
+    @property
+    def paths_a_band(self) -> int:
+        """Paths that take as long as a progress bar may stand still."""
+        return round(min(max(_BAND / max(self.path, 1e-9), _FEWEST), PATHS_A_BAND))
+
+    def __str__(self) -> str:
+        seconds = round(self.picture)
+        minutes, rest = divmod(seconds, 60)
+        hours, left = divmod(minutes, 60)
+        if seconds < 90:
+            return f"{seconds} s"
+        if minutes < 90:
+            return f"{minutes} min {rest // 10 * 10} s" if minutes < 10 else f"{minutes} min"
+        return f"{hours} h {left} min"
+
+
+def pace_of(
+    mi: Any, scene: Any, sensor: Any, tracer: PathTracer, *, spp: int, features: bool
+) -> Pace:
+    """Measured on a few paths all over the picture.
+
+    Starting costs the same however many paths there are, so what counts is how much longer four
+    times as many took. Of a picture of few paths nothing is measured, and its pace is 0.
+    """
+    width, height = (int(n) for n in sensor.film().crop_size())
+    pixels = width * height
+    whole = pixels * spp
+
+    def seconds(count: int) -> float:
+        # The golden ratio spreads any number of pixels evenly.
+        chosen = (np.arange(count) * 0.6180339887498949 % 1 * pixels).astype(np.int64)
+        pixel = uploaded(mi, np.minimum(chosen, pixels - 1))
+        sample = dr.opaque(mi.UInt32, 0, count)
+        began = time.perf_counter()
+        found, _ = follow(mi, scene, sensor, tracer, pixel, sample, 0, features)
+        dr.eval(found.light)
+        dr.sync_thread()
+        return time.perf_counter() - began
+
+    count, path = _FIRST, 0.0
+    if _MORE * count <= _PART * whole:
+        seconds(count)  # compiles
+        first = before = seconds(count)
+        while _MORE * count <= _PART * whole and before < _ENOUGH * first:
+            after = seconds(_MORE * count)
+            path = max(after - before, 0.0) / ((_MORE - 1) * count)
+            count, before = _MORE * count, after
+    return Pace(path, whole * path)
+
+
+def load_denoiser() -> Any:
+    """The package `pyoidn`.
+
+    Raises:
+        ModuleNotFoundError: it is not installed, or its library cannot be loaded.
+    """
+    try:
+        return importlib.import_module("pyoidn")
+    except ModuleNotFoundError:
+        raise ModuleNotFoundError(
+            "denoise needs Open Image Denoise: pip install 'harnack[denoise]'"
+        ) from None
+    except OSError as wrong:
+        raise ModuleNotFoundError(f"Open Image Denoise cannot be loaded: {wrong}") from None
+
+
+def denoised(found: Exposure) -> npt.NDArray[np.float32]:
+    """The image of an exposure with features, (h, w, 4), without noise. What part of each pixel is
+    covered stays as it is."""
+    if found.albedo is None or found.normal is None:
+        raise ValueError("an exposure without features cannot be denoised")
+    light = np.maximum(found.image[..., :3], 0)
+    features = (np.clip(found.albedo, 0, 1), np.clip(found.normal, -1, 1))
+    parts = [np.ascontiguousarray(part, dtype=np.float32) for part in (light, *features)]
+    clean = load_denoiser().denoise(parts[0], albedo=parts[1], normal=parts[2], hdr=True)
+    return np.concatenate([clean, found.image[..., 3:]], axis=-1)

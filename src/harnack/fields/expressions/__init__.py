@@ -1,1 +1,0 @@
-"""Fields that users write as formulas."""

@@ -1,1 +1,0 @@
-"""Meshes whose faces are polygons, flat or not."""

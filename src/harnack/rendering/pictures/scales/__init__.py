@@ -1,1 +1,0 @@
-"""Numbers as colours, and the bars that explain them."""
