@@ -224,6 +224,7 @@ def test_meshes_that_lack_single_triangles_get_them_back() -> None:
     assert facts["refined"]
 
 
+@pytest.mark.slow
 def test_points_are_moved_in_another_way_where_a_change_is_not_known() -> None:
     box = trimesh.creation.box().subdivide().subdivide()
     rng = np.random.default_rng(628030259)

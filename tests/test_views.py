@@ -17,7 +17,8 @@ import harnack as hk
 from harnack.cli import main
 from harnack.geometry import shapes
 from harnack.rendering import register
-from harnack.rendering.pictures.scales import Scale, bar
+from harnack.rendering.pictures import scales
+from harnack.rendering.pictures.scales import Scale
 from harnack.rendering.studio.upright import upright
 
 FIELD = hk.SolidAngle(shapes.wavy_polygon(24))
@@ -422,13 +423,13 @@ def test_pictures_of_numbers_stand_before_a_color(show: str) -> None:
 def test_titles_of_bars_have_the_letters_of_some_typeface(monkeypatch: pytest.MonkeyPatch) -> None:
     """ψ and ö were refused. Machines without a typeface that has them say so."""
     with contextlib.suppress(ValueError):
-        face = bar.typeface_for("ψ in Höhe", 12)
+        face = scales.typeface_for("ψ in Höhe", 12)
         assert bytes(face.getmask("ψ")) != bytes(face.getmask("ö"))
         seen = hk.render(
             hk.Sphere(1.0), show="depth", colorbar="ψ in Höhe", size=(40, 30), progress=False
         )
         assert seen.shown.shape[1] > 40
-    monkeypatch.setattr(bar, "_TYPEFACES", ())
+    monkeypatch.setattr(scales, "_TYPEFACES", ())
     with pytest.raises(ValueError, match=r"no typeface .* all letters of 'über 4π'"):
         hk.render(hk.Sphere(1.0), show="depth", colorbar="über 4π")
     with pytest.raises(ValueError, match="one line of letters"):
