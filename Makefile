@@ -49,7 +49,7 @@ test-slow: $(STAMP)
 test-frameworks: $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(FRAMEWORKS)
 	$(BIN)/python -c "import torch"
-	$(BIN)/python -m pytest -q -m "slow or not slow" tests/test_frameworks.py
+	$(BIN)/python -m pytest -q -m "slow or not slow" tests/backend/test_frameworks.py
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -33,7 +33,7 @@ times one that falls from 1, so that I is the same integral for s = 1 up to some
 That is the largest for b = 1, or where U_m(a b) = 0 at an angle k pi/(m+1), k >= 1. Lobes between
 such angles alternate and grow with x, as x^m (1 - x^2)^(-1/2) does: the integral is at most its
 last lobe, which is the largest if it ends at b = 1, where it is below 0.4 for m <= 7 (quadrature in
-`tests/test_morph.py`).
+`tests/fields/test_morph.py`).
 
 In four dimensions the gradient of n.grad_x K is at most 2 * 1.1855/D^3: its square is
 cos^2 (K''^2 + (dw K')^2) + sin^2 (K'/r)^2, cos the angle of n to z, and so at most the larger of

@@ -18,7 +18,7 @@ from harnack.enclosures import Cusp, Gaps, Nearest, Sheet, Slopes
 from harnack.fields.plane.branches import Branches, Disk, Stretch, complex_type
 from harnack.fields.plane.functions import branches_of
 from harnack.testing import BrokenPromiseError, check_field
-from tests.test_kernels import compiled
+from tests.backend.test_kernels import compiled
 
 Product = Callable[[np.ndarray, np.ndarray], np.ndarray]
 

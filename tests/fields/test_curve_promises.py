@@ -13,8 +13,7 @@ from harnack.enclosures import Curvature
 from harnack.fields.edges.edge_records import LoopEdges
 from harnack.fields.edges.edge_sums import sum_over_edges
 from harnack.geometry import shapes
-
-from .oracles.oracle import CurveOracle
+from tests.oracles.oracle import CurveOracle
 
 PRECISIONS = ("double", "single")
 CURVES = {

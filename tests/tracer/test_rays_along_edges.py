@@ -13,7 +13,7 @@ from harnack.fields import LineLipschitz
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.geometry.mesh_shapes import icosphere
 from harnack.geometry.shapes import wavy_polygon
-from tests.test_solid_angle import CurveOracle, lines_beside, moves_along, unit
+from tests.fields.test_solid_angle import CurveOracle, lines_beside, moves_along, unit
 
 Mesh = tuple[np.ndarray, np.ndarray]
 

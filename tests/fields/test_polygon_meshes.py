@@ -21,7 +21,7 @@ from harnack.geometry.polygon_meshes import polygon_patches
 from harnack.rendering import Camera
 from harnack.testing import check_field
 from harnack.tree.boxes import NO_BOX, BoxTree
-from tests.test_kernels import compiled
+from tests.backend.test_kernels import compiled
 
 PRECISIONS = ("single", "double")
 

@@ -12,8 +12,8 @@ import pytest
 import harnack as hk
 from harnack.fields.waves.cosine_series import CosineBounds, fit_cosines, midpoints, on_nodes
 from harnack.testing import BrokenPromiseError, check_field
+from tests.backend.test_kernels import compiled
 from tests.oracles.oracle import OracleValues, first_crossings
-from tests.test_kernels import compiled
 
 HALF = 3 * math.pi / 4
 FIG_21 = ((-HALF,) * 3, (HALF,) * 3)

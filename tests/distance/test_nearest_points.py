@@ -16,8 +16,8 @@ from harnack.distance import search
 from harnack.distance.surface_cells import remainder
 from harnack.fields.look import Sample
 from harnack.geometry import mesh_shapes, shapes
-from tests.test_distance import CURVED, Bare, surface_points, true_distance, unit
-from tests.test_mesh_distances import (
+from tests.distance.test_distance import CURVED, Bare, surface_points, true_distance, unit
+from tests.distance.test_mesh_distances import (
     beside_faces,
     distance_to_closed_mesh,
     distances_to_triangles,

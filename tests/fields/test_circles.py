@@ -19,7 +19,7 @@ from harnack.geometry import CurveError, shapes
 from harnack.testing import check_field
 from tests.oracles.circle_oracle import MixedOracle, circle_values
 from tests.oracles.oracle import first_crossings
-from tests.test_first_hits import is_near_surface, random_level, rotation, unit
+from tests.tracer.test_first_hits import is_near_surface, random_level, rotation, unit
 
 FOUR_PI = 4 * math.pi
 PRECISIONS = ("single", "double")

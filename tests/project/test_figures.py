@@ -17,7 +17,7 @@ from figures.registry import FIGURES
 from figures.view import View, mesh_hits
 from harnack.geometry import mesh_shapes, shapes
 
-PAGE = Path(__file__).resolve().parent.parent / "docs" / "figures.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "figures.md"
 # Those that show a result.
 OF_THE_PAPER = [1, 4, 5, *range(7, 10), *range(11, 18), *range(19, 28)]
 

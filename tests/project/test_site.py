@@ -10,7 +10,7 @@ from types import ModuleType
 import harnack as hk
 from harnack.gallery import SCENES
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 
 

@@ -44,11 +44,11 @@ from harnack.geometry import shapes
 from harnack.geometry.mesh_shapes import bumpy_sphere, icosphere, remove_faces
 from harnack.testing import BrokenPromiseError, check_field, check_looks, scaled
 from harnack.testing.cases import case_of
+from tests.arithmetic.test_arithmetics import PROOFS
+from tests.enclosures.test_bounded_laplacian import FIELDS as SOURCED
+from tests.fields.test_shapes import SHAPES
 from tests.oracles.direct_sums import dipole_sum, winding_sum
 from tests.oracles.step_contracts import check_steps
-from tests.test_arithmetics import PROOFS
-from tests.test_bounded_laplacian import FIELDS as SOURCED
-from tests.test_shapes import SHAPES
 
 BOUNDS = (Classic, Slope, Caps, GreenBall, Cone, Taylor)
 

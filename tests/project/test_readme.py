@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def blocks_of(page: Path) -> list[str]:
@@ -17,7 +17,7 @@ def blocks_of(page: Path) -> list[str]:
 
 
 README = blocks_of(ROOT / "README.md")
-# `tests/test_frameworks.py` runs the code that needs PyTorch and JAX.
+# `tests/backend/test_frameworks.py` runs the code that needs PyTorch and JAX.
 PAGES = sorted({*(ROOT / "docs").glob("*.md")} - {ROOT / "docs" / "frameworks.md"})
 DOCS = [block for page in PAGES for block in blocks_of(page)]
 

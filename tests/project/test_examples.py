@@ -11,7 +11,7 @@ import pytest
 
 from tests.oracles.mesh_files import read_closed
 
-EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 SMALL = (64, 48)
 
 

@@ -17,8 +17,8 @@ jax: Any = pytest.importorskip("jax", reason="make test-frameworks installs JAX"
 import harnack as hk  # noqa: E402
 from harnack.backend import Precision, choose_backend, to_numpy, to_vector3  # noqa: E402
 from harnack.geometry import shapes  # noqa: E402
-from tests.test_kernels import compiled  # noqa: E402
-from tests.test_readme import ROOT, blocks_of, run_code  # noqa: E402
+from tests.backend.test_kernels import compiled  # noqa: E402
+from tests.project.test_readme import ROOT, blocks_of, run_code  # noqa: E402
 
 # PyTorch's and JAX's arrays lie on the CPU here.
 pytestmark = pytest.mark.skipif(

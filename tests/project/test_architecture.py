@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-SOURCE = Path(__file__).parent.parent / "src" / "harnack"
+SOURCE = Path(__file__).resolve().parents[2] / "src" / "harnack"
 FILES = sorted(SOURCE.rglob("*.py"))
 
 # Each room imports from itself and from the rooms before it.

@@ -18,9 +18,9 @@ from harnack.fields.meshes.morph_slice import GRADIENT, SlicedKernel, centroids
 from harnack.geometry.mesh_shapes import bumpy_sphere, icosphere, remove_faces, torus_mesh
 from harnack.geometry.meshes import MeshError
 from harnack.testing.walks import look_at, random_directions
+from tests.backend.test_kernels import compiled
 from tests.oracles.direct_sums import sliced_sum
 from tests.oracles.oracle import OracleValues, first_crossings
-from tests.test_kernels import compiled
 
 TORUS = torus_mesh(0.7, 0.25, 24, 12)
 BUMPY = (0.8 * bumpy_sphere(3)[0], bumpy_sphere(3)[1])

@@ -13,7 +13,7 @@ import pytest
 
 from harnack import cli
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 # Where the command begins, as it is installed.
 MODULE, FUNCTION = re.findall(
     r'^harnack = "([\w.]+):(\w+)"', (ROOT / "pyproject.toml").read_text(encoding="utf-8"), re.M
