@@ -18,7 +18,7 @@ from harnack.enclosures import LineLipschitz, any_covers, longest_step
 from harnack.fields.look import value_error
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.tracer.contact import AIM, CLOSER, Accepted, Contact, Hysteresis
-from harnack.tracer.sheet_comparison import compare_with_sheet
+from harnack.tracer.sheet_comparison import SheetComparison, compare_with_sheet
 from harnack.tracer.tolerance import PreparedTolerance, Status
 
 if TYPE_CHECKING:
@@ -113,6 +113,44 @@ class MarchState:
 
 
 @dataclass(frozen=True)
+class _Seen:
+    """A look at the trial points of rays.
+
+    t: where, and `at_end`, whether the ray ends there. size: of coordinates there.
+    unproved: of the way there, the last part, which no step has proved before.
+    look, gradient_norm: what was seen, and how long its gradient is.
+    gaps: how far f is from the levels on both sides; in contact, where the hysteresis puts them.
+    total_error: what rounding and truncation may have done to f.
+    within: how near in value a level makes a hit; in contact, a crossing. band: as
+        `Hysteresis.band`, in contact.
+    is_near: whether a level is near enough for a hit, may_pass: and the point may be accepted
+        though on which side of it the point lies is not known.
+    excess: as that of `MarchState`.
+    is_smooth: whether value and slope predict f.
+    """
+
+    t: Real
+    at_end: Mask
+    size: Real
+    unproved: Real
+    look: Look
+    gradient_norm: Real
+    gaps: Gaps
+    total_error: Real
+    within: Real
+    band: Real
+    is_near: Mask
+    may_pass: Mask
+    excess: Real
+    is_smooth: bool
+
+    @property
+    def value(self) -> Real:
+        """Of f."""
+        return self.look.sample.value
+
+
+@dataclass(frozen=True)
 class March:
     """How to march: towards which levels, until when, and with which over-stepping factor.
 
@@ -196,28 +234,74 @@ class March:
         ahead: Crossing | None = None,
     ) -> MarchState:
         """One look more at rays on their way, from `base`: see `advance`."""
-        real, size = self.backend.Float, largest_component(path.origin)
-        is_smooth = ahead is None and not field.has_detail
-        t = now.base + now.step
-        if ahead is not None:  # the crossing exactly
-            t = dr.select(now.step >= end - now.base, end, t)
-        if now.contact is not None:
-            t = dr.select(now.step >= end - now.base, end, t)
-        at_end = None if ahead is None else t == end
+        seen = self._look(field, path, end, now, ahead)
+        if self.hysteresis is not None and now.contact is not None:
+            seen = self._in_contact(seen, self.hysteresis, now.contact)
+        accepted, detail, too_coarse = self._accept(field, seen, now, ahead)
 
-        # Look there.
-        has_detail = field.has_detail and now.detail is not None
-        seen = field.at_detail(now.detail) if has_detail else field
-        unproved = now.step - now.reach
-        candidate = fmin(now.candidate, end - t)
-        look = seen.look(path, t, candidate, fmax(unproved, real(0)))
+        # Is it a hit, a sheet, or a crossing?
+        hit, gaps_ahead, sheet = accepted & seen.is_near, seen.gaps, None
+        if ahead is not None:
+            sheet = compare_with_sheet(
+                ahead, accepted & seen.at_end, seen.value, seen.total_error, self.levels
+            )
+            gaps_ahead = sheet.gaps
+        aims, contact, value = gaps_ahead, now.contact, seen.value
+        if self.hysteresis is not None and now.contact is not None:
+            contact, hit, sheet, value = self._cross(
+                seen, self.hysteresis, now.contact, path, now, accepted, ahead, sheet
+            )
+            after = contact, value, self.levels.gaps(value), seen.band
+            gaps_ahead, aims = self.hysteresis.gaps(*after), self.hysteresis.gaps(*after, AIM)
+
+        # How far to go from there.
+        proved = self._proved(seen, gaps_ahead)
+        trial = self._trial(proved, seen.look, aims, now, path, seen.is_smooth)
+        forward = proved
+        if self.occupied is not None:
+            forward, trial = self._jump(self.occupied, path, end, seen, accepted, forward, trial)
+        now = self._asked(now, seen, end, accepted, proved, contact, hit)
+        free = self._is_free(now, seen, end, accepted, forward, contact)
+        if sheet is not None:
+            free = dr.select(sheet.has_crossing, sheet.at_crossing, free)
+        evaluations = now.evaluations + 1
+        status = self._status(hit, free)
+        gradient = dr.select(accepted, seen.look.sample.gradient, now.gradient)
+        if sheet is not None:
+            status, gradient = sheet.mark(status, gradient)
+        base = dr.select(accepted, seen.t, now.base)
+        step = dr.select(accepted, trial, dr.select(too_coarse, now.step, now.reach))
+        return MarchState(
+            base=base,
+            step=fmin(step, end - base),
+            reach=dr.select(accepted, forward, now.reach),
+            candidate=now.candidate,
+            value=dr.select(accepted, value, now.value),
+            gradient=gradient,
+            excess=dr.select(accepted, seen.excess, now.excess),
+            evaluations=evaluations,
+            detail=detail,
+            status=status,
+            active=now.active & ~(hit | free | (evaluations >= self.max_steps)),
+            contact=contact,
+        )
+
+    def _look(
+        self, field: Field, path: Path, end: Real, now: MarchState, ahead: Crossing | None
+    ) -> _Seen:
+        """A look at the trial points of rays."""
+        real = self.backend.Float
+        t = now.base + now.step
+        if ahead is not None or now.contact is not None:  # the end exactly
+            t = dr.select(now.step >= end - now.base, end, t)
+        seen = field.at_detail(now.detail) if _has_detail(field, now) else field
+        unproved, size = now.step - now.reach, largest_component(path.origin) + t
+        look = seen.look(path, t, fmin(now.candidate, end - t), fmax(unproved, real(0)))
         sample, gradient_norm = look.sample, length(look.sample.gradient)
         gaps = self.levels.gaps(sample.value)
         if self.cover is not None:
             gaps = gaps.less(self.cover * t * gradient_norm)
-        total_error = value_error(sample, gradient_norm, size + t)
-
-        # Is all up to there proved free, and is the sample fine enough to say so?
+        total_error = value_error(sample, gradient_norm, size)
         steepness = fmax(gradient_norm - sample.gradient_error, real(0))
         if look.slope_error is not None:  # the gradient is at least as long as its shadow
             steepness = fmax(dr.abs(look.slope) - look.slope_error, steepness)
@@ -230,126 +314,160 @@ class March:
         # Where not even the gradient is known, rounding makes no hits.
         rounding = dr.select(knows_gradient, total_error - sample.truncation, 0)
         is_near = self._is_near(
-            gaps.smaller, within, total_error, rounding, look, gradient_norm, size + t, end
+            gaps.smaller, within, total_error, rounding, look, gradient_norm, size, end
         )
-        excess = fmax(gaps.smaller + total_error - within, real(0))
-        band, may_pass = within, is_near
-        if self.hysteresis is not None and now.contact is not None:
-            # In contact all that rounding does to f counts, or a ray would stick in a crease.
-            band = self.hysteresis.band(within, total_error - sample.truncation)
-            gaps = self.hysteresis.gaps(now.contact, sample.value, gaps, band)
-            within = CLOSER * within
-            may_pass &= ~now.contact.is_touching
-            if self.levels.period is not None:  # the value alone tells its side of a level
-                may_pass = self.backend.Bool(False)
+        return _Seen(
+            t=t,
+            at_end=t == end,
+            size=size,
+            unproved=unproved,
+            look=look,
+            gradient_norm=gradient_norm,
+            gaps=gaps,
+            total_error=total_error,
+            within=within,
+            band=within,
+            is_near=is_near,
+            may_pass=is_near,
+            excess=fmax(gaps.smaller + total_error - within, real(0)),
+            is_smooth=ahead is None and not field.has_detail,
+        )
+
+    def _in_contact(self, seen: _Seen, hysteresis: Hysteresis, contact: Contact) -> _Seen:
+        """The same, with levels where the hysteresis puts them. All that rounding does to f counts,
+        or a ray would stick in a crease."""
+        band = hysteresis.band(seen.within, seen.total_error - seen.look.sample.truncation)
+        may_pass = seen.may_pass & ~contact.is_touching
+        if self.levels.period is not None:  # the value alone tells its side of a level
+            may_pass = self.backend.Bool(False)
+        gaps = hysteresis.gaps(contact, seen.value, seen.gaps, band)
+        return replace(seen, gaps=gaps, within=CLOSER * seen.within, band=band, may_pass=may_pass)
+
+    def _accept(
+        self, field: Field, seen: _Seen, now: MarchState, ahead: Crossing | None
+    ) -> tuple[Mask, Real | None, Mask]:
+        """Whether all up to the trial point is proved free by a sample that is fine enough to say
+        so, the detail of the next sample, and whether this one was too coarse."""
         accepted = now.step <= now.reach
         if self.overstep > 1:
-            knows_side = may_pass | (gaps.smaller > total_error)
-            accepted |= knows_side & any_covers(look.back, gaps.less(total_error), unproved)
-        too_coarse, finer, coarser = self.backend.Bool(False), now.detail, now.detail
-        if has_detail:
-            deciding = self._deciding_gap(sample.value, ahead, at_end)
-            detail = fmax(now.detail, field.coarsest_detail)
-            finer, too_coarse = _finer(detail, deciding, total_error, sample.truncation, within)
-            coarser = _coarser(detail, gaps.smaller, sample.truncation, field.coarsest_detail)
-        accepted &= ~too_coarse & dr.isfinite(total_error)  # what is not known is not free
-        next_detail = now.detail
-        if has_detail:
-            kept = dr.select(accepted, coarser, now.detail)
-            next_detail = dr.select(too_coarse, finer, kept)
+            knows_side = seen.may_pass | (seen.gaps.smaller > seen.total_error)
+            covered = any_covers(seen.look.back, seen.gaps.less(seen.total_error), seen.unproved)
+            accepted |= knows_side & covered
+        is_known = dr.isfinite(seen.total_error)  # what is not known is not free
+        if now.detail is None or not field.has_detail:
+            return accepted & is_known, now.detail, self.backend.Bool(False)
+        truncation, coarsest = seen.look.sample.truncation, field.coarsest_detail
+        deciding = self._deciding_gap(seen.value, ahead, seen.at_end)
+        at = fmax(now.detail, coarsest)
+        finer, too_coarse = _finer(at, deciding, seen.total_error, truncation, seen.within)
+        coarser = _coarser(at, seen.gaps.smaller, truncation, coarsest)
+        accepted &= ~too_coarse & is_known
+        detail = dr.select(too_coarse, finer, dr.select(accepted, coarser, now.detail))
+        return accepted, detail, too_coarse
 
-        # Is it a hit, or a sheet?
-        hit, gaps_ahead, sheet = accepted & is_near, gaps, None
-        if ahead is not None:
-            sheet = compare_with_sheet(
-                ahead, accepted & at_end, sample.value, total_error, self.levels
-            )
-            gaps_ahead = sheet.gaps
+    def _cross(
+        self,
+        seen: _Seen,
+        hysteresis: Hysteresis,
+        contact: Contact,
+        path: Path,
+        now: MarchState,
+        accepted: Mask,
+        ahead: Crossing | None,
+        sheet: SheetComparison | None,
+    ) -> tuple[Contact, Mask, SheetComparison | None, Real]:
+        """The contact behind a look, whether rays have crossed the level, what is known of the
+        sheet, and f behind it."""
+        value = seen.value
+        before = now.base, now.value, dr.dot(now.gradient, path.direction), now.gradient
+        last = seen.at_end if sheet is None else seen.at_end & ~sheet.has_crossing
+        doubt = dr.select(seen.total_error > seen.within, fmax(seen.excess, now.excess), 0)
+        there = Accepted(
+            seen.t, value, seen.look.sample.gradient, seen.look.slope, before, doubt,
+            seen.total_error, seen.is_near, seen.band, last,
+        )  # fmt: skip
+        contact, hit = hysteresis.update(contact, accepted, there)
+        if ahead is not None and sheet is not None:
+            # What was crossed before the sheet comes first: the sheet is looked at again.
+            passed = sheet.at_crossing & ~hit
+            contact, jumps = hysteresis.jump(contact, passed, there, ahead, path.direction)
+            sheet = replace(sheet, at_crossing=passed, is_hit=jumps)
+            value = value + dr.select(passed, ahead.jump, 0)
+        return contact, hit, sheet, value
 
-        # Or a crossing?
-        aims, contact, value = gaps_ahead, now.contact, sample.value
-        if self.hysteresis is not None and now.contact is not None:
-            before = now.base, now.value, dr.dot(now.gradient, path.direction), now.gradient
-            last = t == end if sheet is None else (t == end) & ~sheet.has_crossing
-            doubt = dr.select(total_error > within, fmax(excess, now.excess), 0)
-            there = Accepted(
-                t,
-                value,
-                sample.gradient,
-                look.slope,
-                before,
-                doubt,
-                total_error,
-                is_near,
-                band,
-                last,
-            )
-            contact, hit = self.hysteresis.update(now.contact, accepted, there)
-            if ahead is not None and sheet is not None:
-                # What was crossed before the sheet comes first: the sheet is looked at again.
-                passed = sheet.at_crossing & ~hit
-                contact, jumps = self.hysteresis.jump(contact, passed, there, ahead, path.direction)
-                sheet = replace(sheet, at_crossing=passed, is_hit=jumps)
-                value = value + dr.select(passed, ahead.jump, 0)
-            after = contact, value, self.levels.gaps(value), band
-            gaps_ahead, aims = self.hysteresis.gaps(*after), self.hysteresis.gaps(*after, AIM)
-
-        # How far to go from there.
-        spent = _WIDENING * gaps.smaller
+    def _proved(self, seen: _Seen, gaps: Gaps) -> Real:
+        """How far from a look rays are proved free of levels so far away in value."""
+        spent = _WIDENING * seen.gaps.smaller
         if self.cover is not None:
-            gaps_ahead = gaps_ahead.less(spent)
-        forward = longest_step(look.ahead, gaps_ahead.less(total_error))
+            gaps = gaps.less(spent)
+        forward = longest_step(seen.look.ahead, gaps.less(seen.total_error))
         if self.cover is not None:
-            widening = fmax(self.cover * gradient_norm, float(dr.smallest(real)))
-            away = dr.select(gaps.down <= gaps.up, look.slope, -look.slope)
+            slope, smallest = seen.look.slope, float(dr.smallest(self.backend.Float))
+            widening = fmax(self.cover * seen.gradient_norm, smallest)
+            away = dr.select(seen.gaps.down <= seen.gaps.up, slope, -slope)
             for_ever = (forward == dr.inf) & (away >= widening)
             forward = dr.select(for_ever, forward, fmin(forward, spent / widening))
-        forward = dr.select(gaps_ahead.smaller > total_error, forward, 0)
-        proved = forward
-        trial = self._trial(forward, look, aims, now, path, is_smooth)
-        if self.occupied is not None:  # what follows is proved to be free, too
-            free_to = dr.select(accepted, t + forward, self.last)
-            free_to = self.occupied.free_until(path.origin, path.direction, free_to, self.last)
-            forward = fmax(forward, dr.select(free_to >= self.last, dr.inf, free_to - t))
-            trial = fmax(trial, forward)
-            if self.is_part:
-                there = path.point(t + fmin(trial, end - t))
-                trial = dr.select(self.occupied.cell(there).free > 0, forward, trial)
-        base = dr.select(accepted, t, now.base)
-        step = dr.select(accepted, trial, dr.select(too_coarse, now.step, now.reach))
-        reach = dr.select(accepted, forward, now.reach)
+        return dr.select(gaps.smaller > seen.total_error, forward, 0)
+
+    def _jump(
+        self,
+        occupied: UniformGrid,
+        path: Path,
+        end: Real,
+        seen: _Seen,
+        accepted: Mask,
+        forward: Real,
+        trial: Real,
+    ) -> tuple[Real, Real]:
+        """What is free and what to try, across cells that hold no level behind what is proved."""
+        free_to = dr.select(accepted, seen.t + forward, self.last)
+        free_to = occupied.free_until(path.origin, path.direction, free_to, self.last)
+        forward = fmax(forward, dr.select(free_to >= self.last, dr.inf, free_to - seen.t))
+        trial = fmax(trial, forward)
+        if self.is_part:
+            there = path.point(seen.t + fmin(trial, end - seen.t))
+            trial = dr.select(occupied.cell(there).free > 0, forward, trial)
+        return forward, trial
+
+    def _asked(
+        self,
+        now: MarchState,
+        seen: _Seen,
+        end: Real,
+        accepted: Mask,
+        proved: Real,
+        contact: Contact | None,
+        hit: Mask,
+    ) -> MarchState:
+        """The same, with how far ahead enclosures are asked to reach next."""
         # After a step of zero enclosures are asked for a third of the length: bisection.
-        shorter = dr.select(dr.isfinite(candidate), candidate / 3, 1 + 16 * (size + t))
-        tried = dr.select(proved > 0, look.growth * proved, shorter)
+        candidate = fmin(now.candidate, end - seen.t)
+        shorter = dr.select(dr.isfinite(candidate), candidate / 3, 1 + 16 * seen.size)
+        tried = dr.select(proved > 0, seen.look.growth * proved, shorter)
         if now.contact is not None and contact is not None:  # off the surface, all lies ahead
             leaves = now.contact.is_touching & ~contact.is_touching
-            tried = dr.select(leaves | hit, end - t, tried)
-        farthest = float(dr.largest(real)) ** _FARTHEST
+            tried = dr.select(leaves | hit, end - seen.t, tried)
+        return replace(now, candidate=dr.select(accepted, tried, now.candidate))
+
+    def _is_free(
+        self,
+        now: MarchState,
+        seen: _Seen,
+        end: Real,
+        accepted: Mask,
+        forward: Real,
+        contact: Contact | None,
+    ) -> Mask:
+        """Whether rays are proved free to their end."""
+        farthest = float(dr.largest(self.backend.Float)) ** _FARTHEST
+        base, reach = (
+            dr.select(accepted, seen.t, now.base), dr.select(accepted, forward, now.reach)
+        )  # fmt: skip
         free = base + reach >= dr.select(end == dr.inf, farthest, end)
         if self.hysteresis is not None and contact is not None:  # a contact may end at the end
             undecided = contact.is_touching & self.hysteresis.is_free_after
-            free &= ~(accepted & undecided & (t < end))
-        if sheet is not None:
-            free = dr.select(sheet.has_crossing, sheet.at_crossing, free)
-        evaluations = now.evaluations + 1
-        status = self._status(hit, free)
-        gradient = dr.select(accepted, sample.gradient, now.gradient)
-        if sheet is not None:
-            status, gradient = sheet.mark(status, gradient)
-        return MarchState(
-            base=base,
-            step=fmin(step, end - base),
-            reach=reach,
-            candidate=dr.select(accepted, tried, now.candidate),
-            value=dr.select(accepted, value, now.value),
-            gradient=gradient,
-            excess=dr.select(accepted, excess, now.excess),
-            evaluations=evaluations,
-            detail=next_detail,
-            status=status,
-            active=now.active & ~(hit | free | (evaluations >= self.max_steps)),
-            contact=contact,
-        )
+            free &= ~(accepted & undecided & (seen.t < end))
+        return free
 
     def _is_near(
         self,
@@ -428,6 +546,10 @@ class March:
             behind = self.levels.gaps(value + ahead.jump).smaller
             gap = dr.select(at_end & (ahead.sheet != NO_SHEET), fmin(gap, behind), gap)
         return gap
+
+
+def _has_detail(field: Field, now: MarchState) -> bool:
+    return field.has_detail and now.detail is not None
 
 
 def _finer(
