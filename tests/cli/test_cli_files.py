@@ -223,7 +223,7 @@ def test_gltf_and_obj_are_y_up_and_other_formats_z_up(tmp_path):
     ("name", "content", "options", "complaint"),
     [
         ("a.xyz", "0 0 0\n1 0 0\n0 1 0\n0 0 1\n", [],
-         r"a.xyz: 4 points without faces or normals: .* --normals estimate"),
+         r"a.xyz: 4 points without faces, and no normals read: .* --normals estimate"),
         ("a.xyz", "0 0 0\n1 0 0\n", ["--normals", "estimate"], "a.xyz: .*at least 4"),
         ("a.xyz", "0 0 0\n1 0 0\n", ["--as", "winding"], "it holds points only"),
         ("a.step", "ISO-10303-21;", [], r"a.step' is no scene: .*\.glb, .*\.xyz"),

@@ -253,7 +253,7 @@ def test_points_with_normals_are_a_cloud(save, name, content):
 def test_points_without_normals_are_a_cloud(save, name, content):
     cloud = read_surface(save(name, content))
     assert isinstance(cloud, Cloud)
-    assert cloud.said == "4 points without faces or normals: a point cloud"
+    assert cloud.said == "4 points without faces, and no normals read: a point cloud"
     assert cloud.normals is None
     assert cloud.points.tolist() == [row[:3] for row in ROWS]
 

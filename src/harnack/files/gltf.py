@@ -29,6 +29,13 @@ from harnack.files.file_format import (
 _COMPONENT_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 _COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _DEEPEST = 1000
+# Extensions by which files move or hide what is drawn, or store vertices otherwise.
+_MOVING = (
+    "EXT_mesh_gpu_instancing", "KHR_mesh_quantization", "KHR_node_visibility",
+    "EXT_meshopt_compression", "KHR_meshopt_compression",
+)  # fmt: skip
+# How triangles may be listed: one by one, or in strips.
+_TRIANGLES, _FAN = (4, 5), 6
 # Extensions under which vertices and indices are stored as always.
 _HARMLESS = ("KHR_materials", "KHR_texture", "KHR_lights", "EXT_texture", "KHR_xmp")
 
@@ -109,6 +116,10 @@ def _check(place: Place, header: dict[str, Any], size: int) -> None:
     for name in header.get("extensionsRequired", []):
         if not str(name).startswith(_HARMLESS):
             raise place.error(f"it needs the extension {name}, which is not read: save it without")
+    for name in header.get("extensionsUsed", []):
+        if name in _MOVING:
+            raise place.error(f"it uses the extension {name}, which is not read: save it without")
+    _check_still(place, header)
     views, accessors = header.get("bufferViews", []), header.get("accessors", [])
     asked = 0
     for view in views:
@@ -124,6 +135,26 @@ def _check(place: Place, header: dict[str, Any], size: int) -> None:
             f"its header asks for {asked:,} bytes of data, many times those of the file ({size:,})"
         )
     _check_nodes(place, header, _drawn(place, header, accessors))
+
+
+def _check_still(place: Place, header: dict[str, Any]) -> None:
+    """What moves vertices but nodes is not read, nor triangles in fans, nor what is drawn besides
+    triangles."""
+    nodes: list[Any] = header.get("nodes", [])
+    meshes: list[Any] = header.get("meshes", [])
+    if any("skin" in node for node in nodes):
+        raise place.error("its vertices are moved by a skin: apply it, and save the mesh as it is")
+    primitives = [one for mesh in meshes for one in mesh["primitives"]]
+    weights = [w for one in (*nodes, *meshes) for w in one.get("weights", [])]
+    if any(weights) and any("targets" in one for one in primitives):
+        raise place.error(
+            "its vertices are moved by morph targets: apply them, and save the mesh as it is"
+        )
+    modes = {one.get("mode", _TRIANGLES[0]) for one in primitives}
+    if _FAN in modes:
+        raise place.error("triangles in fans are not read: save them one by one")
+    if modes & {*_TRIANGLES} and modes - {*_TRIANGLES}:
+        raise place.error("it draws points or lines beside triangles: save one kind alone")
 
 
 def _drawn(place: Place, header: dict[str, Any], accessors: list[Any]) -> list[int]:

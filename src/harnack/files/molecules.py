@@ -58,14 +58,14 @@ def atoms_in(path: Path, data: bytes) -> Atoms:
     place = Place(path)
     if b"\0" in data:
         raise place.error("this is binary data, not the text that its extension announces")
-    text = data.decode("utf-8", "replace")
+    is_cif = path.suffix.lower() in CIF_FILES
+    text = _text(data, is_cif=is_cif)
     try:
-        is_cif = path.suffix.lower() in CIF_FILES
         if is_cif:
             structure = gemmi.make_structure_from_block(gemmi.cif.read_string(text).sole_block())
         else:
             _check_coordinates(path, text)
-            structure = gemmi.read_pdb_string(text)
+            structure = gemmi.read_pdb_string(text, split_chain_on_ter=True)
     except FileFormatError:
         raise
     except (RuntimeError, ValueError, IndexError, UnicodeError) as error:
@@ -93,25 +93,42 @@ def atoms_in(path: Path, data: bytes) -> Atoms:
     return Atoms(positions, radii, elements, _said(elements, left_out, len(structure)))
 
 
+def _text(data: bytes, *, is_cif: bool) -> str:
+    """The text of a file, without byte order mark, its lines ended alike. In .pdb files, where
+    columns count and gemmi counts bytes, other letters than those of ASCII become one byte."""
+    data = data.removeprefix(b"\xef\xbb\xbf")
+    if is_cif:
+        return data.decode("utf-8", "replace")
+    try:
+        text = data.decode("utf-8")
+    except UnicodeDecodeError:
+        text = data.decode("latin-1")
+    text = text.replace("\r\n", "\n").replace("\r", "\n")
+    return text.encode("ascii", "replace").decode("ascii")
+
+
 def _without_alternatives(model: Any) -> list[Any]:
-    """The atoms of a model, and of those that are marked as alternatives the first of each name in
-    the first residue of each place."""
-    residues: dict[tuple[str, str], str] = {}
-    marks: dict[tuple[str, str, str], str] = {}
+    """The atoms of a model, and of those that are marked as alternatives, by other letters, the
+    first of each name in the first residue of each place. A line TER ends a chain: behind it the
+    same name and number are another place."""
+    residues: dict[tuple[int, str], tuple[str, str]] = {}
+    marks: dict[tuple[int, str, str, str], str] = {}
     found: list[Any] = []
-    for site in model.all():
-        atom, residue = site.atom, site.residue
-        if atom.has_altloc():
-            place = (site.chain.name, str(residue.seqid))
-            is_first = residues.setdefault(place, residue.name) == residue.name
-            if not is_first or marks.setdefault((*place, atom.name), atom.altloc) != atom.altloc:
-                continue
-        found.append(atom)
+    for chain, residue in ((k, one) for k, part in enumerate(model) for one in part):
+        for atom in residue:
+            if atom.has_altloc():
+                place = (chain, str(residue.seqid))
+                name, letter = residues.setdefault(place, (residue.name, atom.altloc))
+                is_other = name != residue.name and letter != atom.altloc
+                mark = marks.setdefault((*place, residue.name, atom.name), atom.altloc)
+                if is_other or mark != atom.altloc:
+                    continue
+            found.append(atom)
     return found
 
 
 def _atom_lines(text: str) -> int:
-    return sum(line[:4].upper() in _ATOM_LINES for line in text.splitlines())
+    return sum(line[:4].upper() in _ATOM_LINES for line in text.split("\n"))
 
 
 def _check_coordinates(path: Path, text: str) -> None:
@@ -122,9 +139,16 @@ def _check_coordinates(path: Path, text: str) -> None:
     Raises:
         FileFormatError: naming the first line where they are not.
     """
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(text.split("\n"), start=1):
         if line[:4].upper() not in _ATOM_LINES:
+            if line.lstrip()[:6].upper().strip() in ("ATOM", "HETATM"):
+                raise Place(path, f"line {number}").error("ATOM and HETATM begin in column 1")
             continue
+        points = {line[k : k + 8].find(".") for k in (30, 38, 46)}
+        if len(points) > 1 and not any(c.isspace() for c in line[30:54]):
+            raise Place(path, f"line {number}").error(
+                f"coordinates run out of their columns 31 to 54: {line[30:54]!r}"
+            )
         try:
             finite = all(math.isfinite(float(line[k : k + 8])) for k in (30, 38, 46))
         except ValueError:

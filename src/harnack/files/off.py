@@ -27,6 +27,11 @@ def read_off(path: Path, data: bytes) -> Contents:
             f"its header promises {count:,} vertices and {faces_count:,} faces, but "
             f"{len(lines):,} lines follow: the file is truncated"
         )
+    if len(lines) > count + faces_count:
+        raise lines.places[count + faces_count].error(
+            f"more follows than the {count:,} vertices and {faces_count:,} faces that its header "
+            "promises, one a line"
+        )
     if not count:
         raise Place(path).error("it holds no vertices")
     vertices = read_table(lines[:count], 3)

@@ -40,6 +40,10 @@ _CODES = {
 }  # fmt: skip
 _BYTE_ORDERS = {b"ascii": "", b"binary_little_endian": "<", b"binary_big_endian": ">"}
 _MAX_HEADER = 1 << 16
+# Elements that hold faces in a form that is not read, or under another name.
+_OTHER_FACES = ("tristrips", "strips", "trifans", "faces", "polygon", "polygons", "triangle")
+# What may follow the last row of a binary file.
+_PADDING = b"\0 \t\r\n"
 
 
 @dataclass(frozen=True)
@@ -179,6 +183,7 @@ def read_ply(path: Path, data: bytes) -> Contents:
         FileFormatError: a malformed header, fewer data than it declares, an index out of range.
     """
     header = _header(path, data)
+    _check_elements(path, header)
     tables = (_binary_tables if header.byte_order else _text_tables)(path, data, header)
     vertices, normals = np.zeros((0, 3)), None
     if table := tables.get("vertex"):
@@ -197,6 +202,27 @@ def read_ply(path: Path, data: bytes) -> Contents:
     if differ_in_size(faces):
         check_element_count(Place(path), header.promised(len(data)))
     return Contents(path, vertices, normals, faces, edges)
+
+
+def _check_elements(path: Path, header: Header) -> None:
+    """No element holds what would be left out."""
+    names = [section.name for section in header.sections]
+    for name in names:
+        is_odd = name.lower() in ("vertex", "face", "edge") and name != name.lower()
+        if name.lower() in _OTHER_FACES or is_odd:
+            raise Place(path).error(
+                f"its element {name[:40]!r} is not read: triangles are rows of the element 'face'"
+            )
+        if names.count(name) > 1:
+            raise Place(path).error(f"its header has the element {name[:40]!r} twice")
+
+
+def _check_end(path: Path, left: bytes) -> None:
+    """Nothing follows the last row."""
+    if left.strip(_PADDING):
+        raise Place(path).error(
+            "more follows than the rows that its header promises: its counts are too small"
+        )
 
 
 def _polygons(table: Table, corners: npt.NDArray[Any], sizes: IntArray, count: int) -> Polygons:
@@ -251,6 +277,7 @@ def _text_tables(path: Path, data: bytes, header: Header) -> dict[str, Table]:
             how = "few" if ends[wrong[0]] > np.cumsum(counts)[wrong[0]] else "many"
             raise places[wrong[0]].error(f"{counts[wrong[0]]} numbers are too {how}")
         tables[section.name] = Table(values, columns, places)
+    _check_end(path, b"".join(lines.text[:1]))
     return tables
 
 
@@ -280,6 +307,7 @@ def _binary_tables(path: Path, data: bytes, header: Header) -> dict[str, Table]:
             raise _too_short(path, section) from None
         begin = int(ends[-1])
         tables[section.name] = Table(values, columns, places)
+    _check_end(path, data[begin:])
     return tables
 
 

@@ -12,6 +12,8 @@ from harnack.files.text_tables import Lines, content_lines, excerpt, read_table
 from harnack.geometry.singular import weld_vertices
 
 _HEADER = 84
+# Of UTF-8, before the text of some programs.
+_MARK = b"\xef\xbb\xbf"
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _KEYWORDS = (b"solid", b"facet", b"outer", b"vertex", b"endloop", b"endfacet", b"endsolid")
 
@@ -34,7 +36,7 @@ def _is_binary(data: bytes) -> bool:
     """Many binary files begin with "solid" as well, so their length decides first."""
     if len(data) >= _HEADER and len(data) == _HEADER + _count(data) * _FACET.itemsize:
         return True
-    return data.lstrip()[:5].lower() != b"solid" or b"\0" in data
+    return data.removeprefix(_MARK).lstrip()[:5].lower() != b"solid" or b"\0" in data
 
 
 def _count(data: bytes) -> int:
@@ -53,6 +55,11 @@ def _binary(path: Path, data: bytes) -> FloatArray:
             f"its header promises {count:,} triangles, but there is room for {held:,}: the file is "
             "truncated, or no .stl file"
         )
+    if held > count:
+        raise Place(path).error(
+            f"its header promises {count:,} triangles, but {held - count:,} more follow: the count "
+            "is wrong, or several files were joined"
+        )
     facets = np.frombuffer(data, _FACET, count, _HEADER)
     return facets["corners"].reshape(-1, 3).astype(np.float64)
 
@@ -67,7 +74,9 @@ def _text(path: Path, data: bytes) -> FloatArray:
         raise lines.places[len(words) - 1].error("the file ends before 'endsolid': it is truncated")
     at = [k for k, word in enumerate(words) if word == b"vertex"]
     facets = words.count(b"facet")
-    if len(at) != 3 * facets:
+    begins = [k for k, word in enumerate(words) if word == b"facet"]
+    of_facets = np.histogram(at, [*begins, len(words)])[0] if begins else np.zeros(0, int)
+    if len(at) != 3 * facets or (of_facets != 3).any():
         raise Place(path).error(f"{len(at):,} vertices in {facets:,} facets: each needs three")
     rows = [lines.text[k][len("vertex") :] for k in at]
     return read_table(Lines(rows, Places(path, "line", [lines.places.numbers[k] for k in at])), 3)

@@ -264,7 +264,8 @@ def _cloud(contents: Contents) -> Cloud:
     points = checked_points(contents.vertices)
     count = f"{len(points):,} points"
     if contents.normals is None:
-        return Cloud(points, None, None, f"{count} without faces or normals: a point cloud")
+        said = f"{count} without faces, and no normals read: a point cloud"
+        return Cloud(points, None, None, said)
     normals = checked_normals(contents.normals, len(points))
     return Cloud(points, normals, None, f"{count} with normals, no faces: a point cloud")
 

@@ -83,7 +83,7 @@ def as_number(word: bytes, place: Place) -> float:
         FileFormatError: it is not one.
     """
     try:
-        value = float(word)
+        value = float(b"" if b"_" in word else word)  # Python reads 1_0 as 10
     except ValueError:
         raise place.error(f"{excerpt(word)} is not a number") from None
     if not math.isfinite(value):
@@ -98,7 +98,7 @@ def as_integer(word: bytes, place: Place) -> int:
         FileFormatError: it is not one.
     """
     try:
-        value = int(word)
+        value = int(b"" if b"_" in word else word)
     except ValueError:
         # Some programs write 3 as 3.000e+00.
         if not _is_integral(word):
@@ -111,7 +111,7 @@ def as_integer(word: bytes, place: Place) -> int:
 
 def _is_integral(word: bytes) -> bool:
     try:
-        return float(word).is_integer()
+        return b"_" not in word and float(word).is_integer()
     except ValueError:
         return False
 
@@ -177,7 +177,7 @@ def _at_once(lines: Lines, columns: Sequence[int] | None = None) -> FloatArray |
 
     columns: which to read. None: all, if there are as many in each line.
     """
-    if not len(lines):
+    if not len(lines) or any(b"_" in line for line in lines.text):
         return None
     try:
         with warnings.catch_warnings():
