@@ -154,6 +154,25 @@ def carries_derivatives(value: Any) -> bool:
     return False
 
 
+def holds_numbers_alone(value: Any) -> bool:
+    """Whether a value holds numbers of Python and NumPy, in tuples, dictionaries and dataclasses of
+    this package, and nothing that may get derivatives later: no Dr.Jit array, no function."""
+    left: list[Any] = [value]
+    for one in left:  # which grows
+        kind = cast("Any", type(one))
+        if kind in _PLAIN:
+            continue
+        if kind is tuple:
+            left += one
+        elif kind is dict:
+            left += one.values()
+        elif dataclasses.is_dataclass(one) and kind.__module__.startswith("harnack."):
+            left += vars(one).values()
+        else:
+            return False
+    return True
+
+
 _PLAIN = frozenset((str, bytes, bool, int, float, complex, np.ndarray, np.float64, type(None)))
 _GROUPS = (list, tuple, set, frozenset)
 # Functions of these packages refer to no numbers of the caller's.

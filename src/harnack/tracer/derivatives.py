@@ -17,8 +17,10 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 
 from harnack.backend.lengths import length as norm
+from harnack.backend.numbers import holds_numbers_alone
 from harnack.enclosures import TargetLevels
 from harnack.fields.field import NO_TRUNCATION
+from harnack.fields.kept import KeptWithFields
 from harnack.tracer.tolerance import Status
 
 if TYPE_CHECKING:
@@ -30,6 +32,10 @@ if TYPE_CHECKING:
 _POLISH, _POLISH_OF_SUMS = 4, 3
 
 
+# Fields that will never carry derivatives unless an attribute is set: they are asked once.
+_FIXED: KeptWithFields[bool] = KeptWithFields()
+
+
 def wants_derivatives(prepared: PreparedLevelSet, o: Vec3, d: Vec3) -> bool:
     """Whether rays, levels or the field's parameters have derivatives enabled.
 
@@ -37,7 +43,9 @@ def wants_derivatives(prepared: PreparedLevelSet, o: Vec3, d: Vec3) -> bool:
         NotImplementedError: parameters of a field with sheets have. They move the sheets, and
             the derivative of that is not known here; zero would be wrong.
     """
-    prepared.field.check_parameters()
+    field = prepared.field
+    if not _FIXED.get(field, None, lambda: holds_numbers_alone(vars(field))):
+        field.check_parameters()
     parameters = prepared.field.parameters()
     of_field = any(dr.grad_enabled(p) for p in parameters)
     if of_field and prepared.field.has_sheets:

@@ -260,7 +260,7 @@ class March:
         forward = proved
         if self.occupied is not None:
             forward, trial = self._jump(self.occupied, path, end, seen, accepted, forward, trial)
-        now = self._asked(now, seen, end, accepted, proved, contact, hit)
+        candidate = self._candidate(now, seen, end, proved, contact, hit)
         free = self._is_free(now, seen, end, accepted, forward, contact)
         if sheet is not None:
             free = dr.select(sheet.has_crossing, sheet.at_crossing, free)
@@ -275,7 +275,7 @@ class March:
             base=base,
             step=fmin(step, end - base),
             reach=dr.select(accepted, forward, now.reach),
-            candidate=now.candidate,
+            candidate=dr.select(accepted, candidate, now.candidate),
             value=dr.select(accepted, value, now.value),
             gradient=gradient,
             excess=dr.select(accepted, seen.excess, now.excess),
@@ -429,17 +429,16 @@ class March:
             trial = dr.select(occupied.cell(there).free > 0, forward, trial)
         return forward, trial
 
-    def _asked(
+    def _candidate(
         self,
         now: MarchState,
         seen: _Seen,
         end: Real,
-        accepted: Mask,
         proved: Real,
         contact: Contact | None,
         hit: Mask,
-    ) -> MarchState:
-        """The same, with how far ahead enclosures are asked to reach next."""
+    ) -> Real:
+        """How far ahead enclosures are asked to reach next."""
         # After a step of zero enclosures are asked for a third of the length: bisection.
         candidate = fmin(now.candidate, end - seen.t)
         shorter = dr.select(dr.isfinite(candidate), candidate / 3, 1 + 16 * seen.size)
@@ -447,7 +446,7 @@ class March:
         if now.contact is not None and contact is not None:  # off the surface, all lies ahead
             leaves = now.contact.is_touching & ~contact.is_touching
             tried = dr.select(leaves | hit, end - seen.t, tried)
-        return replace(now, candidate=dr.select(accepted, tried, now.candidate))
+        return tried
 
     def _is_free(
         self,
