@@ -96,11 +96,11 @@ def damaged(mesh: MeshArrays, kind: str, seed: int) -> MeshArrays:
     vertices, faces = mesh
     share = min(0.05, _MOST / len(faces))
     if kind == "holes":  # four large ones and many small ones
-        centre = vertices[faces].mean(axis=1)
+        center = vertices[faces].mean(axis=1)
         rng = np.random.default_rng(seed)
-        for seen in centre[rng.integers(len(faces), size=4)]:
+        for seen in center[rng.integers(len(faces), size=4)]:
             nearest = np.argsort(((vertices[faces].mean(axis=1) - seen) ** 2).sum(axis=1))
-            faces = np.delete(faces, nearest[: len(centre) // 200], axis=0)
+            faces = np.delete(faces, nearest[: len(center) // 200], axis=0)
         faces = remove_faces(faces, share, seed)
     elif kind == "flips":
         faces = flip_faces(faces, share, seed)

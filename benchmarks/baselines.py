@@ -231,7 +231,7 @@ def _length(x: list[Interval]) -> Interval:
 def _fan_bounds(
     rays: Rays, start: Array, end: Array, rows: npt.NDArray[np.int64]
 ) -> tuple[Array, Array]:
-    """Bounds of the solid angle between two lengths, of a fan about the centre of the vertices."""
+    """Bounds of the solid angle between two lengths, of a fan about the center of the vertices."""
     field = rays.field
     assert isinstance(field, hk.SolidAngle)
     p, q = rays.points(start, rows), rays.points(end, rows)

@@ -33,10 +33,10 @@ _ROUNDINGS = 64.0
 class Scene:
     """Random blobs of compact support and their threshold.
 
-    centres: (n, 3). reaches: (n,) R, where a blob ends. heights: (n,). threshold: T.
+    centers: (n, 3). reaches: (n,) R, where a blob ends. heights: (n,). threshold: T.
     """
 
-    centres: np.ndarray
+    centers: np.ndarray
     reaches: np.ndarray
     heights: np.ndarray
     threshold: float
@@ -49,15 +49,15 @@ class Scene:
         """Blobs of random radii r in a cube of half the edge `size`; each alone would be a ball of
         radius r, and ends at width r."""
         generator = np.random.default_rng(seed)
-        centres = generator.uniform(-size, size, (count, 3))
+        centers = generator.uniform(-size, size, (count, 3))
         radius = generator.uniform(*radii, count)
         height = np.full(count, 1.0 / (1 - 1 / width**2) ** 3)
-        return cls(centres, width * radius, height, 1.0, width)
+        return cls(centers, width * radius, height, 1.0, width)
 
     @property
     def box(self) -> tuple[np.ndarray, np.ndarray]:
         reach = self.reaches[:, None]
-        return (self.centres - reach).min(0), (self.centres + reach).max(0)
+        return (self.centers - reach).min(0), (self.centers + reach).max(0)
 
     def rays(self, count: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Origins, unit directions and lengths of rays between random points of the box's faces."""
@@ -82,7 +82,7 @@ class Scene:
         """f in double precision, at points (n, 3): of several groups the largest sum, where blob k
         is in group k modulo their number."""
         sums = np.full((groups, len(points)), -self.threshold)
-        for k, c in enumerate(self.centres):
+        for k, c in enumerate(self.centers):
             w = 1 - ((points - c) ** 2).sum(1) / self.reaches[k] ** 2
             sums[k % groups] += self.heights[k] * np.maximum(w, 0) ** 3
         return sums.max(0)
@@ -99,9 +99,9 @@ class Scene:
 
     def field(self, groups: int = 1) -> hk.Blobs:
         """The same field plus its threshold, as the library has it."""
-        grouped = None if groups == 1 else np.arange(len(self.centres)) % groups
+        grouped = None if groups == 1 else np.arange(len(self.centers)) % groups
         kernel = Compact(support=self.width)
-        return hk.Blobs(self.centres, self.reaches / self.width, kernel=kernel, groups=grouped)
+        return hk.Blobs(self.centers, self.reaches / self.width, kernel=kernel, groups=grouped)
 
     def first_inside(self, rays: tuple[np.ndarray, ...], samples: int) -> np.ndarray:
         """Where f is first seen to be positive, at so many points of each ray; else infinity."""
@@ -131,7 +131,7 @@ class BlobFormula(Formula):
 
     def prepare(self, backend: Any) -> BlobFormula:
         scene = self.scene
-        table = np.column_stack([scene.centres, scene.reaches**-2.0, scene.heights])
+        table = np.column_stack([scene.centers, scene.reaches**-2.0, scene.heights])
         parts = [Records.upload(backend, table[k :: self.groups]) for k in range(self.groups)]
         return dataclasses.replace(self, records=tuple(parts))
 
@@ -164,8 +164,8 @@ class BlobsAlong(FormulaAlong):
         zero = 0 * self.p.x
 
         def body(row: list[Any], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            centre, rate, height = row[:3], row[3], row[4]
-            v = [centre[k] - self.p[k] for k in range(3)]
+            center, rate, height = row[:3], row[3], row[4]
+            v = [center[k] - self.p[k] for k in range(3)]
             middle = sum((v[k] * self.direction[k] for k in range(1, 3)), v[0] * self.direction[0])
             aside = [v[k] - middle * self.direction[k] for k in range(3)]
             away = aside[0] * aside[0] + aside[1] * aside[1] + aside[2] * aside[2]
@@ -222,7 +222,7 @@ def _extrema(
 
 
 def _product(away: Any, rate: Any, height: Any, x: Any, y: Any) -> tuple[Any, Any]:
-    """The range of k'(d) times the range of d', with d the distance from the centre."""
+    """The range of k'(d) times the range of d', with d the distance from the center."""
     first, last = dr.sqrt(away + x * x), dr.sqrt(away + y * y)
     ratios = [one / fmax(d, 1e-20) for one, d in ((x, first), (y, last))]
     nearest = dr.select((x < 0) & (y > 0), dr.sqrt(away), fmin(first, last))

@@ -30,7 +30,7 @@ class Solid:
     """A solid by its signed distance.
 
     distance: of points (n, 3). gradient: (n, 3), for convex distances alone; else None.
-    ball: centre and radius of a ball around it; None if it is infinite.
+    ball: center and radius of a ball around it; None if it is infinite.
     """
 
     distance: Callable[[np.ndarray], np.ndarray]
@@ -65,9 +65,9 @@ def plane(height: float) -> Solid:
     )
 
 
-def torus(centre: tuple[float, float, float], large: float, small: float, turn: float) -> Solid:
+def torus(center: tuple[float, float, float], large: float, small: float, turn: float) -> Solid:
     """A torus, turned about the x axis."""
-    c = np.array(centre)
+    c = np.array(center)
     rotation = np.array([
         [1, 0, 0], [0, math.cos(turn), -math.sin(turn)], [0, math.sin(turn), math.cos(turn)],
     ])  # fmt: skip
@@ -137,9 +137,9 @@ def trace(
             # Balls first, from the nearest on: a heap does the same one by one.
             for k, solid in enumerate(solids):
                 if solid.ball is not None:
-                    centre, radius = solid.ball
+                    center, radius = solid.ball
                     ask = np.isfinite(known[:, k])
-                    away = np.linalg.norm(p - centre, axis=1) - radius
+                    away = np.linalg.norm(p - center, axis=1) - radius
                     known[ask, k] = np.maximum(known[ask, k], t[rows][ask] + away[ask])
                     bounds += int(ask.sum())
         order = np.argsort(known, axis=1) if bounding or triangle else None

@@ -27,7 +27,7 @@ class GyroidByLaplacian(hk.Field):
     cell/(2 pi), 3 by experiment. None: f is only known to be Lipschitz. domain: where it is drawn.
 
     On a ball of radius r (in those units) f stays within [-3/2, 3/2] and within sqrt(3) r of its
-    value at the centre, and the Laplacian between these ends times -2.
+    value at the center, and the Laplacian between these ends times -2.
     """
 
     default_level = 0.0

@@ -128,7 +128,7 @@ def _curve_errors(loop: FloatArray, made: trimesh.Trimesh) -> tuple[float, float
 
 
 def _distances(made: trimesh.Trimesh, points: FloatArray) -> FloatArray:
-    """(n,) to the nearest of those triangles of which a centre or a middle of an edge is among the
+    """(n,) to the nearest of those triangles of which a center or a middle of an edge is among the
     32 nearest: hardly too large."""
     from scipy.spatial import cKDTree
 

@@ -142,7 +142,7 @@ def _blobs() -> Drawn:
 
     def gradients(p: np.ndarray) -> np.ndarray:
         total = np.zeros_like(p)
-        for c, reach, height in zip(scene.centres, scene.reaches, scene.heights, strict=True):
+        for c, reach, height in zip(scene.centers, scene.reaches, scene.heights, strict=True):
             v = p - c
             w = np.maximum(1 - (v**2).sum(1) / reach**2, 0)
             total += (-6 * height / reach**2 * w**2)[:, None] * v
@@ -152,7 +152,7 @@ def _blobs() -> Drawn:
         from isoray.arithmetic.interval import ia_sqr
 
         low, high = np.full(len(ends[0]), -scene.threshold), np.full(len(ends[0]), -scene.threshold)
-        for c, reach, height in zip(scene.centres, scene.reaches, scene.heights, strict=True):
+        for c, reach, height in zip(scene.centers, scene.reaches, scene.heights, strict=True):
             squares = [ia_sqr(ends[2 * i] - c[i], ends[2 * i + 1] - c[i]) for i in range(3)]
             least, most = (sum(one[side] for one in squares) for side in (0, 1))
             low += height * np.maximum(1 - most / reach**2, 0) ** 3
@@ -161,7 +161,7 @@ def _blobs() -> Drawn:
 
     def formula(x: Any, y: Any, z: Any) -> Any:
         total = -scene.threshold
-        for c, reach, height in zip(scene.centres, scene.reaches, scene.heights, strict=True):
+        for c, reach, height in zip(scene.centers, scene.reaches, scene.heights, strict=True):
             u, v, w = x - float(c[0]), y - float(c[1]), z - float(c[2])
             inside = dr.maximum(1 - (u * u + v * v + w * w) * float(reach**-2), 0)
             total = total + float(height) * inside * inside * inside
@@ -170,7 +170,7 @@ def _blobs() -> Drawn:
     terms = [
         f"{height:.12f}*pow(max(0,1-{reach**-2:.12f}*((x-({c[0]:.12f}))*(x-({c[0]:.12f}))"
         f"+(y-({c[1]:.12f}))*(y-({c[1]:.12f}))+(z-({c[2]:.12f}))*(z-({c[2]:.12f})))),3)"
-        for c, reach, height in zip(scene.centres, scene.reaches, scene.heights, strict=True)
+        for c, reach, height in zip(scene.centers, scene.reaches, scene.heights, strict=True)
     ]
     points = np.random.default_rng(0).uniform(low, high, (400_000, 3))
     steepest = float(np.linalg.norm(gradients(points), axis=1).max())
@@ -311,7 +311,7 @@ def by_povray(
 
 
 def pov_scene(drawn: Drawn, *, positions: bool) -> str:
-    """The scene file. Colours are positions, or flat."""
+    """The scene file. Colors are positions, or flat."""
     forward, right, up = _axes()
     wide = 2 * math.tan(FIELD_OF_VIEW / 2)
     flat = "pigment { rgb <1,1,1> }"
@@ -355,7 +355,7 @@ def _run_povray(path: Path, threads: int, out: Path | None) -> tuple[float, floa
 
 
 def _distances(path: Path, d: np.ndarray) -> np.ndarray:
-    """t of the positions that a picture's colours are; infinite where it shows the background."""
+    """t of the positions that a picture's colors are; infinite where it shows the background."""
     from mitsuba import Bitmap
 
     pixels = np.array(Bitmap(str(path)), dtype=np.float64).reshape(-1, 3)[: len(d)] / 65535
@@ -435,7 +435,7 @@ def compare_with_povray() -> str:
         "## Beside POV-Ray and isoray\n",
         f"{WIDTH} x {WIDTH} first hits by the camera above, tolerance 1e-4, without shading. "
         "POV-Ray 3.7 draws an `isosurface` with max_gradient at the largest gradient there is in "
-        "the container, which no user knows and which favours it, and with flat colour; its times "
+        "the container, which no user knows and which favors it, and with flat color; its times "
         "are what it tells of tracing. isoray 0.4 bisects with NumPy by its interval arithmetic. "
         f"Wrong pixels, of {len(checked):,}: seen or not, {_APART} behind the first root, or "
         f"{_NEAR:.0f} tolerances off the surface, against {SAMPLES} samples a ray and bisection in "

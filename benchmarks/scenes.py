@@ -33,12 +33,12 @@ class WithoutExtent(hk.SolidAngle):
 
 
 def unit(loops):  # type: ignore[no-untyped-def]
-    """Loops centred and scaled to fit the unit ball."""
+    """Loops centered and scaled to fit the unit ball."""
     loops = loops if isinstance(loops, list) else [loops]
     points = np.concatenate(loops)
-    centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
-    size = np.linalg.norm(points - centre, axis=1).max()
-    return [(loop - centre) / size for loop in loops]
+    center = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    size = np.linalg.norm(points - center, axis=1).max()
+    return [(loop - center) / size for loop in loops]
 
 
 def polygons() -> list[Scene]:

@@ -48,7 +48,7 @@ def libigl(vertices: FloatArray, faces: Any, points: FloatArray) -> FloatArray:
 
 
 def query_points(vertices: FloatArray, n: int = POINTS) -> FloatArray:
-    """(n, 3) points, uniform in the bounding box made half as large again about its centre."""
+    """(n, 3) points, uniform in the bounding box made half as large again about its center."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     unit = np.random.default_rng(1).uniform(-0.75, 0.75, (n, 3))
     return 0.5 * (low + high) + unit * (high - low)

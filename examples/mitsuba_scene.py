@@ -1,7 +1,7 @@
 """Beside Mitsuba's own shapes, with a material of your own.
 
 Our surfaces are shapes of a Mitsuba scene like any other: its lamps light them, its mirrors
-reflect them. Their material is any BSDF, also one written in Python: here white paint, coloured by
+reflect them. Their material is any BSDF, also one written in Python: here white paint, colored by
 the direction of the normal.
 """
 
@@ -23,15 +23,15 @@ class Tinted(mi.BSDF):
         self.m_components = [self.paint.flags(i) for i in range(self.paint.component_count())]
         self.m_flags = self.paint.flags()
 
-    def colour(self, si):
+    def color(self, si):
         return mi.Color3f(0.5 + 0.4 * si.sh_frame.n)
 
     def sample(self, ctx, si, sample1, sample2, active=True):
         chosen, weight = self.paint.sample(ctx, si, sample1, sample2, active)
-        return chosen, weight * self.colour(si)
+        return chosen, weight * self.color(si)
 
     def eval(self, ctx, si, wo, active=True):
-        return self.paint.eval(ctx, si, wo, active) * self.colour(si)
+        return self.paint.eval(ctx, si, wo, active) * self.color(si)
 
     def pdf(self, ctx, si, wo, active=True):
         return self.paint.pdf(ctx, si, wo, active)

@@ -35,8 +35,8 @@ def figure_7(width: int) -> Report:
             hits_of.append(counts.evaluations_hitting)
             most, lost = max(most, counts.most), lost + counts.out_of_steps
             positive = (found.value > 0)[:, None]
-            colour = np.where(positive, FRONT, BACK)
-            row.append(Panel(halved(view.shade(found.normal, found.hit, colour, 0.8 * colour)),
+            color = np.where(positive, FRONT, BACK)
+            row.append(Panel(halved(view.shade(found.normal, found.hit, color, 0.8 * color)),
                              f"l = {degree}, m = {order}"))  # fmt: skip
         rows.append(row)
     caption = (

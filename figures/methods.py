@@ -59,8 +59,8 @@ class _Contest:
         normal = np.zeros((len(self.inside), 3))
         normal[self.inside] = gradient / np.maximum(size, 1e-30)
         picture = self.view.shade(normal, self._all(hit))
-        for where, colour in ((result.early, FALSE), (result.late, MISSED)):
-            picture = marked(picture, self._all(where), colour)
+        for where, color in ((result.early, FALSE), (result.late, MISSED)):
+            picture = marked(picture, self._all(where), color)
         return picture
 
     def told(self, results: list[Result]) -> str:
@@ -108,7 +108,7 @@ def _contest(name: str, width: int) -> _Contest:
     return _Contest.of(field, 2 * math.pi, View.of(field.loops[0], size, camera))
 
 
-_COLOURS = (
+_COLORS = (
     f"Missed first hits are magenta; hits where nothing is, or more than {APART} before the "
     "surface, green; against dense samples of every ray."
 )
@@ -122,7 +122,7 @@ def figure_25(width: int) -> Report:
     results.append(contest.ours)
     caption = (
         f"The 2π level of a polygon of 12 vertices, {len(contest.truth):,} rays with "
-        f"{contest.hits:,} hits, followed in equal steps (unproved) and by harnack. {_COLOURS} "
+        f"{contest.hits:,} hits, followed in equal steps (unproved) and by harnack. {_COLORS} "
         f"{contest.told(results)}. With the smallest step no hit is missed here, and nothing says "
         "so beforehand."
     )
@@ -152,7 +152,7 @@ def figure_26(width: int) -> Report:
         )
     caption = (
         "Sphere tracing with three claimed Lipschitz constants L, of which none holds near the "
-        f"curve (unproved), and harnack. {_COLOURS} Rays that are still on their way after "
+        f"curve (unproved), and harnack. {_COLORS} Rays that are still on their way after "
         f"{baselines.MOST:,} steps count as missed. {'. '.join(texts)}."
     )
     differs = (
@@ -181,7 +181,7 @@ def figure_27(width: int) -> Report:
             f"{contest.told(results)}"
         )
     caption = (
-        f"Newton's method, bisection and interval analysis (unproved), and harnack. {_COLOURS} "
+        f"Newton's method, bisection and interval analysis (unproved), and harnack. {_COLORS} "
         f"{'. '.join(texts)}. Interval analysis is a proof where the function is continuous, as "
         "the gyroid is: its false hits there are leaves that it cannot tell from the surface; on "
         "the angles it stops at jumps."

@@ -54,8 +54,8 @@ def figure_12(width: int) -> Report:
         missed = truth.hit & (t > real + APART) & ~lost
         false = np.isfinite(t) & (t < real - APART)
         shown = view.shade(truth.normal, truth.hit)
-        for where, colour in ((missed, MISSED), (false, FALSE)):
-            shown = marked(shown, where, colour)
+        for where, color in ((missed, MISSED), (false, FALSE)):
+            shown = marked(shown, where, color)
         first.append(Panel(doubled(shown), name))
         texts.append(
             f"{name} {int(missed.sum()):,} missed, {int(false.sum()):,} false, "

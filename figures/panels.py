@@ -81,9 +81,9 @@ def drawn(what: Any, size: tuple[int, int], **settings: Any) -> tuple[Pixels, Co
 
 
 def heat(numbers: Any, top: float, size: tuple[int, int]) -> Pixels:
-    """Numbers (n,), row by row, as colours: 0 is dark blue; `top`, and all above, yellow."""
-    colours = viridis(np.asarray(numbers, np.float64) / top)
-    return (colours * 255 + 0.5).astype(np.uint8).reshape(*size[::-1], 3)
+    """Numbers (n,), row by row, as colors: 0 is dark blue; `top`, and all above, yellow."""
+    colors = viridis(np.asarray(numbers, np.float64) / top)
+    return (colors * 255 + 0.5).astype(np.uint8).reshape(*size[::-1], 3)
 
 
 def halved(pixels: Pixels) -> Pixels:

@@ -32,13 +32,13 @@ def figure_1(width: int) -> Report:
     points, segments = _isolines(field)
     picture = view.shade(hits.normal, hits.hit)
     t = np.where(hits.hit, hits.t, np.inf)
-    for lines, colour in (
+    for lines, color in (
         (hk.Tubes(points, segments, 0.006), (0.25, 0.25, 0.25)),
         (hk.Tubes(places[[0, -1]], [(0, 1)], 0.012), (0.75, 0.55, 0.1)),
     ):
         met = view.trace(lines)
         nearer = met.hit & (met.t < t)
-        drawn_lines = view.shade(met.normal, met.hit, colour, colour).reshape(-1, 3)
+        drawn_lines = view.shade(met.normal, met.hit, color, color).reshape(-1, 3)
         picture.reshape(-1, 3)[nearer] = drawn_lines[nearer]
         t = np.where(nearer, met.t, t)
     radii = np.linalg.norm(np.diff(places, axis=0), axis=1)
@@ -46,8 +46,8 @@ def figure_1(width: int) -> Report:
     d = view.directions()
     mirrored = d - 2 * (d * hits.normal).sum(axis=1, keepdims=True) * hits.normal
     light = np.sin(16 * np.arcsin(np.clip(mirrored[:, 2], -1, 1))) > 0
-    colours = np.where(light[:, None], 0.92, 0.16) * np.ones(3)
-    stripes = view.pixels(np.where(hits.hit[:, None], colours, 1.0))
+    colors = np.where(light[:, None], 0.92, 0.16) * np.ones(3)
+    stripes = view.pixels(np.where(hits.hit[:, None], colors, 1.0))
     caption = (
         f"The 2π level of the solid angle of a polygon of {len(loop)} vertices, isolines of a "
         "slice every π/2, a ray, and the balls that the published rule proves empty along it: "
@@ -65,21 +65,21 @@ def figure_1(width: int) -> Report:
     return Report(montage((left, Panel(halved(stripes), "reflection lines"))), caption, differs)
 
 
-def _with_balls(view: View, picture: Pixels, t: Array, centres: Array, radii: Array) -> Pixels:
+def _with_balls(view: View, picture: Pixels, t: Array, centers: Array, radii: Array) -> Pixels:
     """A picture with clear balls over what is met at t (n,); the farthest first."""
-    d, colours = view.directions(), picture.reshape(-1, 3) / 255.0
-    for k in np.argsort(-np.linalg.norm(centres - view.eye, axis=1)):
+    d, colors = view.directions(), picture.reshape(-1, 3) / 255.0
+    for k in np.argsort(-np.linalg.norm(centers - view.eye, axis=1)):
         if radii[k] < 0.004:  # less than a pixel
             continue
-        away = centres[k] - view.eye
+        away = centers[k] - view.eye
         middle = d @ away
         rows = np.flatnonzero(away @ away - middle**2 < radii[k] ** 2)
         half = np.sqrt(radii[k] ** 2 - (away @ away - middle[rows] ** 2))
         seen = middle[rows] - half < t[rows]
         rim = 1 - half / radii[k]
         share = np.where(seen, 0.10 + 0.55 * rim**3, 0.0)[:, None]
-        colours[rows] = (1 - share) * colours[rows] + share * np.array([0.25, 0.45, 0.75])
-    return view.pixels(colours)
+        colors[rows] = (1 - share) * colors[rows] + share * np.array([0.25, 0.45, 0.75])
+    return view.pixels(colors)
 
 
 def _steps(
@@ -204,8 +204,8 @@ def _drawn_patch(view: View, vertices: Array, faces: Array, folded: Array) -> Pi
     one, other = (mesh_hits(vertices, faces[some], view.eye, d) for some in (~folded, folded))
     over = (other.t <= one.t + 1e-3) & other.hit
     normal = np.where(over[:, None], other.normal, one.normal)
-    colour = np.where(over[:, None], (0.9, 0.2, 0.6), FRONT)
-    return view.shade(normal, one.hit | other.hit, colour, colour)
+    color = np.where(over[:, None], (0.9, 0.2, 0.6), FRONT)
+    return view.shade(normal, one.hit | other.hit, color, color)
 
 
 def _bilinear(quad: Array, n: int) -> tuple[Array, Array, Array]:

@@ -89,7 +89,7 @@ _ALL = (
     Figure(
         16,
         "Mesh repair",
-        "a mesh with holes (left) and the surface of its generalised winding number (right).",
+        "a mesh with holes (left) and the surface of its generalized winding number (right).",
         repairs.figure_16,
     ),
     Figure(

@@ -101,8 +101,8 @@ def _points(field: hk.DipolePotential, size: tuple[int, int], camera: Camera) ->
         light = 255 * (0.6 + 0.4 * (depth.max() - depth[k]) / np.ptp(depth))
         rows = np.clip(row + offsets, 0, picture.shape[0] - 1)
         columns = np.clip(column + offsets, 0, picture.shape[1] - 1)
-        colour = np.array(FRONT if facing[k] else BACK) * light
-        picture[np.ix_(rows, columns)] = colour.astype(np.uint8)
+        color = np.array(FRONT if facing[k] else BACK) * light
+        picture[np.ix_(rows, columns)] = color.astype(np.uint8)
     return halved(picture)
 
 
@@ -139,7 +139,7 @@ def figure_16(width: int) -> Report:
     caption = (
         "Meshes (left; insides in blue) and the level 1/2 of their winding number (right; what "
         "spans "
-        "gaps in another colour): " + ". ".join(texts) + ". Hits on triangles are exact."
+        "gaps in another color): " + ". ".join(texts) + ". Hits on triangles are exact."
     )
     differs = (
         "The paper repeats Fig. 1 of Jacobson et al. (2013), whose mesh we do not have. Ours "

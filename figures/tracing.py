@@ -92,9 +92,9 @@ def figure_5(width: int) -> Report:
     size = fitting(width, 0.6)
     by_value, by_slope = 0.35, 0.05
     panels, zoomed = [], []
-    for centre, half, row in (((0.0, 0.0), 1.35, panels), ((1.0, 0.45), 0.12, zoomed)):
-        u = centre[0] + half * np.linspace(-1, 1, 2 * size[0])
-        w = centre[1] + 0.6 * half * np.linspace(1, -1, 2 * size[1])
+    for center, half, row in (((0.0, 0.0), 1.35, panels), ((1.0, 0.45), 0.12, zoomed)):
+        u = center[0] + half * np.linspace(-1, 1, 2 * size[0])
+        w = center[1] + 0.6 * half * np.linspace(1, -1, 2 * size[1])
         grid = np.stack(np.meshgrid(u, [0.0], w, indexing="xy"), axis=-1)
         points = grid.transpose(2, 1, 0, 3).reshape(-1, 3)
         gap, slope = _gap_and_slope(field, points)
@@ -103,8 +103,8 @@ def figure_5(width: int) -> Report:
             (np.abs(gap) < by_slope * slope, "|f - level| < eps |grad f|"),
         ):
             shades = np.where((np.floor(gap / (math.pi / 4)) % 2 == 0)[:, None], 0.97, 0.90)
-            colours = np.where(near[:, None], (0.85, 0.35, 0.2), shades * np.ones(3))
-            pixels = (colours * 255).astype(np.uint8).reshape(2 * size[1], 2 * size[0], 3)
+            colors = np.where(near[:, None], (0.85, 0.35, 0.2), shades * np.ones(3))
+            pixels = (colors * 255).astype(np.uint8).reshape(2 * size[1], 2 * size[0], 3)
             row.append(Panel(np.asarray(Image.fromarray(pixels).reduce(2)), name))
     thin = _thickness(field, by_value, by_slope)
     caption = (

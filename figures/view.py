@@ -18,13 +18,13 @@ from harnack.rendering import Camera, register
 
 Array = npt.NDArray[np.float64]
 Pixels = npt.NDArray[np.uint8]
-Colour = tuple[float, float, float]
+Color = tuple[float, float, float]
 
-FRONT: Colour = (0.93, 0.55, 0.36)
-BACK: Colour = (0.36, 0.56, 0.72)
-MISSED: Colour = (1.0, 0.0, 1.0)
-FALSE: Colour = (0.1, 0.75, 0.2)
-_PAPER: Colour = (0.95, 0.95, 0.94)
+FRONT: Color = (0.93, 0.55, 0.36)
+BACK: Color = (0.36, 0.56, 0.72)
+MISSED: Color = (1.0, 0.0, 1.0)
+FALSE: Color = (0.1, 0.75, 0.2)
+_PAPER: Color = (0.95, 0.95, 0.94)
 _AMBIENT, _DIFFUSE, _GLOSS = 0.38, 0.62, 0.25
 
 
@@ -72,11 +72,11 @@ class View:
         self,
         normals: Array,
         hit: npt.NDArray[np.bool_],
-        front: Colour | Array = FRONT,
-        back: Colour | Array = BACK,
+        front: Color | Array = FRONT,
+        back: Color | Array = BACK,
     ) -> Pixels:
-        """The picture (height, width, 3) of hits with unit normals (n, 3): one colour, or (n, 3)
-        colours, for the side to which normals point, another for the other side."""
+        """The picture (height, width, 3) of hits with unit normals (n, 3): one color, or (n, 3)
+        colors, for the side to which normals point, another for the other side."""
         d = self.directions()
         facing = -(normals * d).sum(axis=1)
         outward = normals * np.sign(facing)[:, None]
@@ -86,20 +86,20 @@ class View:
         cosine = outward @ light
         mirrored = d + 2 * np.abs(facing)[:, None] * outward
         gloss = np.clip(mirrored @ light, 0, 1) ** 24
-        colour = np.where(facing[:, None] > 0, front, back)
+        color = np.where(facing[:, None] > 0, front, back)
         level = _AMBIENT + _DIFFUSE * np.clip(cosine, 0, 1)
-        shown = colour * level[:, None] + _GLOSS * gloss[:, None]
+        shown = color * level[:, None] + _GLOSS * gloss[:, None]
         return self.pixels(np.where(hit[:, None], shown, _PAPER))
 
-    def pixels(self, colours: Array) -> Pixels:
-        """The picture of colours (n, 3) in [0, 1]."""
-        return (np.clip(colours, 0, 1) * 255 + 0.5).astype(np.uint8).reshape(*self.size[::-1], 3)
+    def pixels(self, colors: Array) -> Pixels:
+        """The picture of colors (n, 3) in [0, 1]."""
+        return (np.clip(colors, 0, 1) * 255 + 0.5).astype(np.uint8).reshape(*self.size[::-1], 3)
 
 
-def marked(picture: Pixels, where: npt.NDArray[np.bool_], colour: Colour) -> Pixels:
-    """The picture with some of its pixels, row by row, in a colour."""
+def marked(picture: Pixels, where: npt.NDArray[np.bool_], color: Color) -> Pixels:
+    """The picture with some of its pixels, row by row, in a color."""
     picture = picture.copy()
-    picture.reshape(-1, 3)[where] = np.round(np.array(colour) * 255).astype(np.uint8)
+    picture.reshape(-1, 3)[where] = np.round(np.array(color) * 255).astype(np.uint8)
     return picture
 
 

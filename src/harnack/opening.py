@@ -127,8 +127,8 @@ def _field(surface: Surface, normals: str | None, rotation: FloatArray) -> Field
     if isinstance(surface, PolygonSurface):
         return PolygonMesh(surface.vertices @ rotation.T, surface.faces)
     if isinstance(surface, Metaballs):
-        centres = surface.centres @ rotation.T
-        return Blobs(centres, surface.radii, surface.weights, groups=surface.groups)
+        centers = surface.centers @ rotation.T
+        return Blobs(centers, surface.radii, surface.weights, groups=surface.groups)
     if isinstance(surface, Atoms):
         return Molecule(replace(surface, positions=surface.positions @ rotation.T))
     points = surface.points @ rotation.T

@@ -120,10 +120,10 @@ def test_affine_forms_enclose(name: str, precision: str) -> None:
     p, d, h, *exact = paths(precision, 3000, 2)
     s, values = along(formula, tuple(exact))
     made = formula(*Affine.along(p, d, h))
-    centre, slope, error = (wide(one, h) for one in (made.centre, made.slope, made.error))
-    known = np.isfinite(centre + slope + error)
+    center, slope, error = (wide(one, h) for one in (made.center, made.slope, made.error))
+    known = np.isfinite(center + slope + error)
     assert known.mean() > 0.8
-    line = centre + slope * (2 * s / exact[2] - 1)
+    line = center + slope * (2 * s / exact[2] - 1)
     allowed = 4e-18 * (np.abs(values) + 50)
     assert not (np.abs(values - line) > error + allowed)[:, known].any()
 

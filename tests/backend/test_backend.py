@@ -517,5 +517,5 @@ except AttributeError as error:
 """
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     rooms, missed = run.stdout.splitlines()
-    assert rooms == "['_version', 'backend', 'choices']"
+    assert rooms == "['_version', 'backend', 'names']"
     assert missed == "module 'harnack' has no attribute 'traec'; did you mean \"trace\"?"

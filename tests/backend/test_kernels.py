@@ -102,7 +102,7 @@ def test_curves_around_a_circle_have_hulls_of_all_kinds() -> None:
 
 @pytest.mark.parametrize("wanted", ["value", "trace"])
 @pytest.mark.parametrize("level", [None, 5.0])
-def test_a_step_of_an_optimisation_compiles_no_kernel(wanted: str, level: float | None) -> None:
+def test_a_step_of_an_optimization_compiles_no_kernel(wanted: str, level: float | None) -> None:
     """Other proofs would hold of each of the curves, and hulls have other numbers of planes."""
     backend = choose_backend()
     towards = 0.3 * np.random.default_rng(0).normal(size=(40, 3))
@@ -160,11 +160,11 @@ def cut(k: int) -> hk.geometry.Volume:
 
 
 def lines(k: int) -> list[hk.Isolines]:
-    """At other levels, of other widths and colours."""
+    """At other levels, of other widths and colors."""
     levels = np.random.default_rng(k).normal(size=3 + k)
-    colour = (0.04 * k, 1 - 0.04 * k, 0.5)
+    color = (0.04 * k, 1 - 0.04 * k, 0.5)
     return [
-        hk.Isolines("z", levels, width=0.01 + 0.001 * k, color=colour),
+        hk.Isolines("z", levels, width=0.01 + 0.001 * k, color=color),
         hk.Isolines(knot(k), spacing=np.pi / (1 + k), color="white"),
         hk.Isolines("x", spacing=0.1 + 0.01 * k),
     ]

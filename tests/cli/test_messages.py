@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.choices import did_you_mean
 from harnack.cli import main
 from harnack.cli.arguments import parsers
 from harnack.cli.messages import OPTIONS, error_line, in_options, level_text, printable
 from harnack.files import FileFormatError
 from harnack.geometry import shapes
 from harnack.geometry.mesh_shapes import icosphere
+from harnack.names import did_you_mean
 from harnack.opening import open_surface
 from harnack.rendering import MATERIALS, UnboundedSurfaceError, shape
 

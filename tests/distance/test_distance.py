@@ -223,8 +223,8 @@ def surface_points(field: hk.Field, n: int, seed: int = 0) -> np.ndarray:
     volume = field.domain or field.extent((field.default_level,))
     assert volume is not None
     lower, upper = volume.bounds()
-    centre, size = 0.5 * (lower + upper), 0.5 * float(np.linalg.norm(upper - lower))
-    o = centre + 0.5 * size * rng.normal(size=(n, 3))
+    center, size = 0.5 * (lower + upper), 0.5 * float(np.linalg.norm(upper - lower))
+    o = center + 0.5 * size * rng.normal(size=(n, 3))
     hits = hk.trace(field, o, unit(rng.normal(size=(n, 3))), t_max=3 * size, tolerance=1e-5 * size)
     x = hits.position[hits.hit].astype(np.float64)
     for _ in range(4):
@@ -417,7 +417,7 @@ def test_newton_leaves_symmetric_stationary_points() -> None:
     x = np.column_stack([t, 0 * t, 0 * t])
     exact = -b * np.sqrt(1 - t**2 / (a**2 - b**2))
     for field in (Ellipsoid(a, b), Ellipsoid2(a, b)):
-        # At the centre, where grad f = 0, a descent begins at a point that is seen.
+        # At the center, where grad f = 0, a descent begins at a point that is seen.
         assert np.abs(signed_distance(field, x) - exact).max() < 1e-12
 
 
@@ -500,7 +500,7 @@ def test_the_rim_of_a_disk_belongs_to_it() -> None:
 
 
 def test_points_without_a_descent_see_the_surface() -> None:
-    """From the centre of a sphere every way is as good: no gradient."""
+    """From the center of a sphere every way is as good: no gradient."""
     found = signed_distance(Ellipsoid2(1, 1, 1), [[0, 0, 0], [0.5, 0, 0], [0, 3, 0]])
     assert found == pytest.approx([-1, -0.5, 2.0])
     assert np.linalg.norm(closest_points(Ellipsoid2(1, 1, 1), [[0, 0, 0]])) == pytest.approx(1)

@@ -65,10 +65,10 @@ def distance_to_boxes(boxes: list[Box], x: np.ndarray, level: float = 0.5) -> np
     ends = [np.unique(one) for one in corners.T]
     knots = [np.concatenate([[-1e9], one, [1e9]]) for one in ends]
     middles = [0.5 * (one[1:] + one[:-1]) for one in knots]
-    centres = np.stack(np.meshgrid(*middles, indexing="ij"), axis=-1)
-    w = np.zeros(centres.shape[:3])
+    centers = np.stack(np.meshgrid(*middles, indexing="ij"), axis=-1)
+    w = np.zeros(centers.shape[:3])
     for low, high, count in boxes:
-        w += count * ((centres > low) & (centres < high)).all(axis=-1)
+        w += count * ((centers > low) & (centers < high)).all(axis=-1)
     best = np.full(len(x), np.inf)
     for axis in range(3):
         u, v = (k for k in range(3) if k != axis)

@@ -26,7 +26,7 @@ PLANETS = (((0.0, 0.0, 0.0), 1.0, 3.0), ((1.3, 0.2, 0.0), 0.4, 8.0), ((0.2, -0.9
 class Matter(Field):
     """Newton's potential of balls of constant density: superharmonic, its Laplacian jumps.
 
-    |grad f| falls with the distance from a ball's surface, f with that from its centre; a ball of
+    |grad f| falls with the distance from a ball's surface, f with that from its center; a ball of
     radius `reach` either misses a ball of matter, meets it or lies within it.
     """
 
@@ -37,8 +37,8 @@ class Matter(Field):
     def evaluate(self, p: Any) -> Sample:
         value = lower = upper = least = most = 0.0
         gradient, reach = type(p)(0.0), self.reach
-        for centre, size, density in PLANETS:
-            away = p - type(p)(*centre)
+        for center, size, density in PLANETS:
+            away = p - type(p)(*center)
             r = dr.norm(away)
             near, far = dr.maximum(r - reach, 0), r + reach
 
@@ -137,7 +137,7 @@ def test_the_function_with_the_kernels_sign_nearly_attains_the_bound(
     grid = Grid(q)
     source = np.sign(grid.kernel)
     turn = grid.integral(source * grid.slope)
-    # f has next to no slope: then the Laplacian matters most. h - c at the centre is the share.
+    # f has next to no slope: then the Laplacian matters most. h - c at the center is the share.
     ahead, behind = 0.5 * (share + turn / 3) + 1e-3, 0.5 * (share - turn / 3)
     h, slope = ahead + behind, 3 * (ahead - behind) - turn
     there = ahead * (1 + q) / (1 - q) ** 2 + behind * (1 - q) / (1 + q) ** 2
@@ -294,8 +294,8 @@ def gyroid(x: np.ndarray) -> OracleValues:
 
 def matter(x: np.ndarray) -> OracleValues:
     value, gradient = np.zeros(len(x)), np.zeros_like(x)
-    for centre, size, density in PLANETS:
-        away = x - np.array(centre)
+    for center, size, density in PLANETS:
+        away = x - np.array(center)
         r = np.linalg.norm(away, axis=1)
         mass = density * np.minimum(r, size) ** 3 / 3
         value += mass / r + 0.5 * density * np.maximum(size**2 - r**2, 0)

@@ -16,7 +16,7 @@ from harnack.fields import Field, Sample
 from harnack.fields.look import Look
 from harnack.fields.look import Path as RayPath
 
-CENTRES = np.random.default_rng(5).uniform(-0.8, 0.8, (5, 3))
+CENTERS = np.random.default_rng(5).uniform(-0.8, 0.8, (5, 3))
 WIDTH = 0.4
 # Of exp(-u^2): the second derivative is 4u^2 - 2 times it, between -2 and 4 exp(-3/2).
 _MOST = 4 * math.exp(-1.5)
@@ -30,11 +30,11 @@ class Blobs(Field):
 
     def evaluate(self, p: Any) -> Sample:
         value, gradient = type(p.x)(0), type(p)(0)
-        for centre in CENTRES:
-            u = (p - type(p)(*centre.tolist())) / WIDTH
+        for center in CENTERS:
+            u = (p - type(p)(*center.tolist())) / WIDTH
             one = dr.exp(-dr.squared_norm(u))
             value, gradient = value + one, gradient - 2 / WIDTH * one * u
-        return Sample(value, gradient, (hk.Curvature(2 * len(CENTRES) / WIDTH**2),), 1e-6)
+        return Sample(value, gradient, (hk.Curvature(2 * len(CENTERS) / WIDTH**2),), 1e-6)
 
 
 class TaylorBlobs(Blobs):
@@ -58,10 +58,10 @@ class TaylorBlobs(Blobs):
 
     def second_derivatives(self, path: RayPath, start: Any, end: Any) -> tuple[Any, Any]:
         least, most = type(start)(0), type(start)(0)
-        for centre in CENTRES:
-            to_centre = type(path.origin)(*centre.tolist()) - path.origin
-            middle = dr.dot(to_centre, path.direction)
-            h = dr.squared_norm(to_centre - middle * path.direction) / WIDTH**2
+        for center in CENTERS:
+            to_center = type(path.origin)(*center.tolist()) - path.origin
+            middle = dr.dot(to_center, path.direction)
+            h = dr.squared_norm(to_center - middle * path.direction) / WIDTH**2
             u0, u1 = (start - middle) / WIDTH, (end - middle) / WIDTH
             bends = [(4 * u * u - 2) * dr.exp(-u * u) for u in (u0, u1)]
             low, high = dr.minimum(*bends), dr.maximum(*bends)
@@ -105,7 +105,7 @@ def test_no_hit_of_a_path_s_own_enclosures_is_missed() -> None:
     t = np.linspace(0, 4.9, 4000)
     x = o[:, None] + t[:, None] * d[:, None]
     inside = (x**2).sum(axis=2) <= 2.5**2
-    distance = ((x[:, :, None] - CENTRES) ** 2).sum(axis=3) / WIDTH**2
+    distance = ((x[:, :, None] - CENTERS) ** 2).sum(axis=3) / WIDTH**2
     above = (np.exp(-distance).sum(axis=2) > 0.5 + 1e-4) & inside
     first = np.where(above.any(axis=1), t[above.argmax(axis=1)], np.inf)
     assert (hits.t <= first + 1e-4).all()

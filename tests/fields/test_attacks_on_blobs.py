@@ -39,10 +39,10 @@ QUICK_KERNELS = [
 class Sum:
     """The largest of the sums of blobs, along rays, in double precision."""
 
-    def __init__(self, name: str, centres: Any, radii: Any, weights: Any, groups: Any) -> None:
+    def __init__(self, name: str, centers: Any, radii: Any, weights: Any, groups: Any) -> None:
         kernel, self.support, self.k = KERNELS[name]
-        self.blobs = hk.Blobs(centres, radii, weights, kernel=kernel, groups=groups)
-        self.c, self.r, self.w = centres, radii, weights / self.k(self.support**-2)
+        self.blobs = hk.Blobs(centers, radii, weights, kernel=kernel, groups=groups)
+        self.c, self.r, self.w = centers, radii, weights / self.k(self.support**-2)
         self.groups = np.zeros(len(radii), int) if groups is None else groups
 
     def along(self, o: Any, d: Any, t: Any) -> Any:
@@ -138,15 +138,15 @@ def check_rays(scene: Sum, o: Any, d: Any, precision: Any, tolerance: float) -> 
 def test_rays_that_all_but_touch(name: str, precision: Any, kind: str) -> None:
     rng = np.random.default_rng(4)
     count = 90 if kind == "grid" else 12
-    centres = rng.uniform(-1.5, 1.5, (count, 3)) * (count / 12) ** (1 / 3)
+    centers = rng.uniform(-1.5, 1.5, (count, 3)) * (count / 12) ** (1 / 3)
     radii = 10 ** rng.uniform(-0.5, 0.1, count)
     weights = np.ones(count) if kind == "grid" else rng.uniform(-1.5, 2.0, count)
     if kind == "equal and nested":
-        centres[1], centres[2], weights = centres[0], centres[3] + 0.05, np.abs(weights)
+        centers[1], centers[2], weights = centers[0], centers[3] + 0.05, np.abs(weights)
         radii[2] = 0.2 * radii[3]
     groups = rng.integers(0, 4, count) if kind == "groups" else None
-    scene = Sum(name, centres, radii, weights, groups)
-    x = centres[:4] + 0.3
+    scene = Sum(name, centers, radii, weights, groups)
+    x = centers[:4] + 0.3
     mine = [scene.along(one, np.array([1.0, 0, 0]), np.zeros(1))[0] for one in x]
     np.testing.assert_allclose(scene.blobs.value(x, precision="double"), mine, atol=1e-10)
     depths = [1e-3, 1e-4, 3e-5] if precision == "single" else [1e-3, 1e-5, 1e-8]
@@ -180,23 +180,23 @@ def test_rays_that_all_but_touch_cross_twice(name: str, precision: Any) -> None:
 @pytest.mark.parametrize("kind", ["lattice", "giants", "clusters", "tiny"])
 def test_rays_along_faces_and_edges_of_cells(precision: Any, kind: str) -> None:
     rng = np.random.default_rng(8)
-    centres = rng.uniform(-6, 6, (216, 3))
+    centers = rng.uniform(-6, 6, (216, 3))
     radii = rng.uniform(0.5, 1.0, 216)
     if kind == "lattice":
-        centres = 2.0 * np.stack(np.meshgrid(*[np.arange(6)] * 3), -1).reshape(-1, 3)
+        centers = 2.0 * np.stack(np.meshgrid(*[np.arange(6)] * 3), -1).reshape(-1, 3)
     if kind == "giants":
         radii[:3] = 30.0, 12.0, 50.0
     if kind == "clusters":
-        centres += rng.choice([0.0, 25.0, -40.0], (216, 3))
+        centers += rng.choice([0.0, 25.0, -40.0], (216, 3))
     if kind == "tiny":
         radii *= 10 ** rng.uniform(-3, 0, 216)
-    scene = Sum("compact", centres, radii, np.ones(216), None)
+    scene = Sum("compact", centers, radii, np.ones(216), None)
     lists = scene.blobs.cell_lists()
     assert lists is not None
     low, cell = lists.origin, lists.cell
     count = 60
     # From corners, edges and faces of cells that hold blobs, along axes and diagonals.
-    place = np.floor((centres[rng.integers(0, 216, count)] - low) / cell)
+    place = np.floor((centers[rng.integers(0, 216, count)] - low) / cell)
     place += rng.random((count, 3)) * rng.integers(0, 2, (count, 3))
     d = rng.choice([-1.0, 0.0, 1.0], (count, 3))
     d[::2] = np.roll(np.eye(3), 1, axis=0)[rng.integers(0, 3, count // 2)]
@@ -212,8 +212,8 @@ def test_no_path_leaves_the_lists_of_its_cells(precision: Any) -> None:
     """Where a path may go lies within the margin in which the lists of its cells are right: of one
     cell, and of all the empty ones around."""
     rng = np.random.default_rng(2)
-    centres = rng.uniform(-9, 9, (80, 3))
-    lists = CellLists.of(centres, np.full(80, 0.7))
+    centers = rng.uniform(-9, 9, (80, 3))
+    lists = CellLists.of(centers, np.full(80, 0.7))
     backend = choose_backend(precision)
     grid = Grid.upload(backend, lists)
     p = rng.uniform(-10, 10, (4000, 3)).astype(backend.dtype).astype(np.float64)
@@ -270,7 +270,7 @@ def test_slopes_of_hrbf_on_short_pieces(precision: Any, offset: float) -> None:
 
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize(
-    ("centre", "radius", "weight", "most"),
+    ("center", "radius", "weight", "most"),
     [
         (0.0, 1.0, 1e300, "single"),
         (0.0, 1e38, 1.0, "single"),
@@ -281,11 +281,11 @@ def test_slopes_of_hrbf_on_short_pieces(precision: Any, offset: float) -> None:
     ],
 )
 def test_blobs_that_a_precision_does_not_hold(
-    centre: float, radius: float, weight: float, most: str, precision: Any
+    center: float, radius: float, weight: float, most: str, precision: Any
 ) -> None:
     """They were called too small whatever was wrong with them, in single precision always; and one
     whose inverse radius vanished filled all of space."""
-    blobs = hk.Blobs([[0, 0, 0], [centre, 0, 0]], [1.0, radius], [1.0, weight])
+    blobs = hk.Blobs([[0, 0, 0], [center, 0, 0]], [1.0, radius], [1.0, weight])
     backend = choose_backend(precision)
     if precision == "double" and most == "single":
         blobs.prepare(backend)

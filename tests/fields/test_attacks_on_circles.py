@@ -26,7 +26,7 @@ def test_windows_far_above_small_circles_hold() -> None:
     a point is: the lift fell 0.5 below its window, where a level lay."""
     big, small = hk.Circle(1.0), hk.Circle(1e-4, (1.25, 0.0, 0.25))
     n, rng = 200, np.random.default_rng(0)
-    x = np.array(small.centre) + np.column_stack(
+    x = np.array(small.center) + np.column_stack(
         [6e-5 * rng.uniform(-1, 1, (n, 2)), rng.uniform(0.25, 1, n)]
     )
     x = x.astype(np.float32).astype(np.float64)
@@ -54,14 +54,14 @@ def test_rays_beside_circles_far_from_the_origin_end(offset: float) -> None:
     """Beside the curve rounding hid on which side of the plane's region a point is, and a ball of
     radius 0 was all that was promised: one ray in ten ran out of steps."""
     rng, n = np.random.default_rng(3), 600
-    centre, normal = np.array([offset, -offset, offset]), unit([0.3, 0.5, 0.8])
-    ring = [hk.Circle(1, tuple(centre), tuple(normal)), hk.Circle(0.5, tuple(centre), -normal)]
+    center, normal = np.array([offset, -offset, offset]), unit([0.3, 0.5, 0.8])
+    ring = [hk.Circle(1, tuple(center), tuple(normal)), hk.Circle(0.5, tuple(center), -normal)]
     first = unit(np.cross(normal, [0.3, 0.5, 0.1]))
     turn = rng.uniform(0, 2 * np.pi, (n, 1))
     radius = rng.choice([0.5, 1.0], (n, 1))
     radius *= 1 + 10.0 ** rng.uniform(-8, -1, (n, 1)) * rng.choice([-1, 1], (n, 1))
-    target = centre + radius * (np.cos(turn) * first + np.sin(turn) * np.cross(normal, first))
-    o = centre + 3 * unit(rng.normal(size=(n, 3)))
+    target = center + radius * (np.cos(turn) * first + np.sin(turn) * np.cross(normal, first))
+    o = center + 3 * unit(rng.normal(size=(n, 3)))
     field = hk.SolidAngle(ring)
     assert field.describe()["certificate"] == "planar"
     hits = hk.trace(field, o, target - o, level=1.2, precision="single", t_max=8)

@@ -38,9 +38,9 @@ QUICK_PRECISIONS = ["single", pytest.param("double", marks=SLOWLY)]
 def scene(count: int = 40, seed: int = 5, **settings: Any) -> hk.Blobs:
     """Random blobs in a box, those of the tables in docs for 40 and seed 5."""
     rng = np.random.default_rng(seed)
-    centres = rng.uniform(-4.0, 4.0, (count, 3))
+    centers = rng.uniform(-4.0, 4.0, (count, 3))
     radii = rng.uniform(0.8, 1.6, count)
-    return hk.Blobs(centres, radii, **settings)
+    return hk.Blobs(centers, radii, **settings)
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Oracle:
         """(..., groups) the sums of all groups at points (..., 3)."""
         b = self.blobs
         reach = b.radii * b.kernel.support
-        q = ((x[..., None, :] - b.centres) ** 2).sum(-1) / reach**2
+        q = ((x[..., None, :] - b.centers) ** 2).sum(-1) / reach**2
         terms = b.weights * b.kernel.amplitude * b.kernel.height(q)
         groups = np.zeros(len(b), int) if b.groups is None else b.groups
         return np.stack([terms[..., groups == g].sum(-1) for g in np.unique(groups)], -1)
@@ -138,7 +138,7 @@ def test_what_is_promised(kernel: Any) -> None:
 def test_single_precision_is_within_the_stated_error(kernel: Any) -> None:
     for offset in (0.0, 1e4):
         base = scene(90, weights=np.linspace(-1, 2, 90), kernel=kernel)
-        blobs = hk.Blobs(base.centres + offset, base.radii, base.weights, kernel=kernel)
+        blobs = hk.Blobs(base.centers + offset, base.radii, base.weights, kernel=kernel)
         single = choose_backend("single")
         (x,) = rounded(single, np.random.default_rng(3).uniform(-6, 6, (2000, 3)) + offset)
         sample = blobs.prepare(single).evaluate(to_vector3(single, x))
@@ -160,8 +160,8 @@ def test_ranges_hold_and_are_attained(kernel: Any, precision: Any, offset: float
     rng = np.random.default_rng(7)
     backend = choose_backend(precision)
     count, radius = 150, 1.3
-    centre = np.array([0.3, -0.2, 0.1]) + offset
-    blob = hk.Blobs(centre[None], radius, -0.8, kernel=kernel)
+    center = np.array([0.3, -0.2, 0.1]) + offset
+    blob = hk.Blobs(center[None], radius, -0.8, kernel=kernel)
     d = rng.normal(size=(count, 3))
     d /= np.linalg.norm(d, axis=1)[:, None]
     aside = np.cross(d, rng.normal(size=(count, 3)))
@@ -170,7 +170,7 @@ def test_ranges_hold_and_are_attained(kernel: Any, precision: Any, offset: float
     # Through the middle, at random, just inside and just outside of the support.
     beside = rng.choice([0.0, 1e-5, 0.3, 0.7, 1 - 1e-6, 1.0, 1 + 1e-6, 1.2], count) * reach
     before = rng.choice([0.0, 0.5, 1.0, 3.0, 50.0], count) * reach
-    p, d = rounded(backend, centre + beside[:, None] * aside - before[:, None] * d, d)
+    p, d = rounded(backend, center + beside[:, None] * aside - before[:, None] * d, d)
     (length,) = rounded(backend, rng.random(count) * reach * 2 + before)
     knots = [0.0, *(backend.Float(part * length) for part in (0.4, 0.9, 1.0))]
     prepared: Any = blob.prepare(backend)
@@ -183,7 +183,7 @@ def test_ranges_hold_and_are_attained(kernel: Any, precision: Any, offset: float
     for k, part in enumerate(found.parts):
         s = ends[k][:, None] + np.linspace(0, 1, 300) * (ends[k + 1] - ends[k])[:, None]
         x = p[:, None] + s[..., None] * d[:, None]
-        v = (x - centre) / reach
+        v = (x - center) / reach
         q, along = (v * v).sum(-1), (v * d[:, None]).sum(-1)
         speed = (d * d).sum(-1)[:, None]
         k1, k2 = derivatives(kernel, q)
@@ -321,7 +321,7 @@ def check_first_hits(blobs: hk.Blobs, count: int, precision: Any, most_looks: fl
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_a_grid_changes_no_hit(precision: Any) -> None:
     blobs = scene(300, seed=3)
-    loose: Any = hk.Blobs(blobs.centres, blobs.radii)
+    loose: Any = hk.Blobs(blobs.centers, blobs.radii)
     loose.cell_lists = lambda: None
     o, d, length = box_rays(blobs, 700)
     for level in (1.0, 2.5):
@@ -337,12 +337,12 @@ def test_a_grid_changes_no_hit(precision: Any) -> None:
 
 def test_lists_hold_every_support_that_meets_a_cell() -> None:
     rng = np.random.default_rng(0)
-    centres, radii = rng.uniform(-3, 3, (200, 3)), 10 ** rng.uniform(-1.5, 0.4, 200)
-    lists = CellLists.of(centres, radii)
+    centers, radii = rng.uniform(-3, 3, (200, 3)), 10 ** rng.uniform(-1.5, 0.4, 200)
+    lists = CellLists.of(centers, radii)
     x = rng.uniform(-4, 4, (4000, 3))
     place = np.floor((x - lists.origin) / lists.cell).astype(int)
     inside = ((place >= 0) & (place < np.array(lists.shape))).all(1)
-    near = ((x[:, None] - centres) ** 2).sum(-1) < radii**2
+    near = ((x[:, None] - centers) ** 2).sum(-1) < radii**2
     assert not near[~inside].any()
     for k in np.flatnonzero(inside):
         i, j, m = place[k]
@@ -388,9 +388,9 @@ def test_blobs_in_other_formulas() -> None:
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
-def test_equal_centres_far_from_the_origin(precision: Any) -> None:
-    centres = np.array([[0.0, 0, 0], [0, 0, 0], [3, 0, 0]]) + 1e4
-    blobs = hk.Blobs(centres, [1.0, 1.0, 0.5])
+def test_equal_centers_far_from_the_origin(precision: Any) -> None:
+    centers = np.array([[0.0, 0, 0], [0, 0, 0], [3, 0, 0]]) + 1e4
+    blobs = hk.Blobs(centers, [1.0, 1.0, 0.5])
     o = np.array([1e4, 1e4, 1e4 - 10.0])
     beside = np.array([[0.0, 0, 0], [3, 0, 0], [20, 0, 0]])
     hits = hk.trace(blobs, o + beside, [[0, 0, 1.0]] * 3, precision=precision)
@@ -432,11 +432,11 @@ def test_blobs_of_any_size(radius: float, precision: Any) -> None:
     [
         (([], 1.0), {}, "shape"),
         ((np.zeros((0, 3)), 1.0), {}, "there are none"),
-        (([[0, 0, np.nan]], 1.0), {}, "centre 0"),
+        (([[0, 0, np.nan]], 1.0), {}, "center 0"),
         (([[0, 0, 0]], 0.0), {}, "radius 0 is 0"),
         (([[0, 0, 0]], np.nan), {}, "radii: entry 0"),
         (([[0, 0, 0]], -1.0), {}, "positive"),
-        (([[0, 0, 0]], [1.0, 2.0]), {}, "one for each centre"),
+        (([[0, 0, 0]], [1.0, 2.0]), {}, "one for each center"),
         (([[0, 0, 0]], 1.0, [np.inf]), {}, "weights"),
         (([[0, 0, 0]], 1.0), {"groups": [0.5]}, "integers"),
         (([[0, 0, 0]], 1.0), {"kernel": "gausian"}, "gaussian"),

@@ -100,8 +100,8 @@ def test_values_on_the_axis_and_in_the_plane(precision: Any) -> None:
 
 
 def random_circle(rng: np.random.Generator, scale: float = 1.0) -> hk.Circle:
-    centre, normal = scale * rng.uniform(-1, 1, 3), rng.normal(size=3)
-    return hk.Circle(scale * rng.uniform(0.2, 1.0), tuple(centre), tuple(normal))
+    center, normal = scale * rng.uniform(-1, 1, 3), rng.normal(size=3)
+    return hk.Circle(scale * rng.uniform(0.2, 1.0), tuple(center), tuple(normal))
 
 
 def points_about(rng: np.random.Generator, circle: hk.Circle, n: int) -> np.ndarray:
@@ -114,9 +114,9 @@ def points_about(rng: np.random.Generator, circle: hk.Circle, n: int) -> np.ndar
     x[third : third + third // 2, 2] *= 10.0 ** rng.uniform(-6, -1, third // 2)
     x[third + third // 2 : 2 * third, :2] *= 1e-3
     axis = np.array(circle.normal)
-    first, second = circle.polygon(4)[:2] - np.array(circle.centre)
+    first, second = circle.polygon(4)[:2] - np.array(circle.center)
     frame = np.stack([first / circle.radius, second / circle.radius, axis])
-    return np.array(circle.centre) + circle.radius * x @ frame
+    return np.array(circle.center) + circle.radius * x @ frame
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
@@ -148,10 +148,10 @@ def test_a_circle_agrees_with_a_polygon_of_4096_sides(precision: Any) -> None:
     circle = hk.Circle(0.7, (0.3, -0.2, 0.1), (1.0, 2.0, -1.5))
     half = math.pi / 4096
     share = math.sqrt(2 * half / math.sin(2 * half))
-    centre = np.array(circle.centre)
-    loop = centre + share * (circle.polygon(4096) - centre)
+    center = np.array(circle.center)
+    loop = center + share * (circle.polygon(4096) - center)
     x = points_about(rng, circle, 600)
-    x = x[np.abs(np.linalg.norm(x - centre, axis=1) - 0.7) > 0.02]
+    x = x[np.abs(np.linalg.norm(x - center, axis=1) - 0.7) > 0.02]
     one, other = hk.SolidAngle(circle), hk.SolidAngle(loop, certificate="edges")
     tolerance = 1e-4 if precision == "single" else 1e-5
     apart = one.value(x, precision=precision) - other.value(x, precision=precision)
@@ -254,10 +254,10 @@ def sums_over(field: hk.SolidAngle, x: np.ndarray) -> Any:
     return on.circles.sums(on.unit(p))
 
 
-def test_the_gradient_s_bound_is_attained_at_the_centre() -> None:
-    """The integral of |dp|/D^2 bounds it: at the centre it is the gradient."""
+def test_the_gradient_s_bound_is_attained_at_the_center() -> None:
+    """The integral of |dp|/D^2 bounds it: at the center it is the gradient."""
     field = hk.SolidAngle(TILTED, certificate="edges")
-    sums = sums_over(field, np.array([TILTED.centre]))
+    sums = sums_over(field, np.array([TILTED.center]))
     share = dr.norm(sums.gradient) / sums.squares
     assert 1 - 1e-12 < share[0] <= 1 + 1e-12
     # Elsewhere it is a bound, and nearly attained beside the circle.
@@ -367,7 +367,7 @@ def test_where_a_circle_is() -> None:
     area = np.cross(polygon, np.roll(polygon, -1, axis=0)).sum(axis=0) / 2
     np.testing.assert_allclose(area, math.pi * 4 * np.array(circle.normal), rtol=1e-4, atol=1e-4)
     around = circle.polygon(6, around=True)
-    middle = 0.5 * (around + np.roll(around, -1, axis=0)) - np.array(circle.centre)
+    middle = 0.5 * (around + np.roll(around, -1, axis=0)) - np.array(circle.center)
     np.testing.assert_allclose(np.linalg.norm(middle, axis=1), 2.0)
 
 
@@ -425,7 +425,7 @@ def placed(
     moved = [
         hk.Circle(
             scale * one.radius,
-            tuple(scale * (turn @ np.array(one.centre) + shift)),
+            tuple(scale * (turn @ np.array(one.center) + shift)),
             tuple(turn @ np.array(one.normal)),
         )
         for one in circles
@@ -443,10 +443,10 @@ def compare(seed: int, curves: int, rays: int, precision: Any) -> tuple[int, int
         loops, circles = placed(rng, *random_curves(rng, kind))
         oracle = MixedOracle(loops, circles)
         points = np.concatenate([*loops, *(one.polygon(48) for one in circles)])
-        centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
-        size = float(np.linalg.norm(points - centre, axis=1).max())
-        o = centre + size * rng.uniform(0.1, 3.0, (rays, 1)) * unit(rng.normal(size=(rays, 3)))
-        target = centre + size * rng.uniform(0, 1.2, (rays, 1)) * unit(rng.normal(size=(rays, 3)))
+        center = 0.5 * (points.min(axis=0) + points.max(axis=0))
+        size = float(np.linalg.norm(points - center, axis=1).max())
+        o = center + size * rng.uniform(0.1, 3.0, (rays, 1)) * unit(rng.normal(size=(rays, 3)))
+        target = center + size * rng.uniform(0, 1.2, (rays, 1)) * unit(rng.normal(size=(rays, 3)))
         third = rays // 3
         target[:third] = points[rng.integers(len(points), size=third)]
         away = 10 ** rng.uniform(-5, -1, (third, 1)) * size

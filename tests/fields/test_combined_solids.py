@@ -16,8 +16,8 @@ from harnack.testing import check_field
 Values = Callable[[FloatArray], FloatArray]
 
 
-def sphere(p: FloatArray, radius: float = 1.0, centre: Any = (0, 0, 0)) -> FloatArray:
-    return np.linalg.norm(p - np.asarray(centre), axis=-1) - radius
+def sphere(p: FloatArray, radius: float = 1.0, center: Any = (0, 0, 0)) -> FloatArray:
+    return np.linalg.norm(p - np.asarray(center), axis=-1) - radius
 
 
 def torus(p: FloatArray, major: float, minor: float) -> FloatArray:
@@ -127,18 +127,18 @@ QUICK = ("difference", "twisted", "gyroid in a torus", "spanning surface and tub
 EVERY = [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in CASES]
 
 
-def rays(count: int, seed: int, centre: Any, size: float) -> tuple[FloatArray, FloatArray]:
+def rays(count: int, seed: int, center: Any, size: float) -> tuple[FloatArray, FloatArray]:
     rng = np.random.default_rng(seed)
     o = rng.normal(size=(count, 3))
     o *= 3 * size / np.linalg.norm(o, axis=1, keepdims=True)
     d = rng.normal(size=(count, 3)) * 0.5 * size - o
-    return o + np.asarray(centre), d / np.linalg.norm(d, axis=1, keepdims=True)
+    return o + np.asarray(center), d / np.linalg.norm(d, axis=1, keepdims=True)
 
 
 def missed(make: Callable[[], hk.Solid], value: Values, precision: Any, count: int) -> FloatArray:
     """By how much hits come after the first sample inside, in units of the samples' distance."""
-    centre = (1, 2, 3) if value is CASES["moved gyroid"][1] else (0, 0, 0)
-    o, d = rays(count, 3, centre, 1.3)
+    center = (1, 2, 3) if value is CASES["moved gyroid"][1] else (0, 0, 0)
+    o, d = rays(count, 3, center, 1.3)
     t = np.linspace(0, 8, 3201)
     inside = np.stack([value(o + one * d) <= 0 for one in t], axis=1)
     first = np.where(inside.any(axis=1), t[inside.argmax(axis=1)], np.inf)

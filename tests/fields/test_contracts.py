@@ -61,8 +61,8 @@ class Charges(Field):
 
     def evaluate(self, p: Any) -> Sample:
         value, gradient, nearest = 0.0, type(p)(0.0), math.inf
-        for centre in ((-0.8, 0.0, 0.0), (0.8, 0.0, 0.0), (0.0, 0.9, 0.3)):
-            away = p - type(p)(*centre)
+        for center in ((-0.8, 0.0, 0.0), (0.8, 0.0, 0.0), (0.0, 0.9, 0.3)):
+            away = p - type(p)(*center)
             r = dr.norm(away)
             value, gradient = value + 1 / r, gradient - away / (r * r * r)
             nearest = dr.minimum(nearest, r)
@@ -124,7 +124,7 @@ REAL: dict[str, Field] = {
     "lobes 3,2": hk.Lobes(3, 2),
     "lobes 2,1, positive": hk.Lobes(2, 1, part="positive", scale=20.0),
     "Eq. 8": hk.HarmonicPolynomial({(2, 1, 0): 1, (0, 1, 2): -1}),
-    "polynomial off centre": hk.HarmonicPolynomial(
+    "polynomial off center": hk.HarmonicPolynomial(
         {(2, 1, 0): 1, (0, 1, 2): -1, (1, 0, 0): 0.3, (0, 0, 0): 0.1, (1, 1, 1): 0.5},
         domain=hk.Ball((0.3, 0.0, -0.2), 1.5),
     ),

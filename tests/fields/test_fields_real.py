@@ -504,13 +504,13 @@ def test_unit_sphere_covers(covering: float) -> None:
     np.testing.assert_allclose(np.linalg.norm(points, axis=1), 1.0, atol=1e-12)
     probes = np.concatenate([on_unit_sphere(50000), [[0, 0, 1], [0, 0, -1]]])
     # Probes near a pole and near the rings' gaps are where a mistake would show.
-    probes = np.concatenate([probes, normalised(probes * [0.05, 0.05, 1])])
+    probes = np.concatenate([probes, normalized(probes * [0.05, 0.05, 1])])
     chord = cKDTree(points).query(probes)[0]
     angle = 2 * np.arcsin(chord / 2).max()
     assert 0.75 * covering <= angle <= covering
 
 
-def normalised(v: np.ndarray) -> np.ndarray:
+def normalized(v: np.ndarray) -> np.ndarray:
     return v / np.linalg.norm(v, axis=1, keepdims=True)
 
 

@@ -17,7 +17,7 @@ from tests.oracles.oracle import OracleValues, first_crossings
 
 HALF = 3 * math.pi / 4
 FIG_21 = ((-HALF,) * 3, (HALF,) * 3)
-CENTRES = np.random.default_rng(5).uniform(-0.6, 0.6, (12, 3))
+CENTERS = np.random.default_rng(5).uniform(-0.6, 0.6, (12, 3))
 CUBE = ((-1.2,) * 3, (1.2,) * 3)
 
 
@@ -27,7 +27,7 @@ def figure_21(x: np.ndarray) -> np.ndarray:
 
 
 def blobs(x: np.ndarray) -> np.ndarray:
-    return np.exp(-((x[:, None] - CENTRES) ** 2).sum(axis=2) / 0.06).sum(axis=1) - 0.5
+    return np.exp(-((x[:, None] - CENTERS) ** 2).sum(axis=2) / 0.06).sum(axis=1) - 0.5
 
 
 def random_series(rng: np.random.Generator, shape: tuple[int, int, int]) -> np.ndarray:

@@ -14,7 +14,7 @@ import pytest
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.geometry import shapes
-from harnack.geometry.net_loops import uncancelled_edges
+from harnack.geometry.net_loops import uncanceled_edges
 from harnack.testing import BrokenPromiseError, check_field
 
 MANY_TERMS = hk.EigenfunctionSum(
@@ -291,7 +291,7 @@ def test_edges_run_both_ways_are_no_boundary() -> None:
     square = [[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]]
     hole = [[-1, -1, 0], [-1, 1, 0], [1, 1, 0], [1, -1, 0]]
     keyhole = [*square, square[0], *hole, hole[0]]
-    start, end = uncancelled_edges((np.array(keyhole, float),))
+    start, end = uncanceled_edges((np.array(keyhole, float),))
     assert len(start) == 8
     assert not (np.abs(start - end) == 1).any()
     field = hk.SolidAngle(keyhole)
@@ -311,7 +311,7 @@ def test_a_curve_that_cancels_as_a_whole_has_none() -> None:
 @pytest.mark.parametrize("precision", ["single", "double"])
 @pytest.mark.parametrize("length", [1e-90, 1e-40, 1e-25, 1e-18, 1e-12])
 def test_tiny_edges_leave_all_numbers_finite(length: float, precision: str) -> None:
-    """At the centre of the curve, where single precision tells their ends apart."""
+    """At the center of the curve, where single precision tells their ends apart."""
     square = [[0.0, 0, 0], [1, 1, 0.2], [-1, 1, 0], [-1, -1, -0.2], [1, -1, 0]]
     tiny = [square[0], [length, 0, 0], *square[1:]]
     backend = choose_backend(precision)  # type: ignore[arg-type]

@@ -34,7 +34,7 @@ def on_sphere(x: np.ndarray) -> np.ndarray:
 
 
 def reference(degree: int, j: int, m: int, X: np.ndarray) -> np.ndarray:
-    """P_ljm on the unit sphere by SciPy's functions, normalised by their textbook integrals."""
+    """P_ljm on the unit sphere by SciPy's functions, normalized by their textbook integrals."""
     y, w = X[:, :3], X[:, 3]
     r = np.linalg.norm(y, axis=1)
     cosine = np.divide(y[:, 2], r, out=np.ones_like(r), where=r > 0)

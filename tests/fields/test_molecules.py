@@ -134,7 +134,7 @@ def test_metaballs_of_a_file(tmp_path: Path) -> None:
     text = "# a pair\n0 0 0 1\n1.5 0 0 0.8 -0.5 # carves\n"
     found = read_surface(written(tmp_path, "a.blobs", text))
     assert isinstance(found, Metaballs)
-    np.testing.assert_allclose(found.centres, [[0, 0, 0], [1.5, 0, 0]])
+    np.testing.assert_allclose(found.centers, [[0, 0, 0], [1.5, 0, 0]])
     np.testing.assert_allclose(found.radii, [1, 0.8])
     np.testing.assert_allclose(found.weights, [1, -0.5])
     assert found.groups is None
@@ -149,7 +149,7 @@ def test_metaballs_of_a_file(tmp_path: Path) -> None:
 def test_opening_turns_the_axis_up(tmp_path: Path) -> None:
     opened = open_surface(written(tmp_path, "a.blobs", "1 2 3 0.5\n"), up="x")
     assert isinstance(opened.field, Blobs)
-    np.testing.assert_allclose(opened.field.centres, [[2, 3, 1]])
+    np.testing.assert_allclose(opened.field.centers, [[2, 3, 1]])
     opened = open_surface(written(tmp_path, "a.pdb", pdb([("N", (1, 2, 3))])))
     assert isinstance(opened.field, Molecule)
     assert opened.field.describe()["atoms"] == 1

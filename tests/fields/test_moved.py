@@ -31,7 +31,7 @@ def torn(x: np.ndarray) -> np.ndarray:
 
 
 def twisted(x: np.ndarray) -> np.ndarray:
-    """Wrung around an axis and stretched along it; neighbours stay so."""
+    """Wrung around an axis and stretched along it; neighbors stay so."""
     angle = 2.5 * x[:, 2]
     c, s = np.cos(angle), np.sin(angle)
     return np.column_stack([c * x[:, 0] - s * x[:, 1], s * x[:, 0] + c * x[:, 1], 4 * x[:, 2]])

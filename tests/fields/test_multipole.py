@@ -126,7 +126,7 @@ def terms(level: NodeMoments, x: np.ndarray, order: int, derivatives: int) -> An
     """Value, gradient and Hessian that a node alone gives at x (k, 3)."""
     backend = choose_backend("double")
     c = [dr.opaque(backend.Float, float(v)) for v in cartesian(level.moments, order)[0]]
-    r = x - level.centre[0]
+    r = x - level.center[0]
     inverse = backend.Float(1 / np.linalg.norm(r, axis=1))
     found = far_terms(c, backend.Array3f(r.T), inverse, derivatives)
     out = [to_numpy(found.value)]
@@ -222,15 +222,15 @@ def test_nodes_have_the_moments_of_what_they_hold(n: int, spread: bool) -> None:
     points, normals = triangle_dipoles(corners)
     boxes = corners.min(axis=1), corners.max(axis=1)
     levels = triangle_levels(tree, corners) if spread else all_levels(tree, points, normals, *boxes)
-    assert [len(level.centre) for level in levels] == list(tree.counts)
+    assert [len(level.center) for level in levels] == list(tree.counts)
     held = tree.slots
     for level, arity in zip(levels, (*tree.arities, 1), strict=True):
-        for node in range(len(level.centre)):
+        for node in range(len(level.center)):
             rows = held[node][held[node] >= 0]
-            d = (points[rows] - level.centre[node]).reshape(1, -1, 3)
+            d = (points[rows] - level.center[node]).reshape(1, -1, 3)
             a = normals[rows].reshape(1, -1, 3)
             size = np.linalg.norm(a, axis=-1)
-            far = np.linalg.norm(corners[rows] - level.centre[node], axis=-1).max()
+            far = np.linalg.norm(corners[rows] - level.center[node], axis=-1).max()
             assert far <= level.radius[node] * (1 + 1e-12)
             assert level.area[node] == pytest.approx(size.sum())
             square = (d * d).sum(axis=-1)
@@ -247,11 +247,11 @@ def test_nodes_have_the_moments_of_what_they_hold(n: int, spread: bool) -> None:
         held = held.reshape(len(held) // arity, -1)
 
 
-def test_nodes_without_area_have_a_centre() -> None:
+def test_nodes_without_area_have_a_center() -> None:
     """Two turned copies cancel as dipoles but keep their areas; nothing at all has none."""
     y = np.array([[0.0, 0, 0], [2.0, 0, 0]])
     level = level_of(y, np.zeros((2, 3)))
-    np.testing.assert_array_equal(level.centre, [[1.0, 0, 0]])
+    np.testing.assert_array_equal(level.center, [[1.0, 0, 0]])
     assert level.area.tolist() == [0]
     assert all(np.isfinite(value).all() for value in truncation(level, 2 * level.radius))
 
@@ -284,8 +284,8 @@ def test_triangle_dipoles_integrate_to_degree_four() -> None:
 def test_cartesian_terms_are_the_harmonics(order: int) -> None:
     for seed in range(6):
         level = level_of(*cluster(seed))
-        x = level.centre + 3 * np.random.default_rng(seed).normal(size=(50, 3))
-        far = irregular(x - level.centre, order + 1)
+        x = level.center + 3 * np.random.default_rng(seed).normal(size=(50, 3))
+        far = irregular(x - level.center, order + 1)
         expected = -sum(
             np.conj(at(level.moments, l, m)) * at(far, l, m)
             for l in range(1, order + 2)
@@ -301,7 +301,7 @@ def test_derivatives_of_terms(order: int) -> None:
     h = 1e-4
     for seed in range(6):
         level = level_of(*cluster(seed))
-        x = level.centre + 2 * unit(np.random.default_rng(seed).normal(size=(40, 3)))
+        x = level.center + 2 * unit(np.random.default_rng(seed).normal(size=(40, 3)))
         value, gradient, hessian = terms(level, x, order, 2)
         np.testing.assert_array_equal(value, terms(level, x, order, 0)[0])
         np.testing.assert_array_equal(gradient, terms(level, x, order, 1)[1])
@@ -338,7 +338,7 @@ def test_sup_norm_bounds_every_term() -> None:
 def viewpoints(level: NodeMoments, q: float, seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     r = level.radius[0] / q * np.where(np.arange(60) < 30, 1.0, rng.uniform(1, 4, 60))
-    return level.centre[0] + r[:, None] * unit(rng.normal(size=(60, 3)))
+    return level.center[0] + r[:, None] * unit(rng.normal(size=(60, 3)))
 
 
 @pytest.mark.parametrize("order", ORDERS)
@@ -353,7 +353,7 @@ def test_truncation_is_bounded(order: int, accuracy: float) -> None:
         nearest = accuracy * level.radius
         e, g, _ = (bound[0] for bound in truncation(level, nearest, order))
         x = viewpoints(level, 1 / accuracy, seed)
-        r = np.linalg.norm(x - level.centre[0], axis=1)
+        r = np.linalg.norm(x - level.center[0], axis=1)
         value, gradient = terms(level, x, order, 1)
         off = np.abs(value - dipole_sum(x, y, normal))
         slope = np.linalg.norm(gradient - dipole_gradient(x, y, normal), axis=1)
@@ -395,7 +395,7 @@ def test_truncation_is_bounded_for_triangles(order: int) -> None:
         for accuracy in (1.5, 2.0, 4.0):
             e = truncation(level, accuracy * level.radius, order)[0][0]
             x = viewpoints(level, 1 / accuracy, seed)
-            r = np.linalg.norm(x - level.centre[0], axis=1)
+            r = np.linalg.norm(x - level.center[0], axis=1)
             off = np.abs(terms(level, x, order, 0)[0] - solid_angles(x, corners))
             assert (off <= e / r ** (k + 1) + 1e-12).all()
 
@@ -410,10 +410,10 @@ def bent(
 ) -> tuple[np.ndarray, np.ndarray]:
     """How far f moves off the linear on steps along `way` (60, 3), and the bound of it."""
     columns = node_columns(level, 2, rough, np.zeros(1))[0]
-    np.testing.assert_array_equal(columns[:3], level.centre[0])
+    np.testing.assert_array_equal(columns[:3], level.center[0])
     assert columns[3] == pytest.approx(rough * level.radius[0])
     x = viewpoints(level, 1 / rough, 7)
-    r = np.linalg.norm(x - level.centre[0], axis=1)
+    r = np.linalg.norm(x - level.center[0], axis=1)
     q = part * longest_part(rough)
     t = q * r
     linear = (dipole_gradient(x, y, normal) * way).sum(axis=1) * t
@@ -429,7 +429,7 @@ def test_fields_of_nodes_bend_as_their_columns_say(rough: float) -> None:
         y, normal = cluster(seed)
         level = level_of(y, normal)
         tiny = 1e-11 * np.linalg.norm(normal, axis=1).sum() / level.radius[0] ** 2
-        inwards = -unit(viewpoints(level, 1 / rough, 7) - level.centre[0])
+        inwards = -unit(viewpoints(level, 1 / rough, 7) - level.center[0])
         for part in (0.02, 0.3, 0.7, 1.0):
             for way in (inwards, unit(inwards + rng.normal(size=(60, 3)))):
                 off, bound = bent(level, rough, way, part, y, normal)

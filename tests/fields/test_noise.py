@@ -71,7 +71,7 @@ def test_the_slope_is_bounded_by_an_eigenvalue(kind: Any) -> None:
     total = np.einsum("ncij,ncik->njk", a / weights[..., None, None], a)
     bound = np.sqrt(np.linalg.eigvalsh(total)[:, -1]).reshape(33, 33, 33)
     assert ATTAINED[kind] * (1 - 1e-9) <= bound.max() <= CONSTANTS[kind].slope
-    # Near its largest values it changes by less than what the constant leaves between neighbours.
+    # Near its largest values it changes by less than what the constant leaves between neighbors.
     high = bound > 0.97 * bound.max()
     change = max(
         np.abs(np.diff(bound, axis=k))[

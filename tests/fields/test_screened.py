@@ -197,7 +197,7 @@ def seen(level: ClusterMoments, x: np.ndarray, kappa: float) -> tuple[Any, ...]:
     zeros = np.zeros((len(x), 4))
     head = np.concatenate([zeros, level.radius[:, None], level.weight[:, None]], axis=1)
     c = np.concatenate([coefficients(level), level.third[:, None]], axis=1)
-    z = level.centre - x
+    z = level.center - x
     source = seen_cluster(
         [to_float(DOUBLE, column) for column in head.T],
         [to_float(DOUBLE, column) for column in c.T],
@@ -229,7 +229,7 @@ def test_truncation_stays_within_its_bound(kappa: float) -> None:
         members = tree.gather(rows).reshape(count, -1, 8)
         level = repeated(level, views)
         away = level.radius * 10 ** rng.uniform(0.02, 1.5, len(level.radius))
-        x = level.centre + away[:, None] * random_directions(rng, len(away))
+        x = level.center + away[:, None] * random_directions(rng, len(away))
         value, gradient, error, slope = seen(level, x, kappa)
         f, g = np.zeros(len(x)), np.zeros((len(x), 3))
         for k in range(members.shape[1]):

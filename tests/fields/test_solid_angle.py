@@ -202,9 +202,9 @@ def test_no_level_lies_outside_the_extent(name: str, levels: tuple[float, ...]) 
     extent = hk.SolidAngle(loops).extent(levels)
     assert extent is not None
     lower, upper = extent.bounds()
-    centre, reach = 0.5 * (lower + upper), 0.5 * np.linalg.norm(upper - lower)
+    center, reach = 0.5 * (lower + upper), 0.5 * np.linalg.norm(upper - lower)
     rng = np.random.default_rng(5)
-    o = centre + reach * rng.uniform(0.3, 1.5, (3000, 1)) * unit(rng.normal(size=(3000, 3)))
+    o = center + reach * rng.uniform(0.3, 1.5, (3000, 1)) * unit(rng.normal(size=(3000, 3)))
     d, length = unit(rng.normal(size=(3000, 3))), 0.3 * reach
     along = np.linspace(0, length, 20)
     x = o[:, None] + along[:, None] * d[:, None]
@@ -276,9 +276,9 @@ def aimed_at(loops: list[np.ndarray], n: int) -> tuple[np.ndarray, np.ndarray]:
     """Rays from around curves towards places near them."""
     rng = np.random.default_rng(8)
     points = np.concatenate(loops)
-    centre, size = points.mean(axis=0), np.ptp(points, axis=0).max()
-    o = centre + 2 * size * unit(rng.normal(size=(n, 3)))
-    return o, unit(centre + 0.6 * size * rng.uniform(-1, 1, (n, 3)) - o)
+    center, size = points.mean(axis=0), np.ptp(points, axis=0).max()
+    o = center + 2 * size * unit(rng.normal(size=(n, 3)))
+    return o, unit(center + 0.6 * size * rng.uniform(-1, 1, (n, 3)) - o)
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
@@ -303,7 +303,7 @@ CORNERS = np.array([[-1.0, -1, 0], [1, -1, 0.2], [1, 1, 0.1], [-1, 1, -0.3]])
 HALVES = [CORNERS[[0, 1, 2]], CORNERS[[2, 3, 0]]]
 KEYHOLE = np.array([[-2.0, -2, 0], [2, -2, 0], [2, 2, 0.5], [-2, 2, 0], [-2, -2, 0], [-1, -1, 0.1],
                     [-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0.1]])  # fmt: skip
-CANCELLING: dict[str, tuple[list[np.ndarray], list[np.ndarray], np.ndarray]] = {
+CANCELING: dict[str, tuple[list[np.ndarray], list[np.ndarray], np.ndarray]] = {
     "halves": (HALVES, [CORNERS], CORNERS[[0, 2]]),
     "keyhole": ([KEYHOLE], [KEYHOLE[:4], KEYHOLE[5:9]], KEYHOLE[4:6]),
 }
@@ -322,9 +322,9 @@ def rays_beside(edge: np.ndarray, n: int, seed: int = 9) -> tuple[np.ndarray, np
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
-@pytest.mark.parametrize("name", CANCELLING)
+@pytest.mark.parametrize("name", CANCELING)
 def test_edges_run_both_ways_are_not_there(name: str, precision: str) -> None:
-    loops, net, edge = CANCELLING[name]
+    loops, net, edge = CANCELING[name]
     o, d = rays_beside(edge, 4000)
     field, other = hk.SolidAngle(loops), hk.SolidAngle(net)
     assert field.convex_position == other.convex_position
@@ -349,10 +349,10 @@ def test_edges_run_both_ways_are_not_there(name: str, precision: str) -> None:
 
 def test_parts_that_cancel_are_left_out() -> None:
     square = shapes.regular_polygon(4)
-    assert hk.SolidAngle(HALVES).describe()["cancelled edges"] == 2
-    assert hk.SolidAngle(square).describe()["cancelled edges"] == 0
+    assert hk.SolidAngle(HALVES).describe()["canceled edges"] == 2
+    assert hk.SolidAngle(square).describe()["canceled edges"] == 0
     # What is run twice the same way counts twice.
-    assert hk.SolidAngle([square, square]).describe()["cancelled edges"] == 0
+    assert hk.SolidAngle([square, square]).describe()["canceled edges"] == 0
     (net,) = net_loops((square, square, square[::-1].copy()))
     assert sorted(map(tuple, net)) == sorted(map(tuple, square))
     kept = (square, square)
@@ -390,7 +390,7 @@ def test_a_curve_that_cancels_as_a_whole_has_no_surface(
     assert all((to_numpy(row) == 0).all() for row in field.hessian(p))
     assert (to_numpy(field.differentiable_value(p)) == 0).all()
     assert field.closest_on_boundary(p) is None
-    assert field.describe()["cancelled edges"] == sum(map(len, NOTHING[name]))
+    assert field.describe()["canceled edges"] == sum(map(len, NOTHING[name]))
     for level in (0.0, FOUR_PI, -2 * FOUR_PI):
         with pytest.raises(ValueError, match="cancel"):
             hk.trace(field, o, d, level=level)

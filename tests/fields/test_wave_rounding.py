@@ -143,9 +143,9 @@ def test_gyroids_far_from_the_origin_are_right_or_not_known(
     precision: Any, far: float, status: hk.Status
 ) -> None:
     rng = np.random.default_rng(1)
-    centre = far * np.array([1.0, -1.0, 0.5])
-    gyroid = hk.Gyroid(1.0, domain=hk.Ball(tuple(centre), 100.0))
-    o, d = centre + rng.normal(size=(100, 3)), rng.normal(size=(100, 3))
+    center = far * np.array([1.0, -1.0, 0.5])
+    gyroid = hk.Gyroid(1.0, domain=hk.Ball(tuple(center), 100.0))
+    o, d = center + rng.normal(size=(100, 3)), rng.normal(size=(100, 3))
     for field in (gyroid, hk.solid(hk.Gyroid(1.0), between=(-0.3, 0.3))):
         assert (hk.trace(field, o, d, precision=precision).status == status).all()
     x = o.astype(np.float32) if precision == "single" else o

@@ -412,10 +412,10 @@ def test_lengths_far_apart(precision: Any) -> None:
     assert (np.abs(field.value(far, precision=precision)) < 1e-2).all()
     tiny = 1e-10 if precision == "single" else 1e-70
     # The tiny one is where coordinates are small: in the middle.
-    centred = merged(OCTANT, (-OCTANT[0], OCTANT[1]), (tiny * OCTANT[0] + tiny, OCTANT[1]))
-    field = WindingNumber(*centred, method="exact")
+    centered = merged(OCTANT, (-OCTANT[0], OCTANT[1]), (tiny * OCTANT[0] + tiny, OCTANT[1]))
+    field = WindingNumber(*centered, method="exact")
     x = tiny * rng.uniform(-3, 3, (500, 3)).astype(np.float32)
-    off = np.abs(field.value(x, precision=precision) - direct_sum(centred[0][centred[1]], x))
+    off = np.abs(field.value(x, precision=precision) - direct_sum(centered[0][centered[1]], x))
     assert (off <= field.error_bound(x, precision=precision)).all()
 
 
@@ -611,7 +611,7 @@ FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
         (TETRAHEDRON, FACES + 1, "out of range.*subtract 1"),
         (TETRAHEDRON, FACES - 1, "out of range"),
         (TETRAHEDRON, [[0, 1, 1]], "zero area"),
-        (TETRAHEDRON, [[0, 1, 2], [2, 1, 0]], "every face is cancelled"),
+        (TETRAHEDRON, [[0, 1, 2], [2, 1, 0]], "every face is canceled"),
         (TETRAHEDRON, FACES.astype(float), "integer"),
         (TETRAHEDRON[:, :2], FACES, "shape"),
         (TETRAHEDRON, np.zeros((0, 3), int), "no faces"),

@@ -62,7 +62,7 @@ def test_a_mesh_is_the_same_in_every_format(save, kind):
         (lambda f: remove_faces(f, 0.9, 0), r"32 triangles, \d+ singular edges: a triangle soup"),
         (lambda f: np.concatenate([f, [[0, 1, 1], [2, 2, 2]]]),
          "320 triangles .*a closed mesh; 2 of zero area left out"),
-        (lambda f: np.concatenate([f, f[:3]]), "323 triangles, .*; 3 are added to or cancelled"),
+        (lambda f: np.concatenate([f, f[:3]]), "323 triangles, .*; 3 are added to or canceled"),
         (lambda f: f[:, ::-1], "a closed mesh, whose faces look inward"),
     ],
 )  # fmt: skip

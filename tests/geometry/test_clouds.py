@@ -124,7 +124,7 @@ def test_cells_in_a_plane_are_those_of_qhull():
     plane = rng().random((400, 2))
     rotation = np.linalg.qr(rng().normal(size=(3, 3)))[0]
     points = np.column_stack([plane, np.zeros(400)]) @ rotation.T
-    areas = estimate_areas(points, np.broadcast_to(rotation[:, 2], (400, 3)), neighbours=60)
+    areas = estimate_areas(points, np.broadcast_to(rotation[:, 2], (400, 3)), neighbors=60)
     diagram = Voronoi(plane)
     compared = 0
     for k in range(400):
@@ -162,8 +162,8 @@ def test_the_other_side_of_a_thin_wall_takes_nothing_away():
     x = rng().random((800, 2))
     wall = np.column_stack([np.tile(x, (2, 1)), np.repeat([0.0, 0.005], 800)])
     normals = np.repeat([[0, 0, -1.0], [0, 0, 1.0]], 800, axis=0)
-    one_side = estimate_areas(wall[:800], normals[:800], neighbours=40)
-    both = estimate_areas(wall, normals, neighbours=80)
+    one_side = estimate_areas(wall[:800], normals[:800], neighbors=40)
+    both = estimate_areas(wall, normals, neighbors=80)
     inner = (np.abs(x - 0.5) < 0.4).all(axis=1)
     np.testing.assert_allclose(both[:800][inner], one_side[inner], rtol=0.02)
 
@@ -189,7 +189,7 @@ def test_few_points_have_areas_too():
     ("points", "options", "message"),
     [
         ([POINTS[0]] * 3, {}, "all points are at one position"),
-        (POINTS, {"neighbours": 2}, "at least 3 neighbours"),
+        (POINTS, {"neighbors": 2}, "at least 3 neighbors"),
         ([[0, 0, 0], [1e-120, 0, 0], [0, 1e-120, 0]], {}, "within 1e-100"),
     ],
 )
@@ -279,8 +279,8 @@ def test_normals_do_not_depend_on_the_scale():
     [
         (POINTS, {}, "3 different points do not show a surface"),
         ([POINTS[0]] * 9, {}, "1 different points do not"),
-        (np.outer(np.arange(40), [1.0, 2.0, 3.0]), {}, "neighbours of 40 points lie on a line"),
-        (np.eye(4, 3), {"neighbours": 1}, "at least 3 neighbours"),
+        (np.outer(np.arange(40), [1.0, 2.0, 3.0]), {}, "neighbors of 40 points lie on a line"),
+        (np.eye(4, 3), {"neighbors": 1}, "at least 3 neighbors"),
         ([], {}, "there are no points"),
     ],
 )

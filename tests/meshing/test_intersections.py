@@ -141,7 +141,7 @@ def test_random_faces_that_share_corners(seed: int) -> None:
     assert set(intersecting_faces(x, faces).tolist()) == expected
 
 
-def test_neighbours_do_not_meet() -> None:
+def test_neighbors_do_not_meet() -> None:
     vertices, faces = icosphere(2)
     assert not len(intersecting_faces(vertices, faces))
     moved = vertices.copy()

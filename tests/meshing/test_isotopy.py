@@ -107,9 +107,9 @@ def test_what_is_proved_holds_where_it_is_sampled() -> None:
     """(b), on random simplices; and most of what holds is proved, after halving."""
     field, rng = hk.SolidAngle(shapes.torus_knot(2, 3, 96)), np.random.default_rng(1)
     function = LevelFunction(field, 2 * math.pi)
-    centre = rng.uniform(-1.2, 1.2, (3000, 1, 3))
-    corners = centre + rng.normal(size=(3000, 4, 3)) * 10 ** rng.uniform(-2.5, -0.8, (3000, 1, 1))
-    slope = function.at(centre[:, 0]).gradient + rng.normal(size=(3000, 3))
+    center = rng.uniform(-1.2, 1.2, (3000, 1, 3))
+    corners = center + rng.normal(size=(3000, 4, 3)) * 10 ** rng.uniform(-2.5, -0.8, (3000, 1, 1))
+    slope = function.at(center[:, 0]).gradient + rng.normal(size=(3000, 3))
     # F is 0 at a corner of each, so that (a) cannot hold.
     proved = isotopy._regular(function, corners, np.zeros(3000), slope, np.ones(3))
     share = rng.dirichlet([0.6] * 4, (3000, 60))
@@ -122,7 +122,7 @@ def test_what_is_proved_holds_where_it_is_sampled() -> None:
 
 def test_four_corners_on_the_level() -> None:
     """Corners of a cube on a sphere, and no point within: all tetrahedra there have all corners on
-    the level, and the side of each is that of its centre."""
+    the level, and the side of each is that of its center."""
     rng, function = np.random.default_rng(0), LevelFunction(hk.Sphere(1.0), 0.0)
     signs = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
     on = signs + 1e-3 * rng.normal(size=signs.shape)

@@ -39,12 +39,12 @@ def test_a_limit_of_triangles_is_named():
         hk.mesh(hk.Sphere(1.0), max_triangles=0)
 
 
-def test_vertices_and_centres_are_looked_at():
+def test_vertices_and_centers_are_looked_at():
     function = LevelFunction(hk.Sphere(1.0), 0.0)
     x = np.array(_BALL.vertices, np.float64)
     check_near_level(function, x, _FACES, 0.02, None)
     with pytest.raises(LocalError, match="farther than the tolerance"):
-        check_near_level(function, x, _FACES, 1e-3, None)  # the centres are not so near
+        check_near_level(function, x, _FACES, 1e-3, None)  # the centers are not so near
     x[7] *= 1.05
     with pytest.raises(LocalError, match="farther than the tolerance") as found:
         check_near_level(function, x, _FACES, 0.02, None)

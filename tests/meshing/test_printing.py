@@ -345,7 +345,7 @@ def test_cavities_belong_to_the_innermost_shell_around_them() -> None:
 
 
 class Holed(hk.Shape):
-    """A sphere that is no number beside its centre."""
+    """A sphere that is no number beside its center."""
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         return hk.sqrt(x * x + y * y + z * z - 0.3) - 0.7

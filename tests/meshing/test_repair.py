@@ -51,11 +51,11 @@ def check(given: trimesh.Trimesh, euler: int = 2) -> trimesh.Trimesh:
         assert np.abs(w - 0.5).max() <= 1e-6
     patches = np.asarray(made.faces)[m:]
     assert not (intersecting_pairs(np.asarray(made.vertices), np.asarray(made.faces)) >= m).any()
-    # Refined: centres are within the tolerance, by the slope there.
+    # Refined: centers are within the tolerance, by the slope there.
     facts = made.metadata["harnack"]
-    centre = made.vertices[patches].mean(axis=1)
-    off = field.value(centre, precision="double") - 0.5
-    slope = np.linalg.norm(field.gradient(centre, precision="double"), axis=1)
+    center = made.vertices[patches].mean(axis=1)
+    off = field.value(center, precision="double") - 0.5
+    slope = np.linalg.norm(field.gradient(center, precision="double"), axis=1)
     rim = trimesh.grouping.group_rows(given.edges_sorted, require_count=1)
     size = np.ptp(given.vertices[np.unique(given.edges_sorted[rim])], axis=0).max()
     ends = {tuple(edge) for edge in given.edges_sorted[rim].tolist()}

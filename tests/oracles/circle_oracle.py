@@ -39,7 +39,7 @@ class MixedOracle:
 def circle_values(circle: hk.Circle, x: FloatArray) -> OracleValues:
     """Solid angle at points (n, 3), by the formulas of Paxton (1959) and of a current loop."""
     normal = np.array(circle.normal)
-    away = (x - np.array(circle.centre)) / circle.radius
+    away = (x - np.array(circle.center)) / circle.radius
     z = away @ normal
     outward = away - z[:, None] * normal
     r = np.linalg.norm(outward, axis=1)

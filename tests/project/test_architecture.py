@@ -13,7 +13,7 @@ FILES = sorted(SOURCE.rglob("*.py"))
 
 # Each room imports from itself and from the rooms before it.
 ROOMS = (
-    "choices",
+    "names",
     "backend",
     "geometry",
     "files",

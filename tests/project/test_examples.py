@@ -77,9 +77,9 @@ def test_sharper_proofs_take_fewer_evaluations(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_material_of_ones_own_colours_a_surface(tmp_path: Path) -> None:
+def test_a_material_of_ones_own_colors_a_surface(tmp_path: Path) -> None:
     picture = example("mitsuba_scene").main(tmp_path, SMALL, spp=4)
-    red, green, blue = np.asarray(picture)[24, 24]  # the knot; all else is grey
+    red, green, blue = np.asarray(picture)[24, 24]  # the knot; all else is gray
     assert blue > 1.1 * green
     assert red > 1.1 * green
 

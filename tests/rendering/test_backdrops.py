@@ -1,4 +1,4 @@
-"""Colours and images behind surfaces: their pixels, and what is no backdrop."""
+"""Colors and images behind surfaces: their pixels, and what is no backdrop."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from PIL import Image
 
 import harnack as hk
 from harnack.rendering.pictures.images import exr_bytes
-from harnack.rendering.surfaces.colours import NAMED_COLOURS, colour_of, linear
+from harnack.rendering.surfaces.colors import NAMED_COLORS, color_of, linear
 
 SMALL: dict[str, Any] = {"size": (40, 30), "progress": False, "show": "shaded", "spp": 4}
 
@@ -36,14 +36,14 @@ def corners(picture: Any) -> np.ndarray:
         ("black", (0, 0, 0)),
     ],
 )
-def test_colours_are_shown_as_they_are(given: Any, pixel: tuple[int, int, int]) -> None:
+def test_colors_are_shown_as_they_are(given: Any, pixel: tuple[int, int, int]) -> None:
     picture = drawn(given)
     assert np.abs(corners(picture).astype(int) - pixel).max() <= 1
     shown = [part / 255 for part in pixel]
     np.testing.assert_allclose(picture[0, 0], linear((shown[0], shown[1], shown[2])), atol=0.004)
 
 
-def test_the_surface_is_the_same_before_any_colour() -> None:
+def test_the_surface_is_the_same_before_any_color() -> None:
     middle = np.s_[10:20, 15:25]
     reference = drawn("white").shown[middle]
     for backdrop in ("black", ("red", "blue")):
@@ -65,7 +65,7 @@ def blocks(shape: tuple[int, int]) -> np.ndarray:
 
 
 def check_blocks(picture: Any) -> None:
-    """That the picture shows the three colours of `blocks` in its upper corner rows."""
+    """That the picture shows the three colors of `blocks` in its upper corner rows."""
     row = picture.shown[0].astype(int)
     assert np.abs(row[0] - (200, 0, 0)).max() <= 2
     assert np.abs(row[20] - (0, 200, 0)).max() <= 2
@@ -90,9 +90,9 @@ def test_images_are_read_from_files(name: str, tmp_path: Path) -> None:
         assert np.abs(row[[0, 20, -1]] - np.diag([200] * 3)).max() <= 6
 
 
-def test_grey_images_and_clear_ones_are_read(tmp_path: Path) -> None:
-    Image.fromarray(np.full((30, 40), 100, dtype=np.uint8)).save(tmp_path / "grey.png")
-    assert np.abs(corners(drawn(tmp_path / "grey.png")).astype(int) - 100).max() <= 1
+def test_gray_images_and_clear_ones_are_read(tmp_path: Path) -> None:
+    Image.fromarray(np.full((30, 40), 100, dtype=np.uint8)).save(tmp_path / "gray.png")
+    assert np.abs(corners(drawn(tmp_path / "gray.png")).astype(int) - 100).max() <= 1
     clear = np.zeros((30, 40, 4), dtype=np.uint8)
     clear[:, :20, 3] = 255
     Image.fromarray(clear).save(tmp_path / "clear.png")
@@ -153,6 +153,6 @@ def test_files_that_hold_no_image_are_refused(name: str, tmp_path: Path) -> None
         drawn(tmp_path / name)
 
 
-def test_names_of_colours_are_those_of_css() -> None:
-    assert len(NAMED_COLOURS) == 148
-    assert colour_of("RebeccaPurple", "it") == (0x66 / 255, 0x33 / 255, 0x99 / 255)
+def test_names_of_colors_are_those_of_css() -> None:
+    assert len(NAMED_COLORS) == 148
+    assert color_of("RebeccaPurple", "it") == (0x66 / 255, 0x33 / 255, 0x99 / 255)

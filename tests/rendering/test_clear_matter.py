@@ -95,10 +95,10 @@ def test_walls_of_a_shell_absorb_and_its_hollow_does_not() -> None:
 
 def test_glass_bends_light_and_shows_what_is_opaque_behind_it() -> None:
     """A ball of glass turns what is behind it upside down."""
-    grey = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.02] * 3}}
+    gray = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.02] * 3}}
     board = T().look_at(origin=(-EYE / 2).tolist(), target=EYE.tolist(), up=[0, 0, 1])
     upper = {"type": "rectangle", "to_world": board @ T().translate([0, 3, 0]).scale([6, 3, 1]),
-             "bsdf": {"type": "twosided", "nested": grey}}  # fmt: skip
+             "bsdf": {"type": "twosided", "nested": gray}}  # fmt: skip
     image = drawn(ball(1.5, tint=None), upper).mean(axis=-1)
     middle = N // 2
     column = image[:, middle]

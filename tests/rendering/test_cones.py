@@ -102,7 +102,7 @@ def test_what_is_covered_altogether_is_not_found() -> None:
 @pytest.fixture
 def black(monkeypatch: pytest.MonkeyPatch) -> None:
     """Surfaces are black: on a sky of one, pictures show how much of a pixel is free."""
-    monkeypatch.setattr(Light, "on", lambda _, colour, *others: colour * 0)
+    monkeypatch.setattr(Light, "on", lambda _, color, *others: color * 0)
 
 
 def drawn(what: Any, **settings: Any) -> np.ndarray:

@@ -162,7 +162,7 @@ def test_what_is_the_same_for_all_pictures_is_no_function(name: str, tmp_path: P
 
 
 @pytest.mark.parametrize("name", ["a.gif", "a.mp4"])
-def test_films_have_room_for_colour_bars(name: str, tmp_path: Path) -> None:
+def test_films_have_room_for_color_bars(name: str, tmp_path: Path) -> None:
     settings = {"frames": 2, "show": "value", "of": "z", "colorbar": True}
     hk.animate(FIELD, tmp_path / name, turn=90, **{**SMALL, **settings})
     av = pytest.importorskip("av")

@@ -205,7 +205,7 @@ def test_pictures_of_values_have_isolines_and_smooth_edges() -> None:
 
 
 @pytest.mark.parametrize("show", ["color", "shaded"])
-def test_lines_have_their_colours(show: str) -> None:
+def test_lines_have_their_colors(show: str) -> None:
     plain = seen(hk.Sphere(1.0), None, show, material="clay")
     width = 0.3
     lines = [hk.Isolines("z", [0.0], width=width, color="blue")]

@@ -243,7 +243,7 @@ def test_surfaces_stand_on_the_ground() -> None:
     [
         ({"path": "a.jpg"}, r"\.png or \.exr"),
         ({"path": "nowhere/a.png"}, "create the folder"),
-        ({"show": "colour"}, "show must be one of"),
+        ({"show": "color"}, "show must be one of"),
         ({"size": (0, 3)}, "size must be"),
         ({"spp": 0}, "spp must be"),
         ({"material": "cheese"}, "unknown material 'cheese'"),
@@ -291,17 +291,17 @@ def test_tone_mapping_keeps_order_and_range() -> None:
     assert mapped[0] == 0
     assert mapped[-1] == 255
     assert (np.diff(mapped.astype(int)) >= 0).all()
-    assert tone_mapped(np.array([0.21586], np.float32))[0] == 128  # sRGB's middle grey
+    assert tone_mapped(np.array([0.21586], np.float32))[0] == 128  # sRGB's middle gray
     assert tone_mapped(np.array([np.nan], np.float32))[0] == 0
 
 
 def test_viridis_is_viridis() -> None:
     x = np.linspace(0, 1, 64).reshape(8, 8)
-    colours = viridis(x)
-    assert colours.shape == (8, 8, 3)
-    np.testing.assert_allclose(colours[0, 0], (0.267, 0.005, 0.329), atol=0.02)
-    np.testing.assert_allclose(colours[-1, -1], (0.993, 0.906, 0.144), atol=0.02)
-    luminance = (colours @ (0.2126, 0.7152, 0.0722)).ravel()
+    colors = viridis(x)
+    assert colors.shape == (8, 8, 3)
+    np.testing.assert_allclose(colors[0, 0], (0.267, 0.005, 0.329), atol=0.02)
+    np.testing.assert_allclose(colors[-1, -1], (0.993, 0.906, 0.144), atol=0.02)
+    luminance = (colors @ (0.2126, 0.7152, 0.0722)).ravel()
     assert (np.diff(luminance) > 0).all()
 
 
@@ -310,7 +310,7 @@ def in_a_new_process(code: str) -> str:
         [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=300
     )
     assert run.returncode == 0, run.stderr
-    return run.stdout.strip().splitlines()[-1].removeprefix("\x1b[0m")  # Mitsuba's colours
+    return run.stdout.strip().splitlines()[-1].removeprefix("\x1b[0m")  # Mitsuba's colors
 
 
 def test_mitsuba_is_imported_only_to_draw() -> None:

@@ -196,7 +196,7 @@ def test_tolerances_draw_the_same_picture() -> None:
         difference = np.abs(image - images[2]).max(axis=-1)
         assert np.mean(difference > 0.15) < 0.01
         assert np.mean(difference) < 0.03
-    surface = images[0][..., 0] - images[0][..., 1] > 0.02  # red: the sky is grey
+    surface = images[0][..., 0] - images[0][..., 1] > 0.02  # red: the sky is gray
     assert surface.mean() > 0.2
     dark = [np.mean(image[surface].max(axis=-1) < 0.01) for image in images]
     assert max(dark) < 0.002
@@ -404,7 +404,7 @@ def test_xml_scene_names_our_surfaces(tmp_path: Any) -> None:
         render(tmp_path / "scene.xml", material="gold")
 
 
-def test_xml_shape_with_a_misspelt_property_is_refused() -> None:
+def test_xml_shape_with_a_misspelled_property_is_refused() -> None:
     text = (
         '<scene version="3.0.0"><shape type="harnack"><string name="field" value="gyroid"/>'
         '<float name="levle" value="1"/></shape></scene>'

@@ -44,8 +44,8 @@ class Sphere(Field):
         return Sample(self.sign * (distance - 1.0), gradient, (Lipschitz(1.0),))
 
 
-def diffuse(*colour: float) -> dict[str, Any]:
-    return {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(colour)}}
+def diffuse(*color: float) -> dict[str, Any]:
+    return {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(color)}}
 
 
 def scene(*members: Any) -> dict[str, Any]:
@@ -68,7 +68,7 @@ def camera_axes() -> np.ndarray:
     return np.stack([right, np.cross(back, right), back])
 
 
-def sphere_by_hand(colour: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def sphere_by_hand(color: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A matt unit sphere as the formula has it, and where it is."""
     right, up, back = camera_axes()
     place = (2 * (np.arange(N) + 0.5) / N - 1) * np.tan(np.radians(20))
@@ -84,16 +84,16 @@ def sphere_by_hand(colour: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     wrapped = np.clip((n @ key + 0.25) / 1.25, 0, 1)[..., None]
     share = 0.5 + 0.5 * (n @ up)[..., None]
     sky = np.array([0.25, 0.225, 0.20]) * (1 - share) + np.array([0.36, 0.40, 0.46]) * share
-    lit = colour * (np.array([0.74, 0.71, 0.66]) * wrapped + sky)
+    lit = color * (np.array([0.74, 0.71, 0.66]) * wrapped + sky)
     return np.where(inside[..., None] > 0, lit, SKY), inside > 0
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_matt_sphere_is_lit_by_the_formula_on_both_sides(sign: float) -> None:
-    colour = np.array([0.8, 0.5, 0.3])
-    image = drawn(shape(Sphere(sign), bsdf={"type": "twosided", "nested": diffuse(*colour)}))
+    color = np.array([0.8, 0.5, 0.3])
+    image = drawn(shape(Sphere(sign), bsdf={"type": "twosided", "nested": diffuse(*color)}))
     tint = np.array([0.52, 0.60, 0.74]) if sign > 0 else 1.0  # seen from the larger values
-    expected, hit = sphere_by_hand(colour * tint)
+    expected, hit = sphere_by_hand(color * tint)
     assert 0.2 < hit.mean() < 0.7
     wrong = np.abs(image - expected).max(axis=-1) > 1e-3
     outline = hit & ~(np.roll(hit, 1, 0) & np.roll(hit, -1, 0) & np.roll(hit, 1, 1))
@@ -117,7 +117,7 @@ def test_mitsubas_sphere_is_drawn_as_ours() -> None:
     assert np.mean(np.abs(ours - theirs).max(axis=-1) > 2e-3) < 0.01
 
 
-def test_two_colours_are_for_the_two_sides() -> None:
+def test_two_colors_are_for_the_two_sides() -> None:
     material = Material(diffuse(0.8, 0.1, 0.1), diffuse(0.1, 0.1, 0.8))
     images = [
         draw(hk.level_set(Sphere(sign), tolerance=1e-4), material=material) for sign in (1, -1)
@@ -181,7 +181,7 @@ def test_what_mends_a_mesh_is_tinted() -> None:
     np.testing.assert_allclose(warmth[1][rim], warmth[0][rim], rtol=0.1)
 
 
-def test_metals_and_glass_have_a_colour() -> None:
+def test_metals_and_glass_have_a_color() -> None:
     gyroid = hk.Gyroid(1.0, domain=hk.Ball(radius=1.0))
     for name in ("gold", "glass"):
         image = draw(gyroid, solid=(-0.4, 0.4), material=name, spp=1)

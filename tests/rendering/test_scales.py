@@ -1,4 +1,4 @@
-"""Values on surfaces, scales of colours, and bars beside pictures."""
+"""Values on surfaces, scales of colors, and bars beside pictures."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_angles_are_hues_without_a_jump_at_the_period() -> None:
     assert turns.min() > 0
     assert turns.max() < 1  # none was cut off
     scale = Scale.cyclic(4 * np.pi, "angle")
-    np.testing.assert_allclose(*scale.colours(np.array([[0.5], [0.5 + 8 * np.pi]])), atol=1e-9)
+    np.testing.assert_allclose(*scale.colors(np.array([[0.5], [0.5 + 8 * np.pi]])), atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -154,7 +154,7 @@ def test_a_bar_changes_no_number_and_no_pixel_of_the_picture(
     assert titled.shown.shape[1] > beside.shown.shape[1]
 
 
-def test_bars_show_the_colours_of_their_numbers() -> None:
+def test_bars_show_the_colors_of_their_numbers() -> None:
     scale = Scale(-1.0, 3.0, "it")
     dark = (26 / 255, 26 / 255, 28 / 255)
     strip = with_bar(np.zeros((400, 5, 3), dtype=np.uint8), scale, dark)[:, 5:].astype(int)

@@ -272,7 +272,7 @@ def test_far_away_derivatives_keep_their_bounds(method: Any, precision: Any) -> 
         u, share = r / rho, 1 / (4 * np.pi * rho**3)
         along = (u * normal).sum(axis=1)[:, None]
         gradient = share * (3 * along * u - normal)
-        # Of the next order, which for a triangle about its centre is the octupole.
+        # Of the next order, which for a triangle about its center is the octupole.
         left_out = 10 * share / rho**2
         off = np.linalg.norm(
             np.abs(field.gradient(x, precision=precision)) - np.abs(gradient), axis=1

@@ -64,8 +64,8 @@ def placed(rng: np.random.Generator, loops: Loops) -> Loops:
 
 def size_of(loops: Loops) -> tuple[np.ndarray, float]:
     points = np.concatenate(loops)
-    centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
-    return centre, float(np.linalg.norm(points - centre, axis=1).max())
+    center = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    return center, float(np.linalg.norm(points - center, axis=1).max())
 
 
 def unit(v: np.ndarray) -> np.ndarray:
@@ -75,9 +75,9 @@ def unit(v: np.ndarray) -> np.ndarray:
 def random_rays(rng: np.random.Generator, loops: Loops, n: int) -> tuple[np.ndarray, np.ndarray]:
     """Rays towards the curve's ball, from outside and inside; a third graze it: they run along
     the field lines' normal plane at points of the ball, or are aimed at points of the curve."""
-    centre, size = size_of(loops)
-    o = centre + size * rng.uniform(0.1, 3.0, (n, 1)) * unit(rng.normal(size=(n, 3)))
-    target = centre + size * rng.uniform(0, 1.2, (n, 1)) * unit(rng.normal(size=(n, 3)))
+    center, size = size_of(loops)
+    o = center + size * rng.uniform(0.1, 3.0, (n, 1)) * unit(rng.normal(size=(n, 3)))
+    target = center + size * rng.uniform(0, 1.2, (n, 1)) * unit(rng.normal(size=(n, 3)))
     third = n // 3
     start = np.concatenate(loops)
     end = np.concatenate([np.roll(loop, -1, axis=0) for loop in loops])
@@ -256,7 +256,7 @@ def test_the_assumed_range_misses_hits_of_a_coil_and_ours_does_not() -> None:
 def test_the_published_method_misses_hits_of_a_coil_of_eight_turns(
     certificate: str,
 ) -> None:
-    """Five turns are too few for c = -4 pi with the classic step: at the centre of a coil of k
+    """Five turns are too few for c = -4 pi with the classic step: at the center of a coil of k
     turns the solid angle falls by 2 pi k per radius, and Harnack's inequality with u >= 4 pi
     allows for 12 pi. It does break the range itself: see the next test."""
     coil = [shapes.coil(8, 198, height=0.2)]
@@ -283,22 +283,22 @@ def test_the_published_method_misses_hits_of_a_coil_of_eight_turns(
 def test_the_lift_of_a_coil_leaves_the_assumed_range() -> None:
     """On the axis, within the ball that reaches to the coil, the lift falls by 2.6 times 4 pi;
     c = -4 pi allows for at most twice 4 pi. What we promise there is kept."""
-    centre = np.array([[0.0, 0.0, 1.0]])
-    oracle, p = CurveOracle(COIL), to_vector3(choose_backend("double"), centre)
+    center = np.array([[0.0, 0.0, 1.0]])
+    oracle, p = CurveOracle(COIL), to_vector3(choose_backend("double"), center)
     assumed = hk.SolidAngle(COIL, certificate="paper").evaluate(p).known[0]
     proved = hk.SolidAngle(COIL).evaluate(p).weaker[0]
-    assert movement(oracle, centre, assumed).min() < -2.5 * FOUR_PI
+    assert movement(oracle, center, assumed).min() < -2.5 * FOUR_PI
     assert assumed.lower == -1.5 * FOUR_PI
-    value = oracle(centre).value[0]
-    moved = movement(oracle, centre, proved)
+    value = oracle(center).value[0]
+    moved = movement(oracle, center, proved)
     assert value + moved.min() > float(proved.lower[0])
     assert value + moved.max() < float(proved.upper[0])
 
 
-def movement(oracle: CurveOracle, centre: np.ndarray, ball: hk.HarmonicBall) -> np.ndarray:
-    """Of the lift along the z axis through the centre of a ball."""
+def movement(oracle: CurveOracle, center: np.ndarray, ball: hk.HarmonicBall) -> np.ndarray:
+    """Of the lift along the z axis through the center of a ball."""
     along = np.linspace(-0.999, 0.999, 4001)[:, None] * float(ball.radius[0])
-    lift = np.unwrap(oracle(centre + along * [[0.0, 0.0, 1.0]]).value, period=FOUR_PI)
+    lift = np.unwrap(oracle(center + along * [[0.0, 0.0, 1.0]]).value, period=FOUR_PI)
     return lift - lift[2000]
 
 

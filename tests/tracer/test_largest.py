@@ -48,9 +48,9 @@ def rays(n, seed):
     return o, d / np.linalg.norm(d, axis=1)[:, None]
 
 
-def through_sphere(o, d, radius, centre):
+def through_sphere(o, d, radius, center):
     """The first crossing (n,) in front of each ray, inf for none, and which are certain."""
-    o = o - np.array(centre)
+    o = o - np.array(center)
     along, square = (o * d).sum(axis=1), (o * o).sum(axis=1)
     room = radius**2 - square + along**2
     half = np.sqrt(np.maximum(room, 0))
@@ -95,7 +95,7 @@ def test_wrong_groups_are_noticed(monkeypatch):
     alone[1, 1, 1] = True
     field = hk.Sphere(*BIG) | hk.Sphere(*SMALL)
     with monkeypatch.context() as patch:
-        patch.setattr(components, "_AROUND", alone)  # no cell has a neighbour
+        patch.setattr(components, "_AROUND", alone)  # no cell has a neighbor
         assert wrong(field, 1000, 0) > 100
     field = hk.Sphere(*BIG) | hk.Sphere(*SMALL)  # nothing is kept of it
     with monkeypatch.context() as patch:

@@ -20,7 +20,7 @@ PRECISIONS = ("single", "double")
 
 
 def noisy_sphere(n: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """Points near the unit sphere and normals that point away from its centre."""
+    """Points near the unit sphere and normals that point away from its center."""
     rng = np.random.default_rng(seed)
     normals = rng.normal(size=(n, 3))
     normals /= np.linalg.norm(normals, axis=1)[:, None]

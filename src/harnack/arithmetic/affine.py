@@ -27,12 +27,12 @@ _ROUNDINGS = 16.0
 
 @dataclass(frozen=True, eq=False)
 class Affine(Operators):
-    """centre + slope e + r for -1 <= e <= 1, with |r| <= error.
+    """center + slope e + r for -1 <= e <= 1, with |r| <= error.
 
-    centre, slope, error: numbers of the backend.
+    center, slope, error: numbers of the backend.
     """
 
-    centre: Real
+    center: Real
     slope: Real
     error: Real
 
@@ -51,30 +51,30 @@ class Affine(Operators):
     def range(self) -> Interval:
         """Where the function stays."""
         room = dr.abs(self.slope) + self.error
-        slack = _slack(dr.abs(self.centre) + room)
-        return Interval(self.centre - room - slack, self.centre + room + slack)
+        slack = _slack(dr.abs(self.center) + room)
+        return Interval(self.center - room - slack, self.center + room + slack)
 
     def constant(self, x: float | Real) -> Affine:
-        kind = cast("Any", type(self.centre))
+        kind = cast("Any", type(self.center))
         value = kind(x)
         exact = not isinstance(x, int | float) or (float(x).is_integer() and abs(x) < 2**20)
         error = 0 * value if exact else _slack(dr.abs(value))
-        return Affine(value, 0 * self.centre, error)
+        return Affine(value, 0 * self.center, error)
 
     def __neg__(self) -> Affine:
-        return Affine(-self.centre, -self.slope, self.error)
+        return Affine(-self.center, -self.slope, self.error)
 
     def sum(self, other: Any) -> Affine:
-        centre, slope = self.centre + other.centre, self.slope + other.slope
+        center, slope = self.center + other.center, self.slope + other.slope
         return Affine(
-            centre, slope, self.error + other.error + _slack(dr.abs(centre) + dr.abs(slope))
+            center, slope, self.error + other.error + _slack(dr.abs(center) + dr.abs(slope))
         )
 
     def product(self, other: Any) -> Affine:
         """Proof. Of (c + l e + r)(d + m e + q), e^2 lies in [0, 1], so l m e^2 within l m/2 of
         l m/2; everything else that is not linear in e is an error."""
-        c, l, r = self.centre, self.slope, self.error  # noqa: E741
-        d, m, q = other.centre, other.slope, other.error
+        c, l, r = self.center, self.slope, self.error  # noqa: E741
+        d, m, q = other.center, other.slope, other.error
         both = 0.5 * l * m
         error = (dr.abs(c) + dr.abs(l)) * q + (dr.abs(d) + dr.abs(m)) * r + r * q + dr.abs(both)
         size = (dr.abs(c) + dr.abs(l) + r) * (dr.abs(d) + dr.abs(m) + q)
@@ -113,12 +113,12 @@ class Affine(Operators):
         )
         flat = (value.middle, 0 * width, value.radius + _slack(dr.abs(value.middle)))
         best = _better(_better(chord, mean), flat)
-        centre, rate, error = best
-        moved = rate * (self.centre - middle)
+        center, rate, error = best
+        moved = rate * (self.center - middle)
         slack = _slack(
-            dr.abs(centre) + dr.abs(rate) * (dr.abs(self.centre) + dr.abs(self.slope) + self.error)
+            dr.abs(center) + dr.abs(rate) * (dr.abs(self.center) + dr.abs(self.slope) + self.error)
         )
-        return Affine(centre + moved, rate * self.slope, error + dr.abs(rate) * self.error + slack)
+        return Affine(center + moved, rate * self.slope, error + dr.abs(rate) * self.error + slack)
 
     def larger(self, other: Any) -> Affine:
         """max(f, g) = g + max(f - g, 0); the one that is surely larger where there is one."""
@@ -129,10 +129,10 @@ class Affine(Operators):
         # -x y/(y - x), at 0.
         rate = x.high / (x.high - x.low)
         above = -x.low * rate
-        centre = rate * (difference.centre - x.low) - 0.5 * above
-        size = dr.abs(rate) * (dr.abs(difference.centre) + dr.abs(x.low) + dr.abs(x.high))
+        center = rate * (difference.center - x.low) - 0.5 * above
+        size = dr.abs(rate) * (dr.abs(difference.center) + dr.abs(x.low) + dr.abs(x.high))
         part = Affine(
-            centre, rate * difference.slope, rate * difference.error + 0.5 * above + _slack(size)
+            center, rate * difference.slope, rate * difference.error + 0.5 * above + _slack(size)
         )
         both = other.sum(part)
         return Affine(
@@ -144,7 +144,7 @@ class Affine(Operators):
 
 
 def _entries(x: Affine) -> tuple[Real, Real, Real]:
-    return x.centre, x.slope, x.error
+    return x.center, x.slope, x.error
 
 
 def _better(one: tuple[Real, Real, Real], two: tuple[Real, Real, Real]) -> tuple[Real, Real, Real]:

@@ -8,10 +8,10 @@ packet gathers, elementary functions, gradients, scatters, a Mitsuba render):
     up to 14   refused by Dr.Jit, which then has no CPU backend
     15, 16     abort the whole process at the first `dr.minimum` ("Cannot select ... fmaximum")
     17 to 19   work
-    20         not tried (no package at hand); its neighbours work
+    20         not tried (no package at hand); its neighbors work
     21 to 23   work; 22 and 23 made the tracing kernels 10 to 15 % slower than 19
 
-So 17 is the minimum, 19 the favourite, and a version newer than those tried is the last choice.
+So 17 is the minimum, 19 the favorite, and a version newer than those tried is the last choice.
 """
 
 from __future__ import annotations

@@ -89,7 +89,7 @@ class Records:
     def for_each(self, body: EachRecord, state: State, label: str, active: Mask = True) -> State:
         """The state after `body` of all records, one after the other, on lanes that are active.
 
-        Lanes that are not cost nothing where their neighbours are not either.
+        Lanes that are not cost nothing where their neighbors are not either.
         """
         trips = self.trips if active is True else dr.select(active, self.trips, 0)
 

@@ -62,7 +62,7 @@ class OccupiedCells(GridLayout):
         """A grid around the empty set: one cell, and all is empty."""
         return cls(np.zeros(3), 1.0, (1, 1, 1), distances_to_full(np.ones((1, 1, 1), np.bool_)))
 
-    def centres(self) -> FloatArray:
+    def centers(self) -> FloatArray:
         """Of the cells that are not empty, (n, 3)."""
         x, y, z = self.shape
         places = np.argwhere((self.free == 0).reshape(z, y, x))[:, ::-1]
@@ -83,7 +83,7 @@ class OccupiedCells(GridLayout):
         return UniformGrid(*UniformGrid.placed(backend, self), _MARGIN)
 
 
-# Cells that share a face, an edge or a corner are neighbours.
+# Cells that share a face, an edge or a corner are neighbors.
 _AROUND = np.ones((3, 3, 3), np.bool_)
 
 
@@ -102,10 +102,10 @@ def largest_component(cells: OccupiedCells) -> OccupiedCells:
     Proof that no component of the set is cut in two. All of the set lies in cells that are not
     empty, as closed cubes. A connected part of it cannot be covered by two unions of such cubes
     that are closed and have no point in common; cubes have a point in common if they share at least
-    a corner, which is to be neighbours. So it lies in the cells of one group.
+    a corner, which is to be neighbors. So it lies in the cells of one group.
 
     Proof that rays may jump across the other groups, with the margin that `UniformGrid.run` goes
-    beyond the cells that it jumps across. A neighbour of a cell of another group belongs to that
+    beyond the cells that it jumps across. A neighbor of a cell of another group belongs to that
     group or was empty before, and the margin is less than a cell, so it holds nothing of this
     group; that of a cell that was empty before holds nothing of the set at all.
     """

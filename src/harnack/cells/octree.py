@@ -28,7 +28,7 @@ class Cells:
     size: FloatArray
 
     @property
-    def centres(self) -> FloatArray:
+    def centers(self) -> FloatArray:
         """(n, 3)."""
         return self.corners + 0.5 * self.size
 
@@ -44,7 +44,7 @@ class Cells:
     def wrapped(self, slack: float) -> ConvexHull:
         """A polytope around all of them, `slack` thicker, with the 26 directions of a cube's faces,
         edges and corners."""
-        return _wrapped(self.centres, 0.5 * self.size + slack)
+        return _wrapped(self.centers, 0.5 * self.size + slack)
 
     def split(self) -> Cells:
         """Eight of each."""
@@ -56,11 +56,11 @@ class Cells:
         return Cells(self.corners[which], self.size)
 
     def proved_empty(self, clearance: Clearance, margin: float = 0.0) -> BoolArray:
-        """(n,) whether a cell's ball is within the clearance of its centre; that of the cell
+        """(n,) whether a cell's ball is within the clearance of its center; that of the cell
         enlarged on all sides by `margin` times its size."""
         if not len(self.corners):
             return np.zeros(0, np.bool_)
-        return clearance(self.centres) > self.half_diagonal * (1 + 2 * margin + 1e-9)
+        return clearance(self.centers) > self.half_diagonal * (1 + 2 * margin + 1e-9)
 
 
 def wrapped_points(points: FloatArray, slack: float) -> ConvexHull:
@@ -78,12 +78,12 @@ def union(one: ConvexHull, other: ConvexHull) -> ConvexHull:
     )
 
 
-def _wrapped(centres: FloatArray, half: FloatArray) -> ConvexHull:
+def _wrapped(centers: FloatArray, half: FloatArray) -> ConvexHull:
     """The polytope around boxes of half sizes (3,)."""
     normals = np.array([v for v in itertools.product((-1, 0, 1), repeat=3) if any(v)], float)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    offsets = (centres @ normals.T).max(axis=0) + np.abs(normals) @ half
-    return ConvexHull(normals, offsets, centres.min(axis=0) - half, centres.max(axis=0) + half)
+    offsets = (centers @ normals.T).max(axis=0) + np.abs(normals) @ half
+    return ConvexHull(normals, offsets, centers.min(axis=0) - half, centers.max(axis=0) + half)
 
 
 @dataclass(frozen=True)

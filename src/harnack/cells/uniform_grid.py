@@ -30,7 +30,7 @@ class GridLayout:
     """A grid on the host.
 
     origin: (3,) its lower corner, numbers of single precision. cell: the side of a cell
-        (`short_length`). shape: cells a side. The first cell's neighbour is the next along x.
+        (`short_length`). shape: cells a side. The first cell's neighbor is the next along x.
     free: (cells,) 0 where a cell is not empty, else the distance to the nearest that is not, in
         cells, the largest of the three coordinates.
     """

@@ -10,19 +10,19 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NoReturn
 
 from harnack._version import __version__
-from harnack.choices import did_you_mean
 from harnack.cli.mesh_files import MESH_FILES
 from harnack.cli.messages import printable
 from harnack.enclosures.proofs import BOUNDS
 from harnack.fields.expressions import TextFormula
 from harnack.files.surfaces import SURFACE_FILES
 from harnack.meshing.samples import MOST_FACES
+from harnack.names import did_you_mean
 from harnack.opening import UP_AXES
 from harnack.rendering import MATERIALS, SHOW_MODES
 from harnack.rendering.arguments import ANTIALIASING, MAX_SIDE, MAX_SPP
 from harnack.rendering.studio.backdrops import IMAGE_FILES, checked_backdrop
 from harnack.rendering.studio.materials import material_of
-from harnack.rendering.surfaces.colours import colour_of
+from harnack.rendering.surfaces.colors import color_of
 
 # Of what was typed, this much is repeated in messages.
 _SHOWN = 60
@@ -322,7 +322,7 @@ def _add_mesh(commands: Any) -> None:
     )  # fmt: skip
     one.add_argument(
         "--scale", type=_positive, metavar="FACTOR",
-        help="multiply all lengths at the end: millimetres for one unit of the scene (1)",
+        help="multiply all lengths at the end: millimeters for one unit of the scene (1)",
     )  # fmt: skip
     _add_up(_add_file(one))
     one.add_argument("--quiet", action="store_true", help="do not say what is being done")
@@ -428,14 +428,14 @@ def _material(text: str) -> str:
 
 def _color(text: str) -> str:
     try:
-        colour_of(text, "a color")
+        color_of(text, "a color")
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
     return text
 
 
 def _backdrop(text: str) -> Any:
-    """What `render` takes: a name, colours with a comma, or an image's file."""
+    """What `render` takes: a name, colors with a comma, or an image's file."""
     parts = [part.strip() for part in text.split(",")]
     is_file = text.lower().endswith(IMAGE_FILES)
     given: Any = text if is_file or len(parts) != 2 else tuple(parts)

@@ -13,7 +13,6 @@ import numpy as np
 from rich.console import Console
 
 from harnack.backend import doctor
-from harnack.choices import did_you_mean
 from harnack.cli.mesh_files import check_mesh_path, write_mesh
 from harnack.cli.messages import in_options, printable
 from harnack.fields import Field, expression
@@ -23,6 +22,7 @@ from harnack.gallery import SCENES, Scene
 from harnack.geometry import Ball, Box, HalfSpace
 from harnack.geometry.singular import weld_vertices
 from harnack.meshing import mesh, repair
+from harnack.names import did_you_mean
 from harnack.opening import open_surface
 from harnack.rendering import Camera, Isolines, animate, render
 from harnack.rendering.film import check_film_path

@@ -48,7 +48,7 @@ def write_mesh(mesh: trimesh.Trimesh, path: str | os.PathLike[str]) -> None:
 
     Closed meshes are closed in the file as well: see `ClosedMesh`.
 
-    3MF has millimetres as its unit, which is written there; the other formats have none.
+    3MF has millimeters as its unit, which is written there; the other formats have none.
 
     Raises:
         ValueError, ImportError, OSError: as `check_mesh_path`.

@@ -41,16 +41,16 @@ _RIM_SPREAD = 4.0
 class SurfaceCells:
     """Cubes and what is known of the surface in them.
 
-    centre: (n, 3). half: (n,) half the length of an edge.
-    foot: (n, 3) a point of the surface, no farther from the centre than the cell is wide, or FAR.
+    center: (n, 3). half: (n,) half the length of an edge.
+    foot: (n, 3) a point of the surface, no farther from the center than the cell is wide, or FAR.
     normal: (n, 3), offset, thickness: (n,) the surface within the ball around the cell has
-        |normal . (y - centre) - offset| <= thickness, which is FAR where nothing is known. The
+        |normal . (y - center) - offset| <= thickness, which is FAR where nothing is known. The
         normal is zero where no plane is known that is nearly the surface.
     spread: (n,) within this radius about its foot the surface is nearly that plane.
     rim: (n, 3) a point of the rim at which a domain cuts the surface, or FAR. rim_curvature: (n,).
     """
 
-    centre: FloatArray
+    center: FloatArray
     half: FloatArray
     foot: FloatArray
     normal: FloatArray
@@ -61,12 +61,12 @@ class SurfaceCells:
     rim_curvature: FloatArray
 
     @classmethod
-    def unknown(cls, centre: FloatArray, half: FloatArray) -> SurfaceCells:
+    def unknown(cls, center: FloatArray, half: FloatArray) -> SurfaceCells:
         """Cubes of which nothing is known."""
         n = len(half)
         far, zero = np.full((n, 3), FAR), np.zeros(n)
         return cls(
-            centre, half, far, np.zeros((n, 3)), zero, np.full(n, FAR), zero.copy(), far.copy(),
+            center, half, far, np.zeros((n, 3)), zero, np.full(n, FAR), zero.copy(), far.copy(),
             zero.copy(),
         )  # fmt: skip
 
@@ -116,7 +116,7 @@ class CellTree:
         apart = np.where(is_plain, _APART, _APART_ELSEWHERE) * cells.half
         doubt = np.where(cells.is_sheet, cells.thickness, 0.0)
         records = np.column_stack([
-            cells.centre, cells.half, cells.foot, cells.thickness, cells.normal, cells.offset,
+            cells.center, cells.half, cells.foot, cells.thickness, cells.normal, cells.offset,
             np.arange(n, dtype=np.float64), cells.spread, doubt, apart,
         ])[both]  # fmt: skip
         reach = _RIM_SPREAD * cells.half[cut]
@@ -125,11 +125,11 @@ class CellTree:
         records[n:, 12:] = np.column_stack([
             np.full(len(cut), -1), reach, bulge, _APART_ELSEWHERE * cells.half[cut],
         ])  # fmt: skip
-        centre, half = cells.centre[both], cells.half[both, None]
-        hierarchy = build_hierarchy(centre, leaf_size=_LEAF_SIZE)
+        center, half = cells.center[both], cells.half[both, None]
+        hierarchy = build_hierarchy(center, leaf_size=_LEAF_SIZE)
         placed = hierarchy.gather(records)
         placed[hierarchy.slots < 0] = [FAR] * 3 + [0] + [FAR] * 4 + [0, 0, 0, 0, -1, 0, 0, 0]
-        levels = box_levels(hierarchy, centre - half, centre + half)
+        levels = box_levels(hierarchy, center - half, center + half)
         return cls(pack(backend, hierarchy, levels, placed))
 
     def nearest(self, x: Vec3, limit: Real) -> Vec3:
@@ -205,7 +205,7 @@ class _Record:
     apart: feet that are closer to this one than that lead to the same place.
     """
 
-    centre: Vec3
+    center: Vec3
     half: Real
     foot: Vec3
     thickness: Real
@@ -231,7 +231,7 @@ class _Record:
     def lower(self, x: Vec3) -> Real:
         """A length that the surface in the cell is no nearer than: of its box, and of its slab."""
         vector = cast("Any", type(x))
-        away = x - self.centre
+        away = x - self.center
         box = dr.norm(vector(*(fmax(dr.abs(away[k]) - self.half, 0) for k in range(3))))
         height = dr.dot(away, self.normal)
         across = dr.norm(dr.fma(vector(-height), self.normal, away))
@@ -254,5 +254,5 @@ class _Record:
 
     def is_within(self, y: Vec3, radius: Real) -> Mask:
         """Whether the whole cell is within a radius of y."""
-        away = dr.abs(y - self.centre) + self.half
+        away = dr.abs(y - self.center) + self.half
         return dr.squared_norm(away) < radius * radius

@@ -78,7 +78,7 @@ def find_closest(
 
     is_proved: whether `lower` is wanted as close as cells can prove it.
 
-    They are looked at cell by cell along a Morton curve, so that neighbouring lanes walk a tree
+    They are looked at cell by cell along a Morton curve, so that neighboring lanes walk a tree
     together.
     """
     x = finite_vectors(points, "points")

@@ -15,8 +15,8 @@ from harnack.backend.arrays import finite_vectors, upload_vectors
 from harnack.backend.extrema import fmax
 from harnack.backend.loops import while_active
 from harnack.backend.numbers import refuses_derivatives
-from harnack.choices import did_you_mean
 from harnack.distance.tangent import Eigen, TangentPlane
+from harnack.names import did_you_mean
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Precision, Real, Vec3

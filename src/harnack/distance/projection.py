@@ -1,7 +1,7 @@
 """The closest point of a level set, by descent: onto the level, then along it.
 
 What is found is a point of the level set, to rounding, with x - y at right angles to the surface
-and no way to come nearer in its neighbourhood. It is a *local* minimum of the distance: another
+and no way to come nearer in its neighborhood. It is a *local* minimum of the distance: another
 part of the surface may be nearer still, so the distance is an upper bound of the true one.
 """
 
@@ -125,7 +125,7 @@ class Descent:
         and half the squared distance falls by t.w - w.Bw/2 with B = 1 + (r.n) A/|g|. Where an
         eigenvalue of B is not positive its size is taken instead, so that the step still goes
         down; where t vanishes as well, y is a saddle or a maximum of the distance (x is beyond a
-        centre of curvature), left along that eigenvector. The step ends with Newton's method
+        center of curvature), left along that eigenvector. The step ends with Newton's method
         back to the level, and counts if it came no farther from x, else a quarter is tried.
 
         y is accepted if |t| <= 4 sqrt(epsilon) |r| and a few roundings: then, by the same formula,

@@ -96,7 +96,7 @@ class Tolerance:
 class _Cube:
     """A cube that holds the surface, or the part of it that is looked at."""
 
-    centre: FloatArray
+    center: FloatArray
     half: float
 
     @classmethod
@@ -127,11 +127,11 @@ def search(
         root = _Cube.around(x.min(axis=0), x.max(axis=0))
         away = np.linalg.norm(x - feet[rows], axis=1)
         half = max(4 * half, 1.0 + 4 * root.half, 1.1 * float(np.nanmax(away, initial=0.0)))
-        root = _Cube(root.centre, root.half + half)
+        root = _Cube(root.center, root.half + half)
         so_far = Known(feet[rows], known.near[rows])
         found = _in_parts(surface, root, x, so_far, descents, tolerance, progress)
         # Beyond the cube there may be more.
-        to_walls = root.half - np.abs(x - root.centre).max(axis=1)
+        to_walls = root.half - np.abs(x - root.center).max(axis=1)
         feet[rows], lower[rows] = found.feet, np.minimum(found.lower, to_walls)
         distance = np.linalg.norm(x - found.feet, axis=1)
         rows = rows[~(distance <= half)]
@@ -181,7 +181,7 @@ def _split(
 ) -> SurfaceCells:
     """Cells of the root, split until there are enough: in each round the larger half of those where
     the surface may be more than one sheet, and the others by how much it may bend."""
-    cells = proofs.kept(root.centre[None], np.array([root.half]))
+    cells = proofs.kept(root.center[None], np.array([root.half]))
     for _ in range(_FINEST):
         if not 0 < len(cells) < enough:
             break
@@ -194,8 +194,8 @@ def _split(
 def _halved(proofs: CellProofs, cells: SurfaceCells, which: BoolArray) -> SurfaceCells:
     """The cells, those of a mask (n,) cut in eight."""
     half = 0.5 * cells.half[which]
-    centre = cells.centre[which, None] + half[:, None, None] * _CORNERS
-    parts = proofs.kept(centre.reshape(-1, 3), np.repeat(half, 8))
+    center = cells.center[which, None] + half[:, None, None] * _CORNERS
+    parts = proofs.kept(center.reshape(-1, 3), np.repeat(half, 8))
     return SurfaceCells.joined([cells.some(~which), parts])
 
 

@@ -12,13 +12,13 @@ import numpy as np
 
 from harnack.backend import FloatArray, choose_backend
 from harnack.backend.numbers import refuses_derivatives
-from harnack.choices import did_you_mean
 from harnack.distance.batches import in_batches
 from harnack.distance.closest import Closest, find_closest
 from harnack.distance.estimates import first_order, second_order
 from harnack.enclosures import TargetLevels
 from harnack.fields.clearance import distance_below
 from harnack.fields.field import Field, check_is_field
+from harnack.names import did_you_mean
 from harnack.tracer import level_set
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ def closest_points(
 
     Of the winding number of a closed mesh they are exact: the nearest of the triangles that are the
     level, cut where others pass through them. Of other fields the surface is enclosed in cells, and
-    descents from the points of the surface that cells know lead to places where no neighbour is
+    descents from the points of the surface that cells know lead to places where no neighbor is
     nearer; `distance_bounds` also splits cells where a nearer point may be. The curve in which the
     level sets of a field end counts as part of them, such as the vertices and edges of a solid
     angle, and so does the rim at which the field's domain cuts them. NaN, with a RuntimeWarning

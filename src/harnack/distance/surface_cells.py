@@ -90,22 +90,22 @@ class CellProofs:
     def _field(self) -> Field:
         return self._prepared.field
 
-    def kept(self, centre: FloatArray, half: FloatArray) -> SurfaceCells:
+    def kept(self, center: FloatArray, half: FloatArray) -> SurfaceCells:
         """Of cubes (n, 3), half the length of an edge (n,), those that are not proved empty, with
         what is known of them."""
         radius = _WITHIN * half
-        inside, start = np.ones(len(centre), np.bool_), centre
-        away: FloatArray = np.zeros(len(centre))
+        inside, start = np.ones(len(center), np.bool_), center
+        away: FloatArray = np.zeros(len(center))
         if self._volume is not None:
-            inside = self._volume.contains_points(centre)
-            away, start = self._at(self._pulled_inside, centre)
+            inside = self._volume.contains_points(center)
+            away, start = self._at(self._pulled_inside, center)
             some = inside | (away <= radius)
-            centre, half, radius = centre[some], half[some], radius[some]
+            center, half, radius = center[some], half[some], radius[some]
             inside, start, away = inside[some], start[some], away[some]
-        cells = SurfaceCells.unknown(centre, half)
+        cells = SurfaceCells.unknown(center, half)
         # Nothing is promised about places outside the domain.
         empty, cells.normal[inside], cells.offset[inside], cells.thickness[inside] = self._at(
-            self._slab, centre[inside], radius[inside]
+            self._slab, center[inside], radius[inside]
         )
         kept = np.ones(len(cells), np.bool_)
         kept[inside] = empty == 0
@@ -187,7 +187,7 @@ class CellProofs:
         return dr.select(near, y, self._backend.Array3f(FAR)), dr.select(near, curvature, 0)
 
     def _foot(self, p: Vec3, radius: Real) -> Vec3:
-        """Where Newton's method leads from the centre, if that is near."""
+        """Where Newton's method leads from the center, if that is near."""
         real, vector, count = self._backend.Float, self._backend.Array3f, self._backend.UInt32
         zero = dr.opaque(real, 0.0)  # no component of a gradient is a constant of the loop
 
@@ -211,7 +211,7 @@ class CellProofs:
         return dr.select(near, y, vector(FAR))
 
     def _hit(self, p: Vec3, radius: Real) -> Vec3:
-        """The hit nearest to the centre of rays through the cell, of a field that jumps."""
+        """The hit nearest to the center of rays through the cell, of a field that jumps."""
         real, vector, count = self._backend.Float, self._backend.Array3f, self._backend.UInt32
 
         def body(foot: Vec3, best: Real, k: Any) -> tuple[Any, ...]:

@@ -27,7 +27,7 @@ _PI_BELOW = 3.14159
 
 @dataclass(frozen=True)
 class Arc(Enclosure):
-    """|F - slope psi| <= curvature psi^2/2, psi the angle travelled along the path's circle.
+    """|F - slope psi| <= curvature psi^2/2, psi the angle traveled along the path's circle.
 
     slopes: of f along the path, in f per length, where it starts.
     curvature: a bound of the second derivative of f in the angle, on the whole circle.

@@ -127,7 +127,7 @@ class AffineBand(Band):
         form = function.through(lambda p, d: Affine.along(p, d, length))
         start = _value(function)
         rate = 2 * form.slope / length
-        line = Interval.exactly(form.centre) + Interval.exactly(-form.slope)
+        line = Interval.exactly(form.center) + Interval.exactly(-form.slope)
         offsets = line + Interval(-form.error, form.error) - start
         slack = 4 * dr.epsilon(type(length)) * dr.abs(rate)
         return cls(offsets, Slopes(rate - slack, rate + slack), length)

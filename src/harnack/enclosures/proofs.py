@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from harnack.backend.extrema import fmax
-from harnack.choices import did_you_mean
 from harnack.enclosures.balls.bounded_laplacian import GreenBall
 from harnack.enclosures.balls.caps import Caps
 from harnack.enclosures.balls.classic import Classic
@@ -25,6 +24,7 @@ from harnack.enclosures.parabola import Cone, Taylor
 from harnack.enclosures.pieces import LinearTaylor, Pieces, QuadraticTaylor, Segment
 from harnack.enclosures.promises import LineLipschitz, Promise
 from harnack.enclosures.tangent import Tangent
+from harnack.names import did_you_mean
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real

@@ -40,10 +40,10 @@ class BoxedParts(UnitCoordinates):
         their order.
         """
         low, high = lower.min(axis=0), upper.max(axis=0)
-        centre = single(0.5 * (low + high))
-        size = 2.0 ** math.ceil(math.log2(np.abs(np.stack([low, high]) - centre).max()))
-        tree = BoxTree.of(backend, (lower - centre) / size, (upper - centre) / size)
-        return cls(*placed(backend, centre, size), tree)
+        center = single(0.5 * (low + high))
+        size = 2.0 ** math.ceil(math.log2(np.abs(np.stack([low, high]) - center).max()))
+        tree = BoxTree.of(backend, (lower - center) / size, (upper - center) / size)
+        return cls(*placed(backend, center, size), tree)
 
     def next(
         self, o: Vec3, d: Vec3, after: PartEntry, start: Real, end: Real, active: Mask

@@ -55,7 +55,7 @@ def tight_extent(
 ) -> ConvexHull:
     """A polytope of few planes that holds every point of the level sets inside a box.
 
-    Cells of the box are left out if their ball is within the clearance of its centre; those left at
+    Cells of the box are left out if their ball is within the clearance of its center; those left at
     the end are wrapped. most, finest: as for `cells.carve`.
 
     points: (n, 3) that the polytope is to hold in any case. What lies in the polytope around them

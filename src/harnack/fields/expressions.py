@@ -19,8 +19,8 @@ import numpy as np
 
 from harnack import arithmetic
 from harnack.backend.numbers import refuse_derivatives, refuses_derivatives
-from harnack.choices import did_you_mean
 from harnack.fields.formula import Formula, as_jet, probe, warn_of_price
+from harnack.names import did_you_mean
 
 if TYPE_CHECKING:
     from harnack.geometry import Volume

@@ -33,7 +33,7 @@ def at_points(
     """The arrays that `kernel` gives at points (n, 3), in their order; of a single point (3,) their
     only entries.
 
-    The points are visited cell by cell along a Morton curve, so that neighbouring lanes walk a
+    The points are visited cell by cell along a Morton curve, so that neighboring lanes walk a
     tree together, which halves the time.
 
     Raises:

@@ -36,12 +36,12 @@ SLOPE_ROUNDINGS, SECOND_ROUNDINGS = 16.0, 320.0
 
 
 def longest_part(rough: float) -> float:
-    """Of the distance of a far node's centre: the longest step that certificates cover."""
+    """Of the distance of a far node's center: the longest step that certificates cover."""
     return _WAY * (1 - 1 / rough)
 
 
 def free_part(rough: float) -> float:
-    """Of the distance of a far node's centre: what is counted as free of dipoles."""
+    """Of the distance of a far node's center: what is counted as free of dipoles."""
     return longest_part(rough) / _REACHES[-1]
 
 
@@ -91,7 +91,7 @@ class FieldSums:
         and second derivatives along lines; the last is None without a Hessian.
     rounding: bound of what rounding has done to the value.
     free_distance: of the nearest singular point, a dipole or an edge, or `free_part` of that to the
-        nearest far node's centre if that is less.
+        nearest far node's center if that is less.
     s4, s5: sums of a/rho^4 and a/rho^5 over dipoles a at rho and, with A + K/r^2 of
         `truncation.bend_columns` for a, over far nodes at r. Edges: see `LiftedEdge.bounds`.
     """
@@ -213,11 +213,11 @@ class FieldSums:
         its largest value on equal vectors), so that Taylor's remainder after the linear term is at
         most a ((rho-t)^-2 - rho^-2 - 2t rho^-3) = a t^2 rho^-4 phi(t/rho), phi(q) =
         (3-2q)/(1-q)^2. That of a far node is at most that of a dipole of area A + K/r^2 in its
-        centre, for t/r <= `longest_part` (`truncation.bend_columns`). phi is convex: on [0, b] it
+        center, for t/r <= `longest_part` (`truncation.bend_columns`). phi is convex: on [0, b] it
         lies below 3 + rise q, rise = (phi(b)-3)/b = (4-3b)/(1-b)^2. With t <= r = b free_distance,
         |f(y) - f(x) - g.(y-x)| <= t^2 (3 s4 + rise r s5).
         A ball of that radius bounds f by |g| r more, and holds harmonic f: dipoles of far nodes
-        are farther away than 1 - 1/rough times the centre, and `longest_part` is less.
+        are farther away than 1 - 1/rough times the center, and `longest_part` is less.
         """
         g = share * self.gradient
         slope_error = share * dr.fma(SLOPE_ROUNDINGS * unit, self.s4, self.slope_truncation)

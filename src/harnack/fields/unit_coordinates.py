@@ -23,15 +23,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class UnitCoordinates:
-    """The way to coordinates centre + size times these; what lies there, subclasses say."""
+    """The way to coordinates center + size times these; what lies there, subclasses say."""
 
     backend: Backend
-    centre: Vec3
+    center: Vec3
     size: Real
 
     def unit(self, p: Vec3) -> Vec3:
         """A point in these coordinates."""
-        return (self.backend.Array3f(p) - self.centre) / self.size
+        return (self.backend.Array3f(p) - self.center) / self.size
 
 
 Uploaded = TypeVar("Uploaded", bound=UnitCoordinates)
@@ -102,17 +102,17 @@ class DetailedField(UploadedField[Uploaded]):
         return device
 
 
-def single(centre: FloatArray) -> FloatArray:
-    """The nearest centre that single precision holds exactly: to subtract it from points nearby
+def single(center: FloatArray) -> FloatArray:
+    """The nearest center that single precision holds exactly: to subtract it from points nearby
     then rounds nothing, however far the origin is."""
     with np.errstate(over="ignore"):
-        rounded = centre.astype(np.float32).astype(np.float64)
-    return np.where(np.isfinite(rounded), rounded, centre)
+        rounded = center.astype(np.float32).astype(np.float64)
+    return np.where(np.isfinite(rounded), rounded, center)
 
 
-def placed(backend: Backend, centre: FloatArray, size: float) -> tuple[Backend, Vec3, Real]:
+def placed(backend: Backend, center: FloatArray, size: float) -> tuple[Backend, Vec3, Real]:
     """What `UnitCoordinates` consist of; neither becomes part of a kernel's code."""
-    opaque = (dr.opaque(backend.Float, float(c)) for c in centre)
+    opaque = (dr.opaque(backend.Float, float(c)) for c in center)
     return backend, backend.Array3f(*opaque), dr.opaque(backend.Float, size)
 
 

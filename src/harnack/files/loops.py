@@ -34,7 +34,7 @@ def read_loops(path: str | os.PathLike[str], *, boundary: bool = False) -> list[
     repeated. Where edges are joined, equal positions count as one vertex.
 
     boundary: not the faces, but the boundary of the surface they form: the edges that do not
-    cancel between neighbouring faces, equal positions counted as one vertex.
+    cancel between neighboring faces, equal positions counted as one vertex.
 
     Raises:
         FileFormatError: unreadable, malformed or hostile; open polylines; a loop that

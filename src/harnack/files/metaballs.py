@@ -19,18 +19,20 @@ import numpy as np
 from harnack.backend import FloatArray, IntArray
 from harnack.files.file_format import Place
 from harnack.files.text_tables import content_lines, read_floats
+from harnack.names import renamed
 
 _COLUMNS = "x y z radius [weight [group]]"
 
 
+@renamed(centres="centers")
 @dataclass(frozen=True, eq=False)
 class Metaballs:
-    """Blobs from a file: centres (n, 3), radii (n,), weights (n,), and groups (n,) or None.
+    """Blobs from a file: centers (n, 3), radii (n,), weights (n,), and groups (n,) or None.
 
     said: what was found.
     """
 
-    centres: FloatArray
+    centers: FloatArray
     radii: FloatArray
     weights: FloatArray
     groups: IntArray | None

@@ -11,7 +11,6 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from harnack.backend import FloatArray, IntArray
-from harnack.choices import did_you_mean
 from harnack.files.file_format import Contents, FileFormatError, Place, read_bytes
 from harnack.files.gltf import read_gltf
 from harnack.files.loops import loops_in, read_loops
@@ -27,6 +26,7 @@ from harnack.geometry.curves import CurveError, validate_loops
 from harnack.geometry.meshes import MeshError, without_zero_area_faces
 from harnack.geometry.polygons import triangulate
 from harnack.geometry.singular import net_faces, singular_edges, singular_loops, weld_vertices
+from harnack.names import did_you_mean
 
 __all__ = [
     "SURFACE_FILES",
@@ -230,7 +230,7 @@ def _mesh(contents: Contents) -> Mesh:
     if len(found) > len(faces):
         said += f"; {len(found) - len(faces):,} of zero area left out"
     if len(faces) > len(net.faces):
-        said += f"; {len(faces) - len(net.faces):,} are added to or cancelled by others"
+        said += f"; {len(faces) - len(net.faces):,} are added to or canceled by others"
     if len(contents.polylines):
         said += "; polylines not used"
     return Mesh(vertices, faces, said)

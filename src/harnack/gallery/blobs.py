@@ -23,10 +23,10 @@ def _metaballs() -> list[LevelSet]:
     """Drops around a large one, and a bite taken out of it."""
     angle = np.linspace(0, 2 * math.pi, 9, endpoint=False)
     ring = np.column_stack([np.cos(angle), np.sin(angle), 0.35 * np.sin(3 * angle)])
-    centres = np.concatenate([[[0.0, 0.0, 0.0]], 1.15 * ring, [[0.35, -0.55, 0.5]]])
+    centers = np.concatenate([[[0.0, 0.0, 0.0]], 1.15 * ring, [[0.35, -0.55, 0.5]]])
     radii = np.concatenate([[0.72], 0.26 + 0.06 * np.cos(2 * angle), [0.42]])
     weights = np.array([1.0] * 10 + [-1.2])
-    return _solid(Blobs(centres, radii, weights, kernel=Compact(1.8)), 1.0)
+    return _solid(Blobs(centers, radii, weights, kernel=Compact(1.8)), 1.0)
 
 
 def _groups() -> list[LevelSet]:
@@ -34,8 +34,8 @@ def _groups() -> list[LevelSet]:
     angle = np.linspace(0, 2 * math.pi, 12, endpoint=False)
     flat = np.column_stack([np.cos(angle) - 0.5, np.sin(angle), 0 * angle])
     upright = np.column_stack([np.cos(angle) + 0.5, 0 * angle, np.sin(angle)])
-    centres = np.concatenate([flat, upright])
-    return _solid(Blobs(centres, 0.3, groups=[0] * 12 + [1] * 12), 1.0)
+    centers = np.concatenate([flat, upright])
+    return _solid(Blobs(centers, 0.3, groups=[0] * 12 + [1] * 12), 1.0)
 
 
 def _through_points() -> list[LevelSet]:

@@ -11,23 +11,25 @@ from typing import Any
 import numpy as np
 
 from harnack.backend.numbers import LARGEST, FloatArray, real_array, vector_text
+from harnack.names import renamed
 
 __all__ = ["Circle", "net_circles"]
 
 _SMALLEST = 1 / LARGEST
 
 
+@renamed(centre="center")
 @dataclass(frozen=True)
 class Circle:
     """A circle, run counter-clockwise as seen from where its normal points to.
 
-    radius: a positive length. centre: (3,). normal: (3,), not zero; kept with length one.
+    radius: a positive length. center: (3,). normal: (3,), not zero; kept with length one.
 
     Raises ValueError, or TypeError for what is no number.
     """
 
     radius: float
-    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    center: tuple[float, float, float] = (0.0, 0.0, 0.0)
     normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
@@ -37,12 +39,12 @@ class Circle:
                 f"radius of a circle must lie between {_SMALLEST:g} and {LARGEST:g}, not "
                 f"{float(radius):g}"
             )
-        centre, normal = (
-            _numbers(self.centre, "centre", (3,)),
+        center, normal = (
+            _numbers(self.center, "center", (3,)),
             _numbers(self.normal, "normal", (3,)),
         )
-        if np.abs(centre).max() > LARGEST:
-            raise ValueError(f"centre of a circle is {vector_text(centre)}: choose smaller units")
+        if np.abs(center).max() > LARGEST:
+            raise ValueError(f"center of a circle is {vector_text(center)}: choose smaller units")
         largest = float(np.abs(normal).max())
         if largest == 0.0:
             raise ValueError("normal of a circle is zero: give the direction of its axis")
@@ -50,7 +52,7 @@ class Circle:
             normal = normal / largest
             normal = normal / np.linalg.norm(normal)
         object.__setattr__(self, "radius", float(radius))
-        object.__setattr__(self, "centre", tuple(centre.tolist()))
+        object.__setattr__(self, "center", tuple(center.tolist()))
         object.__setattr__(self, "normal", tuple(normal.tolist()))
 
     @property
@@ -61,12 +63,12 @@ class Circle:
     def reversed(self) -> Circle:
         """The same circle, run the other way: a hole in what another curve bounds."""
         x, y, z = self.normal
-        return Circle(self.radius, self.centre, (-x, -y, -z))
+        return Circle(self.radius, self.center, (-x, -y, -z))
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         """Lower and upper corner of the box around it, (3,) each."""
         reach = self.radius * np.sqrt(np.maximum(1 - np.square(self.normal), 0))
-        return np.array(self.centre) - reach, np.array(self.centre) + reach
+        return np.array(self.center) - reach, np.array(self.center) + reach
 
     def polygon(self, sides: int, *, around: bool = False) -> FloatArray:
         """(sides, 3) corners of the regular polygon in the circle, or of that around it."""
@@ -78,7 +80,7 @@ class Circle:
         first /= np.linalg.norm(first)
         angle = 2 * math.pi * np.arange(sides)[:, None] / sides
         across = np.cos(angle) * first + np.sin(angle) * np.cross(axis, first)
-        return np.array(self.centre) + radius * across
+        return np.array(self.center) + radius * across
 
 
 def _numbers(values: Any, name: str, shape: tuple[int, ...]) -> FloatArray:
@@ -94,7 +96,7 @@ def _numbers(values: Any, name: str, shape: tuple[int, ...]) -> FloatArray:
 def net_circles(circles: Iterable[Circle]) -> tuple[Circle, ...]:
     """The circles without those that are run there and back, as `net_loops` for edges.
 
-    Only circles with exactly the same centre and radius and exactly opposite normals cancel.
+    Only circles with exactly the same center and radius and exactly opposite normals cancel.
     """
     surplus: Counter[Circle] = Counter()
     for one in circles:

@@ -31,6 +31,7 @@ from harnack.backend.numbers import (
     vector_text,
 )
 from harnack.geometry.singular import weld_vertices
+from harnack.names import renamed
 
 __all__ = ["CloudError", "estimate_areas", "estimate_normals", "validate_cloud"]
 
@@ -119,30 +120,31 @@ def checked_normals(normals: Any, count: int) -> FloatArray:
     return n / np.linalg.norm(n, axis=1, keepdims=True)
 
 
+@renamed(neighbours="neighbors")
 def estimate_areas(
-    points: npt.ArrayLike, normals: npt.ArrayLike, neighbours: int = 20
+    points: npt.ArrayLike, normals: npt.ArrayLike, neighbors: int = 20
 ) -> FloatArray:
     """The area (n,) that each point of a cloud stands for: its Voronoi cell in the tangent plane.
 
-    After Barill et al. 2018, section 3.1, who project the nearest neighbours to the tangent plane
+    After Barill et al. 2018, section 3.1, who project the nearest neighbors to the tangent plane
     and take the area of the point's Voronoi cell among them. Here the tangent plane is cut out of
     the point's cell in space instead: the same for points in a plane, but a point on the other
     side of a thin wall takes nothing away, since its bisecting plane is parallel to the tangent
     plane. Points at the same position share the cell.
 
-    Points beyond the farthest neighbour, at distance R, can cut the cell only beyond R/2; so within
+    Points beyond the farthest neighbor, at distance R, can cut the cell only beyond R/2; so within
     the disc of that radius the cell is exact, and there it ends. At the rim of an open surface a
-    cell may reach out without end: where all neighbours lie on one side (of a line through the
+    cell may reach out without end: where all neighbors lie on one side (of a line through the
     point), their mirror images bound the cell too, so that it reaches out as far as in.
 
-    neighbours: how many; more cost time, fewer cut large cells of uneven samples.
+    neighbors: how many; more cost time, fewer cut large cells of uneven samples.
 
     Raises:
-        CloudError: as `validate_cloud`; all points are at one position; fewer than 3 neighbours.
+        CloudError: as `validate_cloud`; all points are at one position; fewer than 3 neighbors.
     """
     x = checked_points(points)
     n = checked_normals(normals, len(x))
-    check_neighbours(neighbours)
+    check_neighbors(neighbors)
     welded = weld_vertices(x)
     positions, where = np.unique(welded, return_inverse=True)
     sharing = np.bincount(where)[where]
@@ -150,7 +152,7 @@ def estimate_areas(
     areas = np.empty(len(x))
 
     def estimate(part: slice) -> None:
-        nearest, distance = nearest_others(tree, x[part], neighbours)
+        nearest, distance = nearest_others(tree, x[part], neighbors)
         offsets = tree.data[nearest] - x[part, None]
         areas[part] = _cell_areas(offsets, n[part], 0.5 * distance[:, -1])
 
@@ -166,14 +168,14 @@ def _as_numbers(values: Any, name: str) -> FloatArray:
     return np.array(array, dtype=np.float64, order="C")
 
 
-def check_neighbours(neighbours: int) -> None:
-    """That there are enough neighbours to show a surface.
+def check_neighbors(neighbors: int) -> None:
+    """That there are enough neighbors to show a surface.
 
     Raises:
         CloudError: there are fewer than 3.
     """
-    if neighbours < 3:
-        raise CloudError(f"at least 3 neighbours are needed, not {neighbours}")
+    if neighbors < 3:
+        raise CloudError(f"at least 3 neighbors are needed, not {neighbors}")
 
 
 def point_tree(points: FloatArray) -> Any:
@@ -193,14 +195,14 @@ def point_tree(points: FloatArray) -> Any:
 def nearest_others(tree: Any, points: FloatArray, count: int) -> tuple[IntArray, FloatArray]:
     """Indices and distances (m, k) of the points nearest to some points (m, 3) of a tree.
 
-    A point does not count as its own neighbour. Nearest first; k = count, or all there are.
+    A point does not count as its own neighbor. Nearest first; k = count, or all there are.
 
     Raises:
         CloudError: they lie so close that squared distances vanish.
     """
     distance, index = tree.query(points, k=min(count + 1, tree.n))
     if distance[:, -1].min() < 1e-100:
-        raise CloudError(f"a point and its {count} neighbours all lie within 1e-100: remove some")
+        raise CloudError(f"a point and its {count} neighbors all lie within 1e-100: remove some")
     return index[:, 1:], distance[:, 1:]
 
 
@@ -215,7 +217,7 @@ def in_parts(work: Callable[[slice], None], count: int) -> None:
 def _cell_areas(offsets: FloatArray, normals: FloatArray, radii: FloatArray) -> FloatArray:
     """Areas of cells in tangent planes, cut off at `radii`: (m,).
 
-    offsets: (m, k, 3) from the points to their neighbours. normals: (m, 3). radii: (m,).
+    offsets: (m, k, 3) from the points to their neighbors. normals: (m, 3). radii: (m,).
     """
     offsets = offsets / radii[:, None, None]
     u, v = across_rows(normals)
@@ -268,40 +270,41 @@ def _disc_cut_by_lines(q: FloatArray, b: FloatArray) -> FloatArray:
 
 Indices = npt.NDArray[np.int64] | npt.NDArray[np.int32]
 
-# Of the variances of a neighbourhood, the second over the first: below it lies on a line.
+# Of the variances of a neighborhood, the second over the first: below it lies on a line.
 _LINE = 1e-9
 # Where to look for extreme points: towards the faces, edges and corners of a cube.
 _DIRECTIONS = np.array([d for d in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(d)])
 
 
-def estimate_normals(points: npt.ArrayLike, neighbours: int = 16) -> FloatArray:
+@renamed(neighbours="neighbors")
+def estimate_normals(points: npt.ArrayLike, neighbors: int = 16) -> FloatArray:
     """Unit normals (n, 3), outward, of points (n, 3) that sample a surface.
 
-    Hoppe et al. 1992. The line of a normal is that in which a point and its nearest neighbours
+    Hoppe et al. 1992. The line of a normal is that in which a point and its nearest neighbors
     vary least. Its direction is carried from point to point along the tree that spans the graph of
-    neighbours and in which normals agree best, mirrored as Xie et al. 2003 propose, which carries
+    neighbors and in which normals agree best, mirrored as Xie et al. 2003 propose, which carries
     it around edges and thin walls. What then remains is one sign for each connected piece of the
     graph: the one with which the piece's extreme points in 26 directions face outward, added up.
     That sign is right for a closed surface, however unevenly sampled.
 
     So each piece faces outward by itself: the inner wall of a hollow body does not face its cavity,
     and how an open surface faces is a convention (a flat one: to the positive side of the axis
-    nearest to its normal). Where details are smaller than neighbourhoods, normals may be turned
+    nearest to its normal). Where details are smaller than neighborhoods, normals may be turned
     wrongly. Look at the result.
 
     Points at the same position get the same normal.
 
     Raises:
-        CloudError: as `validate_cloud` for points; fewer than 4 positions; neighbourhoods on a
-            line, which have no plane; fewer than 3 neighbours.
+        CloudError: as `validate_cloud` for points; fewer than 4 positions; neighborhoods on a
+            line, which have no plane; fewer than 3 neighbors.
     """
     x = checked_points(points)
-    check_neighbours(neighbours)
+    check_neighbors(neighbors)
     positions, where = np.unique(weld_vertices(x), return_inverse=True)
     x = x[positions]
     if len(x) < 4:
         raise CloudError(f"{len(x)} different points do not show a surface: give at least 4")
-    normals, nearest = _planes(x, neighbours)
+    normals, nearest = _planes(x, neighbors)
     piece, parent = _spanning_forest(x, normals, nearest)
     sign = _carried_signs(x, normals, parent)
     normals *= sign[:, None]
@@ -309,15 +312,15 @@ def estimate_normals(points: npt.ArrayLike, neighbours: int = 16) -> FloatArray:
     return normals[where]
 
 
-def _planes(x: FloatArray, neighbours: int) -> tuple[FloatArray, npt.NDArray[np.int32]]:
-    """Normals (n, 3) of any sign, and the indices of the neighbours (n, k)."""
+def _planes(x: FloatArray, neighbors: int) -> tuple[FloatArray, npt.NDArray[np.int32]]:
+    """Normals (n, 3) of any sign, and the indices of the neighbors (n, k)."""
     tree = point_tree(x)
     normals = np.empty_like(x)
-    nearest = np.empty((len(x), min(neighbours, len(x) - 1)), dtype=np.int32)
+    nearest = np.empty((len(x), min(neighbors, len(x) - 1)), dtype=np.int32)
     on_line = np.zeros(len(x), dtype=bool)
 
     def fit(part: slice) -> None:
-        index, distance = nearest_others(tree, x[part], neighbours)
+        index, distance = nearest_others(tree, x[part], neighbors)
         nearest[part] = index
         offsets = (x[index] - x[part, None]) / distance[:, -1, None, None]
         offsets = np.concatenate([offsets, np.zeros_like(offsets[:, :1])], axis=1)
@@ -330,8 +333,8 @@ def _planes(x: FloatArray, neighbours: int) -> tuple[FloatArray, npt.NDArray[np.
     if on_line.any():
         first = int(np.flatnonzero(on_line)[0])
         raise CloudError(
-            f"the {nearest.shape[1]} nearest neighbours of {on_line.sum():,} points lie on a line, "
-            f"first of {vector_text(x[first])}: they show no surface; ask for more neighbours, or "
+            f"the {nearest.shape[1]} nearest neighbors of {on_line.sum():,} points lie on a line, "
+            f"first of {vector_text(x[first])}: they show no surface; ask for more neighbors, or "
             "give normals"
         )
     return normals, nearest

@@ -39,7 +39,7 @@ def is_convex_position(loops: tuple[FloatArray, ...]) -> bool:
     send it to two places; both lie in the wedge { a n + b n', a, b >= 0 } at the vertex, where
     n.x <= delta and n'.x <= delta leave |x| <= 2 delta / (1 + n.n'), and n.n' >= -0.9 is
     required, so a path of that size on the boundary joins them. It cannot meet another edge
-    (1e-9 away); crossings with its neighbour, near the common vertex, are cut off as loops of
+    (1e-9 away); crossings with its neighbor, near the common vertex, are cut off as loops of
     area below 1e-15. So the theorems hold for a curve within w = 2e-11 of P, and the two
     solid angles differ by at most 2 w / r for each edge at distance r: at r = 1e-4 that is less
     than the rounding of the solid angle itself in single precision.
@@ -67,7 +67,7 @@ def _is_flat(x: FloatArray) -> bool:
 
 
 def _lies_on_hull(x: FloatArray) -> bool:
-    """Whether every edge has a supporting plane, and neighbours' planes are not opposite."""
+    """Whether every edge has a supporting plane, and neighbors' planes are not opposite."""
     count = len(x)
     normals = np.empty((count, 3))
     is_strict = np.empty(count, dtype=np.bool_)

@@ -82,7 +82,7 @@ def without_zero_area_faces(
     """The mesh without the faces of `zero_area_faces`, as `validate_mesh` returns it.
 
     All vertices stay, so indices keep their meaning. A face without area adds nothing to a winding
-    number. Where one filled a gap of no width (a vertex in the middle of its neighbour's edge), the
+    number. Where one filled a gap of no width (a vertex in the middle of its neighbor's edge), the
     edges at that gap become boundary edges on top of each other: they still cancel in every sum,
     they only make what counts distances to boundary edges more careful than need be.
 

@@ -13,7 +13,7 @@ from harnack.backend.numbers import FloatArray, IntArray
 from harnack.geometry.curves import Loops
 from harnack.geometry.singular import net_edges, singular_loops, weld_vertices
 
-__all__ = ["net_loops", "uncancelled_edges"]
+__all__ = ["net_loops", "uncanceled_edges"]
 
 
 def net_loops(loops: Loops) -> Loops:
@@ -38,7 +38,7 @@ def net_loops(loops: Loops) -> Loops:
     return tuple(points[np.array(loop)] for loop in singular_loops(edges, weights))
 
 
-def uncancelled_edges(loops: Loops) -> tuple[FloatArray, FloatArray]:
+def uncanceled_edges(loops: Loops) -> tuple[FloatArray, FloatArray]:
     """Starts and ends (k, 3) of the edges of closed loops that are left (`net_loops`), each once.
 
     Around an edge that is run n times net, the solid angle changes by 4 pi n: unless n = 0 it

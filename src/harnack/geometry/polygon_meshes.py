@@ -274,7 +274,7 @@ def _check_edges(found: PolygonFaces) -> None:
     if (first := _first_double(face * len(edge) + edge.reshape(-1))) is not None:
         raise MeshError(
             f"face {face[first]} runs along the edge from vertex {begin[first]} to {end[first]} "
-            "twice: leave it out of both loops, or join its neighbours"
+            "twice: leave it out of both loops, or join its neighbors"
         )
 
 
@@ -329,7 +329,7 @@ def polygon_patches(
 
     Corners of a patch are vertices of the mesh; vertices within patches are left out. smoothing:
     how often corners of just two edges are moved to the middle between where they are and the mean
-    of their neighbours, since boundaries along triangles run in zigzags.
+    of their neighbors, since boundaries along triangles run in zigzags.
 
     Raises:
         ValueError: fewer than two patches, or more than triangles.
@@ -361,10 +361,10 @@ def _smoothed(points: FloatArray, edges: IntArray, times: int) -> FloatArray:
     both = np.concatenate([edges, edges[:, ::-1]])
     inner = np.bincount(both[:, 0], minlength=len(points)) == 2
     both = both[np.argsort(both[:, 0], kind="stable")]
-    neighbours = both[inner[both[:, 0]], 1].reshape(-1, 2)
+    neighbors = both[inner[both[:, 0]], 1].reshape(-1, 2)
     for _ in range(times):
         moved = points.copy()
-        moved[inner] = 0.5 * (points[inner] + points[neighbours].mean(axis=1))
+        moved[inner] = 0.5 * (points[inner] + points[neighbors].mean(axis=1))
         points = moved
     return points
 
@@ -382,14 +382,14 @@ def _clusters(
     points = np.hstack([corners.mean(axis=1), _NORMAL_WEIGHT * normal / area[:, None]])
     chance = area / area.sum()
     rng = np.random.default_rng(seed)
-    centres = points[rng.choice(len(points), count, p=chance, replace=False)]
+    centers = points[rng.choice(len(points), count, p=chance, replace=False)]
     patch = np.zeros(len(faces), dtype=np.int64)
     for _ in range(iterations):
-        patch = spatial.KDTree(centres).query(points)[1]
+        patch = spatial.KDTree(centers).query(points)[1]
         weight = np.bincount(patch, area, count)
         for axis in range(points.shape[1]):
             moment = np.bincount(patch, area * points[:, axis], count)
-            centres[:, axis] = np.where(weight > 0, moment / np.maximum(weight, 1e-300), np.inf)
-        centres = centres[weight > 0]
-        count = len(centres)
-    return spatial.KDTree(centres).query(points)[1]
+            centers[:, axis] = np.where(weight > 0, moment / np.maximum(weight, 1e-300), np.inf)
+        centers = centers[weight > 0]
+        count = len(centers)
+    return spatial.KDTree(centers).query(points)[1]

@@ -18,7 +18,7 @@ so around every point off S it has a local potential, and this is harmonic. The 
 a closed path off S is a multiple of 4 pi: move the path slightly so that it meets triangles in
 their interiors only; between these crossings it follows 4 pi w, and each crossing of T takes
 +-4 pi m_T. So 4 pi w mod 4 pi extends to a function on R^3 minus S that is harmonic in the
-neighbourhood of each point, with values mod 4 pi. QED.
+neighborhood of each point, with values mod 4 pi. QED.
 
 The n_e are the boundary of an integral chain, so at each vertex as much weight begins as ends:
 S is made of closed loops, and 4 pi w is mod 4 pi the solid angle of these loops.
@@ -161,7 +161,7 @@ def singular_loops(edges: IntArray, weights: IntArray) -> list[list[int]]:
 def _equal_rows(rows: npt.NDArray[np.uint64]) -> tuple[IntArray, IntArray]:
     """An order (n,) that puts equal rows next to each other, and where each group starts in it.
 
-    Rows are ordered by a 64-bit hash, and neighbours then compared in full. Should different rows
+    Rows are ordered by a 64-bit hash, and neighbors then compared in full. Should different rows
     ever have the same hash, they are sorted by their columns instead, which is three times slower.
     """
     hashed = np.zeros(len(rows), dtype=np.uint64)

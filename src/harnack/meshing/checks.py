@@ -78,7 +78,7 @@ def check_manifold(faces: IntArray, vertices: FloatArray | None = None) -> None:
     ways = np.bincount(index, np.where(pairs[:, 0] < pairs[:, 1], 1, -1), minlength=len(uses))
     if ((uses == 2) & (ways != 0)).any():
         fail(
-            "neighbouring faces of the mesh do not agree on its two sides: cells are too large for "
+            "neighboring faces of the mesh do not agree on its two sides: cells are too large for "
             "this level set; choose a smaller `spacing`",
             np.unique(pairs[((uses == 2) & (ways != 0))[index]]),
         )
@@ -95,7 +95,7 @@ def check_apart(vertices: FloatArray, faces: IntArray) -> None:
     decided exactly.
 
     Raises:
-        MeshingError: so; a LocalError with the centres of these faces.
+        MeshingError: so; a LocalError with the centers of these faces.
     """
     if not np.isfinite(vertices).all():
         raise MeshingError("vertices of the mesh are no numbers: choose another level or `clip`")
@@ -135,7 +135,7 @@ def check_near_level(
     tolerance: float,
     volume: Volume | None,
 ) -> None:
-    """Raise unless vertices and centres of faces are within `tolerance` of the level, by looks at
+    """Raise unless vertices and centers of faces are within `tolerance` of the level, by looks at
     the function.
 
     A point is, if the slope says so, |f|/|grad f| <= tolerance; or if f changes its sign between
@@ -169,7 +169,7 @@ def check_near_level(
         far = far[one == other]
     if len(far):
         raise LocalError(
-            f"{len(far):,} of {len(points):,} vertices and centres of triangles are farther than "
+            f"{len(far):,} of {len(points):,} vertices and centers of triangles are farther than "
             f"the tolerance, {tolerance:.3g}, from the level, such as {_point(points[far][0])}: "
             "choose a smaller `spacing` or a larger `tolerance`",
             points[far],

@@ -4,7 +4,7 @@ Two triangles in different planes meet beyond their common corners if and only i
 passes through the other, with its ends on both sides of that one's plane, or ends on it: corners
 that lie on other triangles are not looked for, since edges beyond them would pass through. Two
 triangles in one plane overlap unless the line of an edge has them on its two sides (separating
-axes), whatever they share: faces that are there twice, or folded back onto their neighbours, do.
+axes), whatever they share: faces that are there twice, or folded back onto their neighbors, do.
 Pairs are looked for among those whose boxes overlap.
 
 Exact signs of determinants: on which side of a plane, or of a line in a plane, points lie.
@@ -108,7 +108,7 @@ _PAIRS_AT_ONCE = 1 << 18
 
 
 def turned_faces(function: LevelFunction, vertices: FloatArray, faces: IntArray) -> IntArray:
-    """Indices of faces whose normal does not point to where the function grows, at their centre."""
+    """Indices of faces whose normal does not point to where the function grows, at their center."""
     corner = vertices[faces]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     slope = function.at(corner.mean(axis=1)).gradient
@@ -156,11 +156,11 @@ def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
         return np.zeros((0, 2), np.int64)
     ends = lower[chosen].min(axis=0), upper[chosen].max(axis=0)
     near = (lower <= ends[1]).all(axis=1) & (upper >= ends[0]).all(axis=1)
-    centre = 0.5 * (lower + upper)
+    center = 0.5 * (lower + upper)
     radius = 0.5 * lengths(upper - lower)
     octave = np.floor(np.log2(np.maximum(radius, 1e-300)))
     groups = [np.flatnonzero(near & (octave == one)) for one in np.unique(octave[near])]
-    trees = [searching.cKDTree(centre[rows]) for rows in groups]
+    trees = [searching.cKDTree(center[rows]) for rows in groups]
     found: list[IntArray] = []
     for i, j in itertools.product(range(len(groups)), repeat=2):
         reach = float(radius[groups[i]].max() + radius[groups[j]].max())
@@ -168,7 +168,7 @@ def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
         first = groups[i][chosen[groups[i]]]
         for start in range(0, len(first), step):
             rows = first[start : start + step]
-            some = searching.cKDTree(centre[rows])
+            some = searching.cKDTree(center[rows])
             table = some.sparse_distance_matrix(trees[j], reach, output_type="ndarray")
             one, other = rows[table["i"]], groups[j][table["j"]]
             keep = (lower[one] <= upper[other]).all(axis=1)

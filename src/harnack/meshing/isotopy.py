@@ -12,7 +12,7 @@ Theorem. If each tetrahedron T satisfies (a), (b) or (c), the zero sets of f and
 Proof. Let H_t(x) = 0 for some t. By (a), x is in tetrahedra of kinds (b) and (c) alone. Some n has
 n . grad f(x) > 0 and n . grad F|T > 0 for all T that hold x: if all are of kind (b), n = grad f(x);
 else x lies in a simplex of one of kind (c), all corners of which have such an n, and all T that
-hold x are around each of them. H_t is Lipschitz, and Clarke's generalised gradient of it at x is
+hold x are around each of them. H_t is Lipschitz, and Clarke's generalized gradient of it at x is
 the convex hull of (1-t) grad F|T + t grad f(x) over these T: it does not hold 0. By Clarke's
 implicit function theorem the zero set of H in (x, t) is near there the graph of a Lipschitz
 function over n's orthogonal plane and t. The fields n/(n . n), patched by a partition of unity,
@@ -30,7 +30,7 @@ mesh. So (b) and (c) are asked of both normals. Other such T are not proved.
 An angle. Where f's lift stays within half a period of the level on T, which is a part of the check
 of (b), the wrapped values at the corners are that lift's, and all is as for a number.
 
-The check. |grad f(y) - grad f(c)| <= D for all y in the ball around T with centre c and radius R,
+The check. |grad f(y) - grad f(c)| <= D for all y in the ball around T with center c and radius R,
 by the field's own promise (`Field.slope_change`). So (b) holds if grad f(c) . grad F > D |grad F|,
 and f has no zero in T if |f(c)| > (|grad f(c)| + D) R. If neither holds T is halved, across its
 longest edge, a few times: grad F is the same in both halves, and (a) or (b) may hold in each.
@@ -136,8 +136,8 @@ def _has_bounds(function: LevelFunction, corners: FloatArray) -> bool:
     """Whether changes of the gradient are bounded on any of tetrahedra (n, 4, 3); without, all that
     is cut stays unproved, and no other needs to be looked at."""
     some = corners[:: max(1, len(corners) // _FEW)]
-    centre, radius = _balls(some)
-    return not len(some) or bool((function.slopes(centre, radius)[1] < _UNKNOWN).any())
+    center, radius = _balls(some)
+    return not len(some) or bool((function.slopes(center, radius)[1] < _UNKNOWN).any())
 
 
 def _share(proved: BoolArray) -> float:
@@ -145,9 +145,9 @@ def _share(proved: BoolArray) -> float:
 
 
 def _balls(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Centres (n, 3) and radii (n,) of balls around simplices (n, k, 3)."""
-    centre = corners.mean(axis=1)
-    return centre, np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)
+    """Centers (n, 3) and radii (n,) of balls around simplices (n, k, 3)."""
+    center = corners.mean(axis=1)
+    return center, np.linalg.norm(corners - center[:, None], axis=2).max(axis=1)
 
 
 @dataclass(frozen=True)
@@ -242,8 +242,8 @@ def _free(function: LevelFunction, corners: FloatArray) -> BoolArray:
     none and f crosses no level on their edges, net, both are between the same two levels: (a)."""
     owner, pieces = np.arange(len(corners)), corners
     for _ in range(_HALVINGS + 1):
-        centre, radius = _balls(pieces)
-        bad = function.clearance(centre) <= radius * (1 + 1e-9)
+        center, radius = _balls(pieces)
+        bad = function.clearance(center) <= radius * (1 + 1e-9)
         owner = np.concatenate([owner[bad], owner[bad]])
         pieces = _halved(pieces[bad])
         if not len(pieces):
@@ -271,9 +271,9 @@ def _regular(
     for halving in range(_HALVINGS + 1):
         if not len(pieces):
             break
-        centre, radius = _balls(pieces)
+        center, radius = _balls(pieces)
         radius = radius * (1 + 1e-9)
-        samples, change = function.slopes(centre, radius)
+        samples, change = function.slopes(center, radius)
         change = np.minimum(change, _UNKNOWN)
         if (change == _UNKNOWN).all():
             proved[owner] = False

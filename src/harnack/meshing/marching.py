@@ -252,7 +252,7 @@ def _faces_on_the_level(
     """Faces of tetrahedra with all corners on the level that have another side of it behind than
     before them, and the way up through each.
 
-    A side is that of the fourth corner, or if it is on the level too, of the centre.
+    A side is that of the fourth corner, or if it is on the level too, of the center.
     """
     on = points.is_on[tets.corners]
     triples: list[IntArray] = []
@@ -291,6 +291,6 @@ def _wrap(change: FloatArray, period: float) -> FloatArray:
 def _beside(points: PointSet, tets: Tetrahedra, rows: IntArray) -> FloatArray:
     corners = tets.corners[rows[:, 3]]
     apex = corners[np.arange(len(rows)), rows[:, 4]]
-    centre = points.points[corners].mean(axis=1)
+    center = points.points[corners].mean(axis=1)
     is_on: BoolArray = points.is_on[apex]
-    return np.where(is_on[:, None], centre, points.points[apex])
+    return np.where(is_on[:, None], center, points.points[apex])

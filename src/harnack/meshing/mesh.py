@@ -72,7 +72,7 @@ def mesh(
 
     Tetrahedra around the level set, found by an octree whose empty cells are proved empty, are cut
     by it; the surface of an angle ends exactly at its curve. Then edges are cut and vertices moved
-    onto the surface until middles of edges and centres of triangles are within the tolerance.
+    onto the surface until middles of edges and centers of triangles are within the tolerance.
     Solids are put together from the meshes of smooth levels by manifold3d, and so cut by the clip.
 
     field: a `SolidAngle` of polygons, or a real-valued field that is continuous.
@@ -100,7 +100,7 @@ def mesh(
     progress: told what is being done.
 
     What is returned has been checked, all of it: every edge has two faces, or one at a rim, no two
-    triangles pass through each other, vertices and centres of triangles are within the tolerance of
+    triangles pass through each other, vertices and centers of triangles are within the tolerance of
     the level by looks at the field, and inside the clip (of a thick part, the surface that it is
     made of). Else a MeshingError is raised.
 

@@ -38,14 +38,14 @@ class Places:
     points: FloatArray
     radius: float
 
-    def meet(self, centres: FloatArray, radii: FloatArray | float) -> BoolArray:
+    def meet(self, centers: FloatArray, radii: FloatArray | float) -> BoolArray:
         """(k,) whether balls about points (k, 3) meet one of these."""
-        if not len(centres):
+        if not len(centers):
             return np.zeros(0, np.bool_)
         import scipy.spatial  # here: half a second that few need
 
         searching: Any = scipy.spatial
-        apart: FloatArray = searching.cKDTree(self.points).query(centres)[0]
+        apart: FloatArray = searching.cKDTree(self.points).query(centers)[0]
         return apart < self.radius + radii
 
 
@@ -147,7 +147,7 @@ def place_points(
     Raises MemoryError for more than four million cells.
     """
     tree = octree(root[0], function.clearance, _MOST_CELLS, root[1])
-    points, size = _corners_and_centres(tree, _finer_cells(function, tree.leaves, finer))
+    points, size = _corners_and_centers(tree, _finer_cells(function, tree.leaves, finer))
     free = _FREE * np.minimum(size, 2 * float(tree.leaves.size.max()))
     is_far = _is_far(points, free, boundary)
     points, size = points[is_far], size[is_far]
@@ -177,18 +177,18 @@ def _finer_cells(function: LevelFunction, leaves: Cells, finer: tuple[Places, ..
     for places in finer:
         split: list[Cells] = []
         for cells in pool:
-            halves = cells.some(places.meet(cells.centres, cells.half_diagonal)).split()
+            halves = cells.some(places.meet(cells.centers, cells.half_diagonal)).split()
             split.append(halves.some(~halves.proved_empty(function.clearance)))
         pool += split
     found = [cells for cells in pool[1:] if len(cells.corners)]
     return sorted(found, key=lambda cells: float(cells.size.max()))
 
 
-def _corners_and_centres(tree: Octree, finer: list[Cells]) -> tuple[FloatArray, FloatArray]:
-    """Points (n, 3), each once: corners of all cells, and centres of leaves and of `finer` ones;
+def _corners_and_centers(tree: Octree, finer: list[Cells]) -> tuple[FloatArray, FloatArray]:
+    """Points (n, 3), each once: corners of all cells, and centers of leaves and of `finer` ones;
     and the size (n,) of the smallest cell at each."""
     leaves = [*finer, tree.leaves]
-    points = [cells.centres for cells in leaves]
+    points = [cells.centers for cells in leaves]
     sizes = [np.full(len(cells.corners), float(cells.size.max())) for cells in leaves]
     for some in [*leaves, *reversed(tree.empty)]:
         corners = (some.corners[:, None] + _CORNERS * some.size).reshape(-1, 3)

@@ -223,7 +223,7 @@ def _checked(mesh: Any) -> tuple[FloatArray, IntArray]:
         raise MeshError(
             f"vertices {used[welded[twice[0]]]} and {used[twice[0]]} are at the same place, and "
             f"{len(twice):,} in all: join such vertices first, for instance by "
-            "mesh.merge_vertices() of trimesh, or faces are not known to be neighbours"
+            "mesh.merge_vertices() of trimesh, or faces are not known to be neighbors"
         )
     return vertices, faces
 

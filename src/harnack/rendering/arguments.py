@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from harnack.choices import did_you_mean
 from harnack.fields import Field
+from harnack.names import did_you_mean
 from harnack.rendering.pictures.scales import require_pillow, typeface_for
 from harnack.rendering.pictures.views import GROUND_OF_VIEWS, SCALED, VIEWS
 from harnack.rendering.studio.backdrops import Backdrop, Gradient, Ground, checked_backdrop

@@ -16,7 +16,7 @@ from harnack.meshing import mesh
 from harnack.rendering.arguments import check_settings
 from harnack.rendering.studio.materials import Material, material_of
 from harnack.rendering.studio.stage import StudioObject
-from harnack.rendering.surfaces.colours import Colour
+from harnack.rendering.surfaces.colors import Color
 from harnack.rendering.surfaces.isolines import Isolines
 from harnack.tracer import LevelSet, level_set
 
@@ -31,7 +31,7 @@ _OWN = (
 # What tubes around the ends of surfaces are made of.
 _RIM = "gold"
 
-MaterialLike = str | Colour | Material | Mapping[str, Any]
+MaterialLike = str | Color | Material | Mapping[str, Any]
 
 
 def _is_color(given: Any) -> bool:

@@ -96,7 +96,7 @@ def render(
     spp: samples a pixel of a color picture, by default 64 or the scene's own, and of the edges
         of one that is shaded or shows values, by default 9. Others have one ray a pixel.
     antialias: of shaded pictures, which pixels get all their samples: "edges", the default, those
-        that differ from a neighbour; "cones" also those that a surface covers in part, found by
+        that differ from a neighbor; "cones" also those that a surface covers in part, found by
         a cone around each pixel. Wires thinner than a pixel then stay lines. It looks at fields
         about twice as often, goes by |f - level| / |grad f|, and takes no fields that jump, such as
         winding numbers of meshes.

@@ -151,8 +151,8 @@ def _sourced(rng: np.random.Generator, rows: int, *, mirrored: bool) -> Trial:
     places, shares = rng.uniform(-1, 1, (rows, 3)), rng.dirichlet([0.7] * 3, rows)
     # As h - c >= mass (1-q^2)/8, f stays above c if its Laplacian stays below 0.75 of the mass: a
     # potential is at most (1-q^2)/6 times the largest density.
-    centres = rng.uniform(-0.9, 0.9, (rows, 2))
-    sizes = (1 - np.abs(centres)) * rng.uniform(0.1, 1, (rows, 2))
+    centers = rng.uniform(-0.9, 0.9, (rows, 2))
+    sizes = (1 - np.abs(centers)) * rng.uniform(0.1, 1, (rows, 2))
     density = rng.uniform(-0.18, 0.18, (rows, 4)) * 10 ** rng.uniform(-3, 0, (rows, 1))
     kind = rng.integers(0, 4, rows)
     places[kind < 2, :2], shares[kind < 2, 2], density[kind < 2, 1:3] = (1, -1), 0, 0
@@ -162,11 +162,11 @@ def _sourced(rng: np.random.Generator, rows: int, *, mirrored: bool) -> Trial:
     shares /= shares.sum(axis=1, keepdims=True)
     density *= mass[:, None]
     balls = GreenPotentials(
-        np.column_stack([np.zeros(rows), centres]), np.column_stack([np.ones(rows), sizes])
+        np.column_stack([np.zeros(rows), centers]), np.column_stack([np.ones(rows), sizes])
     )
     even, wave = density[:, :3], density[:, 3]
     u = AxialFunctions("points", places, shares * mass[:, None], radius, 3)
-    potential, slope = balls.at_centre(even)
+    potential, slope = balls.at_center(even)
     turns = np.stack([-0.5 * wave, wave])  # P_2 is between -1/2 and 1
     least = density[:, 0] + np.minimum(even[:, 1:], 0).sum(axis=1) + turns.min(axis=0)
     most = density[:, 0] + np.maximum(even[:, 1:], 0).sum(axis=1) + turns.max(axis=0)

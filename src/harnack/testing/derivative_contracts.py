@@ -31,7 +31,7 @@ _SHARE = 0.2
 # size are tried.
 _TRIED = (1.0, 0.1, 0.01, 1e-3, 1e-4)
 # Of a field with an error the differences must agree at this share of the points even without it:
-# between neighbouring points an approximation mostly is a smooth function itself.
+# between neighboring points an approximation mostly is a smooth function itself.
 _SMOOTH = 0.5
 # Of a field with creases they must agree at this share.
 _OFF_CREASES = 0.9

@@ -136,7 +136,7 @@ def check_field(
     points and places in these balls ends (`search_worst_places`: some 14,000 places for each
     promise); enclosures along paths, of a field that gives its own (`check_looks`), hold; some step
     is possible at most points; no level set leaves its `extent`. Jumps across sheets
-    are taken out on the way, and values may move between neighbouring points by `Sample.error`
+    are taken out on the way, and values may move between neighboring points by `Sample.error`
     besides, as they do where a tree takes other clusters as wholes.
 
     The default takes one to three seconds for most fields, on two cores; for meshes about ten, for

@@ -2,7 +2,7 @@
 
 A positive harmonic function on the unit ball of R^n is a Poisson integral of a positive measure
 on the sphere. Along an axis only the latitude s of its mass counts, s = 1 ahead and s = -1
-behind. Everything is written as a movement, the value at q minus that at the centre, free of
+behind. Everything is written as a movement, the value at q minus that at the center, free of
 cancellation at small q, and shares no formula with `harnack.enclosures`.
 """
 
@@ -123,7 +123,7 @@ class AxialFunctions:
 
     @property
     def slope(self) -> FloatArray:
-        """(rows,) derivative along the axis at the centre."""
+        """(rows,) derivative along the axis at the center."""
         if self.kind == "points":
             each = self.dimension * self.places
         else:
@@ -145,17 +145,17 @@ class AxialFunctions:
 class GreenPotentials:
     """Potentials, 0 on the unit sphere of space, of balls of constant density on its axis.
 
-    centres, sizes: (rows, k), |centre| + size <= 1. With density s the potential is w with
+    centers, sizes: (rows, k), |center| + size <= 1. With density s the potential is w with
     Laplacian -s in the ball and 0 outside: Newton's minus that of the image, which is harmonic in
-    the unit ball and so that of a point mass at the centre.
+    the unit ball and so that of a point mass at the center.
     """
 
-    centres: FloatArray
+    centers: FloatArray
     sizes: FloatArray
 
-    def at_centre(self, density: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Value and derivative along the axis (rows,) at the centre of the unit ball."""
-        y, size = self.centres, self.sizes
+    def at_center(self, density: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Value and derivative along the axis (rows,) at the center of the unit ball."""
+        y, size = self.centers, self.sizes
         distance = np.abs(y)
         with np.errstate(divide="ignore", invalid="ignore"):
             outside = distance > size
@@ -167,8 +167,8 @@ class GreenPotentials:
     def movement(self, q: FloatArray, density: FloatArray) -> FloatArray:
         """w(q) - w(0) at places q (rows, m) on the axis, 0 <= q < 1: (rows, m)."""
         total = np.zeros_like(q)
-        for j in range(self.centres.shape[1]):
-            y, size = self.centres[:, j, None], self.sizes[:, j, None]
+        for j in range(self.centers.shape[1]):
+            y, size = self.centers[:, j, None], self.sizes[:, j, None]
             total += density[:, j, None] * (_newton(q, y, size) - size**3 / 3 * q * y / (1 - q * y))
         return total
 

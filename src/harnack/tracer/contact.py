@@ -121,7 +121,7 @@ class Hysteresis:
     3. *Nothing sticks.* In contact, f is `band/2` or more away from the level beyond and no further
        than its error, so the gap that steps are solved for is at least a fifth of the band.
 
-    The lift of an angle-valued f. Before contact, f lies between two neighbouring levels of the
+    The lift of an angle-valued f. Before contact, f lies between two neighboring levels of the
     ladder, and in contact it is proved to stay nearer to the level reached than to all others: the
     window is less than a period wide, and the value tells where in it f is. (Looking back from a
     point takes the window there, and the two stretches proved share a point, so their lifts agree.)

@@ -25,7 +25,7 @@ __all__ = ["CELLS_ACROSS", "largest_cells"]
 
 # Cells along the longest side of the box around a surface, if nothing else is asked for.
 CELLS_ACROSS = 128
-# Centres so many cells away from the surface, to first order, are far from it; cells are useless if
+# Centers so many cells away from the surface, to first order, are far from it; cells are useless if
 # more than this share of them is.
 _FAR, _MOST_FAR = 4.0, 0.5
 
@@ -41,7 +41,7 @@ def largest_cells(
     along x, y and z, taken together (see `largest_component`).
 
     A cell is left out if it, or each of its eight halves, is proved to have nothing of the level
-    set, as its ball is within the clearance of its centre (or, where that is outside of the field's
+    set, as its ball is within the clearance of its center (or, where that is outside of the field's
     domain, of a point at its boundary), or nothing of the volume, as its signed distance says. Of
     solids, those without a level all of which is in the solid are kept. For the rest of the proof
     see `largest_component`.
@@ -97,12 +97,12 @@ def _check_proved(
     field: Field, levels: tuple[float, ...], solid: _Ends | None, cells: OccupiedCells
 ) -> None:
     """Raise ValueError if most cells that are left are far from the surface."""
-    centres = cells.centres()
+    centers = cells.centers()
     if field.domain is not None:
-        centres = centres[field.domain.contains_points(centres)]
-    if not len(centres):
+        centers = centers[field.domain.contains_points(centers)]
+    if not len(centers):
         return
-    gap, slope, value = _samples(field, levels)(centres)
+    gap, slope, value = _samples(field, levels)(centers)
     far = gap > _FAR * cells.cell * slope
     if solid is not None:
         far &= ~((value >= solid[0]) & (value <= solid[1]))

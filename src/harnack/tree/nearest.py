@@ -81,7 +81,7 @@ def square_to_some_point(tree: PackedTree, x: Vec3, column: int) -> Real:
     """The least squared distance from x to the points of a leaf nearby, whose coordinates begin at
     a column of their records.
 
-    From the root on, the child whose box has the nearest centre, down to a leaf.
+    From the root on, the child whose box has the nearest center, down to a leaf.
     """
     backend = tree.backend
     real, index, vector = backend.Float, backend.UInt32, backend.Array3f
@@ -180,9 +180,9 @@ def _boxes(rays: TriangleRays, x: Vec3, pad: Real) -> Any:
         if not slab:
             return close
         n, offset, thickness, radius = vector(*slab[:3]), slab[3], slab[4], slab[5]
-        from_centre = x - 0.5 * (low + high)
-        height = dr.dot(from_centre, n)
-        across = dr.norm(dr.fma(vector(-height), n, from_centre))
+        from_center = x - 0.5 * (low + high)
+        height = dr.dot(from_center, n)
+        across = dr.norm(dr.fma(vector(-height), n, from_center))
         off = fmax(dr.abs(height - offset) - (thickness + pad), 0)
         beside = fmax(across - (radius + pad), 0)
         return close & (dr.fma(off, off, beside * beside) <= square)

@@ -74,7 +74,7 @@ def box_levels(tree: Hierarchy, low: FloatArray, high: FloatArray) -> list[Float
 
 def slab_levels(tree: Hierarchy, corners: FloatArray, boxes: list[FloatArray]) -> list[FloatArray]:
     """Slabs (k, 6) of the nodes of all levels: a unit normal n, an offset, half a thickness and a
-    radius. With c the centre of a node's box, the triangles' points are c + h n + r, r at right
+    radius. With c the center of a node's box, the triangles' points are c + h n + r, r at right
     angles to n, with |h - offset| <= thickness and |r| <= radius.
 
     A patch of a smooth surface is much thinner than its box, and seen from far away what counts is
@@ -305,7 +305,7 @@ def crossing(row: list[Real], frame: Frame | Upwards) -> tuple[Real, Real]:
     over its edges, +1 for each that crosses the half-line v = 0, u > 0 upwards and -1 downwards.
     Upwards means from v <= 0 to v > 0, which v alone decides; that u > 0 there is the sign of
     `side`. Both are the same for all triangles around a vertex or an edge, so that what one of
-    them counts its neighbour discounts: the sum over a closed surface is right whatever the
+    them counts its neighbor discounts: the sum over a closed surface is right whatever the
     rounding did, and rays through edges and vertices need no special case.
 
     t is where a point of the triangle lies that is next to the ray to a few roundings of

@@ -81,7 +81,7 @@ def pieces_of_faces(rays: TriangleRays, vertices: FloatArray, faces: IntArray) -
 def on_level(rays: TriangleRays, pieces: FloatArray, levels: tuple[float, ...]) -> BoolArray:
     """(k,) whether the winding number passes a level from one side of a triangle to the other.
 
-    A ray along the normal of each counts the crossings ahead of its centre, and those ahead of a
+    A ray along the normal of each counts the crossings ahead of its center, and those ahead of a
     place just behind it: with that, triangles in the same place are passed all at once.
     """
     backend = rays.tree.backend
@@ -243,11 +243,11 @@ _BESIDE = 1e-9
 
 @dataclass(frozen=True)
 class MeshSurface:
-    """Triangles: corners (k, 3, 3) in coordinates of at most about one, centre + size times which
+    """Triangles: corners (k, 3, 3) in coordinates of at most about one, center + size times which
     are the real ones. is_all: whether the surface is nothing else."""
 
     corners: FloatArray
-    centre: FloatArray
+    center: FloatArray
     size: float
     is_all: bool
 
@@ -261,15 +261,15 @@ class MeshSurface:
         vertices, faces, is_closed = mesh
         low, high = vertices[faces].min(axis=(0, 1)), vertices[faces].max(axis=(0, 1))
         size = float(2.0 ** np.ceil(np.log2(0.5 * (high - low).max())))
-        centre = single(0.5 * (low + high))
-        unit = (vertices - centre) / size
+        center = single(0.5 * (low + high))
+        unit = (vertices - center) / size
         rays = _tree(choose_backend("double"), unit, faces)
         pieces = pieces_of_faces(rays, unit, faces)
         if is_closed:
             on = on_level(rays, pieces, surface.numbers)
         else:
-            on = _proved_on_level(surface, centre + size * pieces, size)
-        return cls(pieces[on], centre, size, is_closed)
+            on = _proved_on_level(surface, center + size * pieces, size)
+        return cls(pieces[on], center, size, is_closed)
 
     def upload(self, backend: Backend) -> Callable[[Vec3], Vec3]:
         """A function that gives the way from points to the nearest; NaN if there are none."""
@@ -279,11 +279,11 @@ class MeshSurface:
         corners = self.corners
         faces = np.arange(3 * len(corners)).reshape(-1, 3)
         rays = _tree(backend, corners.reshape(-1, 3), faces, slabs=True)
-        on, centre, size = placed(backend, self.centre, self.size)
+        on, center, size = placed(backend, self.center, self.size)
         del on
 
         def nearest(p: Vec3) -> Vec3:
-            x: Any = (vector(p) - centre) / size
+            x: Any = (vector(p) - center) / size
             limit = square_to_some_vertex(rays, x)
             after = real(-1), backend.UInt32(NO_TRIANGLE)
             return nearest_triangle(rays, x, after, limit, backend.Bool(True)).offset * size
@@ -301,9 +301,9 @@ def _tree(
 def _proved_on_level(surface: LevelSet, corners: FloatArray, size: float) -> BoolArray:
     """(k,) whether all of a triangle, which none passes through, belongs to a level.
 
-    Proof. With its jumps, whole numbers, removed, f is smooth about the triangle's centre, and
+    Proof. With its jumps, whole numbers, removed, f is smooth about the triangle's center, and
     takes no level mod 1 within the radius that `distance_below` proves. If that holds the triangle,
-    f on either side of it stays on the same side of the level as just beside the centre.
+    f on either side of it stays on the same side of the level as just beside the center.
     """
     backend, field = choose_backend("double"), surface.field
     prepared = field.prepare(backend)
@@ -313,13 +313,13 @@ def _proved_on_level(surface: LevelSet, corners: FloatArray, size: float) -> Boo
     def clearance(p: Vec3) -> tuple[Any]:
         return (distance_below(backend, smooth, targets, p, prepared.evaluate(p)),)
 
-    centre = corners.mean(axis=1)
-    (free,) = in_batches(backend, clearance, centre)
-    radius = np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)
+    center = corners.mean(axis=1)
+    (free,) = in_batches(backend, clearance, center)
+    radius = np.linalg.norm(corners - center[:, None], axis=2).max(axis=1)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     way = _BESIDE * size * normal / np.maximum(length, 1e-300)
-    sides = [field.value(centre + sign * way, precision="double") for sign in (1, -1)]
+    sides = [field.value(center + sign * way, precision="double") for sign in (1, -1)]
     low, high = np.minimum(*sides), np.maximum(*sides)
     between = np.any([(low < v) & (v < high) for v in surface.numbers], axis=0)
     return between & (free > radius + 2 * _BESIDE * size) & (length[:, 0] > 0)

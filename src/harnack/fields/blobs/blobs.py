@@ -36,6 +36,7 @@ from harnack.fields.formula import Formula, is_jet
 from harnack.fields.kept import prepared_once
 from harnack.fields.look import Look, Path, Sample
 from harnack.geometry import Box
+from harnack.names import renamed
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
@@ -49,13 +50,14 @@ class BlobError(ValueError):
     """Blobs that cannot be; the message says which and why."""
 
 
+@renamed(centres="centers")
 class Blobs(Formula):
     """f(x) = sum of w_i A k(|x - c_i|^2 / R_i^2): metaballs, whose surface is f = 1.
 
     A single blob of weight 1 is the ball with its radius; where blobs meet, they flow together.
     Inside f is larger.
 
-    centres: (n, 3). radii: (n,) or one number, > 0. weights: (n,), or None for 1; negative ones
+    centers: (n, 3). radii: (n,) or one number, > 0. weights: (n,), or None for 1; negative ones
         carve.
     kernel: "compact" (a polynomial of the sixth degree), "gaussian", or the soft objects "cubic"
         and "sextic"; or one with numbers of one's own, such as `Gaussian(sharpness=2.0)`. Each ends
@@ -73,22 +75,22 @@ class Blobs(Formula):
 
     def __init__(
         self,
-        centres: Any,
+        centers: Any,
         radii: Any,
         weights: Any = None,
         *,
         kernel: str | Kernel = "compact",
         groups: Any = None,
     ) -> None:
-        self.centres, self.radii, self.weights, self.groups = _checked(
-            centres, radii, weights, groups
+        self.centers, self.radii, self.weights, self.groups = _checked(
+            centers, radii, weights, groups
         )
         self.kernel = choose_kernel(kernel)
         self._on: _BlobData | None = None
         self._lists: CellLists | None = None
 
     def __len__(self) -> int:
-        return len(self.centres)
+        return len(self.centers)
 
     @property
     def _supports(self) -> FloatArray:
@@ -97,7 +99,7 @@ class Blobs(Formula):
     def cell_lists(self) -> CellLists | None:
         """The lists of blobs near each cell of a grid, made once; None for few blobs."""
         if self._lists is None and len(self) >= _MANY:
-            self._lists = CellLists.of(self.centres, self._supports)
+            self._lists = CellLists.of(self.centers, self._supports)
         return self._lists
 
     @prepared_once
@@ -123,7 +125,7 @@ class Blobs(Formula):
         """The box around all supports: outside f is 0."""
         del levels
         reach = self._supports[:, None] * (1 + 1e-6)
-        return Box((self.centres - reach).min(axis=0), (self.centres + reach).max(axis=0))
+        return Box((self.centers - reach).min(axis=0), (self.centers + reach).max(axis=0))
 
     def check_levels(self, levels: tuple[float, ...]) -> None:
         for level in levels:
@@ -281,17 +283,17 @@ class _BlobData:
 
 
 def _rows(backend: Backend, blobs: Blobs) -> FloatArray:
-    """Records (n, 8): the centre, what of it the precision leaves over, 1/R, and the amplitude."""
+    """Records (n, 8): the center, what of it the precision leaves over, 1/R, and the amplitude."""
     supports = blobs.radii * blobs.kernel.support
     info = np.finfo(backend.dtype)
     largest, smallest = float(info.max), float(info.smallest_normal)
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
         amplitude = blobs.weights * blobs.kernel.amplitude
-        near = blobs.centres.astype(backend.dtype).astype(np.float64)
+        near = blobs.centers.astype(backend.dtype).astype(np.float64)
         strong = np.abs(amplitude) * max(1.0, blobs.kernel.steepness.bend)
         inverse = 1 / supports
         bend = strong * inverse * inverse
-    outside = ~((np.abs(blobs.centres) <= largest) & (supports[:, None] * smallest < 1)).all(axis=1)
+    outside = ~((np.abs(blobs.centers) <= largest) & (supports[:, None] * smallest < 1)).all(axis=1)
     outside |= ~((inverse < 1e30) & (strong <= largest) & (bend <= largest))
     if outside.any():
         worst = int(np.argmax(outside))
@@ -299,11 +301,11 @@ def _rows(backend: Backend, blobs: Blobs) -> FloatArray:
         help_ = 'use precision="double" or ' if precision == "single" else ""
         raise BlobError(
             f"blob {worst}, with a radius of {blobs.radii[worst]:g}, a weight of "
-            f"{blobs.weights[worst]:g} and its centre at {vector_text(blobs.centres[worst])}, is "
+            f"{blobs.weights[worst]:g} and its center at {vector_text(blobs.centers[worst])}, is "
             f"too small, too large or too far away for {precision} precision: "
             f"{help_}choose units nearer to 1"
         )
-    rest = blobs.centres - near
+    rest = blobs.centers - near
     return np.column_stack([near, rest, 1 / supports, amplitude])
 
 
@@ -344,18 +346,18 @@ def _number_of(*jets: Jet) -> Any:
 
 
 def _checked(
-    centres: Any, radii: Any, weights: Any, groups: Any
+    centers: Any, radii: Any, weights: Any, groups: Any
 ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray | None]:
     """Arrays of what was given.
 
     Raises:
         BlobError: wrong shapes, or numbers that no blob can have.
     """
-    c = real_array(centres, "centres", BlobError).astype(np.float64)
-    check_vectors(c, "centres", BlobError)
+    c = real_array(centers, "centers", BlobError).astype(np.float64)
+    check_vectors(c, "centers", BlobError)
     if not len(c):
-        raise BlobError("centres: there are none; give at least one blob")
-    check_finite(c, "centre {}", BlobError)
+        raise BlobError("centers: there are none; give at least one blob")
+    check_finite(c, "center {}", BlobError)
     check_size(c, BlobError)
     r = _numbers(radii, "radii", len(c))
     bad = np.flatnonzero(~(r > 0))
@@ -380,7 +382,7 @@ def _numbers(values: Any, name: str, count: int) -> FloatArray:
         array = np.full(count, float(array))
     if array.shape != (count,):
         raise BlobError(
-            f"{name} must be one number, or {count}, one for each centre, not an array of shape "
+            f"{name} must be one number, or {count}, one for each center, not an array of shape "
             f"{array.shape}"
         )
     bad = np.flatnonzero(~np.isfinite(array))

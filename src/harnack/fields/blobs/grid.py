@@ -39,13 +39,13 @@ class CellLists(GridLayout):
     entries: IntArray
 
     @classmethod
-    def of(cls, centres: FloatArray, supports: FloatArray, cell: float | None = None) -> CellLists:
-        """The lists of balls with centres (n, 3) and radii (n,).
+    def of(cls, centers: FloatArray, supports: FloatArray, cell: float | None = None) -> CellLists:
+        """The lists of balls with centers (n, 3) and radii (n,).
 
         cell: about how large a cell is; None for 3/5 of the median radius.
         """
         size = float(np.median(supports)) * 0.6 if cell is None else cell
-        low, high = (centres - supports[:, None]).min(0), (centres + supports[:, None]).max(0)
+        low, high = (centers - supports[:, None]).min(0), (centers + supports[:, None]).max(0)
         while True:
             size = short_length(size)
             margin = _MARGIN * size
@@ -58,7 +58,7 @@ class CellLists(GridLayout):
                 break
             size *= 1.25
         shape = (int(counts[0]), int(counts[1]), int(counts[2]))
-        cells, blobs = _pairs(centres, supports, origin, size, shape)
+        cells, blobs = _pairs(centers, supports, origin, size, shape)
         order = np.argsort(cells, kind="stable")
         total = shape[0] * shape[1] * shape[2]
         starts = np.zeros(total + 1, dtype=np.int64)
@@ -68,7 +68,7 @@ class CellLists(GridLayout):
 
 
 def _pairs(
-    centres: FloatArray,
+    centers: FloatArray,
     radii: FloatArray,
     origin: FloatArray,
     size: float,
@@ -76,8 +76,8 @@ def _pairs(
 ) -> tuple[IntArray, IntArray]:
     """Cells, enlarged by the margin, and balls that meet; balls in order for each cell."""
     wide = radii * (1 + 1e-6)
-    first = np.floor((centres - wide[:, None] - origin) / size - _MARGIN).astype(np.int64)
-    last = np.floor((centres + wide[:, None] - origin) / size + _MARGIN).astype(np.int64)
+    first = np.floor((centers - wide[:, None] - origin) / size - _MARGIN).astype(np.int64)
+    last = np.floor((centers + wide[:, None] - origin) / size + _MARGIN).astype(np.int64)
     spans = (last - first).max(axis=1) + 1
     cells: list[IntArray] = []
     blobs: list[IntArray] = []
@@ -87,7 +87,7 @@ def _pairs(
             places = first[part, :, None] + np.arange(span)  # (m, 3, span)
             lower = origin[:, None] + (places - _MARGIN) * size
             upper = origin[:, None] + (places + 1 + _MARGIN) * size
-            c = centres[part, :, None]
+            c = centers[part, :, None]
             squares = np.maximum(np.maximum(lower - c, c - upper), 0) ** 2
             inside = (places >= 0) & (places < np.array(shape)[:, None])
             squares[~inside] = np.inf

@@ -1,7 +1,7 @@
-"""Kernels: how much of a blob is left at a distance from its centre, and along a line.
+"""Kernels: how much of a blob is left at a distance from its center, and along a line.
 
 Lengths are in units of the support: a kernel is a function k(q) of the squared distance q, falling
-from its centre to 0 at q = 1, where it ends with k' = 0. Along a line that passes the centre at the
+from its center to 0 at q = 1, where it ends with k' = 0. Along a line that passes the center at the
 distance h, x from the nearest point, it is k(h^2 + x^2): a function of x on the chord |x| <= S,
 S^2 = 1 - h^2. Its derivatives in x all have the same shape, and that is what proofs rest on:
 
@@ -25,7 +25,7 @@ import numpy as np
 from harnack.arithmetic import Function, Interval
 from harnack.arithmetic.interval import unit_of
 from harnack.backend.extrema import fmax, fmin
-from harnack.choices import did_you_mean
+from harnack.names import did_you_mean
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Real

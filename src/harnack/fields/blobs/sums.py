@@ -3,9 +3,9 @@
 One loop over the blobs. Each is seen from the point in units of its own support, so that one set of
 bounds serves blobs of every size.
 
-What rounding does. Let u be the unit roundoff, v the vector from the point to a centre in units of
-the support, t = v.d. Centres are stored as the sum of two numbers, so that v is right within 4u|v|;
-then so are t, the distance h of the line from the centre (as a length), and the places x = s - t,
+What rounding does. Let u be the unit roundoff, v the vector from the point to a center in units of
+the support, t = v.d. Centers are stored as the sum of two numbers, so that v is right within 4u|v|;
+then so are t, the distance h of the line from the center (as a length), and the places x = s - t,
 within 8u(2 + |t|) where they matter: that is a displacement of the blob beside the path, in which
 also falls that |d| is 1 up to 2u only. A displacement by e changes f' by at most `Steepness.slope`
 times e, and f'' by `Steepness.bend` times e (its jumps at the end of the support are looked for
@@ -225,7 +225,7 @@ def _value(kernel: Kernel, backend: Backend, state: State) -> BlobValue:
 
 
 def _from(p: Vec3, row: list[Real]) -> Vec3:
-    """The vector from p to the centre of a blob."""
+    """The vector from p to the center of a blob."""
     return type(p)(*((row[k] - p[k]) + row[3 + k] for k in range(3)))
 
 
@@ -239,10 +239,10 @@ def _slopes(chord: Chord, a: Real, b: Real, at_a: Real, at_b: Real) -> tuple[Rea
 
 def _bends(chord: Chord, a: Real, b: Real, at_a: Real, at_b: Real) -> tuple[Real, Real]:
     """The range of the second derivative between a and b."""
-    centre = (a <= 0) & (b >= 0)
+    center = (a <= 0) & (b >= 0)
     right = (a <= chord.bend) & (b >= chord.bend)
     left = (a <= -chord.bend) & (b >= -chord.bend)
-    low = dr.select(centre, chord.least, fmin(at_a, at_b))
+    low = dr.select(center, chord.least, fmin(at_a, at_b))
     return low, dr.select(left | right, chord.most, fmax(at_a, at_b))
 
 

@@ -156,9 +156,9 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
     With a_i the areas that the points stand for, f is about 4 pi inside and 0 outside: the
     surface is f = 2 pi. It passes through every point, with the point's normal.
 
-    points: (n, 3). normals: (n, 3), outward, of any length; or "estimate", from neighbours,
+    points: (n, 3). normals: (n, 3), outward, of any length; or "estimate", from neighbors,
         oriented along a spanning tree (`geometry.estimate_normals`). areas: (n,), or None to
-        estimate them from neighbours (Barill et al. 2018, Sec. 3.1).
+        estimate them from neighbors (Barill et al. 2018, Sec. 3.1).
     accuracy: a cluster of points is taken as a whole beyond `accuracy` times its radius; by
         default 2 for values at points and 4 for tracing, which takes more where the tolerance asks
         for it. At least 1.5.
@@ -183,7 +183,7 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
         if normals is None:
             raise CloudError(
                 "normals are missing, and without them inside and outside are not known: give "
-                'them, or normals="estimate" to estimate them from neighbouring points'
+                'them, or normals="estimate" to estimate them from neighboring points'
             )
         if accuracy is not None and not 1.5 <= accuracy <= 100:
             raise ValueError(f"accuracy must lie between 1.5 and 100, not {accuracy}")
@@ -198,7 +198,7 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
             self.areas = estimate_areas(self.points, self.normals)
         self.accuracy = accuracy
         self._box = low, high = self.points.min(axis=0), self.points.max(axis=0)
-        self._centre = single(0.5 * (low + high))
+        self._center = single(0.5 * (low + high))
         extent = max(0.5 * float((high - low).max()), math.sqrt(float(self.areas.sum())) / 4)
         self._size = 2.0 ** math.ceil(math.log2(extent))
         self._hierarchy: Hierarchy | None = None
@@ -208,7 +208,7 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
     ) -> DipolePotential:
         """The potential of as many points (n, 3) elsewhere; normals and areas as for a new one.
 
-        The tree, if there is one, keeps its shape and gets new centres, radii, moments and bounds.
+        The tree, if there is one, keeps its shape and gets new centers, radii, moments and bounds.
         All that is promised is computed from where the points are now, so a tree whose points moved
         far is slower than a new one, never wrong. Raises CloudError as for a new field.
         """
@@ -229,13 +229,13 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
 
     def _upload(self, backend: Backend, *, traced: bool) -> _DipoleBuffers:
         accuracy = self.accuracy or (_TRACED if traced else _VALUES)
-        unit = (self.points - self._centre) / self._size
+        unit = (self.points - self._center) / self._size
         # Areas shrink with the square of lengths, and the potential knows no scale.
         moments = (self.areas / self._size**2)[:, None] * self.normals
         if self._hierarchy is None:
             self._hierarchy = hierarchy_of(unit)
         tree = DipoleTree.of(backend, self._hierarchy, unit, moments, accuracy)
-        return _DipoleBuffers(*placed(backend, self._centre, self._size), tree)
+        return _DipoleBuffers(*placed(backend, self._center, self._size), tree)
 
     def prepare(self, backend: Backend) -> Self:
         prepared = super().prepare(backend)

@@ -35,7 +35,6 @@ import numpy as np
 
 from harnack.backend import FloatArray, backend_of
 from harnack.backend.extrema import fmax, fmin
-from harnack.choices import did_you_mean
 from harnack.enclosures import Curvature, HarmonicBall
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.clearance import tight_extent
@@ -58,6 +57,7 @@ from harnack.fields.unit_coordinates import (
 )
 from harnack.geometry.clouds import estimate_areas, validate_cloud
 from harnack.geometry.meshes import validate_mesh
+from harnack.names import did_you_mean
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
@@ -203,7 +203,7 @@ class ScreenedWindingNumber(DetailedField["_ScreenedBuffers"], BatchedField):
     and deep inside w is near 0 again. The level that lies on the surface is the mean of the two
     limits: 1/2 for l much larger than the surface, 0 for l much smaller. `default_level` is the
     mean of w over (some of) the points, each without its own term, by area, as Kazhdan et al.
-    2006 choose theirs. l should be longer than the distance between neighbouring points: else
+    2006 choose theirs. l should be longer than the distance between neighboring points: else
     the level sets are those of single dipoles.
 
     points, normals: (n, 3), normals of any length, to the outside. areas: (n,) that each point
@@ -264,11 +264,11 @@ class ScreenedWindingNumber(DetailedField["_ScreenedBuffers"], BatchedField):
         self.has_detail = self.method == "tree"
         low, high = self.points.min(axis=0), self.points.max(axis=0)
         extent = max(0.5 * float((high - low).max()), math.sqrt(float(self.areas.max())))
-        self._centre = single(0.5 * (low + high))
+        self._center = single(0.5 * (low + high))
         # A power of two, so that lengths are scaled without rounding.
         self._size = 2.0 ** math.ceil(math.log2(extent))
         share = self.areas[:, None] / (4 * math.pi * self._size**2)
-        self._rows = dipole_rows((self.points - self._centre) / self._size, share * self.normals)
+        self._rows = dipole_rows((self.points - self._center) / self._size, share * self.normals)
         self._kappa = self._size / self.length
         self.default_level = mean_at_dipoles(self._rows, self._kappa)
         self._extents: dict[tuple[float, ...], Volume | None] = {}
@@ -347,7 +347,7 @@ class ScreenedWindingNumber(DetailedField["_ScreenedBuffers"], BatchedField):
             dipoles = DirectSum(backend, self._rows, kernel)
         else:
             dipoles = TreeSum(backend, ClusteredDipoles.of(self._rows), kernel, self.accuracy)
-        return _ScreenedBuffers(*placed(backend, self._centre, self._size), kernel, dipoles)
+        return _ScreenedBuffers(*placed(backend, self._center, self._size), kernel, dipoles)
 
     def _sample(self, on: _ScreenedBuffers, p: Vec3, detail: Real) -> Sample:
         x = on.unit(p)

@@ -5,7 +5,7 @@ and Savart's integrals are bounded by
 
     |grad Omega| <= integral of |dp|/D^2 = 2 pi a/(P d)
 
-(D^2 = A - 2r cos(phi) has this integral exactly; attained at the centre), and
+(D^2 = A - 2r cos(phi) has this integral exactly; attained at the center), and
 
     integral of |dp|/D^3 = 4 a E/(P d^2) <= 2 pi a B,   B = sqrt((1/d^2 + 1/P^2)/2)/(P d),
 
@@ -185,7 +185,7 @@ class CircleSums:
 
 @dataclass(frozen=True)
 class _Seen:
-    """A circle of radius a as seen from x: outward is the part of x - centre in its plane, of
+    """A circle of radius a as seen from x: outward is the part of x - center in its plane, of
     length r a, and x is z a above it."""
 
     a: Real
@@ -204,17 +204,17 @@ class _Seen:
 
 @dataclass(frozen=True)
 class Circles:
-    """Circles on a backend, as records of centre, radius and normal, in units of order one."""
+    """Circles on a backend, as records of center, radius and normal, in units of order one."""
 
     records: Records
 
     @classmethod
     def upload(
-        cls, backend: Backend, circles: Sequence[Circle], centre: FloatArray, size: float
+        cls, backend: Backend, circles: Sequence[Circle], center: FloatArray, size: float
     ) -> Circles:
-        """Circles in coordinates with another centre, divided by a size."""
+        """Circles in coordinates with another center, divided by a size."""
         rows = [
-            [*(np.array(one.centre) - centre) / size, one.radius / size, *one.normal, 0.0]
+            [*(np.array(one.center) - center) / size, one.radius / size, *one.normal, 0.0]
             for one in circles
         ]
         return cls(Records.upload(backend, np.array(rows)))
@@ -334,8 +334,8 @@ class Circles:
 
     def _seen(self, row: list[Real], x: Vec3) -> _Seen:
         vector = self.records.backend.Array3f
-        centre, a, normal = vector(*row[:3]), row[3], vector(*row[4:7])
-        away = x - centre
+        center, a, normal = vector(*row[:3]), row[3], vector(*row[4:7])
+        away = x - center
         height = dr.dot(normal, away)
         # A second projection takes out what the normal, rounded, has left of the first.
         outward = dr.fma(vector(-height), normal, away)

@@ -36,7 +36,7 @@ _MOST_RECORDS = 2**24
 class FaceCurves:
     """Records of all faces: where their edges are, and in which coordinates.
 
-    heads: of a face, its centre and size, the first record of its edges, how many there are (less
+    heads: of a face, its center and size, the first record of its edges, how many there are (less
     than 0 if it is in convex position), and what rounding may do to a point, in units of the face,
     and to the value.
     """
@@ -46,14 +46,14 @@ class FaceCurves:
 
     @classmethod
     def upload(cls, backend: Backend, faces: PolygonFaces) -> FaceCurves:
-        """All faces, each centred and scaled to unit size.
+        """All faces, each centered and scaled to unit size.
 
-        Centres are numbers of the backend, so that near a face they are subtracted exactly.
+        Centers are numbers of the backend, so that near a face they are subtracted exactly.
         """
         low, high = faces.boxes()
-        centre = (0.5 * (low + high)).astype(backend.dtype).astype(np.float64)
+        center = (0.5 * (low + high)).astype(backend.dtype).astype(np.float64)
         face = faces.face_of_corner
-        x = faces.vertices[faces.corners] - centre[face]
+        x = faces.vertices[faces.corners] - center[face]
         first = np.flatnonzero(np.diff(face, prepend=-1))
         size = np.maximum.reduceat(np.linalg.norm(x, axis=1), first)
         magnitude = np.maximum(np.abs(low), np.abs(high)).max(axis=1) / size
@@ -68,7 +68,7 @@ class FaceCurves:
         corners, signed = np.bincount(face), np.where(faces.in_convex_position, -trips, trips)
         heads = np.column_stack(
             [
-                centre, size, np.cumsum(trips) - trips, signed,
+                center, size, np.cumsum(trips) - trips, signed,
                 backend.epsilon * (6 + 2 * magnitude),
                 backend.epsilon * (8 + 2 * np.sqrt(corners)),
             ]

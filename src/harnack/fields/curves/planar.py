@@ -89,7 +89,7 @@ class PlanarRegion:
 
 @dataclass(frozen=True)
 class _Loop:
-    """A simple loop in a plane: its points (k, 2) or, of a circle, centre and radius; sign: 1 if it
+    """A simple loop in a plane: its points (k, 2) or, of a circle, center and radius; sign: 1 if it
     runs counter-clockwise."""
 
     points: FloatArray
@@ -126,18 +126,18 @@ def planar_region(loops: Loops, circles: Sequence[Circle]) -> PlanarRegion | Non
     normal, origin, size, axes = plane
     flat: list[_Loop] = []
     for loop in loops:
-        centred = (loop - origin) / size
-        edges = np.roll(centred, -1, axis=0) - centred
-        if len(loop) < 3 or not (edges * edges).sum(axis=1).all() or not is_simple(centred):
+        centered = (loop - origin) / size
+        edges = np.roll(centered, -1, axis=0) - centered
+        if len(loop) < 3 or not (edges * edges).sum(axis=1).all() or not is_simple(centered):
             return None
-        points = centred @ axes.T
+        points = centered @ axes.T
         following = np.roll(points, -1, axis=0)
         area = float((points[:, 0] * following[:, 1] - points[:, 1] * following[:, 0]).sum())
         flat.append(_Loop(points, 0.0, 1 if area > 0 else -1))
     for one in circles:
-        centre = ((np.array(one.centre) - origin) / size) @ axes.T
+        center = ((np.array(one.center) - origin) / size) @ axes.T
         sign = 1 if float(np.dot(one.normal, normal)) > 0 else -1
-        flat.append(_Loop(centre[None], one.radius / size, sign))
+        flat.append(_Loop(center[None], one.radius / size, sign))
     if not all(_apart(one, other) for one, other in itertools.combinations(flat, 2)):
         return None
     # Just inside of a loop: the signs of all loops around it. Just outside of all, 0.
@@ -166,7 +166,7 @@ def _plane_of(
     if circles:
         normal = np.array(circles[0].normal)
         # Of all points the first circle's are meant exactly.
-        origin = np.array(circles[0].centre)
+        origin = np.array(circles[0].center)
         x = (points - origin) / size
     else:
         normal = np.linalg.svd(x - x.mean(axis=0), full_matrices=False)[2][2]

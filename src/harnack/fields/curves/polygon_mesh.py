@@ -141,7 +141,7 @@ class _Cells:
 
 
 def _are_empty(
-    curves: FaceCurves, face: IntArray, centres: FloatArray, half: FloatArray,
+    curves: FaceCurves, face: IntArray, centers: FloatArray, half: FloatArray,
     levels: tuple[float, ...],
 ) -> BoolArray:  # fmt: skip
     """Whether no level set of a face comes within `half` of points: (k,) faces, (k, 3), (k,).
@@ -162,7 +162,7 @@ def _are_empty(
     real = backend.Float
     index = aligned_integers(backend, face)
     on = curves.face(index).face
-    x = (to_vector3(backend, centres) - on.centre) / on.size
+    x = (to_vector3(backend, centers) - on.center) / on.size
     h = aligned(backend, half) / on.size
 
     def add(p: Vec3, q: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:

@@ -14,7 +14,6 @@ import numpy as np
 from harnack.backend import FloatArray, backend_of, choose_backend, to_numpy
 from harnack.backend.extrema import fmin
 from harnack.backend.tensors import is_tensor, vectors_of
-from harnack.choices import did_you_mean
 from harnack.enclosures import HarmonicBall, LineLipschitz
 from harnack.fields.clearance import tight_extent
 from harnack.fields.curves.circle_sums import Circles, CircleSums
@@ -38,7 +37,8 @@ from harnack.fields.unit_coordinates import UnitCoordinates, UploadedField, epsi
 from harnack.geometry import Circle, ConvexHull, is_convex_position, total_length
 from harnack.geometry.circles import net_circles
 from harnack.geometry.curves import CurveShapeError, Loops, validate_curves
-from harnack.geometry.net_loops import net_loops, uncancelled_edges
+from harnack.geometry.net_loops import net_loops, uncanceled_edges
+from harnack.names import did_you_mean
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -63,7 +63,7 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
     Dr.Jit 3-vector of n lanes or a tensor (n, 3): hits and values can be differentiated by its
     vertices. Circles are exact, and cost about as much as nine vertices.
 
-    Edges that are run there and back, by one loop or by two neighbours, are taken out before
+    Edges that are run there and back, by one loop or by two neighbors, are taken out before
     anything is computed (`net_loops`): f does not see them. If none is left, f is 0 everywhere,
     every ray a proved miss, and levels that are multiples of 4 pi are refused.
 
@@ -112,8 +112,8 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         self._asked = certificate
         self.certificate = self._choose(certificate)
         points = self._points_around()
-        self._centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
-        self._size = float(np.linalg.norm(points - self._centre, axis=1).max())
+        self._center = 0.5 * (points.min(axis=0) + points.max(axis=0))
+        self._size = float(np.linalg.norm(points - self._center, axis=1).max())
         self._extents: dict[tuple[float, ...], Volume | None] = {}
 
     @property
@@ -162,31 +162,31 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
 
     def _upload(self, backend: Backend, *, traced: bool) -> _CurveBuffers:
         del traced
-        # Centred and scaled to unit size: products of eight lengths stay far from overflow. The
-        # centre is a number of the backend, so that near the curve it is subtracted exactly.
+        # Centered and scaled to unit size: products of eight lengths stay far from overflow. The
+        # center is a number of the backend, so that near the curve it is subtracted exactly.
         cast = np.float64 if backend.precision == "double" else np.float32
-        if (size := float(np.abs(self._centre).max()) + self._size) > 0.1 * float(
+        if (size := float(np.abs(self._center).max()) + self._size) > 0.1 * float(
             np.finfo(cast).max
         ):
             raise ValueError(
                 f"coordinates up to {size:g} are too large for {backend.precision} precision: "
                 "choose units nearer to 1"
             )
-        centre = self._centre.astype(cast).astype(np.float64)
-        unit = tuple((loop - centre) / self._size for loop in self._net)
+        center = self._center.astype(cast).astype(np.float64)
+        unit = tuple((loop - center) / self._size for loop in self._net)
         edges = LoopEdges.upload(backend, unit) if unit else None
         circles = None
         if self._net_circles:
-            circles = Circles.upload(backend, self._net_circles, centre, self._size)
+            circles = Circles.upload(backend, self._net_circles, center, self._size)
         plane = None
         if self._region is not None:
-            height = (self._region.offset - float(self._region.normal @ centre)) / self._size
+            height = (self._region.offset - float(self._region.normal @ center)) / self._size
             numbers = (*self._region.normal.tolist(), height)
             plane = tuple(dr.opaque(backend.Float, number) for number in numbers)
         magnitude = float(np.abs(self._points_around()).max() / self._size)
         factors = sum(len(loop) for loop in self._net)
         return _CurveBuffers(
-            *placed(backend, centre, self._size),
+            *placed(backend, center, self._size),
             edges,
             circles,
             plane,
@@ -221,7 +221,7 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
             ball = self._planar_ball(on, x, sums, distance)
         else:
             ball = HarmonicBall(distance, -1.5 * _PERIOD, 1.5 * _PERIOD)
-        # On the curve itself, to rounding, every level meets (`uncancelled_edges`) and no gradient
+        # On the curve itself, to rounding, every level meets (`uncanceled_edges`) and no gradient
         # exists: give one so steep that the point counts as close to any level. A value that is
         # not a number anywhere else stays one, and the tracer refuses it.
         met = sums.distance <= 2 * rounding
@@ -309,21 +309,21 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         return slope_change(sums.cubes, sums.fourths, distance, reach) / on.size
 
     def closest_on_boundary(self, p: Vec3) -> Vec3 | None:
-        """The closest point of the curve, edges that cancel left out (`uncancelled_edges`)."""
+        """The closest point of the curve, edges that cancel left out (`uncanceled_edges`)."""
         if self._is_empty:
             return None
         on = self._on(p)
         x = on.unit(p)
         nearest, square = on.backend.Array3f(0), on.backend.Float(dr.inf)
         if self._net:
-            centre = to_numpy(on.centre).reshape(3).astype(np.float64)
-            start, end = ((q - centre) / self._size for q in uncancelled_edges(self._net))
+            center = to_numpy(on.center).reshape(3).astype(np.float64)
+            start, end = ((q - center) / self._size for q in uncanceled_edges(self._net))
             nearest = closest_on_segments(segments(on.backend, start, end), x)
             square = dr.squared_norm(x - nearest)
         if on.circles is not None:
             other, apart = on.circles.closest(x)
             nearest = dr.select(apart < square, other, nearest)
-        return nearest * on.size + on.centre
+        return nearest * on.size + on.center
 
     def parameters(self) -> tuple[Any, ...]:
         return tuple(one for one in self._movable if _is_drjit(one))
@@ -407,7 +407,7 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
             "loops": len(self.loops) + len(self.circles),
             **({"circles": len(self.circles)} if self.circles else {}),
             "vertices": sum(len(loop) for loop in self.loops),
-            "cancelled edges": sum(map(len, self.loops)) - sum(map(len, self._net)),
+            "canceled edges": sum(map(len, self.loops)) - sum(map(len, self._net)),
             "convex position": self.convex_position,
             "certificate": self.certificate,
         }
@@ -419,7 +419,7 @@ class _CurveBuffers(UnitCoordinates):
 
     circles: likewise. plane: normal (x, y, z) and offset of the `PlanarRegion`, if there is one.
     rounding: how far a point may be from where it was meant to be, in units of the curve. Near the
-        curve p - centre is exact, division and the curve's own coordinates have a few roundings of
+        curve p - center is exact, division and the curve's own coordinates have a few roundings of
         size 1, and p itself was rounded once, at the curve's distance from 0.
     value_rounding: what rounding may do to a product of so many factors.
     """

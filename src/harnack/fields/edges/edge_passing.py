@@ -13,7 +13,7 @@ distance of the edge from the points of a stretch of the line from below, and |e
     w <= 1/(rho^2 sqrt(rho^2 + h^2)),
 
 for a point of the edge at length l from the nearest one is at least sqrt(rho^2 + l^2) away, and
-the integral over an interval of l of length 2h is largest if it is centred. Walking from x by at
+the integral over an interval of l of length 2h is largest if it is centered. Walking from x by at
 most T, rho falls no faster than one walks, and nowhere below the distance rho' of the edge from the
 whole line, nor below the distance rho" of the stretch from the line through the edge (a ray may
 meet that one at a small angle, far ahead). So for |s| <= T
@@ -92,7 +92,7 @@ def rates_along(
 ) -> tuple[Real, ...]:
     """For each length T a constant K of the module's bound on the line for |s| <= T.
 
-    Infinite on lanes that are not active, which cost nothing where their neighbours are not
+    Infinite on lanes that are not active, which cost nothing where their neighbors are not
     either, and where the line meets the curve within T, to rounding.
     """
 

@@ -26,7 +26,7 @@ Spinor: TypeAlias = "tuple[Real, Real, Real, Real]"
 
 # Often, and without squares: beside a vertex or far away, the product of a few factors leaves the
 # range of float32.
-_RENORMALISE_EVERY = 2
+_RENORMALIZE_EVERY = 2
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def sum_over_edges(edges: LoopEdges, x: Vec3) -> EdgeSums:
             lb, sb, cb = spinor(b)
             re, im = inner_product(ca, cb)
             zr, zi = dr.fma(zr, re, -(zi * im)), dr.fma(zr, im, zi * re)
-            if k % _RENORMALISE_EVERY == _RENORMALISE_EVERY - 1:
+            if k % _RENORMALIZE_EVERY == _RENORMALIZE_EVERY - 1:
                 scale = dr.rcp(dr.abs(zr) + dr.abs(zi))
                 zr, zi = zr * scale, zi * scale
             e = q - p
@@ -117,7 +117,7 @@ def inner_product(a: Spinor, b: Spinor) -> tuple[Real, Real]:
 
 
 def spinor(a: Vec3) -> tuple[Real, Real, Spinor]:
-    """|a|, |a| + |a_z| and the (unnormalised) spinor of direction a as four reals."""
+    """|a|, |a| + |a_z| and the (unnormalized) spinor of direction a as four reals."""
     length = dr.sqrt(dr.fma(a.z, a.z, dr.fma(a.x, a.x, a.y * a.y)))
     s = length + dr.abs(a.z)
     up = a.z >= 0

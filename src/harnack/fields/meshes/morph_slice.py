@@ -291,7 +291,7 @@ class MorphSlice(DetailedField["_SliceBuffers"], BatchedField):
         low = np.min([one.min(axis=(0, 1)) for one in corners], axis=0)
         high = np.max([one.max(axis=(0, 1)) for one in corners], axis=0)
         self._box = low, high
-        self._centre = single(0.5 * (low + high))
+        self._center = single(0.5 * (low + high))
         # A power of two, so that lengths are scaled without rounding.
         self._size = 2.0 ** math.ceil(math.log2(0.5 * float((high - low).max())))
         longest = [spacing * height for height in self.heights]
@@ -304,7 +304,7 @@ class MorphSlice(DetailedField["_SliceBuffers"], BatchedField):
     def _clustered(self, pieces: Centroids) -> ClusteredDipoles:
         """The pieces in unit coordinates, scaled so that f is the sum of both."""
         share = 1 / (8 * math.pi * self._size**2)
-        points = (pieces.points - self._centre) / self._size
+        points = (pieces.points - self._center) / self._size
         return ClusteredDipoles.of(dipole_rows(points, share * pieces.moments))
 
     @property
@@ -353,7 +353,7 @@ class MorphSlice(DetailedField["_SliceBuffers"], BatchedField):
             TreeSum(backend, dipoles, SlicedKernel(backend, height / self._size), self.accuracy)
             for dipoles, height in zip(self._dipoles, self.heights, strict=True)
         )
-        return _SliceBuffers(*placed(backend, self._centre, self._size), clouds)
+        return _SliceBuffers(*placed(backend, self._center, self._size), clouds)
 
     def _sample(self, on: _SliceBuffers, p: Vec3, detail: Real) -> Sample:
         return on.sample(p, detail)

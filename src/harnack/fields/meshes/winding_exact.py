@@ -105,7 +105,7 @@ class ChainLeaves:
 
 
 def chain_leaves(vertices: FloatArray, trails: list[IntArray]) -> ChainLeaves:
-    """Trails of vertices, each ending where it begins, laid out; neighbours next to each other.
+    """Trails of vertices, each ending where it begins, laid out; neighbors next to each other.
 
     Trails of as many leaves are the primitives of a tree of their own. Its empty slots stay empty
     leaves, so that its nodes are nodes here. The largest such tree comes first, and so each begins
@@ -155,7 +155,7 @@ def _ranges(start: IntArray, end: IntArray, width: int) -> IntArray:
 def chain_columns(
     leaves: ChainLeaves, nodes: int, vertices: FloatArray, epsilon: float
 ) -> FloatArray:
-    """Numbers of the nodes of a level: centre, radius, accepting distances of rough and close looks
+    """Numbers of the nodes of a level: center, radius, accepting distances of rough and close looks
     | 15 coefficients, errors of value and gradient, A and K of `bend_columns`, chord from and to,
     1/its length^2 or 0 for whole trails, which have none.
 
@@ -178,7 +178,7 @@ def chain_columns(
     chord = vertices[np.stack([leaves.edges[begin, 0], leaves.edges[end - 1, 1]], axis=1)]
     square = ((chord[:, 1] - chord[:, 0]) ** 2).sum(axis=1)
     inverse = np.where(whole[begin] | (square == 0), 0, 1 / np.where(square > 0, square, 1))
-    parts = (level.centre, level.radius * (1 + 1e-6), *accept, cartesian(level.moments))
+    parts = (level.center, level.radius * (1 + 1e-6), *accept, cartesian(level.moments))
     parts += (error, slope, *bend_columns(level, RATIO), chord.reshape(-1, 6), inverse)
     found = np.column_stack(parts)
     table = np.zeros((nodes, found.shape[1]))
@@ -248,9 +248,9 @@ class EdgeChains:
         pad, close = 16 * unit, fmax(real(detail), real(1))
 
         def visit(node: Node, state: State) -> tuple[Mask, State]:
-            centre, radius = vector(*node.head[:3]), node.head[3] + pad
-            r = x - centre
-            square, (u, v) = dr.squared_norm(r), frame.across(centre)
+            center, radius = vector(*node.head[:3]), node.head[3] + pad
+            r = x - center
+            square, (u, v) = dr.squared_norm(r), frame.across(center)
             missed = (dr.fma(u, u, v * v) > radius * radius) | (dr.dot(r, frame.d) > radius)
             accepting = dr.select(detail < 1, node.head[4], node.head[5] * close)
             far = missed & (square > dr.square(accepting))

@@ -1,4 +1,4 @@
-"""A mesh made ready for winding numbers: welded, duplicates cancelled, scaled, in a tree."""
+"""A mesh made ready for winding numbers: welded, duplicates canceled, scaled, in a tree."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class WindingMesh:
     source: (m,) the face that it comes from.
     singular: (k, 2) directed edges at which triangles do not cancel, an edge of weight 2 twice.
     given: (g, 3) all faces, as given. welded: (n,) the vertex that stands for each.
-    centre, size: `unit_vertices` = (vertices - centre)/size, with a power of two for a size, so
+    center, size: `unit_vertices` = (vertices - center)/size, with a power of two for a size, so
         that lengths can be scaled to and fro without rounding.
     """
 
@@ -44,7 +44,7 @@ class WindingMesh:
     singular: IntArray
     given: IntArray
     welded: IntArray
-    centre: FloatArray
+    center: FloatArray
     size: float
 
     @classmethod
@@ -58,7 +58,7 @@ class WindingMesh:
         welded = weld_vertices(x)
         net = net_faces(welded[f])
         if len(net.faces) == 0:
-            raise MeshError("faces: every face is cancelled by its own copy turned round")
+            raise MeshError("faces: every face is canceled by its own copy turned round")
         if net.multiplicity.sum() >= MOST_TRIANGLES:
             raise MeshError(
                 f"faces: at most {MOST_TRIANGLES - 1} are possible; cut the mesh in parts"
@@ -72,7 +72,7 @@ class WindingMesh:
             np.repeat(edges, weights, axis=0),
             f,
             welded,
-            *_centre_and_size(x, net.faces),
+            *_center_and_size(x, net.faces),
         )
 
     def moved(self, vertices: npt.ArrayLike) -> WindingMesh:
@@ -98,8 +98,8 @@ class WindingMesh:
                     f"vertices: {i} and {self.welded[i]} were at the same place, where faces were "
                     "joined, and now are not: make a new winding number of this mesh"
                 )
-        centre, size = _centre_and_size(x, self.faces)
-        mesh = dataclasses.replace(self, vertices=x, centre=centre, size=size)
+        center, size = _center_and_size(x, self.faces)
+        mesh = dataclasses.replace(self, vertices=x, center=center, size=size)
         made = vars(self)
         vars(mesh).update({name: made[name] for name in _SHARED if name in made})
         return mesh
@@ -107,7 +107,7 @@ class WindingMesh:
     @functools.cached_property
     def unit_vertices(self) -> FloatArray:
         """(n, 3) vertices about the origin, of size about one."""
-        return (self.vertices - self.centre) / self.size
+        return (self.vertices - self.center) / self.size
 
     @functools.cached_property
     def triangles(self) -> IntArray:
@@ -194,7 +194,7 @@ def _box(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, FloatArray]
     return vertices[used].min(axis=0), vertices[used].max(axis=0)
 
 
-def _centre_and_size(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, float]:
+def _center_and_size(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, float]:
     low, high = _box(vertices, faces)
     size = 2.0 ** np.ceil(np.log2(0.5 * float((high - low).max())))
     return single(0.5 * (low + high)), float(size)

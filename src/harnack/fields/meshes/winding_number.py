@@ -1,4 +1,4 @@
-"""The generalised winding number of triangle meshes: holes, soups, overlaps, all repaired.
+"""The generalized winding number of triangle meshes: holes, soups, overlaps, all repaired.
 
 Where the level sets of a winding number can be: its triangles, and what spans its holes.
 
@@ -20,7 +20,6 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray, IntArray, backend_of
-from harnack.choices import did_you_mean
 from harnack.enclosures import LineLipschitz
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.clearance import occupied_cells, tight_extent
@@ -31,6 +30,7 @@ from harnack.fields.meshes.winding_tree import TreeWinding
 from harnack.fields.sheets import NO_SHEET, Crossing, NearestSheet
 from harnack.fields.unit_coordinates import UnitCoordinates, UploadedField, epsilon_at, placed
 from harnack.geometry import Box
+from harnack.names import did_you_mean
 from harnack.tree.nearest import distance_to_triangles, jumps_within, nearest_triangle
 from harnack.tree.triangles import Frame, TriangleRays
 
@@ -202,7 +202,7 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
         """The winding number of the same faces with their vertices (n, 3) elsewhere, for less work.
 
         Faces are not joined and sorted into a tree again: the tree keeps its shape, and gets new
-        centres, radii, moments and bounds. All that is promised is computed from where the vertices
+        centers, radii, moments and bounds. All that is promised is computed from where the vertices
         are now, so a tree whose vertices moved far is slower than a new one, never wrong.
 
         Raises MeshError as for a new mesh, and for vertices that coincided and come apart.
@@ -241,7 +241,7 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
             winding = ExactWinding.of(backend, mesh, rays, traced)
         else:
             winding = TreeWinding.of(backend, mesh, accuracy, self.order)
-        return _MeshBuffers(*placed(backend, mesh.centre, mesh.size), winding, rays)
+        return _MeshBuffers(*placed(backend, mesh.center, mesh.size), winding, rays)
 
     def occupied(self, levels: tuple[float, ...]) -> OccupiedCells | None:
         """Where edges are summed up exactly, and are not few."""

@@ -22,7 +22,7 @@ class SeenCluster:
     """A node of the tree from points x.
 
     head: its numbers that every visit reads. payload: the others, fetched where it is far.
-    r: x from its centre. square: |r|^2, plus that of the height. inverse: 1/sqrt(square), or 0
+    r: x from its center. square: |r|^2, plus that of the height. inverse: 1/sqrt(square), or 0
     where the node is not far. far: whether it is far enough to be taken as a whole.
     """
 
@@ -41,7 +41,7 @@ def walk_clusters(
     tree: PackedTree, x: Vec3, closer: Real, add_cluster: EachCluster,
     add_primitive: EachPrimitive, state: State, active: Mask = True, height_square: Real = 0.0,
 ) -> State:  # fmt: skip
-    """The state after a walk over a tree whose nodes begin with their centre and the distance from
+    """The state after a walk over a tree whose nodes begin with their center and the distance from
     which on they may be taken as a whole; `closer` times that is asked for.
 
     add_cluster(cluster, state): the state with a node added where it is far. add_primitive: as

@@ -42,10 +42,10 @@ AddPrimitive: TypeAlias = "Callable[[list[Real], Mask, FieldSums, Own], tuple[Fi
 
 def node_columns(level: NodeMoments, order: int, rough: float, error: FloatArray) -> FloatArray:
     """Numbers of nodes as the walk below reads them, that may be taken as a whole beyond `rough`
-    times their radius: centre, accepting distance, A and K of `bend_columns` | 15 coefficients,
+    times their radius: center, accepting distance, A and K of `bend_columns` | 15 coefficients,
     value error E (k,), as given."""
     head = [rough * level.radius, *bend_columns(level, rough)]
-    parts = (level.centre, *head, cartesian(level.moments, order), error)
+    parts = (level.center, *head, cartesian(level.moments, order), error)
     return np.column_stack(parts)
 
 

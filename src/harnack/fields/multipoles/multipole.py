@@ -37,7 +37,7 @@ _POWERS = 10
 class NodeMoments:
     """The nodes of one level of the tree.
 
-    centre: (k, 3) about which the moments are taken: the mean of the dipoles by area.
+    center: (k, 3) about which the moments are taken: the mean of the dipoles by area.
     radius: (k,) of a ball around it that holds all the dipoles.
     area: (k,) sum of a_i = |a_i n_i|.
     second, third, fourth: (k, 3, 3), (k, 3) and (k,) sums of a_i d_i d_i^T, of a_i |d_i|^2 d_i and
@@ -45,7 +45,7 @@ class NodeMoments:
     moments: M_lm, (k,) each, for 1 <= l <= 5 and m >= 0.
     """
 
-    centre: FloatArray
+    center: FloatArray
     radius: FloatArray
     area: FloatArray
     second: FloatArray
@@ -129,7 +129,7 @@ def _leaves(
 ) -> tuple[NodeMoments, list[Real], FloatArray, FloatArray]:
     """The leaves, their `_PARTS` on the backend, and boxes around them.
 
-    One lane a leaf, which looks at its primitives twice: for the centre, and about it.
+    One lane a leaf, which looks at its primitives twice: for the center, and about it.
     """
     index, real, vector = backend.UInt32, backend.Float, backend.Array3f
     filled = tree.slots != NO_PRIMITIVE
@@ -155,7 +155,7 @@ def _leaves(
 
     def summed(of: _Primitive, *parts: Real) -> tuple[Any, ...]:
         for one in of.dipoles:
-            away = [(weight, point - centre) for weight, point in one.points]
+            away = [(weight, point - center) for weight, point in one.points]
             more = _powers(dr.norm(one.normal), away) + _flat(_spread_out(one.normal, away))
             parts = tuple(a + b for a, b in zip(parts, more, strict=True))
         return parts
@@ -163,12 +163,12 @@ def _leaves(
     nothing = (vector(dr.inf), vector(-dr.inf), real(0), vector(0))
     low, high, area, weighted = visit(measured, nothing)
     # The mean of positions by area, or the box's middle where there is no area.
-    centre = dr.select(area > 0, weighted / dr.select(area > 0, area, 1), 0.5 * (low + high))
+    center = dr.select(area > 0, weighted / dr.select(area > 0, area, 1), 0.5 * (low + high))
     sums = visit(summed, (real(0),) * (_POWERS + len(_PARTS)))
     powers, parts = sums[:_POWERS], sums[_POWERS:]
-    dr.eval(low, high, area, centre, *sums)
+    dr.eval(low, high, area, center, *sums)
     boxes = to_numpy(low), to_numpy(high)
-    at, (xx, yy, zz, xy, xz, yz, *third, fourth) = to_numpy(centre), map(to_numpy, powers)
+    at, (xx, yy, zz, xy, xz, yz, *third, fourth) = to_numpy(center), map(to_numpy, powers)
     second = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
     sizes = to_numpy(area), second, np.stack(third, axis=1), fourth
     return NodeMoments(at, _reach(at, *boxes), *sizes, _moments_of(parts)), list(parts), *boxes
@@ -215,10 +215,10 @@ def _parents(
     """The level above, whose boxes are given, and its `_PARTS`."""
     count, arity = len(low), len(below.area) // len(low)
     area = below.area.reshape(-1, arity).sum(axis=1)
-    weighted = (below.area[:, None] * below.centre).reshape(-1, arity, 3).sum(axis=1)
+    weighted = (below.area[:, None] * below.center).reshape(-1, arity, 3).sum(axis=1)
     some = (area > 0)[:, None]
-    centre = np.where(some, weighted / np.where(some, area[:, None], 1), 0.5 * (low + high))
-    shift = below.centre - np.repeat(centre, arity, axis=0)
+    center = np.where(some, weighted / np.where(some, area[:, None], 1), 0.5 * (low + high))
+    shift = below.center - np.repeat(center, arity, axis=0)
     given: Pairs = dict.fromkeys(KEYS, (0.0, 0.0))
     for (l, m, part), values in zip(_PARTS, parts, strict=True):
         given[l, m] = (given[l, m][0], values) if part else (values, 0.0)
@@ -230,12 +230,12 @@ def _parents(
     second, third, fourth = (
         one.reshape(count, arity, *one.shape[1:]).sum(axis=1) for one in _moved(below, shift)
     )
-    reach, moments = _reach(centre, low, high), _moments_of(sums)
-    return NodeMoments(centre, reach, area, second, third, fourth, moments), sums
+    reach, moments = _reach(center, low, high), _moments_of(sums)
+    return NodeMoments(center, reach, area, second, third, fourth, moments), sums
 
 
 def _moved(level: NodeMoments, s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Second, third and fourth about centre - s: what they are of d + s. About its own centre a
+    """Second, third and fourth about center - s: what they are of d + s. About its own center a
     node has no first moment."""
     a, square = level.area[:, None], (s * s).sum(axis=1)
     trace, bent = np.einsum("kii->k", level.second), np.einsum("kij,kj->ki", level.second, s)
@@ -245,9 +245,9 @@ def _moved(level: NodeMoments, s: FloatArray) -> tuple[FloatArray, FloatArray, F
     return second, third, fourth + 4 * ((level.third + bent) * s).sum(axis=1)
 
 
-def _reach(centre: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """Distance from the centre to the farthest corner of the box."""
-    return np.linalg.norm(np.maximum(high - centre, centre - low), axis=1)
+def _reach(center: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Distance from the center to the farthest corner of the box."""
+    return np.linalg.norm(np.maximum(high - center, center - low), axis=1)
 
 
 def cartesian(moments: Moments, order: int = 2) -> FloatArray:

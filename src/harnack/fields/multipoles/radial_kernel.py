@@ -256,7 +256,7 @@ def seen_dipole(row: Sequence[Real], x: Vec3, kernel: RadialKernel, derivatives:
 
 
 def cluster_parts(c: Sequence[Real], z: Vec3, inverse: Real) -> list[Part]:
-    """The parts of a cluster with coefficients c (`radial_tree.coefficients`), centre x + z;
+    """The parts of a cluster with coefficients c (`radial_tree.coefficients`), center x + z;
     inverse = 1/D.
 
     P_1 = c0.z + c3; P_2 = z.(A z + b); P_3 = C[z, z, z] with symmetric A, C.

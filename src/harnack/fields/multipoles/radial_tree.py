@@ -137,7 +137,7 @@ def seen_cluster(
     head: Sequence[Real], c: Sequence[Real], z: Vec3, length: Real, kernel: RadialKernel,
     derivatives: int,
 ) -> Source:  # fmt: skip
-    """A node with numbers `columns`, its centre at z, D = length, and what is left out."""
+    """A node with numbers `columns`, its center at z, D = length, and what is left out."""
     radius, weight = head[4], head[5]
     inverse = dr.rcp(length)
     parts = cluster_parts(c, z, inverse)
@@ -183,10 +183,10 @@ class ClusteredDipoles:
 
 @dataclass(frozen=True)
 class ClusterMoments:
-    """The nodes of one level: centre (k, 3), radius, weight, third = sum w |d|^3 (k,) each, and
+    """The nodes of one level: center (k, 3), radius, weight, third = sum w |d|^3 (k,) each, and
     T1 (k, 3), T2 (k, 3, 3), T3 (k, 3, 3, 3), symmetric."""
 
-    centre: FloatArray
+    center: FloatArray
     radius: FloatArray
     weight: FloatArray
     third: FloatArray
@@ -198,7 +198,7 @@ class ClusterMoments:
 def clusters(tree: Hierarchy, rows: FloatArray) -> list[ClusterMoments]:
     """Moments of all levels, from the leaves to the root.
 
-    T1, T2, T3 move from a child's centre to its parent's, d -> d + s: T2 gains sym(T1 s) and T3
+    T1, T2, T3 move from a child's center to its parent's, d -> d + s: T2 gains sym(T1 s) and T3
     sym(2 T2 s + T1 s s). The rest is taken from the dipoles themselves.
     """
     slots = in_slots(tree, rows)
@@ -206,8 +206,8 @@ def clusters(tree: Hierarchy, rows: FloatArray) -> list[ClusterMoments]:
     for count, arity in zip(tree.counts, (0, *tree.arities), strict=True):
         p, m, w = np.split(slots.reshape(count, -1, slots.shape[2])[..., :7], [3, 6], axis=2)
         weight = w.sum(axis=(1, 2))
-        centre = (w * p).sum(axis=1) / np.where(weight > 0, weight, 1)[:, None]
-        d = p - centre[:, None]
+        center = (w * p).sum(axis=1) / np.where(weight > 0, weight, 1)[:, None]
+        d = p - center[:, None]
         length = np.where(w[..., 0] > 0, np.linalg.norm(d, axis=2), 0)
         third = (w[..., 0] * length**3).sum(axis=1)
         if not levels:
@@ -218,15 +218,15 @@ def clusters(tree: Hierarchy, rows: FloatArray) -> list[ClusterMoments]:
                 np.einsum("ksi,ksj,ksl->kijl", m, d, d),
             )
         else:
-            moments = _moved(levels[-1], centre, arity)
-        levels.append(ClusterMoments(centre, length.max(axis=1), weight, third, *moments))
+            moments = _moved(levels[-1], center, arity)
+        levels.append(ClusterMoments(center, length.max(axis=1), weight, third, *moments))
     return levels
 
 
 def _moved(
-    children: ClusterMoments, centre: FloatArray, arity: int
+    children: ClusterMoments, center: FloatArray, arity: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    s = children.centre - np.repeat(centre, arity, axis=0)
+    s = children.center - np.repeat(center, arity, axis=0)
     t1, t2, t3 = children.t1, children.t2, children.t3
     first = np.einsum("ki,kj->kij", t1, s)
     second = t3 + np.einsum("kij,kl->kijl", 2 * t2 + first, s)
@@ -256,7 +256,7 @@ def coefficients(level: ClusterMoments) -> FloatArray:
 
 
 def columns(level: ClusterMoments, accept: FloatArray) -> FloatArray:
-    """(k, 30): centre, accepting distance, radius, weight | coefficients, third."""
-    # Rounding of centre and radius must not let a dipole out.
+    """(k, 30): center, accepting distance, radius, weight | coefficients, third."""
+    # Rounding of center and radius must not let a dipole out.
     head = np.stack([accept, level.radius * (1 + 1e-5) + 1e-6, level.weight], axis=1)
-    return np.concatenate([level.centre, head, coefficients(level), level.third[:, None]], axis=1)
+    return np.concatenate([level.center, head, coefficients(level), level.third[:, None]], axis=1)

@@ -114,7 +114,7 @@ class Part(abc.ABC):
 
     @abc.abstractmethod
     def disk(self) -> tuple[Complex, Real]:
-        """Centre and radius of a disk that holds it."""
+        """Center and radius of a disk that holds it."""
 
 
 @dataclass(frozen=True)
@@ -290,14 +290,14 @@ class PowerProduct(Branches):
     def prepare(self, backend: Backend) -> Branches:
         return replace(super().prepare(backend), _on=_uploaded(self.places, backend))
 
-    def _centres(self, z: Complex) -> tuple[Complex, ...]:
+    def _centers(self, z: Complex) -> tuple[Complex, ...]:
         return self._on or tuple(type(z)(a.real, a.imag) for a in self.places)
 
     def moved_off(self, z: Complex, rounding: Real) -> Complex:
         """Also off zeros, where the logarithm of the product is not a number: by one rounding."""
         z = super().moved_off(z, rounding)
         unit = 4 * float(dr.epsilon(z.real))
-        for a, alpha in zip(self._centres(z), self.exponents, strict=True):
+        for a, alpha in zip(self._centers(z), self.exponents, strict=True):
             if alpha > 0 and alpha.is_integer():
                 least = _LEAST_SQUARED + unit * fmax(dr.abs(a.real), dr.abs(a.imag))
                 beside = type(z)(a.real + least, a.imag)
@@ -308,7 +308,7 @@ class PowerProduct(Branches):
         scale, angle = 0 * z.real, 0 * z.real
         slope = type(z)(scale, scale)
         other = slope
-        for a, alpha in zip(self._centres(z), self.exponents, strict=True):
+        for a, alpha in zip(self._centers(z), self.exponents, strict=True):
             away = z - a
             scale = scale + alpha * dr.log(abs(away))
             angle = angle + alpha * dr.atan2(away.imag, away.real)
@@ -329,7 +329,7 @@ class PowerProduct(Branches):
     def bend(self, part: Part) -> Real:
         nearest: list[Real] = []
         farthest: list[Real] = []
-        for a in self._centres(part.disk()[0]):
+        for a in self._centers(part.disk()[0]):
             low, high = part.distances(a)
             nearest.append(dr.log(low))
             farthest.append(dr.log(high))
@@ -360,7 +360,7 @@ class PowerProduct(Branches):
     def roundings(self, z: Complex, branches: tuple[Branch, ...]) -> Real:
         """Of exp and of the angle: by a few units of their arguments."""
         most = 12 + 4 * math.pi * sum(abs(alpha) for alpha in self.exponents)
-        for a, alpha in zip(self._centres(z), self.exponents, strict=True):
+        for a, alpha in zip(self._centers(z), self.exponents, strict=True):
             most = most + 4 * abs(alpha) * dr.abs(dr.log(abs(z - a)))
         return most * abs(branches[0].value)
 
@@ -387,13 +387,13 @@ class Logarithm(Branches):
     def prepare(self, backend: Backend) -> Branches:
         return replace(super().prepare(backend), _on=_uploaded(self.places, backend))
 
-    def _centres(self, z: Complex) -> tuple[Complex, ...]:
+    def _centers(self, z: Complex) -> tuple[Complex, ...]:
         return self._on or tuple(type(z)(a.real, a.imag) for a in self.places)
 
     def at(self, z: Complex) -> tuple[Branch, ...]:
         zero = type(z)(0 * z.real, 0 * z.real)
         value, first, second = zero, zero, zero
-        for a, n in zip(self._centres(z), self.multiplicities, strict=True):
+        for a, n in zip(self._centers(z), self.multiplicities, strict=True):
             away = z - a
             inverse = dr.rcp(away)
             value = value + n * type(z)(dr.log(abs(away)), dr.atan2(away.imag, away.real))
@@ -403,14 +403,14 @@ class Logarithm(Branches):
 
     def bend(self, part: Part) -> Real:
         total = 0 * part.disk()[1]
-        for a, n in zip(self._centres(part.disk()[0]), self.multiplicities, strict=True):
+        for a, n in zip(self._centers(part.disk()[0]), self.multiplicities, strict=True):
             total = total + abs(n) / dr.square(part.distances(a)[0])
         return total * _WIDENED
 
     def roundings(self, z: Complex, branches: tuple[Branch, ...]) -> Real:
         del branches
         most = 0 * z.real
-        for a, n in zip(self._centres(z), self.multiplicities, strict=True):
+        for a, n in zip(self._centers(z), self.multiplicities, strict=True):
             most = most + abs(n) * (8 * math.pi + 4 * dr.abs(dr.log(abs(z - a))))
         return most
 

@@ -9,7 +9,6 @@ from numbers import Real
 from typing import Any, cast
 
 from harnack.backend import choose_backend
-from harnack.choices import did_you_mean
 from harnack.fields.plane.branches import (
     ArcSine,
     Branches,
@@ -19,6 +18,7 @@ from harnack.fields.plane.branches import (
     PowerProduct,
     complex_type,
 )
+from harnack.names import did_you_mean
 
 __all__ = ["branches_of", "power_product"]
 

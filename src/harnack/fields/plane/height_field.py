@@ -88,9 +88,9 @@ class HeightField(Formula):
         backend = choose_backend("double")
         size = (upper - lower)[:2] / _CELLS
         cells = np.indices((_CELLS, _CELLS)).reshape(2, -1).T + 0.5
-        centres = np.column_stack([cells * size + lower[:2], np.zeros(len(cells))])
+        centers = np.column_stack([cells * size + lower[:2], np.zeros(len(cells))])
         half = backend.Float(0.5 * float(size.max()) * (1 + 1e-9))
-        jets = Jet.within(to_vector3(backend, centres, "points"), half)
+        jets = Jet.within(to_vector3(backend, centers, "points"), half)
         heights = as_jet(self.function(*jets[:2]), jets[0], "HeightField").value
         low = to_numpy(0 * half + dr.min(heights.low)).min()
         return float(low), float(to_numpy(0 * half + dr.max(heights.high)).max())

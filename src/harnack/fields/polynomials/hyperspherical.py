@@ -242,12 +242,12 @@ class HypersphericalHarmonic(Field):
     def _beside(self, p: Vec3, square: Real) -> tuple[Curvature, ...]:
         """The bound of the Hessian beside a zero of high order; none where there is none."""
         by_axis = min(abs(m) for one in self._orders for _, m in one.weights)
-        by_centre = min(one.j for one in self._orders)
-        if by_centre < 3:
+        by_center = min(one.j for one in self._orders)
+        if by_center < 3:
             return ()
         y = (2 / (1 + square)) * p
         r, rho = dr.norm(y), dr.norm(type(y)(y.x, y.y, 0))
-        chord = _BESIDE / (by_centre - 2) * r
+        chord = _BESIDE / (by_center - 2) * r
         if by_axis > 2:
             chord = fmin(chord, _BESIDE / (by_axis - 2) * rho)
         least = self._least(square, _MOST_BESIDE)

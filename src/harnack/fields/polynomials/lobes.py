@@ -52,7 +52,7 @@ class Lobes(Field):
 
     for the lobes where Y is positive or negative; the lobes are where f <= 0. The factor r^2 makes
     second derivatives bounded at the origin, where all lobes meet: f and its gradient vanish there,
-    and the origin belongs to the surface. To tell signs by colour, draw both parts:
+    and the origin belongs to the surface. To tell signs by color, draw both parts:
 
         lobes, signs = hk.Lobes(3, 2), ["plastic", "porcelain"]
         hk.render([lobes.positive, lobes.negative], material=signs, solid=(-math.inf, 0))

@@ -39,7 +39,7 @@ def degree_and_order(key: Any) -> tuple[int, int]:
         ) from None
 
 
-def normalisation(l: int, m: int) -> float:  # noqa: E741
+def normalization(l: int, m: int) -> float:  # noqa: E741
     """N_lm, with which the real Y_lm have unit mean square integral over the unit sphere."""
     order = abs(m)
     ratio = math.factorial(l - order) / math.factorial(l + order)
@@ -53,7 +53,7 @@ def odd_factorial(m: int) -> float:
 
 def legendre_weight(l: int, m: int) -> float:  # noqa: E741
     """N_lm (2m-1)!!, what `Legendre` leaves out of r^l Y_lm, m >= 0."""
-    return normalisation(l, m) * odd_factorial(m)
+    return normalization(l, m) * odd_factorial(m)
 
 
 class Legendre:

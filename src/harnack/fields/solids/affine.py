@@ -141,10 +141,10 @@ class Affine(Map):
         m, b = np.array(self.matrix), np.array(self.offset)
         factor = self.similarity
         if isinstance(volume, Ball) and factor is not None:
-            centre = m @ np.array(volume.center) + b
-            pad = 1e-12 * (np.abs(centre).max() + factor * volume.radius)
+            center = m @ np.array(volume.center) + b
+            pad = 1e-12 * (np.abs(center).max() + factor * volume.radius)
             return Ball(
-                (float(centre[0]), float(centre[1]), float(centre[2])), factor * volume.radius + pad
+                (float(center[0]), float(center[1]), float(center[2])), factor * volume.radius + pad
             )
         low, high = volume.bounds()
         if not (np.isfinite(low).all() and np.isfinite(high).all()):
@@ -301,9 +301,9 @@ def without_balls(promises: tuple[Promise, ...], sample: Sample) -> tuple[Promis
     """The promises, harmonic balls as bounds of second derivatives and bounded Laplacians as
     Lipschitz constants: what is no similarity leaves no function harmonic.
 
-    Proof. On a ball of radius R about its centre, f_vv = R^-2 times the mean of f 5 (3 s^2 - 1)
+    Proof. On a ball of radius R about its center, f_vv = R^-2 times the mean of f 5 (3 s^2 - 1)
     over the sphere, s the cosine of the angle to v; of f between lower and upper that is at most
-    10/(3 sqrt 3) (upper - lower)/R^2. Points within R/2 are centres of balls of radius R/2.
+    10/(3 sqrt 3) (upper - lower)/R^2. Points within R/2 are centers of balls of radius R/2.
     """
     made: list[Promise] = []
     for one in promises:
@@ -321,7 +321,7 @@ def without_balls(promises: tuple[Promise, ...], sample: Sample) -> tuple[Promis
 def lipschitz_of_laplacian(one: BoundedLaplacian) -> Lipschitz:
     """A Lipschitz constant on half the ball, from ranges of f and its Laplacian.
 
-    Proof. Points within R/2 are centres of balls of radius r = R/2. There f is a harmonic h with
+    Proof. Points within R/2 are centers of balls of radius r = R/2. There f is a harmonic h with
     the same boundary values, which are between lower and upper, less the integral of G Laplacian f:
     so |h_v| <= 3/2 (upper - lower)/(2 r), and the integral of |d_v G| is 3 r/8.
     """

@@ -232,8 +232,8 @@ def _cylinder(volume: Volume | None, axis: str) -> tuple[float, tuple[float, flo
     most = np.maximum(np.abs(low), np.abs(high))
     radius = float(np.hypot(most[(k + 1) % 3], most[(k + 2) % 3])) * (1 + 1e-12)
     if isinstance(volume, Ball):
-        centre = np.asarray(volume.center, dtype=float)
-        radius = float(np.hypot(centre[(k + 1) % 3], centre[(k + 2) % 3]) + volume.radius)
+        center = np.asarray(volume.center, dtype=float)
+        radius = float(np.hypot(center[(k + 1) % 3], center[(k + 2) % 3]) + volume.radius)
         radius *= 1 + 1e-12
     return radius, (float(low[k]), float(high[k]))
 

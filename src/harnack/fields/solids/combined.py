@@ -266,9 +266,9 @@ def shortest_wave(parts: Iterable[Solid]) -> float | None:
 def lipschitz_of(sample: Sample) -> Lipschitz | None:
     """A Lipschitz constant that a sample promises, or that follows from a ball.
 
-    Proof. Let f be within M of a constant on a ball of radius r in R^n. At its centre f_v is n/r
+    Proof. Let f be within M of a constant on a ball of radius r in R^n. At its center f_v is n/r
     times the mean of f s over the sphere, s the cosine of the angle to v, so at most n M/r times
-    the mean of |s|: 1.28, 1.5 and 1.7 M/r for n = 2, 3, 4. Points within R/2 are centres of balls
+    the mean of |s|: 1.28, 1.5 and 1.7 M/r for n = 2, 3, 4. Points within R/2 are centers of balls
     of radius R/2, on which M is half of upper - lower. `lipschitz_of_laplacian` has another proof.
     """
     for one in sample.promises:

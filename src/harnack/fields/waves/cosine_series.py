@@ -75,7 +75,7 @@ def on_nodes(
 class CellBounds:
     """Bounds of all second derivatives around each cell of a grid of n^3 over the box.
 
-    count: n. bounds: (n^3,), x first: on the cell and all its neighbours.
+    count: n. bounds: (n^3,), x first: on the cell and all its neighbors.
     """
 
     count: int
@@ -198,7 +198,7 @@ def _spectral_norms(
 def _over_cells(
     values: FloatArray, angles: list[FloatArray], count: int, around: int, best: Any
 ) -> FloatArray:
-    """The extremes over the nodes on and next to each of count^3 cells, with `around` neighbours
+    """The extremes over the nodes on and next to each of count^3 cells, with `around` neighbors
     on each side."""
     for axis in range(3):
         intervals = len(angles[axis]) - 1

@@ -1,4 +1,4 @@
-"""Cosine series on a backend: sum factorisation, with its derivatives, and local bounds.
+"""Cosine series on a backend: sum factorization, with its derivatives, and local bounds.
 
 The sum over k is made for each i and j, that over j for each i, that over i last: about 2 K^3
 products in all where a sum of terms would need 7 K^3. i runs in a recorded loop over rows of a
@@ -140,7 +140,7 @@ class _Cells:
         return cls(backend, cells.count, _data(backend, size / cells.count), bounds)
 
     def curvature(self, share: Vec3) -> Curvature:
-        """Of the cell in which a point lies, on a ball that stays within its neighbours."""
+        """Of the cell in which a point lies, on a ball that stays within its neighbors."""
         place, index = share * float(self.count), self.backend.UInt32(0)
         free: Real = dr.inf
         for axis in (2, 1, 0):

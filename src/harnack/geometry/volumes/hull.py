@@ -59,8 +59,8 @@ class ConvexHull(Polytope):
         size = float((upper - lower).max())
         if size <= 0.0:
             raise ValueError("a convex hull needs at least two different points")
-        centred = (x - 0.5 * (lower + upper)) / size
-        normals, is_thin = _hull_normals(centred)
+        centered = (x - 0.5 * (lower + upper)) / size
+        normals, is_thin = _hull_normals(centered)
         normals = _spread_first(normals)
         padding = (THIN_PADDING if is_thin else 1e-12) * size
         padding += 4.0 * sys.float_info.epsilon * float(np.abs(x).max())
@@ -94,7 +94,7 @@ def _support(x: FloatArray, normals: FloatArray) -> FloatArray:
 
 
 def _hull_normals(x: FloatArray) -> tuple[FloatArray, bool]:
-    """Unit outward normals that bound the hull of x (centred, of size 1), and if x is thin."""
+    """Unit outward normals that bound the hull of x (centered, of size 1), and if x is thin."""
     axes: FloatArray = np.linalg.svd(x - x.mean(axis=0), full_matrices=len(x) < 3)[2]
     along: FloatArray = np.einsum("ij,kj->ik", x, axes)
     thickness: FloatArray = np.ptp(along, axis=0)

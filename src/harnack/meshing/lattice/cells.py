@@ -1,15 +1,15 @@
-"""Tetrahedra that fill cells of a box without a Delaunay triangulation: a body-centred lattice.
+"""Tetrahedra that fill cells of a box without a Delaunay triangulation: a body-centered lattice.
 
-Its points are the corners and the centres of equal cells, and where a cell lies on the box, the
-centres of its faces there. Two centres on both sides of a face make four tetrahedra with the four
-edges of the face; at the box, where the outer centre is that of the face itself, half as large
+Its points are the corners and the centers of equal cells, and where a cell lies on the box, the
+centers of its faces there. Two centers on both sides of a face make four tetrahedra with the four
+edges of the face; at the box, where the outer center is that of the face itself, half as large
 ones. So the tetrahedra fill the box, and those at the faces of some cells contain these cells. In
 cubes their dihedral angles are 60 and 90 degrees (Labelle and Shewchuk 2007).
 
 Cells that are proved empty need none. Proof. Let the level set meet chosen cells only, and let a
 tetrahedron at a face of a chosen cell have its other apex in a cell that is not: that cell holds no
-level, so its centre and the corners of the face, which it has too, are on one side. Of the faces of
-the tetrahedron only those with the chosen cell's centre and a corner of another side are crossed,
+level, so its center and the corners of the face, which it has too, are on one side. Of the faces of
+the tetrahedron only those with the chosen cell's center and a corner of another side are crossed,
 and the tetrahedron behind such a face belongs to a face of the chosen cell as well.
 """
 
@@ -39,8 +39,8 @@ _MOST_ROOTS = 200_000
 class Lattice:
     """counts: (3,) cells along each side of a box from `lower`, each with edges `size` (3,).
 
-    Points have even coordinates (n, 3) in half cells if they are corners, and odd ones if centres;
-    centres of faces on the box have one even coordinate.
+    Points have even coordinates (n, 3) in half cells if they are corners, and odd ones if centers;
+    centers of faces on the box have one even coordinate.
     """
 
     lower: FloatArray
@@ -136,9 +136,9 @@ class Lattice:
             others = [k for k in range(3) if k != axis]
             ends: list[IntArray] = []
             for way in (-1, 1):
-                centre = face + 1
-                centre[:, axis] = np.clip(face[:, axis] + way, 0, shape[axis] - 1)
-                ends.append(_keys(centre, shape))
+                center = face + 1
+                center[:, axis] = np.clip(face[:, axis] + way, 0, shape[axis] - 1)
+                ends.append(_keys(center, shape))
             ring: list[IntArray] = []
             for i, j in ((0, 0), (2, 0), (2, 2), (0, 2)):
                 corner = face.copy()

@@ -40,7 +40,7 @@ __all__ = [
 ]
 
 # Lengths in cells: how near the level seems to a point; how far it may be moved to it; how far what
-# is found has to be from all triangles, by their corners and centres, which are less than half a
+# is found has to be from all triangles, by their corners and centers, which are less than half a
 # cell from all that is on them; and from the faces of the box, beyond which there may be more.
 _NEAR, _FOUND, _APART, _DEEP = 1.0, 1.5, 0.75, 0.5
 # Points nearer than the first belong together; parts at least as long as the second are missed.
@@ -104,7 +104,7 @@ def check_nothing_missed(
 
 
 def _longest_part(x: FloatArray, apart: float) -> FloatArray:
-    """Of points (n, 3) those of the longest chain of which neighbours are no farther apart."""
+    """Of points (n, 3) those of the longest chain of which neighbors are no farther apart."""
     import scipy.sparse  # here: half a second that few need
     import scipy.sparse.csgraph as csgraph_module
     import scipy.spatial
@@ -222,7 +222,7 @@ def closed_surface(
 ) -> Surface:
     """The boundary of the points of a lattice's box where the function is negative.
 
-    On the box it is made of the faces of the cells whose centres are negative, as if the points of
+    On the box it is made of the faces of the cells whose centers are negative, as if the points of
     the lattice there were on the level. Triangles in the two outermost layers of cells are coarse
     and may touch in vertices: they are to be cut away. There are no faces if
     the function is nowhere negative.
@@ -284,7 +284,7 @@ class _Inside(LevelFunction):
     """A function that is on the level wherever it is within one and a half cells of the box.
 
     So nothing is cut there. Triangles that end in the outermost cells would be cut again and again:
-    the edge they end with stays as it is, and their centres are no deeper than that.
+    the edge they end with stays as it is, and their centers are no deeper than that.
     """
 
     function: LevelFunction

@@ -38,8 +38,8 @@ def largest_body(surface: Surface) -> Surface:
     part = _parts(surface)
     names, shell = np.unique(part, return_inverse=True)
     cross, corner = _crosses(surface), surface.vertices[surface.faces]
-    centre = surface.vertices.mean(axis=0)
-    volumes = np.bincount(shell, dots(cross, corner[:, 0] - centre)) / 6
+    center = surface.vertices.mean(axis=0)
+    volumes = np.bincount(shell, dots(cross, corner[:, 0] - center)) / 6
     bodies = volumes.copy()
     owner = np.arange(len(names))
     outer = np.flatnonzero(volumes > 0)

@@ -24,21 +24,21 @@ _DRAWN = 0.25
 class _Side:
     """One side of a volume's boundary: a plane normal.x = offset, or a sphere."""
 
-    centre: FloatArray
+    center: FloatArray
     normal: FloatArray
     radius: float | None
 
     def heights(self, x: FloatArray) -> FloatArray:
         """(n,) distances of points (n, 3) from it, negative inside."""
         if self.radius is None:
-            return (x - self.centre) @ self.normal
-        return np.linalg.norm(x - self.centre, axis=1) - self.radius
+            return (x - self.center) @ self.normal
+        return np.linalg.norm(x - self.center, axis=1) - self.radius
 
     def slopes(self, x: FloatArray) -> FloatArray:
         """(n, 3) the gradients of these."""
         if self.radius is None:
             return np.broadcast_to(self.normal, x.shape)
-        away = x - self.centre
+        away = x - self.center
         return away / np.maximum(np.linalg.norm(away, axis=1), 1e-300)[:, None]
 
 
@@ -115,7 +115,7 @@ def _cut(surface: Surface, side: _Side) -> Surface:
     share = (h[a] / (h[a] - h[b]))[:, None]
     points = vertices[a] + share * (vertices[b] - vertices[a])
     if side.radius is not None:
-        points = _on_sphere(vertices[a], vertices[b], side.centre, side.radius)
+        points = _on_sphere(vertices[a], vertices[b], side.center, side.radius)
     first = len(vertices)
 
     def at(i: IntArray, j: IntArray) -> IntArray:
@@ -138,11 +138,11 @@ def _cut(surface: Surface, side: _Side) -> Surface:
     return Surface.of(np.concatenate([vertices, points]), made[whole])
 
 
-def _on_sphere(a: FloatArray, b: FloatArray, centre: FloatArray, radius: float) -> FloatArray:
+def _on_sphere(a: FloatArray, b: FloatArray, center: FloatArray, radius: float) -> FloatArray:
     """Where segments from a to b (n, 3), one inside and one outside, pass through the sphere."""
-    inside = np.linalg.norm(a - centre, axis=1) < np.linalg.norm(b - centre, axis=1)
+    inside = np.linalg.norm(a - center, axis=1) < np.linalg.norm(b - center, axis=1)
     start, end = np.where(inside[:, None], a, b), np.where(inside[:, None], b, a)
-    o, d = start - centre, end - start
+    o, d = start - center, end - start
     dd, od = (d * d).sum(axis=1), (o * d).sum(axis=1)
     room = np.maximum(radius**2 - (o * o).sum(axis=1), 0)
     share = room / (od + np.sqrt(od * od + dd * room))

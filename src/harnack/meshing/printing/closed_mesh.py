@@ -70,7 +70,7 @@ class ClosedMesh(trimesh.Trimesh):
 
 
 def _step(x: FloatArray) -> float:
-    """The distance between neighbours of the grid that points are rounded to: a power of two, of
+    """The distance between neighbors of the grid that points are rounded to: a power of two, of
     which single precision, with its 24 bits, holds all multiples as large as the points.
 
     Raises:

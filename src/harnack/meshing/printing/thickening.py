@@ -96,18 +96,18 @@ def _beyond_reach(surface: Surface, normals: FloatArray, thickness: float) -> st
     tree = searching.cKDTree(surface.vertices)
     own = np.arange(len(surface.vertices))
     few = min(16, len(own))
-    neighbours = distinct(edge_keys(directed_edges(surface.faces), len(own)))
+    neighbors = distinct(edge_keys(directed_edges(surface.faces), len(own)))
     for sign in (1, -1):
         side = surface.vertices + sign * half * normals
         turned = (_crosses(side, surface.faces) * flat).sum(axis=1) <= 0
         if areas[turned].sum() > _TURNED * areas.sum():  # less are slivers
             return f"{turned.sum()} triangles turn over: the surface bends more than 1/{half:.3g}"
-        # Nearer than the vertex that a point was moved from are at most its neighbours.
+        # Nearer than the vertex that a point was moved from are at most its neighbors.
         away, other = tree.query(side, k=few)
         pairs = np.stack([np.broadcast_to(own[:, None], other.shape), other], axis=-1)
         near = (away < _NEAR * half) & (pairs[..., 0] != pairs[..., 1])
         found = distinct(edge_keys(pairs[near], len(own)))
-        count = int((~np.isin(found, neighbours)).sum())
+        count = int((~np.isin(found, neighbors)).sum())
         if count:
             return f"{count} points of a side are nearer to another place than to their own"
     return None

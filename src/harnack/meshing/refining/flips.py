@@ -44,7 +44,7 @@ def flipped(
     """Faces after rounds of flips, each of which improves the two triangles it touches; of several
     flips of one triangle the best is made.
 
-    tolerance: how far the middles of new edges, and the centres of new triangles, may be from the
+    tolerance: how far the middles of new edges, and the centers of new triangles, may be from the
         surface, by the slope there.
     """
     refused = np.zeros(0, np.int64)
@@ -145,9 +145,9 @@ def without_slivers(
     """Faces without those slivers of which an end of the shortest edge can be moved to the other.
 
     An edge (u, v) can be contracted to u without a change of topology if u and v have just the two
-    neighbours in common that are the third corners of its faces (the link condition), and v is not
+    neighbors in common that are the third corners of its faces (the link condition), and v is not
     `fixed` (n,), as vertices of the rim are. It is, if no new triangle is a sliver, all face the
-    way that the surface does, and their centres are within `tolerance` of it.
+    way that the surface does, and their centers are within `tolerance` of it.
     """
     slivers = np.flatnonzero(least_angles(vertices, faces) < _SLIVER)
     gone = np.zeros(len(faces), np.bool_)

@@ -51,7 +51,7 @@ def refined(
     report: Callable[[str], None],
 ) -> tuple[FloatArray, IntArray]:
     """Cut edges at their middles, and move these onto the surface, until the middles of all edges
-    but those of the boundary, and the centres of all faces, are within `tolerance` of it; or until
+    but those of the boundary, and the centers of all faces, are within `tolerance` of it; or until
     that is seen not to succeed, which whoever asks for it has to check (`check_near_level`).
 
     Raises:
@@ -155,18 +155,18 @@ def _corners_in(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, walls: Walls
 ) -> FloatArray:
     """A point on the surface within each of some faces (k, 3) that cut off a corner: where the
-    tangent planes of its vertices meet, or near the centre."""
+    tangent planes of its vertices meet, or near the center."""
     corner = vertices[faces]
-    centre = corner.mean(axis=1)
+    center = corner.mean(axis=1)
     span = np.stack([lengths(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
-    moved = newton(function, centre, function.at(centre), 0.5 * span, walls)
+    moved = newton(function, center, function.at(center), 0.5 * span, walls)
     slope = function.at(corner.reshape(-1, 3)).gradient
     normal = (slope / np.maximum(lengths(slope), 1e-300)[:, None]).reshape(-1, 3, 3)
     rows = np.flatnonzero(np.abs(np.linalg.det(normal)) > _INDEPENDENT)
-    away = (normal * (corner - centre[:, None])).sum(axis=2)
+    away = (normal * (corner - center[:, None])).sum(axis=2)
     solve: Any = np.linalg.solve
     way: FloatArray = solve(normal[rows], away[rows][:, :, None])[:, :, 0]
-    there, good = _level_towards(function, centre[rows], way, _BESIDE * span[rows], walls)
+    there, good = _level_towards(function, center[rows], way, _BESIDE * span[rows], walls)
     moved[rows[good]] = there[good]
     return moved
 
@@ -209,7 +209,7 @@ class _Far:
 
     edges: (m, 3) of the faces. ends: (k, 2) vertices, middle: (k, 3), span: (k,) and marked: (k,)
         of edges.
-    samples: at the middles. cuts_off: (m,) faces whose centre alone is beyond, at a corner.
+    samples: at the middles. cuts_off: (m,) faces whose center alone is beyond, at a corner.
     """
 
     edges: IntArray
@@ -229,7 +229,7 @@ class _Far:
         tolerance: float,
         walls: Walls,
     ) -> _Far:
-        """Those whose middle, or the centre of a face beside them, is beyond the tolerance."""
+        """Those whose middle, or the center of a face beside them, is beyond the tolerance."""
         ends, edges, is_rim = _edges(faces)
         if walls is not None:  # the rim lies in them, and so do the middles of its edges
             is_rim = np.zeros_like(is_rim)
@@ -322,7 +322,7 @@ def smoothed(
     walls: Walls,
     rounds: int = 3,
 ) -> FloatArray:
-    """Vertices moved towards the mean of their neighbours and back onto the surface, a few times;
+    """Vertices moved towards the mean of their neighbors and back onto the surface, a few times;
     those of the boundary stay. Moves that turn a face by much are taken back."""
     ends, _, _ = _edges(faces)
     rim = np.unique(boundary_edges(faces))
@@ -341,7 +341,7 @@ def smoothed(
                 )
         aim = 0.5 * (vertices + sums / count[:, None])
         start = function.at(aim[rows])
-        # No farther than neighbours are: beside the curve gradients turn.
+        # No farther than neighbors are: beside the curve gradients turn.
         span = lengths(aim[rows] - vertices[rows]) + 1e-300
         there = vertices.copy()
         there[rows] = newton(function, aim[rows], start, 2 * span, walls)
@@ -359,7 +359,7 @@ def smoothed_within(
     walls: Walls,
     tolerance: float,
 ) -> FloatArray:
-    """As `smoothed`, but for vertices of faces whose middles of edges or centre would get farther
+    """As `smoothed`, but for vertices of faces whose middles of edges or center would get farther
     from the surface than `tolerance` by that, as beside a crease."""
     after = smoothed(function, vertices, faces, walls)
     for _ in range(8):
@@ -367,7 +367,7 @@ def smoothed_within(
         off = (far.samples.distance > tolerance)[far.edges].any(axis=1)
         off |= function.at(after[faces].mean(axis=1)).distance > tolerance
         back = np.zeros(len(vertices), np.bool_)
-        for _ in range(2):  # with neighbours, so that this ends soon
+        for _ in range(2):  # with neighbors, so that this ends soon
             back[faces[off]] = True
             off = back[faces].any(axis=1)
         back = np.flatnonzero(back)

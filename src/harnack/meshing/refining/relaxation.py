@@ -1,9 +1,9 @@
 """Vertices of the worst triangles moved along the surface to where their least angle is larger.
 
-Means of neighbours, to which `smoothed` moves vertices, make thin triangles where lengths of edges
+Means of neighbors, to which `smoothed` moves vertices, make thin triangles where lengths of edges
 change quickly, as beside the long edges of a rim that cannot be cut. Here some places are tried for
 each vertex of a thin triangle, and it moves to the best of them if the least angle of all triangles
-around it grows. No two neighbours move at once, so that what was measured is what is made: the
+around it grows. No two neighbors move at once, so that what was measured is what is made: the
 least angle around a moved vertex never falls.
 """
 
@@ -42,7 +42,7 @@ def relaxed(
 ) -> FloatArray:
     """Vertices (n, 3), those of the rim where they were, of triangles with larger least angles.
 
-    tolerance: how far the centres of triangles around moved vertices may be from the surface.
+    tolerance: how far the centers of triangles around moved vertices may be from the surface.
     """
     fixed = np.zeros(len(vertices), np.bool_)
     fixed[boundary_edges(faces)] = True
@@ -51,7 +51,7 @@ def relaxed(
         angles = least_angles(vertices, faces)
         thin = np.unique(faces[angles < _THIN])
         stars = _Stars.of(faces, thin[~fixed[thin]], len(vertices))
-        if not len(stars.centres):
+        if not len(stars.centers):
             break
         before = stars.least(angles[stars.face])
         there, after = _best_places(function, vertices, faces, stars, walls)
@@ -60,39 +60,39 @@ def relaxed(
         rows = rows[_is_near(function, vertices, faces, stars, there, rows, tolerance)]
         if not len(rows):
             break
-        vertices[stars.centres[rows]] = there[rows]
+        vertices[stars.centers[rows]] = there[rows]
     return vertices
 
 
 @dataclass(frozen=True)
 class _Stars:
-    """Faces around some vertices: centres (k,), and pairs of one of these, owner (p,), and a face,
-    face (p,), with the corners of that face, corners (p, 3), the centre first."""
+    """Faces around some vertices: centers (k,), and pairs of one of these, owner (p,), and a face,
+    face (p,), with the corners of that face, corners (p, 3), the center first."""
 
-    centres: IntArray
+    centers: IntArray
     owner: IntArray
     face: IntArray
     corners: IntArray
 
     @classmethod
-    def of(cls, faces: IntArray, centres: IntArray, count: int) -> _Stars:
+    def of(cls, faces: IntArray, centers: IntArray, count: int) -> _Stars:
         place = np.full(count, -1, np.int64)
-        place[centres] = np.arange(len(centres))
+        place[centers] = np.arange(len(centers))
         face, column = np.nonzero(place[faces] >= 0)
         corners = np.stack([faces[face, (column + k) % 3] for k in range(3)], axis=1)
-        return cls(centres, place[corners[:, 0]], face, corners)
+        return cls(centers, place[corners[:, 0]], face, corners)
 
     def least(self, of_pairs: FloatArray) -> FloatArray:
         """(k,) the least of numbers (p,) around each vertex."""
-        found = np.full(len(self.centres), np.inf)
+        found = np.full(len(self.centers), np.inf)
         np.minimum.at(found, self.owner, of_pairs)
         return found
 
     def mean(self, of_pairs: FloatArray) -> FloatArray:
         """(k, 3) means of vectors (p, 3) around each vertex."""
-        count = np.bincount(self.owner, minlength=len(self.centres))
+        count = np.bincount(self.owner, minlength=len(self.centers))
         sums = [
-            np.bincount(self.owner, of_pairs[:, axis], minlength=len(self.centres))
+            np.bincount(self.owner, of_pairs[:, axis], minlength=len(self.centers))
             for axis in range(3)
         ]
         return np.stack(sums, axis=1) / count[:, None]
@@ -112,7 +112,7 @@ def _best_places(
     middle = 0.5 * (a + b)
     # Where the triangle over the opposite edge has equal sides.
     apex = middle + np.sqrt(0.75) * np.cross(normal, b - a)
-    start = vertices[stars.centres]
+    start = vertices[stars.centers]
     aims = [stars.mean(apex), stars.mean(middle), 0.5 * (stars.mean(apex) + stars.mean(middle))]
     angles = least_angles(vertices, faces[stars.face])
     thinnest = angles <= stars.least(angles)[stars.owner]
@@ -150,13 +150,13 @@ def _least_at(
 def _independent(
     rows: IntArray, gain: FloatArray, stars: _Stars, faces: IntArray, count: int
 ) -> IntArray:
-    """Those of some vertices that gain more than all neighbours do."""
+    """Those of some vertices that gain more than all neighbors do."""
     rank = np.full(count, len(rows))
     ordered = rows[np.argsort(-gain[rows], kind="stable")]
-    rank[stars.centres[ordered]] = np.arange(len(rows))
-    first = np.full(len(stars.centres), len(rows))
+    rank[stars.centers[ordered]] = np.arange(len(rows))
+    first = np.full(len(stars.centers), len(rows))
     np.minimum.at(first, stars.owner, rank[stars.corners].min(axis=1))
-    return rows[first[rows] == rank[stars.centres[rows]]]
+    return rows[first[rows] == rank[stars.centers[rows]]]
 
 
 def _is_near(
@@ -170,7 +170,7 @@ def _is_near(
 ) -> BoolArray:
     """(k,) whether some vertices, where they would be, are on the surface, and the triangles
     around them near it, facing the way it does."""
-    moved = np.zeros(len(stars.centres), np.bool_)
+    moved = np.zeros(len(stars.centers), np.bool_)
     moved[rows] = True
     pairs = np.flatnonzero(moved[stars.owner])
     corner = vertices[stars.corners[pairs]]
@@ -180,8 +180,8 @@ def _is_near(
     size = lengths(normal) * lengths(samples.gradient)
     good = dots(normal, samples.gradient) > _FACING * size
     good &= samples.distance <= tolerance
-    off = np.zeros(len(stars.centres), np.int64)
+    off = np.zeros(len(stars.centers), np.int64)
     np.add.at(off, stars.owner[pairs[~good]], 1)
-    length = lengths(there[rows] - vertices[stars.centres[rows]])
+    length = lengths(there[rows] - vertices[stars.centers[rows]])
     on = function.at(there[rows]).distance <= 1e-7 * np.maximum(length, 0.1 * tolerance)
     return on & (off[rows] == 0)

@@ -5,7 +5,7 @@ triangles that are each a point, corners of its bounding box: no ray meets them,
 bounding box is right, and the mesh holds the BSDF. `world.World` finds the carriers in a scene
 and traces what they carry.
 
-Surfaces that have lines drawn on them: matter of other colours, chosen by the line's number.
+Surfaces that have lines drawn on them: matter of other colors, chosen by the line's number.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from harnack.backend import aligned
 from harnack.rendering.mitsuba.clear import tint_of
 from harnack.rendering.mitsuba.scene_files import load_dictionary
 from harnack.rendering.mitsuba.variant import load_mitsuba, mitsuba_backend
-from harnack.rendering.surfaces.colours import Colour, linear
+from harnack.rendering.surfaces.colors import Color, linear
 from harnack.rendering.surfaces.extent import box_of
 from harnack.rendering.surfaces.isolines import Isolines
 from harnack.rendering.surfaces.placement import PlacedSurface, Placement
@@ -31,17 +31,17 @@ if TYPE_CHECKING:
     from harnack.backend import FloatArray, Mask
 
 
-def with_lines(mi: Any, bsdf: Any, colours: Sequence[Colour]) -> Any:
+def with_lines(mi: Any, bsdf: Any, colors: Sequence[Color]) -> Any:
     """A BSDF that is another one off lines, and matt on both sides on them.
 
-    colours: of the lines, in sRGB.
+    colors: of the lines, in sRGB.
     """
-    paints = [load_dictionary(mi, _matt(colour)) for colour in colours]
+    paints = [load_dictionary(mi, _matt(color)) for color in colors]
     return _lined_class(mi.variant())(bsdf, paints)
 
 
-def _matt(colour: Colour) -> dict[str, Any]:
-    reflectance = {"type": "rgb", "value": list(linear(colour))}
+def _matt(color: Color) -> dict[str, Any]:
+    reflectance = {"type": "rgb", "value": list(linear(color))}
     return {"type": "twosided", "nested": {"type": "diffuse", "reflectance": reflectance}}
 
 
@@ -149,9 +149,9 @@ def from_properties(
                 "those of another function, or a solid, whose caps show them"
             )
     if isolines:
-        colours = [one.colour for one in isolines]
-        props["bsdf"] = with_lines(mi, props["bsdf"], colours)
-        cut_bsdf = None if cut_bsdf is None else with_lines(mi, cut_bsdf, colours)
+        colors = [one.rgb for one in isolines]
+        props["bsdf"] = with_lines(mi, props["bsdf"], colors)
+        cut_bsdf = None if cut_bsdf is None else with_lines(mi, cut_bsdf, colors)
     if any("MeshAttribute" in _words(one) for one in (props.get("bsdf", None), cut_bsdf)):
         raise ValueError(
             "a mesh_attribute belongs to vertices or faces, which a level set has not: take a "
@@ -199,7 +199,7 @@ def _carrier_class(variant: str) -> Any:
             self.cut_face = None if cut_bsdf is None else _bearer(mi, cut_bsdf)
             backend, size = mitsuba_backend(mi), float(np.linalg.norm(np.diff(ends, axis=0)))
             self.placed = PlacedSurface.of(surface, placement, backend, isolines, size)
-            self.line_colours = tuple(one.colour for one in isolines)
+            self.line_colors = tuple(one.rgb for one in isolines)
             params = mi.traverse(self)
             corners = np.concatenate(placement.world_bounds(ends))
             params["vertex_positions"] = aligned(backend, corners)

@@ -26,14 +26,14 @@ def tint_of(mi: Any, tint: Any) -> Any:
         return None
     wrong = "tint is what is left of red, green and blue after one unit of length, in (0, 1]"
     try:
-        colour = [float(part) for part in tint]
+        color = [float(part) for part in tint]
     except (TypeError, ValueError):
         raise TypeError(f"{wrong}, such as (0.9, 0.5, 0.1), not {tint!r}") from None
-    if len(colour) != 3 or not all(0 < part <= 1 for part in colour):
+    if len(color) != 3 or not all(0 < part <= 1 for part in color):
         raise ValueError(f"{wrong}, such as (0.9, 0.5, 0.1), not {tint!r}")
-    if min(colour) == 1:
+    if min(color) == 1:
         return None
-    return mi.load_dict({"type": "srgb", "color": colour}, parallel=False)
+    return mi.load_dict({"type": "srgb", "color": color}, parallel=False)
 
 
 def index_of(mi: Any, carrier: Any) -> Any:
@@ -63,7 +63,7 @@ def transmittance(mi: Any, carriers: Any, start: Any, si: Any, d: Any) -> Any:
         if carrier.tint is None:
             continue
         inside = is_inside(mi, carrier, start, d) & si.is_valid()
-        # The spectrum of a reflectance of that colour, at the ray's wavelengths.
+        # The spectrum of a reflectance of that color, at the ray's wavelengths.
         once = mi.Spectrum(carrier.tint.eval(si, inside))
         left *= dr.select(inside, dr.power(dr.maximum(once, 1e-6), si.t), 1)
     return left
@@ -71,7 +71,7 @@ def transmittance(mi: Any, carriers: Any, start: Any, si: Any, d: Any) -> Any:
 
 def refracted(normal: Any, d: Any, index: Any) -> tuple[Any, Any]:
     """Where rays in unit directions d go through a boundary with an outward unit normal, and how
-    much of unpolarised light is reflected there (Fresnel). All of it is where it is 1: then the
+    much of unpolarized light is reflected there (Fresnel). All of it is where it is 1: then the
     direction is that of the mirror.
 
     index: of refraction, of the inside relative to the outside.

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 PLUGIN = "harnack_path"
 INTEGRATOR = "HarnackPath"
-# What a ray that ran out of steps is drawn in: nothing in nature is this colour.
-LOST_COLOUR = (1.0, 0.0, 1.0)
+# What a ray that ran out of steps is drawn in: nothing in nature is this color.
+LOST_COLOR = (1.0, 0.0, 1.0)
 
 _UNLIMITED = 2**32 - 1
 
@@ -151,9 +151,7 @@ class PathTracer:
         self._deepest = dr.opaque(mi.UInt32, self.max_depth)
         self._first_gamble = dr.opaque(mi.UInt32, rr_depth)
         self._brightest = dr.opaque(mi.Float, clamp)
-        self.lost_colour = mi.load_dict(
-            {"type": "srgb", "color": list(LOST_COLOUR)}, parallel=False
-        )
+        self.lost_color = mi.load_dict({"type": "srgb", "color": list(LOST_COLOR)}, parallel=False)
 
     def with_depth(self, max_depth: int) -> PathTracer:
         """The same with another longest path."""
@@ -217,7 +215,7 @@ class PathTracer:
         if hidden is not None:
             shows &= ~hidden
         light = self._emitted(world.scene, paths, si, shows)
-        shown = paths.throughput * mi.Spectrum(self.lost_colour.eval(si, met.lost))
+        shown = paths.throughput * mi.Spectrum(self.lost_color.eval(si, met.lost))
         light += dr.select(met.lost, shown, 0)
         active = si.is_valid() & (here + 1 < self._deepest)
         bsdf = si.bsdf()

@@ -15,7 +15,7 @@ def surface_interaction(mi: Any, met: SurfaceHit, ray: Any, shape: Any) -> Any:
     """The SurfaceInteraction3f of a ray with one of our surfaces, valid where `met.met`.
 
     shape: ShapePtr of the carrier, whose BSDF is asked. Texture coordinates are x and y of the
-    position in the world: a level set has no parametrisation of its own. The index of the primitive
+    position in the world: a level set has no parametrization of its own. The index of the primitive
     is the number of the isoline that is drawn there, which `lined` looks at.
     """
     si = dr.zeros(mi.SurfaceInteraction3f)

@@ -21,10 +21,10 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from harnack.choices import did_you_mean
 from harnack.fields import Gyroid, SchwarzD, SchwarzP, SolidAngle, SphericalHarmonic
 from harnack.files import read_loops
 from harnack.geometry import Ball, Box, Intersection
+from harnack.names import did_you_mean
 from harnack.rendering.mitsuba import carrier, integrator
 from harnack.rendering.mitsuba.stock import watch
 from harnack.rendering.mitsuba.variant import load_mitsuba

@@ -36,7 +36,7 @@ def shape(
             ...
         })
 
-    bsdf: dictionary or BSDF object; grey diffuse, seen from both sides, if left out. Open
+    bsdf: dictionary or BSDF object; gray diffuse, seen from both sides, if left out. Open
         surfaces have two sides: wrap one-sided BSDFs as {"type": "twosided", ...}.
     to_world: matrix (4, 4) or Mitsuba transform of moves, turns and one scale for all axes.
     tint: of a solid of glass, what is left of red, green and blue light after one unit of length

@@ -18,7 +18,7 @@ def load_mitsuba() -> Any:
     `harnack.backend.choose_backend` finds a device.
 
     Raises:
-        RuntimeError: the variant that is set has no vectorised arrays, or tracks polarisation.
+        RuntimeError: the variant that is set has no vectorised arrays, or tracks polarization.
         LLVMNotFoundError: LLVM is wanted and there is none that Dr.Jit can work with.
     """
     mi = importlib.import_module("mitsuba")
@@ -27,7 +27,7 @@ def load_mitsuba() -> Any:
     elif _USABLE.fullmatch(mi.variant()) is None:
         raise RuntimeError(
             f"the Mitsuba variant is {mi.variant()}, and surfaces are traced with Dr.Jit arrays "
-            "that have derivatives and no polarisation: call "
+            "that have derivatives and no polarization: call "
             'mitsuba.set_variant("llvm_ad_rgb") or ("cuda_ad_rgb") before the scene is made'
         )
     return mi

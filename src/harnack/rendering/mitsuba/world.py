@@ -125,18 +125,18 @@ class World:
     def has_line_near(self, si: Any, ray: Any, d: Any, t: Any) -> Mask:
         """Whether the edge of an isoline may pass through the pixel of a ray with differentials.
 
-        d: in which the ray arrives, t: after that way. What neighbouring rays would meet of the
+        d: in which the ray arrives, t: after that way. What neighboring rays would meet of the
         tangent plane is laid along d.
         """
         mi, near = self.mi, self.mi.Bool(False)
         normal = mi.Vector3f(si.n)
         facing = dr.dot(normal, d)
 
-        def to_neighbour(o: Any, along: Any) -> Any:
+        def to_neighbor(o: Any, along: Any) -> Any:
             way = o + t * along - ray.o - t * ray.d
             return way - d * (dr.dot(way, normal) / facing)
 
-        across, down = to_neighbour(ray.o_x, ray.d_x), to_neighbour(ray.o_y, ray.d_y)
+        across, down = to_neighbor(ray.o_x, ray.d_x), to_neighbor(ray.o_y, ray.d_y)
         for carrier in self.carriers:
             if carrier.placed.lines:
                 found = carrier.placed.has_line_near(si.p, normal, across, down)

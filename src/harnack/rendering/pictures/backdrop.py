@@ -1,8 +1,8 @@
 """What is behind everything in a picture of the studio.
 
 The camera does not see the environment that lights the stage, but the ground going on to the
-horizon, and above it a wall of the same colour that is darker higher up. So there is no edge at the
-horizon, however low the camera stands. Or it sees colours or an image, as they are.
+horizon, and above it a wall of the same color that is darker higher up. So there is no edge at the
+horizon, however low the camera stands. Or it sees colors or an image, as they are.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from harnack.rendering.pictures.pixels import film_places
 from harnack.rendering.pictures.shading import Light
 from harnack.rendering.studio.backdrops import Gradient, Ground, Photo
 from harnack.rendering.studio.lighting import far_ground, reflectance_of
-from harnack.rendering.surfaces.colours import linear
+from harnack.rendering.surfaces.colors import linear
 
 # How much darker the wall is straight above.
 _DARKER = 0.45
@@ -45,14 +45,14 @@ def wall(mi: Any, sensor: Any, ground: Ground, azimuth: float, show: str) -> Flo
 def _far_shaded(mi: Any, sensor: Any, ground: Ground) -> FloatArray:
     """Radiance (3,) of the ground far away, in the light of shaded pictures."""
     matrix = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
-    colour = mi.Color3f(*reflectance_of(ground.name).tolist())
+    color = mi.Color3f(*reflectance_of(ground.name).tolist())
     up, one = mi.Vector3f(0, 0, 1), mi.Float(1)
-    lit = Light.of(matrix).on(colour, up, up, mi.Bool(False), one)
+    lit = Light.of(matrix).on(color, up, up, mi.Bool(False), one)
     return to_numpy(lit).reshape(3).astype(np.float64)
 
 
 def flat(mi: Any, backdrop: Gradient | Photo, size: tuple[int, int]) -> FloatImage:
-    """Linear sRGB (h, w, 3) of colours or an image in a picture of (width, height) pixels."""
+    """Linear sRGB (h, w, 3) of colors or an image in a picture of (width, height) pixels."""
     if isinstance(backdrop, Photo):
         return _covering(mi, backdrop.pixels, size)
     width, height = size

@@ -19,13 +19,13 @@ from harnack.rendering.studio.lighting import FLOOR
 # Cells a side of a square of half this side, which holds what stands on the stage and its shadow.
 _CELLS = 64
 _REACH = 2.4
-# Rays of a cell to the key light and to the sky. Each of 4 x 4 neighbouring cells has others.
+# Rays of a cell to the key light and to the sky. Each of 4 x 4 neighboring cells has others.
 _RAYS = 8
 _BLOCK = 4
 # The tangent of the angle that the key light seems wide, and how far the rays look.
 _SPREAD = 0.34
 _FAR = 3.5
-# Weights of a cell and its neighbours along each axis: a block's cells count nearly alike.
+# Weights of a cell and its neighbors along each axis: a block's cells count nearly alike.
 _BLUR = (0.05, 0.2, 0.25, 0.25, 0.2, 0.05)
 
 

@@ -106,7 +106,7 @@ def follow(
 
 
 def _mixed(seed: int) -> int:
-    """32 bits of any whole number: neighbouring seeds have nothing in common."""
+    """32 bits of any whole number: neighboring seeds have nothing in common."""
     return int(np.random.SeedSequence(seed % 2**63).generate_state(1)[0])
 
 
@@ -135,9 +135,9 @@ def as_rgb(mi: Any, radiance: Any, wavelengths: Any) -> Any:
     return mi.Color3f(radiance[0]) if mi.is_monochromatic else mi.Color3f(radiance)
 
 
-def mean_of_blocks(colour: Any, spp: int) -> Any:
-    """The mean of each `spp` neighbouring lanes."""
-    return type(colour)(*(dr.block_sum(channel, spp) / spp for channel in colour))
+def mean_of_blocks(color: Any, spp: int) -> Any:
+    """The mean of each `spp` neighboring lanes."""
+    return type(color)(*(dr.block_sum(channel, spp) / spp for channel in color))
 
 
 # Paths that are tried: at first, how many times as many next, and no more than this part of all.

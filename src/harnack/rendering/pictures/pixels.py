@@ -14,7 +14,7 @@ from harnack.backend.arrays import aligned_integers
 from harnack.rendering.mitsuba.variant import mitsuba_backend
 
 _TILE = 4
-# Neighbours that differ by more than this, of 255, are an edge.
+# Neighbors that differ by more than this, of 255, are an edge.
 _EDGE = 16
 
 
@@ -71,7 +71,7 @@ def grid_offsets(count: int) -> FloatArray:
 
 
 def edges_of(picture: npt.NDArray[np.uint8]) -> BoolArray:
-    """Pixels (h, w) of a picture (h, w, 3) that differ visibly from one of four neighbours."""
+    """Pixels (h, w) of a picture (h, w, 3) that differ visibly from one of four neighbors."""
     shown = picture.astype(np.int64)
     edge = np.zeros(shown.shape[:2], dtype=np.bool_)
     across = (np.abs(np.diff(shown, axis=1)) > _EDGE).any(axis=-1)

@@ -1,8 +1,8 @@
-"""A bar of colours beside a picture, with ticks at nice numbers.
+"""A bar of colors beside a picture, with ticks at nice numbers.
 
-Scales: which number has which colour, and where ticks stand.
+Scales: which number has which color, and where ticks stand.
 
-Numbers as colours.
+Numbers as colors.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.rendering.pictures.images import transferred
-from harnack.rendering.surfaces.colours import Colour
+from harnack.rendering.surfaces.colors import Color
 
 # Least-squares polynomial of degree 6 to the map "viridis" (Smith and van der Walt, matplotlib,
 # 2015, CC0), lowest degree first; off by at most 0.017.
@@ -34,15 +34,15 @@ _VIRIDIS = np.array(
 
 
 def viridis(x: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
-    """Colours (..., 3) in sRGB, in [0, 1], of numbers (...) in [0, 1]: dark blue to yellow.
+    """Colors (..., 3) in sRGB, in [0, 1], of numbers (...) in [0, 1]: dark blue to yellow.
 
-    Equal differences look equally large, and it reads well in grey and for the colour-blind.
+    Equal differences look equally large, and it reads well in gray and for the color-blind.
     """
     x = np.clip(np.nan_to_num(x), 0.0, 1.0).astype(np.float64)
-    colours = np.zeros((*x.shape, 3))
+    colors = np.zeros((*x.shape, 3))
     for coefficients in _VIRIDIS[::-1]:  # Horner
-        colours = colours * x[..., None] + coefficients
-    return np.clip(colours, 0.0, 1.0)
+        colors = colors * x[..., None] + coefficients
+    return np.clip(colors, 0.0, 1.0)
 
 
 # Of OKLab (Ottosson 2020): to the cube roots of cone responses, and from these to linear sRGB.
@@ -60,13 +60,13 @@ _FROM_CONES = np.array(
         [-0.0041960863, -0.7034186147, 1.7076147010],
     ]
 )
-# Of equally light colours in a circle: none leaves sRGB.
+# Of equally light colors in a circle: none leaves sRGB.
 _LIGHTNESS, _CHROMA = 0.72, 0.11
 
 
 def hues(x: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
-    """Colours (..., 3) in sRGB of numbers (...) of which 0 and 1 are the same: all hues, equally
-    light and equally far from grey."""
+    """Colors (..., 3) in sRGB of numbers (...) of which 0 and 1 are the same: all hues, equally
+    light and equally far from gray."""
     angle = 2 * np.pi * np.nan_to_num(x).astype(np.float64)
     lab = np.stack(
         [np.full_like(angle, _LIGHTNESS), _CHROMA * np.cos(angle), _CHROMA * np.sin(angle)], axis=-1
@@ -75,10 +75,10 @@ def hues(x: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
     return np.clip(transferred(light), 0.0, 1.0)
 
 
-def greys(x: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
-    """Greys (..., 3) of numbers (...) in [0, 1]: 0 is white, 1 is dark."""
-    grey = 0.25 + 0.75 * (1 - np.clip(np.nan_to_num(x), 0.0, 1.0).astype(np.float64))
-    return np.repeat(grey[..., None], 3, axis=-1)
+def grays(x: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
+    """Grays (..., 3) of numbers (...) in [0, 1]: 0 is white, 1 is dark."""
+    gray = 0.25 + 0.75 * (1 - np.clip(np.nan_to_num(x), 0.0, 1.0).astype(np.float64))
+    return np.repeat(gray[..., None], 3, axis=-1)
 
 
 Numbers = npt.NDArray[np.floating[Any]]
@@ -92,9 +92,9 @@ _MOST_PI = 16
 
 @dataclass(frozen=True)
 class Scale:
-    """Colours of numbers from `low` to `high`; others have those of the ends.
+    """Colors of numbers from `low` to `high`; others have those of the ends.
 
-    name: of what is shown, on colour bars.
+    name: of what is shown, on color bars.
     period: of numbers that count modulo `high` - `low` = period; None for others.
     passed: whether numbers that are shown lie below `low`, and above `high`.
     """
@@ -102,13 +102,13 @@ class Scale:
     low: float
     high: float
     name: str
-    colours_of: Callable[[Numbers], npt.NDArray[np.float64]] = viridis
+    colors_of: Callable[[Numbers], npt.NDArray[np.float64]] = viridis
     period: float | None = None
     passed: tuple[bool, bool] = (False, False)
 
     @classmethod
     def cyclic(cls, period: float, name: str) -> Scale:
-        """Of numbers that count modulo a period: its ends have one colour."""
+        """Of numbers that count modulo a period: its ends have one color."""
         return cls(0.0, period, name, hues, period)
 
     def passed_by(self, numbers: Numbers) -> Scale:
@@ -119,13 +119,13 @@ class Scale:
         below, above = numbers.min() < self.low - slack, numbers.max() > self.high + slack
         return replace(self, passed=(bool(below), bool(above)))
 
-    def colours(self, numbers: Numbers) -> npt.NDArray[np.float64]:
-        """Colours (..., 3) in sRGB, in [0, 1]."""
+    def colors(self, numbers: Numbers) -> npt.NDArray[np.float64]:
+        """Colors (..., 3) in sRGB, in [0, 1]."""
         if self.period is not None:
-            return self.colours_of(np.mod(numbers, self.period) / self.period)
+            return self.colors_of(np.mod(numbers, self.period) / self.period)
         # The range of equal numbers is their rounding.
         span = max(self.high - self.low, 1e-6 * abs(self.high), 1e-30)
-        return self.colours_of((numbers - self.low) / span)
+        return self.colors_of((numbers - self.low) / span)
 
     def ticks(self, most: int) -> list[tuple[float, str]]:
         """At most so many, but at least two: numbers and how they are written."""
@@ -244,7 +244,7 @@ def typeface_for(text: str, size: int) -> Any:
     )
 
 
-def with_bar(pixels: Pixels, scale: Scale, background: Colour) -> Pixels:
+def with_bar(pixels: Pixels, scale: Scale, background: Color) -> Pixels:
     """A picture (h, w, 3) with the bar of its scale to the right: (h, w + more, 3).
 
     An end of the bar is a point where the picture has numbers beyond it.
@@ -270,15 +270,15 @@ def with_bar(pixels: Pixels, scale: Scale, background: Colour) -> Pixels:
     values = scale.high - (np.arange(length) + 0.5) / length * (scale.high - scale.low)
     if scale.period is not None:  # the upper end is the lower one
         values = np.minimum(values, np.nextafter(scale.high, scale.low))
-    column = (scale.colours(values) * 255 + 0.5).astype(np.uint8)
-    for row, colour in enumerate(column):
-        draw.line([(letters, top + row), (letters + thick - 1, top + row)], fill=tuple(colour))
-    for is_passed, row, away, colour in zip(
+    column = (scale.colors(values) * 255 + 0.5).astype(np.uint8)
+    for row, color in enumerate(column):
+        draw.line([(letters, top + row), (letters + thick - 1, top + row)], fill=tuple(color))
+    for is_passed, row, away, color in zip(
         scale.passed, (top + length, top - 1), (point, -point), (column[-1], column[0]), strict=True
     ):
         if is_passed:
             ends = [(letters, row), (letters + thick - 1, row), (letters + thick // 2, row + away)]
-            draw.polygon(ends, fill=tuple(colour))
+            draw.polygon(ends, fill=tuple(color))
     for value, text in ticks:
         part = (value - scale.low) / (scale.high - scale.low) if scale.high > scale.low else 0.5
         y = top + round((1 - part) * (length - 1))

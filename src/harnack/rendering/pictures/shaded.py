@@ -1,7 +1,7 @@
 """Shaded pictures: one ray a pixel, more where the picture has edges, and no noise.
 
 The rays through the middles of all pixels are traced first. Pixels that differ visibly from a
-neighbour are then drawn again as the mean of a fixed grid of samples, and so are those that the
+neighbor are then drawn again as the mean of a fixed grid of samples, and so are those that the
 edge of an isoline may pass through: outlines are smooth, lines thinner than a pixel have no gaps,
 and the inside of a surface costs one ray a pixel. Cones find more pixels to draw again, if asked
 for: those that a surface covers in part, though no ray through a middle tells.
@@ -11,7 +11,7 @@ How much of the sky is hidden by what is near, from what the picture itself show
 Which pixels surfaces may cover in part: found by cones, so that no thin part is overlooked.
 
 The ray through the middle of a pixel misses what is thinner than the pixel more often than not, and
-so do those of its neighbours. The cone that holds the pixel does not.
+so do those of its neighbors. The cone that holds the pixel does not.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ import numpy.typing as npt
 
 from harnack.backend import BoolArray, aligned, choose_backend, to_numpy
 from harnack.fields import Solid
-from harnack.rendering.mitsuba.integrator import LOST_COLOUR
+from harnack.rendering.mitsuba.integrator import LOST_COLOR
 from harnack.rendering.mitsuba.variant import mitsuba_backend
 from harnack.rendering.mitsuba.world import World
 from harnack.rendering.pictures.floor import Floor
@@ -187,7 +187,7 @@ class _Seen:
     normal: Any
     eye: Any
     width: Any
-    colour: Any
+    color: Any
     light: Any
     through: Any
     glossy: Any
@@ -199,8 +199,8 @@ class _Seen:
     @classmethod
     def nothing(cls, mi: Any, count: int) -> _Seen:
         """Room for as many pixels, to scatter to."""
-        vectors, colours, masks = (mi.Vector3f,) * 3, (mi.Color3f,) * 3, (mi.Bool,) * 5
-        kinds = (*vectors, mi.Float, *colours, *masks)
+        vectors, colors, masks = (mi.Vector3f,) * 3, (mi.Color3f,) * 3, (mi.Bool,) * 5
+        kinds = (*vectors, mi.Float, *colors, *masks)
         return cls(*(dr.zeros(kind, count) for kind in kinds))
 
 
@@ -225,7 +225,7 @@ def shaded(
     advance: told what part of the picture has been finished since the last call.
 
     Raises:
-        ValueError: the Mitsuba variant is spectral, whose four wavelengths a ray are no colour;
+        ValueError: the Mitsuba variant is spectral, whose four wavelengths a ray are no color;
             or cones are asked to find a field that jumps.
     """
     if mi.is_spectral:
@@ -263,9 +263,9 @@ def shaded(
     rest, share = offsets[~traced], float(traced.mean())
     for start, stop in bands(len(edges), max(1, _RAYS_A_BAND // max(1, len(rest)))):
         chosen = edges[start:stop]
-        colour, gone = painter.refine(chosen, rest, seen.position, sky)
+        color, gone = painter.refine(chosen, rest, seen.position, sky)
         first = image.reshape(-1, 4)[chosen]
-        image.reshape(-1, 4)[chosen] = colour + share * (first - colour)
+        image.reshape(-1, 4)[chosen] = color + share * (first - color)
         lost += gone
         advance((1 - _FIRST) * (stop - start) / len(edges))
     return image, lost
@@ -294,23 +294,23 @@ class _Painter:
         lost = first.lost | dr.zeros(mi.Bool, dr.width(pixel))
         met = first.met & ~lost
         inside, open_surface = si.wi.z > 0, self._is_open(si)
-        colour, other = (self._reflectance(si, side) * weight for side in (1, -1))
-        colour, other = (as_rgb(mi, c, ray.wavelengths) for c in (colour, other))
+        color, other = (self._reflectance(si, side) * weight for side in (1, -1))
+        color, other = (as_rgb(mi, c, ray.wavelengths) for c in (color, other))
         painted = first.line > 0
-        colour, other = reflectance(colour, painted), reflectance(other, painted)
-        plain = ~painted  # lines have their own colour
-        colour = of_side(colour, other, inside & open_surface & plain)
-        colour = of_mended(colour, first.mended & plain)
+        color, other = reflectance(color, painted), reflectance(other, painted)
+        plain = ~painted  # lines have their own color
+        color = of_side(color, other, inside & open_surface & plain)
+        color = of_mended(color, first.mended & plain)
         shone = si.emitter(scene).eval(si, ~lost) * weight
         light = as_rgb(mi, sight.throughput * shone + weight * sight.gathered, ray.wavelengths)
-        light = dr.select(lost, mi.Color3f(LOST_COLOUR), light)
+        light = dr.select(lost, mi.Color3f(LOST_COLOR), light)
         covered = met | lost | (sight.boundaries > 1)  # what is clear covers, too
         if self.cut_out:
             light = dr.select(covered, light, 0)
         through = as_rgb(mi, sight.throughput, ray.wavelengths)
         d = sight.ray.d
         normal = mi.Vector3f(dr.mulsign(mi.Vector3f(si.n), -dr.dot(si.n, d)))
-        t = dr.select(met, sight.travelled + first.t, 0)
+        t = dr.select(met, sight.traveled + first.t, 0)
         width = dr.norm(ray.o_x + t * ray.d_x - ray.o - t * ray.d)
         flags = si.bsdf().flags()
         glossy = mi.has_flag(flags, mi.BSDFFlags.Glossy) | mi.has_flag(flags, mi.BSDFFlags.Delta)
@@ -318,7 +318,7 @@ class _Painter:
         lined = met & self.world.has_line_near(si, ray, d, t)
         position = dr.select(met, mi.Vector3f(si.p), dr.nan)
         return _Seen(
-            position, normal, -d, width, colour, light, through, glossy, met, lost, covered, lined
+            position, normal, -d, width, color, light, through, glossy, met, lost, covered, lined
         )
 
     def ray(self, pixel: Any, offset: Any) -> tuple[Any, Any]:
@@ -351,7 +351,7 @@ class _Painter:
         if self.floor is not None:
             key, above = self.floor.at(seen.position)
             sky = dr.minimum(sky, above)
-        lit = self.light.on(seen.colour, seen.normal, seen.eye, seen.glossy, sky, key)
+        lit = self.light.on(seen.color, seen.normal, seen.eye, seen.glossy, sky, key)
         light = dr.select(seen.met, seen.through * lit, 0) + seen.light
         return self.mi.Vector4f(*light, dr.select(seen.covered, self.mi.Float(1), 0))
 
@@ -365,9 +365,9 @@ class _Painter:
         pixel = dr.gather(mi.UInt32, uploaded(mi, chosen), lane // many)
         table = mi.Vector2f(*(aligned(mitsuba_backend(mi), one) for one in offsets.T))
         seen = self.look(pixel, dr.gather(mi.Vector2f, table, lane % many))
-        colour = self.paint(seen, self._nearest_sky(seen, pixel, position, sky))
-        dr.eval(colour, seen.lost)
-        return to_numpy(mean_of_blocks(colour, spp)), int(dr.count(seen.lost)[0])
+        color = self.paint(seen, self._nearest_sky(seen, pixel, position, sky))
+        dr.eval(color, seen.lost)
+        return to_numpy(mean_of_blocks(color, spp)), int(dr.count(seen.lost)[0])
 
     def _nearest_sky(self, seen: _Seen, pixel: Any, position: Any, sky: Any) -> Any:
         """The sky over what of the pixel's surroundings lies nearest to the sample."""

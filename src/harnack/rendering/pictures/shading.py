@@ -16,12 +16,12 @@ import numpy as np
 
 from harnack.backend import FloatArray
 
-Colour = tuple[float, float, float]
+Color = tuple[float, float, float]
 
 # Irradiance over pi, linear sRGB: of the key light at its brightest, and of the hemisphere.
-_KEY: Colour = (0.74, 0.71, 0.66)
-_ABOVE: Colour = (0.36, 0.40, 0.46)
-_BELOW: Colour = (0.25, 0.225, 0.20)
+_KEY: Color = (0.74, 0.71, 0.66)
+_ABOVE: Color = (0.36, 0.40, 0.46)
+_BELOW: Color = (0.25, 0.225, 0.20)
 # Towards the key light, along the camera's axes to the right, up and back.
 _TO_KEY = np.array([-0.52, 0.62, 0.59]) / np.linalg.norm([-0.52, 0.62, 0.59])
 # The key light reaches round to where its cosine is minus this.
@@ -32,14 +32,14 @@ _HIGHLIGHT = 0.22
 _SHARPNESS = 60.0
 _RIM = 0.45
 # What shines through is drawn in this; mirrors keep their hue.
-_CLEAR: Colour = (0.52, 0.60, 0.64)
+_CLEAR: Color = (0.52, 0.60, 0.64)
 _METAL = 0.78
-# The side of larger values of a surface that has one colour for both.
-_INSIDE: Colour = (0.52, 0.60, 0.74)
-# Where a level set spans what a mesh leaves open: this share of amber, or of teal on warm colours.
+# The side of larger values of a surface that has one color for both.
+_INSIDE: Color = (0.52, 0.60, 0.74)
+# Where a level set spans what a mesh leaves open: this share of amber, or of teal on warm colors.
 _MENDED = 0.55
-_AMBER: Colour = (0.92, 0.40, 0.06)
-_TEAL: Colour = (0.05, 0.40, 0.46)
+_AMBER: Color = (0.92, 0.40, 0.06)
+_TEAL: Color = (0.05, 0.40, 0.46)
 
 
 @dataclass(frozen=True)
@@ -57,11 +57,11 @@ class Light:
         return cls(key.tolist(), up.tolist())
 
     def on(
-        self, colour: Any, normal: Any, eye: Any, glossy: Any, visible: Any, reached: Any = 1.0
+        self, color: Any, normal: Any, eye: Any, glossy: Any, visible: Any, reached: Any = 1.0
     ) -> Any:
         """Radiance towards the eye; all are Dr.Jit arrays.
 
-        colour: reflectance. normal, eye: unit, on the same side. glossy: mask. visible: the part
+        color: reflectance. normal, eye: unit, on the same side. glossy: mask. visible: the part
         of the hemisphere over the normal that nothing near hides, and reached: the part of the
         key light that is not in shadow, in [0, 1].
         """
@@ -69,41 +69,41 @@ class Light:
         wrapped = dr.clip((dr.dot(normal, key) + _WRAP) / (1 + _WRAP), 0, 1)
         shown = (1 - _KEY_HIDDEN * (1 - visible)) * reached
         share = 0.5 + 0.5 * dr.dot(normal, up)
-        sky = dr.lerp(_like(colour, _BELOW), _like(colour, _ABOVE), share) * visible
-        radiance = colour * (_like(colour, _KEY) * (wrapped * shown) + sky)
+        sky = dr.lerp(_like(color, _BELOW), _like(color, _ABOVE), share) * visible
+        radiance = color * (_like(color, _KEY) * (wrapped * shown) + sky)
         half = dr.normalize(key + eye)
         # Where the light is below the horizon there is no highlight, and no edge to it either.
         spot = _HIGHLIGHT * dr.power(dr.maximum(dr.dot(normal, half), 0), _SHARPNESS)
         rim = _RIM * dr.power(1 - dr.clip(dr.dot(normal, eye), 0, 1), 5)
-        gloss = _like(colour, _KEY) * (spot * wrapped * shown) + sky * rim
+        gloss = _like(color, _KEY) * (spot * wrapped * shown) + sky * rim
         return radiance + dr.select(glossy, gloss, 0)
 
 
-def reflectance(colour: Any, painted: Any) -> Any:
+def reflectance(color: Any, painted: Any) -> Any:
     """What a surface is drawn in, from the reflectance that its BSDF reports straight on.
 
     painted: mask of lines, which are of that reflectance, and black where it is 0.
     """
-    own = colour
-    top = dr.max(colour)
-    metal = dr.square(colour / top) * _METAL  # what is seen in a mirror has met it more than once
-    colour = dr.select(top > 1, metal, colour)
-    return dr.select(painted, own, dr.select(top > 0, colour, _like(colour, _CLEAR)))
+    own = color
+    top = dr.max(color)
+    metal = dr.square(color / top) * _METAL  # what is seen in a mirror has met it more than once
+    color = dr.select(top > 1, metal, color)
+    return dr.select(painted, own, dr.select(top > 0, color, _like(color, _CLEAR)))
 
 
-def of_side(colour: Any, other: Any, inside: Any) -> Any:
-    """The colour of a side: that of larger values is darker and cooler if the other is as it.
+def of_side(color: Any, other: Any, inside: Any) -> Any:
+    """The color of a side: that of larger values is darker and cooler if the other is as it.
 
     inside: mask of what is seen from the side of larger values.
     """
-    same = dr.max(dr.abs(colour - other)) < 1e-4
-    return dr.select(inside & same, colour * _like(colour, _INSIDE), colour)
+    same = dr.max(dr.abs(color - other)) < 1e-4
+    return dr.select(inside & same, color * _like(color, _INSIDE), color)
 
 
-def of_mended(colour: Any, mended: Any) -> Any:
-    """The colour, tinted where a level set spans what a mesh leaves open."""
-    tint = dr.select(colour[0] > 1.6 * colour[2], _like(colour, _TEAL), _like(colour, _AMBER))
-    return dr.select(mended, dr.lerp(colour, tint, _MENDED), colour)
+def of_mended(color: Any, mended: Any) -> Any:
+    """The color, tinted where a level set spans what a mesh leaves open."""
+    tint = dr.select(color[0] > 1.6 * color[2], _like(color, _TEAL), _like(color, _AMBER))
+    return dr.select(mended, dr.lerp(color, tint, _MENDED), color)
 
 
 def _parameter(array: Any, numbers: Sequence[float]) -> Any:

@@ -29,7 +29,7 @@ class Sight:
     """What rays see: the first thing that light does not pass through.
 
     ray: the last part of their way. si, first: what it meets. throughput: what is left of the light
-    from there. gathered: the light that boundaries on the way reflect to the eye. travelled: the
+    from there. gathered: the light that boundaries on the way reflect to the eye. traveled: the
     length of the way before the last part.
     """
 
@@ -38,7 +38,7 @@ class Sight:
     first: Any
     throughput: Any
     gathered: Any
-    travelled: Real
+    traveled: Real
     boundaries: Any
     active: Mask
 
@@ -107,7 +107,7 @@ class Through:
             first=first,
             throughput=throughput * part,
             gathered=sight.gathered + gathered,
-            travelled=sight.travelled + dr.select(clear, first.t, 0),
+            traveled=sight.traveled + dr.select(clear, first.t, 0),
             boundaries=boundaries,
             active=sight.active & clear,
         )

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from harnack.backend import FloatArray, IntArray, aligned, to_numpy
 from harnack.fields import Field
-from harnack.rendering.mitsuba.integrator import LOST_COLOUR
+from harnack.rendering.mitsuba.integrator import LOST_COLOR
 from harnack.rendering.mitsuba.variant import mitsuba_backend
 from harnack.rendering.mitsuba.world import World
 from harnack.rendering.pictures.images import as_bytes, linear_of, transferred
@@ -29,8 +29,8 @@ from harnack.rendering.pictures.pixels import (
     in_tiles,
     uploaded,
 )
-from harnack.rendering.pictures.scales import Scale, greys, viridis, with_bar
-from harnack.rendering.surfaces.colours import Colour
+from harnack.rendering.pictures.scales import Scale, grays, viridis, with_bar
+from harnack.rendering.surfaces.colors import Color
 from harnack.rendering.surfaces.functions import defined_in
 from harnack.rendering.surfaces.placement import Placement
 from harnack.tracer import Status
@@ -42,9 +42,9 @@ GROUND_OF_VIEWS = {"dark": _BACKGROUND, "light": (0.90, 0.90, 0.89)}
 """What is behind views before the studio's backdrops, which are no single color."""
 _UNKNOWN = (0.45, 0.45, 0.45)
 _IDENTITY = Placement.identity()
-_STATUS_COLOURS = {
+_STATUS_COLORS = {
     Status.HIT: (0.93, 0.93, 0.90),
-    Status.OUT_OF_STEPS: LOST_COLOUR,
+    Status.OUT_OF_STEPS: LOST_COLOR,
 }
 
 
@@ -72,7 +72,7 @@ class View:
     lined: npt.NDArray[np.bool_]
     value: FloatArray | None = None
     period: float | None = None
-    background: Colour = _BACKGROUND
+    background: Color = _BACKGROUND
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Viewer:
     sensor: Any
     placement: Placement
     function: Field | None
-    background: Colour = _BACKGROUND
+    background: Color = _BACKGROUND
 
     @classmethod
     def of(
@@ -98,7 +98,7 @@ class Viewer:
         sensor: Any,
         placement: Placement = _IDENTITY,
         function: Field | None = None,
-        background: Colour = _BACKGROUND,
+        background: Color = _BACKGROUND,
     ) -> Viewer:
         """Of a loaded scene."""
         return cls(mi, World.of(mi, scene), sensor, placement, function, background)
@@ -150,7 +150,7 @@ class Viewer:
         lined, line = mi.Bool(False), mi.Vector3f(dr.nan)
         if self.function is not None:
             lined = first.met & self.world.has_line_near(si, ray, ray.d, first.t)
-            line = self._line_colour(si, first)
+            line = self._line_color(si, first)
         dr.eval(first, lined, line)
 
         def numbers(values: Any) -> Any:
@@ -175,7 +175,7 @@ class Viewer:
             value[met] = _values(self.function, self.placement.undo(numbers(first.position)[met]))
         return replace(view, value=value, period=self.function.period)
 
-    def _line_colour(self, si: Any, first: Any) -> Any:
+    def _line_color(self, si: Any, first: Any) -> Any:
         """sRGB of the line that is met; NaN where none is."""
         mi = self.mi
         found = mi.Vector3f(dr.nan)
@@ -183,8 +183,8 @@ class Viewer:
             own = first.met & (si.shape == mi.ShapePtr(carrier))
             if carrier.cut_face is not None:
                 own |= first.met & (si.shape == mi.ShapePtr(carrier.cut_face))
-            for number, colour in enumerate(carrier.line_colours, start=1):
-                found = dr.select(own & (first.line == number), mi.Vector3f(*colour), found)
+            for number, color in enumerate(carrier.line_colors, start=1):
+                found = dr.select(own & (first.line == number), mi.Vector3f(*color), found)
         return found
 
 
@@ -213,31 +213,31 @@ def normal_picture(view: View) -> npt.NDArray[np.uint8]:
 def status_picture(view: View) -> npt.NDArray[np.uint8]:
     """Misses dark, hits white, out of steps magenta."""
     picture = np.zeros((*view.status.shape, 3))
-    for status, colour in {Status.MISS: view.background, **_STATUS_COLOURS}.items():
-        picture[view.status == int(status)] = colour
+    for status, color in {Status.MISS: view.background, **_STATUS_COLORS}.items():
+        picture[view.status == int(status)] = color
     return as_bytes(picture)
 
 
 def depth_picture(view: View, scale: Scale) -> npt.NDArray[np.uint8]:
-    """Depths of what is met as the colours of a scale."""
-    return _of_surfaces(view, scale.colours(view.depth))
+    """Depths of what is met as the colors of a scale."""
+    return _of_surfaces(view, scale.colors(view.depth))
 
 
 def value_picture(view: View, scale: Scale) -> npt.NDArray[np.uint8]:
-    """Values on what is met as the colours of a scale, grey where there is none; isolines on it."""
+    """Values on what is met as the colors of a scale, gray where there is none; isolines on it."""
     value = value_of(view)
-    picture = np.where(np.isnan(value)[..., None], _UNKNOWN, scale.colours(value))
+    picture = np.where(np.isnan(value)[..., None], _UNKNOWN, scale.colors(value))
     return _of_surfaces(view, np.where(np.isnan(view.line), picture, view.line))
 
 
 def evaluations_picture(view: View, scale: Scale) -> npt.NDArray[np.uint8]:
-    """Evaluations as the colours of a scale, of rays that miss as well."""
-    return _with_lost(view, scale.colours(view.evaluations.astype(np.float64)))
+    """Evaluations as the colors of a scale, of rays that miss as well."""
+    return _with_lost(view, scale.colors(view.evaluations.astype(np.float64)))
 
 
 def depth_scale(view: View) -> Scale:
     """Near is bright, far is dark."""
-    return Scale(*_range(view, view.depth), "depth", greys)
+    return Scale(*_range(view, view.depth), "depth", grays)
 
 
 def evaluations_scale(view: View) -> Scale:
@@ -267,14 +267,14 @@ def _range(view: View, numbers: FloatArray) -> tuple[float, float]:
 
 
 def _of_surfaces(view: View, picture: FloatArray) -> npt.NDArray[np.uint8]:
-    """Colours where something is met, before the background."""
+    """Colors where something is met, before the background."""
     met = (view.status == int(Status.HIT))[..., None]
     return _with_lost(view, np.where(met, picture, view.background))
 
 
 def _with_lost(view: View, picture: FloatArray) -> npt.NDArray[np.uint8]:
     lost = (view.status == int(Status.OUT_OF_STEPS))[..., None]
-    return as_bytes(np.where(lost, LOST_COLOUR, picture))
+    return as_bytes(np.where(lost, LOST_COLOR, picture))
 
 
 @dataclass(frozen=True)
@@ -321,7 +321,7 @@ def drawn(
 ) -> npt.NDArray[np.uint8]:
     """The pixels of what a viewer has seen.
 
-    value_range: of the scale, in place of what is seen. bar: whether to put a colour bar beside
+    value_range: of the scale, in place of what is seen. bar: whether to put a color bar beside
     it, or what to write over that. spp: rays of a pixel on an edge, of pictures that are averaged.
     """
     one = VIEWS[show]
@@ -329,7 +329,7 @@ def drawn(
     if scale is None:
         return one.picture(view, None)
     if value_range is not None:
-        map_of = viridis if scale.period is not None else scale.colours_of
+        map_of = viridis if scale.period is not None else scale.colors_of
         scale = Scale(*value_range, scale.name, map_of)
     if isinstance(bar, str):
         scale = replace(scale, name=bar)
@@ -349,15 +349,15 @@ def _average(
     viewer: Viewer,
     view: View,
     picture: npt.NDArray[np.uint8],
-    colours: Callable[[View], npt.NDArray[np.uint8]],
+    colors: Callable[[View], npt.NDArray[np.uint8]],
     spp: int,
 ) -> None:
-    """Make pixels that differ visibly from a neighbour, or that the edge of an isoline may pass
+    """Make pixels that differ visibly from a neighbor, or that the edge of an isoline may pass
     through, the mean light of a grid of rays."""
     order = in_tiles(viewer.size)
     again = order[(edges_of(picture) | view.lined).ravel()[order]]
     offsets = grid_offsets(spp)
     for start, stop in bands(len(again), max(1, _RAYS_A_BAND // len(offsets))):
         chosen = again[start:stop]
-        light = linear_of(colours(viewer.look_again(chosen, offsets)) / 255)
+        light = linear_of(colors(viewer.look_again(chosen, offsets)) / 255)
         picture.reshape(-1, 3)[chosen] = as_bytes(transferred(light.mean(axis=1)))

@@ -1,4 +1,4 @@
-"""What stands behind the surfaces in place of the studio's wall: colours and images."""
+"""What stands behind the surfaces in place of the studio's wall: colors and images."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from harnack.choices import did_you_mean
 from harnack.files.file_format import Place, read_bytes
+from harnack.names import did_you_mean
 from harnack.rendering.mitsuba.variant import load_mitsuba
 from harnack.rendering.studio.lighting import GROUNDS
-from harnack.rendering.surfaces.colours import NAMED_COLOURS, Colour, colour_of
+from harnack.rendering.surfaces.colors import NAMED_COLORS, Color, color_of
 
 FloatImage = npt.NDArray[np.float32]
 
 TRANSPARENT = "transparent"
 BACKDROPS = (*GROUNDS, "white", TRANSPARENT)
-"""Names. Those of colours will do as well."""
+"""Names. Those of colors will do as well."""
 IMAGE_FILES = (".png", ".jpg", ".jpeg", ".exr")
 
 
@@ -34,10 +34,10 @@ class Ground:
 
 @dataclass(frozen=True)
 class Gradient:
-    """From a colour at the bottom of a picture to one at its top, both in sRGB."""
+    """From a color at the bottom of a picture to one at its top, both in sRGB."""
 
-    bottom: Colour
-    top: Colour
+    bottom: Color
+    top: Color
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,12 +65,12 @@ def checked_backdrop(given: Any) -> Backdrop:
     if isinstance(given, str):
         return _named(given)
     if isinstance(given, list | tuple) and len(pair := cast("list[Any]", given)) == 2:
-        return Gradient(*(colour_of(one, "a color of the backdrop") for one in pair))
+        return Gradient(*(color_of(one, "a color of the backdrop") for one in pair))
     try:
-        colour = colour_of(given, "backdrop")
+        color = color_of(given, "backdrop")
     except TypeError:
         raise TypeError(f"backdrop must be one of {_KNOWN}, not {given!r}") from None
-    return Gradient(colour, colour)
+    return Gradient(color, color)
 
 
 _KNOWN = (
@@ -87,13 +87,13 @@ def _named(given: str) -> Backdrop:
     if Path(given).suffix.lower() in IMAGE_FILES:
         return Photo(_read(Path(given)))
     try:
-        colour = colour_of(given, "backdrop")
+        color = color_of(given, "backdrop")
     except ValueError:
-        known = (*BACKDROPS, *NAMED_COLOURS)
+        known = (*BACKDROPS, *NAMED_COLORS)
         raise ValueError(
             f"backdrop must be one of {_KNOWN}, not {given!r}{did_you_mean(given, known)}"
         ) from None
-    return Gradient(colour, colour)
+    return Gradient(color, color)
 
 
 def _pixels(image: npt.NDArray[Any]) -> FloatImage:
@@ -158,11 +158,11 @@ def _of_exr(data: bytes) -> FloatImage:
                 name: np.array(one.pixels, dtype=np.float32)
                 for name, one in file.channels().items()
             }
-    if "RGBA" in channels:  # colours are multiplied by alpha
+    if "RGBA" in channels:  # colors are multiplied by alpha
         both = channels["RGBA"]
         pixels = both[..., :3] + (1 - np.clip(both[..., 3:], 0, 1))
     elif "RGB" in channels:
         pixels = channels["RGB"]
-    else:  # KeyError: no colours at all
+    else:  # KeyError: no colors at all
         pixels = np.repeat(channels["Y"][..., None], 3, axis=-1)
     return np.maximum(np.nan_to_num(pixels, posinf=1e6), 0)

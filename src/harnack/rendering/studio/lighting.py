@@ -41,12 +41,12 @@ def far_ground(backdrop: str, azimuth: float) -> FloatArray:
 def ground(mi: Any, backdrop: str) -> dict[str, Any]:
     """A wide floor."""
     floor = mi.ScalarTransform4f().translate([0, 0, FLOOR]).scale(100)
-    colour = {"type": "rgb", "value": list(GROUNDS[backdrop])}
+    color = {"type": "rgb", "value": list(GROUNDS[backdrop])}
     return {
         "ground": {
             "type": "disk",
             "to_world": floor,
-            "bsdf": {"type": "diffuse", "reflectance": colour},
+            "bsdf": {"type": "diffuse", "reflectance": color},
         }
     }
 

@@ -6,26 +6,26 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 
-from harnack.choices import did_you_mean
-from harnack.rendering.surfaces.colours import NAMED_COLOURS, Colour, colour_of, linear
+from harnack.names import did_you_mean
+from harnack.rendering.surfaces.colors import NAMED_COLORS, Color, color_of, linear
 
 Dictionary = dict[str, Any]
 
-# How rough a surface is that only a colour is given of: between porcelain and eggshell. No paint
+# How rough a surface is that only a color is given of: between porcelain and eggshell. No paint
 # reflects all light, or none.
 _PAINT, _BLACK, _WHITE = 0.2, 0.005, 0.9
 
 
-def _rgb(colour: Colour) -> Dictionary:
-    """A colour as linear sRGB reflectance."""
-    return {"type": "rgb", "value": list(colour)}
+def _rgb(color: Color) -> Dictionary:
+    """A color as linear sRGB reflectance."""
+    return {"type": "rgb", "value": list(color)}
 
 
-def _glazed(colour: Colour, roughness: float) -> Dictionary:
-    """A coloured base under a clear coat."""
+def _glazed(color: Color, roughness: float) -> Dictionary:
+    """A colored base under a clear coat."""
     return {
         "type": "roughplastic",
-        "diffuse_reflectance": _rgb(colour),
+        "diffuse_reflectance": _rgb(color),
         "alpha": roughness,
         "nonlinear": True,
     }
@@ -52,7 +52,7 @@ class Material:
     back: Dictionary | None = None
     two_sided: bool = True
     transparent: bool = False
-    tint: Colour | None = None
+    tint: Color | None = None
 
     def __post_init__(self) -> None:
         if self.tint is not None and not self.transparent:
@@ -79,14 +79,14 @@ class Material:
         return nested if self.back is None else {**nested, "back": self.back}
 
 
-def _tinted(tint: Colour, index: float = 1.5) -> Material:
+def _tinted(tint: Color, index: float = 1.5) -> Material:
     """Glass that takes some of the light away."""
     glass: Dictionary = {"type": "dielectric", "int_ior": index, "ext_ior": 1.0}
     return Material(glass, transparent=True, tint=tint)
 
 
-def _painted(colour: Colour) -> Material:
-    red, green, blue = (max(_WHITE * part, _BLACK) for part in colour)
+def _painted(color: Color) -> Material:
+    red, green, blue = (max(_WHITE * part, _BLACK) for part in color)
     return Material(_glazed((red, green, blue), _PAINT))
 
 
@@ -111,11 +111,11 @@ MATERIALS: Mapping[str, Material] = {
 
 
 def material_of(wanted: Any) -> Material:
-    """A material from its name, from a colour, or from a BSDF dictionary used as it stands.
+    """A material from its name, from a color, or from a BSDF dictionary used as it stands.
 
     Raises:
         TypeError: it is none of these.
-        ValueError: there is no material or colour of that name.
+        ValueError: there is no material or color of that name.
     """
     if wanted is None:
         return MATERIALS["two-tone"]
@@ -126,7 +126,7 @@ def material_of(wanted: Any) -> Material:
     if isinstance(wanted, str) and wanted.strip().lower() in MATERIALS:
         return MATERIALS[wanted.strip().lower()]
     try:
-        return _painted(linear(colour_of(wanted, "material")))
+        return _painted(linear(color_of(wanted, "material")))
     except TypeError:
         raise TypeError(
             f"a material is a name, a color, a Material or a BSDF dictionary, not {wanted!r}; "
@@ -136,5 +136,5 @@ def material_of(wanted: Any) -> Material:
         raise ValueError(
             f"unknown material {wanted!r}; there are {', '.join(MATERIALS)}, and colors, by a "
             f'name of CSS, "#rrggbb" or three numbers from 0 to 1'
-            f"{did_you_mean(wanted, (*MATERIALS, *NAMED_COLOURS))}"
+            f"{did_you_mean(wanted, (*MATERIALS, *NAMED_COLORS))}"
         ) from None

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from harnack.backend import FloatArray
-from harnack.choices import did_you_mean
 from harnack.geometry.volumes.volume import checked_point
+from harnack.names import did_you_mean
 
 # Rotations that turn the named axis to z. From y, the front of a glTF model (z) turns to -y,
 # which is where the studio's camera stands.

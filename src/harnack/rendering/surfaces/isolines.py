@@ -29,7 +29,7 @@ import numpy as np
 from harnack.backend import aligned
 from harnack.backend.lengths import length as norm
 from harnack.fields import Field
-from harnack.rendering.surfaces.colours import Colour, colour_of
+from harnack.rendering.surfaces.colors import Color, color_of
 from harnack.rendering.surfaces.functions import defined_in, function_of
 
 if TYPE_CHECKING:
@@ -72,12 +72,12 @@ class Isolines:
     width: float | None = None
     color: Any = "black"
     function: Field = field(init=False, repr=False)
-    colour: Colour = field(init=False, repr=False)
+    rgb: Color = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         put: dict[str, Any] = {
             "function": function_of(self.of, "of, whose isolines are drawn,"),
-            "colour": colour_of(self.color, "color of isolines"),
+            "rgb": color_of(self.color, "color of isolines"),
         }
         for name in ("spacing", "width"):
             if getattr(self, name) is not None:
@@ -197,7 +197,7 @@ class PreparedIsolines:
     def pass_near(self, p: Vec3, normal: Vec3, across: Vec3, down: Vec3) -> Mask:
         """Whether the edge of a line passes through a pixel, to first order, or near it.
 
-        across, down: from a pixel's middle on the surface to those of its neighbours.
+        across, down: from a pixel's middle on the surface to those of its neighbors.
         """
         gap, along = self._rise(p, normal)
         reach = dr.abs(dr.dot(along, across)) + dr.abs(dr.dot(along, down))

@@ -175,7 +175,7 @@ class PlacedSurface:
     def has_line_near(self, position: Vec3, normal: Vec3, across: Vec3, down: Vec3) -> Mask:
         """Whether the edge of a line passes near points of the surface, in the world.
 
-        across, down: how far it is to the points that neighbouring pixels show.
+        across, down: how far it is to the points that neighboring pixels show.
         """
         vector = self.prepared.backend.Array3f
         p = self._to_local(vector(position) - self.translation) / self.scale

@@ -111,7 +111,7 @@ class Julia(Solid):
             return self.prepare(backend_of(p)).evaluate(p)
         zero = 0 * p.x
         value, gradient, error, (steepest,) = self._orbit(p, (zero,))
-        # No step is longer than this, for no ball has a smaller constant than its centre.
+        # No step is longer than this, for no ball has a smaller constant than its center.
         longest = dr.abs(value) / steepest
         longest = clamp(dr.select(dr.isfinite(longest), longest, 1), 1e-6, self._number("_b"))
         radii = tuple(longest * one for one in _RADII)

@@ -238,14 +238,14 @@ class Tube(Solid):
 
 def _grouped(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Records of segments in groups of `_GROUP`, the last filled up with copies, and a ball
-    (centre, radius) around each group."""
+    (center, radius) around each group."""
     missing = -len(rows) % _GROUP
     rows = np.concatenate([rows, np.repeat(rows[-1:], missing, axis=0)])
     ends = np.concatenate([rows[:, :3], rows[:, :3] + rows[:, 3:6]], axis=1)
     points = ends.reshape(-1, 2 * _GROUP, 3)
-    centres = 0.5 * (points.min(axis=1) + points.max(axis=1))
-    radii = np.linalg.norm(points - centres[:, None], axis=2).max(axis=1)
-    return rows, np.column_stack([centres, radii * (1 + 1e-5)])
+    centers = 0.5 * (points.min(axis=1) + points.max(axis=1))
+    radii = np.linalg.norm(points - centers[:, None], axis=2).max(axis=1)
+    return rows, np.column_stack([centers, radii * (1 + 1e-5)])
 
 
 def _by_groups(

@@ -74,8 +74,8 @@ class Tubes(BoxedField["_TubeBuffers"]):
 
     def _upload(self, backend: Backend) -> _TubeBuffers:
         boxes = BoxedParts.upload(backend, *self.boxes())
-        centre = np.array(boxes.centre, dtype=np.float64).reshape(3)
-        start, end = ((self.points[ends] - centre) for ends in self.segments.T)
+        center = np.array(boxes.center, dtype=np.float64).reshape(3)
+        start, end = ((self.points[ends] - center) for ends in self.segments.T)
         side = end - start
         inverse = 1.0 / (side * side).sum(axis=1)
         rows = np.column_stack([start, self.radius, side, inverse])
@@ -99,7 +99,7 @@ class Tubes(BoxedField["_TubeBuffers"]):
 
 @dataclass(frozen=True)
 class _TubeBuffers:
-    """The tubes' boxes and segments on a backend; segments relative to the centre of the boxes."""
+    """The tubes' boxes and segments on a backend; segments relative to the center of the boxes."""
 
     boxes: BoxedParts
     segments: Records
@@ -120,7 +120,7 @@ class _Segment(Field):
     def evaluate(self, p: Vec3) -> Sample:
         backend, row = self._boxes.backend, self._row
         vector, unit = backend.Array3f, 2 * backend.epsilon
-        from_start = vector(p) - self._boxes.centre - vector(*row[:3])
+        from_start = vector(p) - self._boxes.center - vector(*row[:3])
         side = vector(*row[4:7])
         along = clamp(dr.dot(from_start, side) * row[7], 0, 1)
         away = dr.fma(side, vector(-along), from_start)

@@ -1,4 +1,4 @@
-"""Colours as people give them: by the names of CSS, as hexadecimal numbers, or as three numbers."""
+"""Colors as people give them: by the names of CSS, as hexadecimal numbers, or as three numbers."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, cast
 
-from harnack.choices import did_you_mean
+from harnack.names import did_you_mean
 
-Colour = tuple[float, float, float]
+Color = tuple[float, float, float]
 
-# The named colours of CSS Color Module Level 4, section 6.1, which are those of SVG.
+# The named colors of CSS Color Module Level 4, section 6.1, which are those of SVG.
 _NAMED = """
     aliceblue=f0f8ff antiquewhite=faebd7 aqua=00ffff aquamarine=7fffd4 azure=f0ffff beige=f5f5dc
     bisque=ffe4c4 black=000000 blanchedalmond=ffebcd blue=0000ff blueviolet=8a2be2 brown=a52a2a
@@ -45,7 +45,7 @@ _NAMED = """
     turquoise=40e0d0 violet=ee82ee wheat=f5deb3 white=ffffff whitesmoke=f5f5f5 yellow=ffff00
     yellowgreen=9acd32
 """
-NAMED_COLOURS: Mapping[str, str] = MappingProxyType(
+NAMED_COLORS: Mapping[str, str] = MappingProxyType(
     {name: number for name, _, number in (one.partition("=") for one in _NAMED.split())}
 )
 """Hexadecimal numbers by name."""
@@ -53,10 +53,10 @@ NAMED_COLOURS: Mapping[str, str] = MappingProxyType(
 _HOW = 'a name of CSS such as "steelblue", "#4682b4", or three numbers from 0 to 1'
 
 
-def colour_of(given: Any, what: str) -> Colour:
-    """A colour in sRGB, three numbers in [0, 1], as screens show them.
+def color_of(given: Any, what: str) -> Color:
+    """A color in sRGB, three numbers in [0, 1], as screens show them.
 
-    what: the colour is of, for messages.
+    what: the color is of, for messages.
 
     Raises:
         TypeError: neither text nor three numbers.
@@ -72,25 +72,25 @@ def colour_of(given: Any, what: str) -> Colour:
         raise TypeError(f"{what} must be {_HOW}, not {given!r}")
     if not all(0 <= one <= 1 for one in numbers):
         raise ValueError(f"{what} must be {_HOW}, not {given!r}")
-    return cast("Colour", tuple(numbers))
+    return cast("Color", tuple(numbers))
 
 
-def _from_text(text: str, what: str) -> Colour:
-    digits = NAMED_COLOURS.get(text.strip().lower())
+def _from_text(text: str, what: str) -> Color:
+    digits = NAMED_COLORS.get(text.strip().lower())
     if digits is None:
         found = re.fullmatch(r"#([0-9a-fA-F]{3}|[0-9a-fA-F]{6})", text.strip())
         if found is None:
             raise ValueError(
-                f"{what} must be {_HOW}, not {text!r}{did_you_mean(text, NAMED_COLOURS)}"
+                f"{what} must be {_HOW}, not {text!r}{did_you_mean(text, NAMED_COLORS)}"
             )
         digits = found[1] if len(found[1]) == 6 else "".join(2 * digit for digit in found[1])
     red, green, blue = (int(digits[k : k + 2], 16) / 255 for k in (0, 2, 4))
     return red, green, blue
 
 
-def linear(colour: Colour) -> Colour:
-    """A colour in sRGB as linear sRGB, which light adds up in (IEC 61966-2-1)."""
-    red, green, blue = (_linear(part) for part in colour)
+def linear(color: Color) -> Color:
+    """A color in sRGB as linear sRGB, which light adds up in (IEC 61966-2-1)."""
+    red, green, blue = (_linear(part) for part in color)
     return red, green, blue
 
 
