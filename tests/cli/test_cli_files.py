@@ -13,11 +13,11 @@ import pytest
 import trimesh
 
 from harnack.cli import main
+from harnack.field_from_file import open_surface
 from harnack.fields import DipolePotential, SolidAngle, WindingNumber
 from harnack.gallery import SCENES
 from harnack.geometry import shapes
 from harnack.geometry.mesh_shapes import icosphere
-from harnack.opening import open_surface
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -236,7 +236,7 @@ def test_gltf_and_obj_are_y_up_and_other_formats_z_up(tmp_path):
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", ["--boundary", "--as", "dipole"],
          "--boundary takes faces as curves, which contradicts --as dipole"),
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", ["--level", "0"], "level 0 "),
-        ("a.xml", "<scene/>", ["--up", "y"], "up of a Mitsuba scene: set in its own file"),
+        ("a.xml", "<scene/>", ["--up", "y"], "up: a Mitsuba scene sets this in its own file"),
         ("trefoil", None, ["--as", "loops"], "--as is for surface files"),
     ],
 )  # fmt: skip

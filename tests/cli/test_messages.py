@@ -16,11 +16,11 @@ import harnack as hk
 from harnack.cli import main
 from harnack.cli.arguments import parsers
 from harnack.cli.messages import OPTIONS, error_line, in_options, level_text, printable
+from harnack.field_from_file import open_surface
 from harnack.files import FileFormatError
 from harnack.geometry import shapes
 from harnack.geometry.mesh_shapes import icosphere
 from harnack.names import did_you_mean
-from harnack.opening import open_surface
 from harnack.rendering import MATERIALS, UnboundedSurfaceError, shape
 
 POLYGON = hk.SolidAngle(shapes.wavy_polygon(12))
@@ -70,7 +70,7 @@ def test_a_wrong_kind_of_argument_is_named(settings: dict[str, Any], complaint: 
 @pytest.mark.parametrize(
     ("settings", "complaint"),
     [
-        ({"max_depth": 3, "show": "shaded"}, 'max_depth is of pictures with show="color"'),
+        ({"max_depth": 3, "show": "shaded"}, 'max_depth needs a picture with show="color"'),
         ({"material": "goldd"}, r"unknown material 'goldd'; .*; did you mean \"gold\"\?$"),
         ({"material": "tomatoe"}, r"unknown material 'tomatoe'; .*; did you mean \"tomato\"\?$"),
         ({"material": (0.5, 0.5, 2.0)}, r"unknown material \(0.5, 0.5, 2.0\); .* from 0 to 1$"),
@@ -129,7 +129,7 @@ def test_fields_of_wrong_things_say_what_they_want(
 
 
 def test_what_cannot_be_seen_or_drawn_is_said(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="clip and section have no room in common with it"):
+    with pytest.raises(ValueError, match="clip and section do not overlap"):
         draw(clip=hk.Ball((5, 5, 5), 1.0))
     with pytest.raises(ValueError, match="at s = 0 of the film, the surface of level 0 reaches"):
         hk.animate(POLYGON, tmp_path / "a.gif", level=lambda s: s, frames=3, size=(16, 12))

@@ -256,7 +256,7 @@ def test_wrapping_alone_would_be_noticed(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(spanned_module(), "_MOST_LOCAL", 0)
     mesh = hk.mesh(field, spacing=spacing, tolerance=0.05)
     assert mesh.metadata["harnack"]["euler_characteristic"] == 1
-    marching = sys.modules["harnack.meshing.marching"]
+    marching = sys.modules["harnack.meshing.marching_tetrahedra"]
     monkeypatch.setattr(marching, "_integrated", lambda field, p, q, wrapped, period: wrapped)
     with pytest.raises(hk.MeshingError, match="spacing"):
         hk.mesh(field, spacing=spacing, tolerance=0.05)

@@ -109,7 +109,7 @@ def test_level_curves_are_walls_and_angles_are_refused() -> None:
     mesh = hk.mesh(hk.LevelCurves("log", of=charges), tolerance=4e-3)
     assert np.abs(mesh.vertices[:, 0]).max() < 1e-9
     assert mesh.area == pytest.approx(4 * 0.5, rel=1e-6)
-    with pytest.raises(TypeError, match="does not say where it ends"):
+    with pytest.raises(TypeError, match="is angle-valued, and mesh"):
         hk.mesh(hk.LevelCurves("log", "imag", of=charges))
 
 

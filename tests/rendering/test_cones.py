@@ -14,7 +14,7 @@ from harnack.geometry import mesh_shapes
 from harnack.rendering import Camera, register, render, shape
 from harnack.rendering.pictures.shaded import balls_of
 from harnack.rendering.pictures.shading import Light
-from harnack.tracer.covers import Cones
+from harnack.tracer.pixel_cones import Cones
 
 mi = register()
 T = mi.ScalarTransform4f
@@ -213,7 +213,7 @@ def test_wrong_use_is_said_early() -> None:
     ball = hk.Sphere(1.0)
     with pytest.raises(ValueError, match="antialias must be one of edges, cones, not 'cone'"):
         small(ball, antialias="cone")
-    with pytest.raises(ValueError, match='antialias is of pictures with show="shaded"'):
+    with pytest.raises(ValueError, match='antialias needs a picture with show="shaded"'):
         small(ball, antialias="cones", show="depth")
     with pytest.raises(ValueError, match="spp is 1: give spp=9"):
         small(ball, antialias="cones", spp=1)

@@ -169,7 +169,7 @@ def test_pictures_refuse_isolines_that_make_no_sense() -> None:
     lines = hk.Isolines("z", spacing=0.1)
     with pytest.raises(TypeError, match=r"must be harnack\.Isolines"):
         hk.render(CIRCLE, show="shaded", isolines="z", **SMALL)
-    with pytest.raises(ValueError, match='isolines are of pictures with show="color"'):
+    with pytest.raises(ValueError, match='isolines need a picture with show="color"'):
         hk.render(CIRCLE, show="depth", isolines=lines, **SMALL)
     with pytest.raises(ValueError, match="on its own level set: it is constant there"):
         hk.render(CIRCLE, show="shaded", isolines=hk.Isolines(CIRCLE), **SMALL)

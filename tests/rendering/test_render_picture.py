@@ -205,7 +205,7 @@ def test_tubes_around_boundaries_have_a_material() -> None:
     assert ((blue[..., 2] > 2 * blue[..., 0]) & (gold[..., 0] > gold[..., 2])).mean() > 0.005
     with pytest.raises(ValueError, match="boundary_material: tubes have no inside"):
         draw(POLYGON, boundary=np.float32(0.1), boundary_material="glass")
-    with pytest.raises(ValueError, match="boundary_material is of tubes: give their radius"):
+    with pytest.raises(ValueError, match="boundary_material needs the radius of the tubes"):
         draw(POLYGON, boundary_material="gold")
 
 

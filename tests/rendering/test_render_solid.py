@@ -13,7 +13,7 @@ import harnack as hk
 from harnack.backend import choose_backend, to_float, to_numpy, to_vector3
 from harnack.geometry.volumes import Volume
 from harnack.rendering.surfaces.encounter import facing
-from harnack.rendering.surfaces.solid import Solid
+from harnack.rendering.surfaces.solid import CappedSolid
 
 BACKEND = choose_backend()
 BALL = hk.Ball((0.1, 0.0, -0.05), 0.9)
@@ -26,10 +26,10 @@ def gyroid(p: np.ndarray) -> np.ndarray:
     return np.sin(x) * np.cos(y) + np.sin(y) * np.cos(z) + np.sin(z) * np.cos(x)
 
 
-def solid_of(low: float, high: float, volume: Volume) -> Solid:
+def solid_of(low: float, high: float, volume: Volume) -> CappedSolid:
     field = hk.Gyroid(1.0, domain=volume)
     surface = hk.level_set(field, solid=(low, high), tolerance=TOLERANCE)
-    return Solid.of(surface, surface.prepare(BACKEND))
+    return CappedSolid.of(surface, surface.prepare(BACKEND))
 
 
 def rays(n: int, seed: int, spread: float) -> tuple[np.ndarray, np.ndarray]:
@@ -39,7 +39,9 @@ def rays(n: int, seed: int, spread: float) -> tuple[np.ndarray, np.ndarray]:
     return o, d / np.linalg.norm(d, axis=1, keepdims=True)
 
 
-def met_by(solid: Solid, o: np.ndarray, d: np.ndarray, t_max: float, leaves: float = 0.0) -> Any:
+def met_by(
+    solid: CappedSolid, o: np.ndarray, d: np.ndarray, t_max: float, leaves: float = 0.0
+) -> Any:
     return solid.meet(
         to_vector3(BACKEND, o),
         to_vector3(BACKEND, d),
@@ -142,7 +144,7 @@ def test_a_ray_that_slipped_through_a_thin_part_crosses_back_at_once() -> None:
 def test_only_solids_are_solid() -> None:
     surface = hk.level_set(hk.Gyroid())
     with pytest.raises(ValueError, match="solid"):
-        Solid.of(surface, surface.prepare(BACKEND))
+        CappedSolid.of(surface, surface.prepare(BACKEND))
 
 
 def test_a_normal_is_turned_only_if_it_faces_away() -> None:

@@ -140,6 +140,6 @@ def test_a_surface_is_drawn_as_a_thick_sheet():
     thin = hk.render(square, **settings)
     thick = hk.render(square, thickness=0.2, boundary=0.02, **settings)
     assert np.isfinite(thick).sum() > np.isfinite(thin).sum() + 10
-    with pytest.raises(ValueError, match="thick already"):
+    with pytest.raises(ValueError, match="a solid has an inside already"):
         hk.render(hk.Sphere(1.0), solid=(-math.inf, 0.0), thickness=0.1, **settings)
     assert parse(["render", "trefoil", "--thickness", "0.1"]).thickness == 0.1

@@ -386,7 +386,7 @@ def test_axes_with_a_minus_turn_files_from_the_command_line(up: str, tmp_path: P
         (["trefoil", "--isolines", "w:1"], "'w' is unknown"),
         (["trefoil", "--show", "value", "--of", "x*"], "'x*' is no formula"),
         (["trefoil", "--isolines", "z:0"], "positive"),
-        (["trefoil", "--isolines-color", "red"], "color of isolines that are not there"),
+        (["trefoil", "--isolines-color", "red"], "color of isolines without isolines"),
         (["trefoil", "--show", "value"], "such as --of z"),
         (["trefoil", "--bound", "slop"], 'did you mean "slope"'),
         (["trefoil", "--position", "1,2"], "3 numbers"),

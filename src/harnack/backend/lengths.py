@@ -23,7 +23,7 @@ def length(v: Vec3) -> Real:
     `drjit.norm` squares first: in single precision it is 0 for vectors shorter than 1e-19, such as
     the gradient of a polynomial of degree 12 at a fiftieth of its size from a zero of that order.
     """
-    largest = largest_component(v)
+    largest = largest_coordinate(v)
     real = cast("Any", type(largest))
     (low, up), (high, down) = _powers(largest)
     short, long = largest < 2.0**low, largest > 2.0**high
@@ -34,14 +34,14 @@ def length(v: Vec3) -> Real:
 
 def unit(v: Vec3) -> Vec3:
     """v/|v|, right for every vector whose largest component is a normal number."""
-    largest = dr.detach(largest_component(v))
+    largest = dr.detach(largest_coordinate(v))
     (low, _), (high, _) = _powers(largest)
     ordinary = (largest >= 2.0**low) & (largest <= 2.0**high)
     scaled = v / dr.select(ordinary, 1, largest)
     return scaled / dr.norm(scaled)
 
 
-def largest_component(v: Vec3) -> Real:
+def largest_coordinate(v: Vec3) -> Real:
     """The largest of |x|, |y| and |z|."""
     return fmax(fmax(dr.abs(v.x), dr.abs(v.y)), dr.abs(v.z))
 

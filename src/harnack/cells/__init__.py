@@ -1,6 +1,6 @@
 """Cells that may hold a level set, found by leaving out those that are proved empty."""
 
-from harnack.cells.components import OccupiedCells, largest_component
+from harnack.cells.components import OccupiedCells, largest_connected_component
 from harnack.cells.octree import (
     Cells,
     Clearance,
@@ -17,7 +17,7 @@ __all__ = [
     "OccupiedCells",
     "Octree",
     "carve",
-    "largest_component",
+    "largest_connected_component",
     "octree",
     "union",
     "wrapped_points",

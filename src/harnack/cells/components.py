@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, IntArray
     from harnack.cells.octree import Clearance
 
-__all__ = ["OccupiedCells", "largest_component"]
+__all__ = ["OccupiedCells", "largest_connected_component"]
 
 # Empty cells are proved to be empty so far beyond their faces, in cells; cubes of the octree's
 # first round have 2^_ROUNDS cells a side.
@@ -87,7 +87,7 @@ class OccupiedCells(GridLayout):
 _AROUND = np.ones((3, 3, 3), np.bool_)
 
 
-def largest_component(cells: OccupiedCells) -> OccupiedCells:
+def largest_connected_component(cells: OccupiedCells) -> OccupiedCells:
     """The grid in which only the cells of one group are not empty: that with the largest shadows,
     in all, along the three axes.
 

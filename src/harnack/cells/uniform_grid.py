@@ -11,7 +11,7 @@ import numpy as np
 
 from harnack.backend.arrays import aligned_integers
 from harnack.backend.extrema import clamp, fmin
-from harnack.backend.lengths import largest_component
+from harnack.backend.lengths import largest_coordinate
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, BoolArray, FloatArray, IntArray, Mask, Real, Vec3
@@ -108,7 +108,7 @@ class UniformGrid:
 
     def resolves(self, o: Vec3, end: Real) -> Mask:
         """Whether rounding leaves points of rays up to `end` in their cells or close to them."""
-        rounding = 4 * self.backend.epsilon * (largest_component(o) + end)
+        rounding = 4 * self.backend.epsilon * (largest_coordinate(o) + end)
         return (rounding < _ROUNDING * self.size) & dr.all(dr.isfinite(o))
 
     def free_until(self, o: Vec3, d: Vec3, t: Real, end: Real) -> Real:

@@ -13,11 +13,11 @@ from harnack._version import __version__
 from harnack.cli.mesh_files import MESH_FILES
 from harnack.cli.messages import printable
 from harnack.enclosures.proofs import BOUNDS
+from harnack.field_from_file import UP_AXES
 from harnack.fields.expressions import TextFormula
 from harnack.files.surfaces import SURFACE_FILES
 from harnack.meshing.samples import MOST_FACES
 from harnack.names import did_you_mean
-from harnack.opening import UP_AXES
 from harnack.rendering import MATERIALS, SHOW_MODES
 from harnack.rendering.arguments import ANTIALIASING, MAX_SIDE, MAX_SPP
 from harnack.rendering.studio.backdrops import IMAGE_FILES, checked_backdrop

@@ -15,6 +15,7 @@ from rich.console import Console
 from harnack.backend import doctor
 from harnack.cli.mesh_files import check_mesh_path, write_mesh
 from harnack.cli.messages import in_options, printable
+from harnack.field_from_file import open_surface
 from harnack.fields import Field, expression
 from harnack.fields.expressions import looks_like_formula
 from harnack.files.surfaces import SURFACE_FILES, Mesh, read_surface
@@ -23,7 +24,6 @@ from harnack.geometry import Ball, Box, HalfSpace
 from harnack.geometry.singular import weld_vertices
 from harnack.meshing import mesh, repair
 from harnack.names import did_you_mean
-from harnack.opening import open_surface
 from harnack.rendering import Camera, Isolines, animate, render
 from harnack.rendering.film import check_film_path
 from harnack.rendering.pictures.images import check_picture_path
@@ -64,7 +64,9 @@ def _turntable(options: Any) -> int:
         raise ValueError("-o is empty: name the film to write, such as a.gif")
     target = check_film_path(options.output or f"{source.stem or 'turntable'}.gif")
     if source.suffix.lower() == ".xml":
-        raise ValueError("a turntable is of a scene of the gallery or a surface file")
+        raise ValueError(
+            "a turntable needs a scene of the gallery or a surface file, not a Mitsuba scene"
+        )
     what, settings = _drawn(options, source)
     film: dict[str, Any] = {
         "size": (320, 240), **settings, "show": options.show or "shaded",
@@ -115,7 +117,7 @@ def _mitsuba_scene(options: Any) -> tuple[str, dict[str, Any]]:
     }  # fmt: skip
     wrong = [name for name, value in given.items() if value is not None]
     if wrong:
-        raise ValueError(f"{', '.join(wrong)} of a Mitsuba scene: set in its own file")
+        raise ValueError(f"{', '.join(wrong)}: a Mitsuba scene sets this in its own file")
     names = ("show", "of", "value_range", "colorbar")
     shown = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
     return options.scene, {**_quality(options), **_noise(options), **shown}
@@ -139,7 +141,9 @@ def _lines(options: Any) -> dict[str, Any]:
     style = {name: value for name, value in asked.items() if value is not None}
     if options.isolines is None:
         if style:
-            raise ValueError(f"{' and '.join(style)} of isolines that are not there: --isolines")
+            raise ValueError(
+                f"{' and '.join(style)} of isolines without isolines: give --isolines as well"
+            )
         return {}
     axis, spacing = options.isolines
     return {"isolines": Isolines(axis, spacing=spacing, **style)}
@@ -297,7 +301,9 @@ def _meshed(options: Any, source: Path) -> tuple[Field, dict[str, Any]]:
         return opened.field, {}
     surfaces = SCENES[options.scene].surfaces()
     if len(surfaces) != 1:
-        raise ValueError(f"scene {source} has {len(surfaces)} surfaces, and a mesh is of one")
+        raise ValueError(
+            f"scene {source} has {len(surfaces)} surfaces, and a mesh can be made of one only"
+        )
     surface = surfaces[0]
     if surface.solid is not None:
         if options.level is not None:  # then it is the level that is asked for

@@ -15,7 +15,7 @@ from harnack.backend.arrays import finite_vectors, upload_vectors
 from harnack.backend.extrema import fmax
 from harnack.backend.lengths import length
 from harnack.distance.batches import in_batches
-from harnack.distance.closing_in import close_in
+from harnack.distance.compass_search import close_in
 from harnack.distance.estimates import first_order
 from harnack.distance.meshes.on_sheets import SheetSearch
 from harnack.distance.meshes.surface import MeshSurface

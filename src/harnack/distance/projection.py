@@ -113,7 +113,7 @@ class Descent:
         state = vector(start), real(0), mask(False), mask(False), count(0), mask(True)
         y, first, found, singular, _, _ = dr.while_loop(state, more, body, label="Newton's method")
         limit = (dr.norm(x - start) + 2 * first) * (1 + 64 * self.backend.epsilon)
-        limit = dr.fma(64 * self.backend.epsilon, lengths.largest_component(y), limit)
+        limit = dr.fma(64 * self.backend.epsilon, lengths.largest_coordinate(y), limit)
         return y, found & (dr.norm(x - y) <= limit), singular & ~found
 
     def closest(self, x: Vec3, start: Vec3) -> tuple[Vec3, Mask, Mask]:
@@ -181,7 +181,7 @@ class Descent:
     def _look(self, y: Vec3) -> tuple[Real, _Place]:
         """f - level at y, and the place."""
         sample, real = self.field.evaluate(y), self.backend.Float
-        size = lengths.largest_component(y)
+        size = lengths.largest_coordinate(y)
         epsilon, gradient_norm = self.backend.epsilon, lengths.length(sample.gradient)
         blur = dr.fma(8 * epsilon, dr.abs(sample.value), sample.error)
         noise = dr.fma(4 * epsilon, size, blur / gradient_norm)
@@ -198,7 +198,7 @@ class Descent:
     @staticmethod
     def _is_close(above: Real, place: _Place) -> Mask:
         """Whether a place is on the level, to rounding; not where that hardly says where it is."""
-        size = lengths.largest_component(place.y)
+        size = lengths.largest_coordinate(place.y)
         known = place.noise <= _CLEAR * fmax(size, place.reach)
         return known & (dr.abs(above) <= 2 * lengths.length(place.gradient) * place.noise)
 

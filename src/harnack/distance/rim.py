@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 
 from harnack.backend.extrema import clamp, fmax, fmin
-from harnack.backend.lengths import largest_component, length
+from harnack.backend.lengths import largest_coordinate, length
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -125,7 +125,7 @@ class RimDescent:
     def _at(self, y: Vec3) -> _RimPlace:
         real, vector = self.backend.Float, self.backend.Array3f
         sample = self.field.evaluate(y)
-        gradient, size = vector(sample.gradient), largest_component(y)
+        gradient, size = vector(sample.gradient), largest_coordinate(y)
         steep, n = length(gradient), vector(self.domain.outward_normal(y))
         u = gradient / steep
         inwards = -self.domain.signed_distance(y) - _INSIDE * self.backend.epsilon * size

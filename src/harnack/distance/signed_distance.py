@@ -146,14 +146,15 @@ def distance_bounds(
 ) -> DistanceBounds:
     """Distances of points (n, 3) from a level set, with proved lower bounds.
 
-    What is proved: cells that hold no surface by the field's promises are left out; in the others
-    it lies in a slab, where the promises say so (`surface_cells.remainder`); and about a foot there
-    is a ball in which no point of the surface is nearer (`closest._Points`). The least distance
-    of what is left is `lower`. Cells are split where that is less than `upper` by more than 1e-6
-    of the size of the surface, up to about half as many cells as there are points, but at least
-    60,000: so a few points are proved to that tolerance, of many those for which the balls suffice.
-    What is not proved: that `upper` is the distance where `lower` is less; it is the least of
-    several descents, from the point and from feet of cells in different places.
+    `lower` is proved. Cells that hold no surface by the field's promises are left out; in each of
+    the others the surface lies in a slab, where the promises say so; and around every foot there
+    is a ball that holds no nearer point of the surface. `lower` is the least distance to what is
+    left. Cells are split where it is less than `upper` by more than 1e-6 of the size of the
+    surface, up to about half as many cells as there are points, but at least 60,000: so a few
+    points are proved to that tolerance, and of many points those for which the balls suffice.
+
+    `upper` is the distance to a point of the surface, found by several descents. Where `lower` is
+    less, the true distance may lie anywhere between the two.
 
     Raises:
         TypeError, ValueError: as `signed_distance`.

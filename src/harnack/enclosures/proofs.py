@@ -119,8 +119,8 @@ class Proofs:
         ]
         if not usable:
             return (
-                f"no bound applies: the field promises {made}, from which nothing follows; a "
-                "HarmonicBall needs an end that is not infinite, a BoundedLaplacian two"
+                f"no bound applies to what the field promises, {made}: a HarmonicBall needs at "
+                "least one limit that is not infinite, lower or upper, a BoundedLaplacian both"
             )
         others = "" if not self.uses_weaker else ", or leave bound=None for the sharpest there is"
         return (

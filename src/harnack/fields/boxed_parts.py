@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 import numpy as np
 
 from harnack.fields.field import Field
-from harnack.fields.kept import prepared_once
+from harnack.fields.field_cache import prepared_once
 from harnack.fields.sheets import PartEntry
 from harnack.fields.unit_coordinates import UnitCoordinates, placed, single
 from harnack.geometry import Box

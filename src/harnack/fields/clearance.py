@@ -11,7 +11,7 @@ import numpy as np
 
 from harnack.backend import FloatArray, choose_backend, to_numpy, to_vector3
 from harnack.backend.extrema import fmax, fmin
-from harnack.backend.lengths import largest_component, length
+from harnack.backend.lengths import largest_coordinate, length
 from harnack.cells import Cells, OccupiedCells, carve, union, wrapped_points
 from harnack.enclosures import Gaps, Slopes, TargetLevels, choose_proofs, longest_step
 
@@ -113,7 +113,7 @@ def distance_below(
     jumps taken out, which is f up to the nearest sheet.
     """
     steepest = length(sample.gradient) + sample.gradient_error
-    size = largest_component(p)
+    size = largest_coordinate(p)
     epsilon = backend.epsilon
     rounding = 8 * epsilon * dr.abs(sample.value) + 4 * epsilon * size * steepest
     gaps = levels.gaps(sample.value).less(rounding + sample.error)

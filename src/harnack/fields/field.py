@@ -161,8 +161,8 @@ class Field(abc.ABC):
     is drawn."""
 
     wavelength: float | None = None
-    """Of waves, the shortest length in which they repeat that matters, where it is known: what
-    samples f in cells makes them smaller."""
+    """The shortest wavelength of f that matters, where it is known: code that samples f in cells
+    makes them smaller than this."""
 
     has_sheets: bool = False
     """Whether f jumps across sheets (see `harnack.fields.sheets`). Then `next_crossing` and
@@ -218,7 +218,7 @@ class Field(abc.ABC):
         return f"{type(self).__name__}({', '.join(said)})"
 
     def __getattr__(self, name: str) -> Any:
-        """Says of what a field would have to be a solid for."""
+        """For methods that only solids have, the error says how to make a solid of the field."""
         own = f"{type(self).__name__!r} object has no attribute {name!r}"
         if name in _OF_SOLIDS:
             own += ": make a solid of the field first, by harnack.solid(field, below=level)"
@@ -466,7 +466,28 @@ class Field(abc.ABC):
         del o, d, behind, ahead, offset
         return self
 
-    # Of fields with parts only; the last two likewise.
+    # Of fields with sheets only: distances ask for them, also while a loop is being recorded.
+
+    def distance_to_sheets(self, p: Vec3) -> Real:
+        """The distance from p to the nearest sheet, rounded down: lower bounds of distances rest on
+        it. inf where there is none."""
+        del p
+        return float("inf")
+
+    def nearest_sheet(
+        self, p: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
+    ) -> NearestSheet | None:
+        """The first sheet behind `after` = (order, index), nearer than the distance `limit`.
+
+        Sheets are ordered by their distance from p, in whatever measure `NearestSheet.order` gives,
+        then by index; from (-1, NO_SHEET) on, all come up, each once. The default, None, says
+        nothing: distances then look for the nearest sheet alone, by how `distance_to_sheets` falls.
+        """
+        del p, after, limit, active
+        return None
+
+    # Of fields with parts only, but for `for_levels`, which every field is asked for. The last two
+    # may be called while a loop is being recorded.
 
     def for_levels(self, levels: tuple[float, ...]) -> Field:
         """This field with boxes that hold the parts of these levels, to be prepared."""
@@ -490,24 +511,6 @@ class Field(abc.ABC):
         `evaluate` and `look` may be called for points of any size, promises hold in all space."""
         del index
         return self
-
-    def distance_to_sheets(self, p: Vec3) -> Real:
-        """The distance from p to the nearest sheet, rounded down: lower bounds of distances rest on
-        it. inf where there is none."""
-        del p
-        return float("inf")
-
-    def nearest_sheet(
-        self, p: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
-    ) -> NearestSheet | None:
-        """The first sheet behind `after` = (order, index), nearer than the distance `limit`.
-
-        Sheets are ordered by their distance from p, in whatever measure `NearestSheet.order` gives,
-        then by index; from (-1, NO_SHEET) on, all come up, each once. The default, None, says
-        nothing: distances then look for the nearest sheet alone, by how `distance_to_sheets` falls.
-        """
-        del p, after, limit, active
-        return None
 
 
 class AtDetail(Field):

@@ -24,7 +24,7 @@ from harnack.arithmetic.dual import Dual
 from harnack.arithmetic.operators import Operators
 from harnack.backend import choose_backend
 from harnack.backend.extrema import fmin
-from harnack.backend.lengths import largest_component, length
+from harnack.backend.lengths import largest_coordinate, length
 from harnack.enclosures import Lipschitz, Piece, Slopes, Tangent
 from harnack.fields.field import Field
 from harnack.fields.look import Look, Path, Sample
@@ -84,7 +84,7 @@ class Formula(Field):
         middle, doubt = sample.gradient, sample.gradient_error
         steep = length(middle)
         way = dr.select(steep > 0, middle / steep, 0) + type(p)(*_ASIDE)
-        size = largest_component(p) + dr.abs(sample.value)
+        size = largest_coordinate(p) + dr.abs(sample.value)
         size = dr.select(size > 0, size, 1)
         away = Dual.at_point(p + way * (_BESIDE * epsilon * size))
         try:

@@ -12,7 +12,7 @@ import numpy as np
 
 from harnack.backend import backend_of
 from harnack.fields.field import AtDetail, Field
-from harnack.fields.kept import prepared_once
+from harnack.fields.field_cache import prepared_once
 
 if TYPE_CHECKING:
     from typing import Self

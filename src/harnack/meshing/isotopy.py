@@ -1,7 +1,8 @@
 """How much of a mesh in tetrahedra is proved to have the topology of the level set.
 
 Let f be the function less its level, F its interpolation at the corners of the tetrahedra, linear
-on each, whose zero set are the triangles of `marching`, and H_t = (1-t) F + t f, 0 <= t <= 1.
+on each, whose zero set are the triangles of `marching_tetrahedra`, and
+H_t = (1-t) F + t f, 0 <= t <= 1.
 
 Theorem. If each tetrahedron T satisfies (a), (b) or (c), the zero sets of f and F are isotopic:
 (a) neither f nor F has a zero in T, and both have the same sign there;
@@ -21,9 +22,9 @@ moves the zero set of F onto that of f (Thom's argument, for Lipschitz functions
 box, where the surface ends, x moves within the wall: there (b) is asked of the gradients'
 projections onto it, for each face, edge or corner of a tetrahedron that lies in walls.
 
-Four corners on the level. F is 0 on such a T, and `marching` gives all of it to one side. If two of
-its faces are in the mesh, put F = +-epsilon at the middle of the edge that the other two share: T
-becomes two tetrahedra, on each of which grad F is a normal of one of those faces, F elsewhere
+Four corners on the level. F is 0 on such a T, and `marching_tetrahedra` gives all of it to one
+side. If two of its faces are in the mesh, put F = +-epsilon at the middle of the edge that the
+other two share: T becomes two tetrahedra, on each of which grad F is a normal of one of those faces, F elsewhere
 changes by no more than epsilon, which (b) and (c) bear as they are strict, and the zero set is the
 mesh. So (b) and (c) are asked of both normals. Other such T are not proved.
 

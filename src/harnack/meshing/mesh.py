@@ -136,7 +136,7 @@ def mesh(
     if solid is None and isinstance(field, Solid) and thickness is None:
         solid = True
     if solid and thickness is not None:
-        raise ValueError("give either solid or thickness: a solid is thick already")
+        raise ValueError("give either solid or thickness, not both: a solid has an inside already")
     is_closed = bool(solid) or thickness is not None
     if simplify and not is_closed:
         raise ValueError("simplify is for closed meshes: give solid or thickness as well")
@@ -203,7 +203,10 @@ def _checked(field: Field) -> Field:
             )
         return SolidAngle(list(field.loops))
     if field.period is not None:
-        raise TypeError(f"{type(field).__name__} is angle-valued and does not say where it ends")
+        raise TypeError(
+            f"{type(field).__name__} is angle-valued, and mesh() knows of no other angle-valued "
+            "field than SolidAngle where its surfaces end"
+        )
     return field
 
 

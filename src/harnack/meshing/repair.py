@@ -27,7 +27,7 @@ from harnack.meshing.checks import (
 )
 from harnack.meshing.edges import Edges, IntArray, directed_edges
 from harnack.meshing.intersections import intersecting_faces
-from harnack.meshing.marching import crossings_of, triangles_of
+from harnack.meshing.marching_tetrahedra import crossings_of, triangles_of
 from harnack.meshing.points import Boundary, Places, box_cells, place_points
 from harnack.meshing.refining.refinement import far_places, improved, refined, smoothed
 from harnack.meshing.samples import LevelFunction

@@ -7,7 +7,7 @@ from harnack.rendering.film import animate
 from harnack.rendering.mitsuba.plugins import register, register_surfaces
 from harnack.rendering.mitsuba.shapes import shape
 from harnack.rendering.picture import render
-from harnack.rendering.pictures.shown import Picture
+from harnack.rendering.pictures.picture_array import Picture
 from harnack.rendering.studio.camera import Camera
 from harnack.rendering.studio.materials import MATERIALS, Material
 from harnack.rendering.surfaces.extent import UnboundedSurfaceError

@@ -107,7 +107,7 @@ def checked_request(
         raise TypeError(f"denoise must be True or False, not {denoise!r}")
     for name, given in (("denoise", denoise), ("max_depth", max_depth is not None)):
         if given and show != "color":
-            raise ValueError(f'{name} is of pictures with show="color", not show="{show}"')
+            raise ValueError(f'{name} needs a picture with show="color", not show="{show}"')
     return Request(
         show,
         None if size is None else check_size(size),
@@ -129,7 +129,7 @@ def check_isolines(isolines: Any, show: str) -> tuple[Isolines, ...]:
     """Isolines as a tuple; ValueError for pictures that have none."""
     lines = checked_isolines(isolines)
     if lines and show not in LINED:
-        raise ValueError(f'isolines are of pictures with show={_either(LINED)}, not "{show}"')
+        raise ValueError(f'isolines need a picture with show={_either(LINED)}, not "{show}"')
     return lines
 
 
@@ -137,7 +137,7 @@ def check_function(of: Any, show: str) -> Field | None:
     """The function of which values are shown; ValueError where there is none, or no use for it."""
     if show != "value":
         if of is not None:
-            raise ValueError(f'of is the function of pictures with show="value", not "{show}"')
+            raise ValueError(f'of=... needs a picture with show="value", not show="{show}"')
         return None
     if of is None:
         raise ValueError(
@@ -187,7 +187,7 @@ def check_behind(backdrop: Any, show: str) -> Backdrop:
         return Gradient(*(GROUND_OF_VIEWS[behind.name],) * 2)
     if show in VIEWS and not (isinstance(behind, Gradient) and behind.bottom == behind.top):
         raise ValueError(
-            f'behind a picture with show="{show}" is one color, such as backdrop="white", '
+            f'with show="{show}", backdrop must be one color, such as backdrop="white", '
             f"not {backdrop!r}"
         )
     return behind
@@ -195,7 +195,7 @@ def check_behind(backdrop: Any, show: str) -> Backdrop:
 
 def _check_scaled(setting: str, show: str) -> None:
     if show not in SCALED:
-        raise ValueError(f'{setting} is of pictures with show={_either(SCALED)}, not "{show}"')
+        raise ValueError(f'{setting} needs a picture with show={_either(SCALED)}, not "{show}"')
 
 
 def _either(names: Sequence[str]) -> str:
@@ -221,11 +221,11 @@ def check_antialias(antialias: Any, show: str, spp: Any) -> None:
             f"{did_you_mean(antialias, ANTIALIASING)}"
         )
     if show != "shaded":
-        raise ValueError(f'antialias is of pictures with show="shaded", not show="{show}"')
+        raise ValueError(f'antialias needs a picture with show="shaded", not show="{show}"')
     if antialias == "cones" and spp == 1:
         raise ValueError(
             'antialias="cones" finds pixels for more than one sample, and spp is 1: give spp=9, '
-            "or leave it away"
+            "or leave antialias out"
         )
 
 

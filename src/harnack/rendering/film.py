@@ -21,13 +21,13 @@ from harnack.backend import FloatArray
 from harnack.files.writing import check_writable, write_atomically
 from harnack.geometry import Box
 from harnack.rendering.arguments import check_camera, check_integer, check_size
-from harnack.rendering.exhibits import surfaces_of
 from harnack.rendering.mitsuba.plugins import register
 from harnack.rendering.mitsuba.variant import mitsuba_backend
 from harnack.rendering.picture import render
 from harnack.rendering.progress import progress_bar
 from harnack.rendering.studio.camera import Camera
 from harnack.rendering.studio.upright import upright
+from harnack.rendering.studio_scene import surfaces_of
 from harnack.rendering.surfaces.extent import UnboundedSurfaceError
 from harnack.rendering.surfaces.framing import visible_points
 

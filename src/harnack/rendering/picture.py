@@ -21,11 +21,10 @@ from harnack.rendering.arguments import (
     checked_request,
     refuse_studio_settings,
 )
-from harnack.rendering.exhibits import OF_STUDIO, MaterialLike, exhibits
 from harnack.rendering.mitsuba.integrator import PathTracer
+from harnack.rendering.mitsuba.other_integrators import stand_in
 from harnack.rendering.mitsuba.plugins import register
 from harnack.rendering.mitsuba.scene_files import load_dictionary, load_scene_file
-from harnack.rendering.mitsuba.stock import stand_in
 from harnack.rendering.pictures.backdrop import flat, wall
 from harnack.rendering.pictures.images import check_picture_path, tone_mapped, write_image
 from harnack.rendering.pictures.light_paths import (
@@ -36,13 +35,14 @@ from harnack.rendering.pictures.light_paths import (
     load_denoiser,
     pace_of,
 )
+from harnack.rendering.pictures.picture_array import Picture
 from harnack.rendering.pictures.shaded import shaded
-from harnack.rendering.pictures.shown import Picture
 from harnack.rendering.pictures.views import VIEWS, Viewer, drawn
 from harnack.rendering.progress import Advance, progress_bar
 from harnack.rendering.studio.backdrops import Gradient, Ground
 from harnack.rendering.studio.camera import Camera
 from harnack.rendering.studio.stage import Studio, StudioObject, studio
+from harnack.rendering.studio_scene import OF_STUDIO, MaterialLike, exhibits
 from harnack.rendering.surfaces.isolines import Isolines
 from harnack.rendering.surfaces.placement import Placement
 from harnack.tracer import LevelSet
@@ -90,8 +90,8 @@ def render(
     path: .png (8-bit sRGB, tone mapped) or .exr (the numbers).
     show: "color" follows light paths; "shaded" lights first hits by a formula, in seconds and
         without noise; or what one ray a pixel found: "normal", "evaluations" (of the fields),
-        "status" and "depth", or "value", that of another function, whose edges are smoothed in
-        what is shown.
+        "status" and "depth", or "value", which colors the surface by the function `of`. Edges of
+        pictures of values are antialiased, the numbers that are returned are not.
     size: (width, height) in pixels, by default (800, 600) or the scene's own.
     spp: samples a pixel of a color picture, by default 64 or the scene's own, and of the edges
         of one that is shaded or shows values, by default 9. Others have one ray a pixel.
@@ -104,9 +104,9 @@ def render(
         a function of three coordinates. All are those of the surface or, of a scene, of the world.
     value_range: (low, high) of the colors of values, depths or evaluations, by default what is
         seen; the same for all pictures of a series.
-    colorbar: whether to put a bar with numbers to the right of these pictures, which makes what
-        is written and shown wider, or the bar's title. The numbers returned stay the same. Needs
-        Pillow, which `pip install harnack[film]` brings.
+    colorbar: True, or the title, for a bar with numbers to the right of these pictures. It widens
+        the picture that is written and displayed, not the array that is returned. Needs Pillow,
+        which `pip install harnack[film]` brings.
     max_depth: longest light path in edges, -1 for no limit; by default 12 or the scene's own.
     seed: another seed, other noise; the same seed, the same picture. Only color pictures have
         noise.

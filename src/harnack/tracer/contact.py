@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import drjit as dr
 
 from harnack.backend.extrema import fmax, fmin
-from harnack.backend.lengths import largest_component, length
+from harnack.backend.lengths import largest_coordinate, length
 from harnack.backend.loops import while_active
 from harnack.enclosures import Gaps, TargetLevels
 from harnack.fields.look import value_error
@@ -297,7 +297,7 @@ def settled(
     smallest = 4 * float(dr.epsilon(type(found.root)))
 
     def body(now: _Settling) -> _Settling:
-        sample, size = field.evaluate(path.point(now.t)), largest_component(path.origin) + now.t
+        sample, size = field.evaluate(path.point(now.t)), largest_coordinate(path.origin) + now.t
         x, steepness = -levels.to_nearest(sample.value), length(sample.gradient)
         near = dr.abs(x) <= fmax(
             tolerance.in_value(steepness, now.t), value_error(sample, steepness, size)

@@ -20,7 +20,7 @@ from harnack.backend.lengths import length as norm
 from harnack.backend.numbers import holds_numbers_alone
 from harnack.enclosures import TargetLevels
 from harnack.fields.field import NO_TRUNCATION
-from harnack.fields.kept import KeptWithFields
+from harnack.fields.field_cache import FieldCache
 from harnack.tracer.tolerance import Status
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ _POLISH, _POLISH_OF_SUMS = 4, 3
 
 
 # Fields that will never carry derivatives unless an attribute is set: they are asked once.
-_FIXED: KeptWithFields[bool] = KeptWithFields()
+_FIXED: FieldCache[bool] = FieldCache()
 
 
 def wants_derivatives(prepared: PreparedLevelSet, o: Vec3, d: Vec3) -> bool:

@@ -12,7 +12,7 @@ import numpy as np
 
 from harnack.backend import backend_of, choose_backend, to_float, to_numpy, to_vector3
 from harnack.backend.arrays import as_data
-from harnack.backend.lengths import largest_component, unit
+from harnack.backend.lengths import largest_coordinate, unit
 from harnack.backend.lengths import length as norm
 from harnack.backend.tensors import is_tensor, numbers_of, tensor_of, vectors_of
 from harnack.tracer.all_hits import (
@@ -252,7 +252,7 @@ def _rays(
     if not n:
         return o, d, near, far
     if not dr.is_array_v(type(directions)):
-        _check_numpy_rays(to_numpy(largest_component(d)), to_numpy(near), to_numpy(far))
+        _check_numpy_rays(to_numpy(largest_coordinate(d)), to_numpy(near), to_numpy(far))
     return o, unit(d), near, far
 
 

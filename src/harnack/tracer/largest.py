@@ -11,10 +11,10 @@ import numpy as np
 
 from harnack.backend import FloatArray, choose_backend, to_numpy, to_vector3
 from harnack.backend.lengths import length
-from harnack.cells import OccupiedCells, largest_component
+from harnack.cells import OccupiedCells, largest_connected_component
 from harnack.enclosures import TargetLevels
 from harnack.fields.clearance import clearance_of
-from harnack.fields.kept import KeptWithFields
+from harnack.fields.field_cache import FieldCache
 
 if TYPE_CHECKING:
     from harnack.backend import BoolArray
@@ -30,21 +30,21 @@ CELLS_ACROSS = 128
 _FAR, _MOST_FAR = 4.0, 0.5
 
 _Ends: TypeAlias = tuple[float, float]
-_CELLS: KeptWithFields[OccupiedCells] = KeptWithFields()
+_CELLS: FieldCache[OccupiedCells] = FieldCache()
 
 
 def largest_cells(
     field: Field, levels: tuple[float, ...], volume: Volume | None, solid: _Ends | None, across: int
 ) -> OccupiedCells:
     """Cells that hold one component of a level set in a volume, or of a solid {low <= f <= high},
-    and no others that could be told from it: those of the component that casts the largest shadows
-    along x, y and z, taken together (see `largest_component`).
+    that with the largest sum of projected areas along x, y and z, and whatever no cells that are
+    proved empty separate from it (see `largest_connected_component`).
 
     A cell is left out if it, or each of its eight halves, is proved to have nothing of the level
     set, as its ball is within the clearance of its center (or, where that is outside of the field's
     domain, of a point at its boundary), or nothing of the volume, as its signed distance says. Of
     solids, those without a level all of which is in the solid are kept. For the rest of the proof
-    see `largest_component`.
+    see `largest_connected_component`.
 
     Raises:
         ValueError: the volume is not bounded; or most of the cells that could not be proved empty
@@ -90,7 +90,7 @@ def _made(
         return OccupiedCells.none()
     cells = OccupiedCells.of(lower, upper, clearance, across).thinned(clearance)
     _check_proved(field, levels, solid, cells)
-    return largest_component(cells)
+    return largest_connected_component(cells)
 
 
 def _check_proved(
@@ -108,16 +108,17 @@ def _check_proved(
         far &= ~((value >= solid[0]) & (value <= solid[1]))
     if far.sum() > _MOST_FAR * len(far):
         raise ValueError(
-            f"largest: too little is proved of this {type(field).__name__} off rays to tell "
-            f"components apart by {round(max(cells.shape))} cells across; give a larger number of "
-            "them, or mesh it with largest=True"
+            f"largest: with {round(max(cells.shape))} cells along the longest side, most cells of "
+            f"this {type(field).__name__} could not be proved empty, so that its components cannot "
+            "be told apart: give a larger number of cells, or mesh it with largest=True"
         )
 
 
 def _into_domain(field: Field) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
     """For points (n, 3), others where the field may be asked, and how far they are off, (n,),
-    infinite where none was found: what a field promises need only hold in its domain. A set that
-    is c away from the one is c less that distance away from the other."""
+    infinite where none was found: what a field promises need only hold in its domain. If the
+    point found is at least c away from a set, the point given is at least c minus that distance
+    away from it."""
     domain = None if field.is_entire else field.domain
     backend = choose_backend("double")
     prepared = None if domain is None else domain.prepare(backend)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 
 from harnack.backend.extrema import clamp, fmax, fmin
-from harnack.backend.lengths import largest_component, length
+from harnack.backend.lengths import largest_coordinate, length
 from harnack.backend.loops import while_active
 from harnack.enclosures import LineLipschitz, any_covers, longest_step
 from harnack.fields.look import value_error
@@ -155,7 +155,8 @@ class March:
     """How to march: towards which levels, until when, and with which over-stepping factor.
 
     hysteresis: for rays that end where they have crossed a level, and not where they reach one.
-    cover: for cones that end where they come near a level: their radius per unit of t (`covers`).
+    cover: for cones that end where they come near a level (`pixel_cones`): their radius per unit
+        of t.
     occupied: cells outside of which there is no level, not even behind a sheet, for rays that end
         where they reach one; and `last`, where these rays end.
     is_part: whether there may be levels outside of these cells that do not count.
@@ -295,7 +296,7 @@ class March:
         if ahead is not None or now.contact is not None:  # the end exactly
             t = dr.select(now.step >= end - now.base, end, t)
         seen = field.at_detail(now.detail) if _has_detail(field, now) else field
-        unproved, size = now.step - now.reach, largest_component(path.origin) + t
+        unproved, size = now.step - now.reach, largest_coordinate(path.origin) + t
         look = seen.look(path, t, fmin(now.candidate, end - t), fmax(unproved, real(0)))
         sample, gradient_norm = look.sample, length(look.sample.gradient)
         gaps = self.levels.gaps(sample.value)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 
 from harnack.backend.extrema import fmax, fmin
-from harnack.backend.lengths import largest_component
+from harnack.backend.lengths import largest_coordinate
 from harnack.fields.look import Path
 from harnack.fields.sheets import NO_PART, NO_SHEET
 from harnack.tracer.contact import Contact, Hysteresis, settled
@@ -215,7 +215,7 @@ class PreparedLevelSet:
         Then f rises at least as steeply behind as on the way there, no longer than end - start: a
         seventh of that behind the end it is 8/7 e above the level, and is seen there.
         """
-        none, size = self.backend.Bool(False), largest_component(path.origin)
+        none, size = self.backend.Bool(False), largest_coordinate(path.origin)
         rounding = _ON_SHEET * self.backend.epsilon * (size + t_min)
         if self.volume is None:
             return start, end, Hysteresis.of(self.levels, (none, none), start, rounding)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from harnack.geometry import Volume
 
 _FIRST_HITS = (
-    "largest is of first hits: neither of all_hits and confirm, nor of pictures with "
+    "largest=... works for first hits alone: it cannot be combined with all_hits, confirm or "
     'antialias="cones"'
 )
 
@@ -83,7 +83,7 @@ class LevelSet:
             self.check_crossings("confirm")
         if self.largest and (self.field.has_sheets or self.field.has_parts):
             raise ValueError(
-                f"largest is of one continuous function, and this {type(self.field).__name__} "
+                f"largest=... needs one continuous function, and this {type(self.field).__name__} "
                 "jumps or has parts"
             )
         if self.largest and self.confirm:

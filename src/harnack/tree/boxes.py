@@ -10,7 +10,7 @@ import numpy as np
 
 from harnack.backend import FloatArray
 from harnack.backend.extrema import fmax, fmin
-from harnack.backend.lengths import largest_component
+from harnack.backend.lengths import largest_coordinate
 from harnack.tree.hierarchy import build_hierarchy
 from harnack.tree.packed import PackedTree, pack
 from harnack.tree.triangles import box_levels
@@ -94,7 +94,7 @@ class BoxTree:
         # Never zero: 1e-18 of the boxes' size is far below their padding.
         steep = dr.select(dr.abs(d) < 1e-18, dr.select(d < 0, vector(-1e-18), vector(1e-18)), d)
         inverse = dr.rcp(steep)
-        pad = 16 * backend.epsilon * (1 + largest_component(o))
+        pad = 16 * backend.epsilon * (1 + largest_coordinate(o))
 
         def span(box: Any) -> tuple[Real, Real]:
             low, high = vector(*box[:3]) - pad, vector(*box[3:6]) + pad

@@ -16,7 +16,7 @@ import numpy as np
 from harnack.backend import FloatArray, IntArray
 from harnack.backend.basis import across
 from harnack.backend.extrema import clamp, fmax, fmin
-from harnack.backend.lengths import largest_component
+from harnack.backend.lengths import largest_coordinate
 from harnack.tree.hierarchy import Hierarchy
 from harnack.tree.packed import PackedTree, pack
 from harnack.tree.walk import Node, State, for_each, walk
@@ -273,7 +273,7 @@ class TriangleRays:
         steep = dr.select(dr.abs(d) < 1e-18, dr.select(d < 0, vector(-1e-18), vector(1e-18)), d)
         inverse = dr.rcp(steep)
         o = frame.o
-        size = largest_component(o)
+        size = largest_coordinate(o)
         pad = 16 * backend.epsilon * (1 + size)
 
         def inside(node: Node, t_min: Real, t_max: Real) -> Mask:

@@ -32,8 +32,8 @@ from harnack.fields.blobs.sums import (
     sum_along,
     value_at,
 )
+from harnack.fields.field_cache import prepared_once
 from harnack.fields.formula import Formula, is_jet
-from harnack.fields.kept import prepared_once
 from harnack.fields.look import Look, Path, Sample
 from harnack.geometry import Box
 from harnack.names import renamed

@@ -18,8 +18,8 @@ from harnack.backend.records import Records
 from harnack.enclosures import Lipschitz, Piece, Slopes
 from harnack.fields.blobs.jets import summed
 from harnack.fields.blobs.sums import PIECES, Along, BlobValue, Knots, State, over
+from harnack.fields.field_cache import prepared_once
 from harnack.fields.formula import Formula, is_jet
-from harnack.fields.kept import prepared_once
 from harnack.fields.look import Look, Path, Sample
 from harnack.geometry import Box
 

@@ -167,7 +167,7 @@ class LargestAlong(Enclosure):
     def step(self, gaps: Gaps) -> Real:
         """Proof. See above. Of a group whose sum is lower by g, the level above is farther by g and
         the level below nearer by g; g is known up to the errors of both sums, of which the gaps
-        are clear by at least the larger (`March._total_error`)."""
+        are clear by at least the larger (`look.value_error`)."""
         backend = self.blobs.records.backend
         real = backend.Float
 

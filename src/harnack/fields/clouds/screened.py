@@ -216,7 +216,7 @@ class ScreenedWindingNumber(DetailedField["_ScreenedBuffers"], BatchedField):
     Promises (`promises` has the formulas), for d_i the distances from x, d the least of them:
 
     - Curvature. On B(x, r), r < d, each term's second derivatives are at most |K'''|(d_i - s) =
-      6 Q_3(kappa (d_i-s))/(d_i-s)^4 at distance s from x (`screened_kernel`, kappa = 1/l). By
+      6 Q_3(kappa (d_i-s))/(d_i-s)^4 at distance s from x (`YukawaKernel`, kappa = 1/l). By
       Taylor the integral of (t-s) times that bounds w(y) - w(x) - grad w.(y-x), t = |y-x|. With
       Q_3(kappa (d_i-s)) <= exp(kappa r) Q_3(kappa d_i) and t/d_i = q it is at most
       exp(kappa r) Q_3(kappa d_i) (3-2q)/(1-q)^2 t^2/d_i^4; (3-2q)/(1-q)^2 is convex, hence below
@@ -289,7 +289,7 @@ class ScreenedWindingNumber(DetailedField["_ScreenedBuffers"], BatchedField):
         This is quadrature by the midpoint rule, not the integral over the triangles. Seen from a
         distance r > R, R that of the centroid to the farthest corner, a triangle of area a and
         edges e is off by at most a (e1^2+e2^2+e3^2)/36 (3-2q)/((1-q)^2 r^4)/(4 pi), q = R/r (the
-        first moment about the centroid vanishes; `screened_tree`, with one order less). Nearer
+        first moment about the centroid vanishes; `radial_tree`, with one order less). Nearer
         than about an edge's length the result is not that of the mesh at all: w is smooth where a
         triangle would make it jump and infinite at the centroids. Each subdivision divides that
         range by 2 and the error beyond it by 4.
@@ -330,7 +330,7 @@ class ScreenedWindingNumber(DetailedField["_ScreenedBuffers"], BatchedField):
     def _held(self, on: _ScreenedBuffers, sums: FieldSums, unit: Real) -> tuple[Real, Real, Real]:
         """What the screening adds to the rounding of value, gradient and second derivatives.
 
-        Exponentials are held at exp(-80) = 2e-35 (`screened_kernel.LONGEST`), times at most
+        Exponentials are held at exp(-80) = 2e-35 (`LONGEST`), times at most
         Q_3(80) exp(80) = 9e4. Fourth derivatives of the kernel have Q_4(t) <= (1 + t/4) Q_3(t), and
         a coordinate is off by `unit`.
         """

@@ -68,8 +68,8 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
     every ray a proved miss, and levels that are multiples of 4 pi are refused.
 
     Promises. Second derivatives are bounded near every curve (`curve_promises`), and steps rest on
-    that. The other proofs, chosen by `bound=`, need the range of the lift on a ball, which is
-    longer steps' price: on wavy polygons and knots they take 1.4 to 2 times as many evaluations.
+    that. The other proofs, chosen by `bound=`, need the range of the lift on a ball:
+    on wavy polygons and knots they take 1.4 to 2 times as many evaluations.
 
     certificate: how the lift is bounded on a ball. "auto" takes "planar" where its hypothesis is
     checked to hold, "convex" where that does, else "edges"; if loops are Dr.Jit arrays it takes

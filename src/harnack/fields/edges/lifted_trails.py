@@ -1,7 +1,7 @@
 """The solid angle of closed trails of edges along rays, edge by edge, and as fast as it will go.
 
 The formula is that of `edge_lift`, and its decisions are made by the same bits. A close sum over a
-tree of chains (`edge_chains`) goes down to most of its leaves, on other ways in neighboring lanes,
+tree of chains (`EdgeChains`) goes down to most of its leaves, on other ways in neighboring lanes,
 so that up to some thousands of edges a plain loop over all of them is faster, and exact. What is
 needed of a vertex is computed once and not once for each of its edges, and roots and divisions,
 which cost most, are shared by edges where a bound allows it.

@@ -17,7 +17,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend.extrema import fmax, fmin
-from harnack.backend.lengths import largest_component
+from harnack.backend.lengths import largest_coordinate
 from harnack.backend.records import Records
 
 if TYPE_CHECKING:
@@ -155,7 +155,7 @@ class EdgeTrails:
         dr.eval(*turns, *doubts)
         order = dr.arange(index, n)
         some = dr.gather(real, dr.concat(doubts), order) <= 0
-        far = largest_component(x) > _FAR
+        far = largest_coordinate(x) > _FAR
         return dr.gather(real, dr.concat(turns), order), some | far
 
     def _over_records(self, points: list[Point]) -> tuple[list[_Product], list[Real]]:

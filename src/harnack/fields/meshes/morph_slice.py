@@ -273,7 +273,7 @@ class MorphSlice(DetailedField["_SliceBuffers"], BatchedField):
 
     corners: two arrays (m, 3, 3) of triangles. w, gap, spacing, accuracy: as for `Morph`.
 
-    Promises, with the 4D distances D of all points, d the least of them (`sliced_kernel` has the
+    Promises, with the 4D distances D of all points, d the least of them (`SlicedKernel` has the
     proof that terms bend no more than dipoles at a distance D): `Curvature` within 0.45 d, and a
     `HarmonicBall` of dimension 4 and radius 0.35 d, which proves shorter steps.
     """

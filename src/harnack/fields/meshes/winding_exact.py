@@ -2,7 +2,7 @@
 
 See `edge_lift` for the formula. At points the cost is that of one ray through a tree of boxes plus
 one pass over the edges at which the triangles do not cancel, however many triangles there are.
-Along rays a tree of chains of these edges takes less than all of them (`edge_chains`).
+Along rays a tree of chains of these edges takes less than all of them (`EdgeChains`).
 
 The solid angle of long boundaries along rays: far chains of edges as a chord and a small loop.
 

@@ -154,7 +154,7 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
     spans its holes. Faces are counter-clockwise seen from outside.
 
     vertices: (n, 3). faces: (m, 3) indices into them.
-    method: "exact" (`edge_lift`: no truncation, cost by boundary edges; along rays `edge_chains`,
+    method: "exact" (`edge_lift`: no truncation, cost by boundary edges; along rays `EdgeChains`,
         no more truncation than rounding), "tree" (`winding_tree`), or "auto": exact up to 2048
         boundary edges.
     accuracy: of the tree: a cluster of triangles is taken as a whole beyond `accuracy` times its

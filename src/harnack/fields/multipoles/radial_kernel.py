@@ -4,8 +4,8 @@ With psi_0 = K and psi_(k+1) = -psi_k'/r a dipole m at y = x + z gives -m.grad_y
 a polynomial P(z) times psi_k has the gradient grad P psi_k - P psi_(k+1) z and the Hessian
 HP psi_k - (grad P z^T + z grad P^T) psi_(k+1) - P psi_(k+1) I + P psi_(k+2) z z^T (in z; the
 gradient in x has the opposite sign). What K is, and how fast its derivatives fall, a `RadialKernel`
-says: all else is shared by screened sums (`clouds.screened_kernel`) and by slices of four
-dimensions (`meshes.sliced_kernel`).
+says: all else is shared by screened sums (`clouds.screened.YukawaKernel`) and by slices of four
+dimensions (`meshes.morph_slice.SlicedKernel`).
 
 Distances. A kernel may be regular at r = 0: it counts all lengths as D = sqrt(r^2 + height^2), from
 a point beside the space of the dipoles. Its bounds are |d^m K[u_1, ..., u_m]| <= m! Q_m/D^(m+1)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 
 from harnack.backend import backend_of
-from harnack.backend.lengths import largest_component
+from harnack.backend.lengths import largest_coordinate
 from harnack.enclosures import Curvature, HarmonicBall
 from harnack.fields.field import Field
 from harnack.fields.look import Sample
@@ -121,6 +121,6 @@ class LevelCurves(Field):
 
     def _at(self, p: Vec3) -> tuple[Real, Complex, Branch]:
         """The rounding of the point, the point in the plane, and the function there."""
-        rounding = 4 * backend_of(p).epsilon * largest_component(p)
+        rounding = 4 * backend_of(p).epsilon * largest_coordinate(p)
         z = self.branches.moved_off(complex_of(p.x, p.y), rounding)
         return rounding, z, self.branches.at(z)[0]

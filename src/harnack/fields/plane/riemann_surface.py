@@ -13,7 +13,7 @@ import numpy as np
 
 from harnack.backend import backend_of
 from harnack.backend.extrema import fmax, fmin
-from harnack.backend.lengths import largest_component
+from harnack.backend.lengths import largest_coordinate
 from harnack.enclosures import (
     Curvature,
     Cusp,
@@ -245,7 +245,7 @@ class RiemannSurface(Field):
         slope = place.sign * place.nearest.slope(d)
         shadow = complex_of(d.x, d.y)
         speed = abs(shadow)
-        longest = fmin(ahead, _LONGEST * (1 + largest_component(p)))
+        longest = fmin(ahead, _LONGEST * (1 + largest_coordinate(p)))
         reach = self.branches.clearance(place.z)
         lengths = [longest, *(fmin(longest, part * reach / speed) for part in _PARTS)]
         forwards = [self._enclosure(place, d, shadow, length) for length in lengths]
@@ -297,7 +297,7 @@ class RiemannSurface(Field):
 
     def _rounding(self, p: Vec3) -> Real:
         """How far rounding may have moved a point in the plane, generously."""
-        return 4 * backend_of(p).epsilon * largest_component(p)
+        return 4 * backend_of(p).epsilon * largest_coordinate(p)
 
     def _graphs(self, p: Vec3, branches: tuple[Branch, ...]) -> list[_Graph]:
         """phi of all sheets; with a period and several branches, of two next to the point each.

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from harnack.arithmetic import Jet
 from harnack.backend.extrema import fmax
-from harnack.backend.lengths import largest_component, length
+from harnack.backend.lengths import largest_coordinate, length
 from harnack.enclosures import (
     BoundedLaplacian,
     Curvature,
@@ -255,7 +255,7 @@ class AffineImage(Derived):
     def _size(self, p: Vec3, t: Real) -> Real:
         """The size of what the local coordinates of p + t d are summed from."""
         numbers = self.numbers
-        return numbers.stretch * (largest_component(p) + numbers.offset_size + t) * math.sqrt(3)
+        return numbers.stretch * (largest_coordinate(p) + numbers.offset_size + t) * math.sqrt(3)
 
     def _image(self, sample: Sample, size: Real) -> Sample:
         numbers = self.numbers

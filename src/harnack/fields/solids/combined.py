@@ -13,7 +13,7 @@ import numpy as np
 
 from harnack.arithmetic import maximum, minimum
 from harnack.backend.extrema import fmax, fmin
-from harnack.backend.lengths import largest_component, length
+from harnack.backend.lengths import largest_coordinate, length
 from harnack.enclosures import (
     BoundedLaplacian,
     Enclosure,
@@ -124,7 +124,7 @@ class Combined(Solid):
 
     def evaluate(self, p: Vec3) -> Sample:
         samples = [one.evaluate(p) for one in self.parts]
-        return self._joined(samples, largest_component(p))[0]
+        return self._joined(samples, largest_coordinate(p))[0]
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         best: Any = None
@@ -142,7 +142,7 @@ class Combined(Solid):
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
         """The largest of the parts that may be the one whose derivatives are taken. Where rounding
         leaves open which of two that is, nothing is known: derivatives jump there."""
-        size = largest_component(p)
+        size = largest_coordinate(p)
         sign = -1.0 if self.is_union else 1.0
         whole = value_error(sample, length(sample.gradient), size)
         near, slopes, bends = 0 * p.x, 0 * p.x, 0 * p.x
@@ -161,7 +161,7 @@ class Combined(Solid):
     def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
         """Looks at every part; what they prove together is `Greatest`."""
         looks = [one.look(path, t, ahead, back) for one in self.parts]
-        size = largest_component(path.origin) + t
+        size = largest_coordinate(path.origin) + t
         sample, below, extreme = self._joined([one.sample for one in looks], size)
         slope, slope_error = looks[-1].slope, looks[-1].slope_doubt
         for look in looks[:-1]:

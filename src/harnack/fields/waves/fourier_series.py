@@ -15,7 +15,7 @@ import numpy as np
 from harnack.backend import backend_of
 from harnack.backend.numbers import real_array
 from harnack.fields.field import Field, Sample, check_in_range
-from harnack.fields.kept import prepared_once
+from harnack.fields.field_cache import prepared_once
 from harnack.fields.waves.cosine_series import CosineBounds, fit_cosines, midpoints
 from harnack.fields.waves.cosine_sums import CosineSums
 from harnack.fields.waves.waves import mean_wavelength

@@ -136,7 +136,7 @@ def from_properties(
     """
     if tint is not None and surface.solid is None:
         raise ValueError(
-            "tint is of a solid, which light goes through: give solid=(low, high), for instance "
+            "tint needs a solid, which light goes through: give solid=(low, high), for instance "
             "solid=(-math.inf, level)"
         )
     placement = Placement.identity()

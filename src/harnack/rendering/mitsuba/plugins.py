@@ -26,7 +26,7 @@ from harnack.files import read_loops
 from harnack.geometry import Ball, Box, Intersection
 from harnack.names import did_you_mean
 from harnack.rendering.mitsuba import carrier, integrator
-from harnack.rendering.mitsuba.stock import watch
+from harnack.rendering.mitsuba.other_integrators import watch
 from harnack.rendering.mitsuba.variant import load_mitsuba
 from harnack.tracer import LevelSet, level_set
 

@@ -64,7 +64,7 @@ def check_scene_file(path: Path) -> None:
     if path.suffix.lower() in SURFACE_FILES:
         raise Place(path).error(
             "this is a surface file, not a Mitsuba scene (.xml): draw the field that "
-            "harnack.opening.open_surface(path).field makes of it"
+            "harnack.field_from_file.open_surface(path).field makes of it"
         )
     if looks_like_formula(str(path)) and not path.exists():
         raise Place(path).error(

@@ -55,7 +55,9 @@ def shape(
             raise ValueError(f"{', '.join(settings)}: a LevelSet holds its settings already")
     else:
         if "material" in settings:
-            raise TypeError("a shape has a bsdf, and no material: that is of harnack.render")
+            raise TypeError(
+                "a shape takes bsdf=..., not material=...: that is an argument of harnack.render"
+            )
         surface = level_set(surface, **settings)
     props = mi.Properties()
     props["bsdf"] = as_bsdf(mi, bsdf)

@@ -40,8 +40,8 @@ from harnack.rendering.pictures.pixels import (
     in_tiles,
     uploaded,
 )
+from harnack.rendering.pictures.refraction import Through
 from harnack.rendering.pictures.shading import Light, of_mended, of_side, reflectance
-from harnack.rendering.pictures.through import Through
 from harnack.rendering.surfaces.placement import PlacedSurface
 
 if TYPE_CHECKING:

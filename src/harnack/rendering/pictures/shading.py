@@ -1,8 +1,8 @@
 """The light of shaded pictures: a formula, so that one ray a sample is all they need.
 
 A soft key light from the upper left of the camera, a hemisphere of light that is cooler above
-than below, and a gloss on what is glossy. `occlusion` says how much of the
-hemisphere is hidden by what is near, `floor` where the studio's floor lies in shadow.
+than below, and a gloss on what is glossy. `shaded.visible_sky` says how much
+of the hemisphere is hidden by what is near, `floor` where the studio's floor lies in shadow.
 """
 
 from __future__ import annotations

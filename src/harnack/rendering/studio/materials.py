@@ -57,7 +57,7 @@ class Material:
     def __post_init__(self) -> None:
         if self.tint is not None and not self.transparent:
             raise ValueError(
-                "tint is of a material that light passes through: give transparent=True too"
+                "tint needs a material that light passes through: give transparent=True too"
             )
 
     def bsdf(self, *, solid: bool) -> Dictionary:

@@ -13,7 +13,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import FloatArray, to_float, to_numpy, to_vector3
-from harnack.fields.kept import KeptWithFields
+from harnack.fields.field_cache import FieldCache
 from harnack.rendering.surfaces.extent import box_of
 from harnack.rendering.surfaces.placement import PlacedSurface, Placement
 from harnack.tracer import Tolerance
@@ -28,7 +28,7 @@ _GRID, _CLOSER = 48, 32
 _TILE = 8
 # Squares of lengths, divided by tolerances, stay far from the ends of single precision.
 _SMALLEST, _LARGEST = 1e-15, 1e16
-_POINTS: KeptWithFields[FloatArray] = KeptWithFields()
+_POINTS: FieldCache[FloatArray] = FieldCache()
 
 
 def visible_points(surface: LevelSet, backend: Backend) -> FloatArray:
@@ -71,8 +71,8 @@ def _found(surface: LevelSet, backend: Backend, ends: FloatArray) -> FloatArray:
     if len(points) == 0:
         if (lower > upper).any():
             raise ValueError(
-                "nothing is to be seen of this surface: its domain, clip and section have no room "
-                "in common with it"
+                "nothing is to be seen of this surface: its domain, clip and section do not "
+                "overlap, so that nothing is left to draw"
             )
         raise ValueError(
             "nothing is to be seen of this surface: no ray of a grid on the sides of its box "

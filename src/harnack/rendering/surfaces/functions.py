@@ -1,4 +1,4 @@
-"""Functions on surfaces: what their lines and values are asked of."""
+"""Scalar functions on surfaces, for isolines and for pictures of values."""
 
 from __future__ import annotations
 

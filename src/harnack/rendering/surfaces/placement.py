@@ -15,8 +15,8 @@ from harnack.backend import FloatArray
 from harnack.backend.lanes import on_some
 from harnack.rendering.surfaces.encounter import SurfaceHit, meet_surface
 from harnack.rendering.surfaces.isolines import Isolines, PreparedIsolines, line_at
-from harnack.rendering.surfaces.solid import Solid
-from harnack.tracer.covers import Cones
+from harnack.rendering.surfaces.solid import CappedSolid
+from harnack.tracer.pixel_cones import Cones
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Index, Mask, Real, Vec3
@@ -109,7 +109,7 @@ class PlacedSurface:
     """
 
     prepared: PreparedLevelSet
-    solid: Solid | None
+    solid: CappedSolid | None
     scale: Real
     rows: tuple[Vec3, Vec3, Vec3]
     translation: Vec3
@@ -126,7 +126,7 @@ class PlacedSurface:
             return backend.Array3f(*(dr.opaque(backend.Float, float(x)) for x in numbers))
 
         prepared = surface.prepare(backend)
-        solid = None if surface.solid is None else Solid.of(surface, prepared)
+        solid = None if surface.solid is None else CappedSolid.of(surface, prepared)
         rows = tuple(vector(row) for row in placement.rotation)
         scale = dr.opaque(backend.Float, placement.scale)
         lines = tuple(one.prepare(backend, size) for one in isolines)

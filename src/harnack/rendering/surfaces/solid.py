@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Solid:
+class CappedSolid:
     """A prepared level set whose levels are the finite ones of `low` and `high`."""
 
     prepared: PreparedLevelSet
@@ -30,7 +30,7 @@ class Solid:
     high: Real
 
     @classmethod
-    def of(cls, surface: LevelSet, prepared: PreparedLevelSet) -> Solid:
+    def of(cls, surface: LevelSet, prepared: PreparedLevelSet) -> CappedSolid:
         """The solid that `surface.solid` describes."""
         if surface.solid is None:
             raise ValueError("this level set is not a solid: make it with solid=(low, high)")

@@ -26,7 +26,7 @@ __all__ = ["PlainTracer", "RayTracer", "TracerOf", "trace_queued"]
 
 
 class RayTracer(Protocol):
-    """A loop over the stations of rays: trial points, sheets, or parts."""
+    """A walk that advances each ray by one item a turn: a trial point, a sheet, or a part."""
 
     def begin(self, state: MarchState) -> Any:
         """Rays at their start."""

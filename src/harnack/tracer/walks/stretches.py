@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 
 from harnack.backend.extrema import fmax, fmin
-from harnack.backend.lengths import largest_component
+from harnack.backend.lengths import largest_coordinate
 from harnack.backend.loops import while_active
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.tracer.march import March, MarchState
@@ -186,7 +186,7 @@ class SheetTracer:
         first one that jumps as all of them together do.
         """
         real, count = self.backend.Float, self.backend.UInt32
-        size = largest_component(self.path.origin)
+        size = largest_coordinate(self.path.origin)
         close = _SAME * self.backend.epsilon * (size + first.t)
         steep = fmax(dr.abs(dr.dot(first.normal, self.path.direction)), real(_STEEP))
         furthest = fmax(fmin(first.t + close / steep, self.end), first.t)

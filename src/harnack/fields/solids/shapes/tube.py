@@ -14,11 +14,11 @@ import numpy.typing as npt
 
 from harnack.backend import FloatArray, backend_of
 from harnack.backend.extrema import clamp, fmax, fmin
-from harnack.backend.lengths import largest_component
+from harnack.backend.lengths import largest_coordinate
 from harnack.backend.numbers import check_finite, check_size, check_vectors, real_array
 from harnack.backend.records import Records
 from harnack.enclosures import Enclosure, Gaps, Lipschitz, Pieces
-from harnack.fields.kept import prepared_once
+from harnack.fields.field_cache import prepared_once
 from harnack.fields.look import Look, Path, Sample
 from harnack.fields.solids.shapes.checks import box_around, positive
 from harnack.fields.solids.solid import Solid
@@ -179,7 +179,7 @@ class Tube(Solid):
             return path.look(self.evaluate(p))
         if not hasattr(self, "_records"):
             return self.prepare(backend_of(p)).look(path, t, ahead, ahead)
-        far = _FAR * (largest_component(p) + self._number("_size"))
+        far = _FAR * (largest_coordinate(p) + self._number("_size"))
         length = dr.select(dr.isfinite(ahead), ahead, far)
         knots = (*(one * length for one in _KNOTS), ahead)
         sample, distance, lows = self._seen(p, path.direction, knots)

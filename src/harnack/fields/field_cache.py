@@ -17,7 +17,7 @@ Prepare = TypeVar("Prepare", bound=Callable[..., Field])
 Value = TypeVar("Value")
 
 
-class KeptWithFields(Generic[Value]):
+class FieldCache(Generic[Value]):
     """One value for each field, the one that was asked for last. It goes when the field goes.
 
     A value must not hold its field, or neither would ever go; the field itself is not kept.
@@ -52,7 +52,7 @@ def prepared_once(prepare: Prepare) -> Prepare:
     Fields with parameters are uploaded each time: a parameter may change in place, and its
     derivatives belong to one trace.
     """
-    kept: defaultdict[Backend, KeptWithFields[Field]] = defaultdict(KeptWithFields)
+    kept: defaultdict[Backend, FieldCache[Field]] = defaultdict(FieldCache)
 
     @functools.wraps(prepare)
     def once(self: Field, backend: Backend) -> Field:

@@ -99,7 +99,9 @@ def exhibits(
         made.append(StudioObject(surface, material, fits, isolines=lines))
     _refuse_doubles([one.surface for one in made])
     if boundary is None and boundary_material is not None:
-        raise ValueError("boundary_material is of tubes: give their radius as well, boundary=0.03")
+        raise ValueError(
+            "boundary_material needs the radius of the tubes as well, such as boundary=0.03"
+        )
     rim = material_of(_RIM if boundary_material is None else boundary_material)
     if rim.transparent:
         raise ValueError("boundary_material: tubes have no inside, so light cannot pass through")
@@ -114,7 +116,7 @@ def exhibits(
 def _thick(surface: LevelSet, thickness: float) -> LevelSet:
     """The closed mesh that `mesh` makes of a surface with a thickness, as a surface."""
     if surface.solid is not None or len(surface.levels) != 1:
-        raise ValueError("thickness is of one level of a field: a solid is thick already")
+        raise ValueError("thickness needs a surface of one level; a solid has an inside already")
     if surface.largest:
         raise ValueError("thickness and largest: mesh the surface by hk.mesh(..., largest=True)")
     made = mesh(
@@ -129,7 +131,7 @@ def _with_faces(made: list[StudioObject], material: Material) -> list[StudioObje
     """The same, with a material for the faces of solids on their sections."""
     if not any(one.surface.section and one.surface.solid for one in made):
         raise ValueError(
-            "cut_material is of the faces of a solid on its section: give "
+            "cut_material needs a solid with a section, whose faces are made of it: give "
             "section=harnack.HalfSpace(normal, offset) as well and, of what is no harnack.Solid, "
             "solid=(low, high)"
         )

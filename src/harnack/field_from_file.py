@@ -64,8 +64,9 @@ def open_surface(
     normals: Literal["estimate"] | None = None,
     up: Axis | None = None,
 ) -> OpenedSurface:
-    """The field of a surface file: meshes wind, clouds are dipoles, curves span solid angles, and
-    so do polygons if asked for; metaballs and atoms are blobs.
+    """The field of a surface file: of a mesh a `WindingNumber`, of a cloud with normals a
+    `DipolePotential`, of closed curves a `SolidAngle`, of polygons, if asked for, a `PolygonMesh`,
+    of metaballs and molecules `Blobs`.
 
     as_: "winding", "dipole", "loops" or "polygons" instead of what `read_surface` decides.
     boundary: the curves that bound the faces. normals: "estimate" finds those of a point cloud,

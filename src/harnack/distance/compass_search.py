@@ -13,7 +13,7 @@ import drjit as dr
 
 from harnack.backend.basis import across
 from harnack.backend.extrema import fmax, fmin
-from harnack.backend.lengths import largest_component
+from harnack.backend.lengths import largest_coordinate
 from harnack.distance.meshes.on_sheets import takes_level
 from harnack.fields.sheets import NO_SHEET
 from harnack.tracer import Status
@@ -192,7 +192,7 @@ def _is_on_surface(surface: PreparedLevelSet, y: Vec3, hit: MarchResult, active:
     """Whether hits y are on a sheet, or f takes the level about them: beside the rim of a sheet,
     where its gradient has no bound, rays are within the tolerance of any level to first order."""
     is_smooth = active & (hit.sheet == NO_SHEET)
-    radius = _ABOUT * surface.backend.epsilon * fmax(largest_component(y), hit.t)
+    radius = _ABOUT * surface.backend.epsilon * fmax(largest_coordinate(y), hit.t)
     return ~is_smooth | takes_level(surface, y, radius, is_smooth)
 
 

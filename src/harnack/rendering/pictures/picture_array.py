@@ -51,7 +51,7 @@ class Picture(np.ndarray[Any, np.dtype[Any]]):
         """
         if self._shown is None:
             raise AttributeError(
-                "only what `render` returned has pixels to show, not what it became"
+                "this array was computed from a picture: only what `render` returned has `.shown`"
             )
         return self._shown
 
