@@ -243,7 +243,7 @@ def test_surfaces_stand_on_the_ground() -> None:
     [
         ({"path": "a.jpg"}, r"\.png or \.exr"),
         ({"path": "nowhere/a.png"}, "create the folder"),
-        ({"show": "color"}, "show must be one of"),
+        ({"show": "rainbow"}, "show must be one of"),
         ({"size": (0, 3)}, "size must be"),
         ({"spp": 0}, "spp must be"),
         ({"material": "cheese"}, "unknown material 'cheese'"),

@@ -416,7 +416,7 @@ def test_pictures_of_numbers_stand_before_a_color(show: str) -> None:
     light = hk.render(hk.Sphere(1.0), show=show, backdrop="light", size=(8, 6), **asked)
     assert show == "evaluations" or light.shown[0, 0].min() > 200
     for other in ("transparent", ("white", "black")):
-        with pytest.raises(ValueError, match="is one color"):
+        with pytest.raises(ValueError, match="must be one color"):
             hk.render(hk.Sphere(1.0), show=show, backdrop=other, **asked)
 
 

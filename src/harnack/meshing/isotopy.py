@@ -24,9 +24,9 @@ projections onto it, for each face, edge or corner of a tetrahedron that lies in
 
 Four corners on the level. F is 0 on such a T, and `marching_tetrahedra` gives all of it to one
 side. If two of its faces are in the mesh, put F = +-epsilon at the middle of the edge that the
-other two share: T becomes two tetrahedra, on each of which grad F is a normal of one of those faces, F elsewhere
-changes by no more than epsilon, which (b) and (c) bear as they are strict, and the zero set is the
-mesh. So (b) and (c) are asked of both normals. Other such T are not proved.
+other two share: T becomes two tetrahedra, on each of which grad F is a normal of one of those
+faces, F elsewhere changes by no more than epsilon, which (b) and (c) bear as they are strict, and
+the zero set is the mesh. So (b) and (c) are asked of both normals. Other such T are not proved.
 
 An angle. Where f's lift stays within half a period of the level on T, which is a part of the check
 of (b), the wrapped values at the corners are that lift's, and all is as for a number.

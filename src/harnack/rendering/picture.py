@@ -42,7 +42,7 @@ from harnack.rendering.progress import Advance, progress_bar
 from harnack.rendering.studio.backdrops import Gradient, Ground
 from harnack.rendering.studio.camera import Camera
 from harnack.rendering.studio.stage import Studio, StudioObject, studio
-from harnack.rendering.studio_scene import OF_STUDIO, MaterialLike, exhibits
+from harnack.rendering.studio_scene import OF_STUDIO, MaterialLike, studio_objects
 from harnack.rendering.surfaces.isolines import Isolines
 from harnack.rendering.surfaces.placement import Placement
 from harnack.tracer import LevelSet
@@ -170,7 +170,7 @@ def render(
     in_studio = isinstance(what, Field | LevelSet | list | tuple)
     if in_studio:
         check_memory(asked.show, *(asked.size or _SIZE))
-        on_stage = exhibits(
+        on_stage = studio_objects(
             what, material, settings, boundary=boundary, boundary_material=boundary_material,
             cut=cut_material, isolines=asked.isolines, thickness=thickness,
         )  # fmt: skip

@@ -43,11 +43,11 @@ def surfaces_of(
     what: Any, boundary: float | None = None, thickness: float | None = None, **settings: Any
 ) -> list[LevelSet]:
     """The surfaces that `render` draws of fields and level sets, with settings of surfaces."""
-    drawn = exhibits(what, None, settings, boundary=boundary, thickness=thickness)
+    drawn = studio_objects(what, None, settings, boundary=boundary, thickness=thickness)
     return [one.surface for one in drawn]
 
 
-def exhibits(
+def studio_objects(
     what: Any,
     materials: Any,
     settings: Mapping[str, Any],

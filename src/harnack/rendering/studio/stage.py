@@ -74,7 +74,7 @@ class Studio:
 
 def studio(
     mi: Any,
-    exhibits: Sequence[StudioObject],
+    studio_objects: Sequence[StudioObject],
     *,
     size: tuple[int, int],
     camera: Camera,
@@ -89,7 +89,7 @@ def studio(
     """
     backend = mitsuba_backend(mi)
     if camera.box is None:
-        points = np.concatenate([visible_points(one.surface, backend) for one in exhibits])
+        points = np.concatenate([visible_points(one.surface, backend) for one in studio_objects])
     else:
         points = _corners(np.array(camera.box.bounds()))
     placement = on_ground(points, upright(up))
@@ -103,7 +103,7 @@ def studio(
         },
         "sensor": _sensor(mi, pose, size),
     }
-    for k, one in enumerate(exhibits):
+    for k, one in enumerate(studio_objects):
         surface = one.surface
         if one.fitted:
             close = _OF_PARTS if surface.field.has_parts else _TOLERANCE
