@@ -113,7 +113,7 @@ def test_a_picture_larger_than_memory_is_refused(monkeypatch: pytest.MonkeyPatch
         (lambda: hk.Isolines("z", levels="0.1"), "levels of isolines must be numbers"),
         (lambda: hk.mesh(POLYGON, thickness="0.1"), "thickness must be a number"),  # pyright: ignore
         (lambda: hk.expression(lambda x, y, z: x == y), "write left - right"),
-        (lambda: shape(POLYGON, material="gold"), "has a bsdf, and no material"),
+        (lambda: shape(POLYGON, material="gold"), "takes bsdf=..., not material="),
         (lambda: shape(POLYGON, bsdf="gold"), r"MATERIALS\['gold'\].front, not str"),
         (lambda: hk.SphericalHarmonic(2.5, 1), r"two whole numbers, .* not \(2.5, 1\)"),  # pyright: ignore[reportArgumentType]
         (lambda: hk.HarmonicPolynomial("x"), r"such as \{\(2, 1, 0\): 1, .* not by 'x'"),  # pyright: ignore[reportArgumentType]

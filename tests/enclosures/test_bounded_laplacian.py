@@ -196,7 +196,7 @@ def test_the_name_takes_lipschitz_constants_where_there_is_nothing_else() -> Non
     (made,) = choose_proofs("laplacian").enclose((Lipschitz(real(1), real(1)),), (), *given)
     assert type(made) is Cone
     endless = BoundedLaplacian(real(1), -np.inf, real(1), real(0), real(1))
-    with pytest.raises(ValueError, match="a BoundedLaplacian two"):
+    with pytest.raises(ValueError, match="a BoundedLaplacian both"):
         choose_proofs("laplacian").enclose((endless,), (), *given)
 
 

@@ -560,7 +560,7 @@ def test_bounds_are_chosen_by_name() -> None:
     with pytest.raises(ValueError, match=r"Sample\.known is empty"):
         choose_proofs(None).enclose((LineLipschitz(1.0, 1.0),), (), *given)
     endless = HarmonicBall(real(1), -math.inf, math.inf)
-    with pytest.raises(ValueError, match="an end that is not infinite"):
+    with pytest.raises(ValueError, match="at least one limit that is not infinite"):
         choose_proofs(None).enclose((endless,), (), *given)
     with pytest.raises(ValueError, match=r'choose "lipschitz"$'):
         choose_proofs(None).enclose((), (Lipschitz(1.0),), *given)

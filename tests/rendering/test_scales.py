@@ -196,7 +196,7 @@ def test_the_smallest_pictures_have_bars(size: tuple[int, int]) -> None:
     [
         ({"show": "value"}, "needs the function"),
         ({"show": "value", "of": "height"}, "of: 'height' is no formula"),
-        ({"show": "depth", "of": "z"}, 'of is the function of pictures with show="value"'),
+        ({"show": "depth", "of": "z"}, 'needs a picture with show="value"'),
         ({"show": "color", "colorbar": True}, 'colorbar needs a picture with show="evaluations"'),
         ({"show": "normal", "value_range": (0, 1)}, "value_range needs a picture with"),
         ({"show": "depth", "value_range": (1, 0)}, "two finite numbers in order"),

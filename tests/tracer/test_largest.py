@@ -187,7 +187,7 @@ def test_rays_whose_cells_rounding_leaves_open_are_out_of_steps():
 def test_what_has_no_largest_component_is_refused():
     ray = [[3.0, 0, 0]], [[-1.0, 0, 0]]
     for settings in ({"confirm": True}, {"all_hits": 2}):
-        with pytest.raises(ValueError, match="of first hits"):
+        with pytest.raises(ValueError, match="first hits alone"):
             hk.trace(FIELDS["solids"], *ray, largest=True, **settings)
     with pytest.raises(ValueError, match="with bounds"):
         hk.trace(hk.Plane(), *ray, largest=True)
