@@ -218,6 +218,7 @@ def _staged(mi: Any, asked: Request, drawn: list[StudioObject], up: Any) -> tupl
     made = studio(
         mi, drawn, size=asked.size or _SIZE, camera=asked.camera, backdrop=asked.backdrop,
         up="z" if up is None else up, bare=asked.show not in _LIT,
+        traced_light=asked.show == "color",
     )  # fmt: skip
     return made, mi.load_dict(made.scene, parallel=False)
 

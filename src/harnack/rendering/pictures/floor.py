@@ -42,7 +42,7 @@ class Floor:
         mi = world.mi
         cell = (np.arange(_CELLS) + 0.5) / _CELLS * 2 * _REACH - _REACH
         y, x = np.meshgrid(cell, cell, indexing="ij")
-        seen = [_part_seen(world, x, y, to) for to in (_to_key(light.key), _to_sky())]
+        seen = _parts_seen(world, x, y, np.stack([_to_key(light.key), _to_sky()]))
         image = np.stack([_blurred(part) for part in seen], axis=-1)
         numbers = mi.Float(aligned(mitsuba_backend(mi), image.ravel()))
         tensor = mi.TensorXf(numbers, image.shape)
@@ -57,22 +57,22 @@ class Floor:
         return dr.select(on_floor, key, 1), dr.select(on_floor, sky, 1)
 
 
-def _part_seen(world: World, x: FloatArray, y: FloatArray, towards: FloatArray) -> FloatArray:
-    """What part (n, n) of their directions (16, rays, 3) points of the floor see to be free."""
+def _parts_seen(world: World, x: FloatArray, y: FloatArray, towards: FloatArray) -> FloatArray:
+    """What parts (k, n, n) of their directions (k, 16, rays, 3) points of the floor see free."""
     mi = world.mi
     j, i = np.indices(x.shape)
-    kind = (j % _BLOCK) * _BLOCK + i % _BLOCK
-    d = towards[kind].reshape(-1, 3)
-    o = np.stack([x, y, np.zeros_like(x)], axis=-1).repeat(_RAYS, axis=1).reshape(-1, 3)
+    d = towards[:, (j % _BLOCK) * _BLOCK + i % _BLOCK]
+    o = np.stack([x, y, np.zeros_like(x)], axis=-1)[:, :, None]
+    o = np.broadcast_to(o, d.shape)
     ray = mi.Ray3f(_vectors(mi.Point3f, o), _vectors(mi.Vector3f, d))
     ray.maxt = mi.Float(_FAR)
     free = to_numpy(~world.occluded(ray, mi.Bool(True)))
-    part: FloatArray = free.reshape(*x.shape, _RAYS).mean(axis=-1)
-    return part
+    parts: FloatArray = free.reshape(d.shape[:-1]).mean(axis=-1)
+    return parts
 
 
 def _vectors(kind: Any, rows: FloatArray) -> Any:
-    return kind(np.ascontiguousarray(rows.T, dtype=np.float32))
+    return kind(np.ascontiguousarray(rows.reshape(-1, 3).T, dtype=np.float32))
 
 
 def _square() -> FloatArray:

@@ -81,11 +81,13 @@ def studio(
     backdrop: Backdrop = _LIGHT,
     up: Any = "z",
     bare: bool = False,
+    traced_light: bool = True,
 ) -> Studio:
     """Surfaces on the stage, seen in a picture of (width, height) pixels.
 
     up: the direction of the surfaces' coordinates that is up on the stage, as `upright` takes it.
     bare: only surfaces and camera, without ground and lights.
+    traced_light: whether the picture follows light paths, and so needs whole materials.
     """
     backend = mitsuba_backend(mi)
     if camera.box is None:
@@ -108,8 +110,8 @@ def studio(
         if one.fitted:
             close = _OF_PARTS if surface.field.has_parts else _TOLERANCE
             surface = replace(surface, tolerance=Tolerance(close / placement.scale))
-        bsdf = one.material.bsdf(solid=surface.solid is not None)
-        cut = None if one.cut is None else one.cut.bsdf(solid=True)
+        bsdf = one.material.bsdf(solid=surface.solid is not None, traced_light=traced_light)
+        cut = None if one.cut is None else one.cut.bsdf(solid=True, traced_light=traced_light)
         scene[f"surface{k}"] = shape(
             surface, bsdf=bsdf, to_world=placement.matrix, tint=one.material.tint, cut_bsdf=cut,
             isolines=one.isolines,
