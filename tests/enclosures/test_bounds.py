@@ -26,7 +26,7 @@ from harnack.enclosures import (
     choose_proofs,
     longest_step,
 )
-from harnack.fields import Curvature, HarmonicBall, LineLipschitz, Lipschitz
+from harnack.fields import Curvature, HarmonicBall, Lipschitz
 from harnack.testing import BrokenPromiseError, check_bound, scaled
 from harnack.testing.cases import BallCase, Case, CurvatureCase, LaplacianCase, LipschitzCase
 from harnack.testing.poisson import cap_mass, cap_movement, cap_slope, kernel_movement
@@ -558,7 +558,7 @@ def test_bounds_are_chosen_by_name() -> None:
     with pytest.raises(ValueError, match=r'no bound applies.*Lipschitz, which.*Caps.*"lipschitz"'):
         choose_proofs(Caps).enclose((Lipschitz(1.0),), (), *given)
     with pytest.raises(ValueError, match=r"Sample\.known is empty"):
-        choose_proofs(None).enclose((LineLipschitz(1.0, 1.0),), (), *given)
+        choose_proofs(None).enclose((), (), *given, (Lipschitz(1.0, 1.0),))
     endless = HarmonicBall(real(1), -math.inf, math.inf)
     with pytest.raises(ValueError, match="at least one limit that is not infinite"):
         choose_proofs(None).enclose((endless,), (), *given)

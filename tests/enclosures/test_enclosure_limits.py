@@ -21,6 +21,8 @@ from drjit.llvm.ad import Float, Float64
 
 import harnack
 from harnack.arithmetic import Interval
+from harnack.backend import choose_backend
+from harnack.backend.arrays import aligned
 from harnack.enclosures import Ball, Enclosure, Gaps, Slopes, any_covers, longest_step
 from harnack.enclosures.arc import Arc
 from harnack.enclosures.balls.bounded_laplacian import GreenBall
@@ -197,7 +199,7 @@ class Numbers:
             drawn[:] = self.by
         self.count += 1
         self.lists.append(values)
-        return self.real(drawn.astype(np.float32 if self.real is Float else np.float64))
+        return aligned(choose_backend("single" if self.real is Float else "double"), drawn)
 
 
 def answers(kind: type[Enclosure], draw: Numbers) -> tuple[np.ndarray, np.ndarray]:

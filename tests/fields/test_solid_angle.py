@@ -11,7 +11,7 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.enclosures import LineLipschitz, choose_proofs
+from harnack.enclosures import choose_proofs
 from harnack.fields.look import Path
 from harnack.geometry import shapes, validate_loops
 from harnack.geometry.net_loops import net_loops
@@ -480,8 +480,7 @@ def test_what_is_promised_along_a_line_holds(name: str, precision: str) -> None:
         x, d = x[away > 1e-4], unit(d[away > 1e-4])
     path = Path(to_vector3(backend, x), to_vector3(backend, d), choose_proofs(None))
     start = backend.Float(0)
-    known = hk.SolidAngle(loops).look(path, start, start, start).sample.known
-    promises = [one for one in known if isinstance(one, LineLipschitz)]
+    promises = hk.SolidAngle(loops).look(path, start, start, start).sample.along
     gain = 0.0
     assert len(promises) == 6
     for promise in promises:

@@ -8,8 +8,18 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import FloatArray, choose_backend, to_numpy, to_vector3
-from harnack.enclosures import Gaps
-from harnack.testing.cases import Case, case_of
+from harnack.enclosures import (
+    BoundedLaplacian,
+    Curvature,
+    Gaps,
+    GreenBall,
+    HarmonicBall,
+    Lipschitz,
+    Promise,
+    Slope,
+    Slopes,
+)
+from harnack.testing.cases import BallCase, Case, CurvatureCase, LaplacianCase, LipschitzCase
 from harnack.testing.failures import BrokenPromiseError
 from harnack.testing.scaled import unscaled
 from harnack.testing.walks import look_at, movements, random_directions, random_points
@@ -19,6 +29,7 @@ if TYPE_CHECKING:
     from harnack.backend import Precision
     from harnack.enclosures import Enclosure
     from harnack.fields.field import Field
+    from harnack.fields.look import Sample
 
 __all__ = ["check_steps"]
 
@@ -57,7 +68,7 @@ def check_steps(
     down, up = _gaps(field, points, generator)
     blur = _blur(sample, points, backend.epsilon)
     near = Gaps(*(real(np.maximum(gap - blur, 0)) for gap in (down, up)))
-    cases = [case_of(one, sample, near) for one in sample.promises]
+    cases = [_case_of(one, sample, near) for one in sample.promises]
     accepted = [one for one in cases if one.accepts(kind)]
     for one in accepted:
         step = to_numpy(one.step(kind, slope)).astype(np.float64) * np.ones(count)
@@ -144,3 +155,26 @@ def _require(
             f"{message}: from {points[k].tolist()} in direction {directions[k].tolist()}, length "
             f"{float(length[k])!r}; {bad.size} of {len(points)} rays"
         )
+
+
+def _case_of(promise: Promise, sample: Sample, gaps: Gaps) -> Case:
+    """A promise of a sample with levels these gaps away."""
+    zero = 0 * sample.value
+    given = promise, sample.value, sample.error, Slopes(zero, zero)
+    if isinstance(promise, HarmonicBall):
+        ball = Slope.of(*given)
+        assert ball is not None
+        return BallCase(
+            ball.radius, ball.range_below, ball.range_above, gaps.down, gaps.up, ball.dimension
+        )
+    if isinstance(promise, BoundedLaplacian):
+        green = GreenBall.of(*given)
+        assert green is not None
+        return LaplacianCase(
+            green.radius, green.range_below, green.range_above,
+            promise.laplacian_lower, promise.laplacian_upper, gaps.down, gaps.up,
+        )  # fmt: skip
+    if isinstance(promise, Curvature):
+        return CurvatureCase(promise.constant, promise.radius, gaps.down, gaps.up)
+    assert isinstance(promise, Lipschitz)
+    return LipschitzCase(promise.constant, promise.radius, gaps.down, gaps.up)

@@ -9,7 +9,6 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.fields import LineLipschitz
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.geometry.mesh_shapes import icosphere
 from harnack.geometry.shapes import wavy_polygon
@@ -67,8 +66,7 @@ def test_what_is_promised_along_rays_holds(thinness: float, method: str, precisi
     start = backend.Float(-1e-20)
     first = Crossing(start, backend.UInt32(NO_SHEET), backend.Float(0), along)
     turns = field.offset(o, along, start, backend.Bool(True))
-    known = field.between(o, along, first, first, turns).evaluate(o).known
-    promises = [one for one in known if isinstance(one, LineLipschitz)]
+    promises = field.between(o, along, first, first, turns).evaluate(o).along
     gain = 0.0
     for promise in promises:
         rate, length = to_numpy(promise.constant) * 4 * math.pi, to_numpy(promise.radius)
@@ -83,9 +81,9 @@ def test_what_is_promised_along_rays_holds(thinness: float, method: str, precisi
 
 def test_a_sample_off_rays_promises_nothing_along_one() -> None:
     field, backend = hk.WindingNumber(*slivers(1e-2, 4)), choose_backend("double")
-    known = field.evaluate(backend.Array3f(0.1, 0.2, 0.3)).known
-    assert known
-    assert not any(isinstance(one, LineLipschitz) for one in known)
+    sample = field.evaluate(backend.Array3f(0.1, 0.2, 0.3))
+    assert sample.known
+    assert not sample.along
 
 
 @pytest.mark.parametrize("precision", ["single", "double"])

@@ -15,7 +15,6 @@ import drjit as dr
 from harnack.backend import lengths
 from harnack.backend.extrema import clamp, fmax, fmin
 from harnack.distance.tangent import Eigen, TangentPlane
-from harnack.enclosures import Lipschitz
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -187,7 +186,7 @@ class Descent:
         noise = dr.fma(4 * epsilon, size, blur / gradient_norm)
         reach = real(0)
         for known in sample.promises:
-            if isinstance(known, Lipschitz):  # of what may have creases
+            if not known.is_smooth:
                 continue
             radius = real(known.radius)
             reach = fmax(reach, dr.select(dr.isfinite(radius), radius, 0))

@@ -15,7 +15,6 @@ from harnack.backend.lengths import length
 from harnack.distance.batches import in_batches
 from harnack.distance.cell_tree import FAR, SurfaceCells
 from harnack.distance.rim import RimDescent
-from harnack.enclosures import Curvature, HarmonicBall
 from harnack.fields.clearance import distance_below
 from harnack.tracer import Status
 
@@ -23,7 +22,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from harnack.backend import Mask, Real, Vec3
-    from harnack.enclosures.promises import Promise
     from harnack.fields.field import Field, Sample
     from harnack.tracer import LevelSet
 
@@ -40,34 +38,11 @@ _DIAGONALS = ((1.0, 1.0, 1.0), (1.0, 1.0, -1.0), (1.0, -1.0, 1.0), (-1.0, 1.0, 1
 
 def remainder(sample: Sample, radius: Real) -> Real:
     """A bound of |f(y) - value - gradient . (y - p)| for |y - p| <= radius; infinite where the
-    field promises none. It falls at least as the square of the radius.
-
-    Proof for a harmonic f >= c on a ball of radius R in n dimensions: f - c is the integral of
-    Poisson's kernel P(q, s) = sum over l of the zonal harmonics, all largest at s = 1, with a
-    measure of mass f(p) - c; those of degree 0 and 1 are the value and the gradient. The rest is
-    between -(P - 1 - n q) and P - 1 - n q at s = 1, P = (1 + q)/(1 - q)^(n - 1), times f(p) - c.
-    The same holds for C - f, and the smaller of both counts.
-    """
+    field promises none. It falls at least as the square of the radius."""
     best: Real = dr.inf
     for known in sample.promises:
-        best = fmin(best, _of_promise(known, sample.value, radius))
+        best = fmin(best, known.remainder(sample.value, radius))
     return best + sample.error + sample.gradient_error * radius
-
-
-def _of_promise(known: Promise, value: Real, radius: Real) -> Real:
-    if isinstance(known, Curvature):
-        bound = 0.5 * known.constant * radius * radius
-        return dr.select(radius < known.radius, bound, dr.inf)
-    if not isinstance(known, HarmonicBall):
-        return dr.inf
-    mass = fmin(value - known.lower, known.upper - value)
-    q = radius / known.radius
-    rest = {
-        2: 2 * q * q / (1 - q),
-        3: q * q * (5 - 3 * q) / dr.square(1 - q),
-        4: q * q * (9 - q * (11 - 4 * q)) / (dr.square(1 - q) * (1 - q)),
-    }[known.dimension]
-    return dr.select((q < 1) & (mass < dr.inf), mass * rest, dr.inf)
 
 
 @dataclass

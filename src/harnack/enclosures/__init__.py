@@ -27,7 +27,6 @@ from harnack.enclosures.promises import (
     BoundedLaplacian,
     Curvature,
     HarmonicBall,
-    LineLipschitz,
     Lipschitz,
     Promise,
 )
@@ -56,7 +55,6 @@ __all__ = [
     "GreenBall",
     "HarmonicBall",
     "IntervalRange",
-    "LineLipschitz",
     "LinearTaylor",
     "Lipschitz",
     "Mixed",

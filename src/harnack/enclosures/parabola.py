@@ -10,7 +10,7 @@ import drjit as dr
 
 from harnack.backend.extrema import fmax, fmin
 from harnack.enclosures.enclosure import Enclosure, Gaps, Slopes
-from harnack.enclosures.promises import Curvature, LineLipschitz, Lipschitz, Promise
+from harnack.enclosures.promises import Curvature, Lipschitz, Promise
 
 if TYPE_CHECKING:
     from typing import Self
@@ -62,7 +62,7 @@ class Cone(Parabola):
 
     @classmethod
     def of(cls, promise: Promise, value: Real, error: Real, slopes: Slopes) -> Self | None:
-        if not isinstance(promise, Lipschitz | LineLipschitz):
+        if not isinstance(promise, Lipschitz):
             return None
         constant = _not_negative(promise.constant)
         return cls(Slopes(-constant, constant), 0.0, 0.0, promise.radius)

@@ -22,12 +22,13 @@ from harnack.enclosures.literature import (
 )
 from harnack.enclosures.parabola import Cone, Taylor
 from harnack.enclosures.pieces import LinearTaylor, Pieces, QuadraticTaylor, Segment
-from harnack.enclosures.promises import LineLipschitz, Promise
+from harnack.enclosures.promises import Promise
 from harnack.enclosures.tangent import Tangent
 from harnack.names import did_you_mean
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real
+    from harnack.enclosures.promises import Lipschitz
     from harnack.enclosures.restriction import Restriction
 
 _NAMED: dict[str, tuple[type[Enclosure], ...]] = {
@@ -79,16 +80,18 @@ class Proofs:
         value: Real,
         error: Real,
         slopes: Slopes,
+        along: tuple[Lipschitz, ...] = (),
     ) -> tuple[Enclosure, ...]:
         """The enclosures of f along a direction in which it has these slopes.
 
-        known, weaker, value, error: as in `Sample`. Raises ValueError if no proof applies.
+        known, weaker, value, error, along: as in `Sample`. Raises ValueError if no proof applies to
+        a promise.
         """
         promises = known + weaker if self.uses_weaker else known
-        made = [(one, self._enclosure(one, value, error, slopes)) for one in promises]
-        if all(one is None or isinstance(promise, LineLipschitz) for promise, one in made):
+        made = [self._enclosure(one, value, error, slopes) for one in (*promises, *along)]
+        if all(one is None for one in made[: len(promises)]):
             raise ValueError(self._useless(known + weaker, value, error, slopes))
-        return tuple(one for _, one in made if one is not None)
+        return tuple(one for one in made if one is not None)
 
     def _enclosure(
         self, promise: Promise, value: Real, error: Real, slopes: Slopes
@@ -104,7 +107,6 @@ class Proofs:
     ) -> str:
         """Why no proof applies, and which would."""
         asked = ", ".join(kind.__name__ for kind in self.kinds)
-        promises = tuple(one for one in promises if not isinstance(one, LineLipschitz))
         if not promises:
             return (
                 f"the bounds asked for ({asked}) need a promise and the field makes none: "

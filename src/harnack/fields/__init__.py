@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from harnack.enclosures import BoundedLaplacian, Curvature, HarmonicBall, LineLipschitz, Lipschitz
+from harnack.enclosures import BoundedLaplacian, Curvature, HarmonicBall, Lipschitz
 from harnack.fields.blobs.blobs import BlobError, Blobs
 from harnack.fields.blobs.hrbf import HRBF
 from harnack.fields.blobs.kernels import Compact, Cubic, Gaussian, Kernel, Sextic
@@ -77,7 +77,6 @@ __all__ = [
     "Julia",
     "Kernel",
     "LevelCurves",
-    "LineLipschitz",
     "Lipschitz",
     "Lobes",
     "Molecule",

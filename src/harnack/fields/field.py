@@ -31,7 +31,6 @@ from harnack.enclosures import (
     BoundedLaplacian,
     Curvature,
     HarmonicBall,
-    LineLipschitz,
     Lipschitz,
     Promise,
 )
@@ -54,7 +53,6 @@ __all__ = [
     "Curvature",
     "Field",
     "HarmonicBall",
-    "LineLipschitz",
     "Lipschitz",
     "Look",
     "Path",

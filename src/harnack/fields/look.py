@@ -9,19 +9,11 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 
 from harnack.backend.extrema import fmax
-from harnack.enclosures import (
-    BoundedLaplacian,
-    Curvature,
-    Enclosure,
-    HarmonicBall,
-    LineLipschitz,
-    Lipschitz,
-    Promise,
-    Proofs,
-    Slopes,
-)
+from harnack.enclosures import Enclosure, Lipschitz, Promise, Proofs, Slopes
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from harnack.backend import Real, Vec3
 
 
@@ -40,6 +32,7 @@ class Sample:
     truncation: the part of `error` that a closer evaluation makes smaller (`Field.at_detail`).
     weaker: promises that are as true as `known`, but proved shorter steps wherever that was
         measured. Only a bound that is asked for by name uses them.
+    along: what holds besides, but only for points of the path that f is looked at along.
     """
 
     value: Real
@@ -50,11 +43,17 @@ class Sample:
     normal: Vec3 | None = None
     truncation: Real = 0.0
     weaker: tuple[Promise, ...] = ()
+    along: tuple[Lipschitz, ...] = ()
 
     @property
     def promises(self) -> tuple[Promise, ...]:
         """All promises, the weaker ones last."""
         return self.known + self.weaker
+
+    def with_promises(self, change: Callable[[Promise], Promise], **numbers: Any) -> Sample:
+        """The sample with each promise changed, and other numbers."""
+        known, weaker = (tuple(map(change, group)) for group in (self.known, self.weaker))
+        return dataclasses.replace(self, known=known, weaker=weaker, **numbers)
 
 
 def lengthened(sample: Sample, size: Real) -> Sample:
@@ -63,23 +62,11 @@ def lengthened(sample: Sample, size: Real) -> Sample:
     Values stay; radii are multiplied by the size, gradients and Lipschitz constants divided by it,
     curvatures and Laplacians by its square.
     """
-
-    def longer(one: Promise) -> Promise:
-        if isinstance(one, HarmonicBall):
-            return HarmonicBall(one.radius * size, one.lower, one.upper, one.dimension)
-        if isinstance(one, BoundedLaplacian):
-            ends = one.laplacian_lower / (size * size), one.laplacian_upper / (size * size)
-            return BoundedLaplacian(one.radius * size, one.lower, one.upper, *ends)
-        if isinstance(one, Lipschitz | LineLipschitz):
-            return type(one)(one.constant / size, one.radius * size)
-        return Curvature(one.constant / (size * size), one.radius * size)
-
-    return dataclasses.replace(
-        sample,
+    return sample.with_promises(
+        lambda one: one.lengthened(size),
         gradient=sample.gradient / size,
         gradient_error=sample.gradient_error / size,
-        known=tuple(longer(one) for one in sample.known),
-        weaker=tuple(longer(one) for one in sample.weaker),
+        along=tuple(one.lengthened(size) for one in sample.along),
     )
 
 
@@ -143,5 +130,7 @@ class Path:
         slope = dr.dot(sample.gradient, self.direction)
         slopes = Slopes.around(slope, sample.gradient_error)
         given = sample.known, sample.weaker, sample.value, sample.error
-        ahead = self.proofs.enclose(*given, slopes)
-        return Look(sample, ahead, self.proofs.enclose(*given, slopes.negated()), slope)
+        ahead, back = (
+            self.proofs.enclose(*given, one, sample.along) for one in (slopes, slopes.negated())
+        )
+        return Look(sample, ahead, back, slope)

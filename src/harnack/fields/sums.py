@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 
 from harnack.backend.extrema import fmax, fmin
-from harnack.enclosures import Curvature, HarmonicBall, LineLipschitz
+from harnack.enclosures import Curvature, HarmonicBall, Lipschitz
 from harnack.fields.batch import Values
 from harnack.fields.field import Sample
 from harnack.fields.symmetric import SymmetricSum
@@ -201,7 +201,7 @@ class FieldSums:
         unit: Real,
         rounding: Real,
         normal: Vec3 | None = None,
-        along: tuple[LineLipschitz, ...] = (),
+        along: tuple[Lipschitz, ...] = (),
     ) -> Sample:
         """`share` times f, with what is known of it.
 
@@ -238,15 +238,17 @@ class FieldSums:
         apart, reach = apart & ~lost, fmax(self.free_distance, reach)
         steep = type(g)(0, 0, most / reach)
         error = dr.fma(share, self.truncation + self.rounding, rounding)
+        along = tuple(one.scaled(share) for one in along)
         return Sample(
             dr.select(apart, value, 0),
             dr.select(apart, g, steep),
-            (*bends, *(LineLipschitz(share * one.constant, one.radius) for one in along)),
+            tuple(bends),
             dr.select(apart, error, most),
             dr.select(apart, slope_error, 0),
             normal,
             dr.select(apart, share * self.truncation, 0),
             (ball,),
+            along,
         )
 
     def with_rates(

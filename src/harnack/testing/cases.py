@@ -17,16 +17,13 @@ from harnack.enclosures import (
     GreenBall,
     HarmonicBall,
     Lipschitz,
-    Promise,
-    Slope,
     Slopes,
 )
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real
-    from harnack.fields.look import Sample
 
-__all__ = ["BallCase", "Case", "CurvatureCase", "LaplacianCase", "LipschitzCase", "case_of"]
+__all__ = ["BallCase", "Case", "CurvatureCase", "LaplacianCase", "LipschitzCase"]
 
 
 @dataclass(frozen=True)
@@ -137,24 +134,3 @@ class CurvatureCase(_Case):
 
 
 Case: TypeAlias = BallCase | LaplacianCase | LipschitzCase | CurvatureCase
-
-
-def case_of(promise: Promise, sample: Sample, gaps: Gaps) -> Case:
-    """A promise of a sample with levels these gaps away."""
-    if isinstance(promise, HarmonicBall):
-        zero = 0 * sample.value
-        ball = Slope.of(promise, sample.value, sample.error, Slopes(zero, zero))
-        assert ball is not None
-        return BallCase(
-            ball.radius, ball.range_below, ball.range_above, gaps.down, gaps.up, ball.dimension
-        )
-    if isinstance(promise, BoundedLaplacian):
-        zero = 0 * sample.value
-        green = GreenBall.of(promise, sample.value, sample.error, Slopes(zero, zero))
-        assert green is not None
-        return LaplacianCase(
-            green.radius, green.range_below, green.range_above,
-            promise.laplacian_lower, promise.laplacian_upper, gaps.down, gaps.up,
-        )  # fmt: skip
-    kind = CurvatureCase if isinstance(promise, Curvature) else LipschitzCase
-    return kind(promise.constant, promise.radius, gaps.down, gaps.up)

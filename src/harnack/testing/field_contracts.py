@@ -18,6 +18,7 @@ from harnack.enclosures import (
     Gaps,
     HarmonicBall,
     Lipschitz,
+    Slopes,
     choose_proofs,
     longest_step,
 )
@@ -190,7 +191,7 @@ def _check_numbers(field: Field, points: FloatArray, look: FieldValues) -> None:
             return
         raise BrokenPromiseError("nothing is known: without a promise no step is possible")
     for known in look.known:
-        numbers = [value for key, value in vars(known).items() if key != "dimension"]
+        numbers = [vars(known)[name] for name, *_ in known.units]
         name = type(known).__name__
         require(~np.isnan(numbers).any(axis=0), f"{name} has a NaN", points)
         if isinstance(known, HarmonicBall):
@@ -205,7 +206,7 @@ def _check_numbers(field: Field, points: FloatArray, look: FieldValues) -> None:
             require(inside, f"{name}: the value is not within [lower, upper]", points)
             is_ordered = known.laplacian_lower <= known.laplacian_upper
             require(is_ordered, f"{name}: laplacian_lower exceeds laplacian_upper", points)
-        else:
+        elif isinstance(known, Lipschitz | Curvature):
             require(known.constant >= 0, f"{name}: the constant is negative", points)
     usable = np.any([known.radius > 0 for known in look.known], axis=0)
     if usable.mean() < 0.5:
@@ -281,25 +282,21 @@ def _check_promise(
         ways = (steepest, -steepest, random_directions(rng, len(points)))
         d = ways[min(k, 2)]
         t = reach[:, None] * share
-        if not isinstance(known, HarmonicBall | BoundedLaplacian):
+        if not known.of_all_space:
             t = np.minimum(reach, _way_out(field, points, d))[:, None] * share
         walk = movements(field, points, d, t)
         moved = walk.moved
         rounding = 1e-9 * (np.abs(look.value)[:, None] + (field.period or 0) + np.abs(moved))
         rounding += look.error[:, None] + walk.error  # of both ends, also of approximations
+        slope = np.einsum("nk,nk->n", look.gradient, d)
+        slopes = Slopes(*((slope + sign * look.gradient_error)[:, None] for sign in (-1, 1)))
+        each = known.each(lambda number, _, __: number[:, None])
+        with np.errstate(invalid="ignore"):  # 0 * inf, at the point itself
+            low, high = each.movement(look.value[:, None], slopes, t)
+            excess = np.maximum(moved - high, low - moved)
         if isinstance(known, HarmonicBall):
-            excess = _beyond_ball(known, look.value, moved, share) - rounding
-        elif isinstance(known, BoundedLaplacian):
-            value = look.value[:, None] + moved
-            beyond = np.maximum(known.lower[:, None] - value, value - known.upper[:, None])
-            excess = beyond - rounding
-        elif isinstance(known, Lipschitz):
-            excess = np.abs(moved) - _constants(known, t) * t - rounding
-        else:
-            assert isinstance(known, Curvature)
-            slope = np.einsum("nk,nk->n", look.gradient, d)[:, None]
-            bent = np.abs(moved - slope * t) - 0.5 * _constants(known, t) * t * t
-            excess = bent - rounding - look.gradient_error[:, None] * t
+            excess = np.fmax(excess, _beyond_ball(known, look.value, moved, share))
+        excess = np.where(t > 0, excess, 0.0) - rounding
         worst = excess.argmax(axis=1)
         rows = np.arange(len(points))
         there = points + t[rows, worst, None] * d
@@ -316,12 +313,6 @@ def _way_out(field: Field, points: FloatArray, d: FloatArray) -> FloatArray:
     ends = field.domain.prepare(backend).clip(o, way, backend.Float(0), backend.Float(np.inf))
     end = np.broadcast_to(to_numpy(ends[1]), (len(points),))
     return np.maximum(end * (1 - 1e-9) - 1e-12 * np.abs(points).max(axis=1), 0)
-
-
-def _constants(known: Lipschitz | Curvature, t: FloatArray) -> FloatArray:
-    """The constants (n, m) that hold at distances t (n, m): an infinite one, which is of no use,
-    says nothing of the point itself."""
-    return np.where(t > 0, known.constant[:, None], 0.0)
 
 
 def _beyond_ball(

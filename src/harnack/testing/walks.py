@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import numpy as np
@@ -40,18 +39,12 @@ class FieldValues:
 
     def at(self, rows: BoolArray) -> FieldValues:
         """The same at some of the points."""
-        known: list[Promise] = []
-        for one in self.known:
-            numbers: dict[str, Any] = {
-                key: value[rows] for key, value in vars(one).items() if key != "dimension"
-            }
-            known.append(dataclasses.replace(one, **numbers))
         return FieldValues(
             self.value[rows],
             self.gradient[rows],
             self.error[rows],
             self.gradient_error[rows],
-            tuple(known),
+            tuple(one.each(lambda number, _, __: number[rows]) for one in self.known),
         )
 
 
@@ -63,13 +56,7 @@ def look_at(field: Field, points: FloatArray, precision: Precision = "double") -
     # At once, or each would be computed by a kernel of its own.
     dr.eval(sample.value, sample.gradient, sample.error, sample.gradient_error, numbers_known)
 
-    def on_host(one: Promise) -> Promise:
-        numbers: dict[str, Any] = {
-            key: _spread(value, n) for key, value in vars(one).items() if key != "dimension"
-        }
-        return dataclasses.replace(one, **numbers)
-
-    known = tuple(on_host(one) for one in sample.promises)
+    known = tuple(one.each(lambda number, _, __: _spread(number, n)) for one in sample.promises)
     return FieldValues(
         _spread(sample.value, n),
         np.broadcast_to(to_numpy(sample.gradient), (n, 3)).astype(np.float64),

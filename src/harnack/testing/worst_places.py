@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
-from harnack.enclosures import BoundedLaplacian, Curvature, HarmonicBall, Lipschitz
+from harnack.enclosures import BoundedLaplacian, HarmonicBall, Slopes
 from harnack.testing.failures import require
 from harnack.testing.walks import FieldValues, look_at, movements, random_directions
 
@@ -145,7 +145,7 @@ class _Search:
             reach[rows] = np.minimum(known.radius, self.longest)
             y = p + reach[:, None] * w
             usable = reach[rows] > _SMALLEST * np.abs(p[rows]).max(axis=1)
-            if not isinstance(known, HarmonicBall | BoundedLaplacian):
+            if not known.of_all_space:
                 usable &= self._within(y[rows])
             rows, look = rows[usable], look.at(usable)
             if len(rows):
@@ -170,21 +170,21 @@ class _Search:
         error = error + _ROUNDING * (np.abs(look.value) + (self.field.period or 0) + np.abs(moved))
         distance = reach * np.linalg.norm(w, axis=1)
         with np.errstate(all="ignore"):
-            if isinstance(known, Lipschitz):
-                return (np.abs(moved) - error) / (known.constant * distance)
-            if isinstance(known, Curvature):
-                straight = np.einsum("nk,nk->n", look.gradient, y - p)
-                bent = np.abs(moved - straight) - error - look.gradient_error * distance
-                return bent / (0.5 * known.constant * distance**2)
-            if not isinstance(known, HarmonicBall | BoundedLaplacian):
-                return np.full(len(p), -np.inf)
-            below, above = look.value - known.lower + error, known.upper - look.value + error
-            ratio = np.maximum(moved / above, -moved / below)
-            free = reach - distance
+            slope = np.einsum("nk,nk->n", look.gradient, y - p) / distance
+            low, high = known.movement(look.value, Slopes(slope, slope), distance)
+            if not known.of_all_space:
+                middle, half = 0.5 * (low + high), 0.5 * (high - low)
+                error = error + look.gradient_error * distance * (middle != 0)
+                return (np.abs(moved - middle) - error) / half
+            below, above = error - low, error + high
+            ratio, free = np.maximum(moved / above, -moved / below), reach - distance
             if isinstance(known, HarmonicBall):
                 gap = np.minimum(below + moved, above - moved)
-                return np.fmax(ratio, _slope_ratio(known, there, free, gap))
-            return np.fmax(ratio, self._laplacian_ratio(known, y, there, _SPACING * free))
+                ratio = np.fmax(ratio, _slope_ratio(known, there, free, gap))
+            if isinstance(known, BoundedLaplacian):
+                spacing = _SPACING * free
+                ratio = np.fmax(ratio, self._laplacian_ratio(known, y, there, spacing))
+            return ratio
 
     def _lift(self, p: FloatArray, y: FloatArray, samples: int) -> FloatArray:
         """How far the continuous lift moves from p to y (n,)."""

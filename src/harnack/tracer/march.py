@@ -14,7 +14,7 @@ import drjit as dr
 from harnack.backend.extrema import clamp, fmax, fmin
 from harnack.backend.lengths import largest_coordinate, length
 from harnack.backend.loops import while_active
-from harnack.enclosures import LineLipschitz, any_covers, longest_step
+from harnack.enclosures import any_covers, longest_step
 from harnack.fields.look import value_error
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.tracer.contact import AIM, CLOSER, Accepted, Contact, Hysteresis
@@ -165,7 +165,7 @@ class March:
     backend: Backend
     levels: TargetLevels
     tolerance: PreparedTolerance
-    max_steps: int
+    max_steps: Any
     overstep: float
     hysteresis: Hysteresis | None = None
     cover: Real | None = None
@@ -493,8 +493,7 @@ class March:
         near = gap <= fmax(within - sample.truncation, 2 * rounding)
         for promise in sample.known:
             radius = promise.radius
-            if not isinstance(promise, LineLipschitz):
-                size = fmax(dr.select(dr.isfinite(radius), radius, 0), size)
+            size = fmax(dr.select(dr.isfinite(radius), radius, 0), size)
         excess = gap + total_error - within
         crosses = (gap <= within - sample.truncation) | (end < dr.inf)
         crosses |= excess <= dr.abs(look.slope) * size

@@ -86,7 +86,7 @@ class PreparedLevelSet:
     volume: Volume | None
     proofs: Proofs
     tolerance: PreparedTolerance
-    max_steps: int
+    max_steps: Any
     overstep: float
     confirm: bool = False
     region: Volume | None = None

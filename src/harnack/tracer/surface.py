@@ -150,7 +150,7 @@ class LevelSet:
             None if volume is None else volume.prepare(backend),
             self.bound,
             self.tolerance.prepare(backend),
-            self.max_steps,
+            dr.opaque(backend.UInt32, self.max_steps),
             self.overstep,
             self.confirm,
             None if region is None else region.prepare(backend),

@@ -10,7 +10,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend.records import Records
-from harnack.enclosures import HarmonicBall
+from harnack.enclosures import HarmonicBall, Lipschitz
 from harnack.fields.edges.curve_promises import bends, swept_ball
 from harnack.fields.edges.edge_passing import Line, known_along, rates_along
 from harnack.fields.edges.edge_records import LoopEdges
@@ -133,12 +133,14 @@ class FaceCurve(Field):
         gradient = dr.select(met, steep, sums.gradient)
         error = dr.select(met, 0, 2 * backend.epsilon * sums.squares) + face.value_rounding
         error = dr.select(met, 8 * PERIOD, error)
+        along: tuple[Lipschitz, ...] = ()
         if direction is not None:
             line = Line(x, backend.Array3f(direction), rounding)
 
             def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
                 return rates_along(face.edges, line, lengths, active)
 
-            known = (*known, *known_along(line, sums.gradient, sums.distance, rates))
+            along = known_along(line, sums.gradient, sums.distance, rates)
         value = dr.select(met, 0, sums.angle)
-        return lengthened(Sample(value, gradient, known, error, weaker=(ball,)), face.size)
+        sample = Sample(value, gradient, known, error, weaker=(ball,), along=along)
+        return lengthened(sample, face.size)

@@ -14,7 +14,7 @@ import numpy as np
 from harnack.backend import FloatArray, backend_of, choose_backend, to_numpy
 from harnack.backend.extrema import fmin
 from harnack.backend.tensors import is_tensor, vectors_of
-from harnack.enclosures import HarmonicBall, LineLipschitz
+from harnack.enclosures import HarmonicBall, Lipschitz
 from harnack.fields.clearance import tight_extent
 from harnack.fields.curves.circle_sums import Circles, CircleSums
 from harnack.fields.curves.edge_angles import differentiable_angle
@@ -242,9 +242,10 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
             gradient_error = dr.select(met, 0, slope)
         error = dr.select(met, 8 * _PERIOD, error)  # that gradient times 2 rounding
         along = _along_curves(on, x, sums, direction)
-        known = (ball,) if self._asked == "paper" else (*known, *along)
+        if self._asked == "paper":
+            known = (ball,)
         value = dr.select(met, 0, sums.angle)
-        sample = Sample(value, gradient, known, error, gradient_error, weaker=(ball,))
+        sample = Sample(value, gradient, known, error, gradient_error, weaker=(ball,), along=along)
         return lengthened(sample, on.size)
 
     def _planar_ball(
@@ -480,7 +481,7 @@ class CurveSums:
 
 def _along_curves(
     on: _CurveBuffers, x: Vec3, sums: CurveSums, direction: Vec3 | None
-) -> tuple[LineLipschitz, ...]:
+) -> tuple[Lipschitz, ...]:
     """What is known at x, in unit coordinates, along a direction, if one is given."""
     if direction is None:
         return ()

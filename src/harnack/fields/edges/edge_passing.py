@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import drjit as dr
 
 from harnack.backend.extrema import clamp, fmax
-from harnack.enclosures import LineLipschitz
+from harnack.enclosures import Lipschitz
 from harnack.fields.edges.edge import Edge
 from harnack.fields.sums import SUM_ROUNDING
 
@@ -67,9 +67,7 @@ class Line:
         return dr.fma(8 * float(dr.epsilon(self.x)), dr.norm(self.x), self.rounding)
 
 
-def known_along(
-    line: Line, gradient: Vec3, distance: Real, rates: Rates
-) -> tuple[LineLipschitz, ...]:
+def known_along(line: Line, gradient: Vec3, distance: Real, rates: Rates) -> tuple[Lipschitz, ...]:
     """How fast f moves along lines through points so far from the curve, for lengths that lead from
     half that distance to the curve's size; only on lanes where it may be worth its cost.
 
@@ -84,7 +82,7 @@ def known_along(
         lengths.append(lengths[-1] * longer)
     found = rates(tuple(lengths), dr.abs(slope) < flat)
     pairs = zip(found, lengths, strict=True)
-    return tuple(LineLipschitz(rate * (1 + SUM_ROUNDING), length) for rate, length in pairs)
+    return tuple(Lipschitz(rate * (1 + SUM_ROUNDING), length) for rate, length in pairs)
 
 
 def rates_along(

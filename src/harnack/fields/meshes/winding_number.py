@@ -20,7 +20,6 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray, IntArray, backend_of
-from harnack.enclosures import LineLipschitz
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.clearance import occupied_cells, tight_extent
 from harnack.fields.field import Field, Sample, lengthened
@@ -341,8 +340,7 @@ def _at_start(on: _MeshBuffers, frame: Frame, turns: Real, detail: float) -> Sam
     """The sample where rays begin; turns: the crossings that are ahead."""
     nowhere = Crossing(0.0, on.backend.UInt32(NO_SHEET), 0.0, on.backend.Array3f(0, 0, 1))
     sample = on.winding.on_stretch(frame, frame.o, nowhere, turns, on.backend.Float(detail))
-    known = tuple(one for one in sample.known if not isinstance(one, LineLipschitz))
-    return lengthened(dataclasses.replace(sample, known=known), on.size)
+    return lengthened(dataclasses.replace(sample, along=()), on.size)
 
 
 class _Stretch(Field):

@@ -12,13 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.arithmetic import Jet
-from harnack.backend.extrema import fmax
 from harnack.backend.lengths import largest_coordinate, length
 from harnack.enclosures import (
-    BoundedLaplacian,
-    Curvature,
-    HarmonicBall,
-    Lipschitz,
     Promise,
     Stretched,
 )
@@ -32,9 +27,6 @@ if TYPE_CHECKING:
     from harnack.geometry import Volume
 
 from harnack.fields.solids.maps import Map, axis_index
-
-# Bounds of f'' in the middle half of a harmonic ball: see `without_balls`.
-_HARMONIC_SECOND = 10 / (3 * math.sqrt(3))
 
 
 @dataclass(frozen=True)
@@ -264,71 +256,20 @@ class AffineImage(Derived):
         factor, stretch = numbers.factor, numbers.stretch
 
         def image(one: Promise) -> Promise:
-            if isinstance(one, HarmonicBall):
-                return replace(
-                    one, radius=one.radius / stretch,
-                    lower=one.lower * factor, upper=one.upper * factor,
-                )  # fmt: skip
-            if isinstance(one, BoundedLaplacian):
-                square, (low, high) = stretch * stretch, (one.laplacian_lower, one.laplacian_upper)
-                # It is a similarity, by at most `stretch` and hardly less.
-                slack = 5e-6 * (dr.abs(low) + dr.abs(high))
-                return BoundedLaplacian(
-                    one.radius / stretch, one.lower * factor, one.upper * factor,
-                    (low - slack) * square * factor, (high + slack) * square * factor,
-                )  # fmt: skip
-            if isinstance(one, Curvature):
-                return Curvature(one.constant * factor * stretch * stretch, one.radius / stretch)
-            return type(one)(one.constant * factor * stretch, one.radius / stretch)
+            if self.map.similarity is None:
+                one = one.of_any_map(sample.value)
+            return one.scaled(factor).shortened(stretch)
 
-        known, weaker = sample.known, sample.weaker
-        if self.map.similarity is None:
-            known, weaker = (without_balls(group, sample) for group in (known, weaker))
-        return replace(
-            sample,
+        return sample.with_promises(
+            image,
             value=sample.value * factor,
             gradient=numbers.pulled(sample.gradient) * factor,
             error=(sample.error + moved) * factor,
             gradient_error=sample.gradient_error * factor * stretch,
             normal=None,
             truncation=sample.truncation * factor,
-            known=tuple(image(one) for one in known),
-            weaker=tuple(image(one) for one in weaker),
+            along=(),
         )
-
-
-def without_balls(promises: tuple[Promise, ...], sample: Sample) -> tuple[Promise, ...]:
-    """The promises, harmonic balls as bounds of second derivatives and bounded Laplacians as
-    Lipschitz constants: what is no similarity leaves no function harmonic.
-
-    Proof. On a ball of radius R about its center, f_vv = R^-2 times the mean of f 5 (3 s^2 - 1)
-    over the sphere, s the cosine of the angle to v; of f between lower and upper that is at most
-    10/(3 sqrt 3) (upper - lower)/R^2. Points within R/2 are centers of balls of radius R/2.
-    """
-    made: list[Promise] = []
-    for one in promises:
-        if isinstance(one, HarmonicBall):
-            span = (one.upper - sample.value) + (sample.value - one.lower)
-            half = 0.5 * one.radius
-            made.append(Curvature(1.0001 * _HARMONIC_SECOND * span / (half * half), half))
-        elif isinstance(one, BoundedLaplacian):
-            made.append(lipschitz_of_laplacian(one))
-        else:
-            made.append(one)
-    return tuple(made)
-
-
-def lipschitz_of_laplacian(one: BoundedLaplacian) -> Lipschitz:
-    """A Lipschitz constant on half the ball, from ranges of f and its Laplacian.
-
-    Proof. Points within R/2 are centers of balls of radius r = R/2. There f is a harmonic h with
-    the same boundary values, which are between lower and upper, less the integral of G Laplacian f:
-    so |h_v| <= 3/2 (upper - lower)/(2 r), and the integral of |d_v G| is 3 r/8.
-    """
-    half = 0.5 * one.radius
-    most = fmax(dr.abs(one.laplacian_lower), dr.abs(one.laplacian_upper))
-    steepest = 0.75 * (one.upper - one.lower) / half + 0.375 * half * most
-    return Lipschitz(1.0001 * steepest, half)
 
 
 @dataclass(frozen=True)

@@ -15,19 +15,15 @@ from harnack.arithmetic import maximum, minimum
 from harnack.backend.extrema import fmax, fmin
 from harnack.backend.lengths import largest_coordinate, length
 from harnack.enclosures import (
-    BoundedLaplacian,
     Enclosure,
     Greatest,
-    HarmonicBall,
     Lipschitz,
     Negated,
     Part,
-    Promise,
 )
 from harnack.fields.field import Field
 from harnack.fields.formula import as_data
 from harnack.fields.look import Look, Path, Sample, value_error
-from harnack.fields.solids.affine import lipschitz_of_laplacian
 from harnack.fields.solids.solid import Derived, Solid, not_a_solid
 from harnack.geometry import Box, Intersection
 
@@ -264,27 +260,10 @@ def shortest_wave(parts: Iterable[Solid]) -> float | None:
 
 
 def lipschitz_of(sample: Sample) -> Lipschitz | None:
-    """A Lipschitz constant that a sample promises, or that follows from a ball.
-
-    Proof. Let f be within M of a constant on a ball of radius r in R^n. At its center f_v is n/r
-    times the mean of f s over the sphere, s the cosine of the angle to v, so at most n M/r times
-    the mean of |s|: 1.28, 1.5 and 1.7 M/r for n = 2, 3, 4. Points within R/2 are centers of balls
-    of radius R/2, on which M is half of upper - lower. `lipschitz_of_laplacian` has another proof.
-    """
-    for one in sample.promises:
-        if isinstance(one, Lipschitz):
-            return one
-    for one in sample.promises:
-        if isinstance(one, HarmonicBall) and not _is_open(one.lower) and not _is_open(one.upper):
-            span = (one.upper - sample.value) + (sample.value - one.lower)
-            return Lipschitz(1.7001 * span / one.radius, 0.5 * one.radius)
-        if isinstance(one, BoundedLaplacian):
-            return lipschitz_of_laplacian(one)
-    return None
-
-
-def _is_open(end: Any) -> bool:
-    return isinstance(end, float) and math.isinf(end)
+    """A Lipschitz constant that a sample promises or, failing that, that follows from a promise."""
+    found = [one.lipschitz(sample.value) for one in sample.promises]
+    stated = (one for one in sample.promises if isinstance(one, Lipschitz))
+    return next(stated, None) or next((one for one in found if one is not None), None)
 
 
 def _around(volumes: list[Volume]) -> Volume | None:
@@ -345,22 +324,11 @@ def negated_look(look: Look) -> Look:
 
 def negated_sample(sample: Sample) -> Sample:
     """The sample of -f."""
-
-    def turned(one: Promise) -> Promise:
-        if isinstance(one, BoundedLaplacian):
-            ends = -one.laplacian_upper, -one.laplacian_lower
-            return BoundedLaplacian(one.radius, -one.upper, -one.lower, *ends)
-        if isinstance(one, HarmonicBall):
-            return replace(one, lower=-one.upper, upper=-one.lower)
-        return one
-
-    return replace(
-        sample,
+    return sample.with_promises(
+        lambda one: one.negated(),
         value=-sample.value,
         gradient=-sample.gradient,
         normal=None if sample.normal is None else -sample.normal,
-        known=tuple(turned(one) for one in sample.known),
-        weaker=tuple(turned(one) for one in sample.weaker),
     )
 
 
@@ -395,19 +363,11 @@ class Offset(Derived):
 
     def _shifted(self, sample: Sample) -> Sample:
         """The sample, its value rounded once more."""
-
-        def moved(one: Promise) -> Promise:
-            if not isinstance(one, HarmonicBall | BoundedLaplacian):
-                return one
-            return replace(one, lower=one.lower - self.distance, upper=one.upper - self.distance)
-
         size = dr.abs(sample.value) + abs(self.distance)
-        return replace(
-            sample,
+        return sample.with_promises(
+            lambda one: one.shifted(-self.distance),
             value=sample.value - self.distance,
             error=sample.error + 8 * float(dr.epsilon(type(sample.value))) * size,
-            known=tuple(moved(one) for one in sample.known),
-            weaker=tuple(moved(one) for one in sample.weaker),
         )
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:

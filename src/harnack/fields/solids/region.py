@@ -19,7 +19,6 @@ from harnack.enclosures import Curvature, Enclosure, Gaps
 from harnack.fields.field import Field, check_is_field
 from harnack.fields.formula import Formula, as_data, is_jet
 from harnack.fields.look import Look, Path, Sample
-from harnack.fields.solids.affine import without_balls
 from harnack.fields.solids.combined import Complement, Offset, lipschitz_of, negated_sample
 from harnack.fields.solids.solid import Derived, Solid
 
@@ -228,11 +227,11 @@ def _pairs(n: int, count: int) -> list[tuple[int, int]]:
 
 def _second_derivatives(field: Field, sample: Sample) -> tuple[Real, Real]:
     """A bound of all second derivatives, and the radius within which it holds."""
-    for one in without_balls(sample.promises, sample):
-        is_ball = one not in sample.promises
+    for promise in sample.promises:
+        one = promise.of_any_map(sample.value)
         if isinstance(one, Curvature):
             everywhere = isinstance(one.radius, float) and math.isinf(one.radius)
-            if is_ball or everywhere:
+            if one is not promise or everywhere:
                 return one.constant, one.radius
     raise TypeError(
         f"{type(field).__name__} promises neither a HarmonicBall with both ends nor a Curvature "
@@ -318,6 +317,7 @@ class Near(Derived):
             normal=None,
             known=() if lipschitz is None else (lipschitz,),
             weaker=(),
+            along=(),
         ), offset
 
 
