@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from harnack.backend import choose_backend, to_numpy
+from harnack.backend.arrays import aligned
 from harnack.enclosures import (
     Ball,
     Caps,
@@ -31,9 +32,7 @@ from harnack.testing import BrokenPromiseError, check_bound, scaled
 from harnack.testing.cases import BallCase, Case, CurvatureCase, LaplacianCase, LipschitzCase
 from harnack.testing.poisson import cap_mass, cap_movement, cap_slope, kernel_movement
 from harnack.testing.scaled import unscaled
-from tests.oracles.exact import exact_step, on_host
-
-BOUNDS = (Classic, Slope, Caps, GreenBall, Cone, Taylor)
+from tests.oracles.exact import BOUNDS, exact_step, on_host
 
 
 # Solved to the end: the default number of rounds trades a little length for time.
@@ -130,10 +129,10 @@ def ratios(
     """step/exact of each row; the exact step from the numbers as rounded to the precision."""
     backend = choose_backend(precision)  # type: ignore[arg-type]
     fields = {
-        key: backend.Float(value) if isinstance(value, np.ndarray) else value
+        key: aligned(backend, value) if isinstance(value, np.ndarray) else value
         for key, value in vars(certificate).items()
     }
-    on_device, s = type(certificate)(**fields), backend.Float(slope)
+    on_device, s = type(certificate)(**fields), aligned(backend, slope)
     exact = exact_step(
         unscaled(bound), on_host(on_device, len(slope)), to_numpy(s).astype(np.float64)
     )

@@ -46,9 +46,8 @@ from tests.arithmetic.test_arithmetics import PROOFS
 from tests.enclosures.test_bounded_laplacian import FIELDS as SOURCED
 from tests.fields.test_shapes import SHAPES
 from tests.oracles.direct_sums import dipole_sum, winding_sum
+from tests.oracles.exact import BOUNDS
 from tests.oracles.step_contracts import check_steps
-
-BOUNDS = (Classic, Slope, Caps, GreenBall, Cone, Taylor)
 
 
 class Charges(Field):

@@ -10,6 +10,7 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
+from harnack.backend.arrays import aligned
 from harnack.backend.lengths import length
 from harnack.enclosures import (
     Caps,
@@ -59,7 +60,9 @@ def rounding_used(weights: Weights, n: int, seed: int) -> tuple[float, float]:
     p = p.astype(np.float64)
     exact_f, exact_g = evaluate(weights, *p.T)
     rounding = HarmonicRounding.of(weights, is_divided=False)
-    rho, r = (DOUBLE.Float(one) for one in (np.hypot(p[:, 0], p[:, 1]), np.linalg.norm(p, axis=1)))
+    rho, r = (
+        aligned(DOUBLE, one) for one in (np.hypot(p[:, 0], p[:, 1]), np.linalg.norm(p, axis=1))
+    )
     lost = 2.0**-126 * rounding.lost
     of_value = UNIT * on_host(rounding.value(rho, r), n) + lost
     of_gradient = UNIT * on_host(rounding.gradient(rho, r), n) + 100 * lost

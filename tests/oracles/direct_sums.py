@@ -13,7 +13,7 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend import FloatArray, choose_backend, to_numpy
+from harnack.backend import FloatArray, choose_backend, to_numpy, to_vector3
 from harnack.backend.records import Records
 
 if TYPE_CHECKING:
@@ -115,6 +115,6 @@ def _in_parts(
     backend = choose_backend("double")
     columns: list[tuple[FloatArray, ...]] = []
     for i in range(0, max(len(points), 1), _AT_ONCE):
-        x = backend.Array3f(np.ascontiguousarray(points[i : i + _AT_ONCE].T))
+        x = to_vector3(backend, points[i : i + _AT_ONCE])
         columns.append(tuple(to_numpy(one) for one in total(x, backend)))
     return tuple(np.concatenate(one) for one in zip(*columns, strict=True))

@@ -8,18 +8,18 @@ import drjit as dr
 import numpy as np
 import pytest
 
+from harnack.backend.arrays import aligned_integers
 from harnack.rendering import register
 from harnack.rendering.mitsuba.sobol import SobolSampler
+from harnack.rendering.mitsuba.variant import mitsuba_backend
 
 mi: Any = register()
 
 
 def sampler(pixel: np.ndarray, index: np.ndarray, seed: int = 0, dimension: int = 0) -> Any:
-    uint = mi.UInt32
-    return SobolSampler(
-        mi, uint(pixel.astype(np.uint32)), uint(index.astype(np.uint32)), uint(seed),
-        uint(dimension),
-    )  # fmt: skip
+    backend = mitsuba_backend(mi)
+    pixels, indices = (aligned_integers(backend, one) for one in (pixel, index))
+    return SobolSampler(mi, pixels, indices, mi.UInt32(seed), mi.UInt32(dimension))
 
 
 def points(one: Any) -> np.ndarray:

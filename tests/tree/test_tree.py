@@ -8,7 +8,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from harnack.backend import choose_backend, to_numpy
+from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.geometry.mesh_shapes import bumpy_sphere, torus_mesh
 from harnack.tree import NO_PRIMITIVE, Hierarchy, build_hierarchy, for_each, pack, walk
 from harnack.tree.triangles import Frame, TriangleRays, triangle_records
@@ -191,7 +191,7 @@ def ray_tree(backend: Any, vertices: np.ndarray, faces: np.ndarray) -> TriangleR
 
 
 def frame_of(backend: Any, o: np.ndarray, d: np.ndarray) -> Frame:
-    return Frame.along(backend, backend.Array3f(o.T), backend.Array3f(d.T))
+    return Frame.along(backend, to_vector3(backend, o), to_vector3(backend, d))
 
 
 def unit(v: np.ndarray) -> np.ndarray:
@@ -234,7 +234,7 @@ def test_turns_ahead_tell_inside_from_outside(precision: Any, shape: str) -> Non
     turns = to_numpy(rays.turns_ahead(frame_of(backend, o, d), 0, backend.Bool(True)))
     np.testing.assert_array_equal(turns, inside)
     for way in (1, -1):  # turns are about the axis upwards
-        turns = to_numpy(rays.turns_along(backend.Array3f(o.T), backend.Float(way)))
+        turns = to_numpy(rays.turns_along(to_vector3(backend, o), backend.Float(way)))
         np.testing.assert_array_equal(way * turns, inside)
 
 
@@ -263,7 +263,7 @@ def test_rays_exactly_through_vertices_and_edges(precision: Any) -> None:
         turns = to_numpy(rays.turns_ahead(frame_of(backend, o, d), 0, backend.Bool(True)))
         np.testing.assert_array_equal(turns, inside)
         for way in (1, -1):
-            turns = to_numpy(rays.turns_along(backend.Array3f(o.T), backend.Float(way)))
+            turns = to_numpy(rays.turns_along(to_vector3(backend, o), backend.Float(way)))
             np.testing.assert_array_equal(way * turns, inside)
 
 
