@@ -25,20 +25,24 @@ from harnack.geometry.singular import weld_vertices
 from harnack.meshing import mesh, repair
 from harnack.names import did_you_mean
 from harnack.rendering import Camera, Isolines, animate, render
+from harnack.rendering.arguments import OF_STUDIO, SETTINGS
 from harnack.rendering.film import check_film_path
 from harnack.rendering.pictures.images import check_picture_path
 
 _DEMO_SIZE = (480, 360)
 
 
-def _quality(options: Any) -> dict[str, Any]:
-    asked = {"size": options.size, "spp": options.spp}
-    chosen = {name: value for name, value in asked.items() if value is not None}
-    return {**chosen, "seed": options.seed, "progress": not options.quiet}
+# Settings of pictures that are options of the same name; several options make up the others.
+_BY_NAME = tuple(
+    name for name in SETTINGS if name not in ("boundary", "camera", "isolines", "progress")
+)
 
 
-def _noise(options: Any) -> dict[str, Any]:
-    return {"denoise": True} if options.denoise else {}
+def _of_picture(options: Any) -> dict[str, Any]:
+    """Settings of the picture that were asked for."""
+    asked = {name: getattr(options, name, None) for name in _BY_NAME}
+    given = (name for name, value in asked.items() if value is not None and value is not False)
+    return {**{name: asked[name] for name in given}, "progress": not options.quiet}
 
 
 def _render(options: Any) -> int:
@@ -50,8 +54,6 @@ def _render(options: Any) -> int:
         what, settings = _mitsuba_scene(options)
     else:
         what, settings = _drawn(options, source)
-    if options.antialias is not None:
-        settings["antialias"] = options.antialias
     render(what, target, **settings)
     _say(f"wrote {target}")
     return 0
@@ -93,10 +95,7 @@ def _is_formula(name: str) -> bool:
 
 def _drawn(options: Any, source: Path) -> tuple[Any, dict[str, Any]]:
     """Surfaces of a scene or a file, and the settings of their picture."""
-    names = ("show", "backdrop", "up", "material", "of", "value_range", "colorbar")
-    chosen = {name: getattr(options, name) for name in names}
-    settings = {name: value for name, value in chosen.items() if value is not None}
-    settings |= {**_lines(options), **_quality(options), **_noise(options), **_of_surfaces(options)}
+    settings = {**_of_picture(options), **_lines(options), **_of_surfaces(options)}
     if any(value is not None for value in _view(options).values()):
         settings["camera"] = _camera(options)
     if options.scene in SCENES:
@@ -111,16 +110,13 @@ def _drawn(options: Any, source: Path) -> tuple[Any, dict[str, Any]]:
 def _mitsuba_scene(options: Any) -> tuple[str, dict[str, Any]]:
     """A scene that has everything of its own."""
     _refuse_file_options(options)
-    given = {
-        **_of_surfaces(options), **_view(options), "level": options.level, "up": options.up,
-        "material": options.material, "backdrop": options.backdrop, **_lines(options),
-    }  # fmt: skip
-    wrong = [name for name, value in given.items() if value is not None]
+    settings = {**_of_picture(options), **_lines(options)}
+    of_scene = {**_of_surfaces(options), **_view(options), "level": options.level}
+    wrong = [name for name, value in of_scene.items() if value is not None]
+    wrong += [name for name in settings if name in OF_STUDIO]
     if wrong:
         raise ValueError(f"{', '.join(wrong)}: a Mitsuba scene sets this in its own file")
-    names = ("show", "of", "value_range", "colorbar")
-    shown = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
-    return options.scene, {**_quality(options), **_noise(options), **shown}
+    return options.scene, settings
 
 
 def _of_surfaces(options: Any) -> dict[str, Any]:
@@ -128,9 +124,7 @@ def _of_surfaces(options: Any) -> dict[str, Any]:
     asked = {
         "confirm": True if options.confirm else None, "bound": options.bound,
         "solid": options.solid, "clip": _clip(options), "section": _section(options),
-        "largest": True if options.largest else None, "cut_material": options.cut_material,
-        "boundary": options.boundary_tube, "boundary_material": options.boundary_material,
-        "thickness": options.thickness,
+        "largest": True if options.largest else None, "boundary": options.boundary_tube,
     }  # fmt: skip
     return {name: value for name, value in asked.items() if value is not None}
 
@@ -361,7 +355,7 @@ def _gallery(options: Any) -> int:
         )
         target = folder / f"{scene.name}.png"
         small = {"size": _DEMO_SIZE, "spp": scene.demo_spp} if options.demo else {}
-        scene.render(target, **{**small, **_quality(options)})
+        scene.render(target, **{**small, **_of_picture(options)})
         _say(f"    {target}")
     _say(f"{len(wanted)} pictures in {folder.resolve()}")
     return 0

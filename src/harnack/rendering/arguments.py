@@ -6,8 +6,8 @@ import inspect
 import math
 import operator
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 from harnack.fields import Field
@@ -19,23 +19,6 @@ from harnack.rendering.studio.camera import Camera
 from harnack.rendering.surfaces.functions import function_of
 from harnack.rendering.surfaces.isolines import Isolines, checked_isolines
 from harnack.tracer import level_set
-
-__all__ = [
-    "ANTIALIASING",
-    "MAX_SIDE",
-    "MAX_SPP",
-    "SHOW_MODES",
-    "Request",
-    "check_camera",
-    "check_integer",
-    "check_memory",
-    "check_settings",
-    "check_show",
-    "check_size",
-    "check_spp",
-    "checked_request",
-    "refuse_studio_settings",
-]
 
 SHOW_MODES: tuple[str, ...] = ("color", "shaded", *VIEWS)
 # Pictures that may have isolines.
@@ -61,68 +44,26 @@ _BYTES = {"color": 50, "shaded": 280, "value": 240}
 _BYTES_OF_VIEWS = 130
 
 
-@dataclass(frozen=True)
-class Request:
-    """What `render` is asked for, as it is used: sizes and counts are integers, None for unset."""
-
-    show: str
-    size: tuple[int, int] | None
-    spp: int | None
-    max_depth: int | None
-    seed: int
-    camera: Camera
-    backdrop: Backdrop
-    antialias: str | None
-    isolines: tuple[Isolines, ...]
-    function: Field | None
-    value_range: tuple[float, float] | None
-    colorbar: bool | str
-    denoise: bool
+def check_max_depth(max_depth: Any, show: str) -> int | None:
+    """The longest path, or None; ValueError for pictures without paths."""
+    if max_depth is None:
+        return None
+    _check_has_paths("max_depth", show)
+    return check_integer("max_depth", max_depth)
 
 
-def checked_request(
-    *,
-    show: Any,
-    size: Any,
-    spp: Any,
-    max_depth: Any,
-    seed: Any,
-    camera: Any,
-    backdrop: Any,
-    antialias: Any,
-    isolines: Any,
-    of: Any,
-    value_range: Any,
-    colorbar: Any,
-    denoise: Any,
-) -> Request:
-    """What was asked for.
-
-    Raises:
-        TypeError, ValueError: naming the argument that is wrong, and what it should be.
-    """
-    check_show(show)
-    check_antialias(antialias, show, spp)
+def check_denoise(denoise: Any, show: str) -> bool:
+    """Whether to denoise; ValueError for pictures without noise."""
     if not isinstance(denoise, bool):
         raise TypeError(f"denoise must be True or False, not {denoise!r}")
-    for name, given in (("denoise", denoise), ("max_depth", max_depth is not None)):
-        if given and show != "color":
-            raise ValueError(f'{name} needs a picture with show="color", not show="{show}"')
-    return Request(
-        show,
-        None if size is None else check_size(size),
-        None if spp is None else check_spp(spp),
-        None if max_depth is None else check_integer("max_depth", max_depth),
-        check_integer("seed", seed),
-        Camera() if camera is None else check_camera(camera),
-        check_behind(backdrop, show),
-        antialias,
-        check_isolines(isolines, show),
-        check_function(of, show),
-        None if value_range is None else check_value_range(value_range, show),
-        check_colorbar(colorbar, show),
-        denoise,
-    )
+    if denoise:
+        _check_has_paths("denoise", show)
+    return denoise
+
+
+def _check_has_paths(setting: str, show: str) -> None:
+    if show != "color":
+        raise ValueError(f'{setting} needs a picture with show="color", not show="{show}"')
 
 
 def check_isolines(isolines: Any, show: str) -> tuple[Isolines, ...]:
@@ -147,8 +88,10 @@ def check_function(of: Any, show: str) -> Field | None:
     return function_of(of)
 
 
-def check_value_range(value_range: Any, show: str) -> tuple[float, float]:
-    """The numbers at the ends of a scale; ValueError for pictures that have none."""
+def check_value_range(value_range: Any, show: str) -> tuple[float, float] | None:
+    """The numbers at the ends of a scale, or None; ValueError for pictures that have none."""
+    if value_range is None:
+        return None
     _check_scaled("value_range", show)
     wrong = f"value_range must be (low, high), two finite numbers in order, not {value_range!r}"
     try:
@@ -202,19 +145,21 @@ def _either(names: Sequence[str]) -> str:
     return " or ".join(f'"{name}"' for name in names)
 
 
-def check_show(show: Any) -> None:
-    """Raise ValueError for what is no mode."""
+def check_show(show: Any) -> str:
+    """A mode; ValueError for what is none."""
     if not isinstance(show, str) or show not in SHOW_MODES:
         raise ValueError(
             f"show must be one of {', '.join(SHOW_MODES)}, not {show!r}"
             f"{did_you_mean(show, SHOW_MODES)}"
         )
+    return show
 
 
-def check_antialias(antialias: Any, show: str, spp: Any) -> None:
-    """Raise ValueError for what is no way to choose pixels, or where there is none to choose."""
+def check_antialias(antialias: Any, show: str) -> str | None:
+    """A way to choose pixels, or None; ValueError for what is none, or where there is none to
+    choose."""
     if antialias is None:
-        return
+        return None
     if not isinstance(antialias, str) or antialias not in ANTIALIASING:
         raise ValueError(
             f"antialias must be one of {', '.join(ANTIALIASING)}, not {antialias!r}"
@@ -222,11 +167,7 @@ def check_antialias(antialias: Any, show: str, spp: Any) -> None:
         )
     if show != "shaded":
         raise ValueError(f'antialias needs a picture with show="shaded", not show="{show}"')
-    if antialias == "cones" and spp == 1:
-        raise ValueError(
-            'antialias="cones" finds pixels for more than one sample, and spp is 1: give spp=9, '
-            "or leave antialias out"
-        )
+    return antialias
 
 
 def check_size(size: Any) -> tuple[int, int]:
@@ -271,7 +212,9 @@ def check_integer(name: str, number: Any) -> int:
 
 
 def check_camera(camera: Any) -> Camera:
-    """A camera, or one at a position (x, y, z)."""
+    """A camera, one at a position (x, y, z), or that of all pictures."""
+    if camera is None:
+        return Camera()
     if isinstance(camera, Camera):
         return camera
     try:
@@ -284,15 +227,97 @@ def check_camera(camera: Any) -> Camera:
     return Camera(position=(x, y, z))
 
 
-def check_settings(settings: Mapping[str, Any], own: Sequence[str]) -> None:
-    """Raise TypeError for a setting that neither `render` (own) nor `level_set` has."""
+Check = Callable[[Any, str], Any]
+
+
+def _by(check: Callable[[Any], Any]) -> Check:
+    """A check that does not depend on what is shown."""
+    return lambda given, show: check(given)
+
+
+def _if_given(check: Callable[[Any], Any]) -> Check:
+    """The same, of what may be left out."""
+    return lambda given, show: None if given is None else check(given)
+
+
+def _as_given(given: Any, show: str) -> Any:
+    """Of what is checked elsewhere, by what uses it."""
+    del show
+    return given
+
+
+def _integer(name: str) -> Check:
+    return lambda given, show: check_integer(name, given)
+
+
+def _setting(check: Check = _as_given, **marks: bool) -> Mapping[str, Any]:
+    """How a setting is checked, from what is given and what is shown. of_studio: a scene that has
+    everything of its own does not take it. of_surfaces: it says where they are."""
+    return {"check": check, **marks}
+
+
+@dataclass(frozen=True)
+class Request:
+    """The settings of pictures as they are used, each with its check: sizes and counts are
+    integers, None is for unset. The one table of them, which films read too.
+    """
+
+    show: str = field(metadata=_setting(_by(check_show)))
+    size: tuple[int, int] | None = field(metadata=_setting(_if_given(check_size)))
+    spp: int | None = field(metadata=_setting(_if_given(check_spp)))
+    antialias: str | None = field(metadata=_setting(check_antialias))
+    material: Any = field(metadata=_setting(of_studio=True))
+    camera: Camera = field(metadata=_setting(_by(check_camera), of_studio=True))
+    backdrop: Backdrop = field(metadata=_setting(check_behind, of_studio=True))
+    up: Any = field(metadata=_setting(of_studio=True))
+    boundary: float | None = field(metadata=_setting(of_studio=True, of_surfaces=True))
+    boundary_material: Any = field(metadata=_setting(of_studio=True))
+    cut_material: Any = field(metadata=_setting(of_studio=True))
+    isolines: tuple[Isolines, ...] = field(metadata=_setting(check_isolines, of_studio=True))
+    thickness: float | None = field(metadata=_setting(of_studio=True, of_surfaces=True))
+    of: Field | None = field(metadata=_setting(check_function))
+    value_range: tuple[float, float] | None = field(metadata=_setting(check_value_range))
+    colorbar: bool | str = field(metadata=_setting(check_colorbar))
+    max_depth: int | None = field(metadata=_setting(check_max_depth))
+    seed: int = field(metadata=_setting(_integer("seed")))
+    denoise: bool = field(metadata=_setting(check_denoise))
+    progress: bool = field(metadata=_setting())
+
+    def __post_init__(self) -> None:
+        if self.antialias == "cones" and self.spp == 1:
+            raise ValueError(
+                'antialias="cones" finds pixels for more than one sample, and spp is 1: give '
+                "spp=9, or leave antialias out"
+            )
+
+    @classmethod
+    def checked(cls, given: Mapping[str, Any]) -> Request:
+        """What was asked for, by name.
+
+        Raises:
+            TypeError, ValueError: naming the setting that is wrong, and what it should be.
+        """
+        show: str = given["show"]
+        return cls(
+            **{one.name: one.metadata["check"](given[one.name], show) for one in fields(cls)}
+        )
+
+
+SETTINGS = tuple(one.name for one in fields(Request))
+OF_STUDIO = tuple(one.name for one in fields(Request) if "of_studio" in one.metadata)
+# Those that do not change where surfaces are.
+OF_PICTURES = tuple(one.name for one in fields(Request) if "of_surfaces" not in one.metadata)
+
+
+def check_settings(settings: Mapping[str, Any]) -> None:
+    """Raise TypeError for a setting that neither `render` nor `level_set` has."""
     of_surface = [name for name in inspect.signature(level_set).parameters if name != "field"]
     for name in settings:
         if name not in of_surface:
             ours = _CALLED_ELSEWHERE.get(name.lower())
-            hint = did_you_mean(name, (*own, *of_surface))
+            hint = did_you_mean(name, (*SETTINGS, *of_surface))
             raise TypeError(
-                f"there is no setting {name!r}; there are {', '.join(own)} and, of surfaces, "
+                f"there is no setting {name!r}; there are {', '.join(SETTINGS)} and, of surfaces, "
                 f"{', '.join(of_surface)}{hint if ours is None else f'; did you mean {ours}?'}"
             )
 

@@ -20,7 +20,12 @@ import numpy.typing as npt
 from harnack.backend import FloatArray
 from harnack.files.writing import check_writable, write_atomically
 from harnack.geometry import Box
-from harnack.rendering.arguments import check_camera, check_integer, check_size
+from harnack.rendering.arguments import (
+    OF_PICTURES,
+    check_camera,
+    check_integer,
+    check_size,
+)
 from harnack.rendering.mitsuba.plugins import register
 from harnack.rendering.mitsuba.variant import mitsuba_backend
 from harnack.rendering.picture import render
@@ -199,7 +204,7 @@ def _points(moments: list[dict[str, Any]], steps: FloatArray) -> FloatArray:
     seen: list[FloatArray] = []
     last: Any = None
     for moment, s in zip(moments, steps.tolist(), strict=True):
-        rest = {name: value for name, value in moment.items() if name not in _OF_PICTURES}
+        rest = {name: value for name, value in moment.items() if name not in OF_PICTURES}
         if last is not None and all(rest[name] is last[name] for name in rest):
             continue  # the same surfaces
         last = rest
@@ -208,13 +213,6 @@ def _points(moments: list[dict[str, Any]], steps: FloatArray) -> FloatArray:
         except UnboundedSurfaceError as error:
             raise ValueError(f"at s = {s:g} of the film, {error}") from None
     return np.concatenate(seen)
-
-
-# Settings that do not change where a surface is.
-_OF_PICTURES = (
-    "camera", "material", "boundary_material", "cut_material", "backdrop", "up", "spp", "antialias",
-    "isolines", "of", "value_range", "colorbar", "max_depth", "seed", "denoise",
-)  # fmt: skip
 
 
 def _three(point: FloatArray) -> tuple[float, float, float]:

@@ -15,10 +15,10 @@ from rich.console import Console
 from harnack.fields import Field
 from harnack.fields.field import instead_of_field
 from harnack.rendering.arguments import (
+    OF_STUDIO,
     Request,
     check_memory,
     check_spp,
-    checked_request,
     refuse_studio_settings,
 )
 from harnack.rendering.mitsuba.integrator import PathTracer
@@ -42,7 +42,7 @@ from harnack.rendering.progress import Advance, progress_bar
 from harnack.rendering.studio.backdrops import Gradient, Ground
 from harnack.rendering.studio.camera import Camera
 from harnack.rendering.studio.stage import Studio, StudioObject, studio
-from harnack.rendering.studio_scene import OF_STUDIO, MaterialLike, studio_objects
+from harnack.rendering.studio_scene import MaterialLike, studio_objects
 from harnack.rendering.surfaces.isolines import Isolines
 from harnack.rendering.surfaces.placement import Placement
 from harnack.tracer import LevelSet
@@ -156,12 +156,9 @@ def render(
     mode or material, settings that make no surface, a surface without bounds, or a picture that
     does not fit into memory; OSError where the picture cannot be written.
     """
+    arguments = locals()  # the settings by name
     target = None if path is None else check_picture_path(path)
-    asked = checked_request(
-        show=show, size=size, spp=spp, max_depth=max_depth, seed=seed, camera=camera,
-        antialias=antialias, backdrop=backdrop, isolines=isolines, of=of, value_range=value_range,
-        colorbar=colorbar, denoise=denoise,
-    )  # fmt: skip
+    asked = Request.checked(arguments)
     if asked.denoise:
         load_denoiser()
     if target is not None and asked.colorbar and target.suffix.lower() == ".exr":
@@ -176,19 +173,14 @@ def render(
         )  # fmt: skip
         stage, scene = _staged(mi, asked, on_stage, up)
     else:
-        given = (
-            material, camera, backdrop, up, boundary, boundary_material, cut_material, isolines,
-            thickness,
-        )  # fmt: skip
-        of_studio = dict(zip(OF_STUDIO, given, strict=True))
-        refuse_studio_settings({**of_studio, **settings})
+        refuse_studio_settings({name: arguments[name] for name in OF_STUDIO} | settings)
         stage, scene = None, _loaded(mi, what, asked.size)
         check_memory(asked.show, *map(int, scene.sensors()[0].film().crop_size()))
     names: list[str] | None = None
     tracer = stand_in(mi, scene) if show == "color" else None
     if show in VIEWS:
         placement = Placement.identity() if stage is None else stage.placement
-        viewer = Viewer.of(mi, scene, scene.sensors()[0], placement, asked.function)
+        viewer = Viewer.of(mi, scene, scene.sensors()[0], placement, asked.of)
         if isinstance(asked.backdrop, Gradient):
             viewer = replace(viewer, background=asked.backdrop.bottom)
         view = viewer.look()

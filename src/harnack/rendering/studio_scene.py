@@ -20,14 +20,6 @@ from harnack.rendering.surfaces.colors import Color
 from harnack.rendering.surfaces.isolines import Isolines
 from harnack.tracer import LevelSet, level_set
 
-OF_STUDIO = (
-    "material", "camera", "backdrop", "up", "boundary", "boundary_material", "cut_material",
-    "isolines", "thickness",
-)  # fmt: skip
-_OWN = (
-    "show", "size", "spp", "antialias", *OF_STUDIO, "of", "value_range", "colorbar", "max_depth",
-    "seed", "denoise", "progress",
-)  # fmt: skip
 # What tubes around the ends of surfaces are made of.
 _RIM = "gold"
 
@@ -68,7 +60,7 @@ def studio_objects(
     Raises:
         TypeError, ValueError: there is nothing to draw, or something wrong with what is asked for.
     """
-    check_settings(settings, _OWN)
+    check_settings(settings)
     given: list[Any] = [*what] if isinstance(what, list | tuple) else [what]
     if not given:
         raise ValueError("there is nothing to draw: give at least one field")
