@@ -38,12 +38,12 @@ parts: $(STAMP)
 	$(BIN)/harnack mesh gyroid --tolerance 0.002 --scale 30 -o out/gyroid.stl
 	$(BIN)/harnack mesh trefoil --thickness 0.08 --scale 25 -o out/trefoil.stl
 
-# One worker a core; tests/conftest.py divides Dr.Jit's threads among them.
+# One worker a core; tests/conftest.py divides Dr.Jit's threads among them. Tests of a file share kernels.
 test: $(STAMP)
-	$(BIN)/python -m pytest -q -n auto
+	$(BIN)/python -m pytest -q -n auto --dist loadfile
 
 test-slow: $(STAMP)
-	$(BIN)/python -m pytest -q -n auto -m slow
+	$(BIN)/python -m pytest -q -n auto --dist loadfile -m slow
 
 # Exact versions, so that pip takes a file for processors alone where one is offered.
 test-frameworks: $(STAMP)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
 
@@ -22,6 +23,22 @@ settings.register_profile(
     suppress_health_check=[HealthCheck.too_slow],
 )
 settings.load_profile("harnack")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Of a test marked `few(k)`, the quick suite runs k of its parameters, spread over all of them;
+    the others are slow."""
+    tests: defaultdict[str, list[pytest.Item]] = defaultdict(list)
+    for item in items:
+        if item.get_closest_marker("few") and not item.get_closest_marker("slow"):
+            tests[item.nodeid.partition("[")[0]].append(item)
+    for each in tests.values():
+        (count,) = each[0].get_closest_marker("few").args  # type: ignore[union-attr]
+        quick = {(2 * k + 1) * len(each) // (2 * count) for k in range(count)}
+        for number, item in enumerate(each):
+            if number not in quick:
+                item.add_marker(pytest.mark.slow)
 
 
 def _share_cores() -> None:

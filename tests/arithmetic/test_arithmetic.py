@@ -201,6 +201,7 @@ TRUTHS: dict[str, tuple[Function, Callable[[Any], tuple[Any, Any, Any]]]] = {
 }  # fmt: skip
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("precision", QUICK_PRECISIONS)
 @pytest.mark.parametrize("name", TRUTHS)
 def test_functions(name: str, precision: Any) -> None:
@@ -266,6 +267,7 @@ def places(rng: Any, count: int) -> tuple[Any, Any, Any]:
     return p, d, 10.0 ** rng.uniform(-4, 1, count)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", QUICK_PRECISIONS)
 @pytest.mark.parametrize("name", FORMULAS)
 @pytest.mark.parametrize("anchored", [True, pytest.param(False, marks=pytest.mark.slow)])
@@ -327,6 +329,7 @@ def check_within(result: Interval, true: Any, doubt: Any, where: Any, what: str)
         )
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("precision", QUICK_PRECISIONS)
 @pytest.mark.parametrize("name", FORMULAS)
 def test_gradients_and_hessians_at_points(name: str, precision: Any) -> None:

@@ -89,6 +89,7 @@ def wide(x: Any, like: Any) -> Any:
     return (0 * like + x).numpy().astype(np.longdouble)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", ["single", pytest.param("double", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", FORMULAS)
 def test_parabolas_enclose(name: str, precision: str) -> None:
@@ -113,6 +114,7 @@ def test_parabolas_enclose(name: str, precision: str) -> None:
         assert ((low <= values[0] + allowed[0]) & (values[0] <= high + allowed[0])).all()
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("precision", ["single", pytest.param("double", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", FORMULAS)
 def test_affine_forms_enclose(name: str, precision: str) -> None:
@@ -149,6 +151,7 @@ def expressions() -> st.SearchStrategy[str]:
     return st.recursive(leaf, more, max_leaves=6)
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
 @given(text=expressions(), seed=st.integers(0, 100))
 def test_random_expressions_are_enclosed(text: str, seed: int) -> None:
@@ -186,6 +189,7 @@ def test_parabolas_are_exact_where_they_can_be() -> None:
     np.testing.assert_allclose(wide(c, h), chord, rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_parabolas_of_smooth_functions_have_their_slope_at_the_start() -> None:
     """Exact to first order on short lengths: that is what makes the march converge."""
     p, d = paths("double", 500, 4)[:2]
@@ -224,6 +228,7 @@ def test_steps_meet_no_level_and_slightly_longer_ones_would(kind: Any) -> None:
         assert ((values[0] - values.min(0))[cut] >= gap[cut]).all()
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", ["single", pytest.param("double", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", ["torus", "gyroid", "quartic", "blobs", "clipped by hand"])
 def test_all_proofs_hit_the_same(name: str, precision: str) -> None:

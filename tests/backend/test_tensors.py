@@ -26,6 +26,7 @@ def vector(values: Any) -> Any:
     return to_vector3(BACKEND, values)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("settings", [{}, {"all_hits": 3}])
 def test_tensors_are_traced_as_numpy_arrays_are(settings: dict[str, Any]) -> None:
     levels = [5.0, 2 * np.pi]
@@ -50,6 +51,7 @@ def test_tensors_are_traced_as_numpy_arrays_are(settings: dict[str, Any]) -> Non
             np.testing.assert_allclose(got.numpy(), value, atol=2e-4, err_msg=name)
 
 
+@pytest.mark.slow
 def test_levels_may_be_tensors_one_by_one() -> None:
     rays = tensor(EYE[None]), tensor(AWAY)
     levels = tensor(5.0), tensor(2 * np.pi)
@@ -89,6 +91,7 @@ def test_values_and_gradients_of_tensors(name: str) -> None:
         np.testing.assert_allclose(single.numpy(), expected[0], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_derivatives_pass_through_tensors() -> None:
     inputs = {"tensor": tensor, "vector": vector}
     found: dict[str, list[np.ndarray]] = {}
@@ -121,6 +124,7 @@ def test_each_loop_of_a_curve_may_be_moved_by_itself() -> None:
     assert np.abs(both[1].grad.numpy()).max() > 0
 
 
+@pytest.mark.slow
 def test_components_that_are_one_number_have_the_derivative_of_their_sum() -> None:
     """Vertices at one height, and rays from one: they are gathered, lane by lane."""
     flat = LOOP * [1, 1, 0] + [0, 0, 0.25]

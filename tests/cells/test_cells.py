@@ -36,6 +36,7 @@ def index_of(cells: OccupiedCells, empty: bool) -> np.ndarray:
     return at[:, ::-1]
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("seed", range(2))
 def test_empty_cells_are_off_the_level(seed: int) -> None:
     field = broken(seed=seed)

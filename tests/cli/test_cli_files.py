@@ -81,6 +81,7 @@ def extent_of(path: Path, **settings: Any) -> np.ndarray:
     return np.ptp(field.mesh.vertices, axis=0)
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("kind", ["obj", "ply", "stl", "off", "glb", "gltf"])
 def test_a_closed_mesh_of_any_format_is_drawn_by_its_winding_number(run, tmp_path, kind):
     code, said, _ = run(write_mesh(tmp_path / f"a.{kind}"))
@@ -93,6 +94,7 @@ def test_a_closed_mesh_of_any_format_is_drawn_by_its_winding_number(run, tmp_pat
     assert len(np.unique(image.reshape(-1, image.shape[2]), axis=0)) > 10
 
 
+@pytest.mark.slow
 def test_a_mesh_with_holes_is_drawn_by_its_winding_number(run, tmp_path):
     code, said, _ = run(write_mesh(tmp_path / "a.obj", missing=20), "--level", "0.4")
     assert code == 0
@@ -118,6 +120,7 @@ def test_curves_are_drawn_by_their_solid_angle(run, tmp_path):
     assert "SolidAngle: loops: 1, vertices: 12" in said
 
 
+@pytest.mark.slow
 def test_meshes_and_clouds_are_shaded_and_curves_drawn_in_color(tmp_path, capsys):
     mesh = write_mesh(tmp_path / "a.stl", missing=20)
     cloud = write_cloud(tmp_path / "a.xyz")
@@ -150,6 +153,7 @@ def test_the_camera_goes_where_it_is_sent(run, tmp_path):
     assert "elevation must lie within" in said
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("options", "field", "said"),
     [

@@ -41,6 +41,7 @@ def run(code: str, folder: Path) -> tuple[int, str]:
     return done.returncode, done.stderr
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     "name", ["harnack", "numpy", "drjit", "scipy.spatial", "harnack.cli", "rich.console", "mitsuba"]
 )
@@ -67,6 +68,7 @@ sys.exit({MODULE}.{FUNCTION}())
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "patch",
     [

@@ -265,6 +265,7 @@ def test_every_complaint_is_one_line(
     assert sorted(tmp_path.iterdir()) == before
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", ["a b.obj", "\xfc.obj", "[red].obj", "[bold] b.obj", "-a.obj"])
 def test_files_of_any_name_are_drawn(
     tmp_path: Path,
@@ -321,6 +322,7 @@ def raised_messages() -> list[str]:
     ]
 
 
+@pytest.mark.slow
 def test_the_command_line_names_its_options_and_not_arguments_of_python() -> None:
     _, commands = parsers()
     actions = [one for command in commands.values() for one in command._actions]

@@ -32,6 +32,7 @@ def true_curvatures(g: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return trace / 2, (trace**2 - np.einsum("nij,nji->n", shape, shape)) / 2
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_no_derivatives_within_the_errors_bend_otherwise(precision: Any) -> None:
     """Random gradients and Hessians, moved by random vectors and matrices of the sizes stated and

@@ -18,6 +18,7 @@ def azimuth(line: np.ndarray) -> np.ndarray:
     return np.unwrap(np.arctan2(line[:, 1], line[:, 0]))
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", ["single", "double"])
 def test_lines_of_a_torus_are_its_circles(precision: Any) -> None:
     small = 1e-4 if precision == "single" else 1e-9
@@ -36,6 +37,7 @@ def test_lines_of_a_torus_are_its_circles(precision: Any) -> None:
         np.testing.assert_allclose(steps, 0.05, rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_the_error_falls_with_the_fourth_power_of_the_step() -> None:
     """On an ellipsoid: the ends of lines, against steps eight times as short."""
     body, seed = hk.Ellipsoid((1.0, 0.7, 0.45)), [[0.6, 0.45, 0.2]]
@@ -51,6 +53,7 @@ def test_the_error_falls_with_the_fourth_power_of_the_step() -> None:
     assert fine < coarse / 10
 
 
+@pytest.mark.slow
 def test_lines_end_at_umbilics_at_curves_and_at_the_clip_volume() -> None:
     # On a sphere every point is an umbilic: no direction is known, and there is no line.
     assert [len(line) for line in hk.curvature_lines(hk.Sphere(), SEEDS, step=0.1, length=1.0)] == [

@@ -421,6 +421,7 @@ def test_newton_leaves_symmetric_stationary_points() -> None:
         assert np.abs(signed_distance(field, x) - exact).max() < 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CURVED)
 def test_feet_lie_on_the_surface_and_below_the_point(name: str) -> None:
     """They are points of the surface, so that the distance is an upper bound of the true one; and
@@ -443,6 +444,7 @@ def test_feet_lie_on_the_surface_and_below_the_point(name: str) -> None:
     assert (slant * np.abs(d) <= 1e-7 * np.abs(d) + 1e-13)[inner].all()
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", CURVED)
 def test_no_sample_of_the_surface_is_nearer_but_for_a_few(name: str) -> None:
     """Upper bounds always; nearly always the distance itself."""
@@ -485,6 +487,7 @@ def disk_distance(x: np.ndarray, corners: np.ndarray) -> np.ndarray:
     return np.where((cross > 0).all(axis=1), np.abs(x[:, 2]), edge)
 
 
+@pytest.mark.slow
 def test_the_rim_of_a_disk_belongs_to_it() -> None:
     """The 2 pi level of a plane polygon is the polygon; beyond its edges the edge is closest."""
     corners = shapes.regular_polygon(9)
@@ -540,6 +543,7 @@ def on_sphere(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return points, points, np.full(n, 4 * np.pi / n)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [60, pytest.param(600, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", ["dipoles", "dipoles by tree", "screened", "barely screened"])
 def test_every_point_has_a_distance_from_a_cloud(kind: str, n: int) -> None:
@@ -592,6 +596,7 @@ def test_the_lower_bound_is_attained_by_planes_and_spheres(precision: Any) -> No
     assert (found >= round_ * (1 - 1e-5)).all()
 
 
+@pytest.mark.slow
 def test_the_lower_bound_is_of_first_order() -> None:
     for name, field in CURVED.items():
         y = surface_points(field, 500)
@@ -623,6 +628,7 @@ def cases(rng: np.random.Generator, n: int) -> list[tuple[type[Enclosure], Case,
     return result
 
 
+@pytest.mark.slow
 def test_the_steepest_directions_have_the_shortest_steps() -> None:
     """What the proof of the lower bound says of every bound: of all directions' steps, those up
     and down the gradient are the smallest, taken together."""
@@ -761,6 +767,7 @@ def test_a_field_must_say_how_far_its_sheets_are() -> None:
 METHODS = ("first", "second", "newton", "lower")
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("method", METHODS)
 def test_results_are_float64_arrays_of_the_same_length(method: Any) -> None:
     for n in (0, 7):
@@ -773,6 +780,7 @@ def test_results_are_float64_arrays_of_the_same_length(method: Any) -> None:
     assert curvature(WAVY, np.zeros((0, 3))).normal.shape == (0, 3)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("method", METHODS)
 def test_batches_make_no_difference(method: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     x = points_around(WAVY, 40)

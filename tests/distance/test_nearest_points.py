@@ -102,6 +102,7 @@ def test_faces_that_pass_through_one_another_are_cut() -> None:
 # --- smooth surfaces ---------------------------------------------------------------------------
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", ["wavy", "knot", "gyroid"])
 @pytest.mark.parametrize(
     ("n", "rays"), [(1500, 30_000), pytest.param(20_000, 300_000, marks=pytest.mark.slow)]
@@ -227,6 +228,7 @@ def test_the_remainder_is_attained_by_poissons_kernel(dimension: int) -> None:
     assert np.isinf(np.array(remainder(Sample(real(0), zero, (ball,)), real(1.5)))).all()
 
 
+@pytest.mark.slow
 def test_lower_bounds_of_clouds_hold() -> None:
     k = np.arange(300) + 0.5
     z, turn = 1 - 2 * k / 300, np.pi * (1 + np.sqrt(5)) * k
@@ -279,6 +281,7 @@ def rim_on_sphere(field: hk.Field, radius: float, circles: int) -> np.ndarray:
     return radius * (np.cos(low)[:, None] * u[row] + np.sin(low)[:, None] * v[row])
 
 
+@pytest.mark.few(2)
 @pytest.mark.usefixtures("coarse")
 @pytest.mark.parametrize(
     ("field", "point", "distance"),
@@ -330,6 +333,7 @@ def test_sheets_that_cross_within_a_cell() -> None:
     assert (found.upper <= 1e-4 * (1 + 1e-9)).all()
 
 
+@pytest.mark.few(1)
 @pytest.mark.usefixtures("coarse")
 @pytest.mark.parametrize("name", ["wavy", "knot"])
 def test_points_of_the_boundary_and_from_very_far(name: str) -> None:
@@ -350,7 +354,7 @@ def test_points_of_the_boundary_and_from_very_far(name: str) -> None:
 @pytest.mark.parametrize("where", ["inside", "outside"])
 @pytest.mark.parametrize("name", ["wavy", "knot", "gyroid", "Y 5,3"])
 def test_no_dense_sample_is_nearer_in_many_points(name: str, where: str) -> None:
-    """100,000 points, 400,000 samples of the surface and, where a ball cuts it, many of its rim."""
+    """25,000 points, 200,000 samples of the surface and, where a ball cuts it, many of its rim."""
     field = CURVED[name]
     volume = field.domain or field.extent((field.default_level,))
     assert volume is not None
@@ -358,15 +362,15 @@ def test_no_dense_sample_is_nearer_in_many_points(name: str, where: str) -> None
     size = float(np.linalg.norm(upper - lower))
     middle, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
     wide = 1.0 if where == "inside" else 2.0
-    x = middle + np.random.default_rng(14).uniform(-wide, wide, (100_000, 3)) * half
+    x = middle + np.random.default_rng(14).uniform(-wide, wide, (25_000, 3)) * half
     if field.domain is not None:
         inside = field.domain.contains_points(x)
         x = x[inside if where == "inside" else ~inside]
         radius = 0.5 * float((upper - lower)[0])
         rim = rim_on_sphere(field, radius * (1 - 1e-13), 20_000)
-        nearest, _ = cKDTree(np.concatenate([surface_points(field, 400_000), rim])).query(x)
+        nearest, _ = cKDTree(np.concatenate([surface_points(field, 200_000), rim])).query(x)
     else:
-        nearest = true_distance(field, x, 400_000)
+        nearest = true_distance(field, x, 200_000)
     found = check_bounds(field, x)
     assert (found.lower <= nearest + 1e-12 * size).all()
     assert (found.upper > nearest + 1e-6 * size).sum() <= 2

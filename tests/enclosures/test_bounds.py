@@ -172,17 +172,20 @@ def test_reference_formulas_agree_with_quadrature(n: int) -> None:
             assert kernel_movement(q, s, n) == pytest.approx(plain, abs=1e-11)
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("precision", ["double", "single"])
 @pytest.mark.parametrize("bound", BOUNDS, ids=name_of)
 def test_no_function_meets_a_level_within_a_step(bound: type[Enclosure], precision: str) -> None:
     check_bound(bound, precision=precision)  # type: ignore[arg-type]
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("bound", PATIENT, ids=name_of)
 def test_extremal_functions_attain_the_bound(bound: type[Enclosure]) -> None:
     check_equality(bound)
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("bound", BOUNDS, ids=name_of)
 def test_few_rounds_lose_little(bound: type[Enclosure]) -> None:
     rng = np.random.default_rng(8)
@@ -193,6 +196,7 @@ def test_few_rounds_lose_little(bound: type[Enclosure]) -> None:
         assert np.quantile(ratio, 0.2) >= 1 - 1.01e-5
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("bound", BOUNDS, ids=name_of)
 def test_single_precision_is_never_longer_than_exact(bound: type[Enclosure]) -> None:
     rng = np.random.default_rng(9)
@@ -206,9 +210,9 @@ def test_single_precision_is_never_longer_than_exact(bound: type[Enclosure]) -> 
 @pytest.mark.parametrize("precision", ["double", "single"])
 @pytest.mark.parametrize("bound", BOUNDS, ids=name_of)
 def test_bounds_hold_in_many_trials(bound: type[Enclosure], precision: str) -> None:
-    check_bound(bound, precision=precision, rng=1, rows=20_000)  # type: ignore[arg-type]
+    check_bound(bound, precision=precision, rng=1, rows=8_000)  # type: ignore[arg-type]
     rng = np.random.default_rng(2)
-    for certificate, slope in random_certificates(bound, rng, 40_000):
+    for certificate, slope in random_certificates(bound, rng, 15_000):
         assert ratios(bound, certificate, slope, precision).max() <= 1
 
 
@@ -218,6 +222,7 @@ def test_mutation_is_seen_by_check_bound(bound: type[Enclosure]) -> None:
         check_bound(scaled(bound, 1.001))
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("bound", PATIENT, ids=name_of)
 @pytest.mark.parametrize("factor", [1.001, 0.999])
 def test_mutation_is_seen_by_the_equality_cases(bound: type[Enclosure], factor: float) -> None:
@@ -231,6 +236,7 @@ def test_mutation_of_covers_alone_is_seen() -> None:
             check_bound(scaled(bound, 1.0, covers=1.001), rows=2000)
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("n", [2, 3, 4])
 @pytest.mark.parametrize("sides", ["below", "both"])
 def test_sharper_bounds_step_further(n: int, sides: str) -> None:
@@ -262,6 +268,7 @@ TOO_LONG = [
 ]
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("bound", "n", "radius", "below", "above", "down", "up", "slope"), TOO_LONG
 )

@@ -212,6 +212,7 @@ def answers(kind: type[Enclosure], draw: Numbers) -> tuple[np.ndarray, np.ndarra
     return np.concatenate(steps), np.concatenate(covered)
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("kind", MAKERS, ids=lambda kind: kind.__name__)
 def test_no_longer_step_than_in_double_precision(kind: type[Enclosure]) -> None:
     single, _ = answers(kind, Numbers(Float, 60_000))

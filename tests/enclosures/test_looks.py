@@ -98,6 +98,7 @@ def test_what_a_field_proves_along_a_path_is_used(precision: Any) -> None:
     assert (taylor.status != int(hk.Status.OUT_OF_STEPS)).all()
 
 
+@pytest.mark.slow
 def test_no_hit_of_a_path_s_own_enclosures_is_missed() -> None:
     """Against samples of f along the rays, in float64."""
     o, d = rays(1500)

@@ -132,6 +132,7 @@ def check_rays(scene: Sum, o: Any, d: Any, precision: Any, tolerance: float) -> 
         assert largest - sign <= allowed, (o[i].tolist(), d[i].tolist())
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("precision", ["single", pytest.param("double", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", QUICK_KERNELS)
 @pytest.mark.parametrize("kind", ["equal and nested", "negative", "groups", "grid"])
@@ -155,6 +156,7 @@ def test_rays_that_all_but_touch(name: str, precision: Any, kind: str) -> None:
     check_rays(scene, o, d, precision, 1e-2)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("name", ["compact", "cubic"])
 def test_rays_that_all_but_touch_cross_twice(name: str, precision: Any) -> None:
@@ -176,6 +178,7 @@ def test_rays_that_all_but_touch_cross_twice(name: str, precision: Any) -> None:
     np.testing.assert_array_equal(confirmed.t, hits.t[:, 0])
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("kind", ["lattice", "giants", "clusters", "tiny"])
 def test_rays_along_faces_and_edges_of_cells(precision: Any, kind: str) -> None:

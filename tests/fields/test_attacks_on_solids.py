@@ -31,6 +31,7 @@ def test_solids_turn_anticlockwise(axis: Any, degrees: float, start: Any, end: A
     assert ball.value(np.array([end], dtype=float))[0] == pytest.approx(-0.1, abs=1e-6)
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize(
     ("solid", "o", "d", "t"),
@@ -63,6 +64,7 @@ def test_what_is_near_a_level_and_grown_is_not_clipped() -> None:
     assert hits.t[0] == pytest.approx(3 - np.sqrt(4 - 1.8**2), abs=1e-3)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("power", [1.0, 1.5])
 def test_shrunk_blends_are_not_clipped(power: float) -> None:
     """Where both solids are deep inside, their blend is lower than the lesser less the radius: rays
@@ -161,6 +163,7 @@ def test_functions_of_numpy_with_the_same_meaning() -> None:
     assert hits.t[0] == pytest.approx(2 + np.tan(0.5), abs=1e-3)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize(
     ("solid", "o", "d", "roots"),
@@ -195,6 +198,7 @@ def test_the_rounding_of_one_part_makes_no_hit_inside_of_another() -> None:
     assert hits.status[0] == hk.Status.OUT_OF_STEPS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["confirm", "all_hits"])
 def test_confirmed_hits_at_creases_lie_on_the_surface(how: str) -> None:
     """The cubic between two points with a crease between them had its root anywhere: |f| was up to

@@ -107,6 +107,7 @@ def test_a_single_blob_is_a_ball(kernel: Any) -> None:
     np.testing.assert_allclose(hits.t, 3 - 1.4, atol=1e-7)
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("kernel", QUICK_KERNELS)
 @pytest.mark.parametrize("grouped", [False, True])
 @pytest.mark.parametrize("count", [40, 90])  # 90 blobs are kept in a grid
@@ -230,6 +231,7 @@ def derivatives(kernel: Any, q: Any) -> tuple[Any, Any]:
     return np.where(inside, -rate * (e - 1), 0), np.where(inside, rate * rate * e, 0)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     "bound",
     [
@@ -279,11 +281,13 @@ def test_steps_are_free_and_no_longer(
         assert leaves(1.001).sum() > 3
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_first_hits_and_looks(precision: Any) -> None:
     check_first_hits(scene(), 700, precision)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", QUICK_PRECISIONS)
 @pytest.mark.parametrize("grouped", [False, True])
 def test_first_hits_in_a_grid(precision: Any, grouped: bool) -> None:
@@ -294,7 +298,7 @@ def test_first_hits_in_a_grid(precision: Any, grouped: bool) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_many_first_hits(precision: Any) -> None:
-    check_first_hits(scene(), 20_000, precision)
+    check_first_hits(scene(), 8_000, precision)
 
 
 def check_first_hits(blobs: hk.Blobs, count: int, precision: Any, most_looks: float = 3.3) -> None:

@@ -168,18 +168,7 @@ FIELDS = {
     **OWN,
 }
 # One or two of each kind for what is tried with every bound on every run.
-SOME = (
-    "wavy",
-    "trefoil",
-    "coil",
-    "holes",
-    "Y 5,3",
-    "gyroid",
-    "charges",
-    "azimuth",
-    "plane",
-    "matter",
-)
+SOME = ("coil", "Y 5,3", "charges", "matter")
 
 
 # Which proofs apply to what a field promises, by groups: a harmonic ball with both ends has caps
@@ -273,7 +262,7 @@ def test_every_field_there_is_is_tested() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("bound", [*LOOKS, *PROOFS])
-@pytest.mark.parametrize("name", ["torus", "rounded box", "displaced", "capsule"])
+@pytest.mark.parametrize("name", ["torus", "rounded box", "displaced"])
 def test_every_proof_from_ranges_holds(name: str, bound: str) -> None:
     points = np.random.default_rng(4).uniform(-1.5, 1.5, (80, 3))
     if (
@@ -286,13 +275,14 @@ def test_every_proof_from_ranges_holds(name: str, bound: str) -> None:
         check_looks(SHAPES[name][0], points, rng=5, bound=bound, precision=precision)
 
 
-@pytest.mark.parametrize("name", FIELDS)
+@pytest.mark.parametrize("name", SOME)
 def test_fields_keep_their_promises(name: str) -> None:
     field = FIELDS[name]
     levels = (1.0, 5.0) if isinstance(field, hk.SolidAngle) else ()
     check_field(field, count=60, directions=4, levels=(field.default_level, *levels))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [
@@ -359,6 +349,7 @@ def spread(n: int, seed: int = 2) -> np.ndarray:
     return x
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("fine", [True, False])
 @pytest.mark.parametrize("accuracy", [2.0, 3.0, 4.0])
 def test_what_a_tree_of_dipoles_leaves_out_is_within_its_bounds(
@@ -400,6 +391,7 @@ def test_one_dipole_attains_its_curvature_promises(scale: float) -> None:
     assert seen == 3
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("fine", [True, False])
 @pytest.mark.parametrize("accuracy", [2.0, 3.0, 4.0])
 @pytest.mark.parametrize("order", [*(pytest.param(k, marks=pytest.mark.slow) for k in (0, 1)), 2])
@@ -432,6 +424,7 @@ def test_what_a_tree_of_triangles_leaves_out_is_within_its_bounds(
     check_promises(sample, on_host, x, lift)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fine", [True, False])
 def test_what_chains_of_edges_leave_out_is_within_its_bounds(fine: bool) -> None:
     vertices, faces = bumpy_sphere(3)
@@ -466,16 +459,15 @@ def test_lanes_are_looked_at_as_closely_as_each_asks(field: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", APPROXIMATE)
 def test_approximate_and_jumping_fields_keep_their_promises_at_many_points(name: str) -> None:
-    check_field(APPROXIMATE[name], rng=1, count=600)
+    check_field(APPROXIMATE[name], rng=1, count=250)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("name", FIELDS)
-def test_fields_keep_their_promises_at_many_points(name: str, seed: int) -> None:
+def test_fields_keep_their_promises_at_many_points(name: str) -> None:
     field = FIELDS[name]
     levels = (0.6, 3.0, 5.0, 9.0) if isinstance(field, hk.SolidAngle) else ()
-    check_field(field, rng=seed, count=800, levels=(field.default_level, *levels))
+    check_field(field, rng=0, count=800, levels=(field.default_level, *levels))
 
 
 @pytest.mark.parametrize(("name", "bound"), SOME_PAIRS, ids=name_of)
@@ -487,9 +479,8 @@ def test_no_level_lies_within_a_step(name: str, bound: type[Enclosure]) -> None:
 @pytest.mark.parametrize("precision", ["double", "single"])
 @pytest.mark.parametrize(("name", "bound"), PAIRS, ids=name_of)
 def test_no_level_lies_within_many_steps(name: str, bound: type[Enclosure], precision: str) -> None:
-    for seed in range(2):
-        found = check_steps(FIELDS[name], bound, rng=seed, count=2000, precision=precision)  # type: ignore[arg-type]
-        assert found > 0
+    found = check_steps(FIELDS[name], bound, rng=1, count=2000, precision=precision)  # type: ignore[arg-type]
+    assert found > 0
 
 
 @pytest.mark.parametrize("precision", ["double", "single"])
@@ -725,6 +716,7 @@ BROKEN: dict[str, tuple[Field, str]] = {
 }
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("name", BROKEN)
 def test_broken_promises_are_seen(name: str) -> None:
     field, message = BROKEN[name]
@@ -785,6 +777,7 @@ BY_5_PERCENT: dict[str, Field] = {
 }
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("name", BY_5_PERCENT)
 def test_promises_wrong_by_5_percent_are_found(name: str) -> None:
     found = "f leaves what is promised here|the Laplacian is not between its ends"

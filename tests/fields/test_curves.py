@@ -276,6 +276,7 @@ def test_convex_position_agrees_with_the_hull_of_qhull(n, seed, kind):
         raise AssertionError("all edges lie on the hull, but no proof was found")
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), flatten=st.sampled_from([1.0, 1e-6, 0.0]))
 def test_the_clearance_of_segments_is_a_lower_bound_and_sharp(seed, flatten):

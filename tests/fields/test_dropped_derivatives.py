@@ -236,6 +236,7 @@ def traced(all_hits: int | None, source: str, values: np.ndarray, *, enabled: bo
     return arrays[source], hk.trace(field, *rays, **settings)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("source", SOURCES)
 @pytest.mark.parametrize("all_hits", [None, 1])
 def test_each_result_of_a_trace_has_its_derivative_or_refuses_it(

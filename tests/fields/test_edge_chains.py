@@ -120,6 +120,7 @@ def summed(ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return 2 * np.arctan2(im, re).sum(axis=1), gradient
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("fine", [True, False])
 @pytest.mark.parametrize("kind", KINDS)
 def test_sums_along_rays_are_those_over_all_edges(kind: str, fine: bool) -> None:
@@ -140,6 +141,7 @@ def test_sums_along_rays_are_those_over_all_edges(kind: str, fine: bool) -> None
     assert (off.max() > 1e-5) != fine  # a rough look leaves something out
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("kind", KINDS)
 def test_along_the_z_axis_chains_decide_as_single_edges_do(kind: str) -> None:
     """On both sides of edges, and on them: the very same turns, in single precision too."""
@@ -160,6 +162,7 @@ def test_along_the_z_axis_chains_decide_as_single_edges_do(kind: str) -> None:
         assert np.abs(found - angle).max() < (3e-3 if precision == "single" else 1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind",
     [kind if kind == "many" else pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS],

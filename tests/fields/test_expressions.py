@@ -178,6 +178,7 @@ def test_where_a_formula_is_not_defined_nothing_is_claimed() -> None:
     assert hits.t[1] == pytest.approx(3.0, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_promises_without_a_radius_are_no_broken_ones() -> None:
     # Of one of the points tried, beside f = 0, no Lipschitz constant is known.
     box = hk.Box((-1, -1, -1), (1, 1, 1))

@@ -34,6 +34,7 @@ class Plane(hk.Field):
         return hk.Sample(p.x, type(p)(1, 0, 0), (hk.Lipschitz(1.0),))
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("name", FIELDS)
 def test_values_and_derivatives_at_points(name: str) -> None:
     """Gradients against differences of values, Hessians against those of gradients."""
@@ -52,6 +53,7 @@ def test_values_and_derivatives_at_points(name: str) -> None:
         np.testing.assert_allclose(bend / (2 * h), hessian[:, :, k], atol=1e-2)
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("name", FIELDS)
 def test_single_points_and_no_points(name: str) -> None:
     field = FIELDS[name]
@@ -129,6 +131,7 @@ def test_values_are_differentiable_in_a_curves_vertices() -> None:
     np.testing.assert_allclose(rate, (ahead - behind) / (2 * h), atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["curve", "mesh", pytest.param("tree", marks=pytest.mark.slow), "cloud", "screened"]
 )

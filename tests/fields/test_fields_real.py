@@ -254,6 +254,7 @@ def test_value_differentiates(name: str) -> None:
 # --- conversion from monomials --------------------------------------------------------------
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("seed", range(4))
 def test_monomials_convert_exactly(seed: int) -> None:
     """Expand random harmonic polynomials of every degree into monomials, and come back."""
@@ -462,6 +463,7 @@ def test_ranges_of_spherical_harmonics(l: int) -> None:
         assert min(f.min(), -f.max() if m else f.min()) <= low * (1 - 1e-4)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("seed", range(6))
 def test_ranges_of_random_polynomials_are_proved_and_tight(seed: int) -> None:
     rng = np.random.default_rng(seed)

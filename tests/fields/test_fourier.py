@@ -123,6 +123,7 @@ def test_bounds_hold_between_nodes(seed: int) -> None:
         assert cells.bounds.mean() < 0.9 * bounds.curvature
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind",
     [
@@ -139,17 +140,18 @@ def test_series_keep_their_promises(kind: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("terms", [2, 12, 16, 24, (16, 4, 9)])
+@pytest.mark.parametrize("terms", [2, 16, (16, 4, 9)])
 def test_other_series_keep_their_promises(terms: Any) -> None:
-    check_field(hk.FourierSeries.fit(blobs, CUBE, terms), count=400)
+    check_field(hk.FourierSeries.fit(blobs, CUBE, terms), count=150)
     torus = hk.FourierSeries.fit(
         lambda x: np.hypot(np.hypot(x[:, 0], x[:, 1]) - 0.6, x[:, 2]) - 0.25,
         CUBE,
         3 if terms == 2 else terms,  # it is even on every axis: of two terms one is left
     )
-    check_field(torus, count=400)
+    check_field(torus, count=150)
 
 
+@pytest.mark.slow
 def test_local_bounds_that_are_too_small_are_seen() -> None:
     field = hk.FourierSeries.fit(blobs, CUBE, 8)
     assert field._bounds.cells
@@ -187,6 +189,7 @@ def agree(field: Any, level: float, n: int, size: float, precision: Any, **setti
     return hits
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["single", pytest.param("double", marks=pytest.mark.slow)])
 def test_first_hits_of_figure_21(precision: Any) -> None:
     field = hk.FourierSeries.fit(figure_21, FIG_21, 10)
@@ -202,13 +205,14 @@ def test_first_hits_of_figure_21(precision: Any) -> None:
 @pytest.mark.parametrize("name", ["figure 21", "blobs"])
 def test_first_hits_of_many_rays(name: str, precision: Any) -> None:
     if name == "blobs":
-        agree(hk.FourierSeries.fit(blobs, CUBE, 12), 0.0, 5000, 1.2, precision)
+        agree(hk.FourierSeries.fit(blobs, CUBE, 12), 0.0, 2000, 1.2, precision)
     else:
         field = hk.FourierSeries.fit(figure_21, FIG_21, 10)
         ball = hk.Ball(radius=math.pi / 2)
-        agree(field, 0.5, 5000, math.pi / 2, precision, clip=ball)
+        agree(field, 0.5, 2000, math.pi / 2, precision, clip=ball)
 
 
+@pytest.mark.slow
 def test_displacements_are_those_of_the_surfaces() -> None:
     """A sphere whose radius grew by 0.01: the surfaces are that far apart."""
     wave = hk.FourierSeries.fit(lambda x: np.exp(-4 * (x**2).sum(axis=1)), CUBE, 10)

@@ -71,6 +71,7 @@ def rounding_used(weights: Weights, n: int, seed: int) -> tuple[float, float]:
     return float(used.max()), float((np.linalg.norm(off, axis=1) / of_gradient).max())
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("l", range(13))
 def test_rounding_of_harmonics_is_within_its_bound(l: int) -> None:  # noqa: E741
     """And the bound is never ten times the largest error seen."""
@@ -81,6 +82,7 @@ def test_rounding_of_harmonics_is_within_its_bound(l: int) -> None:  # noqa: E74
         assert l == 0 or of_value > 0.1
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("seed", range(12))
 def test_rounding_of_sums_is_within_its_bound(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -217,6 +219,7 @@ def rays(kind: str, n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 PRECISIONS = ["double", "single"]
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("bound", [None, "caps", "slope"])
 def test_rays_by_zeros_of_high_order_arrive(bound: str | None, precision: Any) -> None:

@@ -119,6 +119,7 @@ def test_it_is_symmetric_and_of_harmonic_fields_free_of_trace(name: str) -> None
         assert np.median(trace) > 0.01 * np.median(size(found))
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     "l",
     [

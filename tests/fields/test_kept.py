@@ -98,6 +98,7 @@ def test_vertices_with_derivatives_are_uploaded_each_time() -> None:
     assert field.prepare(backend) is not field.prepare(backend)
 
 
+@pytest.mark.slow
 def test_a_picture_from_another_side_finds_the_surface_no_more() -> None:
     def picture(field: hk.Field, **settings: Any) -> tuple[np.ndarray, int]:
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):

@@ -187,6 +187,7 @@ def test_the_surface_is_that_of_gaussians_but_for_their_tails() -> None:
     assert off[2] < 0.003
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["single", pytest.param("double", marks=pytest.mark.slow)])
 def test_a_helix_of_atoms(precision: Any) -> None:
     """First hits in a grid against a dense sum, and few looks."""

@@ -95,6 +95,7 @@ def test_nothing_moved_nothing_changed(method: Any) -> None:
     np.testing.assert_array_equal(back.faces_of_sheets, field.faces_of_sheets)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("method", ["exact", "tree"])
 @pytest.mark.parametrize("motion", [breathed, twisted])
 def test_hits_are_those_of_a_new_field(motion: Any, method: Any) -> None:

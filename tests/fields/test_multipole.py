@@ -422,6 +422,7 @@ def bent(
     return np.abs(off), (columns[4] + columns[5] / r**2) * q * q * phi / r**2
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("rough", [1.5, 2.0, 2.5])
 def test_fields_of_nodes_bend_as_their_columns_say(rough: float) -> None:
     rng = np.random.default_rng(3)

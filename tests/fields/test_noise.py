@@ -58,6 +58,7 @@ def test_the_slope_is_attained_within_one_percent(kind: Any) -> None:
     assert 0.99 * CONSTANTS[kind].slope <= gradient[0] <= CONSTANTS[kind].slope
 
 
+@pytest.mark.few(1)
 @FADES
 def test_the_slope_is_bounded_by_an_eigenvalue(kind: Any) -> None:
     """The proof of `NoiseConstants`: the largest eigenvalue with weights, over an eighth of a cell,

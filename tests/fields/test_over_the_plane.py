@@ -40,11 +40,13 @@ def rays(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     return o, d / np.linalg.norm(d, axis=1, keepdims=True)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", CURVES)
 def test_promises_hold(name: str) -> None:
     check_field(CURVES[name], rng=1)
 
 
+@pytest.mark.slow
 def test_promises_of_a_height_field_hold() -> None:
     check_field(WAVES)
 
@@ -73,6 +75,7 @@ def check_curves(name: str, n: int, precision: Any, bound: Any, samples: int) ->
     assert not (passed & smooth).any()
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("bound", [None, "slope"])
 @pytest.mark.parametrize("name", CURVES)
 def test_no_curve_is_passed(name: str, bound: Any) -> None:
@@ -83,7 +86,7 @@ def test_no_curve_is_passed(name: str, bound: Any) -> None:
 @pytest.mark.parametrize("precision", ["single", "double"])
 @pytest.mark.parametrize("name", CURVES)
 def test_no_curve_is_passed_by_thousands_of_rays(name: str, precision: str) -> None:
-    check_curves(name, 5000, precision, None, 1500)
+    check_curves(name, 2000, precision, None, 1500)
 
 
 def check_heights(n: int, precision: Any) -> None:

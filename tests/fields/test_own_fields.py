@@ -45,6 +45,7 @@ def bent(width: float) -> tuple[Any, ...]:
     return (Curvature(2.001 / width**2),)
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("known", [steep, bent, lambda w: (*bent(w), *steep(w))])
 @pytest.mark.parametrize("radius", [None, 2.0, 6.0, 20.0])
 @pytest.mark.parametrize("width", [0.5, 1.0])

@@ -104,6 +104,7 @@ class OnePart(hk.Field):
         return self.box
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("index", range(5))
 def test_parts_keep_their_promises(index: int) -> None:
     check_field(OnePart(hostile(), index), count=60, directions=4)
@@ -174,6 +175,7 @@ def assert_same_hits(mesh: hk.PolygonMesh, n: int, precision: Any, **settings: A
     assert (hits.sheet[~hits.hit] == -1).all()
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_first_hits_are_those_of_the_faces_one_by_one(precision: Any) -> None:
     assert_same_hits(hk.PolygonMesh(*patches(24)), 400, precision)
@@ -182,10 +184,10 @@ def test_first_hits_are_those_of_the_faces_one_by_one(precision: Any) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("precision", PRECISIONS)
-@pytest.mark.parametrize("level", [2 * np.pi, 2 * np.pi + 1.0, 4.0])
+@pytest.mark.parametrize("level", [2 * np.pi, 4.0])
 def test_first_hits_of_many_faces(precision: Any, level: float) -> None:
-    assert_same_hits(hk.PolygonMesh(*patches(300, 4)), 5000, precision, level=level)
-    assert_same_hits(hostile(), 5000, precision, level=level)
+    assert_same_hits(hk.PolygonMesh(*patches(300, 4)), 2000, precision, level=level)
+    assert_same_hits(hostile(), 2000, precision, level=level)
 
 
 @pytest.mark.slow
@@ -287,6 +289,7 @@ def test_a_face_in_a_lane_is_the_solid_angle_of_that_face(precision: Any) -> Non
                 )
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("level", [2 * np.pi, 5.0])
 def test_boxes_hold_the_surfaces(level: float) -> None:
     for mesh in (hostile(), hk.PolygonMesh(*patches(12))):
@@ -330,6 +333,7 @@ def test_another_mesh_compiles_no_kernel() -> None:
     assert [trace(k) for k in range(2, 6)] == [0] * 4
 
 
+@pytest.mark.slow
 def test_derivatives_by_rays() -> None:
     mesh, backend = hk.PolygonMesh(SQUARE, [[0, 1, 2, 3]]), choose_backend("double")
     o = backend.Array3f(0.4, 0.45, 2.0)
@@ -342,6 +346,7 @@ def test_derivatives_by_rays() -> None:
     np.testing.assert_allclose(found, -normal / (normal @ d), rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("show", ["shaded", pytest.param("color", marks=pytest.mark.slow)])
 def test_pictures(show: str) -> None:
     vertices, faces = patches(24)

@@ -287,6 +287,7 @@ SMALL["large"] = field_of((1e3 * _p + 2e3, _n, 1e6 * _a), 300.0)
 SMALL["small"] = field_of((1e-3 * _p - 1e-3, _n, 1e-6 * _a), 1e-3)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     "name",
     [
@@ -352,6 +353,7 @@ def tree_field(length: float, accuracy: float, n: int = 1000) -> ScreenedWinding
     return field_of(cloud, length, method="tree", accuracy=accuracy)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("length", [0.05, 0.4, 100.0])
 def test_tree_keeps_its_promises_for_the_exact_function(length: float) -> None:
     field = tree_field(length, 4.0)
@@ -413,6 +415,7 @@ def test_promises_are_attained_by_one_dipole() -> None:
             assert moved / (known.lower - look.value) == pytest.approx(1, abs=1e-4)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", ["sphere, short", "sphere", "torus, long", "soup"])
 def test_extension_to_four_dimensions_stays_in_the_ball_range(name: str) -> None:
     """w(y) cos(s/l) on the whole ball of R^4, not only where s = 0."""
@@ -524,6 +527,7 @@ def compare(field: ScreenedWindingNumber, level: float, seed: int, **options: An
     return int(hits.hit.sum())
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("length", "bound"),
     [(0.15, None), (0.6, None), (50.0, None), (0.6, "slope"), (50.0, "classic")],
@@ -538,6 +542,7 @@ def test_first_hits(length: float, bound: str | None) -> None:
     assert hits > 60
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("length", [0.15, 50.0])
 def test_first_hits_through_the_tree(length: float) -> None:
     field = tree_field(length, 6.0, 400)

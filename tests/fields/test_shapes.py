@@ -168,6 +168,7 @@ SOME_QUICK = pytest.mark.parametrize(
 )
 
 
+@pytest.mark.slow
 @SOME_QUICK
 def test_contract(name: str) -> None:
     check_field(SHAPES[name][0], rng=1, count=25, directions=2)
@@ -187,6 +188,7 @@ def unit_vectors(rng: Any, n: int) -> Any:
     return d / norm(d)[:, None]
 
 
+@pytest.mark.few(4)
 @EVERY
 @QUICK_PRECISIONS
 def test_no_level_within_a_step(name: str, precision: Any) -> None:
@@ -291,6 +293,7 @@ def test_hulls_hold_the_solid(name: str, level: float) -> None:
     assert hull.contains_points(x[inside]).all()
 
 
+@pytest.mark.few(3)
 @EVERY
 @QUICK_PRECISIONS
 def test_first_hits(name: str, precision: Any) -> None:

@@ -12,6 +12,7 @@ from harnack.geometry import HalfSpace
 SHELLS = ("shell-ring", "shell-court", "shell-columns")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [pytest.param(one, marks=pytest.mark.slow) if k else one for k, one in
              enumerate(SHELLS)],

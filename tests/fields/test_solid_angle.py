@@ -74,6 +74,7 @@ def away_from_curve(loops: list[np.ndarray], x: np.ndarray, precision: str) -> n
     return x[CurveOracle(loops)(x).smooth > limit]
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("name", CURVES)
 def test_values_and_gradients(name: str, precision: str) -> None:
@@ -194,6 +195,7 @@ def test_sign_and_size_above_a_disk() -> None:
 # --- extents --------------------------------------------------------------------------------
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("levels", [(2 * math.pi,), (0.5,), (3.0, 11.0)], ids=str)
 @pytest.mark.parametrize("name", CURVES)
 def test_no_level_lies_outside_the_extent(name: str, levels: tuple[float, ...]) -> None:
@@ -234,6 +236,7 @@ class Unbounded(hk.SolidAngle):
         return other
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("level", [2 * math.pi, 1.0])
 @pytest.mark.parametrize("name", ["trefoil", "coil", "link", "rings", "holes", "wavy"])
 def test_the_extent_holds_every_hit_found_without_it(name: str, level: float) -> None:
@@ -464,6 +467,7 @@ def moves_along(
     return worst
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", [pytest.param("single", marks=pytest.mark.slow), "double"])
 @pytest.mark.parametrize(
     "name",
@@ -507,6 +511,7 @@ def rays_along(loops: list[np.ndarray], away: float, n: int) -> tuple[np.ndarray
     return place - rng.uniform(0, 2.5, (n, 1)) * d, d
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-7])
 @pytest.mark.parametrize("name", ["triangle", "wavy", "holes", "coil", "spiky"])
@@ -528,6 +533,7 @@ def test_hostile_rays_end(name: str, tolerance: float, precision: str) -> None:
     assert all(end.hit.all() for end in ends[: 4 if tolerance == 1e-4 else 1])
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("name", "away"),
     [("wavy", 1e-3), ("triangle", 2e-3), ("spiky", 2e-3), ("coil", 1e-3),

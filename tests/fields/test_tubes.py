@@ -96,6 +96,7 @@ def _in_unbounded_solids() -> dict[str, tuple[Any, float]]:
     }
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", ["single", "double"])
 @pytest.mark.parametrize("name", _in_unbounded_solids())
 def test_tubes_are_seen_in_solids_without_bounds(name: str, precision: Any) -> None:

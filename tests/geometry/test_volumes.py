@@ -115,6 +115,7 @@ def random_rays(
     return o, d
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("precision", ["single", "double"])
 @pytest.mark.parametrize("kind", KINDS)
 @settings(max_examples=8, deadline=None)

@@ -117,6 +117,7 @@ def test_pairs_among_some() -> None:
     assert intersecting_faces(x, faces, np.zeros(6, bool)).tolist() == []
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("seed", range(3))
 def test_random_faces_that_share_corners(seed: int) -> None:
     """Edges through faces, in exact arithmetic; one by one."""

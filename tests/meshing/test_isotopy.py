@@ -77,6 +77,7 @@ def test_a_field_that_promises_nothing_proves_nothing() -> None:
     assert mesh.metadata["harnack"]["isotopy"] == 0.0
 
 
+@pytest.mark.slow
 def test_wrong_values_and_wrong_topology_are_not_proved() -> None:
     """One corner on the wrong side of the level is a bump or a bubble that the surface lacks."""
     field = hk.Gyroid(cell=1.0)

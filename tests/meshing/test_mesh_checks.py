@@ -92,6 +92,7 @@ _CUBE = hk.Cuboid((0.5,) * 3)
 _CARVED = hk.Sphere(1.0) - hk.Cuboid((0.5, 0.5, 2.0))
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("part", "message"),
     [
@@ -116,6 +117,7 @@ def test_what_is_closed_in_memory_and_not_in_a_file_is_not_written(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_what_was_refused_is_right_once_it_is_moved_and_scaled(tmp_path: Path):
     made = hk.mesh(hk.Torus(0.8, 0.3).moved((1e6, 0, 0)), tolerance=2e-2)
     made.apply_translation((-1e6, 0, 0))
@@ -132,6 +134,7 @@ def test_what_was_refused_is_right_once_it_is_moved_and_scaled(tmp_path: Path):
     assert "harnack" in made.metadata
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3, 1e10])
 def test_slivers_that_turn_over_in_single_precision_are_left_out(scale: float, tmp_path: Path):
     """A vertex in the middle of a face, 1e-9 from one of its edges: rounded, it lies beyond it."""
@@ -150,6 +153,7 @@ def test_slivers_that_turn_over_in_single_precision_are_left_out(scale: float, t
     assert read_closed(path).volume == pytest.approx(made.volume, rel=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("field", "settings"),
     [
@@ -215,15 +219,16 @@ def _volume(part: hk.Solid, half: tuple[float, float, float], step: float) -> fl
     return float((part.value(points) < 0).sum()) * step**3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("part", "half", "bodies"),
     [
         (hk.solid(hk.SchwarzP(1.0), between=(-0.3, 0.3)) & hk.Cylinder(0.6, 6.0),
          (0.6, 0.6, 6.0), 1),
         (_WALLS.scaled(0.1) & hk.Cylinder(0.3, 3.0), (0.3, 0.3, 3.0), 1),
-        pytest.param(_WALLS & hk.Cylinder(20.0, 20.0), (20.0,) * 3, None, marks=pytest.mark.slow),
+        pytest.param(_WALLS & hk.Cylinder(10.0, 10.0), (10.0,) * 3, None, marks=pytest.mark.slow),
     ],
-    ids=["Schwarz P", "gyroid", "gyroid of 40 mm"],
+    ids=["Schwarz P", "gyroid", "gyroid of 20 mm"],
 )  # fmt: skip
 def test_cells_are_as_small_as_a_lattice_needs(
     part: hk.Solid, half: tuple[float, float, float], bodies: int | None
@@ -246,6 +251,7 @@ def test_a_spacing_that_is_asked_for_is_not_changed_for_waves():
         hk.mesh(part, tolerance=2e-2, max_triangles=500)
 
 
+@pytest.mark.slow
 def test_thin_parts_are_made_finer_until_no_faces_pass_through_each_other():
     made = hk.mesh(hk.Cylinder(0.01, 1.0), tolerance=4e-3)
     assert made.is_watertight
@@ -254,6 +260,7 @@ def test_thin_parts_are_made_finer_until_no_faces_pass_through_each_other():
     assert (np.hypot(x[:, 0], x[:, 1]) <= 0.01 + 1e-9).all()
 
 
+@pytest.mark.slow
 def test_sharp_creases_are_found_and_not_cut_into_ever_smaller_triangles():
     made = hk.mesh(hk.Cylinder(0.3, 1.0).moved((0.2, 0, 0)))
     assert made.is_watertight

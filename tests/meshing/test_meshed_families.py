@@ -33,6 +33,7 @@ def test_an_octahedron_of_absolute_values() -> None:
     assert facts["creases"] > 100
 
 
+@pytest.mark.slow
 def test_smooth_surfaces_have_no_creases() -> None:
     mesh = hk.mesh(hk.Gyroid(1.0), 0.2, clip=BOX, tolerance=4e-3)
     assert mesh.metadata["harnack"]["creases"] == 0
@@ -46,6 +47,7 @@ def test_a_cut_ball_as_one_greatest_value() -> None:
     assert mesh.volume == pytest.approx(4 / 3 * math.pi * 0.9**3 - cap, rel=3e-3)
 
 
+@pytest.mark.slow
 def test_walls_thinner_than_cells_are_noticed() -> None:
     """Between points of the lattice a wall changes no sign: this one came back as ten pieces with
     264 holes and a third of its volume, without a word."""
@@ -92,6 +94,7 @@ def test_slices_of_morphs() -> None:
         hk.mesh(hk.Morph(torus, ball, gap=0.2, w=0.0), tolerance=1e-2)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("powers", "radii", "volume"),
     [((1.0, 1.0), (1.0, 1.0, 1.0), 4 / 3), ((2.0, 2.0), (1.0, 0.5, 0.3), 0.2 * math.pi)],
@@ -140,6 +143,7 @@ def hairpin(width: float, length: float) -> np.ndarray:
                      [-length, half, 0.2 * width]])  # fmt: skip
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("loops", "expected"),
     [

@@ -87,6 +87,7 @@ def gyroid(x: np.ndarray) -> np.ndarray:
     return s[:, 0] * c[:, 1] + s[:, 1] * c[:, 2] + s[:, 2] * c[:, 0]
 
 
+@pytest.mark.slow
 def test_gyroid_walls_are_a_part_within_the_box(walls: Any) -> None:
     """The volume by quadrature of 400^3 points is 1.54867."""
     assert is_part(walls)
@@ -129,6 +130,7 @@ def lens(r: float, s: float, d: float) -> float:
     )  # fmt: skip
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("part", "volume"),
     [
@@ -180,6 +182,7 @@ def test_a_thick_seifert_surface_ends_at_the_knot() -> None:
 # Open surfaces that are cut
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     "clip", [hk.Ball((0.1, 0, 0), 0.5), hk.HalfSpace((1, 1, 0), 0.1), hk.Box((0, 0, 0), (1, 1, 1))]
 )
@@ -217,6 +220,7 @@ def test_a_level_without_extent_is_cut_by_the_clip() -> None:
 # Thickness
 
 
+@pytest.mark.slow
 def test_a_thick_surface_has_the_volume_of_area_times_thickness() -> None:
     mesh = hk.mesh(hk.SolidAngle(KNOT), thickness=0.06, tolerance=2e-3)
     facts = mesh.metadata["harnack"]
@@ -301,6 +305,7 @@ def test_the_largest_part_is_kept() -> None:
     assert mesh.volume == pytest.approx(4 / 3 * math.pi * 0.125, rel=1e-2)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("part", "arguments", "volume"),
     [
@@ -354,6 +359,7 @@ class Holed(hk.Shape):
 CURVE = hk.SolidAngle(shapes.wavy_polygon(12))
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize(
     ("field", "arguments", "message"),
     [
@@ -397,6 +403,7 @@ def test_what_is_no_part_is_refused(field: Any, arguments: Any, message: str) ->
 # Files
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["stl", "ply", "obj", "glb", "3mf"])
 def test_files_of_every_format_are_closed_when_read_again(kind: str, tmp_path: Path) -> None:
     path = tmp_path / f"part.{kind}"

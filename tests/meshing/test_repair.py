@@ -66,6 +66,7 @@ def check(given: trimesh.Trimesh, euler: int = 2) -> trimesh.Trimesh:
     return made
 
 
+@pytest.mark.slow
 def test_a_ball_with_three_holes() -> None:
     made = check(ball())
     facts = made.metadata["harnack"]
@@ -75,6 +76,7 @@ def test_a_ball_with_three_holes() -> None:
     assert 3.8 < made.volume < 4.19  # holes are closed from rim to rim, a little flatter than caps
 
 
+@pytest.mark.slow
 def test_holes_that_touch_in_vertices() -> None:
     vertices, faces = icosphere(2)
     kept = np.random.default_rng(1).random(len(faces)) > 0.12
@@ -92,12 +94,14 @@ def test_many_random_holes(seed: int) -> None:
     check(trimesh.Trimesh(vertices, faces[rng.random(len(faces)) > 0.1], process=False))
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("scale", "shift"), [(1e-5, 0.0), (1.0, 300.0), (2e4, -1e5)])
 def test_units_and_places(scale: float, shift: float) -> None:
     given = ball(AXES[:1], subdivisions=2)
     check(trimesh.Trimesh(given.vertices * scale + shift, given.faces, process=False))
 
 
+@pytest.mark.slow
 def test_two_openings_of_a_tube_are_capped_or_joined() -> None:
     """Patches of a long tube are caps; those of a short wide one join its rims to a torus."""
     for height, euler in ((6.0, 2), (0.3, 0)):
@@ -118,6 +122,7 @@ def test_a_closed_mesh_gets_nothing_added() -> None:
     assert made.metadata["harnack"]["holes"] == 0
 
 
+@pytest.mark.slow
 def test_patches_that_meet_the_mesh_are_refused() -> None:
     """A small ball stands in the hole of a large one."""
     large = ball(AXES[:1])

@@ -116,6 +116,7 @@ def misplaced_imports(path: Path, source: str) -> list[str]:
     return wrong
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(SOURCE)))
 def test_file_imports_from_earlier_rooms(path: Path) -> None:
     source = path.read_text(encoding="utf-8")

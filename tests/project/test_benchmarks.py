@@ -26,6 +26,7 @@ def test_the_blobs_of_the_benchmark_and_of_the_library_are_the_same() -> None:
         np.testing.assert_allclose(library.value.numpy() - SCENE.threshold, expected, atol=1e-12)
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("method", inclusion.METHODS, ids=lambda one: one[0])
 def test_no_method_misses_a_hit(method: inclusion.Method) -> None:
     reference = SCENE.first_inside(SCENE.rays(300), 500)
@@ -35,6 +36,7 @@ def test_no_method_misses_a_hit(method: inclusion.Method) -> None:
     assert 1 <= row.looks < 25
 
 
+@pytest.mark.slow
 def test_methods_come_in_the_published_order() -> None:
     """Those of table 1 of Aydinlilar and Zanni (2023), from the most looks to the fewest."""
     scene = inclusion.table1_scene()
@@ -79,6 +81,7 @@ def test_scene_files_name_the_camera_and_the_container() -> None:
     assert "pigment_map" in text
 
 
+@pytest.mark.slow
 def test_the_oracle_finds_the_roots_of_the_tracer(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(povray, "WIDTH", 24)
     gyroid = povray.pictures()[0]
@@ -92,6 +95,7 @@ def test_the_oracle_finds_the_roots_of_the_tracer(monkeypatch: pytest.MonkeyPatc
     assert isinstance(gyroid.field, hk.Gyroid)
 
 
+@pytest.mark.slow
 def test_methods_without_a_proof_miss_first_hits(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(baselines, "SAMPLES", 1500)
     field = hk.SolidAngle(shapes.wavy_polygon(12))

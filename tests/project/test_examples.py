@@ -70,6 +70,7 @@ def test_a_field_of_ones_own_is_hit_where_its_formula_says(tmp_path: Path) -> No
     assert value == pytest.approx(12.0, abs=5e-3)
 
 
+@pytest.mark.slow
 def test_sharper_proofs_take_fewer_evaluations(tmp_path: Path) -> None:
     work = example("comparing_bounds").main(tmp_path, SMALL)
     assert work["classic"] > 8 * work["slope"]

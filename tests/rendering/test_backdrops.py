@@ -72,6 +72,7 @@ def check_blocks(picture: Any) -> None:
     assert np.abs(row[-1] - (0, 0, 200)).max() <= 2
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("shape", [(30, 40), (300, 400), (12, 16), (200, 80)])
 def test_images_cover_the_picture(shape: tuple[int, int]) -> None:
     check_blocks(drawn(blocks(shape)))

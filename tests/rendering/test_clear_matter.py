@@ -129,6 +129,7 @@ def test_rays_follow_snell_and_fresnel(index: float) -> None:
         assert (reflected == 0).all()
 
 
+@pytest.mark.slow
 def test_named_glass_is_tinted_in_both_kinds_of_picture() -> None:
     gyroid = hk.Gyroid(1.0, domain=hk.Ball(radius=1.0))
     small: dict[str, Any] = {"solid": (-0.4, 0.4), "size": (40, 30), "progress": False}

@@ -192,6 +192,7 @@ def test_edges_are_the_default() -> None:
     np.testing.assert_array_equal(small(ball), small(ball, antialias="edges"))
 
 
+@pytest.mark.slow
 def test_several_surfaces_and_solids_are_found() -> None:
     ring = np.linspace(0, 2 * np.pi, 40)
     wire = hk.Tube(np.column_stack([np.cos(ring), np.sin(ring), 0 * ring]), 2e-3)

@@ -23,6 +23,7 @@ def draw(what: Any = POLYGON, **settings: Any) -> np.ndarray:
     return np.asarray(hk.render(what, **{**small, **settings}))
 
 
+@pytest.mark.slow
 def test_denoising_comes_closer_to_many_samples() -> None:
     many, few, clean = draw(spp=128), draw(), draw(denoise=True)
     before, after = (np.sqrt(np.mean((one - many) ** 2)) for one in (few, clean))
@@ -134,6 +135,7 @@ def test_bands_last_a_few_seconds() -> None:
     assert Pace(0, 0).paths_a_band == 2**21
 
 
+@pytest.mark.slow
 def test_a_long_picture_is_announced(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -30,6 +30,7 @@ def orange(picture: np.ndarray) -> np.ndarray:
     return np.abs(picture[..., 0] - picture[..., 2]) > 40
 
 
+@pytest.mark.slow
 def test_a_turntable_goes_around_once(tmp_path: Path) -> None:
     hk.animate(FIELD, tmp_path / "a.gif", turn=360, frames=6, **SMALL)
     film = pictures(tmp_path / "a.gif")
@@ -55,6 +56,7 @@ def test_the_frame_stays_while_a_surface_grows(tmp_path: Path) -> None:
     assert areas[2] / areas[0] == pytest.approx(4, rel=0.15)
 
 
+@pytest.mark.slow
 def test_every_setting_may_move(tmp_path: Path) -> None:
     hk.animate(
         FIELD, tmp_path / "a.gif", frames=3, level=lambda s: 3 + 6 * s, camera=hk.Camera(zoom=0.8),
@@ -81,6 +83,7 @@ def test_the_camera_comes_closer(tmp_path: Path) -> None:
     assert areas[2] / areas[0] == pytest.approx(4, rel=0.3)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("camera", [(4.0, -6.0, 5.0), hk.Camera(distance=8.0)])
 def test_a_camera_that_has_a_place_goes_around_too(camera: Any, tmp_path: Path) -> None:
     still = SMALL | {"frames": 4, "turn": 360}
@@ -94,6 +97,7 @@ def test_a_camera_that_has_a_place_goes_around_too(camera: Any, tmp_path: Path) 
     assert orange(film[0]).sum() > 0.6 * alone.sum()
 
 
+@pytest.mark.slow
 def test_what_is_up_may_change(tmp_path: Path) -> None:
     what = [hk.Torus(1, 0.2), hk.Sphere(0.1)]
     wide = SMALL | {"size": (120, 30), "frames": 4, "show": "normal"}
@@ -103,6 +107,7 @@ def test_what_is_up_may_change(tmp_path: Path) -> None:
         assert (rim < 30).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("show", ["shaded", pytest.param("color", marks=pytest.mark.slow)])
 def test_nothing_is_compiled_after_the_second_picture(show: str, tmp_path: Path) -> None:
     counts: list[int] = []
@@ -121,6 +126,7 @@ def test_nothing_is_compiled_after_the_second_picture(show: str, tmp_path: Path)
     assert sum(not one["cache_hit"] or one["cache_disk"] for one in kernels) == 0
 
 
+@pytest.mark.slow
 def test_a_film_in_mp4(tmp_path: Path) -> None:
     av = pytest.importorskip("av")
     hk.animate(

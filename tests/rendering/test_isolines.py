@@ -182,6 +182,7 @@ def seen(what: Any, isolines: Any, show: str, **settings: Any) -> np.ndarray:
     return hk.render(what, show=show, isolines=isolines, **asked).shown.astype(int)
 
 
+@pytest.mark.slow
 def test_pictures_of_values_have_isolines_and_smooth_edges() -> None:
     """Numbers are those of one ray a pixel, whatever is drawn; edges are means of several."""
     asked: dict[str, Any] = {"show": "value", "of": "x", "backdrop": "white", **SMALL}
@@ -230,6 +231,7 @@ def test_lines_thinner_than_a_pixel_have_no_gaps_in_shaded_pictures() -> None:
     assert columns.max() < 2.0 * expected
 
 
+@pytest.mark.slow
 def test_caps_of_solids_show_isolines_of_their_own_function() -> None:
     camera = hk.Camera(elevation=89)
     box = hk.Box((-2, -2, -2), (2, 2, 0))
@@ -244,6 +246,7 @@ def test_caps_of_solids_show_isolines_of_their_own_function() -> None:
     assert radius.std() < 0.12 * radius.mean()
 
 
+@pytest.mark.slow
 def test_lines_on_glass_are_opaque_in_shaded_pictures() -> None:
     settings = {"solid": (-np.inf, 0.0), "material": "glass"}
     lines = hk.Isolines("z", [0.0], width=0.3, color="black")
@@ -252,6 +255,7 @@ def test_lines_on_glass_are_opaque_in_shaded_pictures() -> None:
     assert ((image.max(axis=-1) < 40) & (plain.min(axis=-1) > 60)).sum() > 50
 
 
+@pytest.mark.slow
 def test_of_several_surfaces_those_that_a_function_is_constant_on_have_no_lines() -> None:
     other = hk.Torus(1.0, 0.4)
     plain = seen([CIRCLE, other], None, "shaded")

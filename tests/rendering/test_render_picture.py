@@ -44,6 +44,7 @@ def test_a_png_and_an_exr_are_written(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.exr", "a.png"]
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("shape", [(30, 40, 3), (33, 7), (16, 16, 3), (1, 1)])
 def test_exr_files_hold_what_was_written(shape: tuple[int, ...], tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
@@ -79,6 +80,7 @@ def test_the_same_seed_draws_the_same_picture() -> None:
     assert first.mean() == pytest.approx(other.mean(), rel=0.03)
 
 
+@pytest.mark.slow
 def test_bands_leave_no_seam(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = draw(spp=64)
     monkeypatch.setattr("harnack.rendering.picture.PATHS_A_BAND", 64 * 50)
@@ -86,6 +88,7 @@ def test_bands_leave_no_seam(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_array_equal(whole, bands)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("show", SHOW_MODES)
 def test_every_mode_makes_numbers_and_a_picture(show: str, tmp_path: Path) -> None:
     image = draw(path=tmp_path / "a.png", show=show, of="x" if show == "value" else None)
@@ -119,6 +122,7 @@ def test_pictures_of_large_and_small_surfaces_are_alike(scale: float) -> None:
     np.testing.assert_allclose(depth[hit], reference[hit], rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_out_of_steps_is_never_background(tmp_path: Path) -> None:
     status = draw(path=tmp_path / "a.png", show="status", max_steps=4)
     lost = status == hk.Status.OUT_OF_STEPS
@@ -148,6 +152,7 @@ def test_settings_of_a_level_set_are_replaced() -> None:
     assert not np.array_equal(clipped, draw(solid, show="depth"))
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", MATERIALS)
 def test_every_material_draws(name: str) -> None:
     image = draw(GYROID, material=name, solid=(-0.3, 0.3))
@@ -155,6 +160,7 @@ def test_every_material_draws(name: str) -> None:
     assert 0.1 < image.mean() < 1.2
 
 
+@pytest.mark.slow
 def test_materials_are_told_apart_and_one_may_be_given_for_each_surface() -> None:
     pair = [hk.level_set(GYROID, level) for level in (-0.5, 0.5)]
     gold, mixed = draw(pair, material="gold"), draw(pair, material=["gold", "porcelain"])
@@ -189,6 +195,7 @@ def test_levels_of_one_field_may_have_materials_of_their_own() -> None:
         draw(GYROID, level=levels, material=["red", "blue", "gold"])
 
 
+@pytest.mark.slow
 def test_parts_of_one_surface_may_be_drawn_as_several() -> None:
     halves = [hk.Box((0, -1, -1), (1, 1, 1)), hk.Box((-1, -1, -1), (0, 1, 1))]
     parts = [hk.level_set(hk.Sphere(0.9), clip=half) for half in halves]
@@ -197,6 +204,7 @@ def test_parts_of_one_surface_may_be_drawn_as_several() -> None:
     assert (image[..., 2] > 2 * image[..., 0]).any()
 
 
+@pytest.mark.slow
 def test_tubes_around_boundaries_have_a_material() -> None:
     gold = draw(POLYGON, boundary=0.1, show="shaded")
     same = draw(POLYGON, boundary=0.1, boundary_material="gold", show="shaded")
@@ -215,6 +223,7 @@ def test_camera_and_backdrop_change_the_picture() -> None:
     assert draw(backdrop="dark").mean() < 0.7 * default.mean()
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("size", [(60, 20), (20, 60), (40, 40)])
 @pytest.mark.parametrize("elevation", [-30.0, 0.0, 35.0, 90.0])
 def test_the_camera_frames_the_surface(size: tuple[int, int], elevation: float) -> None:
@@ -331,10 +340,12 @@ except RuntimeError as error:
 """
 
 
+@pytest.mark.slow
 def test_a_variant_is_chosen_if_there_is_none() -> None:
     assert in_a_new_process(DRAW.format(before="")).split()[0] in ("llvm_ad_rgb", "cuda_ad_rgb")
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_spectral_polarized"])
 def test_a_variant_that_cannot_work_is_refused_and_kept(variant: str) -> None:
     said = in_a_new_process(DRAW.format(before=f"mi.set_variant('{variant}')"))
@@ -353,6 +364,7 @@ def test_other_variants_draw_the_same_picture(variant: str) -> None:
     np.testing.assert_allclose(ours, reference, rtol=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "show",
     [

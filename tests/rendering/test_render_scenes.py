@@ -79,6 +79,7 @@ def drawn(members: dict[str, Any], spp: int = 16, depth: int = 8, **kw: Any) -> 
 GYROID = hk.Gyroid(1.0, domain=hk.Ball(radius=1.0))
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("tolerance", [1e-3, 1e-4, 1e-5])
 @pytest.mark.parametrize(
     "settings",
@@ -129,6 +130,7 @@ BSDFS: dict[str, dict[str, Any]] = {
 }
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", BSDFS)
 def test_solid_sphere_looks_like_mitsubas(name: str) -> None:
     surroundings = {
@@ -178,6 +180,7 @@ def _lit_gyroid(tolerance: float) -> dict[str, Any]:
 LIGHTS = {"sky": {"type": "constant", "radiance": 0.3}, "lamp": lamp()}
 
 
+@pytest.mark.slow
 def test_gyroid_looks_like_its_mesh() -> None:
     ours = drawn({**LIGHTS, **_lit_gyroid(1e-4)}, spp=196, size=64)
     mesh = drawn({**LIGHTS, **_mesh_of_gyroid(160)}, spp=196, size=64)
@@ -345,6 +348,7 @@ def test_mitsubas_own_render_shows_and_counts_what_was_lost() -> None:
     np.testing.assert_allclose(image[..., 0], image[..., 2], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_pictures_differentiate_with_respect_to_materials() -> None:
     bsdf = {"type": "twosided", "nested": red()}
     scene = mi.load_dict(
@@ -440,6 +444,7 @@ def drawn_by(integrator: dict[str, Any], member: Any, **members: Any) -> Any:
     return mi.load_dict({"type": "scene", **scene})
 
 
+@pytest.mark.slow
 def test_integrators_are_followed_left_to_mitsuba_or_refused_by_name() -> None:
     """`direct`, `aov` and `volpath` were replaced by paths without a word."""
     theirs, ours = {"type": "sphere"}, shape(Sphere())

@@ -132,6 +132,7 @@ def draw(what: Any = POLYGON, **settings: Any) -> np.ndarray:
     return render(what, None, **{**small, **settings})
 
 
+@pytest.mark.slow
 def test_the_picture_is_always_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = draw()
     np.testing.assert_array_equal(whole, draw(seed=7))
@@ -139,6 +140,7 @@ def test_the_picture_is_always_the_same(monkeypatch: pytest.MonkeyPatch) -> None
     np.testing.assert_allclose(draw(), whole, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_more_samples_smooth_edges_and_nothing_else() -> None:
     once, smooth = draw(spp=1), draw(spp=16)
     changed = np.abs(once - smooth).max(axis=-1) > 1e-6
@@ -159,6 +161,7 @@ def test_samples_of_a_pixel_are_spread(count: int) -> None:
     np.testing.assert_allclose(places.mean(axis=0), 0.5, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_surfaces_keep_their_own_materials_and_the_nearer_hides_the_other() -> None:
     gyroid = hk.Gyroid(1.0, domain=hk.Ball(radius=1.0))
     levels = [hk.level_set(gyroid, level, tolerance=1e-3) for level in (-0.5, 0.5)]
@@ -169,6 +172,7 @@ def test_surfaces_keep_their_own_materials_and_the_nearer_hides_the_other() -> N
     np.testing.assert_allclose(two, swapped, atol=2e-2)
 
 
+@pytest.mark.slow
 def test_what_mends_a_mesh_is_tinted() -> None:
     vertices, faces = mesh_shapes.icosphere(2)
     opened = faces[vertices[faces].mean(axis=1)[:, 2] < 0.7]
@@ -231,6 +235,7 @@ def test_the_floor_is_dark_beneath_a_ball_and_light_far_from_it() -> None:
     assert np.array(part)[0] == pytest.approx(1 - 1 / 5**1.5, abs=0.04)
 
 
+@pytest.mark.slow
 def test_lost_rays_are_magenta_and_counted() -> None:
     with pytest.warns(UserWarning, match=r"\d+ rays ran out of steps"):
         image = draw(max_steps=4, tolerance=1e-4, spp=1)

@@ -65,6 +65,7 @@ def dense_crossings(
     return first, inside[:, 0]
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     "volume",
     [
@@ -125,6 +126,7 @@ def test_occlusion_is_meeting() -> None:
         np.testing.assert_array_equal(to_numpy(occluded), to_numpy(met.met))
 
 
+@pytest.mark.slow
 def test_a_ray_that_slipped_through_a_thin_part_crosses_back_at_once() -> None:
     solid = solid_of(-0.4, 0.3, BALL)
     o, d = rays(3000, 11, 1.2)

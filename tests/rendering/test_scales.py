@@ -138,6 +138,7 @@ def test_ticks_of_angles_are_parts_of_turns(turns: int, most: int, written: list
     assert ticks[-1][0] == pytest.approx(turns * np.pi)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("show", "of"), [("evaluations", None), ("depth", None), ("value", "z"), ("value", KNOT)]
 )

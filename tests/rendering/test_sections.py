@@ -84,6 +84,7 @@ def test_faces_of_a_solid_on_its_section_are_told_from_all_others():
     )
 
 
+@pytest.mark.slow
 def test_pictures_show_faces_in_their_own_material():
     settings = {"size": (40, 30), "show": "shaded", "spp": 1, "progress": False,
                 "camera": hk.Camera(azimuth=-90, elevation=0), "material": "porcelain"}  # fmt: skip
@@ -132,6 +133,7 @@ def test_sections_of_the_command_line():
             parse(["render", "gyroid", "--section", wrong])
 
 
+@pytest.mark.slow
 def test_a_surface_is_drawn_as_a_thick_sheet():
     """A square seen along its plane is nothing to be seen of, a sheet of it a bar."""
     square = hk.SolidAngle([[0.5, 0.5, 0], [-0.5, 0.5, 0], [-0.5, -0.5, 0], [0.5, -0.5, 0]])

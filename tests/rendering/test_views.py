@@ -38,6 +38,7 @@ def middle(mask: np.ndarray) -> np.ndarray:
     return np.argwhere(mask).mean(axis=0)[::-1]
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     "position", [(3.0, 3.0, 3.0), (0.3, -4.0, 0.1), (0.0, 0.0, 5.0), (1, 2, -9)]
 )
@@ -137,6 +138,7 @@ def test_what_is_no_direction_is_refused(up: Any) -> None:
         draw(up=up)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("show", ["color", "shaded"])
 def test_white_is_white_and_transparent_is_as_much_as_is_covered(show: str, tmp_path: Path) -> None:
     from PIL import Image
@@ -163,6 +165,7 @@ def test_white_is_white_and_transparent_is_as_much_as_is_covered(show: str, tmp_
 TORUS = hk.Torus(1, 0.3)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("show", ["color", "shaded"])
 @pytest.mark.parametrize(
     "settings",
@@ -231,6 +234,7 @@ def test_the_depth_of_another_integrator_is_taken() -> None:
     assert hk.render(scene, spp=4, progress=False).max() == 0
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("show", ["color", "shaded"])
 @pytest.mark.parametrize("far", [50.0, 1e3, 4e3])
 def test_a_surface_seen_from_far_away_is_as_large(show: str, far: float) -> None:
@@ -291,6 +295,7 @@ def test_there_is_no_edge_behind_the_surface(show: str, backdrop: str, elevation
     assert column.min() > 1e-3
 
 
+@pytest.mark.slow
 def test_a_tube_is_drawn_around_the_curve() -> None:
     """It sticks out of the surface by its radius, and follows circles."""
     bare = np.isfinite(draw(show="depth"))
@@ -332,6 +337,7 @@ def test_pictures_show_themselves() -> None:
     np.testing.assert_array_equal(sent.shown, image.shown)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -403,6 +409,7 @@ def test_options_that_cannot_be(
     assert complaint in capsys.readouterr().err.replace("\n", " ")
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("show", ["value", "depth", "evaluations"])
 def test_pictures_of_numbers_stand_before_a_color(show: str) -> None:
     asked = {"of": "z"} if show == "value" else {}

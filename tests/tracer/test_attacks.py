@@ -36,6 +36,7 @@ def grazing(
     return target - 1.2 * d, d, target
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("method", ["exact", "tree"])
 @pytest.mark.parametrize("kind", ["axis", "random", "edges"])
@@ -112,6 +113,7 @@ def test_rays_that_start_at_vertices_of_curves_hit_them(precision: Any) -> None:
     assert hits.t.max() < 1e-4
 
 
+@pytest.mark.slow
 def test_closest_points_of_clouds_are_on_the_surface_whatever_the_accuracy() -> None:
     """They were on that of the approximate sum: up to a fifth of the size off."""
     rng = np.random.default_rng(3)
@@ -160,6 +162,7 @@ def test_directions_may_have_any_length(precision: Any) -> None:
             np.testing.assert_allclose(same.t, hit.t, rtol=1e-6)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("method", ["exact", "tree"])
 def test_rays_on_the_line_of_a_boundary_edge_see_the_right_value(method: Any) -> None:
     """Exactly on it the edge's factor was as short as what stood for its imaginary part: f along
@@ -174,6 +177,7 @@ def test_rays_on_the_line_of_a_boundary_edge_see_the_right_value(method: Any) ->
     np.testing.assert_allclose(hit.value, field.value(hit.position, precision="double"), atol=1e-6)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("method", ["exact", "tree"])
 def test_rays_along_boundary_edges_miss_no_hit(method: Any) -> None:
     """Of a mesh with whole numbers for coordinates, so that rays are on the very lines: 27,000
@@ -208,6 +212,7 @@ def test_rays_along_boundary_edges_miss_no_hit(method: Any) -> None:
     assert regular.mean() > 0.6
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("method", ["exact", "tree"])
 def test_sheets_in_one_plane_that_cancel_are_no_surface(method: Any, precision: Any) -> None:
@@ -304,6 +309,7 @@ def test_curvatures_where_rounding_meets_a_shifted_curve_are_unknown() -> None:
     assert (off <= (found.mean_error + exact.mean_error)[known]).all()
 
 
+@pytest.mark.slow
 def test_distances_from_absurdly_far_away() -> None:
     """The newton distance to a cloud was 0 from 1e20 sizes on; from 1e160 an IndexError."""
     vertices, faces = icosphere(2)

@@ -16,6 +16,7 @@ SPHERES = hk.Sphere(0.5, (-0.6, 0, 0)) | hk.Sphere(0.2, (2, 0, 0))
 FROM_RIGHT = [[3.0, 0, 0]], [[-1.0, 0, 0]]
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("radius", "power"), [(0.4, 2), (0.35, 3)])
 def test_a_component_on_which_the_gradient_vanishes_is_no_larger_for_it(
     radius: float, power: int
@@ -30,6 +31,7 @@ def test_a_component_on_which_the_gradient_vanishes_is_no_larger_for_it(
     assert hk.trace(field, *FROM_RIGHT, largest=True).t[0] == pytest.approx(3.1, abs=1e-3)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("half", [0.005, 0.001, 1e-4])
 def test_both_sides_of_a_thin_plate_are_no_smaller_than_one_of_a_thick_one(half: float) -> None:
     """Where both sides passed the same cells, one was left out of the area."""

@@ -99,6 +99,7 @@ def wrong_hits(
     return missed, at[off & (cKDTree(points).query(x)[0] > 1e-5)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("n", "count", "spacing"),
     [(100, 1000, 0.1), (1000, 1000, 0.15), pytest.param(10_000, 1000, 0.2, marks=pytest.mark.slow)],
@@ -132,6 +133,7 @@ def test_the_oracle_sees_hits_that_are_late_or_nowhere() -> None:
         assert len(wrong_hits(spoiled, truth, some, o, d)[wrong]) > 0.7 * crossed.sum()
 
 
+@pytest.mark.slow
 def test_a_tree_that_hides_its_error_misses_hits() -> None:
     """Truncation matters: the test above would see it if the bound did not enter the steps."""
 

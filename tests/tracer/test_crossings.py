@@ -96,6 +96,7 @@ CASES: dict[str, tuple[Any, Any, tuple[float, ...], float]] = {
 }  # fmt: skip
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("name", CASES)
 def test_crossings_are_those_of_a_dense_oracle(name: str, precision: Any) -> None:
@@ -139,6 +140,7 @@ def test_crossings_are_those_of_a_dense_oracle(name: str, precision: Any) -> Non
     assert np.isnan(found.position[~at]).all()
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("level", [2 * math.pi, (0.5, 1.5, 2 * math.pi, 9.0)])
 def test_the_ladder_of_an_angle_is_climbed_rung_by_rung(level: Any, precision: Any) -> None:
@@ -375,6 +377,7 @@ def changes_of_winding(
     return t[passes], passes
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("method", "precision"),
     [
@@ -404,6 +407,7 @@ def test_closed_meshes_are_crossed_at_their_triangles(method: str, precision: An
     np.testing.assert_array_equal(sure.sheet, found.sheet[:, 0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["exact", pytest.param("tree", marks=pytest.mark.slow)])
 def test_meshes_with_holes_are_crossed_where_the_winding_number_passes(method: str) -> None:
     vertices, faces = balls()

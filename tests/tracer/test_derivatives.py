@@ -65,6 +65,7 @@ def numpy(array: dr.ArrayBase) -> np.ndarray:
     return np.array(array).T
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", ["convex position", "trefoil"])
 def test_vertices_forward(name: str) -> None:
     loop = LOOP if name == "convex position" else TREFOIL
@@ -111,6 +112,7 @@ FIELDS: dict[str, tuple[hk.Field, float]] = {
 }
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", FIELDS)
 def test_level_forward_and_reverse(name: str) -> None:
     field, level = FIELDS[name]
@@ -149,6 +151,7 @@ def test_rays_forward_and_reverse(name: str, moved: str) -> None:
     agree((numpy(dr.grad(ray)) * motion).sum(axis=1), expected)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("field", "levels"),
     [
@@ -233,6 +236,7 @@ def rays_at(size: float, n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return o, rng.uniform(-size, size, (n, 3)) - o
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [
@@ -320,6 +324,7 @@ OF_LOOPS: dict[str, tuple[Callable[[], hk.Field], float]] = {
 }
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", OF_LOOPS)
 def test_reverse_mode_passes_every_field(name: str) -> None:
     """Hits, and values at points, whose derivatives are those of the normal and the gradient."""

@@ -75,6 +75,7 @@ def wrong(field, n, seed, **settings):
     return int((certain & (off | (hits.status == hk.Status.OUT_OF_STEPS))).sum())
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", ["single", "double"])
 @pytest.mark.parametrize("name", FIELDS)
 def test_first_hits_are_those_of_the_largest(name, precision):
@@ -90,6 +91,7 @@ def test_first_hits_with_other_steps(tolerance, overstep):
         assert wrong(FIELDS[name], 50_000, 1, **settings) == 0
 
 
+@pytest.mark.slow
 def test_wrong_groups_are_noticed(monkeypatch):
     alone = np.zeros((3, 3, 3), np.bool_)
     alone[1, 1, 1] = True
@@ -145,6 +147,7 @@ def test_a_section_is_for_looking_into_what_was_the_largest():
     assert hits.t[0] == pytest.approx(3.1, abs=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["single", "double"])
 def test_of_a_solid_the_part_of_largest_volume_is_there(precision):
     backend = choose_backend(precision)
@@ -184,6 +187,7 @@ def test_rays_whose_cells_rounding_leaves_open_are_out_of_steps():
     assert hk.trace(FIELDS["solids"], o, d, largest=True, precision="double").hit.all()
 
 
+@pytest.mark.slow
 def test_what_has_no_largest_component_is_refused():
     ray = [[3.0, 0, 0]], [[-1.0, 0, 0]]
     for settings in ({"confirm": True}, {"all_hits": 2}):

@@ -43,6 +43,7 @@ CASES: dict[str, Callable[[], hk.LevelSet]] = {
 }
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", ["single", "double"])
 @pytest.mark.parametrize("name", CASES)
 def test_a_queue_changes_no_bit(name: str, precision: Any) -> None:

@@ -36,6 +36,7 @@ def lines_in_planes(mesh: Mesh, n: int) -> tuple[np.ndarray, np.ndarray]:
     return q, d.astype(np.float32).astype(float)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["exact", "tree"])
 @pytest.mark.parametrize(
     ("thinness", "precision"),
@@ -86,6 +87,7 @@ def test_a_sample_off_rays_promises_nothing_along_one() -> None:
     assert not sample.along
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("precision", ["single", "double"])
 @pytest.mark.parametrize("method", ["exact", "tree"])
 @pytest.mark.parametrize("thinness", [1e-2, 1e-4, 1e-6])
@@ -116,6 +118,7 @@ def ends_of_edges(mesh: Mesh, n: int, seed: int = 3) -> tuple[np.ndarray, np.nda
     return corners[np.arange(n), i], corners[np.arange(n), (i + step) % 3]
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", ["single", "double"])
 @pytest.mark.parametrize("kind", ["curve", "exact", "tree"])
 def test_rays_that_pass_edges_at_small_angles_end(kind: str, precision: str) -> None:
@@ -141,6 +144,7 @@ def test_rays_that_pass_edges_at_small_angles_end(kind: str, precision: str) -> 
             assert (end.status != int(hk.Status.OUT_OF_STEPS)).all()
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", ["single", "double"])
 @pytest.mark.parametrize("method", ["exact", "tree"])
 def test_rays_along_cracks_of_t_junctions_end(method: str, precision: str) -> None:

@@ -391,6 +391,7 @@ KINDS = [BruteForceWinding, CountedWinding]
 # --- first hits -----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [name if name == "strip" else pytest.param(name, marks=pytest.mark.slow) for name in MESHES],
@@ -441,6 +442,7 @@ def check_sheets_hit(hits: hk.Hits, exact: ExactWinding, faces: np.ndarray, d: n
     assert (hits.value[rows] >= 0.5 - 1e-3)[clear & ~rising].all()
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("name", "level"),
     [("nested boxes", 1.5), ("strip", -0.3), ("flipped face", 0.75), ("doubled faces", 1.2)],
@@ -463,6 +465,7 @@ def test_other_levels(name: str, level: float) -> None:
     np.testing.assert_allclose(hit_t(both), np.minimum(hit_t(hits), hit_t(plain)), atol=2 * REACH)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("factor", [0.9, 1.1])
 @pytest.mark.parametrize("kind", KINDS)
 def test_wrong_jumps_are_seen(kind: type[BruteForceWinding], factor: float) -> None:
@@ -478,6 +481,7 @@ def test_wrong_jumps_are_seen(kind: type[BruteForceWinding], factor: float) -> N
     assert len(verdict.missed if factor < 1 else verdict.early) > 3
 
 
+@pytest.mark.slow
 def test_the_oracle_sees_hits_that_are_late_early_or_not_there() -> None:
     vertices, faces = MESHES["open cube"]
     exact = ExactWinding(vertices, faces)
@@ -554,6 +558,7 @@ class Staircase(hk.Field):
         return Staircase(self.slope, self.planes, offset)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("overstep", [1.0, 1.4])
 @pytest.mark.parametrize("precision", ["single", "double"])
 def test_staircases(precision: Any, overstep: float) -> None:
@@ -602,6 +607,7 @@ class Approximate(hk.Field):
         return hk.Sample(p.x, gradient, (ball,), 0.0, self.gradient_error)
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("overstep", [1.0, 1.4])
 @pytest.mark.parametrize("bound", [None, "slope", "caps"])
 @pytest.mark.parametrize("direction", [1.0, -1.0])
@@ -672,6 +678,7 @@ def check_uncertain_steps(factor: float = 1.0, covers: float = 1.0) -> None:
         assert not free[1][inside].any(), kind
 
 
+@pytest.mark.slow
 def test_steps_are_those_of_the_worst_slope() -> None:
     check_uncertain_steps()
 
@@ -713,6 +720,7 @@ def test_looks_see_the_error_of_the_slope_in_both_directions() -> None:
 # --- parts of rays --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_rays_that_begin_and_end_anywhere(kind: type[BruteForceWinding]) -> None:
     """By t_min and t_max, and by clip volumes: crossings outside do not count as met, and those
@@ -770,6 +778,7 @@ def test_a_sheet_at_the_start_is_met_there() -> None:
     assert beyond.t[0] > 1e-3
 
 
+@pytest.mark.slow
 def test_few_steps_end_with_the_proved_length() -> None:
     vertices, faces = MESHES["flipped face"]
     field = BruteForceWinding(vertices, faces)
@@ -806,6 +815,7 @@ def test_closed_meshes_cost_one_evaluation_a_crossing() -> None:
 # --- other ways in --------------------------------------------------------------------------
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", ["single", "double"])
 def test_drjit_rays_get_the_same(precision: Any) -> None:
     vertices, faces = MESHES["open cube"]
@@ -886,6 +896,7 @@ def test_a_level_within_rounding_of_a_side_counts_as_between(
 # --- derivatives ----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_derivatives_by_rays_are_those_of_the_plane() -> None:
     vertices, faces = MESHES["open cube"]
     field = BruteForceWinding(vertices, faces)
@@ -919,6 +930,7 @@ def test_derivatives_by_rays_are_those_of_the_plane() -> None:
     np.testing.assert_allclose(found[~on_sheet], expected[~on_sheet], rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_level_moves_smooth_hits_only() -> None:
     vertices, faces = MESHES["open cube"]
     backend = choose_backend("double")
@@ -994,6 +1006,7 @@ def test_rays_that_leave_a_sheet_do_not_meet_it_again() -> None:
         assert not to_numpy(blocked).any()
 
 
+@pytest.mark.slow
 def test_polished_hits_stay_on_the_surface_and_sheets_where_they_are() -> None:
     vertices, faces = MESHES["open cube"]
     backend, exact = choose_backend("double"), ExactWinding(vertices, faces)

@@ -142,6 +142,7 @@ def test_smooth_hits_of_damaged_meshes_meet_the_tolerance(precision: Any) -> Non
     check_mesh(1e-4, precision, 600)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_edges_between_triangles_are_no_surface(precision: Any) -> None:
     """Rays through edges and vertices of an outer ball, across which w goes from 0 to 1, towards
@@ -183,7 +184,7 @@ def test_tight_tolerances_in_single_precision_state_their_rounding() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("precision", PRECISIONS)
-@pytest.mark.parametrize("tolerance", [1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7])
+@pytest.mark.parametrize("tolerance", [1e-2, 1e-4, 1e-7])
 def test_many_hits_meet_the_tolerance(tolerance: float, precision: Any) -> None:
     for n, accuracy, level in ((300, None, 2 * np.pi), (3000, None, 1.0), (1000, 1.5, 0.3)):
         points, normals = noisy_sphere(n, seed=n)
@@ -198,7 +199,7 @@ def test_many_hits_meet_the_tolerance(tolerance: float, precision: Any) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("precision", PRECISIONS)
-@pytest.mark.parametrize("tolerance", [1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7])
+@pytest.mark.parametrize("tolerance", [1e-2, 1e-4, 1e-7])
 def test_many_smooth_hits_of_meshes_meet_the_tolerance(tolerance: float, precision: Any) -> None:
-    check_mesh(tolerance, precision, 4000)
-    check_mesh(tolerance, precision, 2000, accuracy=1.5, order=0)
+    check_mesh(tolerance, precision, 2000)
+    check_mesh(tolerance, precision, 1000, accuracy=1.5, order=0)

@@ -154,6 +154,7 @@ def test_precisions_agree() -> None:
         assert np.quantile(np.abs(single.t[both] - double.t[both]), 0.98) < 2e-4
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     "overstep", [1.0, *(pytest.param(x, marks=pytest.mark.slow) for x in (1.2, 1.4)), 1.9]
 )

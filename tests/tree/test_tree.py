@@ -165,6 +165,7 @@ def test_lanes_that_are_not_active_do_not_walk() -> None:
     assert total.tolist() == [50, 0] * 4
 
 
+@pytest.mark.slow
 def test_payload_and_leaves_are_those_of_the_node() -> None:
     backend = choose_backend("double")
     tree = build_hierarchy(points(100), leaf_size=4)
