@@ -140,6 +140,7 @@ def test_meshes_and_clouds_are_shaded_and_curves_drawn_in_color(tmp_path, capsys
     assert outside[0] >= outside[1] >= outside[2] > 90  # eggshell
 
 
+@pytest.mark.slow
 def test_the_camera_goes_where_it_is_sent(run, tmp_path):
     mesh = write_mesh(tmp_path / "a.stl", missing=20)
     assert run(mesh)[0] == 0

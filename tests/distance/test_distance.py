@@ -789,6 +789,7 @@ def test_batches_make_no_difference(method: Any, monkeypatch: pytest.MonkeyPatch
     assert np.allclose(signed_distance(WAVY, x, method=method), whole, rtol=1e-12)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("method", METHODS)
 def test_precisions_agree(method: Any) -> None:
     x = points_around(WAVY, 300)
@@ -838,6 +839,7 @@ def test_several_levels() -> None:
     assert found == pytest.approx([-0.5, -0.3])
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("far", [1e90, 1e99])
 def test_distances_from_very_far_away_come_without_warnings_of_numpy(far: float) -> None:
     field = hk.SolidAngle(shapes.wavy_polygon(12))

@@ -38,6 +38,7 @@ def check_bounds(field: hk.Field, x: np.ndarray, **given: Any) -> hk.DistanceBou
 # --- closed meshes -----------------------------------------------------------------------------
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_distances_to_a_closed_mesh_are_exact(precision: Any) -> None:
     vertices, faces = mesh_shapes.bumpy_sphere(3)
@@ -124,6 +125,7 @@ def test_no_dense_sample_is_nearer(name: str, n: int, rays: int) -> None:
     assert np.quantile(found.upper - found.lower, 0.9) < 0.03 * np.linalg.norm(upper - lower)
 
 
+@pytest.mark.slow
 def test_a_few_points_are_proved_to_the_tolerance() -> None:
     """Up to 1e-6 of the size, but for points whose nearest is where the surface ends."""
     field = CURVED["wavy"]
@@ -144,6 +146,7 @@ def test_beside_the_surface_all_is_proved() -> None:
         assert (found.lower >= 0.99e-9).mean() > 0.9, name
 
 
+@pytest.mark.slow
 def test_far_away_and_on_the_axis() -> None:
     """From 1000 sizes away, and from where many points are as near as one another."""
     disk = hk.SolidAngle(shapes.regular_polygon(12))
@@ -199,6 +202,7 @@ def test_the_rim_of_a_domain() -> None:
     assert np.abs(found.upper - rim).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_parts_make_no_difference(monkeypatch: pytest.MonkeyPatch) -> None:
     field, x = CURVED["wavy"], np.random.default_rng(8).uniform(-1, 1, (60, 3))
     whole = hk.signed_distance(field, x)
@@ -281,7 +285,7 @@ def rim_on_sphere(field: hk.Field, radius: float, circles: int) -> np.ndarray:
     return radius * (np.cos(low)[:, None] * u[row] + np.sin(low)[:, None] * v[row])
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.usefixtures("coarse")
 @pytest.mark.parametrize(
     ("field", "point", "distance"),
@@ -319,6 +323,7 @@ def test_rims_from_outside_a_ball() -> None:
     assert np.median(nearest - found.upper) < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("coarse")
 def test_sheets_that_cross_within_a_cell() -> None:
     """The zeros of Y_5,3 cross in lines, along which a cell knows a point of one sheet only: points

@@ -172,7 +172,7 @@ def test_reference_formulas_agree_with_quadrature(n: int) -> None:
             assert kernel_movement(q, s, n) == pytest.approx(plain, abs=1e-11)
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("precision", ["double", "single"])
 @pytest.mark.parametrize("bound", BOUNDS, ids=name_of)
 def test_no_function_meets_a_level_within_a_step(bound: type[Enclosure], precision: str) -> None:

@@ -515,6 +515,7 @@ def test_rays_in_the_plane_and_at_the_circle(precision: Any) -> None:
     assert (hits.evaluations < 60).all()
 
 
+@pytest.mark.slow
 def test_few_evaluations_a_ray() -> None:
     """At most twelve a hitting ray: of a circle, a ring, a court, and circles one above another."""
     rng = np.random.default_rng(0)

@@ -63,6 +63,7 @@ def rays(n: int, size: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     return o, d / np.linalg.norm(d, axis=1, keepdims=True)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("shape", [(4, 3, 5), (1, 6, 2)])
 def test_a_series_is_fitted_exactly(shape: tuple[int, int, int]) -> None:
     rng = np.random.default_rng(1)
@@ -90,6 +91,7 @@ def test_a_series_is_fitted_exactly(shape: tuple[int, int, int]) -> None:
         )
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("seed", range(3))
 def test_bounds_hold_between_nodes(seed: int) -> None:
     """On grids that are no multiples of the bounds' own; and they are not far too large."""
@@ -232,6 +234,7 @@ def test_displacements_are_those_of_the_surfaces() -> None:
         hk.FourierSeries(np.ones((2, 2, 2)), CUBE).displacement()
 
 
+@pytest.mark.slow
 def test_values_have_derivatives() -> None:
     import drjit as dr
     from drjit.llvm.ad import Array3f64
@@ -244,6 +247,7 @@ def test_values_have_derivatives() -> None:
     np.testing.assert_allclose(p.grad.numpy().T, field.gradient(x, precision="double"), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_another_function_compiles_no_kernel() -> None:
     """Coefficients, box, bounds and roundings are data; only the number of terms is code."""
     o, d = rays(300, 1.2)

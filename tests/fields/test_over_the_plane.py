@@ -147,6 +147,7 @@ def test_errors_say_what_is_wrong() -> None:
         hk.HeightField(lambda x, y: math.sin(x))
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("field", [hk.LevelCurves("log", "imag"), hk.RiemannSurface("log")])
 def test_walls_of_entire_fields_go_beyond_where_they_are_drawn(field: hk.Field) -> None:
     """Angle-valued ones were cut to it: values said inside where rays missed."""

@@ -261,6 +261,7 @@ def test_out_of_steps_is_no_miss() -> None:
     assert (few.evaluations <= 3).all()
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_a_face_in_a_lane_is_the_solid_angle_of_that_face(precision: Any) -> None:
     mesh, backend = hostile(), choose_backend(precision)

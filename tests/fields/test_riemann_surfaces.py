@@ -267,6 +267,7 @@ def test_few_evaluations_are_needed(name: str, most: float) -> None:
     assert hits.evaluations[hits.status == hk.Status.HIT].mean() <= most
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("precision", ["single", "double"])
 @pytest.mark.parametrize("name", ["sqrt", "cbrt", "2/3", "real asin"])
 def test_hits_beside_branch_points_are_near_the_surface(name: str, precision: Any) -> None:

@@ -236,7 +236,7 @@ class Unbounded(hk.SolidAngle):
         return other
 
 
-@pytest.mark.few(5)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("level", [2 * math.pi, 1.0])
 @pytest.mark.parametrize("name", ["trefoil", "coil", "link", "rings", "holes", "wavy"])
 def test_the_extent_holds_every_hit_found_without_it(name: str, level: float) -> None:
@@ -399,6 +399,7 @@ def test_a_curve_that_cancels_as_a_whole_has_no_surface(
             hk.trace(field, o, d, level=level)
 
 
+@pytest.mark.slow
 def test_vertices_can_be_differentiated_by_where_edges_cancel() -> None:
     """Against finite differences, for a loop whose bridge is run there and back."""
     backend = choose_backend("double")

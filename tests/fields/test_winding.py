@@ -316,7 +316,7 @@ CUBE_FACES = np.array([
 ])  # fmt: skip
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("missing", [1, 2, 3, 5, 7, 11])
@@ -350,6 +350,7 @@ def lattice_squares(n: int, count: int, seed: int) -> Mesh:
     return lattice.reshape(-1, 3), np.unique(np.concatenate([first, second]), axis=0)
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("count", [6, 60, 300])
 def test_lattices_are_all_ties(count: int, precision: Any) -> None:
@@ -660,6 +661,7 @@ def test_points_that_are_refused() -> None:
     assert field.value(np.zeros((0, 3))).shape == (0,)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("method", ["exact", "tree"])
 def test_lifts_stay_within_their_promise(method: str) -> None:
     """The continuous lift of w, followed along segments in the ball, against [lower, upper]."""

@@ -97,6 +97,7 @@ def test_gyroid_walls_are_a_part_within_the_box(walls: Any) -> None:
     assert walls.euler_number == -102
 
 
+@pytest.mark.slow
 def test_points_of_gyroid_walls_are_on_walls_or_on_caps(walls: Any) -> None:
     points = np.asarray(trimesh.sample.sample_surface(walls, 20_000, seed=0)[0])
     on_cap = np.abs(np.abs(points).max(axis=1) - 1) < 1e-9

@@ -58,6 +58,7 @@ def test_a_cloud_is_near_what_it_was_taken_from(tmp_path: Path) -> None:
     assert example("point_cloud").main(tmp_path, SMALL, count=2000) < 0.005
 
 
+@pytest.mark.slow
 def test_a_field_of_ones_own_is_hit_where_its_formula_says(tmp_path: Path) -> None:
     module = example("own_field")
     z = module.main(tmp_path, SMALL)

@@ -27,6 +27,7 @@ def test_there_is_code() -> None:
     assert len(DOCS) >= 10
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("block", README, ids=lambda b: b.splitlines()[-1][:40])
 def test_code_of_the_readme_runs(block: str, tmp_path: Path) -> None:
     run_code(block, tmp_path)

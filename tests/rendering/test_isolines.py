@@ -205,6 +205,7 @@ def test_pictures_of_values_have_isolines_and_smooth_edges() -> None:
     assert (with_line[crossed] < without[crossed]).any(axis=-1).all()
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("show", ["color", "shaded"])
 def test_lines_have_their_colors(show: str) -> None:
     plain = seen(hk.Sphere(1.0), None, show, material="clay")
@@ -219,6 +220,7 @@ def test_lines_have_their_colors(show: str) -> None:
     assert blue > 2 * max(red, green, 1)
 
 
+@pytest.mark.slow
 def test_lines_thinner_than_a_pixel_have_no_gaps_in_shaded_pictures() -> None:
     camera = hk.Camera(elevation=0)
     settings = {"material": "porcelain", "camera": camera, "size": (120, 90)}
@@ -273,6 +275,7 @@ def test_there_are_no_lines_where_the_function_is_not_defined() -> None:
     np.testing.assert_array_equal(on, everywhere & inside)
 
 
+@pytest.mark.slow
 def test_shapes_of_mitsuba_scenes_have_lines_in_their_own_coordinates() -> None:
     turned = mi.ScalarTransform4f().translate([5, 0, 0]).rotate([0, 1, 0], 90).scale(2)
 

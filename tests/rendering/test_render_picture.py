@@ -152,7 +152,7 @@ def test_settings_of_a_level_set_are_replaced() -> None:
     assert not np.array_equal(clipped, draw(solid, show="depth"))
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", MATERIALS)
 def test_every_material_draws(name: str) -> None:
     image = draw(GYROID, material=name, solid=(-0.3, 0.3))

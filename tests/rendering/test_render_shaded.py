@@ -301,6 +301,7 @@ def test_what_first_rays_have_seen_is_not_traced_again(monkeypatch: pytest.Monke
     np.testing.assert_allclose(image, again, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_solids_have_the_color_of_their_outside_without_being_asked() -> None:
     """Found by a user: the outside of a `Solid` was tinted like the inside of an open surface."""
     small = {"material": "gold", "show": "shaded", "size": (40, 30), "progress": False}

@@ -282,6 +282,7 @@ def test_the_alpha_of_a_film_is_kept() -> None:
 
 
 # Not in color at 0 degrees: there the light on the ground itself ends within a few pixels.
+@pytest.mark.few(1)
 @pytest.mark.parametrize("backdrop", ["light", "dark"])
 @pytest.mark.parametrize(
     ("show", "elevation"),

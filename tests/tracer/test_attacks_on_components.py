@@ -89,6 +89,7 @@ def test_cells_of_tiny_clips_do_not_fill_the_memory() -> None:
     assert hits.status.tolist() == [hk.Status.OUT_OF_STEPS]  # cells as small as roundings
 
 
+@pytest.mark.slow
 def test_faces_of_solids_are_lost_where_rounding_leaves_open_which_component_it_is() -> None:
     """The face was met all the same, an eighth off."""
     backend = choose_backend("single")

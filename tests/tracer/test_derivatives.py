@@ -129,6 +129,7 @@ def test_level_forward_and_reverse(name: str) -> None:
     agree(numpy(dr.grad(parameter)), np.array([expected.sum()]))
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", FIELDS)
 @pytest.mark.parametrize("moved", ["origin", "direction"])
 def test_rays_forward_and_reverse(name: str, moved: str) -> None:

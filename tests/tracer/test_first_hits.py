@@ -431,6 +431,7 @@ def mesh_rays(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return o, unit(1.2 * unit(rng.normal(size=o.shape)) * rng.random((len(o), 1)) - o)
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("precision", ["single", "double"])
 @pytest.mark.parametrize("subdivisions", range(4))
 def test_small_closed_meshes_by_tree(subdivisions: int, precision: Any) -> None:
@@ -448,6 +449,7 @@ def test_small_closed_meshes_by_tree(subdivisions: int, precision: Any) -> None:
     assert (tree.evaluations < 200).all()
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", ["single", "double"])
 @pytest.mark.parametrize("method", ["exact", "tree"])
 def test_rays_through_a_flat_mesh(method: Any, precision: Any) -> None:
@@ -474,6 +476,7 @@ def test_rays_through_a_flat_mesh(method: Any, precision: Any) -> None:
             assert (hits.sheet >= 0).all()
 
 
+@pytest.mark.slow
 def test_rays_beside_an_edge_of_a_mesh_by_tree() -> None:
     """Beside an edge a triangle's solid angle turns by 2 pi within the rounding of a point, also
     where another triangle cancels the edge."""

@@ -180,6 +180,7 @@ def test_what_is_not_told_apart_stays_together():
     assert hk.trace(apart, o, d, largest=16).hit.all()
 
 
+@pytest.mark.slow
 def test_rays_whose_cells_rounding_leaves_open_are_out_of_steps():
     o, d = [[1e5, 0.0, 0.0], [10.0, 0.0, 0.0]], [[-1.0, 0.0, 0.0]]
     hits = hk.trace(FIELDS["solids"], o, d, largest=True)

@@ -607,7 +607,7 @@ class Approximate(hk.Field):
         return hk.Sample(p.x, gradient, (ball,), 0.0, self.gradient_error)
 
 
-@pytest.mark.few(5)
+@pytest.mark.few(3)
 @pytest.mark.parametrize("overstep", [1.0, 1.4])
 @pytest.mark.parametrize("bound", [None, "slope", "caps"])
 @pytest.mark.parametrize("direction", [1.0, -1.0])
@@ -980,6 +980,7 @@ def test_what_makes_no_sense_is_refused() -> None:
 OPEN_CUBE = BruteForceWinding(*MESHES["open cube"])
 
 
+@pytest.mark.slow
 def test_rays_that_leave_a_sheet_do_not_meet_it_again() -> None:
     """To both sides, however flat. From outside the cube nothing else can be met."""
     vertices, faces = MESHES["tetrahedron"]

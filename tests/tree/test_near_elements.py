@@ -260,6 +260,7 @@ def on_host(number: Any) -> Any:
     return to_numpy(number) if dr.is_array_v(type(number)) else number
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("kind", ["polygon", "knot", "far"])
 def test_solid_angles_beside_curves_are_within_their_bounds(kind: str, precision: Any) -> None:
