@@ -501,6 +501,7 @@ def test_rows_have_frames() -> None:
         np.testing.assert_allclose(ours, hb.to_numpy(theirs), atol=1e-15)
 
 
+@pytest.mark.slow
 def test_names_are_imported_where_they_are_first_used() -> None:
     """Importing the package imports no more than Dr.Jit, and every name there is can be had."""
     code = """

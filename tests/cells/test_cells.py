@@ -91,6 +91,7 @@ def test_extents_hold_the_level_set_and_the_triangles() -> None:
     assert np.abs(w).max() < 0.5
 
 
+@pytest.mark.slow
 def test_hits_are_those_without_cells() -> None:
     field = broken()
     rng = np.random.default_rng(3)

@@ -192,6 +192,7 @@ def test_an_empty_level_set() -> None:
     assert np.isnan(found.upper).all()
 
 
+@pytest.mark.slow
 def test_the_rim_of_a_domain() -> None:
     """A plane cut by a ball: beyond the disk its rim is the nearest."""
     field = hk.HarmonicPolynomial({(0, 0, 1): 1.0}, domain=hk.Ball(radius=2.0))
@@ -310,6 +311,7 @@ def test_the_nearest_is_where_it_was_not_found(
     assert found.lower[0] <= distance
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("coarse")
 def test_rims_from_outside_a_ball() -> None:
     """From outside one point in a thousand had another part of the rim nearer."""

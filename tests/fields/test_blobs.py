@@ -94,6 +94,7 @@ def box_rays(blobs: hk.Blobs, count: int, seed: int = 1) -> tuple[Any, Any, Any]
     return a[keep], ((b - a) / length[:, None])[keep], length[keep]
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("kernel", KERNELS.values(), ids=KERNELS)
 def test_a_single_blob_is_a_ball(kernel: Any) -> None:
     blob = hk.Blobs([[1.0, 2.0, 3.0]], 0.7, kernel=kernel)

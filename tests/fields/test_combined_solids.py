@@ -353,6 +353,7 @@ def test_numbers_of_numpy_are_numbers() -> None:
         hk.Sphere(1).tapered(("a", 1), (2, 0.5))  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_a_ray_through_a_crease_is_a_hit_where_its_gradients_say_how_near_the_surface_is() -> None:
     """A path of the gallery's `carved` was out of steps: in a crease, where the gradient is a range
     as long as its middle, rounding was larger than what was left of the gap."""

@@ -91,6 +91,7 @@ def test_points_in_batches_are_points_one_by_one(n: int) -> None:
         np.testing.assert_array_equal(three, np.full(n, 3.0))
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("name", FIELDS)
 def test_arrays_of_drjit_carry_derivatives(name: str) -> None:
     field, backend = FIELDS[name], choose_backend("double")

@@ -292,6 +292,7 @@ def test_slices_near_an_end_are_near_the_mesh_in_proportion() -> None:
     assert 0 < second < 0.7 * first < 0.05
 
 
+@pytest.mark.slow
 def test_meshes_with_holes() -> None:
     vertices, faces = BUMPY
     field = hk.Morph(TORUS, (vertices, remove_faces(faces, 0.1, seed=0)), gap=GAP, w=0.2)

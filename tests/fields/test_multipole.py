@@ -281,6 +281,7 @@ def test_triangle_dipoles_integrate_to_degree_four() -> None:
 # --- terms ----------------------------------------------------------------------------------
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("order", ORDERS)
 def test_cartesian_terms_are_the_harmonics(order: int) -> None:
     for seed in range(6):

@@ -480,6 +480,7 @@ def test_rays_past_branch_points_take_no_small_steps(name: str) -> None:
     assert hits.evaluations.max() <= 40
 
 
+@pytest.mark.slow
 def test_hits_carry_derivatives() -> None:
     backend = choose_backend("double")
     place = np.array([0.3, 0.4, 2.0])

@@ -216,6 +216,7 @@ def repeated(level: ClusterMoments, views: int) -> ClusterMoments:
     return ClusterMoments(*(np.repeat(value, views, axis=0) for value in vars(level).values()))
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("kappa", [1e-3, 1.0, 30.0])
 def test_truncation_stays_within_its_bound(kappa: float) -> None:
     """100,000 views of clusters of 8 to 2048 dipoles, their moments moved up from the leaves."""

@@ -174,6 +174,7 @@ def test_contract(name: str) -> None:
     check_field(SHAPES[name][0], rng=1, count=25, directions=2)
 
 
+@pytest.mark.few(17)
 @EVERY
 @QUICK_PRECISIONS
 def test_values(name: str, precision: Any) -> None:

@@ -324,6 +324,7 @@ def rays_beside(edge: np.ndarray, n: int, seed: int = 9) -> tuple[np.ndarray, np
     return place - rng.uniform(0, 4, (n, 1)) * unit(d), unit(d)
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("name", CANCELING)
 def test_edges_run_both_ways_are_not_there(name: str, precision: str) -> None:

@@ -312,7 +312,7 @@ def moved_cloud(n=3000, seed=0):
     return u, np.full(n, 4 * np.pi / n)
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("motion", ["none", "small", "turned", "shuffled"])
 def test_a_moved_cloud_is_the_cloud_that_is_there(motion, monkeypatch):
     """Also where the tree no longer fits: its bounds are of where the points are now."""

@@ -142,6 +142,7 @@ def test_four_corners_on_the_level() -> None:
     assert np.abs(np.linalg.norm(vertices[np.unique(faces)], axis=1) - 1).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_thin_necks_of_a_gyroid_are_proved_by_small_pieces() -> None:
     """0.9936 with three halvings of tetrahedra, 0.9997 with five: near level 1 necks are thin."""
     box = hk.Box((-1, -1, -1), (1, 1, 1))

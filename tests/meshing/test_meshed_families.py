@@ -129,6 +129,7 @@ def test_dipoles_of_a_sphere() -> None:
     assert mesh.volume == pytest.approx(4 / 3 * math.pi, rel=0.03)
 
 
+@pytest.mark.slow
 def test_circles_are_refused_and_their_polygons_are_not() -> None:
     with pytest.raises(TypeError, match=r"give circle\.polygon"):
         hk.mesh(hk.SolidAngle([hk.Circle(1.0)]))

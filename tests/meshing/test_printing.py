@@ -429,6 +429,7 @@ def test_formats_whose_packages_lack_are_refused_early(
     assert "pip install 'harnack[3mf]'" in capsys.readouterr().err
 
 
+@pytest.mark.few(7)
 @pytest.mark.parametrize(
     ("options", "said"),
     [

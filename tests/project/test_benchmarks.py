@@ -26,7 +26,7 @@ def test_the_blobs_of_the_benchmark_and_of_the_library_are_the_same() -> None:
         np.testing.assert_allclose(library.value.numpy() - SCENE.threshold, expected, atol=1e-12)
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("method", inclusion.METHODS, ids=lambda one: one[0])
 def test_no_method_misses_a_hit(method: inclusion.Method) -> None:
     reference = SCENE.first_inside(SCENE.rays(300), 500)

@@ -177,6 +177,7 @@ def test_materials_are_told_apart_and_one_may_be_given_for_each_surface() -> Non
     np.testing.assert_allclose(own, dictionary, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_levels_of_one_field_may_have_materials_of_their_own() -> None:
     levels, names = [-0.5, 0.5], ["red", "blue"]
     one = draw(GYROID, level=levels, material=names, show="shaded", tolerance=1e-4)
@@ -217,6 +218,7 @@ def test_tubes_around_boundaries_have_a_material() -> None:
         draw(POLYGON, boundary_material="gold")
 
 
+@pytest.mark.slow
 def test_camera_and_backdrop_change_the_picture() -> None:
     default = draw()
     assert np.abs(default - draw(camera=Camera(azimuth=10))).mean() > 0.02
@@ -322,6 +324,7 @@ def in_a_new_process(code: str) -> str:
     return run.stdout.strip().splitlines()[-1].removeprefix("\x1b[0m")  # Mitsuba's colors
 
 
+@pytest.mark.slow
 def test_mitsuba_is_imported_only_to_draw() -> None:
     code = "import sys, harnack, harnack.rendering; print('mitsuba' in sys.modules)"
     assert in_a_new_process(code) == "False"

@@ -417,6 +417,7 @@ def test_xml_shape_with_a_misspelled_property_is_refused() -> None:
         mi.load_string(text)
 
 
+@pytest.mark.slow
 def test_integrators_that_cannot_see_our_surfaces_are_named_in_a_warning() -> None:
     theirs = {"type": "sphere"}
     path, ours = {"type": "path"}, {"type": "harnack_path"}

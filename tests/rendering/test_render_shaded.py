@@ -117,6 +117,7 @@ def test_mitsubas_sphere_is_drawn_as_ours() -> None:
     assert np.mean(np.abs(ours - theirs).max(axis=-1) > 2e-3) < 0.01
 
 
+@pytest.mark.slow
 def test_two_colors_are_for_the_two_sides() -> None:
     material = Material(diffuse(0.8, 0.1, 0.1), diffuse(0.1, 0.1, 0.8))
     images = [

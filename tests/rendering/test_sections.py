@@ -111,6 +111,7 @@ def test_wrong_faces_are_refused():
         shape(hk.Sphere(1.0), section=cut, cut_bsdf={"type": "diffuse"})
 
 
+@pytest.mark.slow
 def test_meshes_are_cut_by_sections_too():
     half = hk.mesh(hk.Sphere(1.0), section=hk.HalfSpace((0, 0, 1), 0.0), tolerance=5e-3)
     assert half.is_watertight

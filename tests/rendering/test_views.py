@@ -322,6 +322,7 @@ def test_a_tube_needs_a_curve() -> None:
         draw(GYROID, boundary=0.1)
 
 
+@pytest.mark.slow
 def test_pictures_show_themselves() -> None:
     image = draw(show="shaded")
     assert image._repr_png_().startswith(b"\x89PNG")
@@ -357,6 +358,7 @@ def test_options_of_the_command(arguments: list[str], tmp_path: Path) -> None:
     assert target.stat().st_size > 300
 
 
+@pytest.mark.slow
 def test_values_with_a_bar_from_the_command_line(tmp_path: Path) -> None:
     asked = ["--show", "value", "--of", "z", "--value-range", "-1:1", "--colorbar"]
     small = ["--size", "32x24", "--quiet", "-o", str(tmp_path / "a.png")]

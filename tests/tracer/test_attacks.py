@@ -212,7 +212,7 @@ def test_rays_along_boundary_edges_miss_no_hit(method: Any) -> None:
     assert regular.mean() > 0.6
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("method", ["exact", "tree"])
 def test_sheets_in_one_plane_that_cancel_are_no_surface(method: Any, precision: Any) -> None:
@@ -262,6 +262,7 @@ def test_hits_on_dipoles_say_how_far_off_they_are() -> None:
     assert (hits.uncertainty[hits.hit] > 1e-5).sum() > 50
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("method", ["exact", "tree"])
 def test_far_away_derivatives_keep_their_bounds(method: Any, precision: Any) -> None:

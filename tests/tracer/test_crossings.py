@@ -167,6 +167,7 @@ def test_the_ladder_of_an_angle_is_climbed_rung_by_rung(level: Any, precision: A
     assert 0.3 < found.count.mean() < 10
 
 
+@pytest.mark.slow
 def test_rays_that_begin_where_the_extent_does_are_seen_from_outside() -> None:
     """The 2 pi level of a flat curve is the disc that it bounds: it has no inside to start from."""
     field = hk.SolidAngle(np.array([[1.0, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]]))

@@ -80,6 +80,7 @@ def test_vertices_forward(name: str) -> None:
     agree(found, expected)
 
 
+@pytest.mark.slow
 def test_vertices_reverse() -> None:
     o, d = clean_rays(hk.SolidAngle(LOOP), [LEVEL])
     weights = np.random.default_rng(2).normal(size=len(o))

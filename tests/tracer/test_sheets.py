@@ -1027,6 +1027,7 @@ def test_polished_hits_stay_on_the_surface_and_sheets_where_they_are() -> None:
     np.testing.assert_array_equal(counts, smooth.astype(int))
 
 
+@pytest.mark.slow
 def test_views_of_an_open_cube() -> None:
     normal = hk.render(OPEN_CUBE, show="normal", size=(40, 30))
     depth = hk.render(OPEN_CUBE, show="depth", size=(40, 30))
@@ -1039,6 +1040,7 @@ def test_views_of_an_open_cube() -> None:
     assert np.isinf(depth[~hit]).all()
 
 
+@pytest.mark.slow
 def test_a_small_picture_of_an_open_cube(tmp_path: Path) -> None:
     path = tmp_path / "cube.png"
     image = hk.render(OPEN_CUBE, path, size=(32, 24), spp=4, progress=False)

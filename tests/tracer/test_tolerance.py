@@ -136,6 +136,7 @@ def check_mesh(tolerance: float, precision: Any, n: int, **settings: Any) -> Non
     assert over.max() <= 1
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_smooth_hits_of_damaged_meshes_meet_the_tolerance(precision: Any) -> None:
     """They were up to 31 tolerances off."""

@@ -24,6 +24,10 @@ if TYPE_CHECKING:
     from harnack.enclosures.promises import Promise
     from harnack.enclosures.restriction import Restriction
 
+# A length that is proved in exact arithmetic, times this, is proved in that of single precision:
+# the formulas of steps have some ten roundings.
+ROUND_DOWN = 1.0 - 1e-6
+
 
 @dataclass(frozen=True)
 class Gaps:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import drjit as dr
 
 from harnack.backend.extrema import fmax, fmin
-from harnack.enclosures.enclosure import Enclosure, Gaps
+from harnack.enclosures.enclosure import ROUND_DOWN, Enclosure, Gaps
 from harnack.enclosures.proofs import any_covers, longest_step
 
 if TYPE_CHECKING:
@@ -106,13 +106,13 @@ class Stretched(Enclosure):
     factor: Real
 
     def step(self, gaps: Gaps) -> Real:
-        return self.inner.step(self._gaps(gaps)) / self.speed * _ROUND_DOWN
+        return self.inner.step(self._gaps(gaps)) / self.speed * ROUND_DOWN
 
     def covers(self, gaps: Gaps, length: Real) -> Mask:
-        return self.inner.covers(self._gaps(gaps), length * self.speed / _ROUND_DOWN)
+        return self.inner.covers(self._gaps(gaps), length * self.speed / ROUND_DOWN)
 
     def _gaps(self, gaps: Gaps) -> Gaps:
-        share = _ROUND_DOWN / self.factor
+        share = ROUND_DOWN / self.factor
         down, up = _scaled(gaps.down, share), _scaled(gaps.up, share)
         return Gaps(down, up, gaps.is_one_sided)
 
@@ -121,6 +121,3 @@ def _scaled(gap: Real, share: Real) -> Real:
     """The gap times a positive number; a level stays one, however far away it comes to lie."""
     largest = type(gap)(dr.largest(type(gap)))
     return dr.select(gap == dr.inf, gap, fmin(largest, gap * share))
-
-
-_ROUND_DOWN = 1.0 - 1e-6

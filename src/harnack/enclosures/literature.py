@@ -13,7 +13,7 @@ import drjit as dr
 
 from harnack.arithmetic import Affine, Interval, Jet, Parabolas
 from harnack.backend.extrema import fmax, fmin
-from harnack.enclosures.enclosure import Enclosure, Gaps, Slopes
+from harnack.enclosures.enclosure import ROUND_DOWN, Enclosure, Gaps, Slopes
 from harnack.enclosures.parabola import Parabola
 from harnack.enclosures.pieces import LinearTaylor, QuadraticTaylor
 from harnack.enclosures.restriction import Evaluable
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
     from harnack.backend import Real, Vec3
     from harnack.enclosures.restriction import Restriction
-
-_ROUND_DOWN = 1.0 - 1e-6
 
 
 @dataclass(frozen=True)
@@ -46,7 +44,7 @@ class BottomUpQuadratic(Parabola):
 
     def step(self, gaps: Gaps) -> Real:
         # All of the length without a pull-back, which would cost a ray that misses a look.
-        nearer = Gaps(gaps.down * _ROUND_DOWN, gaps.up * _ROUND_DOWN)
+        nearer = Gaps(gaps.down * ROUND_DOWN, gaps.up * ROUND_DOWN)
         known = dr.isfinite(self.slopes.low + self.slopes.high)
         known &= dr.isfinite(self.least_curvature + self.most_curvature) & (self.reach > 0)
         free = known & self.covers(nearer, self.reach)
@@ -109,7 +107,7 @@ class Band(Enclosure):
     def _free(self, gap: Real, offset: Real, slope: Real) -> Real:
         none = gap == dr.inf
         left = gap - offset
-        reach = dr.select(slope > 0, left / slope * _ROUND_DOWN, self.reach)
+        reach = dr.select(slope > 0, left / slope * ROUND_DOWN, self.reach)
         known = (left > 0) & dr.isfinite(slope)  # and not NaN
         return dr.select(none, self.reach, dr.select(known, fmin(reach, self.reach), 0))
 

@@ -8,13 +8,11 @@ from typing import TYPE_CHECKING
 import drjit as dr
 
 from harnack.backend.extrema import fmax, fmin
-from harnack.enclosures.enclosure import Enclosure, Gaps, Slopes
+from harnack.enclosures.enclosure import ROUND_DOWN, Enclosure, Gaps, Slopes
 from harnack.enclosures.parabola import first_root
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real
-
-_ROUND_DOWN = 1.0 - 1e-6
 
 
 @dataclass(frozen=True)
@@ -72,4 +70,4 @@ class Nearest(Enclosure):
             known &= one >= 0
             length = fmin(length, one)
         known &= (self.bend >= 0) & (self.reach > 0)
-        return fmax(dr.select(known, fmin(length, self.reach), 0) * _ROUND_DOWN, 0)
+        return fmax(dr.select(known, fmin(length, self.reach), 0) * ROUND_DOWN, 0)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import drjit as dr
 
 from harnack.backend.extrema import fmax, fmin
-from harnack.enclosures.enclosure import Enclosure, Gaps, Slopes
+from harnack.enclosures.enclosure import ROUND_DOWN, Enclosure, Gaps, Slopes
 from harnack.enclosures.promises import Curvature, Lipschitz, Promise
 
 if TYPE_CHECKING:
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
     from harnack.backend import Mask, Real
 
-_ROUND_DOWN = 1.0 - 1e-6
 _ROOT_OF_TWO = math.sqrt(2.0)
 
 
@@ -44,7 +43,7 @@ class Parabola(Enclosure):
         up = first_root(gaps.up, self.slopes.high, self.most_curvature)
         down = first_root(gaps.down, -self.slopes.low, -self.least_curvature)
         known = (up >= 0) & (down >= 0) & (self.reach > 0)  # and not NaN
-        return fmax(dr.select(known, fmin(fmin(up, down), self.reach), 0) * _ROUND_DOWN, 0)
+        return fmax(dr.select(known, fmin(fmin(up, down), self.reach), 0) * ROUND_DOWN, 0)
 
     def covers(self, gaps: Gaps, length: Real) -> Mask:
         free = _stays_below(gaps.up, self.slopes.high, self.most_curvature, length)
@@ -72,7 +71,7 @@ class Cone(Parabola):
     def step(self, gaps: Gaps) -> Real:
         length = gaps.smaller / self.slopes.high
         known = (gaps.down > 0) & (gaps.up > 0) & (self.slopes.high >= 0) & (self.reach > 0)
-        return dr.select(known, fmin(length, self.reach), 0) * _ROUND_DOWN
+        return dr.select(known, fmin(length, self.reach), 0) * ROUND_DOWN
 
     def covers(self, gaps: Gaps, length: Real) -> Mask:
         moved = self.slopes.high * length

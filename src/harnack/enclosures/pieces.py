@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import drjit as dr
 
 from harnack.backend.extrema import fmax, fmin
-from harnack.enclosures.enclosure import Enclosure, Gaps, Slopes
+from harnack.enclosures.enclosure import ROUND_DOWN, Enclosure, Gaps, Slopes
 from harnack.enclosures.parabola import first_root
 from harnack.enclosures.restriction import Piece
 
@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
     from harnack.backend import Mask, Real
     from harnack.enclosures.restriction import Restriction
-
-_ROUND_DOWN = 1.0 - 1e-6
 
 
 @dataclass(frozen=True)
@@ -67,7 +65,7 @@ class Pieces(Enclosure):
             reach, is_free = fmin(up, down), is_free_above & is_free_below
         # The end of the last piece is exact: pulled back, it would cost a ray that misses a look.
         reach = fmax(reach, 0)
-        return dr.select(is_free, reach, reach * _ROUND_DOWN)
+        return dr.select(is_free, reach, reach * ROUND_DOWN)
 
     def _reach(self, gap: Real, rises: Mask | bool) -> tuple[Real, Mask]:
         """The first s at which F, or -F, may reach the gap, or the whole length if it cannot; and
@@ -100,7 +98,7 @@ class Pieces(Enclosure):
         by_line = dr.select(most > 0, left / most, dr.select(most <= 0, dr.inf, 0))
         by_line = dr.select(left > 0, by_line, 0)
         by_parabola = first_root(left, slope, bend)
-        reach = fmin(fmax(by_parabola, by_line) * _ROUND_DOWN, length)
+        reach = fmin(fmax(by_parabola, by_line) * ROUND_DOWN, length)
         # Rises and falls may cancel: their rounding counts, not that of their sum.
         unit = 4 * float(dr.epsilon(type(left)))
         bent, straight = 0.5 * length * length * bend, slope * length

@@ -8,12 +8,10 @@ from typing import TYPE_CHECKING
 import drjit as dr
 
 from harnack.backend.extrema import fmax
-from harnack.enclosures.enclosure import Enclosure, Gaps, Slopes
+from harnack.enclosures.enclosure import ROUND_DOWN, Enclosure, Gaps, Slopes
 
 if TYPE_CHECKING:
     from harnack.backend import Real
-
-_ROUND_DOWN = 1.0 - 1e-6
 
 
 @dataclass(frozen=True)
@@ -31,5 +29,5 @@ class Tangent(Enclosure):
     def step(self, gaps: Gaps) -> Real:
         falls = -self.slopes.low
         down = dr.select(falls > 0, gaps.down / falls, dr.select(falls <= 0, dr.inf, 0))
-        down = dr.select(gaps.down > 0, down * _ROUND_DOWN, 0)
+        down = dr.select(gaps.down > 0, down * ROUND_DOWN, 0)
         return dr.select(gaps.up == dr.inf, fmax(down, 0), 0)

@@ -128,7 +128,7 @@ def find_crossings(
         more = found & (crossings < k)
         status = dr.select(more, count(int(Status.MISS)), after.status)
         if now.sheets is None:
-            more &= after.base + after.reach < end
+            more &= after.proved_to + after.proved_step < end
         else:
             more |= after.active
         return there.moved(dataclasses.replace(after, status=status, active=more), crossings)
@@ -143,7 +143,7 @@ def find_crossings(
     origins, directions = gather_vectors(backend, o, ray), gather_vectors(backend, d, ray)
     t, gradient, looks = prepared.settled(origins, directions, roots, dr.isfinite(t))
     evaluations = last.evaluations + dr.block_reduce(dr.ReduceOp.Add, looks, k)
-    followed = dr.select(last.status == int(Status.MISS), dr.inf, last.base)
+    followed = dr.select(last.status == int(Status.MISS), dr.inf, last.proved_to)
     return CrossingsFound(t, gradient, sheets, side, walk.count, followed, evaluations, last.status)
 
 

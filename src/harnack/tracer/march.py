@@ -56,12 +56,12 @@ _POWER, _MOST_DETAIL = 3.2, 1e6
 class MarchState:
     """Where rays are.
 
-    base: the ray is proved free up to here; a point that was accepted.
-    reach: a length from there that is proved free too.
-    step: from base to the next trial point.
-    candidate: how far ahead enclosures are asked to reach next.
-    value, gradient: f at base.
-    excess: by how much f at base may be farther from a level than the tolerance allows.
+    proved_to: the ray is proved free up to here; a point that was accepted.
+    proved_step: a length from there that is proved free too.
+    trial_step: from there to the next trial point.
+    look_ahead: how far enclosures are asked to reach next.
+    value, gradient: f at `proved_to`.
+    excess: by how much f there may be farther from a level than the tolerance allows.
     evaluations: so far.
     detail: of the next sample (`Field.at_detail`); None for fields that have none (Dr.Jit records
         a loop twice in which a state never changes).
@@ -70,10 +70,10 @@ class MarchState:
     contact: what is known of the level reached last; None for rays that end where they reach one.
     """
 
-    base: Real
-    step: Real
-    reach: Real
-    candidate: Real
+    proved_to: Real
+    trial_step: Real
+    proved_step: Real
+    look_ahead: Real
     value: Real
     gradient: Vec3
     excess: Real
@@ -97,10 +97,10 @@ class MarchState:
         """At the start of rays, before anything was looked at."""
         real, vector, count = backend.Float, backend.Array3f, backend.UInt32
         return cls(
-            base=real(start),
-            step=real(0),
-            reach=real(0),
-            candidate=real(end - start),
+            proved_to=real(start),
+            trial_step=real(0),
+            proved_step=real(0),
+            look_ahead=real(end - start),
             value=real(0),
             gradient=vector(0),
             excess=real(0),
@@ -183,12 +183,13 @@ class March:
     ) -> MarchState:
         """Marches to the first level, or to the end.
 
-        Proof that no hit is missed: `base` is a point up to which the ray is free, `reach` a proved
-        length from there. A trial point base + step is accepted only if step <= reach, or an
-        enclosure at the trial point, looking back, covers step - reach; then all up to it is free.
-        Otherwise the ray goes back to base + reach, which needs no such test. A ray ends as a miss
-        when base + reach passes its end, as a hit only at an accepted point. A point is not
-        accepted on a sample that is too coarse (`_finer`), but sampled again.
+        Proof that no hit is missed: `proved_to` is a point up to which the ray is free, and
+        `proved_step` a proved length from there. A trial point, `trial_step` from there, is
+        accepted only if that is no more than `proved_step`, or an enclosure at the trial point,
+        looking back, covers the difference; then all up to it is free. Otherwise the ray goes back
+        to proved_to + proved_step, which needs no such test. A ray ends as a miss when proved_to +
+        proved_step passes its end, as a hit only at an accepted point. A point is not accepted on a
+        sample that is too coarse (`_finer`), but sampled again.
 
         A hit is a point where f is within the tolerance of a level *after* the truncation error of
         f is taken off; where rounding leaves f less certain than that, within twice what it leaves.
@@ -261,7 +262,7 @@ class March:
         forward = proved
         if self.occupied is not None:
             forward, trial = self._jump(self.occupied, path, end, seen, accepted, forward, trial)
-        candidate = self._candidate(now, seen, end, proved, contact, hit)
+        look_ahead = self._look_ahead(now, seen, end, proved, contact, hit)
         free = self._is_free(now, seen, end, accepted, forward, contact)
         if sheet is not None:
             free = dr.select(sheet.has_crossing, sheet.at_crossing, free)
@@ -270,13 +271,13 @@ class March:
         gradient = dr.select(accepted, seen.look.sample.gradient, now.gradient)
         if sheet is not None:
             status, gradient = sheet.mark(status, gradient)
-        base = dr.select(accepted, seen.t, now.base)
-        step = dr.select(accepted, trial, dr.select(too_coarse, now.step, now.reach))
+        proved_to = dr.select(accepted, seen.t, now.proved_to)
+        step = dr.select(accepted, trial, dr.select(too_coarse, now.trial_step, now.proved_step))
         return MarchState(
-            base=base,
-            step=fmin(step, end - base),
-            reach=dr.select(accepted, forward, now.reach),
-            candidate=dr.select(accepted, candidate, now.candidate),
+            proved_to=proved_to,
+            trial_step=fmin(step, end - proved_to),
+            proved_step=dr.select(accepted, forward, now.proved_step),
+            look_ahead=dr.select(accepted, look_ahead, now.look_ahead),
             value=dr.select(accepted, value, now.value),
             gradient=gradient,
             excess=dr.select(accepted, seen.excess, now.excess),
@@ -292,12 +293,12 @@ class March:
     ) -> _Seen:
         """A look at the trial points of rays."""
         real = self.backend.Float
-        t = now.base + now.step
+        t = now.proved_to + now.trial_step
         if ahead is not None or now.contact is not None:  # the end exactly
-            t = dr.select(now.step >= end - now.base, end, t)
+            t = dr.select(now.trial_step >= end - now.proved_to, end, t)
         seen = field.at_detail(now.detail) if _has_detail(field, now) else field
-        unproved, size = now.step - now.reach, largest_coordinate(path.origin) + t
-        look = seen.look(path, t, fmin(now.candidate, end - t), fmax(unproved, real(0)))
+        unproved, size = now.trial_step - now.proved_step, largest_coordinate(path.origin) + t
+        look = seen.look(path, t, fmin(now.look_ahead, end - t), fmax(unproved, real(0)))
         sample, gradient_norm = look.sample, length(look.sample.gradient)
         gaps = self.levels.gaps(sample.value)
         if self.cover is not None:
@@ -349,7 +350,7 @@ class March:
     ) -> tuple[Mask, Real | None, Mask]:
         """Whether all up to the trial point is proved free by a sample that is fine enough to say
         so, the detail of the next sample, and whether this one was too coarse."""
-        accepted = now.step <= now.reach
+        accepted = now.trial_step <= now.proved_step
         if self.overstep > 1:
             knows_side = seen.may_pass | (seen.gaps.smaller > seen.total_error)
             covered = any_covers(seen.look.back, seen.gaps.less(seen.total_error), seen.unproved)
@@ -380,7 +381,7 @@ class March:
         """The contact behind a look, whether rays have crossed the level, what is known of the
         sheet, and f behind it."""
         value = seen.value
-        before = now.base, now.value, dr.dot(now.gradient, path.direction), now.gradient
+        before = now.proved_to, now.value, dr.dot(now.gradient, path.direction), now.gradient
         last = seen.at_end if sheet is None else seen.at_end & ~sheet.has_crossing
         doubt = dr.select(seen.total_error > seen.within, fmax(seen.excess, now.excess), 0)
         there = Accepted(
@@ -430,7 +431,7 @@ class March:
             trial = dr.select(occupied.cell(there).free > 0, forward, trial)
         return forward, trial
 
-    def _candidate(
+    def _look_ahead(
         self,
         now: MarchState,
         seen: _Seen,
@@ -441,7 +442,7 @@ class March:
     ) -> Real:
         """How far ahead enclosures are asked to reach next."""
         # After a step of zero enclosures are asked for a third of the length: bisection.
-        candidate = fmin(now.candidate, end - seen.t)
+        candidate = fmin(now.look_ahead, end - seen.t)
         shorter = dr.select(dr.isfinite(candidate), candidate / 3, 1 + 16 * seen.size)
         tried = dr.select(proved > 0, seen.look.growth * proved, shorter)
         if now.contact is not None and contact is not None:  # off the surface, all lies ahead
@@ -460,10 +461,9 @@ class March:
     ) -> Mask:
         """Whether rays are proved free to their end."""
         farthest = float(dr.largest(self.backend.Float)) ** _FARTHEST
-        base, reach = (
-            dr.select(accepted, seen.t, now.base), dr.select(accepted, forward, now.reach)
-        )  # fmt: skip
-        free = base + reach >= dr.select(end == dr.inf, farthest, end)
+        proved_to = dr.select(accepted, seen.t, now.proved_to)
+        proved_step = dr.select(accepted, forward, now.proved_step)
+        free = proved_to + proved_step >= dr.select(end == dr.inf, farthest, end)
         if self.hysteresis is not None and contact is not None:  # a contact may end at the end
             undecided = contact.is_touching & self.hysteresis.is_free_after
             free &= ~(accepted & undecided & (seen.t < end))
@@ -524,7 +524,7 @@ class March:
 
         With D the difference quotient and s0, s the slopes: 2 (2s + s0 - 3D)/h (Hermite).
         """
-        h, slope, before = now.step, look.slope, dr.dot(now.gradient, path.direction)
+        h, slope, before = now.trial_step, look.slope, dr.dot(now.gradient, path.direction)
         rise = look.sample.value - now.value
         if self.levels.period is not None:  # the lift that the slopes predict
             turns = dr.round((rise - 0.5 * h * (slope + before)) / self.levels.period)

@@ -94,7 +94,7 @@ class Cones:
         march = March(backend, *settings, cover=self.radius)
         now = march.advance(prepared.field, path, real(end), state)
         met = now.status == int(Status.HIT)
-        begin = dr.select(met, now.base, 0)
+        begin = dr.select(met, now.proved_to, 0)
         gap = prepared.levels.to_nearest(now.value)
         level, side = now.value + gap, dr.select(gap < 0, real(1), -1)
 

@@ -135,7 +135,7 @@ class PreparedLevelSet:
     ) -> MarchResult:
         """The first hit of rays o + t d, |d| = 1, for t_min <= t <= t_max. Inactive rays miss."""
         end, sheet = self._march(o, d, t_min, t_max, active)
-        t, gradient, excess, side = end.base, end.gradient, end.excess, None
+        t, gradient, excess, side = end.proved_to, end.gradient, end.excess, None
         contact, evaluations = end.contact, end.evaluations
         if contact is not None:
             crossed = end.status == int(Status.HIT)

@@ -12,12 +12,11 @@ import drjit as dr
 
 from harnack.backend.extrema import clamp, fmax, fmin
 from harnack.enclosures.balls.ball import Ball
+from harnack.enclosures.enclosure import ROUND_DOWN
 
 if TYPE_CHECKING:
     from harnack.backend import Real
     from harnack.enclosures.enclosure import Gaps
-
-_ROUND_DOWN = 1.0 - 1e-6
 
 
 @dataclass(frozen=True)
@@ -64,7 +63,7 @@ def _one_sided(u: Real, gap_away: Real, gap_toward: Real, dimension: int) -> Rea
     up = dr.select((gap_away == dr.inf) | (u <= 0), 1, growing(u, u + gap_away, gap_away))
     v = u - gap_toward
     down = dr.select((v <= 0) | (gap_toward == dr.inf), 1, falling(u, fmax(v, 0), gap_toward))
-    return clamp(fmin(up, down), 0, 1) * _ROUND_DOWN
+    return clamp(fmin(up, down), 0, 1) * ROUND_DOWN
 
 
 def _plane(u: Real, v: Real, gap: Real) -> Real:

@@ -93,7 +93,7 @@ class PartTracer:
         before = MarchState.at(backend, self.start, self.end, walk.active, has_detail=False)
         end = dataclasses.replace(
             before,
-            base=walk.t,
+            proved_to=walk.t,
             value=walk.value,
             gradient=walk.gradient,
             excess=walk.excess,
@@ -126,7 +126,7 @@ class PartTracer:
         return PartWalk(
             enter=entry.enter,
             box=entry.part,
-            t=dr.select(hit, now.base, dr.select(lost, near, walk.t)),
+            t=dr.select(hit, now.proved_to, dr.select(lost, near, walk.t)),
             value=dr.select(looked, now.value, walk.value),
             gradient=dr.select(ended, now.gradient, walk.gradient),
             excess=dr.select(ended, now.excess, walk.excess),

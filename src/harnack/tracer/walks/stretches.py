@@ -88,7 +88,7 @@ class SheetTracer:
         each of them the field is the continuous one that `march` sees, up to and including its
         last point, where the value behind the sheet is compared with that before it; from there
         it goes on with the step that the value behind the sheet allows. So the part of the ray
-        up to `base` is free of smooth levels, and every sheet on it was looked at.
+        up to `proved_to` is free of smooth levels, and every sheet on it was looked at.
 
         The walk begins just before `start`, so that a sheet on the very start is looked at.
         """
@@ -122,13 +122,13 @@ class SheetTracer:
         stops = ahead.sheet != NO_SHEET
         stop = dr.select(stops, ahead.t, self.end)
         # The last step may already have proved the rest of the ray.
-        goes_on = now.base + now.reach < stop
+        goes_on = now.proved_to + now.proved_step < stop
         if now.contact is not None and self.march.hysteresis is not None:
             undecided = now.contact.is_touching & self.march.hysteresis.is_free_after
-            goes_on |= undecided & (now.base < stop)
+            goes_on |= undecided & (now.proved_to < stop)
         active = now.active & (stops | goes_on)
-        step = fmin(self.march.overstep * now.reach, stop - now.base)
-        now = dataclasses.replace(now, step=step, active=active)
+        step = fmin(self.march.overstep * now.proved_step, stop - now.proved_to)
+        now = dataclasses.replace(now, trial_step=step, active=active)
         field = self.field.between(o, d, behind, ahead, outer.offset)
         now = self.march.advance(field, self.path, stop, now, ahead)
         passed = active & stops & (now.status == int(Status.MISS))
