@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack import enclosures, fields
+from harnack import enclosures
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.enclosures import (
     Caps,
@@ -230,11 +230,8 @@ LOOKS = ("pieces", "segment", "linear-taylor", "quadratic-taylor")
 
 
 def test_every_field_there_is_is_tested() -> None:
-    exported = {
-        kind
-        for kind in vars(fields).values()
-        if inspect.isclass(kind) and issubclass(kind, Field) and not inspect.isabstract(kind)
-    }
+    public = {one for one in (getattr(hk, name) for name in hk.__all__) if inspect.isclass(one)}
+    exported = {kind for kind in public if issubclass(kind, Field) and not inspect.isabstract(kind)}
     shapes = [shape for shape, _ in SHAPES.values()]
     tested = {type(field) for field in (*FIELDS.values(), *APPROXIMATE.values(), *shapes)}
     # Those have contracts in the test files of their own.
@@ -243,8 +240,8 @@ def test_every_field_there_is_is_tested() -> None:
     assert all(any(issubclass(one, kind) for one in tested) for kind in exported)
     proofs = {
         kind
-        for kind in vars(enclosures).values()
-        if inspect.isclass(kind) and issubclass(kind, Enclosure) and not inspect.isabstract(kind)
+        for kind in public | {one for one in vars(enclosures).values() if inspect.isclass(one)}
+        if issubclass(kind, Enclosure) and not inspect.isabstract(kind)
     }
     # A bare parabola is made of no promise; `test_bounds` tries it by itself. Proofs from ranges
     # along a path are tried in `test_arithmetics`, those of combinations in `test_combined_solids`.
