@@ -44,8 +44,9 @@ CASES: dict[str, Callable[[], hk.LevelSet]] = {
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize("precision", ["single", "double"])
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    ("name", "precision"), [*((name, "single") for name in CASES), ("sheets", "double")]
+)
 def test_a_queue_changes_no_bit(name: str, precision: Any) -> None:
     backend = choose_backend(precision)
     prepared = CASES[name]().prepare(backend)
