@@ -69,7 +69,7 @@ def test_another_surface_compiles_no_kernel(make: Callable[[int], hk.Field], lev
         return compiled(lambda: hk.trace(make(k), o, d, **settings), size=300)
 
     trace(0), trace(1)
-    assert [trace(k) for k in range(2, 7)] == [0] * 5
+    assert [trace(k) for k in range(2, 5)] == [0] * 3
 
 
 @pytest.mark.few(1)
@@ -221,4 +221,4 @@ PICTURES: dict[str, Callable[[int], int]] = {
 @pytest.mark.parametrize("name", PICTURES)
 def test_no_other_picture_compiles_a_kernel(name: str) -> None:
     PICTURES[name](0), PICTURES[name](1)
-    assert [PICTURES[name](k) for k in range(2, 7)] == [0] * 5
+    assert [PICTURES[name](k) for k in range(2, 5)] == [0] * 3
