@@ -44,7 +44,8 @@ def renamed(**new_names: str) -> Callable[[_T], _T]:
         kind = cast("Any", target)
         kind.__init__ = _with_old_keywords(kind.__init__, kind.__name__, new_names)
         for old, new in new_names.items():
-            setattr(kind, old, property(functools.partial(_renamed_attribute, old=old, new=new)))
+            get = functools.partial(_renamed_attribute, old=old, new=new)
+            setattr(kind, old, property(get, doc=f"The old name of `{new}`."))
         return cast("_T", kind)
 
     return decorate
