@@ -201,7 +201,7 @@ TRUTHS: dict[str, tuple[Function, Callable[[Any], tuple[Any, Any, Any]]]] = {
 }  # fmt: skip
 
 
-@pytest.mark.few(5)
+@pytest.mark.few(4)
 @pytest.mark.parametrize("precision", QUICK_PRECISIONS)
 @pytest.mark.parametrize("name", TRUTHS)
 def test_functions(name: str, precision: Any) -> None:
@@ -329,7 +329,7 @@ def check_within(result: Interval, true: Any, doubt: Any, where: Any, what: str)
         )
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("precision", QUICK_PRECISIONS)
 @pytest.mark.parametrize("name", FORMULAS)
 def test_gradients_and_hessians_at_points(name: str, precision: Any) -> None:

@@ -102,7 +102,7 @@ def test_curves_around_a_circle_have_hulls_of_all_kinds() -> None:
     assert len({len(one.extent((2 * np.pi,)).planes()) for one in curves}) > 2
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("wanted", ["value", "trace"])
 @pytest.mark.parametrize("level", [None, 5.0])
 def test_a_step_of_an_optimization_compiles_no_kernel(wanted: str, level: float | None) -> None:

@@ -81,7 +81,7 @@ def extent_of(path: Path, **settings: Any) -> np.ndarray:
     return np.ptp(field.mesh.vertices, axis=0)
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(3)
 @pytest.mark.parametrize("kind", ["obj", "ply", "stl", "off", "glb", "gltf"])
 def test_a_closed_mesh_of_any_format_is_drawn_by_its_winding_number(run, tmp_path, kind):
     code, said, _ = run(write_mesh(tmp_path / f"a.{kind}"))
@@ -111,6 +111,7 @@ def test_a_cloud_is_drawn_by_its_dipoles(run, tmp_path, kind):
     assert len(np.unique(picture(tmp_path))) > 10
 
 
+@pytest.mark.slow
 def test_curves_are_drawn_by_their_solid_angle(run, tmp_path):
     path = tmp_path / "a.loops"
     path.write_text(" ".join(f"{c:.6f}" for c in shapes.wavy_polygon(12).ravel()) + "\n")
@@ -282,6 +283,7 @@ def test_the_gallery_lists_a_scene_a_line_however_narrow_the_window(capsys, monk
     assert "hyperspherical-sextic  a hyperspherical harmonic of degree 6 (j = 4, m = 3)" in lines
 
 
+@pytest.mark.slow
 def test_meshes_of_files_take_the_options_that_their_messages_name(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -282,6 +282,7 @@ def test_files_of_any_name_are_drawn(
     assert said.endswith(f"wrote {name}.png\n")
 
 
+@pytest.mark.slow
 def test_the_longest_name_that_the_disk_allows_is_written(tmp_path: Path) -> None:
     target = tmp_path / ("y" * 251 + ".png")
     assert main(["render", "polygon", *SMALL, "-o", str(target)]) == 0

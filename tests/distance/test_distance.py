@@ -326,6 +326,7 @@ def test_curvature_needs_second_derivatives() -> None:
 # --- first and second order --------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_example_of_a_charge() -> None:
     """f = 1/r - 1 at r = 0.8: 0.16 to first order, 0.2 is true. With the sign that was printed,
     d (1 - k d/2), the second order would be 0.128."""
@@ -352,6 +353,7 @@ def order_of(field: hk.Field, method: Any) -> float:
     return float(np.polyfit(np.log(lengths), np.log(errors), 1)[0])
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("name", ["wavy", "knot", "polynomial", "Y 5,2", "gyroid"])
 def test_orders_of_accuracy(name: str) -> None:
     """Points d along the normal from points of the surface are at distance d."""
@@ -386,6 +388,7 @@ def test_where_the_gradient_vanishes() -> None:
         assert signed_distance(field, level, level=-1.0, method=method).tolist() == [0.0]  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_the_sign_is_that_of_the_nearest_level() -> None:
     """Of the ladder 0, 2 pi, ..: above it up to half a period, then below the next one."""
     x = np.array([[1.0, 0.0, z] for z in (0.3, 2.8, 3.5, 6.0, 6.6)])
@@ -403,6 +406,7 @@ def test_newton_finds_the_distance_from_a_torus() -> None:
     assert np.abs(found - Torus.distance(x)).max() < 1e-13
 
 
+@pytest.mark.slow
 def test_newton_works_without_second_derivatives() -> None:
     x = np.random.default_rng(5).uniform(-2, 2, (500, 3))
     assert np.abs(signed_distance(Bare(), x) - (np.linalg.norm(x, axis=1) - 1)).max() < 1e-14
@@ -444,7 +448,7 @@ def test_feet_lie_on_the_surface_and_below_the_point(name: str) -> None:
     assert (slant * np.abs(d) <= 1e-7 * np.abs(d) + 1e-13)[inner].all()
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", CURVED)
 def test_no_sample_of_the_surface_is_nearer_but_for_a_few(name: str) -> None:
     """Upper bounds always; nearly always the distance itself."""
@@ -522,6 +526,7 @@ def test_points_without_a_surface_are_counted() -> None:
         assert np.isnan(closest_points(field, x[:1])).all()
 
 
+@pytest.mark.slow
 def test_feet_lie_in_the_domain() -> None:
     """The plane x = 0.9 within the unit ball: beside the part that is left of it, its rim."""
     field = hk.HarmonicPolynomial({(1, 0, 0): 1.0})
@@ -685,6 +690,7 @@ def check_lower_bound(field: hk.Field, points: int, rays: int, precision: Any) -
     return float(np.median(lower / exact))
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", ["wavy", "polynomial", "gyroid"])
 def test_the_lower_bound_is_one(name: str) -> None:
     assert check_lower_bound(CURVED[name], 2000, 20_000, "double") > 0.3
@@ -789,7 +795,7 @@ def test_batches_make_no_difference(method: Any, monkeypatch: pytest.MonkeyPatch
     assert np.allclose(signed_distance(WAVY, x, method=method), whole, rtol=1e-12)
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("method", METHODS)
 def test_precisions_agree(method: Any) -> None:
     x = points_around(WAVY, 300)

@@ -112,6 +112,7 @@ class Grid:
         return float((density * self.volume).sum())
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("q", [0.05, 0.5, 0.8])
 def test_the_oracles_norm_is_that_of_the_definition(q: float) -> None:
     grid = Grid(q)
@@ -121,7 +122,7 @@ def test_the_oracles_norm_is_that_of_the_definition(q: float) -> None:
     assert norm <= kappa_ratio(q, 0.02) * (1 + 2e-4)
 
 
-@pytest.mark.few(5)
+@pytest.mark.few(4)
 @pytest.mark.parametrize("precision", ["single", "double"])
 @pytest.mark.parametrize("share", [1.4, 30.0])
 @pytest.mark.parametrize("q", [0.1, 0.5, 0.8])

@@ -172,7 +172,7 @@ def test_reference_formulas_agree_with_quadrature(n: int) -> None:
             assert kernel_movement(q, s, n) == pytest.approx(plain, abs=1e-11)
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", ["double", "single"])
 @pytest.mark.parametrize("bound", BOUNDS, ids=name_of)
 def test_no_function_meets_a_level_within_a_step(bound: type[Enclosure], precision: str) -> None:
@@ -185,7 +185,7 @@ def test_extremal_functions_attain_the_bound(bound: type[Enclosure]) -> None:
     check_equality(bound)
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(3)
 @pytest.mark.parametrize("bound", BOUNDS, ids=name_of)
 def test_few_rounds_lose_little(bound: type[Enclosure]) -> None:
     rng = np.random.default_rng(8)
@@ -196,7 +196,7 @@ def test_few_rounds_lose_little(bound: type[Enclosure]) -> None:
         assert np.quantile(ratio, 0.2) >= 1 - 1.01e-5
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("bound", BOUNDS, ids=name_of)
 def test_single_precision_is_never_longer_than_exact(bound: type[Enclosure]) -> None:
     rng = np.random.default_rng(9)

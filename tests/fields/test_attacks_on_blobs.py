@@ -178,7 +178,7 @@ def test_rays_that_all_but_touch_cross_twice(name: str, precision: Any) -> None:
     np.testing.assert_array_equal(confirmed.t, hits.t[:, 0])
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("kind", ["lattice", "giants", "clusters", "tiny"])
 def test_rays_along_faces_and_edges_of_cells(precision: Any, kind: str) -> None:

@@ -14,6 +14,7 @@ import harnack as hk
 PRECISIONS = ("single", "double")
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("bound", ["curvature", "slope", "caps"])
 def test_rays_from_creases_miss_nothing(bound: str, precision: Any) -> None:
@@ -33,6 +34,7 @@ def test_rays_from_creases_miss_nothing(bound: str, precision: Any) -> None:
     assert hits.hit.sum() > 100
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize(
     ("function", "settings"),

@@ -94,7 +94,7 @@ def box_rays(blobs: hk.Blobs, count: int, seed: int = 1) -> tuple[Any, Any, Any]
     return a[keep], ((b - a) / length[:, None])[keep], length[keep]
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("kernel", KERNELS.values(), ids=KERNELS)
 def test_a_single_blob_is_a_ball(kernel: Any) -> None:
     blob = hk.Blobs([[1.0, 2.0, 3.0]], 0.7, kernel=kernel)
@@ -108,7 +108,7 @@ def test_a_single_blob_is_a_ball(kernel: Any) -> None:
     np.testing.assert_allclose(hits.t, 3 - 1.4, atol=1e-7)
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("kernel", QUICK_KERNELS)
 @pytest.mark.parametrize("grouped", [False, True])
 @pytest.mark.parametrize("count", [40, 90])  # 90 blobs are kept in a grid
@@ -131,6 +131,7 @@ def test_values_and_derivatives(kernel: Any, grouped: bool, count: int) -> None:
         np.testing.assert_allclose(to_numpy(mine), to_numpy(other), atol=1e-9)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("kernel", QUICK_KERNELS)
 def test_what_is_promised(kernel: Any) -> None:
     check_field(scene(12, weights=np.linspace(-1, 2, 12), kernel=kernel), count=60, directions=6)
@@ -153,6 +154,7 @@ def test_single_precision_is_within_the_stated_error(kernel: Any) -> None:
         assert (off <= to_numpy(sample.gradient_error)).all()
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("precision", QUICK_PRECISIONS)
 @pytest.mark.parametrize("kernel", QUICK_KERNELS)
 @pytest.mark.parametrize("offset", [0.0, 1e4])
@@ -232,7 +234,7 @@ def derivatives(kernel: Any, q: Any) -> tuple[Any, Any]:
     return np.where(inside, -rate * (e - 1), 0), np.where(inside, rate * rate * e, 0)
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     "bound",
     [

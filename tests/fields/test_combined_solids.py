@@ -297,6 +297,7 @@ def reach(solid: hk.Field, axis: int) -> float:
     return float(20.0 - hk.trace(solid, [o], [-o], precision="double", tolerance=1e-7).t[0])
 
 
+@pytest.mark.slow
 def test_f_is_measured_in_the_units_of_each_map_in_turn() -> None:
     """A map that makes all lengths grow alike multiplies f; in a row, the others hid that."""
     ball = hk.Sphere(1)

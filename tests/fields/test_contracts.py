@@ -338,7 +338,7 @@ def spread(n: int, seed: int = 2) -> np.ndarray:
     return x
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("fine", [True, False])
 @pytest.mark.parametrize("accuracy", [2.0, 3.0, 4.0])
 def test_what_a_tree_of_dipoles_leaves_out_is_within_its_bounds(
@@ -434,6 +434,7 @@ def test_what_chains_of_edges_leave_out_is_within_its_bounds(fine: bool) -> None
     check_promises(sample, on_host, x, lift)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("field", ["dipoles, accuracy 4", "mesh by tree, accuracy 4"])
 def test_lanes_are_looked_at_as_closely_as_each_asks(field: str) -> None:
     x = spread(400)

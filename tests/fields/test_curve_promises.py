@@ -57,6 +57,7 @@ def integrals(loops: list[np.ndarray], x: np.ndarray, power: int) -> np.ndarray:
     return total
 
 
+@pytest.mark.few(7)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("name", sorted(CURVES))
 def test_integrals_over_edges(name: str, precision: str) -> None:
@@ -114,6 +115,7 @@ def remainders(field: hk.SolidAngle, x: np.ndarray, d: np.ndarray) -> list[np.nd
     return out
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("name", sorted(FIELDS))
 def test_taylor_s_remainder(name: str) -> None:
     field, rng = FIELDS[name], np.random.default_rng(1)

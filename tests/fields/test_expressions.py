@@ -186,6 +186,7 @@ def test_promises_without_a_radius_are_no_broken_ones() -> None:
     check_field(field)
 
 
+@pytest.mark.slow
 def test_a_false_claim_of_convexity_is_found() -> None:
     check_field(hk.expression(lambda x, y, z: x * x + 2 * y * y + z * z - 1, is_convex=True))
     saddle = hk.expression(lambda x, y, z: x * x - y * y + z, is_convex=True)

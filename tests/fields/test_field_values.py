@@ -53,7 +53,7 @@ def test_values_and_derivatives_at_points(name: str) -> None:
         np.testing.assert_allclose(bend / (2 * h), hessian[:, :, k], atol=1e-2)
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", FIELDS)
 def test_single_points_and_no_points(name: str) -> None:
     field = FIELDS[name]
@@ -91,7 +91,7 @@ def test_points_in_batches_are_points_one_by_one(n: int) -> None:
         np.testing.assert_array_equal(three, np.full(n, 3.0))
 
 
-@pytest.mark.few(5)
+@pytest.mark.few(3)
 @pytest.mark.parametrize("name", FIELDS)
 def test_arrays_of_drjit_carry_derivatives(name: str) -> None:
     field, backend = FIELDS[name], choose_backend("double")

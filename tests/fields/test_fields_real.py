@@ -340,6 +340,7 @@ def violation(field: Field, n_points: int, n_samples: int, seed: int = 0) -> flo
     return float(worst)
 
 
+@pytest.mark.few(12)
 @pytest.mark.parametrize("name", [n for n in FIELDS if n != "Y_00"])
 def test_harmonic_balls_keep_their_promise(name: str) -> None:
     assert violation(FIELDS[name], n_points=120, n_samples=2000) <= 0
@@ -393,6 +394,7 @@ def test_lipschitz_constants_keep_their_promise(name: str) -> None:
             assert (change <= constant[i] * np.linalg.norm(step, axis=1) + 1e-12).all()
 
 
+@pytest.mark.few(10)
 @pytest.mark.parametrize("name", [n for n in FIELDS if n != "Y_00"])
 def test_curvature_keeps_its_promise(name: str) -> None:
     field = FIELDS[name]

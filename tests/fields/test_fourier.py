@@ -91,7 +91,7 @@ def test_a_series_is_fitted_exactly(shape: tuple[int, int, int]) -> None:
         )
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("seed", range(3))
 def test_bounds_hold_between_nodes(seed: int) -> None:
     """On grids that are no multiples of the bounds' own; and they are not far too large."""

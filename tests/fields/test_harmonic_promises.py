@@ -120,6 +120,7 @@ def test_error_of_a_sample_covers_single_precision(l: int, m: int, radius: float
             assert (off[:, None] * t <= spare).all()
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("l", [1, 2, 3, 5, 8, 12])
 def test_bounds_near_the_axis_hold_and_are_attained(l: int) -> None:  # noqa: E741
     rng = np.random.default_rng(l)
@@ -219,7 +220,7 @@ def rays(kind: str, n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 PRECISIONS = ["double", "single"]
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("bound", [None, "caps", "slope"])
 def test_rays_by_zeros_of_high_order_arrive(bound: str | None, precision: Any) -> None:
@@ -273,6 +274,7 @@ def test_single_precision_hits_are_as_close_as_documented(l: int, m: int) -> Non
     assert (off <= 2.1 * (8 * UNIT * size + error) + 1.05e-6).all()
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("bound", [Classic, Slope, Caps, Cone, Taylor])
 def test_no_level_lies_within_a_step_near_the_zeros(bound: Any) -> None:
     assert check_steps(POLYNOMIALS["(12, -6)"], bound, count=150) > 0

@@ -85,6 +85,7 @@ def size(matrices: np.ndarray) -> np.ndarray:
     return np.abs(matrices).max(axis=(1, 2))
 
 
+@pytest.mark.few(9)
 @pytest.mark.parametrize("name", FIELDS)
 def test_it_is_the_derivative_of_the_gradient(name: str) -> None:
     field = FIELDS[name]

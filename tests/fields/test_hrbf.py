@@ -28,6 +28,7 @@ def test_it_passes_through_the_points_along_the_normals() -> None:
     np.testing.assert_allclose(far.value(1e3 * f.points + 1e5, precision="double"), 0, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_values_and_derivatives_are_those_of_the_formula() -> None:
     f = surface()
     check_field(f, count=60, directions=4)

@@ -110,6 +110,7 @@ def compare(field, n, seed, precision, tolerance):
     return hits
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", SMALL)
 def test_lobes_keep_their_promises(name):
     check_field(SMALL[name], count=60, directions=4)

@@ -139,6 +139,7 @@ def test_pieces_keep_area_and_first_moment() -> None:
     np.testing.assert_allclose((pieces.moments[:, 2:] * pieces.points).sum(axis=0), first)
 
 
+@pytest.mark.slow
 def test_balls_in_closed_form() -> None:
     vertices, faces = icosphere(4)
     corners = vertices[faces]
@@ -173,6 +174,7 @@ def test_quadrature_bound_holds_against_a_fine_one() -> None:
 # ---------------------------------------------------------------- the field
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("w", [0.08, 0.15])
 def test_tree_is_the_sum_within_its_error(w: float) -> None:
     field = morph(w, accuracy=2.0)

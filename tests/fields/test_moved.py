@@ -47,7 +47,7 @@ def winding(x: Any, **options: Any) -> hk.WindingNumber:
     return hk.WindingNumber(x, FACES, **options)
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("motion", [breathed, twisted, torn])
 def test_values_are_within_the_bound(motion: Any) -> None:
     """Of the exact ones, by a tree that was made for other places, and used there."""
@@ -65,7 +65,7 @@ def test_values_are_within_the_bound(motion: Any) -> None:
     assert np.quantile(single, 0.99) < 1e-2
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(3)
 @pytest.mark.parametrize("motion", [breathed, twisted, torn])
 @pytest.mark.parametrize("method", ["exact", "tree"])
 def test_moved_is_as_new(method: Any, motion: Any) -> None:

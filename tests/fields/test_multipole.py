@@ -212,7 +212,7 @@ def test_moments_moved_are_moments(seed: int) -> None:
         np.testing.assert_allclose(found[key], value, rtol=1e-10, atol=1e-10)
 
 
-@pytest.mark.few(5)
+@pytest.mark.few(3)
 @pytest.mark.parametrize("spread", [True, False])
 @pytest.mark.parametrize("n", [1, 2, 9, 100, 333])
 def test_nodes_have_the_moments_of_what_they_hold(n: int, spread: bool) -> None:
@@ -281,7 +281,7 @@ def test_triangle_dipoles_integrate_to_degree_four() -> None:
 # --- terms ----------------------------------------------------------------------------------
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("order", ORDERS)
 def test_cartesian_terms_are_the_harmonics(order: int) -> None:
     for seed in range(6):
@@ -343,7 +343,7 @@ def viewpoints(level: NodeMoments, q: float, seed: int) -> np.ndarray:
     return level.center[0] + r[:, None] * unit(rng.normal(size=(60, 3)))
 
 
-@pytest.mark.few(5)
+@pytest.mark.few(3)
 @pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize("accuracy", [1.5, 2.0, 4.0])
 def test_truncation_is_bounded(order: int, accuracy: float) -> None:
@@ -367,7 +367,7 @@ def test_truncation_is_bounded(order: int, accuracy: float) -> None:
     assert max(used) > 0.2
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize("accuracy", [1.5, 4.0])
 def test_bounds_are_not_rounded_below_their_series(order: int, accuracy: float) -> None:

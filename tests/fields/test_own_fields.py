@@ -45,7 +45,7 @@ def bent(width: float) -> tuple[Any, ...]:
     return (Curvature(2.001 / width**2),)
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("known", [steep, bent, lambda w: (*bent(w), *steep(w))])
 @pytest.mark.parametrize("radius", [None, 2.0, 6.0, 20.0])
 @pytest.mark.parametrize("width", [0.5, 1.0])
@@ -104,6 +104,7 @@ class Square(Field):
         return Sample(dr.select(inside, dr.squared_norm(p), dr.nan), 2 * p, (Lipschitz(4.0),))
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("field", [Logarithm(), Square()])
 def test_nothing_is_asked_outside_the_domain(field: Field) -> None:
     assert field.domain is not None

@@ -110,6 +110,7 @@ def test_parts_keep_their_promises(index: int) -> None:
     check_field(OnePart(hostile(), index), count=60, directions=4)
 
 
+@pytest.mark.slow
 def test_segments_keep_their_promises() -> None:
     tubes = hk.Tubes(10 * SQUARE, [[0, 1], [1, 2], [0, 2]], [0.5, 0.1, 1e-3])
     for index in range(3):
@@ -221,6 +222,7 @@ def test_rays_along_edges_and_through_vertices(precision: Any, level: float) -> 
             assert apart.sum() <= 6
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(("scale", "shift"), [(1e-6, 0.0), (1e6, 0.0), (1.0, 300.0)])
 def test_hits_move_with_the_mesh(scale: float, shift: float) -> None:
     vertices, faces = patches(24)
@@ -235,6 +237,7 @@ def test_hits_move_with_the_mesh(scale: float, shift: float) -> None:
     assert np.median(np.abs(moved.t[both] / scale - plain.t[both])) < 2e-4
 
 
+@pytest.mark.slow
 def test_rays_start_and_end_anywhere() -> None:
     mesh = hk.PolygonMesh(*patches(24))
     o, d = rays(500, 3, mesh.vertices)
@@ -321,6 +324,7 @@ def test_boxes_of_convex_faces_are_those_of_their_vertices() -> None:
     assert hk.PolygonMesh(twice, [list(range(10))]).faces.in_convex_position.tolist() == [False]
 
 
+@pytest.mark.slow
 def test_another_mesh_compiles_no_kernel() -> None:
     o, d = rays(300, 6, SQUARE)
 

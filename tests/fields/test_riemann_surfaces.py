@@ -267,7 +267,7 @@ def test_few_evaluations_are_needed(name: str, most: float) -> None:
     assert hits.evaluations[hits.status == hk.Status.HIT].mean() <= most
 
 
-@pytest.mark.few(5)
+@pytest.mark.few(3)
 @pytest.mark.parametrize("precision", ["single", "double"])
 @pytest.mark.parametrize("name", ["sqrt", "cbrt", "2/3", "real asin"])
 def test_hits_beside_branch_points_are_near_the_surface(name: str, precision: Any) -> None:
@@ -331,6 +331,7 @@ def test_other_bounds_find_the_same_hits(bound: str) -> None:
     assert theirs.evaluations.mean() > ours.evaluations.mean()
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize(
     ("branches", "sharpest"),
     [
@@ -436,6 +437,7 @@ def test_levels_of_the_logarithm_are_the_surface_moved_up() -> None:
     assert hits.t[0] == pytest.approx(2.5, abs=1e-3)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", ["single", "double"])
 def test_walls_about_all_sheets_are_met_first(precision: Any) -> None:
     """Levels +-0.05 of the cube root: the nearest sheet is so far below or above."""

@@ -216,7 +216,7 @@ def repeated(level: ClusterMoments, views: int) -> ClusterMoments:
     return ClusterMoments(*(np.repeat(value, views, axis=0) for value in vars(level).values()))
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("kappa", [1e-3, 1.0, 30.0])
 def test_truncation_stays_within_its_bound(kappa: float) -> None:
     """100,000 views of clusters of 8 to 2048 dipoles, their moments moved up from the leaves."""
@@ -459,6 +459,7 @@ def test_winding_number_is_the_limit() -> None:
     np.testing.assert_allclose(field.value(x), [1, 1, 0, 0], atol=5e-3)
 
 
+@pytest.mark.slow
 def test_mesh_quadrature_is_as_good_as_it_says() -> None:
     """A triangle against itself cut into 4^6, at distances from 1.1 to 30 of its radius."""
     rng = np.random.default_rng(11)
@@ -561,6 +562,7 @@ def test_rays_at_a_dipole_hit() -> None:
     assert on.hit.all()
 
 
+@pytest.mark.slow
 def test_hits_carry_derivatives() -> None:
     field = SMALL["sphere"]
     backend = choose_backend("double")

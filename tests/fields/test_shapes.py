@@ -174,7 +174,7 @@ def test_contract(name: str) -> None:
     check_field(SHAPES[name][0], rng=1, count=25, directions=2)
 
 
-@pytest.mark.few(17)
+@pytest.mark.few(11)
 @EVERY
 @QUICK_PRECISIONS
 def test_values(name: str, precision: Any) -> None:
@@ -189,7 +189,7 @@ def unit_vectors(rng: Any, n: int) -> Any:
     return d / norm(d)[:, None]
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @EVERY
 @QUICK_PRECISIONS
 def test_no_level_within_a_step(name: str, precision: Any) -> None:

@@ -195,7 +195,7 @@ def test_sign_and_size_above_a_disk() -> None:
 # --- extents --------------------------------------------------------------------------------
 
 
-@pytest.mark.few(5)
+@pytest.mark.few(3)
 @pytest.mark.parametrize("levels", [(2 * math.pi,), (0.5,), (3.0, 11.0)], ids=str)
 @pytest.mark.parametrize("name", CURVES)
 def test_no_level_lies_outside_the_extent(name: str, levels: tuple[float, ...]) -> None:
@@ -236,7 +236,7 @@ class Unbounded(hk.SolidAngle):
         return other
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("level", [2 * math.pi, 1.0])
 @pytest.mark.parametrize("name", ["trefoil", "coil", "link", "rings", "holes", "wavy"])
 def test_the_extent_holds_every_hit_found_without_it(name: str, level: float) -> None:
@@ -284,6 +284,7 @@ def aimed_at(loops: list[np.ndarray], n: int) -> tuple[np.ndarray, np.ndarray]:
     return o, unit(center + 0.6 * size * rng.uniform(-1, 1, (n, 3)) - o)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_a_tiny_edge_hides_no_hits(precision: str) -> None:
     """A ring run through twice: its 2 pi level lies far outside of its flat hull."""
@@ -324,7 +325,7 @@ def rays_beside(edge: np.ndarray, n: int, seed: int = 9) -> tuple[np.ndarray, np
     return place - rng.uniform(0, 4, (n, 1)) * unit(d), unit(d)
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("name", CANCELING)
 def test_edges_run_both_ways_are_not_there(name: str, precision: str) -> None:
@@ -372,6 +373,7 @@ NOTHING: dict[str, list[np.ndarray]] = {
 }
 
 
+@pytest.mark.few(11)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("certificate", ["auto", "edges", "paper"])
 @pytest.mark.parametrize("name", NOTHING)
@@ -513,7 +515,7 @@ def rays_along(loops: list[np.ndarray], away: float, n: int) -> tuple[np.ndarray
     return place - rng.uniform(0, 2.5, (n, 1)) * d, d
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(3)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-7])
 @pytest.mark.parametrize("name", ["triangle", "wavy", "holes", "coil", "spiky"])

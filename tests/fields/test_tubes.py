@@ -46,6 +46,7 @@ def test_the_distance_is_that_from_the_nearest_of_all(count: int, precision: Any
     np.testing.assert_allclose(found, distance(x, lines) - 0.03, atol=small)
 
 
+@pytest.mark.slow
 def test_contracts_of_tubes_in_groups() -> None:
     check_field(hk.Tube.around(polylines(25), 0.03))
 

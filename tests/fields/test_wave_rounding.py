@@ -75,6 +75,7 @@ FIELDS = {
 }  # fmt: skip
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("name", FIELDS)
 def test_error_of_waves_covers_single_precision(name: str) -> None:
     """And is never a hundred times the largest error seen, also of sums of forty waves."""

@@ -142,6 +142,7 @@ def test_values_are_within_their_bound(method: Any, precision: Any) -> None:
         assert fine < 0.005
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("method", METHODS)
 def test_derivatives_are_those_of_the_value(method: Any) -> None:
     """Differences of the direct sum, away from faces, over which it jumps."""
@@ -220,6 +221,7 @@ def test_hessians_on_the_device_are_rows() -> None:
         np.testing.assert_allclose(found, field.hessian(x, precision="double"), atol=1e-12)
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("method", METHODS)
 def test_closed_meshes_have_whole_numbers(method: Any, precision: Any) -> None:
@@ -295,6 +297,7 @@ def test_units_and_places_do_not_matter(method: Any, scale: float, shift: float)
         np.testing.assert_allclose(found, expected, atol=close * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_one_triangle() -> None:
     vertices = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
     faces = np.array([[0, 1, 2]])
@@ -316,7 +319,7 @@ CUBE_FACES = np.array([
 ])  # fmt: skip
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("missing", [1, 2, 3, 5, 7, 11])
@@ -350,7 +353,7 @@ def lattice_squares(n: int, count: int, seed: int) -> Mesh:
     return lattice.reshape(-1, 3), np.unique(np.concatenate([first, second]), axis=0)
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("count", [6, 60, 300])
 def test_lattices_are_all_ties(count: int, precision: Any) -> None:
@@ -549,6 +552,7 @@ def check_sheets(hits: Any, field: WindingNumber, exact: Any, mesh: Mesh, d: np.
         assert np.median(off) < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_first_hits(method: Any) -> None:
     check_first_hits(damaged("soup", 1), method, 500, 0, "single")

@@ -240,6 +240,7 @@ def test_another_volume_of_the_kind_uses_the_same_kernel(kind):
     assert hashes[0] == hashes[1]
 
 
+@pytest.mark.few(15)
 @pytest.mark.parametrize("precision", ["single", "double"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_contains_bounds_and_padding_agree(kind, precision):

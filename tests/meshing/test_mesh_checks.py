@@ -244,6 +244,7 @@ def test_cells_are_as_small_as_a_lattice_needs(
     assert bodies is None or made.body_count == bodies
 
 
+@pytest.mark.slow
 def test_a_spacing_that_is_asked_for_is_not_changed_for_waves():
     part = hk.solid(hk.SchwarzP(1.0), below=0.0) & hk.Cuboid((0.3, 0.3, 3.0))
     assert hk.mesh(part, spacing=0.25, tolerance=2e-2).metadata["harnack"]["spacing"] == 0.25

@@ -39,6 +39,7 @@ def test_smooth_surfaces_have_no_creases() -> None:
     assert mesh.metadata["harnack"]["creases"] == 0
 
 
+@pytest.mark.slow
 def test_a_cut_ball_as_one_greatest_value() -> None:
     field = hk.expression(lambda x, y, z: hk.maximum(x * x + y * y + z * z - 0.81, z - 0.3))
     mesh = hk.mesh(field, solid=BELOW, clip=BOX, tolerance=4e-3)
@@ -66,6 +67,7 @@ def test_walls_far_thinner_than_cells_are_refused(half: float) -> None:
             hk.mesh(wall(half), clip=BOX, tolerance=4e-3, spacing=1 / 12, **arguments)
 
 
+@pytest.mark.slow
 def test_knife_edges_are_noticed() -> None:
     edge = hk.expression(lambda x, y, z: hk.maximum(z - 0.05 * x, -z - 0.05 * x) + 0 * y)
     with pytest.raises(hk.MeshingError, match="make the solid of smooth parts"):

@@ -298,6 +298,7 @@ def test_simplified_parts_are_within_the_tolerance() -> None:
     assert apart.max() < tolerance * size
 
 
+@pytest.mark.slow
 def test_the_largest_part_is_kept() -> None:
     both = hk.Sphere(0.3) | hk.Sphere(0.5).moved((1.5, 0, 0))
     mesh = hk.mesh(both, largest=True, tolerance=4e-3)
@@ -360,7 +361,7 @@ class Holed(hk.Shape):
 CURVE = hk.SolidAngle(shapes.wavy_polygon(12))
 
 
-@pytest.mark.few(5)
+@pytest.mark.few(4)
 @pytest.mark.parametrize(
     ("field", "arguments", "message"),
     [
@@ -429,7 +430,7 @@ def test_formats_whose_packages_lack_are_refused_early(
     assert "pip install 'harnack[3mf]'" in capsys.readouterr().err
 
 
-@pytest.mark.few(7)
+@pytest.mark.few(4)
 @pytest.mark.parametrize(
     ("options", "said"),
     [

@@ -26,7 +26,7 @@ def test_the_blobs_of_the_benchmark_and_of_the_library_are_the_same() -> None:
         np.testing.assert_allclose(library.value.numpy() - SCENE.threshold, expected, atol=1e-12)
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("method", inclusion.METHODS, ids=lambda one: one[0])
 def test_no_method_misses_a_hit(method: inclusion.Method) -> None:
     reference = SCENE.first_inside(SCENE.rays(300), 500)
@@ -45,6 +45,7 @@ def test_methods_come_in_the_published_order() -> None:
     assert looks == sorted(looks, reverse=True)
 
 
+@pytest.mark.slow
 def test_enhancements_see_the_same_surface_with_fewer_evaluations() -> None:
     solids = hart.scenes()["nine balls and a plane"]
     plain = hart.trace(solids)
@@ -70,6 +71,7 @@ def test_bisection_is_bounded_by_its_depth() -> None:
     assert np.abs(values).max() < 0.05
 
 
+@pytest.mark.slow
 def test_scene_files_name_the_camera_and_the_container() -> None:
     gyroid, some_blobs = povray.pictures()
     text = povray.pov_scene(gyroid, positions=False)

@@ -62,6 +62,7 @@ def test_sections_are_written_one_by_one(tmp_path: Path) -> None:
     assert (tmp_path / "images" / "figures" / "figure-04.png").exists()
 
 
+@pytest.mark.slow
 def test_the_published_algorithm_depends_on_what_is_claimed() -> None:
     loop = shapes.wavy_polygon(12)
     field = hk.SolidAngle(loop)

@@ -24,7 +24,7 @@ def corners(picture: Any) -> np.ndarray:
     return picture.shown[[0, 0, -1, -1], [0, -1, 0, -1]]
 
 
-@pytest.mark.few(5)
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("given", "pixel"),
     [

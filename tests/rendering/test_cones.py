@@ -51,6 +51,7 @@ BALLS = {
 }
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("precision", ["single", "double"])
 @pytest.mark.parametrize("name", ["distance", "polynomial", "blob"])
 def test_cones_find_the_outline_of_a_ball_and_nothing_else(name: str, precision: str) -> None:
@@ -165,6 +166,7 @@ def test_wires_thinner_than_a_pixel_are_lines(thin: float) -> None:
     assert (broken == 0).any()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("black")
 def test_a_turned_plate_seen_on_edge_is_a_line() -> None:
     """Its hull is thin and the box around that is not: cones that passed it were cut away."""
@@ -174,6 +176,7 @@ def test_a_turned_plate_seen_on_edge_is_a_line() -> None:
     assert middle.min() > 0.5 * np.median(middle)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("black")
 def test_what_hides_a_wire_hides_it_from_cones() -> None:
     ends = np.array([(-1.0, -0.3, 0.01), (-1.0, 0.3, 0.02)])
@@ -187,6 +190,7 @@ def small(what: Any, **settings: Any) -> np.ndarray:
     return render(what, **{"size": (32, 24), "show": "shaded", "progress": False, **settings})
 
 
+@pytest.mark.slow
 def test_edges_are_the_default() -> None:
     ball = hk.Sphere(1.0)
     np.testing.assert_array_equal(small(ball), small(ball, antialias="edges"))

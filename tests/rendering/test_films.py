@@ -140,6 +140,7 @@ def test_a_film_in_mp4(tmp_path: Path) -> None:
     assert np.abs(frames[0].astype(int) - frames[4]).mean() > 3
 
 
+@pytest.mark.few(6)
 @pytest.mark.parametrize(
     ("settings", "complaint"),
     [
@@ -198,6 +199,7 @@ def test_what_is_missing_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     target = tmp_path / "a.gif"
     arguments = ["--frames", "3", "--size", "32x24", "--spp", "1", "--quiet", "--backdrop", "white"]

@@ -33,6 +33,7 @@ def read(path: Path) -> np.ndarray:
     return np.array(mi.Bitmap(str(path)))
 
 
+@pytest.mark.slow
 def test_a_png_and_an_exr_are_written(tmp_path: Path) -> None:
     image = draw(path=tmp_path / "a.png")
     assert image.shape == (30, 40, 3)
@@ -44,7 +45,7 @@ def test_a_png_and_an_exr_are_written(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.exr", "a.png"]
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("shape", [(30, 40, 3), (33, 7), (16, 16, 3), (1, 1)])
 def test_exr_files_hold_what_was_written(shape: tuple[int, ...], tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
@@ -72,6 +73,7 @@ print(True)
     ) or shape == (1, 1)
 
 
+@pytest.mark.slow
 def test_the_same_seed_draws_the_same_picture() -> None:
     first = draw(seed=3)
     np.testing.assert_array_equal(first, draw(seed=3))
@@ -139,6 +141,7 @@ def test_nothing_is_lost_and_nothing_is_said_with_enough_steps() -> None:
         draw()
 
 
+@pytest.mark.slow
 def test_settings_of_a_level_set_are_replaced() -> None:
     surface = hk.level_set(POLYGON, 2.5 * math.pi, tolerance=1e-3)
     replaced = draw([surface], show="depth", level=math.pi)
@@ -225,7 +228,7 @@ def test_camera_and_backdrop_change_the_picture() -> None:
     assert draw(backdrop="dark").mean() < 0.7 * default.mean()
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("size", [(60, 20), (20, 60), (40, 40)])
 @pytest.mark.parametrize("elevation", [-30.0, 0.0, 35.0, 90.0])
 def test_the_camera_frames_the_surface(size: tuple[int, int], elevation: float) -> None:

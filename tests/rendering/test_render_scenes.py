@@ -79,7 +79,7 @@ def drawn(members: dict[str, Any], spp: int = 16, depth: int = 8, **kw: Any) -> 
 GYROID = hk.Gyroid(1.0, domain=hk.Ball(radius=1.0))
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("tolerance", [1e-3, 1e-4, 1e-5])
 @pytest.mark.parametrize(
     "settings",
@@ -205,6 +205,7 @@ def test_tolerances_draw_the_same_picture() -> None:
     assert max(dark) < 0.002
 
 
+@pytest.mark.slow
 def test_shadows_fall_both_ways() -> None:
     sun = {"type": "directional", "direction": [0, 0, -1], "irradiance": 3.0}
     above = {"type": "sphere", "center": [0, 0, 2], "radius": 0.4}
@@ -307,6 +308,7 @@ def test_errors_say_what_is_wrong(bad: tuple[Callable[[], Any], str]) -> None:
         make()
 
 
+@pytest.mark.slow
 def test_mitsubas_own_render_draws_the_same_picture() -> None:
     scene = mi.load_dict(
         {
@@ -475,6 +477,7 @@ def test_integrators_are_followed_left_to_mitsuba_or_refused_by_name() -> None:
             render(drawn_by({"type": kind}, ours), **quiet)
 
 
+@pytest.mark.slow
 def test_direct_light_is_that_of_paths_of_two_edges_and_hidden_lamps_stay_hidden() -> None:
     white = {"type": "constant"}
     direct, two = (

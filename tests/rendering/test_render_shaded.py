@@ -311,6 +311,7 @@ def test_solids_have_the_color_of_their_outside_without_being_asked() -> None:
     np.testing.assert_allclose(plain[15, 20], asked[15, 20], rtol=2e-2)
 
 
+@pytest.mark.slow
 def test_solids_may_be_of_glass() -> None:
     small = {"show": "shaded", "size": (40, 30), "progress": False}
     glass = hk.render(hk.Sphere(1.0), material="cobalt", **small)

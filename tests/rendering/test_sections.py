@@ -59,6 +59,7 @@ def test_what_lies_beyond_a_section_is_not_hit(precision):
     np.testing.assert_allclose(hits.t[both], t[both], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_faces_of_a_solid_on_its_section_are_told_from_all_others():
     backend = choose_backend("double")
     surface = hk.level_set(

@@ -38,7 +38,7 @@ def middle(mask: np.ndarray) -> np.ndarray:
     return np.argwhere(mask).mean(axis=0)[::-1]
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     "position", [(3.0, 3.0, 3.0), (0.3, -4.0, 0.1), (0.0, 0.0, 5.0), (1, 2, -9)]
 )
@@ -366,6 +366,7 @@ def test_values_with_a_bar_from_the_command_line(tmp_path: Path) -> None:
     assert np.array(mi.Bitmap(str(tmp_path / "a.png"))).shape[1] > 50
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("up", ["-x", "-y", "-z"])
 def test_axes_with_a_minus_turn_files_from_the_command_line(up: str, tmp_path: Path) -> None:
     """As a field that is turned by hand."""

@@ -85,6 +85,7 @@ def test_hits_of_triangles_seen_edge_on_lie_on_them(precision: Any) -> None:
         assert ((x - p) * inward).sum(axis=1).min() > -1e-5
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_what_is_lost_in_rounding_is_no_hit(precision: Any) -> None:
     """Far from a screened cloud the level 0 is nowhere, and w is nothing but held exponentials:
@@ -145,6 +146,7 @@ def test_curvatures_beside_curves_state_their_error(precision: Any) -> None:
     ).all()
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_directions_may_have_any_length(precision: Any) -> None:
     """Those whose squares overflow were proved misses, and short ones pointed elsewhere."""
@@ -244,6 +246,7 @@ def test_walls_thicker_than_rounding_are_hit(precision: Any) -> None:
     assert (hits.sheet == 0).all()
 
 
+@pytest.mark.slow
 def test_hits_on_dipoles_say_how_far_off_they_are() -> None:
     """Points that rounding takes for a dipole were hits three tolerances from it, without a word:
     all levels meet there, but nowhere else."""
@@ -262,7 +265,7 @@ def test_hits_on_dipoles_say_how_far_off_they_are() -> None:
     assert (hits.uncertainty[hits.hit] > 1e-5).sum() > 50
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("method", ["exact", "tree"])
 def test_far_away_derivatives_keep_their_bounds(method: Any, precision: Any) -> None:

@@ -40,6 +40,7 @@ def test_both_sides_of_a_thin_plate_are_no_smaller_than_one_of_a_thick_one(half:
     assert hk.trace(solid, o, d, largest=True).hit.tolist() == [True, False]
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("largest", [True, np.True_, 64, np.int64(64)])
 def test_level_sets_take_what_calls_take(largest: Any) -> None:
     """True was taken for one cell; NumPy's were refused."""

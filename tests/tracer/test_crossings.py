@@ -197,6 +197,7 @@ def test_a_sphere_is_entered_and_left(precision: Any) -> None:
     np.testing.assert_allclose(found.normal[hit, :2], found.position[hit, :2], atol=2e-5)
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("overstep", [1.0, 1.4])
 def test_rays_that_graze_do_not_stick(precision: Any, overstep: float) -> None:

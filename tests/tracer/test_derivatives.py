@@ -130,7 +130,7 @@ def test_level_forward_and_reverse(name: str) -> None:
     agree(numpy(dr.grad(parameter)), np.array([expected.sum()]))
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", FIELDS)
 @pytest.mark.parametrize("moved", ["origin", "direction"])
 def test_rays_forward_and_reverse(name: str, moved: str) -> None:
@@ -183,6 +183,7 @@ def test_each_hit_follows_its_own_level(field: hk.Field, levels: list[float]) ->
     assert len(set(np.argmin(away, axis=0))) >= 2
 
 
+@pytest.mark.slow
 def test_misses_have_no_derivative_and_positions_move_with_t() -> None:
     o = np.array([EYE, EYE])
     d = np.array([[-2.1, 2.2, -1.55], [1.0, 0.0, 0.0]])

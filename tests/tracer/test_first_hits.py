@@ -253,6 +253,7 @@ def test_the_assumed_range_misses_hits_of_a_coil_and_ours_does_not() -> None:
     assert ours.hits == 204
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("certificate", ["paper", "auto"])
 def test_the_published_method_misses_hits_of_a_coil_of_eight_turns(
     certificate: str,
@@ -431,7 +432,7 @@ def mesh_rays(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return o, unit(1.2 * unit(rng.normal(size=o.shape)) * rng.random((len(o), 1)) - o)
 
 
-@pytest.mark.few(5)
+@pytest.mark.few(3)
 @pytest.mark.parametrize("precision", ["single", "double"])
 @pytest.mark.parametrize("subdivisions", range(4))
 def test_small_closed_meshes_by_tree(subdivisions: int, precision: Any) -> None:

@@ -106,6 +106,7 @@ def test_wrong_groups_are_noticed(monkeypatch):
     assert wrong(hk.Sphere(*BIG) | hk.Sphere(*SMALL), 1000, 0) == 0
 
 
+@pytest.mark.slow
 def test_pieces_that_a_clip_leaves_are_left_out():
     """Above level 1 Schwarz's P surface is a closed surface in each cell of the lattice."""
     field, ball = hk.SchwarzP(1.0), hk.Ball(radius=0.9)
@@ -121,6 +122,7 @@ def test_pieces_that_a_clip_leaves_are_left_out():
     assert (np.abs(hits.t[both] - alone.t[both]) < 5e-3).mean() > 0.999
 
 
+@pytest.mark.slow
 def test_parts_that_end_at_the_domain_are_told_apart_there():
     """x y z = 0.05 has four parts, one in each octant where x y z > 0, that end at the sphere in
     which the polynomial is known."""
@@ -171,6 +173,7 @@ def test_of_a_solid_the_part_of_largest_volume_is_there(precision):
     assert (np.abs(t[both] - t_alone[both]) < 5e-3).mean() > 0.998
 
 
+@pytest.mark.slow
 def test_what_is_not_told_apart_stays_together():
     near = hk.Sphere(0.5, (-0.5005, 0, 0)) | hk.Sphere(0.4, (0.4005, 0, 0))
     o, d = np.array([[0.4, 0, 3.0], [-0.5, 0, 3.0]]), np.array([[0, 0, -1.0]])

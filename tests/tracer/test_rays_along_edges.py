@@ -87,7 +87,7 @@ def test_a_sample_off_rays_promises_nothing_along_one() -> None:
     assert not sample.along
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(3)
 @pytest.mark.parametrize("precision", ["single", "double"])
 @pytest.mark.parametrize("method", ["exact", "tree"])
 @pytest.mark.parametrize("thinness", [1e-2, 1e-4, 1e-6])

@@ -28,7 +28,7 @@ def camera(width: int) -> tuple[np.ndarray, np.ndarray]:
     return eye[None], (d / np.linalg.norm(d, axis=-1, keepdims=True)).reshape(-1, 3)
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("bound", ["slope", "caps"])
 @pytest.mark.parametrize(
     ("precision", "tolerance"),

@@ -607,7 +607,7 @@ class Approximate(hk.Field):
         return hk.Sample(p.x, gradient, (ball,), 0.0, self.gradient_error)
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("overstep", [1.0, 1.4])
 @pytest.mark.parametrize("bound", [None, "slope", "caps"])
 @pytest.mark.parametrize("direction", [1.0, -1.0])

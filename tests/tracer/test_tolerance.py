@@ -104,6 +104,7 @@ def test_hits_of_clouds_meet_the_tolerance(level: float, accuracy: float | None)
     check_cloud(field, truth, level, 1e-4, "double", 500)
 
 
+@pytest.mark.slow
 def test_hits_of_screened_clouds_meet_the_tolerance() -> None:
     """They were up to 268 tolerances off."""
     field = hk.ScreenedWindingNumber(*noisy_sphere(1500), length=2.0, method="tree")

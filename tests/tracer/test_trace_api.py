@@ -195,6 +195,7 @@ def test_a_ray_without_end_ends_in_a_miss() -> None:
         assert (hits.evaluations < 200).all()
 
 
+@pytest.mark.slow
 def test_clip_volumes() -> None:
     o, d = above(100), DOWN
     half = hk.trace(FIELD, o, d, clip=hk.HalfSpace((1.0, 0.0, 0.0), 0.0))

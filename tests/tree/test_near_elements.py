@@ -119,7 +119,7 @@ def check_mesh(kind: str, method: Any, precision: Any, n: int) -> None:
     assert np.median(bound / size) < (1e-3 if method == "exact" else 0.5)
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("kind", KINDS)
@@ -229,6 +229,7 @@ def second_derivatives(
     return np.stack(columns, axis=2)
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("distance", [3.0, 1e2, 1e4])
 def test_derivatives_far_from_meshes_are_within_their_bounds(distance: float, method: Any) -> None:
@@ -260,7 +261,7 @@ def on_host(number: Any) -> Any:
     return to_numpy(number) if dr.is_array_v(type(number)) else number
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(3)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("kind", ["polygon", "knot", "far"])
 def test_solid_angles_beside_curves_are_within_their_bounds(kind: str, precision: Any) -> None:
