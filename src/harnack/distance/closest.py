@@ -121,7 +121,7 @@ def _in_order(
 def _closest_on_mesh(
     backend: Backend, surface: LevelSet, levels: TargetLevels, mesh: MeshSurface, points: Any
 ) -> Closest:
-    prepared, nearest = surface.field.prepare(backend), mesh.upload(backend)
+    prepared, nearest = surface.field_on(backend), mesh.upload(backend)
 
     def look(p: Vec3) -> tuple[Real | Vec3, ...]:
         above = -levels.to_nearest(prepared.evaluate(p).value)
@@ -152,7 +152,7 @@ class _Points:
     levels: TargetLevels
 
     def __post_init__(self) -> None:
-        backend, field = self.backend, self.surface.field.prepare(self.backend)
+        backend, field = self.backend, self.surface.field_on(self.backend)
         set_ = object.__setattr__
         set_(self, "_field", field)
         exact = field.without_truncation(backend)

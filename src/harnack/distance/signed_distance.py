@@ -80,7 +80,7 @@ def signed_distance(
         return np.copysign(found.distance, found.above)
     backend = choose_backend(precision)
     surface = _surface(field, level)
-    levels, prepared = _levels(backend, surface), field.prepare(backend)
+    levels, prepared = surface.levels_on(backend), surface.field_on(backend)
     compute = _COMPUTE[method]
 
     def of_points(p: Vec3) -> tuple[Real | Vec3, ...]:
@@ -169,7 +169,7 @@ def _found(
 ) -> Closest:  # fmt: skip
     backend = choose_backend(precision)
     surface = _surface(field, level)
-    levels = _levels(backend, surface)
+    levels = surface.levels_on(backend)
     found = find_closest(backend, surface, levels, points, progress or _silent, is_proved=is_proved)
     _warn(name, found)
     return found
@@ -186,15 +186,7 @@ def _surface(field: Field, level: Any) -> LevelSet:
             f"{type(field).__name__} has sheets but does not say how far they are: define its "
             "method distance_to_sheets(p)"
         )
-    return level_set(field, level, tolerance=_CLOSE, overstep=1.0)
-
-
-def _levels(backend: Backend, surface: LevelSet) -> TargetLevels:
-    values = tuple(
-        one if dr.is_array_v(type(one)) else dr.opaque(backend.Float, float(one))
-        for one in surface.levels
-    )
-    return TargetLevels(values, surface.field.period)
+    return level_set(field, level, tolerance=_CLOSE, overstep=1.0).in_one_call()
 
 
 def _warn(name: str, found: Closest) -> None:

@@ -144,21 +144,20 @@ def mesh(
     volume = _volume(field, clip, section)
     region = None
     if solid:
-        region = region_of(field, solid, level)
-        made, size, facts = _solid(*region, volume, tolerance, spacing, seed, max_triangles, report)
+        region = LevelFunction(*region_of(field, solid, level), most_faces=max_triangles)
+        made, size, facts = _solid(region, volume, tolerance, spacing, seed, report)
         facts["solid"] = solid
     else:
         level = field.default_level if level is None else float(level)
-        made, size, facts = _surface(
-            field, level, volume, tolerance, spacing, seed, max_triangles, report
-        )
+        function = LevelFunction(field, level, most_faces=max_triangles)
+        made, size, facts = _surface(function, volume, tolerance, spacing, seed, report)
         if largest:
             made = largest_part(made)
-        _check_level(LevelFunction(field, level), made, tolerance * size, volume)
+        _check_level(function, made, tolerance * size, volume)
         if thickness is not None:
             report("thickening")
             made, more = thickened(
-                made, normals_of(field, level, made), float(thickness), 0.5 * tolerance * size
+                made, normals_of(function, made), float(thickness), 0.5 * tolerance * size
             )
             facts |= more
     if largest and is_closed:
@@ -166,7 +165,7 @@ def mesh(
 
     def check(one: Surface) -> None:
         if region is not None:
-            _check_level(LevelFunction(*region), one, tolerance * size, volume)
+            _check_level(region, one, tolerance * size, volume)
         check_manifold(one.faces)
         check_apart(one.vertices, one.faces)
 
@@ -222,23 +221,23 @@ def _volume(field: Field, clip: Volume | None, section: Volume | None) -> Volume
 
 
 def _solid(
-    region: Solid,
-    at: float,
+    region: LevelFunction,
     volume: Volume | None,
     tolerance: float,
     spacing: float | None,
     seed: int,
-    most_faces: int,
     report: Callable[[str], None],
 ) -> tuple[Surface, float, dict[str, Any]]:
     """The closed surface of a solid, its size, and what is known of it."""
+    solid, at, most_faces = cast("Solid", region.field), region.level, region.most_faces
     evaluations = [0]
 
     def sheets(error: float, cells: float) -> Sheet:
         def sheet(angle: SolidAngle, value: float) -> Surface:
             angle = cast("SolidAngle", _checked(angle))
             box = _box(angle, value, None)
-            made, facts = _spanned(angle, value, box, error, cells, 1, seed, most_faces, report)
+            function = LevelFunction(angle, value, most_faces=most_faces)
+            made, facts = _spanned(function, box, error, cells, 1, seed, report)
             evaluations[0] += facts["evaluations"]
             return made
 
@@ -246,11 +245,11 @@ def _solid(
 
     def check(made: Surface, size: float) -> None:
         report("checking")
-        _check_level(LevelFunction(region, at), made, tolerance * size, volume)
+        _check_level(region, made, tolerance * size, volume)
         check_manifold(made.faces, made.vertices)
         check_apart(made.vertices, made.faces)
 
-    made = mesh_solid(region, at, volume, tolerance, spacing, sheets, most_faces, check, report)
+    made = mesh_solid(solid, at, volume, tolerance, spacing, sheets, most_faces, check, report)
     facts = {
         "level": at,
         "spacing": made.spacing,
@@ -261,16 +260,15 @@ def _solid(
 
 
 def _surface(
-    field: Field,
-    level: float,
+    function: LevelFunction,
     volume: Volume | None,
     tolerance: float,
     spacing: float | None,
     seed: int,
-    most_faces: int,
     report: Callable[[str], None],
 ) -> tuple[Surface, float, dict[str, Any]]:
     """A level set, its size, and what is known of it."""
+    field, level = function.field, function.level
     field.check_levels((level,))
     box = _box(field, level, volume)
     size = float((box.upper - box.lower).max())
@@ -279,12 +277,9 @@ def _surface(
         cells = min(cells, field.wavelength / CELLS_PER_WAVE)
     attempts = 1 if spacing is not None else _MOST_ATTEMPTS
     if isinstance(field, SolidAngle):
-        made, facts = _spanned(field, level, box, 0.5 * tolerance * size, cells, attempts, seed,
-                               most_faces, report)  # fmt: skip
+        made, facts = _spanned(function, box, 0.5 * tolerance * size, cells, attempts, seed, report)
     else:
-        made, facts = _filling(
-            field, level, box, 0.5 * tolerance * size, cells, attempts, most_faces, report
-        )
+        made, facts = _filling(function, box, 0.5 * tolerance * size, cells, attempts, report)
     if volume is not None and not (isinstance(volume, Box) and box.has_walls):
         made = cut_by(made, volume)
         if not len(made.faces):
@@ -293,17 +288,14 @@ def _surface(
 
 
 def _filling(
-    field: Field,
-    level: float,
+    function: LevelFunction,
     box: _Filled,
     tolerance: float,
     spacing: float,
     attempts: int,
-    most_faces: int,
     report: Callable[[str], None],
 ) -> tuple[Surface, dict[str, Any]]:
     """The level set of a real-valued field in a box, in cells of a lattice."""
-    function = LevelFunction(field, level, most_faces=most_faces)
     while True:
         report(f"cells of {spacing:.3g}")
         try:
@@ -331,18 +323,15 @@ def _filling(
 
 
 def _spanned(
-    field: SolidAngle,
-    level: float,
+    function: LevelFunction,
     box: _Filled,
     tolerance: float,
     spacing: float,
     attempts: int,
     seed: int,
-    most_faces: int,
     report: Callable[[str], None],
 ) -> tuple[Surface, dict[str, Any]]:
     """The level set of an angle, which ends at its curve."""
-    function = LevelFunction(field, level, most_faces=most_faces)
     ends = box.lower, box.upper
     made = spanned_surface(
         function, spacing, attempts, ends, box.has_walls, seed, tolerance, report

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from harnack.backend import Real, Vec3
     from harnack.fields import Field
 
-__all__ = ["CELLS_PER_WAVE", "MOST_FACES", "LevelFunction", "Samples"]
+__all__ = ["CELLS_PER_WAVE", "MOST_FACES", "LevelFunction", "Samples", "Uploads"]
 
 MOST_FACES = 2_000_000
 """Triangles of a level set, unless a person chooses otherwise."""
@@ -62,22 +62,35 @@ class Samples:
         return np.abs(self.value) / np.maximum(steep, 1e-300)
 
 
+class Uploads:
+    """Fields on the backend of double precision, each prepared once."""
+
+    def __init__(self) -> None:
+        self._made: dict[int, tuple[Field, Field]] = {}
+
+    def of(self, field: Field) -> Field:
+        if id(field) not in self._made:  # it is kept, so that no other has its id
+            self._made[id(field)] = field, field.prepare(choose_backend("double"))
+        return self._made[id(field)][1]
+
+
 @dataclass
 class LevelFunction:
     """f - level, in double precision.
 
     most_faces: no more triangles may be made of it.
-    evaluations: of f so far, in points.
+    evaluations: of f so far, in points. uploads: of fields, which functions share.
     """
 
     field: Field
     level: float
     most_faces: int = dataclasses.field(default=MOST_FACES, kw_only=True)
+    uploads: Uploads = dataclasses.field(default_factory=Uploads, kw_only=True)
     evaluations: int = dataclasses.field(default=0, init=False)
 
     def __post_init__(self) -> None:
         self._backend = choose_backend("double")
-        self._prepared = self.field.prepare(self._backend)
+        self._prepared = self.uploads.of(self.field)
         # Data, so that other levels compile nothing.
         level = dr.opaque(self._backend.Float, self.level)
         self._levels = TargetLevels((level,), self.field.period)

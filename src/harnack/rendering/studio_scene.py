@@ -184,7 +184,7 @@ def _rims(made: list[StudioObject], radius: Any, material: Material) -> list[Stu
 def _surface(one: Field | LevelSet, settings: Mapping[str, Any], clear: bool) -> LevelSet:
     """A surface with settings. A `Solid` is drawn with its inside where that is seen: it is opened
     by a section, or clear."""
-    made = _with_settings(one, settings)
+    made = _with_settings(one, settings).in_one_call(begins=True)
     opened = isinstance(made.field, Solid) and made.solid is None
     opened &= clear or made.section is not None
     if not opened or len(made.levels) != 1:

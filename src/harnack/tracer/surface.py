@@ -5,9 +5,9 @@ from __future__ import annotations
 import dataclasses
 import math
 import operator
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import drjit as dr
 
@@ -25,8 +25,11 @@ from harnack.tracer.tolerance import Tolerance
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real
+    from harnack.cells import OccupiedCells
     from harnack.fields.field import Field
     from harnack.geometry import Volume
+
+_T = TypeVar("_T")
 
 _FIRST_HITS = (
     "largest=... works for first hits alone: it cannot be combined with all_hits, confirm or "
@@ -66,6 +69,10 @@ class LevelSet:
     confirm: bool = False
     section: Volume | None = None
     largest: int = 0
+    # What `once` has made; None outside of a call of the library.
+    _made: dict[Any, Any] | None = dataclasses.field(
+        default=None, repr=False, compare=False, kw_only=True
+    )
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "largest", checked_largest(self.largest))
@@ -116,12 +123,54 @@ class LevelSet:
         """What it is cut by besides the field's own domain: clip and section together."""
         return _common([self.clip, self.section])
 
+    def in_one_call(self, *, begins: bool = False) -> LevelSet:
+        """The same surface, which asks its field at most once for what it is on a backend, for its
+        extent and for its cells; and so do all that are made of it by `dataclasses.replace`.
+
+        begins: whether this is the first use in a call of the library: between two calls, users
+            may have changed a field in place.
+        """
+        return self if self._made is not None and not begins else replace(self, _made={})
+
+    def once(self, what: Any, make: Callable[[], _T]) -> _T:
+        """What `make` gives of the field and the levels, made once in a call of the library."""
+        if self._made is None:
+            return make()
+        key = what, id(self.field), self.numbers
+        if key not in self._made:
+            self._made[key] = make(), self.field  # kept, so that no other has its id
+        return self._made[key][0]
+
+    @property
+    def extent(self) -> Volume | None:
+        """The volume in which the field proves its levels to lie; None where it knows of none."""
+        return self.once("extent", lambda: self.field.extent(self.numbers))
+
     @property
     def volume(self) -> Volume | None:
         """What rays are clipped to: domain, proved extent, clip and section together; None for all
         space."""
-        extent = self.field.extent(self.numbers)
-        return _common([self.field.domain, extent, self.clip, self.section])
+        return _common([self.field.domain, self.extent, self.clip, self.section])
+
+    def field_on(self, backend: Backend) -> Field:
+        """The field on a backend. Its derivatives are those of where it is asked for."""
+        is_followed = any(dr.grad_enabled(one) for one in self.field.parameters())
+        what = "field", backend, is_followed
+        return self.once(what, lambda: self.field.for_levels(self.numbers).prepare(backend))
+
+    def levels_on(self, backend: Backend) -> TargetLevels:
+        """The levels on a backend."""
+        levels = tuple(as_data(to_float(backend, level, "level")) for level in self.levels)
+        return TargetLevels(levels, self.field.period)
+
+    def _occupied(self) -> OccupiedCells | None:
+        """Outside of these cells no level counts."""
+        if not self.largest:
+            return self.once("cells", lambda: self.field.occupied(self.numbers))
+        whole = _common([self.field.domain, self.extent, self.clip])
+        given = self.field, self.numbers, whole, self.solid, self.largest
+        what = "largest", self.clip, self.solid, self.largest
+        return self.once(what, lambda: largest_cells(*given))
 
     def prepare(
         self, backend: Backend, *, crosses: bool = False, many: bool = True
@@ -134,19 +183,13 @@ class LevelSet:
         if self.largest and crosses:
             raise ValueError(_FIRST_HITS)
         volume, region = self.volume, None
-        if self.largest:
-            whole = _common([self.field.domain, self.field.extent(self.numbers), self.clip])
-            given = self.field, self.numbers, whole, self.solid, self.largest
-            occupied = largest_cells(*given)
-        else:
-            occupied = self.field.occupied(self.numbers) if many and not crosses else None
+        occupied = self._occupied() if self.largest or (many and not crosses) else None
         if crosses or self.confirm:
             region = _common([self.field.domain, self.clip, self.section])
-        levels = tuple(as_data(to_float(backend, level, "level")) for level in self.levels)
         return PreparedLevelSet(
             backend,
-            self.field.for_levels(self.numbers).prepare(backend),
-            TargetLevels(levels, self.field.period),
+            self.field_on(backend),
+            self.levels_on(backend),
             None if volume is None else volume.prepare(backend),
             self.bound,
             self.tolerance.prepare(backend),

@@ -306,7 +306,7 @@ def _proved_on_level(surface: LevelSet, corners: FloatArray, size: float) -> Boo
     f on either side of it stays on the same side of the level as just beside the center.
     """
     backend, field = choose_backend("double"), surface.field
-    prepared = field.prepare(backend)
+    prepared = surface.field_on(backend)
     smooth = AtDetail(prepared.evaluate)
     targets = TargetLevels(tuple(dr.opaque(backend.Float, v) for v in surface.numbers), 1.0)
 

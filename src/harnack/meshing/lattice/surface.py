@@ -252,7 +252,12 @@ def closed_surface(
         check_size(function, vertices, rest, tolerance)
         vertices = smoothed(function, vertices, rest, None)
         inside = _Inside(
-            function.field, function.level, function, lattice, most_faces=function.most_faces
+            function.field,
+            function.level,
+            function,
+            lattice,
+            most_faces=function.most_faces,
+            uploads=function.uploads,
         )
         vertices, rest = refined(inside, vertices, rest, tolerance, None, report)
         vertices = smoothed_within(inside, vertices, rest, None, tolerance)

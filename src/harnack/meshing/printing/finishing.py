@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
     import trimesh
 
-    from harnack.fields import Field
 
 __all__ = ["check_options", "finished", "normals_of", "simplified"]
 
@@ -55,7 +54,7 @@ def _number(value: Any, name: str) -> float:
         raise TypeError(f"{name} must be a number, not {value!r}") from None
 
 
-def normals_of(field: Field, level: float, surface: Surface) -> FloatArray:
+def normals_of(function: LevelFunction, surface: Surface) -> FloatArray:
     """Unit normals (n, 3) at vertices: the slope of the field, and where it has none, as at the
     curve that a surface ends on, the mean of the faces there by area."""
     corner = surface.vertices[surface.faces]
@@ -64,12 +63,12 @@ def normals_of(field: Field, level: float, surface: Surface) -> FloatArray:
     for k in range(3):
         np.add.at(mean, surface.faces[:, k], normal)
     mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-300)[:, None]
-    slope = LevelFunction(field, level).at(surface.vertices).gradient
+    slope = function.at(surface.vertices).gradient
     steep: FloatArray = np.linalg.norm(slope, axis=1)
     slope = slope / np.maximum(steep, 1e-300)[:, None]
     # Beside the curve slopes turn within a triangle.
     good = np.isfinite(steep) & (steep > 0) & ((slope * mean).sum(axis=1) > 0.7)
-    if field.period is not None:
+    if function.period is not None:
         good[np.unique(boundary_edges(surface.faces))] = False
     chosen: FloatArray = np.where(good[:, None], slope, mean)
     return chosen

@@ -27,7 +27,7 @@ from harnack.geometry import Ball, Box
 from harnack.meshing.checks import MeshingError
 from harnack.meshing.lattice import Lattice, Surface, closed_surface
 from harnack.meshing.printing.manifolds import box_manifold, manifold_of
-from harnack.meshing.samples import LevelFunction, Samples
+from harnack.meshing.samples import LevelFunction, Samples, Uploads
 
 if TYPE_CHECKING:
     from manifold3d import Manifold
@@ -49,6 +49,7 @@ class RegionMesher:
     sheet: meshes surfaces that end at a curve. most_faces: of each level set.
     evaluations, levels, finest: of fields, in points, how many level sets were meshed so far, and
         the smallest spacing of these.
+    uploads: of the fields that were meshed so far.
     """
 
     lower: FloatArray
@@ -62,6 +63,7 @@ class RegionMesher:
     evaluations: int = 0
     levels: int = 0
     finest: float = math.inf
+    uploads: Uploads = dataclasses.field(default_factory=Uploads)
 
     def below(self, solid: Solid, level: float) -> Manifold:
         """The points of the box where a solid's function is at most `level`; what there is outside
@@ -111,13 +113,16 @@ class RegionMesher:
         if self.per_wave is not None and field.wavelength is not None:
             spacing = min(spacing, field.wavelength / self.per_wave)
         self.finest = min(self.finest, spacing)
-        function = _WithinDomain(_entire(field), level, most_faces=self.most_faces)
+        function = self._function(_entire(field), level)
         self.report(f"level {level:g} of {type(field).__name__} in cells of {spacing:.3g}")
         lattice = Lattice.filling(lower, upper, spacing, layers=2)
         made = closed_surface(function, lattice, self.tolerance, self.report)
         self.evaluations += function.evaluations
         self.levels += 1
         return made, is_whole
+
+    def _function(self, field: Field, level: float) -> LevelFunction:
+        return _WithinDomain(field, level, most_faces=self.most_faces, uploads=self.uploads)
 
     def _space(self) -> Manifold:
         pad = 1e-3 * (self.upper - self.lower)
@@ -153,7 +158,7 @@ class RegionMesher:
         )
         points = lattice.points(2 * np.argwhere(np.ones(lattice.counts)) + 1)
         middle = 0.5 * (low + high)
-        samples = _WithinDomain(field, middle).at(points)
+        samples = self._function(field, middle).at(points)
         # Where the wall may be near.
         near = samples.distance <= np.median(samples.distance)
         steep = float(np.median(np.linalg.norm(samples.gradient[near], axis=1)))

@@ -17,7 +17,7 @@ from harnack.meshing.checks import LocalError, MeshingError
 from harnack.meshing.lattice import MissedError, Surface
 from harnack.meshing.printing.manifolds import surface_of, volume_manifold
 from harnack.meshing.printing.regions import RegionMesher, Sheet, is_smooth
-from harnack.meshing.samples import CELLS_PER_WAVE
+from harnack.meshing.samples import CELLS_PER_WAVE, Uploads
 
 __all__ = ["SolidMesh", "mesh_solid", "region_of"]
 
@@ -102,10 +102,12 @@ def mesh_solid(
     error = 0.5 * tolerance * size
     attempts = _MOST_ATTEMPTS if spacing is None else 1
     per_wave = CELLS_PER_WAVE if spacing is None else None
+    uploads = Uploads()
     while True:
         mesher = RegionMesher(
-            lower, upper, error, cells, per_wave, sheets(error, cells), most_faces, report
-        )
+            lower, upper, error, cells, per_wave, sheets(error, cells), most_faces, report,
+            uploads=uploads,
+        )  # fmt: skip
         try:
             made = _put_together(mesher, solid, level, volume)
             if not len(made.faces):

@@ -58,7 +58,7 @@ def register_surfaces(plugin: str, surface: Callable[[Any], LevelSet]) -> Any:
     mi = load_mitsuba()
 
     def made(props: Any) -> Any:
-        return carrier.from_properties(mi, props, surface(props))
+        return carrier.from_properties(mi, props, surface(props).in_one_call())
 
     mi.register_shape(plugin, made)
     return mi

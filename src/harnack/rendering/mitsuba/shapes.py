@@ -59,6 +59,7 @@ def shape(
                 "a shape takes bsdf=..., not material=...: that is an argument of harnack.render"
             )
         surface = level_set(surface, **settings)
+    surface = surface.in_one_call()
     props = mi.Properties()
     props["bsdf"] = as_bsdf(mi, bsdf)
     if to_world is not None:

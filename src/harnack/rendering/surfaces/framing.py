@@ -43,7 +43,7 @@ def visible_points(surface: LevelSet, backend: Backend) -> FloatArray:
     """
     ends = box_of(surface)
     check_size(ends)
-    prepared = surface.field.for_levels(surface.numbers).prepare(backend)
+    prepared = surface.field_on(backend)
 
     def found() -> FloatArray:
         return _found(surface, backend, ends)
