@@ -12,8 +12,7 @@ import pytest
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.distance.curvature import _Derivatives
-from harnack.fields.batch import BatchedField, Values
-from harnack.fields.symmetric import SymmetricSum
+from harnack.fields.batch import BatchedField, SymmetricSum, Values
 
 PRECISIONS = ("double", "single")
 

@@ -8,12 +8,9 @@ them. `harnack.testing.check_field` tests a field against this page.
 from __future__ import annotations
 
 import abc
-import copy
-import dataclasses
-import functools
 import inspect
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import drjit as dr
 import numpy as np
@@ -32,17 +29,17 @@ from harnack.enclosures import (
     Curvature,
     HarmonicBall,
     Lipschitz,
-    Promise,
 )
-from harnack.fields.look import Look, Path, Sample, lengthened
-from harnack.fields.points import at_points
-from harnack.fields.sheets import NO_PART, NO_SHEET, Crossing, NearestSheet, PartEntry
+from harnack.fields.detail import Detail
+from harnack.fields.look import Look, Path, Sample, checked_samples, lengthened
+from harnack.fields.points import also_at_points, at_points
+from harnack.fields.sheets import Boundary, Parts, Sheets
 from harnack.geometry.volumes.volume import check_volume
 
 if TYPE_CHECKING:
     from typing import Self
 
-    from harnack.backend import Backend, FloatArray, IntArray, Mask, Precision, Real, Vec3
+    from harnack.backend import Backend, Precision, Real, Vec3
     from harnack.cells import OccupiedCells
     from harnack.geometry import Volume
 
@@ -64,80 +61,14 @@ __all__ = [
 _OF_SOLIDS = frozenset(
     ("moved", "rotated", "scaled", "transformed", "twisted", "tapered", "grown", "blended")
 )
-# A detail at which nothing is left out.
-NO_TRUNCATION = 1e9
-
-_R = TypeVar("_R", bound="Sample | Promise")
-_HOW = (
-    "return harnack.Sample(value, gradient, known), with a Dr.Jit number, a Dr.Jit 3-vector and a "
-    "tuple of promises, such as (harnack.Lipschitz(1.0),) if |grad f| <= 1"
-)
 
 
-def _of_points(hessian: Callable[[Any, Vec3], Any]) -> Callable[..., Any]:
-    """The same method, which also takes NumPy points and gives NumPy matrices."""
-
-    @functools.wraps(hessian)
-    def general(self: Any, p: Any, *, precision: Precision = "single") -> Any:
-        if dr.is_array_v(type(p)):
-            refuse_derivatives(f"the Hessian of {type(self).__name__}", p, self.parameters())
-            return hessian(self, p)
-
-        def kernel(backend: Backend, x: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-            return self.prepare(backend).hessian(x)
-
-        return np.stack(at_points(p, kernel, precision), axis=-2)
-
-    return general
-
-
-def _checked(evaluate: Callable[[Any, Vec3], Sample]) -> Callable[[Any, Vec3], Sample]:
-    """The same method, which raises TypeError if it returns anything but a proper `Sample`."""
-
-    @functools.wraps(evaluate)
-    def checked(self: Any, p: Vec3) -> Sample:
-        sample: Any = evaluate(self, p)
-        name = f"{type(self).__name__}.evaluate"
-        if not isinstance(sample, Sample):
-            raise TypeError(f"{name} returned {_named(sample)}, not a Sample: {_HOW}")
-        given: Any
-        for place, given in (("known", sample.known), ("weaker", sample.weaker)):
-            if not isinstance(given, tuple):
-                raise TypeError(f"{name}: Sample.{place} is {_named(given)}, not a tuple: {_HOW}")
-            for one in cast("tuple[Any, ...]", given):
-                if not isinstance(one, Promise):
-                    wrong = f"Sample.{place} holds {_named(one)}, no promise"
-                    raise TypeError(f"{name}: {wrong}: {_HOW}")
-        gradient: Any = sample.gradient
-        if not dr.is_array_v(type(gradient)) or dr.size_v(type(gradient)) != 3:
-            raise TypeError(f"{name}: Sample.gradient is {_named(gradient)}, no 3-vector: {_HOW}")
-        if type(self).parameters is Field.parameters and not dr.grad_enabled(p):
-            refuse_derivatives(type(self).__name__, sample.value)
-        return dataclasses.replace(
-            _plain(sample),
-            known=tuple(_plain(one) for one in sample.known),
-            weaker=tuple(_plain(one) for one in sample.weaker),
-        )
-
-    return checked
-
-
-def _plain(record: _R) -> _R:
-    """A record whose scalars of NumPy are Python's: Dr.Jit takes no others."""
-    scalars: dict[str, Any] = {
-        key: one.item() for key, one in vars(record).items() if isinstance(one, np.generic)
-    }
-    return dataclasses.replace(record, **scalars) if scalars else record
-
-
-def _named(value: Any) -> str:
-    return "nothing" if value is None else f"an object of type {type(value).__name__}"
-
-
-class Field(abc.ABC):
+class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
     """A scalar function on R^3 whose level sets can be traced with a proof.
 
     Subclasses define `evaluate`; the class attributes are defaults that an instance may override.
+    What only some fields are capable of (jumps across sheets, parts, detail, curves at which level
+    sets end) is in the base classes, whose defaults say that a field is not.
     """
 
     period: ClassVar[float | None] = None
@@ -162,26 +93,12 @@ class Field(abc.ABC):
     """The shortest wavelength of f that matters, where it is known: code that samples f in cells
     makes them smaller than this."""
 
-    has_sheets: bool = False
-    """Whether f jumps across sheets (see `harnack.fields.sheets`). Then `next_crossing` and
-    `between` are needed, and what `evaluate` promises is about f with the jumps taken out."""
-
-    has_parts: bool = False
-    """Whether the surface is that of many level sets, each of a field of its own (see
-    `harnack.fields.sheets`). Then `next_part` and `part_at` are needed."""
-
     has_creases: bool = False
     """Whether the gradient jumps somewhere, as it does where the surfaces of a union meet."""
 
-    has_detail: bool = False
-    """Whether f can be evaluated more coarsely and more closely; then `at_detail` is needed."""
-
-    coarsest_detail: float = 1.0
-    """What detail 0 amounts to, as a detail in (0, 1]: see `at_detail`."""
-
     def __new__(cls, *given: Any, **named: Any) -> Self:
         """Refuses parameters with derivatives, unless the class says that it has `parameters`."""
-        if cls.parameters is Field.parameters:
+        if cls.drops_derivatives():
             refuse_derivatives(cls.__name__, given, named)
         return super().__new__(cls)
 
@@ -196,13 +113,13 @@ class Field(abc.ABC):
                 checked_maker = refuses_derivatives(cast("Any", own).__func__)
                 setattr(cls, name, classmethod(checked_maker))
         if "evaluate" in vars(cls):
-            checked = _checked(cls.evaluate)
-            cls.evaluate = checked  # pyright: ignore[reportAttributeAccessIssue]
+            checked: Any = checked_samples(cls.evaluate)
+            cls.evaluate = checked
             if "look" not in vars(cls):  # that of a base would pass it by
                 cls.look = Field.look
         if "hessian" in vars(cls):
-            general = _of_points(cls.hessian)
-            cls.hessian = general  # pyright: ignore[reportAttributeAccessIssue]
+            general: Any = also_at_points(cls.hessian)
+            cls.hessian = general
 
     def __repr__(self) -> str:
         """The field as it was made, as far as it remembers, with arrays by their shapes."""
@@ -231,7 +148,7 @@ class Field(abc.ABC):
         """
 
     def prepare(self, backend: Backend) -> Field:
-        """A field equal to this one whose data lie on the backend, called once before a trace.
+        """A field equal to this one whose data lie on the backend: asked for once by each call.
 
         The default suits fields that hold only Python numbers.
         """
@@ -255,12 +172,6 @@ class Field(abc.ABC):
         del levels
         return None
 
-    def change_along(self, p: FloatArray, q: FloatArray) -> FloatArray | None:
-        """How an angle-valued f changes along straight segments from p to q (n, 3), followed as it
-        goes round; None if only its values are known. Meshes ask for it on long edges."""
-        del p, q
-        return None
-
     def slope_change(self, p: Vec3, radius: Real) -> Real:
         """A length that |grad f(y) - grad f(p)| is proved not to exceed for any y with
         |y - p| <= radius; infinite where nothing is known, which is the default. Proofs that a mesh
@@ -278,10 +189,15 @@ class Field(abc.ABC):
         """
         return ()
 
+    @classmethod
+    def drops_derivatives(cls) -> bool:
+        """Whether the class names no `parameters`, so that derivatives by any would be dropped."""
+        return cls.parameters is Field.parameters
+
     def check_parameters(self) -> None:
         """Raise NotImplementedError for derivatives by parameters that the field does not name, as
         by what its formula refers to: they would be dropped."""
-        if type(self).parameters is Field.parameters:
+        if self.drops_derivatives():
             kind = type(self)
             is_own = not kind.__module__.startswith("harnack.")
             refuse_derivatives(kind.__name__, vars(self), kind.evaluate if is_own else None)
@@ -349,7 +265,7 @@ class Field(abc.ABC):
 
         return at_points(points, kernel, precision)[0]
 
-    @_of_points
+    @also_at_points
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         """Rows of the symmetric matrix of second derivatives at p, in f per length squared.
 
@@ -363,24 +279,11 @@ class Field(abc.ABC):
             'ask for what needs none, such as signed_distance(..., method="first")'
         )
 
-    def closest_on_boundary(self, p: Vec3) -> Vec3 | None:
-        """The closest point of the curve in which every level set ends; None where none does.
-
-        Only distances ask for it, while no loop is being recorded. Ends at `domain` do not count.
-        """
+    def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
+        """Bounds of the errors of the gradient, as a length, and of `hessian`, in the spectral
+        norm, at the point p of a sample: what the sample states, and nothing for the Hessian."""
         del p
-        return None
-
-    def mesh_of_sheets(self) -> tuple[FloatArray, IntArray, bool] | None:
-        """Vertices (n, 3) and faces (m, 3) of the mesh whose winding number f is, faces as often as
-        they count, and whether f is a whole number everywhere off them; None if f is no winding
-        number. Distances ask for it."""
-        return None
-
-    @property
-    def boundary_curves(self) -> tuple[FloatArray, ...]:
-        """Closed curves (n, 3) at which level sets end; the first point is not repeated."""
-        return ()
+        return sample.gradient_error, 0.0
 
     def describe(self) -> dict[str, Any]:
         """What a person would want to know about the choices this field made by itself."""
@@ -395,120 +298,6 @@ class Field(abc.ABC):
         """
         del ahead, back
         return path.look(self.evaluate(path.point(t)))
-
-    def at_detail(self, detail: Real) -> Field:
-        """This field, evaluated so closely in each lane: 0 as coarsely as the field allows, 1 as
-        `evaluate` does, more than 1 more closely.
-
-        `Sample.truncation` falls about as detail^-3 and is 0 for a detail that is large enough.
-        A coarse sample is as true as any: it states a larger `error`. The tracer asks for detail
-        where that error matters.
-        """
-        del detail
-        return self
-
-    def without_truncation(self, backend: Backend) -> Field:
-        """This field, prepared for the backend, with nothing left out when it is evaluated."""
-        if not self.has_detail:
-            return self
-        closely = copy.copy(self)
-        closely.evaluate = self.at_detail(backend.Float(NO_TRUNCATION)).evaluate
-        return closely
-
-    def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """Bounds of the errors of the gradient, as a length, and of `hessian`, in the spectral
-        norm, at the point p of a sample: what the sample states, and nothing for the Hessian."""
-        del p
-        return sample.gradient_error, 0.0
-
-    # Of fields with sheets only. All may be called while a loop is being recorded, for rays
-    # o + t d with |d| = 1; answers for lanes that are not active are not looked at.
-
-    def next_crossing(
-        self, o: Vec3, d: Vec3, after: Crossing, t_max: Real, active: Mask
-    ) -> Crossing:
-        """The first crossing strictly after another one, with t <= t_max.
-
-        Crossings are ordered by (t, sheet): sheets crossed at the same t come one after the other
-        by their index. NO_SHEET is the largest index, so that nothing follows it at the same t.
-        Every crossing of a walk along the ray must come up in that order, at the same t and with
-        the same jump, whatever the walk began with. Where there is none, t = inf, sheet =
-        NO_SHEET, jump = 0.
-        """
-        del o, d, after, t_max, active
-        return Crossing(float("inf"), NO_SHEET, 0.0, (0.0, 0.0, 0.0))
-
-    def offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
-        """A number of this field's own at the start of a ray, handed back by `between`.
-
-        The tracer adds the jump of every crossing that it passes. Crossings with t <= t_min are
-        behind the start (`next_crossing` after (t_min, NO_SHEET)), all others ahead of it.
-        """
-        del o, d, t_min, active
-        return 0.0
-
-    def between(self, o: Vec3, d: Vec3, behind: Crossing, ahead: Crossing, offset: Real) -> Field:
-        """The field as seen on the stretch of the ray between two successive crossings.
-
-        `evaluate` of the field returned is asked at points p = o + t d with behind.t <= t <=
-        ahead.t, to rounding. It gives the value continued along the stretch, *also at its ends*:
-        at ahead.t what f is just before that sheet, at behind.t just behind that one, even where
-        rounding puts p on the other side or the two t are equal. What it promises is about the
-        smooth function that continues these values through all sheets; the tracer uses it on the
-        stretch only.
-
-        behind: the crossing last passed, or the start of the ray with sheet NO_SHEET.
-        ahead: the next one, or t = inf and sheet NO_SHEET.
-        offset: `offset` at the start of the ray plus all jumps since.
-        """
-        del o, d, behind, ahead, offset
-        return self
-
-    # Of fields with sheets only: distances ask for them, also while a loop is being recorded.
-
-    def distance_to_sheets(self, p: Vec3) -> Real:
-        """The distance from p to the nearest sheet, rounded down: lower bounds of distances rest on
-        it. inf where there is none."""
-        del p
-        return float("inf")
-
-    def nearest_sheet(
-        self, p: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
-    ) -> NearestSheet | None:
-        """The first sheet behind `after` = (order, index), nearer than the distance `limit`.
-
-        Sheets are ordered by their distance from p, in whatever measure `NearestSheet.order` gives,
-        then by index; from (-1, NO_SHEET) on, all come up, each once. The default, None, says
-        nothing: distances then look for the nearest sheet alone, by how `distance_to_sheets` falls.
-        """
-        del p, after, limit, active
-        return None
-
-    # Of fields with parts only, but for `for_levels`, which every field is asked for. The last two
-    # may be called while a loop is being recorded.
-
-    def for_levels(self, levels: tuple[float, ...]) -> Field:
-        """This field with boxes that hold the parts of these levels, to be prepared."""
-        del levels
-        return self
-
-    def next_part(
-        self, o: Vec3, d: Vec3, after: PartEntry, start: Real, end: Real, active: Mask
-    ) -> PartEntry:
-        """The first box behind `after` that a ray enters at start <= t <= end.
-
-        A ray that begins in a box enters it at `start`. Entries are ordered by (enter, part), and
-        every box that the ray meets between `start` and `end` must come up in that order, once,
-        after an entry at less than `start`. Where there is none, part = NO_PART.
-        """
-        del o, d, after, start, end, active
-        return PartEntry(float("inf"), float("inf"), NO_PART)
-
-    def part_at(self, index: Any) -> Field:
-        """The field, in each lane another, whose level set the part with that index is. Its
-        `evaluate` and `look` may be called for points of any size, promises hold in all space."""
-        del index
-        return self
 
 
 class AtDetail(Field):

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import drjit as dr
+import numpy as np
 
 from harnack.backend.extrema import fmax
+from harnack.backend.numbers import refuse_derivatives
 from harnack.enclosures import Enclosure, Lipschitz, Promise, Proofs, Slopes
 
 if TYPE_CHECKING:
@@ -54,6 +57,55 @@ class Sample:
         """The sample with each promise changed, and other numbers."""
         known, weaker = (tuple(map(change, group)) for group in (self.known, self.weaker))
         return dataclasses.replace(self, known=known, weaker=weaker, **numbers)
+
+
+_R = TypeVar("_R", bound=Sample | Promise)
+_HOW = (
+    "return harnack.Sample(value, gradient, known), with a Dr.Jit number, a Dr.Jit 3-vector and a "
+    "tuple of promises, such as (harnack.Lipschitz(1.0),) if |grad f| <= 1"
+)
+
+
+def checked_samples(
+    evaluate: Callable[[Any, Vec3], Sample],
+) -> Callable[[Any, Vec3], Sample]:
+    """The method `evaluate` of a field, which raises TypeError if it returns anything but a proper
+    `Sample`, and NotImplementedError if the value has derivatives that the field would drop."""
+
+    @functools.wraps(evaluate)
+    def checked(self: Any, p: Vec3) -> Sample:
+        sample: Any = evaluate(self, p)
+        name = f"{type(self).__name__}.evaluate"
+        if not isinstance(sample, Sample):
+            raise TypeError(f"{name} returned {_named(sample)}, not a Sample: {_HOW}")
+        given: Any
+        for place, given in (("known", sample.known), ("weaker", sample.weaker)):
+            if not isinstance(given, tuple):
+                raise TypeError(f"{name}: Sample.{place} is {_named(given)}, not a tuple: {_HOW}")
+            for one in cast("tuple[Any, ...]", given):
+                if not isinstance(one, Promise):
+                    wrong = f"Sample.{place} holds {_named(one)}, no promise"
+                    raise TypeError(f"{name}: {wrong}: {_HOW}")
+        gradient: Any = sample.gradient
+        if not dr.is_array_v(type(gradient)) or dr.size_v(type(gradient)) != 3:
+            raise TypeError(f"{name}: Sample.gradient is {_named(gradient)}, no 3-vector: {_HOW}")
+        if self.drops_derivatives() and not dr.grad_enabled(p):
+            refuse_derivatives(type(self).__name__, sample.value)
+        return _plain(sample).with_promises(_plain)
+
+    return checked
+
+
+def _plain(record: _R) -> _R:
+    """A record whose scalars of NumPy are Python's: Dr.Jit takes no others."""
+    scalars: dict[str, Any] = {
+        key: one.item() for key, one in vars(record).items() if isinstance(one, np.generic)
+    }
+    return dataclasses.replace(record, **scalars) if scalars else record
+
+
+def _named(value: Any) -> str:
+    return "nothing" if value is None else f"an object of type {type(value).__name__}"
 
 
 def lengthened(sample: Sample, size: Real) -> Sample:

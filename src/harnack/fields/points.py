@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, cast
 
@@ -16,7 +17,7 @@ from harnack.backend.numbers import refuse_derivatives
 if TYPE_CHECKING:
     from harnack.backend import Backend, Precision, Vec3
 
-__all__ = ["at_points", "in_batches", "morton_order"]
+__all__ = ["also_at_points", "at_points", "in_batches", "morton_order"]
 
 # Points in one kernel: enough to keep a GPU busy, few enough to keep memory small.
 _AT_ONCE = 1 << 20
@@ -51,6 +52,23 @@ def at_points(
     if given.shape == (3,):
         return tuple(one[0] for one in in_batches(backend, visit, given[None]))
     return in_batches(backend, visit, given)
+
+
+def also_at_points(hessian: Callable[[Any, Vec3], Any]) -> Callable[..., Any]:
+    """The same method of a field, which also takes NumPy points and gives NumPy matrices."""
+
+    @functools.wraps(hessian)
+    def general(self: Any, p: Any, *, precision: Precision = "single") -> Any:
+        if dr.is_array_v(type(p)):
+            refuse_derivatives(f"the Hessian of {type(self).__name__}", p, self.parameters())
+            return hessian(self, p)
+
+        def kernel(backend: Backend, x: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+            return self.prepare(backend).hessian(x)
+
+        return np.stack(at_points(p, kernel, precision), axis=-2)
+
+    return general
 
 
 def in_batches(

@@ -1,4 +1,6 @@
-"""Sheets: surfaces, such as triangles, across which a field jumps.
+"""Where a field is not one smooth function whose level sets have no end.
+
+Sheets: surfaces, such as triangles, across which a field jumps.
 
 Off its sheets such a field is as smooth as any other. Along a ray the sheets cut the field into
 *stretches*; on each of them the values, continued up to and onto both of its ends, are a smooth
@@ -20,15 +22,18 @@ enters them, and no farther than the first hit so far.
 A field with parts says `has_parts = True` and answers two questions (see `Field`): `next_part`,
 which part comes next, and `part_at`, the field whose level set that is. The parts share the period,
 the levels and the domain of the field. Its own `evaluate` has no meaning.
+
+Boundary: curves at which every level set ends, such as those of an angle, which goes round them.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 if TYPE_CHECKING:
-    from harnack.backend import Mask, Real, Vec3
+    from harnack.backend import FloatArray, IntArray, Mask, Real, Vec3
+    from harnack.fields.field import Field
 
 NO_SHEET = 0xFFFFFFFF
 """The index of no sheet, larger than that of any."""
@@ -86,3 +91,134 @@ class PartEntry:
     enter: Real
     leave: Real
     part: Any
+
+
+class Sheets:
+    """What a field with sheets is asked for, and what those without answer.
+
+    All of it may be asked for while a loop is being recorded; rays are o + t d with |d| = 1, and
+    answers for lanes that are not active are not looked at.
+    """
+
+    has_sheets: bool = False
+    """Whether f jumps across sheets. Then `next_crossing` and `between` are needed, and what
+    `evaluate` promises is about f with the jumps taken out."""
+
+    def next_crossing(
+        self, o: Vec3, d: Vec3, after: Crossing, t_max: Real, active: Mask
+    ) -> Crossing:
+        """The first crossing strictly after another one, with t <= t_max.
+
+        Crossings are ordered by (t, sheet): sheets crossed at the same t come one after the other
+        by their index. NO_SHEET is the largest index, so that nothing follows it at the same t.
+        Every crossing of a walk along the ray must come up in that order, at the same t and with
+        the same jump, whatever the walk began with. Where there is none, t = inf, sheet =
+        NO_SHEET, jump = 0.
+        """
+        del o, d, after, t_max, active
+        return Crossing(float("inf"), NO_SHEET, 0.0, (0.0, 0.0, 0.0))
+
+    def offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
+        """A number of this field's own at the start of a ray, handed back by `between`.
+
+        The tracer adds the jump of every crossing that it passes. Crossings with t <= t_min are
+        behind the start (`next_crossing` after (t_min, NO_SHEET)), all others ahead of it.
+        """
+        del o, d, t_min, active
+        return 0.0
+
+    def between(self, o: Vec3, d: Vec3, behind: Crossing, ahead: Crossing, offset: Real) -> Field:
+        """The field as seen on the stretch of the ray between two successive crossings.
+
+        `evaluate` of the field returned is asked at points p = o + t d with behind.t <= t <=
+        ahead.t, to rounding. It gives the value continued along the stretch, *also at its ends*:
+        at ahead.t what f is just before that sheet, at behind.t just behind that one, even where
+        rounding puts p on the other side or the two t are equal. What it promises is about the
+        smooth function that continues these values through all sheets; the tracer uses it on the
+        stretch only.
+
+        behind: the crossing last passed, or the start of the ray with sheet NO_SHEET.
+        ahead: the next one, or t = inf and sheet NO_SHEET.
+        offset: `offset` at the start of the ray plus all jumps since.
+        """
+        del o, d, behind, ahead, offset
+        return cast("Field", self)
+
+    def distance_to_sheets(self, p: Vec3) -> Real:
+        """The distance from p to the nearest sheet, rounded down: lower bounds of distances rest on
+        it. inf where there is none."""
+        del p
+        return float("inf")
+
+    def nearest_sheet(
+        self, p: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
+    ) -> NearestSheet | None:
+        """The first sheet behind `after` = (order, index), nearer than the distance `limit`.
+
+        Sheets are ordered by their distance from p, in whatever measure `NearestSheet.order` gives,
+        then by index; from (-1, NO_SHEET) on, all come up, each once. The default, None, says
+        nothing: distances then look for the nearest sheet alone, by how `distance_to_sheets` falls.
+        """
+        del p, after, limit, active
+        return None
+
+    def mesh_of_sheets(self) -> tuple[FloatArray, IntArray, bool] | None:
+        """Vertices (n, 3) and faces (m, 3) of the mesh whose winding number f is, faces as often as
+        they count, and whether f is a whole number everywhere off them; None if f is no winding
+        number. Distances ask for it."""
+        return None
+
+
+class Parts:
+    """What a field with parts is asked for, and what those without answer. `for_levels` comes
+    first; the others may be asked for while a loop is being recorded."""
+
+    has_parts: bool = False
+    """Whether the surface is that of many level sets, each of a field of its own. Then `next_part`
+    and `part_at` are needed."""
+
+    def for_levels(self, levels: tuple[float, ...]) -> Field:
+        """This field with boxes that hold the parts of these levels, to be prepared."""
+        del levels
+        return cast("Field", self)
+
+    def next_part(
+        self, o: Vec3, d: Vec3, after: PartEntry, start: Real, end: Real, active: Mask
+    ) -> PartEntry:
+        """The first box behind `after` that a ray enters at start <= t <= end.
+
+        A ray that begins in a box enters it at `start`. Entries are ordered by (enter, part), and
+        every box that the ray meets between `start` and `end` must come up in that order, once,
+        after an entry at less than `start`. Where there is none, part = NO_PART.
+        """
+        del o, d, after, start, end, active
+        return PartEntry(float("inf"), float("inf"), NO_PART)
+
+    def part_at(self, index: Any) -> Field:
+        """The field, in each lane another, whose level set the part with that index is. Its
+        `evaluate` and `look` may be called for points of any size, promises hold in all space."""
+        del index
+        return cast("Field", self)
+
+
+class Boundary:
+    """What a field whose level sets end at curves is asked for, and what others answer."""
+
+    @property
+    def boundary_curves(self) -> tuple[FloatArray, ...]:
+        """Closed curves (n, 3) at which level sets end; the first point is not repeated."""
+        return ()
+
+    def closest_on_boundary(self, p: Vec3) -> Vec3 | None:
+        """The closest point of the curve in which every level set ends; None where none does.
+
+        Only distances ask for it, while no loop is being recorded. Ends at `domain` do not count.
+        """
+        del p
+        return None
+
+    def change_along(self, p: FloatArray, q: FloatArray) -> FloatArray | None:
+        """How an angle-valued f changes along straight segments from p to q (n, 3), followed as it
+        goes round; None if only its values are known. Meshes ask for it on long edges."""
+        del p, q
+        return None

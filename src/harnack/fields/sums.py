@@ -15,9 +15,8 @@ import drjit as dr
 
 from harnack.backend.extrema import fmax, fmin
 from harnack.enclosures import Curvature, HarmonicBall, Lipschitz
-from harnack.fields.batch import Values
+from harnack.fields.batch import SymmetricSum, Values
 from harnack.fields.field import Sample
-from harnack.fields.symmetric import SymmetricSum
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3

@@ -19,7 +19,7 @@ import drjit as dr
 from harnack.backend.lengths import length as norm
 from harnack.backend.numbers import holds_numbers_alone
 from harnack.enclosures import TargetLevels
-from harnack.fields.field import NO_TRUNCATION
+from harnack.fields.detail import NO_TRUNCATION
 from harnack.fields.field_cache import FieldCache
 from harnack.tracer.tolerance import Status
 

@@ -15,13 +15,12 @@ import numpy as np
 
 from harnack.backend import backend_of
 from harnack.backend.extrema import fmax
-from harnack.fields.batch import BatchedField, Values
+from harnack.fields.batch import BatchedField, SymmetricSum, Values
 from harnack.fields.field import Sample, lengthened
 from harnack.fields.multipoles.dipole_records import dipole_rows, hierarchy_of, in_slots
 from harnack.fields.multipoles.far_clusters import Treecode
 from harnack.fields.multipoles.multipole import all_levels
 from harnack.fields.sums import FieldSums, Terms, rounding_of_dipole, rounding_of_sum
-from harnack.fields.symmetric import SymmetricSum
 from harnack.fields.unit_coordinates import (
     DetailedField,
     UnitCoordinates,

@@ -71,7 +71,7 @@ import numpy as np
 
 from harnack.backend.extrema import clamp, fmax, fmin
 from harnack.backend.records import Records
-from harnack.fields.symmetric import SymmetricSum
+from harnack.fields.batch import SymmetricSum
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Mask, Real, Vec3

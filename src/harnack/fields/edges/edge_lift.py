@@ -24,10 +24,10 @@ import numpy as np
 
 from harnack.backend.extrema import fmax, fmin
 from harnack.backend.records import Records
+from harnack.fields.batch import SymmetricSum
 from harnack.fields.edges.edge import Edge, edge_variation
 from harnack.fields.edges.edge_records import single_edges
 from harnack.fields.sums import FieldSums, Terms
-from harnack.fields.symmetric import SymmetricSum
 from harnack.fields.unit_coordinates import epsilon_at
 from harnack.tree.triangles import Upwards, side
 

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import drjit as dr
 
 from harnack.backend.extrema import fmin
+from harnack.fields.batch import SymmetricSum
 from harnack.fields.edges.edge import Edge
-from harnack.fields.symmetric import SymmetricSum
 from harnack.tree.nearest import squared_distance_to_segment
 
 if TYPE_CHECKING:

@@ -37,7 +37,7 @@ import numpy as np
 from harnack.backend import FloatArray, IntArray
 from harnack.backend.extrema import fmax
 from harnack.enclosures import Lipschitz
-from harnack.fields.batch import Values
+from harnack.fields.batch import SymmetricSum, Values
 from harnack.fields.edges.edge_lift import (
     LiftedEdge,
     LiftedEdges,
@@ -54,7 +54,6 @@ from harnack.fields.multipoles.multipole import cartesian, triangle_levels
 from harnack.fields.multipoles.multipole_kernel import far_terms
 from harnack.fields.multipoles.truncation import bend_columns, truncation
 from harnack.fields.sums import FieldSums, free_part, rounding_of_sum
-from harnack.fields.symmetric import SymmetricSum
 from harnack.fields.unit_coordinates import epsilon_at
 from harnack.tree import (
     NO_PRIMITIVE,

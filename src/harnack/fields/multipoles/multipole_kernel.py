@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 
+from harnack.fields.batch import SymmetricSum
 from harnack.fields.sums import Terms
-from harnack.fields.symmetric import SymmetricSum
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -23,8 +23,8 @@ import drjit as dr
 
 from harnack.backend.extrema import fmin
 from harnack.enclosures import Curvature
+from harnack.fields.batch import SymmetricSum
 from harnack.fields.sums import SUM_ROUNDING, FieldSums, Terms
-from harnack.fields.symmetric import SymmetricSum
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
