@@ -11,8 +11,8 @@ from harnack.cells import OccupiedCells
 from harnack.cells.uniform_grid import distances_to_full
 from harnack.fields.edges.edge_lift import LiftedEdges, lifted_sums
 from harnack.fields.edges.lifted_trails import LiftedTrails
-from harnack.fields.meshes.edge_trails import closed_trails
-from harnack.fields.meshes.winding_number import winding_box
+from harnack.fields.winding.edge_trails import closed_trails
+from harnack.fields.winding.winding_number import winding_box
 from harnack.geometry.mesh_shapes import icosphere
 from harnack.tree.triangles import Frame
 from tests.oracles.direct_sums import winding_sum

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.distance import batches, closest_points, curvature, signed_distance
-from harnack.distance.estimates import second_order
+from harnack.distance.tangent import second_order
 from harnack.enclosures import Caps, Classic, Cone, Enclosure, Slope, Taylor
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.geometry import shapes

@@ -44,7 +44,7 @@ from harnack.enclosures.tangent import Tangent
 from harnack.fields.blobs.blobs import _After  # pyright: ignore[reportPrivateUsage]
 from harnack.fields.blobs.largest import LargestAlong
 from harnack.fields.solids.region import Folded
-from harnack.fields.solids.shapes.tube import TubeAhead
+from harnack.fields.solids.tube import TubeAhead
 
 SIZES = [0.0, 1e-12, 1e-4, 0.3, 1.0, 7.0, 1e5, 1e12, 1e25, np.inf]
 NUMBERS = SIZES + [-one for one in SIZES]

@@ -14,7 +14,7 @@ from scipy.special import beta, betainc, eval_chebyu
 import harnack as hk
 from harnack.backend import choose_backend, to_float, to_numpy
 from harnack.enclosures import Curvature, HarmonicBall
-from harnack.fields.meshes.morph_slice import GRADIENT, SlicedKernel, centroids
+from harnack.fields.winding.morph_slice import GRADIENT, SlicedKernel, centroids
 from harnack.geometry.mesh_shapes import bumpy_sphere, icosphere, remove_faces, torus_mesh
 from harnack.geometry.meshes import MeshError
 from harnack.testing.walks import look_at, random_directions

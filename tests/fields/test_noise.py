@@ -11,7 +11,7 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend
-from harnack.fields.solids.shapes.fractal import (
+from harnack.fields.solids.fractal import (
     CONSTANTS,
     CORNERS,
     cell_noise,

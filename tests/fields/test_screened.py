@@ -13,12 +13,6 @@ from scipy.special import eval_legendre, spherical_in, spherical_kn
 import harnack as hk
 from harnack.backend import choose_backend, to_float, to_numpy, to_vector3
 from harnack.enclosures import Curvature, HarmonicBall
-from harnack.fields.clouds.screened import (
-    ScreenedWindingNumber,
-    YukawaKernel,
-    accepting_distance,
-    thetas,
-)
 from harnack.fields.multipoles.dipole_records import dipole_rows
 from harnack.fields.multipoles.radial_kernel import seen_dipole
 from harnack.fields.multipoles.radial_tree import (
@@ -26,6 +20,12 @@ from harnack.fields.multipoles.radial_tree import (
     clusters,
     coefficients,
     seen_cluster,
+)
+from harnack.fields.winding.screened import (
+    ScreenedWindingNumber,
+    YukawaKernel,
+    accepting_distance,
+    thetas,
 )
 from harnack.geometry import mesh_shapes
 from harnack.geometry.clouds import CloudError

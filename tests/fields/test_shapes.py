@@ -19,7 +19,7 @@ from harnack.enclosures import Gaps, choose_proofs
 from harnack.enclosures.proofs import longest_step
 from harnack.fields.formula import Formula
 from harnack.fields.look import Path, value_error
-from harnack.fields.solids.shapes.fractal import CORNERS, lattice_vector
+from harnack.fields.solids.fractal import CORNERS, lattice_vector
 from harnack.testing import check_field
 
 Oracle = Callable[[Any], Any]

@@ -20,7 +20,7 @@ from harnack.meshing.checks import (
     check_inside,
     check_near_level,
 )
-from harnack.meshing.lattice import Surface
+from harnack.meshing.lattice_surface import Surface
 from harnack.meshing.printing.closed_mesh import ClosedMesh
 from harnack.meshing.printing.finishing import simplified
 from harnack.meshing.samples import LevelFunction

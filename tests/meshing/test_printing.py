@@ -17,7 +17,8 @@ from harnack.cli import main
 from harnack.geometry import shapes
 from harnack.meshing import checks
 from harnack.meshing.intersections import intersecting_faces
-from harnack.meshing.lattice import Lattice, Surface
+from harnack.meshing.lattice import Lattice
+from harnack.meshing.lattice_surface import Surface
 from harnack.meshing.printing import bodies, thickening
 from tests.oracles.mesh_files import read_closed
 

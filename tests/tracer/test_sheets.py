@@ -39,7 +39,7 @@ from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.rendering.surfaces.encounter import meet_surface
 from harnack.testing import scaled
 from harnack.testing.cases import BallCase, Case, CurvatureCase
-from harnack.tracer.sheet_comparison import compare_with_sheet
+from harnack.tracer.contact import compare_with_sheet
 from tests.oracles.exact import exact_step, on_host
 from tests.oracles.jump_oracle import first_side_changes, judge
 

@@ -7,15 +7,11 @@ from harnack.fields.blobs.blobs import BlobError, Blobs
 from harnack.fields.blobs.hrbf import HRBF
 from harnack.fields.blobs.kernels import Compact, Cubic, Gaussian, Kernel, Sextic
 from harnack.fields.blobs.molecule import Molecule
-from harnack.fields.clouds.dipole import DipolePotential
-from harnack.fields.clouds.screened import ScreenedWindingNumber
 from harnack.fields.curves.polygon_mesh import PolygonMesh
 from harnack.fields.curves.solid_angle import SolidAngle
 from harnack.fields.expressions import expression
 from harnack.fields.field import Field, Sample
 from harnack.fields.formula import Formula
-from harnack.fields.meshes.morph import Morph
-from harnack.fields.meshes.winding_number import WindingNumber
 from harnack.fields.plane.branches import BranchPoint
 from harnack.fields.plane.height_field import HeightField
 from harnack.fields.plane.level_curves import LevelCurves
@@ -25,10 +21,10 @@ from harnack.fields.polynomials.lobes import Lobes
 from harnack.fields.polynomials.polynomial import HarmonicPolynomial, SphericalHarmonic
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.fields.solids.combined import intersection, union
+from harnack.fields.solids.fractal import Displaced, FractalNoise, Noise
+from harnack.fields.solids.julia import Julia
 from harnack.fields.solids.region import solid
-from harnack.fields.solids.shapes.fractal import Displaced, FractalNoise, Noise
-from harnack.fields.solids.shapes.julia import Julia
-from harnack.fields.solids.shapes.round import (
+from harnack.fields.solids.round import (
     Capsule,
     Cylinder,
     DoubleCone,
@@ -37,13 +33,17 @@ from harnack.fields.solids.shapes.round import (
     Sphere,
     Torus,
 )
-from harnack.fields.solids.shapes.square import Cuboid, Superellipsoid, Supertorus
-from harnack.fields.solids.shapes.tube import Tube
-from harnack.fields.solids.shapes.tubes import Tubes
 from harnack.fields.solids.solid import Shape, Solid
+from harnack.fields.solids.square import Cuboid, Superellipsoid, Supertorus
+from harnack.fields.solids.tube import Tube
+from harnack.fields.solids.tubes import Tubes
 from harnack.fields.waves.fourier_series import FourierSeries
 from harnack.fields.waves.periodic import EigenfunctionSum, Gyroid, SchwarzD, SchwarzP
 from harnack.fields.waves.waves import PlaneWave, Product, cosine, sine
+from harnack.fields.winding.dipole import DipolePotential
+from harnack.fields.winding.morph import Morph
+from harnack.fields.winding.screened import ScreenedWindingNumber
+from harnack.fields.winding.winding_number import WindingNumber
 
 __all__ = [
     "HRBF",

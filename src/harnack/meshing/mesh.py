@@ -20,7 +20,8 @@ from harnack.meshing.checks import (
     check_manifold,
     check_near_level,
 )
-from harnack.meshing.lattice import Lattice, Surface, open_surface
+from harnack.meshing.lattice import Lattice
+from harnack.meshing.lattice_surface import Surface, open_surface
 from harnack.meshing.printing.bodies import largest_body, largest_part
 from harnack.meshing.printing.clipping import cut_by
 from harnack.meshing.printing.finishing import (

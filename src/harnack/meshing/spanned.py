@@ -28,7 +28,7 @@ from harnack.meshing.checks import LocalError, MeshingError, check_manifold
 from harnack.meshing.edges import IntArray, boundary_edges, edge_keys
 from harnack.meshing.intersections import intersecting_faces, turned_faces
 from harnack.meshing.isotopy import Isotopy, isotopy_of
-from harnack.meshing.lattice import check_size
+from harnack.meshing.lattice_surface import check_size
 from harnack.meshing.marching_tetrahedra import Crossings, crossings_of, is_cut, triangles_of
 from harnack.meshing.points import Boundary, Places, PointSet, box_cells, newton, place_points
 from harnack.meshing.refining.refinement import improved, refined, smoothed

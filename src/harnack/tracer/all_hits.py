@@ -21,8 +21,8 @@ from harnack.fields.sheets import NO_SHEET
 from harnack.tracer.contact import Contact
 from harnack.tracer.derivatives import attach, refuse_derivative, wants_derivatives
 from harnack.tracer.prepared import MarchResult
+from harnack.tracer.stretches import SheetTracer, SheetWalk
 from harnack.tracer.tolerance import Status
-from harnack.tracer.walks.stretches import SheetTracer, SheetWalk
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3

@@ -17,8 +17,15 @@ from harnack.backend.loops import while_active
 from harnack.enclosures import any_covers, longest_step
 from harnack.fields.look import value_error
 from harnack.fields.sheets import NO_SHEET, Crossing
-from harnack.tracer.contact import AIM, CLOSER, Accepted, Contact, Hysteresis
-from harnack.tracer.sheet_comparison import SheetComparison, compare_with_sheet
+from harnack.tracer.contact import (
+    AIM,
+    CLOSER,
+    Accepted,
+    Contact,
+    Hysteresis,
+    SheetComparison,
+    compare_with_sheet,
+)
 from harnack.tracer.tolerance import PreparedTolerance, Status
 
 if TYPE_CHECKING:

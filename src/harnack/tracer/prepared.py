@@ -13,10 +13,10 @@ from harnack.fields.look import Path
 from harnack.fields.sheets import NO_PART, NO_SHEET
 from harnack.tracer.contact import Contact, Hysteresis, settled
 from harnack.tracer.march import March, MarchState
+from harnack.tracer.parts import PartTracer
+from harnack.tracer.queue import PlainTracer, RayTracer, trace_queued
+from harnack.tracer.stretches import SheetTracer
 from harnack.tracer.tolerance import PreparedTolerance, Status
-from harnack.tracer.walks.parts import PartTracer
-from harnack.tracer.walks.queue import PlainTracer, RayTracer, trace_queued
-from harnack.tracer.walks.stretches import SheetTracer
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3

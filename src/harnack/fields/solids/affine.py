@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Real, Vec3
     from harnack.geometry import Volume
 
-from harnack.fields.solids.maps import Map, axis_index
+from harnack.fields.solids.solid import Map, axis_index
 
 
 @dataclass(frozen=True)

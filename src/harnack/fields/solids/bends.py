@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
     from harnack.geometry import Volume
 
-from harnack.fields.solids.maps import AXES, Map, axis_index
+from harnack.fields.solids.solid import AXES, Map, axis_index
 
 
 class Bend(Map):

@@ -1,4 +1,7 @@
-"""What a solid is: the points where a function is not positive, and what can be done with one."""
+"""What a solid is: the points where a function is not positive, and what can be done with one.
+
+What a map of space is, for solids.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +21,23 @@ if TYPE_CHECKING:
 
     from harnack.backend import Backend, Real, Vec3
     from harnack.fields.look import Sample
-    from harnack.fields.solids.maps import Map
     from harnack.geometry import Volume
+
+AXES = {"x": 0, "y": 1, "z": 2}
+
+
+class Map(abc.ABC):
+    """A map of space, one to one."""
+
+    @abc.abstractmethod
+    def of(self, solid: Solid) -> Solid:
+        """The image of a solid that is no combination of others."""
+
+
+def axis_index(axis: str) -> int:
+    if axis not in AXES:
+        raise ValueError(f'axis must be "x", "y" or "z", not {axis!r}')
+    return AXES[axis]
 
 
 def not_a_solid(other: Any) -> str:

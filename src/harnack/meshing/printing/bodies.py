@@ -10,7 +10,7 @@ import numpy as np
 from harnack.backend import FloatArray
 from harnack.meshing.checks import MeshingError
 from harnack.meshing.edges import IntArray, dots, lengths
-from harnack.meshing.lattice import Surface
+from harnack.meshing.lattice_surface import Surface
 
 __all__ = ["largest_body", "largest_part"]
 

@@ -10,7 +10,7 @@ from harnack.backend import FloatArray
 from harnack.geometry import Ball, Box, ConvexHull, HalfSpace, Intersection, Volume
 from harnack.meshing.checks import MeshingError
 from harnack.meshing.edges import IntArray, boundary_edges, edge_keys
-from harnack.meshing.lattice import Surface
+from harnack.meshing.lattice_surface import Surface
 
 __all__ = ["cut_by"]
 

@@ -12,7 +12,7 @@ from harnack.backend import BoolArray, FloatArray
 from harnack.meshing.checks import LocalError, MeshingError, check_apart, check_manifold
 from harnack.meshing.edges import IntArray
 from harnack.meshing.intersections import intersecting_faces
-from harnack.meshing.lattice import Surface
+from harnack.meshing.lattice_surface import Surface
 from harnack.meshing.printing.manifolds import manifold_of, surface_of
 
 __all__ = ["ClosedMesh"]

@@ -14,7 +14,7 @@ from harnack.meshing.checks import (
     euler_characteristic,
 )
 from harnack.meshing.edges import Edges, IntArray, boundary_edges, directed_edges, dots, lengths
-from harnack.meshing.lattice import Surface
+from harnack.meshing.lattice_surface import Surface
 from harnack.meshing.printing.manifolds import manifold_of, surface_of
 from harnack.meshing.samples import LevelFunction
 

@@ -10,7 +10,7 @@ import numpy as np
 from harnack.backend import FloatArray
 from harnack.geometry import Ball, Box, ConvexHull, HalfSpace, Intersection
 from harnack.meshing.checks import MeshingError
-from harnack.meshing.lattice import Surface
+from harnack.meshing.lattice_surface import Surface
 
 if TYPE_CHECKING:
     from manifold3d import Manifold

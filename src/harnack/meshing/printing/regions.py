@@ -25,7 +25,8 @@ from harnack.fields.solids.combined import Combined, Complement, Offset
 from harnack.fields.solids.region import Near, Region, bounded_side
 from harnack.geometry import Ball, Box
 from harnack.meshing.checks import MeshingError
-from harnack.meshing.lattice import Lattice, Surface, closed_surface
+from harnack.meshing.lattice import Lattice
+from harnack.meshing.lattice_surface import Surface, closed_surface
 from harnack.meshing.printing.manifolds import box_manifold, manifold_of
 from harnack.meshing.samples import LevelFunction, Samples, Uploads
 

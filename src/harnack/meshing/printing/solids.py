@@ -14,7 +14,7 @@ from harnack.fields import Field, Solid
 from harnack.fields.solids.region import solid as solid_of
 from harnack.geometry import Box, Intersection, Volume
 from harnack.meshing.checks import LocalError, MeshingError
-from harnack.meshing.lattice import MissedError, Surface
+from harnack.meshing.lattice_surface import MissedError, Surface
 from harnack.meshing.printing.manifolds import surface_of, volume_manifold
 from harnack.meshing.printing.regions import RegionMesher, Sheet, is_smooth
 from harnack.meshing.samples import CELLS_PER_WAVE, Uploads

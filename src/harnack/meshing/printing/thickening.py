@@ -18,7 +18,7 @@ from harnack.backend import FloatArray
 from harnack.meshing.checks import MeshingError
 from harnack.meshing.edges import boundary_edges, directed_edges, distinct, edge_keys
 from harnack.meshing.intersections import intersecting_faces
-from harnack.meshing.lattice import Surface
+from harnack.meshing.lattice_surface import Surface
 from harnack.meshing.printing.manifolds import surface_of
 
 __all__ = ["thickened"]

@@ -23,11 +23,11 @@ from harnack.backend import FloatArray, IntArray, backend_of
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.clearance import occupied_cells, tight_extent
 from harnack.fields.field import Field, Sample, lengthened
-from harnack.fields.meshes.winding_exact import ExactWinding
-from harnack.fields.meshes.winding_mesh import WindingMesh
-from harnack.fields.meshes.winding_tree import TreeWinding
 from harnack.fields.sheets import NO_SHEET, Crossing, NearestSheet
 from harnack.fields.unit_coordinates import UnitCoordinates, UploadedField, epsilon_at, placed
+from harnack.fields.winding.winding_exact import ExactWinding
+from harnack.fields.winding.winding_mesh import WindingMesh
+from harnack.fields.winding.winding_tree import TreeWinding
 from harnack.geometry import Box
 from harnack.names import did_you_mean
 from harnack.tree.nearest import distance_to_triangles, jumps_within, nearest_triangle

@@ -10,8 +10,8 @@ import numpy as np
 from harnack.backend import FloatArray, IntArray
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.field import Field, Sample
-from harnack.fields.meshes.morph_slice import MorphSlice
-from harnack.fields.meshes.winding_number import WindingNumber
+from harnack.fields.winding.morph_slice import MorphSlice
+from harnack.fields.winding.winding_number import WindingNumber
 from harnack.geometry.meshes import MeshError, validate_mesh
 
 if TYPE_CHECKING:

@@ -16,10 +16,10 @@ import numpy as np
 from harnack.backend.extrema import fmax
 from harnack.fields.edges.edge_lift import LiftedProduct, LiftedSums
 from harnack.fields.edges.edge_passing import Line, known_along, with_edge_rates
-from harnack.fields.meshes.triangle_kernel import edges_of
 from harnack.fields.multipoles.far_clusters import Treecode
 from harnack.fields.sums import FieldSums, Terms, rounding_of_sum
 from harnack.fields.unit_coordinates import epsilon_at
+from harnack.fields.winding.triangle_kernel import edges_of
 from harnack.tree.triangles import INDEX, Upwards, crossing, in_slots
 
 if TYPE_CHECKING:
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from harnack.fields.batch import Values
     from harnack.fields.edges.edge_passing import Rates
     from harnack.fields.field import Sample
-    from harnack.fields.meshes.winding_mesh import WindingMesh
     from harnack.fields.sheets import Crossing
+    from harnack.fields.winding.winding_mesh import WindingMesh
     from harnack.tree.triangles import Frame
 
     IsAhead: TypeAlias = Callable[[list[Real], Real], Mask]

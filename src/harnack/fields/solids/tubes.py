@@ -15,7 +15,7 @@ from harnack.backend.records import Records
 from harnack.enclosures import Curvature, Lipschitz, Promise
 from harnack.fields.boxed_parts import BoxedField, BoxedParts
 from harnack.fields.field import Field, Sample
-from harnack.fields.solids.shapes.checks import positive
+from harnack.fields.solids.checks import positive
 from harnack.tree.boxes import MOST_BOXES
 
 if TYPE_CHECKING:

@@ -20,8 +20,8 @@ from harnack.backend.extrema import fmax, fmin
 from harnack.backend.lengths import largest_coordinate
 from harnack.backend.loops import while_active
 from harnack.fields.sheets import NO_SHEET, Crossing
+from harnack.tracer.contact import ON_SHEET
 from harnack.tracer.march import March, MarchState
-from harnack.tracer.sheet_comparison import ON_SHEET
 from harnack.tracer.tolerance import Status
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ import drjit as dr
 from harnack.backend.extrema import clamp, fmax, fmin
 from harnack.enclosures import Lipschitz
 from harnack.fields.look import Sample
-from harnack.fields.solids.shapes.checks import ball_around, finite, whole
+from harnack.fields.solids.checks import ball_around, finite, whole
 from harnack.fields.solids.solid import Solid
 
 if TYPE_CHECKING:

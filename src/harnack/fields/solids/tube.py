@@ -20,7 +20,7 @@ from harnack.backend.records import Records
 from harnack.enclosures import Enclosure, Gaps, Lipschitz, Pieces
 from harnack.fields.field_cache import prepared_once
 from harnack.fields.look import Look, Path, Sample
-from harnack.fields.solids.shapes.checks import box_around, positive
+from harnack.fields.solids.checks import box_around, positive
 from harnack.fields.solids.solid import Solid
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from harnack.arithmetic import minimum, norm
 from harnack.arithmetic.blends import corner
 from harnack.fields.formula import prepared_numbers
-from harnack.fields.solids.shapes.checks import (
+from harnack.fields.solids.checks import (
     Point,
     box_around,
     finite,

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from harnack.arithmetic import cos, maximum, minimum, norm, sin
 from harnack.arithmetic.blends import corner
-from harnack.fields.solids.shapes.checks import (
+from harnack.fields.solids.checks import (
     Point,
     ball_around,
     box_around,

@@ -49,12 +49,12 @@ from harnack.fields.edges.edge_lift import (
 from harnack.fields.edges.edge_passing import Line, known_along, with_edge_rates
 from harnack.fields.edges.lifted_trails import LiftedTrails
 from harnack.fields.field import Sample
-from harnack.fields.meshes.edge_trails import EdgeTrails, closed_trails
 from harnack.fields.multipoles.multipole import cartesian, triangle_levels
 from harnack.fields.multipoles.multipole_kernel import far_terms
 from harnack.fields.multipoles.truncation import bend_columns, truncation
 from harnack.fields.sums import FieldSums, free_part, rounding_of_sum
 from harnack.fields.unit_coordinates import epsilon_at
+from harnack.fields.winding.edge_trails import EdgeTrails, closed_trails
 from harnack.tree import (
     NO_PRIMITIVE,
     Hierarchy,
@@ -70,8 +70,8 @@ from harnack.tree.walk import State
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.fields.meshes.winding_mesh import WindingMesh
     from harnack.fields.sheets import Crossing
+    from harnack.fields.winding.winding_mesh import WindingMesh
 
 # A chain is taken as a whole beyond this many times its radius.
 RATIO = 2.5

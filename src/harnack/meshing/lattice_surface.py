@@ -23,7 +23,7 @@ from harnack.backend import BoolArray, FloatArray
 from harnack.meshing.checks import MeshingError, TooLargeError, singular_vertices
 from harnack.meshing.edges import IntArray, lengths
 from harnack.meshing.isotopy import Isotopy, isotopy_of
-from harnack.meshing.lattice.cells import Lattice, distinct_rows
+from harnack.meshing.lattice import Lattice, distinct_rows
 from harnack.meshing.marching_tetrahedra import crossings_of, is_cut, triangles_of
 from harnack.meshing.points import Boundary, PointSet, newton
 from harnack.meshing.refining.refinement import refined, smoothed, smoothed_within

@@ -1,1 +1,0 @@
-"""Distances to closed triangle meshes."""

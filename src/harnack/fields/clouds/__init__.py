@@ -1,1 +1,0 @@
-"""Sums over points: potentials of oriented points, with and without screening."""

@@ -1,1 +1,0 @@
-"""The winding number of triangle meshes, exact or by a tree."""

@@ -1,1 +1,0 @@
-"""Shapes: solids that are given by a few numbers."""

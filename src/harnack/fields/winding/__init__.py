@@ -1,0 +1,1 @@
+"""Winding numbers: of triangle meshes, exactly or by a tree, and of oriented points."""

@@ -1,1 +1,0 @@
-"""Rays station by station: trial points, sheets, parts; followed together, or by a queue."""
