@@ -1,7 +1,7 @@
-"""NumPy arrays of numbers that a caller gives: their types, and the checks that all of them pass.
+"""Numbers that a caller gives, alone or in NumPy arrays: the checks that all of them pass.
 
-Each check raises the error class of whoever asks, in one wording. Counts and units, which differ
-between curves, meshes and clouds, are checked where those are.
+Checks of arrays raise the error class of whoever asks, in one wording. Counts and units, which
+differ between curves, meshes and clouds, are checked where those are.
 """
 
 from __future__ import annotations
@@ -9,6 +9,8 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
+import math
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias, TypeVar, cast
 
@@ -222,3 +224,72 @@ def is_same(a: Any, b: Any) -> bool:
     """Whether two values are one, or equal numbers, texts or tuples of these."""
     plain = (int, float, str, tuple)
     return a is b or (isinstance(a, plain) and isinstance(b, plain) and bool(np.all(a == b)))
+
+
+def real(value: Any, name: str) -> float:
+    """A number of Python or NumPy, as a float; infinities and NaN too.
+
+    Raises:
+        TypeError: it is none.
+    """
+    try:
+        return float("none" if isinstance(value, str | bytes | bool) else value)
+    except (TypeError, ValueError):
+        raise TypeError(f"{name} must be a number, not {value!r}") from None
+
+
+def positive(value: Any, name: str) -> float:
+    """A positive finite number.
+
+    Raises:
+        TypeError: it is no number. ValueError: it is another one.
+    """
+    number = real(value, name)
+    if not 0.0 < number < math.inf:
+        raise ValueError(f"{name} must be positive and finite, not {value!r}")
+    return number
+
+
+def finite(value: Any, name: str) -> float:
+    """A finite number.
+
+    Raises:
+        TypeError: it is no number. ValueError: it is another one.
+    """
+    number = real(value, name)
+    if not math.isfinite(number):
+        raise ValueError(f"{name} must be finite, not {value!r}")
+    return number
+
+
+def whole(value: Any, name: str, least: int, most: int) -> int:
+    """An integer from `least` to `most`.
+
+    Raises:
+        ValueError: it is none.
+    """
+    try:
+        number = operator.index(value)
+    except TypeError:
+        number = least - 1
+    if not least <= number <= most:
+        end = f"2^{n} - 1" if (n := most.bit_length()) >= 32 else str(most)
+        raise ValueError(f"{name} must be an integer from {least} to {end}, not {value!r}")
+    return number
+
+
+def triple(value: Any, name: str, *, all_positive: bool = False) -> tuple[float, float, float]:
+    """Three finite numbers.
+
+    Raises:
+        TypeError, ValueError: they are not.
+    """
+    try:
+        entries = tuple(value)
+    except TypeError:
+        raise TypeError(f"{name} must be three numbers, not {value!r}") from None
+    if len(entries) != 3:
+        raise ValueError(f"{name} must be three numbers, not {len(entries)}: {value!r}")
+    check = positive if all_positive else finite
+    x, y, z = (check(one, f"each of {name}") for one in entries)
+    return x, y, z

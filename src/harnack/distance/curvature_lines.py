@@ -14,7 +14,7 @@ from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy
 from harnack.backend.arrays import finite_vectors, upload_vectors
 from harnack.backend.extrema import fmax
 from harnack.backend.loops import while_active
-from harnack.backend.numbers import refuses_derivatives
+from harnack.backend.numbers import positive, refuses_derivatives
 from harnack.distance.tangent import Eigen, TangentPlane
 from harnack.names import did_you_mean
 
@@ -81,9 +81,7 @@ def curvature_lines(
         known = ", ".join(f'"{one}"' for one in get_args(Family))
         hint = did_you_mean(family, get_args(Family))
         raise ValueError(f"unknown family {family!r}; choose one of {known}{hint}")
-    for name, value in (("step", step), ("length", length)):
-        if not (math.isfinite(value) and value > 0):
-            raise ValueError(f"{name} must be positive, not {value!r}")
+    step, length = positive(step, "step"), positive(length, "length")
     count = math.ceil(length / step)
     if count > _MOST_STEPS:
         raise ValueError(f"length/step asks for {count:,} steps: at most {_MOST_STEPS:,}")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import html
 import math
-import numbers
 import os
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
@@ -18,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray
+from harnack.backend.numbers import finite
 from harnack.files.writing import check_writable, write_atomically
 from harnack.geometry import Box
 from harnack.rendering.arguments import (
@@ -99,7 +99,7 @@ def animate(
     count = check_integer("frames", frames)
     if not 1 <= count <= _MOST_FRAMES:
         raise ValueError(f"frames must be from 1 to {_MOST_FRAMES:,}, not {count}")
-    fps, turn = _number("fps", fps), _number("turn", turn)
+    fps, turn = finite(fps, "fps"), finite(turn, "turn")
     if not 0 < fps <= 240:
         raise ValueError(f"fps must be more than 0 and at most 240, not {fps}")
     for name, value in (("size", size), ("show", show)):
@@ -136,14 +136,6 @@ def check_film_path(path: str | os.PathLike[str]) -> Path:
         raise ValueError(f"{target}: films are written as {' or '.join(FILM_FILES)}")
     check_writable(target)
     return target
-
-
-def _number(name: str, value: Any) -> float:
-    if isinstance(value, bool | str) or not isinstance(value, numbers.Real):
-        raise TypeError(f"{name} must be a number, not {value!r}")
-    if not math.isfinite(value):
-        raise ValueError(f"{name} must be a finite number, not {value}")
-    return float(value)
 
 
 def _at(value: Any, s: float) -> Any:

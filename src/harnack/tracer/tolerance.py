@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import drjit as dr
 
 from harnack.backend.extrema import fmax
+from harnack.backend.numbers import real
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real
@@ -49,8 +50,8 @@ class Tolerance:
 
     def __post_init__(self) -> None:
         for name in ("distance", "per_length", "value"):
-            number = getattr(self, name)
-            if not (math.isfinite(number) and number >= 0):
+            number = real(getattr(self, name), f"tolerance: {name}")
+            if not 0 <= number < math.inf:
                 raise ValueError(f"tolerance: {name} must be finite and >= 0, not {number!r}")
         if self.distance == 0 and self.value == 0 and self.per_length == 0:
             raise ValueError("tolerance must be positive: a level set is never met exactly")

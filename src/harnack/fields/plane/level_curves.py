@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, cast
 
@@ -11,6 +10,7 @@ import drjit as dr
 
 from harnack.backend import backend_of
 from harnack.backend.lengths import largest_coordinate
+from harnack.backend.numbers import finite
 from harnack.enclosures import Curvature, HarmonicBall
 from harnack.fields.field import Field
 from harnack.fields.look import Sample
@@ -75,9 +75,7 @@ class LevelCurves(Field):
                 f"{self.branches.count}: draw its Riemann surface, whose plane cuts they are"
             )
         self.domain = Box((-2.0, -2.0, -0.25), (2.0, 2.0, 0.25)) if domain is None else domain
-        if not math.isfinite(level):
-            raise ValueError(f"level must be finite, not {level!r}")
-        self.default_level = float(level)
+        self.default_level = finite(level, "level")
         shift = self.branches.period(part == "imag")
         self.period = shift  # pyright: ignore[reportAttributeAccessIssue]
 

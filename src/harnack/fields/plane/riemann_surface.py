@@ -14,6 +14,7 @@ import numpy as np
 from harnack.backend import backend_of
 from harnack.backend.extrema import fmax, fmin
 from harnack.backend.lengths import largest_coordinate
+from harnack.backend.numbers import finite
 from harnack.enclosures import (
     Curvature,
     Cusp,
@@ -150,8 +151,8 @@ class RiemannSurface(Field):
     ) -> None:
         if part not in ("imag", "real"):
             raise ValueError(f'part must be "imag" or "real", not {part!r}')
-        if not (math.isfinite(height) and height != 0):
-            raise ValueError(f"height must be a finite factor other than 0, not {height!r}")
+        if finite(height, "height") == 0:
+            raise ValueError("height must be a factor other than 0")
         self.part = part
         self.height = float(height)
         self.branches: Branches = branches_of(

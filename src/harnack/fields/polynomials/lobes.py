@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-import numbers
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Literal, cast
 
@@ -12,6 +11,7 @@ import drjit as dr
 
 from harnack.backend.extrema import fmax, fmin
 from harnack.backend.lengths import length
+from harnack.backend.numbers import finite, positive
 from harnack.enclosures import Curvature, Parabola, Slopes
 from harnack.fields.field import Field, Sample
 from harnack.fields.look import Look, lengthened
@@ -95,9 +95,7 @@ class Lobes(Field):
 
     def _fill(self, weights: Any, scale: Any, part: Part) -> None:
         self.weights = _checked(weights)
-        scale = _number(scale, "the scale of lobes")
-        if not 0.0 < scale < math.inf:
-            raise ValueError(f"the scale of lobes must be positive and finite, not {scale!r}")
+        scale = positive(scale, "the scale of lobes")
         if part not in _PARTS:
             raise ValueError(f"part must be one of {', '.join(_PARTS)}, not {part!r}")
         self.scale, self.part = scale, part
@@ -319,17 +317,9 @@ def _checked(weights: Any) -> dict[tuple[int, int], float]:
             raise ValueError(f"the degree l must be 0 to {LARGEST_DEGREE}, not {l}")
         if abs(m) > l:
             raise ValueError(f"the order m must be -l to l, here -{l} to {l}, not {m}")
-        number = _number(weight, f"the coefficient of Y_{l},{m}")
-        if not math.isfinite(number):
-            raise ValueError(f"the coefficient of Y_{l},{m} must be a finite number, not {weight}")
+        number = finite(weight, f"the coefficient of Y_{l},{m}")
         if number != 0:
             kept[l, m] = number
     if not kept:
         raise ValueError("lobes need a coefficient that is not zero")
     return kept
-
-
-def _number(value: Any, name: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, numbers.Real):
-        raise TypeError(f"{name} must be a number, not {value!r}")
-    return float(value)

@@ -14,6 +14,7 @@ import numpy as np
 from harnack.arithmetic import maximum, minimum
 from harnack.backend.extrema import fmax, fmin
 from harnack.backend.lengths import largest_coordinate, length
+from harnack.backend.numbers import finite
 from harnack.enclosures import (
     Enclosure,
     Greatest,
@@ -343,8 +344,7 @@ class Offset(Derived):
     distance: float
 
     def __post_init__(self) -> None:
-        if not math.isfinite(self.distance):
-            raise ValueError(f"distance must be finite, not {self.distance!r}")
+        object.__setattr__(self, "distance", finite(self.distance, "distance"))
         self._take_over("domain", "lipschitz")
 
     def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:

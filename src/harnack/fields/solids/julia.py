@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 
 from harnack.backend.extrema import clamp, fmax, fmin
+from harnack.backend.numbers import finite, whole
 from harnack.enclosures import Lipschitz
 from harnack.fields.look import Sample
-from harnack.fields.solids.checks import ball_around, finite, whole
-from harnack.fields.solids.solid import Solid
+from harnack.fields.solids.solid import Solid, ball_around
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3

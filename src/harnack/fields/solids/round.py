@@ -13,16 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 from harnack.arithmetic import cos, maximum, minimum, norm, sin
 from harnack.arithmetic.blends import corner
-from harnack.fields.solids.checks import (
-    Point,
-    ball_around,
-    box_around,
-    finite,
-    positive,
-    set_checked,
-    triple,
-)
-from harnack.fields.solids.solid import Shape
+from harnack.backend.numbers import finite, positive, triple
+from harnack.fields.solids.solid import Point, Shape, ball_around, box_around, set_checked
 
 if TYPE_CHECKING:
     from harnack.geometry import Volume

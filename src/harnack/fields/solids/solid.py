@@ -1,6 +1,8 @@
 """What a solid is: the points where a function is not positive, and what can be done with one.
 
 What a map of space is, for solids.
+
+Volumes around shapes.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from harnack.backend.numbers import refuses_derivatives
 from harnack.fields.field import Field
 from harnack.fields.formula import Formula
+from harnack.geometry import Ball, Box, Volume
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -21,7 +24,32 @@ if TYPE_CHECKING:
 
     from harnack.backend import Backend, Real, Vec3
     from harnack.fields.look import Sample
-    from harnack.geometry import Volume
+
+# Extents are widened by this part of the coordinates: numbers of a shape are rounded to the
+# precision in which it is traced.
+_ROUNDED = 1e-6
+
+Point = tuple[float, float, float]
+
+
+def box_around(half: tuple[float, float, float], center: Any = (0.0, 0.0, 0.0)) -> Volume:
+    """The box of the half sides given; one with no side >= 0 holds no surface."""
+    sizes = [max(h, 0.0) + _ROUNDED * (abs(h) + abs(c)) for h, c in zip(half, center, strict=True)]
+    lower = [c - s for c, s in zip(center, sizes, strict=True)]
+    upper = [c + s for c, s in zip(center, sizes, strict=True)]
+    return Box((lower[0], lower[1], lower[2]), (upper[0], upper[1], upper[2]))
+
+
+def ball_around(center: tuple[float, float, float], radius: float) -> Volume:
+    """The ball of the radius given; where that is not positive, one that holds no surface."""
+    slack = _ROUNDED * (abs(radius) + sum(abs(c) for c in center)) + 1e-30
+    return Ball(center, max(radius, 0.0) + slack)
+
+
+def set_checked(shape: Any, name: str, value: Any) -> None:
+    """Puts a number that was checked in the place of the one given."""
+    object.__setattr__(shape, name, value)
+
 
 AXES = {"x": 0, "y": 1, "z": 2}
 
@@ -161,7 +189,7 @@ class Solid(Field):
         where f is a distance."""
         from harnack.fields.solids.combined import Offset
 
-        return Offset(self, float(distance))
+        return Offset(self, distance)
 
     # Maps of space. Those that bend are for solids with a formula.
 

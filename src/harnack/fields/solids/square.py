@@ -7,16 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from harnack.arithmetic import minimum, norm
 from harnack.arithmetic.blends import corner
+from harnack.backend.numbers import finite, positive, triple
 from harnack.fields.formula import prepared_numbers
-from harnack.fields.solids.checks import (
-    Point,
-    box_around,
-    finite,
-    positive,
-    set_checked,
-    triple,
-)
-from harnack.fields.solids.solid import Shape
+from harnack.fields.solids.solid import Point, Shape, box_around, set_checked
 
 if TYPE_CHECKING:
     from harnack.backend import Backend

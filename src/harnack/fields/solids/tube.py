@@ -15,13 +15,12 @@ import numpy.typing as npt
 from harnack.backend import FloatArray, backend_of
 from harnack.backend.extrema import clamp, fmax, fmin
 from harnack.backend.lengths import largest_coordinate
-from harnack.backend.numbers import check_finite, check_size, check_vectors, real_array
+from harnack.backend.numbers import check_finite, check_size, check_vectors, positive, real_array
 from harnack.backend.records import Records
 from harnack.enclosures import Enclosure, Gaps, Lipschitz, Pieces
 from harnack.fields.field_cache import prepared_once
 from harnack.fields.look import Look, Path, Sample
-from harnack.fields.solids.checks import box_around, positive
-from harnack.fields.solids.solid import Solid
+from harnack.fields.solids.solid import Solid, box_around
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3

@@ -10,12 +10,11 @@ import numpy as np
 
 from harnack.backend import FloatArray, IntArray
 from harnack.backend.extrema import clamp, fmax
-from harnack.backend.numbers import check_finite, check_size, check_vectors, real_array
+from harnack.backend.numbers import check_finite, check_size, check_vectors, positive, real_array
 from harnack.backend.records import Records
 from harnack.enclosures import Curvature, Lipschitz, Promise
 from harnack.fields.boxed_parts import BoxedField, BoxedParts
 from harnack.fields.field import Field, Sample
-from harnack.fields.solids.checks import positive
 from harnack.tree.boxes import MOST_BOXES
 
 if TYPE_CHECKING:

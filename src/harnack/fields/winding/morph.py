@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from harnack.backend import FloatArray, IntArray
+from harnack.backend.numbers import positive
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.field import Field, Sample
 from harnack.fields.winding.morph_slice import MorphSlice
@@ -72,8 +72,7 @@ class Morph(BatchedField):
         spacing: float = 1.0,
         accuracy: float = 6.0,
     ) -> None:
-        if not (math.isfinite(gap) and gap > 0):
-            raise ValueError(f"gap must be positive and finite, not {gap!r}")
+        gap = positive(gap, "gap")
         if not 0 <= w <= gap:
             raise ValueError(f"w must lie between 0 and the gap {gap!r}, not {w!r}")
         if not 0 < spacing <= 2:

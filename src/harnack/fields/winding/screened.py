@@ -35,6 +35,7 @@ import numpy as np
 
 from harnack.backend import FloatArray, backend_of
 from harnack.backend.extrema import fmax, fmin
+from harnack.backend.numbers import positive
 from harnack.enclosures import Curvature, HarmonicBall
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.clearance import tight_extent
@@ -246,8 +247,7 @@ class ScreenedWindingNumber(DetailedField["_ScreenedBuffers"], BatchedField):
         accuracy: float = 6.0,
     ) -> None:
         super().__init__()
-        if not (math.isfinite(length) and length > 0):
-            raise ValueError(f"length must be positive and finite, not {length!r}")
+        length = positive(length, "length")
         if method not in ("auto", "sum", "tree"):
             hint = did_you_mean(method, ("auto", "sum", "tree"))
             raise ValueError(f'method is "auto", "sum" or "tree", not {method!r}{hint}')

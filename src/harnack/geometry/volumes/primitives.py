@@ -13,13 +13,13 @@ import numpy.typing as npt
 
 from harnack.backend import Backend, BoolArray, FloatArray, Mask, Real, Vec3, backend_of
 from harnack.backend.extrema import fmax, fmin
+from harnack.backend.numbers import real
 from harnack.geometry.volumes.polytope import Polytope
 from harnack.geometry.volumes.volume import (
     Point,
     Volume,
     as_points,
     checked_distance,
-    checked_number,
     checked_point,
     emptied,
     rounding,
@@ -43,7 +43,7 @@ class Ball(Volume):
                 f"the origin, write Ball(radius={self.center!r})"
             )
         object.__setattr__(self, "center", checked_point(self.center, "the center of a ball"))
-        radius = checked_number(self.radius, "the radius of a ball")
+        radius = real(self.radius, "the radius of a ball")
         if not 0.0 < radius < np.inf:
             raise ValueError(f"the radius of a ball must be positive, not {self.radius!r}")
         object.__setattr__(self, "radius", radius)
@@ -154,7 +154,7 @@ class HalfSpace(Polytope):
             raise ValueError("the normal of a half-space must not be zero")
         normal /= size  # so that squares neither overflow nor vanish
         length = float(np.linalg.norm(normal))
-        offset = checked_number(self.offset, "the offset of a half-space") / size / length
+        offset = real(self.offset, "the offset of a half-space") / size / length
         if not np.isfinite(offset):
             raise ValueError(
                 f"the offset of a half-space must be finite, not {self.offset!r}, and so must its "

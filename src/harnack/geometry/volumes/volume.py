@@ -10,7 +10,7 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend.numbers import check_vectors, real_array, refuse_derivatives
+from harnack.backend.numbers import check_vectors, real, real_array, refuse_derivatives
 
 if TYPE_CHECKING:
     from typing import Self
@@ -115,7 +115,7 @@ def checked_point(value: Iterable[float], name: str, *, finite: bool = True) -> 
     try:
         if isinstance(value, str | bytes):
             raise TypeError
-        numbers = tuple(checked_number(v, name) for v in value)
+        numbers = tuple(real(v, name) for v in value)
     except TypeError:
         raise ValueError(f"{name} must be three numbers, not {value!r}") from None
     if len(numbers) != 3:
@@ -123,18 +123,6 @@ def checked_point(value: Iterable[float], name: str, *, finite: bool = True) -> 
     if any(np.isnan(numbers)) or (finite and not all(np.isfinite(numbers))):
         raise ValueError(f"{name} must be finite, not {numbers}")
     return numbers
-
-
-def checked_number(value: Any, name: str) -> float:
-    """A number as a float.
-
-    Raises:
-        TypeError: it is none.
-    """
-    try:
-        return float("none" if isinstance(value, str | bytes) else value)
-    except (TypeError, ValueError):
-        raise TypeError(f"{name} must be a number, not {value!r}") from None
 
 
 def check_volume(given: object, name: str) -> None:

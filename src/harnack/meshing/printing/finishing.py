@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harnack.backend import FloatArray
+from harnack.backend.numbers import real
 from harnack.meshing.checks import (
     MeshingError,
     euler_characteristic,
@@ -34,24 +35,17 @@ _SIMPLER = (0.4, 0.2, 0.1)
 
 def check_options(tolerance: Any, spacing: Any, thickness: Any, seed: Any, most: Any) -> None:
     """Raise ValueError or TypeError for numbers out of range."""
-    if not 0 < _number(tolerance, "tolerance") < 0.5:
+    if not 0 < real(tolerance, "tolerance") < 0.5:
         raise ValueError(
             f"tolerance is a part of the size: it must lie in (0, 0.5), not {tolerance}"
         )
     for name, value in (("spacing", spacing), ("thickness", thickness)):
-        if value is not None and not 0 < _number(value, name) < math.inf:
+        if value is not None and not 0 < real(value, name) < math.inf:
             raise ValueError(f"{name} must be a positive length, not {value!r}")
     if operator.index(seed) < 0:
         raise ValueError(f"seed must not be negative, not {seed}")
     if operator.index(most) < 1:
         raise ValueError(f"max_triangles must be positive, not {most}")
-
-
-def _number(value: Any, name: str) -> float:
-    try:
-        return float("none" if isinstance(value, str) else value)
-    except (TypeError, ValueError):
-        raise TypeError(f"{name} must be a number, not {value!r}") from None
 
 
 def normals_of(function: LevelFunction, surface: Surface) -> FloatArray:

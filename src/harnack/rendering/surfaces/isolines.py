@@ -19,7 +19,6 @@ width too far.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, cast
 
@@ -28,6 +27,7 @@ import numpy as np
 
 from harnack.backend import aligned
 from harnack.backend.lengths import length as norm
+from harnack.backend.numbers import positive
 from harnack.fields import Field
 from harnack.rendering.surfaces.colors import Color, color_of
 from harnack.rendering.surfaces.functions import defined_in, function_of
@@ -81,7 +81,7 @@ class Isolines:
         }
         for name in ("spacing", "width"):
             if getattr(self, name) is not None:
-                put[name] = _positive(getattr(self, name), name)
+                put[name] = positive(getattr(self, name), f"{name} of isolines")
         if self.levels is not None:
             if self.spacing is not None:
                 raise ValueError("isolines have either levels or a spacing, not both")
@@ -133,16 +133,6 @@ def _table(levels: tuple[float, ...], period: float | None) -> FloatArray:
         ordered = np.array([ordered[-1] - period, *ordered, ordered[0] + period])
     entries = max(_ENTRIES, 2 ** len(ordered).bit_length()) - 1
     return np.concatenate([ordered, np.full(entries - len(ordered), np.inf)])
-
-
-def _positive(value: Any, name: str) -> float:
-    try:
-        number = float("" if isinstance(value, str | bool) else value)
-    except (TypeError, ValueError):
-        raise TypeError(f"{name} of isolines must be a number, not {value!r}") from None
-    if not 0 < number < math.inf:
-        raise ValueError(f"{name} of isolines must be positive, not {value!r}")
-    return number
 
 
 def _numbers(levels: Any) -> tuple[float, ...]:
