@@ -41,6 +41,7 @@ def main() -> None:
     make_venv(apt)
     run([*PIP, "install", "--quiet", "--editable", f"{ROOT}[dev]"])
     provide_libraries(apt)
+    provide_webgpu(apt)
     if subprocess.run([str(VENV_PYTHON), "-c", DOCTOR], cwd=ROOT, check=False).returncode:
         sys.exit("setup: harnack cannot run yet; see the advice above")
 
@@ -110,6 +111,16 @@ def provide_libraries(apt: Apt | None) -> None:
         return
     apt.unpack([*packages, *apt.missing_dependencies(packages)], VENV / "unpacked")
     adopt_libraries(VENV / "unpacked")
+
+
+def provide_webgpu(apt: Apt | None) -> None:
+    """Install a device for tests of WebGPU that is none: Mesa's, which computes on the CPU."""
+    if works(VENV_PYTHON, "import wgpu; wgpu.gpu.request_adapter_sync()"):
+        return
+    if apt is not None and apt.is_root:
+        apt.install("mesa-vulkan-drivers", "libvulkan1")
+    else:
+        print("setup: no device for WebGPU, so its tests are skipped: install a Vulkan driver")
 
 
 def adopt_libraries(folder: Path) -> None:

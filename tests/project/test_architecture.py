@@ -15,6 +15,7 @@ FILES = sorted(SOURCE.rglob("*.py"))
 ROOMS = (
     "names",
     "backend",
+    "webgpu",
     "geometry",
     "files",
     "tree",

@@ -1,0 +1,158 @@
+"""A device behind WebGPU, driven from Python: shaders compiled and run, rays by the thousand.
+
+The package `wgpu` speaks to Vulkan, Metal and Direct3D.
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+import numpy.typing as npt
+
+from harnack.backend import to_numpy
+from harnack.webgpu.wgsl import WORKGROUP, Shader
+
+if TYPE_CHECKING:
+    pass
+
+__all__ = ["Device", "Program", "find_device"]
+
+_Bits = npt.NDArray[np.uint32]
+# Seconds that one dispatch should take: a system kills what keeps its display waiting.
+_SHORT, _LONG = 0.1, 0.4
+_FIRST, _MOST = 1 << 15, 1 << 21
+# Workgroups along an axis, at most, on every device.
+_ACROSS = 65535
+# Shaders that stay compiled.
+_KEPT = 64
+
+
+class NoDeviceError(RuntimeError):
+    """There is no device behind WebGPU, or no package to reach it."""
+
+
+@dataclass(frozen=True)
+class Device:
+    """A device, and how it names itself."""
+
+    handle: Any
+    name: str
+
+    @functools.lru_cache(maxsize=_KEPT)  # noqa: B019  # devices last as long as the process
+    def compile(self, shader: Shader) -> Program:
+        """The shader, ready to run; compiled once."""
+        module = self.handle.create_shader_module(code=shader.code)
+        pipeline = self.handle.create_compute_pipeline(
+            layout="auto", compute={"module": module, "entry_point": "main"}
+        )
+        return Program(self, shader, pipeline)
+
+
+@functools.cache
+def find_device() -> Device:
+    """The fastest device that there is.
+
+    Raises:
+        NoDeviceError: there is none, or the package `wgpu` is missing.
+    """
+    try:
+        import wgpu
+    except ImportError:
+        raise NoDeviceError(
+            'backend="webgpu" needs the package wgpu: pip install "harnack[webgpu]"'
+        ) from None
+    try:
+        adapter: Any = wgpu.gpu.request_adapter_sync(power_preference="high-performance")
+    except RuntimeError as wrong:
+        raise NoDeviceError(f"no device for WebGPU was found: {wrong}") from None
+    wanted = ("max-storage-buffer-binding-size", "max-buffer-size")
+    limits = {name: adapter.limits[name] for name in wanted}
+    info = adapter.info
+    name = f"{info['device']} ({info['backend_type']})"
+    return Device(adapter.request_device_sync(required_limits=limits), name)
+
+
+@dataclass(frozen=True)
+class Program:
+    """A shader on a device."""
+
+    device: Device
+    shader: Shader
+    pipeline: Any
+
+    def run(
+        self, data: Mapping[str, Any], lanes: Mapping[str, Any], count: int
+    ) -> dict[str, _Bits]:
+        """The bits of the results, (count,) each, by their labels.
+
+        data: the arrays of numbers and tables. lanes: (count,) each.
+        """
+        made = self._data(data)
+        given = np.stack([_bits(lanes[label]) for label in self.shader.lanes])
+        results = np.empty((len(self.shader.results), count), np.uint32)
+        first, size = 0, _FIRST
+        while first < count:
+            last = min(first + size, count)
+            start = time.perf_counter()
+            results[:, first:last] = self._dispatch(made, given[:, first:last])
+            took = time.perf_counter() - start
+            if took < _SHORT and size < _MOST:
+                size *= 2
+            elif took > _LONG and size > WORKGROUP:
+                size //= 2
+            first = last
+        return dict(zip(self.shader.results, results, strict=True))
+
+    def _data(self, data: Mapping[str, Any]) -> _Bits:
+        shader = self.shader
+        tables = [_bits(data[label]) for label in shader.tables]
+        numbers = [_bits(data[label])[:1] for label in shader.numbers]
+        begin = 2 + len(tables) + len(numbers)
+        places = begin + np.cumsum([0, *map(len, tables)])[:-1].astype(np.uint32)
+        head = np.zeros(2, np.uint32)
+        return np.concatenate([head, places, *numbers, *tables]).astype(np.uint32)
+
+    def _dispatch(self, data: _Bits, lanes: _Bits) -> _Bits:
+        import wgpu
+
+        handle, usage = self.device.handle, wgpu.BufferUsage
+        count = lanes.shape[1]
+        data = data.copy()
+        data[0] = count
+        size = 4 * count * len(self.shader.results)
+        buffers = [
+            handle.create_buffer_with_data(data=data, usage=usage.STORAGE),
+            handle.create_buffer_with_data(data=np.ascontiguousarray(lanes), usage=usage.STORAGE),
+            handle.create_buffer(size=size, usage=usage.STORAGE | usage.COPY_SRC),
+        ]
+        entries = [{"binding": k, "resource": {"buffer": one}} for k, one in enumerate(buffers)]
+        layout = self.pipeline.get_bind_group_layout(0)
+        encoder = handle.create_command_encoder()
+        work = encoder.begin_compute_pass()
+        work.set_pipeline(self.pipeline)
+        work.set_bind_group(0, handle.create_bind_group(layout=layout, entries=entries))
+        groups = -(-count // WORKGROUP)
+        across = min(groups, _ACROSS)
+        work.dispatch_workgroups(across, -(-groups // across))
+        work.end()
+        handle.queue.submit([encoder.finish()])
+        found: _Bits = np.frombuffer(handle.queue.read_buffer(buffers[2]), dtype=np.uint32)
+        for one in buffers:
+            one.destroy()
+        return found.reshape(-1, count)
+
+
+def _bits(array: Any) -> _Bits:
+    """The 32 bits of each entry."""
+    values: npt.NDArray[Any] = np.atleast_1d(
+        to_numpy(array) if dr.is_array_v(type(array)) else array
+    )
+    if values.dtype.itemsize != 4:
+        values = values.astype(np.uint32)
+    return np.ascontiguousarray(values).view(np.uint32)

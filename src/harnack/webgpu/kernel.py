@@ -1,0 +1,467 @@
+"""A kernel that Dr.Jit recorded, read: straight-line operations on lanes, and loops that nest.
+
+Dr.Jit writes kernels for LLVM as one function over packets of lanes. What a lane does is the same
+in all of them, so the packets go, and with them the masks that only keep lanes of a packet apart.
+Of LLVM's language exactly the part is known that Dr.Jit writes; anything else is refused by name.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from typing import Literal, TypeAlias
+
+__all__ = ["Kernel", "Kind", "Load", "Loop", "Operation", "Store", "UntranslatableError", "parse"]
+
+Kind: TypeAlias = Literal["f32", "u32", "bool"]
+_KINDS: dict[str, Kind] = {"float": "f32", "i32": "u32", "i1": "bool", "i8": "u32"}
+
+
+class UntranslatableError(NotImplementedError):
+    """A kernel holds an operation that is not known here."""
+
+
+@dataclass(frozen=True)
+class Constant:
+    """A number of a kernel: its 32 bits."""
+
+    kind: Kind
+    bits: int
+
+
+Value: TypeAlias = "str | Constant"
+
+
+@dataclass(frozen=True)
+class Operation:
+    """result = name(operands), each a constant or the result of an operation before."""
+
+    result: str
+    kind: Kind
+    name: str
+    operands: tuple[Value, ...]
+
+
+@dataclass(frozen=True)
+class Load:
+    """result = an array's entry: that of the lane, the only one, or entry `index` * stride + offset
+    where `mask` holds, and else 0.
+
+    source: "lane", "number" or "table". parameter: which array.
+    """
+
+    result: str
+    kind: Kind
+    source: Literal["lane", "number", "table"]
+    parameter: int
+    index: Value | None = None
+    stride: int = 1
+    offset: int = 0
+    mask: Value | None = None
+
+
+@dataclass(frozen=True)
+class Store:
+    """The lane's entry of an array = value."""
+
+    parameter: int
+    kind: Kind
+    value: Value
+
+
+@dataclass(frozen=True)
+class Variable:
+    """Of a loop: what it is before the first turn, and after each."""
+
+    name: str
+    kind: Kind
+    before: Value
+    after: Value
+
+
+@dataclass
+class Loop:
+    """Turns of `test` and `body` while `condition`, which `test` computes, holds."""
+
+    variables: list[Variable] = field(default_factory=list[Variable])
+    test: list[Statement] = field(default_factory=list["Statement"])
+    condition: Value = ""
+    body: list[Statement] = field(default_factory=list["Statement"])
+
+
+Statement: TypeAlias = "Operation | Load | Store | Loop"
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """What a lane does.
+
+    labels: of parameters, as far as they are known: of those that lanes read at places which they
+        compute, the label of what was read.
+    """
+
+    statements: list[Statement]
+    labels: dict[int, str]
+
+    def walk(self) -> Iterator[Statement]:
+        """All statements, also those of loops."""
+        waiting = list(self.statements)
+        while waiting:
+            one = waiting.pop()
+            yield one
+            if isinstance(one, Loop):
+                waiting += [*one.test, *one.body]
+
+
+def parse(text: str) -> Kernel:
+    """The kernel of a text in LLVM's language, as `drjit.kernel_history` gives it.
+
+    Raises:
+        UntranslatableError: it holds an operation that is not known.
+    """
+    start = text.rfind("define void @drjit_")
+    if start < 0:
+        raise UntranslatableError("this text holds no kernel of Dr.Jit for LLVM")
+    body = text[start : text.index("\n}", start)]
+    reader = _Reader()
+    for line in body.split("\n")[1:]:
+        reader.read(line)
+    return Kernel(reader.statements, reader.labels)
+
+
+@dataclass
+class _Address:
+    """Where lanes read: a parameter's array, at an index, in records of `stride` numbers."""
+
+    parameter: int
+    index: Value | None = None
+    stride: int = 1
+    mask: Value | None = None
+
+
+_VECTOR = r"<\d+ x (\w+)>"
+_NAME = r"%[\w.]+"
+# A result, a constant of a packet, or a number.
+_V = r"(%[\w.]+|<[^>]*>|[^,<>]+)"
+# Of each instruction what it looks like, without what only says how LLVM may compile it.
+_FLAGS = re.compile(r"\b(?:fast|nnan|ninf|nsz|arcp|contract|afn|reassoc|nuw|nsw|exact)\b ?")
+_BINARY = [
+    "fadd",
+    "fsub",
+    "fmul",
+    "fdiv",
+    "sub",
+    "mul",
+    "udiv",
+    "urem",
+    "sdiv",
+    "srem",
+    "and",
+    "or",
+    "xor",
+    "shl",
+    "lshr",
+    "ashr",
+]
+_CONVERSIONS = ["bitcast", "sitofp", "uitofp", "fptosi", "fptoui", "sext", "zext"]
+_UNARY_CALLS = {
+    "sqrt": "sqrt", "fabs": "abs", "floor": "floor", "ceil": "ceil", "trunc": "trunc",
+    "nearbyint": "round", "rint": "round", "x86.avx512.rsqrt14": "rsqrt",
+    "x86.avx512.rcp14": "rcp", "x86.sse.rsqrt": "rsqrt", "x86.avx.rsqrt": "rsqrt",
+    "x86.sse.rcp": "rcp", "x86.avx.rcp": "rcp", "ctpop": "popcount", "abs": "iabs",
+}  # fmt: skip
+_CALLS = {
+    "fma": 3, "fmuladd": 3, "minnum": 2, "maxnum": 2, "minimum": 2, "maximum": 2, "copysign": 2,
+    "umin": 2, "umax": 2, "smin": 2, "smax": 2,
+}  # fmt: skip
+
+
+def _nothing(*groups: str) -> None:
+    del groups
+
+
+class _Reader:
+    """Reads a kernel line by line."""
+
+    def __init__(self) -> None:
+        self.statements: list[Statement] = []
+        self.labels: dict[int, str] = {}
+        self._tables: dict[str, int] = {}  # which parameter a result was read from
+        self._into = self.statements
+        self._loops: list[Loop] = []
+        self._known: dict[str, Value] = {}  # names for other values
+        self._addresses: dict[str, _Address] = {}
+        self._records: dict[str, _Address] = {}  # of results that are several numbers
+        self._label: str | None = None
+        self._labeled = ""  # the variable that it is of
+        self._block = ""
+        self._patterns = {
+            word: [(re.compile(pattern), action) for pattern, action in several]
+            for word, several in self._grammar().items()
+        }
+
+    def read(self, line: str) -> None:
+        """One line more."""
+        text = line.partition(", !")[0].strip()
+        if text.startswith(";"):
+            self._label, self._labeled = text[1:].strip(), ""
+        elif text.endswith(":"):
+            self._begin(text[:-1])
+        elif text:
+            result, _, said = text.rpartition(" = ")
+            variable = result.partition("_")[0]
+            self._labeled = self._labeled or variable
+            if variable != self._labeled:
+                self._label = None
+            said = _FLAGS.sub("", said.partition(", align ")[0])
+            for pattern, action in self._patterns.get(said.partition(" ")[0], ()):
+                if (found := pattern.fullmatch(said)) is not None:
+                    action(*((result,) if result else ()), *found.groups())
+                    return
+            raise UntranslatableError(
+                f"a kernel of this field holds what is not translated for other GPUs: {text[:160]}"
+            )
+
+    def _begin(self, block: str) -> None:
+        """A block of the kernel: of a loop, what is before it, its test, its body, its end."""
+        self._block = block
+        if re.fullmatch(r"l_\d+_cond", block):
+            loop = Loop()
+            self._into.append(loop)
+            self._loops.append(loop)
+            self._into = loop.test
+        elif re.fullmatch(r"l_\d+_body", block):
+            self._into = self._loops[-1].body
+        elif re.fullmatch(r"l_\d+_done", block):
+            loop = self._loops.pop()
+            loop.variables = [
+                replace(one, after=self._value(str(one.after), one.kind)) for one in loop.variables
+            ]
+            outer = self._loops[-1] if self._loops else None
+            self._into = outer.body if outer else self.statements
+
+    def _value(self, text: str, kind: Kind) -> Value:
+        text = text.strip()
+        if text.startswith("%"):
+            return self._known.get(text, text)
+        if text in ("zeroinitializer", "undef", "poison", "false"):
+            return Constant(kind, 0)
+        if text == "true":
+            return Constant(kind, 1)
+        if (several := re.match(r"<\w+ (\S+?)(?:,|>)", text)) is not None:
+            text = several.group(1)
+        if kind == "f32":
+            double = (
+                struct.unpack(">d", bytes.fromhex(text[2:].zfill(16)))[0]
+                if text.startswith("0x")
+                else float(text)
+            )
+            return Constant(kind, struct.unpack("<I", struct.pack("<f", double))[0])
+        return Constant(kind, int(text) & 0xFFFFFFFF)
+
+    def _put(self, result: str, kind: Kind, name: str, *operands: Value) -> None:
+        self._into.append(Operation(result, kind, name, operands))
+
+    def _of_parameter(self, parameter: int) -> None:
+        if self._label is not None:
+            self.labels.setdefault(parameter, self._label)
+
+    def _grammar(self) -> dict[str, list[tuple[str, Callable[..., None]]]]:
+        """By the word for what is done: what lines look like, and what is to do for each."""
+        place = rf"ptr ({_NAME}), <\d+ x i32> (\S+)"
+        binary: list[tuple[str, Callable[..., None]]]
+        binary = [(rf"(\w+) {_VECTOR} {_V}, {_V}", self._arithmetic)]
+        convert: list[tuple[str, Callable[..., None]]]
+        convert = [(rf"(\w+) {_VECTOR} {_V} to {_VECTOR}", self._convert)]
+        return {
+            # Of packets and branches; results under another name.
+            "br": [
+                (rf"br i1 ({_NAME}), label %l_\d+_body, label %l_\d+_done", self._test),
+                (r"br .*", _nothing),
+            ],
+            "ret": [(r"ret void", _nothing)],
+            "phi": [
+                (rf"phi {_VECTOR} \[ (\S+), %\w+ \], \[ (\S+), %\w+ \]", self._phi),
+                (r"phi i64 .*", _nothing),
+            ],
+            "insertelement": [
+                (rf"insertelement {_VECTOR} (?:undef|poison), \w+ (\S+), i32 0", self._same)
+            ],
+            "shufflevector": [
+                (rf"shufflevector {_VECTOR} ({_NAME}), .* zeroinitializer", self._same)
+            ],
+            # Arrays.
+            "getelementptr": [
+                (r"getelementptr inbounds ptr, ptr %params, i32 (\d+)", self._parameter),
+                (rf"getelementptr inbounds \w+, ptr ({_NAME}), i64 %index", self._pointer),
+                (r"getelementptr \[\d+ x \w+\], ptr @\w+, .*", _nothing),  # zeros
+                (rf"getelementptr (?:inbounds )?\[(\d+) x \w+\], {place}", self._record),
+                (rf"getelementptr (?:inbounds )?(?:float|i32|i8), {place}", self._entry),
+            ],
+            "load": [
+                (rf"load ptr, ptr ({_NAME})", self._pointer),
+                (rf"load (\w+), ptr ({_NAME})", self._load_number),
+                (rf"load {_VECTOR}, ptr ({_NAME})", self._load_lane),
+            ],
+            "store": [(rf"store {_VECTOR} (.+?), ptr ({_NAME})", self._store)],
+            "extractvalue": [
+                (rf"extractvalue \[\d+ x {_VECTOR}\] ({_NAME}), (\d+)", self._extract)
+            ],
+            # Arithmetic.
+            **dict.fromkeys(_BINARY, binary),
+            "add": [
+                (rf"add {_VECTOR} ({_NAME}), <i32 0, i32 1, .*>", self._same),  # the lane's index
+                (r"add i64 .*", _nothing),
+                *binary,
+            ],
+            **dict.fromkeys(_CONVERSIONS, convert),
+            "trunc": [
+                (r"trunc i64 %(index|end) to i32", self._lane),
+                (rf"(trunc) (i8) ({_NAME}) to (i1)", self._convert),
+                *convert,
+            ],
+            "fneg": [(rf"(fneg) {_VECTOR} (\S+)", self._unary)],
+            "fcmp": [(rf"(fcmp \w+) {_VECTOR} {_V}, {_V}", self._compare)],
+            "icmp": [
+                (rf"(icmp \w+) {_VECTOR} {_V}, {_V}", self._compare),
+                (r"icmp uge i64 .*", _nothing),
+            ],
+            "select": [
+                (rf"select <\d+ x i1> {_V}, <\d+ x ptr> ({_NAME}), .*", self._masked),
+                (rf"select <\d+ x i1> {_V}, {_VECTOR} {_V}, <\d+ x \w+> {_V}", self._select),
+            ],
+            "call": [
+                (r"call i1 @llvm\.vector\.reduce\.or\.v\d+i1\(<\d+ x (i1)> (\S+)\)", self._same),
+                (r"call (?:fastcc )?\[\d+ x <\d+ x \w+>\] @gather_\d+x\w+\(<\d+ x ptr> "
+                 rf"({_NAME})\)", self._gather_record),
+                (rf"call {_VECTOR} @llvm\.masked\.gather\S*\(<\d+ x ptr> ({_NAME}), i32 \d+, "
+                 rf"<\d+ x i1> {_V}, <\d+ x \w+> \S+\)", self._gather),
+                (r"call <\d+ x i1> @llvm\.x86\.avx512\.(fpclass)\S*\(<\d+ x (float)> (\S+), "
+                 r"i32 (\d+)\)", self._class),
+                (rf"call {_VECTOR} @llvm\.([\w.]+)\((.*)\)", self._call),
+            ],
+        }  # fmt: skip
+
+    # The actions; arguments are the groups of the pattern.
+
+    def _test(self, condition: str) -> None:
+        self._loops[-1].condition = self._value(condition, "bool")
+
+    def _phi(self, result: str, element: str, before: str, after: str) -> None:
+        kind = self._kind(element)
+        variable = Variable(result, kind, self._value(before, kind), after)
+        self._loops[-1].variables.append(variable)
+
+    def _same(self, result: str, element: str, value: str) -> None:
+        if element != "ptr":
+            self._known[result] = self._value(value, self._kind(element))
+
+    def _lane(self, result: str, which: str) -> None:
+        self._known[result] = "lane" if which == "index" else "count"
+
+    def _parameter(self, result: str, number: str) -> None:
+        self._addresses[result] = _Address(int(number))
+        self._of_parameter(int(number))
+
+    def _pointer(self, result: str, pointer: str) -> None:
+        self._addresses[result] = self._addresses[pointer]
+
+    def _load_number(self, result: str, element: str, pointer: str) -> None:
+        at = self._addresses[pointer]
+        self._into.append(Load(result, self._kind(element), "number", at.parameter))
+
+    def _load_lane(self, result: str, element: str, pointer: str) -> None:
+        at = self._addresses[pointer]
+        self._into.append(Load(result, self._kind(element), "lane", at.parameter))
+
+    def _store(self, element: str, value: str, pointer: str) -> None:
+        kind = self._kind(element)
+        self._into.append(Store(self._addresses[pointer].parameter, kind, self._value(value, kind)))
+
+    def _record(self, result: str, stride: str, pointer: str, index: str) -> None:
+        at = self._addresses[pointer]
+        self._addresses[result] = _Address(at.parameter, self._value(index, "u32"), int(stride))
+
+    def _masked(self, result: str, mask: str, pointer: str) -> None:
+        at = self._addresses[pointer]
+        self._addresses[result] = _Address(
+            at.parameter, at.index, at.stride, self._value(mask, "bool")
+        )
+
+    def _entry(self, result: str, pointer: str, index: str) -> None:
+        self._record(result, "1", pointer, index)
+
+    def _gather_record(self, result: str, pointer: str) -> None:
+        self._records[result] = self._addresses[pointer]
+
+    def _extract(self, result: str, element: str, record: str, entry: str) -> None:
+        at = self._records[record]
+        self._read_table(result, element, at, int(entry), at.mask)
+
+    def _gather(self, result: str, element: str, pointer: str, mask: str) -> None:
+        at = self._addresses[pointer]
+        self._read_table(result, element, at, 0, self._value(mask, "bool"))
+        self._of_parameter(at.parameter)
+
+    def _read_table(
+        self, result: str, element: str, at: _Address, entry: int, mask: Value | None
+    ) -> None:
+        kind = self._kind(element)
+        load = Load(result, kind, "table", at.parameter, at.index, at.stride, entry, mask)
+        self._into.append(load)
+        self._tables[result] = at.parameter
+
+    def _arithmetic(self, result: str, name: str, element: str, a: str, b: str) -> None:
+        kind = self._kind(element)
+        self._put(result, kind, name, self._value(a, kind), self._value(b, kind))
+
+    def _unary(self, result: str, name: str, element: str, a: str) -> None:
+        kind = self._kind(element)
+        self._put(result, kind, name, self._value(a, kind))
+
+    def _compare(self, result: str, name: str, element: str, a: str, b: str) -> None:
+        kind = self._kind(element)
+        self._put(result, "bool", name, self._value(a, kind), self._value(b, kind))
+
+    def _select(self, result: str, mask: str, element: str, a: str, b: str) -> None:
+        kind = self._kind(element)
+        values = self._value(mask, "bool"), self._value(a, kind), self._value(b, kind)
+        self._put(result, kind, "select", *values)
+
+    def _convert(self, result: str, name: str, given: str, a: str, wanted: str) -> None:
+        kind, own = self._kind(wanted), self._kind(given)
+        value = self._value(a, own)
+        if name == "bitcast" and isinstance(value, str):  # of what was read from a table
+            if value in self._tables:
+                self._of_parameter(self._tables[value])
+            if kind == own:
+                self._known[result] = value
+                return
+        self._put(result, kind, f"{name} {own}", value)
+
+    def _class(self, result: str, name: str, element: str, value: str, mask: str) -> None:
+        self._put(result, "bool", f"{name} {mask}", self._value(value, self._kind(element)))
+
+    def _call(self, result: str, element: str, function: str, arguments: str) -> None:
+        kind = self._kind(element)
+        given = re.findall(r"<\d+ x \w+> (<[^>]*>|[^,\s]+)", arguments)
+        stem = re.sub(r"\.(?:v\d+\w*|ps|f32|i32|ss)\b.*", "", function)
+        if stem in _UNARY_CALLS:
+            self._put(result, kind, _UNARY_CALLS[stem], self._value(given[0], kind))
+        elif len(given) == _CALLS.get(stem, -1):
+            self._put(result, kind, stem, *(self._value(one, kind) for one in given))
+        else:
+            raise UntranslatableError(
+                f"a kernel of this field calls {function}, which is not translated for other GPUs"
+            )
+
+    @staticmethod
+    def _kind(element: str) -> Kind:
+        if element not in _KINDS:
+            raise UntranslatableError(
+                f"a kernel of this field computes with numbers of type {element}: other GPUs have "
+                "single precision alone"
+            )
+        return _KINDS[element]

@@ -1,0 +1,179 @@
+"""The kernel that Dr.Jit records for a computation, and which of its arrays is which.
+
+A kernel knows its arrays by the places of their pointers alone. Names come with it as comments:
+`drjit.set_label` gives a variable one, and `JitFlag.PrintIR` has them written. An array that a
+kernel reads at places which lanes compute is named by what `drjit.gather` returns of it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import io
+import threading
+from collections.abc import Callable, Generator, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, cast
+
+import drjit as dr
+
+from harnack.webgpu.kernel import parse
+from harnack.webgpu.wgsl import Shader, shader_of
+
+__all__ = ["Recording", "leaves", "record"]
+
+# A flag of Dr.Jit and its function `gather` are changed for all threads while one records.
+_ALONE = threading.Lock()
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A kernel as a shader, and the arrays that it reads and writes, by their labels.
+
+    data: of numbers and tables. results: what Dr.Jit made of the lanes. constants: of results that
+    no lane computes.
+    """
+
+    shader: Shader
+    data: dict[str, Any]
+    results: dict[str, Any]
+    constants: dict[str, Any]
+
+
+def record(
+    compute: Callable[..., Mapping[str, Any]], lanes: Mapping[str, Any], data: Any
+) -> Recording:
+    """What `compute(**lanes)` records, run on Dr.Jit's own backend for these lanes.
+
+    compute: gives arrays by name, none of them evaluated, from one kernel.
+    lanes: arrays by name, of the same length, of two entries at least.
+    data: whatever else `compute` reads: all arrays in it are looked for.
+
+    Raises:
+        UntranslatableError: the kernel holds what is not known.
+        RuntimeError: it is more than one kernel.
+    """
+    with _ALONE:
+        naming = _Naming()
+        for label, array in leaves("lane", dict(lanes)):
+            dr.set_label(array, label)
+        for array in _arrays_in(data):
+            naming.number(array)
+        with dr.suspend_grad(), naming.gathers():
+            given = compute(**lanes)
+        results = dict(leaves("result", dict(given)))
+        computed = {k: one for k, one in results.items() if not _is_constant(one)}
+        for label, array in computed.items():
+            dr.set_label(array, label)
+        text = _evaluated(list(computed.values()))
+    constants = {label: one for label, one in results.items() if label not in computed}
+    return Recording(_shader(text), naming.known, computed, constants)
+
+
+@functools.lru_cache(maxsize=64)
+def _shader(text: str) -> Shader:
+    return shader_of(parse(text))
+
+
+def _is_constant(array: Any) -> bool:
+    return array.state == dr.VarState.Literal
+
+
+def _evaluated(arrays: list[Any]) -> str:
+    """Evaluates arrays, and gives the text of the kernel."""
+    with (
+        dr.scoped_set_flag(dr.JitFlag.KernelHistory, True),
+        dr.scoped_set_flag(dr.JitFlag.PrintIR, True),
+        contextlib.redirect_stdout(io.StringIO()),  # the flag also has it printed
+    ):
+        dr.kernel_history_clear()
+        dr.eval(arrays)
+        kernels = [one for one in dr.kernel_history() if one.get("ir") is not None]
+    if len(kernels) != 1:
+        raise RuntimeError(f"this computation is {len(kernels)} kernels, and not one")
+    return kernels[0]["ir"].getvalue()
+
+
+class _Naming:
+    """Labels of arrays, in the order in which they are met, so that they are the same for data of
+    the same shape: they are a part of the kernel, which is compiled anew for others."""
+
+    def __init__(self) -> None:
+        self.known: dict[str, Any] = {}
+        self._tables: dict[int, str] = {}
+
+    def number(self, array: Any) -> None:
+        """Gives an evaluated array a name."""
+        if array.state == dr.VarState.Evaluated:
+            label = f"data {len(self.known)}"
+            dr.set_label(array, label)
+            self.known[label] = array
+
+    @contextlib.contextmanager
+    def gathers(self) -> Generator[None]:
+        """While it lasts, what `drjit.gather` returns is named after the array it is from."""
+        module = cast("Any", dr)
+        original = module.gather
+
+        def gather(dtype: Any, source: Any, index: Any, *rest: Any, **named: Any) -> Any:
+            found = original(dtype, source, index, *rest, **named)
+            if dr.is_array_v(type(source)) and dr.depth_v(type(source)) == 1:
+                self._name_parts(found, source)
+            return found
+
+        module.gather = gather
+        try:
+            yield
+        finally:
+            module.gather = original
+
+    def _name_parts(self, found: Any, source: Any) -> None:
+        for _, part in leaves("", found):
+            if part.state == dr.VarState.Evaluated:  # at a place that is known already
+                self.number(part)
+            elif source.state == dr.VarState.Evaluated:
+                dr.set_label(part, self._table(source))
+
+    def _table(self, source: Any) -> str:
+        if source.index not in self._tables:
+            label = f"table {len(self._tables)}"
+            self._tables[source.index] = label
+            self.known[label] = type(source)(source)  # kept, so that no other has its index
+        return self._tables[source.index]
+
+
+def leaves(name: str, value: Any) -> list[tuple[str, Any]]:
+    """The flat arrays in a record, dictionary, sequence or nested array, with their names."""
+    if dr.is_array_v(type(value)):
+        if (
+            dr.depth_v(type(value)) == 1
+            and dr.size_v(type(value)) == dr.Dynamic
+            and dr.is_jit_v(value)
+        ):
+            return [(name, value)]
+        return [leaf for k in range(len(value)) for leaf in leaves(f"{name} {k}", value[k])]
+    if isinstance(value, dict):
+        items = cast("dict[str, Any]", value).items()
+        return [leaf for key, one in items for leaf in leaves(f"{name} {key}", one)]
+    return []
+
+
+def _arrays_in(data: Any) -> Iterator[Any]:
+    """The flat arrays that an object holds, once each, in a fixed order."""
+    seen: set[int] = set()
+    waiting: list[Any] = [data]
+    while waiting:
+        one = waiting.pop(0)
+        if id(one) in seen or isinstance(one, type | str | bytes | int | float | None.__class__):
+            continue
+        seen.add(id(one))
+        if dr.is_array_v(type(one)):
+            for _, leaf in leaves("", one):
+                yield leaf
+        elif isinstance(one, dict):
+            waiting += one.values()
+        elif isinstance(one, list | tuple):
+            waiting += one
+        elif dataclasses.is_dataclass(one) or hasattr(one, "__dict__"):
+            waiting += vars(one).values()

@@ -1,0 +1,314 @@
+"""WGSL, WebGPU's language, for what a lane of a recorded kernel does: one lane an invocation.
+
+WGSL promises less than LLVM: division may be off by 2.5 units in the last place, `fma` may round
+twice, denormals may be zero, and a compiler may take infinities and NaN for impossible. So
+constants that are not finite come from a buffer, NaN and infinity are told by bits, and what a
+device makes of a shader is compared with Dr.Jit's answers (`harnack.webgpu.evaluation`).
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+
+from harnack.webgpu.kernel import (
+    Constant,
+    Kernel,
+    Load,
+    Loop,
+    Operation,
+    Statement,
+    Store,
+    UntranslatableError,
+    Value,
+)
+
+WORKGROUP = 64
+
+_HEAD = """\
+@group(0) @binding(0) var<storage, read> data: array<u32>;
+@group(0) @binding(1) var<storage, read> lanes: array<u32>;
+@group(0) @binding(2) var<storage, read_write> results: array<u32>;
+
+fn is_nan(x: f32) -> bool {
+  return (bitcast<u32>(x) & 0x7fffffffu) > 0x7f800000u;
+}
+fn min_number(x: f32, y: f32) -> f32 {
+  if (is_nan(x)) { return y; }
+  return select(x, y, y < x);
+}
+fn max_number(x: f32, y: f32) -> f32 {
+  if (is_nan(x)) { return y; }
+  return select(x, y, y > x);
+}
+fn min_or_nan(x: f32, y: f32) -> f32 {
+  if (is_nan(x)) { return x; }
+  return select(x, y, y < x || is_nan(y));
+}
+fn max_or_nan(x: f32, y: f32) -> f32 {
+  if (is_nan(x)) { return x; }
+  return select(x, y, y > x || is_nan(y));
+}
+fn has_class(x: f32, classes: u32) -> bool {
+  let bits = bitcast<u32>(x);
+  let exponent = (bits >> 23u) & 255u;
+  let rest = bits & 0x7fffffu;
+  var class_of = 0u;
+  if (exponent == 255u && rest != 0u) { class_of = 0x81u; }
+  else if (exponent == 255u) { class_of = select(8u, 16u, bits >> 31u == 1u); }
+  else if (exponent == 0u && rest == 0u) { class_of = select(2u, 4u, bits >> 31u == 1u); }
+  else if (exponent == 0u) { class_of = 32u; }
+  if (bits >> 31u == 1u && exponent != 255u && (exponent != 0u || rest != 0u)) { class_of |= 64u; }
+  return (class_of & classes) != 0u;
+}
+fn to_signed(x: f32) -> u32 {
+  return bitcast<u32>(i32(x));
+}
+"""
+
+_INFIX = {
+    "fadd": "+", "fsub": "-", "fmul": "*", "fdiv": "/", "add": "+", "sub": "-", "mul": "*",
+    "udiv": "/", "urem": "%",
+}  # fmt: skip
+_BITS = {"and": ("&", "&&"), "or": ("|", "||"), "xor": ("^", "!=")}
+_FUNCTIONS = {
+    "sqrt": "sqrt", "abs": "abs", "floor": "floor", "ceil": "ceil", "trunc": "trunc",
+    "round": "round", "rsqrt": "inverseSqrt", "fma": "fma", "fmuladd": "fma",
+    "minnum": "min_number", "maxnum": "max_number", "minimum": "min_or_nan",
+    "maximum": "max_or_nan", "umin": "min", "umax": "max", "popcount": "countOneBits",
+}  # fmt: skip
+_ORDER = {"eq": "==", "ne": "!=", "gt": ">", "ge": ">=", "lt": "<", "le": "<="}
+_OPPOSITE = {"gt": "le", "ge": "lt", "lt": "ge", "le": "gt", "eq": "ne"}
+
+
+@dataclass(frozen=True)
+class Shader:
+    """A kernel in WGSL, and what its buffers hold.
+
+    data: `count`, the number of lanes; 0; for each of `tables` where it begins; each of `numbers`;
+        then the tables. lanes: for each of `lanes` an entry a lane, one array after the other;
+        results likewise. All are labels of arrays, in order.
+    """
+
+    code: str
+    numbers: tuple[str, ...]
+    tables: tuple[str, ...]
+    lanes: tuple[str, ...]
+    results: tuple[str, ...]
+
+
+def shader_of(kernel: Kernel) -> Shader:
+    """The shader of a kernel.
+
+    Raises:
+        UntranslatableError: an operation is not known, or nothing says what an array is.
+    """
+    return _Writer(kernel).shader()
+
+
+class _Writer:
+    def __init__(self, kernel: Kernel) -> None:
+        self._kernel = kernel
+        places: dict[str, list[int]] = {"number": [], "table": [], "lane": []}
+        self._stores: list[Store] = []
+        for one in kernel.walk():
+            if isinstance(one, Load) and one.parameter not in places[one.source]:
+                places[one.source].append(one.parameter)
+            elif isinstance(one, Store):
+                self._stores.append(one)
+        self._places = {source: sorted(found) for source, found in places.items()}
+        self._stores.sort(key=lambda one: one.parameter)
+        self._lines: list[str] = []
+        self._depth = 1
+
+    def shader(self) -> Shader:
+        for one in self._kernel.statements:
+            self._write(one)
+        names = {
+            source: tuple(self._label(parameter) for parameter in found)
+            for source, found in self._places.items()
+        }
+        results = tuple(self._label(one.parameter) for one in self._stores)
+        code = "\n".join(
+            [
+                _HEAD,
+                f"@compute @workgroup_size({WORKGROUP})",
+                "fn main(",
+                "  @builtin(global_invocation_id) id: vec3<u32>,",
+                "  @builtin(num_workgroups) groups: vec3<u32>",
+                ") {",
+                f"  let lane = id.x + id.y * groups.x * {WORKGROUP}u;",
+                "  let count = data[0];",
+                "  let zero = data[1];",
+                "  if (lane >= count) { return; }",
+                *self._lines,
+                "}",
+                "",
+            ]
+        )
+        return Shader(code, names["number"], names["table"], names["lane"], results)
+
+    def _label(self, parameter: int) -> str:
+        label = self._kernel.labels.get(parameter)
+        if label is None:
+            raise UntranslatableError(f"parameter {parameter} of a kernel has no name")
+        return label
+
+    def _put(self, line: str) -> None:
+        self._lines.append("  " * self._depth + line)
+
+    def _write(self, one: Statement) -> None:
+        if isinstance(one, Loop):
+            self._loop(one)
+        elif isinstance(one, Store):
+            place = self._stores.index(one)
+            value = self._text(one.value)
+            bits = value if one.kind == "u32" else f"bitcast<u32>({value})"
+            self._put(f"results[{place}u * count + lane] = {bits};")
+        elif isinstance(one, Load):
+            self._put(f"let {_name(one.result)} = {self._load(one)};")
+        else:
+            self._put(f"let {_name(one.result)} = {self._operation(one)};")
+
+    def _loop(self, loop: Loop) -> None:
+        for one in loop.variables:
+            self._put(f"var {_name(one.name)}: {one.kind} = {self._text(one.before)};")
+        self._put("loop {")
+        self._depth += 1
+        for one in loop.test:
+            self._write(one)
+        self._put(f"if (!{self._text(loop.condition)}) {{ break; }}")
+        for one in loop.body:
+            self._write(one)
+        changed = [one for one in loop.variables if one.after != one.name]
+        # At once: what one becomes may be what another was.
+        for one in changed:
+            self._put(f"let next_{_name(one.name)} = {self._text(one.after)};")
+        for one in changed:
+            self._put(f"{_name(one.name)} = next_{_name(one.name)};")
+        self._depth -= 1
+        self._put("}")
+
+    def _load(self, load: Load) -> str:
+        place = self._places[load.source].index(load.parameter)
+        if load.source == "lane":
+            bits = f"lanes[{place}u * count + lane]"
+        elif load.source == "number":
+            bits = f"data[{2 + len(self._places['table']) + place}]"
+        else:
+            assert load.index is not None
+            index = self._text(load.index)
+            if load.stride > 1:
+                index = f"{index} * {load.stride}u + {load.offset}u"
+            bits = f"data[data[{2 + place}] + {index}]"
+            if load.mask is not None and not (isinstance(load.mask, Constant) and load.mask.bits):
+                bits = f"select(0u, {bits}, {self._text(load.mask)})"
+        return bits if load.kind == "u32" else f"bitcast<f32>({bits})"
+
+    def _operation(self, one: Operation) -> str:
+        a = [self._text(value) for value in one.operands]
+        name, _, how = one.name.partition(" ")
+        if name in _INFIX:
+            return f"{a[0]} {_INFIX[name]} {a[1]}"
+        if name in _BITS:
+            return f"{a[0]} {_BITS[name][one.kind == 'bool']} {a[1]}"
+        if name in _FUNCTIONS:
+            return f"{_FUNCTIONS[name]}({', '.join(a)})"
+        match name:
+            case "fneg":
+                return f"-{a[0]}"
+            case "rcp":
+                return f"1.0f / {a[0]}"
+            case "shl":
+                return f"{a[0]} << ({a[1]} & 31u)"
+            case "lshr":
+                return f"{a[0]} >> ({a[1]} & 31u)"
+            case "ashr":
+                return f"bitcast<u32>({_signed(a[0])} >> ({a[1]} & 31u))"
+            case "sdiv" | "srem":
+                operator = "/" if name == "sdiv" else "%"
+                return f"bitcast<u32>({_signed(a[0])} {operator} {_signed(a[1])})"
+            case "smin" | "smax":
+                return f"bitcast<u32>({name[1:]}({_signed(a[0])}, {_signed(a[1])}))"
+            case "copysign":
+                return (
+                    f"bitcast<f32>((bitcast<u32>({a[0]}) & 0x7fffffffu) | "
+                    f"(bitcast<u32>({a[1]}) & 0x80000000u))"
+                )
+            case "select":
+                return f"select({a[2]}, {a[1]}, {a[0]})"
+            case "fpclass":
+                return f"has_class({a[0]}, {how}u)"
+            case "fcmp":
+                return _compared(how, a[0], a[1])
+            case "icmp":
+                if how in ("eq", "ne"):
+                    return f"{a[0]} {_ORDER[how]} {a[1]}"
+                x, y = (_signed(v) for v in a) if how[0] == "s" else a
+                return f"{x} {_ORDER[how[1:]]} {y}"
+            case _:
+                return _converted(one, name, how, a[0])
+
+    def _text(self, value: Value) -> str:
+        if isinstance(value, str):
+            return _name(value)
+        if value.kind == "bool":
+            return "true" if value.bits else "false"
+        if value.kind == "u32":
+            return f"{value.bits}u"
+        number: float = struct.unpack("<f", struct.pack("<I", value.bits))[0]
+        exponent = (value.bits >> 23) & 255
+        if exponent == 255:
+            return f"bitcast<f32>({value.bits}u ^ zero)"
+        if exponent == 0 and value.bits:
+            return f"bitcast<f32>({value.bits}u)"
+        return f"{number!r}f" if number >= 0 and value.bits >> 31 == 0 else f"({number!r}f)"
+
+
+def _name(result: str) -> str:
+    return result.replace("%", "v_").replace(".", "_")
+
+
+def _signed(text: str) -> str:
+    return f"bitcast<i32>({text})"
+
+
+def _compared(how: str, x: str, y: str) -> str:
+    """Of numbers; "o.." are false of NaN, "u.." true."""
+    if how in ("ord", "uno"):
+        either = f"is_nan({x}) || is_nan({y})"
+        return either if how == "uno" else f"!({either})"
+    if x == y and how in ("oeq", "une"):
+        return f"is_nan({x})" if how == "une" else f"!is_nan({x})"
+    family, order = how[0], how[1:]
+    if how == "one":
+        return f"{x} != {y} && !is_nan({x}) && !is_nan({y})"
+    if how == "une":
+        return f"{x} != {y} || is_nan({x}) || is_nan({y})"
+    if family == "o":
+        return f"{x} {_ORDER[order]} {y}"
+    return f"!({x} {_ORDER[_OPPOSITE[order]]} {y})"
+
+
+def _converted(one: Operation, name: str, own: str, x: str) -> str:
+    match name, own, one.kind:
+        case "bitcast", _, kind:
+            return x if own == kind else f"bitcast<{kind}>({x})"
+        case "sitofp", "u32", _:
+            return f"f32({_signed(x)})"
+        case "uitofp", "u32" | "bool", _:
+            return f"f32({x})"
+        case "fptosi", _, _:
+            return f"to_signed({x})"
+        case "fptoui", _, _:
+            return f"u32({x})"
+        case "sext", "bool", _:
+            return f"select(0u, 0xffffffffu, {x})"
+        case "zext", "bool", _:
+            return f"select(0u, 1u, {x})"
+        case "trunc", "u32", "bool":
+            return f"({x} & 1u) != 0u"
+        case "zext" | "trunc", "u32", "u32":
+            return x
+        case _:
+            raise UntranslatableError(f"{one.name} to {one.kind} is not translated for other GPUs")

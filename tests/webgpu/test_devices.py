@@ -1,0 +1,147 @@
+"""Rays on another GPU: Mesa's, which computes on the CPU, stands for all of them."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+import harnack as hk
+from harnack.geometry.mesh_shapes import icosphere
+from harnack.tracer import hits as tracing
+from harnack.webgpu import DeviceDisagreesError, NoDeviceError, find_device
+from tests.fields.test_contracts import APPROXIMATE, FIELDS
+from tests.fields.test_shapes import SHAPES
+
+try:
+    find_device()
+except NoDeviceError as missing:
+    pytest.skip(str(missing), allow_module_level=True)
+
+_BALL = icosphere(1)
+# Fields whose contracts are elsewhere.
+OTHERS: dict[str, Callable[[], hk.Field]] = {
+    "polygon mesh": lambda: hk.PolygonMesh(_BALL[0], [[*face] for face in _BALL[1]]),
+    "blobs": lambda: hk.Blobs(np.random.default_rng(1).normal(size=(30, 3)) * 0.5, radii=0.3),
+    "HRBF": lambda: hk.HRBF(_BALL[0], _BALL[0]),
+    "log": lambda: hk.RiemannSurface("log", domain=hk.Ball(radius=1.0)),
+    "asin": lambda: hk.RiemannSurface("asin", domain=hk.Ball(radius=1.0)),
+    "level curves": lambda: hk.LevelCurves("log"),
+}
+
+
+def field_of(name: str) -> hk.Field:
+    if name in OTHERS:
+        return OTHERS[name]()
+    return {**FIELDS, **APPROXIMATE}[name] if name not in SHAPES else SHAPES[name][0]
+
+
+def rays(field: hk.Field, count: int, seed: int = 3) -> tuple[Any, Any, float]:
+    """From all sides through the surface's box, and a tolerance for its size."""
+    box = field.extent((field.default_level,)) or field.domain
+    ends = np.array([[-2.0] * 3, [2.0] * 3] if box is None else box.bounds())
+    lower, upper = np.clip(ends, -1e4, 1e4)
+    size = 0.5 * float(np.linalg.norm(upper - lower))
+    rng = np.random.default_rng(seed)
+    away = rng.normal(size=(count, 3))
+    o = 0.5 * (lower + upper) + 2 * size * away / np.linalg.norm(away, axis=1, keepdims=True)
+    return o, rng.uniform(lower, upper, (count, 3)) - o, 1e-4 * size
+
+
+def check_same_hits(field: hk.Field, count: int) -> None:
+    """Against Dr.Jit's own: the same ends but for grazes, and hits within the tolerance."""
+    o, d, tolerance = rays(field, count)
+    other = hk.trace(field, o, d, tolerance=tolerance, backend="webgpu")
+    own = hk.trace(field, o, d, tolerance=tolerance)
+    unit = d / np.linalg.norm(d, axis=1, keepdims=True)
+    assert tracing._differences(own, other, unit, hk.Tolerance(tolerance)) == ""
+    both = own.hit & other.hit
+    assert (own.status != other.status).sum() <= 1e-3 * count
+    assert both.any()
+    assert np.quantile(np.abs(own.t[both] - other.t[both]), 0.9) <= 0.1 * tolerance
+    np.testing.assert_array_equal(own.sheet[both], other.sheet[both])
+
+
+# Walks its tree for more turns than Mesa's compiler lets loops have.
+TOO_LONG = ("morph",)
+
+
+@pytest.mark.few(6)
+@pytest.mark.parametrize("name", [
+    *(first := ("gyroid", "wavy", "mesh, exact", "torus", "polygon mesh", "log")),
+    *(one for one in [*FIELDS, *APPROXIMATE, *SHAPES, *OTHERS] if one not in (*first, *TOO_LONG)),
+])  # fmt: skip
+def test_every_field_is_hit_as_on_the_cpu(name: str) -> None:
+    check_same_hits(field_of(name), 5000)
+
+
+@dataclasses.dataclass(frozen=True)
+class Lying:
+    """A device of which one operation is wrong: the line of the shader that `wrong` chooses."""
+
+    device: Any
+    line: int
+    name: str = "a device that lies"
+
+    def compile(self, shader: Any) -> Any:
+        lines = shader.code.split("\n")
+        numbers = [k for k, one in enumerate(lines) if re.match(r" +let v_f\d+ = [^;]*;$", one)]
+        k = numbers[self.line % len(numbers)]
+        lines[k] = re.sub(r"= (.*);", r"= (\1) * 1.001f;", lines[k])
+        return self.device.compile(dataclasses.replace(shader, code="\n".join(lines)))
+
+
+def test_a_device_that_lies_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One operation wrong by a thousandth: most are refused, the others do no harm."""
+    field = hk.Gyroid(0.5, domain=hk.Ball(radius=1.0))
+    o, d, tolerance = rays(field, 4096)
+    own = hk.trace(field, o, d, tolerance=tolerance)
+    refused = 0
+    for line in range(0, 600, 30):
+        monkeypatch.setattr(tracing, "find_device", lambda k=line: Lying(find_device(), k))
+        try:
+            other = hk.trace(field, o, d, tolerance=tolerance, backend="webgpu")
+        except DeviceDisagreesError:
+            refused += 1
+            continue
+        assert (own.status == other.status).mean() > 0.998
+        both = own.hit & other.hit
+        assert np.quantile(np.abs(own.t[both] - other.t[both]), 0.9) < tolerance
+    assert refused >= 5
+
+
+def test_the_device_is_named_that_lies(monkeypatch: pytest.MonkeyPatch) -> None:
+    field = hk.Gyroid(0.5, domain=hk.Ball(radius=1.0))
+    o, d, _ = rays(field, 4096)
+    monkeypatch.setattr(tracing, "find_device", lambda: Lying(find_device(), 0))
+    with pytest.raises(DeviceDisagreesError, match=r"a device that lies does not .*leave out back"):
+        hk.trace(field, o, d, backend="webgpu")
+
+
+def test_what_is_not_for_other_devices() -> None:
+    field = hk.Sphere(1.0)
+    o, d, _ = rays(field, 8)
+    with pytest.raises(ValueError, match="single precision alone"):
+        hk.trace(field, o, d, precision="double", backend="webgpu")
+    with pytest.raises(NotImplementedError, match="first hits alone"):
+        hk.trace(field, o, d, all_hits=3, backend="webgpu")  # type: ignore[call-overload]
+    with pytest.raises(ValueError, match="'metal'"):
+        hk.trace(field, o, d, backend="metal")  # type: ignore[call-overload]
+    backend = hk.backend.choose_backend("single")
+    with pytest.raises(TypeError, match="NumPy arrays"):
+        hk.trace(field, backend.Array3f(0, 0, 2), d, backend="webgpu")
+
+
+def test_few_rays_and_many() -> None:
+    field = hk.Sphere(1.0)
+    for count in (1, 2, 3, 5000, 40000):
+        o, d, _ = rays(field, count)
+        own, other = hk.trace(field, o, d), hk.trace(field, o, d, backend="webgpu")
+        np.testing.assert_array_equal(own.status, other.status)
+        np.testing.assert_allclose(other.position[other.hit], own.position[own.hit], atol=1e-4)
+    none = hk.trace(field, np.zeros((0, 3)), np.zeros((0, 3)), backend="webgpu")
+    assert len(none.t) == 0
