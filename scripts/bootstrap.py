@@ -115,7 +115,8 @@ def provide_libraries(apt: Apt | None) -> None:
 
 def provide_webgpu(apt: Apt | None) -> None:
     """Install a device for tests of WebGPU that is none: Mesa's, which computes on the CPU."""
-    if works(VENV_PYTHON, "import wgpu; wgpu.gpu.request_adapter_sync()"):
+    found = "import sys, wgpu; info = wgpu.gpu.request_adapter_sync().info; "
+    if works(VENV_PYTHON, found + "sys.exit(info['backend_type'] == 'OpenGL')"):
         return
     if apt is not None and apt.is_root:
         apt.install("mesa-vulkan-drivers", "libvulkan1")
