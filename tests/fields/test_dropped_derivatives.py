@@ -122,7 +122,7 @@ FUNCTIONS = {
 # Settings that are no numbers of the result: names, counts, switches, and volumes.
 SETTINGS = {
     "precision", "max_steps", "largest", "confirm", "all_hits", "bound", "method", "progress",
-    "is_convex", "clip", "section",
+    "is_convex", "clip", "section", "backend",
 }  # fmt: skip
 
 
