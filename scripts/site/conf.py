@@ -74,6 +74,7 @@ CONTENTS = {
     "First steps": ["docs/notebooks/*", "docs/examples", "docs/gallery", "docs/platforms"],
     "Guides": [
         "docs/pictures",
+        "docs/live",
         "docs/meshes",
         "docs/printing",
         "docs/distances",

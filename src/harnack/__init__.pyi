@@ -117,6 +117,7 @@ from .geometry import Ball, Box, Circle, ConvexHull, HalfSpace, Intersection
 from .meshing import MeshingError, mesh, repair
 from .rendering import Camera, Isolines, animate, render
 from .tracer import AllHits, Hits, LevelSet, Status, Tolerance, level_set, trace
+from .view import page
 
 __all__ = [
     "HRBF",
@@ -226,6 +227,7 @@ __all__ = [
     "meshing",
     "minimum",
     "norm",
+    "page",
     "render",
     "rendering",
     "repair",

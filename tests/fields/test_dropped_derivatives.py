@@ -111,8 +111,8 @@ WITH_DERIVATIVES = {
 }  # fmt: skip
 # Functions of any numbers, of solids, and of scenes and files, whose results carry nothing.
 OTHERS = {
-    "maximum", "minimum", "norm", "union", "intersection", "animate", "render", "mesh", "repair",
-    "wrap_for_jax",
+    "maximum", "minimum", "norm", "union", "intersection", "animate", "render", "page", "mesh",
+    "repair", "wrap_for_jax",
 }  # fmt: skip
 FUNCTIONS = {
     name: getattr(hk, name)

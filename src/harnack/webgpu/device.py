@@ -21,9 +21,9 @@ from harnack.webgpu.wgsl import WORKGROUP, Shader
 if TYPE_CHECKING:
     pass
 
-__all__ = ["Device", "Program", "find_device"]
+__all__ = ["Bits", "Device", "NoDeviceError", "Program", "bits_of", "data_of", "find_device"]
 
-_Bits = npt.NDArray[np.uint32]
+Bits = npt.NDArray[np.uint32]
 # Seconds that one dispatch should take: a system kills what keeps its display waiting.
 _SHORT, _LONG = 0.1, 0.4
 _FIRST, _MOST = 1 << 15, 1 << 21
@@ -86,15 +86,13 @@ class Program:
     shader: Shader
     pipeline: Any
 
-    def run(
-        self, data: Mapping[str, Any], lanes: Mapping[str, Any], count: int
-    ) -> dict[str, _Bits]:
+    def run(self, data: Mapping[str, Any], lanes: Mapping[str, Any], count: int) -> dict[str, Bits]:
         """The bits of the results, (count,) each, by their labels.
 
         data: the arrays of numbers and tables. lanes: (count,) each.
         """
-        made = self._data(data)
-        given = np.stack([_bits(lanes[label]) for label in self.shader.lanes])
+        made = data_of(self.shader, data)
+        given = np.stack([bits_of(lanes[label]) for label in self.shader.lanes])
         results = np.empty((len(self.shader.results), count), np.uint32)
         first, size = 0, _FIRST
         while first < count:
@@ -109,16 +107,7 @@ class Program:
             first = last
         return dict(zip(self.shader.results, results, strict=True))
 
-    def _data(self, data: Mapping[str, Any]) -> _Bits:
-        shader = self.shader
-        tables = [_bits(data[label]) for label in shader.tables]
-        numbers = [_bits(data[label])[:1] for label in shader.numbers]
-        begin = 2 + len(tables) + len(numbers)
-        places = begin + np.cumsum([0, *map(len, tables)])[:-1].astype(np.uint32)
-        head = np.zeros(2, np.uint32)
-        return np.concatenate([head, places, *numbers, *tables]).astype(np.uint32)
-
-    def _dispatch(self, data: _Bits, lanes: _Bits) -> _Bits:
+    def _dispatch(self, data: Bits, lanes: Bits) -> Bits:
         import wgpu
 
         handle, usage = self.device.handle, wgpu.BufferUsage
@@ -142,13 +131,23 @@ class Program:
         work.dispatch_workgroups(across, -(-groups // across))
         work.end()
         handle.queue.submit([encoder.finish()])
-        found: _Bits = np.frombuffer(handle.queue.read_buffer(buffers[2]), dtype=np.uint32)
+        found: Bits = np.frombuffer(handle.queue.read_buffer(buffers[2]), dtype=np.uint32)
         for one in buffers:
             one.destroy()
         return found.reshape(-1, count)
 
 
-def _bits(array: Any) -> _Bits:
+def data_of(shader: Shader, data: Mapping[str, Any]) -> Bits:
+    """The buffer of numbers and tables that a shader reads (`Shader`), for no lanes as yet."""
+    tables = [bits_of(data[label]) for label in shader.tables]
+    numbers = [bits_of(data[label])[:1] for label in shader.numbers]
+    begin = 2 + len(tables) + len(numbers)
+    places = begin + np.cumsum([0, *map(len, tables)])[:-1].astype(np.uint32)
+    head = np.zeros(2, np.uint32)
+    return np.concatenate([head, places, *numbers, *tables]).astype(np.uint32)
+
+
+def bits_of(array: Any) -> Bits:
     """The 32 bits of each entry."""
     values: npt.NDArray[Any] = np.atleast_1d(
         to_numpy(array) if dr.is_array_v(type(array)) else array

@@ -34,32 +34,16 @@ fn is_nan(x: f32) -> bool {
   return (bitcast<u32>(x) & 0x7fffffffu) > 0x7f800000u;
 }
 fn min_number(x: f32, y: f32) -> f32 {
-  if (is_nan(x)) { return y; }
-  return select(x, y, y < x);
+  return select(x, y, (y < x) | is_nan(x));
 }
 fn max_number(x: f32, y: f32) -> f32 {
-  if (is_nan(x)) { return y; }
-  return select(x, y, y > x);
+  return select(x, y, (y > x) | is_nan(x));
 }
 fn min_or_nan(x: f32, y: f32) -> f32 {
-  if (is_nan(x)) { return x; }
-  return select(x, y, y < x || is_nan(y));
+  return select(x, y, ((y < x) | is_nan(y)) & !is_nan(x));
 }
 fn max_or_nan(x: f32, y: f32) -> f32 {
-  if (is_nan(x)) { return x; }
-  return select(x, y, y > x || is_nan(y));
-}
-fn has_class(x: f32, classes: u32) -> bool {
-  let bits = bitcast<u32>(x);
-  let exponent = (bits >> 23u) & 255u;
-  let rest = bits & 0x7fffffu;
-  var class_of = 0u;
-  if (exponent == 255u && rest != 0u) { class_of = 0x81u; }
-  else if (exponent == 255u) { class_of = select(8u, 16u, bits >> 31u == 1u); }
-  else if (exponent == 0u && rest == 0u) { class_of = select(2u, 4u, bits >> 31u == 1u); }
-  else if (exponent == 0u) { class_of = 32u; }
-  if (bits >> 31u == 1u && exponent != 255u && (exponent != 0u || rest != 0u)) { class_of |= 64u; }
-  return (class_of & classes) != 0u;
+  return select(x, y, ((y > x) | is_nan(y)) & !is_nan(x));
 }
 fn to_signed(x: f32) -> u32 {
   return bitcast<u32>(i32(x));
@@ -70,7 +54,8 @@ _INFIX = {
     "fadd": "+", "fsub": "-", "fmul": "*", "fdiv": "/", "add": "+", "sub": "-", "mul": "*",
     "udiv": "/", "urem": "%",
 }  # fmt: skip
-_BITS = {"and": ("&", "&&"), "or": ("|", "||"), "xor": ("^", "!=")}
+# Of truth values as of bits: "&&" would be a branch.
+_BITS = {"and": ("&", "&"), "or": ("|", "|"), "xor": ("^", "!=")}
 _FUNCTIONS = {
     "sqrt": "sqrt", "abs": "abs", "floor": "floor", "ceil": "ceil", "trunc": "trunc",
     "round": "round", "rsqrt": "inverseSqrt", "fma": "fma", "fmuladd": "fma",
@@ -238,7 +223,7 @@ class _Writer:
             case "select":
                 return f"select({a[2]}, {a[1]}, {a[0]})"
             case "fpclass":
-                return f"has_class({a[0]}, {how}u)"
+                return _classified(int(how), a[0])
             case "fcmp":
                 return _compared(how, a[0], a[1])
             case "icmp":
@@ -276,18 +261,34 @@ def _signed(text: str) -> str:
 def _compared(how: str, x: str, y: str) -> str:
     """Of numbers; "o.." are false of NaN, "u.." true."""
     if how in ("ord", "uno"):
-        either = f"is_nan({x}) || is_nan({y})"
+        either = f"is_nan({x}) | is_nan({y})"
         return either if how == "uno" else f"!({either})"
     if x == y and how in ("oeq", "une"):
         return f"is_nan({x})" if how == "une" else f"!is_nan({x})"
     family, order = how[0], how[1:]
     if how == "one":
-        return f"{x} != {y} && !is_nan({x}) && !is_nan({y})"
+        return f"({x} != {y}) & !is_nan({x}) & !is_nan({y})"
     if how == "une":
-        return f"{x} != {y} || is_nan({x}) || is_nan({y})"
+        return f"({x} != {y}) | is_nan({x}) | is_nan({y})"
     if family == "o":
         return f"{x} {_ORDER[order]} {y}"
     return f"!({x} {_ORDER[_OPPOSITE[order]]} {y})"
+
+
+def _classified(classes: int, x: str) -> str:
+    """Whether a number is of one of the classes of AVX-512's `fpclass`."""
+    bits = f"bitcast<u32>({x})"
+    tests = {
+        0x81: f"is_nan({x})",
+        0x02: f"({bits} == 0u)",
+        0x04: f"({bits} == 0x80000000u)",
+        0x08: f"({bits} == 0x7f800000u)",
+        0x10: f"({bits} == 0xff800000u)",
+        0x20: f"((({bits} & 0x7fffffffu) - 1u) < 0x7fffffu)",
+    }
+    if classes & 0x40 or not classes:
+        raise UntranslatableError(f"fpclass {classes} is not translated for other GPUs")
+    return " | ".join(test for mask, test in tests.items() if classes & mask)
 
 
 def _converted(one: Operation, name: str, own: str, x: str) -> str:
