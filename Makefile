@@ -6,7 +6,7 @@ STAMP := .venv/.setup-stamp
 FRAMEWORKS := torch==2.13.0 "jax==0.10.2; python_version >= '3.11'" "jaxlib==0.10.2; python_version >= '3.11'"
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo parts test test-slow test-frameworks lint format site site-pictures images
+.PHONY: help setup demo parts test test-slow test-frameworks test-browser lint format site site-pictures images
 .PHONY: bench figures clean
 
 help:
@@ -16,6 +16,7 @@ help:
 	@echo "make test       run the quick tests"
 	@echo "make test-slow  run the slow tests"
 	@echo "make test-frameworks  install PyTorch and JAX into .venv and test derivatives to and from them"
+	@echo "make test-browser  install Chromium if need be and test pages and views in it"
 	@echo "make lint       check style and types"
 	@echo "make format     apply the style"
 	@echo "make site       build the documentation into site/; a warning is an error"
@@ -50,6 +51,11 @@ test-frameworks: $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(FRAMEWORKS)
 	$(BIN)/python -c "import torch"
 	$(BIN)/python -m pytest -q -m "slow or not slow" tests/backend/test_frameworks.py
+
+# Chromium draws pages and views, with a GPU that is computed on the CPU; pictures go to out/browser.
+test-browser: $(STAMP)
+	$(BIN)/python scripts/bootstrap.py browser
+	$(BIN)/python -m pytest -q -m browser tests/view
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

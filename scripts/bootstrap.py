@@ -124,6 +124,23 @@ def provide_webgpu(apt: Apt | None) -> None:
         print("setup: no device for WebGPU, so its tests are skipped: install a Vulkan driver")
 
 
+def provide_browser() -> None:
+    """Install Chromium for tests of pages: of Debian as root, else Playwright's own."""
+    if shutil.which("chromium"):
+        return
+    apt = Apt() if shutil.which("apt-get") and shutil.which("dpkg") else None
+    # Ubuntu's package of this name is a step to a snap, which containers cannot install.
+    if apt is not None and apt.is_root and Path("/etc/debian_version").exists() and not is_ubuntu():
+        apt.install("chromium")
+        return
+    run([str(VENV_PYTHON), "-m", "playwright", "install", "chromium"])
+
+
+def is_ubuntu() -> bool:
+    release = Path("/etc/os-release")
+    return release.exists() and "\nID=ubuntu" in "\n" + release.read_text()
+
+
 def adopt_libraries(folder: Path) -> None:
     """Move unpacked shared libraries to NATIVE, such that the dynamic linker finds them there."""
     NATIVE.mkdir(exist_ok=True)
@@ -222,4 +239,4 @@ class Apt:
 
 
 if __name__ == "__main__":
-    main()
+    provide_browser() if sys.argv[1:] == ["browser"] else main()

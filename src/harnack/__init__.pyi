@@ -42,82 +42,50 @@ from .distance import (
     distance_bounds,
     signed_distance,
 )
-from .enclosures import (
-    BoundedLaplacian,
-    Caps,
-    Classic,
-    Cone,
-    Curvature,
-    Enclosure,
-    GreenBall,
-    HarmonicBall,
-    Lipschitz,
-    Parabola,
-    Pieces,
-    Slope,
-    Taylor,
-)
-from .fields import (
-    HRBF,
-    Blobs,
-    BranchPoint,
-    Capsule,
-    Compact,
-    Cubic,
-    Cuboid,
-    Cylinder,
-    DipolePotential,
-    Displaced,
-    DoubleCone,
-    EigenfunctionSum,
-    Ellipsoid,
-    Field,
-    FourierSeries,
-    FractalNoise,
-    Gaussian,
-    Gyroid,
-    HarmonicPolynomial,
-    HeightField,
-    HypersphericalHarmonic,
-    Julia,
-    LevelCurves,
-    Lobes,
-    Molecule,
-    Morph,
-    Noise,
-    Plane,
-    PlaneWave,
-    PolygonMesh,
-    Product,
-    RiemannSurface,
-    Sample,
-    SchwarzD,
-    SchwarzP,
-    ScreenedWindingNumber,
-    Sextic,
-    Shape,
-    Solid,
-    SolidAngle,
-    Sphere,
-    SphericalHarmonic,
-    Superellipsoid,
-    Supertorus,
-    Torus,
-    Tube,
-    Tubes,
-    WindingNumber,
-    cosine,
-    expression,
-    intersection,
-    sine,
-    solid,
-    union,
-)
+from .enclosures.balls.bounded_laplacian import GreenBall
+from .enclosures.balls.caps import Caps
+from .enclosures.balls.classic import Classic
+from .enclosures.balls.slope import Slope
+from .enclosures.enclosure import Enclosure
+from .enclosures.parabola import Cone, Parabola, Taylor
+from .enclosures.pieces import Pieces
+from .enclosures.promises import BoundedLaplacian, Curvature, HarmonicBall, Lipschitz
+from .fields.blobs.blobs import Blobs
+from .fields.blobs.hrbf import HRBF
+from .fields.blobs.kernels import Compact, Cubic, Gaussian, Sextic
+from .fields.blobs.molecule import Molecule
+from .fields.curves.polygon_mesh import PolygonMesh
+from .fields.curves.solid_angle import SolidAngle
+from .fields.expressions import expression
+from .fields.field import Field, Sample
+from .fields.plane.branches import BranchPoint
+from .fields.plane.height_field import HeightField
+from .fields.plane.level_curves import LevelCurves
+from .fields.plane.riemann_surface import RiemannSurface
+from .fields.polynomials.hyperspherical import HypersphericalHarmonic
+from .fields.polynomials.lobes import Lobes
+from .fields.polynomials.polynomial import HarmonicPolynomial, SphericalHarmonic
+from .fields.solids.combined import intersection, union
+from .fields.solids.fractal import Displaced, FractalNoise, Noise
+from .fields.solids.julia import Julia
+from .fields.solids.region import solid
+from .fields.solids.round import Capsule, Cylinder, DoubleCone, Ellipsoid, Plane, Sphere, Torus
+from .fields.solids.solid import Shape, Solid
+from .fields.solids.square import Cuboid, Superellipsoid, Supertorus
+from .fields.solids.tube import Tube
+from .fields.solids.tubes import Tubes
+from .fields.waves.fourier_series import FourierSeries
+from .fields.waves.periodic import EigenfunctionSum, Gyroid, SchwarzD, SchwarzP
+from .fields.waves.waves import PlaneWave, Product, cosine, sine
+from .fields.winding.dipole import DipolePotential
+from .fields.winding.morph import Morph
+from .fields.winding.screened import ScreenedWindingNumber
+from .fields.winding.winding_number import WindingNumber
 from .geometry import Ball, Box, Circle, ConvexHull, HalfSpace, Intersection
 from .meshing import MeshingError, mesh, repair
 from .rendering import Camera, Isolines, animate, render
 from .tracer import AllHits, Hits, LevelSet, Status, Tolerance, level_set, trace
-from .view import page
+from .view import SavedScene, SceneFileError, Slider, View, page, read_scene, view, write_scene
 
 __all__ = [
     "HRBF",
@@ -178,11 +146,14 @@ __all__ = [
     "Product",
     "RiemannSurface",
     "Sample",
+    "SavedScene",
+    "SceneFileError",
     "SchwarzD",
     "SchwarzP",
     "ScreenedWindingNumber",
     "Sextic",
     "Shape",
+    "Slider",
     "Slope",
     "Solid",
     "SolidAngle",
@@ -196,6 +167,7 @@ __all__ = [
     "Torus",
     "Tube",
     "Tubes",
+    "View",
     "WindingNumber",
     "__version__",
     "absolute",
@@ -228,6 +200,7 @@ __all__ = [
     "minimum",
     "norm",
     "page",
+    "read_scene",
     "render",
     "rendering",
     "repair",
@@ -243,5 +216,7 @@ __all__ = [
     "trace",
     "tracer",
     "union",
+    "view",
     "wrap_for_jax",
+    "write_scene",
 ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import functools
 import itertools
+import sys
 import warnings
 from collections.abc import Callable, Iterable
 from typing import Any, TypeVar, cast
@@ -75,3 +76,17 @@ def _renamed_attribute(owner: Any, *, old: str, new: str) -> Any:
 def _warn_of_old(old: str, new: str) -> None:
     message = f"{old} is now called {new}; the old name will be removed in a later version"
     warnings.warn(message, DeprecationWarning, stacklevel=3)
+
+
+def names_that_moved(room: str) -> Callable[[str], Any]:
+    """The `__getattr__` of a room whose fields or proofs are names of `harnack` alone."""
+
+    package: Any = sys.modules[room.partition(".")[0]]
+
+    def getattr_(name: str) -> Any:
+        if name.startswith("_") or name not in package.__all__:
+            raise AttributeError(f"module {room!r} has no attribute {name!r}")
+        _warn_of_old(f"{room}.{name}", f"harnack.{name}")
+        return getattr(package, name)
+
+    return getattr_

@@ -8,7 +8,7 @@ import pytest
 import harnack as hk
 from benchmarks import baselines, blobs, formulas, hart, inclusion, povray
 from harnack.backend import choose_backend, to_vector3
-from harnack.enclosures import BottomUpLinear
+from harnack.enclosures.literature import BottomUpLinear
 from harnack.geometry import shapes
 
 SCENE = blobs.Scene.random(6, 1.5, (0.6, 1.0), 1.6, seed=2)

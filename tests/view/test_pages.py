@@ -1,4 +1,4 @@
-"""Pages: what is in the file, and that the kernel in it finds what the rays in it say."""
+"""Pages: what is in the file, and that the kernels in it find what the rays in it say."""
 
 from __future__ import annotations
 
@@ -13,19 +13,36 @@ import pytest
 
 import harnack as hk
 from harnack.geometry import shapes
+from harnack.view.sliders import Subject
 from harnack.webgpu import NoDeviceError, find_device
 from harnack.webgpu.device import Program
 from harnack.webgpu.wgsl import Shader
 
 
 def scene_of(path: Path) -> dict[str, Any]:
-    found = re.search(r"^open\((\{.*\}), canvas, say\)", path.read_text("utf-8"), re.MULTILINE)
+    found = re.search(r"^const scene = (\{.*\});$", path.read_text("utf-8"), re.MULTILINE)
     assert found is not None
     return json.loads(found.group(1))
 
 
 def words(text: str) -> Any:
     return np.frombuffer(base64.b64decode(text), np.uint32)
+
+
+def run(surface: dict[str, Any], data: Any) -> tuple[Any, Any]:
+    """What a surface's kernel finds for its rays: what is expected, and what a device says."""
+    try:
+        device = find_device()
+    except NoDeviceError as missing:
+        pytest.skip(str(missing))
+    lanes = words(surface["check"]["lanes"]).reshape(len(surface["lanes"]), -1)
+    names = tuple(map(str, range(len(lanes))))
+    places = surface["results"]
+    outputs = tuple(map(str, range(sum(place < 99 for place in places))))
+    program: Program = device.compile(Shader(surface["code"], (), (), names, outputs))
+    given = program._dispatch(data, lanes)
+    found = np.array([0 * given[0] if place == 99 else given[place] for place in places])
+    return words(surface["check"]["results"]).reshape(7, -1), found
 
 
 @pytest.mark.parametrize("name", ["trefoil", "gyroid"])
@@ -35,39 +52,93 @@ def test_the_kernel_of_a_page_finds_what_its_rays_say(name: str, tmp_path: Path)
         "gyroid": lambda: hk.Gyroid(0.5, domain=hk.Ball(radius=1.0)),
     }
     path = tmp_path / "a.html"
-    hk.page(fields[name](), path, title="A <surface> & more")
+    hk.page(fields[name](), path, title="A <surface> & more", progress=False)
     text = path.read_text("utf-8")
     assert len(text) < 1e6
     assert "A &lt;surface&gt; &amp; more" in text
-    assert not re.search(r"(src|href)=.https?:|@import|fetch\(|import\(", text)
-    scene = scene_of(path)
-    check, results = scene["check"], scene["results"]
-    status = words(check["status"])
+    assert not re.search(
+        r"(src|href)=.https?:|@import .?(url|http)|fetch\(|import\(|^import |^export ", text, re.M
+    )
+    (surface,) = scene_of(path)["state"]["surfaces"]
+    expected, found = run(surface, words(surface["data"]))
+    status = expected[0]
     assert (status == int(hk.Status.HIT)).mean() > 0.4
-    try:
-        device = find_device()
-    except NoDeviceError as missing:
-        pytest.skip(str(missing))
-    shader = Shader(scene["code"], (), (), tuple(map(str, range(6))), tuple(results))
-    program: Program = device.compile(shader)
-    data, lanes = words(scene["data"]), words(check["lanes"]).reshape(6, -1)
-    found = dict(zip(results, program._dispatch(data, lanes), strict=True))
-    assert (found["status"] != status).mean() <= 1e-3
-    both = (status == 1) & (found["status"] == 1)
-    t = words(check["t"]).view(np.float32)[both]
-    off = np.abs(found["t"].view(np.float32)[both] - t)
-    assert np.quantile(off, 0.9) <= 0.1 * scene["tolerance"] + 1e-5
+    assert (found[0] != status).mean() <= 1e-3
+    both = (status == 1) & (found[0] == 1)
+    off = np.abs(found[1].view(np.float32) - expected[1].view(np.float32))[both]
+    assert np.quantile(off, 0.9) <= 0.1 * surface["tolerance"] + 1e-5
+
+
+def test_the_places_of_sliders_are_in_the_page(tmp_path: Path) -> None:
+    path = tmp_path / "a.html"
+    hk.page(
+        lambda r: hk.Torus(1.0, r),
+        path,
+        level=hk.Slider(-0.1, 0.1),
+        r=hk.Slider(0.2, 0.4, step=0.1),
+        progress=False,
+    )
+    scene = scene_of(path)
+    (surface,) = scene["state"]["surfaces"]
+    places, frames = scene["frames"]["places"], scene["frames"]["frames"]
+    assert np.allclose(places["r"], [0.2, 0.3, 0.4])
+    assert len(frames) == 17 * 3
+    data = words(surface["data"]).copy()
+    (change,) = frames[-1]["changes"]
+    data[words(change["at"])] = words(change["to"])
+    data[0] = 2048
+    _, found = run(surface, data)
+    lanes = words(surface["check"]["lanes"]).view(np.float32).reshape(len(surface["lanes"]), -1)
+    rays = {part: lanes[k] for k, part in enumerate(surface["lanes"])}
+    o, d = (np.column_stack([rays[k] for k in part]) for part in ((0, 1, 2), (3, 4, 5)))
+    # The rays are the stage's: the surface stands there turned, moved and scaled.
+    turned, moved, scale = np.split(np.array(scene["placement"]), [9, 12])
+    o, d = (o - moved) @ turned.reshape(3, 3) / scale, d @ turned.reshape(3, 3)
+    torus = hk.level_set(hk.Torus(1.0, 0.4), 0.1, tolerance=surface["tolerance"] / scale[0])
+    expected = hk.trace(torus, o, d)
+    assert (found[0] != expected.status).mean() <= 2e-3
+    both = expected.hit & (found[0] == 1)
+    assert both.mean() > 0.4
+    off = np.abs(found[1].view(np.float32)[both] - scale * expected.t[both])
+    assert np.quantile(off, 0.9) < 1e-4
+
+
+def test_too_many_choices_of_places_are_refused(tmp_path: Path) -> None:
+    one = hk.Slider(1, 2, step=0.01)
+    with pytest.raises(ValueError, match="a, b have 10,201 choices of places"):
+        hk.page(lambda a, b: hk.Sphere(a + b), tmp_path / "a.html", a=one, b=one, progress=False)
 
 
 def test_what_is_no_page(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"written as \.html"):
         hk.page(hk.Sphere(1.0), tmp_path / "a.png")
-    with pytest.raises(TypeError, match="holds its settings already"):
-        hk.page(hk.level_set(hk.Sphere(1.0)), tmp_path / "a.html", level=0.1)
-    with pytest.raises(ValueError, match="leave out solid"):
-        hk.page(hk.Gyroid(), tmp_path / "a.html", solid=(0.0, 1.0))
+    with pytest.raises(ValueError, match="not drawn transparent"):
+        hk.page(hk.Sphere(1.0), tmp_path / "a.html", material="glass")
     with pytest.raises(ValueError, match="reaches to infinity"):
         hk.page(hk.Plane((0.0, 0.0, 1.0)), tmp_path / "a.html")
-    with pytest.raises(TypeError, match="a harnack field is needed"):
-        hk.page("gyroid", tmp_path / "a.html")  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="fields and level sets, not"):
+        hk.page("gyroid", tmp_path / "a.html")
+    with pytest.raises(TypeError, match="no setting 'levle'"):
+        hk.page(hk.Sphere(1.0), tmp_path / "a.html", levle=0.1)
+    with pytest.raises(ValueError, match='"light" or "dark"'):
+        hk.page(hk.Sphere(1.0), tmp_path / "a.html", backdrop="tomato")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_sliders() -> None:
+    assert hk.Slider(0, 1).start == 0.5
+    assert hk.Slider(1, 8, step=2).places(99) == [1, 3, 5, 7]
+    assert hk.Slider(1, 8, step=2).start == 3
+    assert hk.Slider(0, 1, step=0.1).places(9)[3] == pytest.approx(0.3)
+    for wrong in ((1, 1), (0, 1, 2), (0, 1, 0.5, 0), (0, 1, 0.5, 2)):
+        with pytest.raises(ValueError, match=r"slider goes|step must|start must"):
+            hk.Slider(*wrong)
+    with pytest.raises(TypeError, match="low"):
+        hk.Slider("0", 1)  # type: ignore[arg-type]
+    subject = Subject.of(lambda r: hk.Sphere(r), {"level": hk.Slider(0, 1), "r": hk.Slider(1, 2)})
+    what, settings = subject.at({"level": 0.25, "r": 2.0})
+    assert (what.radius, settings) == (2.0, {"level": 0.25})
+    with pytest.raises(TypeError, match=r"a function of 'q'.*no such slider"):
+        Subject.of(lambda q: hk.Sphere(q), {"r": hk.Slider(1, 2)})
+    with pytest.raises(TypeError, match="nothing depends on the slider 'r'"):
+        Subject.of(hk.Sphere(1.0), {"r": hk.Slider(1, 2)})

@@ -76,7 +76,7 @@ TOO_LONG = ("morph",)
     *(one for one in [*FIELDS, *APPROXIMATE, *SHAPES, *OTHERS] if one not in (*first, *TOO_LONG)),
 ])  # fmt: skip
 def test_every_field_is_hit_as_on_the_cpu(name: str) -> None:
-    check_same_hits(field_of(name), 5000)
+    check_same_hits(field_of(name), 20_000)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -129,7 +129,7 @@ l_7_done:
 @pytest.mark.parametrize(("how", "of_nan", "of_order"), [
     ("olt", False, True), ("ult", True, True), ("oge", False, False), ("uge", True, False),
     ("one", False, True), ("une", True, True), ("ord", False, True), ("uno", True, False),
-    ("oeq", False, False),
+    ("oeq", False, False), ("ueq", True, False),
 ])  # fmt: skip
 def test_comparisons_of_nan(how: str, of_nan: bool, of_order: bool) -> None:
     """As Python would work out what is written, for 1 and 2 and for NaN."""

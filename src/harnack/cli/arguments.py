@@ -23,6 +23,7 @@ from harnack.rendering.arguments import ANTIALIASING, MAX_SIDE, MAX_SPP
 from harnack.rendering.studio.backdrops import IMAGE_FILES, checked_backdrop
 from harnack.rendering.studio.materials import material_of
 from harnack.rendering.surfaces.colors import color_of
+from harnack.view.sliders import Slider
 
 # Of what was typed, this much is repeated in messages.
 _SHOWN = 60
@@ -74,6 +75,7 @@ def parsers() -> tuple[_Parser, dict[str, _Parser]]:
     commands = whole.add_subparsers(required=True, metavar="COMMAND", dest="command")
     _add_render(commands)
     _add_turntable(commands)
+    _add_live(commands)
     _add_mesh(commands)
     _add_repair(commands)
     many = commands.add_parser("gallery", help="draw or list the named scenes")
@@ -120,8 +122,62 @@ def _add_turntable(commands: Any) -> None:
     _add_drawn(one, "all")
 
 
+def _add_live(commands: Any) -> None:
+    page = commands.add_parser(
+        "page", help="one HTML file in which a surface turns",
+        description="Write one HTML file that opens in any browser with WebGPU, without Python and "
+        "without a network. The visitor's own GPU traces the surface.",
+    )  # fmt: skip
+    page.add_argument("-o", "--output", metavar="FILE", help="the page, .html (SCENE.html)")
+    page.add_argument("--quiet", action="store_true", help="no progress bar")
+    view = commands.add_parser(
+        "view", help="a surface live in the browser: turned, its curve dragged, its level moved",
+        description="Serve a page to the browser of this machine, until Ctrl-C. Python prepares "
+        "what is moved there.",
+    )  # fmt: skip
+    view.add_argument(
+        "--host", default="127.0.0.1",
+        help="address to serve at; any but this machine's own is open to the network, and the "
+        "page's address then has a token (127.0.0.1)",
+    )  # fmt: skip
+    view.add_argument("--port", type=_port, metavar="N", default=0, help="0 for a free one (0)")
+    view.add_argument("--no-browser", action="store_true", help="open no browser")
+    view.set_defaults(quiet=True)
+    for one in (page, view):
+        one.set_defaults(show=None)
+        one.add_argument("--title", metavar="TEXT", help="of the page")
+        one.add_argument(
+            "--slider", type=_slider, metavar="NAME=LOW:HIGH[:STEP]", action="append", default=[],
+            help="a slider of the level (level=1:12) or of a name in the formula; as often as "
+            "there are sliders",
+        )  # fmt: skip
+        _add_scene(one)
+        _add_surface(one)
+        _add_isolines(one)
+        _add_view(one)
+        _add_file(one)
+
+
 def _add_drawn(one: Any, shaded: str) -> None:
     """What is drawn, how, and seen from where. shaded: what is drawn so unless asked otherwise."""
+    _add_scene(one)
+    _add_choice(
+        one, "--show", SHOW_MODES,
+        "what to draw: color follows light paths, shaded lights first hits by a formula, "
+        f"without noise (shaded for {shaded})",
+    )  # fmt: skip
+    _add_surface(one)
+    _add_values(_add_isolines(one))
+    _add_view(one)
+    _add_file(one)
+    _add_quality(one)
+    one.add_argument(
+        "--denoise", action="store_true",
+        help="take the noise out of a color picture (needs pip install 'harnack[denoise]')",
+    )  # fmt: skip
+
+
+def _add_scene(one: Any) -> None:
     one.add_argument(
         "scene",
         metavar="SCENE",
@@ -131,27 +187,21 @@ def _add_drawn(one: Any, shaded: str) -> None:
         "--level", type=parse_level,
         help="level to draw (1/2 for meshes, 2pi for curves); pi is understood: 2pi, pi/2",
     )  # fmt: skip
+    _add_parameters(one)
     one.add_argument(
         "--material", type=_material, metavar="NAME",
         help=f"what it is made of: {', '.join(MATERIALS)}, or a color by name or #rrggbb",
-    )  # fmt: skip
-    _add_choice(
-        one, "--show", SHOW_MODES,
-        "what to draw: color follows light paths, shaded lights first hits by a formula, "
-        f"without noise (shaded for {shaded})",
     )  # fmt: skip
     one.add_argument(
         "--confirm", action="store_true",
         help="a ray hits only where the field changes sign, not where it comes near and turns back",
     )  # fmt: skip
-    _add_surface(one)
-    _add_lines(one)
-    _add_view(one)
-    _add_file(one)
-    _add_quality(one)
+
+
+def _add_parameters(one: Any) -> None:
     one.add_argument(
-        "--denoise", action="store_true",
-        help="take the noise out of a color picture (needs pip install 'harnack[denoise]')",
+        "--set", type=_parameter, metavar="NAME=NUMBER", action="append", default=[],
+        dest="parameters", help="what a name in the formula stands for; once for each name",
     )  # fmt: skip
 
 
@@ -207,7 +257,7 @@ def _add_surface(one: Any) -> None:
     )
 
 
-def _add_lines(one: Any) -> None:
+def _add_isolines(one: Any) -> Any:
     group = one.add_argument_group("lines and values on the surface")
     group.add_argument(
         "--isolines", type=_isolines, metavar="FORMULA:SPACING",
@@ -220,6 +270,10 @@ def _add_lines(one: Any) -> None:
     group.add_argument(
         "--isolines-color", type=_color, metavar="COLOR", help="a name or #rrggbb (black)"
     )
+    return group
+
+
+def _add_values(group: Any) -> None:
     group.add_argument(
         "--of", type=_formula, metavar="FORMULA",
         help="the coordinate or the formula of x, y and z that --show value shows",
@@ -294,6 +348,7 @@ def _add_mesh(commands: Any) -> None:
     )
     one.add_argument("-o", "--output", metavar="FILE", help=f"{', '.join(MESH_FILES)} (SCENE.stl)")
     one.add_argument("--level", type=parse_level, help="as for render")
+    _add_parameters(one)
     one.add_argument(
         "--tolerance", type=_positive, metavar="PART",
         help="how far triangles may be from the surface, as a part of its size (0.001)",
@@ -387,6 +442,36 @@ def _positive(text: str) -> float:
     if not 0 < number < math.inf:
         raise argparse.ArgumentTypeError(f"{_shown(text)} must be a positive number")
     return number
+
+
+def _port(text: str) -> int:
+    if not re.fullmatch(r"[0-9]{1,5}", text) or int(text) > 65535:
+        raise argparse.ArgumentTypeError(f"{_shown(text)} must be a number from 0 to 65535")
+    return int(text)
+
+
+def _parameter(text: str) -> tuple[str, float]:
+    """ "a=0.5" as ("a", 0.5)."""
+    name, equals, number = text.partition("=")
+    if not equals or not name.strip().isidentifier():
+        raise argparse.ArgumentTypeError(f"{_shown(text)}: write a name and a number as a=0.5")
+    return name.strip(), parse_level(number)
+
+
+def _slider(text: str) -> tuple[str, Slider]:
+    """ "a=0:2:0.5" as ("a", Slider(0, 2, step=0.5))."""
+    name, _, rest = text.partition("=")
+    numbers = rest.split(":")
+    if not name.strip().isidentifier() or len(numbers) not in (2, 3):
+        raise argparse.ArgumentTypeError(
+            f"{_shown(text)}: write a name and two ends as level=1:12, a step behind them as "
+            "level=1:12:0.5"
+        )
+    low, high, *step = map(parse_level, numbers)
+    try:
+        return name.strip(), Slider(low, high, step=step[0] if step else None)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{_shown(text)}: {error}") from None
 
 
 def _ends(text: str) -> tuple[float, float]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from rich.console import Console
@@ -16,8 +17,8 @@ from harnack.backend import doctor
 from harnack.cli.mesh_files import check_mesh_path, write_mesh
 from harnack.cli.messages import in_options, printable
 from harnack.field_from_file import open_surface
-from harnack.fields import Field, expression
-from harnack.fields.expressions import looks_like_formula
+from harnack.fields import Field
+from harnack.fields.expressions import expression, looks_like_formula
 from harnack.files.surfaces import SURFACE_FILES, Mesh, read_surface
 from harnack.gallery import SCENES, Scene
 from harnack.geometry import Ball, Box, HalfSpace
@@ -28,6 +29,10 @@ from harnack.rendering import Camera, Isolines, animate, render
 from harnack.rendering.arguments import OF_STUDIO, SETTINGS
 from harnack.rendering.film import check_film_path
 from harnack.rendering.pictures.images import check_picture_path
+from harnack.rendering.studio_scene import surfaces_of
+from harnack.tracer import LevelSet
+from harnack.view import SavedScene, page, read_scene, view
+from harnack.view.scene_file import STILL_SETTINGS, SURFACE_SETTINGS, Origins
 
 _DEMO_SIZE = (480, 360)
 
@@ -53,7 +58,7 @@ def _render(options: Any) -> int:
     if options.scene not in SCENES and source.suffix.lower() == ".xml":
         what, settings = _mitsuba_scene(options)
     else:
-        what, settings = _drawn(options, source)
+        what, settings, _ = _drawn(options, source)
     render(what, target, **settings)
     _say(f"wrote {target}")
     return 0
@@ -69,7 +74,7 @@ def _turntable(options: Any) -> int:
         raise ValueError(
             "a turntable needs a scene of the gallery or a surface file, not a Mitsuba scene"
         )
-    what, settings = _drawn(options, source)
+    what, settings, _ = _drawn(options, source)
     film: dict[str, Any] = {
         "size": (320, 240), **settings, "show": options.show or "shaded",
         "frames": options.frames, "fps": options.fps, "turn": options.turn,
@@ -79,39 +84,130 @@ def _turntable(options: Any) -> int:
     return 0
 
 
+def _page(options: Any) -> int:
+    """A file to open in a browser."""
+    source = _source(options)
+    if options.output == "":
+        raise ValueError("-o is empty: name the page to write, such as a.html")
+    target = options.output or f"{source.stem or 'surface'}.html"
+    what, settings, _ = _live(options, source)
+    page(what, target, **settings)
+    _say(f"wrote {target}")
+    return 0
+
+
+def _view(options: Any) -> int:
+    """A page that is served."""
+    what, settings, origins = _live(options, _source(options))
+    settings.pop("progress")
+    view(
+        what, origins=origins, host=options.host, port=options.port, opens=not options.no_browser,
+        waits=True, **settings,
+    )  # fmt: skip
+    return 0
+
+
+def _live(options: Any, source: Path) -> _Drawn:
+    """What moves under a mouse, and its settings, some of them sliders."""
+    if source.suffix.lower() == ".xml":
+        raise ValueError("a page needs a scene, a surface file or a formula, no Mitsuba scene")
+    sliders = dict(options.slider)
+    if _is_saved(source):
+        sliders = {**read_scene(source).sliders, **sliders}
+    names = [name for name in sliders if name != "level"]
+    if "level" in sliders:
+        if options.level is not None:
+            sliders["level"] = replace(sliders["level"], start=options.level)
+        options.level = sliders["level"].start
+    if names and not _is_formula(options.scene):
+        raise ValueError(
+            f"--slider {names[0]}: there are sliders of level and of names in formulas"
+        )
+    starts = {name: cast("float", sliders[name].start) for name in names}
+    drawn, settings, origins = _drawn(options, source, starts)
+    settings = {**settings, "show": "shaded", "title": options.title or "", **sliders}
+    for name in STILL_SETTINGS:
+        settings.pop(name, None)
+    if not names:
+        return drawn, settings, origins
+    text, fixed = options.scene, dict(options.parameters)
+
+    def formula(**values: float) -> Field:
+        return expression(text, parameters={**fixed, **values})
+
+    kind = inspect.Parameter.KEYWORD_ONLY
+    own = [inspect.Parameter(name, kind) for name in names]
+    cast("Any", formula).__signature__ = inspect.Signature(own)
+    return formula, settings, origins
+
+
 def _source(options: Any) -> Path:
     """The file to draw, or the name of a scene; of a formula, a name for its picture."""
     if _is_formula(options.scene):
         return Path("formula")
+    if options.parameters:
+        raise ValueError(f"--set {options.parameters[0][0]}: only formulas have names to set")
     if options.scene not in SCENES:
         _check_source(options.scene)
     return Path(options.scene)
 
 
 def _is_formula(name: str) -> bool:
-    is_file = Path(name).suffix.lower() in (*SURFACE_FILES, ".xml")
+    is_file = Path(name).suffix.lower() in (*SURFACE_FILES, ".xml", ".json")
     return name not in SCENES and not is_file and looks_like_formula(name)
 
 
-def _drawn(options: Any, source: Path) -> tuple[Any, dict[str, Any]]:
-    """Surfaces of a scene or a file, and the settings of their picture."""
+_Drawn = tuple[Any, dict[str, Any], Origins]
+"""Surfaces, the settings of their picture, and where their fields come from."""
+
+
+def _drawn(options: Any, source: Path, moved: Mapping[str, float] | None = None) -> _Drawn:
+    """What a scene, a file or a formula is. moved: parameters of a formula besides those of the
+    options."""
     settings = {**_of_picture(options), **_lines(options), **_of_surfaces(options)}
-    if any(value is not None for value in _view(options).values()):
+    if any(value is not None for value in _seen_from(options).values()):
         settings["camera"] = _camera(options)
     if options.scene in SCENES:
         _refuse_file_options(options)
         return _of_scene(SCENES[options.scene], options, settings)
     if _is_formula(options.scene):
         _refuse_file_options(options)
-        return expression(options.scene), {"level": options.level, **settings}
+        return _formula(options, moved), {"level": options.level, **settings}, ()
+    if _is_saved(source):
+        _refuse_file_options(options)
+        return _of_saved(read_scene(source), options, settings)
     return _of_file(source, options, settings)
+
+
+def _is_saved(source: Path) -> bool:
+    """Whether it is a scene file, as a view saves it."""
+    return source.suffix.lower() == ".json"
+
+
+def _of_saved(saved: SavedScene, options: Any, settings: dict[str, Any]) -> _Drawn:
+    own = dict(saved.settings)
+    asked = {name: value for name, value in _seen_from(options).items() if value is not None}
+    if asked:
+        usual = own.get("camera") or Camera()
+        if {"azimuth", "elevation", "distance"} & set(asked):
+            usual = replace(usual, position=None)
+        settings["camera"] = replace(usual, **asked)
+    if options.level is not None:
+        if len(saved.surfaces) != 1:
+            raise ValueError("a scene of several surfaces has their levels; --level does not apply")
+        settings["level"] = options.level
+    return [*saved.surfaces], {**own, **settings}, saved.origins
+
+
+def _formula(options: Any, moved: Mapping[str, float] | None = None) -> Field:
+    return expression(options.scene, parameters={**dict(options.parameters), **(moved or {})})
 
 
 def _mitsuba_scene(options: Any) -> tuple[str, dict[str, Any]]:
     """A scene that has everything of its own."""
     _refuse_file_options(options)
     settings = {**_of_picture(options), **_lines(options)}
-    of_scene = {**_of_surfaces(options), **_view(options), "level": options.level}
+    of_scene = {**_of_surfaces(options), **_seen_from(options), "level": options.level}
     wrong = [name for name, value in of_scene.items() if value is not None]
     wrong += [name for name in settings if name in OF_STUDIO]
     if wrong:
@@ -169,10 +265,11 @@ def _check_source(name: str) -> None:
     Raises:
         ValueError: it is neither.
     """
-    if Path(name).suffix.lower() not in (*SURFACE_FILES, ".xml"):
+    if Path(name).suffix.lower() not in (*SURFACE_FILES, ".xml", ".json"):
         raise ValueError(
             f"{name!r} is no scene: give a name from `harnack gallery --list`, a surface "
-            f"file ({', '.join(SURFACE_FILES)}), a Mitsuba scene (.xml) or a formula such as "
+            f"file ({', '.join(SURFACE_FILES)}), a scene file (.json), a Mitsuba scene (.xml) or a "
+            "formula such as "
             '"x^2 + y^2 + z^2 = 1"'
             f"{did_you_mean(name, SCENES)}"
         )
@@ -183,7 +280,7 @@ def _say(text: str) -> None:
     Console(highlight=False, soft_wrap=True, markup=False, emoji=False).print(printable(text))
 
 
-def _view(options: Any) -> dict[str, Any]:
+def _seen_from(options: Any) -> dict[str, Any]:
     """What was asked of the camera; None for what was not."""
     names = ("azimuth", "elevation", "fov", "zoom", "position", "target", "distance")
     return {name: getattr(options, name) for name in names}
@@ -192,7 +289,7 @@ def _view(options: Any) -> dict[str, Any]:
 def _camera(options: Any) -> Camera:
     """The camera asked for; what was not given stays that of the scene or the studio."""
     usual = SCENES[options.scene].camera if options.scene in SCENES else Camera()
-    asked = {name: value for name, value in _view(options).items() if value is not None}
+    asked = {name: value for name, value in _seen_from(options).items() if value is not None}
     if "position" in asked:  # in place of where the scene's own stands
         usual = replace(usual, azimuth=None, elevation=None, distance=None)
     return replace(usual, **asked)
@@ -207,7 +304,7 @@ def _refuse_file_options(options: Any) -> None:
             raise ValueError(f"{name} is for surface files ({', '.join(SURFACE_FILES)}) only")
 
 
-def _of_file(source: Path, options: Any, settings: dict[str, Any]) -> tuple[Field, dict[str, Any]]:
+def _of_file(source: Path, options: Any, settings: dict[str, Any]) -> _Drawn:
     up = settings.pop("up", None)
     opened = open_surface(
         source, as_=options.as_, boundary=options.boundary, normals=options.normals, up=up
@@ -219,10 +316,12 @@ def _of_file(source: Path, options: Any, settings: dict[str, Any]) -> tuple[Fiel
         settings["show"] = opened.show
         _say(f"drawn {opened.show}; --show color follows light paths, in minutes")
     usual = {"level": options.level, "material": opened.material}
-    return opened.field, {**usual, **settings}
+    asked = {"as": options.as_, "boundary": options.boundary, "normals": options.normals, "up": up}
+    origin = {"file": str(source.resolve()), **{k: v for k, v in asked.items() if v}}
+    return opened.field, {**usual, **settings}, [(opened.field, origin)]
 
 
-def _of_scene(scene: Scene, options: Any, settings: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+def _of_scene(scene: Scene, options: Any, settings: dict[str, Any]) -> _Drawn:
     surfaces = scene.surfaces()
     if options.level is not None:
         if len(surfaces) != 1 or (surfaces[0].solid is not None and options.solid is None):
@@ -230,7 +329,8 @@ def _of_scene(scene: Scene, options: Any, settings: dict[str, Any]) -> tuple[Any
         settings["level"] = options.level
     if options.solid is not None and len(surfaces) != 1:
         raise ValueError(f"scene {scene.name} has several surfaces; --solid does not apply")
-    return surfaces, {**scene.settings(len(surfaces)), **settings}
+    origins = [(one.field, {"scene": scene.name, "number": k}) for k, one in enumerate(surfaces)]
+    return surfaces, {**scene.settings(len(surfaces)), **settings}, origins
 
 
 def _mesh(options: Any) -> int:
@@ -253,7 +353,8 @@ def _mesh(options: Any) -> int:
     clip = _clip(options)
     if clip is not None:
         settings["clip"] = clip
-    settings["section"] = _section(options)
+    if options.section is not None:
+        settings["section"] = _section(options)
     settings |= {"simplify": options.simplify, "largest": options.largest}
     if options.quiet:
         made = mesh(field, **settings)
@@ -285,25 +386,32 @@ def _meshed(options: Any, source: Path) -> tuple[Field, dict[str, Any]]:
         if options.up is not None:
             raise ValueError(f"--up is for surface files ({', '.join(SURFACE_FILES)}) only")
     if _is_formula(options.scene):
-        return expression(options.scene), {}
-    if options.scene not in SCENES:
+        return _formula(options), {}
+    if options.scene not in SCENES and not _is_saved(source):
         opened = open_surface(
             source, as_=options.as_, boundary=options.boundary, normals=options.normals,
             up=options.up,
         )  # fmt: skip
         _say(f"{source}: {in_options(opened.said)}")
         return opened.field, {}
-    surfaces = SCENES[options.scene].surfaces()
+    is_saved = _is_saved(source)
+    surfaces = _surfaces_of(read_scene(source)) if is_saved else SCENES[options.scene].surfaces()
     if len(surfaces) != 1:
         raise ValueError(
             f"scene {source} has {len(surfaces)} surfaces, and a mesh can be made of one only"
         )
     surface = surfaces[0]
+    cut = {"clip": surface.clip, "section": surface.section}
     if surface.solid is not None:
         if options.level is not None:  # then it is the level that is asked for
-            return surface.field, {"clip": surface.clip}
-        return surface.field, {"solid": surface.solid, "clip": surface.clip}
-    return surface.field, {"level": surface.numbers[0], "clip": surface.clip}
+            return surface.field, cut
+        return surface.field, {"solid": surface.solid, **cut}
+    return surface.field, {"level": surface.numbers[0], **cut}
+
+
+def _surfaces_of(saved: SavedScene) -> list[LevelSet]:
+    own = {name: one for name, one in saved.settings.items() if name in SURFACE_SETTINGS}
+    return surfaces_of([*saved.surfaces], **own)
 
 
 def _repair(options: Any) -> int:
@@ -385,6 +493,8 @@ COMMANDS: Mapping[str, Callable[[Any], int]] = MappingProxyType(
     {
         "render": _render,
         "turntable": _turntable,
+        "page": _page,
+        "view": _view,
         "mesh": _mesh,
         "repair": _repair,
         "gallery": _gallery,

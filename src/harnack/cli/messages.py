@@ -12,6 +12,7 @@ OPTIONS = (
     "cut_material", "denoise", "largest", "level", "material", "max_triangles", "normals", "of",
     "seed", "show", "simplify", "size", "spacing", "spp", "thickness", "tolerance", "up",
 )  # fmt: skip
+_PARAMETER = re.compile(r'parameters=\{"(\w+)": 1\.0\}')
 # One of them with a value, as messages write it, that is not inside of a call.
 _ARGUMENT = re.compile(rf'(?<![(\w])({"|".join(OPTIONS)})=("[^"]*"|True\b|[\w.-]+)')
 # What is written otherwise. Longer phrases come before their parts.
@@ -57,6 +58,7 @@ def in_options(text: str) -> str:
     """A message of the library, with options of the command line for arguments of Python."""
     for written, option in _PHRASES.items():
         text = text.replace(written, option)
+    text = _PARAMETER.sub(r"--set \1=1", text)
     return _ARGUMENT.sub(lambda found: _option(*found.groups()), text)
 
 

@@ -281,7 +281,7 @@ class Request:
     max_depth: int | None = field(metadata=_setting(check_max_depth))
     seed: int = field(metadata=_setting(_integer("seed")))
     denoise: bool = field(metadata=_setting(check_denoise))
-    progress: bool = field(metadata=_setting())
+    progress: Any = field(metadata=_setting())
 
     def __post_init__(self) -> None:
         if self.antialias == "cones" and self.spp == 1:

@@ -80,7 +80,7 @@ def render(
     max_depth: int | None = None,
     seed: int = 0,
     denoise: bool = False,
-    progress: bool = True,
+    progress: bool | Advance = True,
     **settings: Any,
 ) -> Picture:
     """Draw fields or a Mitsuba scene, and write the picture to `path` if there is one.
@@ -113,7 +113,8 @@ def render(
     denoise: whether a neural network (Open Image Denoise; `pip install harnack[denoise]`) takes the
         noise out of a color picture. It guesses: do not read numbers off such a picture.
     progress: whether a bar on stderr shows how far the picture is, and a line before it how long a
-        long one will take.
+        long one will take; or a function that is told each part, of 1, that is done, in its place.
+        What it raises ends the picture.
 
     In the studio only:
 
@@ -261,7 +262,9 @@ def _warn_of(lost: int, what: str) -> None:
         )
 
 
-def _radiance(mi: Any, scene: Any, asked: Request, tracer: PathTracer, progress: bool) -> Draw:
+def _radiance(
+    mi: Any, scene: Any, asked: Request, tracer: PathTracer, progress: bool | Advance
+) -> Draw:
     sensor = scene.sensors()[0]
     if asked.max_depth is not None:
         tracer = tracer.with_depth(asked.max_depth)
@@ -272,7 +275,7 @@ def _radiance(mi: Any, scene: Any, asked: Request, tracer: PathTracer, progress:
     if progress:
         pace = pace_of(mi, scene, sensor, tracer, spp=spp, features=asked.denoise)
         paths_a_band = pace.paths_a_band
-        if pace.picture > SHORT:
+        if progress is True and pace.picture > SHORT:
             Console(stderr=True, highlight=False).print(
                 f"this picture will take about {pace}, with {spp} samples a pixel"
             )

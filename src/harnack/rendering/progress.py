@@ -22,13 +22,17 @@ _INTERVAL = 5.0
 
 
 @contextmanager
-def progress_bar(name: str, shown: bool) -> Generator[Advance]:
+def progress_bar(name: str, shown: bool | Advance) -> Generator[Advance]:
     """Progress of `name` on stderr; what it yields is told each part, of 1, that has been finished.
+
+    shown: whether to show it; or who is told in its place, and may raise an exception to end all.
 
     In a notebook a bar would need ipywidgets, and control codes of terminals are shown as they are.
     """
     console = Console(stderr=True)
-    if not shown:
+    if callable(shown):
+        yield shown
+    elif not shown:
         yield lambda part: None
     elif console.is_terminal and not console.is_jupyter:
         columns = (TextColumn(name), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())

@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from harnack.fields import Field, Solid, Tube, WindingNumber
+from harnack.fields import Field, Solid
 from harnack.fields.field import instead_of_field
+from harnack.fields.solids.tube import Tube
+from harnack.fields.winding.winding_number import WindingNumber
 from harnack.meshing import mesh
 from harnack.rendering.arguments import check_settings
 from harnack.rendering.studio.materials import Material, material_of
@@ -184,7 +186,7 @@ def _rims(made: list[StudioObject], radius: Any, material: Material) -> list[Stu
 def _surface(one: Field | LevelSet, settings: Mapping[str, Any], clear: bool) -> LevelSet:
     """A surface with settings. A `Solid` is drawn with its inside where that is seen: it is opened
     by a section, or clear."""
-    made = _with_settings(one, settings).in_one_call(begins=True)
+    made = with_settings(one, settings).in_one_call(begins=True)
     opened = isinstance(made.field, Solid) and made.solid is None
     opened &= clear or made.section is not None
     if not opened or len(made.levels) != 1:
@@ -192,7 +194,8 @@ def _surface(one: Field | LevelSet, settings: Mapping[str, Any], clear: bool) ->
     return replace(made, solid=(-math.inf, made.numbers[0]))
 
 
-def _with_settings(one: Field | LevelSet, settings: Mapping[str, Any]) -> LevelSet:
+def with_settings(one: Field | LevelSet, settings: Mapping[str, Any]) -> LevelSet:
+    """A surface with settings of `level_set` in the place of its own."""
     if isinstance(one, Field):
         return level_set(one, **settings)
     if not settings:

@@ -242,7 +242,7 @@ class March:
         now: MarchState,
         ahead: Crossing | None = None,
     ) -> MarchState:
-        """One look more at rays on their way, from `base`: see `advance`."""
+        """The state after one more trial point of each ray; `advance` has the proof."""
         seen = self._look(field, path, end, now, ahead)
         if self.hysteresis is not None and now.contact is not None:
             seen = self._in_contact(seen, self.hysteresis, now.contact)

@@ -41,7 +41,9 @@ _FIRST_HITS = (
 class LevelSet:
     """A surface: where a field takes one of some levels, and how closely to trace it.
 
-    levels: None for the field's default, a number, several, or Dr.Jit numbers or a tensor of them.
+    field: the function. levels: one or more numbers, or Dr.Jit numbers; `level_set` fills in the
+        field's default. tolerance: see `Tolerance`. max_steps: evaluations that a ray may take.
+    bound: the proofs by which steps are made (`choose_proofs`).
     clip: a volume to cut the surface with, besides the field's own domain.
     section: another one, that opens the surface to be looked into: the faces of a solid on it may
         have a material of their own.

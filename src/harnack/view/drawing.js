@@ -1,403 +1,572 @@
-// Draws one traced surface on the visitor's GPU: rays of a camera, the kernel that Dr.Jit recorded
-// as a shader, and light. No dependency; the page hands over what `harnack.view.page` has written.
+// Draws traced surfaces on the visitor's GPU: rays of a camera, the kernels that Dr.Jit recorded as
+// shaders, and the light of shaded pictures. No dependency: what is drawn comes from
+// `harnack.view.scene`, what is done around the kernels is in passes.wgsl.
 // @ts-check
 
+import { Camera, dot } from "./camera.js";
+
+/** @import {Pose} from "./camera.js" */
+/** @typedef {{lanes: string, results: string, count: number}} Check */
 /** @typedef {{
- *   code: string, data: string, lanes: number[], results: Record<string, number>, count: number,
- *   center: number[], radius: number, front: number[], back: number[], tolerance: number,
- *   check: {lanes: string, status: string, t: string, normal: string, count: number}
+ *   key: string, code: string, data: string, lanes: number[], results: number[],
+ *   paints: {front: number[], back: number[], glossy: boolean}[], tolerance: number, check?: Check
+ * }} Surface */
+/** @typedef {{surfaces: Surface[], curves: number[][][]}} State */
+/** @typedef {{name: string, low: number, high: number, start: number, step: number | null}} Slider */
+/** @typedef {{
+ *   title: string, placement: number[], camera: Pose, floor: number, show: string,
+ *   ground: number[], sliders: Slider[], editable: boolean, middle: number[], reach: number,
+ *   state: State
  * }} Scene */
+/** @typedef {{points: number[][], color: number[], width: number}} Marks */
 
 const STATUS = { MISS: 0, HIT: 1, OUT_OF_STEPS: 2 };
-const TILE = 1 << 16;
-const GROUP = 64;
-// Milliseconds that a picture may take while the camera moves.
-const QUICK = 40;
+export const SHOWS = ["shaded", "normal", "depth", "evaluations", "status"];
+// Rays that are traced at once, at most, and milliseconds that they should take.
+const TILE = 1 << 17;
+const TILE_TIME = 60;
+// Milliseconds that a picture may take while something moves.
+export const QUICK = 50;
 const SAMPLES = 16;
-
-const PASSES = (/** @type {Scene} */ scene) => `
-struct View {
-  eye: vec4f, right: vec4f, up: vec4f, forward: vec4f,
-  width: u32, height: u32, first: u32, count: u32,
-  jitter: vec2f, weight: f32, dark: f32,
-}
-@group(0) @binding(0) var<uniform> view: View;
-@group(0) @binding(1) var<storage, read_write> lanes: array<f32>;
-@group(0) @binding(2) var<storage, read> results: array<u32>;
-@group(0) @binding(3) var<storage, read_write> picture: array<vec4f>;
-
-fn direction(pixel: u32) -> vec3f {
-  let place = vec2f(f32(pixel % view.width), f32(pixel / view.width)) + view.jitter;
-  let size = vec2f(f32(view.width), f32(view.height));
-  let across = (place - 0.5 * size) / min(size.x, size.y);
-  return normalize(view.forward.xyz + across.x * view.right.xyz - across.y * view.up.xyz);
-}
-
-@compute @workgroup_size(${GROUP})
-fn aim(@builtin(global_invocation_id) id: vec3u) {
-  if (id.x >= view.count) { return; }
-  let d = direction(view.first + id.x);
-  let values = array<f32, 6>(view.eye.x, view.eye.y, view.eye.z, d.x, d.y, d.z);
-  let order = array<u32, 6>(${scene.lanes.map((k) => `${k}u`).join(", ")});
-  for (var k = 0u; k < 6u; k++) { lanes[k * view.count + id.x] = values[order[k]]; }
-}
-
-fn result(k: u32, lane: u32) -> u32 { return results[k * view.count + lane]; }
-
-@compute @workgroup_size(${GROUP})
-fn light(@builtin(global_invocation_id) id: vec3u) {
-  if (id.x >= view.count) { return; }
-  let pixel = view.first + id.x;
-  let d = direction(pixel);
-  let high = f32(pixel / view.width) / f32(view.height);
-  var color = mix(vec3f(0.93, 0.94, 0.96), vec3f(0.78, 0.80, 0.84), high);
-  if (view.dark > 0.5) { color = mix(vec3f(0.10, 0.11, 0.13), vec3f(0.04, 0.045, 0.05), high); }
-  let status = result(${scene.results.status}u, id.x);
-  if (status == ${STATUS.OUT_OF_STEPS}u) { color = vec3f(1.0, 0.0, 1.0); }
-  if (status == ${STATUS.HIT}u) {
-    let n = vec3f(
-      bitcast<f32>(result(${scene.results["normal 0"]}u, id.x)),
-      bitcast<f32>(result(${scene.results["normal 1"]}u, id.x)),
-      bitcast<f32>(result(${scene.results["normal 2"]}u, id.x)),
-    );
-    let outside = dot(n, d) < 0.0;
-    let facing = select(-n, n, outside);
-    let base = select(vec3f(${scene.back.join(", ")}), vec3f(${scene.front.join(", ")}), outside);
-    let key = normalize(view.up.xyz * 0.8 + view.right.xyz * 0.5 - view.forward.xyz * 0.7);
-    let sky = 0.5 + 0.5 * dot(facing, vec3f(0.0, 0.0, 1.0));
-    let lit = max(dot(facing, key), 0.0);
-    let half_way = normalize(key - d);
-    let shine = pow(max(dot(facing, half_way), 0.0), 60.0);
-    let rim = pow(1.0 - abs(dot(facing, d)), 5.0);
-    color = base * (0.25 + 0.35 * sky + 0.75 * lit) + vec3f(0.18 * shine + 0.12 * rim);
-  }
-  let linear = vec4f(color, 1.0) * view.weight;
-  if (view.weight > 0.99) { picture[pixel] = linear; return; }
-  picture[pixel] = picture[pixel] * (1.0 - view.weight) + linear;
-}
-
-@vertex
-fn corner(@builtin(vertex_index) k: u32) -> @builtin(position) vec4f {
-  return vec4f(f32(k & 1u) * 4.0 - 1.0, f32(k >> 1u) * 4.0 - 1.0, 0.0, 1.0);
-}
-struct Shown { width: u32, height: u32, across: f32, down: f32 }
-@group(0) @binding(4) var<uniform> shown: Shown;
-@group(0) @binding(5) var<storage, read> seen: array<vec4f>;
-@fragment
-fn show(@builtin(position) at: vec4f) -> @location(0) vec4f {
-  let x = min(u32(at.x * shown.across), shown.width - 1u);
-  let y = min(u32(at.y * shown.down), shown.height - 1u);
-  let color = seen[y * shown.width + x].rgb;
-  return vec4f(pow(clamp(color, vec3f(0.0), vec3f(1.0)), vec3f(1.0 / 2.2)), 1.0);
-}
-`;
+const GROUP = 64;
+// What other roundings explain: see `harnack.tracer.hits`.
+const [GRAZING, OTHERWISE, APART, TURNED, ALIKE, MORE] = [0.1, 1e-3, 0.1, 2e-4, 0.9, 0.03];
+const VIEW_BYTES = 176;
+const PAINTS = 128;
+// Of the floor's light: see `harnack.rendering.pictures.floor`.
+const [CELLS, RAYS, BLOCK, SPREAD] = [64, 8, 4, 0.34];
+const BLUR = [0.025, 0.125, 0.225, 0.25, 0.225, 0.125, 0.025];
 
 /** The 32-bit words of a text in base64. @param {string} text */
-function words(text) {
+export function words(text) {
   const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
   return new Uint32Array(bytes.buffer);
 }
 
-/** @param {number[]} a @param {number[]} b */
-const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+/** Places in the unit square, spread evenly (Roberts 2018), as `floor._square` has them. */
+function square() {
+  const plastic = 1.32471795724474602596;
+  const count = BLOCK * BLOCK;
+  /** @type {number[][]} */
+  const places = [];
+  for (let block = 0; block < count; block++)
+    for (let ray = 0; ray < RAYS; ray++) {
+      const k = ray * count + block;
+      places.push([(0.5 + k / plastic) % 1, (0.5 + k / plastic ** 2) % 1]);
+    }
+  return places;
+}
 
 export class Drawing {
-  /** @param {GPUDevice} device @param {Scene} scene @param {HTMLCanvasElement} canvas */
-  constructor(device, scene, canvas) {
+  /** @param {GPUDevice} device @param {Scene} scene @param {HTMLCanvasElement} canvas
+   *  @param {string} passes */
+  constructor(device, scene, canvas, passes) {
     this.device = device;
     this.scene = scene;
     this.canvas = canvas;
-    this.home = { azimuth: -50, elevation: 28, zoom: 1, across: 0, down: 0 };
-    this.view = { ...this.home };
+    this.camera = new Camera(scene.camera);
+    this.ground = scene.ground;
+    this.show = "shaded";
+    this.range = [0, 1];
+    /** @type {Marks[]} */
+    this.lines = [];
+    /** @type {Marks[]} */
+    this.dots = [];
     this.scale = 0.25;
+    this.tile = 1 << 14;
     this.turn = 0;
+    this.pictures = 0;
+    // Rays of a pixel when nothing moves.
+    this.samples = SAMPLES;
+    this.tick = 0;
+    this.stopped = false;
+    // Pixels that are traced in a millisecond.
+    this.rate = 0;
+    this.passes = passes;
+    /** @type {Map<string, Promise<GPUComputePipeline>>} */
+    this.traces = new Map();
+    /** @type {any} */
+    this.pipelines = {};
+    /** @type {any[]} */
+    this.surfaces = [];
     this.context = /** @type {GPUCanvasContext} */ (canvas.getContext("webgpu"));
     this.format = navigator.gpu.getPreferredCanvasFormat();
     this.context.configure({ device, format: this.format, alphaMode: "opaque" });
-    const usage = GPUBufferUsage;
-    const count = Object.keys(scene.results).length;
-    this.data = this.buffer(words(scene.data), usage.STORAGE);
-    this.lanes = this.buffer(24 * TILE, usage.STORAGE);
-    this.results = this.buffer(4 * count * TILE, usage.STORAGE | usage.COPY_SRC);
-    this.traced_with = { 0: this.data, 1: this.lanes, 2: this.results };
-    this.camera = this.buffer(96, usage.UNIFORM);
-    this.shown = this.buffer(16, usage.UNIFORM);
-    this.picture = this.buffer(16, usage.STORAGE);
+    const { STORAGE, UNIFORM, COPY_SRC } = GPUBufferUsage;
+    this.view = this.buffer(VIEW_BYTES, UNIFORM);
+    this.overlay = this.buffer(VIEW_BYTES, UNIFORM);
+    this.lanes = this.buffer(28 * TILE, STORAGE);
+    this.results = this.buffer(28 * TILE, STORAGE | COPY_SRC);
+    this.towards = this.buffer(32 * BLOCK * BLOCK * RAYS, STORAGE);
+    this.blocked = this.buffer(8 * CELLS * CELLS * RAYS, STORAGE | COPY_SRC);
+    this.floor = this.buffer(new Float32Array(2 * CELLS * CELLS).fill(1), STORAGE);
+    this.colors = this.buffer(32 * PAINTS, STORAGE);
+    this.marks = this.buffer(32, STORAGE);
+    this.most = Math.floor(device.limits.maxStorageBufferBindingSize / 32);
+    this.reserve(1024);
   }
 
-  /** @param {Uint32Array | number} given @param {number} usage */
+  /** @param {ArrayBufferView | number} given @param {number} usage */
   buffer(given, usage) {
     const size = typeof given === "number" ? given : given.byteLength;
     const made = this.device.createBuffer({
-      size: Math.max(16, size), usage: usage | GPUBufferUsage.COPY_DST,
+      size: Math.max(32, size), usage: usage | GPUBufferUsage.COPY_DST,
     });
-    if (typeof given !== "number") this.device.queue.writeBuffer(made, 0, given);
+    if (typeof given !== "number") this.device.queue.writeBuffer(made, 0, /** @type {any} */ (given));
     return made;
-  }
-
-  async compile() {
-    const device = this.device;
-    const traced = device.createShaderModule({ code: this.scene.code });
-    const passes = device.createShaderModule({ code: PASSES(this.scene) });
-    const compute = (/** @type {GPUShaderModule} */ module, /** @type {string} */ entryPoint) =>
-      device.createComputePipelineAsync({ layout: "auto", compute: { module, entryPoint } });
-    [this.trace, this.aim, this.light] = await Promise.all([
-      compute(traced, "main"), compute(passes, "aim"), compute(passes, "light"),
-    ]);
-    this.show = await device.createRenderPipelineAsync({
-      layout: "auto",
-      vertex: { module: passes, entryPoint: "corner" },
-      fragment: { module: passes, entryPoint: "show", targets: [{ format: this.format }] },
-    });
-  }
-
-  /** @param {GPUComputePassEncoder} pass @param {any} pipeline
-   *  @param {Record<number, GPUBuffer>} buffers @param {number} count */
-  run(pass, pipeline, buffers, count) {
-    pass.setPipeline(pipeline);
-    pass.setBindGroup(0, this.device.createBindGroup({
-      layout: pipeline.getBindGroupLayout(0),
-      entries: Object.entries(buffers).map(([binding, buffer]) => ({
-        binding: Number(binding), resource: { buffer },
-      })),
-    }));
-    pass.dispatchWorkgroups(Math.ceil(count / GROUP));
-  }
-
-  /** What the device says of the rays that came with the page, against what Dr.Jit said of them.
-   *  Nothing, if they agree. */
-  async check() {
-    const { check, results, tolerance } = this.scene;
-    const n = check.count;
-    this.device.queue.writeBuffer(this.data, 0, new Uint32Array([n]));
-    this.device.queue.writeBuffer(this.lanes, 0, words(check.lanes));
-    const size = 4 * n * Object.keys(results).length;
-    const back = this.device.createBuffer({
-      size, usage: GPUBufferUsage.MAP_READ | GPUBufferUsage.COPY_DST,
-    });
-    const encoder = this.device.createCommandEncoder();
-    const pass = encoder.beginComputePass();
-    this.run(pass, this.trace, this.traced_with, n);
-    pass.end();
-    encoder.copyBufferToBuffer(this.results, 0, back, 0, size);
-    this.device.queue.submit([encoder.finish()]);
-    await back.mapAsync(GPUMapMode.READ);
-    const bits = new Uint32Array(back.getMappedRange().slice(0));
-    back.destroy();
-    const numbers = new Float32Array(bits.buffer);
-    const [status, t] = [words(check.status), new Float32Array(words(check.t).buffer)];
-    const normal = new Float32Array(words(check.normal).buffer);
-    const rays = new Float32Array(words(check.lanes).buffer);
-    const order = this.scene.lanes;
-    const at = (/** @type {number} */ k, /** @type {number} */ part) =>
-      rays[order.indexOf(part) * n + k];
-    let [other, far, hits] = [0, 0, 0];
-    for (let k = 0; k < n; k++) {
-      const found = bits[results.status * n + k];
-      if (found !== status[k]) { other++; continue; }
-      if (found !== STATUS.HIT) continue;
-      hits++;
-      const [d, m] = [[3, 4, 5].map((p) => at(k, p)), [0, 1, 2].map((p) => normal[p * n + k])];
-      const climb = Math.max(Math.abs(dot(d, m)), 0.1);
-      const off = Math.abs(numbers[results.t * n + k] - t[k]) * climb;
-      const turned = Math.hypot(...[0, 1, 2].map(
-        (p) => numbers[results[`normal ${p}`] * n + k] - m[p]));
-      if (!(off <= 0.2 * tolerance + 8e-6 * (1 + t[k])) || !(turned < 2e-3 || climb <= 0.1)) far++;
-    }
-    if (other > 1e-3 * n) return `${other} of ${n} rays end otherwise`;
-    if (far > 0.05 * hits) return `${far} of ${hits} hits lie elsewhere`;
-    return "";
-  }
-
-  /** The camera, in coordinates of the surface. */
-  pose() {
-    const { azimuth, elevation, zoom, across, down } = this.view;
-    const [a, e] = [azimuth, elevation].map((x) => (x * Math.PI) / 180);
-    const back = [Math.cos(e) * Math.cos(a), Math.cos(e) * Math.sin(a), Math.sin(e)];
-    const right = [-Math.sin(a), Math.cos(a), 0];
-    const up = [
-      back[1] * right[2] - back[2] * right[1], back[2] * right[0] - back[0] * right[2],
-      back[0] * right[1] - back[1] * right[0],
-    ];
-    const slope = Math.tan((13 * Math.PI) / 180);
-    const distance = (1.15 * this.scene.radius) / Math.sin((13 * Math.PI) / 180) / zoom;
-    const move = this.scene.radius / zoom;
-    const eye = this.scene.center.map(
-      (c, k) => c + distance * back[k] - move * (across * right[k] - down * up[k]));
-    return { eye, right: right.map((x) => 2 * slope * x), up: up.map((x) => 2 * slope * x),
-             forward: back.map((x) => -x) };
-  }
-
-  /** Traces one picture, tile by tile, until the camera moves. @param {number} width
-   *  @param {number} height @param {number[]} jitter @param {number} weight @param {number} turn */
-  async traced(width, height, jitter, weight, turn) {
-    const { eye, right, up, forward } = this.pose();
-    const dark = matchMedia("(prefers-color-scheme: dark)").matches ? 1 : 0;
-    for (let first = 0; first < width * height; first += TILE) {
-      const count = Math.min(TILE, width * height - first);
-      const view = new ArrayBuffer(96);
-      new Float32Array(view).set([...eye, 0, ...right, 0, ...up, 0, ...forward, 0]);
-      new Uint32Array(view, 64).set([width, height, first, count]);
-      new Float32Array(view, 80).set([...jitter, weight, dark]);
-      this.device.queue.writeBuffer(this.camera, 0, view);
-      this.device.queue.writeBuffer(this.data, 0, new Uint32Array([count]));
-      const encoder = this.device.createCommandEncoder();
-      const pass = encoder.beginComputePass();
-      this.run(pass, this.aim, { 0: this.camera, 1: this.lanes }, count);
-      this.run(pass, this.trace, this.traced_with, count);
-      this.run(pass, this.light, { 0: this.camera, 2: this.results, 3: this.picture }, count);
-      pass.end();
-      this.device.queue.submit([encoder.finish()]);
-      await this.device.queue.onSubmittedWorkDone();
-      if (turn !== this.turn && weight < 1) return false;
-    }
-    return true;
-  }
-
-  /** @param {number} width @param {number} height */
-  present(width, height) {
-    const { canvas } = this;
-    const shown = new ArrayBuffer(16);
-    new Uint32Array(shown).set([width, height]);
-    new Float32Array(shown, 8).set([width / canvas.width, height / canvas.height]);
-    this.device.queue.writeBuffer(this.shown, 0, shown);
-    const encoder = this.device.createCommandEncoder();
-    const pass = encoder.beginRenderPass({ colorAttachments: [{
-      view: this.context.getCurrentTexture().createView(), loadOp: "clear", storeOp: "store",
-    }] });
-    pass.setPipeline(/** @type {GPURenderPipeline} */ (this.show));
-    pass.setBindGroup(0, this.device.createBindGroup({
-      layout: /** @type {GPURenderPipeline} */ (this.show).getBindGroupLayout(0),
-      entries: [{ binding: 4, resource: { buffer: this.shown } },
-                { binding: 5, resource: { buffer: this.picture } }],
-    }));
-    pass.draw(3);
-    pass.end();
-    this.device.queue.submit([encoder.finish()]);
   }
 
   /** Room for a picture. @param {number} pixels */
   reserve(pixels) {
-    if (this.picture.size >= 16 * pixels) return;
-    this.picture.destroy();
+    if (this.seen && this.seen.size >= 32 * pixels) return;
+    for (const one of [this.seen, this.sky, this.picture]) one?.destroy();
+    this.seen = this.buffer(32 * pixels, GPUBufferUsage.STORAGE | GPUBufferUsage.COPY_SRC);
+    this.sky = this.buffer(4 * pixels, GPUBufferUsage.STORAGE);
     this.picture = this.buffer(16 * pixels, GPUBufferUsage.STORAGE);
   }
 
-  /** Draws: coarsely while the camera moves, then at every pixel, then with many rays a pixel. */
+  async compile() {
+    const { device, format } = this;
+    const module = device.createShaderModule({ code: this.passes });
+    const names = ["aim", "begin", "gather", "look_up", "paint", "aim_up", "gather_up"];
+    const made = await Promise.all(names.map((entryPoint) =>
+      device.createComputePipelineAsync({ layout: "auto", compute: { module, entryPoint } })));
+    names.forEach((name, k) => { this.pipelines[name] = made[k]; });
+    const blend = /** @type {GPUBlendState} */ ({
+      color: { srcFactor: "src-alpha", dstFactor: "one-minus-src-alpha" }, alpha: {},
+    });
+    const drawn = (/** @type {string} */ vertex, /** @type {string} */ fragment) =>
+      device.createRenderPipelineAsync({
+        layout: "auto", vertex: { module, entryPoint: vertex },
+        fragment: { module, entryPoint: fragment,
+                    targets: [fragment === "show" ? { format } : { format, blend }] },
+      });
+    [this.pipelines.show, this.pipelines.line, this.pipelines.dot] = await Promise.all(
+      [drawn("corner", "show"), drawn("line", "mark"), drawn("dot_at", "mark")]);
+  }
+
+  /** The pipeline of a kernel, compiled once. @param {Surface} surface */
+  traced(surface) {
+    const found = this.traces.get(surface.key);
+    if (found) return found;
+    const module = this.device.createShaderModule({ code: surface.code });
+    const made = this.device.createComputePipelineAsync({
+      layout: "auto", compute: { module, entryPoint: "main" },
+    });
+    this.traces.set(surface.key, made);
+    return made;
+  }
+
+  /** Draws other surfaces from now on. What is wrong with them on this device, if anything is.
+   *  @param {State} state @param {boolean} [checks] */
+  async set(state, checks = true) {
+    const made = await Promise.all(state.surfaces.map((one) => this.traced(one)));
+    const old = this.surfaces;
+    let paints = 0;
+    this.surfaces = state.surfaces.map((given, k) => {
+      const numbers = new Uint32Array(20);
+      numbers.set(given.lanes, 0);
+      numbers.set(given.results, 8);
+      numbers.set([paints, given.lanes.length], 16);
+      paints += given.paints.length;
+      return { given, trace: made[k], data: this.buffer(words(given.data), GPUBufferUsage.STORAGE),
+               numbers: this.buffer(numbers, GPUBufferUsage.UNIFORM) };
+    });
+    const colors = new Float32Array(8 * PAINTS);
+    colors.set(state.surfaces.flatMap((one) => one.paints).slice(0, PAINTS).flatMap(
+      ({ front, back, glossy }) => [...front, glossy ? 1 : 0, ...back, glossy ? 1 : 0]));
+    this.device.queue.writeBuffer(this.colors, 0, colors);
+    for (const one of old) { one.data.destroy(); one.numbers.destroy(); }
+    if (checks)
+      for (const one of this.surfaces) {
+        const wrong = await this.check(one);
+        if (wrong) return wrong;
+      }
+    return "";
+  }
+
+  /** @param {GPUComputePassEncoder} pass @param {GPUComputePipeline} pipeline
+   *  @param {Record<number, GPUBuffer>} buffers @param {number} count */
+  run(pass, pipeline, buffers, count) {
+    pass.setPipeline(pipeline);
+    pass.setBindGroup(0, this.bound(pipeline, buffers));
+    pass.dispatchWorkgroups(Math.ceil(count / GROUP));
+  }
+
+  /** @param {GPUComputePipeline | GPURenderPipeline} pipeline
+   *  @param {Record<number, GPUBuffer>} buffers */
+  bound(pipeline, buffers) {
+    return this.device.createBindGroup({
+      layout: pipeline.getBindGroupLayout(0),
+      entries: Object.entries(buffers).map(([binding, buffer]) => ({
+        binding: Number(binding), resource: { buffer },
+      })),
+    });
+  }
+
+  /** @param {GPUBuffer} buffer @param {number} size */
+  async read(buffer, size) {
+    const back = this.device.createBuffer({
+      size, usage: GPUBufferUsage.MAP_READ | GPUBufferUsage.COPY_DST,
+    });
+    const encoder = this.device.createCommandEncoder();
+    encoder.copyBufferToBuffer(buffer, 0, back, 0, size);
+    this.device.queue.submit([encoder.finish()]);
+    await back.mapAsync(GPUMapMode.READ);
+    const found = new Uint32Array(back.getMappedRange().slice(0));
+    back.destroy();
+    return found;
+  }
+
+  /** What the device says of the rays that came with a surface, against what Dr.Jit said of them.
+   *  Nothing, if they agree. @param {any} surface */
+  async check(surface) {
+    const { check, results, tolerance, lanes } = /** @type {Surface} */ (surface.given);
+    if (!check) return "";
+    const n = check.count;
+    this.device.queue.writeBuffer(surface.data, 0, new Uint32Array([n]));
+    this.device.queue.writeBuffer(this.lanes, 0, words(check.lanes));
+    const encoder = this.device.createCommandEncoder();
+    const pass = encoder.beginComputePass();
+    this.run(pass, surface.trace, { 0: surface.data, 1: this.lanes, 2: this.results }, n);
+    pass.end();
+    this.device.queue.submit([encoder.finish()]);
+    const bits = await this.read(this.results, 28 * n);
+    const numbers = new Float32Array(bits.buffer);
+    const expected = words(check.results);
+    const [wanted, rays] = [new Float32Array(expected.buffer), new Float32Array(words(check.lanes).buffer)];
+    const at = (/** @type {number} */ k, /** @type {number} */ part) => rays[lanes.indexOf(part) * n + k];
+    // The criteria are those of `harnack.tracer.hits`, with what was measured there.
+    let [other, stray, alike, many, others] = [0, 0, 0, 0, 0];
+    /** @type {number[]} */
+    const [off, turned] = [[], []];
+    for (let k = 0; k < n; k++) {
+      const [found, looks] = [bits[results[0] * n + k], bits[results[5] * n + k]];
+      const looked = expected[5 * n + k];
+      [many, others, alike] = [many + looked, others + looks, alike + (looks === looked ? 1 : 0)];
+      const normal = [2, 3, 4].map((p) => wanted[p * n + k]);
+      const climb = Math.abs(dot([3, 4, 5].map((p) => at(k, p)), normal));
+      if (found !== expected[k]) {
+        other++;
+        const grazes = Math.max(found, expected[k]) === STATUS.OUT_OF_STEPS || climb < GRAZING;
+        if (!grazes && expected[k] === STATUS.HIT) stray++;
+      }
+      if (found !== STATUS.HIT || expected[k] !== STATUS.HIT) continue;
+      const t = wanted[n + k];
+      const apart = Math.abs(numbers[results[1] * n + k] - t) * Math.max(climb, GRAZING) - 8e-6 * (1 + t);
+      off.push(Number.isNaN(apart) ? Infinity : apart / tolerance);
+      if (climb >= GRAZING)
+        turned.push(Math.hypot(...[2, 3, 4].map((p, c) => numbers[results[p] * n + k] - normal[c])));
+    }
+    if (stray || other > OTHERWISE * n) return `${other} of ${n} rays end otherwise`;
+    if (off.filter((one) => one > 2).length > OTHERWISE * n) return "hits lie off the surface";
+    if (largest(off, 0.9) > APART) return "hits lie elsewhere, if within the tolerance";
+    if (!(largest(turned, 0.9) <= TURNED)) return "normals differ";
+    if (alike < ALIKE * n || Math.abs(others - many) > MORE * many + 2)
+      return "rays take another number of evaluations";
+    return "";
+  }
+
+  /** The numbers of a pass. @param {{width: number, height: number, first?: number, count?: number,
+   *  jitter?: number[], weight?: number, ways?: number, turn?: number, kind?: number}} asked */
+  numbers(asked) {
+    const { width, height, first = 0, count = 0, jitter = [0.5, 0.5], weight = 1 } = asked;
+    const { ways = 16, turn = 0.5, kind = 0 } = asked;
+    const { floor } = this.scene;
+    const [eye, axes] = [this.camera.eye(), this.camera.axes()];
+    const low = this.show === "evaluations" ? 0 : this.range[0];
+    const high = this.show === "evaluations" ? Math.log2(65) : this.range[1];
+    const dark = this.ground[0] < 0.3;
+    const has_floor = eye[2] > floor ? 1 : 0;
+    const made = new ArrayBuffer(VIEW_BYTES);
+    new Float32Array(made).set([
+      ...eye, ways, ...axes.right, this.camera.pixel(width, height), ...axes.up, turn,
+      ...axes.forward, Infinity, ...this.key(), floor, ...this.ground, has_floor,
+      low, 1 / (high - low), 0, 0, ...(dark ? [0.10, 0.10, 0.11] : [0.90, 0.90, 0.89]), 1,
+      this.canvas.width, this.canvas.height, ...jitter,
+    ]);
+    new Uint32Array(made, 144).set([width, height, first, count]);
+    new Float32Array(made, 160).set([weight]);
+    new Uint32Array(made, 164).set([SHOWS.indexOf(this.show), kind]);
+    return made;
+  }
+
+  /** To the key light: `Light.of`. */
+  key() {
+    const { right, up, forward } = this.camera.axes();
+    const length = Math.hypot(0.52, 0.62, 0.59);
+    return right.map((r, k) => (-0.52 * r + 0.62 * up[k] - 0.59 * forward[k]) / length);
+  }
+
+  /** Traces one picture, tile by tile; false if something moved before it was done.
+   *  @param {{width: number, height: number, jitter?: number[], weight?: number, ways?: number,
+   *  turn?: number}} asked @param {number} now */
+  async trace(asked, now) {
+    const { queue } = this.device;
+    const pixels = asked.width * asked.height;
+    const { view, lanes, results } = this;
+    const [seen, sky] = [/** @type {GPUBuffer} */ (this.seen), /** @type {GPUBuffer} */ (this.sky)];
+    for (let first = 0; first < pixels; ) {
+      const count = Math.min(this.tile, pixels - first);
+      const start = performance.now();
+      queue.writeBuffer(view, 0, this.numbers({ ...asked, first, count }));
+      const encoder = this.device.createCommandEncoder();
+      const pass = encoder.beginComputePass();
+      this.run(pass, this.pipelines.begin, { 0: view, 4: seen }, count);
+      for (const one of this.surfaces) {
+        queue.writeBuffer(one.data, 0, new Uint32Array([count]));
+        this.run(pass, this.pipelines.aim, { 0: view, 1: one.numbers, 2: lanes }, count);
+        this.run(pass, one.trace, { 0: one.data, 1: lanes, 2: results }, count);
+        this.run(pass, this.pipelines.gather, { 0: view, 1: one.numbers, 3: results, 4: seen }, count);
+      }
+      pass.end();
+      queue.submit([encoder.finish()]);
+      await queue.onSubmittedWorkDone();
+      first += count;
+      const took = performance.now() - start;
+      if (took < 0.5 * TILE_TIME) this.tile = Math.min(TILE, 2 * this.tile);
+      else if (took > 2 * TILE_TIME) this.tile = Math.max(1024, this.tile / 2);
+      if (this.stopped || (now !== this.turn && this.tick > 0)) return false;
+    }
+    if (this.show === "shaded") await this.whole("look_up", asked, { 0: view, 4: seen, 5: sky });
+    return true;
+  }
+
+  /** Runs a pass over all pixels. @param {string} name @param {{width: number, height: number}} asked
+   *  @param {Record<number, GPUBuffer>} buffers */
+  async whole(name, asked, buffers) {
+    const pixels = asked.width * asked.height;
+    const most = 65535 * GROUP;
+    for (let first = 0; first < pixels; first += most) {
+      const count = Math.min(most, pixels - first);
+      this.device.queue.writeBuffer(this.view, 0, this.numbers({ ...asked, first, count }));
+      const encoder = this.device.createCommandEncoder();
+      const pass = encoder.beginComputePass();
+      this.run(pass, this.pipelines[name], buffers, count);
+      pass.end();
+      this.device.queue.submit([encoder.finish()]);
+    }
+    await this.device.queue.onSubmittedWorkDone();
+  }
+
+  /** @param {{width: number, height: number, weight?: number}} asked */
+  async paint(asked) {
+    const [seen, sky, picture] = /** @type {GPUBuffer[]} */ ([this.seen, this.sky, this.picture]);
+    await this.whole("paint", asked, {
+      0: this.view, 4: seen, 5: sky, 6: picture, 7: this.colors, 8: this.floor,
+    });
+  }
+
+  /** What of the key light and of the sky reaches the floor, as `harnack.rendering.pictures.floor`
+   *  has it. False if something moved before it was done. @param {number} now */
+  async light_floor(now) {
+    const { queue } = this.device;
+    const { view, lanes, results, towards, blocked } = this;
+    const key = this.key();
+    const rays = CELLS * CELLS * RAYS;
+    queue.writeBuffer(towards, 0, directions(key));
+    queue.writeBuffer(blocked, 0, new Uint32Array(2 * rays));
+    for (const kind of [0, 1])
+      for (let first = 0; first < rays; ) {
+        const count = Math.min(this.tile, rays - first);
+        queue.writeBuffer(view, 0, this.numbers({ width: 1, height: 1, first, count, kind }));
+        for (const one of this.surfaces) {
+          queue.writeBuffer(one.data, 0, new Uint32Array([count]));
+          const encoder = this.device.createCommandEncoder();
+          const pass = encoder.beginComputePass();
+          this.run(pass, this.pipelines.aim_up,
+            { 0: view, 1: one.numbers, 2: lanes, 9: towards }, count);
+          this.run(pass, one.trace, { 0: one.data, 1: lanes, 2: results }, count);
+          this.run(pass, this.pipelines.gather_up,
+            { 0: view, 1: one.numbers, 3: results, 10: blocked }, count);
+          pass.end();
+          queue.submit([encoder.finish()]);
+        }
+        await queue.onSubmittedWorkDone();
+        if (now !== this.turn) return false;
+        first += count;
+      }
+    const found = await this.read(blocked, 8 * rays);
+    const light = new Float32Array(2 * CELLS * CELLS);
+    for (const kind of [0, 1]) {
+      const free = Array.from({ length: CELLS }, (_, j) => Array.from({ length: CELLS }, (_, i) => {
+        let sum = 0;
+        const at = kind * rays + RAYS * (j * CELLS + i);
+        for (let k = 0; k < RAYS; k++) sum += found[at + k];
+        return 1 - sum / RAYS;
+      }));
+      blurred(free).forEach((row, j) => row.forEach((x, i) => { light[2 * (j * CELLS + i) + kind] = x; }));
+    }
+    queue.writeBuffer(this.floor, 0, light);
+    return true;
+  }
+
+  /** Puts the picture on the canvas, and lines and dots before it. @param {number} width
+   *  @param {number} height */
+  present(width, height) {
+    const { queue } = this.device;
+    const [seen, picture] = /** @type {GPUBuffer[]} */ ([this.seen, this.picture]);
+    queue.writeBuffer(this.view, 0, this.numbers({ width, height }));
+    const encoder = this.device.createCommandEncoder();
+    const pass = encoder.beginRenderPass({ colorAttachments: [{
+      view: this.context.getCurrentTexture().createView(), loadOp: "clear", storeOp: "store",
+    }] });
+    pass.setPipeline(this.pipelines.show);
+    pass.setBindGroup(0, this.bound(this.pipelines.show, { 0: this.view, 11: picture }));
+    pass.draw(3);
+    const kept = [];
+    for (const [name, several] of /** @type {[string, Marks[]][]} */ ([["line", this.lines], ["dot", this.dots]]))
+      for (const one of several) {
+        const count = one.points.length;
+        if (!count) continue;
+        const ratio = this.canvas.width / Math.max(this.canvas.clientWidth, 1);
+        const numbers = new Float32Array(8 * count);
+        one.points.forEach((p, k) => numbers.set([...p, ratio * one.width], 4 * k));
+        for (let k = 0; k < count; k++) numbers.set(one.color, 4 * (count + k));
+        const marks = this.buffer(numbers, GPUBufferUsage.STORAGE);
+        const view = this.buffer(new Uint8Array(this.numbers({ width, height, kind: count })), GPUBufferUsage.UNIFORM);
+        kept.push(marks, view);
+        pass.setPipeline(this.pipelines[name]);
+        pass.setBindGroup(0, this.bound(this.pipelines[name], { 0: view, 12: seen, 13: marks }));
+        pass.draw(name === "line" ? 3 * count : 6 * count);
+      }
+    pass.end();
+    queue.submit([encoder.finish()]);
+    for (const one of kept) one.destroy();
+    this.shown = [width, height];
+    this.pictures++;
+  }
+
+  /** The depths of what is seen, for their colors. @param {number} pixels */
+  async depths(pixels) {
+    const found = await this.read(/** @type {GPUBuffer} */ (this.seen), 32 * pixels);
+    const t = new Float32Array(found.buffer);
+    let [low, high] = [Infinity, 0];
+    for (let k = 0; k < pixels; k++)
+      if ((found[8 * k + 7] & 3) === 2) { low = Math.min(low, t[8 * k + 3]); high = Math.max(high, t[8 * k + 3]); }
+    this.range = low < high ? [low, high] : [0, 1];
+  }
+
+  /** Draws: coarsely while something moves, then at every pixel, then with many rays a pixel. */
   async draw() {
     const turn = ++this.turn;
     if (this.busy) return;
     this.busy = true;
-    for (let now = turn, round = -1; ; ) {
-      const scale = round < 0 ? this.scale : 1;
-      const width = Math.max(8, Math.round(this.canvas.width * scale));
-      const height = Math.max(8, Math.round(this.canvas.height * scale));
-      this.reserve(width * height);
-      const jitter = round < 1 ? [0.5, 0.5] : [(0.5 + round * 0.7549) % 1, (0.5 + round * 0.5698) % 1];
-      const start = performance.now();
-      const done = await this.traced(width, height, jitter, round < 1 ? 1 : 1 / (round + 1), now);
-      if (done) this.present(width, height);
-      if (round < 0) {
-        const better = this.scale * Math.sqrt(QUICK / Math.max(performance.now() - start, 1));
-        this.scale = Math.min(1, Math.max(0.06, 0.5 * (this.scale + better)));
+    try {
+      for (let now = turn; !this.stopped; now = this.turn) {
+        this.tick = 0;
+        await this.quickly(now);
+        // Something may have moved while the last picture was painted.
+        if (now === this.turn && await this.slowly(now) && now === this.turn) break;
       }
-      if (now !== this.turn) { now = this.turn; round = -1; continue; }
-      if (++round >= SAMPLES) break;
+    } finally {
+      this.busy = false;
     }
-    this.busy = false;
     this.canvas.dispatchEvent(new Event("rest"));
   }
 
-  /** Mouse, touch and keys. */
-  listen() {
+  /** Draws no more. */
+  stop() {
+    this.stopped = true;
+    this.turn++;
+  }
+
+  /** One coarse picture. @param {number} now */
+  async quickly(now) {
+    const start = performance.now();
+    const { width, height } = this.size(this.scale);
+    const asked = { width, height, ways: 6 };
+    await this.trace(asked, now);
+    if (this.stopped) return;
+    await this.paint(asked);
+    this.present(width, height);
+    const better = this.scale * Math.sqrt(QUICK / Math.max(performance.now() - start, 1));
+    this.scale = Math.min(1, Math.max(0.06, 0.5 * (this.scale + better)));
+  }
+
+  /** Whole pictures; false if something moved. @param {number} now */
+  async slowly(now) {
+    const { width, height } = this.size(1);
+    for (let k = 0; k < this.samples; k++) {
+      this.tick = 1;
+      const jitter = [(0.5 + k * 0.7548776662) % 1, (0.5 + k * 0.5698402910) % 1];
+      const asked = { width, height, jitter, weight: 1 / (k + 1),
+                      ways: k ? 4 : 16, turn: (0.5 + 0.381966 * k) % 1 };
+      const start = performance.now();
+      if (!await this.trace(asked, now)) return false;
+      this.rate = (width * height) / (performance.now() - start);
+      if (k === 0 && this.show === "depth") await this.depths(width * height);
+      await this.paint(asked);
+      this.present(width, height);
+      if (k === 0) this.canvas.dispatchEvent(new Event("whole"));
+      if (now !== this.turn) return false;
+      if (k === 0 && this.show === "shaded") {
+        if (!await this.light_floor(now)) return false;
+        await this.paint(asked);
+        this.present(width, height);
+      }
+      if (this.show === "evaluations" || this.show === "status") return true;
+    }
+    return true;
+  }
+
+  /** The size of pictures at a scale. @param {number} scale */
+  size(scale) {
     const { canvas } = this;
-    /** @type {Map<number, PointerEvent>} */
-    const down = new Map();
-    canvas.addEventListener("pointerdown", (e) => {
-      canvas.setPointerCapture(e.pointerId);
-      down.set(e.pointerId, e);
-    });
-    for (const name of ["pointerup", "pointercancel"])
-      canvas.addEventListener(name, (e) => down.delete(/** @type {PointerEvent} */ (e).pointerId));
-    canvas.addEventListener("pointermove", (e) => {
-      const before = down.get(e.pointerId);
-      if (!before) return;
-      const size = Math.min(canvas.clientWidth, canvas.clientHeight);
-      const [x, y] = [(e.clientX - before.clientX) / size, (e.clientY - before.clientY) / size];
-      if (down.size === 2) {
-        const [one, two] = [...down.values()].filter((p) => p.pointerId !== e.pointerId).concat(e);
-        const length = Math.hypot(one.clientX - two.clientX, one.clientY - two.clientY);
-        const was = Math.hypot(one.clientX - before.clientX, one.clientY - before.clientY);
-        this.zoom(length / Math.max(was, 1));
-      } else if (e.shiftKey || before.button === 2) {
-        this.view.across += 2.3 * x;
-        this.view.down += 2.3 * y;
-      } else this.orbit(-220 * x, 220 * y);
-      down.set(e.pointerId, e);
-      this.draw();
-    });
-    canvas.addEventListener("contextmenu", (e) => e.preventDefault());
-    canvas.addEventListener("wheel", (e) => {
-      e.preventDefault();
-      this.zoom(Math.exp(-0.0015 * e.deltaY));
-      this.draw();
-    }, { passive: false });
-    canvas.addEventListener("dblclick", () => { this.view = { ...this.home }; this.draw(); });
-    canvas.addEventListener("keydown", (e) => {
-      const move = /** @type {Record<string, () => void>} */ ({
-        ArrowLeft: () => this.orbit(-5, 0), ArrowRight: () => this.orbit(5, 0),
-        ArrowUp: () => this.orbit(0, 5), ArrowDown: () => this.orbit(0, -5),
-        "+": () => this.zoom(1.1), "-": () => this.zoom(1 / 1.1),
-        Home: () => { this.view = { ...this.home }; },
-      })[e.key];
-      if (!move) return;
-      e.preventDefault();
-      move();
-      this.draw();
-    });
-    new ResizeObserver(() => this.resize()).observe(canvas);
+    const fit = Math.min(scale, Math.sqrt(this.most / (canvas.width * canvas.height)));
+    const [width, height] = [canvas.width, canvas.height].map((x) => Math.max(8, Math.round(x * fit)));
+    this.reserve(width * height);
+    return { width, height };
   }
-
-  /** @param {number} azimuth @param {number} elevation */
-  orbit(azimuth, elevation) {
-    this.view.azimuth += azimuth;
-    this.view.elevation = Math.max(-89.9, Math.min(89.9, this.view.elevation + elevation));
-  }
-
-  /** @param {number} factor */
-  zoom(factor) { this.view.zoom = Math.max(0.2, Math.min(50, this.view.zoom * factor)); }
 
   resize() {
     const ratio = Math.min(devicePixelRatio, 2);
-    this.canvas.width = Math.max(16, Math.round(this.canvas.clientWidth * ratio));
-    this.canvas.height = Math.max(16, Math.round(this.canvas.clientHeight * ratio));
+    const [width, height] = [this.canvas.clientWidth, this.canvas.clientHeight].map(
+      (x) => Math.max(16, Math.round(x * ratio)));
+    if (width === this.canvas.width && height === this.canvas.height && this.pictures) return;
+    this.canvas.width = width;
+    this.canvas.height = height;
     this.draw();
   }
 }
 
-/** Draws a scene on a canvas; says in words what it does. @param {Scene} scene
- *  @param {HTMLCanvasElement} canvas @param {(words: string, isDrawn?: boolean) => void} say */
-export async function open(scene, canvas, say) {
-  if (!navigator.gpu) return say("This browser has no WebGPU here (the page must come from https, "
-    + "or from 127.0.0.1): this is a still picture.");
-  const adapter = await navigator.gpu.requestAdapter({ powerPreference: "high-performance" });
-  if (!adapter) return say("No GPU was found for WebGPU: this is a still picture.");
-  const most = adapter.limits.maxStorageBufferBindingSize;
-  const device = await adapter.requestDevice({ requiredLimits: {
-    maxStorageBufferBindingSize: most, maxBufferSize: adapter.limits.maxBufferSize } });
-  device.lost.then((e) => say(`The GPU was lost: ${e.message}`, false));
-  say("Compiling the surface for this GPU ...");
-  const drawing = new Drawing(device, scene, canvas);
-  try {
-    await drawing.compile();
-  } catch (wrong) {
-    return say(`This GPU cannot compile the surface (${wrong}): this is a still picture.`);
-  }
-  const wrong = await drawing.check();
-  if (wrong) return say("This GPU does not compute what the surface was proved with: "
-    + `${wrong}. This is a still picture.`);
-  say("", true);
-  drawing.listen();
-  drawing.resize();
-  return drawing;
+/** What a part of numbers is at most; NaN if one of them is. @param {number[]} several @param {number} part */
+function largest(several, part) {
+  if (several.some(Number.isNaN)) return NaN;
+  return several.sort((a, b) => a - b)[Math.floor(part * (several.length - 1))] ?? 0;
+}
+
+/** Directions to places on the round key light and to the sky. @param {number[]} key */
+function directions(key) {
+  const axis = key.map(Math.abs).indexOf(Math.min(...key.map(Math.abs)));
+  const e = [0, 0, 0];
+  e[axis] = 1;
+  const unit = (/** @type {number[]} */ v) => v.map((x) => x / Math.hypot(...v));
+  const cross = (/** @type {number[]} */ a, /** @type {number[]} */ b) =>
+    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+  const u = unit(cross(key, e));
+  const v = cross(key, u);
+  const places = square();
+  const made = new Float32Array(8 * places.length);
+  places.forEach(([s, turn], k) => {
+    const [radius, angle] = [SPREAD * Math.sqrt(s), 2 * Math.PI * turn];
+    const d = key.map((x, i) => x + radius * (Math.cos(angle) * u[i] + Math.sin(angle) * v[i]));
+    d[2] = Math.max(d[2], 0.05);
+    made.set(unit(d), 4 * k);
+    const across = Math.sqrt(s);
+    made.set([across * Math.cos(angle), across * Math.sin(angle), Math.sqrt(Math.max(1 - s, 1e-3))],
+      4 * (places.length + k));
+  });
+  return made;
+}
+
+/** A picture blurred along both axes; outside of it, all is free. @param {number[][]} picture */
+function blurred(picture) {
+  const n = picture.length;
+  const once = (/** @type {number[][]} */ rows) => Array.from({ length: n }, (_, i) =>
+    rows.map((row) => BLUR.reduce((sum, weight, k) => {
+      const at = i + k - 3;
+      return sum + weight * (at < 0 || at >= n ? 1 : row[at]);
+    }, 0)));
+  return once(once(picture));
 }

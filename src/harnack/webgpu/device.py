@@ -9,7 +9,7 @@ import functools
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -17,9 +17,6 @@ import numpy.typing as npt
 
 from harnack.backend import to_numpy
 from harnack.webgpu.wgsl import WORKGROUP, Shader
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = ["Bits", "Device", "NoDeviceError", "Program", "bits_of", "data_of", "find_device"]
 

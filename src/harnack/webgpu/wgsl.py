@@ -63,7 +63,7 @@ _FUNCTIONS = {
     "maximum": "max_or_nan", "umin": "min", "umax": "max", "popcount": "countOneBits",
 }  # fmt: skip
 _ORDER = {"eq": "==", "ne": "!=", "gt": ">", "ge": ">=", "lt": "<", "le": "<="}
-_OPPOSITE = {"gt": "le", "ge": "lt", "lt": "ge", "le": "gt", "eq": "ne"}
+_OPPOSITE = {"gt": "le", "ge": "lt", "lt": "ge", "le": "gt"}
 
 
 @dataclass(frozen=True)
@@ -215,6 +215,8 @@ class _Writer:
                 return f"bitcast<u32>({_signed(a[0])} {operator} {_signed(a[1])})"
             case "smin" | "smax":
                 return f"bitcast<u32>({name[1:]}({_signed(a[0])}, {_signed(a[1])}))"
+            case "iabs":
+                return f"bitcast<u32>(abs({_signed(a[0])}))"
             case "copysign":
                 return (
                     f"bitcast<f32>((bitcast<u32>({a[0]}) & 0x7fffffffu) | "
@@ -266,6 +268,8 @@ def _compared(how: str, x: str, y: str) -> str:
     if x == y and how in ("oeq", "une"):
         return f"is_nan({x})" if how == "une" else f"!is_nan({x})"
     family, order = how[0], how[1:]
+    if how == "ueq":
+        return f"({x} == {y}) | is_nan({x}) | is_nan({y})"
     if how == "one":
         return f"({x} != {y}) & !is_nan({x}) & !is_nan({y})"
     if how == "une":

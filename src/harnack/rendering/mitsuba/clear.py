@@ -1,8 +1,8 @@
 """Clear matter: solids that light passes through, what they take away of it, and how they bend it.
 
 What a solid takes away follows Beer and Lambert: of light that travels a length t in it, the part
-tint^t is left. As going in and out of a solid alternate (`Solid.meet`), a ray that leaves a point
-of its boundary against the outward normal is inside up to the next thing that it meets.
+tint^t is left. As going in and out of a solid alternate (`CappedSolid.meet`), a ray that leaves a
+point of its boundary against the outward normal is inside up to the next thing that it meets.
 """
 
 from __future__ import annotations

@@ -21,7 +21,9 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from harnack.fields import Gyroid, SchwarzD, SchwarzP, SolidAngle, SphericalHarmonic
+from harnack.fields.curves.solid_angle import SolidAngle
+from harnack.fields.polynomials.polynomial import SphericalHarmonic
+from harnack.fields.waves.periodic import Gyroid, SchwarzD, SchwarzP
 from harnack.files import read_loops
 from harnack.geometry import Ball, Box, Intersection
 from harnack.names import did_you_mean

@@ -8,22 +8,28 @@ from typing import Any
 
 from harnack.backend import Backend, backend_of, choose_backend
 
-_USABLE = re.compile(r"(llvm|cuda)_ad_(mono|rgb|spectral)(_double)?")
+_USABLE = re.compile(r"(llvm|cuda|metal)_ad_(mono|rgb|spectral)(_double)?")
 
 
 def load_mitsuba() -> Any:
     """The `mitsuba` module, with a variant set.
 
-    A variant that was set before stays. If none was, it becomes cuda_ad_rgb or llvm_ad_rgb, as
-    `harnack.backend.choose_backend` finds a device.
+    A variant that was set before stays. If none was, it becomes cuda_ad_rgb, metal_ad_rgb or
+    llvm_ad_rgb, as `harnack.backend.choose_backend` finds a device.
 
     Raises:
-        RuntimeError: the variant that is set has no vectorised arrays, or tracks polarization.
+        RuntimeError: Mitsuba lacks the device's variant, or the one that is set has no vectorised
+            arrays, or tracks polarization.
         LLVMNotFoundError: LLVM is wanted and there is none that Dr.Jit can work with.
     """
     mi = importlib.import_module("mitsuba")
     if mi.variant() is None:
-        mi.set_variant(f"{choose_backend().name}_ad_rgb")
+        wanted = f"{choose_backend().name}_ad_rgb"
+        if wanted not in mi.variants():
+            raise RuntimeError(
+                f"this Mitsuba has no variant {wanted}: set HARNACK_BACKEND=llvm to draw on the CPU"
+            )
+        mi.set_variant(wanted)
     elif _USABLE.fullmatch(mi.variant()) is None:
         raise RuntimeError(
             f"the Mitsuba variant is {mi.variant()}, and surfaces are traced with Dr.Jit arrays "

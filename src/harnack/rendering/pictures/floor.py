@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import drjit as dr
 import numpy as np
@@ -12,7 +12,6 @@ import numpy as np
 from harnack.backend import FloatArray, to_numpy
 from harnack.backend.arrays import aligned
 from harnack.rendering.mitsuba.variant import mitsuba_backend
-from harnack.rendering.mitsuba.world import World
 from harnack.rendering.pictures.shading import Light
 from harnack.rendering.studio.lighting import FLOOR
 
@@ -29,6 +28,17 @@ _FAR = 3.5
 _BLUR = (0.05, 0.2, 0.25, 0.25, 0.2, 0.05)
 
 
+class Casting(Protocol):
+    """What casts shadows, such as a `World`."""
+
+    @property
+    def mi(self) -> Any: ...
+
+    def occluded(self, ray: Any, active: Any) -> Any:
+        """Whether rays of Mitsuba's meet anything."""
+        ...
+
+
 @dataclass(frozen=True)
 class Floor:
     """What of the key light and of the sky reaches the floor: a texture of two channels."""
@@ -37,7 +47,7 @@ class Floor:
     texture: Any
 
     @classmethod
-    def of(cls, world: World, light: Light) -> Floor:
+    def of(cls, world: Casting, light: Light) -> Floor:
         """Traced in a studio."""
         mi = world.mi
         cell = (np.arange(_CELLS) + 0.5) / _CELLS * 2 * _REACH - _REACH
@@ -57,7 +67,7 @@ class Floor:
         return dr.select(on_floor, key, 1), dr.select(on_floor, sky, 1)
 
 
-def _parts_seen(world: World, x: FloatArray, y: FloatArray, towards: FloatArray) -> FloatArray:
+def _parts_seen(world: Casting, x: FloatArray, y: FloatArray, towards: FloatArray) -> FloatArray:
     """What parts (k, n, n) of their directions (k, 16, rays, 3) points of the floor see free."""
     mi = world.mi
     j, i = np.indices(x.shape)

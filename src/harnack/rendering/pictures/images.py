@@ -17,7 +17,7 @@ from harnack.files.writing import check_writable, write_atomically
 FloatImage = npt.NDArray[np.float32]
 
 # Radiances up to here are shown as they are; brighter ones approach white smoothly.
-_SHOULDER = 0.8
+SHOULDER = 0.8
 _ROWS_AT_ONCE = 64
 
 
@@ -70,8 +70,8 @@ def _tone_mapped(image: FloatArray, behind: FloatImage | None) -> npt.NDArray[np
 
 def _shouldered(radiance: FloatArray) -> FloatArray:
     x = np.clip(np.nan_to_num(radiance, nan=0.0, posinf=1e6), 0.0, None)
-    room = 1.0 - _SHOULDER
-    return np.where(x <= _SHOULDER, x, 1.0 - room * np.exp(-(x - _SHOULDER) / room))
+    room = 1.0 - SHOULDER
+    return np.where(x <= SHOULDER, x, 1.0 - room * np.exp(-(x - SHOULDER) / room))
 
 
 def transferred(x: FloatArray) -> FloatArray:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, cast
 
-from harnack.fields import Field, expression
+from harnack.fields import Field
+from harnack.fields.expressions import expression
 
 if TYPE_CHECKING:
     from harnack.geometry import Volume

@@ -1,0 +1,146 @@
+// Questions to the Python behind a view: by a socket, or by messages of a notebook's widget.
+// @ts-check
+
+/** @import {Panel as PanelClass} from "./panel.js" */
+
+/** Questions that wait for an answer. */
+class Questions {
+  constructor() {
+    this.last = 0;
+    /** @type {Map<number, {resolve: (answer: any) => void, reject: (wrong: Error) => void,
+     *                      told?: (done: number, stop: () => void) => void}>} */
+    this.waiting = new Map();
+  }
+
+  /** Sends a question, as soon as that can be done. @param {object} question
+   *  @returns {Promise<void>} */
+  async send(question) { throw new Error(`nobody hears ${JSON.stringify(question)}`); }
+
+  /** An answer, or how much of it is done.
+   *  @param {{id: number | null, answer?: any, error?: string, done?: number}} said */
+  hear({ id, answer, error, done }) {
+    // Of a text that is no question Python cannot say which it was.
+    if (id === null) return this.end(new Error(error));
+    const asked = this.waiting.get(id);
+    if (done !== undefined) return asked?.told?.(done, () => this.cancel(id));
+    this.waiting.delete(id);
+    if (error) asked?.reject(new Error(error));
+    else asked?.resolve(answer);
+  }
+
+  /** A picture, its number before it. @param {ArrayBuffer} data */
+  take(data) {
+    const [id, height, width] = new Uint32Array(data, 0, 3);
+    this.waiting.get(id)?.resolve(new ImageData(new Uint8ClampedArray(data, 12), width, height));
+    this.waiting.delete(id);
+  }
+
+  /** Nothing that was asked will be answered. @param {Error} wrong */
+  end(wrong) {
+    for (const one of this.waiting.values()) one.reject(wrong);
+    this.waiting.clear();
+  }
+
+  /** @param {string} kind @param {object} given
+   *  @param {(done: number, stop: () => void) => void} [told] how much of it is done
+   *  @returns {Promise<any>} */
+  ask(kind, given, told) {
+    const id = ++this.last;
+    return new Promise((resolve, reject) => {
+      this.waiting.set(id, { resolve, reject, told });
+      this.send({ ...given, id, kind }).catch((wrong) => { this.waiting.delete(id); reject(wrong); });
+      told?.(0, () => this.cancel(id));
+    });
+  }
+
+  /** Has Python stop with an answer. @param {number} which */
+  cancel(which) { this.send({ kind: "cancel", which }); }
+
+  /** @param {object} wanted */
+  change(wanted) { return this.ask("change", wanted); }
+}
+
+/** The server of `harnack.view`; its socket is opened again when it was lost. */
+export class Server extends Questions {
+  /** @param {string} address of the socket */
+  constructor(address) {
+    super();
+    this.address = address;
+    this.loaded = "";
+  }
+
+  /** @returns {Promise<WebSocket>} */
+  connected() {
+    if (this.socket && this.socket.readyState <= WebSocket.OPEN && this.opened) return this.opened;
+    const socket = new WebSocket(this.address);
+    this.socket = socket;
+    socket.binaryType = "arraybuffer";
+    socket.onmessage = (e) =>
+      (typeof e.data === "string" ? this.hear(JSON.parse(e.data)) : this.take(e.data));
+    socket.onclose = () =>
+      this.end(new Error("Python does not answer any more: it may have been stopped."));
+    this.opened = new Promise((resolve, reject) => {
+      socket.onopen = () => {
+        // A socket that is opened again knows nothing of the scene that was opened in the old one.
+        if (this.loaded)
+          socket.send(JSON.stringify({ kind: "load", text: this.loaded, id: ++this.last }));
+        resolve(socket);
+      };
+      socket.onerror = () => reject(new Error("Python does not answer: it may have been stopped."));
+    });
+    return this.opened;
+  }
+
+  /** @param {object} question */
+  async send(question) { (await this.connected()).send(JSON.stringify(question)); }
+
+  /** @param {string} kind @param {object} given
+   *  @param {(done: number, stop: () => void) => void} [told] */
+  async ask(kind, given, told) {
+    const answer = await super.ask(kind, given, told);
+    if (kind === "load") this.loaded = /** @type {any} */ (given).text;
+    return answer;
+  }
+}
+
+/** What anywidget gives a widget of its Python side.
+ * @typedef {{
+ *   get(name: string): any, set(name: string, value: any): void, save_changes(): void,
+ *   send(message: any): void, on(event: string, heard: (...given: any[]) => void): void,
+ * }} Model */
+
+/** The kernel of a notebook, by the messages of a widget. */
+export class Kernel extends Questions {
+  /** @param {Model} model */
+  constructor(model) {
+    super();
+    this.model = model;
+    model.on("msg:custom", (said, buffers) => {
+      if (!buffers?.length) return this.hear(said);
+      const { buffer, byteOffset, byteLength } = /** @type {DataView} */ (buffers[0]);
+      return this.take(/** @type {ArrayBuffer} */ (buffer.slice(byteOffset, byteOffset + byteLength)));
+    });
+  }
+
+  /** @param {object} question */
+  async send(question) { this.model.send(JSON.stringify(question)); }
+}
+
+/** A widget of a notebook: the panel, whose camera, sliders and points are attributes in Python.
+ *  @param {typeof PanelClass} Panel @param {Model} model @param {HTMLElement} el */
+export function widget(Panel, model, el) {
+  const root = document.createElement("div");
+  root.style.height = `${model.get("height")}px`;
+  el.append(root);
+  let panel = new Panel(root, model.get("_scene"), model.get("_passes"), new Kernel(model), model.get("_still"));
+  root.addEventListener("panel", (e) => { panel = /** @type {CustomEvent} */ (e).detail; });
+  root.addEventListener("moved", (e) => {
+    for (const [name, value] of Object.entries(/** @type {CustomEvent} */ (e).detail))
+      model.set(name, value);
+    model.save_changes();
+  });
+  for (const name of ["camera", "sliders", "points", "show"])
+    model.on(`change:${name}`, () => panel.take_over({ [name]: model.get(name) }));
+  panel.open();
+  return () => panel.close();
+}

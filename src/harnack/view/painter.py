@@ -1,0 +1,215 @@
+"""Pictures of what is live by this machine's own processor, for visitors whose device is slower.
+
+They are those of `show="shaded"` with one ray a pixel, of the same formulas. Mitsuba's scene is
+left out, which takes longer to be put together than a small picture to be traced; and no kernel is
+recorded anew for another camera, level, slider or curve of as many vertices.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+import numpy.typing as npt
+
+from harnack.backend import to_numpy
+from harnack.rendering.mitsuba.integrator import LOST_COLOR
+from harnack.rendering.mitsuba.plugins import register
+from harnack.rendering.mitsuba.variant import mitsuba_backend
+from harnack.rendering.pictures.floor import Floor
+from harnack.rendering.pictures.images import SHOULDER, as_bytes, transferred
+from harnack.rendering.pictures.scales import viridis
+from harnack.rendering.pictures.shaded import visible_sky
+from harnack.rendering.pictures.shading import Light
+from harnack.rendering.studio.lighting import FLOOR, reflectance_of
+from harnack.view.scene import paint_of
+
+if TYPE_CHECKING:
+    from harnack.backend import FloatArray
+    from harnack.rendering.surfaces.placement import PlacedSurface
+
+__all__ = ["Eye", "Painted", "Painter", "Pixels"]
+
+Pixels = npt.NDArray[np.uint8]
+_BEHIND = {"light": (0.90, 0.90, 0.89), "dark": (0.10, 0.10, 0.11)}
+# How much darker the wall behind the stage is straight above, as in `backdrop`.
+_DARKER = 0.45
+# The base-2 logarithm of one more than the evaluations that are brightest.
+_MANY = 6.0224
+
+
+@dataclass(frozen=True)
+class Eye:
+    """A camera on the stage: where it is, unit vectors to the right, up and forwards (3,), and how
+    wide a pixel of a picture one unit away is."""
+
+    origin: FloatArray
+    right: FloatArray
+    up: FloatArray
+    forward: FloatArray
+    pixel: float
+
+
+@dataclass(frozen=True)
+class Painted:
+    """A surface on the stage, and its paints (`scene.paints_of`)."""
+
+    placed: PlacedSurface
+    paints: Sequence[Mapping[str, Any]]
+
+
+@dataclass
+class Painter:
+    """Draws surfaces where they stand. Keeps the shadow on the floor while things move."""
+
+    floor: Floor | None = None
+
+    def paint(
+        self, painted: Sequence[Painted], eye: Eye, size: tuple[int, int], *, show: str,
+        ground: str, rests: bool,
+    ) -> Pixels:  # fmt: skip
+        """A picture (h, w, 4) of sRGB and 255. rests: whether nothing moves, so that it pays to
+        trace the shadow on the floor anew."""
+        mi = register()
+        light = Light.of(_matrix(eye))
+        has_floor = show == "shaded" and eye.origin[2] > FLOOR
+        seen = self._look(mi, painted, eye, size, has_floor=has_floor)
+        dr.eval(seen)
+        if show != "shaded":
+            return _numbers(seen, show, _BEHIND[ground], size)
+        # First: it evaluates, and what is recorded before that makes another kernel of the rest.
+        if has_floor and (rests or self.floor is None):
+            self.floor = Floor.of(_Casting(mi, painted), light)
+        width = seen["t"] * eye.pixel * dr.dot(seen["d"], _vector(mi, eye.forward))
+        sky = visible_sky(mi, seen["position"], seen["normal"], width, size)
+        reflectance = reflectance_of(ground)
+        color = seen["color"]
+        key: Any = mi.Float(1)
+        if self.floor is not None and has_floor:
+            key, above = self.floor.at(seen["position"])
+            key, above = dr.select(seen["ground"], key, 1), dr.select(seen["ground"], above, 1)
+            sky = dr.minimum(sky, above)
+            color = dr.select(seen["ground"], _vector(mi, reflectance, mi.Color3f), color)
+        lit = light.on(color, seen["normal"], -seen["d"], seen["glossy"], sky, key)
+        far, z = _vector(mi, reflectance, mi.Color3f), mi.Vector3f(0, 0, 1)
+        wall = light.on(far, z, z, mi.Bool(False), mi.Float(1))
+        wall = wall * (1 - _DARKER * dr.power(dr.clip(seen["d"].z, 0, 1), 0.7))
+        room = 1 - SHOULDER
+        bright = 1 - room * dr.exp((SHOULDER - lit) / room)
+        shown = dr.select(seen["met"], dr.select(lit > SHOULDER, bright, lit), wall)
+        shown = dr.clip(dr.select(seen["lost"], mi.Color3f(LOST_COLOR), shown), 0, 1)
+        srgb = dr.select(
+            shown <= 0.0031308, 12.92 * shown, 1.055 * dr.power(shown, 1 / 2.4) - 0.055
+        )
+        red, green, blue = (mi.UInt32(255 * part + 0.5) for part in srgb)
+        packed = red | (green << 8) | (blue << 16) | (255 << 24)
+        return to_numpy(packed).astype("<u4").view(np.uint8).reshape(size[1], size[0], 4)
+
+    def _look(
+        self, mi: Any, painted: Sequence[Painted], eye: Eye, size: tuple[int, int], *,
+        has_floor: bool,
+    ) -> dict[str, Any]:  # fmt: skip
+        """What the rays through the middles of the pixels meet first."""
+        columns, rows = (dr.opaque(mi.UInt32, n) for n in size)
+        index = dr.arange(mi.UInt32, size[0] * size[1])
+        pixel = dr.opaque(mi.Float, eye.pixel)
+        x = (mi.Float(index % columns) + 0.5 - 0.5 * mi.Float(columns)) * pixel
+        y = (mi.Float(index // columns) + 0.5 - 0.5 * mi.Float(rows)) * pixel
+        d = dr.normalize(
+            _vector(mi, eye.forward) + x * _vector(mi, eye.right) - y * _vector(mi, eye.up)
+        )
+        origin = _vector(mi, eye.origin)
+        vector = mitsuba_backend(mi).Array3f
+        o = vector(origin) + dr.zeros(vector, dr.width(d))
+        t, normal, color = mi.Float(dr.inf), mi.Vector3f(0, 0, 1), mi.Color3f(0)
+        glossy, lost, ground = mi.Bool(False), mi.Bool(False), mi.Bool(False)
+        if has_floor:
+            far = (FLOOR - origin.z) / dr.minimum(d.z, -1e-9)
+            ground = (d.z < 0) & (dr.norm(origin + far * d) < 100.0)
+            t = dr.select(ground, far, t)
+        looks = mi.UInt32(0)
+        for one in painted:
+            met = one.placed.meet(o, vector(d), mi.Float(dr.inf), mi.Bool(True))
+            looks += met.evaluations
+            lost |= met.lost
+            # The floor stands below what was drawn at first: it hides nothing that has moved below.
+            nearer = met.met & ~met.lost & (ground | (met.t < t))
+            n = mi.Vector3f(met.normal)
+            own, shines = _color(mi, one.paints, paint_of(met), dr.dot(n, d) < 0)
+            t = dr.select(nearer, met.t, t)
+            normal = dr.select(nearer, n, normal)
+            color = dr.select(nearer, own, color)
+            glossy = dr.select(nearer, shines, glossy)
+            ground &= ~nearer
+        met = dr.isfinite(t) & ~lost
+        return {
+            "t": t, "d": d, "normal": dr.mulsign(normal, -dr.dot(normal, d)),
+            "position": dr.select(met, origin + t * d, dr.nan), "color": color, "glossy": glossy,
+            "met": met, "lost": lost, "ground": ground, "evaluations": looks, "gradient": normal,
+        }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Casting:
+    """Surfaces as what casts the shadow on the floor."""
+
+    mi: Any
+    painted: Sequence[Painted]
+
+    def occluded(self, ray: Any, active: Any) -> Any:
+        vector = mitsuba_backend(self.mi).Array3f
+        found = self.mi.Bool(False)
+        for one in self.painted:
+            found |= one.placed.occludes(vector(ray.o), vector(ray.d), ray.maxt, active)
+        return found
+
+
+def _color(
+    mi: Any, paints: Sequence[Mapping[str, Any]], paint: Any, in_front: Any
+) -> tuple[Any, Any]:
+    """The colors of paints, and whether they are glossy."""
+    color, glossy = mi.Color3f(0), mi.Bool(False)
+    for k, one in enumerate(paints):
+        sides = (_vector(mi, one[name], mi.Color3f) for name in ("front", "back"))
+        color = dr.select(paint == k, dr.select(in_front, *sides), color)
+        glossy = dr.select(paint == k, dr.opaque(mi.Bool, one["glossy"]), glossy)
+    return color, glossy
+
+
+def _vector(mi: Any, numbers: Any, kind: Any = None) -> Any:
+    """Numbers that no kernel is compiled anew for."""
+    return (mi.Vector3f if kind is None else kind)(
+        *(dr.opaque(mi.Float, float(x)) for x in numbers)
+    )
+
+
+def _matrix(eye: Eye) -> FloatArray:
+    """The camera's axes to the left, up and forwards as columns."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.stack([-eye.right, eye.up, eye.forward], axis=1)
+    return matrix
+
+
+def _numbers(
+    seen: dict[str, Any], show: str, behind: Sequence[float], size: tuple[int, int]
+) -> Pixels:
+    """Numbers as colors."""
+    met, lost = to_numpy(seen["met"]), to_numpy(seen["lost"])
+    picture = np.empty((len(met), 3))
+    picture[:] = behind
+    if show == "normal":
+        picture[met] = 0.5 + 0.5 * to_numpy(seen["gradient"])[met]
+    elif show == "depth" and met.any():
+        t = to_numpy(seen["t"])[met]
+        share = (t - t.min()) / max(float(np.ptp(t)), 1e-12)
+        picture[met] = (0.95 + share * (0.12 - 0.95))[:, None]
+    elif show == "evaluations":
+        picture[:] = viridis(np.log2(1.0 + to_numpy(seen["evaluations"])) / _MANY)
+    elif show == "status":
+        picture[met] = (0.93, 0.93, 0.90)
+    picture[lost] = transferred(np.array(LOST_COLOR))
+    opaque = np.column_stack([picture, np.ones(len(picture))])
+    return as_bytes(opaque).reshape(size[1], size[0], 4)

@@ -1,0 +1,787 @@
+// The window: a canvas, what is said of it, and the controls beside it.
+// @ts-check
+
+import { Camera, along, dot } from "./camera.js";
+import { Drawing, QUICK, SHOWS } from "./drawing.js";
+
+/** @import {Marks, Scene, Slider, State} from "./drawing.js" */
+/** What brings other states, and in a view with Python behind it what else can be asked for.
+ * @typedef {{
+ *   change(wanted: {sliders: Record<string, number>, loops: number[][][] | null, cut: Cut | null,
+ *     checks: boolean}): Promise<State>,
+ *   ask?(kind: string, given: object, told?: (done: number, stop: () => void) => void): Promise<any>,
+ * }} Link */
+/** A volume that cuts all surfaces: see `harnack.view.session`.
+ * @typedef {{ball?: number[], box?: number[], plane?: number[]}} Cut */
+
+const GROUNDS = { light: [0.74, 0.73, 0.715], dark: [0.055, 0.058, 0.065] };
+// What cuts the surfaces, and the numbers of it: from, to, at first.
+/** @type {Record<string, Record<string, number[]>>} */
+const CUTS = {
+  none: {},
+  ball: { size: [0.02, 1.05, 0.8] },
+  box: { "size x": [0.02, 1.05, 0.6], "size y": [0.02, 1.05, 0.6], "size z": [0.02, 1.05, 0.6] },
+  plane: { turn: [-180, 180, -60], tilt: [-90, 90, 20], offset: [-1, 1, 0] },
+};
+const CURVE = [0.95, 0.75, 0.2, 1];
+// Pixels within which a pointer takes a point.
+const NEAR = 12;
+// Milliseconds after which nothing moves any more.
+const STILL = 400;
+
+/** @template {keyof HTMLElementTagNameMap} K @param {K} kind @param {object} [given]
+ *  @param {(Node | string)[]} within @returns {HTMLElementTagNameMap[K]} */
+function element(kind, given = {}, ...within) {
+  const made = Object.assign(document.createElement(kind), given);
+  made.append(...within);
+  return made;
+}
+
+export class Panel {
+  /** @param {HTMLElement} root @param {Scene} scene @param {string} passes @param {Link | null} link
+   *  @param {string} still a picture for where there is no GPU */
+  constructor(root, scene, passes, link, still) {
+    this.root = root;
+    this.scene = scene;
+    this.passes = passes;
+    this.link = link;
+    /** @type {Record<string, number>} */
+    this.values = Object.fromEntries(scene.sliders.map((one) => [one.name, one.start]));
+    this.curves = scene.state.curves;
+    /** @type {number[][][][]} */
+    this.before = [];
+    /** @type {number[][][][]} */
+    this.after = [];
+    this.edited = false;
+    this.editing = false;
+    this.probing = false;
+    /** @type {Camera | undefined} */
+    this.seen = undefined;
+    this.show = scene.show;
+    /** What was told of each attribute. @type {Record<string, string>} */
+    this.told = {};
+    this.telling = false;
+    this.ground = scene.ground[0] < 0.3 ? "dark" : "light";
+    /** @type {Marks[]} */
+    this.probed = [];
+    this.cutter = "none";
+    /** @type {Record<string, number>} */
+    this.cuts = {};
+    /** @type {ResizeObserver[]} */
+    this.observers = [];
+    /** @type {[number, number] | null} */
+    this.chosen = null;
+    root.classList.add("harnack");
+    this.canvas = element("canvas", { tabIndex: 0 });
+    this.canvas.setAttribute("role", "img");
+    this.canvas.setAttribute("aria-label",
+      `${scene.title}. Drag or use the arrow keys to turn it, the wheel or + and - to come closer.`);
+    this.still = element("img", { alt: scene.title, src: still });
+    this.said = element("p", { className: "said" });
+    this.said.setAttribute("role", "status");
+    this.controls = this.build();
+    this.plain = element("canvas", { tabIndex: 0, className: "plain" });
+    this.plain.style.display = "none";
+    this.sheet = document.createElement("canvas");
+    this.scale = 0.25;
+    this.pictures = 0;
+    /** @type {Marks[]} */
+    this.lines = [];
+    /** @type {Marks[]} */
+    this.dots = [];
+    root.append(this.still, this.canvas, this.plain, this.said, this.controls);
+  }
+
+  /** @param {string} words @param {boolean} [is_drawn] */
+  say(words, is_drawn = this.drawing !== undefined) {
+    this.said.textContent = words;
+    this.canvas.style.visibility = is_drawn ? "visible" : "hidden";
+    this.still.style.display = is_drawn || this.is_remote ? "none" : "";
+    this.root.dataset.state = is_drawn ? "drawn" : words ? "said" : "";
+  }
+
+  build() {
+    const { scene } = this;
+    const show = element("select", { onchange: () => { this.show = show.value; this.redraw(); } },
+      ...SHOWS.map((name) => element("option", { value: name }, name)));
+    const ground = element("select", { onchange: () => { this.ground = ground.value; this.redraw(); } },
+      ...Object.keys(GROUNDS).map((name) => element("option", { value: name }, name)));
+    [show.value, ground.value] = [this.show, this.ground];
+    this.shows = show;
+    /** @type {HTMLElement[]} */
+    const rows = [
+      element("label", {}, "Show ", show), element("label", {}, "Ground ", ground),
+      ...scene.sliders.map((one) => this.slider(one)),
+    ];
+    /** @type {HTMLElement[]} */
+    const buttons = [this.button("Reset view", () => { this.camera().reset(); this.redraw(); })];
+    if (scene.editable) {
+      const edit = element("input", { type: "checkbox", onchange: () => {
+        this.editing = edit.checked;
+        this.chosen = null;
+        this.mark();
+      } });
+      rows.push(element("label", {}, edit, " Edit points"));
+      buttons.push(
+        this.button("Undo", () => this.undo(this.before, this.after)),
+        this.button("Redo", () => this.undo(this.after, this.before)),
+        this.button("Smooth", () => this.edit(this.curves.map(smoothed))),
+      );
+    }
+    buttons.push(this.button("Save picture", () => this.save()));
+    if (this.link?.ask) {
+      const probe = element("input", { type: "checkbox", onchange: () => {
+        this.probing = probe.checked;
+        this.probed = [];
+        this.mark();
+      } });
+      rows.push(element("label", {}, probe, " Probe by click"));
+      rows.push(...this.cutting());
+      const width = element("input", { type: "number", min: "16", max: "8192", value: "1600", name: "width" });
+      const quality = element("select", { name: "quality" },
+        ...["shaded", "color"].map((name) => element("option", { value: name }, name)));
+      rows.push(element("label", {}, "Render, pixels wide ", width, quality));
+      const file = element("input", { type: "file", accept: ".json", hidden: true, name: "scene",
+        onchange: () => { if (file.files?.[0]) this.load(file.files[0]); file.value = ""; } });
+      buttons.push(
+        this.button("Render", () => this.render(Number(width.value), quality.value)),
+        this.button("Save scene", () => this.save_scene()),
+        this.button("Open scene", () => file.click()), file,
+      );
+    }
+    this.asked = element("div", { className: "buttons" }, ...buttons);
+    return element("details", { open: innerWidth > 600 && scene.sliders.length > 0 },
+      element("summary", {}, "Controls"), ...rows, this.asked);
+  }
+
+  /** What cuts the surfaces, and sliders of it. */
+  cutting() {
+    const numbers = element("div", { className: "cut" });
+    const chosen = element("select", { name: "cut", onchange: () => {
+      this.cutter = chosen.value;
+      this.cuts = Object.fromEntries(
+        Object.entries(CUTS[chosen.value]).map(([name, ends]) => [name, ends[2]]));
+      numbers.replaceChildren(...Object.entries(CUTS[chosen.value]).map(([name, [low, high, start]]) => {
+        const input = element("input", {
+          type: "range", min: String(low), max: String(high), step: "any", name, value: String(start),
+          oninput: () => { this.cuts[name] = Number(input.value); this.change(); },
+        });
+        return element("label", {}, `${name} `, input);
+      }));
+      this.change();
+    } }, ...Object.keys(CUTS).map((name) => element("option", { value: name }, name)));
+    return [element("label", {}, "Cut by ", chosen), numbers];
+  }
+
+  /** What cuts the surfaces now, in their coordinates. @returns {Cut | null} */
+  cut() {
+    const { middle, reach } = this.scene;
+    const { size, turn, tilt, offset } = this.cuts;
+    if (this.cutter === "ball") return { ball: [...middle, size * reach] };
+    if (this.cutter === "box") {
+      const half = ["x", "y", "z"].map((axis) => reach * this.cuts[`size ${axis}`]);
+      return { box: [...middle.map((x, k) => x - half[k]), ...middle.map((x, k) => x + half[k])] };
+    }
+    if (this.cutter !== "plane") return null;
+    const [a, b] = [turn, tilt].map((degrees) => degrees * Math.PI / 180);
+    const normal = [Math.cos(b) * Math.cos(a), Math.cos(b) * Math.sin(a), Math.sin(b)];
+    return { plane: [...normal, dot(normal, middle) + offset * reach] };
+  }
+
+  /** @param {string} name @param {() => void} onclick */
+  button(name, onclick) { return element("button", { type: "button", onclick }, name); }
+
+  /** @param {Slider} one */
+  slider(one) {
+    const shown = element("output", {}, format(one.start));
+    const input = element("input", {
+      type: "range", min: String(one.low), max: String(one.high),
+      step: one.step === null ? "any" : String(one.step), name: one.name, value: String(one.start),
+      oninput: () => {
+        this.values[one.name] = Number(input.value);
+        shown.textContent = format(Number(input.value));
+        this.change();
+      },
+    });
+    return element("label", {}, `${one.name} `, shown, input);
+  }
+
+  async open() {
+    if (!navigator.gpu) return this.fall_back("This browser has no WebGPU here (the page must come "
+      + "from https, or from 127.0.0.1)");
+    const adapter = await navigator.gpu.requestAdapter({ powerPreference: "high-performance" });
+    if (!adapter) return this.fall_back("No GPU was found for WebGPU");
+    const { maxStorageBufferBindingSize, maxBufferSize, maxStorageBuffersPerShaderStage } = adapter.limits;
+    const device = await adapter.requestDevice({ requiredLimits: {
+      maxStorageBufferBindingSize, maxBufferSize, maxStorageBuffersPerShaderStage } });
+    device.lost.then((e) => { if (!this.is_closed) this.fall_back(`The GPU was lost (${e.message})`); });
+    device.addEventListener("uncapturederror", (e) => console.error(e.error.message));
+    this.say("Compiling the surface for this GPU ...");
+    const drawing = new Drawing(device, this.scene, this.canvas, this.passes);
+    try {
+      await drawing.compile();
+      const wrong = await drawing.set(this.scene.state);
+      if (wrong) return this.fall_back(`This GPU does not compute what the surface was proved with: ${wrong}`);
+    } catch (wrong) {
+      return this.fall_back(`This GPU cannot compile the surface (${wrong})`);
+    }
+    this.drawing = drawing;
+    this.say("");
+    this.listen(this.canvas);
+    this.observe(this.canvas, () => drawing.resize());
+    this.mark();
+    drawing.resize();
+    if (this.link?.ask) this.canvas.addEventListener("whole", () => this.compare(), { once: true });
+  }
+
+  /** @param {HTMLElement} target @param {() => void} heard */
+  observe(target, heard) {
+    const one = new ResizeObserver(heard);
+    one.observe(target);
+    this.observers.push(one);
+  }
+
+  /** Draws no more, and frees the device. */
+  close() {
+    this.is_closed = true;
+    for (const one of this.observers) one.disconnect();
+    clearTimeout(this.rest);
+    this.drawing?.stop();
+    this.drawing?.device.destroy();
+    this.drawing = undefined;
+    this.is_remote = false;
+    this.root.replaceChildren();
+  }
+
+  /** Shows another scene in this place. @param {Scene} scene */
+  replace(scene) {
+    this.close();
+    const next = new Panel(this.root, scene, this.passes, this.link, this.still.src);
+    this.root.dispatchEvent(new CustomEvent("panel", { detail: next }));
+    next.open();
+  }
+
+  /** @param {HTMLElement} target */
+  listen(target) {
+    this.camera().listen(target, () => this.redraw(), (e) => this.take(e));
+    target.addEventListener("pointermove", (e) => this.drag(e));
+    target.addEventListener("pointerup", (e) => this.let_go(e));
+    target.addEventListener("dblclick", (e) => this.insert(e));
+    target.addEventListener("keydown", (e) => this.key(e));
+  }
+
+  /** @returns {Camera} */
+  camera() {
+    if (this.drawing) return this.drawing.camera;
+    this.seen ??= new Camera(this.scene.camera);
+    return this.seen;
+  }
+
+  /** Without a GPU that can be trusted: Python draws, where it is; else a picture stands still.
+   *  @param {string} why */
+  fall_back(why) {
+    if (this.link?.ask) return this.let_python_draw(`${why}: Python draws.`);
+    this.drawing?.stop();
+    this.drawing = undefined;
+    this.say(`${why}: this is a still picture.`, false);
+  }
+
+  /** @param {string} why */
+  let_python_draw(why) {
+    const camera = this.camera();
+    this.drawing?.stop();
+    this.drawing = undefined;
+    this.seen = camera;
+    this.is_remote = true;
+    this.plain.style.display = "";
+    this.say(why, false);
+    this.listen(this.plain);
+    this.observe(this.root, () => this.redraw());
+    this.redraw();
+  }
+
+  /** What a person has moved, as the attributes of a notebook's widget have it. */
+  moved() {
+    const camera = this.camera();
+    return {
+      camera: { position: this.unplaced(camera.eye()), target: this.unplaced(camera.target), fov: camera.fov },
+      sliders: { ...this.values }, points: this.curves, show: this.show,
+    };
+  }
+
+  /** Tells those who listen what has been moved, once a frame at most. */
+  tell() {
+    if (this.telling) return;
+    this.telling = true;
+    requestAnimationFrame(() => {
+      this.telling = false;
+      if (this.is_closed) return;
+      const now = this.moved();
+      const changed = Object.fromEntries(Object.entries(now).filter(
+        ([name, value]) => JSON.stringify(value) !== this.told[name]));
+      for (const [name, value] of Object.entries(changed)) this.told[name] = JSON.stringify(value);
+      if (Object.keys(changed).length)
+        this.root.dispatchEvent(new CustomEvent("moved", { detail: changed }));
+    });
+  }
+
+  /** Moves what somebody else than the person has moved.
+   *  @param {{camera?: {position: number[], target: number[], fov: number},
+   *  sliders?: Record<string, number>, points?: number[][][], show?: string}} given */
+  take_over(given) {
+    for (const [name, value] of Object.entries(given)) {
+      if (JSON.stringify(value) === this.told[name]) continue;
+      this.told[name] = JSON.stringify(value);
+      if (name === "camera") {
+        const { position, target, fov } = /** @type {any} */ (value);
+        this.camera().look(this.place(position), this.place(target), fov);
+        this.redraw();
+      } else if (name === "show") {
+        this.show = this.shows.value = /** @type {string} */ (value);
+        this.redraw();
+      } else if (name === "points") this.edit(/** @type {number[][][]} */ (value));
+      else this.slide(/** @type {Record<string, number>} */ (value));
+    }
+  }
+
+  /** Moves sliders. @param {Record<string, number>} values */
+  slide(values) {
+    Object.assign(this.values, values);
+    for (const [name, value] of Object.entries(values)) {
+      const input = this.controls.querySelector(`input[name="${CSS.escape(name)}"]`);
+      if (!(input instanceof HTMLInputElement)) continue;
+      input.value = String(value);
+      const shown = input.parentElement?.querySelector("output");
+      if (shown) shown.textContent = format(value);
+    }
+    this.change();
+  }
+
+  redraw() {
+    const { drawing } = this;
+    this.tell();
+    if (!drawing) { if (this.is_remote) this.draw_remotely(); return; }
+    drawing.show = this.show;
+    drawing.lines = this.lines;
+    drawing.dots = this.dots;
+    drawing.ground = GROUNDS[/** @type {"light" | "dark"} */ (this.ground)];
+    drawing.draw();
+  }
+
+  /** Pictures from Python: coarse ones, and a whole one when nothing moves any more. */
+  async draw_remotely() {
+    this.stale = true;
+    if (this.fetching) return;
+    this.fetching = true;
+    try {
+      for (let rests = false; this.stale || !rests; ) {
+        rests = !this.stale;
+        this.stale = false;
+        const start = performance.now();
+        const image = await this.drawn(rests ? 1 : this.scale, rests);
+        this.put(image);
+        if (rests) continue;
+        const better = this.scale * Math.sqrt(QUICK / Math.max(performance.now() - start, 1));
+        this.scale = Math.min(1, Math.max(0.06, 0.5 * (this.scale + better)));
+      }
+      this.plain.dispatchEvent(new Event("rest"));
+    } catch (wrong) {
+      this.say(/** @type {Error} */ (wrong).message, false);
+    } finally {
+      this.fetching = false;
+    }
+  }
+
+  /** Puts a picture of any size into the window, and lines and dots before it.
+   *  @param {ImageData} image */
+  put(image) {
+    const [width, height] = [this.root.clientWidth, this.root.clientHeight];
+    this.sheet.width = image.width;
+    this.sheet.height = image.height;
+    this.sheet.getContext("2d")?.putImageData(image, 0, 0);
+    this.plain.width = width;
+    this.plain.height = height;
+    const pen = this.plain.getContext("2d");
+    if (!pen) return;
+    pen.drawImage(this.sheet, 0, 0, width, height);
+    const camera = this.camera();
+    const at = (/** @type {number[]} */ p) => camera.project(p, width, height);
+    const color = (/** @type {number[]} */ c) =>
+      `rgb(${c.slice(0, 3).map((x) => Math.round(255 * x)).join(" ")} / ${0.7 * c[3]})`;
+    for (const { points, color: c, width: wide } of this.lines) {
+      pen.strokeStyle = color(c);
+      pen.lineWidth = wide;
+      pen.beginPath();
+      points.map(at).forEach((p, k) => (k % 2 ? pen.lineTo(p.x, p.y) : pen.moveTo(p.x, p.y)));
+      pen.stroke();
+    }
+    for (const { points, color: c, width: wide } of this.dots) {
+      pen.fillStyle = color(c);
+      for (const p of points.map(at)) {
+        pen.beginPath();
+        pen.arc(p.x, p.y, 0.5 * wide, 0, 7);
+        pen.fill();
+      }
+    }
+    this.pictures++;
+  }
+
+  /** A picture by Python of one ray a pixel. @param {number} scale @param {boolean} rests
+   *  @returns {Promise<ImageData>} */
+  drawn(scale, rests) {
+    const camera = this.camera();
+    const size = [this.root.clientWidth, this.root.clientHeight].map((x) => Math.max(8, Math.round(scale * x)));
+    const eye = { origin: camera.eye(), ...camera.axes(), pixel: camera.pixel(size[0], size[1]) };
+    return /** @type {any} */ (this.link).ask("draw", {
+      ...this.state(), size, show: this.show, ground: this.ground, eye, rests,
+    });
+  }
+
+  /** Lets draw who is quicker: this browser's device, or Python. */
+  async compare() {
+    const { drawing } = this;
+    if (!drawing || !this.link?.ask) return;
+    const pixels = (this.root.clientWidth * this.root.clientHeight) / 16;
+    let took = 0;
+    try {
+      for (let k = 0; k < 2; k++) {  // the first picture compiles kernels
+        const start = performance.now();
+        await this.drawn(0.25, false);
+        took = performance.now() - start;
+      }
+    } catch (wrong) {
+      return this.say(/** @type {Error} */ (wrong).message);
+    }
+    if (pixels / took > 1.5 * drawing.rate && drawing === this.drawing)
+      this.let_python_draw("Python draws: it is quicker here than this browser's device.");
+  }
+
+  /** What is seen now, at a size: what Python needs to draw the same. @param {number} width */
+  seen_at(width) {
+    const camera = this.camera();
+    const shape = this.root.clientHeight / this.root.clientWidth;
+    const size = [width, Math.max(1, Math.round(width * shape))];
+    // The larger side's, of a camera whose 4 : 3 picture fits into the window.
+    const half = 0.5 * camera.pixel(size[0], size[1]) * Math.max(size[0], size[1]);
+    return {
+      ...this.state(), size, show: this.show, ground: this.ground,
+      camera: { position: camera.eye(), target: camera.target, fov: (360 / Math.PI) * Math.atan(half) },
+    };
+  }
+
+  /** A picture by Python of what is seen. @param {number} width @param {string} [quality] */
+  async picture(width, quality = "shaded") {
+    const seen = this.seen_at(width);
+    const show = quality === "color" && seen.show === "shaded" ? "color" : seen.show;
+    const bar = element("progress", { max: 1, value: 0 });
+    const { png } = await /** @type {Link} */ (this.link).ask?.("picture", { ...seen, show },
+      (done, stop) => {
+        if (!bar.isConnected) {
+          this.say("Rendering ");
+          this.said.append(bar, " ", this.button("Cancel", stop));
+        }
+        bar.value = done;
+      });
+    return `data:image/png;base64,${png}`;
+  }
+
+  /** @param {number} width @param {string} quality */
+  async render(width, quality) {
+    await this.tried(async () => {
+      element("a", { href: await this.picture(width, quality), download: "surface.png" }).click();
+      this.say("");
+    });
+  }
+
+  /** Does something, or says what is wrong. @param {() => Promise<void>} what */
+  async tried(what) {
+    try {
+      await what();
+    } catch (wrong) {
+      this.say(/** @type {Error} */ (wrong).message);
+    }
+  }
+
+  /** Saves what is seen as a scene file. */
+  save_scene() {
+    return this.tried(async () => {
+      const { text, lost } = await this.link?.ask?.("save", this.seen_at(800));
+      const href = URL.createObjectURL(new Blob([text], { type: "application/json" }));
+      element("a", { href, download: "scene.json" }).click();
+      setTimeout(() => URL.revokeObjectURL(href), 1000);
+      this.say(lost.length ? `Saved as it stands: a file cannot hold the sliders ${lost.join(", ")}.` : "");
+    });
+  }
+
+  /** Opens a scene file in this window. @param {File} file */
+  load(file) {
+    return this.tried(async () => this.replace(
+      await this.link?.ask?.("load", { text: await file.text() })));
+  }
+
+  /** What the sliders and the curves are now. */
+  state() {
+    return { sliders: { ...this.values }, loops: this.edited ? this.curves : null, cut: this.cut() };
+  }
+
+  /** Asks for the state at the sliders and points, one after the other, the last one for sure. */
+  async change() {
+    this.wanted = true;
+    if (this.asking || !this.link) return;
+    this.asking = true;
+    try {
+      while (this.wanted) {
+        this.wanted = false;
+        if (this.is_remote) { this.mark(); continue; }
+        const state = await this.link.change({ ...this.state(), checks: false });
+        if (!this.drawing) continue;
+        const wrong = await this.drawing.set(state, state.surfaces.some((one) => one.check));
+        if (wrong) return this.fall_back(`This GPU does not compute what the surface was proved with: ${wrong}`);
+        // An answer may be to an older question than the last edit.
+        if (!this.edited) this.curves = state.curves;
+        this.say("");
+        this.mark();
+      }
+    } catch (wrong) {
+      this.say(/** @type {Error} */ (wrong).message);
+    } finally {
+      this.asking = false;
+    }
+    if (!this.link.ask) return;
+    clearTimeout(this.rest);
+    this.rest = setTimeout(() => this.confirm(), STILL);
+  }
+
+  /** Has the device checked against Dr.Jit for what is drawn now. */
+  async confirm() {
+    if (this.asking || !this.drawing || !this.link) return;
+    try {
+      const state = await this.link.change({ ...this.state(), checks: true });
+      if (this.asking || !this.drawing) return;
+      const wrong = await this.drawing.set(state);
+      if (wrong) this.fall_back(`This GPU does not compute what the surface was proved with: ${wrong}`);
+      else this.redraw();
+    } catch (wrong) {
+      this.say(/** @type {Error} */ (wrong).message);
+    }
+  }
+
+  /** Draws the curves and their points while they are edited, and what was probed. */
+  mark() {
+    this.lines = !this.editing ? [] : this.curves.map((curve) => ({
+      points: curve.flatMap((p, k) => [this.place(p), this.place(curve[(k + 1) % curve.length])]),
+      color: CURVE, width: 2.5,
+    }));
+    this.dots = !this.editing ? [] : this.curves.map((curve) => ({
+      points: curve.map((p) => this.place(p)), color: [0.1, 0.1, 0.1, 1], width: 6,
+    }));
+    const chosen = this.chosen && this.curves[this.chosen[0]]?.[this.chosen[1]];
+    if (this.editing && chosen)
+      this.dots.push({ points: [this.place(chosen)], color: [1, 0.3, 0.1, 1], width: 8 });
+    this.lines.push(...this.probed.filter((one) => one.width < 4));
+    this.dots.push(...this.probed.filter((one) => one.width >= 4));
+    this.redraw();
+  }
+
+  /** A point of the surfaces, on the stage. @param {number[]} p */
+  place(p) {
+    const { placement } = this.scene;
+    return [0, 1, 2].map((k) => placement[12] * (placement[3 * k] * p[0] + placement[3 * k + 1] * p[1]
+      + placement[3 * k + 2] * p[2]) + placement[9 + k]);
+  }
+
+  /** A point on the stage, in the surfaces' coordinates. @param {number[]} p */
+  unplaced(p) {
+    const { placement } = this.scene;
+    return this.unplace(p.map((x, k) => x - placement[9 + k]));
+  }
+
+  /** A way on the stage, in the surfaces' coordinates. @param {number[]} d */
+  unplace(d) {
+    const { placement } = this.scene;
+    return [0, 1, 2].map((k) => (placement[k] * d[0] + placement[3 + k] * d[1] + placement[6 + k] * d[2])
+      / placement[12]);
+  }
+
+  /** Where a pointer is. @param {MouseEvent} e */
+  pointer(e) {
+    const box = this.root.getBoundingClientRect();
+    return { width: box.width, height: box.height, x: e.clientX - box.left, y: e.clientY - box.top };
+  }
+
+  /** The point that is nearest to a pointer; null if none is near. @param {MouseEvent} e */
+  nearest(e) {
+    const camera = this.camera();
+    const { width, height, x, y } = this.pointer(e);
+    /** @type {{at: [number, number], far: number, z: number} | null} */
+    let best = null;
+    this.curves.forEach((curve, c) => curve.forEach((p, k) => {
+      const there = camera.project(this.place(p), width, height);
+      const far = Math.hypot(there.x - x, there.y - y);
+      if (far < NEAR && (!best || far < best.far)) best = { at: [c, k], far, z: there.z };
+    }));
+    return /** @type {{at: [number, number], far: number, z: number} | null} */ (best);
+  }
+
+  /** Whether a pointer takes a point. @param {PointerEvent} e */
+  take(e) {
+    this.pressed = e;
+    if (!this.editing || e.button !== 0) return false;
+    const found = this.nearest(e);
+    this.chosen = found ? found.at : null;
+    if (!found) { this.mark(); return false; }
+    this.remember();
+    /** @type {Element} */ (e.target).setPointerCapture(e.pointerId);
+    this.held = { x: e.clientX, y: e.clientY, z: found.z };
+    this.mark();
+    return true;
+  }
+
+  /** @param {PointerEvent} e */
+  drag(e) {
+    if (!this.held || !this.chosen) return;
+    const { width, height } = this.pointer(e);
+    const way = this.camera().moved(
+      this.held.z, e.clientX - this.held.x, e.clientY - this.held.y, width, height);
+    this.held = { ...this.held, x: e.clientX, y: e.clientY };
+    const [c, k] = this.chosen;
+    this.curves = this.curves.map((curve, i) => (i !== c ? curve
+      : curve.map((p, j) => (j === k ? along(p, 1, this.unplace(way)) : p))));
+    this.edited = true;
+    this.change();
+  }
+
+  /** @param {PointerEvent} e */
+  let_go(e) {
+    const { pressed } = this;
+    if (this.probing && pressed && Math.hypot(e.clientX - pressed.clientX, e.clientY - pressed.clientY) < 3)
+      this.probe(e);
+    if (!this.held) return;
+    this.held = undefined;
+    this.change();
+  }
+
+  /** Asks Python what the ray through a pointer meets, and draws its proved steps.
+   *  @param {MouseEvent} e */
+  async probe(e) {
+    const { width, height, x, y } = this.pointer(e);
+    const camera = this.camera();
+    const { right, up, forward } = camera.axes();
+    const pixel = camera.pixel(width, height);
+    const way = along(along(forward, pixel * (x - 0.5 * width), right), -pixel * (y - 0.5 * height), up);
+    const eye = camera.eye();
+    const origin = this.unplaced(eye);
+    const direction = this.unplace(way);
+    try {
+      const found = await this.link?.ask?.("probe", { ...this.state(), origin, direction });
+      const length = Math.hypot(...direction);
+      const at = (/** @type {number} */ t) => this.place(along(origin, t / length, direction));
+      const ends = [...found.steps, ...(found.t === undefined ? [] : [found.t])].map(at);
+      this.probed = [
+        { points: ends.slice(1).flatMap((p, k) => [ends[k], p]), color: [0.1, 0.4, 0.9, 0.9], width: 2 },
+        { points: ends.slice(1), color: [0.1, 0.4, 0.9, 1], width: 5 },
+      ];
+      this.say(said_of(found));
+      this.mark();
+    } catch (wrong) {
+      this.say(/** @type {Error} */ (wrong).message);
+    }
+  }
+
+  /** A new point on the segment that is nearest to a pointer. @param {MouseEvent} e */
+  insert(e) {
+    const camera = this.camera();
+    if (!this.editing) { camera.reset(); this.redraw(); return; }
+    const { width, height, x, y } = this.pointer(e);
+    /** @type {{c: number, k: number, point: number[], far: number} | null} */
+    let best = null;
+    this.curves.forEach((curve, c) => curve.forEach((p, k) => {
+      const q = curve[(k + 1) % curve.length];
+      const [a, b] = [p, q].map((one) => camera.project(this.place(one), width, height));
+      const [dx, dy] = [b.x - a.x, b.y - a.y];
+      const s = Math.max(0, Math.min(1, ((x - a.x) * dx + (y - a.y) * dy) / Math.max(dx * dx + dy * dy, 1e-9)));
+      const far = Math.hypot(a.x + s * dx - x, a.y + s * dy - y);
+      if (far < NEAR && (!best || far < best.far))
+        best = { c, k, point: along(p, s, along(q, -1, p)), far };
+    }));
+    const found = /** @type {{c: number, k: number, point: number[]} | null} */ (/** @type {unknown} */ (best));
+    if (!found) return;
+    this.chosen = [found.c, found.k + 1];
+    this.edit(this.curves.map((curve, c) => (c !== found.c ? curve
+      : [...curve.slice(0, found.k + 1), found.point, ...curve.slice(found.k + 1)])));
+  }
+
+  /** @param {KeyboardEvent} e */
+  key(e) {
+    if (!this.scene.editable) return;
+    if ((e.ctrlKey || e.metaKey) && e.key.toLowerCase() === "z") {
+      e.preventDefault();
+      if (e.shiftKey) this.undo(this.after, this.before);
+      else this.undo(this.before, this.after);
+    } else if ((e.key === "Delete" || e.key === "Backspace") && this.editing && this.chosen) {
+      e.preventDefault();
+      const [c, k] = this.chosen;
+      if (this.curves[c].length <= 3) return this.say("A curve has three points at least.");
+      this.chosen = null;
+      this.edit(this.curves.map((curve, i) => (i === c ? curve.filter((_, j) => j !== k) : curve)));
+    }
+  }
+
+  remember() {
+    this.before.push(this.curves);
+    this.after.length = 0;
+  }
+
+  /** @param {number[][][]} curves */
+  edit(curves) {
+    this.remember();
+    this.curves = curves;
+    this.edited = true;
+    this.mark();
+    this.change();
+  }
+
+  /** @param {number[][][][]} from @param {number[][][][]} to */
+  undo(from, to) {
+    const curves = from.pop();
+    if (!curves) return;
+    to.push(this.curves);
+    this.curves = curves;
+    this.edited = true;
+    this.chosen = null;
+    this.mark();
+    this.change();
+  }
+
+  /** What is on the canvas, as a file. */
+  save() {
+    this.drawing?.present(...(/** @type {[number, number]} */ (this.drawing.shown)));
+    this.canvas.toBlob((blob) => {
+      if (!blob) return;
+      const address = URL.createObjectURL(blob);
+      element("a", { href: address, download: "surface.png" }).click();
+      setTimeout(() => URL.revokeObjectURL(address), 1000);
+    });
+  }
+}
+
+/** Each point halfway to the middle of its neighbors. @param {number[][]} curve */
+function smoothed(curve) {
+  const n = curve.length;
+  return curve.map((p, k) => p.map((x, i) =>
+    0.5 * x + 0.25 * (curve[(k + 1) % n][i] + curve[(k + n - 1) % n][i])));
+}
+
+/** What a probe has found, in words. @param {any} found */
+function said_of(found) {
+  const looks = `${found.evaluations} evaluations`;
+  if (found.t === undefined) return `${found.status.toLowerCase().replaceAll("_", " ")}, ${looks}`;
+  const point = (/** @type {number[]} */ p) => `(${p.map(format).join(", ")})`;
+  const bent = found.mean === undefined ? ""
+    : `, mean curvature ${format(found.mean)}, Gaussian ${format(found.gaussian)}`;
+  return `at ${point(found.position)}, normal ${point(found.normal)}, f = ${format(found.value)}`
+    + `${bent}, ${looks}`;
+}
+
+/** @param {number} x */
+function format(x) { return String(Number(x.toPrecision(4))); }

@@ -1,0 +1,447 @@
+"""What is drawn live: surfaces on the studio's stage, each a kernel for other GPUs and its data.
+
+Everything here is plain: numbers, lists and text, as `drawing.js` takes it.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, cast
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import choose_backend, to_vector3
+from harnack.fields import Solid
+from harnack.fields.curves.solid_angle import SolidAngle
+from harnack.geometry import HalfSpace, Intersection, Volume
+from harnack.rendering import render
+from harnack.rendering.arguments import check_camera
+from harnack.rendering.mitsuba.plugins import register
+from harnack.rendering.pictures.shading import of_mended, of_side, reflectance
+from harnack.rendering.studio.backdrops import Ground, checked_backdrop
+from harnack.rendering.studio.lighting import FLOOR, reflectance_of
+from harnack.rendering.studio.stage import StudioObject, on_ground
+from harnack.rendering.studio.upright import upright
+from harnack.rendering.studio_scene import studio_objects
+from harnack.rendering.surfaces.colors import linear
+from harnack.rendering.surfaces.extent import box_of
+from harnack.rendering.surfaces.framing import visible_points
+from harnack.rendering.surfaces.isolines import checked_isolines
+from harnack.rendering.surfaces.placement import PlacedSurface
+from harnack.tracer import LevelSet, Status, Tolerance
+from harnack.view.scene_file import SURFACE_SETTINGS, Origins, text_of
+from harnack.view.sliders import Subject
+from harnack.webgpu import bits_of, data_of, leaves, record
+
+if TYPE_CHECKING:
+    from harnack.backend import FloatArray, Real, Vec3
+    from harnack.rendering.pictures.picture_array import Picture
+    from harnack.rendering.studio.camera import Camera
+    from harnack.rendering.surfaces.encounter import SurfaceHit
+    from harnack.rendering.surfaces.placement import Placement
+    from harnack.webgpu import Recording
+
+__all__ = ["SHOWS", "Live", "Moved", "Plain", "paint_of", "paints_of", "status_of"]
+
+Plain = dict[str, Any]
+# Rays that travel with a surface, and are traced first on the visitor's device.
+_RAYS = 2048
+# Of surfaces without a tolerance of their own, on the stage.
+_TOLERANCE = 1e-4
+_LANES = ("o 0", "o 1", "o 2", "d 0", "d 1", "d 2", "far")
+_RESULTS = ("status", "t", "normal 0", "normal 1", "normal 2", "evaluations", "paint")
+# The place of a result that is 0 for all rays.
+_NOWHERE = 99
+# Paints of a surface: the first is its own, then those of what spans what a mesh leaves open and of
+# faces on a section, then those of isolines.
+_MENDED, _CUT = 1, 2
+_OF_STUDIO = ("boundary", "boundary_material", "thickness")
+_OF_STAGE = ("camera", "backdrop", "up", "show")
+SHOWS = ("shaded", "normal", "depth", "evaluations", "status")
+"""What a page can show."""
+_SIZE = (4, 3)
+
+
+@dataclass(frozen=True)
+class Moved:
+    """What a person has moved.
+
+    values: of all sliders. loops: vertices (n, 3) in the place of those of the field's curve.
+    cut: a volume that cuts all surfaces; a half-space opens them, as `section` of `level_set` does.
+    """
+
+    values: Mapping[str, float]
+    loops: Sequence[FloatArray] | None = None
+    cut: Volume | None = None
+
+
+@dataclass(frozen=True)
+class Live:
+    """What is drawn live, where it stands, and rays to each of its surfaces as it was at first.
+
+    editable: whether the vertices of its curve can be moved. up: as `render` takes it. show: what
+    is shown at first. middle, reach: a ball around what is seen at first, in the surfaces' own
+    coordinates.
+    """
+
+    subject: Subject
+    placement: Placement
+    camera: Plain
+    ground: str
+    rays: tuple[tuple[FloatArray, FloatArray], ...]
+    editable: bool
+    up: Any
+    show: str
+    middle: FloatArray
+    reach: float
+    origins: Origins = ()
+
+    @classmethod
+    def of(
+        cls, what: Any, given: Mapping[str, Any], *, edits: bool = False, origins: Origins = ()
+    ) -> Live:
+        """From what users give `page` and `view`.
+
+        edits: whether vertices of curves are to be moved, so that they must not decide what is
+            recorded. origins: where fields come from, to be said in scene files.
+
+        Raises:
+            TypeError, ValueError: as `render` does; also for a transparent material, a `show` that
+                is not in `SHOWS`, and a backdrop that is not "light" or "dark".
+        """
+        given = dict(given)
+        camera, backdrop, up, show = (given.pop(name, None) for name in _OF_STAGE)
+        show = "shaded" if show is None else show
+        if show not in SHOWS:
+            raise ValueError(f"show must be one of {', '.join(SHOWS)} where it moves, not {show!r}")
+        ground = Ground("light") if backdrop is None else checked_backdrop(backdrop)
+        if not isinstance(ground, Ground):
+            raise ValueError('backdrop: what is drawn live stands on a ground: "light" or "dark"')
+        subject = Subject.of(what, given)
+        drawn = _drawn(subject, subject.starts)
+        curve = _curve_of(drawn) if edits else None
+        backend = choose_backend("single")
+        points = [visible_points(one.surface, backend) for one in drawn]
+        together = np.concatenate(points)
+        up = "z" if up is None else up
+        placement = on_ground(together, upright(up))
+        seen = _seen(check_camera(camera), placement, together)
+        rays = tuple(_rays(placement.apply(one)) for one in points)
+        middle: FloatArray = 0.5 * (together.min(axis=0) + together.max(axis=0))
+        reach = float(np.linalg.norm(together - middle, axis=1).max())
+        return cls(
+            subject, placement, seen, ground.name, rays, curve is not None, up, show, middle, reach,
+            origins,
+        )  # fmt: skip
+
+    def scene(self, title: str) -> Plain:
+        """All that a page has to know at first."""
+        place = self.placement
+        return {
+            "title": title,
+            "placement": [*place.rotation.ravel().tolist(), *place.translation.tolist(),
+                          place.scale],
+            "camera": self.camera,
+            "floor": FLOOR,
+            "show": self.show,
+            "ground": reflectance_of(self.ground).tolist(),
+            "sliders": [
+                {"name": name, "low": one.low, "high": one.high, "start": one.start,
+                 "step": one.step}
+                for name, one in self.subject.sliders.items()
+            ],
+            "editable": self.editable,
+            "middle": self.middle.tolist(),
+            "reach": self.reach,
+            "state": self.state(self.start),
+        }  # fmt: skip
+
+    @property
+    def pose(self) -> Plain:
+        """The camera's position, target and field of view, in the surfaces' coordinates."""
+        seen, place = self.camera, self.placement
+        azimuth, elevation = np.radians([seen["azimuth"], seen["elevation"]])
+        back = np.array([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)]) * np.cos(elevation)
+        target = np.array(seen["target"])
+        eye, at = place.undo(np.stack([target + seen["distance"] * back, target]))
+        return {"position": eye.tolist(), "target": at.tolist(), "fov": seen["fov"]}
+
+    @property
+    def start(self) -> Moved:
+        """Nothing has been moved yet."""
+        return Moved(self.subject.starts)
+
+    def state(self, moved: Moved) -> Plain:
+        """The surfaces, and the curves that they end at."""
+        drawn = self.drawn(moved)
+        surfaces = [
+            _traced(one, self.placed(one), *self.rays[min(k, len(self.rays) - 1)])
+            for k, one in enumerate(drawn)
+        ]
+        curves: list[Any] = []
+        for k, one in enumerate(drawn):
+            if all(one.surface.field is not other.surface.field for other in drawn[:k]):
+                curves += one.surface.field.boundary_curves
+        return {"surfaces": surfaces, "curves": [np.asarray(one).tolist() for one in curves]}
+
+    def drawn(self, moved: Moved) -> list[StudioObject]:
+        """The same as objects of the studio."""
+        drawn = [self._fitted(one) for one in _drawn(self.subject, moved.values)]
+        if moved.cut is not None:
+            drawn = [replace(one, surface=cut_by(one.surface, moved.cut)) for one in drawn]
+        curve = _curve_of(drawn) if self.editable else None
+        if curve is None:
+            return drawn
+        # As Dr.Jit's arrays: those of NumPy decide which proof is taken.
+        backend = choose_backend("single")
+        loops = curve.loops if moved.loops is None else moved.loops
+        field = SolidAngle([to_vector3(backend, one) for one in loops])
+        return [
+            replace(one, surface=replace(one.surface, field=field).in_one_call(begins=True))
+            if one.surface.field is curve
+            else one
+            for one in drawn
+        ]
+
+    def rendered(self, moved: Moved, **others: Any) -> Picture:
+        """A picture of it by `render`. others: its settings besides those of what is drawn."""
+        _, settings = self.subject.at(moved.values)
+        own = {name: settings[name] for name in ("isolines", "cut_material") if name in settings}
+        drawn = self.drawn(moved)
+        asked: dict[str, Any] = {
+            "backdrop": self.ground,
+            "up": self.up,
+            "progress": False,
+            **own,
+            **others,
+        }
+        materials = [one.material for one in drawn]
+        return render(
+            [one.surface for one in drawn], material=materials, **{**asked, **own, **others}
+        )
+
+    def saved(self, moved: Moved, **others: Any) -> tuple[str, list[str]]:
+        """It as the text of a scene file, and the names of the sliders that are not in it, because
+        their functions are Python's: what they make of it is. others: settings of `render` besides
+        those of what is drawn.
+
+        Raises:
+            SceneFileError: a text cannot hold it.
+        """
+        what, settings = self.subject.at(moved.values)
+        several: list[Any] = [*what] if isinstance(what, list | tuple) else [what]
+        curve = _curve_of(_drawn(self.subject, moved.values)) if moved.loops else None
+        if curve is not None:
+            several = [_with_loops(one, curve, moved.loops) for one in several]
+        if moved.cut is not None:
+            own = {name: settings.pop(name) for name in SURFACE_SETTINGS if name in settings}
+            made = studio_objects(several, settings.get("material"), own)
+            several = [cut_by(one.surface, moved.cut) for one in made]
+        lost: list[str] = []
+        for name, one in self.subject.sliders.items():
+            if self.subject.settings.get(name) is one and moved.cut is None:
+                settings[name] = replace(one, start=moved.values[name])
+            else:
+                lost.append(name)
+        return text_of(several, {**settings, **others}, self.origins), lost
+
+    def _fitted(self, one: StudioObject) -> StudioObject:
+        """The same, with a tolerance that suits its size on the stage if it has none."""
+        if not one.fitted:
+            return one
+        tolerance = Tolerance(_TOLERANCE / self.placement.scale)
+        return replace(one, surface=replace(one.surface, tolerance=tolerance))
+
+    def placed(self, one: StudioObject) -> PlacedSurface:
+        """On the stage, prepared."""
+        size = float(np.linalg.norm(np.diff(box_of(one.surface), axis=0)))
+        backend = choose_backend("single")
+        return PlacedSurface.of(one.surface, self.placement, backend, one.isolines, size)
+
+
+def cut_by(surface: LevelSet, volume: Volume) -> LevelSet:
+    """A surface cut by one more volume; by a half-space, it is opened to be looked into."""
+    name = "section" if isinstance(volume, HalfSpace) else "clip"
+    own = getattr(surface, name)
+    both = volume if own is None else Intersection((own, volume))
+    made = replace(surface, **cast("Any", {name: both})).in_one_call(begins=True)
+    is_whole = isinstance(made.field, Solid) and made.solid is None and len(made.levels) == 1
+    if name == "clip" or not is_whole:
+        return made
+    return replace(made, solid=(-math.inf, made.numbers[0]))
+
+
+def _with_loops(one: Any, curve: SolidAngle, loops: Any) -> Any:
+    """A field or a surface with other vertices of a curve."""
+    if one is curve:
+        return SolidAngle([*loops])
+    if isinstance(one, LevelSet) and one.field is curve:
+        return replace(one, field=SolidAngle([*loops]))
+    return one
+
+
+def _drawn(subject: Subject, values: Mapping[str, float]) -> list[StudioObject]:
+    what, settings = subject.at(values)
+    studio = {name: settings.pop(name) for name in _OF_STUDIO if name in settings}
+    material, cut = (settings.pop(name, None) for name in ("material", "cut_material"))
+    isolines = checked_isolines(settings.pop("isolines", None))
+    drawn = studio_objects(what, material, settings, cut=cut, isolines=isolines, **studio)
+    for one in drawn:
+        if one.material.transparent:
+            raise ValueError(
+                "what moves is not drawn transparent: choose another "
+                'material, such as material="clay"'
+            )
+    return drawn
+
+
+def _curve_of(drawn: Sequence[StudioObject]) -> SolidAngle | None:
+    """The one field whose curve can be edited; None where there is none, or more than one."""
+    found = {id(one.surface.field): one.surface.field for one in drawn}
+    curves = [one for one in found.values() if isinstance(one, SolidAngle) and not one.circles]
+    return curves[0] if len(curves) == 1 else None
+
+
+def _seen(camera: Camera, placement: Placement, points: FloatArray) -> Plain:
+    """A camera that turns about a point before it, in the coordinates of the stage."""
+    there = placement.apply(points)
+    pose = camera.pose(there, _SIZE, placement.apply)
+    way = pose.target - pose.origin
+    way = way / np.linalg.norm(way)
+    middle = 0.5 * (there.min(axis=0) + there.max(axis=0))
+    distance = max(float((middle - pose.origin) @ way), 1e-3)
+    elevation = np.degrees(np.arcsin(np.clip(-way[2], -1, 1)))
+    azimuth = pose.azimuth if abs(way[2]) > 1 - 1e-9 else np.degrees(np.arctan2(-way[1], -way[0]))
+    return {
+        "target": (pose.origin + distance * way).tolist(),
+        "azimuth": float(azimuth),
+        "elevation": float(elevation),
+        "distance": distance,
+        "fov": float(pose.fov),
+    }
+
+
+def _traced(one: StudioObject, placed: PlacedSurface, o: FloatArray, d: FloatArray) -> Plain:
+    """A surface as its kernel, the data of it, its colors, and rays with Dr.Jit's answers."""
+    backend = choose_backend("single")
+    lanes = {
+        "o": to_vector3(backend, o),
+        "d": to_vector3(backend, d),
+        "far": backend.Float(np.full(len(o), np.inf, np.float32)),
+    }
+
+    def compute(o: Vec3, d: Vec3, far: Real) -> Plain:
+        met = placed.meet(o, d, far, backend.Bool(True))
+        return {
+            "status": status_of(met), "t": met.t, "normal": met.normal,
+            "evaluations": met.evaluations, "paint": paint_of(met),
+        }  # fmt: skip
+
+    made = record(compute, lanes, placed)
+    given = dict(leaves("lane", lanes))
+    results = {name: made.results.get(f"result {name}") for name in _RESULTS}
+    if any(results[name] is None for name in _RESULTS[:-1]):
+        raise ValueError("what rays meet is the same for all of them: there is nothing to draw")
+    answers = [np.zeros(len(o), np.uint32) if x is None else bits_of(x) for x in results.values()]
+    return {
+        "key": hashlib.sha256(made.shader.code.encode()).hexdigest()[:16],
+        "code": made.shader.code,
+        "data": _text(data_of(made.shader, made.data)),
+        "lanes": [_LANES.index(label.removeprefix("lane ")) for label in made.shader.lanes],
+        "results": [_place(made, f"result {name}") for name in _RESULTS],
+        "paints": paints_of(one),
+        "tolerance": placed_tolerance(one, placed),
+        "check": {
+            "lanes": _text(np.stack([bits_of(given[label]) for label in made.shader.lanes])),
+            "results": _text(np.stack(answers)),
+            "count": len(o),
+        },
+    }
+
+
+def status_of(met: SurfaceHit) -> Any:
+    """A `Status` each."""
+    hit, out, miss = (
+        type(met.evaluations)(int(one)) for one in (Status.HIT, Status.OUT_OF_STEPS, Status.MISS)
+    )
+    return dr.select(met.lost, out, dr.select(met.met, hit, miss))
+
+
+def paint_of(met: SurfaceHit) -> Any:
+    """Which of `paints_of` is met."""
+    index = cast("Any", type(met.evaluations))
+    plain = dr.select(met.cut, index(_CUT), dr.select(met.mended, index(_MENDED), index(0)))
+    return dr.select(met.line > 0, index(met.line) + _CUT, plain)
+
+
+def placed_tolerance(one: StudioObject, placed: PlacedSurface) -> float:
+    """On the stage."""
+    return one.surface.tolerance.distance * float(placed.scale[0])
+
+
+def _place(made: Recording, label: str) -> int:
+    """Where a result is; that of no lane's behind all others."""
+    if label in made.constants:
+        return _NOWHERE
+    return made.shader.results.index(label)
+
+
+def _rays(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Origins and unit directions (n, 3) of rays from all sides to places near points of the
+    stage."""
+    rng = np.random.default_rng(0)
+    away = rng.normal(size=(_RAYS, 3))
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    o = 0.5 * (points.min(axis=0) + points.max(axis=0)) + 5.0 * away
+    aims = points[rng.integers(0, len(points), _RAYS)]
+    way = aims + 0.05 * rng.normal(size=(_RAYS, 3)) - o
+    return o, way / np.linalg.norm(way, axis=1, keepdims=True)
+
+
+def paints_of(one: StudioObject) -> list[Plain]:
+    """Linear sRGB of the sides of larger and of smaller values in shaded pictures, and whether they
+    are glossy: of each paint."""
+    surface, mi = one.surface, register()
+    is_solid = surface.solid is not None
+    front, back, glossy = _reflectances(one.material.bsdf(solid=is_solid, traced_light=False))
+    inside = mi.Bool(not is_solid and not isinstance(surface.field, Solid))
+    sides = of_side(front, back, inside), back
+    mended = [of_mended(side, mi.Bool(True)) for side in sides]
+    paints = [_paint(sides[0], sides[1], glossy), _paint(mended[0], mended[1], glossy)]
+    cut = one.material if one.cut is None else one.cut
+    front, back, glossy = _reflectances(cut.bsdf(solid=is_solid, traced_light=False))
+    paints.append(_paint(front, back, glossy))
+    lines = [mi.Color3f(*linear(line.rgb)) for line in one.isolines]
+    return [*paints, *(_paint(line, line, False) for line in lines)]
+
+
+def _paint(front: Any, back: Any, glossy: bool) -> Plain:
+    sides = {"front": front, "back": back}
+    return {
+        "glossy": glossy,
+        **{name: [float(part[0]) for part in color] for name, color in sides.items()},
+    }
+
+
+def _reflectances(bsdf: Mapping[str, Any]) -> tuple[Any, Any, bool]:
+    """Of both sides, as `shaded` draws them, and whether it is glossy."""
+    mi = register()
+    made = mi.load_dict(dict(bsdf), parallel=False)
+    colors: list[Any] = []
+    for side in (1, -1):
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        si.wi, si.t = mi.Vector3f(0, 0, side), mi.Float(1)
+        straight = mi.Color3f(made.eval_diffuse_reflectance(si, True))
+        colors.append(reflectance(straight, mi.Bool(False)))
+    flags = made.flags()
+    glossy = mi.has_flag(flags, mi.BSDFFlags.Glossy) or mi.has_flag(flags, mi.BSDFFlags.Delta)
+    return colors[0], colors[1], bool(glossy)
+
+
+def _text(bits: Any) -> str:
+    return base64.b64encode(np.ascontiguousarray(bits).tobytes()).decode()

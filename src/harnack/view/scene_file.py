@@ -1,0 +1,531 @@
+"""Scenes as text: what is drawn, how and from where, to be read by people and by every command.
+
+A scene file is JSON of version 1. Nothing in it is ever run, and what is not known is refused:
+
+    {
+      "harnack": 1,
+      "surfaces": [{"field": {"curves": [[[1, 0, 0], [0, 1, 0], [0, 0, 1]]]}, "level": 6.28}],
+      "settings": {"material": ["gold"], "camera": {"position": [3, 2, 1], "target": [0, 0, 0]}},
+      "sliders": {"level": {"low": 1, "high": 12, "start": 6.28}}
+    }
+
+A field is one of {"curves": loops of points}, {"formula": text, "parameters": numbers by name},
+{"scene": a name of the gallery, "number": which of its surfaces}, {"file": a surface file, "as":
+..., "boundary": ..., "normals": ..., "up": ...}, or the name of a class and its arguments, as
+{"Sphere": {"radius": 2}}. Beside it stand the settings of `level_set`, under "settings" those of
+`render`, by the names that they have in Python.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import json
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from harnack import geometry
+from harnack.enclosures.proofs import choose_proofs
+from harnack.field_from_file import open_surface
+from harnack.fields import Field, Solid
+from harnack.fields.curves.solid_angle import SolidAngle
+from harnack.fields.expressions import Expression, TextFormula, expression
+from harnack.fields.polynomials.polynomial import SphericalHarmonic
+from harnack.fields.solids import (
+    affine,
+    bends,
+    blended,
+    combined,
+    fractal,
+    julia,
+    region,
+    round,
+    square,
+    tube,
+)
+from harnack.fields.solids.solid import Map
+from harnack.fields.waves.periodic import Gyroid, SchwarzD, SchwarzP
+from harnack.files.writing import write_atomically
+from harnack.gallery import SCENES
+from harnack.geometry import Volume
+from harnack.names import did_you_mean
+from harnack.rendering import Camera, Isolines
+from harnack.rendering.studio_scene import with_settings
+from harnack.tracer import LevelSet, Tolerance, level_set
+from harnack.view.sliders import Slider
+
+__all__ = [
+    "Origins",
+    "SavedScene",
+    "SceneFileError",
+    "read_scene",
+    "scene_of",
+    "text_of",
+    "write_scene",
+]
+
+VERSION = 1
+_LONGEST = 64 * 2**20
+_ENDING = ".json"
+SURFACE_SETTINGS = (
+    "level", "solid", "clip", "section", "tolerance", "max_steps", "bound", "overstep", "confirm",
+    "largest",
+)  # fmt: skip
+"""Of `level_set`."""
+STILL_SETTINGS = ("size", "spp", "antialias", "max_depth", "seed", "denoise")
+"""Of `render`, of pictures that do not move."""
+_OF_PICTURE = (
+    "show", "material", "camera", "backdrop", "up", "boundary", "boundary_material",
+    "cut_material", "isolines", "thickness", *STILL_SETTINGS,
+)  # fmt: skip
+# Fields that say all of themselves by their arguments, besides solids.
+_MORE: tuple[type[Field], ...] = (
+    Gyroid, SchwarzD, SchwarzP, SphericalHarmonic,
+)  # fmt: skip
+_SOLIDS = (
+    affine, bends, blended, combined, fractal, julia, region, round, square, tube,
+)  # fmt: skip
+_FILE_OPTIONS = ("as", "boundary", "normals", "up")
+
+Plain = dict[str, Any]
+Origins = Sequence[tuple[Field, Plain]]
+"""Fields, and where they come from, as scene files say it."""
+
+
+class SceneFileError(ValueError):
+    """What is no scene file, or cannot be written into one."""
+
+
+@dataclass(frozen=True)
+class SavedScene:
+    """What a scene file holds.
+
+    surfaces: as `harnack.render`, `page` and `view` take them. settings: of these functions, by
+    name. sliders: by the names of settings, for `page` and `view`; in `settings` is where they
+    start.
+    """
+
+    surfaces: tuple[Field | LevelSet, ...]
+    settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    sliders: Mapping[str, Slider] = field(default_factory=dict[str, Slider])
+    origins: Origins = field(default=(), repr=False)
+
+
+def read_scene(path: str | os.PathLike[str]) -> SavedScene:
+    """The scene of a file that `write_scene` or a view has written.
+
+        scene = hk.read_scene("mine.json")
+        hk.render(scene.surfaces, "mine.png", **scene.settings)
+
+    Files named in it are looked for beside it.
+
+    Raises:
+        SceneFileError (a ValueError): what is no such file: which part, and what is wrong.
+        OSError: it cannot be read.
+    """
+    source = Path(path)
+    if source.stat().st_size > _LONGEST:
+        raise SceneFileError(f"{source}: a scene file has at most {_LONGEST >> 20} MB")
+    try:
+        text = source.read_text(encoding="utf-8")
+    except UnicodeDecodeError:
+        raise SceneFileError(f"{source}: a scene file is text in UTF-8") from None
+    try:
+        return scene_of(text, lambda name: source.parent / name)
+    except SceneFileError as wrong:
+        raise SceneFileError(f"{source}: {wrong}") from None
+
+
+def write_scene(
+    path: str | os.PathLike[str],
+    what: Any,
+    *,
+    origins: Origins = (),
+    **settings: Any,
+) -> None:
+    """Write what is drawn, and how, into a scene file.
+
+        hk.write_scene("mine.json", hk.SolidAngle(curve), level=2.0, material="gold")
+
+    what, settings: as `harnack.render` and `page` take them, with a `Slider` for `level` if wanted.
+    path: ends in .json. origins: fields that come from files or from the gallery, and where from.
+
+    Raises:
+        SceneFileError (a ValueError): something that a text cannot hold, such as a Python function
+            or a mesh that was made in Python: by its name.
+    """
+    target = os.fspath(path)
+    if not target.lower().endswith(_ENDING):
+        raise SceneFileError(f"{target}: a scene is written as {_ENDING}")
+    text = text_of(what, settings, origins)
+    with write_atomically(target) as partial:
+        partial.write_text(text, encoding="utf-8")
+
+
+# Writing.
+
+
+def text_of(what: Any, settings: Mapping[str, Any], origins: Origins = ()) -> str:
+    """A scene as text.
+
+    Raises:
+        SceneFileError: as `write_scene`.
+    """
+    several: list[Any] = [*what] if isinstance(what, list | tuple) else [what]
+    made: Plain = {"harnack": VERSION, "surfaces": [_surface_text(one, origins) for one in several]}
+    sliders = {name: one for name, one in settings.items() if isinstance(one, Slider)}
+    for name in sliders:
+        if name not in SURFACE_SETTINGS:
+            raise SceneFileError(f"a slider of {name} cannot be written: only settings of surfaces")
+    written = {
+        name: _setting_text(name, one, origins)
+        for name, one in settings.items()
+        if one is not None and name not in sliders
+    }
+    if written:
+        made["settings"] = written
+    if sliders:
+        made["sliders"] = {
+            name: {key: one for key, one in dataclasses.asdict(slider).items() if one is not None}
+            for name, slider in sliders.items()
+        }
+    return _json(made) + "\n"
+
+
+def _json(made: Any, depth: int = 0) -> str:
+    """JSON with a line for each entry, and rows of numbers on one line."""
+    flat = json.dumps(made, allow_nan=False)
+    if len(flat) <= 88 - 2 * depth or not isinstance(made, dict | list):
+        return flat
+    space = "  " * (depth + 1)
+    entries: list[str] = []
+    if isinstance(made, dict):
+        for name, one in cast("Plain", made).items():
+            entries.append(f"{space}{json.dumps(name)}: {_json(one, depth + 1)}")
+    else:
+        entries = [space + _json(one, depth + 1) for one in cast("list[Any]", made)]
+    first, last = "{}" if isinstance(made, dict) else "[]"
+    return f"{first}\n" + ",\n".join(entries) + "\n" + "  " * depth + last
+
+
+def _surface_text(one: Any, origins: Origins) -> Plain:
+    if isinstance(one, Field):
+        return {"field": _field_text(one, origins)}
+    if not isinstance(one, LevelSet):
+        raise SceneFileError(f"what is written are fields and level sets, not {one!r:.60}")
+    made: Plain = {"field": _field_text(one.field, origins)}
+    usual = level_set(one.field)
+    made["tolerance"] = _setting_text("tolerance", one.tolerance, origins)
+    if one.solid is not None:
+        made["solid"] = _setting_text("solid", one.solid, origins)
+    elif one.levels:
+        numbers = [float(number) for number in one.numbers]
+        made["level"] = numbers[0] if len(numbers) == 1 else numbers
+    if one.bound != choose_proofs(None):
+        raise SceneFileError("a LevelSet with proofs chosen by name: give bound= as a setting")
+    for name in ("clip", "section", "max_steps", "overstep", "confirm", "largest"):
+        if getattr(one, name) != getattr(usual, name):
+            made[name] = _setting_text(name, getattr(one, name), origins)
+    return made
+
+
+def _field_text(one: Field, origins: Origins) -> Plain:
+    for known, origin in origins:
+        if one is known:
+            return origin
+    if isinstance(one, Expression) and isinstance(one.function, TextFormula):
+        made: Plain = {"formula": one.function.text, "parameters": dict(one.function.parameters)}
+        extra = {"domain": one.domain, "level": one.default_level, "is_convex": one.is_convex}
+        usual = inspect.signature(expression).parameters
+        made |= {k: _plain(v) for k, v in extra.items() if v != usual[k].default}
+        return {name: value for name, value in made.items() if value != {}}
+    if type(one) is SolidAngle and not one.circles:
+        return {"curves": [np.asarray(loop).tolist() for loop in one.loops]}
+    if type(one).__name__ not in _kinds():
+        raise SceneFileError(
+            f"a {type(one).__name__} that was made in Python cannot be written into a scene file, "
+            "which holds curves, formulas, solids, surfaces of files and of the gallery"
+        )
+    made = _object_text(one)
+    _check_return(one, _field_of(made, "field", None))
+    return made
+
+
+def _check_return(one: Field, other: Field) -> None:
+    """Raise SceneFileError for a field of which the text says too little."""
+    points = np.random.default_rng(0).normal(size=(256, 3))
+    same = np.array_equal(one.value(points), other.value(points), equal_nan=True)
+    if not same or one.default_level != other.default_level or one.domain != other.domain:
+        raise SceneFileError(f"a {type(one).__name__} like this one cannot be written: its own "
+                             "arguments do not say all of it")  # fmt: skip
+
+
+def _object_text(one: Any) -> Plain:
+    """A field or a volume by its class and its arguments."""
+    given: Plain = {}
+    for name, about in inspect.signature(one.__class__).parameters.items():
+        if name.startswith("_") or not hasattr(one, name):
+            continue  # `_check_return` finds what would be lost
+        value = getattr(one, name)
+        if _same(value, about.default):
+            continue
+        given[name] = _plain(value)
+    return {type(one).__name__: given}
+
+
+def _same(value: Any, default: Any) -> bool:
+    try:
+        return bool(value == default)
+    except (TypeError, ValueError):  # arrays
+        return False
+
+
+def _plain(value: Any) -> Any:
+    """Numbers, names, lists, volumes and fields as JSON has them."""
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, float):  # NumPy's double as well
+        return _number(float(value))
+    if isinstance(value, np.ndarray):
+        return _plain(cast("Any", value).tolist())
+    if isinstance(value, np.integer):
+        return int(cast("Any", value))
+    if isinstance(value, Sequence):
+        return [_plain(one) for one in cast("Sequence[Any]", value)]
+    if isinstance(value, Field):
+        return _field_text(value, ())
+    if type(value).__name__ in _kinds():
+        return _object_text(value)
+    raise SceneFileError(f"what is of type {type(value).__name__} cannot be written")
+
+
+def _number(value: float) -> Any:
+    """Infinite ends are "inf" and "-inf": JSON has numbers for neither."""
+    if math.isnan(value):
+        raise SceneFileError("a number that is none (NaN) cannot be written")
+    return value if math.isfinite(value) else ("inf" if value > 0 else "-inf")
+
+
+def _setting_text(name: str, value: Any, origins: Origins) -> Any:
+    _check_name(name, (*SURFACE_SETTINGS, *_OF_PICTURE), "setting")
+    if isinstance(value, Tolerance):
+        usual = Tolerance(value.distance)
+        if value != usual:
+            raise SceneFileError("tolerance: only a length can be written")
+        return value.distance
+    if isinstance(value, Camera):
+        every = {one.name: getattr(value, one.name) for one in dataclasses.fields(value)}
+        usual = {one.name: one.default for one in dataclasses.fields(value)}
+        return {key: _plain(one) for key, one in every.items() if one != usual[key]}
+    if isinstance(value, Isolines):
+        if not isinstance(value.of, str):
+            raise SceneFileError("isolines: only those of a formula as text can be written")
+        names = ("of", "levels", "spacing", "width", "color")
+        return {key: _plain(one) for key in names if (one := getattr(value, key)) is not None}
+    if name == "isolines" and isinstance(value, Sequence):
+        return [_setting_text(name, one, origins) for one in cast("Sequence[Any]", value)]
+    try:
+        return _plain(value)
+    except SceneFileError as wrong:
+        raise SceneFileError(f"{name}: {wrong}") from None
+
+
+# Reading.
+
+
+def scene_of(text: str, find: Callable[[str], Path] | None = None) -> SavedScene:
+    """The scene of a text.
+
+    find: where a file is that the text names; None if it must not name any.
+
+    Raises:
+        SceneFileError: as `read_scene`.
+    """
+    try:
+        given = json.loads(text, parse_constant=_no_number)
+    except (ValueError, RecursionError) as wrong:
+        raise SceneFileError(f"it is no JSON: {wrong}") from None
+    whole = _object(given, "a scene")
+    if whole.get("harnack") != VERSION:
+        raise SceneFileError(f'it must say "harnack": {VERSION}, the version of scene files')
+    for name in whole:
+        _check_name(name, ("harnack", "surfaces", "settings", "sliders"), "part")
+    listed = whole.get("surfaces")
+    if not isinstance(listed, list) or not listed:
+        raise SceneFileError("surfaces must be a list of one surface at least")
+    origins: list[tuple[Field, Plain]] = []
+    surfaces = tuple(
+        _surface_of(one, f"surfaces[{k}]", find, origins)
+        for k, one in enumerate(cast("list[Any]", listed))
+    )
+    settings = _settings_of(_object(whole.get("settings", {}), "settings"), _known_settings())
+    sliders = _object(whole.get("sliders", {}), "sliders")
+    made: dict[str, Slider] = {}
+    for name, one in sliders.items():
+        _check_name(name, SURFACE_SETTINGS, "slider")
+        made[name] = _called(Slider, one, f"sliders: {name}")
+        settings[name] = made[name].start
+    return SavedScene(surfaces, settings, made, tuple(origins))
+
+
+def _known_settings() -> tuple[str, ...]:
+    return (*SURFACE_SETTINGS, *_OF_PICTURE)
+
+
+def _no_number(name: str) -> float:
+    raise ValueError(f"{name} is no number of JSON")
+
+
+def _object(given: Any, where: str) -> Plain:
+    if not isinstance(given, dict):
+        raise SceneFileError(f"{where} must be an object with names, not {given!r:.60}")
+    return cast("Plain", given)
+
+
+def _check_name(name: str, known: Sequence[str], what: str) -> None:
+    if name not in known:
+        raise SceneFileError(f"there is no {what} {name!r:.60}{did_you_mean(name, known)}")
+
+
+def _surface_of(
+    given: Any, where: str, find: Callable[[str], Path] | None, origins: list[tuple[Field, Plain]]
+) -> Field | LevelSet:
+    own = dict(_object(given, where))
+    if "field" not in own:
+        raise SceneFileError(f"{where} has no field")
+    about = own.pop("field")
+    try:
+        one = _origin_of(about, where, find)
+        if one is not None:
+            origins.append((one.field if isinstance(one, LevelSet) else one, about))
+        else:
+            one = _field_of(about, f"{where}: field", find)
+        settings = _settings_of(own, SURFACE_SETTINGS)
+        return with_settings(one, settings) if settings else one
+    except SceneFileError:
+        raise
+    except (ValueError, TypeError, OverflowError, NotImplementedError, OSError) as wrong:
+        raise SceneFileError(f"{where}: {wrong}") from None
+
+
+def _origin_of(
+    given: Any, where: str, find: Callable[[str], Path] | None
+) -> Field | LevelSet | None:
+    """A surface of the gallery or of a file; None for another."""
+    about = _object(given, f"{where}: field")
+    if "scene" in about:
+        for name in about:
+            _check_name(name, ("scene", "number"), "part of a field")
+        scene, number = about["scene"], about.get("number", 0)
+        if scene not in SCENES:
+            raise SceneFileError(
+                f"no scene is named {scene!r:.60}{did_you_mean(str(scene), SCENES)}"
+            )
+        surfaces = SCENES[scene].surfaces()
+        if type(number) is not int or not 0 <= number < len(surfaces):
+            raise SceneFileError(
+                f"{scene} has {len(surfaces)} surfaces, and no number {number!r:.60}"
+            )
+        return surfaces[number]
+    if "file" not in about:
+        return None
+    for name in about:
+        _check_name(name, ("file", *_FILE_OPTIONS), "part of a field")
+    if find is None:
+        raise SceneFileError("a scene that is opened in a browser must not name files")
+    options = {"as_" if key == "as" else key: one for key, one in about.items() if key != "file"}
+    opened = open_surface(find(str(about["file"])), **cast("Any", options))
+    return opened.field
+
+
+def _field_of(given: Any, where: str, find: Callable[[str], Path] | None) -> Field:
+    about = _object(given, where)
+    if "curves" in about:
+        if len(about) > 1:
+            raise SceneFileError(f"{where}: beside curves there is nothing")
+        return SolidAngle(about["curves"])
+    if "formula" in about:
+        known = ("formula", "parameters", "domain", "level", "is_convex")
+        for name in about:
+            _check_name(name, known, "part of a formula")
+        plain = ("formula", "parameters")
+        own = {name: _value_of(one, where) for name, one in about.items() if name not in plain}
+        own["parameters"] = _object(about.get("parameters", {}), f"{where}: parameters")
+        if not isinstance(about["formula"], str):
+            raise SceneFileError(f"{where}: a formula is a text")
+        return expression(about["formula"], **own)
+    made = _value_of(about, where)
+    if not isinstance(made, Field):
+        raise SceneFileError(f"{where}: this is no field: {given!r:.60}")
+    return made
+
+
+def _value_of(given: Any, where: str) -> Any:
+    """Numbers, names and lists as they are; objects of one of the kinds that there are."""
+    if isinstance(given, list):
+        return tuple(_value_of(one, where) for one in cast("list[Any]", given))
+    if given in ("inf", "-inf"):
+        return float(given)
+    if not isinstance(given, dict):
+        return given
+    about = cast("Plain", given)
+    if "curves" in about or "formula" in about:
+        return _field_of(about, where, None)
+    kinds = _kinds()
+    if len(about) != 1:
+        raise SceneFileError(f"{where}: write one name and its arguments, not {about!r:.60}")
+    ((name, arguments),) = about.items()
+    _check_name(name, tuple(kinds), "kind of field or volume")
+    return _called(kinds[name], arguments, f"{where}: {name}")
+
+
+def _called(kind: type, given: Any, where: str) -> Any:
+    known = [name for name in inspect.signature(kind).parameters if not name.startswith("_")]
+    about = _object(given, where)
+    for name in about:
+        _check_name(name, known, f"argument of {kind.__name__}")
+    try:
+        return kind(**{name: _value_of(one, where) for name, one in about.items()})
+    except SceneFileError:
+        raise
+    except (ValueError, TypeError, OverflowError, NotImplementedError) as wrong:
+        raise SceneFileError(f"{where}: {wrong}") from None
+
+
+def _settings_of(given: Plain, known: Sequence[str]) -> Plain:
+    made: Plain = {}
+    for name, one in given.items():
+        _check_name(name, known, "setting")
+        if name == "camera":
+            made[name] = _called(Camera, one, name)
+        elif name == "isolines":
+            listed = cast("list[Any]", one if isinstance(one, list) else [one])
+            made[name] = [_called(Isolines, each, name) for each in listed]
+        else:
+            value = _value_of(one, name)
+            made[name] = (
+                [*value] if name in ("material", "level") and type(value) is tuple else value
+            )
+    return made
+
+
+def _kinds() -> dict[str, type]:
+    """Fields and volumes that are their class and its arguments: solids, volumes, and some more.
+    None of them reads files or calls what it is given."""
+    found: dict[str, type] = {one.__name__: one for one in _MORE}
+    for room in (*_SOLIDS, geometry):
+        for name, one in vars(room).items():
+            if (
+                inspect.isclass(one)
+                and issubclass(one, Solid | Volume | Map)
+                and dataclasses.is_dataclass(one)
+                and not name.startswith("_")
+            ):
+                found[name] = one
+    return found

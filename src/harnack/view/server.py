@@ -1,0 +1,282 @@
+"""`view`: a small server on this machine, to whose page Python sends what has changed."""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+import sys
+import threading
+import webbrowser
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+from harnack.backend.numbers import whole
+from harnack.view.page import document, still_of
+from harnack.view.scene import Live
+from harnack.view.scene_file import Origins
+from harnack.view.session import Client, QuestionError
+
+if TYPE_CHECKING:
+    from typing import Self
+
+    from aiohttp import web
+
+    from harnack.view.scene import Plain
+    from harnack.view.widget import Widget
+
+__all__ = ["View", "view"]
+
+_LOCAL = ("127.0.0.1", "::1", "localhost")
+# Bytes of a message, and messages of a client that wait.
+_LONGEST = 4 * 2**20
+_WAITING = 8
+
+
+@dataclass(frozen=True)
+class View:
+    """A page that is being served. address: to open in a browser."""
+
+    address: str
+    _loop: asyncio.AbstractEventLoop
+    _thread: threading.Thread
+
+    def close(self) -> None:
+        """Serve it no longer."""
+        if self._thread.is_alive():
+            self._loop.call_soon_threadsafe(self._loop.stop)
+            self._thread.join()
+
+    def wait(self) -> None:
+        """Until Ctrl-C, or until it is closed elsewhere."""
+        try:
+            while self._thread.is_alive():
+                self._thread.join(0.2)
+        except KeyboardInterrupt:
+            print("stopped", file=sys.stderr)
+        finally:
+            self.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:  # fmt: skip
+        self.close()
+
+    def _repr_html_(self) -> str:
+        """For notebooks on this machine: the page, in a frame."""
+        return f'<iframe src="{self.address}" style="width:100%;height:480px;border:0"></iframe>'
+
+
+def view(
+    what: Any,
+    *,
+    title: str = "",
+    host: str = "127.0.0.1",
+    port: int = 0,
+    opens: bool = True,
+    waits: bool | None = None,
+    origins: Origins = (),
+    height: int = 480,
+    **settings: Any,
+) -> View | Widget:
+    """Show surfaces live in the browser: turned, moved by sliders, their curves dragged.
+
+        hk.view(hk.SolidAngle(vertices))
+        hk.view(lambda l, m: hk.SphericalHarmonic(int(l), int(m)), level=0.1,
+                l=hk.Slider(1, 8, 5, step=1), m=hk.Slider(0, 5, 3, step=1))
+
+    The visitor's browser traces all rays by the kernels that Dr.Jit recorded, as a page of `page`
+    does; Python prepares what has changed and sends it. While a point or a slider moves no kernel
+    is compiled.
+
+    In a notebook that has anywidget (`pip install harnack[notebook]`) it is a live widget, whose
+    `camera`, `sliders`, `points` and `show` are attributes with events. `port` or `opens=False`
+    asks for the server there too.
+
+    what, title, settings: as `page` takes them. The points of the curve of a `SolidAngle` can be
+        moved, inserted (double click), removed (Delete) and smoothed, with undo and redo.
+    host: the address to serve at; anything but this machine's own is open to the network, so that
+        the address of the page then has a token, without which nothing is answered.
+    port: 0 for a free one. height: of a widget, in pixels. opens: whether to open a browser.
+    waits: whether to return only when Ctrl-C is pressed; by default where Python is not used
+        interactively.
+
+    origins: fields that come from files or the gallery, and where from, for scene files that are
+        saved in the view; as `SavedScene` has them.
+
+    Raises what `page` raises; ModuleNotFoundError without aiohttp (`pip install harnack[view]`);
+    OSError for an address that cannot be served at.
+    """
+    port = whole(port, "port", least=0, most=65535)
+    height = whole(height, "height", least=16, most=10_000)
+    live = Live.of(what, settings, edits=True, origins=origins)
+    title = title or live.subject.name
+    if opens and port == 0 and host == _LOCAL[0] and waits is None and in_notebook():
+        try:
+            from harnack.view.widget import Widget
+        except ImportError:
+            print(
+                "a view in this notebook itself needs anywidget: pip install 'harnack[notebook]'",
+                file=sys.stderr,
+            )
+        else:
+            return Widget(live, title, height)
+    scene = live.scene(title)
+    token = "" if host in _LOCAL else secrets.token_urlsafe(16)
+    served = _Server(live, document(scene, still_of(live), link="server"), token)
+    made = served.start(host, port)
+    print(f"{scene['title']}: {made.address}", file=sys.stderr)
+    if token:
+        print("open to the network: whoever has this address can use it", file=sys.stderr)
+    if opens:
+        webbrowser.open(made.address)
+    if waits is None:
+        waits = not (hasattr(sys, "ps1") or "ipykernel" in sys.modules)
+    if waits:
+        made.wait()
+    return made
+
+
+def in_notebook() -> bool:
+    """Whether Python runs in a notebook."""
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    marimo = sys.modules.get("marimo")
+    return hasattr(shell, "kernel") or (marimo is not None and marimo.running_in_notebook())
+
+
+class _Server:
+    def __init__(self, live: Live, page: str, token: str) -> None:
+        self.live, self.page, self.token = live, page, token
+        # Dr.Jit works on all cores for one question at a time.
+        self.worker = ThreadPoolExecutor(1, thread_name_prefix="harnack-view")
+        self.clients = 0
+
+    def start(self, host: str, port: int) -> View:
+        """Serves in a thread of its own."""
+        try:
+            from aiohttp import web
+        except ImportError:
+            raise ModuleNotFoundError(
+                "a view is served by the package aiohttp: pip install 'harnack[view]'"
+            ) from None
+        loop = asyncio.new_event_loop()
+        application = web.Application(client_max_size=_LONGEST)
+        application.router.add_get("/", self._give_page)
+        application.router.add_get("/questions", self._talk)
+        application.router.add_get("/clients", self._count)
+        runner = web.AppRunner(application, handle_signals=False, shutdown_timeout=1.0)
+
+        async def begin() -> int:
+            await runner.setup()
+            await web.TCPSite(runner, host, port).start()
+            return int(runner.addresses[0][1])
+
+        def serve() -> None:
+            asyncio.set_event_loop(loop)
+            loop.run_forever()
+            loop.run_until_complete(runner.cleanup())
+            self.worker.shutdown(wait=False, cancel_futures=True)
+            loop.close()
+
+        # In a thread of its own from the start: notebooks have a loop that runs in this one.
+        thread = threading.Thread(target=serve, name="harnack-view", daemon=True)
+        thread.start()
+        try:
+            bound = asyncio.run_coroutine_threadsafe(begin(), loop).result()
+        except OSError as wrong:
+            View("", loop, thread).close()
+            raise OSError(f"a view cannot be served at {host}, port {port}: {wrong}") from None
+        shown = f"[{host}]" if ":" in host else host
+        query = f"?token={self.token}" if self.token else ""
+        return View(f"http://{shown}:{bound}/{query}", loop, thread)
+
+    def _refuse(self, request: web.Request) -> str:
+        """Why a request is not answered; nothing if it is. A page of somebody else's must not ask
+        this server, by whatever name it calls it."""
+        name = request.host.rsplit(":", 1)[0].strip("[]")
+        if self.token:
+            given = request.query.get("token", "")
+            return "" if secrets.compare_digest(given, self.token) else "the token is wrong"
+        if name not in _LOCAL:
+            return "this view is for its own machine alone"
+        origin = request.headers.get("Origin")
+        if origin is not None and origin != f"http://{request.host}":
+            return "this view answers its own page alone"
+        return ""
+
+    async def _give_page(self, request: web.Request) -> web.Response:
+        from aiohttp import web
+
+        wrong = self._refuse(request)
+        if wrong:
+            return web.Response(status=403, text=wrong)
+        return web.Response(
+            text=self.page, content_type="text/html", headers={"Cache-Control": "no-store"}
+        )
+
+    async def _count(self, request: web.Request) -> web.Response:
+        from aiohttp import web
+
+        wrong = self._refuse(request)
+        if wrong:
+            return web.Response(status=403, text=wrong)
+        return web.json_response({"clients": self.clients})
+
+    async def _talk(self, request: web.Request) -> web.StreamResponse:
+        from aiohttp import WSMsgType, web
+
+        wrong = self._refuse(request)
+        if wrong:
+            return web.Response(status=403, text=wrong)
+        socket = web.WebSocketResponse(max_msg_size=_LONGEST, heartbeat=30.0)
+        await socket.prepare(request)
+        self.clients += 1
+        client, waiting = Client(self.live), set[asyncio.Task[None]]()
+        try:
+            async for message in socket:
+                if message.type != WSMsgType.TEXT:
+                    continue
+                try:
+                    question = client.read(message.data)
+                except QuestionError as wrong:
+                    await _send(socket, {"id": None, "error": str(wrong)})
+                    continue
+                if question is None:
+                    continue
+                if len(waiting) >= _WAITING:
+                    many = f"more than {_WAITING} questions at once"
+                    await _send(socket, {"id": question["id"], "error": many})
+                    continue
+                task = asyncio.ensure_future(self._answer(socket, client, question))
+                waiting.add(task)
+                task.add_done_callback(waiting.discard)
+        finally:
+            client.is_gone = True
+            for task in waiting:
+                task.cancel()
+            self.clients -= 1
+        return socket
+
+    async def _answer(self, socket: web.WebSocketResponse, client: Client, asked: Plain) -> None:
+        loop = asyncio.get_running_loop()
+
+        def send(part: Plain) -> None:
+            asyncio.run_coroutine_threadsafe(_send(socket, part), loop)
+
+        await _send(socket, await loop.run_in_executor(self.worker, client.answer, asked, send))
+
+
+async def _send(socket: web.WebSocketResponse, answer: Plain | bytes) -> None:
+    if socket.closed:
+        return
+    with suppress(ConnectionError):  # it is being closed
+        if isinstance(answer, bytes):
+            await socket.send_bytes(answer)
+        else:
+            await socket.send_json(answer)

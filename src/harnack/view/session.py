@@ -1,0 +1,367 @@
+"""What Python answers to whoever looks at a live surface, by whatever way the questions come.
+
+A question is {"kind": ..., ...}, plain numbers, lists and text from outside, none of it trusted.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from harnack.distance import curvature
+from harnack.geometry import Ball, Box, HalfSpace
+from harnack.names import did_you_mean
+from harnack.rendering import Camera
+from harnack.rendering.arguments import check_size
+from harnack.rendering.studio.lighting import GROUNDS
+from harnack.tracer import Status, trace
+from harnack.view.painter import Eye, Painted, Painter
+from harnack.view.scene import SHOWS, Live, Moved, paints_of
+from harnack.view.scene_file import STILL_SETTINGS, scene_of
+
+if TYPE_CHECKING:
+    from harnack.backend import FloatArray
+    from harnack.geometry import Volume
+    from harnack.view.painter import Pixels
+    from harnack.view.scene import Plain
+
+__all__ = ["Client", "QuestionError", "Session", "pose_of"]
+
+# Of all curves of a message together, so that no message fills the memory.
+_MOST_POINTS = 20_000
+# Steps of a ray that are drawn.
+_MOST_STEPS = 200
+# Seconds between words about how much is done.
+_TELL_EVERY = 0.1
+_LARGEST_PICTURE = 8192
+
+
+Tell = Callable[[float], None]
+
+
+def _nobody(part: float) -> None:
+    """Nobody is told."""
+
+
+class QuestionError(ValueError):
+    """A question that makes no sense."""
+
+
+class Ended(Exception):
+    """Nobody waits for the answer any more."""
+
+
+class Client:
+    """One client's questions as texts, and the answers as what is sent back."""
+
+    def __init__(self, live: Live) -> None:
+        self.session = Session(live)
+        self.is_gone = False
+        self._ended: set[int] = set()
+
+    def read(self, text: str) -> Plain | None:
+        """The question in a text; None for a "cancel", which is carried out here.
+
+        Raises:
+            QuestionError: it holds none.
+        """
+        try:
+            given = json.loads(text)
+        except (ValueError, RecursionError):
+            raise QuestionError("a question is an object in JSON") from None
+        if not isinstance(given, dict):
+            raise QuestionError("a question is an object")
+        question = cast("Plain", given)
+        if question.get("kind") == "cancel" and type(question.get("which")) is int:
+            self._ended.add(question["which"])
+            return None
+        number = question.get("id")
+        if type(number) is not int or not 0 <= number < 2**32:
+            raise QuestionError("id must be a whole number, by which the answer is known")
+        return question
+
+    def answer(self, question: Plain, send: Callable[[Plain], None]) -> Plain | bytes:
+        """What to send back: an object, or of a picture its number, height and width, four bytes
+        each, the last byte first, and then its pixels: red, green, blue and alpha, row by row.
+
+        send: sends how much is done of what takes long.
+        """
+        number, done, last = question["id"], 0.0, time.monotonic()
+
+        def tell(part: float) -> None:
+            nonlocal done, last
+            if self.is_gone or number in self._ended:
+                raise Ended("stopped, as asked")
+            done, now = done + part, time.monotonic()
+            if now > last + _TELL_EVERY:
+                last = now
+                send({"id": number, "done": done})
+
+        try:
+            tell(0.0)
+            answer = self.session.answer(question, tell)
+        except Exception as wrong:
+            kind = "" if isinstance(wrong, Ended) else f"{type(wrong).__name__}: "
+            return {"id": number, "error": f"{kind}{wrong}"}
+        finally:
+            self._ended.discard(number)
+        if isinstance(answer, dict):
+            return {"id": number, "answer": answer}
+        head = np.array([number, *answer.shape[:2]], dtype="<u4").tobytes()
+        return head + answer.tobytes()
+
+
+class Session:
+    """Answers about what is drawn live."""
+
+    def __init__(self, live: Live) -> None:
+        self.live = live
+        self._painter = Painter()
+        self._painted: tuple[Any, list[Painted]] = (None, [])
+
+    def answer(self, question: Mapping[str, Any], tell: Tell = _nobody) -> Plain | Pixels:
+        """The answer to a question; a picture (h, w, 4) to "draw".
+
+        tell: called during long work with the fraction of it, from 0 to 1, that was finished since
+            the last call; an exception that it raises ends the work.
+
+        Raises:
+            QuestionError: it makes no sense; the message says what does.
+            ValueError, TypeError, ...: what the library says of numbers that make no surface.
+        """
+        kinds = {
+            "change": self._change,
+            "probe": self._probe,
+            "picture": self._picture,
+            "draw": self._draw,
+            "save": self._save,
+            "load": self._load,
+        }
+        kind = question.get("kind")
+        if kind not in kinds:
+            raise QuestionError(f"kind must be one of {', '.join(kinds)}, not {kind!r}")
+        return kinds[kind](question, self.moved(question), tell)
+
+    def moved(self, question: Mapping[str, Any]) -> Moved:
+        """What a person has moved.
+
+        Raises:
+            QuestionError: it makes no sense.
+        """
+        values = self._values(question.get("sliders", {}))
+        return Moved(values, self._loops(question.get("loops")), _volume(question.get("cut")))
+
+    def _values(self, given: Any) -> dict[str, float]:
+        sliders = self.live.subject.sliders
+        if not isinstance(given, dict):
+            raise QuestionError("sliders must be numbers by name")
+        values = dict(self.live.subject.starts)
+        for name, value in cast("dict[str, Any]", given).items():
+            if name not in sliders:
+                raise QuestionError(f"there is no slider {name!r}{did_you_mean(name, sliders)}")
+            one = sliders[name]
+            if not _is_number(value) or not one.low <= value <= one.high:
+                raise QuestionError(
+                    f"{name} must be a number from {one.low:g} to {one.high:g}, not {value!r}"
+                )
+            values[name] = float(value) if one.step is None else one.nearest(value)
+        return values
+
+    def _loops(self, given: Any) -> list[FloatArray] | None:
+        if given is None:
+            return None
+        if not self.live.editable:
+            raise QuestionError("loops: this surface has no curve whose points can be moved")
+        if not isinstance(given, list) or not given:
+            raise QuestionError("loops must be a list of curves")
+        loops = [_points(one, "loops") for one in cast("list[Any]", given)]
+        if sum(map(len, loops)) > _MOST_POINTS:
+            raise QuestionError(f"loops: at most {_MOST_POINTS:,} points")
+        return loops
+
+    def _change(self, question: Mapping[str, Any], moved: Moved, tell: Tell) -> Plain:
+        state = self.live.state(moved)
+        if question.get("checks") is not True:
+            for one in state["surfaces"]:
+                one.pop("check")
+        return state
+
+    def _probe(self, question: Mapping[str, Any], moved: Moved, tell: Tell) -> Plain:
+        """The first hit of a ray of the surfaces' coordinates, and how far each step was proved."""
+        origin = _points([question.get("origin")], "origin")
+        direction = _points([question.get("direction")], "direction")
+        surfaces = [one.surface for one in self.live.drawn(moved)]
+        every = [trace(one, origin, direction) for one in surfaces]
+        nearest = min(range(len(every)), key=lambda k: float(every[k].t[0]))
+        hits, surface = every[nearest], surfaces[nearest]
+        steps = [0.0]
+        for most in range(1, min(int(hits.evaluations[0]), _MOST_STEPS)):
+            reached = trace(replace(surface, max_steps=most), origin, direction).t[0]
+            if steps[-1] < reached < hits.t[0]:
+                steps.append(float(reached))
+        there: Plain = {
+            "status": Status(int(hits.status[0])).name,
+            "evaluations": int(hits.evaluations[0]),
+            "steps": steps,
+        }
+        if not hits.hit[0]:
+            return there
+        point = hits.position
+        there |= {
+            "t": float(hits.t[0]),
+            "position": point[0].tolist(),
+            "normal": hits.normal[0].tolist(),
+            "value": float(surface.field.value(point)[0]),
+        }
+        try:
+            bent = curvature(surface.field, point)
+        except NotImplementedError:
+            return there
+        return there | {"mean": float(bent.mean[0]), "gaussian": float(bent.gaussian[0])}
+
+    def _draw(self, question: Mapping[str, Any], moved: Moved, tell: Tell) -> Pixels:
+        """A picture of one ray a pixel."""
+        size = _size(question)
+        show, ground = question.get("show", "shaded"), question.get("ground", self.live.ground)
+        if show not in SHOWS or ground not in GROUNDS:
+            raise QuestionError(
+                f"show is one of {', '.join(SHOWS)}, ground of {', '.join(GROUNDS)}"
+            )
+        eye = question.get("eye")
+        if not isinstance(eye, dict):
+            raise QuestionError("eye must be an object of origin, right, up, forward and pixel")
+        given = cast("Plain", eye)
+        origin, right, up, forward = (
+            _points([given.get(name)], f"eye: {name}")[0]
+            for name in ("origin", "right", "up", "forward")
+        )
+        pixel: Any = given.get("pixel")
+        if not _is_number(pixel) or not pixel > 0:
+            raise QuestionError("eye: pixel must be a positive number")
+        seen = Eye(origin, right, up, forward, pixel)
+        return self._painter.paint(
+            self._surfaces(moved), seen, size, show=show, ground=ground,
+            rests=question.get("rests") is True,
+        )  # fmt: skip
+
+    def _surfaces(self, moved: Moved) -> list[Painted]:
+        """The surfaces, prepared once as long as only the camera moves."""
+        loops = None if moved.loops is None else [one.tobytes() for one in moved.loops]
+        key = moved.values, loops, moved.cut
+        if self._painted[0] != key:
+            drawn = self.live.drawn(moved)
+            made = [Painted(self.live.placed(one), paints_of(one)) for one in drawn]
+            self._painted = key, made
+        return self._painted[1]
+
+    def _picture(self, question: Mapping[str, Any], moved: Moved, tell: Tell) -> Plain:
+        """A picture of what is seen, as base64 of a PNG file."""
+        size = _size(question)
+        made: Any = self.live.rendered(
+            moved, show=question.get("show", "shaded"), size=size, progress=tell,
+            camera=self._camera(question), spp=question.get("spp"),
+            backdrop=question.get("ground", self.live.ground),
+        )  # fmt: skip
+        return {"png": base64.b64encode(made._repr_png_()).decode()}
+
+    def _camera(self, question: Mapping[str, Any]) -> Camera:
+        """Of a pose on the stage, in the surfaces' coordinates."""
+        place = self.live.placement
+        eye, target, fov = pose_of(question.get("camera"))
+        eye, target = (place.undo(one[None])[0] for one in (eye, target))
+        return Camera(position=tuple(eye.tolist()), target=tuple(target.tolist()), fov=fov)
+
+    def _save(self, question: Mapping[str, Any], moved: Moved, tell: Tell) -> Plain:
+        """What is seen as the text of a scene file, and what of it a text cannot hold."""
+        text, lost = self.live.saved(
+            moved, camera=self._camera(question), show=question.get("show", "shaded"),
+            backdrop=question.get("ground", self.live.ground), up=self.live.up,
+        )  # fmt: skip
+        return {"text": text, "lost": lost}
+
+    def _load(self, question: Mapping[str, Any], moved: Moved, tell: Tell) -> Plain:
+        """Replaces the scene by that of a scene file, and returns it as `Live.scene` does.
+
+        Settings that only still pictures have (`STILL_SETTINGS`) are dropped.
+        """
+        text = question.get("text")
+        if not isinstance(text, str):
+            raise QuestionError("text must be that of a scene file")
+        saved = scene_of(text)
+        settings = {**saved.settings, **saved.sliders}
+        for name in STILL_SETTINGS:
+            settings.pop(name, None)
+        show = settings.get("show")
+        if show not in SHOWS:
+            settings.pop("show", None)
+        self.live = Live.of([*saved.surfaces], settings, edits=True, origins=saved.origins)
+        self._painter, self._painted = Painter(), (None, [])
+        return self.live.scene(self.live.subject.name)
+
+
+def pose_of(given: Any) -> tuple[FloatArray, FloatArray, float]:
+    """Position (3,), target (3,) and field of view, in degrees, of an object that holds them.
+
+    Raises:
+        QuestionError: it does not.
+    """
+    if not isinstance(given, dict):
+        raise QuestionError("camera must be an object of position, target and fov")
+    pose = cast("Plain", given)
+    eye, target = (
+        _points([pose.get(name)], f"camera: {name}")[0] for name in ("position", "target")
+    )
+    fov: Any = pose.get("fov")
+    if not _is_number(fov):
+        raise QuestionError("camera: fov must be a number of degrees")
+    return eye, target, fov
+
+
+def _size(question: Mapping[str, Any]) -> tuple[int, int]:
+    size = check_size(question.get("size"))
+    if max(size) > _LARGEST_PICTURE:
+        raise QuestionError(f"size: at most {_LARGEST_PICTURE} pixels a side")
+    return size
+
+
+def _volume(given: Any) -> Volume | None:
+    """What cuts all surfaces, in their coordinates."""
+    if given is None:
+        return None
+    kinds = {"ball": 4, "box": 6, "plane": 4}
+    about = cast("Plain", given) if isinstance(given, dict) else {}
+    if len(about) != 1 or not set(about) <= set(kinds):
+        raise QuestionError(f"cut is one of {', '.join(kinds)} and its numbers")
+    ((kind, numbers),) = about.items()
+    listed = cast("list[Any]", numbers) if isinstance(numbers, list) else []
+    if len(listed) != kinds[kind] or not all(map(_is_number, listed)):
+        raise QuestionError(f"cut: a {kind} has {kinds[kind]} finite numbers")
+    if kind == "ball":
+        return Ball(tuple(listed[:3]), listed[3])
+    if kind == "box":
+        return Box(tuple(listed[:3]), tuple(listed[3:]))
+    return HalfSpace(tuple(listed[:3]), listed[3])
+
+
+def _points(given: Any, name: str) -> FloatArray:
+    """Points (n, 3) of finite numbers."""
+    wrong = f"{name}: points are three finite numbers each"
+    try:
+        points: FloatArray = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise QuestionError(wrong) from None
+    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+        raise QuestionError(wrong)
+    return points
+
+
+def _is_number(value: Any) -> bool:
+    is_real = isinstance(value, int | float) and not isinstance(value, bool)
+    return is_real and math.isfinite(value)

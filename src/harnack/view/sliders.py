@@ -1,0 +1,135 @@
+"""What is drawn as a function of numbers that a person moves."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, cast
+
+from harnack.backend.numbers import finite
+from harnack.fields import Field
+from harnack.names import did_you_mean
+from harnack.tracer import LevelSet, level_set
+
+__all__ = ["Slider", "Subject"]
+
+
+@dataclass(frozen=True)
+class Slider:
+    """A number between two ends that whoever looks at a page or a view moves.
+
+    low, high: its ends. start: where it stands at first; by default in the middle, or on the whole
+        step before it. step: between neighboring places, counted from `low`; None for none.
+
+    Raises:
+        TypeError: no numbers.
+        ValueError: ends out of order, a start outside of them, or a step that is not positive.
+    """
+
+    low: float
+    high: float
+    start: float | None = None
+    step: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("low", "high", "start", "step"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, finite(getattr(self, name), name))
+        if not self.low < self.high:
+            raise ValueError(f"a slider goes from low to high, not from {self.low} to {self.high}")
+        if self.step is not None and not 0 < self.step <= self.high - self.low:
+            raise ValueError(
+                f"step must be positive and at most {self.high - self.low:g}, not {self.step}"
+            )
+        if self.start is None:
+            object.__setattr__(self, "start", self.nearest(0.5 * (self.low + self.high)))
+        if not self.low <= cast("float", self.start) <= self.high:
+            raise ValueError(f"start must lie between {self.low} and {self.high}: {self.start}")
+
+    def nearest(self, number: float) -> float:
+        """The place that is nearest to a number, and not above it between two steps."""
+        number = min(max(number, self.low), self.high)
+        if self.step is None:
+            return number
+        return self.low + self.step * math.floor((number - self.low) / self.step + 1e-9)
+
+    def places(self, count: int) -> list[float]:
+        """All its places, or `count` places evenly spread where it has no step."""
+        if self.step is None:
+            return [self.low + (self.high - self.low) * k / (count - 1) for k in range(count)]
+        steps = math.floor((self.high - self.low) / self.step + 1e-9)
+        return [self.low + self.step * k for k in range(steps + 1)]
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Fields and settings, of which some are functions of sliders.
+
+    what: what `hk.render` draws in its studio, or a function of sliders that gives it. settings: of
+    `render` and `level_set`; functions likewise. sliders: by their names.
+    """
+
+    what: Any
+    settings: Mapping[str, Any]
+    sliders: Mapping[str, Slider]
+
+    @classmethod
+    def of(cls, what: Any, given: Mapping[str, Any]) -> Subject:
+        """What users give: sliders stand in the place of numbers, or are arguments of functions.
+
+        Raises:
+            TypeError: a function of what is no slider, or a slider that nothing depends on.
+        """
+        sliders = {name: one for name, one in given.items() if isinstance(one, Slider)}
+        known = inspect.signature(level_set).parameters
+        settings = {name: one for name, one in given.items() if name not in sliders}
+        settings |= {name: sliders[name] for name in sliders if name in known}
+        asked: set[str] = set(settings) & set(sliders)
+        for name, one in {"the first argument": what, **settings}.items():
+            if _is_function(one):
+                needs = list(inspect.signature(one).parameters)
+                for argument in needs:
+                    if argument not in sliders:
+                        raise TypeError(
+                            f"{name} is a function of {argument!r}, and there is no such "
+                            f"slider{did_you_mean(argument, sliders)}: give "
+                            f"{argument}=harnack.Slider(...)"
+                        )
+                asked |= set(needs)
+        for name in sliders:
+            if name not in asked:
+                raise TypeError(
+                    f"nothing depends on the slider {name!r}: it is no setting of surfaces, and no "
+                    f"function has an argument of that name{did_you_mean(name, known)}"
+                )
+        return cls(what, settings, sliders)
+
+    @property
+    def starts(self) -> dict[str, float]:
+        """Where the sliders stand at first."""
+        return {name: cast("float", one.start) for name, one in self.sliders.items()}
+
+    @property
+    def name(self) -> str:
+        """What is drawn at first, in words."""
+        what, _ = self.at(self.starts)
+        several: list[Any] = [*what] if isinstance(what, list | tuple) else [what]
+        return ", ".join(repr(getattr(one, "field", one)) for one in several)
+
+    def at(self, values: Mapping[str, float]) -> tuple[Any, dict[str, Any]]:
+        """What is drawn, and its settings, for values of all sliders."""
+        settings = {name: self._at(name, one, values) for name, one in self.settings.items()}
+        return self._at("", self.what, values), settings
+
+    def _at(self, name: str, one: Any, values: Mapping[str, float]) -> Any:
+        if isinstance(one, Slider):
+            return values[name]
+        if not _is_function(one):
+            return one
+        return one(**{argument: values[argument] for argument in inspect.signature(one).parameters})
+
+
+def _is_function(one: Any) -> bool:
+    return callable(one) and not isinstance(one, type | Field | LevelSet)

@@ -1,0 +1,106 @@
+"""A view as a widget of a notebook, by anywidget: Jupyter, VS Code, Colab, marimo."""
+
+from __future__ import annotations
+
+import json
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any, cast
+
+import anywidget
+import traitlets
+
+from harnack.view.page import MODULES, resource, script, still_of
+from harnack.view.scene import SHOWS
+from harnack.view.session import Client, QuestionError, pose_of
+
+if TYPE_CHECKING:
+    from harnack.view.scene import Live, Plain
+
+__all__ = ["Widget"]
+
+_RENDER = "\nexport default { render: ({ model, el }) => widget(Panel, model, el) };\n"
+
+
+class Widget(anywidget.AnyWidget):
+    """A live surface in a notebook, whose attributes follow what a person moves, and move it.
+
+        view = hk.view(field, level=hk.Slider(1, 12))
+        view.observe(lambda change: print(change.new["level"]), names="sliders")
+        view.sliders = {"level": 6.0}
+
+    camera: {"position": (3,), "target": (3,), "fov": degrees} in the surfaces' coordinates, of a
+        picture of 4 : 3. sliders: numbers by name. points: the curves, lists of points (n, 3);
+        those of a `SolidAngle` can be moved. show: one of "shaded", "normal", "depth",
+        "evaluations" and "status". height: of the widget, in pixels.
+
+    Raises traitlets.TraitError for values that make no sense.
+    """
+
+    _esm = script(*MODULES) + _RENDER
+    _css = resource("panel.css")
+    camera: Any = traitlets.Dict().tag(sync=True)
+    sliders: Any = traitlets.Dict().tag(sync=True)
+    points: Any = cast("Any", traitlets.List)().tag(sync=True)
+    show: Any = traitlets.Enum(SHOWS).tag(sync=True)
+    height: Any = traitlets.Int(480).tag(sync=True)
+    _scene: Any = traitlets.Dict().tag(sync=True)
+    _passes: Any = traitlets.Unicode().tag(sync=True)
+    _still: Any = traitlets.Unicode().tag(sync=True)
+
+    def __init__(self, live: Live, title: str, height: int) -> None:
+        self._client = Client(live)
+        # Beside the notebook's own thread, so that a picture can be called off.
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="harnack-widget")
+        scene = live.scene(title)
+        super().__init__(
+            _scene=scene, _passes=resource("passes.wgsl"), height=height, show=live.show,
+            _still=f"data:image/png;base64,{still_of(live)}", points=scene["state"]["curves"],
+            sliders=dict(live.start.values), camera=live.pose,
+        )  # fmt: skip
+        self.on_msg(self._hear)
+
+    def close(self) -> None:
+        """Ends it here and in the page."""
+        self._client.is_gone = True
+        self._worker.shutdown(wait=False, cancel_futures=True)
+        super().close()
+
+    def _hear(self, _: Any, text: Any, __: Any) -> None:
+        try:
+            question = self._client.read(str(text))
+        except QuestionError as wrong:
+            self._say({"id": None, "error": str(wrong)})
+            return
+        if question is not None:
+            self._worker.submit(self._answer, question)
+
+    def _answer(self, question: Plain) -> None:
+        answer = self._client.answer(question, self._say)
+        if isinstance(answer, bytes):
+            self.send({"id": question["id"]}, buffers=[answer])
+        else:
+            self._say(answer)
+
+    def _say(self, answer: Plain) -> None:
+        self.send(answer)
+
+    @traitlets.validate("sliders", "points", "camera")
+    def _checked(self, proposal: Any) -> Any:
+        name, value = proposal["trait"].name, proposal["value"]
+        session = self._client.session
+        try:
+            value = json.loads(json.dumps(value, default=_listed, allow_nan=False))
+            if name == "camera":
+                pose_of(value)
+            elif name == "sliders":
+                value = dict(session.moved({"sliders": {**self.sliders, **value}}).values)
+            elif session.live.editable:
+                session.moved({"loops": value})
+        except (QuestionError, TypeError, ValueError) as wrong:
+            raise traitlets.TraitError(f"{name}: {wrong}") from None
+        return value
+
+
+def _listed(value: Any) -> Any:
+    """NumPy's arrays and numbers as JSON has them."""
+    return value.tolist()

@@ -1,0 +1,190 @@
+"""Scene files: what is written is read again, the same; what is not known is refused by name."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import harnack as hk
+from harnack.cli import main
+from harnack.gallery import SCENES
+from harnack.geometry import shapes
+from harnack.geometry.mesh_shapes import icosphere
+from harnack.view.scene_file import scene_of, text_of
+
+CURVE = hk.SolidAngle(shapes.torus_knot(2, 3, 12))
+SOLIDS = {
+    "sphere": hk.Sphere(1.25),
+    "moved": hk.Torus(1.0, 0.3).moved((1.0, 2.0, 3.0)).rotated(30.0, "x").scaled(2.0),
+    "cut": hk.Sphere(1.0) - hk.Cuboid((0.5, 0.5, 2.0)) | hk.Capsule((0, 0, -1), (0, 0, 1), 0.2),
+    "twisted": hk.Cuboid((0.4, 0.4, 1.0)).twisted(0.5),
+    "tube": hk.Tube(shapes.torus_knot(2, 3, 12), 0.1),
+    "gyroid": hk.Gyroid(0.5, domain=hk.Ball((0.1, 0.0, 0.0), 1.5)),
+    "formula": hk.expression("x^2 + a*y^2 = 1 + z", parameters={"a": 0.1}, level=0.25),
+    "curve": CURVE,
+}
+
+
+@pytest.mark.parametrize("name", SOLIDS)
+def test_fields_come_back_as_they_were(name: str) -> None:
+    field = SOLIDS[name]
+    text = text_of(field, {})
+    saved = scene_of(text)
+    (found,) = saved.surfaces
+    points = np.random.default_rng(1).normal(size=(100, 3))
+    assert isinstance(found, hk.Field)
+    assert np.array_equal(found.value(points), field.value(points), equal_nan=True)
+    assert (found.default_level, found.domain) == (field.default_level, field.domain)
+    assert text_of(saved.surfaces, saved.settings) == text
+
+
+def test_every_scene_of_the_gallery_comes_back() -> None:
+    for name, scene in SCENES.items():
+        surfaces = scene.surfaces()
+        origins = [(one.field, {"scene": name, "number": k}) for k, one in enumerate(surfaces)]
+        settings = scene.settings(len(surfaces))
+        saved = scene_of(text_of(surfaces, settings, origins))
+        assert saved.settings == settings, name
+        for one, other in zip(surfaces, saved.surfaces, strict=True):
+            assert isinstance(other, hk.LevelSet)
+            for part in ("numbers", "clip", "section", "solid", "tolerance", "largest"):
+                assert getattr(one, part) == getattr(other, part), (name, part)
+
+
+def test_settings_and_sliders_come_back(tmp_path: Path) -> None:
+    settings: dict[str, Any] = {
+        "clip": hk.Ball((0, 0, 0), 2.0), "section": hk.HalfSpace((1.0, 0.0, 0.0), 0.5),
+        "tolerance": 1e-3, "material": ["gold"], "backdrop": "dark", "up": "y", "boundary": 0.05,
+        "camera": hk.Camera(position=(3.0, 2.0, 1.0), target=(0.0, 0.0, 0.0), fov=30.0),
+        "isolines": [hk.Isolines("x*y", spacing=0.25, color="navy")],
+    }  # fmt: skip
+    path = tmp_path / "a.json"
+    hk.write_scene(path, CURVE, level=hk.Slider(1.0, 12.0, 5.0), **settings)
+    saved = hk.read_scene(path)
+    assert saved.sliders == {"level": hk.Slider(1.0, 12.0, 5.0)}
+    isolines = saved.settings["isolines"]
+    assert [(one.of, one.spacing, one.color) for one in isolines] == [("x*y", 0.25, "navy")]
+    kept = {name: one for name, one in saved.settings.items() if name != "isolines"}
+    assert kept == {name: one for name, one in settings.items() if name != "isolines"} | {
+        "level": 5.0
+    }
+    surface = hk.level_set(hk.Gyroid(0.5), solid=(-np.inf, 0.1), clip=hk.Ball())
+    (found,) = scene_of(text_of([surface], {})).surfaces
+    assert isinstance(found, hk.LevelSet)
+    assert (found.solid, found.clip) == (surface.solid, surface.clip)
+
+
+def test_a_file_is_found_beside_the_scene(tmp_path: Path) -> None:
+    path = tmp_path / "curve.loops"
+    path.write_text(" ".join(map(str, shapes.wavy_polygon(8).ravel().tolist())))
+    about: Any = {"harnack": 1, "surfaces": [{"field": {"file": "curve.loops"}, "level": 2.0}]}
+    (tmp_path / "a.json").write_text(json.dumps(about))
+    saved = hk.read_scene(tmp_path / "a.json")
+    (one,) = saved.surfaces
+    assert isinstance(one, hk.LevelSet)
+    assert isinstance(one.field, hk.SolidAngle)
+    assert json.loads(text_of(saved.surfaces, {}, saved.origins))["surfaces"][0]["level"] == 2.0
+    with pytest.raises(hk.SceneFileError, match="must not name files"):
+        scene_of(json.dumps(about))
+
+
+# Texts that are no scenes, and fields, surfaces and other parts of scenes that are none.
+WRONG = {
+    "": "no JSON",
+    "[" * 100_000: "no JSON",
+    '{"harnack": NaN}': "NaN is no number",
+    "[]": "must be an object",
+    "{}": 'must say "harnack": 1',
+    '{"harnack": 2, "surfaces": []}': 'must say "harnack": 1',
+    '{"harnack": 1, "surfaces": []}': "one surface at least",
+    '{"harnack": 1, "surfaces": [3]}': "must be an object",
+    '{"harnack": 1, "surfaces": [{}]}': r"surfaces\[0\] has no field",
+}
+WRONG_FIELDS = {
+    '{"Spere": {}}': 'mean "Sphere"',
+    '{"Sphere": {"radus": 1}}': 'mean "radius"',
+    '{"Sphere": {"radius": -1}}': "radius",
+    '{"Sphere": {"radius": "x"}}': "radius",
+    '{"Sphere": {}, "Torus": {}}': "write one name",
+    '{"Ball": {}}': "this is no field",
+    '{"Molecule": {"source": "/etc/hosts"}}': "no kind",
+    '{"expression": {"function": "x"}}': "no kind",
+    '{"scene": "gyroit"}': 'mean "gyroid"',
+    '{"scene": "gyroid", "number": 9}': "no number 9",
+    '{"scene": "gyroid", "path": 9}': "no part of a field",
+    '{"file": "a.ply"}': "must not name files",
+    """{"formula": "__import__('os')"}""": "no formula",
+    '{"formula": 3}': "a formula is a text",
+    '{"formula": "x=1", "parameters": {"a": 1}}': "no parameter 'a'",
+    '{"curves": [[1, 2]]}': "surfaces",
+    '{"curves": [], "level": 1}': "nothing",
+    '{"Sphere": {}}, "levle": 1': 'mean "level"',
+    '{"Sphere": {}}, "level": "x"': "level",
+}
+WRONG_PARTS = {
+    '"a": 1': "no part 'a'",
+    '"settings": {"path": "/a"}': "no setting 'path'",
+    '"settings": {"camera": {"eye": 1}}': "no argument of Camera",
+    '"settings": {"camera": 3}': "must be an object",
+    '"sliders": {"level": {"low": 1}}': "sliders: level",
+    '"sliders": {"material": {"low": 1, "high": 2}}': "no slider",
+}
+WHOLE = '{"harnack": 1, "surfaces": [{"field": %s}]}'
+
+
+@pytest.mark.parametrize(
+    ("text", "wrong"),
+    [
+        *WRONG.items(),
+        *((WHOLE % field, wrong) for field, wrong in WRONG_FIELDS.items()),
+        *(
+            (WHOLE[:-1] % '{"Sphere": {}}' + f", {part}}}", one)
+            for part, one in WRONG_PARTS.items()
+        ),
+    ],
+)
+def test_what_is_not_known_is_refused(text: str, wrong: str) -> None:
+    with pytest.raises(hk.SceneFileError, match=wrong):
+        scene_of(text)
+
+
+def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
+    mesh = hk.WindingNumber(*icosphere(1))
+    with pytest.raises(hk.SceneFileError, match="a WindingNumber that was made in Python"):
+        hk.write_scene(tmp_path / "a.json", mesh)
+    with pytest.raises(hk.SceneFileError, match="Expression that was made in Python"):
+        hk.write_scene(tmp_path / "a.json", hk.expression(lambda x, y, z: x * y - z))
+    with pytest.raises(hk.SceneFileError, match="no setting 'levle'"):
+        hk.write_scene(tmp_path / "a.json", CURVE, levle=1.0)
+    with pytest.raises(hk.SceneFileError, match=r"written as \.json"):
+        hk.write_scene(tmp_path / "a.txt", CURVE)
+    with pytest.raises(hk.SceneFileError, match="only those of a formula as text"):
+        hk.write_scene(
+            tmp_path / "a.json", CURVE, isolines=hk.Isolines(hk.Sphere(1.0), spacing=1.0)
+        )
+    with pytest.raises(hk.SceneFileError, match="material"):
+        hk.write_scene(tmp_path / "a.json", CURVE, material={"type": "diffuse"})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_every_command_reads_a_scene_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, picture = str(tmp_path / "a.json"), tmp_path / "a.png"
+    hk.write_scene(
+        path, hk.Torus(1.0, 0.3), level=hk.Slider(-0.1, 0.1), backdrop="dark", show="normal"
+    )
+    small = ["--size", "32x24", "--quiet"]
+    assert main(["render", path, "-o", str(picture), *small]) == 0
+    assert main(["render", path, "-o", str(tmp_path / "b.png"), "--azimuth", "90", *small]) == 0
+    assert main(["mesh", path, "-o", str(tmp_path / "a.stl"), "--spacing", "0.2", "--quiet"]) == 0
+    assert main(["page", path, "-o", str(tmp_path / "a.html"), "--quiet"]) == 0
+    assert '"name": "level", "low": -0.1' in (tmp_path / "a.html").read_text()
+    assert len(list(tmp_path.iterdir())) == 5
+    (tmp_path / "b.json").write_text("{}")
+    assert main(["render", str(tmp_path / "b.json")]) == 1
+    assert '"harnack": 1' in capsys.readouterr().err

@@ -1,0 +1,226 @@
+"""What Python answers to a live surface: right numbers, and why a question makes no sense."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+
+import harnack as hk
+from harnack.geometry import shapes
+from harnack.view.scene import Live
+from harnack.view.session import Client, QuestionError, Session
+
+LOOP = shapes.torus_knot(2, 3, 18)
+FIELD = hk.SolidAngle(LOOP)
+EYE = {
+    "origin": [0, -6, 0.3], "right": [1, 0, 0], "up": [0, 0, 1], "forward": [0, 1, 0],
+    "pixel": 0.008,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def live() -> Live:
+    return Live.of(FIELD, {"level": hk.Slider(1.0, 12.0, 6.0)}, edits=True)
+
+
+def compiled(session: Session, questions: list[dict[str, Any]]) -> set[str]:
+    """The shaders of all answers, which the browser compiles, each of them once."""
+    every = [session.answer({"kind": "change", **one})["surfaces"] for one in questions]
+    return {surface["key"] for surfaces in every for surface in surfaces}
+
+
+def test_nothing_is_compiled_for_sliders_and_points(live: Live) -> None:
+    rng = np.random.default_rng(0)
+    questions: list[dict[str, Any]] = [{}]
+    for k in range(4):
+        loop = LOOP + 0.05 * rng.normal(size=LOOP.shape)
+        questions.append({"sliders": {"level": 2.0 + k}, "loops": [loop.tolist()]})
+    assert len(compiled(Session(live), questions)) == 1
+
+
+NUMBERS: dict[str, tuple[Any, dict[str, Any]]] = {
+    "radius": (lambda a: hk.Torus(1.0, a), {}),
+    "thickness": (hk.Gyroid(0.5, domain=hk.Ball()), {"solid": lambda a: (-a, a)}),
+    "clip": (hk.Gyroid(0.5), {"clip": lambda a: hk.Ball(radius=1 + a)}),
+    "section": (
+        hk.Torus(1.0, 0.3), {"section": lambda a: hk.HalfSpace((1.0, 0.0, 0.0), a)}
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_nothing_is_compiled_for_numbers_of_surfaces(name: str) -> None:
+    what, settings = NUMBERS[name]
+    session = Session(Live.of(what, {**settings, "a": hk.Slider(0.1, 0.5)}))
+    questions = [{"sliders": {"a": one}} for one in (0.1, 0.23, 0.5)]
+    assert len(compiled(session, questions)) == 1
+
+
+def test_nothing_is_compiled_by_python_either(live: Live) -> None:
+    session = Session(live)
+    asked = {"kind": "draw", "size": (64, 48), "eye": EYE}
+    session.answer({**asked, "loops": [LOOP.tolist()]})
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        for k in range(3):
+            session.answer({**asked, "sliders": {"level": 2.0 + k}, "loops": [(LOOP + k).tolist()]})
+        history = dr.kernel_history()
+    kernels = [one for one in history if one["type"] == dr.KernelType.JIT]
+    assert kernels
+    assert all(one["cache_hit"] for one in kernels)
+
+
+def test_a_drawn_picture_is_that_of_render(live: Live) -> None:
+    session = Session(live)
+    size = (64, 48)
+    asked = {"kind": "draw", "size": size, "eye": EYE, "show": "normal"}
+    drawn = session.answer(asked)
+    assert drawn.shape == (48, 64, 4)
+    assert 0.05 < (np.ptp(drawn[..., :3].astype(int), axis=2) > 8).mean() < 0.9
+    again = session.answer({**asked, "sliders": {"level": 3.0}})
+    assert (again != drawn).any()
+
+
+def test_a_probe_says_what_is_there(live: Live) -> None:
+    asked = {"kind": "probe", "origin": [0.3, 0.2, 5], "direction": [0, 0, -1]}
+    found = Session(live).answer(asked)
+    hit = hk.trace(FIELD, [[0.3, 0.2, 5]], [[0, 0, -1]], level=6.0)
+    assert found["status"] == "HIT"
+    assert found["t"] == pytest.approx(float(hit.t[0]), abs=2e-3)
+    assert np.allclose(found["position"], hit.position[0], atol=2e-3)
+    assert (np.diff(found["steps"]) > 0).all()
+    assert found["steps"][-1] < found["t"]
+    bent = hk.curvature(FIELD, hit.position)
+    assert found["mean"] == pytest.approx(float(bent.mean[0]), rel=0.05)
+    missed = Session(live).answer({**asked, "direction": [0, 0, 1]})
+    assert (missed["status"], "t" in missed) == ("MISS", False)
+
+
+@pytest.mark.parametrize("cut", [{"ball": [0, 0, 0, 0.9]}, {"box": [-1, -1, -1, 1, 1, 0.1]},
+                                 {"plane": [0, 0, 1, 0.05]}])  # fmt: skip
+def test_a_cut_leaves_what_clip_leaves(cut: dict[str, Any], live: Live) -> None:
+    volumes = {
+        "ball": hk.Ball(radius=0.9), "box": hk.Box((-1, -1, -1), (1, 1, 0.1)),
+        "plane": hk.HalfSpace((0, 0, 1.0), 0.05),
+    }  # fmt: skip
+    (kind,) = cut
+    session = Session(live)
+    for x, y in np.random.default_rng(3).uniform(-1, 1, (5, 2)):
+        asked = {"kind": "probe", "origin": [x, y, 5], "direction": [0, 0, -1], "cut": cut}
+        found = session.answer(asked)
+        hit = hk.trace(FIELD, [[x, y, 5]], [[0, 0, -1]], level=6.0, clip=volumes[kind])
+        assert ("t" in found) == bool(hit.hit[0])
+        if "t" in found:
+            assert found["t"] == pytest.approx(float(hit.t[0]), abs=2e-3)
+
+
+def test_what_is_saved_can_be_opened(live: Live) -> None:
+    session = Session(live)
+    pose = {"position": [0, -5, 1], "target": [0, 0, 0], "fov": 30}
+    moved = (LOOP + 0.1).tolist()
+    asked = {
+        "kind": "save",
+        "camera": pose,
+        "sliders": {"level": 4.0},
+        "loops": [moved],
+        "show": "depth",
+    }
+    saved = session.answer(asked)
+    assert saved["lost"] == []
+    scene = session.answer({"kind": "load", "text": saved["text"]})
+    assert scene["show"] == "depth"
+    assert scene["sliders"][0]["start"] == 4.0
+    assert np.allclose(scene["state"]["curves"], [moved])
+    eye = np.array(scene["camera"]["target"])
+    assert np.isfinite(eye).all()
+    cut = session.answer({**asked, "loops": None, "cut": {"ball": [0, 0, 0, 1]}})
+    assert cut["lost"] == ["level"]
+    assert '"Ball"' in cut["text"]
+    text = '{"harnack": 1, "surfaces": [{"field": {"file": "/etc/hosts"}}]}'
+    with pytest.raises(hk.SceneFileError, match="must not name files"):
+        session.answer({"kind": "load", "text": text})
+
+
+@pytest.mark.parametrize(
+    ("question", "wrong"),
+    [
+        ({}, "kind must be one of"),
+        ({"kind": "eval"}, "kind must be one of"),
+        ({"kind": "change", "sliders": 3}, "numbers by name"),
+        ({"kind": "change", "sliders": {"levle": 3}}, 'mean "level"'),
+        ({"kind": "change", "sliders": {"level": 99}}, "from 1 to 12"),
+        ({"kind": "change", "sliders": {"level": True}}, "from 1 to 12"),
+        ({"kind": "change", "sliders": {"level": float("nan")}}, "from 1 to 12"),
+        ({"kind": "change", "loops": []}, "a list of curves"),
+        ({"kind": "change", "loops": [[[0, 0], [1, 1]]]}, "three finite numbers"),
+        ({"kind": "change", "loops": [[[0, 0, "x"]]]}, "three finite numbers"),
+        ({"kind": "change", "loops": [[[0, 0, 0]] * 30_000]}, "at most 20,000"),
+        ({"kind": "change", "cut": {"ball": [0, 0, 0]}}, "4 finite numbers"),
+        ({"kind": "change", "cut": {"cone": [0]}}, "one of ball, box, plane"),
+        ({"kind": "change", "cut": {"ball": [0, 0, 0, -1]}}, "radius"),
+        ({"kind": "probe"}, "origin"),
+        ({"kind": "draw", "size": [99_999, 9]}, "at most 8192|each side"),
+        ({"kind": "draw", "size": [64, 48]}, "eye must be"),
+        ({"kind": "draw", "size": [64, 48], "show": "x", "eye": EYE}, "show is one of"),
+        ({"kind": "draw", "size": [64, 48], "eye": {**EYE, "pixel": 0}}, "pixel must be"),
+        ({"kind": "picture", "size": [64, 48]}, "camera must be"),
+        ({"kind": "load"}, "text must be"),
+    ],
+)
+def test_questions_that_make_no_sense(question: Any, wrong: str, live: Live) -> None:
+    with pytest.raises((QuestionError, ValueError, TypeError), match=wrong):
+        Session(live).answer(question)
+
+
+def test_texts_that_are_no_questions(live: Live) -> None:
+    client = Client(live)
+    for text in (
+        "",
+        "[]",
+        "3",
+        "{",
+        "[" * 9999,
+        '{"kind": "change"}',
+        '{"id": -1}',
+        '{"id": true}',
+    ):
+        with pytest.raises(QuestionError):
+            client.read(text)
+    question = client.read('{"id": 1, "kind": "none"}')
+    assert question is not None
+    said = client.answer(question, lambda part: None)
+    assert isinstance(said, dict)
+    assert said["error"].startswith("QuestionError: kind")
+
+
+def test_a_picture_can_be_called_off(live: Live) -> None:
+    client, said = Client(live), []
+    pose = {"position": [0, -5, 1], "target": [0, 0, 0], "fov": 30}
+    text = json.dumps({"id": 7, "kind": "picture", "camera": pose, "size": [64, 48]})
+    question = client.read(text)
+    assert question is not None
+    assert client.read('{"kind": "cancel", "which": 7}') is None
+    assert client.answer(question, said.append) == {"id": 7, "error": "stopped, as asked"}
+    done = client.answer(question, said.append)
+    assert isinstance(done, dict)
+    assert done["answer"]["png"].startswith("iVBOR")
+    client.is_gone = True
+    assert "error" in client.answer(question, said.append)
+
+
+def test_the_floor_hides_nothing_that_moves_below_it() -> None:
+    """The floor stands where the surface did at first, and hid what a slider moved."""
+    ball = Live.of(lambda z: hk.Sphere(0.5).moved((0, 0, z)), {"z": hk.Slider(-1.0, 0.0, 0.0)})
+    session = Session(ball)
+    eye = {**EYE, "origin": [0, -6, 0.8], "pixel": 0.02}
+    asked = {"kind": "draw", "size": (64, 64), "eye": eye, "rests": True}
+    parts: list[float] = []
+    for z in (0.0, -1.0):
+        drawn = session.answer({**asked, "sliders": {"z": z}})
+        parts.append((np.ptp(drawn[..., :3].astype(int), axis=2) > 40).mean())
+    assert parts[0] > 0.01
+    assert parts[1] == pytest.approx(parts[0], rel=0.3)
