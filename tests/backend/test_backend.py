@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import functools
+import importlib
 import os
 import subprocess
 import sys
+import types
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +21,9 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 import harnack.backend as hb
-from harnack.backend import doctor, llvm
+from harnack.backend import arrays, doctor, llvm
 from harnack.backend.basis import across, across_rows
+from harnack.rendering.mitsuba.variant import load_mitsuba
 
 ELF_WITH_SONAME = b"\x7fELF...\0libc.so.6\0%s\0LLVMCreateMessage\0"
 
@@ -278,8 +282,72 @@ def test_forced_backend(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.skipif(dr.has_backend(dr.JitBackend.CUDA), reason="there is a CUDA device")
 def test_forced_cuda_without_a_device(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HARNACK_BACKEND", "cuda")
-    with pytest.raises(RuntimeError, match="no usable CUDA device"):
+    with pytest.raises(RuntimeError, match=r"HARNACK_BACKEND=cuda.*no usable device"):
         hb.choose_backend()
+
+
+@pytest.fixture
+def metal(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """A stand-in for Dr.Jit on a Mac: the types of LLVM under Metal's name."""
+    module = types.SimpleNamespace(**vars(importlib.import_module("drjit.llvm.ad")))
+    monkeypatch.setitem(sys.modules, "drjit.metal.ad", module)
+    monkeypatch.setattr(dr, "has_backend", lambda kind: kind != dr.JitBackend.CUDA)
+    monkeypatch.delenv("HARNACK_BACKEND", raising=False)
+    arrays._backend.cache_clear()
+    yield module
+    arrays._backend.cache_clear()
+
+
+def test_metal_is_taken_for_single_precision(metal: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert hb.choose_backend().name == "metal"
+    assert hb.choose_backend("double").name == "llvm"
+    monkeypatch.setenv("HARNACK_BACKEND", "metal")
+    assert [hb.choose_backend(one).name for one in ("single", "double")] == ["metal", "llvm"]
+    monkeypatch.setenv("HARNACK_BACKEND", "llvm")
+    assert hb.choose_backend().name == "llvm"
+    monkeypatch.setenv("HARNACK_BACKEND", "metal")
+    monkeypatch.setattr(dr, "has_backend", lambda kind: kind == dr.JitBackend.LLVM)
+    with pytest.raises(RuntimeError, match=r"HARNACK_BACKEND=metal.*macOS"):
+        hb.choose_backend()
+
+
+def test_metal_needs_no_llvm(metal: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing() -> None:
+        raise hb.LLVMNotFoundError("there is none")
+
+    monkeypatch.setattr(arrays, "ensure_llvm", missing)
+    assert hb.choose_backend().name == "metal"
+    with pytest.raises(hb.LLVMNotFoundError):
+        hb.choose_backend("double")
+
+
+@pytest.mark.parametrize("what", ["infinities", "NaN", "quotients"])
+def test_a_metal_that_computes_otherwise_is_not_believed(
+    what: str, metal: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As compilers do that take infinities and NaN for impossible."""
+    right = arrays.to_numpy
+
+    def wrong(array: Any) -> Any:
+        found = right(array).copy()
+        if what == "infinities":
+            found[np.isinf(found)] = 3e38
+        elif what == "NaN":
+            found[np.isnan(found)] = 0
+        else:
+            found[1] *= 1 + 1e-6
+        return found
+
+    monkeypatch.setattr(arrays, "to_numpy", wrong)
+    with pytest.raises(RuntimeError, match=r"does not compute .* as IEEE 754 says.*llvm"):
+        hb.choose_backend()
+
+
+def test_metal_is_named_where_mitsuba_lacks_it(metal: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    stand_in = types.SimpleNamespace(variant=lambda: None, variants=lambda: ["llvm_ad_rgb"])
+    monkeypatch.setitem(sys.modules, "mitsuba", stand_in)
+    with pytest.raises(RuntimeError, match=r"no variant metal_ad_rgb.*HARNACK_BACKEND=llvm"):
+        load_mitsuba()
 
 
 def test_unknown_precision() -> None:

@@ -25,7 +25,7 @@ Vec3: TypeAlias = Any  #: Dr.Jit 3-vector, one a lane
 Index: TypeAlias = Any  #: Dr.Jit integer array
 Mask: TypeAlias = Any  #: Dr.Jit Boolean array
 
-BackendName: TypeAlias = Literal["llvm", "cuda"]
+BackendName: TypeAlias = Literal["llvm", "cuda", "metal"]
 Precision: TypeAlias = Literal["single", "double"]
 
 BACKEND_VARIABLE = "HARNACK_BACKEND"
@@ -36,7 +36,7 @@ _ALIGNMENT = 64  # bytes: the widest vectors of any processor
 class Backend:
     """The Dr.Jit types of one backend and precision. All of them carry derivatives.
 
-    name: "llvm" (CPU) or "cuda" (NVIDIA GPU).
+    name: "llvm" (CPU), "cuda" (NVIDIA GPU) or "metal" (Apple GPU, single precision alone).
     precision: "single" or "double": of Float and of the vectors' components.
     """
 
@@ -75,7 +75,7 @@ def _backend(name: BackendName, precision: Precision) -> Backend:
     def real(stem: str) -> Any:
         return getattr(module, stem + suffix)
 
-    return Backend(
+    backend = Backend(
         name=name,
         precision=precision,
         Float=real("Float"),
@@ -87,33 +87,70 @@ def _backend(name: BackendName, precision: Precision) -> Backend:
         Array4f=real("Array4f"),
         ArrayXf=real("ArrayXf"),
     )
+    if name == "metal":
+        _check_arithmetic(backend)
+    return backend
+
+
+def _check_arithmetic(backend: Backend) -> None:
+    """Metal's compiler may, by default, treat infinities and NaN as if there were none, and round
+    otherwise; proofs rest on both. So a device is asked before it is believed.
+
+    Raises:
+        RuntimeError: it computes otherwise than IEEE 754 says.
+    """
+    given = np.array([1, 3, 0, -0.0, 1e-30, 3e38, np.inf, np.nan, 0.1, 16777216], np.float32)
+    x, one = aligned(backend, given), dr.opaque(backend.Float, 1)
+    unit = np.float32(1)
+    with np.errstate(all="ignore"):
+        # A quotient and a root may be two units off: bounds take more into account.
+        cases: dict[str, tuple[Any, Any, int]] = {
+            "1 / x": (one / x, unit / given, 2), "sqrt(x)": (dr.sqrt(x), np.sqrt(given), 2),
+            "x - x": (x - x, given - given, 0), "x + 1": (x + one, given + unit, 0),
+            "2 x": (2 * one * x, 2 * given, 0),
+            "x == x": (dr.select(x == x, one, 0), (given == given).astype(np.float32), 0),
+        }  # fmt: skip
+        for what, (computed, right, units) in cases.items():
+            found = to_numpy(computed)
+            near = np.abs(found - right) <= units * np.spacing(np.abs(right))
+            same = (found == right) | (np.isnan(found) & np.isnan(right))
+            if not (near | same).all():
+                raise RuntimeError(
+                    f"Dr.Jit's {backend.name} device does not compute {what} as IEEE 754 says, on "
+                    f"which proofs rest: set {BACKEND_VARIABLE}=llvm to compute on the CPU"
+                )
 
 
 def choose_backend(precision: Precision = "single") -> Backend:
-    """The backend to compute on: CUDA if there is a usable device, else LLVM.
+    """The backend to compute on: CUDA if there is a usable device, Metal for single precision if
+    there is one, else LLVM.
 
-    The environment variable HARNACK_BACKEND ("llvm" or "cuda") forces one.
+    The environment variable HARNACK_BACKEND ("llvm", "cuda" or "metal") forces one. Metal knows no
+    double precision, which stays on LLVM.
 
     Raises:
         ValueError: unknown precision, or unknown name in HARNACK_BACKEND.
         LLVMNotFoundError: LLVM is wanted and there is none that Dr.Jit can work with.
-        RuntimeError: CUDA is forced and no device is usable.
+        RuntimeError: CUDA or Metal is forced and no device is usable, or Metal's computes wrongly.
     """
     if precision not in ("single", "double"):
         raise ValueError(f'precision is "single" or "double", not {precision!r}')
     forced = os.environ.get(BACKEND_VARIABLE, "")
-    if forced not in ("", "llvm", "cuda"):
+    if forced not in ("", "llvm", *_DEVICES):
         raise ValueError(
-            f'{BACKEND_VARIABLE} is {forced!r}; set it to "llvm" or "cuda", or unset it'
+            f'{BACKEND_VARIABLE} is {forced!r}; set it to "llvm", "cuda" or "metal", or unset it'
         )
-    has_cuda = forced != "llvm" and dr.has_backend(dr.JitBackend.CUDA)
-    if forced == "cuda" and not has_cuda:
-        raise RuntimeError(
-            f"{BACKEND_VARIABLE}=cuda, but Dr.Jit finds no usable CUDA device: check that "
-            f"nvidia-smi lists one, or unset {BACKEND_VARIABLE}"
-        )
-    if has_cuda:
-        return _backend("cuda", precision)
+    for name, (kind, advice) in _DEVICES.items():
+        if forced not in ("", name):
+            continue
+        if dr.has_backend(kind):
+            if name != "metal" or precision == "single":
+                return _backend(name, precision)
+        elif forced:
+            raise RuntimeError(
+                f"{BACKEND_VARIABLE}={name}, but Dr.Jit finds no usable device for it: {advice}, "
+                f"or unset {BACKEND_VARIABLE}"
+            )
     return _backend("llvm", precision)
 
 
@@ -136,7 +173,8 @@ def backend_of(array: Any) -> Backend:
     if name is None:
         raise TypeError(
             f"{full_name} belongs to Dr.Jit's scalar mode: use the types of "
-            'drjit.llvm.ad or drjit.cuda.ad (in Mitsuba, a variant such as "llvm_ad_rgb")'
+            "drjit.llvm.ad, drjit.cuda.ad or drjit.metal.ad (in Mitsuba, a variant such as "
+            '"llvm_ad_rgb")'
         )
     if dr.is_special_v(kind) or dr.is_tensor_v(kind) or dr.depth_v(kind) > 2:
         raise TypeError(f"expected a Dr.Jit scalar or vector array, got {full_name}")
@@ -150,7 +188,14 @@ def _type_of(value: object) -> Any:
     return type(value)
 
 
-_NAMES: dict[Any, BackendName] = {dr.JitBackend.LLVM: "llvm", dr.JitBackend.CUDA: "cuda"}
+# Devices in the order in which they are taken, and what to do where there is none.
+_DEVICES: dict[BackendName, tuple[Any, str]] = {
+    "cuda": (dr.JitBackend.CUDA, "check that nvidia-smi lists one"),
+    "metal": (dr.JitBackend.Metal, "it is for Macs with macOS 14 or later"),
+}
+_NAMES: dict[Any, BackendName] = {
+    dr.JitBackend.LLVM: "llvm", **{kind: name for name, (kind, _) in _DEVICES.items()}
+}  # fmt: skip
 _PRECISIONS: dict[Any, Precision] = {
     dr.VarType.Float32: "single",
     dr.VarType.Float64: "double",

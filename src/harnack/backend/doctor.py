@@ -8,6 +8,7 @@ import platform
 import subprocess
 import sys
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 from rich.console import Console
@@ -50,7 +51,8 @@ def report() -> tuple[Finding, ...]:
         Finding("Python", f"{platform.python_version()} at {sys.executable}"),
         Finding("system", f"{platform.platform()}, {os.cpu_count()} cores"),
         *(_package(name) for name in _PACKAGES),
-        _cuda(),
+        _device("CUDA", dr.JitBackend.CUDA),
+        _device("Metal", dr.JitBackend.Metal),
         *_llvm(),
     ]
     backend = _backend()
@@ -67,10 +69,10 @@ def _package(name: str) -> Finding:
         return Finding(name, "not installed", ok=False, advice=f"pip install {name}")
 
 
-def _cuda() -> Finding:
-    if dr.has_backend(dr.JitBackend.CUDA):
-        return Finding("CUDA", "a usable device")
-    return Finding("CUDA", "no usable device (none is needed)")
+def _device(name: str, kind: Any) -> Finding:
+    if dr.has_backend(kind):
+        return Finding(name, "a usable device")
+    return Finding(name, "no usable device (none is needed)")
 
 
 def _llvm() -> list[Finding]:
