@@ -14,7 +14,8 @@ from typing import Any
 import drjit as dr
 
 from harnack.backend.arrays import Backend
-from harnack.enclosures import Band, Enclosure, Slopes, TargetLevels
+from harnack.enclosures import Enclosure, Slopes, TargetLevels
+from harnack.enclosures.literature import Band
 
 _DEPTH, _MOST = 48, 2000
 

@@ -21,7 +21,8 @@ import harnack as hk
 from harnack.arithmetic import clipped_power
 from harnack.backend.extrema import clamp, fmax, fmin
 from harnack.backend.records import Records
-from harnack.enclosures import Piece, Slopes
+from harnack.enclosures import Slopes
+from harnack.enclosures.restriction import Piece
 from harnack.fields.blobs.kernels import Compact
 from harnack.fields.formula import Formula, FormulaAlong
 

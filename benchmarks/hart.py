@@ -18,7 +18,8 @@ import numpy as np
 
 import harnack as hk
 from harnack.backend import choose_backend, to_vector3
-from harnack.enclosures import Lipschitz, Parabola, Slopes
+from harnack.enclosures import Lipschitz, Slopes
+from harnack.enclosures.parabola import Parabola
 from harnack.fields.formula import Formula
 
 _WIDTH, _FAR, _NEAR, _MOST = 96, 40.0, 1e-4, 600

@@ -11,7 +11,8 @@ import numpy as np
 
 import harnack as hk
 from harnack.backend import choose_backend, to_float, to_vector3
-from harnack.enclosures import AffineBand, BottomUpLinear, Enclosure
+from harnack.enclosures import Enclosure
+from harnack.enclosures.literature import AffineBand, BottomUpLinear
 
 from .bisection import bisect
 from .blobs import BlobFormula, Scene

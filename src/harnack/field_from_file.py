@@ -8,15 +8,13 @@ from pathlib import Path
 from typing import Literal
 
 from harnack.backend import FloatArray
-from harnack.fields import (
-    Blobs,
-    DipolePotential,
-    Field,
-    Molecule,
-    PolygonMesh,
-    SolidAngle,
-    WindingNumber,
-)
+from harnack.fields import Field
+from harnack.fields.blobs.blobs import Blobs
+from harnack.fields.blobs.molecule import Molecule
+from harnack.fields.curves.polygon_mesh import PolygonMesh
+from harnack.fields.curves.solid_angle import SolidAngle
+from harnack.fields.winding.dipole import DipolePotential
+from harnack.fields.winding.winding_number import WindingNumber
 from harnack.files import (
     Atoms,
     ClosedCurves,

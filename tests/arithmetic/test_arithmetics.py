@@ -26,14 +26,13 @@ from harnack.arithmetic import (
     tanh,
 )
 from harnack.backend import choose_backend, to_float, to_vector3
-from harnack.enclosures import (
+from harnack.enclosures import Gaps, Slopes
+from harnack.enclosures.literature import (
     AffineBand,
     BottomUpLinear,
     BottomUpQuadratic,
-    Gaps,
     IntervalRange,
     Mixed,
-    Slopes,
 )
 from harnack.fields.formula import FormulaAlong
 

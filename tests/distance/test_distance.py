@@ -18,7 +18,11 @@ import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.distance import batches, closest_points, curvature, signed_distance
 from harnack.distance.tangent import second_order
-from harnack.enclosures import Caps, Classic, Cone, Enclosure, Slope, Taylor
+from harnack.enclosures import Enclosure
+from harnack.enclosures.balls.caps import Caps
+from harnack.enclosures.balls.classic import Classic
+from harnack.enclosures.balls.slope import Slope
+from harnack.enclosures.parabola import Cone, Taylor
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.geometry import shapes
 from harnack.testing.cases import BallCase, Case, CurvatureCase, LipschitzCase

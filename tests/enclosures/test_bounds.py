@@ -11,23 +11,23 @@ import pytest
 from harnack.backend import choose_backend, to_numpy
 from harnack.backend.arrays import aligned
 from harnack.enclosures import (
-    Ball,
-    Caps,
-    Classic,
-    Cone,
+    Curvature,
     Enclosure,
     Gaps,
-    GreenBall,
-    Parabola,
-    Slope,
+    HarmonicBall,
+    Lipschitz,
     Slopes,
     TargetLevels,
-    Taylor,
     any_covers,
     choose_proofs,
     longest_step,
 )
-from harnack.fields import Curvature, HarmonicBall, Lipschitz
+from harnack.enclosures.balls.ball import Ball
+from harnack.enclosures.balls.bounded_laplacian import GreenBall
+from harnack.enclosures.balls.caps import Caps
+from harnack.enclosures.balls.classic import Classic
+from harnack.enclosures.balls.slope import Slope
+from harnack.enclosures.parabola import Cone, Parabola, Taylor
 from harnack.testing import BrokenPromiseError, check_bound, scaled
 from harnack.testing.cases import BallCase, Case, CurvatureCase, LaplacianCase, LipschitzCase
 from harnack.testing.poisson import cap_mass, cap_movement, cap_slope, kernel_movement

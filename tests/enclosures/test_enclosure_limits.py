@@ -23,8 +23,9 @@ import harnack
 from harnack.arithmetic import Interval
 from harnack.backend import choose_backend
 from harnack.backend.arrays import aligned
-from harnack.enclosures import Ball, Enclosure, Gaps, Slopes, any_covers, longest_step
+from harnack.enclosures import Enclosure, Gaps, Slopes, any_covers, longest_step
 from harnack.enclosures.arc import Arc
+from harnack.enclosures.balls.ball import Ball
 from harnack.enclosures.balls.bounded_laplacian import GreenBall
 from harnack.enclosures.cusp import Cusp
 from harnack.enclosures.extremum import Greatest, Negated, Part, Stretched

@@ -11,7 +11,8 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.enclosures import Parabola, Slopes, choose_proofs
+from harnack.enclosures import Slopes, choose_proofs
+from harnack.enclosures.parabola import Parabola
 from harnack.fields import Field, Sample
 from harnack.fields.look import Look
 from harnack.fields.look import Path as RayPath

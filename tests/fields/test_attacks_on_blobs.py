@@ -12,7 +12,7 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.fields import BlobError
+from harnack.fields.blobs.blobs import BlobError
 from harnack.fields.blobs.grid import _MARGIN, CellLists, Grid
 from harnack.files import FileFormatError, read_molecule
 

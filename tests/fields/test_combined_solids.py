@@ -10,7 +10,9 @@ import pytest
 
 import harnack as hk
 from harnack.backend import FloatArray, choose_backend, to_numpy
-from harnack.enclosures import Gaps, Greatest, Negated, Parabola, Part, Slopes
+from harnack.enclosures import Gaps, Slopes
+from harnack.enclosures.extremum import Greatest, Negated, Part
+from harnack.enclosures.parabola import Parabola
 from harnack.testing import check_field
 
 Values = Callable[[FloatArray], FloatArray]

@@ -15,22 +15,9 @@ import pytest
 from scipy.special import lpmv
 
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.enclosures import Curvature
-from harnack.fields import (
-    EigenfunctionSum,
-    Field,
-    Gyroid,
-    HarmonicBall,
-    HarmonicPolynomial,
-    Lipschitz,
-    PlaneWave,
-    Product,
-    SchwarzD,
-    SchwarzP,
-    SphericalHarmonic,
-    cosine,
-    sine,
-)
+from harnack.enclosures import Curvature, HarmonicBall, Lipschitz
+from harnack.fields import Field
+from harnack.fields.polynomials.polynomial import HarmonicPolynomial, SphericalHarmonic
 from harnack.fields.polynomials.solid_harmonics import evaluate, from_monomials
 from harnack.fields.polynomials.sphere_range import (
     BallRange,
@@ -38,6 +25,8 @@ from harnack.fields.polynomials.sphere_range import (
     range_of_harmonic,
     unit_sphere,
 )
+from harnack.fields.waves.periodic import EigenfunctionSum, Gyroid, SchwarzD, SchwarzP
+from harnack.fields.waves.waves import PlaneWave, Product, cosine, sine
 from harnack.geometry import Ball, Box, HalfSpace
 
 DOUBLE = choose_backend("double")

@@ -207,7 +207,7 @@ def test_first_hits_of_figure_21(precision: Any) -> None:
 @pytest.mark.parametrize("name", ["figure 21", "blobs"])
 def test_first_hits_of_many_rays(name: str, precision: Any) -> None:
     if name == "blobs":
-        agree(hk.FourierSeries.fit(blobs, CUBE, 12), 0.0, 2000, 1.2, precision)
+        agree(hk.FourierSeries.fit(blobs, CUBE, 12), 0.0, 800, 1.2, precision)
     else:
         field = hk.FourierSeries.fit(figure_21, FIG_21, 10)
         ball = hk.Ball(radius=math.pi / 2)

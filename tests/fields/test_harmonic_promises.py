@@ -12,16 +12,11 @@ import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.backend.arrays import aligned
 from harnack.backend.lengths import length
-from harnack.enclosures import (
-    Caps,
-    Classic,
-    Cone,
-    Curvature,
-    HarmonicBall,
-    Lipschitz,
-    Slope,
-    Taylor,
-)
+from harnack.enclosures import Curvature, HarmonicBall, Lipschitz
+from harnack.enclosures.balls.caps import Caps
+from harnack.enclosures.balls.classic import Classic
+from harnack.enclosures.balls.slope import Slope
+from harnack.enclosures.parabola import Cone, Taylor
 from harnack.fields.polynomials.axial_bounds import (
     AxialBound,
     gradient_bound,

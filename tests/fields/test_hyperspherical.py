@@ -11,7 +11,8 @@ from scipy.special import eval_gegenbauer, gamma, lpmv
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy
-from harnack.enclosures import Arc, Gaps, Slopes
+from harnack.enclosures import Gaps, Slopes
+from harnack.enclosures.arc import Arc
 from harnack.fields.polynomials.hyperspherical_basis import (
     from_monomials,
     gegenbauer,

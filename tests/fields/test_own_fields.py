@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.fields import Curvature, Field, HarmonicBall, Lipschitz, Sample
+from harnack.enclosures import Curvature, HarmonicBall, Lipschitz
+from harnack.fields import Field, Sample
 from harnack.geometry import shapes
 from harnack.testing import BrokenPromiseError, check_field
 

@@ -14,7 +14,9 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy
-from harnack.enclosures import Cusp, Gaps, Nearest, Sheet, Slopes
+from harnack.enclosures import Gaps, Slopes
+from harnack.enclosures.cusp import Cusp
+from harnack.enclosures.nearest import Nearest, Sheet
 from harnack.fields.plane.branches import Branches, Disk, Stretch, complex_type
 from harnack.fields.plane.functions import branches_of
 from harnack.testing import BrokenPromiseError, check_field

@@ -13,7 +13,7 @@ import harnack as hk
 from harnack.backend import choose_backend, to_numpy
 from harnack.backend.sines import largest_angle, sincos
 from harnack.enclosures import Curvature
-from harnack.fields import PlaneWave, Product, cosine, sine
+from harnack.fields.waves.waves import PlaneWave, Product, cosine, sine
 from harnack.testing.walks import look_at
 
 UNIT = 2.0**-24

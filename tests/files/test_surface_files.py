@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from harnack.field_from_file import open_surface
-from harnack.fields import PolygonMesh
+from harnack.fields.curves.polygon_mesh import PolygonMesh
 from harnack.files import gltf
 from harnack.files import ply as ply_files
 from harnack.files.file_format import FileFormatError

@@ -16,7 +16,12 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray, to_numpy
-from harnack.enclosures import Caps, Classic, Cone, Enclosure, GreenBall, Slope, Taylor
+from harnack.enclosures import Enclosure
+from harnack.enclosures.balls.bounded_laplacian import GreenBall
+from harnack.enclosures.balls.caps import Caps
+from harnack.enclosures.balls.classic import Classic
+from harnack.enclosures.balls.slope import Slope
+from harnack.enclosures.parabola import Cone, Taylor
 from harnack.testing.cases import BallCase, Case, CurvatureCase, LaplacianCase, LipschitzCase
 from harnack.testing.poisson import cap_movement, kernel_movement
 

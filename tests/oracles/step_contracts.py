@@ -12,13 +12,13 @@ from harnack.enclosures import (
     BoundedLaplacian,
     Curvature,
     Gaps,
-    GreenBall,
     HarmonicBall,
     Lipschitz,
     Promise,
-    Slope,
     Slopes,
 )
+from harnack.enclosures.balls.bounded_laplacian import GreenBall
+from harnack.enclosures.balls.slope import Slope
 from harnack.testing.cases import BallCase, Case, CurvatureCase, LaplacianCase, LipschitzCase
 from harnack.testing.failures import BrokenPromiseError
 from harnack.testing.scaled import unscaled

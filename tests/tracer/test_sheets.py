@@ -23,16 +23,10 @@ from harnack.backend import (
     to_numpy,
 )  # fmt: skip
 from harnack.backend.extrema import clamp, fmax, fmin
-from harnack.enclosures import (
-    Caps,
-    Curvature,
-    Enclosure,
-    Slope,
-    Slopes,
-    TargetLevels,
-    Taylor,
-    choose_proofs,
-)
+from harnack.enclosures import Curvature, Enclosure, Slopes, TargetLevels, choose_proofs
+from harnack.enclosures.balls.caps import Caps
+from harnack.enclosures.balls.slope import Slope
+from harnack.enclosures.parabola import Taylor
 from harnack.fields import Field, Sample
 from harnack.fields.look import Path as RayPath
 from harnack.fields.sheets import NO_SHEET, Crossing

@@ -10,7 +10,7 @@ import functools
 import inspect
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harnack import arithmetic
-from harnack.backend.numbers import refuse_derivatives, refuses_derivatives
+from harnack.backend.numbers import finite, refuse_derivatives, refuses_derivatives
 from harnack.fields.formula import Formula, as_jet, probe, warn_of_price
 from harnack.names import did_you_mean
 
@@ -59,18 +59,22 @@ class TextFormula:
     text: with + - * / ^ (or **), brackets, numbers, x, y, z, pi, e and the functions above. An
         equation "left = right" means left - right. It is read as a tree and never run as Python,
         so that a text from anywhere does no harm.
+    parameters: numbers by the names that the text calls them.
     """
 
     text: str
     tree: ast.expr
+    parameters: Mapping[str, float] = field(default_factory=dict[str, float])
 
     @classmethod
-    def read(cls, text: str) -> TextFormula:
+    def read(cls, text: str, parameters: Mapping[str, float] | None = None) -> TextFormula:
         """The formula of a text.
 
         Raises:
-            ValueError: the text is no formula, saying where and what is wrong.
+            ValueError: the text is no formula, saying where and what is wrong; or a parameter is
+                not in it, or has a name that means something else.
         """
+        parameters = {name: finite(one, name) for name, one in (parameters or {}).items()}
         if len(text) > _LONGEST:
             raise ValueError(f"a formula has at most {_LONGEST:,} characters, not {len(text):,}")
         strange = re.search(r"[^A-Za-z0-9\s.,+*/^()=<>!-]|\b0[xob]", text, re.IGNORECASE)
@@ -80,9 +84,14 @@ class TextFormula:
         if len(sides) > 2:
             raise _wrong(text, "more than one = sign")
         tree = sides[0] if len(sides) == 1 else ast.BinOp(sides[0], ast.Sub(), sides[1])
-        made = cls(text, tree)
-        _check(text, tree)
-        return made
+        _check(text, tree, parameters)
+        names = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+        for name in parameters:
+            if name in _FUNCTIONS or name in (*_COORDINATES, *_CONSTANTS):
+                raise ValueError(f"{name!r} has a meaning in formulas: call a parameter otherwise")
+            if name not in names:
+                raise ValueError(f"there is no parameter {name!r} in the formula {text!r}")
+        return cls(text, tree, parameters)
 
     @staticmethod
     def _side(text: str, side: str) -> ast.expr:
@@ -100,14 +109,15 @@ class TextFormula:
     def __call__(self, x: Any, y: Any, z: Any) -> Any:
         try:
             with np.errstate(all="ignore"):  # of constants; what comes of it is refused
-                return _value(self.tree, {"x": x, "y": y, "z": z, **_CONSTANTS})
+                return _value(self.tree, {"x": x, "y": y, "z": z, **_CONSTANTS, **self.parameters})
         except ZeroDivisionError:
             raise _wrong(self.text, "it divides by zero") from None
         except OverflowError:
             raise _wrong(self.text, "a number in it is too large, or not real") from None
 
     def __repr__(self) -> str:
-        return self.text
+        numbers = "".join(f", {name} = {one:g}" for name, one in self.parameters.items())
+        return self.text + numbers
 
 
 def looks_like_formula(text: str) -> bool:
@@ -122,26 +132,27 @@ def _wrong(text: str, why: str) -> ValueError:
     )
 
 
-def _check(text: str, node: ast.expr, depth: int = 0) -> None:
+def _check(text: str, node: ast.expr, own: Iterable[str], depth: int = 0) -> None:
     """Raise ValueError for anything in a tree that is not allowed, or no function."""
     if depth > _DEEPEST:
         raise _wrong(text, f"more than {_DEEPEST} operations are within each other")
     if isinstance(node, ast.BinOp):
         if not isinstance(node.op, ast.Pow) and type(node.op) not in _OPERATORS:
             raise _wrong(text, "the operators are + - * / ^")
-        _check(text, node.left, depth + 1)
-        _check(text, node.right, depth + 1)
+        _check(text, node.left, own, depth + 1)
+        _check(text, node.right, own, depth + 1)
     elif isinstance(node, ast.UnaryOp):
         if not isinstance(node.op, ast.USub | ast.UAdd):
             raise _wrong(text, "the signs are + and -")
-        _check(text, node.operand, depth + 1)
+        _check(text, node.operand, own, depth + 1)
     elif isinstance(node, ast.Name):
-        known = (*_COORDINATES, *_CONSTANTS)
+        known = (*_COORDINATES, *_CONSTANTS, *own)
         if node.id not in known:
             raise _wrong(
                 text,
                 f"{node.id!r} is unknown, there are {', '.join(known)} and {', '.join(_FUNCTIONS)}"
-                f"{did_you_mean(node.id, (*known, *_FUNCTIONS))}",
+                f"{did_you_mean(node.id, (*known, *_FUNCTIONS))}; of a number of your own, give "
+                f'parameters={{"{node.id}": 1.0}}',
             )
     elif isinstance(node, ast.Constant):
         value = node.value
@@ -150,7 +161,7 @@ def _check(text: str, node: ast.expr, depth: int = 0) -> None:
         if not math.isfinite(_as_float(text, value)):
             raise _wrong(text, "a number is too large")
     elif isinstance(node, ast.Call):
-        _check_call(text, node, depth + 1)
+        _check_call(text, node, own, depth + 1)
     elif isinstance(node, ast.Compare):
         raise _wrong(text, "an equation has one = between its two sides")
     else:
@@ -164,9 +175,9 @@ def _as_float(text: str, value: float) -> float:
         raise _wrong(text, "a number is too large") from None
 
 
-def _check_call(text: str, node: ast.Call, depth: int) -> None:
+def _check_call(text: str, node: ast.Call, own: Iterable[str], depth: int) -> None:
     name = node.func.id if isinstance(node.func, ast.Name) else ast.unparse(node.func)
-    if name in (*_COORDINATES, *_CONSTANTS) or not isinstance(node.func, ast.Name):
+    if name in (*_COORDINATES, *_CONSTANTS, *own) or not isinstance(node.func, ast.Name):
         raise _wrong(text, f"is a * missing after {name!r}")
     if name not in _FUNCTIONS:
         known = ", ".join(_FUNCTIONS)
@@ -178,7 +189,7 @@ def _check_call(text: str, node: ast.Call, depth: int) -> None:
         plural = "s" if most > 1 else ""
         raise _wrong(text, f"{name} takes {count} argument{plural}, not {len(node.args)}")
     for one in node.args:
-        _check(text, one, depth)
+        _check(text, one, own, depth)
 
 
 def _value(node: ast.expr, names: Mapping[str, Any]) -> Any:
@@ -252,6 +263,7 @@ class Expression(Formula):
 def expression(
     function: Callable[[Any, Any, Any], Any] | str,
     *,
+    parameters: Mapping[str, float] | None = None,
     domain: Volume | None = None,
     level: float = 0.0,
     is_convex: bool = False,
@@ -262,6 +274,7 @@ def expression(
         `cos`, `tan`, `exp`, `log`, `sqrt`, `tanh`, `atan`, `asin`, `acos`, `sinh`, `cosh`,
         `maximum`, `minimum`, `norm`; NumPy's of the same names do too. Or a text, such as
         "x^2 + y^2 = 1 + sin(2*z)", with `max` and `min`; an equation means left - right.
+    parameters: numbers by their names in a text, as of "x^2 + y^2 = a" {"a": 2.0}.
     domain: the volume to draw it in, such as `harnack.Ball()`; None for all of space.
     level: the one drawn when none is asked for.
     is_convex: a promise of yours that the function is convex, as quadrics and norms are: steps
@@ -275,10 +288,12 @@ def expression(
         TypeError: function cannot be called with three coordinates, or uses what has no proved
             ranges; domain is no volume.
         NotImplementedError: function uses numbers with derivatives enabled.
-        ValueError: level is not finite; a text is no formula.
+        ValueError: level is not finite; a text is no formula, or without such a parameter.
     """
     if isinstance(function, str):
-        function = TextFormula.read(function)
+        function = TextFormula.read(function, parameters)
+    elif parameters:
+        raise TypeError("parameters are of formulas as text: a Python function has its own numbers")
     if not callable(function):
         raise TypeError(
             "function must be callable, such as lambda x, y, z: x * y - z, or a text, such as "

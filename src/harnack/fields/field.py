@@ -24,12 +24,7 @@ from harnack.backend.numbers import (
     short_text,
 )
 from harnack.backend.tensors import takes_tensors
-from harnack.enclosures import (
-    BoundedLaplacian,
-    Curvature,
-    HarmonicBall,
-    Lipschitz,
-)
+from harnack.enclosures import BoundedLaplacian, Curvature, HarmonicBall, Lipschitz
 from harnack.fields.detail import Detail
 from harnack.fields.look import Look, Path, Sample, checked_samples, lengthened
 from harnack.fields.points import also_at_points, at_points

@@ -25,7 +25,9 @@ from harnack.arithmetic.operators import Operators
 from harnack.backend import choose_backend
 from harnack.backend.extrema import fmin
 from harnack.backend.lengths import largest_coordinate, length
-from harnack.enclosures import Lipschitz, Piece, Slopes, Tangent
+from harnack.enclosures import Lipschitz, Slopes
+from harnack.enclosures.restriction import Piece
+from harnack.enclosures.tangent import Tangent
 from harnack.fields.field import Field
 from harnack.fields.look import Look, Path, Sample
 

@@ -6,7 +6,11 @@ import math
 
 import numpy as np
 
-from harnack.fields import HRBF, Blobs, Compact, Field, Molecule
+from harnack.fields import Field
+from harnack.fields.blobs.blobs import Blobs
+from harnack.fields.blobs.hrbf import HRBF
+from harnack.fields.blobs.kernels import Compact
+from harnack.fields.blobs.molecule import Molecule
 from harnack.files import Atoms
 from harnack.gallery.scene import DRAWN, Scene
 from harnack.rendering import Camera

@@ -8,21 +8,14 @@ from typing import Any
 import numpy as np
 
 from harnack.backend import FloatArray
-from harnack.fields import (
-    EigenfunctionSum,
-    Field,
-    FourierSeries,
-    Gyroid,
-    HarmonicPolynomial,
-    HypersphericalHarmonic,
-    Lobes,
-    Product,
-    SchwarzD,
-    SchwarzP,
-    SolidAngle,
-    SphericalHarmonic,
-    sine,
-)
+from harnack.fields import Field
+from harnack.fields.curves.solid_angle import SolidAngle
+from harnack.fields.polynomials.hyperspherical import HypersphericalHarmonic
+from harnack.fields.polynomials.lobes import Lobes
+from harnack.fields.polynomials.polynomial import HarmonicPolynomial, SphericalHarmonic
+from harnack.fields.waves.fourier_series import FourierSeries
+from harnack.fields.waves.periodic import EigenfunctionSum, Gyroid, SchwarzD, SchwarzP
+from harnack.fields.waves.waves import Product, sine
 from harnack.gallery.scene import DRAWN, Scene
 from harnack.geometry import Ball, Box, HalfSpace, shapes
 from harnack.rendering import Camera

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from harnack.fields import PolygonMesh, Tubes
+from harnack.fields.curves.polygon_mesh import PolygonMesh
+from harnack.fields.solids.tubes import Tubes
 from harnack.gallery.scene import Scene
 from harnack.geometry import mesh_shapes
 from harnack.geometry.polygon_meshes import polygon_patches

@@ -6,7 +6,9 @@ import math
 from typing import Any
 
 from harnack.arithmetic import cos, exp, sin
-from harnack.fields import HeightField, LevelCurves, RiemannSurface
+from harnack.fields.plane.height_field import HeightField
+from harnack.fields.plane.level_curves import LevelCurves
+from harnack.fields.plane.riemann_surface import RiemannSurface
 from harnack.gallery.scene import DRAWN, Scene
 from harnack.geometry import Ball, Box, Volume
 from harnack.rendering import Camera

@@ -16,7 +16,8 @@ import numpy as np
 
 from harnack.backend import FloatArray
 from harnack.distance import Family, curvature_lines
-from harnack.fields import SolidAngle, Tube
+from harnack.fields.curves.solid_angle import SolidAngle
+from harnack.fields.solids.tube import Tube
 from harnack.gallery.scene import DRAWN, Scene
 from harnack.geometry import Circle, HalfSpace
 from harnack.rendering import Camera

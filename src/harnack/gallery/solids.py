@@ -8,21 +8,17 @@ from typing import Any
 import numpy as np
 
 from harnack.backend import FloatArray
-from harnack.fields import (
-    Blobs,
-    Compact,
-    Displaced,
-    FractalNoise,
-    Gyroid,
-    Julia,
-    Solid,
-    SolidAngle,
-    Sphere,
-    Torus,
-    Tube,
-    solid,
-    union,
-)
+from harnack.fields import Solid
+from harnack.fields.blobs.blobs import Blobs
+from harnack.fields.blobs.kernels import Compact
+from harnack.fields.curves.solid_angle import SolidAngle
+from harnack.fields.solids.combined import union
+from harnack.fields.solids.fractal import Displaced, FractalNoise
+from harnack.fields.solids.julia import Julia
+from harnack.fields.solids.region import solid
+from harnack.fields.solids.round import Sphere, Torus
+from harnack.fields.solids.tube import Tube
+from harnack.fields.waves.periodic import Gyroid
 from harnack.gallery.scene import DRAWN, Scene
 from harnack.geometry import shapes
 from harnack.rendering import Camera

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from harnack.fields import Field, Solid, SolidAngle
+from harnack.fields import Field, Solid
+from harnack.fields.curves.solid_angle import SolidAngle
 from harnack.fields.field import check_is_field
 from harnack.geometry import Box, Intersection, Volume
 from harnack.geometry.volumes import check_volume

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harnack.fields import SolidAngle, WindingNumber
+from harnack.fields.curves.solid_angle import SolidAngle
+from harnack.fields.winding.winding_number import WindingNumber
 from harnack.geometry import MeshError, validate_mesh
 from harnack.geometry.singular import singular_loops, weld_vertices
 from harnack.meshing.checks import (

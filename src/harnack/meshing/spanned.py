@@ -22,7 +22,7 @@ import numpy as np
 
 from harnack.backend import FloatArray
 from harnack.cells import Cells
-from harnack.fields import SolidAngle
+from harnack.fields.curves.solid_angle import SolidAngle
 from harnack.geometry.net_loops import net_loops
 from harnack.meshing.checks import LocalError, MeshingError, check_manifold
 from harnack.meshing.edges import IntArray, boundary_edges, edge_keys

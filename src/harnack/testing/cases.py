@@ -9,16 +9,16 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from harnack.enclosures import (
-    Ball,
     BoundedLaplacian,
     Curvature,
     Enclosure,
     Gaps,
-    GreenBall,
     HarmonicBall,
     Lipschitz,
     Slopes,
 )
+from harnack.enclosures.balls.ball import Ball
+from harnack.enclosures.balls.bounded_laplacian import GreenBall
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real

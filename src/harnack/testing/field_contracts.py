@@ -12,12 +12,9 @@ import numpy as np
 
 from harnack.backend import FloatArray, choose_backend, to_numpy, to_vector3
 from harnack.enclosures import (
-    BoundedLaplacian,
     Choice,
-    Curvature,
     Gaps,
     HarmonicBall,
-    Lipschitz,
     Slopes,
     choose_proofs,
     longest_step,
@@ -194,20 +191,19 @@ def _check_numbers(field: Field, points: FloatArray, look: FieldValues) -> None:
         numbers = [vars(known)[name] for name, *_ in known.units]
         name = type(known).__name__
         require(~np.isnan(numbers).any(axis=0), f"{name} has a NaN", points)
+        for low, high in known.ends[:1]:
+            inside = (vars(known)[low] <= look.value) & (look.value <= vars(known)[high])
+            require(inside, f"{name}: the value is not within [{low}, {high}]", points)
+        for low, high in known.ends:
+            ordered = vars(known)[low] <= vars(known)[high]
+            require(ordered, f"{name}: {low} exceeds {high}", points)
+        if "constant" in vars(known):
+            require(vars(known)["constant"] >= 0, f"{name}: the constant is negative", points)
         if isinstance(known, HarmonicBall):
             if known.dimension not in (2, 3, 4):
                 raise BrokenPromiseError(f"HarmonicBall has dimension {known.dimension!r}")
-            inside = (known.lower <= look.value) & (look.value <= known.upper)
-            require(inside, "HarmonicBall: the value is not within [lower, upper]", points)
             bounded = np.isfinite(known.lower) | np.isfinite(known.upper)
             require(bounded, "HarmonicBall: both ends are infinite", points)
-        elif isinstance(known, BoundedLaplacian):
-            inside = (known.lower <= look.value) & (look.value <= known.upper)
-            require(inside, f"{name}: the value is not within [lower, upper]", points)
-            is_ordered = known.laplacian_lower <= known.laplacian_upper
-            require(is_ordered, f"{name}: laplacian_lower exceeds laplacian_upper", points)
-        elif isinstance(known, Lipschitz | Curvature):
-            require(known.constant >= 0, f"{name}: the constant is negative", points)
     usable = np.any([known.radius > 0 for known in look.known], axis=0)
     if usable.mean() < 0.5:
         raise BrokenPromiseError(

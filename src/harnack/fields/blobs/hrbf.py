@@ -15,7 +15,8 @@ from harnack.backend import FloatArray, backend_of
 from harnack.backend.extrema import fmax, fmin
 from harnack.backend.numbers import check_finite, check_size, check_vectors, real_array
 from harnack.backend.records import Records
-from harnack.enclosures import Lipschitz, Piece, Slopes
+from harnack.enclosures import Lipschitz, Slopes
+from harnack.enclosures.restriction import Piece
 from harnack.fields.blobs.jets import summed
 from harnack.fields.blobs.sums import PIECES, Along, BlobValue, Knots, State, over
 from harnack.fields.field_cache import prepared_once

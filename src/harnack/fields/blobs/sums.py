@@ -24,7 +24,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import drjit as dr
 
 from harnack.backend.extrema import clamp, fmax, fmin
-from harnack.enclosures import Piece, Slopes
+from harnack.enclosures import Slopes
+from harnack.enclosures.restriction import Piece
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3

@@ -15,18 +15,11 @@ from harnack.backend import backend_of
 from harnack.backend.extrema import fmax, fmin
 from harnack.backend.lengths import largest_coordinate
 from harnack.backend.numbers import finite
-from harnack.enclosures import (
-    Curvature,
-    Cusp,
-    Enclosure,
-    HarmonicBall,
-    Lipschitz,
-    Nearest,
-    Parabola,
-    Pieces,
-    Sheet,
-    Slopes,
-)
+from harnack.enclosures import Curvature, Enclosure, HarmonicBall, Lipschitz, Slopes
+from harnack.enclosures.cusp import Cusp
+from harnack.enclosures.nearest import Nearest, Sheet
+from harnack.enclosures.parabola import Parabola
+from harnack.enclosures.pieces import Pieces
 from harnack.fields.field import Field
 from harnack.fields.look import Look, Path, Sample
 from harnack.fields.plane.branches import Branches, Disk, Stretch, complex_of, derivatives

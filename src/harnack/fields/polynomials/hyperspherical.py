@@ -10,7 +10,10 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 
 from harnack.backend.extrema import fmax, fmin
-from harnack.enclosures import Arc, Curvature, Lipschitz, Parabola, Pieces, Slopes
+from harnack.enclosures import Curvature, Lipschitz, Slopes
+from harnack.enclosures.arc import Arc
+from harnack.enclosures.parabola import Parabola
+from harnack.enclosures.pieces import Pieces
 from harnack.fields.field import Field, check_in_range
 from harnack.fields.look import Look, Path, Sample
 from harnack.fields.polynomials.axial_bounds import (

@@ -12,7 +12,8 @@ import drjit as dr
 from harnack.backend.extrema import fmax, fmin
 from harnack.backend.lengths import length
 from harnack.backend.numbers import finite, positive
-from harnack.enclosures import Curvature, Parabola, Slopes
+from harnack.enclosures import Curvature, Slopes
+from harnack.enclosures.parabola import Parabola
 from harnack.fields.field import Field, Sample
 from harnack.fields.look import Look, lengthened
 from harnack.fields.polynomials.harmonic_rounding import HarmonicRounding

@@ -13,10 +13,8 @@ import numpy.typing as npt
 
 from harnack.arithmetic import Jet
 from harnack.backend.lengths import largest_coordinate, length
-from harnack.enclosures import (
-    Promise,
-    Stretched,
-)
+from harnack.enclosures import Promise
+from harnack.enclosures.extremum import Stretched
 from harnack.fields.formula import as_jet, hessian_error, prepared_numbers
 from harnack.fields.look import Look, Path, Sample
 from harnack.fields.solids.solid import Derived, Shape, Solid

@@ -15,13 +15,8 @@ from harnack.arithmetic import maximum, minimum
 from harnack.backend.extrema import fmax, fmin
 from harnack.backend.lengths import largest_coordinate, length
 from harnack.backend.numbers import finite
-from harnack.enclosures import (
-    Enclosure,
-    Greatest,
-    Lipschitz,
-    Negated,
-    Part,
-)
+from harnack.enclosures import Enclosure, Lipschitz
+from harnack.enclosures.extremum import Greatest, Negated, Part
 from harnack.fields.field import Field
 from harnack.fields.formula import as_data
 from harnack.fields.look import Look, Path, Sample, value_error

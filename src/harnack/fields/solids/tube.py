@@ -17,7 +17,8 @@ from harnack.backend.extrema import clamp, fmax, fmin
 from harnack.backend.lengths import largest_coordinate
 from harnack.backend.numbers import check_finite, check_size, check_vectors, positive, real_array
 from harnack.backend.records import Records
-from harnack.enclosures import Enclosure, Gaps, Lipschitz, Pieces
+from harnack.enclosures import Enclosure, Gaps, Lipschitz
+from harnack.enclosures.pieces import Pieces
 from harnack.fields.field_cache import prepared_once
 from harnack.fields.look import Look, Path, Sample
 from harnack.fields.solids.solid import Solid, box_around

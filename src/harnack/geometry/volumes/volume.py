@@ -92,7 +92,7 @@ def _parts(volume: Volume) -> tuple[Volume, ...]:
 
 
 def rounding(backend: Backend) -> float:
-    """Relative error allowed for one clipping formula: ten units in the last place.
+    """Relative error allowed for one clipping formula: ten roundings of half a unit.
 
     The longest chain of roundings among volumes (a plane: normal rounded to the backend, three
     products, three sums, one division) is nine.

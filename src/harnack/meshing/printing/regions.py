@@ -19,10 +19,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from harnack.backend import FloatArray
-from harnack.fields import Cuboid, Field, Plane, Solid, SolidAngle
+from harnack.fields import Field, Solid
+from harnack.fields.curves.solid_angle import SolidAngle
 from harnack.fields.solids.affine import AffineImage
 from harnack.fields.solids.combined import Combined, Complement, Offset
 from harnack.fields.solids.region import Near, Region, bounded_side
+from harnack.fields.solids.round import Plane
+from harnack.fields.solids.square import Cuboid
 from harnack.geometry import Ball, Box
 from harnack.meshing.checks import MeshingError
 from harnack.meshing.lattice import Lattice
