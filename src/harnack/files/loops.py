@@ -22,7 +22,7 @@ __all__ = ["loops_in", "read_loops"]
 
 PlacedLoop = tuple[FloatArray, Place]
 
-_READERS: dict[str, Callable[[Path, bytes], Contents]] = {".obj": read_obj, ".ply": read_ply}
+_LOOP_READERS: dict[str, Callable[[Path, bytes], Contents]] = {".obj": read_obj, ".ply": read_ply}
 
 
 def read_loops(path: str | os.PathLike[str], *, boundary: bool = False) -> list[FloatArray]:
@@ -42,14 +42,14 @@ def read_loops(path: str | os.PathLike[str], *, boundary: bool = False) -> list[
     """
     path = Path(path)
     kind = path.suffix.lower()
-    if kind not in (*_READERS, ".loops"):
+    if kind not in (*_LOOP_READERS, ".loops"):
         raise FileFormatError(f"{path}: curves are read from .obj, .ply and .loops files")
     data = read_bytes(path)
     if kind == ".loops":
         if boundary:
             raise FileFormatError(f"{path}: a .loops file has no faces to take the boundary of")
         return [_validated(loop, place) for loop, place in read_loops_text(path, data)]
-    return loops_in(_READERS[kind](path, data), boundary=boundary)
+    return loops_in(_LOOP_READERS[kind](path, data), boundary=boundary)
 
 
 def loops_in(contents: Contents, *, boundary: bool = False) -> list[FloatArray]:

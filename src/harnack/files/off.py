@@ -11,7 +11,7 @@ import numpy as np
 from harnack.backend import FloatArray
 from harnack.files.file_format import Contents, Place, Polygons, check_indices, positions
 from harnack.files.text_tables import Lines, as_integer, content_lines, read_floats, read_table
-from harnack.geometry.meshes import IntArray
+from harnack.backend import IntArray
 
 
 def read_off(path: Path, data: bytes) -> Contents:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping
 from fractions import Fraction
-from numbers import Real
+import numbers
 from typing import Any, cast
 
 from harnack.backend import choose_backend
@@ -145,7 +145,7 @@ def _own(function: Any, singular: Any, second: Any, period: Any) -> OwnBranches:
         raise TypeError(
             f"singular must be complex numbers or BranchPoints, not {singular!r}"
         ) from None
-    if period is not None and not (isinstance(period, Real) and 0 < float(period) < math.inf):
+    if period is not None and not (isinstance(period, numbers.Real) and 0 < float(period) < math.inf):
         raise ValueError(f"period must be a positive number, not {period!r}")
     backend = choose_backend("double")
     z = complex_type(backend)(*(backend.Float(one) for one in _PROBE))

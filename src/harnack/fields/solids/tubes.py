@@ -14,7 +14,8 @@ from harnack.backend.numbers import check_finite, check_size, check_vectors, pos
 from harnack.backend.records import Records
 from harnack.enclosures import Curvature, Lipschitz, Promise
 from harnack.fields.boxed_parts import BoxedField, BoxedParts
-from harnack.fields.field import Field, Sample
+from harnack.fields.field import Field
+from harnack.fields.look import Sample
 from harnack.tree.boxes import MOST_BOXES
 
 if TYPE_CHECKING:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from harnack.fields.waves.cosine_series import CellBounds, CosineBounds
 
 # Constants are moved up, and radii down, by this much for the roundings of float32.
-_ROUNDING = 1e-5
+_KERNEL_ROUNDING = 1e-5
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class CosineSums:
             _data(backend, np.pi / size),
             Records.upload(backend, table),
             (dr.opaque(backend.Float, rounding[0]), dr.opaque(backend.Float, rounding[1])),
-            dr.opaque(backend.Float, bounds.curvature * (1 + _ROUNDING)),
+            dr.opaque(backend.Float, bounds.curvature * (1 + _KERNEL_ROUNDING)),
             tuple(_Cells.upload(backend, one, size) for one in bounds.cells),
         )
 
@@ -136,7 +136,7 @@ class _Cells:
 
     @classmethod
     def upload(cls, backend: Backend, cells: CellBounds, size: FloatArray) -> _Cells:
-        bounds = aligned(backend, cells.bounds * (1 + _ROUNDING))
+        bounds = aligned(backend, cells.bounds * (1 + _KERNEL_ROUNDING))
         return cls(backend, cells.count, _data(backend, size / cells.count), bounds)
 
     def curvature(self, share: Vec3) -> Curvature:
@@ -149,7 +149,7 @@ class _Cells:
             rest = place[axis] - cell
             free = fmin((1 + fmin(rest, 1 - rest)) * self.sides[axis], free)
         constant = dr.gather(self.backend.Float, self.bounds, index)
-        return Curvature(constant, free * (1 - _ROUNDING * self.count))
+        return Curvature(constant, free * (1 - _KERNEL_ROUNDING * self.count))
 
 
 def _data(backend: Backend, numbers: FloatArray) -> Vec3:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from harnack.fields.winding.winding_mesh import WindingMesh
     from harnack.tree.triangles import Frame
 
-    IsAhead: TypeAlias = Callable[[list[Real], Real], Mask]
+IsAhead: TypeAlias = "Callable[[list[Real], Real], Mask]"
 
 _SHARE = 1 / (4 * math.pi)
 

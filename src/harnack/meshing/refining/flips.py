@@ -28,7 +28,7 @@ __all__ = ["flipped", "least_angles", "without_slivers"]
 # Cosines: by how much a least angle has to grow, and how far normals may turn.
 _GAIN = 0.01
 _FACING = 0.5
-_MOST_ROUNDS = 12
+_MOST_ROUNDS_OF_FLIPS = 12
 # Triangles with a smaller angle, in radians, are slivers: 4 degrees.
 _SLIVER = 0.07
 # The least cosine between normals of the triangles around a contracted edge and the slope.
@@ -49,7 +49,7 @@ def flipped(
     """
     refused = np.zeros(0, np.int64)
     rim = edge_keys(boundary_edges(faces), len(vertices))
-    for _ in range(_MOST_ROUNDS):
+    for _ in range(_MOST_ROUNDS_OF_FLIPS):
         pairs, quads = _quadrilaterals(faces)
         a, b, c, d = quads.T
         before = least_angles(vertices, faces)[pairs].min(axis=1)
@@ -62,10 +62,10 @@ def flipped(
         good[good] = ~np.isin(key[good], refused)
         taken = distinct(edge_keys(quads[:, :2], count))
         good[good] = ~_holds(taken, key[good]) & ~np.isin(key[good], rim)
-        rows = _independent(np.flatnonzero(good), gain, pairs, key, len(faces))
+        rows = _independent_flips(np.flatnonzero(good), gain, pairs, key, len(faces))
         if not len(rows):
             break
-        allowed = _is_near(function, vertices, new[rows], tolerance)
+        allowed = _flips_stay_near(function, vertices, new[rows], tolerance)
         refused = np.concatenate([refused, key[rows[~allowed]]])
         rows = rows[allowed]
         faces = faces.copy()
@@ -87,7 +87,7 @@ def _quadrilaterals(faces: IntArray) -> tuple[IntArray, IntArray]:
     return np.column_stack([one % m, other % m]), quads
 
 
-def _independent(
+def _independent_flips(
     rows: IntArray, gain: FloatArray, pairs: IntArray, key: IntArray, count: int
 ) -> IntArray:
     """Those candidates that are the best of both their faces, and the only ones of their edge."""
@@ -101,7 +101,7 @@ def _independent(
     return rows[np.unique(key[rows], return_index=True)[1]]
 
 
-def _is_near(
+def _flips_stay_near(
     function: LevelFunction, vertices: FloatArray, new: IntArray, tolerance: float
 ) -> BoolArray:
     """(k,) whether both new triangles (k, 2, 3) are near the surface and face the way it does."""

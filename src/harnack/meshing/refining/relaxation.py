@@ -28,7 +28,7 @@ _THIN = 0.52
 _GAIN = 0.01
 # The least cosine between normals of a triangle before and after, and between it and the slope.
 _FACING = 0.5
-_MOST_ROUNDS = 6
+_MOST_ROUNDS_OF_MOVES = 6
 # Parts of the way to each aim that are tried.
 _PARTS = (1.0, 0.5)
 
@@ -47,7 +47,7 @@ def relaxed(
     fixed = np.zeros(len(vertices), np.bool_)
     fixed[boundary_edges(faces)] = True
     vertices = vertices.copy()
-    for _ in range(_MOST_ROUNDS):
+    for _ in range(_MOST_ROUNDS_OF_MOVES):
         angles = least_angles(vertices, faces)
         thin = np.unique(faces[angles < _THIN])
         stars = _Stars.of(faces, thin[~fixed[thin]], len(vertices))
@@ -56,8 +56,8 @@ def relaxed(
         before = stars.least(angles[stars.face])
         there, after = _best_places(function, vertices, faces, stars, walls)
         gain = after - before
-        rows = _independent(np.flatnonzero(gain > _GAIN), gain, stars, faces, len(vertices))
-        rows = rows[_is_near(function, vertices, faces, stars, there, rows, tolerance)]
+        rows = _independent_moves(np.flatnonzero(gain > _GAIN), gain, stars, faces, len(vertices))
+        rows = rows[_moves_stay_near(function, vertices, faces, stars, there, rows, tolerance)]
         if not len(rows):
             break
         vertices[stars.centers[rows]] = there[rows]
@@ -147,7 +147,7 @@ def _least_at(
     return stars.least(np.where(facing, angles, -1.0))
 
 
-def _independent(
+def _independent_moves(
     rows: IntArray, gain: FloatArray, stars: _Stars, faces: IntArray, count: int
 ) -> IntArray:
     """Those of some vertices that gain more than all neighbors do."""
@@ -159,7 +159,7 @@ def _independent(
     return rows[first[rows] == rank[stars.centers[rows]]]
 
 
-def _is_near(
+def _moves_stay_near(
     function: LevelFunction,
     vertices: FloatArray,
     faces: IntArray,

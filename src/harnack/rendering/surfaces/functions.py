@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 # A surface that is cut by the function's own domain reaches beyond it by rounding, a part of its
 # size.
-_ROUNDING = 1e-5
+_PADDING = 1e-5
 
 
 def function_of(given: Any, what: str = "of") -> Field:
@@ -50,4 +50,4 @@ def defined_in(function: Field, size: float) -> Volume | None:
     """
     if function.domain is None or function.is_entire:
         return None
-    return function.domain.padded(_ROUNDING * size)
+    return function.domain.padded(_PADDING * size)
