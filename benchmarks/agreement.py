@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 import harnack as hk
-from harnack.fields.winding.winding_number import WindingNumber
+from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.files import read_surface
 from harnack.geometry.mesh_shapes import (
     MeshArrays,

@@ -13,8 +13,8 @@ import harnack as hk
 from harnack.gallery import SCENES
 from harnack.geometry import shapes
 from harnack.rendering import Camera, render
-from harnack.rendering.pictures.images import tone_mapped
-from harnack.rendering.pictures.pixels import grid_offsets
+from harnack.rendering.images import tone_mapped
+from harnack.rendering.shading import grid_offsets
 
 _SIZE = (320, 240)
 _REFERENCE, _ROUNDS = 100, 3

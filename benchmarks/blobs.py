@@ -19,10 +19,10 @@ import numpy as np
 
 import harnack as hk
 from harnack.arithmetic import clipped_power
-from harnack.backend.extrema import clamp, fmax, fmin
+from harnack.backend.elementary import clamp, fmax, fmin
 from harnack.backend.records import Records
 from harnack.enclosures import Slopes
-from harnack.enclosures.restriction import Piece
+from harnack.enclosures.enclosure import Piece
 from harnack.fields.blobs.kernels import Compact
 from harnack.fields.formula import Formula, FormulaAlong
 

@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 import harnack as hk
 from harnack.backend import choose_backend, to_vector3
-from harnack.fields.winding.dipole import DipolePotential
-from harnack.fields.winding.winding_number import WindingNumber
+from harnack.fields.solid_angles.dipole import DipolePotential
+from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.geometry.mesh_shapes import bumpy_sphere, remove_faces
 
 from .scenes import EYE, camera

@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 
 import harnack as hk
-from harnack.backend.extrema import fmax, fmin
+from harnack.backend.elementary import fmax, fmin
 
 from .rays import measure
 from .scenes import Scene

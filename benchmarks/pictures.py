@@ -12,10 +12,9 @@ import numpy as np
 
 import harnack as hk
 from harnack.rendering import Camera, register
-from harnack.rendering.mitsuba.integrator import PathTracer
-from harnack.rendering.pictures.light_paths import expose
-from harnack.rendering.studio.materials import material_of
-from harnack.rendering.studio.stage import StudioObject, studio
+from harnack.rendering.integrator import PathTracer
+from harnack.rendering.light_paths import expose
+from harnack.rendering.stage import StudioObject, material_of, studio
 
 _SIZE, _SPP, _ROUNDS = (400, 300), 16, 3
 _RINGS = 350

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import choose_backend, to_vector3
-from harnack.fields.winding.winding_number import WindingNumber
+from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.geometry.mesh_shapes import MeshArrays, bumpy_sphere, remove_faces
 
 from .rays import machine

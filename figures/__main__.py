@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from harnack.cli.interrupts import interrupts_noticed
+from harnack.cli.messages import interrupts_noticed
 
 from .page import write
 from .registry import FIGURES

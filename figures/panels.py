@@ -10,8 +10,8 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 import harnack as hk
-from harnack.rendering.pictures.images import tone_mapped
-from harnack.rendering.pictures.scales import viridis
+from harnack.rendering.images import tone_mapped
+from harnack.rendering.scales import viridis
 
 from .figure import Counts
 from .view import Pixels

@@ -6,7 +6,7 @@ import time
 
 import harnack as hk
 from harnack.gallery import SCENES
-from harnack.rendering.pictures.images import tone_mapped
+from harnack.rendering.images import tone_mapped
 
 from .figure import Report
 from .panels import Panel, drawn, fitting, halved, montage

@@ -32,7 +32,7 @@ from .arithmetic import (
     tan,
     tanh,
 )
-from .backend.from_jax import wrap_for_jax
+from .backend.tensors import wrap_for_jax
 from .distance import (
     Curvatures,
     DistanceBounds,
@@ -42,45 +42,50 @@ from .distance import (
     distance_bounds,
     signed_distance,
 )
-from .enclosures.balls.bounded_laplacian import GreenBall
-from .enclosures.balls.caps import Caps
-from .enclosures.balls.classic import Classic
-from .enclosures.balls.slope import Slope
+from .enclosures.bounded_laplacian import GreenBall
 from .enclosures.enclosure import Enclosure
+from .enclosures.harmonic_ball import Caps, Classic, Slope
 from .enclosures.parabola import Cone, Parabola, Taylor
 from .enclosures.pieces import Pieces
 from .enclosures.promises import BoundedLaplacian, Curvature, HarmonicBall, Lipschitz
-from .fields.blobs.blobs import Blobs
+from .fields.analytic.branches import BranchPoint
+from .fields.analytic.fourier_series import FourierSeries
+from .fields.analytic.hyperspherical import HypersphericalHarmonic
+from .fields.analytic.lobes import Lobes
+from .fields.analytic.periodic import EigenfunctionSum, Gyroid, SchwarzD, SchwarzP
+from .fields.analytic.plane import HeightField, LevelCurves
+from .fields.analytic.polynomial import HarmonicPolynomial, SphericalHarmonic
+from .fields.analytic.riemann_surface import RiemannSurface
+from .fields.analytic.waves import PlaneWave, Product, cosine, sine
+from .fields.blobs.blobs import Blobs, Molecule
 from .fields.blobs.hrbf import HRBF
 from .fields.blobs.kernels import Compact, Cubic, Gaussian, Sextic
-from .fields.blobs.molecule import Molecule
-from .fields.curves.polygon_mesh import PolygonMesh
-from .fields.curves.solid_angle import SolidAngle
 from .fields.expressions import expression
 from .fields.field import Field, Sample
-from .fields.plane.branches import BranchPoint
-from .fields.plane.height_field import HeightField
-from .fields.plane.level_curves import LevelCurves
-from .fields.plane.riemann_surface import RiemannSurface
-from .fields.polynomials.hyperspherical import HypersphericalHarmonic
-from .fields.polynomials.lobes import Lobes
-from .fields.polynomials.polynomial import HarmonicPolynomial, SphericalHarmonic
+from .fields.solid_angles.dipole import DipolePotential
+from .fields.solid_angles.morph import Morph
+from .fields.solid_angles.polygon_mesh import PolygonMesh
+from .fields.solid_angles.screened import ScreenedWindingNumber
+from .fields.solid_angles.solid_angle import SolidAngle
+from .fields.solid_angles.winding_number import WindingNumber
 from .fields.solids.combined import intersection, union
 from .fields.solids.fractal import Displaced, FractalNoise, Noise
 from .fields.solids.julia import Julia
+from .fields.solids.primitives import (
+    Capsule,
+    Cuboid,
+    Cylinder,
+    DoubleCone,
+    Ellipsoid,
+    Plane,
+    Sphere,
+    Superellipsoid,
+    Supertorus,
+    Torus,
+)
 from .fields.solids.region import solid
-from .fields.solids.round import Capsule, Cylinder, DoubleCone, Ellipsoid, Plane, Sphere, Torus
 from .fields.solids.solid import Shape, Solid
-from .fields.solids.square import Cuboid, Superellipsoid, Supertorus
-from .fields.solids.tube import Tube
-from .fields.solids.tubes import Tubes
-from .fields.waves.fourier_series import FourierSeries
-from .fields.waves.periodic import EigenfunctionSum, Gyroid, SchwarzD, SchwarzP
-from .fields.waves.waves import PlaneWave, Product, cosine, sine
-from .fields.winding.dipole import DipolePotential
-from .fields.winding.morph import Morph
-from .fields.winding.screened import ScreenedWindingNumber
-from .fields.winding.winding_number import WindingNumber
+from .fields.solids.tube import Tube, Tubes
 from .geometry import Ball, Box, Circle, ConvexHull, HalfSpace, Intersection
 from .meshing import MeshingError, mesh, repair
 from .rendering import Camera, Isolines, animate, render

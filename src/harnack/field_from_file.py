@@ -9,12 +9,11 @@ from typing import Literal
 
 from harnack.backend import FloatArray
 from harnack.fields import Field
-from harnack.fields.blobs.blobs import Blobs
-from harnack.fields.blobs.molecule import Molecule
-from harnack.fields.curves.polygon_mesh import PolygonMesh
-from harnack.fields.curves.solid_angle import SolidAngle
-from harnack.fields.winding.dipole import DipolePotential
-from harnack.fields.winding.winding_number import WindingNumber
+from harnack.fields.blobs.blobs import Blobs, Molecule
+from harnack.fields.solid_angles.dipole import DipolePotential
+from harnack.fields.solid_angles.polygon_mesh import PolygonMesh
+from harnack.fields.solid_angles.solid_angle import SolidAngle
+from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.files import (
     Atoms,
     ClosedCurves,
@@ -27,7 +26,7 @@ from harnack.files import (
     read_surface,
 )
 from harnack.files.surfaces import ReadAs, Surface
-from harnack.rendering.studio.upright import UP_AXES, upright
+from harnack.rendering.framing import UP_AXES, upright
 
 __all__ = ["UP_AXES", "Axis", "OpenedSurface", "open_surface"]
 

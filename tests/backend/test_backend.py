@@ -22,8 +22,8 @@ from rich.console import Console
 
 import harnack.backend as hb
 from harnack.backend import arrays, doctor, llvm
-from harnack.backend.basis import across, across_rows
-from harnack.rendering.mitsuba.variant import load_mitsuba
+from harnack.backend.elementary import across, across_rows
+from harnack.rendering.mitsuba import load_mitsuba
 
 ELF_WITH_SONAME = b"\x7fELF...\0libc.so.6\0%s\0LLVMCreateMessage\0"
 

@@ -14,9 +14,9 @@ import trimesh
 
 from harnack.cli import main
 from harnack.field_from_file import open_surface
-from harnack.fields.curves.solid_angle import SolidAngle
-from harnack.fields.winding.dipole import DipolePotential
-from harnack.fields.winding.winding_number import WindingNumber
+from harnack.fields.solid_angles.dipole import DipolePotential
+from harnack.fields.solid_angles.solid_angle import SolidAngle
+from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.gallery import SCENES
 from harnack.geometry import shapes
 from harnack.geometry.mesh_shapes import icosphere

@@ -73,9 +73,9 @@ sys.exit({MODULE}.{FUNCTION}())
     "patch",
     [
         # between two bands of the picture
-        "import harnack.rendering.pictures.light_paths as m; m._mixed = interrupt",
+        "import harnack.rendering.light_paths as m; m._mixed = interrupt",
         # while Mitsuba calls us from its own code, which makes another error of it
-        "import harnack.rendering.mitsuba.integrator as m; m.PathTracer.__init__ = interrupt",
+        "import harnack.rendering.integrator as m; m.PathTracer.__init__ = interrupt",
         # while the picture is written, and again while that is cleared up
         "import pathlib; w, u = pathlib.Path.write_bytes, pathlib.Path.unlink; "
         "pathlib.Path.write_bytes = lambda p, b: [w(p, b[:9]), interrupt()]; "

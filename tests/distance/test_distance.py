@@ -16,17 +16,15 @@ from scipy.spatial import cKDTree
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.distance import batches, closest_points, curvature, signed_distance
+from harnack.distance import closest_points, curvature, signed_distance, tangent
 from harnack.distance.tangent import second_order
 from harnack.enclosures import Enclosure
-from harnack.enclosures.balls.caps import Caps
-from harnack.enclosures.balls.classic import Classic
-from harnack.enclosures.balls.slope import Slope
+from harnack.enclosures.harmonic_ball import Caps, Classic, Slope
 from harnack.enclosures.parabola import Cone, Taylor
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.geometry import shapes
-from harnack.testing.cases import BallCase, Case, CurvatureCase, LipschitzCase
-from harnack.testing.walks import look_at, movements
+from harnack.testing.bound_contracts import BallCase, Case, CurvatureCase, LipschitzCase
+from harnack.testing.worst_places import look_at, movements
 from tests.oracles.exact import exact_step
 
 # --- fields whose surfaces are known ---------------------------------------------------------
@@ -795,7 +793,7 @@ def test_results_are_float64_arrays_of_the_same_length(method: Any) -> None:
 def test_batches_make_no_difference(method: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     x = points_around(WAVY, 40)
     whole = signed_distance(WAVY, x, method=method)
-    monkeypatch.setattr(batches, "_AT_ONCE", 17)
+    monkeypatch.setattr(tangent, "_AT_ONCE", 17)
     assert np.allclose(signed_distance(WAVY, x, method=method), whole, rtol=1e-12)
 
 

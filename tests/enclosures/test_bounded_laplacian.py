@@ -13,7 +13,7 @@ import harnack as hk
 from benchmarks.laplacian import GyroidByLaplacian
 from harnack.backend import choose_backend, to_numpy
 from harnack.enclosures import BoundedLaplacian, Gaps, Lipschitz, Slopes, choose_proofs
-from harnack.enclosures.balls.bounded_laplacian import KERNEL_NORM, SLOPE_NORM, GreenBall
+from harnack.enclosures.bounded_laplacian import KERNEL_NORM, SLOPE_NORM, GreenBall
 from harnack.enclosures.parabola import Cone
 from harnack.fields import Field, Sample
 from harnack.testing import BrokenPromiseError, check_bound, check_field

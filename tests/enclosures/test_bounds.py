@@ -22,16 +22,20 @@ from harnack.enclosures import (
     choose_proofs,
     longest_step,
 )
-from harnack.enclosures.balls.ball import Ball
-from harnack.enclosures.balls.bounded_laplacian import GreenBall
-from harnack.enclosures.balls.caps import Caps
-from harnack.enclosures.balls.classic import Classic
-from harnack.enclosures.balls.slope import Slope
+from harnack.enclosures.ball import Ball
+from harnack.enclosures.bounded_laplacian import GreenBall
+from harnack.enclosures.harmonic_ball import Caps, Classic, Slope
 from harnack.enclosures.parabola import Cone, Parabola, Taylor
 from harnack.testing import BrokenPromiseError, check_bound, scaled
-from harnack.testing.cases import BallCase, Case, CurvatureCase, LaplacianCase, LipschitzCase
+from harnack.testing.bound_contracts import (
+    BallCase,
+    Case,
+    CurvatureCase,
+    LaplacianCase,
+    LipschitzCase,
+)
 from harnack.testing.poisson import cap_mass, cap_movement, cap_slope, kernel_movement
-from harnack.testing.scaled import unscaled
+from harnack.testing.worst_places import unscaled
 from tests.oracles.exact import BOUNDS, exact_step, on_host
 
 

@@ -24,11 +24,10 @@ from harnack.arithmetic import Interval
 from harnack.backend import choose_backend
 from harnack.backend.arrays import aligned
 from harnack.enclosures import Enclosure, Gaps, Slopes, any_covers, longest_step
-from harnack.enclosures.arc import Arc
-from harnack.enclosures.balls.ball import Ball
-from harnack.enclosures.balls.bounded_laplacian import GreenBall
-from harnack.enclosures.cusp import Cusp
-from harnack.enclosures.extremum import Greatest, Negated, Part, Stretched
+from harnack.enclosures.ball import Ball
+from harnack.enclosures.bounded_laplacian import GreenBall
+from harnack.enclosures.enclosure import Piece
+from harnack.enclosures.extremum import Cusp, Greatest, Nearest, Negated, Part, Sheet, Stretched
 from harnack.enclosures.literature import (
     AffineBand,
     Band,
@@ -37,11 +36,8 @@ from harnack.enclosures.literature import (
     IntervalRange,
     Mixed,
 )  # fmt: skip
-from harnack.enclosures.nearest import Nearest, Sheet
-from harnack.enclosures.parabola import Cone, Parabola, Taylor
+from harnack.enclosures.parabola import Arc, Cone, Parabola, Tangent, Taylor
 from harnack.enclosures.pieces import LinearTaylor, OnePiece, Pieces, QuadraticTaylor, Segment
-from harnack.enclosures.restriction import Piece
-from harnack.enclosures.tangent import Tangent
 from harnack.fields.blobs.blobs import _After  # pyright: ignore[reportPrivateUsage]
 from harnack.fields.blobs.largest import LargestAlong
 from harnack.fields.solids.region import Folded

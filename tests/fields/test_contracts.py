@@ -26,14 +26,12 @@ from harnack.enclosures import (
     Slopes,
     choose_proofs,
 )
-from harnack.enclosures.balls.bounded_laplacian import GreenBall
-from harnack.enclosures.balls.caps import Caps
-from harnack.enclosures.balls.classic import Classic
-from harnack.enclosures.balls.slope import Slope
+from harnack.enclosures.bounded_laplacian import GreenBall
+from harnack.enclosures.harmonic_ball import Caps, Classic, Slope
 from harnack.enclosures.parabola import Cone, Taylor
 from harnack.fields import Field, Sample
+from harnack.fields.analytic.waves import PlaneWave, Product, cosine, sine
 from harnack.fields.sheets import NO_SHEET, Crossing
-from harnack.fields.waves.waves import PlaneWave, Product, cosine, sine
 from harnack.geometry import shapes
 from harnack.geometry.mesh_shapes import bumpy_sphere, icosphere, remove_faces
 from harnack.testing import BrokenPromiseError, check_field, check_looks, scaled

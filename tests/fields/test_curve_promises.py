@@ -10,8 +10,7 @@ import pytest
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.enclosures import Curvature
-from harnack.fields.edges.edge_records import LoopEdges
-from harnack.fields.edges.edge_sums import sum_over_edges
+from harnack.fields.solid_angles.edges import LoopEdges, sum_over_edges
 from harnack.geometry import shapes
 from tests.oracles.oracle import CurveOracle
 

@@ -21,7 +21,7 @@ from harnack import geometry
 from harnack.backend import choose_backend
 from harnack.enclosures import Enclosure, Promise
 from harnack.geometry import shapes
-from harnack.geometry.volumes import Volume
+from harnack.geometry.volume import Volume
 
 DOUBLE = choose_backend("double")
 LOOP = shapes.wavy_polygon(12)

@@ -13,15 +13,15 @@ from hypothesis import strategies as st
 
 import harnack as hk
 from harnack.backend import Backend, choose_backend, to_numpy, to_vector3
-from harnack.fields.edges.edge_lift import LiftedEdges, lifted_sums
-from harnack.fields.winding.edge_trails import closed_trails
-from harnack.fields.winding.winding_exact import (
+from harnack.fields.solid_angles.edge_lift import LiftedEdges, lifted_sums
+from harnack.fields.solid_angles.edge_trails import closed_trails
+from harnack.fields.solid_angles.winding_exact import (
     ChainLeaves,
     EdgeChains,
     chain_columns,
     chain_leaves,
 )
-from harnack.fields.winding.winding_mesh import WindingMesh
+from harnack.fields.solid_angles.winding_mesh import WindingMesh
 from harnack.geometry.mesh_shapes import bumpy_sphere, remove_faces
 from harnack.testing import check_field
 from harnack.tree import NO_PRIMITIVE

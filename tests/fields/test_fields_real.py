@@ -17,16 +17,16 @@ from scipy.special import lpmv
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.enclosures import Curvature, HarmonicBall, Lipschitz
 from harnack.fields import Field
-from harnack.fields.polynomials.polynomial import HarmonicPolynomial, SphericalHarmonic
-from harnack.fields.polynomials.solid_harmonics import evaluate, from_monomials
-from harnack.fields.polynomials.sphere_range import (
+from harnack.fields.analytic.periodic import EigenfunctionSum, Gyroid, SchwarzD, SchwarzP
+from harnack.fields.analytic.polynomial import HarmonicPolynomial, SphericalHarmonic
+from harnack.fields.analytic.solid_harmonics import evaluate, from_monomials
+from harnack.fields.analytic.sphere_bounds import (
     BallRange,
     proved_range,
     range_of_harmonic,
     unit_sphere,
 )
-from harnack.fields.waves.periodic import EigenfunctionSum, Gyroid, SchwarzD, SchwarzP
-from harnack.fields.waves.waves import PlaneWave, Product, cosine, sine
+from harnack.fields.analytic.waves import PlaneWave, Product, cosine, sine
 from harnack.geometry import Ball, Box, HalfSpace
 
 DOUBLE = choose_backend("double")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.fields.waves.cosine_series import CosineBounds, fit_cosines, midpoints, on_nodes
+from harnack.fields.analytic.cosine_series import CosineBounds, fit_cosines, midpoints, on_nodes
 from harnack.testing import BrokenPromiseError, check_field
 from tests.backend.test_kernels import compiled
 from tests.oracles.oracle import OracleValues, first_crossings

@@ -11,23 +11,21 @@ import pytest
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.backend.arrays import aligned
-from harnack.backend.lengths import length
+from harnack.backend.elementary import length
 from harnack.enclosures import Curvature, HarmonicBall, Lipschitz
-from harnack.enclosures.balls.caps import Caps
-from harnack.enclosures.balls.classic import Classic
-from harnack.enclosures.balls.slope import Slope
+from harnack.enclosures.harmonic_ball import Caps, Classic, Slope
 from harnack.enclosures.parabola import Cone, Taylor
-from harnack.fields.polynomials.axial_bounds import (
+from harnack.fields.analytic.rounding import HarmonicRounding
+from harnack.fields.analytic.solid_harmonics import Weights, evaluate, hessian
+from harnack.fields.analytic.sphere_bounds import (
     AxialBound,
     gradient_bound,
     hessian_bound,
     order_on_axis,
     value_bound,
 )
-from harnack.fields.polynomials.harmonic_rounding import HarmonicRounding
-from harnack.fields.polynomials.solid_harmonics import Weights, evaluate, hessian
-from harnack.testing.cases import CurvatureCase, LipschitzCase
-from harnack.testing.walks import look_at
+from harnack.testing.bound_contracts import CurvatureCase, LipschitzCase
+from harnack.testing.worst_places import look_at
 from tests.oracles.step_contracts import check_steps
 
 SINGLE, DOUBLE = choose_backend("single"), choose_backend("double")

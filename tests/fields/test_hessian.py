@@ -14,7 +14,7 @@ import pytest
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.geometry import shapes
-from harnack.geometry.net_loops import uncanceled_edges
+from harnack.geometry.polygons import uncanceled_edges
 from harnack.testing import BrokenPromiseError, check_field
 
 MANY_TERMS = hk.EigenfunctionSum(

@@ -12,13 +12,9 @@ from scipy.special import eval_gegenbauer, gamma, lpmv
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy
 from harnack.enclosures import Gaps, Slopes
-from harnack.enclosures.arc import Arc
-from harnack.fields.polynomials.hyperspherical_basis import (
-    from_monomials,
-    gegenbauer,
-    norm,
-)
-from harnack.fields.polynomials.solid_harmonics import evaluate
+from harnack.enclosures.parabola import Arc
+from harnack.fields.analytic.hyperspherical_basis import from_monomials, gegenbauer, norm
+from harnack.fields.analytic.solid_harmonics import evaluate
 from harnack.testing import BrokenPromiseError, check_field, check_looks
 from tests.oracles.oracle import OracleValues, first_crossings
 

@@ -11,8 +11,7 @@ import pytest
 import harnack as hk
 from harnack.cli import main
 from harnack.field_from_file import open_surface
-from harnack.fields.blobs.blobs import Blobs
-from harnack.fields.blobs.molecule import Molecule
+from harnack.fields.blobs.blobs import Blobs, Molecule
 from harnack.files import Atoms, FileFormatError, Metaballs, read_molecule, read_surface
 
 ATOM = "ATOM  {:>5d}  {:<3s} GLY A{:>4d}    {:8.3f}{:8.3f}{:8.3f}  1.00  0.00          {:>2s}\n"

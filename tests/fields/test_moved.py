@@ -10,7 +10,7 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.fields.winding import winding_mesh
+from harnack.fields.solid_angles import winding_mesh
 from harnack.geometry import MeshError
 from harnack.geometry.mesh_shapes import bumpy_sphere, remove_faces
 

@@ -17,17 +17,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from harnack.backend import choose_backend, to_numpy
-from harnack.fields.multipoles import moments
-from harnack.fields.multipoles.far_clusters import node_columns
-from harnack.fields.multipoles.multipole import (
+from harnack.fields.solid_angles import multipole
+from harnack.fields.solid_angles.far_clusters import far_terms, node_columns
+from harnack.fields.solid_angles.multipole import (
     NodeMoments,
     all_levels,
     cartesian,
+    sup_norm,
     triangle_levels,
     triangle_rule,
+    truncation,
 )
-from harnack.fields.multipoles.multipole_kernel import far_terms
-from harnack.fields.multipoles.truncation import sup_norm, truncation
 from harnack.fields.sums import longest_part
 from harnack.tree import Hierarchy, build_hierarchy
 
@@ -41,13 +41,13 @@ def complex_of(pairs: Any) -> Any:
 
 def regular(x: np.ndarray, order: int) -> Any:
     """R_lm at x (..., 3)."""
-    return complex_of(moments.regular(x[..., 0], x[..., 1], x[..., 2], order))
+    return complex_of(multipole.regular(x[..., 0], x[..., 1], x[..., 2], order))
 
 
 def of_dipoles(d: np.ndarray, normal: np.ndarray) -> Any:
     """M_lm of clusters of dipoles (k, s, 3)."""
-    pairs = moments.of_dipole(
-        moments.regular(*np.moveaxis(d, -1, 0), moments.KNOWN - 1), *np.moveaxis(normal, -1, 0)
+    pairs = multipole.of_dipole(
+        multipole.regular(*np.moveaxis(d, -1, 0), multipole.KNOWN - 1), *np.moveaxis(normal, -1, 0)
     )
     return {key: value.sum(axis=1) for key, value in complex_of(pairs).items()}
 
@@ -206,7 +206,7 @@ def test_moments_moved_are_moments(seed: int) -> None:
     shift = rng.normal(size=(4, 3))
     expected = of_dipoles(d + shift[:, None], normal)
     given = {key: (value.real, value.imag) for key, value in of_dipoles(d, normal).items()}
-    found = complex_of(moments.moved(given, *shift.T))
+    found = complex_of(multipole.moved(given, *shift.T))
     assert found.keys() == expected.keys()
     for key, value in expected.items():
         np.testing.assert_allclose(found[key], value, rtol=1e-10, atol=1e-10)

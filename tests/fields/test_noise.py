@@ -11,13 +11,7 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend
-from harnack.fields.solids.fractal import (
-    CONSTANTS,
-    CORNERS,
-    cell_noise,
-    fade,
-    lattice_vector,
-)
+from harnack.fields.solids.fractal import CONSTANTS, CORNERS, cell_noise, fade, lattice_vector
 
 FADES = pytest.mark.parametrize("kind", ["cubic", "quintic"])
 ATTAINED = {"cubic": math.sqrt(19) / 2, "quintic": math.sqrt(499) / 8}

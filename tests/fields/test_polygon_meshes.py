@@ -20,7 +20,7 @@ from harnack.geometry.meshes import MeshError
 from harnack.geometry.polygon_meshes import polygon_patches
 from harnack.rendering import Camera
 from harnack.testing import check_field
-from harnack.tree.boxes import NO_BOX, BoxTree
+from harnack.tree.nearest import NO_BOX, BoxTree
 from tests.backend.test_kernels import compiled
 
 PRECISIONS = ("single", "double")

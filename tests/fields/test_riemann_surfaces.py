@@ -15,10 +15,9 @@ import pytest
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy
 from harnack.enclosures import Gaps, Slopes
-from harnack.enclosures.cusp import Cusp
-from harnack.enclosures.nearest import Nearest, Sheet
-from harnack.fields.plane.branches import Branches, Disk, Stretch, complex_type
-from harnack.fields.plane.functions import branches_of
+from harnack.enclosures.extremum import Cusp, Nearest, Sheet
+from harnack.fields.analytic.branches import Branches, Disk, Stretch, complex_type
+from harnack.fields.analytic.plane import branches_of
 from harnack.testing import BrokenPromiseError, check_field
 from tests.backend.test_kernels import compiled
 

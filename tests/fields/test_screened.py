@@ -13,15 +13,15 @@ from scipy.special import eval_legendre, spherical_in, spherical_kn
 import harnack as hk
 from harnack.backend import choose_backend, to_float, to_numpy, to_vector3
 from harnack.enclosures import Curvature, HarmonicBall
-from harnack.fields.multipoles.dipole_records import dipole_rows
-from harnack.fields.multipoles.radial_kernel import seen_dipole
-from harnack.fields.multipoles.radial_tree import (
+from harnack.fields.solid_angles.far_clusters import dipole_rows
+from harnack.fields.solid_angles.radial_kernel import seen_dipole
+from harnack.fields.solid_angles.radial_tree import (
     ClusterMoments,
     clusters,
     coefficients,
     seen_cluster,
 )
-from harnack.fields.winding.screened import (
+from harnack.fields.solid_angles.screened import (
     ScreenedWindingNumber,
     YukawaKernel,
     accepting_distance,
@@ -31,7 +31,7 @@ from harnack.geometry import mesh_shapes
 from harnack.geometry.clouds import CloudError
 from harnack.geometry.meshes import MeshError
 from harnack.testing import check_field
-from harnack.testing.walks import look_at, random_directions
+from harnack.testing.worst_places import look_at, random_directions
 from harnack.tree import build_hierarchy
 from tests.oracles.oracle import OracleValues, first_crossings
 

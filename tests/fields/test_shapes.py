@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.arithmetic.blends import blend_intersection, blend_union
+from harnack.arithmetic.norms import blend_intersection, blend_union
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.backend.lengths import length
+from harnack.backend.elementary import length
 from harnack.enclosures import Gaps, choose_proofs
 from harnack.enclosures.proofs import longest_step
 from harnack.fields.formula import Formula

@@ -14,7 +14,7 @@ from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.enclosures import choose_proofs
 from harnack.fields.look import Path
 from harnack.geometry import shapes, validate_loops
-from harnack.geometry.net_loops import net_loops
+from harnack.geometry.polygons import net_loops
 from tests.oracles.oracle import CurveOracle, first_crossings, gap_to_levels
 
 FOUR_PI = 4 * math.pi

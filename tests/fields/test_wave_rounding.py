@@ -11,10 +11,10 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy
-from harnack.backend.sines import largest_angle, sincos
+from harnack.backend.elementary import largest_angle, sincos
 from harnack.enclosures import Curvature
-from harnack.fields.waves.waves import PlaneWave, Product, cosine, sine
-from harnack.testing.walks import look_at
+from harnack.fields.analytic.waves import PlaneWave, Product, cosine, sine
+from harnack.testing.worst_places import look_at
 
 UNIT = 2.0**-24
 

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.enclosures import HarmonicBall
-from harnack.fields.winding.edge_trails import EdgeTrails, closed_trails
-from harnack.fields.winding.winding_number import WindingNumber
+from harnack.fields.solid_angles.edge_trails import EdgeTrails, closed_trails
+from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.geometry import MeshError
 from harnack.geometry.mesh_shapes import (
     bumpy_sphere,

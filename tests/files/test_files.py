@@ -13,9 +13,8 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from harnack.files import file_format
-from harnack.files.file_format import FileFormatError
-from harnack.files.loops import read_loops
-from harnack.files.writing import check_writable, write_atomically
+from harnack.files.file_format import FileFormatError, check_writable, write_atomically
+from harnack.files.surfaces import read_loops
 from harnack.geometry import chains, shapes
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
@@ -466,7 +465,7 @@ def test_what_the_system_refuses_is_said_before_the_work(tmp_path, monkeypatch, 
     def refused(*_, **__):
         raise OSError(number, os.strerror(number), str(tmp_path))
 
-    monkeypatch.setattr("harnack.files.writing.tempfile.TemporaryFile", refused)
+    monkeypatch.setattr("harnack.files.file_format.tempfile.TemporaryFile", refused)
     with pytest.raises(OSError, match=f"cannot write .*a.png: {advice}") as caught:
         check_writable(tmp_path / "a.png")
     assert caught.value.errno == number

@@ -15,14 +15,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from harnack.field_from_file import open_surface
-from harnack.fields.curves.polygon_mesh import PolygonMesh
+from harnack.fields.solid_angles.polygon_mesh import PolygonMesh
 from harnack.files import gltf
 from harnack.files import ply as ply_files
 from harnack.files.file_format import FileFormatError
 from harnack.files.surfaces import ClosedCurves, Cloud, Mesh, read_surface
+from harnack.geometry.chains import singular_edges, weld_vertices
 from harnack.geometry.mesh_shapes import icosphere, remove_faces, torus_mesh
 from harnack.geometry.polygons import triangulate
-from harnack.geometry.singular import singular_edges, weld_vertices
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 FORMATS = ("obj", "stl", "stl_ascii", "off", "ply", "ply_ascii", "glb")

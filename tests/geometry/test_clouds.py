@@ -326,7 +326,7 @@ def test_a_moved_cloud_is_the_cloud_that_is_there(motion, monkeypatch):
         "shuffled": u[np.random.default_rng(1).permutation(len(u))],
     }[motion]
     monkeypatch.setattr(
-        "harnack.fields.multipoles.dipole_records.build_hierarchy", None
+        "harnack.fields.solid_angles.far_clusters.build_hierarchy", None
     )  # no sort again
     moved = field.moved(x, x, areas)
     points = np.random.default_rng(2).uniform(-1.5, 1.5, (800, 3))

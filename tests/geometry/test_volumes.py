@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from harnack.geometry.volumes import Ball, Box, ConvexHull, HalfSpace, Intersection, Volume
-from harnack.geometry.volumes.hull import MAX_PLANES
-from harnack.geometry.volumes.polytope import MAX_UNROLLED, Polytope
+from harnack.geometry.convexity import MAX_PLANES, ConvexHull
+from harnack.geometry.volume import Volume
+from harnack.geometry.volumes import MAX_UNROLLED, Ball, Box, HalfSpace, Intersection, Polytope
 
 EPS = {"single": 2.0**-24, "double": 2.0**-53}
 

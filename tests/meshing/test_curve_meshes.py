@@ -14,9 +14,8 @@ from scipy.spatial.transform import Rotation
 import harnack as hk
 from harnack.geometry import shapes
 from harnack.meshing import checks
-from harnack.meshing.intersections import intersecting_faces
-from harnack.meshing.refining.flips import least_angles
-from harnack.meshing.refining.relaxation import relaxed
+from harnack.meshing.checks import intersecting_faces
+from harnack.meshing.relaxation import least_angles, relaxed
 from harnack.meshing.samples import LevelFunction
 from tests.oracles.oracle import CurveOracle
 from tests.oracles.triangle_pairs import intersecting_pairs

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from harnack.geometry.mesh_shapes import icosphere
-from harnack.meshing.intersections import intersecting_faces, sides_of_lines, sides_of_planes
+from harnack.meshing.checks import intersecting_faces, sides_of_lines, sides_of_planes
 
 # A rotation without short decimals: coplanar corners are not in planes of three coordinates.
 TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])

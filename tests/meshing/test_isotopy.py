@@ -14,10 +14,9 @@ from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.geometry import shapes
 from harnack.meshing import isotopy
 from harnack.meshing.checks import check_manifold, euler_characteristic
-from harnack.meshing.marching_tetrahedra import crossings_of, is_cut, triangles_of
+from harnack.meshing.marching_tetrahedra import crossings_of, delaunay, is_cut, triangles_of
 from harnack.meshing.points import Boundary, PointSet, box_cells, place_points
 from harnack.meshing.samples import LevelFunction
-from harnack.meshing.tetrahedra import delaunay
 
 BOX = (np.full(3, -0.5), np.full(3, 0.5))
 NO_CURVE = Boundary(np.zeros((0, 3)), np.zeros((0, 2), np.int64))

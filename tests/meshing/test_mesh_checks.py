@@ -20,9 +20,9 @@ from harnack.meshing.checks import (
     check_inside,
     check_near_level,
 )
+from harnack.meshing.closed_mesh import ClosedMesh
+from harnack.meshing.finishing import simplified
 from harnack.meshing.lattice_surface import Surface
-from harnack.meshing.printing.closed_mesh import ClosedMesh
-from harnack.meshing.printing.finishing import simplified
 from harnack.meshing.samples import LevelFunction
 from tests.oracles.mesh_files import read_closed
 

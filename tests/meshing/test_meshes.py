@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harnack.geometry import chains, singular
+from harnack.geometry import chains
+from harnack.geometry.chains import net_faces, singular_edges, singular_loops, weld_vertices
 from harnack.geometry.mesh_shapes import (
     bumpy_sphere,
     duplicate_faces,
@@ -24,7 +25,6 @@ from harnack.geometry.meshes import (
     without_zero_area_faces,
     zero_area_faces,
 )
-from harnack.geometry.singular import net_faces, singular_edges, singular_loops, weld_vertices
 
 SQUARE = [[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
 TWO = [[0, 1, 2], [0, 2, 3]]
@@ -155,7 +155,7 @@ def test_welding_agrees_with_the_plain_one(seed, n, kinds):
 
 
 def test_welding_survives_equal_hashes(monkeypatch):
-    monkeypatch.setattr(singular, "_GOLDEN", np.uint64(0))  # every row then has the same hash
+    monkeypatch.setattr(chains, "_GOLDEN", np.uint64(0))  # every row then has the same hash
     x = np.random.default_rng(0).integers(0, 3, size=(100, 3)).astype(float)
     np.testing.assert_array_equal(weld_vertices(x), plainly_welded(x))
 

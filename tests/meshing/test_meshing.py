@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.cells import Cells, carve, octree
 from harnack.geometry import shapes
 from harnack.meshing import checks
 from harnack.meshing.points import Boundary
+from harnack.tree.cells import Cells, carve, octree
 
 
 def test_periodic_surfaces_end_at_the_faces_of_a_box() -> None:

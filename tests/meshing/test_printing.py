@@ -15,11 +15,10 @@ import trimesh
 import harnack as hk
 from harnack.cli import main
 from harnack.geometry import shapes
-from harnack.meshing import checks
-from harnack.meshing.intersections import intersecting_faces
+from harnack.meshing import checks, clipping, finishing
+from harnack.meshing.checks import intersecting_faces
 from harnack.meshing.lattice import Lattice
 from harnack.meshing.lattice_surface import Surface
-from harnack.meshing.printing import bodies, thickening
 from tests.oracles.mesh_files import read_closed
 
 BOX = hk.Box((-1, -1, -1), (1, 1, 1))
@@ -254,7 +253,7 @@ def test_beyond_its_reach_a_surface_is_made_of_hulls() -> None:
 
 
 def test_too_many_hulls_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(thickening, "_MOST_HULLS", 10)
+    monkeypatch.setattr(finishing, "_MOST_HULLS", 10)
     with pytest.raises(hk.MeshingError, match="reach"):
         hk.mesh(hk.Sphere(0.3), thickness=0.8, tolerance=0.05, spacing=0.2)
 
@@ -339,7 +338,7 @@ def test_cavities_belong_to_the_innermost_shell_around_them() -> None:
             [one + k * n for k, one in enumerate(faces)]))  # fmt: skip
 
     def kept(surface: Surface) -> float:
-        body = bodies.largest_body(surface)
+        body = clipping.largest_body(surface)
         return float(trimesh.Trimesh(body.vertices, body.faces, process=False).volume)
 
     whole = float(ball.volume)

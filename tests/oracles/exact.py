@@ -17,12 +17,16 @@ import numpy.typing as npt
 
 from harnack.backend import FloatArray, to_numpy
 from harnack.enclosures import Enclosure
-from harnack.enclosures.balls.bounded_laplacian import GreenBall
-from harnack.enclosures.balls.caps import Caps
-from harnack.enclosures.balls.classic import Classic
-from harnack.enclosures.balls.slope import Slope
+from harnack.enclosures.bounded_laplacian import GreenBall
+from harnack.enclosures.harmonic_ball import Caps, Classic, Slope
 from harnack.enclosures.parabola import Cone, Taylor
-from harnack.testing.cases import BallCase, Case, CurvatureCase, LaplacianCase, LipschitzCase
+from harnack.testing.bound_contracts import (
+    BallCase,
+    Case,
+    CurvatureCase,
+    LaplacianCase,
+    LipschitzCase,
+)
 from harnack.testing.poisson import cap_movement, kernel_movement
 
 __all__ = ["BOUNDS", "exact_step", "on_host"]

@@ -17,12 +17,23 @@ from harnack.enclosures import (
     Promise,
     Slopes,
 )
-from harnack.enclosures.balls.bounded_laplacian import GreenBall
-from harnack.enclosures.balls.slope import Slope
-from harnack.testing.cases import BallCase, Case, CurvatureCase, LaplacianCase, LipschitzCase
-from harnack.testing.failures import BrokenPromiseError
-from harnack.testing.scaled import unscaled
-from harnack.testing.walks import look_at, movements, random_directions, random_points
+from harnack.enclosures.bounded_laplacian import GreenBall
+from harnack.enclosures.harmonic_ball import Slope
+from harnack.testing.bound_contracts import (
+    BallCase,
+    Case,
+    CurvatureCase,
+    LaplacianCase,
+    LipschitzCase,
+)
+from harnack.testing.worst_places import (
+    BrokenPromiseError,
+    look_at,
+    movements,
+    random_directions,
+    random_points,
+    unscaled,
+)
 from tests.oracles.exact import exact_step, on_host
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.fields.solids.square import lipschitz_of_norms
+from harnack.fields.solids.primitives import lipschitz_of_norms
 
 
 def test_equation_16_a_union_of_distances_is_a_bound_only_inside() -> None:

@@ -10,8 +10,8 @@ import pytest
 from PIL import Image
 
 import harnack as hk
-from harnack.rendering.pictures.images import exr_bytes
-from harnack.rendering.surfaces.colors import NAMED_COLORS, color_of, linear
+from harnack.rendering.images import exr_bytes
+from harnack.rendering.scales import NAMED_COLORS, color_of, linear
 
 SMALL: dict[str, Any] = {"size": (40, 30), "progress": False, "show": "shaded", "spp": 4}
 

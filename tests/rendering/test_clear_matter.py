@@ -13,7 +13,7 @@ import harnack as hk
 from harnack.enclosures import Lipschitz
 from harnack.fields.field import Field, Sample
 from harnack.rendering import Material, register, render, shape
-from harnack.rendering.mitsuba.clear import refracted
+from harnack.rendering.mitsuba import refracted
 
 mi = register()
 T = mi.ScalarTransform4f

@@ -12,8 +12,8 @@ import harnack as hk
 from harnack.backend import choose_backend
 from harnack.geometry import mesh_shapes
 from harnack.rendering import Camera, register, render, shape
-from harnack.rendering.pictures.shaded import balls_of
-from harnack.rendering.pictures.shading import Light
+from harnack.rendering.shaded import balls_of
+from harnack.rendering.shading import Light
 from harnack.tracer.pixel_cones import Cones
 
 mi = register()

@@ -11,8 +11,8 @@ import pytest
 import harnack as hk
 from harnack.geometry import shapes
 from harnack.rendering import register, shape
-from harnack.rendering.mitsuba.integrator import PathTracer
-from harnack.rendering.pictures.light_paths import Exposure, Pace, expose, pace_of
+from harnack.rendering.integrator import PathTracer
+from harnack.rendering.light_paths import Exposure, Pace, expose, pace_of
 
 mi = register()
 POLYGON = hk.SolidAngle(shapes.wavy_polygon(24))

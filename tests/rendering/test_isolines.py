@@ -11,7 +11,7 @@ import harnack as hk
 from harnack.backend import choose_backend, to_numpy
 from harnack.backend.arrays import upload_vectors
 from harnack.rendering import register, shape
-from harnack.rendering.surfaces.isolines import line_at
+from harnack.rendering.isolines import line_at
 from harnack.tracer import Status
 
 mi = register()

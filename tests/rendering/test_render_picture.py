@@ -15,9 +15,9 @@ import pytest
 import harnack as hk
 from harnack.geometry import shapes
 from harnack.rendering import MATERIALS, SHOW_MODES, Camera, Material, picture, register, render
-from harnack.rendering.pictures.images import exr_bytes, tone_mapped
-from harnack.rendering.pictures.scales import viridis
-from harnack.rendering.studio.stage import on_ground
+from harnack.rendering.images import exr_bytes, tone_mapped
+from harnack.rendering.scales import viridis
+from harnack.rendering.stage import on_ground
 
 mi = register()
 SMALL: dict[str, Any] = {"size": (40, 30), "progress": False}
@@ -380,7 +380,7 @@ def test_other_variants_draw_the_same_picture(variant: str) -> None:
 )
 def test_views_look_alike_in_bands(show: str, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = draw(show=show)
-    monkeypatch.setattr("harnack.rendering.pictures.views._RAYS_A_BAND", 7)
+    monkeypatch.setattr("harnack.rendering.views._RAYS_A_BAND", 7)
     np.testing.assert_array_equal(draw(show=show), whole)
 
 

@@ -15,13 +15,10 @@ import harnack as hk
 from harnack.enclosures import Lipschitz
 from harnack.fields.field import Field, Sample
 from harnack.geometry import mesh_shapes, shapes
-from harnack.rendering import Camera, Material, register, render, shape
-from harnack.rendering.mitsuba.world import World
-from harnack.rendering.pictures import shaded
-from harnack.rendering.pictures.floor import Floor
-from harnack.rendering.pictures.pixels import grid_offsets, in_tiles
-from harnack.rendering.pictures.shaded import visible_sky
-from harnack.rendering.pictures.shading import Light
+from harnack.rendering import Camera, Material, register, render, shaded, shape
+from harnack.rendering.shaded import visible_sky
+from harnack.rendering.shading import Floor, Light, grid_offsets, in_tiles
+from harnack.rendering.world import World
 
 mi = register()
 T = mi.ScalarTransform4f
@@ -137,7 +134,7 @@ def draw(what: Any = POLYGON, **settings: Any) -> np.ndarray:
 def test_the_picture_is_always_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = draw()
     np.testing.assert_array_equal(whole, draw(seed=7))
-    monkeypatch.setattr("harnack.rendering.pictures.shaded._RAYS_A_BAND", 333)
+    monkeypatch.setattr("harnack.rendering.shaded._RAYS_A_BAND", 333)
     np.testing.assert_allclose(draw(), whole, atol=1e-5)
 
 
@@ -207,7 +204,7 @@ def positions(bend: float) -> tuple[Any, Any]:
 
 
 def test_a_plane_hides_nothing_and_a_wall_hides_what_is_near(monkeypatch: Any) -> None:
-    monkeypatch.setattr("harnack.rendering.pictures.shaded._REACH", 0.4)
+    monkeypatch.setattr("harnack.rendering.shaded._REACH", 0.4)
     flat = np.array(visible_sky(mi, *positions(0.0), mi.Float(1), (41, 41))).reshape(41, 41)
     np.testing.assert_allclose(flat, 1, atol=1e-6)
     bent = np.array(visible_sky(mi, *positions(2.0), mi.Float(1), (41, 41))).reshape(41, 41)

@@ -11,9 +11,8 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_float, to_numpy, to_vector3
-from harnack.geometry.volumes import Volume
-from harnack.rendering.surfaces.encounter import facing
-from harnack.rendering.surfaces.solid import CappedSolid
+from harnack.geometry.volume import Volume
+from harnack.rendering.encounter import CappedSolid, facing
 
 BACKEND = choose_backend()
 BALL = hk.Ball((0.1, 0.0, -0.05), 0.9)

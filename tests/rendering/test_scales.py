@@ -11,8 +11,8 @@ import pytest
 
 import harnack as hk
 from harnack.rendering import register, shape
-from harnack.rendering.pictures.images import as_bytes
-from harnack.rendering.pictures.scales import Scale, hues, viridis, with_bar
+from harnack.rendering.images import as_bytes
+from harnack.rendering.scales import Scale, hues, viridis, with_bar
 
 mi = register()
 SMALL: dict[str, Any] = {"size": (64, 48), "progress": False}

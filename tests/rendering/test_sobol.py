@@ -10,8 +10,8 @@ import pytest
 
 from harnack.backend.arrays import aligned_integers
 from harnack.rendering import register
-from harnack.rendering.mitsuba.sobol import SobolSampler
-from harnack.rendering.mitsuba.variant import mitsuba_backend
+from harnack.rendering.integrator import SobolSampler
+from harnack.rendering.mitsuba import mitsuba_backend
 
 mi: Any = register()
 

@@ -16,10 +16,9 @@ import pytest
 import harnack as hk
 from harnack.cli import main
 from harnack.geometry import shapes
-from harnack.rendering import register
-from harnack.rendering.pictures import scales
-from harnack.rendering.pictures.scales import Scale
-from harnack.rendering.studio.upright import upright
+from harnack.rendering import register, scales
+from harnack.rendering.framing import upright
+from harnack.rendering.scales import Scale
 
 FIELD = hk.SolidAngle(shapes.wavy_polygon(24))
 mi = register()

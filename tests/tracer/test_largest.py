@@ -7,9 +7,9 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.cells import components
 from harnack.fields.clearance import occupied_cells
-from harnack.rendering.surfaces.placement import PlacedSurface, Placement
+from harnack.rendering.placement import PlacedSurface, Placement
+from harnack.tree import cells
 
 BIG, SMALL = (0.5, (-0.6, 0.0, 0.0)), (0.3, (0.5, 0.0, 0.0))
 
@@ -97,11 +97,11 @@ def test_wrong_groups_are_noticed(monkeypatch):
     alone[1, 1, 1] = True
     field = hk.Sphere(*BIG) | hk.Sphere(*SMALL)
     with monkeypatch.context() as patch:
-        patch.setattr(components, "_AROUND", alone)  # no cell has a neighbor
+        patch.setattr(cells, "_AROUND", alone)  # no cell has a neighbor
         assert wrong(field, 1000, 0) > 100
     field = hk.Sphere(*BIG) | hk.Sphere(*SMALL)  # nothing is kept of it
     with monkeypatch.context() as patch:
-        patch.setattr(components.np, "argmax", np.argmin)
+        patch.setattr(cells.np, "argmax", np.argmin)
         assert wrong(field, 1000, 0) > 100
     assert wrong(hk.Sphere(*BIG) | hk.Sphere(*SMALL), 1000, 0) == 0
 

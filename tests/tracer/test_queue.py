@@ -13,7 +13,7 @@ import pytest
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.backend.arrays import aligned
-from harnack.backend.lanes import on_some, while_queued
+from harnack.backend.loops import on_some, while_queued
 from harnack.geometry.mesh_shapes import icosphere
 
 

@@ -22,17 +22,16 @@ from harnack.backend import (
     choose_backend,
     to_numpy,
 )  # fmt: skip
-from harnack.backend.extrema import clamp, fmax, fmin
+from harnack.backend.elementary import clamp, fmax, fmin
 from harnack.enclosures import Curvature, Enclosure, Slopes, TargetLevels, choose_proofs
-from harnack.enclosures.balls.caps import Caps
-from harnack.enclosures.balls.slope import Slope
+from harnack.enclosures.harmonic_ball import Caps, Slope
 from harnack.enclosures.parabola import Taylor
 from harnack.fields import Field, Sample
 from harnack.fields.look import Path as RayPath
 from harnack.fields.sheets import NO_SHEET, Crossing
-from harnack.rendering.surfaces.encounter import meet_surface
+from harnack.rendering.encounter import meet_surface
 from harnack.testing import scaled
-from harnack.testing.cases import BallCase, Case, CurvatureCase
+from harnack.testing.bound_contracts import BallCase, Case, CurvatureCase
 from harnack.tracer.contact import compare_with_sheet
 from tests.oracles.exact import exact_step, on_host
 from tests.oracles.jump_oracle import first_side_changes, judge

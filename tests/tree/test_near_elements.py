@@ -10,10 +10,9 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.fields.multipoles.multipole import all_levels
-from harnack.fields.multipoles.truncation import truncation
+from harnack.fields.solid_angles.multipole import all_levels, truncation
+from harnack.geometry.chains import singular_edges
 from harnack.geometry.mesh_shapes import icosphere
-from harnack.geometry.singular import singular_edges
 from harnack.tree import build_hierarchy
 from tests.oracles.direct_sums import dipole_sum, winding_sum
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from harnack.arithmetic.affine import Affine
-from harnack.arithmetic.blends import blend_intersection, blend_union, corner
-from harnack.arithmetic.clipped import ClippedPower, clipped_power
 from harnack.arithmetic.functions import (
+    ClippedPower,
     Function,
     absolute,
     acos,
     asin,
     atan,
+    clipped_power,
     cos,
     cosh,
     exp,
@@ -25,7 +25,7 @@ from harnack.arithmetic.functions import (
 )
 from harnack.arithmetic.interval import ONE, ZERO, Interval
 from harnack.arithmetic.jet import Jet
-from harnack.arithmetic.norms import maximum, minimum, norm
+from harnack.arithmetic.norms import blend_intersection, blend_union, corner, maximum, minimum, norm
 from harnack.arithmetic.parabolas import Parabolas
 
 __all__ = [

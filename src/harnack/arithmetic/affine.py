@@ -16,7 +16,7 @@ import drjit as dr
 
 from harnack.arithmetic.interval import Interval, unit_of
 from harnack.arithmetic.operators import Operators
-from harnack.backend.extrema import fmax, fmin
+from harnack.backend.elementary import fmax, fmin
 
 if TYPE_CHECKING:
     from harnack.arithmetic.functions import Function

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 import drjit as dr
 import numpy as np
 
-from harnack.backend.extrema import fmax, fmin
+from harnack.backend.elementary import fmax, fmin
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real

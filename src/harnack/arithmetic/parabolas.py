@@ -23,10 +23,10 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import drjit as dr
 
-from harnack.arithmetic.clipped import ClippedPower
+from harnack.arithmetic.functions import ClippedPower
 from harnack.arithmetic.interval import Interval, unit_of
 from harnack.arithmetic.operators import Operators
-from harnack.backend.extrema import clamp, fmax, fmin
+from harnack.backend.elementary import clamp, fmax, fmin
 
 if TYPE_CHECKING:
     from harnack.arithmetic.functions import Function

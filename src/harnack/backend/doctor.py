@@ -17,12 +17,7 @@ from rich.text import Text
 
 from harnack._version import __version__
 from harnack.backend.arrays import BACKEND_VARIABLE, Index, Mask, Real, choose_backend, to_numpy
-from harnack.backend.llvm import (
-    PATH_VARIABLE,
-    LLVMNotFoundError,
-    find_libraries,
-    loaded_library,
-)
+from harnack.backend.llvm import PATH_VARIABLE, LLVMNotFoundError, find_libraries, loaded_library
 
 _PACKAGES = ("drjit", "mitsuba", "numpy", "scipy", "trimesh")
 _KERNEL_SECONDS = 120

@@ -1,10 +1,19 @@
-"""Recorded loops whose state is a record with names."""
+"""Recorded loops whose state is a record with names.
+
+Work on the lanes that need it: what is computed is evaluated, and lanes that are idle are left.
+
+A recorded loop follows the rays of one packet until the last of them has ended, and whatever lanes
+are masked costs as much as the others. Where arrays may be evaluated, outside of any recording,
+`on_some` gathers the lanes of a mask, and in `while_queued` a lane that has finished a ray fetches
+the next. Both give what would be computed for each lane by itself, in any order of lanes.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar, cast
 
 import drjit as dr
 
@@ -66,3 +75,150 @@ def record_of(like: Any, leaves: Iterator[Any]) -> Any:
 def _entries(record: Any) -> list[Any]:
     """The values of a record's fields, in order."""
     return [getattr(record, field.name) for field in dataclasses.fields(record)]
+
+
+Lanes = TypeVar("Lanes")
+Result = TypeVar("Result")
+
+# Lanes that share a queue: so many for each thread of a processor, and on a GPU in all.
+_OF_A_THREAD, _OF_GPU = 1024, 1 << 17
+
+
+def rows_of(mask: Mask) -> tuple[Any, int]:
+    """Indices of the lanes where a mask is set, and how many these are.
+
+    A single one is named twice: Dr.Jit compiles kernels of their own for arrays of one number.
+    """
+    rows = dr.compress(mask)
+    count = len(rows)
+    if count == 1:
+        rows = _own(lambda: dr.full(type(rows), int(rows[0]), 2))
+    return rows, count
+
+
+def wide(record: Lanes, width: int, index: Any) -> Lanes:
+    """A copy of a record in which all lanes may differ, evaluated. index: the type of lanes."""
+    copies = _own(lambda: [_wide(leaf, width, index) for leaf in leaves_of(record)])
+    return record_of(record, iter(copies))
+
+
+def gathered(record: Lanes, rows: Any) -> Lanes:
+    """Some lanes of a record. What is the same in all lanes stays one number."""
+
+    def some(leaf: Any) -> Any:
+        return leaf if dr.width(leaf) == 1 else dr.gather(type(leaf), leaf, rows)
+
+    return record_of(record, map(some, leaves_of(record)))
+
+
+def on_some(
+    mask: Mask, compute: Callable[[Lanes], Result], lanes: Lanes, elsewhere: Result
+) -> Result:
+    """What `compute` makes of a record's lanes where `mask` is set, `elsewhere` on the others.
+
+    All lanes are evaluated first and last, so that kernels do not depend on how many there are.
+    `elsewhere` is a record like the result.
+    """
+    width = dr.width(mask)
+    dr.eval(mask, *leaves_of(lanes), *leaves_of(elsewhere))
+    rows, count = rows_of(mask)
+    result = wide(elsewhere, width, type(rows))
+    if not count:
+        _as_after_a_loop(rows)
+        return result
+    targets, values = [*leaves_of(result)], [*leaves_of(compute(gathered(lanes, rows)))]
+    dr.eval(values)
+    for target, value in zip(targets, values, strict=True):
+        dr.scatter(target, value, rows)
+    dr.eval(targets)
+    _as_after_a_loop(rows)
+    return record_of(result, iter(targets))
+
+
+def while_queued(
+    start: State, body: Callable[[State], State], result: Callable[[State], Result], label: str
+) -> Result:
+    """What `result` makes of each lane after `while_active(start, body, label)`, evaluated.
+
+    Far fewer lanes run the loop than `start` has: one whose ray has ended writes the result and
+    fetches the next ray from a queue, so that none waits for the slowest ray of its packet.
+
+    body: must know of its lane by the state alone, and hold nothing that differs between lanes.
+    """
+    dr.eval(*leaves_of(start))
+    width = max(dr.width(leaf) for leaf in leaves_of(start))
+    active = dr.full(type(start.active), True, width) & start.active
+    rows, count = rows_of(active)
+    done = wide(result(start), width, type(rows))
+    if count:
+        _run_queue(start, body, result, rows, count, [*leaves_of(done)], label)
+    _as_after_a_loop(rows)
+    return done
+
+
+@dataclass(frozen=True)
+class _Lane:
+    """row: in the queue, of the ray that the lane follows. ray: its state."""
+
+    row: Any
+    ray: Any
+
+    @property
+    def active(self) -> Mask:
+        return self.ray.active
+
+
+def _run_queue(
+    start: Any, body: Callable[[Any], Any], result: Callable[[Any], Any],
+    rows: Any, total: int, done: list[Any], label: str,
+) -> None:  # fmt: skip
+    """rows: of the `total` rays in `start` that are to be run. done: where their results go."""
+    index = cast("Any", type(rows))
+    count = dr.opaque(index, total)
+    threads = dr.thread_count() if dr.backend_v(rows) == dr.JitBackend.LLVM else 0
+    at_once = min(len(rows), _OF_A_THREAD * threads or _OF_GPU)
+    taken, first = _own(lambda: [dr.full(index, at_once, 1), dr.arange(index, at_once)])
+
+    def fetched(row: Any, wanted: Mask) -> Any:
+        which = dr.gather(index, rows, row, wanted)
+
+        def of_ray(leaf: Any) -> Any:
+            return leaf if dr.width(leaf) == 1 else dr.gather(type(leaf), leaf, which, wanted)
+
+        return record_of(start, map(of_ray, leaves_of(start)))
+
+    def one_step(lane: _Lane) -> _Lane:
+        now = body(lane.ray)
+        ended = lane.active & ~now.active
+        which = dr.gather(index, rows, lane.row, ended)
+        for target, value in zip(done, leaves_of(result(now)), strict=True):
+            dr.scatter(target, value, which, ended)
+        row = dr.select(ended, dr.scatter_inc(taken, index(0), ended), lane.row)
+        again = ended & (row < count)
+        both = zip(leaves_of(fetched(row, again)), leaves_of(now), strict=True)
+        return _Lane(row, record_of(now, (dr.select(again, *pair) for pair in both)))
+
+    while_active(_Lane(first, fetched(first, first < count)), one_step, label)
+    dr.eval(done)
+
+
+def _as_after_a_loop(array: Any) -> None:
+    """Begin a new scope, as loops do: Dr.Jit looks for equal numbers in one scope only, so that
+    what follows would be another kernel where there was nothing to do."""
+    dr.detail.new_scope(dr.backend_v(array))
+
+
+def _own(make: Callable[[], Any]) -> Any:
+    """What is made, evaluated, in memory of its own.
+
+    Dr.Jit keeps equal arrays once, and kernels differ by what they share: those for as many lanes
+    as another array has by chance would be compiled anew.
+    """
+    with dr.scoped_set_flag(dr.JitFlag.ValueNumbering, False):
+        made = make()
+        dr.make_opaque(made)
+    return made
+
+
+def _wide(leaf: Any, width: int, index: Any) -> Any:
+    return dr.gather(type(leaf), leaf, dr.arange(index, width) * (dr.width(leaf) > 1))

@@ -2,16 +2,20 @@
 
 `drjit.wrap` gives a function tensors and takes back tensors, while what is computed here runs on
 vectors, a lane a row. All conversions pass derivatives on, in both directions.
+
+Functions of Dr.Jit tensors for JAX: the direction of `drjit.wrap` that Dr.Jit lacks.
 """
 
 from __future__ import annotations
 
 import functools
+import importlib
 import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import drjit as dr
+import numpy as np
 
 from harnack.backend.arrays import backend_of
 from harnack.backend.numbers import TRANSPOSE, check_vectors
@@ -81,3 +85,134 @@ def takes_tensors(method: Method) -> Method:
         return tensor_of(method(self, vectors_of(rows, "points"), **settings), tuple(shape))
 
     return cast("Method", general)
+
+
+_TRACED = (
+    "wrap_for_jax(function) cannot run inside jax.jit, jax.vmap or the like, where shapes of "
+    "results must be known beforehand: call it outside, or inside jax.jit give result=, a function "
+    "of the same arguments whose result has these shapes and types, such as "
+    "result=lambda vertices, points: points[:, 0]"
+)
+
+
+def wrap_for_jax(
+    function: Callable[..., Any], *, result: Callable[..., Any] | None = None
+) -> Callable[..., Any]:
+    """A function of Dr.Jit tensors as one of JAX arrays, with derivatives for `jax.grad`.
+
+    What `drjit.wrap(source="torch", target="drjit")` is for PyTorch; Dr.Jit has nothing for JAX.
+
+    function: must be pure. It is called with a Dr.Jit tensor for each array or number among its
+        arguments, of the shape and precision that it has in JAX, and returns Dr.Jit arrays or
+        tensors, in tuples, lists and dictionaries if it likes; 3-vectors become arrays (n, 3).
+    result: only for use inside `jax.jit`: a JAX function of the same arguments whose result has
+        the shapes and types of `function`'s. Only these are looked at.
+
+    Derivatives are those of reverse mode (`jax.grad`, `jax.vjp`, `jax.jacrev`). A derivative calls
+    `function` a second time: JAX may keep what a forward pass leaves, and Dr.Jit's graph is none
+    of what it can keep.
+
+    Raises ImportError where JAX is not installed.
+    """
+    jax: Any = importlib.import_module("jax")
+    run = functools.partial(_run, jax, function)
+    pull_back = functools.partial(_pull_back, jax, function)
+
+    def call(*args: Any) -> Any:
+        if not _is_traced(jax, args):
+            return run(*args)
+        if result is None:
+            raise TypeError(_TRACED)
+        return _called_back(jax, run, jax.eval_shape(result, *args), *args)
+
+    def forward(*args: Any) -> tuple[Any, Any]:
+        return call(*args), args
+
+    def backward(args: Any, cotangents: Any) -> Any:
+        leaves: list[Any] = jax.tree.leaves(args)
+        if _is_traced(jax, (args, cotangents)):
+            shapes = [
+                jax.ShapeDtypeStruct(one.shape, one.dtype) for one in leaves if _is_float(jax, one)
+            ]
+            found = iter(_called_back(jax, pull_back, shapes, args, cotangents))
+        else:
+            found = iter(pull_back(args, cotangents))
+        # JAX has a type of its own for derivatives with respect to integers.
+        gradients = [
+            next(found) if _is_float(jax, one) else np.zeros(np.shape(one), jax.dtypes.float0)
+            for one in leaves
+        ]
+        return jax.tree.unflatten(jax.tree.structure(args), gradients)
+
+    differentiable: Any = jax.custom_vjp(call)
+    differentiable.defvjp(forward, backward)
+
+    @functools.wraps(function)
+    def wrapped(*args: Any) -> Any:
+        return differentiable(*jax.tree.map(jax.numpy.asarray, args))
+
+    return wrapped
+
+
+def _run(jax: Any, function: Callable[..., Any], *args: Any) -> Any:
+    """The result of `function` as JAX arrays. Derivatives are enabled in any case, since hits are
+    polished to rounding where they are: so the result is the same with `jax.grad` and without."""
+    outputs = function(*jax.tree.map(_input, args))
+    return jax.tree.map(_as_jax, outputs)
+
+
+def _pull_back(jax: Any, function: Callable[..., Any], args: Any, cotangents: Any) -> list[Any]:
+    """Gradients with respect to those arguments that are floats, given those of the result."""
+    inputs = jax.tree.map(_input, args)
+    outputs = [_as_tensor(one) for one in jax.tree.leaves(function(*inputs))]
+    for output, cotangent in zip(outputs, jax.tree.leaves(cotangents), strict=True):
+        if dr.grad_enabled(output):
+            dr.accum_grad(output, _tensor(cotangent))  # one may be there twice, or be an input
+            dr.enqueue(dr.ADMode.Backward, output)
+    dr.traverse(dr.ADMode.Backward)
+    return [dr.grad(one).jax() for one in jax.tree.leaves(inputs) if dr.is_float_v(one)]
+
+
+def _is_traced(jax: Any, values: Any) -> bool:
+    """Whether JAX is transforming or compiling, so that values are not there yet."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
+
+
+def _called_back(jax: Any, compute: Callable[..., Any], shapes: Any, *args: Any) -> Any:
+    """What `compute` gives, called while a program that JAX has compiled runs."""
+
+    def on_host(*values: Any) -> Any:
+        # As NumPy arrays: a callback must not wait for work that is JAX's own to do.
+        return jax.tree.map(np.asarray, compute(*jax.tree.map(np.asarray, values)))
+
+    return jax.pure_callback(on_host, shapes, *args, vmap_method="sequential")
+
+
+def _is_float(jax: Any, array: Any) -> bool:
+    return jax.numpy.issubdtype(jax.numpy.result_type(array), jax.numpy.floating)
+
+
+def _tensor(array: Any) -> Any:
+    """A Dr.Jit tensor of the same shape and precision, on the device where the array is."""
+    return dr.detail.import_tensor(array, True)
+
+
+def _input(array: Any) -> Any:
+    """Likewise, with derivatives enabled if it holds floats."""
+    tensor = _tensor(array)
+    if dr.is_float_v(tensor):
+        dr.enable_grad(tensor)
+    return tensor
+
+
+def _as_tensor(value: Any) -> Any:
+    if not dr.is_array_v(cast("Any", type(value))):
+        raise TypeError(
+            "a function for JAX returns Dr.Jit arrays or tensors, in tuples, lists and "
+            f"dictionaries, not {type(value).__name__}: vars(hits) is a dictionary of hits"
+        )
+    return value if is_tensor(value) else tensor_of(value, (dr.width(value),))
+
+
+def _as_jax(value: Any) -> Any:
+    return dr.detach(_as_tensor(value)).jax()

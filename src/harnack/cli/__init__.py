@@ -7,8 +7,7 @@ from collections.abc import Sequence
 
 from harnack.cli.arguments import parse, parse_level, parse_size
 from harnack.cli.commands import COMMANDS
-from harnack.cli.interrupts import interrupts_noticed
-from harnack.cli.messages import error_line
+from harnack.cli.messages import error_line, interrupts_noticed
 
 __all__ = ["main", "parse_level", "parse_size"]
 

@@ -20,9 +20,9 @@ from harnack.meshing.samples import MOST_FACES
 from harnack.names import did_you_mean
 from harnack.rendering import MATERIALS, SHOW_MODES
 from harnack.rendering.arguments import ANTIALIASING, MAX_SIDE, MAX_SPP
-from harnack.rendering.studio.backdrops import IMAGE_FILES, checked_backdrop
-from harnack.rendering.studio.materials import material_of
-from harnack.rendering.surfaces.colors import color_of
+from harnack.rendering.backdrops import IMAGE_FILES, checked_backdrop
+from harnack.rendering.scales import color_of
+from harnack.rendering.stage import material_of
 from harnack.view.sliders import Slider
 
 # Of what was typed, this much is repeated in messages.

@@ -22,13 +22,13 @@ from harnack.fields.expressions import expression, looks_like_formula
 from harnack.files.surfaces import SURFACE_FILES, Mesh, read_surface
 from harnack.gallery import SCENES, Scene
 from harnack.geometry import Ball, Box, HalfSpace
-from harnack.geometry.singular import weld_vertices
+from harnack.geometry.chains import weld_vertices
 from harnack.meshing import mesh, repair
 from harnack.names import did_you_mean
 from harnack.rendering import Camera, Isolines, animate, render
 from harnack.rendering.arguments import OF_STUDIO, SETTINGS
 from harnack.rendering.film import check_film_path
-from harnack.rendering.pictures.images import check_picture_path
+from harnack.rendering.images import check_picture_path
 from harnack.rendering.studio_scene import surfaces_of
 from harnack.tracer import LevelSet
 from harnack.view import SavedScene, page, read_scene, view

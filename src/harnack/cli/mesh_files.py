@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from harnack.files.writing import check_writable, write_atomically
+from harnack.files.file_format import check_writable, write_atomically
 
 if TYPE_CHECKING:
     import trimesh
@@ -54,7 +54,7 @@ def write_mesh(mesh: trimesh.Trimesh, path: str | os.PathLike[str]) -> None:
         ValueError, ImportError, OSError: as `check_mesh_path`.
         MeshingError: as `ClosedMesh.export`.
     """
-    from harnack.meshing.printing.closed_mesh import ClosedMesh  # here: trimesh takes a second
+    from harnack.meshing.closed_mesh import ClosedMesh
 
     target = check_mesh_path(path)
     kind = target.suffix.lower()[1:]

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from harnack.distance.curvature import Curvatures, curvature
-from harnack.distance.curvature_lines import Family, curvature_lines
+from harnack.distance.curvature import Curvatures, Family, curvature, curvature_lines
 from harnack.distance.signed_distance import (
     DistanceBounds,
     Method,

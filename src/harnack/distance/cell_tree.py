@@ -14,14 +14,14 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
-from harnack.backend.extrema import fmax, fmin
+from harnack.backend.elementary import fmax, fmin
 from harnack.tree import PackedTree, build_hierarchy, for_each, pack, walk
 from harnack.tree.nearest import square_to_some_point
 from harnack.tree.triangles import box_levels
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.tree.walk import Node, State
+    from harnack.tree.hierarchy import Node, State
 
 __all__ = ["FAR", "Best", "CellTree", "SurfaceCells"]
 

@@ -12,16 +12,13 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy
 from harnack.backend.arrays import finite_vectors, upload_vectors
-from harnack.backend.extrema import fmax
-from harnack.backend.lengths import length
-from harnack.distance.batches import in_batches
+from harnack.backend.elementary import fmax, length
 from harnack.distance.mesh_surface import MeshSurface
 from harnack.distance.on_sheets import SheetSearch, close_in
 from harnack.distance.projection import Descent
-from harnack.distance.rim import RimDescent
 from harnack.distance.search import Known, Tolerance, search
-from harnack.distance.surface_cells import remainder
-from harnack.distance.tangent import first_order
+from harnack.distance.surface_cells import RimDescent, remainder
+from harnack.distance.tangent import first_order, in_batches
 from harnack.fields.clearance import distance_below
 from harnack.fields.points import morton_order
 

@@ -19,11 +19,10 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, IntArray, choose_backend, to_numpy, to_vector3
 from harnack.backend.arrays import aligned_integers
-from harnack.distance.batches import in_batches
+from harnack.distance.tangent import in_batches
 from harnack.enclosures import TargetLevels
-from harnack.fields.clearance import distance_below
+from harnack.fields.clearance import distance_below, placed, single
 from harnack.fields.field import AtDetail
-from harnack.fields.unit_coordinates import placed, single
 from harnack.tree import build_hierarchy
 from harnack.tree.nearest import nearest_triangle, square_to_some_vertex
 from harnack.tree.triangles import NO_TRIANGLE, Frame, TriangleRays, triangle_records

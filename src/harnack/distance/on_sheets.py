@@ -19,9 +19,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import drjit as dr
 
-from harnack.backend.basis import across
-from harnack.backend.extrema import fmax, fmin
-from harnack.backend.lengths import largest_coordinate
+from harnack.backend.elementary import across, fmax, fmin, largest_coordinate
 from harnack.fields.sheets import NO_SHEET, Crossing, NearestSheet
 from harnack.tracer import Status
 

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
-from harnack.backend import lengths
-from harnack.backend.extrema import clamp, fmax, fmin
+from harnack.backend import elementary as lengths
+from harnack.backend.elementary import clamp, fmax, fmin
 from harnack.distance.tangent import Eigen, TangentPlane
 
 if TYPE_CHECKING:

@@ -12,9 +12,8 @@ import numpy as np
 
 from harnack.backend import FloatArray, choose_backend
 from harnack.backend.numbers import refuses_derivatives
-from harnack.distance.batches import in_batches
 from harnack.distance.closest import Closest, find_closest
-from harnack.distance.tangent import first_order, second_order
+from harnack.distance.tangent import first_order, in_batches, second_order
 from harnack.enclosures import TargetLevels
 from harnack.fields.clearance import distance_below
 from harnack.fields.field import Field, check_is_field

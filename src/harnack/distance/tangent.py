@@ -1,23 +1,28 @@
 """A frame of the tangent plane of a level set, and the second derivatives along it.
 
 Distances to a level set from what is known at the point alone, to first and second order.
+
+What searches compute at points, so many at a time: NumPy on both ends, in double precision.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
+import numpy as np
 
-from harnack.backend.basis import across
-from harnack.backend.extrema import fmax
-from harnack.backend.lengths import length
+from harnack.backend import FloatArray
+from harnack.backend.elementary import across, fmax, length
+from harnack.backend.numbers import LARGEST
+from harnack.fields import points as field_points
 
 if TYPE_CHECKING:
-    from harnack.backend import Real, Vec3
+    from harnack.backend import Backend, Real, Vec3
 
-__all__ = ["Eigen", "TangentPlane", "apply", "first_order", "second_order"]
+__all__ = ["Eigen", "TangentPlane", "apply", "first_order", "in_batches", "second_order"]
 
 
 @dataclass(frozen=True)
@@ -119,3 +124,38 @@ def second_order(above: Real, gradient: Vec3, rows: tuple[Vec3, Vec3, Vec3]) -> 
     k = dr.dot(n, apply(rows, n)) / gradient_norm
     quotient = first / fmax(1 - 0.5 * k * first, 0.5)
     return dr.select(dr.isfinite(first) & (first != 0), quotient, first)
+
+
+# Bounds memory, and the time until an interrupt is noticed.
+_AT_ONCE = 1 << 18
+
+
+def in_batches(
+    backend: Backend,
+    compute: Callable[..., tuple[Real | Vec3, ...]],
+    points: Any,
+    *others: FloatArray,
+) -> tuple[Any, ...]:
+    """The results of `compute` for points of shape (n, 3), as float64 arrays (n,) or (n, 3).
+
+    others: more vectors of the same shape that `compute` is given, one a lane; their values are
+        not looked at.
+
+    Raises:
+        TypeError, ValueError: points that are not an (n, 3) array of finite numbers of at most
+            1e100.
+    """
+    _check_size(points)
+    with np.errstate(over="ignore"):
+        rounded = (one.astype(backend.dtype, copy=False) for one in others)
+        results = field_points.in_batches(backend, compute, points, *rounded, at_once=_AT_ONCE)
+    return tuple(one.astype(np.float64, copy=False) for one in results)
+
+
+def _check_size(points: Any) -> None:
+    given = None if dr.is_array_v(type(points)) else np.asarray(points)
+    if given is None or not given.size or given.dtype.kind not in "fiu":
+        return
+    size = float(np.abs(given).max())
+    if LARGEST < size < np.inf:
+        raise ValueError(f"points: coordinates up to {size:g} are too large: at most {LARGEST:g}")

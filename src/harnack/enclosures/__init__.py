@@ -6,8 +6,7 @@ What all proofs share has its names here; a proof of its own is a name of `harna
 
 from __future__ import annotations
 
-from harnack.enclosures.enclosure import Enclosure, Gaps, Slopes
-from harnack.enclosures.levels import TargetLevels
+from harnack.enclosures.enclosure import Enclosure, Gaps, Slopes, TargetLevels
 from harnack.enclosures.promises import (
     BoundedLaplacian,
     Curvature,

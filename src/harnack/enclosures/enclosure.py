@@ -1,4 +1,6 @@
-"""What an enclosure is: a proof of how far f can move along the next stretch of a path.
+"""A function along a path, as far as enclosures ask for it: ranges, and not values at points.
+
+What an enclosure is: a proof of how far f can move along the next stretch of a path.
 
 An enclosure is about F(s) = f(path(t+s)) - f(path(t)), the movement of f relative to its value
 where it was looked at, so that two large numbers are never subtracted: in float32 that is the
@@ -7,22 +9,74 @@ length free of it (`step`), or says whether a given length is (`covers`), which 
 of the proof and no solve: the tracer asks it looking back.
 
 A new proof is one file of this room: a class derived from `Enclosure`.
+
+Which levels bracket a value: the question every enclosure is asked.
+
+An angle-valued function is known modulo its period, so its levels form a ladder: every
+asked-for level plus every multiple of the period (paper, Alg. 2, with the reduction that the
+printed algorithm leaves out: both bracketing levels are found from the reduced difference).
 """
 
 from __future__ import annotations
 
 import abc
+import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
-from harnack.backend.extrema import fmax, fmin
+import drjit as dr
+
+from harnack.backend.elementary import fmax, fmin
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
     from typing import Self
 
-    from harnack.backend import Mask, Real
+    from harnack.backend import Mask, Real, Vec3
     from harnack.enclosures.promises import Promise
-    from harnack.enclosures.restriction import Restriction
+
+
+@dataclass(frozen=True)
+class Piece:
+    """What F' and F'' are on one piece of the path.
+
+    length: of the piece.
+    slopes: the range of F' on it.
+    least_curvature, most_curvature: the range of F''; an end may be infinite, for functions with
+        kinks.
+    """
+
+    length: Real
+    slopes: Slopes
+    least_curvature: Real
+    most_curvature: Real
+
+
+class Restriction(Protocol):
+    """A function along a path, as enclosures ask for it.
+
+    piece_count: how many pieces of the path take the least time, by experiment.
+    """
+
+    @property
+    def piece_count(self) -> int: ...
+
+    def pieces(self, knots: Sequence[Real]) -> tuple[Piece, ...]:
+        """Ranges of the derivatives of f(path(t+s)) between each knot and the next.
+
+        knots: lengths s, rising, the first of them 0.
+        """
+        ...
+
+
+@runtime_checkable
+class Evaluable(Protocol):
+    """A restriction that is a formula: any arithmetic can be asked for what it makes of it."""
+
+    def through(self, coordinates: Callable[[Vec3, Vec3], tuple[Any, Any, Any]]) -> Any:
+        """The formula of coordinates made from a point p and the direction d of the path."""
+        ...
+
 
 # A length that is proved in exact arithmetic, times this, is proved in that of single precision:
 # the formulas of steps have some ten roundings.
@@ -117,3 +171,44 @@ class Enclosure(abc.ABC):
     def covers(self, gaps: Gaps, length: Real) -> Mask:
         """Whether f is proved to meet no level for 0 < s < length."""
         return length <= self.step(gaps)
+
+
+@dataclass(frozen=True)
+class TargetLevels:
+    """A finite set of target levels, repeated with `period` if there is one.
+
+    `values` may be Python floats or size-1 Dr.Jit arrays of the backend in use (so that a level
+    can change without a kernel being compiled again, or carry derivatives).
+    """
+
+    values: tuple[Real, ...]
+    period: float | None = None
+
+    def gaps(self, f: Real) -> Gaps:
+        """Distances in value from f to the next level below and above.
+
+        Either is infinite when there is no such level. A value on a level has both a gap of
+        zero on one side and, for a ladder, of at most one period on the other. Gaps of a value
+        that is not a number are not numbers.
+        """
+        down: Real = math.inf
+        up: Real = math.inf
+        for level in self.values:
+            above = f - level  # > 0: the level lies below f
+            if self.period is not None:
+                # Within half a period of 0, so that neither side of a level is lost to rounding.
+                reduced = above - self.period * dr.round(above / self.period)
+                is_above = reduced >= 0
+                below_gap = dr.select(is_above, reduced, self.period + reduced)
+                above_gap = dr.select(is_above, self.period - reduced, -reduced)
+            else:
+                # In this order a gap of what is not a number is none, and nothing is proved.
+                below_gap = dr.select(above < 0, math.inf, above)
+                above_gap = dr.select(above > 0, math.inf, -above)
+            down, up = fmin(down, below_gap), fmin(up, above_gap)
+        return Gaps(down, up, len(self.values) == 1 and self.period is None)
+
+    def to_nearest(self, f: Real) -> Real:
+        """level - f for the level nearest to f."""
+        gaps = self.gaps(f)
+        return dr.select(gaps.up < gaps.down, gaps.up, -gaps.down)

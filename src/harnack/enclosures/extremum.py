@@ -1,4 +1,9 @@
-"""The greatest of several functions: unions, intersections and differences of solids."""
+"""The greatest of several functions: unions, intersections and differences of solids.
+
+The nearest of several sheets: surfaces that a function with several branches makes.
+
+Branch points: all branches are close to one value there, and a ray may pass beside it.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +12,9 @@ from typing import TYPE_CHECKING
 
 import drjit as dr
 
-from harnack.backend.extrema import fmax, fmin
-from harnack.enclosures.enclosure import ROUND_DOWN, Enclosure, Gaps
+from harnack.backend.elementary import fmax, fmin
+from harnack.enclosures.enclosure import ROUND_DOWN, Enclosure, Gaps, Slopes
+from harnack.enclosures.parabola import first_root
 from harnack.enclosures.proofs import any_covers, longest_step
 
 if TYPE_CHECKING:
@@ -121,3 +127,118 @@ def _scaled(gap: Real, share: Real) -> Real:
     """The gap times a positive number; a level stays one, however far away it comes to lie."""
     largest = type(gap)(dr.largest(type(gap)))
     return dr.select(gap == dr.inf, gap, fmin(largest, gap * share))
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """One of several functions phi_j, continued along the path from where it was looked at.
+
+    opening: slopes of |phi_j| there. beyond: by how much |phi_j| exceeds the smallest of them,
+        less what rounding may have added.
+    """
+
+    opening: Slopes
+    beyond: Real
+
+
+@dataclass(frozen=True)
+class Nearest(Enclosure):
+    """The movement of f = s min_j |phi_j|, s the sign of the product of all phi_j.
+
+    Such an f is continuous and single-valued wherever the set of the phi_j is, whichever branch is
+    called which, for s changes only where the minimum is 0. It is zero where one of them is.
+
+    Let |phi_j''| <= bend along the path for 0 <= s < reach, for continuations without a jump; and
+    g_j = phi_j with the sign for which it has that of f here.
+
+    Proof towards zero, from f > 0 to a level f - d; downwards is upwards for -f. As long as no g_j
+    has fallen by |phi_j| - f + d, to f - d, f stays above that: if all g_j are positive, no sign
+    has changed and f is the smallest g_j. Otherwise f - d < 0, and where f is negative an odd
+    number of the g_j is, so one of them, and f >= -|g_j| > f - d. A g_j falls along its parabola at
+    most.
+    Away from zero, to a level f + a: f < f + a as long as the nearest has |g_i| below that: as it
+    has not risen by a, nor fallen by 2 f + a. So a step is free of all sheets, not of the nearest
+    alone, and what is the nearest may change on the way.
+
+    sheets: all of them. nearest: that of the smallest. distance: |f|. is_positive: whether f is.
+    """
+
+    sheets: tuple[Sheet, ...]
+    nearest: Sheet
+    distance: Real
+    is_positive: Mask
+    bend: Real
+    reach: Real
+
+    def step(self, gaps: Gaps) -> Real:
+        towards = dr.select(self.is_positive, gaps.down, gaps.up)
+        away = dr.select(self.is_positive, gaps.up, gaps.down)
+        length = first_root(away, self.nearest.opening.high, self.bend)
+        length = fmin(
+            first_root(away + 2 * self.distance, -self.nearest.opening.low, self.bend), length
+        )
+        known = (length >= 0) & (self.distance >= 0)
+        for sheet in self.sheets:
+            gap = fmax(towards + sheet.beyond, 0)
+            one = first_root(gap, -sheet.opening.low, self.bend)
+            known &= one >= 0
+            length = fmin(length, one)
+        known &= (self.bend >= 0) & (self.reach > 0)
+        return fmax(dr.select(known, fmin(length, self.reach), 0) * ROUND_DOWN, 0)
+
+
+_ROUND_DOWN = 1.0 - 1e-5
+# Which part of the room there is goes to the branches, the rest to the ray's own movement.
+_PARTS = (0.5, 0.95)
+
+
+@dataclass(frozen=True)
+class Cusp(Enclosure):
+    """The movement of f = s min_j |h - u_j| near a line z = a about which branches u_j turn.
+
+    Within the radius R of the line |u_j - c| <= C r^alpha, alpha > 0, of all branches (up to a
+    period); r is the distance from it. No parabola reaches far there, for second derivatives grow
+    without bound, though the branches hardly move.
+
+    Proof. Let y = |h - c|, and v the most by which it falls per unit of the path. On a disk of
+    radius r <= R about the line and for a length L of the path, all |h - u_j| are at least
+    y - v L - C r^alpha. For any part q of w = y - (|f| - gap), r = (q w/C)^(1/alpha) and L =
+    (1 - q) w/v leave |f| - gap of it: so f, whose sign changes only where one of them is 0, does
+    not fall that far up to L, or up to where the path leaves the disk if that is earlier.
+
+    height: y. fall: v. foot, across: of the line's foot on the path in the plane, how far ahead it
+    is, and how far off the line, in the plane's lengths. speed: of the path in the plane.
+    inside: the largest r that may be used, R less rounding. distance: |f|.
+    """
+
+    height: Real
+    fall: Real
+    foot: Real
+    across: Real
+    speed: Real
+    power: Real
+    constant: Real
+    inside: Real
+    distance: Real
+    is_positive: Mask
+
+    def step(self, gaps: Gaps) -> Real:
+        towards = dr.select(self.is_positive, gaps.down, gaps.up)
+        away = dr.select(self.is_positive, gaps.up, gaps.down)
+        room = self.height - fmax(self.distance - towards, 0)
+        together = room + self.distance + towards + self.fall + self.speed
+        room = dr.select(together == together, room, 0)  # what is not a number proves nothing
+        best = 0 * self.height
+        for part in _PARTS:
+            share = fmax(part * room / self.constant, 0)
+            radius = dr.power(share, 1 / self.power) * _ROUND_DOWN
+            radius = dr.select(dr.isfinite(share) & (radius >= 0), fmin(radius, self.inside), 0)
+            chord = (radius - self.across) * (radius + self.across)
+            leaves = self.foot + dr.sqrt(fmax(chord, 0))
+            leaves = dr.select(self.speed > 0, leaves / self.speed, dr.inf)
+            length = dr.select(self.fall > 0, (1 - part) * room / self.fall, dr.inf)
+            length = fmin(leaves, length)
+            start = self.across * self.across + self.foot * self.foot < radius * radius
+            known = start & (room > 0) & (chord > 0) & dr.isfinite(chord)  # squares may overflow
+            best = fmax(dr.select(known, length, 0), best)
+        return dr.select(away == dr.inf, best * _ROUND_DOWN, 0)

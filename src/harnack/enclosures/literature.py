@@ -12,17 +12,16 @@ from typing import TYPE_CHECKING, ClassVar
 import drjit as dr
 
 from harnack.arithmetic import Affine, Interval, Jet, Parabolas
-from harnack.backend.extrema import fmax, fmin
-from harnack.enclosures.enclosure import ROUND_DOWN, Enclosure, Gaps, Slopes
+from harnack.backend.elementary import fmax, fmin
+from harnack.enclosures.enclosure import ROUND_DOWN, Enclosure, Evaluable, Gaps, Slopes
 from harnack.enclosures.parabola import Parabola
 from harnack.enclosures.pieces import LinearTaylor, QuadraticTaylor
-from harnack.enclosures.restriction import Evaluable
 
 if TYPE_CHECKING:
     from typing import Self
 
     from harnack.backend import Real, Vec3
-    from harnack.enclosures.restriction import Restriction
+    from harnack.enclosures.enclosure import Restriction
 
 
 @dataclass(frozen=True)

@@ -8,16 +8,15 @@ from typing import TYPE_CHECKING
 
 import drjit as dr
 
-from harnack.backend.extrema import fmax, fmin
-from harnack.enclosures.enclosure import ROUND_DOWN, Enclosure, Gaps, Slopes
+from harnack.backend.elementary import fmax, fmin
+from harnack.enclosures.enclosure import ROUND_DOWN, Enclosure, Gaps, Piece, Slopes
 from harnack.enclosures.parabola import first_root
-from harnack.enclosures.restriction import Piece
 
 if TYPE_CHECKING:
     from typing import Self
 
     from harnack.backend import Mask, Real
-    from harnack.enclosures.restriction import Restriction
+    from harnack.enclosures.enclosure import Restriction
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import drjit as dr
 
-from harnack.backend.extrema import fmax, fmin
+from harnack.backend.elementary import fmax, fmin
 
 if TYPE_CHECKING:
     from typing import Self

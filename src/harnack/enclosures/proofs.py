@@ -7,12 +7,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
-from harnack.backend.extrema import fmax
-from harnack.enclosures.balls.bounded_laplacian import GreenBall
-from harnack.enclosures.balls.caps import Caps
-from harnack.enclosures.balls.classic import Classic
-from harnack.enclosures.balls.slope import Slope
+from harnack.backend.elementary import fmax
+from harnack.enclosures.bounded_laplacian import GreenBall
 from harnack.enclosures.enclosure import Enclosure, Gaps, Slopes
+from harnack.enclosures.harmonic_ball import Caps, Classic, Slope
 from harnack.enclosures.literature import (
     AffineBand,
     BottomUpLinear,
@@ -20,16 +18,15 @@ from harnack.enclosures.literature import (
     IntervalRange,
     Mixed,
 )
-from harnack.enclosures.parabola import Cone, Taylor
+from harnack.enclosures.parabola import Cone, Tangent, Taylor
 from harnack.enclosures.pieces import LinearTaylor, Pieces, QuadraticTaylor, Segment
 from harnack.enclosures.promises import Promise
-from harnack.enclosures.tangent import Tangent
 from harnack.names import did_you_mean
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real
+    from harnack.enclosures.enclosure import Restriction
     from harnack.enclosures.promises import Lipschitz
-    from harnack.enclosures.restriction import Restriction
 
 _NAMED: dict[str, tuple[type[Enclosure], ...]] = {
     "pieces": (Pieces, Tangent, Taylor, Caps, Slope, GreenBall, Cone),

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
 import numpy as np
 
+from harnack.fields.batch import prepared_once
+from harnack.fields.clearance import UnitCoordinates, placed, single
 from harnack.fields.field import Field
-from harnack.fields.field_cache import prepared_once
 from harnack.fields.sheets import PartEntry
-from harnack.fields.unit_coordinates import UnitCoordinates, placed, single
 from harnack.geometry import Box
-from harnack.tree.boxes import BoxTree
+from harnack.tree.nearest import BoxTree
 
 if TYPE_CHECKING:
     from typing import Self

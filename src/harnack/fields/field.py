@@ -17,26 +17,20 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend.arrays import as_data
-from harnack.backend.numbers import (
-    is_same,
-    refuse_derivatives,
-    refuses_derivatives,
-    short_text,
-)
+from harnack.backend.numbers import is_same, refuse_derivatives, refuses_derivatives, short_text
 from harnack.backend.tensors import takes_tensors
 from harnack.enclosures import BoundedLaplacian, Curvature, HarmonicBall, Lipschitz
-from harnack.fields.detail import Detail
 from harnack.fields.look import Look, Path, Sample, checked_samples, lengthened
 from harnack.fields.points import also_at_points, at_points
-from harnack.fields.sheets import Boundary, Parts, Sheets
-from harnack.geometry.volumes.volume import check_volume
+from harnack.fields.sheets import Boundary, Detail, Parts, Sheets
+from harnack.geometry.volume import check_volume
 
 if TYPE_CHECKING:
     from typing import Self
 
     from harnack.backend import Backend, Precision, Real, Vec3
-    from harnack.cells import OccupiedCells
     from harnack.geometry import Volume
+    from harnack.tree.cells import OccupiedCells
 
 
 __all__ = [

@@ -19,15 +19,13 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 
 from harnack.arithmetic import Interval, Jet
-from harnack.arithmetic.counted import operations_of
-from harnack.arithmetic.dual import Dual
-from harnack.arithmetic.operators import Operators
+from harnack.arithmetic.jet import Dual
+from harnack.arithmetic.operators import Operators, operations_of
 from harnack.backend import choose_backend
-from harnack.backend.extrema import fmin
-from harnack.backend.lengths import largest_coordinate, length
+from harnack.backend.elementary import fmin, largest_coordinate, length
 from harnack.enclosures import Lipschitz, Slopes
-from harnack.enclosures.restriction import Piece
-from harnack.enclosures.tangent import Tangent
+from harnack.enclosures.enclosure import Piece
+from harnack.enclosures.parabola import Tangent
 from harnack.fields.field import Field
 from harnack.fields.look import Look, Path, Sample
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 import drjit as dr
 import numpy as np
 
-from harnack.backend.extrema import fmax
+from harnack.backend.elementary import fmax
 from harnack.backend.numbers import refuse_derivatives
 from harnack.enclosures import Enclosure, Lipschitz, Promise, Proofs, Slopes
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
-from harnack.backend.extrema import fmax, fmin
+from harnack.backend.elementary import fmax, fmin
 from harnack.enclosures import Curvature, HarmonicBall, Lipschitz
 from harnack.fields.batch import SymmetricSum, Values
 from harnack.fields.field import Sample

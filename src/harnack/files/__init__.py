@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from harnack.files.file_format import FileFormatError
-from harnack.files.loops import read_loops
-from harnack.files.metaballs import Metaballs
+from harnack.files.file_format import FileFormatError, write_atomically
 from harnack.files.molecules import Atoms, read_molecule
-from harnack.files.surfaces import ClosedCurves, Cloud, Mesh, PolygonSurface, read_surface
-from harnack.files.writing import write_atomically
+from harnack.files.surfaces import (
+    ClosedCurves,
+    Cloud,
+    Mesh,
+    PolygonSurface,
+    read_loops,
+    read_surface,
+)
+from harnack.files.text_formats import Metaballs
 
 __all__ = [
     "Atoms",

@@ -8,14 +8,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from harnack.gallery.blobs import BLOBS
-from harnack.gallery.classic import CURVES, HARMONICS, SOLIDS
+from harnack.gallery.classic import CURVES, HARMONICS, PLANE, SOLIDS
 from harnack.gallery.damaged import MESHES
-from harnack.gallery.exoskeletons import EXOSKELETONS
-from harnack.gallery.plane import PLANE
 from harnack.gallery.scene import Scene
-from harnack.gallery.shells import SHELLS
-from harnack.gallery.solids import SHAPES
+from harnack.gallery.shells import EXOSKELETONS, SHELLS
+from harnack.gallery.solids import BLOBS, SHAPES
 
 __all__ = ["SCENES", "Scene"]
 

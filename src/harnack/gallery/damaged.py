@@ -7,8 +7,8 @@ import math
 import numpy as np
 
 from harnack.backend import FloatArray
-from harnack.fields.winding.dipole import DipolePotential
-from harnack.fields.winding.winding_number import WindingNumber
+from harnack.fields.solid_angles.dipole import DipolePotential
+from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.gallery.scene import DRAWN, Scene
 from harnack.geometry import mesh_shapes, shapes
 from harnack.rendering import Camera

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from harnack.geometry import mesh_shapes, shapes
-from harnack.geometry.circles import Circle
 from harnack.geometry.clouds import CloudError, estimate_areas, estimate_normals, validate_cloud
+from harnack.geometry.convexity import ConvexHull
 from harnack.geometry.curves import (
+    Circle,
     CurveError,
     bounding_box,
     edges,
@@ -19,14 +20,8 @@ from harnack.geometry.meshes import (
     without_zero_area_faces,
     zero_area_faces,
 )
-from harnack.geometry.volumes import (
-    Ball,
-    Box,
-    ConvexHull,
-    HalfSpace,
-    Intersection,
-    Volume,
-)
+from harnack.geometry.volume import Volume
+from harnack.geometry.volumes import Ball, Box, HalfSpace, Intersection
 
 __all__ = [
     "Ball",

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend.basis import across_rows
+from harnack.backend.elementary import across_rows
 from harnack.backend.numbers import (
     TRANSPOSE,
     FloatArray,
@@ -30,7 +30,7 @@ from harnack.backend.numbers import (
     real_array,
     vector_text,
 )
-from harnack.geometry.singular import weld_vertices
+from harnack.geometry.chains import weld_vertices
 from harnack.names import renamed
 
 __all__ = ["CloudError", "estimate_areas", "estimate_normals", "validate_cloud"]

@@ -1,23 +1,41 @@
-"""What a mesh of a level set has to satisfy, whatever made it."""
+"""Triangles of a mesh that meet in more than what they share, decided exactly.
+
+Two triangles in different planes meet beyond their common corners if and only if an edge of one
+passes through the other, with its ends on both sides of that one's plane, or ends on it: corners
+that lie on other triangles are not looked for, since edges beyond them would pass through. Two
+triangles in one plane overlap unless the line of an edge has them on its two sides (separating
+axes), whatever they share: faces that are there twice, or folded back onto their neighbors, do.
+Pairs are looked for among those whose boxes overlap.
+
+Exact signs of determinants: on which side of a plane, or of a line in a plane, points lie.
+
+Determinants are computed in floating point, with a bound of what rounding may have done to them
+(Shewchuk, Adaptive Precision Floating-Point Arithmetic and Fast Robust Geometric Predicates, 1997).
+Where that leaves the sign open it is found in integers: all coordinates are integers times one
+power of two.
+
+What a mesh of a level set has to satisfy, whatever made it.
+"""
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING, Any, Never, cast
 
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend import FloatArray
-from harnack.meshing.edges import Edges, IntArray, boundary_edges, directed_edges, lengths
-from harnack.meshing.intersections import intersecting_faces
+from harnack.backend import BoolArray, FloatArray
+from harnack.meshing.edges import Edges, IntArray, boundary_edges, directed_edges, dots, lengths
+from harnack.meshing.samples import LevelFunction
 
 if TYPE_CHECKING:
     from harnack.geometry import Volume
-    from harnack.meshing.samples import LevelFunction
 
 __all__ = [
     "LocalError",
     "MeshingError",
+    "SignArray",
     "TooLargeError",
     "check_apart",
     "check_count",
@@ -25,8 +43,199 @@ __all__ = [
     "check_manifold",
     "check_near_level",
     "euler_characteristic",
+    "intersecting_faces",
+    "sides_of_lines",
+    "sides_of_planes",
     "singular_vertices",
+    "turned_faces",
 ]
+
+SignArray = npt.NDArray[np.int8]
+
+_UNIT = 2.0**-53
+# Shewchuk's bounds of the rounding of both determinants, over the sum of their terms' magnitudes.
+_PLANE, _LINE = (7 + 56 * _UNIT) * _UNIT, (3 + 16 * _UNIT) * _UNIT
+# What underflow may add, for coordinates of order one.
+_UNDERFLOW = 1e-290
+
+
+def sides_of_planes(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> SignArray:
+    """(n,) signs of det(a - d, b - d, c - d), points (n, 3): 1 where d sees a, b, c run clockwise,
+    0 where the four points are in one plane."""
+    together = _scaled(np.stack([a, b, c, d], axis=1))
+    rows = together[:, :3] - together[:, 3:]
+    (ax, ay, az), (bx, by, bz), (cx, cy, cz) = (rows[:, k].T for k in range(3))
+    terms = [(bx * cy, cx * by, az), (cx * ay, ax * cy, bz), (ax * by, bx * ay, cz)]
+    value = sum((one - other) * height for one, other, height in terms)
+    size = sum((np.abs(one) + np.abs(other)) * np.abs(height) for one, other, height in terms)
+    # A difference of doubles is 0 where they are equal, and only there.
+    flat = (rows == 0).all(axis=1).any(axis=1)
+    return _decided(np.asarray(value), _PLANE * np.asarray(size), flat, together, _exact_sides)
+
+
+def sides_of_lines(a: FloatArray, b: FloatArray, c: FloatArray) -> SignArray:
+    """(n,) signs of det(a - c, b - c), points (n, 2): 1 where a, b, c run counter-clockwise, 0
+    where they are in one line."""
+    together = _scaled(np.stack([a, b, c], axis=1))
+    rows = together[:, :2] - together[:, 2:]
+    (ax, ay), (bx, by) = (rows[:, k].T for k in range(2))
+    value, size = ax * by - ay * bx, np.abs(ax * by) + np.abs(ay * bx)
+    flat = (rows == 0).all(axis=1).any(axis=1)
+    return _decided(value, _LINE * size, flat, together, _exact_turns)
+
+
+def _scaled(points: FloatArray) -> FloatArray:
+    """Points times a power of two, so that the largest coordinate is of order one."""
+    largest = float(np.abs(points).max(initial=0.0))
+    return points if largest == 0 else np.ldexp(points, -int(np.frexp(largest)[1]))
+
+
+def _decided(
+    value: FloatArray, error: FloatArray, zero: BoolArray, points: FloatArray, exact: Any
+) -> SignArray:
+    """Signs of values known up to errors, or to be 0; by `exact` of the points where that is not
+    enough."""
+    signs: SignArray = np.sign(value).astype(np.int8)
+    signs[zero] = 0
+    open_rows = np.flatnonzero(~zero & (np.abs(value) <= error + _UNDERFLOW))
+    if len(open_rows):
+        signs[open_rows] = np.sign(exact(_integers(points[open_rows]))).astype(np.int8)
+    return signs
+
+
+def _integers(points: FloatArray) -> Any:
+    """Points times a power of two, as Python's integers."""
+    mantissa, exponent = np.frexp(points)
+    whole = np.ldexp(mantissa, 53).astype(np.int64).astype(object)
+    used = mantissa != 0
+    least = int(exponent[used].min()) if used.any() else 0
+    return whole * 2 ** np.where(used, exponent - least, 0).astype(object)
+
+
+def _exact_sides(points: Any) -> Any:
+    rows = points[:, :3] - points[:, 3:]
+    (ax, ay, az), (bx, by, bz), (cx, cy, cz) = (rows[:, k].T for k in range(3))
+    return (bx * cy - cx * by) * az + (cx * ay - ax * cy) * bz + (ax * by - bx * ay) * cz
+
+
+def _exact_turns(points: Any) -> Any:
+    rows = points[:, :2] - points[:, 2:]
+    (ax, ay), (bx, by) = (rows[:, k].T for k in range(2))
+    return ax * by - ay * bx
+
+
+_EDGES = ((0, 1), (1, 2), (2, 0))
+_PAIRS_AT_ONCE = 1 << 18
+
+
+def turned_faces(function: LevelFunction, vertices: FloatArray, faces: IntArray) -> IntArray:
+    """Indices of faces whose normal does not point to where the function grows, at their center."""
+    corner = vertices[faces]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    slope = function.at(corner.mean(axis=1)).gradient
+    return np.flatnonzero(dots(normal, slope) <= 0)
+
+
+def intersecting_faces(
+    vertices: FloatArray, faces: IntArray, among: BoolArray | None = None
+) -> IntArray:
+    """Indices of faces (m, 3) that an edge of another face passes through, or that lie on others
+    in their plane, and of those others.
+
+    among: (m,) mask; pairs of which neither is chosen are not looked at.
+    """
+    found: list[IntArray] = []
+    near = _near_pairs(vertices[faces], among)
+    for start in range(0, len(near), _PAIRS_AT_ONCE):
+        pairs = near[start : start + _PAIRS_AT_ONCE]
+        one, other = faces[pairs[:, 0]], faces[pairs[:, 1]]
+        heights = [_heights(vertices, *two) for two in ((one, other), (other, one))]
+        meet = np.zeros(len(pairs), np.bool_)
+        rows = np.flatnonzero((heights[0] == 0).all(axis=1) & (heights[1] == 0).all(axis=1))
+        meet[rows] = _overlap(vertices[one[rows]], vertices[other[rows]])
+        both = np.all([(h.min(axis=1) < 0) & (h.max(axis=1) > 0) for h in heights], axis=0)
+        rows = np.flatnonzero(both)
+        meet[rows] = _cross(vertices, one[rows], other[rows], heights[0][rows])
+        meet[rows] |= _cross(vertices, other[rows], one[rows], heights[1][rows])
+        found.append(pairs[meet].ravel())
+    return np.unique(np.concatenate([*found, np.zeros(0, np.int64)]))
+
+
+def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
+    """Pairs (k, 2) of triangles (m, 3, 3) whose boxes overlap, each once; if not None, with one of
+    those of a mask.
+
+    Triangles of one size (up to 2) at a time, with those no larger: of a large triangle and many
+    small ones only what is near is looked at.
+    """
+    import scipy.spatial  # here: half a second that few need
+
+    searching: Any = scipy.spatial
+    lower, upper = corner.min(axis=1), corner.max(axis=1)
+    chosen = np.ones(len(corner), np.bool_) if among is None else among
+    if not chosen.any():
+        return np.zeros((0, 2), np.int64)
+    ends = lower[chosen].min(axis=0), upper[chosen].max(axis=0)
+    near = (lower <= ends[1]).all(axis=1) & (upper >= ends[0]).all(axis=1)
+    center = 0.5 * (lower + upper)
+    radius = 0.5 * lengths(upper - lower)
+    octave = np.floor(np.log2(np.maximum(radius, 1e-300)))
+    groups = [np.flatnonzero(near & (octave == one)) for one in np.unique(octave[near])]
+    trees = [searching.cKDTree(center[rows]) for rows in groups]
+    found: list[IntArray] = []
+    for i, j in itertools.product(range(len(groups)), repeat=2):
+        reach = float(radius[groups[i]].max() + radius[groups[j]].max())
+        step = max(1, _PAIRS_AT_ONCE // 64)
+        first = groups[i][chosen[groups[i]]]
+        for start in range(0, len(first), step):
+            rows = first[start : start + step]
+            some = searching.cKDTree(center[rows])
+            table = some.sparse_distance_matrix(trees[j], reach, output_type="ndarray")
+            one, other = rows[table["i"]], groups[j][table["j"]]
+            keep = (lower[one] <= upper[other]).all(axis=1)
+            keep &= (lower[other] <= upper[one]).all(axis=1)
+            keep &= (one < other) | ~chosen[other]  # two that are chosen meet once
+            found.append(np.column_stack([one[keep], other[keep]]))
+    return np.concatenate(found).astype(np.int64)
+
+
+def _heights(vertices: FloatArray, plane: IntArray, of: IntArray) -> SignArray:
+    """(k, 3) on which sides of the planes of faces (k, 3) the corners of others lie; 0 on them."""
+    a, b, c = (vertices[plane[:, i]] for i in range(3))
+    signs = np.zeros((len(of), 3), np.int8)
+    for i in range(3):
+        rows = np.flatnonzero((of[:, i, None] != plane).all(axis=1))
+        signs[rows, i] = sides_of_planes(a[rows], b[rows], c[rows], vertices[of[rows, i]])
+    return signs
+
+
+def _cross(vertices: FloatArray, through: IntArray, of: IntArray, heights: SignArray) -> BoolArray:
+    """(k,) whether an edge of faces `of` (k, 3) passes through faces `through`, of whose planes the
+    corners are on the sides `heights`: the line of the edge passes all three edges on one side, or
+    touches them."""
+    found = np.zeros(len(of), np.bool_)
+    for i, j in _EDGES:
+        rows = np.flatnonzero((heights[:, i] * heights[:, j] < 0) & ~found)
+        p, q = vertices[of[rows, i]], vertices[of[rows, j]]
+        x = [vertices[through[rows, k]] for k in range(3)]
+        around = np.stack([sides_of_planes(p, q, x[k], x[m]) for k, m in _EDGES])
+        found[rows] = (around >= 0).all(axis=0) | (around <= 0).all(axis=0)
+    return found
+
+
+def _overlap(one: FloatArray, other: FloatArray) -> BoolArray:
+    """(k,) whether triangles (k, 3, 3) in one plane have an area in common; seen along the axis in
+    which they are thinnest."""
+    normal = np.abs(np.cross(one[:, 1] - one[:, 0], one[:, 2] - one[:, 0]))
+    kept = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
+    flat = [np.take_along_axis(t, kept[:, None].repeat(3, axis=1), axis=2) for t in (one, other)]
+    found = np.ones(len(one), np.bool_)
+    for a, b in (flat, flat[::-1]):
+        turn = sides_of_lines(a[:, 0], a[:, 1], a[:, 2])
+        for i, j in _EDGES:
+            side = [turn * sides_of_lines(a[:, i], a[:, j], b[:, k]) for k in range(3)]
+            found &= (np.stack(side) > 0).any(axis=0)
+    return found
 
 
 class MeshingError(ValueError):

@@ -21,9 +21,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
-from harnack.cells import Cells, Clearance, octree
 from harnack.meshing.checks import MeshingError, TooLargeError
 from harnack.meshing.edges import IntArray, distinct
+from harnack.tree.cells import Cells, Clearance, octree
 
 __all__ = ["Lattice", "distinct_rows"]
 

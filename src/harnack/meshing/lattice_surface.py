@@ -24,11 +24,10 @@ from harnack.meshing.checks import MeshingError, TooLargeError, singular_vertice
 from harnack.meshing.edges import IntArray, lengths
 from harnack.meshing.isotopy import Isotopy, isotopy_of
 from harnack.meshing.lattice import Lattice, distinct_rows
-from harnack.meshing.marching_tetrahedra import crossings_of, is_cut, triangles_of
+from harnack.meshing.marching_tetrahedra import Tetrahedra, crossings_of, is_cut, triangles_of
 from harnack.meshing.points import Boundary, PointSet, newton
-from harnack.meshing.refining.refinement import refined, smoothed, smoothed_within
+from harnack.meshing.refinement import refined, smoothed, smoothed_within
 from harnack.meshing.samples import LevelFunction, Samples
-from harnack.meshing.tetrahedra import Tetrahedra
 
 __all__ = [
     "MissedError",

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from harnack.fields import Field, Solid
-from harnack.fields.curves.solid_angle import SolidAngle
 from harnack.fields.field import check_is_field
+from harnack.fields.solid_angles.solid_angle import SolidAngle
 from harnack.geometry import Box, Intersection, Volume
-from harnack.geometry.volumes import check_volume
+from harnack.geometry.volume import check_volume
 from harnack.meshing.checks import (
     MeshingError,
     TooLargeError,
@@ -21,20 +21,12 @@ from harnack.meshing.checks import (
     check_manifold,
     check_near_level,
 )
+from harnack.meshing.clipping import cut_by, largest_body, largest_part
+from harnack.meshing.finishing import check_options, finished, normals_of, simplified, thickened
 from harnack.meshing.lattice import Lattice
 from harnack.meshing.lattice_surface import Surface, open_surface
-from harnack.meshing.printing.bodies import largest_body, largest_part
-from harnack.meshing.printing.clipping import cut_by
-from harnack.meshing.printing.finishing import (
-    check_options,
-    finished,
-    normals_of,
-    simplified,
-)
-from harnack.meshing.printing.regions import Sheet
-from harnack.meshing.printing.solids import mesh_solid, region_of
-from harnack.meshing.printing.thickening import thickened
 from harnack.meshing.samples import CELLS_PER_WAVE, MOST_FACES, LevelFunction
+from harnack.meshing.solids import Sheet, mesh_solid, region_of
 from harnack.meshing.spanned import spanned_surface
 
 if TYPE_CHECKING:

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
-from harnack.cells import Cells, Octree, octree
 from harnack.meshing.edges import IntArray, dots, lengths
 from harnack.meshing.samples import LevelFunction, Samples
+from harnack.tree.cells import Cells, Octree, octree
 
 __all__ = ["Boundary", "Places", "PointSet", "box_cells", "place_points"]
 

@@ -15,24 +15,23 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harnack.fields.curves.solid_angle import SolidAngle
-from harnack.fields.winding.winding_number import WindingNumber
+from harnack.fields.solid_angles.solid_angle import SolidAngle
+from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.geometry import MeshError, validate_mesh
-from harnack.geometry.singular import singular_loops, weld_vertices
+from harnack.geometry.chains import singular_loops, weld_vertices
 from harnack.meshing.checks import (
     MeshingError,
     TooLargeError,
     check_manifold,
     euler_characteristic,
+    intersecting_faces,
     singular_vertices,
 )
 from harnack.meshing.edges import Edges, IntArray, directed_edges
-from harnack.meshing.intersections import intersecting_faces
-from harnack.meshing.marching_tetrahedra import crossings_of, triangles_of
+from harnack.meshing.marching_tetrahedra import crossings_of, delaunay, triangles_of
 from harnack.meshing.points import Boundary, Places, box_cells, place_points
-from harnack.meshing.refining.refinement import far_places, improved, refined, smoothed
+from harnack.meshing.refinement import far_places, improved, refined, smoothed
 from harnack.meshing.samples import LevelFunction
-from harnack.meshing.tetrahedra import delaunay
 
 if TYPE_CHECKING:
     import trimesh
@@ -444,7 +443,7 @@ def _joined(
     vertices: FloatArray, faces: IntArray, patches: _Patches, given: int
 ) -> trimesh.Trimesh:
     """The mesh and its patches. given: how many of the faces were there before."""
-    from harnack.meshing.printing.closed_mesh import ClosedMesh  # here: trimesh takes a second
+    from harnack.meshing.closed_mesh import ClosedMesh
 
     edges = _open_edges(faces[:given])
     together = np.concatenate([faces, patches.faces])

@@ -11,7 +11,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import FloatArray, choose_backend
-from harnack.backend.lengths import length
+from harnack.backend.elementary import length
 from harnack.enclosures import Gaps, Slopes, TargetLevels, choose_proofs, longest_step
 from harnack.fields.clearance import distance_below
 from harnack.fields.points import in_batches

@@ -21,19 +21,30 @@ from dataclasses import dataclass
 import numpy as np
 
 from harnack.backend import FloatArray
-from harnack.cells import Cells
-from harnack.fields.curves.solid_angle import SolidAngle
-from harnack.geometry.net_loops import net_loops
-from harnack.meshing.checks import LocalError, MeshingError, check_manifold
+from harnack.fields.solid_angles.solid_angle import SolidAngle
+from harnack.geometry.polygons import net_loops
+from harnack.meshing.checks import (
+    LocalError,
+    MeshingError,
+    check_manifold,
+    intersecting_faces,
+    turned_faces,
+)
 from harnack.meshing.edges import IntArray, boundary_edges, edge_keys
-from harnack.meshing.intersections import intersecting_faces, turned_faces
 from harnack.meshing.isotopy import Isotopy, isotopy_of
 from harnack.meshing.lattice_surface import check_size
-from harnack.meshing.marching_tetrahedra import Crossings, crossings_of, is_cut, triangles_of
+from harnack.meshing.marching_tetrahedra import (
+    Crossings,
+    Tetrahedra,
+    crossings_of,
+    delaunay,
+    is_cut,
+    triangles_of,
+)
 from harnack.meshing.points import Boundary, Places, PointSet, box_cells, newton, place_points
-from harnack.meshing.refining.refinement import improved, refined, smoothed
+from harnack.meshing.refinement import improved, refined, smoothed
 from harnack.meshing.samples import LevelFunction
-from harnack.meshing.tetrahedra import Tetrahedra, delaunay
+from harnack.tree.cells import Cells
 
 __all__ = ["Spanned", "spanned_surface", "whole_edges"]
 

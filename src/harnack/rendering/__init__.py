@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from harnack.rendering.arguments import SHOW_MODES
+from harnack.rendering.camera import Camera
 from harnack.rendering.film import animate
-from harnack.rendering.mitsuba.plugins import register, register_surfaces
-from harnack.rendering.mitsuba.shapes import shape
+from harnack.rendering.framing import UnboundedSurfaceError
+from harnack.rendering.images import Picture
+from harnack.rendering.isolines import Isolines
 from harnack.rendering.picture import render
-from harnack.rendering.pictures.picture_array import Picture
-from harnack.rendering.studio.camera import Camera
-from harnack.rendering.studio.materials import MATERIALS, Material
-from harnack.rendering.surfaces.extent import UnboundedSurfaceError
-from harnack.rendering.surfaces.isolines import Isolines
+from harnack.rendering.plugins import register, register_surfaces, shape
+from harnack.rendering.stage import MATERIALS, Material
 
 __all__ = [
     "MATERIALS",

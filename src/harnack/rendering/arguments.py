@@ -12,12 +12,11 @@ from typing import Any
 
 from harnack.fields import Field
 from harnack.names import did_you_mean
-from harnack.rendering.pictures.scales import require_pillow, typeface_for
-from harnack.rendering.pictures.views import GROUND_OF_VIEWS, SCALED, VIEWS
-from harnack.rendering.studio.backdrops import Backdrop, Gradient, Ground, checked_backdrop
-from harnack.rendering.studio.camera import Camera
-from harnack.rendering.surfaces.functions import function_of
-from harnack.rendering.surfaces.isolines import Isolines, checked_isolines
+from harnack.rendering.backdrops import Backdrop, Gradient, Ground, checked_backdrop
+from harnack.rendering.camera import Camera
+from harnack.rendering.isolines import Isolines, checked_isolines, function_of
+from harnack.rendering.scales import require_pillow, typeface_for
+from harnack.rendering.views import GROUND_OF_VIEWS, SCALED, VIEWS
 from harnack.tracer import level_set
 
 SHOW_MODES: tuple[str, ...] = ("color", "shaded", *VIEWS)

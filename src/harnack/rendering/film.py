@@ -18,23 +18,15 @@ import numpy.typing as npt
 
 from harnack.backend import FloatArray
 from harnack.backend.numbers import finite
-from harnack.files.writing import check_writable, write_atomically
+from harnack.files.file_format import check_writable, write_atomically
 from harnack.geometry import Box
-from harnack.rendering.arguments import (
-    OF_PICTURES,
-    check_camera,
-    check_integer,
-    check_size,
-)
-from harnack.rendering.mitsuba.plugins import register
-from harnack.rendering.mitsuba.variant import mitsuba_backend
-from harnack.rendering.picture import render
-from harnack.rendering.progress import progress_bar
-from harnack.rendering.studio.camera import Camera
-from harnack.rendering.studio.upright import upright
+from harnack.rendering.arguments import OF_PICTURES, check_camera, check_integer, check_size
+from harnack.rendering.camera import Camera
+from harnack.rendering.framing import UnboundedSurfaceError, upright, visible_points
+from harnack.rendering.mitsuba import mitsuba_backend
+from harnack.rendering.picture import progress_bar, render
+from harnack.rendering.plugins import register
 from harnack.rendering.studio_scene import surfaces_of
-from harnack.rendering.surfaces.extent import UnboundedSurfaceError
-from harnack.rendering.surfaces.framing import visible_points
 
 FILM_FILES = (".gif", ".mp4")
 _SIZE = (320, 240)

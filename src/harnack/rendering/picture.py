@@ -1,16 +1,23 @@
-"""`render`: a field in, a picture out."""
+"""How far a long task has come: a bar in a terminal, text in notebooks and log files.
+
+`render`: a field in, a picture out.
+"""
 
 from __future__ import annotations
 
 import os
+import sys
+import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, Literal, cast
 
 import numpy as np
 import numpy.typing as npt
 from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from harnack.fields import Field
 from harnack.fields.field import instead_of_field
@@ -21,13 +28,12 @@ from harnack.rendering.arguments import (
     check_spp,
     refuse_studio_settings,
 )
-from harnack.rendering.mitsuba.integrator import PathTracer
-from harnack.rendering.mitsuba.other_integrators import stand_in
-from harnack.rendering.mitsuba.plugins import register
-from harnack.rendering.mitsuba.scene_files import load_dictionary, load_scene_file
-from harnack.rendering.pictures.backdrop import flat, wall
-from harnack.rendering.pictures.images import check_picture_path, tone_mapped, write_image
-from harnack.rendering.pictures.light_paths import (
+from harnack.rendering.backdrops import Gradient, Ground
+from harnack.rendering.camera import Camera
+from harnack.rendering.images import Picture, check_picture_path, tone_mapped, write_image
+from harnack.rendering.integrator import PathTracer
+from harnack.rendering.isolines import Isolines
+from harnack.rendering.light_paths import (
     PATHS_A_BAND,
     SHORT,
     denoised,
@@ -35,17 +41,62 @@ from harnack.rendering.pictures.light_paths import (
     load_denoiser,
     pace_of,
 )
-from harnack.rendering.pictures.picture_array import Picture
-from harnack.rendering.pictures.shaded import shaded
-from harnack.rendering.pictures.views import VIEWS, Viewer, drawn
-from harnack.rendering.progress import Advance, progress_bar
-from harnack.rendering.studio.backdrops import Gradient, Ground
-from harnack.rendering.studio.camera import Camera
-from harnack.rendering.studio.stage import Studio, StudioObject, studio
+from harnack.rendering.mitsuba import load_dictionary, load_scene_file
+from harnack.rendering.placement import Placement
+from harnack.rendering.plugins import register, stand_in
+from harnack.rendering.shaded import shaded
+from harnack.rendering.shading import flat, wall
+from harnack.rendering.stage import Studio, StudioObject, studio
 from harnack.rendering.studio_scene import MaterialLike, studio_objects
-from harnack.rendering.surfaces.isolines import Isolines
-from harnack.rendering.surfaces.placement import Placement
+from harnack.rendering.views import VIEWS, Viewer, drawn
 from harnack.tracer import LevelSet
+
+Advance = Callable[[float], None]
+# Seconds between lines. What is done sooner writes none.
+_INTERVAL = 5.0
+
+
+@contextmanager
+def progress_bar(name: str, shown: bool | Advance) -> Generator[Advance]:
+    """Progress of `name` on stderr; what it yields is told each part, of 1, that has been finished.
+
+    shown: whether to show it; or who is told in its place, and may raise an exception to end all.
+
+    In a notebook a bar would need ipywidgets, and control codes of terminals are shown as they are.
+    """
+    console = Console(stderr=True)
+    if callable(shown):
+        yield shown
+    elif not shown:
+        yield lambda part: None
+    elif console.is_terminal and not console.is_jupyter:
+        columns = (TextColumn(name), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+        with Progress(*columns, console=console, transient=True) as bar:
+            task = bar.add_task("", total=1.0)
+            yield lambda part: bar.advance(task, part)
+    else:
+        yield _Lines(name)
+
+
+class _Lines:
+    """Writes a line of text now and then."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._done = 0.0
+        self._start = self._last = time.monotonic()
+
+    def __call__(self, part: float) -> None:
+        self._done += part
+        now = time.monotonic()
+        if now - self._last < _INTERVAL or self._done >= 1 - 1e-9:
+            return
+        self._last = now
+        past = now - self._start
+        left = past * (1 - self._done) / self._done
+        text = f"{self._name}: {self._done:.0%} after {past:.0f} s, about {left:.0f} s left"
+        print(text, file=sys.stderr, flush=True)
+
 
 ShowMode = Literal["color", "shaded", "normal", "evaluations", "status", "depth", "value"]
 # Modes with ground and lights, and what they send out.

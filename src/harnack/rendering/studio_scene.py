@@ -12,14 +12,13 @@ import numpy as np
 
 from harnack.fields import Field, Solid
 from harnack.fields.field import instead_of_field
+from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.fields.solids.tube import Tube
-from harnack.fields.winding.winding_number import WindingNumber
 from harnack.meshing import mesh
 from harnack.rendering.arguments import check_settings
-from harnack.rendering.studio.materials import Material, material_of
-from harnack.rendering.studio.stage import StudioObject
-from harnack.rendering.surfaces.colors import Color
-from harnack.rendering.surfaces.isolines import Isolines
+from harnack.rendering.isolines import Isolines
+from harnack.rendering.scales import Color
+from harnack.rendering.stage import Material, StudioObject, material_of
 from harnack.tracer import LevelSet, level_set
 
 # What tubes around the ends of surfaces are made of.

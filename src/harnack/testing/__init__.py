@@ -7,8 +7,7 @@ on random functions of every kind, among them the extremal ones. Both raise `Bro
 from __future__ import annotations
 
 from harnack.testing.bound_contracts import check_bound
-from harnack.testing.failures import BrokenPromiseError
 from harnack.testing.field_contracts import check_field, check_looks
-from harnack.testing.scaled import scaled
+from harnack.testing.worst_places import BrokenPromiseError, scaled
 
 __all__ = ["BrokenPromiseError", "check_bound", "check_field", "check_looks", "scaled"]

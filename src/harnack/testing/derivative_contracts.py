@@ -12,8 +12,7 @@ import numpy.typing as npt
 
 from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy, to_vector3
 from harnack.enclosures import BoundedLaplacian, HarmonicBall
-from harnack.testing.failures import BrokenPromiseError, require
-from harnack.testing.walks import FieldValues, jumps, look_at
+from harnack.testing.worst_places import BrokenPromiseError, FieldValues, jumps, look_at, require
 
 if TYPE_CHECKING:
     from harnack.fields.field import Field

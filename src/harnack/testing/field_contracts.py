@@ -11,20 +11,20 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import FloatArray, choose_backend, to_numpy, to_vector3
-from harnack.enclosures import (
-    Choice,
-    Gaps,
-    HarmonicBall,
-    Slopes,
-    choose_proofs,
-    longest_step,
-)
+from harnack.enclosures import Choice, Gaps, HarmonicBall, Slopes, choose_proofs, longest_step
 from harnack.fields.field import Field
 from harnack.fields.look import Path
 from harnack.testing.derivative_contracts import check_derivatives
-from harnack.testing.failures import BrokenPromiseError, require
-from harnack.testing.walks import FieldValues, look_at, movements, random_directions, random_points
-from harnack.testing.worst_places import search_worst_places
+from harnack.testing.worst_places import (
+    BrokenPromiseError,
+    FieldValues,
+    look_at,
+    movements,
+    random_directions,
+    random_points,
+    require,
+    search_worst_places,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

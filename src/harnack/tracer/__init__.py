@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from harnack.tracer.all_hits import AllHits
+from harnack.tracer.contact import Status, Tolerance
 from harnack.tracer.hits import Hits, trace
 from harnack.tracer.prepared import MarchResult, PreparedLevelSet
 from harnack.tracer.surface import LevelSet, level_set
-from harnack.tracer.tolerance import Status, Tolerance
 
 __all__ = [
     "AllHits",

@@ -15,14 +15,13 @@ import numpy as np
 
 from harnack.backend import to_numpy
 from harnack.backend.arrays import gather_vectors
-from harnack.backend.lengths import length as norm
+from harnack.backend.elementary import length as norm
 from harnack.backend.loops import while_active
 from harnack.fields.sheets import NO_SHEET
-from harnack.tracer.contact import Contact
+from harnack.tracer.contact import Contact, Status
 from harnack.tracer.derivatives import attach, refuse_derivative, wants_derivatives
 from harnack.tracer.prepared import MarchResult
-from harnack.tracer.stretches import SheetTracer, SheetWalk
-from harnack.tracer.tolerance import Status
+from harnack.tracer.walks import SheetTracer, SheetWalk
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3

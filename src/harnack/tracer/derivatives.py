@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
-from harnack.backend.lengths import length as norm
+from harnack.backend.elementary import length as norm
 from harnack.backend.numbers import holds_numbers_alone
 from harnack.enclosures import TargetLevels
-from harnack.fields.detail import NO_TRUNCATION
-from harnack.fields.field_cache import FieldCache
-from harnack.tracer.tolerance import Status
+from harnack.fields.batch import FieldCache
+from harnack.fields.sheets import NO_TRUNCATION
+from harnack.tracer.contact import Status
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3

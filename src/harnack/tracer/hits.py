@@ -12,8 +12,8 @@ import numpy as np
 
 from harnack.backend import backend_of, choose_backend, to_float, to_numpy, to_vector3
 from harnack.backend.arrays import as_data
-from harnack.backend.lengths import largest_coordinate, unit
-from harnack.backend.lengths import length as norm
+from harnack.backend.elementary import largest_coordinate, unit
+from harnack.backend.elementary import length as norm
 from harnack.backend.tensors import is_tensor, numbers_of, tensor_of, vectors_of
 from harnack.tracer.all_hits import (
     AllHits,
@@ -22,9 +22,9 @@ from harnack.tracer.all_hits import (
     no_crossings,
     trace_all,
 )
+from harnack.tracer.contact import Status, Tolerance
 from harnack.tracer.derivatives import attach, refuse_derivative, wants_derivatives
 from harnack.tracer.surface import LevelSet, level_set
-from harnack.tracer.tolerance import Status, Tolerance
 from harnack.webgpu import evaluate, find_device
 
 if TYPE_CHECKING:

@@ -10,11 +10,11 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import FloatArray, choose_backend, to_numpy, to_vector3
-from harnack.backend.lengths import length
-from harnack.cells import OccupiedCells, largest_connected_component
+from harnack.backend.elementary import length
 from harnack.enclosures import TargetLevels
+from harnack.fields.batch import FieldCache
 from harnack.fields.clearance import clearance_of
-from harnack.fields.field_cache import FieldCache
+from harnack.tree.cells import OccupiedCells, largest_connected_component
 
 if TYPE_CHECKING:
     from harnack.backend import BoolArray

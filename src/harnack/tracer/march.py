@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
-from harnack.backend.extrema import clamp, fmax, fmin
-from harnack.backend.lengths import largest_coordinate, length
+from harnack.backend.elementary import clamp, fmax, fmin, largest_coordinate, length
 from harnack.backend.loops import while_active
 from harnack.enclosures import any_covers, longest_step
 from harnack.fields.look import value_error
@@ -23,17 +22,18 @@ from harnack.tracer.contact import (
     Accepted,
     Contact,
     Hysteresis,
+    PreparedTolerance,
     SheetComparison,
+    Status,
     compare_with_sheet,
 )
-from harnack.tracer.tolerance import PreparedTolerance, Status
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.cells.uniform_grid import UniformGrid
     from harnack.enclosures import Gaps, TargetLevels
     from harnack.fields.field import Field
     from harnack.fields.look import Look, Path
+    from harnack.tree.cells import UniformGrid
 
 # A coarse sample is repeated at higher detail where a level is closer in value than this many times
 # its total error, to make truncation this part of that distance, or of what truncation may be

@@ -13,12 +13,11 @@ from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 
-from harnack.backend.extrema import fmax, fmin
-from harnack.backend.lengths import length
+from harnack.backend.elementary import fmax, fmin, length
 from harnack.backend.loops import while_active
 from harnack.fields.look import Path
+from harnack.tracer.contact import PreparedTolerance, Status
 from harnack.tracer.march import March, MarchState
-from harnack.tracer.tolerance import PreparedTolerance, Status
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3

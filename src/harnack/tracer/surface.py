@@ -18,16 +18,16 @@ from harnack.backend.tensors import is_tensor, numbers_of
 from harnack.enclosures import Choice, Proofs, TargetLevels, choose_proofs
 from harnack.fields.field import check_is_field
 from harnack.geometry import Intersection
-from harnack.geometry.volumes import check_volume
+from harnack.geometry.volume import check_volume
+from harnack.tracer.contact import Tolerance
 from harnack.tracer.largest import checked_largest, largest_cells
 from harnack.tracer.prepared import PreparedLevelSet
-from harnack.tracer.tolerance import Tolerance
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real
-    from harnack.cells import OccupiedCells
     from harnack.fields.field import Field
     from harnack.geometry import Volume
+    from harnack.tree.cells import OccupiedCells
 
 _T = TypeVar("_T")
 

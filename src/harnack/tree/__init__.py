@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
-from harnack.tree.hierarchy import NO_PRIMITIVE, Hierarchy, build_hierarchy
-from harnack.tree.packed import PackedTree, pack
-from harnack.tree.walk import Node, for_each, walk
+from harnack.tree.hierarchy import (
+    NO_PRIMITIVE,
+    Hierarchy,
+    Node,
+    PackedTree,
+    build_hierarchy,
+    for_each,
+    pack,
+    walk,
+)
 
 __all__ = [
     "NO_PRIMITIVE",

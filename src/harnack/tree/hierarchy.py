@@ -2,18 +2,30 @@
 
 A balanced tree of median splits: every leaf holds w or w - 1 primitives, every level is complete,
 so that a level is a reshape and every sum over nodes a sum along an axis.
+
+A tree on a backend: nodes and primitives as records.
+
+Walking a tree without a stack: depth first, over a subtree or past it.
+
+What a node means, and when to go past it, is up to the caller.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
+import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray, IntArray
+from harnack.backend.records import PACKET, Records
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Mask, Real
 
 NO_PRIMITIVE = -1
 # So many points and their indices stay in the cache.
@@ -155,3 +167,134 @@ def _halves(values: npt.NDArray[Any], order: IntArray, half: int, empty: float) 
     if width % 2:
         out[:, 1, half - 1] = empty
     return out.reshape(-1, half)
+
+
+_HEAD = 6  # numbers of the first packet of a node that its owner chooses; then skip and leaf
+# Links are stored as floats, and single precision counts no further.
+_MOST_NODES = 2**24
+
+
+@dataclass(frozen=True)
+class PackedTree:
+    """Nodes with links, siblings side by side (`Hierarchy.links`); primitives leaf by leaf.
+
+    The head of a node holds six numbers of its owner's, the node that follows its subtree, and
+    the number of its leaf or, for an inner node, minus that of its first child. The owner's other
+    packets lie elsewhere: a walk reads many heads in a row, and few of those.
+    """
+
+    backend: Backend
+    heads: Records
+    payloads: Records | None
+    node_count: Any
+    primitives: Records
+    leaf_size: Any
+
+    def head(self, i: Any) -> list[Real]:
+        """The eight numbers of node i that a walk needs."""
+        return self.heads.row(i)
+
+    def payload(self, i: Any, active: Mask) -> list[Real]:
+        """The other numbers of node i."""
+        return [] if self.payloads is None else self.payloads.row(i, active)
+
+    def primitive(self, leaf: Any, slot: Any, active: Mask) -> list[Real]:
+        """All numbers of a primitive."""
+        return self.primitives.row(leaf * self.leaf_size + slot, active)
+
+
+def pack(
+    backend: Backend, tree: Hierarchy, levels: Sequence[FloatArray], primitives: FloatArray
+) -> PackedTree:
+    """A tree with the numbers of its nodes (k, 6 or more), level by level from the leaves, and of
+    its primitives in their slots (leaves, leaf_size, c).
+
+    Raises:
+        ValueError: more nodes than links in single precision can count.
+    """
+    if tree.node_count >= _MOST_NODES:
+        raise ValueError(f"a tree of {tree.node_count} nodes is too large: cut the input in parts")
+    extra = levels[0].shape[1] - _HEAD
+    heads = np.zeros((tree.node_count, PACKET), backend.dtype)
+    payloads = np.zeros((tree.node_count, extra), backend.dtype)
+    links = tree.links()
+    for number, first, after, values in zip(*links, levels, strict=True):
+        heads[number, :_HEAD] = values[:, :_HEAD]
+        heads[number, _HEAD] = after
+        heads[number, _HEAD + 1] = -first
+        payloads[number] = values[:, _HEAD:]
+    leaves = links[0][0]
+    heads[leaves, _HEAD + 1] = np.arange(len(leaves))
+    return PackedTree(
+        backend,
+        Records.upload(backend, heads),
+        Records.upload(backend, payloads) if extra else None,
+        dr.opaque(backend.UInt32, tree.node_count),
+        Records.upload(backend, primitives.reshape(-1, primitives.shape[2])),
+        dr.opaque(backend.UInt32, tree.leaf_size),
+    )
+
+
+State: TypeAlias = "tuple[Any, ...]"
+
+
+@dataclass(frozen=True)
+class Node:
+    """A node on a walk; all lanes may be at different ones.
+
+    head: its owner's six numbers that every visit reads. leaf: number of its leaf, if it is_leaf.
+    """
+
+    tree: PackedTree
+    index: Any
+    head: tuple[Real, ...]
+    leaf: Any
+    is_leaf: Mask
+
+    def payload(self, active: Mask) -> list[Real]:
+        """The other numbers, fetched where active."""
+        return self.tree.payload(self.index, active)
+
+
+Visit: TypeAlias = "Callable[[Node, State], tuple[Mask, State]]"
+EachPrimitive: TypeAlias = "Callable[[list[Real], Mask, State], State]"
+
+
+def walk(tree: PackedTree, visit: Visit, state: State, active: Mask = True) -> State:
+    """The state after visiting nodes from the root on.
+
+    visit(node, state) gives the new state, and whether to go into the node's children: where it
+    does not, the walk goes on behind the subtree. May be called while a loop is recorded.
+    """
+    index, mask = tree.backend.UInt32, tree.backend.Bool
+
+    def body(i: Any, *state: Any) -> State:
+        head = tree.head(i)
+        is_leaf, number = head[7] >= 0, index(dr.abs(head[7]))
+        node = Node(tree, i, tuple(head[:6]), number, is_leaf)
+        descend, state = visit(node, state)
+        i = dr.select(descend & ~is_leaf, number, index(head[6]))
+        return i, *state
+
+    def more(i: Any, *_: Any) -> Mask:
+        return i < tree.node_count
+
+    start = dr.select(mask(active), index(0), tree.node_count)
+    return dr.while_loop((start, *state), more, body, label="walk")[1:]
+
+
+def for_each(node: Node, active: Mask, body: EachPrimitive, state: State) -> State:
+    """The state after visiting the primitives of a leaf, where active; costs nothing elsewhere.
+
+    Empty slots are visited as well: whoever packed the tree filled them with what does no harm.
+    """
+    tree = node.tree
+    index = tree.backend.UInt32
+
+    def more(slot: Any, *_: Any) -> Mask:
+        return active & (slot < tree.leaf_size)
+
+    def step(slot: Any, *state: Any) -> State:
+        return slot + 1, *body(tree.primitive(node.leaf, slot, active), active, state)
+
+    return dr.while_loop((index(0), *state), more, step, label="leaf")[1:]

@@ -14,12 +14,8 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import FloatArray, IntArray
-from harnack.backend.basis import across
-from harnack.backend.extrema import clamp, fmax, fmin
-from harnack.backend.lengths import largest_coordinate
-from harnack.tree.hierarchy import Hierarchy
-from harnack.tree.packed import PackedTree, pack
-from harnack.tree.walk import Node, State, for_each, walk
+from harnack.backend.elementary import across, clamp, fmax, fmin, largest_coordinate
+from harnack.tree.hierarchy import Hierarchy, Node, PackedTree, State, for_each, pack, walk
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3

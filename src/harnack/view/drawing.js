@@ -33,7 +33,7 @@ const GROUP = 64;
 const [GRAZING, OTHERWISE, APART, TURNED, ALIKE, MORE] = [0.1, 1e-3, 0.1, 2e-4, 0.9, 0.03];
 const VIEW_BYTES = 176;
 const PAINTS = 128;
-// Of the floor's light: see `harnack.rendering.pictures.floor`.
+// Of the floor's light: see `harnack.rendering.shading`.
 const [CELLS, RAYS, BLOCK, SPREAD] = [64, 8, 4, 0.34];
 const BLUR = [0.025, 0.125, 0.225, 0.25, 0.225, 0.125, 0.025];
 
@@ -357,7 +357,7 @@ export class Drawing {
     });
   }
 
-  /** What of the key light and of the sky reaches the floor, as `harnack.rendering.pictures.floor`
+  /** What of the key light and of the sky reaches the floor, as `harnack.rendering.shading`
    *  has it. False if something moved before it was done. @param {number} now */
   async light_floor(now) {
     const { queue } = this.device;

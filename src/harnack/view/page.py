@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harnack.files.writing import write_atomically
-from harnack.rendering.progress import progress_bar
+from harnack.files.file_format import write_atomically
+from harnack.rendering.picture import progress_bar
 from harnack.view.scene import Live, Moved
 
 if TYPE_CHECKING:

@@ -16,20 +16,19 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import to_numpy
-from harnack.rendering.mitsuba.integrator import LOST_COLOR
-from harnack.rendering.mitsuba.plugins import register
-from harnack.rendering.mitsuba.variant import mitsuba_backend
-from harnack.rendering.pictures.floor import Floor
-from harnack.rendering.pictures.images import SHOULDER, as_bytes, transferred
-from harnack.rendering.pictures.scales import viridis
-from harnack.rendering.pictures.shaded import visible_sky
-from harnack.rendering.pictures.shading import Light
-from harnack.rendering.studio.lighting import FLOOR, reflectance_of
+from harnack.rendering.backdrops import FLOOR, reflectance_of
+from harnack.rendering.images import SHOULDER, as_bytes, transferred
+from harnack.rendering.integrator import LOST_COLOR
+from harnack.rendering.mitsuba import mitsuba_backend
+from harnack.rendering.plugins import register
+from harnack.rendering.scales import viridis
+from harnack.rendering.shaded import visible_sky
+from harnack.rendering.shading import Floor, Light
 from harnack.view.scene import paint_of
 
 if TYPE_CHECKING:
     from harnack.backend import FloatArray
-    from harnack.rendering.surfaces.placement import PlacedSurface
+    from harnack.rendering.placement import PlacedSurface
 
 __all__ = ["Eye", "Painted", "Painter", "Pixels"]
 

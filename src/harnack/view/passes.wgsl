@@ -1,5 +1,5 @@
 // What is done around a traced kernel: rays of the camera, what they met, the light of shaded
-// pictures (harnack.rendering.pictures.shading), and lines and points in front.
+// pictures (harnack.rendering.shading), and lines and points in front.
 
 struct View {
   eye: vec4f,         // on the stage; w: ways across the picture that look for the sky

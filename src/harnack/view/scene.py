@@ -17,22 +17,19 @@ import numpy as np
 
 from harnack.backend import choose_backend, to_vector3
 from harnack.fields import Solid
-from harnack.fields.curves.solid_angle import SolidAngle
+from harnack.fields.solid_angles.solid_angle import SolidAngle
 from harnack.geometry import HalfSpace, Intersection, Volume
 from harnack.rendering import render
 from harnack.rendering.arguments import check_camera
-from harnack.rendering.mitsuba.plugins import register
-from harnack.rendering.pictures.shading import of_mended, of_side, reflectance
-from harnack.rendering.studio.backdrops import Ground, checked_backdrop
-from harnack.rendering.studio.lighting import FLOOR, reflectance_of
-from harnack.rendering.studio.stage import StudioObject, on_ground
-from harnack.rendering.studio.upright import upright
+from harnack.rendering.backdrops import FLOOR, Ground, checked_backdrop, reflectance_of
+from harnack.rendering.framing import box_of, upright, visible_points
+from harnack.rendering.isolines import checked_isolines
+from harnack.rendering.placement import PlacedSurface
+from harnack.rendering.plugins import register
+from harnack.rendering.scales import linear
+from harnack.rendering.shading import of_mended, of_side, reflectance
+from harnack.rendering.stage import StudioObject, on_ground
 from harnack.rendering.studio_scene import studio_objects
-from harnack.rendering.surfaces.colors import linear
-from harnack.rendering.surfaces.extent import box_of
-from harnack.rendering.surfaces.framing import visible_points
-from harnack.rendering.surfaces.isolines import checked_isolines
-from harnack.rendering.surfaces.placement import PlacedSurface
 from harnack.tracer import LevelSet, Status, Tolerance
 from harnack.view.scene_file import SURFACE_SETTINGS, Origins, text_of
 from harnack.view.sliders import Subject
@@ -40,10 +37,10 @@ from harnack.webgpu import bits_of, data_of, leaves, record
 
 if TYPE_CHECKING:
     from harnack.backend import FloatArray, Real, Vec3
-    from harnack.rendering.pictures.picture_array import Picture
-    from harnack.rendering.studio.camera import Camera
-    from harnack.rendering.surfaces.encounter import SurfaceHit
-    from harnack.rendering.surfaces.placement import Placement
+    from harnack.rendering.camera import Camera
+    from harnack.rendering.encounter import SurfaceHit
+    from harnack.rendering.images import Picture
+    from harnack.rendering.placement import Placement
     from harnack.webgpu import Recording
 
 __all__ = ["SHOWS", "Live", "Moved", "Plain", "paint_of", "paints_of", "status_of"]

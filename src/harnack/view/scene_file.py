@@ -34,24 +34,16 @@ from harnack import geometry
 from harnack.enclosures.proofs import choose_proofs
 from harnack.field_from_file import open_surface
 from harnack.fields import Field, Solid
-from harnack.fields.curves.solid_angle import SolidAngle
+from harnack.fields.analytic.periodic import Gyroid, SchwarzD, SchwarzP
+from harnack.fields.analytic.polynomial import SphericalHarmonic
 from harnack.fields.expressions import Expression, TextFormula, expression
-from harnack.fields.polynomials.polynomial import SphericalHarmonic
-from harnack.fields.solids import (
-    affine,
-    bends,
-    blended,
-    combined,
-    fractal,
-    julia,
-    region,
-    round,
-    square,
-    tube,
-)
+from harnack.fields.solid_angles.solid_angle import SolidAngle
+from harnack.fields.solids import affine, bends, combined, fractal, julia, region, tube
+from harnack.fields.solids import combined as blended
+from harnack.fields.solids import primitives as round
+from harnack.fields.solids import primitives as square
 from harnack.fields.solids.solid import Map
-from harnack.fields.waves.periodic import Gyroid, SchwarzD, SchwarzP
-from harnack.files.writing import write_atomically
+from harnack.files.file_format import write_atomically
 from harnack.gallery import SCENES
 from harnack.geometry import Volume
 from harnack.names import did_you_mean

@@ -20,7 +20,7 @@ from harnack.geometry import Ball, Box, HalfSpace
 from harnack.names import did_you_mean
 from harnack.rendering import Camera
 from harnack.rendering.arguments import check_size
-from harnack.rendering.studio.lighting import GROUNDS
+from harnack.rendering.backdrops import GROUNDS
 from harnack.tracer import Status, trace
 from harnack.view.painter import Eye, Painted, Painter
 from harnack.view.scene import SHOWS, Live, Moved, paints_of

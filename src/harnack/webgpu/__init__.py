@@ -2,8 +2,16 @@
 
 from __future__ import annotations
 
-from harnack.webgpu.device import Device, NoDeviceError, bits_of, data_of, find_device
-from harnack.webgpu.evaluation import Arrays, DeviceDisagreesError, evaluate
+from harnack.webgpu.device import (
+    Arrays,
+    Device,
+    DeviceDisagreesError,
+    NoDeviceError,
+    bits_of,
+    data_of,
+    evaluate,
+    find_device,
+)
 from harnack.webgpu.kernel import UntranslatableError
 from harnack.webgpu.recording import Recording, leaves, record
 

@@ -1,24 +1,39 @@
 """A device behind WebGPU, driven from Python: shaders compiled and run, rays by the thousand.
 
 The package `wgpu` speaks to Vulkan, Metal and Direct3D.
+
+A computation on a device behind WebGPU, of which a sample is compared with Dr.Jit's answers.
 """
 
 from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend import to_numpy
+from harnack.backend import IntArray, backend_of, to_numpy
+from harnack.backend.arrays import aligned_integers
+from harnack.webgpu.recording import leaves, record
 from harnack.webgpu.wgsl import WORKGROUP, Shader
 
-__all__ = ["Bits", "Device", "NoDeviceError", "Program", "bits_of", "data_of", "find_device"]
+__all__ = [
+    "Arrays",
+    "Bits",
+    "Device",
+    "DeviceDisagreesError",
+    "NoDeviceError",
+    "Program",
+    "bits_of",
+    "data_of",
+    "evaluate",
+    "find_device",
+]
 
 Bits = npt.NDArray[np.uint32]
 # Seconds that one dispatch should take: a system kills what keeps its display waiting.
@@ -152,3 +167,73 @@ def bits_of(array: Any) -> Bits:
     if values.dtype.itemsize != 4:
         values = values.astype(np.uint32)
     return np.ascontiguousarray(values).view(np.uint32)
+
+
+Arrays: TypeAlias = "dict[str, npt.NDArray[Any]]"
+# Lanes that Dr.Jit computes as well: spread evenly over all.
+_SAMPLE = 4096
+
+
+class DeviceDisagreesError(RuntimeError):
+    """A device does not compute what Dr.Jit does."""
+
+
+def evaluate(
+    device: Device,
+    compute: Callable[..., Mapping[str, Any]],
+    lanes: Mapping[str, Any],
+    data: Any,
+    differences: Callable[[IntArray, Arrays, Arrays], str],
+) -> Arrays:
+    """What `compute(**lanes)` gives, as NumPy arrays by name, computed on a device.
+
+    compute, data: as `recording.record` takes them. lanes: Dr.Jit arrays of n entries each.
+    differences: of some lanes, Dr.Jit's answers and the device's, says what is wrong with the last;
+        nothing if they agree.
+
+    Raises:
+        UntranslatableError: the kernel holds what is not known.
+        DeviceDisagreesError: the answers differ.
+    """
+    count = max(dr.width(one) for one in lanes.values())
+    # Two at least: a single lane would be a number.
+    some = max(2, min(count, _SAMPLE))
+    rows: IntArray = np.arange(some) * (count - 1) // (some - 1)
+    recording = record(compute, {name: _some(one, rows) for name, one in lanes.items()}, data)
+    program = device.compile(recording.shader)
+    given = {label: to_numpy(one) for label, one in leaves("lane", dict(lanes))}
+    bits = program.run(recording.data, given, count)
+    expected: Arrays = {}
+    found: Arrays = {}
+    for label, one in recording.results.items():
+        expected[label] = to_numpy(one)
+        found[label] = bits[label].view(expected[label].dtype)
+    for label, one in recording.constants.items():
+        expected[label] = np.full(len(rows), to_numpy(one)[0])
+        found[label] = np.full(count, to_numpy(one)[0])
+    sample = {label: one[rows] for label, one in found.items()}
+    wrong = differences(rows, _named(expected), _named(sample))
+    if wrong:
+        raise DeviceDisagreesError(
+            f"{device.name} does not compute what Dr.Jit does: {wrong}. Nothing that it says is "
+            "used: leave out backend"
+        )
+    return _named(found)
+
+
+def _some(array: Any, rows: npt.NDArray[np.int64]) -> Any:
+    index = aligned_integers(backend_of(array), rows.astype(np.uint32))
+    some = dr.gather(type(array), array, index)
+    dr.make_opaque(some)
+    return some
+
+
+def _named(columns: Arrays) -> Arrays:
+    """Columns "result name" and "result name k" as arrays (n,) and (n, 3) by name."""
+    parts: dict[str, list[npt.NDArray[Any]]] = {}
+    for label, column in columns.items():
+        parts.setdefault(label.split()[1], []).append(column)
+    return {
+        name: several[0] if len(several) == 1 else np.column_stack(several)
+        for name, several in parts.items()
+    }

@@ -3,7 +3,7 @@
 WGSL promises less than LLVM: division may be off by 2.5 units in the last place, `fma` may round
 twice, denormals may be zero, and a compiler may take infinities and NaN for impossible. So
 constants that are not finite come from a buffer, NaN and infinity are told by bits, and what a
-device makes of a shader is compared with Dr.Jit's answers (`harnack.webgpu.evaluation`).
+device makes of a shader is compared with Dr.Jit's answers (`harnack.webgpu.device`).
 """
 
 from __future__ import annotations

@@ -12,14 +12,13 @@ import numpy as np
 
 from harnack.arithmetic import Jet, sqrt
 from harnack.backend import FloatArray, backend_of
-from harnack.backend.extrema import fmax, fmin
+from harnack.backend.elementary import fmax, fmin
 from harnack.backend.numbers import check_finite, check_size, check_vectors, real_array
 from harnack.backend.records import Records
 from harnack.enclosures import Lipschitz, Slopes
-from harnack.enclosures.restriction import Piece
-from harnack.fields.blobs.jets import summed
-from harnack.fields.blobs.sums import PIECES, Along, BlobValue, Knots, State, over
-from harnack.fields.field_cache import prepared_once
+from harnack.enclosures.enclosure import Piece
+from harnack.fields.batch import prepared_once
+from harnack.fields.blobs.sums import PIECES, Along, BlobValue, Knots, State, over, summed
 from harnack.fields.formula import Formula, is_jet
 from harnack.fields.look import Look, Path, Sample
 from harnack.geometry import Box

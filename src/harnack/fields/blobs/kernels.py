@@ -24,7 +24,7 @@ import numpy as np
 
 from harnack.arithmetic import Function, Interval
 from harnack.arithmetic.interval import unit_of
-from harnack.backend.extrema import fmax, fmin
+from harnack.backend.elementary import fmax, fmin
 from harnack.names import did_you_mean
 
 if TYPE_CHECKING:

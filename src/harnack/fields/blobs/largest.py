@@ -17,17 +17,26 @@ from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 
-from harnack.backend.extrema import fmax, fmin
+from harnack.backend.elementary import fmax, fmin
 from harnack.enclosures import Enclosure, Gaps, Slopes, longest_step
-from harnack.fields.blobs.jets import jet_of, leaves, summed
-from harnack.fields.blobs.sums import BlobValue, EachBlob, ForEach, State, sum_along, value_at
+from harnack.fields.blobs.sums import (
+    BlobValue,
+    EachBlob,
+    ForEach,
+    State,
+    jet_of,
+    leaves,
+    sum_along,
+    summed,
+    value_at,
+)
 
 if TYPE_CHECKING:
     from harnack.arithmetic import Jet
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.backend.records import Records
-    from harnack.fields.blobs.jets import Term
     from harnack.fields.blobs.kernels import Kernel
+    from harnack.fields.blobs.sums import Term
     from harnack.fields.look import Path
 
 

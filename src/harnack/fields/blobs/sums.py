@@ -12,20 +12,23 @@ times e, and f'' by `Steepness.bend` times e (its jumps at the end of the suppor
 within a margin), or by `Kernel.share` of that. A sum of n terms adds n u times the sum of their
 largest absolute values. Both are added to the ranges, outwards. The value at the point is right
 within 8u |dk/dq|, by the rounding of q, and (16 + n)u m, with m as in `Kernel.profile`.
+
+Sums over records as jets: what lets blobs be deformed and blended by formulas of others.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import drjit as dr
 
-from harnack.backend.extrema import clamp, fmax, fmin
+from harnack.arithmetic import Interval, Jet
+from harnack.backend.elementary import clamp, fmax, fmin
 from harnack.enclosures import Slopes
-from harnack.enclosures.restriction import Piece
+from harnack.enclosures.enclosure import Piece
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -284,3 +287,51 @@ def over_list(records: Records, entries: Any, begin: Any, end: Any) -> ForEach:
         return dr.while_loop((kind(begin), *state), more, step, label="blobs of a cell")[1:]
 
     return for_each
+
+
+Coordinates: TypeAlias = tuple[Jet, Jet, Jet]
+Term: TypeAlias = "Callable[[list[Real]], Jet]"
+
+
+def summed(term: Term, like: Jet, zero: Real, for_each: ForEach) -> Jet:
+    """The sum of a jet for each record, in a loop whose state is the ends of all intervals.
+
+    like: a jet of the same variables. zero: the number 0 on each lane.
+    """
+
+    def body(row: list[Real], state: State) -> State:
+        total = jet_of(like, iter(state)) + term(row)
+        return tuple(leaves(total, zero))
+
+    start = tuple(leaves(like.constant(0.0), zero))
+    return jet_of(like, iter(for_each(body, start)))
+
+
+def blob_term(kernel: Kernel, coordinates: Coordinates) -> Term:
+    """The jet of one blob at jets of the coordinates."""
+    function = kernel.function()
+
+    def term(row: list[Real]) -> Jet:
+        inverse, amplitude = row[6], row[7]
+        x, y, z = (((one - row[k]) - row[3 + k]) * inverse for k, one in enumerate(coordinates))
+        return (x**2 + y**2 + z**2).apply(function) * amplitude
+
+    return term
+
+
+def leaves(jet: Jet, zero: Real) -> Iterator[Any]:
+    """The ends of all intervals of a jet, as numbers of the backend."""
+    for one in (jet.value, *jet.first, *jet.second):
+        yield zero + one.low
+        yield zero + one.high
+    if jet.start is not None:
+        yield from leaves(jet.start, zero)
+
+
+def jet_of(like: Jet, ends: Iterator[Any]) -> Jet:
+    """A jet of the same variables as another one, with these ends."""
+    value = Interval(next(ends), next(ends))
+    first = tuple(Interval(next(ends), next(ends)) for _ in like.first)
+    second = tuple(Interval(next(ends), next(ends)) for _ in like.second)
+    start = None if like.start is None else jet_of(like.start, ends)
+    return Jet(value, first, second, start, like.width)

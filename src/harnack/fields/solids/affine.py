@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.arithmetic import Jet
-from harnack.backend.lengths import largest_coordinate, length
+from harnack.backend.elementary import largest_coordinate, length
 from harnack.enclosures import Promise
 from harnack.enclosures.extremum import Stretched
 from harnack.fields.formula import as_jet, hessian_error, prepared_numbers

@@ -13,7 +13,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.arithmetic import cos, maximum, minimum, sin
-from harnack.backend.extrema import fmax, fmin
+from harnack.backend.elementary import fmax, fmin
 from harnack.enclosures import Lipschitz, Promise
 from harnack.fields.field import Field
 from harnack.fields.formula import prepared_numbers, probe

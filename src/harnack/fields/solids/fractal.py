@@ -14,7 +14,7 @@ import drjit as dr
 
 from harnack.arithmetic import Interval, Jet
 from harnack.backend import backend_of
-from harnack.backend.extrema import fmax
+from harnack.backend.elementary import fmax
 from harnack.backend.numbers import finite, positive, whole
 from harnack.enclosures import Curvature, Lipschitz
 from harnack.fields.formula import Formula, is_jet, prepared_numbers

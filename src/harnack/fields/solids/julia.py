@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 
-from harnack.backend.extrema import clamp, fmax, fmin
+from harnack.backend.elementary import clamp, fmax, fmin
 from harnack.backend.numbers import finite, whole
 from harnack.enclosures import Lipschitz
 from harnack.fields.look import Sample

@@ -12,8 +12,7 @@ import numpy as np
 
 from harnack.arithmetic import Interval, Jet
 from harnack.backend import backend_of
-from harnack.backend.extrema import fmax, fmin
-from harnack.backend.lengths import length
+from harnack.backend.elementary import fmax, fmin, length
 from harnack.backend.numbers import refuses_derivatives
 from harnack.enclosures import Curvature, Enclosure, Gaps
 from harnack.fields.field import Field, check_is_field

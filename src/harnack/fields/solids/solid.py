@@ -179,7 +179,7 @@ class Solid(Field):
         Raises:
             ValueError: radius or power out of range. TypeError: a solid without a formula.
         """
-        from harnack.fields.solids.blended import Blend
+        from harnack.fields.solids.combined import Blend
 
         return Blend((self, other), radius, power, not intersect)
 

@@ -1,1 +1,0 @@
-"""Proofs by harmonic balls: Harnack's inequality and what is sharper."""

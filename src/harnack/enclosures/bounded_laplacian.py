@@ -1,0 +1,176 @@
+"""The bound for functions that are not harmonic but have a bounded Laplacian.
+
+The talk on Gillespie, Yang, Botsch, Crane 2024 names it as future work; the proof below and its
+constant are harnack's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import drjit as dr
+
+from harnack.backend.elementary import clamp, fmax, fmin
+from harnack.enclosures.ball import is_covered, known_ranges, largest_covered, rounding
+from harnack.enclosures.enclosure import Enclosure, Gaps, Slopes
+from harnack.enclosures.promises import BoundedLaplacian, Promise
+
+if TYPE_CHECKING:
+    from typing import Self
+
+    from harnack.backend import Mask, Real
+
+KERNEL_NORM = 0.394
+"""kappa <= KERNEL_NORM q^2 (2 + ln(1/q))/(1-q^2)^2, proved by `tests/oracles/green_kernel.py`."""
+
+SLOPE_NORM = 0.1907
+"""That of G(0,.) + d_v G(0,.)/3 on the unit ball, (19 - 6 ln 3 - 2 sqrt(3) pi)/8, rounded up."""
+
+# A bound whose gap is this many times its scale is not reached within the ball, but for 1e-6 of it.
+_NEVER = 1e18
+
+
+@dataclass(frozen=True)
+class GreenBall(Enclosure):
+    """c <= f <= C and a <= Laplacian f <= b on B(p, R) of space.
+
+    Proof, R = 1, x = p + q v. With G the Green function of the ball, f = h - integral of G Lap f,
+    where h is harmonic with the boundary values of f, so c <= h <= C. As in `Slope` the chord of
+    the Poisson kernel gives h(x) <= c + (h(p)-c) A + (h_v(p)/3) B with A = (1+3q^2)/(1-q^2)^2 and
+    B = (3q+q^3)/(1-q^2)^2. Put h = f + integral of G Lap f in all three places:
+
+        f(x) <= c + (f(p)-c) A + (f_v(p)/3) B + integral of K Lap f,
+        K = -G(x,.) + A G(p,.) + (B/3) d_v G(p,.).
+
+    With m = (a+b)/2 and l = (b-a)/2 the integral is at most m (A-1+q^2)/6 + l kappa(q), for that of
+    G(x,.) is (1-q^2)/6 and that of d_v G(p,.) is 0; kappa is the integral of |K|, and
+
+        kappa(q) <= 0.394 q^2 (2 + ln(1/q))/(1-q^2)^2  for all 0 < q < 1,
+
+    proved by a quadrature with an error bound (`tests/oracles/green_kernel.py`); numerically
+    none below 0.391 would do, and the logarithm is real. From below the same holds of -f, with
+    -C, -b and -a.
+
+    The first crossing is unique. Let w = f(p)-c + m/6 be at least 0 and m q^2/6 at most 0 left out,
+    both of which only raise the bound. As h-c is positive, |h_v(p)|/3 <= h(p)-c, that
+    is |f_v(p)|/3 <= w + 0.1907 l (the norm of G(p,.) + d_v G(p,.)/3); what exceeds it is cut off.
+    Then the bound, w (A-1) + (f_v/3) B + l kappa + m q^2/6, is convex in q, since A'' >= |B''| and
+    kappa'' >= 0.1907 B'' (checked in the same place), and it is 0 at q = 0.
+
+    Neither end falls as the slope grows: it enters the upper one as +f_v B/3 with B >= 0, and the
+    lower one, that of -f negated, in the same way.
+    """
+
+    radius: Real
+    range_below: Real
+    range_above: Real
+    mean: Real  # m R^2
+    spread: Real  # l R^2
+    slopes: Slopes
+
+    rounds: ClassVar[int] = 5
+    """Of the solver: see `largest_covered`."""
+
+    @classmethod
+    def of(cls, promise: Promise, value: Real, error: Real, slopes: Slopes) -> Self | None:
+        if not isinstance(promise, BoundedLaplacian):
+            return None
+        radius, below, above = known_ranges(promise, value, error)
+        if below is None or above is None:
+            return None
+        ends = promise.laplacian_lower, promise.laplacian_upper
+        return cls.of_ranges(radius, (below, above), ends, slopes)
+
+    @classmethod
+    def of_ranges(
+        cls,
+        radius: Real,
+        ranges: tuple[Real, Real],
+        laplacian: tuple[Real, Real],
+        slopes: Slopes,
+    ) -> Self:
+        """From how far f may move, down and up, and the ends of its Laplacian."""
+        half = 0.5 * radius * radius
+        low, high = half * laplacian[0], half * laplacian[1]
+        mean, spread = low + high, high - low
+        # [mean - spread, mean + spread] holds both ends, whatever the roundings.
+        slack = 4 * float(dr.epsilon(type(spread))) if dr.is_array_v(spread) else 0.0
+        spread = dr.select(spread >= 0, spread + slack * (spread + dr.abs(mean)), dr.nan)
+        return cls(radius, *ranges, mean, spread, slopes)
+
+    def step(self, gaps: Gaps) -> Real:
+        up, down = self._conditions(gaps)
+        q = fmin(largest_covered(up, self.rounds), largest_covered(down, self.rounds))
+        return dr.select(self._is_known(gaps), q * self.radius, 0)
+
+    def covers(self, gaps: Gaps, length: Real) -> Mask:
+        up, down = self._conditions(gaps)
+        q = length / self.radius
+        inside = (q <= 1) & self._is_known(gaps)
+        q = clamp(q, 0, 1)
+        return (length <= 0) | (inside & is_covered(up, q) & is_covered(down, q))
+
+    def _is_known(self, gaps: Gaps) -> Mask:
+        """Whether ranges, Laplacian and gaps are numbers, and not too large or small."""
+        known = (gaps.down >= 0) & (gaps.up >= 0) & dr.isfinite(self.mean)
+        for side in (self.range_below + self.range_above, self.spread):
+            known = known & ((side == 0) | (dr.isfinite(1 / side) & dr.isfinite(4 * side)))
+        return known
+
+    def _conditions(self, gaps: Gaps) -> tuple[_Growth, _Growth]:
+        """What keeps f from the level above, and from the level below."""
+        below, above, slopes = self.range_below, self.range_above, self.slopes
+        return (
+            self._growth(gaps.up, below, above, self.mean, slopes.high),
+            self._growth(gaps.down, above, below, -self.mean, slopes.negated().high),
+        )
+
+    def _growth(self, gap: Real, u: Real, most: Real, mean: Real, slope: Real) -> _Growth:
+        """u, most: how far f is above c and may rise. Everything in units of w + l."""
+        w = fmax(dr.fma(mean, 1 / 6, u), 0)
+        scale = w + self.spread
+        share = dr.select(scale > 0, 1 / scale, 0)
+        w, spread = w * share, self.spread * share
+        steepest = dr.fma(SLOPE_NORM, spread, w)
+        slack = rounding(type(gap))
+        # A slope that is not a number counts as the steepest.
+        slope = fmin(slope * (self.radius / 3 * share) + slack, steepest)
+        slope = fmax(slope, slack - steepest)
+        # Of a level outside the range there is nothing to prove, nor of a constant function.
+        is_met = (gap <= most) & (scale > 0)
+        gap = dr.select(is_met, fmin(gap * share, _NEVER), _NEVER)
+        return _Growth(gap / (dr.sqrt(1 + gap) + 1), w, slope, spread, fmax(mean * share, 0))
+
+
+@dataclass(frozen=True)
+class _Growth:
+    """w (A-1) + s B + l kappa + m q^2/6 <= gap, with `gap` for sqrt(1 + gap) - 1.
+
+    With S = (1-q)^2 (1 + left side), which has no pole, it says sqrt(S) <= (1 + gap) (1-q), that is
+    q k(q) <= gap with k = gap + 1 + (sqrt(S) - 1)/q.
+    """
+
+    gap: Real
+    weight: Real  # w
+    slope: Real  # s, R f_v/3
+    spread: Real
+    mean: Real  # m where positive, else 0
+
+    def start(self) -> tuple[Real, Real]:
+        # The logarithm at about the root of a level without slope.
+        log = clamp(-0.5 * dr.log(fmax(self.gap, 1e-12)), 0, 14)
+        first = 3 * self.slope
+        bend = dr.fma(KERNEL_NORM * self.spread, 2 + log, 5 * self.weight - 2 * first)
+        second = 0.5 * (1 + bend + self.mean / 6) - 0.125 * (first - 2) * (first - 2)
+        return self.gap + 0.5 * first, second
+
+    def __call__(self, q: Real) -> Real:
+        s, r, back = q * q, 1 / (1 + q), 1 - q
+        log = 2 - dr.log(fmax(q, 1e-30))
+        inner = q * dr.fma(self.weight, 5 - s, KERNEL_NORM * self.spread * log)
+        inner = dr.fma(self.slope, 3 + s, inner)
+        c = dr.fma(inner, r * r, q * dr.fma(self.mean * (1 / 6) * back, back, 1))  # (S-1)/q + 2
+        root = dr.sqrt(fmax(dr.fma(q, c - 2, 1), 0))
+        share = 1 / (root + 1)
+        return self.gap + share * (c + q * (c - 2) * share)

@@ -1,0 +1,366 @@
+"""The published rule: Harnack's inequality with a lower bound alone.
+
+Source: Gillespie, Yang, Botsch, Crane 2024, Eq. 4-7 (n = 3) and Eq. 27 (n = 4).
+
+The slope bound: Harnack's inequality that also uses the directional derivative.
+
+The extremal measures are the equality cases of Jensen's inequality and of the chord bound for a
+convex function: a point mass ring at one latitude, and two point masses at the poles.
+
+The spherical-cap bound: the sharpest enclosure for a harmonic function with two known ends.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import drjit as dr
+
+from harnack.backend.elementary import clamp, fmax, fmin
+from harnack.enclosures.ball import Ball, Condition, is_covered, largest_covered, rounding
+from harnack.enclosures.enclosure import ROUND_DOWN
+
+if TYPE_CHECKING:
+    from harnack.backend import Mask, Real
+    from harnack.enclosures.enclosure import Gaps
+
+
+@dataclass(frozen=True)
+class Classic(Ball):
+    """Harnack's inequality for u = f - lower > 0 on B(p, R), in every direction alike.
+
+    Proof. u is a Poisson integral of a positive measure of mass u(p), and the kernel
+    P(q, s) = (1-q^2)/(1+q^2-2qs)^(n/2), q = |y-p|/R, lies between its values at s = -1 and 1:
+
+        u(p) (1-q)/(1+q)^(n-1) <= u(y) <= u(p) (1+q)/(1-q)^(n-1).
+
+    The step is the q at which one of the two first reaches a level. With u = f - lower and
+    v = level - lower the root is, in forms that do not cancel near v = u (the printed Eq. 7 does:
+    20 % too long in float32 at |a-1| = 1e-6),
+
+        n = 2:  |v-u| / (u+v)         n = 3:  2 |v-u| / (u + 2v + sqrt(u (u + 8v)))
+
+    and for n = 4 the cubic is solved by Newton's method from the safe side (`_quartic_growing`).
+    A level at or below `lower` cannot be reached inside the ball: the step is R. The slope does not
+    enter.
+    """
+
+    def step(self, gaps: Gaps) -> Real:
+        return dr.select(self.is_known(gaps), self.radius * self._fraction(gaps), 0)
+
+    def _fraction(self, gaps: Gaps) -> Real:
+        """The step divided by the radius, from whichever sides are bounded."""
+        below = above = None
+        if self.range_below is not None:
+            below = _one_sided(self.range_below, gaps.up, gaps.down, self.dimension)
+        if self.range_above is not None:  # upper - f is positive and harmonic: mirror
+            above = _one_sided(self.range_above, gaps.down, gaps.up, self.dimension)
+        if below is None or above is None:
+            one = below if above is None else above
+            assert one is not None
+            return one
+        return fmax(below, above)
+
+
+def _one_sided(u: Real, gap_away: Real, gap_toward: Real, dimension: int) -> Real:
+    """Safe q for positive u, a level `gap_away` above u and one `gap_toward` below it."""
+    growing, falling = _LEVEL_RULES[dimension]
+    # u = 0 forces u to vanish identically: no level is ever reached.
+    up = dr.select((gap_away == dr.inf) | (u <= 0), 1, growing(u, u + gap_away, gap_away))
+    v = u - gap_toward
+    down = dr.select((v <= 0) | (gap_toward == dr.inf), 1, falling(u, fmax(v, 0), gap_toward))
+    return clamp(fmin(up, down), 0, 1) * ROUND_DOWN
+
+
+def _plane(u: Real, v: Real, gap: Real) -> Real:
+    return gap / (u + v)
+
+
+def _space(u: Real, v: Real, gap: Real) -> Real:
+    # The product of the two roots, as u (u + 8v) may underflow or overflow.
+    return 2 * gap / (u + 2 * v + dr.sqrt(u) * dr.sqrt(u + 8 * v))
+
+
+def _quartic_growing(u: Real, v: Real, gap: Real) -> Real:
+    """(1+q)/(1-q)^3 = w, w = v/u. Newton's method from the safe side, in two forms.
+
+    For w < 2: h(q) = gap - q (u + v (3 - 3q + q^2)) is decreasing and convex, from the left. That
+    cancels for large w, where y = 1-q is the root of the convex w y^3 + y - 2, from the right."""
+    q = gap / (u + 3 * v)
+    for _ in range(4):
+        h = gap - q * (u + v * (3 - 3 * q + q * q))
+        q = q + fmax(h, 0) / (u + 3 * v * (1 - q) * (1 - q))
+    w = v / u
+    y = fmin(dr.cbrt(2 / w), 1)
+    for _ in range(4):
+        y = y - (y * dr.fma(w * y, y, 1) - 2) / dr.fma(3 * w * y, y, 1)
+    return dr.select(v < 2 * u, q, dr.fma(y, -1 - 1e-6, 1))
+
+
+def _quartic_falling(u: Real, v: Real, gap: Real) -> Real:
+    """(1-q)/(1+q)^3 = v/u: h(q) = gap - q (u + v (3 + 3q + q^2)) is decreasing and concave, so
+    Newton's method ends right of the root and the chord from (0, gap) to there ends left of it,
+    the safe side."""
+    q = fmin(gap / (u + 3 * v), 1)
+    for _ in range(4):
+        h = gap - q * (u + v * (3 + 3 * q + q * q))
+        q = q + fmin(h, 0) / (u + 3 * v * (1 + q) * (1 + q))
+    h = fmin(gap - q * (u + v * (3 + 3 * q + q * q)), 0)
+    return q * gap / (gap - h)
+
+
+_LEVEL_RULES = {
+    2: (_plane, _plane),
+    3: (_space, _space),
+    4: (_quartic_growing, _quartic_falling),
+}
+
+
+# A chord whose gap is this many times u is not reached within the ball, but for 1e-6 of it.
+_NEVER = 1e18
+
+
+@dataclass(frozen=True)
+class Slope(Ball):
+    """One- or two-sided slope bound in 2, 3 and 4 dimensions.
+
+    Proof. A positive harmonic u on B(p, R) is, along a unit direction v and with q = t/R,
+    u(p+tv) = integral of P(q, s) dnu(s) over s in [-1, 1], where P(q, s) =
+    (1-q^2)/(1+q^2-2qs)^(n/2), nu >= 0 has mass u(p) and first moment R u_v(p)/n (differentiate
+    at q = 0: dP/dq = n s). So the mean of s is m = R u_v/(n u), and P is convex in s, hence
+
+        u P(q, m) <= u(p+tv) <= u [(1+m)/2 P(q, 1) + (1-m)/2 P(q, -1)]
+
+    (Jensen; chord), both attained. The upper bound is convex in q. The lower one rises, then
+    falls: its derivative has the sign of m q^2 - 2q + m (n = 2), q^3 + m q^2 - 5q + 3m (n = 3)
+    or q^3 - 3q + 2m (n = 4), each decreasing on [0, 1]. So each first crossing is unique, and
+    what is free at q is free before it. With upper - f > 0 the same holds for its negative
+    slope; the better of the two is kept on each side.
+
+    Neither end falls as the slope grows: the upper one rises with m as P(q, 1) >= P(q, -1), the
+    lower one as P(q, .) does. For upper - f, whose slope is negated, they change places and signs.
+    """
+
+    rounds: ClassVar[int] = 4
+    """Of the solver: see `largest_covered`."""
+
+    def step(self, gaps: Gaps) -> Real:
+        q = type(gaps.up)(1)
+        for alternatives in self._conditions(gaps):
+            side = type(q)(0)
+            for condition in alternatives:
+                side = fmax(side, largest_covered(condition, self.rounds))
+            q = fmin(q, side)
+        return dr.select(self.is_known(gaps), q * self.radius, 0)
+
+    def covers(self, gaps: Gaps, length: Real) -> Mask:
+        q = length / self.radius
+        covered = q <= 1
+        q = clamp(q, 0, 1)
+        for alternatives in self._conditions(gaps):
+            free = None
+            for condition in alternatives:
+                proved = is_covered(condition, q)
+                free = proved if free is None else free | proved
+            covered = covered & free
+        return (length <= 0) | (covered & self.is_known(gaps))
+
+    def _conditions(self, gaps: Gaps) -> tuple[list[Condition], list[Condition]]:
+        """What keeps f from the level above, and from the level below."""
+        up: list[Condition] = []
+        down: list[Condition] = []
+        rising = self.slopes
+        for u, slopes, gap_away, away, gap_toward, toward in (
+            (self.range_below, rising, gaps.up, up, gaps.down, down),  # u = f - lower
+            (self.range_above, rising.negated(), gaps.down, down, gaps.up, up),  # u = upper - f
+        ):
+            if u is None:
+                continue
+            # u = 0 forces u to vanish identically: no level is ever reached.
+            share = dr.select(u > 0, 1 / u, dr.inf)
+            scale = self.radius * share / self.dimension
+            most = dr.select(u > 0, slopes.high * scale, 0)
+            least = dr.select(u > 0, slopes.low * scale, 0)
+            slack = rounding(type(gaps.up))
+            # A slope that is not a number counts as the worst one, in either place.
+            steep, flat = fmax(fmin(most + slack, 1), -1), clamp(least - slack, -1, 1)
+            away.append(_Chord.of(fmin(gap_away * share, _NEVER), steep, self.dimension))
+            toward.append(_Jensen(fmin(gap_toward * share, 1), flat, self.dimension))
+        return up, down
+
+
+@dataclass(frozen=True)
+class _Chord:
+    """(1+m)/2 P(q,1) + (1-m)/2 P(q,-1) <= w = 1 + gap/u.
+
+    The left side times (1-q)^K, K = n-1, is B = (1-q)^K + q A/(1+q)^K with a polynomial A, and
+    B^(1/K) <= w^(1/K) (1-q) has no pole: it says q k(q) <= g with g = w^(1/K) - 1 and
+    k = g + 1 + (B^(1/K) - 1)/q.
+    """
+
+    gap: Real  # g
+    mean: Real
+    dimension: int
+
+    @classmethod
+    def of(cls, gap: Real, mean: Real, dimension: int) -> _Chord:
+        if dimension == 3:
+            gap = gap / (dr.sqrt(1 + gap) + 1)
+        elif dimension == 4:
+            root = dr.cbrt(1 + gap)
+            gap = gap / dr.fma(root, root + 1, 1)
+        return cls(gap, mean, dimension)
+
+    def start(self) -> tuple[Real, Real]:
+        n, k = self.dimension, self.dimension - 1
+        first = n * self.mean - k
+        second = n * (1 - self.mean) - 0.5 * (k - 1) / (k * k) * first * first
+        return self.gap + n * self.mean / k, second
+
+    def __call__(self, q: Real) -> Real:
+        m, r, s = self.mean, 1 / (1 + q), q * q
+        if self.dimension == 2:
+            return self.gap + 2 * (q + m) * r
+        if self.dimension == 3:
+            c = dr.fma(q * (5 - s) + m * (3 + s), r * r, q)  # (B - 1)/q + 2
+            root = dr.sqrt(fmax(dr.fma(q, c - 2, 1), 0))
+            share = 1 / (root + 1)
+            return self.gap + share * (c + q * (c - 2) * share)
+        a = q * (9 + s * (s - 2)) + 4 * m * (1 + s)
+        c = dr.fma(a, r * r * r, q * (3 - q))  # (B - 1)/q + 3
+        root = dr.cbrt(fmax(dr.fma(q, c - 3, 1), 0))
+        share = 1 / dr.fma(root, root + 1, 1)
+        return self.gap + share * (c + q * (c - 3) * share * (root + 2))
+
+
+@dataclass(frozen=True)
+class _Jensen:
+    """P(q, m) >= 1 - gap/u.
+
+    With D = 1+q^2-2qm it says (1-g) D^(n/2) <= 1-q^2, that is q k(q) <= g with
+    k = (1-g) (D^(n/2) - 1 + q^2)/q + g q. q k(q) is convex.
+    """
+
+    gap: Real
+    mean: Real
+    dimension: int
+
+    def start(self) -> tuple[Real, Real]:
+        n, m, rest = self.dimension, self.mean, 1 - self.gap
+        second = 1 + 0.5 * n * (1 + (n - 2) * m * m)
+        return -rest * n * m, dr.fma(rest, second, self.gap)
+
+    def __call__(self, q: Real) -> Real:
+        e = q - 2 * self.mean
+        d = dr.fma(q, e, 1)
+        if self.dimension == 2:
+            rise = q + e
+        elif self.dimension == 4:
+            rise = dr.fma(e, d + 1, q)
+        else:
+            x = dr.sqrt(fmax(d, 0))
+            rise = q + e * (d + x + 1) / (x + 1)
+        return dr.fma(1 - self.gap, rise, self.gap * q)
+
+
+@dataclass(frozen=True)
+class Caps(Ball):
+    """Bounded on both sides in space: the extremal boundary values are two spherical caps.
+
+    Proof. With values in [c, C], f = c + (C-c) g and g the Poisson integral of boundary values
+    in [0, 1] with mean p = (f-c)/(C-c) and first moment mu = R f_v/(3 (C-c)) along v. For fixed
+    q the kernel P(q, s) is convex in s, so among densities in [0, 1] with given mass and first
+    moment, integral P g is largest for the indicator of {s <= s1} u {s >= s2} (bathtub principle:
+    P minus the chord through s1, s2 is positive exactly there), two caps about v of heights
+    b = p + mu/(1-p) ahead and a = p - mu/(1-p) behind, which depend on p and mu alone. The
+    integral over caps is elementary,
+
+        U = c + (C-c) [1 - (1-q^2)/(2q) (1/s1 - 1/s2)],
+        s1^2 = (1-q)^2 + 2qb,   s2^2 = (1+q)^2 - 2qa,
+
+    and as s2^2 - s1^2 = 4q (1-p), U <= f + gap is the same as
+
+        (1 - gap/(C-f)) s1 s2 (s1+s2)/2 <= 1-q^2.
+
+    The lower bound is the complement: C - (C-c)(...) with p -> 1-p, mu -> -mu. |mu| <= p (1-p)
+    holds in exact arithmetic and is enforced.
+
+    Neither end falls as the slope grows: weight then moves from s = a-1 to s = 1-b, which is no
+    smaller as a + b = 2p <= 2, and P(q, .) rises. L is the complement, negated.
+
+    The first crossing is unique: (X-s)^(-3/2) with X = (1+q^2)/(2q) is a Laplace transform of
+    exp(-tX) exp(ts), hence totally positive in (q, s) on (0, 1) x (-1, 1) (Karlin 1968), hence
+    variation diminishing: U - level is the transform of values with signs (+, -, +), so it has
+    at most those sign changes, in that order, and where it starts negative it turns once.
+    """
+
+    rounds: ClassVar[int] = 4
+    """Of the solver: see `largest_covered`."""
+
+    @classmethod
+    def applies(cls, dimension: int, is_bounded_below: bool, is_bounded_above: bool) -> bool:
+        return dimension == 3 and is_bounded_below and is_bounded_above
+
+    def step(self, gaps: Gaps) -> Real:
+        up, down = self._conditions(gaps)
+        q = fmin(largest_covered(up, self.rounds), largest_covered(down, self.rounds))
+        return dr.select(self.is_known(gaps), q * self.radius, 0)
+
+    def covers(self, gaps: Gaps, length: Real) -> Mask:
+        up, down = self._conditions(gaps)
+        q = length / self.radius
+        inside = (q <= 1) & self.is_known(gaps)
+        q = clamp(q, 0, 1)
+        return (length <= 0) | (inside & is_covered(up, q) & is_covered(down, q))
+
+    def _conditions(self, gaps: Gaps) -> tuple[_TwoCaps, _TwoCaps]:
+        """What keeps f from the level above, and from the level below."""
+        below, above = self.range_below, self.range_above
+        assert below is not None
+        assert above is not None
+        share = 1 / (below + above)
+        p, rest = below * share, above * share
+        moment = self.radius * share / 3
+        rising, falling = moment * self.slopes.high, -moment * self.slopes.low
+        return (
+            _two_caps(gaps.up, above, p, rest, rising),
+            _two_caps(gaps.down, below, rest, p, falling),
+        )
+
+
+def _two_caps(gap: Real, most: Real, p: Real, rest: Real, mu: Real) -> _TwoCaps:
+    # Without a range f is constant: no level is ever reached.
+    slack = rounding(type(gap)) * p
+    shift = dr.select(rest > 0, mu / rest, 0) + slack
+    shift = fmax(fmin(shift, p), -p)  # the worst one, p, if the slope is not a number
+    return _TwoCaps(dr.select(gap < most, gap / most, 1), p, rest, shift)
+
+
+@dataclass(frozen=True)
+class _TwoCaps:
+    """(1-g) S(q) <= 1-q^2 with S = s1 s2 (s1+s2)/2, g = gap/(C-f) and heights b, a of the caps.
+
+    That is q k(q) <= g with k = (1-g) (S - 1 + q^2)/q + g q.
+    """
+
+    gap: Real
+    p: Real
+    rest: Real  # 1 - p, accurate where it is small
+    shift: Real  # mu/(1-p)
+
+    def start(self) -> tuple[Real, Real]:
+        x, y, rest = self.rest - self.shift, self.rest + self.shift, 1 - self.gap
+        second = 2.5 - 0.75 * dr.fma(x, x, y * y) - x * y + 2 * self.shift * self.shift
+        return 3 * rest * self.shift, dr.fma(rest, second, self.gap)
+
+    def __call__(self, q: Real) -> Real:
+        # s = 1 + q x with x = e/(s+1), as s^2 = 1 + q e.
+        e1, e2 = q - 2 * (self.rest - self.shift), q + 2 * (self.rest + self.shift)
+        back, on = 1 - q, 1 + q
+        s1 = dr.sqrt(dr.fma(back, back, 2 * q * (self.p + self.shift)))
+        s2 = dr.sqrt(dr.fma(on, on, -2 * q * (self.p - self.shift)))
+        both = 1 / ((s1 + 1) * (s2 + 1))
+        total = dr.fma(e1, s2 + 1, e2 * (s1 + 1)) * both  # x1 + x2
+        rise = q * dr.fma(e1 * e2, both, 1) + total * dr.fma(0.5 * s1, s2, 1)
+        return dr.fma(1 - self.gap, rise, self.gap * q)

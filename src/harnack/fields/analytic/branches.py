@@ -1,0 +1,514 @@
+"""Functions of a complex variable with all their branches: what Riemann surfaces are made of."""
+
+from __future__ import annotations
+
+import abc
+import importlib
+import math
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, cast
+
+import drjit as dr
+
+from harnack.backend import backend_of
+from harnack.backend.elementary import fmax, fmin, sincos
+from harnack.backend.numbers import refuse_derivatives
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from harnack.backend import Backend, Real
+
+# A Dr.Jit complex number, one a lane.
+Complex = Any
+
+# Points as close to a singular one are moved off it: the squares of such numbers still exist.
+_LEAST = 1e-12
+# And the least number whose square and its inverse do, in single precision.
+_LEAST_SQUARED = 1e-18
+# What is taken for the distance to a singular point where there is none.
+_NO_POINT = 2.0
+# What bounds of second derivatives are widened by: logarithms and powers of them are rounded.
+_WIDENED = 1 + 2e-4
+
+
+def complex_type(backend: Backend) -> Any:
+    """The complex numbers of a backend."""
+    suffix = "64" if backend.precision == "double" else ""
+    return getattr(importlib.import_module(f"drjit.{backend.name}.ad"), f"Complex2f{suffix}")
+
+
+def complex_of(x: Real, y: Real) -> Complex:
+    """x + i y."""
+    return complex_type(backend_of(x))(x, y)
+
+
+def derivatives(number: Complex, part: str) -> tuple[Real, Real]:
+    """d/dx and d/dy of the part, "imag" or "real", of a function with this derivative."""
+    if part == "imag":
+        return number.imag, number.real
+    return number.real, -number.imag
+
+
+@dataclass(frozen=True)
+class BranchPoint:
+    """A point of the plane where branches are not analytic.
+
+    power, constant, radius, value: within the radius of the point, all branches g have |g - value|
+        <= constant |z - at|^power, with a power > 0 (up to the period of the part that is drawn).
+        None where no such bound is known, as at poles and logarithms.
+    """
+
+    at: complex
+    power: float | None = None
+    constant: float = 1.0
+    radius: float = math.inf
+    value: complex = 0.0
+
+    def __post_init__(self) -> None:
+        refuse_derivatives("a BranchPoint", vars(self))
+        object.__setattr__(self, "at", _finite(self.at, "the place of a branch point"))
+        object.__setattr__(self, "value", _finite(self.value, "the value at a branch point"))
+        if self.power is None:
+            return
+        for name in ("power", "constant", "radius"):
+            number = float(getattr(self, name))
+            if not number > 0 or (name != "radius" and number == math.inf):
+                raise ValueError(f"the {name} of a branch point must be positive, not {number!r}")
+            object.__setattr__(self, name, number)
+
+
+@dataclass(frozen=True)
+class PreparedPoint:
+    """A `BranchPoint` as numbers of a backend, which no kernel is compiled anew for."""
+
+    at: Complex
+    power: float | None
+    constant: Real
+    radius: Real
+    value: Complex
+
+    @classmethod
+    def of(cls, point: BranchPoint, number: Callable[[float], Real], made: Any) -> PreparedPoint:
+        """number: makes a number of the backend, made: a complex one of two."""
+        at, value = (made(number(one.real), number(one.imag)) for one in (point.at, point.value))
+        return cls(at, point.power, number(point.constant), number(point.radius), value)
+
+
+@dataclass(frozen=True)
+class Branch:
+    """One branch at z: its value, its derivative, and its second derivative where it is known."""
+
+    value: Complex
+    first: Complex
+    second: Complex | None = None
+
+
+class Part(abc.ABC):
+    """A part of the plane, by what bounds on it need to know. Everything is rounded outwards."""
+
+    @abc.abstractmethod
+    def distances(self, at: Complex) -> tuple[Real, Real]:
+        """The smallest and the largest distance from a point."""
+
+    @abc.abstractmethod
+    def disk(self) -> tuple[Complex, Real]:
+        """Center and radius of a disk that holds it."""
+
+
+@dataclass(frozen=True)
+class Stretch(Part):
+    """The straight stretch from z to z + length w, w a Dr.Jit complex number.
+
+    rounding: how far rounding may have moved z.
+    """
+
+    z: Complex
+    w: Complex
+    length: Real
+    rounding: Real
+
+    def distances(self, at: Complex) -> tuple[Real, Real]:
+        """The smallest is that of the foot, or of the end nearer to it; the largest is that of an
+        end, for distances are convex."""
+        x, y = self.z.real - at.real, self.z.imag - at.imag
+        speed = dr.square(self.w.real) + dr.square(self.w.imag)
+        foot = -(x * self.w.real + y * self.w.imag) / speed
+        foot = dr.select(speed > 0, fmin(fmax(foot, 0), self.length), 0)
+        start, middle, end = (
+            dr.sqrt(dr.square(x + s * self.w.real) + dr.square(y + s * self.w.imag))
+            for s in (0.0, foot, self.length)
+        )
+        slack = self.rounding + 1e-6 * start
+        return fmax(fmin(middle, start) - slack, 0), fmax(end, start) * (1 + 1e-6) + slack
+
+    def disk(self) -> tuple[Complex, Real]:
+        half = 0.5 * self.length
+        return self.z + half * self.w, half * abs(self.w) * (1 + 1e-6) + self.rounding
+
+
+@dataclass(frozen=True)
+class Disk(Part):
+    """The disk of some radius about z, which rounding may have moved by so much."""
+
+    z: Complex
+    radius: Real
+    rounding: Real
+
+    def distances(self, at: Complex) -> tuple[Real, Real]:
+        middle = abs(self.z - at)
+        slack = self.rounding + 1e-6 * middle + self.radius
+        return fmax(middle - slack, 0), middle + slack
+
+    def disk(self) -> tuple[Complex, Real]:
+        return self.z, self.radius + self.rounding
+
+
+@dataclass(frozen=True)
+class Branches(abc.ABC):
+    """All branches of an analytic function, with what is proved about them."""
+
+    _prepared: tuple[PreparedPoint, ...] = field(
+        default=(), kw_only=True, repr=False, compare=False
+    )
+
+    @property
+    @abc.abstractmethod
+    def points(self) -> tuple[BranchPoint, ...]:
+        """Where branches are not analytic: everywhere else each can be continued."""
+
+    def period(self, imaginary: bool) -> float | None:
+        """By what each branch may be shifted, in the part that is drawn, and still be one."""
+        del imaginary
+        return None
+
+    @property
+    def count(self) -> int:
+        """How many branches there are, up to the period."""
+        return 1
+
+    def prepare(self, backend: Backend) -> Branches:
+        """The same with its numbers as data of the backend."""
+
+        def number(value: float) -> Real:
+            return dr.opaque(backend.Float, value)
+
+        made = complex_type(backend)
+        return replace(
+            self, _prepared=tuple(PreparedPoint.of(one, number, made) for one in self.points)
+        )
+
+    def points_on(self, z: Complex) -> tuple[PreparedPoint, ...]:
+        """The points as numbers of the type of z."""
+        if self._prepared:
+            return self._prepared
+        real, made = cast("Any", type(z.real)), cast("Any", type(z))
+        return tuple(PreparedPoint.of(one, real, made) for one in self.points)
+
+    @abc.abstractmethod
+    def at(self, z: Complex) -> tuple[Branch, ...]:
+        """All branches at z, up to the period, in any order."""
+
+    @abc.abstractmethod
+    def bend(self, part: Part) -> Real:
+        """A bound of |g''|, of all branches, on a part of the plane."""
+
+    def moved_off(self, z: Complex, rounding: Real) -> Complex:
+        """z, moved by its rounding off singular points, where no derivative is a number."""
+        least = rounding + _LEAST
+        for point in self.points_on(z):
+            beside = type(z)(point.at.real + least, point.at.imag)
+            z = dr.select(abs(z - point.at) < least, beside, z)
+        return z
+
+    def clearance(self, z: Complex) -> Real:
+        """The distance to the nearest singular point."""
+        nearest = 0 * z.real + (dr.inf if self.points else _NO_POINT)
+        for point in self.points_on(z):
+            nearest = fmin(abs(z - point.at), nearest)
+        return nearest
+
+    def largest(self, middle: complex, reach: float) -> float:
+        """A bound of |g| on the disk of that radius about a point; inf where none is known."""
+        del middle, reach
+        return math.inf
+
+    def roundings(self, z: Complex, branches: tuple[Branch, ...]) -> Real:
+        """How many units of rounding (2^-23 in single precision) values may be off, as a number."""
+        del z
+        most: Real = 0.0
+        for one in branches:
+            most = fmax(8 * abs(one.value), most)
+        return most
+
+
+@dataclass(frozen=True)
+class PowerProduct(Branches):
+    """The product of (z - a_i)^alpha_i, with rational exponents: q branches, q the least common
+    denominator.
+
+    A turn about a_i multiplies g by exp(2 pi i alpha_i): these generate the q-th roots of unity.
+
+    Bound of g'': with e_i = alpha_i/(z - a_i), g'' = g ((sum e_i)^2 - sum alpha_i/(z - a_i)^2), so
+
+        |g''|/|g| <= sum_i |alpha_i (alpha_i - 1)|/d_i^2 + 2 sum_(i<j) |alpha_i alpha_j|/(d_i d_j),
+
+    d_i the distances from the a_i. Times |g| each term is a product of powers of them: powers below
+    0 are largest at the smallest d_i of the part and the others at the largest. Equality for a
+    single factor.
+    """
+
+    places: tuple[complex, ...]
+    exponents: tuple[float, ...]
+    denominator: int
+    _on: tuple[Complex, ...] = field(default=(), repr=False, compare=False)
+
+    @property
+    def count(self) -> int:
+        return self.denominator
+
+    @property
+    def points(self) -> tuple[BranchPoint, ...]:
+        made: list[BranchPoint] = []
+        for i, (a, alpha) in enumerate(zip(self.places, self.exponents, strict=True)):
+            if alpha > 0 and alpha.is_integer():
+                continue
+            if alpha < 0:
+                made.append(BranchPoint(a))
+                continue
+            others = [
+                (abs(a - b), beta)
+                for j, (b, beta) in enumerate(zip(self.places, self.exponents, strict=True))
+                if j != i
+            ]
+            radius = 0.5 * min((d for d, _ in others), default=math.inf)
+            constant = math.prod((d + math.copysign(radius, beta)) ** beta for d, beta in others)
+            made.append(BranchPoint(a, alpha, constant * (1 + 1e-6), radius))
+        return tuple(made)
+
+    def prepare(self, backend: Backend) -> Branches:
+        return replace(super().prepare(backend), _on=_uploaded(self.places, backend))
+
+    def _centers(self, z: Complex) -> tuple[Complex, ...]:
+        return self._on or tuple(type(z)(a.real, a.imag) for a in self.places)
+
+    def moved_off(self, z: Complex, rounding: Real) -> Complex:
+        """Also off zeros, where the logarithm of the product is not a number: by one rounding."""
+        z = super().moved_off(z, rounding)
+        unit = 4 * float(dr.epsilon(z.real))
+        for a, alpha in zip(self._centers(z), self.exponents, strict=True):
+            if alpha > 0 and alpha.is_integer():
+                least = _LEAST_SQUARED + unit * fmax(dr.abs(a.real), dr.abs(a.imag))
+                beside = type(z)(a.real + least, a.imag)
+                z = dr.select(abs(z - a) < least, beside, z)
+        return z
+
+    def at(self, z: Complex) -> tuple[Branch, ...]:
+        scale, angle = 0 * z.real, 0 * z.real
+        slope = type(z)(scale, scale)
+        other = slope
+        for a, alpha in zip(self._centers(z), self.exponents, strict=True):
+            away = z - a
+            scale = scale + alpha * dr.log(abs(away))
+            angle = angle + alpha * dr.atan2(away.imag, away.real)
+            inverse = dr.rcp(away)
+            slope = slope + alpha * inverse
+            other = other + alpha * (inverse * inverse)
+        size = dr.exp(scale)
+        sine, cosine = sincos(angle)
+        g = type(z)(size * cosine, size * sine)
+        bent = slope * slope - other
+        made: list[Branch] = []
+        for k in range(self.denominator):
+            turn = 2 * math.pi * k / self.denominator
+            value = g * type(z)(math.cos(turn), math.sin(turn)) if k else g
+            made.append(Branch(value, value * slope, value * bent))
+        return tuple(made)
+
+    def bend(self, part: Part) -> Real:
+        nearest: list[Real] = []
+        farthest: list[Real] = []
+        for a in self._centers(part.disk()[0]):
+            low, high = part.distances(a)
+            nearest.append(dr.log(low))
+            farthest.append(dr.log(high))
+        alphas, total = self.exponents, 0 * part.disk()[1]
+        for i, one in enumerate(alphas):
+            for j, other in enumerate(alphas[: i + 1]):
+                factor = abs(one * (one - 1)) if i == j else 2 * abs(one * other)
+                if factor == 0:
+                    continue
+                powers = [alpha - (k == i) - (k == j) for k, alpha in enumerate(alphas)]
+                sizes = [
+                    power * (nearest if power < 0 else farthest)[k]
+                    for k, power in enumerate(powers)
+                    if power != 0
+                ]
+                total = total + factor * dr.exp(sum(sizes)) if sizes else factor
+        return total * _WIDENED
+
+    def largest(self, middle: complex, reach: float) -> float:
+        most = 1.0
+        for a, alpha in zip(self.places, self.exponents, strict=True):
+            away = abs(a - middle)
+            if alpha < 0 and away <= reach:
+                return math.inf
+            most *= (away + math.copysign(reach, alpha)) ** alpha
+        return most
+
+    def roundings(self, z: Complex, branches: tuple[Branch, ...]) -> Real:
+        """Of exp and of the angle: by a few units of their arguments."""
+        most = 12 + 4 * math.pi * sum(abs(alpha) for alpha in self.exponents)
+        for a, alpha in zip(self._centers(z), self.exponents, strict=True):
+            most = most + 4 * abs(alpha) * dr.abs(dr.log(abs(z - a)))
+        return most * abs(branches[0].value)
+
+
+@dataclass(frozen=True)
+class Logarithm(Branches):
+    """sum n_i log(z - a_i), the logarithm of a product of integer powers: its imaginary part is
+    known up to 2 pi.
+
+    |g''| = |sum n_i/(z - a_i)^2| <= sum |n_i|/d_i^2, with the smallest distances of the part.
+    """
+
+    places: tuple[complex, ...] = (0j,)
+    multiplicities: tuple[int, ...] = (1,)
+    _on: tuple[Complex, ...] = field(default=(), repr=False, compare=False)
+
+    @property
+    def points(self) -> tuple[BranchPoint, ...]:
+        return tuple(BranchPoint(a) for a in self.places)
+
+    def period(self, imaginary: bool) -> float | None:
+        return 2 * math.pi * math.gcd(*self.multiplicities) if imaginary else None
+
+    def prepare(self, backend: Backend) -> Branches:
+        return replace(super().prepare(backend), _on=_uploaded(self.places, backend))
+
+    def _centers(self, z: Complex) -> tuple[Complex, ...]:
+        return self._on or tuple(type(z)(a.real, a.imag) for a in self.places)
+
+    def at(self, z: Complex) -> tuple[Branch, ...]:
+        zero = type(z)(0 * z.real, 0 * z.real)
+        value, first, second = zero, zero, zero
+        for a, n in zip(self._centers(z), self.multiplicities, strict=True):
+            away = z - a
+            inverse = dr.rcp(away)
+            value = value + n * type(z)(dr.log(abs(away)), dr.atan2(away.imag, away.real))
+            first = first + n * inverse
+            second = second - n * (inverse * inverse)
+        return (Branch(value, first, second),)
+
+    def bend(self, part: Part) -> Real:
+        total = 0 * part.disk()[1]
+        for a, n in zip(self._centers(part.disk()[0]), self.multiplicities, strict=True):
+            total = total + abs(n) / dr.square(part.distances(a)[0])
+        return total * _WIDENED
+
+    def roundings(self, z: Complex, branches: tuple[Branch, ...]) -> Real:
+        del branches
+        most = 0 * z.real
+        for a, n in zip(self._centers(z), self.multiplicities, strict=True):
+            most = most + abs(n) * (8 * math.pi + 4 * dr.abs(dr.log(abs(z - a))))
+        return most
+
+
+@dataclass(frozen=True)
+class ArcSine(Branches):
+    """asin: its branches are g and pi - g, with g the principal one, modulo 2 pi.
+
+    g' = (1 - z^2)^(-1/2) and g'' = z g'^3, so |g''| <= |z|/(d_1 d_2)^(3/2), d_i the distances from
+    1 and -1. At either, asin(1 - w) = pi/2 - 2 asin sqrt(w/2), whose series has positive
+    coefficients: |g - pi/2| <= 2 asin sqrt(|w|/2), and for |w| <= 1/2 at most (pi/3)/sqrt(1/2)
+    sqrt|w|, as asin is convex.
+    """
+
+    @property
+    def count(self) -> int:
+        return 2
+
+    @property
+    def points(self) -> tuple[BranchPoint, ...]:
+        constant = math.pi / 3 * math.sqrt(2.0) * (1 + 1e-6)
+        half = 0.5 * math.pi
+        return BranchPoint(1, 0.5, constant, 0.5, half), BranchPoint(-1, 0.5, constant, 0.5, -half)
+
+    def period(self, imaginary: bool) -> float | None:
+        return None if imaginary else 2 * math.pi
+
+    def at(self, z: Complex) -> tuple[Branch, ...]:
+        """By Kahan's formulas (1987), which nothing cancels in."""
+        below, above = dr.sqrt(1 - z), dr.sqrt(1 + z)
+        product = below * above
+        real = dr.atan2(z.real, product.real)
+        imaginary = dr.asinh(below.real * above.imag - below.imag * above.real)
+        g, first = type(z)(real, imaginary), dr.rcp(product)
+        second = z * (first * first * first)
+        return Branch(g, first, second), Branch(math.pi - g, -first, -second)
+
+    def bend(self, part: Part) -> Real:
+        complex_number = cast("Any", type(part.disk()[0]))
+        low1, _ = part.distances(complex_number(1, 0))
+        low2, _ = part.distances(complex_number(-1, 0))
+        _, most = part.distances(complex_number(0, 0))
+        inverse = 1 / (low1 * low2)
+        return most * inverse * dr.sqrt(inverse) * _WIDENED
+
+
+@dataclass(frozen=True)
+class OwnBranches(Branches):
+    """Branches that a user gives: see `RiemannSurface`.
+
+    On a part of the plane g'' is bounded as on a disk that holds it, if no singular point lies in
+    that: of a stretch, the disk about its middle that its ends lie on.
+    """
+
+    function: Callable[[Any], Any]
+    singular: tuple[BranchPoint, ...]
+    second: Callable[[Any, Any], Any]
+    number: int
+    shift: float | None = None
+
+    @property
+    def count(self) -> int:
+        return self.number
+
+    @property
+    def points(self) -> tuple[BranchPoint, ...]:
+        return self.singular
+
+    def period(self, imaginary: bool) -> float | None:
+        del imaginary
+        return self.shift
+
+    def at(self, z: Complex) -> tuple[Branch, ...]:
+        made: list[Branch] = []
+        for one in self.function(z):
+            given = [part if dr.is_array_v(type(part)) else type(z)(part) for part in one]
+            made.append(Branch(*given))
+        return tuple(made)
+
+    def bend(self, part: Part) -> Real:
+        middle, radius = part.disk()
+        free = radius == radius
+        for point in self.points_on(middle):
+            free = free & (abs(middle - point.at) > radius)
+        bound = 0 * radius + self.second(middle, radius)
+        return dr.select(free & (bound >= 0), bound, dr.inf)
+
+
+def _uploaded(places: tuple[complex, ...], backend: Backend) -> tuple[Complex, ...]:
+    made = complex_type(backend)
+    real = backend.Float
+    return tuple(made(dr.opaque(real, a.real), dr.opaque(real, a.imag)) for a in places)
+
+
+def _finite(value: Any, name: str) -> complex:
+    try:
+        number = complex(value)
+    except (TypeError, ValueError):
+        raise TypeError(f"{name} must be a complex number, not {value!r}") from None
+    if not (math.isfinite(number.real) and math.isfinite(number.imag)):
+        raise ValueError(f"{name} must be finite, not {value!r}")
+    return number

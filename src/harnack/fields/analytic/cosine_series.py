@@ -1,0 +1,396 @@
+"""Cosine series on a box: fitting, values on grids, and what is proved of them between nodes.
+
+    f(p) = sum a_ijk cos(i u) cos(j v) cos(k w),   (u, v, w) = pi (p - lower)/(upper - lower),
+
+0 <= i < K_x and so on. All of this is NumPy in double precision, made once for a series.
+
+Cosine series on a backend: sum factorization, with its derivatives, and local bounds.
+
+The sum over k is made for each i and j, that over j for each i, that over i last: about 2 K^3
+products in all where a sum of terms would need 7 K^3. i runs in a recorded loop over rows of a
+table, j and k are written out, so that the coefficients are data: another function fitted by as
+many terms compiles no other kernel. Each sum begins with the highest frequency, so that what is
+large, the low ones, takes part in the fewest roundings.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import aligned
+from harnack.backend.elementary import clamp, fmin, sincos
+from harnack.backend.records import Records
+from harnack.enclosures import Curvature
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, FloatArray, Real, Vec3
+
+__all__ = ["CellBounds", "CosineBounds", "fit_cosines", "midpoints", "on_nodes"]
+
+# Nodes for each half wave of the highest frequency: at least so many, and as many as make about so
+# many along an axis, up to the last number.
+_FINE, _ALONG_AXIS, _FINEST = 8, 112, 32
+# Sides, in cells, of the grids that local bounds are tabulated on, and the share of the global
+# bound that they must be below on average to pay for the time of looking them up.
+_CELLS, _PAYS = (16, 8, 4), 0.9
+# Cells of the grid by which the extent of a level is bounded.
+_EXTENT_CELLS = 32
+# Bounds are moved by this much for the rounding of double precision.
+_ROUNDING = 1e-9
+
+
+def midpoints(lower: FloatArray, upper: FloatArray, shape: tuple[int, ...]) -> FloatArray:
+    """The middles (n, 3) of the cells of a box, in the order of a flattened array of this shape."""
+    axes = [
+        lower[a] + (upper[a] - lower[a]) * (np.arange(n) + 0.5) / n for a, n in enumerate(shape)
+    ]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def fit_cosines(grid: FloatArray, terms: tuple[int, int, int]) -> FloatArray:
+    """The first coefficients of the series through values at the midpoints of cells.
+
+    The discrete cosine transform of type 2: the whole series passes through all values, and its
+    part of the first terms is the best fit to them in mean square, since the cosines are orthogonal
+    on the midpoints.
+    """
+    from scipy import fft  # here: time that few need
+
+    whole = np.asarray(cast("Any", fft).dctn(grid, type=2), dtype=np.float64) / grid.size
+    kept = whole[: terms[0], : terms[1], : terms[2]].copy()
+    for axis in range(3):
+        first = [slice(None)] * 3
+        first[axis] = slice(0, 1)
+        kept[tuple(first)] *= 0.5
+    return kept
+
+
+def on_nodes(
+    coefficients: FloatArray, angles: tuple[FloatArray, FloatArray, FloatArray],
+    orders: tuple[int, int, int] = (0, 0, 0),
+) -> FloatArray:  # fmt: skip
+    """Derivatives of these orders in the angles on the grid of angles (n_x, n_y, n_z)."""
+    values = coefficients
+    for angle, order in zip(angles, orders, strict=True):
+        k: FloatArray = np.arange(values.shape[0], dtype=np.float64)
+        # cos(k u) differentiated `order` times.
+        waves: FloatArray = k**order * np.cos(np.outer(angle, k) + 0.5 * math.pi * order)
+        values = np.moveaxis(np.tensordot(waves, values, axes=(1, 0)), 0, -1)
+    return values
+
+
+@dataclass(frozen=True)
+class CellBounds:
+    """Bounds of all second derivatives around each cell of a grid of n^3 over the box.
+
+    count: n. bounds: (n^3,), x first: on the cell and all its neighbors.
+    """
+
+    count: int
+    bounds: FloatArray
+
+
+@dataclass(frozen=True)
+class CosineBounds:
+    """What is proved of a cosine series.
+
+    low, high: f stays within them. curvature: |v.H v| for unit v never exceeds it, H the Hessian.
+    cells: the same locally, finest first; none where that is not worth looking up.
+    cell_low, cell_high: (32, 32, 32) ranges of f on the cells of the box.
+
+    Proof. Along each axis f is a trigonometric polynomial of the angle of degree n = K - 1, and so
+    is v.H v for any fixed v. On a grid of N = 2 n m > 2 n angles to the full turn, of which those
+    from 0 to pi do by symmetry (f is even in each angle, and v.H v becomes v'.H v' with other signs
+    in v), Ehlich and Zeller (1964): |T| <= max over the grid / cos(pi n/N), one axis after the
+    other. With G that bound, Bernstein gives |T_uu| <= n^2 G, and linear interpolation between
+    nodes h = pi/(n m) apart is off by at most h^2/8 n^2 G = pi^2 G/(8 m^2) along each axis: a bound
+    at the nodes of a cell, plus these, is one on the cell.
+    """
+
+    low: float
+    high: float
+    curvature: float
+    cells: tuple[CellBounds, ...]
+    cell_low: FloatArray
+    cell_high: FloatArray
+
+    @classmethod
+    def of(cls, coefficients: FloatArray, size: FloatArray) -> CosineBounds:
+        """size: (3,) of the box."""
+        degrees: list[int] = [n - 1 for n in coefficients.shape]
+        fine = [min(max(_FINE, _ALONG_AXIS // max(n, 1)), _FINEST) for n in degrees]
+        angles: list[FloatArray] = [
+            math.pi * np.arange(n * m + 1) / max(n * m, 1) if n else np.zeros(1)
+            for n, m in zip(degrees, fine, strict=True)
+        ]
+        factor = math.prod(
+            1 / math.cos(0.5 * math.pi / m) if n else 1.0
+            for n, m in zip(degrees, fine, strict=True)
+        )
+        off = sum(
+            math.pi**2 / (8 * m * m) if n else 0.0 for n, m in zip(degrees, fine, strict=True)
+        )
+        nodes = angles[0], angles[1], angles[2]
+        values = on_nodes(coefficients, nodes)
+        middle = 0.5 * float(values.min() + values.max())
+        half = 0.5 * float(values.max() - values.min()) * factor * (1 + _ROUNDING)
+        half += _ROUNDING * abs(middle)
+        bent = _spectral_norms(coefficients, nodes, math.pi / size)
+        curvature = float(bent.max()) * factor * (1 + _ROUNDING)
+        cells: list[CellBounds] = []
+        for count in _CELLS:
+            local = _over_cells(bent, angles, count, 1, np.maximum) + off * curvature
+            local = np.minimum(local * (1 + _ROUNDING), curvature)
+            if float(local.mean()) <= _PAYS * curvature:
+                # x is the first index in `_over_cells` and runs fastest on the device.
+                cells.append(CellBounds(count, np.ascontiguousarray(local.T).ravel()))
+        margin = off * half + _ROUNDING * (abs(middle) + half)
+        return cls(
+            middle - half,
+            middle + half,
+            curvature,
+            tuple(cells),
+            _over_cells(values, angles, _EXTENT_CELLS, 0, np.minimum) - margin,
+            _over_cells(values, angles, _EXTENT_CELLS, 0, np.maximum) + margin,
+        )
+
+    def extent(self, levels: tuple[float, ...]) -> tuple[FloatArray, FloatArray] | None:
+        """Corners, as fractions of the box, of a box that holds the level sets; None for none."""
+        met = np.zeros(self.cell_low.shape, dtype=bool)
+        for level in levels:
+            met |= (self.cell_low <= level) & (level <= self.cell_high)
+        if not met.any():
+            return None
+        low, high = np.zeros(3), np.ones(3)
+        for axis in range(3):
+            rest = tuple(a for a in range(3) if a != axis)
+            some = np.flatnonzero(met.any(axis=rest))
+            low[axis], high[axis] = some[0] / len(met), (some[-1] + 1) / len(met)
+        return low, high
+
+
+def _spectral_norms(
+    coefficients: FloatArray,
+    nodes: tuple[FloatArray, FloatArray, FloatArray],
+    rates: FloatArray,
+) -> FloatArray:
+    """The largest |eigenvalue| of the Hessian at each node, a slab at a time; rates: angles per
+    length. Eigenvalues of symmetric 3x3 matrices by Smith's formula (1961)."""
+    norms = np.empty(tuple(len(one) for one in nodes))
+    slab = max(1, 400_000 // (norms.shape[1] * norms.shape[2]))
+    for start in range(0, len(nodes[0]), slab):
+        part = nodes[0][start : start + slab], nodes[1], nodes[2]
+        second: dict[tuple[int, int], FloatArray] = {}
+        for a, b in itertools.combinations_with_replacement(range(3), 2):
+            orders = [0, 0, 0]
+            orders[a] += 1
+            orders[b] += 1
+            here = on_nodes(coefficients, part, (orders[0], orders[1], orders[2]))
+            second[a, b] = rates[a] * rates[b] * here
+        xx, yy, zz = second[0, 0], second[1, 1], second[2, 2]
+        xy, xz, yz = second[0, 1], second[0, 2], second[1, 2]
+        mean = (xx + yy + zz) / 3
+        x, y, z = xx - mean, yy - mean, zz - mean
+        spread = np.sqrt((x * x + y * y + z * z + 2 * (xy * xy + xz * xz + yz * yz)) / 6)
+        safe = np.where(spread > 0, spread, 1.0)
+        x, y, z, xy, xz, yz = (one / safe for one in (x, y, z, xy, xz, yz))
+        half = 0.5 * (x * (y * z - yz * yz) - xy * (xy * z - yz * xz) + xz * (xy * yz - y * xz))
+        angle = np.arccos(np.clip(half, -1, 1)) / 3
+        top = mean + 2 * spread * np.cos(angle)
+        bottom = mean + 2 * spread * np.cos(angle + 2 * math.pi / 3)
+        # The arccosine is off by the root of what its argument is, where that is near 1.
+        norms[start : start + slab] = np.maximum(np.abs(top), np.abs(bottom)) + 1e-7 * spread
+    return norms
+
+
+def _over_cells(
+    values: FloatArray, angles: list[FloatArray], count: int, around: int, best: Any
+) -> FloatArray:
+    """The extremes over the nodes on and next to each of count^3 cells, with `around` neighbors
+    on each side."""
+    for axis in range(3):
+        intervals = len(angles[axis]) - 1
+        columns: list[FloatArray] = []
+        for cell in range(count):
+            first = max(cell - around, 0) * intervals // count
+            last = -(-min(cell + 1 + around, count) * intervals // count)
+            part = np.moveaxis(values, axis, 0)[first : last + 1]
+            columns.append(best.reduce(part, axis=0))
+        values = np.stack(columns, axis=axis)
+    return values
+
+
+# Constants are moved up, and radii down, by this much for the roundings of float32.
+_KERNEL_ROUNDING = 1e-5
+
+
+@dataclass(frozen=True)
+class CosineSums:
+    """The coefficients and local bounds of a series on a backend.
+
+    lower: corner of the box. rate: pi over its size, angles per length.
+    rounding: of value and gradient, in units of u, but for what moves the point.
+    """
+
+    backend: Backend
+    shape: tuple[int, int, int]
+    lower: Vec3
+    rate: Vec3
+    rows: Records
+    rounding: tuple[Real, Real]
+    curvature: Real
+    cells: tuple[_Cells, ...]
+
+    @classmethod
+    def upload(
+        cls,
+        backend: Backend,
+        coefficients: FloatArray,
+        lower: FloatArray,
+        size: FloatArray,
+        bounds: CosineBounds,
+        rounding: tuple[float, float],
+    ) -> CosineSums:
+        """The series of these coefficients (K_x, K_y, K_z)."""
+        count, along_y, along_z = coefficients.shape
+        first = np.arange(count, dtype=np.float64)[:, None]
+        table = np.concatenate([first, coefficients.reshape(count, -1)], axis=1)[::-1]
+        return cls(
+            backend,
+            (count, along_y, along_z),
+            _data(backend, lower),
+            _data(backend, np.pi / size),
+            Records.upload(backend, table),
+            (dr.opaque(backend.Float, rounding[0]), dr.opaque(backend.Float, rounding[1])),
+            dr.opaque(backend.Float, bounds.curvature * (1 + _KERNEL_ROUNDING)),
+            tuple(_Cells.upload(backend, one, size) for one in bounds.cells),
+        )
+
+    def angles(self, p: Vec3) -> Vec3:
+        """From 0 to pi on the box."""
+        return (self.backend.Array3f(p) - self.lower) * self.rate
+
+    def value(self, p: Vec3) -> tuple[Real, Vec3]:
+        """Value and gradient."""
+        angles = self.angles(p)
+        y, z = _waves(angles.y, self.shape[1]), _waves(angles.z, self.shape[2])
+
+        def add(row: list[Real], state: tuple[Real, ...]) -> tuple[Real, ...]:
+            b, by, bz = _sum_plane(row, y, z)
+            s, c = sincos(row[0] * angles.x)
+            f, gx, gy, gz = state
+            return (
+                dr.fma(b, c, f),
+                dr.fma(b, -row[0] * s, gx),
+                dr.fma(by, c, gy),
+                dr.fma(bz, c, gz),
+            )
+
+        real = self.backend.Float
+        f, gx, gy, gz = self.rows.for_each(add, tuple(real(0) for _ in range(4)), "cosines")
+        return f, self.rate * self.backend.Array3f(gx, gy, gz)
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        """Rows of the matrix of second derivatives."""
+        angles = self.angles(p)
+        y, z = _waves(angles.y, self.shape[1]), _waves(angles.z, self.shape[2])
+
+        def add(row: list[Real], state: tuple[Real, ...]) -> tuple[Real, ...]:
+            b, by, bz, byy, byz, bzz = _sum_plane(row, y, z, second=True)
+            s, c = sincos(row[0] * angles.x)
+            d, e = -row[0] * s, -row[0] * row[0] * c
+            parts = (b * e, byy * c, bzz * c, by * d, bz * d, byz * c)
+            return tuple(one + part for one, part in zip(state, parts, strict=True))
+
+        real, vector, r = self.backend.Float, self.backend.Array3f, self.rate
+        start = tuple(real(0) for _ in range(6))
+        xx, yy, zz, xy, xz, yz = self.rows.for_each(add, start, "second cosines")
+        return (
+            r.x * r * vector(xx, xy, xz),
+            r.y * r * vector(xy, yy, yz),
+            r.z * r * vector(xz, yz, zz),
+        )
+
+    def curvatures(self, p: Vec3) -> tuple[Curvature, ...]:
+        """Around p, the one of the smallest ball first; the last holds everywhere."""
+        everywhere = Curvature(self.curvature + 0 * p.x, dr.inf)
+        if not self.cells:
+            return (everywhere,)
+        share = self.angles(p) * float(1 / np.pi)
+        return (*(one.curvature(share) for one in self.cells), everywhere)
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """Local bounds of the curvature on a backend; sides: of a cell, as lengths."""
+
+    backend: Backend
+    count: int
+    sides: Vec3
+    bounds: Real
+
+    @classmethod
+    def upload(cls, backend: Backend, cells: CellBounds, size: FloatArray) -> _Cells:
+        bounds = aligned(backend, cells.bounds * (1 + _KERNEL_ROUNDING))
+        return cls(backend, cells.count, _data(backend, size / cells.count), bounds)
+
+    def curvature(self, share: Vec3) -> Curvature:
+        """Of the cell in which a point lies, on a ball that stays within its neighbors."""
+        place, index = share * float(self.count), self.backend.UInt32(0)
+        free: Real = dr.inf
+        for axis in (2, 1, 0):
+            cell = clamp(dr.floor(place[axis]), 0, self.count - 1)
+            index = index * self.count + self.backend.UInt32(cell)
+            rest = place[axis] - cell
+            free = fmin((1 + fmin(rest, 1 - rest)) * self.sides[axis], free)
+        constant = dr.gather(self.backend.Float, self.bounds, index)
+        return Curvature(constant, free * (1 - _KERNEL_ROUNDING * self.count))
+
+
+def _data(backend: Backend, numbers: FloatArray) -> Vec3:
+    return backend.Array3f(*(dr.opaque(backend.Float, float(one)) for one in numbers))
+
+
+def _waves(angle: Real, count: int) -> tuple[list[Real], list[Real]]:
+    """cos(k angle) and its derivative -k sin(k angle) for k < count."""
+    values, slopes = [0 * angle + 1], [0 * angle]
+    for k in range(1, count):
+        s, c = sincos(float(k) * angle)
+        values.append(c)
+        slopes.append(-float(k) * s)
+    return values, slopes
+
+
+def _sum_plane(
+    row: list[Real],
+    y: tuple[list[Real], list[Real]],
+    z: tuple[list[Real], list[Real]],
+    *,
+    second: bool = False,
+) -> tuple[Any, ...]:
+    """The sum over j and k for one i, its derivatives by y and z, and with `second` those by y
+    twice, by y and z, and by z twice."""
+    (cos_y, slope_y), (cos_z, slope_z) = y, z
+    many = len(cos_z)
+    sums: list[Any] = [0 * cos_y[0]] * (6 if second else 3)
+    for j in reversed(range(len(cos_y))):
+        a, b, c = 0 * cos_y[0], 0 * cos_y[0], 0 * cos_y[0]
+        for k in reversed(range(many)):
+            one = row[1 + j * many + k]
+            a, b = dr.fma(one, cos_z[k], a), dr.fma(one, slope_z[k], b)
+            if second and k:
+                c = dr.fma(one * float(-k * k), cos_z[k], c)
+        sums[0] = dr.fma(a, cos_y[j], sums[0])
+        sums[1] = dr.fma(a, slope_y[j], sums[1])
+        sums[2] = dr.fma(b, cos_y[j], sums[2])
+        if second:
+            sums[3] = dr.fma(a * float(-j * j), cos_y[j], sums[3])
+            sums[4] = dr.fma(b, slope_y[j], sums[4])
+            sums[5] = dr.fma(c, cos_y[j], sums[5])
+    return tuple(sums)

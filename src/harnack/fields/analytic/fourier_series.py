@@ -1,0 +1,350 @@
+"""Any function on a box, by a cosine series that is fitted to it (paper, section 4.7.1)."""
+
+from __future__ import annotations
+
+import copy
+import math
+import operator
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import backend_of
+from harnack.backend.numbers import real_array
+from harnack.fields.analytic.cosine_series import CosineBounds, CosineSums, fit_cosines, midpoints
+from harnack.fields.analytic.waves import mean_wavelength
+from harnack.fields.batch import prepared_once
+from harnack.fields.field import Field, Sample, check_in_range
+from harnack.geometry.volumes import Box
+
+if TYPE_CHECKING:
+    from typing import Self
+
+    from harnack.backend import Backend, FloatArray, Vec3
+    from harnack.geometry.volume import Volume
+
+__all__ = ["Displacement", "FourierSeries"]
+
+_MOST_TERMS = 24
+# Samples a side by default, for each term and at least; they must not be more in all than the last.
+_SAMPLES, _LEAST_SAMPLES, _MOST_SAMPLES = 4, 64, 1 << 25
+# Points at which the error of a fit is looked at, and how they are brought to the surface.
+_CHECKED, _NEWTON_STEPS, _CONVERGED = 20_000, 12, 1e-9
+# Coefficients as small as this beside the values fitted are the rounding of their sums.
+_NOTHING = 1e-13
+# What is of second order in the unit roundoff.
+_SECOND_ORDER = 1.05
+
+# f of points (n, 3): (n,).
+Function: TypeAlias = Callable[["FloatArray"], Any]
+
+
+@dataclass(frozen=True)
+class Displacement:
+    """How far the surface of a series lies from that of the function it was fitted to: sampled, and
+    to first order, |function - level|/|gradient of the series| at points of its surface.
+
+    mean, largest: lengths. count: how many points were looked at.
+    """
+
+    mean: float
+    largest: float
+    count: int
+
+
+class FourierSeries(Field):
+    """sum a_ijk cos(i u) cos(j v) cos(k w) on a box, u, v, w from 0 to pi along its sides.
+
+    Made by `fit` from any function or grid of values. **What is proved is about the series**, not
+    about the function that it was fitted to: `fit_error` says how far their values differ and
+    `displacement` how far their surfaces do, both by sampling. The series continues the function by
+    reflection at the walls of the box. It converges quickly where the function is smooth and
+    has no slope across the walls; kinks, such as those of distances, cost accuracy, and so do
+    functions that are very steep far from the surface: compress those first, say by tanh.
+
+    coefficients: (K_x, K_y, K_z), at most 24 each. box: a finite `Box`.
+
+    Promises: bounds of the second derivatives (`CosineBounds` has the proof), on the whole box and
+    on balls around the cells of grids laid over it, where those are smaller. Rounding, in units of
+    u: an angle k u is off by 3 roundings of u, which move the point, and one of the product, k pi
+    at most; a sine or cosine by 2; a coefficient by 1; a term takes part in i + j + k + 3 sums.
+
+    Raises:
+        ValueError: coefficients of another shape, not finite, or all zero but the first; a box
+            without size.
+    """
+
+    overstep = 1.5
+
+    fit_error: float | None = None
+    """The largest difference of values between series and function that was seen; None where the
+    series was made from coefficients."""
+
+    def __init__(self, coefficients: Any, box: Box | tuple[Any, Any]) -> None:
+        a = real_array(coefficients, "coefficients").astype(np.float64)
+        if a.ndim != 3 or 0 in a.shape:
+            raise ValueError(f"coefficients must have shape (K_x, K_y, K_z), not {a.shape}")
+        _check_terms(a.shape)
+        if not np.isfinite(a).all():
+            raise ValueError("coefficients must be finite numbers")
+        if not np.any(a.ravel()[1:]):
+            raise ValueError("the series is constant: it has no level sets")
+        self.coefficients = a
+        self.domain = self._box = _finite_box(box)
+        self._lower, upper = self._box.bounds()
+        self._size = upper - self._lower
+        self._bounds = CosineBounds.of(a, self._size)
+        waves = np.indices(a.shape).reshape(3, -1)[:, 1:].T * (math.pi / self._size)
+        self.wavelength = mean_wavelength(a.ravel()[1:], np.linalg.norm(waves, axis=1))
+        self._rounding = _rounding(a, self._size)
+        self._source: Function | FloatArray | None = None
+        self._device: CosineSums | None = None
+
+    @classmethod
+    def fit(
+        cls,
+        function: Function | Any,
+        box: Box | tuple[Any, Any],
+        terms: int | tuple[int, int, int] = 12,
+        *,
+        samples: int | tuple[int, int, int] | None = None,
+    ) -> Self:
+        """The series of `terms` cosines along each axis that is closest to a function.
+
+        function: a callable that takes points (n, 3) and gives values (n,); or a grid (n_x, n_y,
+            n_z) of values at the middles of that many cells of the box.
+        box: a finite `Box`, or its two corners. terms: 1 to 24, along each axis.
+        samples: cells a side, of a function; by default 4 for each term, at least 64.
+
+        Raises:
+            ValueError: values that are NaN or infinite, or of another shape; more terms than 24 or
+                than samples; a function that is constant; a box without size.
+            TypeError: neither a function nor numbers; terms that are no whole numbers.
+        """
+        numbers = _three(terms, "terms")
+        _check_terms(numbers)
+        space = _finite_box(box)
+        lower, upper = space.bounds()
+        if callable(function):
+            chosen = tuple(max(_SAMPLES * n, _LEAST_SAMPLES) for n in numbers)
+            shape = _three(chosen if samples is None else samples, "samples")
+            if math.prod(shape) > _MOST_SAMPLES:
+                raise ValueError(f"{shape} samples are too many: at most {_MOST_SAMPLES} in all")
+            _check_samples(numbers, shape)
+            grid = _values(function, midpoints(lower, upper, shape)).reshape(shape)
+        else:
+            if samples is not None:
+                raise TypeError("samples says where a function is evaluated: a grid has its own")
+            grid = real_array(function, "a grid", type_error=TypeError).astype(np.float64)
+            if grid.ndim != 3 or 0 in grid.shape:
+                raise ValueError(f"a grid must have shape (n_x, n_y, n_z), not {grid.shape}")
+            _check_samples(numbers, cast("tuple[int, int, int]", grid.shape))
+            if not np.isfinite(grid).all():
+                bad = np.argwhere(~np.isfinite(grid))
+                raise ValueError(
+                    f"the grid has {len(bad)} values that are NaN or infinite, the first at "
+                    f"{tuple(bad[0].tolist())}: replace them by numbers"
+                )
+        if float(np.ptp(grid)) == 0.0:
+            raise ValueError("the function is constant: it has no level sets")
+        fitted = fit_cosines(grid, numbers)
+        if np.abs(fitted).sum() - abs(fitted[0, 0, 0]) < _NOTHING * np.abs(grid).max():
+            raise ValueError(
+                f"the series of {numbers} terms is constant, though the function is not: take more "
+                "terms"
+            )
+        made = cls(fitted, space)
+        made._source = cast("Any", function) if callable(function) else grid
+        made.fit_error = made._largest_difference()
+        return made
+
+    @property
+    def value_range(self) -> tuple[float, float]:
+        """Proved: the values of the series stay within it."""
+        return self._bounds.low, self._bounds.high
+
+    @property
+    def curvature(self) -> float:
+        """Proved: no directional second derivative of the series exceeds it in size."""
+        return self._bounds.curvature
+
+    def displacement(self, level: float | None = None, *, rng: int = 0) -> Displacement:
+        """How far the surface at a level lies from that of the function fitted: an estimate.
+
+        Of a function at random points of the surface, of a grid at its points next to the surface.
+
+        Raises:
+            ValueError: the series was not made by `fit`, or no point of the level was found.
+        """
+        if self._source is None:
+            raise ValueError("the series was made from coefficients: there is no function to miss")
+        chosen = self.default_level if level is None else float(level)
+        points, values = self._near(chosen, rng)
+        if not len(points):
+            raise ValueError(f"no point with level {chosen:g} was found in the box")
+        slope = np.linalg.norm(self.gradient(points, precision="double"), axis=1)
+        away = np.abs(values) / np.maximum(slope, 1e-300)
+        return Displacement(float(away.mean()), float(away.max()), len(points))
+
+    def _near(self, level: float, rng: int) -> tuple[FloatArray, FloatArray]:
+        """Points of the surface, or next to it, and what the function differs from the series."""
+        if not callable(self._source):
+            grid = cast("FloatArray", self._source)
+            points = midpoints(self._lower, self._lower + self._size, grid.shape)
+            value = self.value(points, precision="double")
+            slope = np.linalg.norm(self.gradient(points, precision="double"), axis=1)
+            cell = float((self._size / grid.shape).max())
+            near = np.abs(value - level) <= slope * cell
+            return points[near], (grid.ravel() - value)[near]
+        x = self._lower + self._size * np.random.default_rng(rng).random((_CHECKED, 3))
+        for _ in range(_NEWTON_STEPS):
+            gradient = self.gradient(x, precision="double")
+            square = np.maximum((gradient**2).sum(axis=1), 1e-300)
+            off = (self.value(x, precision="double") - level) / square
+            step = off[:, None] * gradient
+            length = np.linalg.norm(step, axis=1, keepdims=True)
+            x = x - step * np.minimum(1, 0.1 * self._size.min() / np.maximum(length, 1e-300))
+            x = np.clip(x, self._lower, self._lower + self._size)
+        slope = np.linalg.norm(self.gradient(x, precision="double"), axis=1)
+        off = np.abs(self.value(x, precision="double") - level)
+        x = x[off <= _CONVERGED * float(self._size.max()) * slope]
+        return x, (_values(self._source, x) if len(x) else np.zeros(0)) - level
+
+    def _largest_difference(self) -> float:
+        """Between series and function: at random points, or at all of a grid."""
+        if callable(self._source):
+            x = self._lower + self._size * np.random.default_rng(0).random((_CHECKED, 3))
+            given = _values(self._source, x)
+        else:
+            grid = cast("FloatArray", self._source)
+            x = midpoints(self._lower, self._lower + self._size, grid.shape)
+            given = grid.ravel()
+        return float(np.abs(self.value(x, precision="double") - given).max())
+
+    @prepared_once
+    def prepare(self, backend: Backend) -> Self:
+        if self._device is not None and self._device.backend is backend:
+            return self
+        prepared = copy.copy(self)
+        prepared._device = self._upload(backend)
+        return prepared
+
+    def _upload(self, backend: Backend) -> CosineSums:
+        return CosineSums.upload(
+            backend, self.coefficients, self._lower, self._size, self._bounds, self._rounding
+        )
+
+    def _on(self, p: Vec3) -> CosineSums:
+        return self._upload(backend_of(p)) if self._device is None else self._device
+
+    def evaluate(self, p: Vec3) -> Sample:
+        on = self._on(p)
+        value, gradient = on.value(p)
+        unit = float(dr.epsilon(type(value))) * _SECOND_ORDER
+        # The rounding of p - lower, times pi/size, moves the point.
+        moved = [dr.fma(3.0, dr.abs(p[k] - on.lower[k]), dr.abs(on.lower[k])) for k in range(3)]
+        error = sum((moved[k] * dr.abs(gradient[k]) for k in range(3)), 0 * p.x)
+        error = unit * (error + on.rounding[0])
+        length = dr.norm(on.backend.Array3f(*moved))
+        slope_error = unit * dr.fma(on.curvature, length, on.rounding[1])
+        return Sample(value, gradient, on.curvatures(p), error, slope_error)
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        """Rows of the Hessian of the series."""
+        return self._on(p).hessian(p)
+
+    def extent(self, levels: tuple[float, ...]) -> Volume | None:
+        """The part of the box in whose cells the series is not proved to stay off the levels."""
+        shares = self._bounds.extent(levels)
+        if shares is None:
+            return self.domain
+        low, high = shares
+        corners = self._lower + low * self._size, self._lower + high * self._size
+        return Box(cast("Any", tuple(corners[0].tolist())), cast("Any", tuple(corners[1].tolist())))
+
+    def check_levels(self, levels: tuple[float, ...]) -> None:
+        check_in_range(levels, self.value_range, "in its box the series")
+
+    def describe(self) -> dict[str, Any]:
+        return {
+            "terms": self.coefficients.shape,
+            "range": self.value_range,
+            "second derivatives": self.curvature,
+            "grids of local bounds": tuple(one.count for one in self._bounds.cells),
+            "error of the fit": self.fit_error,
+        }
+
+
+def _three(numbers: Any, name: str) -> tuple[int, int, int]:
+    try:
+        one = operator.index(numbers)
+    except TypeError:
+        try:
+            several = tuple(operator.index(n) for n in numbers)
+        except TypeError as error:
+            raise TypeError(
+                f"{name} must be whole numbers, one or three, not {numbers!r} ({error})"
+            ) from None
+        if len(several) != 3:
+            raise ValueError(f"{name} must be one number or three, not {len(several)}") from None
+        return several[0], several[1], several[2]
+    return one, one, one
+
+
+def _check_terms(terms: tuple[int, ...]) -> None:
+    if min(terms) < 1 or max(terms) > _MOST_TERMS:
+        raise ValueError(
+            f"terms must be 1 to {_MOST_TERMS} along each axis, not {tuple(terms)}: an evaluation "
+            "takes about 2 K^3 products. Fit a smaller box or a smoother function instead"
+        )
+
+
+def _check_samples(terms: tuple[int, int, int], shape: tuple[int, int, int]) -> None:
+    if any(k > n for k, n in zip(terms, shape, strict=True)):
+        raise ValueError(
+            f"{terms} terms cannot be told apart by {shape} samples: take fewer terms or more "
+            "samples"
+        )
+
+
+def _finite_box(box: Any) -> Box:
+    try:
+        made = box if isinstance(box, Box) else Box(*box)
+    except TypeError:
+        raise TypeError(f"box must be a harnack.Box or two corners, not {box!r}") from None
+    lower, upper = made.bounds()
+    if not (np.isfinite(lower).all() and np.isfinite(upper).all() and (lower < upper).all()):
+        raise ValueError(f"the box of a series needs finite sides longer than 0, not {made}")
+    return made
+
+
+def _values(function: Function, points: FloatArray) -> FloatArray:
+    """The function's values (n,) at points (n, 3), checked."""
+    values = real_array(function(points), "values of the function", type_error=TypeError)
+    if values.shape != (len(points),):
+        raise ValueError(
+            f"the function must give one value for each point (n, 3): for {len(points)} points it "
+            f"gave an array of shape {values.shape}"
+        )
+    bad = np.flatnonzero(~np.isfinite(values))
+    if bad.size:
+        raise ValueError(
+            f"the function is {values[bad[0]]} at {points[bad[0]].tolist()}, and NaN or infinite "
+            f"at {bad.size} of {len(points)} points: bound it first"
+        )
+    return values.astype(np.float64)
+
+
+def _rounding(a: FloatArray, size: FloatArray) -> tuple[float, float]:
+    """Of value and gradient, in units of u, without what moves the point: see the class."""
+    i, j, k = np.indices(a.shape)
+    each = (i + j + k) * (math.pi + 1) + 10
+    sizes = np.abs(a)
+    slopes = [
+        math.pi / size[axis] * float((sizes * n * (each + 4)).sum())
+        for axis, n in enumerate((i, j, k))
+    ]
+    return float((sizes * each).sum()), math.hypot(*slopes)

@@ -1,0 +1,359 @@
+"""Hyperspherical harmonics, seen in space by stereographic projection (paper, section 4.7)."""
+
+from __future__ import annotations
+
+import math
+import operator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
+
+import drjit as dr
+
+from harnack.backend.elementary import fmax, fmin
+from harnack.enclosures import Curvature, Lipschitz, Slopes
+from harnack.enclosures.parabola import Arc, Parabola
+from harnack.enclosures.pieces import Pieces
+from harnack.fields.analytic.hyperspherical_basis import (
+    LARGEST_DEGREE,
+    HypersphereRange,
+    Monomials,
+    SphereWeights,
+    from_monomials,
+    gegenbauer,
+    gegenbauer_rounding,
+    weights_by_order,
+)
+from harnack.fields.analytic.rounding import HarmonicRounding
+from harnack.fields.analytic.solid_harmonics import Weights, evaluate, hessian
+from harnack.fields.analytic.sphere_bounds import (
+    AxialBound,
+    gradient_bound,
+    hessian_bound,
+    value_bound,
+)
+from harnack.fields.field import Field, check_in_range
+from harnack.fields.look import Look, Path, Sample
+from harnack.geometry.volumes import Ball
+
+if TYPE_CHECKING:
+    from harnack.backend import Real, Vec3
+    from harnack.geometry.volume import Volume
+
+__all__ = ["HypersphericalHarmonic"]
+
+# Constants are moved up by this much for the roundings of float32.
+_ROUNDING = 1e-5
+# Radii of the balls on which the Hessian is bounded, in units of sqrt(1 + |p|^2).
+_SHARES = _NEAR, _WIDE = 0.2, 0.6
+# Beside zeros of high order: radii in units of the distance to them over the order less 2, and at
+# most, as above; and what a radius is of the chord of the sphere that it leads to, over 1 + |p|^2.
+_BESIDE, _MOST_BESIDE, _OF_CHORD = 0.5, 0.3, 0.349
+# What is of second order in the unit roundoff, and roundings of the bounds themselves.
+_SECOND_ORDER = 1.05
+# Roundings, in units of u: of 1/(1 + |p|^2), relative; of w; of operations that join the parts.
+_OF_SCALE, _OF_HEIGHT = 6.0, 13.0
+
+
+@dataclass(frozen=True)
+class _Order:
+    """The terms of one j: the sum of solid harmonics times C_n^k(w), with what bounds both."""
+
+    j: int
+    n: int
+    k: int
+    weights: Weights
+    value: AxialBound
+    gradient: AxialBound
+    hessian: AxialBound
+    rounding: HarmonicRounding
+
+    @classmethod
+    def of(cls, l: int, j: int, weights: Weights) -> _Order:  # noqa: E741
+        bounds = value_bound(weights), gradient_bound(weights), hessian_bound(weights)
+        rounding = HarmonicRounding.of(weights, is_divided=True)
+        return cls(j, l - j, j + 1, weights, *bounds, rounding)
+
+    def largest(self, rho: Real, r: Real) -> tuple[Real, Real]:
+        """Bounds of first and second derivatives of S(y) C(w) in R^4, where y is within rho of
+        the third axis and r of 0: C and its derivatives are largest at w = 1."""
+        c, first, second = (float(one) for one in self.axial(1.0))
+        value, slope, bent = self.value(rho, r), self.gradient(rho, r), self.hessian(rho, r)
+        return slope * c + value * first, bent * c + slope * first + value * second
+
+    def axial(self, w: Real) -> tuple[Real, Real, Real]:
+        """C_n^k(w) and its first two derivatives."""
+        n, k = self.n, self.k
+        first = 2 * k * gegenbauer(n - 1, k + 1, w)
+        return gegenbauer(n, k, w), first, 4 * k * (k + 1) * gegenbauer(n - 2, k + 2, w)
+
+
+class HypersphericalHarmonic(Field):
+    """A harmonic function of the sphere S^3 at the point (2p, |p|^2 - 1)/(1 + |p|^2) of it.
+
+    P_ljm(X) = N S_jm(y) |X|^(l-j) C_(l-j)^(j+1)(w/|X|) with X = (y, w): S_jm the solid harmonic of
+    `SphericalHarmonic`, C a Gegenbauer polynomial, the integral of P^2 over S^3 being 1. The origin
+    is seen at w = -1, the unit sphere at w = 0, and far away f tends to the value at w = 1, which
+    is 0 for j > 0. No level set needs to be clipped: rays that leave are proved to meet nothing.
+
+    l, j, m: degree 0 <= l <= 6, and 0 <= j <= l, -j <= m <= j: (l+1)^2 functions for each l.
+        For more general ones see `from_polynomial`.
+    domain: a volume to draw it in; None for all of space. Surfaces of the level that f tends to far
+        away (0 for j > 0) may have no end, nor have rays along them: those need one, or a t_max.
+
+    Proofs. Let P be of degree l with |P| <= M and half of its range A on S^3 (`HypersphereRange`).
+    P is harmonic and homogeneous, so |grad P| <= l M there and |v.H v| <= l (l-1) M for unit
+    vectors v (`BallRange.curvature` has the proof). Let S = 1 + |p|^2.
+
+    - `Curvature`. A line runs on S^3 at speed 2/S, and its second derivative in t has the length
+      4/S^1.5 (`Arc` has the circle: it is sqrt(c^2 + t^2) 4/S^2). By the chain rule
+      |f''| <= M l (4 (l-1)/S^2 + 4/S^1.5) with the least S on the ball, and |grad f| <= 2 l A/S
+      (Bernstein on the great circle along the line).
+    - Where f vanishes to an order above 2, at y = 0 or for |m| > 2 on the circle y_1 = y_2 = 0,
+      another `Curvature`, on a ball that is a share of the distance there. With bounds of S_jm, its
+      gradient and its Hessian at such distances (`AxialBound`), and 2ab <= 1 for the parts (a, b)
+      of unit vectors, it is the same chain rule for S_jm(y) C(w). The ball: R <= 0.3 sqrt(S) leaves
+      1 + |q|^2 >= 0.49 S at q, so that on the sphere it is within the chord 2R/(0.7 S).
+    - Along a ray: `Arc`. On the circle of radius 1/c, in its angle, the first derivative of the
+      point has length 1/c and the second too, so |f_aa| <= M l ((l-1)/c^2 + 1/c); and f is a
+      trigonometric polynomial of degree l of the angle, so |f_aa| <= l^2 A (Bernstein).
+
+    Raises:
+        ValueError: l, j or m outside these ranges.
+        TypeError: l, j or m is no whole number.
+    """
+
+    overstep = 1.6
+    is_entire = True
+
+    def __init__(self, l: int, j: int, m: int, *, domain: Volume | None = None) -> None:  # noqa: E741
+        l, j, m = operator.index(l), operator.index(j), operator.index(m)  # noqa: E741
+        if not 0 <= l <= LARGEST_DEGREE:
+            raise ValueError(f"the degree l must be 0 to {LARGEST_DEGREE}, not {l}")
+        if not 0 <= j <= l:
+            raise ValueError(f"j must be 0 to l = {l}, not {j}")
+        if not -j <= m <= j:
+            raise ValueError(f"the order m must be -{j} to {j}, not {m}")
+        self._set(l, {(j, m): 1.0}, domain)
+
+    @classmethod
+    def from_polynomial(
+        cls, coefficients: Monomials, *, domain: Volume | None = None
+    ) -> HypersphericalHarmonic:
+        """Of a homogeneous harmonic polynomial of R^4, by its coefficients.
+
+        coefficients: (a, b, c, d) -> that of x^a y^b z^c w^d, a + b + c + d = l for all, l <= 6;
+            x, y, z are 2p/(1 + |p|^2) and w = (|p|^2 - 1)/(1 + |p|^2).
+
+        Raises:
+            ValueError: not homogeneous, of a degree above 6, zero, not finite, or not harmonic.
+            TypeError: a key is not four whole numbers.
+        """
+        terms: dict[tuple[int, int, int, int], float] = {}
+        for key, value in coefficients.items():
+            powers = tuple(operator.index(one) for one in key)
+            if len(powers) != 4 or min(powers) < 0:
+                raise TypeError(
+                    f"a monomial of R^4 is four powers >= 0, of x, y, z and w, not {key!r}"
+                )
+            if not math.isfinite(value):
+                raise ValueError(f"the coefficient of {key} is {value!r}, not a finite number")
+            a, b, c, d = powers
+            terms[a, b, c, d] = terms.get((a, b, c, d), 0.0) + float(value)
+        made = cls.__new__(cls)
+        made._set(*from_monomials(terms), domain)
+        return made
+
+    def _set(self, l: int, weights: SphereWeights, domain: Volume | None) -> None:  # noqa: E741
+        self.domain = domain
+        self.degree = l
+        self._orders = [_Order.of(l, j, sums) for j, sums in weights_by_order(l, weights).items()]
+        self._known = HypersphereRange.of(l, weights)
+
+    @property
+    def value_range(self) -> tuple[float, float]:
+        """Proved: the values of f stay within it."""
+        return self._known.low, self._known.high
+
+    def evaluate(self, p: Vec3) -> Sample:
+        square = dr.squared_norm(p)
+        value, gradient, error, gradient_error = self._values(p, 1 + square)
+        known = (*self._beside(p, square), *self._curvatures(square))
+        steep = self.degree * (self._known.high - self._known.low) * (1 + _ROUNDING)
+        lipschitz = Lipschitz(steep / self._least(square, _WIDE), self._reach(square, _WIDE))
+        return Sample(value, gradient, known, error, gradient_error, weaker=(lipschitz,))
+
+    def _values(self, p: Vec3, total: Real) -> tuple[Real, Vec3, Real, Real]:
+        """Value, gradient, and the rounding of both, total = 1 + |p|^2.
+
+        With s = 1/total, y = 2 s p, w = 1 - 2 s, f = sum of S(y) C(w): since S is homogeneous of
+        degree j, grad f = 2 s (sum of C grad S + p S (2 s C' - j C)). To first order in u: y is off
+        by `_OF_SCALE` of its size, all coordinates alike, and by two roundings of each coordinate
+        (`is_divided`); w by `_OF_HEIGHT`; S, grad S and C as their recurrences say.
+        """
+        s = 1 / total
+        y, w, size = 2 * s * p, 1 - 2 * s, dr.norm(p)
+        r, rho = dr.norm(y), dr.norm(type(y)(y.x, y.y, 0))
+        zero = 0 * p.x
+        value, inner, outer = zero, type(p)(0), zero
+        error, slope = zero, zero
+        many = len(self._orders) + 8.0
+        for one in self._orders:
+            c, first, second = one.axial(w)
+            at, (x1, x2, x3) = evaluate(one.weights, y.x, y.y, y.z)
+            value = value + c * at
+            inner = inner + c * type(p)(zero + x1, zero + x2, zero + x3)
+            radial = 2 * s * first - one.j * c
+            outer = outer + at * radial
+            # Rounding.
+            most, steep = one.value(rho, r), one.gradient(rho, r)
+            off = one.rounding.value(rho, r) + _OF_SCALE * one.j * most
+            tilt = one.rounding.gradient(rho, r) + (_OF_SCALE * max(one.j - 1, 0) + many) * steep
+            c_off = dr.fma(_OF_HEIGHT, dr.abs(first), gegenbauer_rounding(one.n, one.k))
+            next_off = 2 * one.k * gegenbauer_rounding(one.n - 1, one.k + 1)
+            first_off = dr.fma(_OF_HEIGHT, dr.abs(second), next_off)
+            radial_off = 2 * s * dr.fma(8.0, dr.abs(first), first_off)
+            radial_off = radial_off + one.j * (c_off + 3 * dr.abs(c))
+            c = dr.abs(c)
+            error = error + c * (off + many * most) + most * c_off
+            slope = slope + c * tilt + steep * c_off
+            slope = slope + size * (dr.abs(radial) * (off + many * most) + most * radial_off)
+        unit = float(dr.epsilon(type(zero))) * _SECOND_ORDER
+        gradient = 2 * s * (inner + p * outer)
+        lost = 64 * float(dr.smallest(type(zero)))
+        return value, gradient, dr.fma(error, unit, lost), 2 * s * unit * slope
+
+    def _least(self, square: Real, share: float) -> Real:
+        """A lower bound of 1 + |y|^2 on the ball of radius share sqrt(1 + |p|^2) about p."""
+        inner = fmax(dr.sqrt(square) - share * dr.sqrt(1 + square), 0)
+        return dr.fma(inner, inner, 1) * (1 - _ROUNDING)
+
+    def _reach(self, square: Real, share: float) -> Real:
+        return share * dr.sqrt(1 + square)
+
+    def _curvatures(self, square: Real) -> list[Curvature]:
+        """Bounds of the Hessian on three balls, the last one all of space."""
+        l = self.degree  # noqa: E741
+        size = l * self._known.largest * (1 + _ROUNDING)
+        made: list[Curvature] = []
+        for share in _SHARES:
+            least = self._least(square, share)
+            bent = (4 * (l - 1) / least + 4 / dr.sqrt(least)) / least
+            made.append(Curvature(fmax(size * bent, 0), self._reach(square, share)))
+        return [*made, Curvature(0 * square + max(size * 4.0 * l, 0.0), dr.inf)]
+
+    def _beside(self, p: Vec3, square: Real) -> tuple[Curvature, ...]:
+        """The bound of the Hessian beside a zero of high order; none where there is none."""
+        by_axis = min(abs(m) for one in self._orders for _, m in one.weights)
+        by_center = min(one.j for one in self._orders)
+        if by_center < 3:
+            return ()
+        y = (2 / (1 + square)) * p
+        r, rho = dr.norm(y), dr.norm(type(y)(y.x, y.y, 0))
+        chord = _BESIDE / (by_center - 2) * r
+        if by_axis > 2:
+            chord = fmin(chord, _BESIDE / (by_axis - 2) * rho)
+        least = self._least(square, _MOST_BESIDE)
+        root = dr.rcp(dr.sqrt(least))
+        bent = 0 * square
+        for one in self._orders:
+            first, second = one.largest(rho + chord, r + chord)
+            bent = bent + 4 * root * root * root * dr.fma(root, second, first)
+        radius = fmin(_OF_CHORD * chord * (1 + square), _MOST_BESIDE * dr.sqrt(1 + square))
+        return (Curvature(bent * (1 + _ROUNDING), radius),)
+
+    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
+        """The sample, with arcs of circles where the sharpest proofs are asked for."""
+        del ahead, back
+        p = path.point(t)
+        sample = self.evaluate(p)
+        if Pieces not in path.proofs.kinds:
+            return path.look(sample)
+        slope = dr.dot(sample.gradient, path.direction)
+        slopes = Slopes.around(slope, sample.gradient_error)
+        # The point of the line closest to the origin, from one end or the other without
+        # cancellation: the origin of the ray may be far away.
+        start = dr.dot(path.origin, path.direction)
+        foot = path.origin - start * path.direction
+        square = 1 + dr.squared_norm(foot)
+        along = dr.dot(p, path.direction)
+        l, c = self.degree, dr.sqrt(square)  # noqa: E741
+        known = self._known
+        most = l * l * 0.5 * (known.high - known.low)
+        bent = fmin(known.largest * l * ((l - 1) / square + 1 / c), most) * (1 + _ROUNDING)
+        forward = Arc(slopes, bent, along, square)
+        backward = Arc(slopes.negated(), bent, -along, square)
+        curvatures = [one for one in sample.known if isinstance(one, Curvature)]
+        beside = curvatures[: -len(_SHARES) - 1]
+        around = [Parabola(slopes, -one.constant, one.constant, one.radius) for one in beside]
+        behind = [
+            Parabola(slopes.negated(), -one.constant, one.constant, one.radius) for one in beside
+        ]
+        return Look(sample, (forward, *around), (backward, *behind), slope)
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        """Rows of the Hessian: f is harmonic on S^3 and not in space, so it has a trace.
+
+        By the chain rule with dy_i/dx_k = 2s (d_ik - 2s x_i x_k), dw/dx_k = 4 s^2 x_k, and
+        second derivatives 4 s^2 (4s x_i x_k x_m - x_m d_ik - x_k d_im - x_i d_km) of y_i and
+        4 s^2 (d_km - 4s x_k x_m) of w.
+        """
+        vector = cast("Any", type(p))
+        s = 1 / (1 + dr.squared_norm(p))
+        y, w, zero = 2 * s * p, 1 - 2 * s, 0 * p.x
+        rows = [[zero] * 4 for _ in range(4)]
+        slopes = [zero] * 4
+        for one in self._orders:
+            c, first, second = one.axial(w)
+            at, gradient = evaluate(one.weights, y.x, y.y, y.z)
+            xx, yy, zz, xy, xz, yz = hessian(one.weights, y.x, y.y, y.z)
+            matrix = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
+            for i in range(3):
+                for k in range(3):
+                    rows[i][k] = rows[i][k] + c * matrix[i][k]
+                rows[i][3] = rows[i][3] + first * gradient[i]
+                slopes[i] = slopes[i] + c * gradient[i]
+            rows[3][3] = rows[3][3] + second * at
+            slopes[3] = slopes[3] + first * at
+        x = (p.x, p.y, p.z)
+        # Columns of the derivative of (y, w), four by three.
+        along = [[2 * s * ((i == k) - 2 * s * x[i] * x[k]) for k in range(3)] for i in range(3)]
+        along.append([4 * s * s * x[k] for k in range(3)])
+        radial = x[0] * slopes[0] + x[1] * slopes[1] + x[2] * slopes[2]
+        out: list[Vec3] = []
+        for k in range(3):
+            row: list[Real] = []
+            for m in range(3):
+                total = zero
+                for i in range(4):
+                    for n in range(4):
+                        entry = rows[min(i, n)][max(i, n)]
+                        total = total + along[i][k] * entry * along[n][m]
+                bent = 4 * s * x[k] * x[m] * (radial - slopes[3])
+                bent = bent - x[m] * slopes[k] - x[k] * slopes[m]
+                if k == m:
+                    bent = bent + slopes[3] - radial
+                row.append(total + 4 * s * s * bent)
+            out.append(vector(*row))
+        return out[0], out[1], out[2]
+
+    def extent(self, levels: tuple[float, ...]) -> Volume | None:
+        """A ball about the origin; None for levels that the surface may follow to infinity."""
+        if self.domain is not None:
+            return self.domain
+        radius = max((self._known.radius(level) for level in levels), default=0.0)
+        return Ball(radius=radius) if 0 < radius < math.inf else None
+
+    def check_levels(self, levels: tuple[float, ...]) -> None:
+        if self.degree == 0:
+            raise ValueError(
+                "a hyperspherical harmonic of degree 0 is constant: it has no level sets"
+            )
+        check_in_range(levels, self.value_range)
+
+    def describe(self) -> dict[str, Any]:
+        return {
+            "degree": self.degree,
+            "harmonics": sum(len(one.weights) for one in self._orders),
+            "range": self.value_range,
+            "value far away": self._known.pole,
+        }

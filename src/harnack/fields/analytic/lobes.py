@@ -1,0 +1,325 @@
+"""The lobes r = |Y| of spherical harmonics, as they are drawn for orbitals of atoms."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Literal, cast
+
+import drjit as dr
+
+from harnack.backend.elementary import fmax, fmin, length
+from harnack.backend.numbers import finite, positive
+from harnack.enclosures import Curvature, Slopes
+from harnack.enclosures.parabola import Parabola
+from harnack.fields.analytic.rounding import HarmonicRounding
+from harnack.fields.analytic.solid_harmonics import (
+    LARGEST_DEGREE,
+    degree_and_order,
+    evaluate,
+    hessian,
+)
+from harnack.fields.analytic.sphere_bounds import BallRange, range_of_harmonic
+from harnack.fields.field import Field, Sample
+from harnack.fields.look import Look, lengthened
+from harnack.geometry.volumes import Ball
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Real, Vec3
+    from harnack.fields.look import Path
+    from harnack.geometry.volume import Volume
+
+__all__ = ["Lobes"]
+
+Part = Literal["both", "positive", "negative"]
+_PARTS: tuple[Part, ...] = ("both", "positive", "negative")
+# Promised ends are moved out by this much of their distance for the roundings of float32.
+_ROUNDING = 1e-5
+# Scales and harmonics from 1/this to this have fourth powers that a precision has room for.
+_REACH = {"single": 1e6, "double": 1e60}
+# Of a bound of second derivatives, where all else is 0.
+_SMALLEST = 1e-20
+
+
+class Lobes(Field):
+    """The surface |x| = scale |Y(x/|x|)| of a real spherical harmonic Y, or its lobes of one sign.
+
+    Y is as in `SphericalHarmonic`: orthonormal, without the Condon-Shortley phase, m > 0 with
+    cos(m phi) and m < 0 with sin(|m| phi). With r = |x|/scale and u = x/|x|,
+
+        f = r^2 (r^2 - Y(u)^2)   for both signs,   f = r^2 (r - Y(u)) or r^2 (r + Y(u))
+
+    for the lobes where Y is positive or negative; the lobes are where f <= 0. The factor r^2 makes
+    second derivatives bounded at the origin, where all lobes meet: f and its gradient vanish there,
+    and the origin belongs to the surface. To tell signs by color, draw both parts:
+
+        lobes, signs = hk.Lobes(3, 2), ["plastic", "porcelain"]
+        hk.render([lobes.positive, lobes.negative], material=signs, solid=(-math.inf, 0))
+
+    l, m: degree 0 <= l <= 12 and order -l <= m <= l.
+    scale: more than 0, the length of a lobe in which Y reaches 1.
+    part: "both", "positive" or "negative".
+
+    Second derivatives. The sum of the harmonics is W = Y^2, Y or -Y, and f = r^4 - r^2 W or
+    r^3 - r^2 W. Along a great circle W is a trigonometric polynomial T of degree N (2 L or L),
+    within A of its middle, so that T' = N A a and T" = N^2 A b with a^2 + b^2 <= 1 (Bernstein and
+    Szego, for T and then T'). r^2 W has the same second derivatives at x as at u; along the unit
+    vector c u + q v, v at right angles to u and c^2 + q^2 = 1, they are
+
+        2 W + 2 c q T' + q^2 T",   and   |2 c q T' + q^2 T"| <= q N A sqrt(4 c^2 + q^2 N^2)
+
+    (Cauchy and Schwarz), at most N^2 A for N >= 2 and 2 A/sqrt(3) for N = 1. Those of r^3 are in
+    [0, 6 r], those of r^4 in [0, 12 r^2]. So those of f along a segment are bounded on both sides
+    by how far its ends are from the origin. The gradient is continuous, 0 at the origin, so that
+    this holds of segments through it as well.
+
+    Raises:
+        ValueError: l, m, scale or part out of range; no direction with that sign.
+        TypeError: l or m is no whole number.
+    """
+
+    overstep = 1.6
+
+    def __init__(self, l: int, m: int, *, scale: float = 1.0, part: Part = "both") -> None:  # noqa: E741
+        self._fill({(l, m): 1.0}, scale, part)
+
+    @classmethod
+    def combined(
+        cls, weights: Mapping[tuple[int, int], float], *, scale: float = 1.0, part: Part = "both"
+    ) -> Lobes:
+        """The lobes of a sum of real spherical harmonics, {(l, m): c} for the sum of c Y_lm."""
+        made = cls.__new__(cls)
+        made._fill(weights, scale, part)
+        return made
+
+    def _fill(self, weights: Any, scale: Any, part: Part) -> None:
+        self.weights = _checked(weights)
+        scale = positive(scale, "the scale of lobes")
+        if part not in _PARTS:
+            raise ValueError(f"part must be one of {', '.join(_PARTS)}, not {part!r}")
+        self.scale, self.part = scale, part
+        self._s: Any = self.scale
+        (first, *others) = self.weights
+        if others:
+            ends = BallRange.of(self.weights).with_spheres(self.weights, 1.0).on_ball(1.0)
+        else:
+            weight = self.weights[first]
+            low, high = (weight * end for end in range_of_harmonic(*first))
+            ends = min(low, high), max(low, high)
+        self.value_range = ends
+        self._rounding = HarmonicRounding.of(self.weights, is_divided=False)
+        if self.extent_radius() <= 0:
+            raise ValueError(f"there is no direction in which the function is {part}")
+
+    @property
+    def positive(self) -> Lobes:
+        """The lobes where Y is positive."""
+        return self._only("positive")
+
+    @property
+    def negative(self) -> Lobes:
+        """The lobes where Y is negative."""
+        return self._only("negative")
+
+    def _only(self, part: Part) -> Lobes:
+        return Lobes.combined(self.weights, scale=self.scale, part=part)
+
+    @property
+    def degree(self) -> int:
+        """The largest degree of a harmonic."""
+        return max(l for l, _ in self.weights)  # noqa: E741
+
+    def extent_radius(self) -> float:
+        """The length of the longest lobe, proved from above; not positive if there is none."""
+        low, high = self.value_range
+        ends = {"both": max(-low, high), "positive": high, "negative": -low}
+        return self.scale * ends[self.part]
+
+    def prepare(self, backend: Backend) -> Field:
+        reach, most = _REACH[backend.precision], max(map(abs, self.value_range))
+        if not (1 / reach <= self.scale <= reach and 1 / reach <= most <= reach):
+            raise ValueError(
+                f"lobes in {backend.precision} precision need a scale and a largest |Y| from "
+                f"{1 / reach:.0e} to {reach:.0e}, not {self.scale:.3g} and {most:.3g}: choose "
+                "another unit of length"
+            )
+        other = copy.copy(self)
+        other._s = dr.opaque(backend.Float, self.scale)
+        return other
+
+    def extent(self, levels: tuple[float, ...]) -> Volume:
+        """With a the length of the longest lobe and scale 1, f > c beyond a + c^(1/4) or, of one
+        sign, a + c^(1/3), for c > 0: there r^2 - W >= (r - a)^2 or r - W >= r - a, and r^2 is at
+        least (r - a)^2. Levels c <= 0 are within a."""
+        beyond = max(*levels, 0.0) ** (1 / 4 if self.part == "both" else 1 / 3)
+        return Ball(radius=(self.extent_radius() + self.scale * beyond) * (1 + 1e-6))
+
+    def evaluate(self, p: Vec3) -> Sample:
+        return lengthened(self._unscaled(p / self._s), self._s)
+
+    def _unscaled(self, x: Vec3) -> Sample:
+        """The sample at a point of lobes of scale 1."""
+        r = length(x)
+        at_origin = r <= float(dr.smallest(type(r))) ** 0.25  # f is 0 to rounding
+        u = dr.select(at_origin, type(x)(0, 0, 1), x / dr.select(at_origin, 1, r))
+        r = dr.select(at_origin, 0, r)
+        y, slope = evaluate(self.weights, u.x, u.y, u.z)
+        across = type(x)(*slope)
+        across -= dr.dot(across, u) * u  # the gradient of Y(x/r), times r
+        if self.part == "both":
+            value = r * r * ((r - y) * (r + y))
+            gradient = r * ((4 * r * r - 2 * y * y) * u - (2 * y) * across)
+        else:
+            y, across = (y, across) if self.part == "positive" else (-y, -across)
+            value = r * r * (r - y)
+            gradient = r * ((3 * r - 2 * y) * u - across)
+        steep = length(across)
+        error, gradient_error = self._errors(r, y, steep, dr.sqrt(u.x * u.x + u.y * u.y))
+        least, most = self._second_derivatives(1.5 * r + 0.5)
+        known = [Curvature(fmax(-least, most), 0.5 * (r + 1))]
+        if self.part == "both" and self.degree > 0:
+            known.append(self._close_by(r, y, steep))
+        return Sample(value, gradient, tuple(known), error, gradient_error)
+
+    def _close_by(self, r: Real, y: Real, slope: Real) -> Curvature:
+        """A bound of second derivatives on a small ball, where Y and its slope may be far less than
+        anywhere: between lobes that come close to each other.
+
+        Proof, for B(x, q r) with q <= 1/4, seen from the origin within the angle 1.05 q. With M and
+        L as for Y itself, second derivatives along the sphere are at most L^2 M, so slopes are at
+        most G = |slope| + 1.05 q L^2 M there, and |Y| <= H = |Y(u)| + 1.05 q G. Second derivatives
+        of r^2 Y^2 are 2 Y^2 + 2 Y (2 c q Y' + q^2 Y") + 2 q^2 Y'^2 with c, q of the class, so at
+        most 2 H^2 + 2 H b + 2 G^2, b being N^2 A of Y. Those of r^4 are at most 12 r^2.
+        """
+        most, degree = max(map(abs, self.value_range)), self.degree
+        q = fmin(0.8 * dr.sqrt(r / most), 0.25) / degree
+        bend = degree**2 * most
+        steepest = slope + (1.05 * bend) * q
+        highest = dr.abs(y) + 1.05 * q * steepest
+        turned = bend if degree > 1 else 2 / math.sqrt(3) * most
+        constant = 2 * (highest * (highest + turned) + steepest * steepest)
+        constant = fmax(constant, 12 * dr.square(r * (1 + q)) + 2 * highest * turned)
+        return Curvature(constant * (1 + _ROUNDING) + _SMALLEST, q * r)
+
+    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
+        """The sample, and the range of second derivatives as far as the path is looked at."""
+        p = path.point(t)
+        sample = self.evaluate(p)
+        look = path.look(sample)
+        slopes = Slopes.around(look.slope, sample.gradient_error)
+
+        def enclosure(reach: Real, sign: int, along: Slopes) -> Parabola:
+            reach = dr.select(dr.isfinite(reach), reach, 4 * (length(p) + self._s))
+            end = dr.fma(type(p)(sign * reach), path.direction, p)
+            farthest = fmax(length(p), length(end)) * ((1 + _ROUNDING) / self._s)
+            share = 1 / dr.square(self._s)
+            least, most = self._second_derivatives(farthest)
+            return Parabola(along, share * least, share * most, reach)
+
+        forward, backward = enclosure(ahead, 1, slopes), enclosure(back, -1, slopes.negated())
+        return Look(sample, (*look.ahead, forward), (*look.back, backward), look.slope)
+
+    def _second_derivatives(self, farthest: Real) -> tuple[Real, Real]:
+        """Least and largest along any line within r <= farthest, for scale 1; see the class."""
+        low, high = self.value_range
+        if self.part == "both":
+            most, degree = max(low * low, high * high), 2 * self.degree
+            low, high = 0.0, most
+            power = 12 * farthest * farthest
+        else:
+            low, high = (low, high) if self.part == "positive" else (-high, -low)
+            degree, power = self.degree, 6 * farthest
+        swing = 0.5 * (high - low) * (degree**2 if degree != 1 else 2 / math.sqrt(3))
+        least, most = -(2 * high + swing), power - (2 * low - swing)
+        room = _ROUNDING * (abs(least) + dr.abs(most))
+        return least - room, most + room
+
+    def _errors(self, r: Real, y: Real, steep: Real, rho: Real) -> tuple[Real, Real]:
+        """How far rounding may move value and gradient, to first order in the unit roundoff e.
+
+        The unit vector is off by 4 e of itself: that moves Y by at most 4 e L M, M = max |Y|, its
+        radial continuation by as much, and its gradient by 4 e L^2 M each. Y itself is evaluated
+        with an error of `HarmonicRounding`. What follows is products, a few roundings each.
+        """
+        unit = float(dr.epsilon(type(r)))
+        most, degree = max(map(abs, self.value_range)), self.degree
+        off = unit * (self._rounding.value(rho, 1.0) + (8 * degree + 4) * most)
+        slope = unit * (
+            2 * self._rounding.gradient(rho, 1.0) + (8 * degree**2 + 16 * degree + 16) * most
+        )
+        if self.part == "both":
+            high = dr.abs(y) + off
+            off, slope = 2 * high * off, 2 * (high * slope + steep * off)
+            return r * r * (off + 8 * unit * r * r), r * (slope + 4 * off + 32 * unit * r * r)
+        return r * r * (off + 8 * unit * r), r * (slope + 2 * off + 24 * unit * r)
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        """Rows of the Hessian of f; see `_of_power`. At the origin it depends on the direction from
+        which one comes: it is that of the direction z there."""
+        distance = length(p)
+        at_origin = distance == 0
+        u = dr.select(at_origin, type(p)(0, 0, 1), p / dr.select(at_origin, 1, distance))
+        r = distance / self._s
+        sign, share = -1.0 if self.part == "negative" else 1.0, 1 / dr.square(self._s)
+        rows: list[Any] = []
+        if self.part == "both":
+            y, slope, second = self._of_power(u, 1)  # r^2 Y^2 is the square of r Y
+            for k in range(3):
+                bend = 2 * (slope[k] * slope + y * second[k])
+                row = r * r * (8 * u[k] * u) - bend
+                row[k] += 4 * r * r
+                rows.append(row)
+        else:
+            second = self._of_power(u, 2)[2]
+            for k in range(3):
+                row = 3 * r * u[k] * u - sign * second[k]
+                row[k] += 3 * r
+                rows.append(row)
+        return share * rows[0], share * rows[1], share * rows[2]
+
+    def _of_power(self, u: Vec3, n: int) -> tuple[Real, Vec3, tuple[Vec3, Vec3, Vec3]]:
+        """Value, gradient and Hessian at unit vectors of r^n Y(x/r), a sum of r^(n-l) P_l with P_l
+        solid harmonics. With k = n - l, that of r^k P is, where r = 1,
+
+            H + k (x g^T + g x^T) + k P (I + (k-2) x x^T),   H and g of P."""
+        vector = cast("Any", type(u))
+        value, gradient = 0 * u.x, 0 * u
+        rows = [0 * u, 0 * u, 0 * u]
+        for l in {l for l, _ in self.weights}:  # noqa: E741
+            part = {key: c for key, c in self.weights.items() if key[0] == l}
+            k, (y, slope) = n - l, evaluate(part, u.x, u.y, u.z)
+            g, (xx, yy, zz, xy, xz, yz) = vector(*slope), hessian(part, u.x, u.y, u.z)
+            value, gradient = value + y, gradient + g + (k * y) * u
+            for i, row in enumerate(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))):
+                turned = vector(*row) + k * (u[i] * g + g[i] * u) + (k * (k - 2) * y * u[i]) * u
+                turned[i] += k * y
+                rows[i] = rows[i] + turned
+        return value, gradient, (rows[0], rows[1], rows[2])
+
+    def describe(self) -> dict[str, Any]:
+        return {"degree": self.degree, "lobes": self.part, "longest": self.extent_radius()}
+
+
+def _checked(weights: Any) -> dict[tuple[int, int], float]:
+    """The coefficients that are not zero.
+
+    Raises:
+        TypeError: a key is no pair of whole numbers, or a coefficient no number.
+        ValueError: there is no coefficient, or one of no harmonic.
+    """
+    if not isinstance(weights, Mapping):
+        raise TypeError(f"weights must be {{(l, m): coefficient}}, not {weights!r}")
+    kept: dict[tuple[int, int], float] = {}
+    for key, weight in cast("Mapping[Any, Any]", weights).items():
+        l, m = degree_and_order(key)  # noqa: E741
+        if not 0 <= l <= LARGEST_DEGREE:
+            raise ValueError(f"the degree l must be 0 to {LARGEST_DEGREE}, not {l}")
+        if abs(m) > l:
+            raise ValueError(f"the order m must be -l to l, here -{l} to {l}, not {m}")
+        number = finite(weight, f"the coefficient of Y_{l},{m}")
+        if number != 0:
+            kept[l, m] = number
+    if not kept:
+        raise ValueError("lobes need a coefficient that is not zero")
+    return kept

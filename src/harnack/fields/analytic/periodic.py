@@ -1,0 +1,382 @@
+"""Sums of Laplacian eigenfunctions, periodic minimal surfaces among them (paper, section 4.7).
+
+The harmonic extension of a sum of waves to four dimensions (paper, section 4.7.1).
+"""
+
+from __future__ import annotations
+
+import math
+import numbers
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+import numpy.typing as npt
+
+from harnack.backend import backend_of
+from harnack.backend.elementary import fmax, fmin
+from harnack.enclosures import Curvature, HarmonicBall, Lipschitz
+from harnack.fields.analytic.rounding import WaveRounding
+from harnack.fields.analytic.waves import (
+    PlaneWave,
+    Product,
+    Term,
+    WaveBounds,
+    checked_terms,
+    cosine,
+    evaluate_terms,
+    hessian_of_terms,
+    mean_wavelength,
+    sine,
+)
+from harnack.fields.field import Field, Sample, check_in_range
+from harnack.geometry.volumes import Ball
+
+if TYPE_CHECKING:
+    from harnack.backend import Real, Vec3
+    from harnack.geometry.volume import Volume
+
+__all__ = [
+    "EigenfunctionSum",
+    "Gyroid",
+    "PlaneWave",
+    "Product",
+    "SchwarzD",
+    "SchwarzP",
+    "cosine",
+    "sine",
+]
+
+# Promised ends are moved out by this much for the roundings of float32.
+_ROUNDING_EXTENSION = 1e-5
+
+
+@dataclass(frozen=True)
+class ExtensionRange:
+    """What the harmonic extension of a sum of waves stays within on B(p, R) of R^4.
+
+    With f = sum f_i, Laplacian f_i = -kappa_i^2 f_i and |f_i| <= A_i, the extension is
+    F(y, w) = sum cosh(kappa_i w) f_i(y): harmonic, F(., 0) = f, and smaller than the paper's
+    exp(kappa w) f. Take any wavenumber kappa, and alpha = cosh(kappa R) - 1,
+    E = sum A_i |cosh(kappa_i R) - cosh(kappa R)|. Then
+
+        F = cosh(kappa w) f + (rest),   |rest| <= E w^2/R^2,   cosh(kappa w) <= 1 + alpha w^2/R^2,
+
+    as (cosh(a w) - cosh(b w))/w^2 is a power series in w^2 with coefficients of one sign. Put
+    x = |y-p|/R, so w^2/R^2 <= 1 - x^2. By Taylor |f(y) - f(p)| <= D x with
+    D = min(G R, |grad f(p)| R + H R^2/2), G and H bounds of the gradient and the Hessian. Hence
+    -F <= Dx - f + (1-x^2) E where Dx <= f (there f(y) >= 0), at most
+    D - f or, if D < 2E, E + D^2/(4E) - f; and where Dx > f
+
+        -F <= h(x) = (1 + alpha (1-x^2)) (Dx - f) + (1-x^2) E,
+
+    a cubic that on x >= 0 is largest at its one critical point
+    x* = D(1+alpha) / (sqrt((alpha f - E)^2 + 3 alpha (1+alpha) D^2) - (alpha f - E)) or, if that
+    is beyond it, at x = 1. The upper end is the same with -f. Neither end need exceed
+    cosh(kappa R) sup|f| + E. A constant term, which is its own extension, is left out of
+    all this and added in the end.
+    """
+
+    radius: float
+    alpha: float
+    spread: float  # E
+    largest: float
+    constant: float
+    largest_gradient: float
+    curvature: float
+
+    @classmethod
+    def best(cls, waves: WaveBounds) -> ExtensionRange:
+        """The radius that is best where it matters, near level 0 at a gradient of mean size.
+
+        There a step loses to the second-order term of the bound, which is proportional to
+        (f - lower)/R^2. For the gyroid (cell 2 pi) R = 1.1, in the middle of the best: with the
+        slope bound, 0.8 to 1.4 took 11.5 to 11.9 evaluations a ray, the paper's exp with the
+        range +-3/2 at its best radius 21.4.
+        """
+        k, a = np.array(waves.wavenumbers), np.array(waves.amplitudes)
+        typical = math.sqrt(0.5 * float(a**2 @ k**2))
+        scale = 1 / math.sqrt(float(a**2 @ k**2) / float(a @ a))
+        steps = (scale * 0.02 * 1.02**n for n in range(300))
+        radii = [r for r in steps if r * float(k.max()) < 30.0]  # cosh stays far from overflow
+        trials = [cls.at(waves, r) for r in radii]
+        return min(trials, key=lambda trial: trial._below_host(typical) / trial.radius**2)
+
+    @classmethod
+    def at(cls, waves: WaveBounds, radius: float) -> ExtensionRange:
+        """The numbers of one radius; kappa is the weighted median, which makes E smallest."""
+        growth: npt.NDArray[np.float64] = np.cosh(radius * np.array(waves.wavenumbers))
+        amplitudes = np.array(waves.amplitudes)
+        order = np.argsort(growth)
+        mass: npt.NDArray[np.float64] = np.cumsum(amplitudes[order])
+        middle = float(growth[order][np.argmax(mass >= 0.5 * mass[-1])])
+        spread = float(amplitudes @ np.abs(growth - middle)) * (1 + 1e-12)
+        largest = middle * waves.largest_value + spread
+        return cls(
+            radius=radius,
+            alpha=middle - 1,
+            spread=spread,
+            largest=largest,
+            constant=waves.constant,
+            largest_gradient=waves.largest_gradient,
+            curvature=waves.largest_curvature,
+        )
+
+    def ball(self, f: Real, slope: Real) -> HarmonicBall:
+        """The promise at a point with value f and |grad f| = slope."""
+        r = self.radius
+        rise = fmin(self.largest_gradient * r, slope * r + 0.5 * self.curvature * r * r)
+        out = 1 + _ROUNDING_EXTENSION
+        real = backend_of(f).Float
+        f = f - self.constant
+        lower = self.constant - out * self._below(f, rise)
+        upper = self.constant + out * self._below(-f, rise)
+        return HarmonicBall(real(r), lower, upper, dimension=4)
+
+    def _below(self, f: Real, rise: Real) -> Real:
+        """A bound of -F on the ball where |f(y) - f| <= rise |y-p|/R."""
+        alpha, e = self.alpha, self.spread
+        b = alpha * f - e
+        root = dr.sqrt(b * b + 3 * alpha * (1 + alpha) * rise * rise)
+        x = fmin((1 + alpha) * rise / (root - b), 1.0)
+        weight = 1 - x * x
+        falling = (1 + alpha * weight) * (rise * x - f) + weight * e
+        level = rise
+        if e > 0:
+            level = dr.select(rise < 2 * e, e + rise * rise / (4 * e), rise)
+        return fmin(fmax(falling, level - f), self.largest)
+
+    def _below_host(self, slope: float) -> float:
+        """The same at f = 0 in Python floats, for choosing the radius."""
+        r, alpha, e = self.radius, self.alpha, self.spread
+        rise = min(self.largest_gradient * r, slope * r + 0.5 * self.curvature * r * r)
+        x = np.linspace(0.0, 1.0, 101)
+        falling = (1 + alpha * (1 - x * x)) * rise * x + (1 - x * x) * e
+        return min(float(falling.max()), self.largest)
+
+
+# Constants are moved up by this much for the roundings of float32.
+_ROUNDING = 1e-5
+# And the bound of the Hessian by this much for the rounding of the gradient.
+_SLOPE_SHARE = 1e-5
+
+
+class EigenfunctionSum(Field):
+    """A sum of products of sines and cosines, and of plane waves: any truncated Fourier series.
+
+    terms: `Product` and `PlaneWave` terms; frequencies in radians per unit length.
+    domain: the volume it is drawn in; by default the ball about the origin whose radius is the
+        longest wavelength.
+
+    Each term is an eigenfunction of the Laplacian, so cosh(kappa w) f with kappa^2 = -eigenvalue
+    is harmonic in R^4 and equals f at w = 0: see `ExtensionRange` for what it is bounded by. The
+    Lipschitz constant is local, |grad f(p)| + H r / 2 on the ball of radius r (Taylor), where
+    `curvature` H bounds the Hessian, and never above `steepness`.
+
+    The rounding of the value is bounded at the point (`WaveRounding`). That of the gradient, E, is
+    part of it. `Curvature` is promised as (1 + h) H, h = `_SLOPE_SHARE`, and for all t
+
+        E t <= E^2/(2 h H) + h H t^2/2   (2 a b <= a^2 + b^2):
+
+    the larger H and E^2/(2 h H) cover what Taylor's formula says with a rounded gradient. On the
+    harmonic ball of radius R it is E R, of which `balls.solve.rounding` pays for 16 u of the
+    mean 4 (f - lower)/R that the slope is measured by, f - lower being about H R^2/2 or more; only
+    what that leaves is added.
+
+    Raises:
+        ValueError: terms that are not finite, or a sum that is constant.
+    """
+
+    is_entire = True
+
+    def __init__(self, terms: Iterable[Term], *, domain: Volume | None = None) -> None:
+        self.terms = checked_terms(terms)
+        self.waves = self._bounds()
+        longest = 2 * math.pi / min(self.waves.wavenumbers)
+        self.wavelength = mean_wavelength(self.waves.amplitudes, self.waves.wavenumbers)
+        self.domain = Ball(radius=longest) if domain is None else domain
+        self._extension = ExtensionRange.best(self.waves)
+        self._rounding = WaveRounding.of(self.terms)
+        radius = self._extension.radius
+        self._slack = 32 * min(0.5 * self.curvature * radius**2, self.steepness * radius)
+
+    def _bounds(self) -> WaveBounds:
+        return WaveBounds.of(self.terms)
+
+    @property
+    def value_range(self) -> tuple[float, float]:
+        """Proved: the values of f stay within it."""
+        middle, most = self.waves.constant, self.waves.largest_value
+        return middle - most, middle + most
+
+    @property
+    def steepness(self) -> float:
+        """Proved: |grad f| never exceeds it."""
+        return self.waves.largest_gradient
+
+    @property
+    def curvature(self) -> float:
+        """Proved: no directional second derivative of f exceeds it in size."""
+        return self.waves.largest_curvature
+
+    def evaluate(self, p: Vec3) -> Sample:
+        value, components = evaluate_terms(self.terms, p)
+        gradient = type(p)(*components)
+        epsilon = float(dr.epsilon(type(value)))
+        error, slope_error = self._rounding.errors(p, gradient)
+        slope = dr.norm(gradient) + slope_error
+        reach = 0.9 * self.steepness / self.curvature  # the best by experiment, gyroid and P
+        local = (slope + 0.5 * self.curvature * reach) * (1 + _ROUNDING)
+        lipschitz = Lipschitz(fmin(local, self.steepness * (1 + _ROUNDING)), reach)
+        known = (Curvature(self.curvature * (1 + _ROUNDING + _SLOPE_SHARE)),)
+        weaker = (self._extension.ball(value, slope), lipschitz)
+        error += slope_error * (slope_error * (0.5 / (_SLOPE_SHARE * self.curvature)))
+        error += fmax(slope_error * self._extension.radius - self._slack * epsilon, 0)
+        return Sample(value, gradient, known, error, weaker=weaker)
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        """Rows of the Hessian; its trace is that of the sum's Laplacian, not zero."""
+        x, y, z = (type(p)(*row) for row in hessian_of_terms(self.terms, p))
+        return x, y, z
+
+    def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
+        del sample
+        return self._rounding.derivative_errors(p)
+
+    def slope_change(self, p: Vec3, radius: Real) -> Real:
+        """As no second derivative exceeds `curvature`, nor does the norm of the Hessian."""
+        return 0 * p.x + radius * (self.curvature * (1 + _ROUNDING))
+
+    def check_levels(self, levels: tuple[float, ...]) -> None:
+        check_in_range(levels, self.value_range)
+
+    def wall_levels(self, half_width: float, *, level: float | None = None) -> tuple[float, float]:
+        """The two levels of the wall |f - level| <= half_width, as `solid=` wants them.
+
+        half_width is a difference of values of f, not a length: see `levels_of_thickness`.
+        level: the middle of the wall, by default `default_level`.
+        """
+        middle = self.default_level if level is None else float(level)
+        if not 0 < half_width < math.inf:
+            raise ValueError(f"the half width of a wall must be positive, not {half_width!r}")
+        low, high = middle - half_width, middle + half_width
+        least, most = self.value_range
+        if low < least or high > most:
+            raise ValueError(
+                f"a wall from {low:g} to {high:g} has a side without surface: the function stays "
+                f"within [{least:g}, {most:g}]; take a smaller half width or thickness"
+            )
+        return low, high
+
+    def levels_of_thickness(
+        self, thickness: float, *, level: float | None = None
+    ) -> tuple[float, float]:
+        """The two levels of a wall about `level` that is proved to be at least this thick.
+
+        thickness is a length. The wall holds every point within thickness/2 of the middle
+        surface, since there |f - level| <= `steepness` * thickness/2; where f is less steep than
+        at its steepest the wall is thicker.
+        """
+        return self.wall_levels(0.5 * self.steepness * float(thickness), level=level)
+
+    def describe(self) -> dict[str, Any]:
+        return {
+            "terms": len(self.terms),
+            "range": self.value_range,
+            "steepness": self.steepness,
+            "radius of the harmonic ball": self._extension.radius,
+        }
+
+
+def _wavenumber(cell: Any) -> float:
+    if not isinstance(cell, numbers.Real):
+        raise TypeError(f"the edge length of the cell must be a number, not {cell!r}")
+    edge = float(cell)
+    if not 0 < edge < math.inf:
+        raise ValueError(f"the edge length of the cell must be positive, not {cell!r}")
+    return 2 * math.pi / edge
+
+
+class _CubicSurface(EigenfunctionSum):
+    """A surface with cubic symmetry and proved constants: bounds of |f|, |grad f| at cell 2 pi."""
+
+    _largest_value: float
+    _steepness: float
+
+    def __init__(self, cell: float, terms: tuple[Term, ...], domain: Volume | None) -> None:
+        self.cell = float(cell)
+        self._wavenumber = _wavenumber(cell)
+        super().__init__(terms, domain=Ball(radius=self.cell) if domain is None else domain)
+
+    def _bounds(self) -> WaveBounds:
+        return replace(
+            super()._bounds(),
+            largest_value=self._largest_value,
+            largest_gradient=self._steepness * self._wavenumber,
+        )
+
+
+class Gyroid(_CubicSurface):
+    """sin X cos Y + sin Y cos Z + sin Z cos X with (X, Y, Z) = 2 pi p/cell (paper, Eq. 18).
+
+    cell: edge length of the cubic cell that it repeats in, 2 pi by default (so X = x).
+    domain: the volume it is drawn in, by default the ball of radius `cell` about the origin.
+
+    |f| <= 3/2: 2 sin a cos b <= sin^2 a + cos^2 b, and the three right sides add up to 3.
+    |grad f| <= sqrt 3 (2 pi/cell): f_X = cos X cos Y - sin Z sin X has, by Cauchy-Schwarz,
+    f_X^2 <= cos^2 Y + sin^2 Z; the three right sides add up to 3. Both are attained.
+    """
+
+    _largest_value = 1.5
+    _steepness = math.sqrt(3.0)
+
+    def __init__(self, cell: float = 2 * math.pi, *, domain: Volume | None = None) -> None:
+        k = _wavenumber(cell)
+        s, c = sine(k), cosine(k)
+        terms = (Product(1.0, x=s, y=c), Product(1.0, y=s, z=c), Product(1.0, z=s, x=c))
+        super().__init__(cell, terms, domain)
+
+
+class SchwarzP(_CubicSurface):
+    """cos X + cos Y + cos Z with (X, Y, Z) = 2 pi p/cell: Schwarz's primitive surface.
+
+    cell, domain: as for `Gyroid`. |f| <= 3 and |grad f|^2 = sum sin^2 <= 3 (2 pi/cell)^2, both
+    attained.
+    """
+
+    _largest_value = 3.0
+    _steepness = math.sqrt(3.0)
+
+    def __init__(self, cell: float = 2 * math.pi, *, domain: Volume | None = None) -> None:
+        c = cosine(_wavenumber(cell))
+        super().__init__(cell, (Product(1.0, x=c), Product(1.0, y=c), Product(1.0, z=c)), domain)
+
+
+class SchwarzD(_CubicSurface):
+    """Schwarz's diamond surface, with s and c for sin and cos of (X, Y, Z) = 2 pi p/cell:
+
+        s s s + s c c + c s c + c c s.
+
+    cell, domain: as for `Gyroid`. |f| <= sqrt 2, attained: f = sin X cos(Y-Z) + cos X sin(Y+Z),
+    at most sqrt(cos^2(Y-Z) + sin^2(Y+Z)) by Cauchy-Schwarz.
+    |grad f| <= sqrt 3 (2 pi/cell), attained: with A, B, C the cosines and P, Q, R the sines of
+    2X, 2Y, 2Z, |grad f|^2 = 3/2 (1 + ABC) - (PQ + QR + RP)/2. Here
+    -2(PQ + QR + RP) <= P^2 + Q^2 + R^2 = 3 - S with S = A^2 + B^2 + C^2, and
+    |ABC| <= (S/3)^(3/2) <= S/3, so |grad f|^2 <= 3/2 + S/2 + (3 - S)/4 <= 3.
+    """
+
+    _largest_value = math.sqrt(2.0)
+    _steepness = math.sqrt(3.0)
+
+    def __init__(self, cell: float = 2 * math.pi, *, domain: Volume | None = None) -> None:
+        k = _wavenumber(cell)
+        s, c = sine(k), cosine(k)
+        terms = (
+            Product(1.0, s, s, s),
+            Product(1.0, s, c, c),
+            Product(1.0, c, s, c),
+            Product(1.0, c, c, s),
+        )
+        super().__init__(cell, terms, domain)

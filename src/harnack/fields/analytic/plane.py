@@ -1,0 +1,393 @@
+"""Names and mappings that stand for functions with branches.
+
+Level curves of harmonic functions of the plane, as walls: Harnack tracing in two dimensions.
+
+Height fields: the graph of a formula over the plane.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import numbers
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any, cast
+
+import drjit as dr
+import numpy as np
+
+from harnack.arithmetic import Jet
+from harnack.backend import backend_of, choose_backend, to_numpy, to_vector3
+from harnack.backend.elementary import largest_coordinate
+from harnack.backend.numbers import finite
+from harnack.enclosures import Curvature, HarmonicBall
+from harnack.fields.analytic.branches import (
+    ArcSine,
+    Branches,
+    BranchPoint,
+    Disk,
+    Logarithm,
+    OwnBranches,
+    PowerProduct,
+    complex_of,
+    complex_type,
+    derivatives,
+)
+from harnack.fields.field import Field
+from harnack.fields.formula import Formula, as_jet, probe, warn_of_price
+from harnack.fields.look import Sample
+from harnack.geometry.volumes import Box, Intersection
+from harnack.names import did_you_mean
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, FloatArray, Real, Vec3
+    from harnack.fields.analytic.branches import Branch, Complex
+    from harnack.geometry import Volume
+
+__all__ = ["branches_of", "power_product"]
+
+_NAMES = ("log", "sqrt", "cbrt", "power", "asin")
+# Exponents are fractions with denominators up to this: so many sheets can still be told apart.
+_MOST_SHEETS = 24
+_LARGEST = 6
+# A point at which a function of one's own is tried.
+_PROBE = 0.31, 0.17
+
+
+def branches_of(
+    function: Any,
+    *,
+    exponent: Any = None,
+    of: Mapping[complex, int] | None = None,
+    singular: Iterable[Any] | None = None,
+    second: Callable[[Any, Any], Any] | None = None,
+    period: float | None = None,
+) -> Branches:
+    """The branches of what a user names: see `RiemannSurface`.
+
+    Raises:
+        TypeError, ValueError: settings that do not belong together, or that are no such function.
+    """
+    own = {"singular": singular, "second": second, "period": period}
+    if callable(function):
+        _refuse("a function of your own", exponent=exponent, of=of)
+        return _own(function, singular, second, period)
+    _refuse("a function that is named; only one of your own has them", **own)
+    if isinstance(function, Mapping):
+        _refuse("a mapping of exponents", exponent=exponent, of=of)
+        return power_product(cast("Mapping[complex, Any]", function))
+    if not isinstance(function, str):
+        raise TypeError(
+            f"function must be one of {', '.join(_NAMES)}, a mapping such as {{0: 0.5, 1: -0.5}}, "
+            f"or a function that returns branches, not {function!r}"
+        )
+    if function not in _NAMES:
+        raise ValueError(
+            f"unknown function {function!r}; choose one of {', '.join(_NAMES)}"
+            f"{did_you_mean(function, _NAMES)}"
+        )
+    if function == "power":
+        if exponent is None:
+            raise ValueError('"power" needs its exponent, such as exponent=2 / 3')
+    else:
+        _refuse(f'"{function}"; use "power"', exponent=exponent)
+    if function == "asin":
+        _refuse('"asin"', of=of)
+        return ArcSine()
+    inner = {complex(a): _whole(n) for a, n in ({0: 1} if of is None else of).items()}
+    if function == "log":
+        if not inner:
+            raise ValueError("of: give at least one zero or pole, such as {1: 1, -1: -1}")
+        return Logarithm(tuple(inner), tuple(inner.values()))
+    power = {"sqrt": Fraction(1, 2), "cbrt": Fraction(1, 3)}.get(function)
+    power = _fraction(exponent) if power is None else power
+    return power_product({a: n * power for a, n in inner.items()})
+
+
+def power_product(exponents: Mapping[complex, Any]) -> PowerProduct:
+    """The product of (z - a)^alpha for a mapping {a: alpha}.
+
+    Raises:
+        TypeError, ValueError: no such mapping.
+    """
+    chosen: dict[complex, Fraction] = {}
+    for a, alpha in exponents.items():
+        place, power = complex(a), _fraction(alpha)
+        if not (math.isfinite(place.real) and math.isfinite(place.imag)):
+            raise ValueError(f"each zero or branch point must be finite, not {a!r}")
+        if power != 0:
+            chosen[place] = power
+    if not chosen:
+        raise ValueError("a product of powers needs at least one exponent other than 0")
+    count = math.lcm(*(power.denominator for power in chosen.values()))
+    if count > _MOST_SHEETS:
+        raise ValueError(
+            f"these exponents make {count} sheets, and no more than {_MOST_SHEETS} are drawn: take "
+            "fractions with a smaller common denominator"
+        )
+    return PowerProduct(tuple(chosen), tuple(float(power) for power in chosen.values()), count)
+
+
+def _fraction(value: Any) -> Fraction:
+    """A number as the fraction with a small denominator that it is."""
+    try:
+        exact = Fraction(value)
+    except (TypeError, ValueError, OverflowError):
+        raise TypeError(f"an exponent must be a rational number, not {value!r}") from None
+    near = exact.limit_denominator(_MOST_SHEETS)
+    if abs(near - exact) > Fraction(1, 10**12):
+        raise ValueError(
+            f"the exponent {value!r} is no fraction with a denominator up to {_MOST_SHEETS}: its "
+            "function has too many sheets to be drawn, infinitely many if it is irrational; write "
+            "Fraction(2, 3) for two thirds"
+        )
+    if not abs(near) <= _LARGEST:
+        raise ValueError(f"exponents must be at most {_LARGEST} in size, not {value!r}")
+    return near
+
+
+def _whole(value: Any) -> int:
+    number = _fraction(value)
+    if number.denominator != 1 or number == 0:
+        raise ValueError(f"of: multiplicities must be whole numbers other than 0, not {value!r}")
+    return int(number)
+
+
+def _own(function: Any, singular: Any, second: Any, period: Any) -> OwnBranches:
+    if singular is None or second is None:
+        raise ValueError(
+            "a function of your own needs singular=, where it is not analytic, such as [0], "
+            "and second=, a bound of |g''| on disks, such as lambda z, r: 2.0"
+        )
+    if not callable(second):
+        raise TypeError(f"second must be a function of z and a radius, not {second!r}")
+    try:
+        points = tuple(
+            one if isinstance(one, BranchPoint) else BranchPoint(one) for one in singular
+        )
+    except TypeError:
+        raise TypeError(
+            f"singular must be complex numbers or BranchPoints, not {singular!r}"
+        ) from None
+    if period is not None and not (
+        isinstance(period, numbers.Real) and 0 < float(period) < math.inf
+    ):
+        raise ValueError(f"period must be a positive number, not {period!r}")
+    backend = choose_backend("double")
+    z = complex_type(backend)(*(backend.Float(one) for one in _PROBE))
+    wrong = "the function must return its branches, each as (g, g') or (g, g', g''), not"
+    try:
+        branches = [tuple(one) for one in function(z)]
+    except TypeError as error:
+        raise TypeError(f"{wrong} what it does ({error})") from None
+    if not branches or any(len(one) not in (2, 3) for one in branches):
+        raise ValueError(f"{wrong} {branches!r}")
+    for one in (number for branch in branches for number in branch):
+        if not isinstance(one, type(z) | backend.Float | int | float | complex):
+            raise TypeError(f"{wrong} with {one!r}: use operators, drjit.sqrt, drjit.log and so on")
+    if period is not None and len(branches) > 1:
+        raise ValueError(
+            "a function with a period must have one branch up to it: of several, no side of the "
+            "surface is told from the other in general; draw each by itself"
+        )
+    bound = _tried(second, z, backend.Float(_PROBE[1]))
+    if not isinstance(bound, backend.Float | int | float):
+        raise TypeError(f"second must return a real number, the bound of |g''|, not {bound!r}")
+    shift = None if period is None else float(period)
+    made = OwnBranches(function, points, second, len(branches), shift)
+    made.at(z)
+    return made
+
+
+def _tried(second: Callable[[Any, Any], Any], z: Any, radius: Any) -> Any:
+    try:
+        return second(z, radius)
+    except TypeError as error:
+        raise TypeError(f"second must take z and a radius, as Dr.Jit numbers: {error}") from error
+
+
+def _refuse(what: str, **settings: Any) -> None:
+    given = [name for name, value in settings.items() if value is not None]
+    if given:
+        raise ValueError(f"{' and '.join(given)} cannot be given for {what}")
+
+
+# Radii of the disks on which the function is bounded, as parts of the distance to the nearest
+# singular point.
+_PARTS = (0.4, 0.8)
+_LONGEST = 1e6
+
+
+class LevelCurves(Field):
+    """f(x, y, z) = Re g(x + i y), or Im: its level sets are walls over level curves of the plane.
+
+    function, exponent, of, singular, second, period: an analytic function with one branch, up to a
+        period, as for `RiemannSurface`: {a_i: n_i} with whole n_i for a rational function, "log"
+        with of={a_i: n_i} for charges n_i at a_i.
+    part: "real" or "imag".
+    level: the one drawn when none is asked for.
+    domain: the volume it is drawn in; by default the box |x|, |y| <= 2, |z| <= 1/4.
+
+    Re g is harmonic in the plane: Harnack's inequality of dimension 2 holds in disks up to the
+    nearest singular point, and as |g''| is bounded there (`Branches.bend`) f moves by at most
+    |g'| r + |g''| r^2/2 on a disk of radius r. It promises that, as a ball of dimension 2, and the
+    second derivatives themselves.
+
+    Raises:
+        TypeError, ValueError: no such function, or one with several branches.
+    """
+
+    is_entire = True
+
+    def __init__(
+        self,
+        function: str | Mapping[complex, Any] | Callable[[Any], Any],
+        part: str = "real",
+        *,
+        exponent: Any = None,
+        of: Mapping[complex, int] | None = None,
+        singular: Iterable[Any] | None = None,
+        second: Callable[[Any, Any], Any] | None = None,
+        period: float | None = None,
+        level: float = 0.0,
+        domain: Volume | None = None,
+    ) -> None:
+        if part not in ("imag", "real"):
+            raise ValueError(f'part must be "real" or "imag", not {part!r}')
+        self.part = part
+        self.branches: Branches = branches_of(
+            function, exponent=exponent, of=of, singular=singular, second=second, period=period
+        )
+        if self.branches.count > 1:
+            raise ValueError(
+                f"level curves need a function with one branch, and this one has "
+                f"{self.branches.count}: draw its Riemann surface, whose plane cuts they are"
+            )
+        self.domain = Box((-2.0, -2.0, -0.25), (2.0, 2.0, 0.25)) if domain is None else domain
+        self.default_level = finite(level, "level")
+        shift = self.branches.period(part == "imag")
+        self.period = shift  # pyright: ignore[reportAttributeAccessIssue]
+
+    def prepare(self, backend: Backend) -> LevelCurves:
+        made = copy.copy(self)
+        made.branches = self.branches.prepare(backend)
+        return made
+
+    def evaluate(self, p: Vec3) -> Sample:
+        rounding, z, branch = self._at(p)
+        x, y = derivatives(branch.first, self.part)
+        vector = cast("Any", type(p))
+        gradient = vector(x, y, 0 * x)
+        slope, error = dr.norm(gradient), self.branches.roundings(z, (branch,))
+        reach = self.branches.clearance(z)
+        known: list[Curvature | HarmonicBall] = []
+        value = branch.value.imag if self.part == "imag" else branch.value.real
+        for part in _PARTS:
+            radius = part * dr.minimum(reach, _LONGEST)
+            bend = self.branches.bend(Disk(z, radius, rounding)) * (1 + 1e-4)
+            moves = (slope * radius + 0.5 * bend * radius * radius) * (1 + 1e-5)
+            known += [
+                Curvature(bend, radius), HarmonicBall(radius, value - moves, value + moves, 2),
+            ]  # fmt: skip
+        return Sample(value, gradient, tuple(known), backend_of(p).epsilon * error)
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        """Rows of the Hessian, free of trace.
+
+        Raises:
+            NotImplementedError: a function of your own comes without its second derivative.
+        """
+        _, _, branch = self._at(p)
+        if branch.second is None:
+            raise NotImplementedError(
+                "this function comes without its second derivative: return (g, g', g'')"
+            )
+        xx, xy = derivatives(branch.second, self.part)
+        zero, vector = 0 * p.x, cast("Any", type(p))
+        return vector(xx, xy, zero), vector(xy, -xx, zero), vector(zero, zero, zero)
+
+    def _at(self, p: Vec3) -> tuple[Real, Complex, Branch]:
+        """The rounding of the point, the point in the plane, and the function there."""
+        rounding = 4 * backend_of(p).epsilon * largest_coordinate(p)
+        z = self.branches.moved_off(complex_of(p.x, p.y), rounding)
+        return rounding, z, self.branches.at(z)[0]
+
+
+# The heights over the domain are bounded on so many cells a side.
+_CELLS = 32
+
+
+def _around_the_origin() -> Volume:
+    return Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+
+
+@dataclass(frozen=True, eq=False)
+class HeightField(Formula):
+    """The surface z = u(x, y): the level 0 of f = z - u, which is negative below it.
+
+    function: u, written with plain operators and `harnack.sin` and its like (see `expression`);
+        called while a kernel is being recorded, its numbers are literals of that kernel.
+    domain: the volume it is drawn in, by default the box of all points with coordinates up to 1.
+
+    Along a ray f'' is that of u alone, and all that is proved is made of its ranges. Rays are
+    clipped to the heights that u has over the domain, as ranges of u on its cells prove.
+
+        hk.HeightField(lambda x, y: 0.3 * hk.sin(3 * x) * hk.cos(3 * y))
+
+    Raises:
+        TypeError: function cannot be called with two coordinates, or uses what has no ranges.
+    """
+
+    function: Callable[[Any, Any], Any]
+    domain: Volume | None = field(default_factory=_around_the_origin)
+
+    def __post_init__(self) -> None:
+        if not callable(self.function):
+            raise TypeError(f"function must be callable with x, y, not {self.function!r}")
+        if self.domain is None or not np.isfinite(self.domain.bounds()).all():
+            raise ValueError(
+                "a height field needs a bounded domain, such as harnack.Ball() or "
+                "harnack.Box((-1, -1, -1), (1, 1, 1))"
+            )
+        point = probe()
+        as_jet(self.formula(*point), point[0], "HeightField")
+        warn_of_price(self)
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        return z - self.function(x, y)
+
+    def prepare(self, backend: Backend) -> Formula:
+        del backend
+        return self
+
+    def extent(self, levels: tuple[float, ...]) -> Volume | None:
+        """The domain, between the least and the largest height that a level can have over it."""
+        assert self.domain is not None
+        lower, upper = self.domain.bounds()
+        low, high = self._heights(lower, upper)
+        slack = 1e-6 * float(np.abs([lower, upper]).max())
+        low, high = low + min(levels) - slack, high + max(levels) + slack
+        if not (np.isfinite([low, high]).all() and (low > lower[2] or high < upper[2])):
+            return self.domain
+        # Where no surface is left, a box that holds none of the domain's.
+        bottom, top = max(low, lower[2] - slack), min(high, upper[2] + slack)
+        if bottom >= top:
+            return self.domain
+        x, y = (float(one) for one in lower[:2])
+        far_x, far_y = (float(one) for one in upper[:2])
+        slab = Box((x - slack, y - slack, bottom), (far_x + slack, far_y + slack, top))
+        return Intersection((self.domain, slab))
+
+    def _heights(self, lower: FloatArray, upper: FloatArray) -> tuple[float, float]:
+        """Proved: u stays within these over the domain's box."""
+        backend = choose_backend("double")
+        size = (upper - lower)[:2] / _CELLS
+        cells = np.indices((_CELLS, _CELLS)).reshape(2, -1).T + 0.5
+        centers = np.column_stack([cells * size + lower[:2], np.zeros(len(cells))])
+        half = backend.Float(0.5 * float(size.max()) * (1 + 1e-9))
+        jets = Jet.within(to_vector3(backend, centers, "points"), half)
+        heights = as_jet(self.function(*jets[:2]), jets[0], "HeightField").value
+        low = to_numpy(0 * half + dr.min(heights.low)).min()
+        return float(low), float(to_numpy(0 * half + dr.max(heights.high)).max())

@@ -1,0 +1,379 @@
+"""Bounds of sums of solid harmonics by the distances rho and r to the z axis and to the origin.
+
+r^l Y_lm vanishes to order |m| along the z axis and to order l at the origin. There it, its
+derivatives and the rounding of both are far smaller than anywhere else on the sphere of radius r,
+and a bound that is to be of use there must shrink with both distances: it is a sum of terms
+c rho^i r^j with c >= 0. As such a sum rises with rho and r, its value at (rho(p) + R, |p| + R)
+bounds whatever it bounds on the whole ball B(p, R).
+
+Every r^l Y_lm is homogeneous, so a constant c need only be found on the unit sphere. With Q = Q_l^m
+of `solid_harmonics`, x + iy = sin(a) exp(i b) and z = cos(a), the functions to be bounded are
+trigonometric polynomials of degree at most l in the polar angle a once the power of sin(a) is taken
+out, and of degree 1 in m b: samples and Bernstein's inequality prove their largest values, as in
+`sphere_range.proved_range`.
+
+Proved ranges of harmonic polynomials on spheres and balls about the origin.
+
+By the maximum principle a range on a sphere is one on its ball. Sampling alone proves nothing;
+sampling with Bernstein's inequality does.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import FloatArray
+from harnack.backend.elementary import fmax, fmin
+from harnack.fields.analytic.solid_harmonics import (
+    Legendre,
+    Weights,
+    evaluate,
+    legendre_weight,
+    unit_hessian,
+)
+
+if TYPE_CHECKING:
+    from harnack.backend import Real
+
+__all__ = [
+    "AxialBound",
+    "amplitudes",
+    "gradient_bound",
+    "hessian_bound",
+    "largest_gradient",
+    "largest_hessian",
+    "order_on_axis",
+    "value_bound",
+]
+
+_ANGLES = 720  # intervals of the polar angle from pole to pole
+_TURNS = 24  # azimuths over half a turn of m b
+
+
+@dataclass(frozen=True)
+class AxialBound:
+    """The sum of c rho^i r^j, c >= 0.
+
+    rows: (i, ((j, c), ...)) with i and j falling.
+    """
+
+    rows: tuple[tuple[int, tuple[tuple[int, float], ...]], ...]
+
+    @classmethod
+    def of(cls, terms: dict[tuple[int, int], float]) -> AxialBound:
+        """terms: (i, j) -> c."""
+        powers = sorted({i for i, _ in terms}, reverse=True)
+        return cls(
+            tuple(
+                (
+                    i,
+                    tuple(
+                        (j, terms[i, j]) for _, j in sorted(terms, reverse=True) if (i, j) in terms
+                    ),
+                )
+                for i in powers
+            )
+        )
+
+    def __call__(self, rho: Real, r: Real) -> Real:
+        """Its value, by Horner's rule in both variables."""
+        outer = [(i, _horner([(j, 0.0 * r + c) for j, c in row], r)) for i, row in self.rows]
+        return _horner(outer, rho) if outer else 0.0 * r
+
+
+def _horner(terms: list[tuple[int, Real]], x: Real) -> Real:
+    """The sum of c x^i over terms (i, c), i falling."""
+    (i, total), *rest = terms
+    for j, c in rest:
+        total, i = total * _power(x, i - j) + c, j
+    return total * _power(x, i) if i else total
+
+
+def _power(x: Real, n: int) -> Real:
+    """x^n for n >= 1 by squaring."""
+    half = None if n < 2 else _power(x, n // 2)
+    if half is None:
+        return x
+    return half * half * x if n % 2 else half * half
+
+
+def order_on_axis(weights: Weights) -> int:
+    """The order to which a sum, less its constant, vanishes along the z axis."""
+    return min((abs(m) for l, m in weights if l > 0), default=0)  # noqa: E741
+
+
+def value_bound(weights: Weights) -> AxialBound:
+    """A bound of |f|: |r^l Y_lm| <= N |Q(cos a)| rho^m r^(l-m)."""
+    return _summed(weights, lambda l, m: (m, l, largest_value(l, m)))  # noqa: E741
+
+
+def gradient_bound(weights: Weights) -> AxialBound:
+    """A bound of |grad f|, of order m-1 in rho (0 for m = 0) for each term."""
+    return _summed(weights, lambda l, m: (max(m - 1, 0), l - 1, largest_gradient(l, m)))  # noqa: E741
+
+
+def hessian_bound(weights: Weights) -> AxialBound:
+    """A bound of all directional second derivatives, of order m-2 in rho (0 for m < 2)."""
+    return _summed(weights, lambda l, m: (max(m - 2, 0), l - 2, largest_hessian(l, m)))  # noqa: E741
+
+
+def _summed(weights: Weights, one: Callable[[int, int], tuple[int, int, float]]) -> AxialBound:
+    """The sum over terms; one: (l, m >= 0) -> power of rho, degree in both, constant for Y_lm.
+
+    cos(m b) and sin(m b) together have an amplitude of the root of the sum of squares.
+    """
+    terms: dict[tuple[int, int], float] = {}
+    for (l, m), amplitude in amplitudes(weights).items():  # noqa: E741
+        power, degree, constant = one(l, m)
+        if degree >= power and constant > 0:
+            key = (power, degree - power)
+            terms[key] = terms.get(key, 0.0) + amplitude * constant
+    return AxialBound.of(terms)
+
+
+def amplitudes(weights: Weights) -> dict[tuple[int, int], float]:
+    """(l, m >= 0) -> amplitude of the harmonics of orders m and -m together."""
+    sizes: dict[tuple[int, int], float] = {}
+    for (l, m), weight in weights.items():  # noqa: E741
+        sizes[l, abs(m)] = math.hypot(sizes.get((l, abs(m)), 0.0), weight)
+    return sizes
+
+
+def polar_samples(count: int = _ANGLES) -> tuple[FloatArray, FloatArray]:
+    """cos(a) and sin(a) at count + 1 polar angles, evenly spaced from 0 to pi."""
+    a = np.linspace(0.0, math.pi, count + 1)
+    return np.cos(a), np.sin(a)
+
+
+def _proved(sampled: FloatArray, degree: int) -> float:
+    """The largest size of a trigonometric polynomial in a, from its samples at `polar_samples`.
+
+    At its maximum A its slope is 0 and its second derivative at most degree^2 A (Bernstein), and a
+    sample is within half a spacing, so the samples fall short of A by at most e A.
+    """
+    e = 0.5 * (max(degree, 1) * 0.5 * math.pi / _ANGLES) ** 2
+    return float(np.abs(sampled).max()) / (1 - e) * (1 + 1e-12)
+
+
+@functools.cache
+def largest_value(l: int, m: int) -> float:  # noqa: E741
+    """The largest N |Q(cos a)|."""
+    z, _ = polar_samples()
+    return legendre_weight(l, m) * _proved(np.broadcast_to(Legendre(z, 1.0)(l, m), z.shape), l)
+
+
+@functools.cache
+def largest_gradient(l: int, m: int) -> float:  # noqa: E741
+    """The largest |grad r^l Y_lm| / sin(a)^(m-1) on the unit sphere (m = 0: |grad|).
+
+    With B = rho^m cos(m b) the components along rho and z are cos(m b) times (Q rho^m)_rho and
+    (l+m) Q_(l-1)^m rho^m, that along b is -sin(m b) m Q rho^(m-1): the length is at most the larger
+    of the two parts.
+    """
+    if l == 0:
+        return 0.0
+    z, rho = polar_samples()
+    q = Legendre(z, 1.0)
+    at_m, at_next = q(l, m), (2 * m + 1) * q(l - 1, m + 1)
+    if m == 0:
+        radial, axial, around = -rho * at_next, l * q(l - 1, 0), 0.0 * z
+    else:
+        radial = m * at_m - rho * rho * at_next
+        axial, around = rho * ((l + m) * (q(l - 1, m) if l > m else 0.0)), m * at_m
+    # The square of a directional derivative is of degree 2 l, and so is their sum.
+    steep = np.maximum(radial**2 + axial**2, around**2)
+    return legendre_weight(l, m) * math.sqrt(_proved(steep, 2 * l))
+
+
+@functools.cache
+def largest_hessian(l: int, m: int) -> float:  # noqa: E741
+    """The largest |v . H v| / sin(a)^(m-2) on the unit sphere, v a unit vector (m < 2: |v . H v|).
+
+    For fixed v in the frame of the cylinder it is of degree l in a, and A cos(m b) + B sin(m b),
+    which samples a spacing w of m b apart find up to cos(w/2).
+    """
+    if l < 2:
+        return 0.0
+    z, rho = polar_samples()
+    worst = 0.0
+    for turn in np.pi * np.arange(_TURNS) / _TURNS:
+        b = turn / max(m, 1)
+        rows = unit_hessian(l, m, rho, z, float(b), drop=max(m - 2, 0))
+        sizes = np.abs(np.linalg.eigvalsh(rows)).max(axis=1)
+        worst = max(worst, _proved(sizes, l))
+        if m == 0:
+            break
+    return worst / math.cos(0.5 * math.pi / _TURNS)
+
+
+# The product of degree and grid spacing: ranges are proved to (this)^2/2 of their half width.
+_RESOLUTION = 0.1
+# Spheres on which the whole polynomial is bounded, as fractions of the largest.
+_FRACTIONS = (0.25, 0.4, 0.55, 0.7, 0.85, 1.0)
+
+
+def unit_sphere(covering: float) -> FloatArray:
+    """Points (3, n) of the unit sphere such that none of it is further than `covering` away.
+
+    Distances are measured along great circles. Rings at equal steps h of latitude, at equal
+    steps w of longitude: the nearest point is within h/2 and w/2 of both, and for polar angles
+    a, b the chord obeys chord^2 = 4 sin^2((a-b)/2) + 4 sin a sin b sin^2(w/4) <=
+    (h/2)^2 + sin a sin b (w/2)^2 with sin b <= sin a + h/2.
+    """
+    chord = 2 * math.sin(0.5 * min(covering, math.pi))
+    rings = math.ceil(math.pi / (1.4 * chord)) + 1
+    h = math.pi / rings
+    points: list[FloatArray] = []
+    for ring in range(rings):
+        a = (ring + 0.5) * h
+        room = math.sqrt(chord**2 - (h / 2) ** 2)
+        w = 2 * room / math.sqrt(math.sin(a) * (math.sin(a) + h / 2))
+        longitude = 2 * math.pi * np.arange(n := math.ceil(2 * math.pi / w)) / n
+        sine = math.sin(a)
+        points.append(
+            np.stack((sine * np.cos(longitude), sine * np.sin(longitude), np.full(n, math.cos(a))))
+        )
+    return np.concatenate(points, axis=1)
+
+
+def proved_range(low: float, high: float, degree: int, covering: float) -> tuple[float, float]:
+    """Bounds of a polynomial of this degree on a sphere, from its extremes over a point set.
+
+    Every point of the sphere is within `covering` (an angle) of the set. Proof: let the true
+    range be [c - A, c + A]. Along the great circle through a maximum and the nearest point of
+    the set, T - c is a trigonometric polynomial of degree L with |T - c| <= A, so by Bernstein's
+    inequality |T''| <= L^2 A. At the maximum T' = 0, hence `high` falls short of it by at most
+    e A, e = (L covering)^2/2; in the same way `low`. So 2A <= high - low + 2 e A.
+    """
+    e = 0.5 * (degree * covering) ** 2
+    if e >= 1:
+        raise ValueError(f"the points are too far apart ({covering:g}) for degree {degree}")
+    half = 0.5 * (high - low) / (1 - e)
+    # The samples carry rounding errors of double precision, far below this.
+    margin = e * half + 1e-11 * (abs(low) + abs(high) + half)
+    return low - margin, high + margin
+
+
+def range_of_harmonic(l: int, m: int) -> tuple[float, float]:  # noqa: E741
+    """Proved range of Y_lm on the unit sphere, within 1e-5 of the true one.
+
+    For m = 0 a circle through the poles takes every value. Elsewhere the factor cos(m phi) or
+    sin(m phi) takes both signs alike, so that the range is symmetric.
+    """
+    n = 8192
+    t = 2 * np.pi * np.arange(n) / n
+    values = evaluate({(l, abs(m)): 1.0}, np.sin(t), 0.0 * t, np.cos(t))[0]
+    low, high = proved_range(float(values.min()), float(values.max()), l, math.pi / n)
+    return (low, high) if m == 0 else (-max(high, -low), max(high, -low))
+
+
+@dataclass(frozen=True)
+class BallRange:
+    """Bounds of a harmonic polynomial f = f_0 + f_1 + ... (f_l homogeneous) on |y| <= s.
+
+    ends: (l, lower, upper) of f_l on the unit sphere. f_l has mean 0 there, so lower <= 0 <=
+        upper, and f lies in f_0 + [sum s^l lower_l, sum s^l upper_l] for |y| <= s.
+    spheres: (s, lower, upper) of f itself on some spheres; as the terms seldom peak together
+        this is tighter. By the maximum principle it holds on the smaller balls too.
+    """
+
+    constant: float
+    ends: tuple[tuple[int, float, float], ...]
+    spheres: tuple[tuple[float, float, float], ...] = ()
+
+    @classmethod
+    def of(cls, weights: Weights) -> BallRange:
+        """The ranges of the degrees of a sum of solid harmonics."""
+        constant, ends = 0.0, list[tuple[int, float, float]]()
+        points, covering = _points(weights)
+        for degree, values in _values(weights, points).items():
+            if degree == 0:
+                constant = float(values[0])
+            else:
+                low, high = float(values.min()), float(values.max())
+                ends.append((degree, *proved_range(low, high, degree, covering)))
+        return cls(constant, tuple(ends))
+
+    def with_spheres(self, weights: Weights, largest: float) -> BallRange:
+        """Itself with the range of the whole on spheres up to a radius; nothing new for one f_l."""
+        if len(self.ends) < 2:
+            return self
+        points, covering = _points(weights)
+        values = _values(weights, points)
+        spheres = [
+            (s, *sphere_range(values, s, covering)) for s in (q * largest for q in _FRACTIONS)
+        ]
+        return BallRange(self.constant, self.ends, tuple(spheres))
+
+    def by_degree(self, s: Real) -> tuple[Real, Real]:
+        """Lower and upper bound on |y| <= s from `ends`; s is a number or an array."""
+        lower = upper = 0.0 * s
+        top = max((degree for degree, _, _ in self.ends), default=0)
+        ends = {degree: (low, high) for degree, low, high in self.ends}
+        for degree in range(top, 0, -1):
+            low, high = ends.get(degree, (0.0, 0.0))
+            lower, upper = (lower + low) * s, (upper + high) * s
+        return lower + self.constant, upper + self.constant
+
+    def curvature(self, s: Real) -> Real:
+        """A bound of all directional second derivatives on |y| <= s.
+
+        If |f_l| <= M on the unit sphere, |grad f_l| <= l M there: along a great circle f_l is a
+        trigonometric polynomial T of degree l, radially its derivative is l T, and
+        T'^2 + l^2 T^2 <= l^2 M^2 (Bernstein-Szego). A directional derivative of f_l is again
+        homogeneous and harmonic, of degree l-1, so |v.H v| <= l (l-1) M |y|^(l-2).
+        """
+        return self._derivative(s, 2)
+
+    def gradient(self, s: Real) -> Real:
+        """A bound of the gradient on |y| <= s, |grad f_l| <= l M |y|^(l-1): see `curvature`."""
+        return self._derivative(s, 1)
+
+    def _derivative(self, s: Real, order: int) -> Real:
+        """The sum over l of l (l-1) .. (l-order+1) M |y|^(l-order), by Horner's rule."""
+        total = 0.0 * s
+        most = {degree: max(-low, high) for degree, low, high in self.ends}
+        for degree in range(max(most, default=0), order - 1, -1):
+            total = total * s + math.perm(degree, order) * most.get(degree, 0.0)
+        return total
+
+    def at(self, s: Real) -> tuple[Real, Real]:
+        """Lower and upper bound on |y| <= s, a Dr.Jit array, from everything known."""
+        lower, upper = self.by_degree(s)
+        for radius, low, high in self.spheres:
+            inside = s <= radius
+            lower = fmax(dr.select(inside, low, -math.inf), lower)
+            upper = fmin(dr.select(inside, high, math.inf), upper)
+        return lower, upper
+
+    def on_ball(self, s: float) -> tuple[float, float]:
+        """The same for one number: the range on |y| <= s."""
+        bounds = [self.by_degree(s), *((low, high) for r, low, high in self.spheres if s <= r)]
+        return max(low for low, _ in bounds), min(high for _, high in bounds)
+
+
+def _points(weights: Weights) -> tuple[FloatArray, float]:
+    covering = _RESOLUTION / max(1, max(degree for degree, _ in weights))
+    return unit_sphere(covering), covering
+
+
+def _values(weights: Weights, points: FloatArray) -> dict[int, FloatArray]:
+    """The values of each f_l at points of the unit sphere."""
+    degrees = sorted({degree for degree, _ in weights})
+    return {
+        degree: evaluate({k: w for k, w in weights.items() if k[0] == degree}, *points)[0]
+        for degree in degrees
+    }
+
+
+def sphere_range(values: dict[int, FloatArray], s: float, covering: float) -> tuple[float, float]:
+    """Proved range of the sum of f_l on the sphere of radius s; values: on the unit sphere."""
+    whole: FloatArray = np.sum([s**degree * v for degree, v in values.items()], axis=0)
+    return proved_range(float(whole.min()), float(whole.max()), max(values), covering)

@@ -1,0 +1,284 @@
+"""Sums of sine waves: their terms, values and gradients, and proved bounds of the sum.
+
+Every Laplacian eigenfunction that separates in Cartesian coordinates is a product of sines and
+cosines, and every such product is a sum of plane waves: terms are evaluated as they are written
+(a product needs one sine and cosine a coordinate), and bounded as plane waves.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from harnack.backend.elementary import sincos
+from harnack.backend.numbers import refuses_derivatives
+
+if TYPE_CHECKING:
+    from harnack.backend import Real, Vec3
+
+__all__ = ["Factor", "PlaneWave", "Product", "Term", "WaveBounds", "cosine", "sine"]
+
+
+@dataclass(frozen=True)
+class Factor:
+    """sin or cos of (frequency * coordinate + phase); made by `sine` and `cosine`."""
+
+    frequency: float
+    phase: float
+    is_cosine: bool
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.frequency) and math.isfinite(self.phase)):
+            raise ValueError(f"a factor needs finite numbers, not {self.frequency}, {self.phase}")
+        if self.frequency == 0:
+            raise ValueError("a factor of frequency 0 is a constant: multiply the amplitude by it")
+
+
+@refuses_derivatives
+def sine(frequency: float = 1.0, phase: float = 0.0) -> Factor:
+    """sin(frequency * coordinate + phase); frequency in radians per unit length."""
+    return Factor(float(frequency), float(phase), False)
+
+
+@refuses_derivatives
+def cosine(frequency: float = 1.0, phase: float = 0.0) -> Factor:
+    """cos(frequency * coordinate + phase); frequency in radians per unit length."""
+    return Factor(float(frequency), float(phase), True)
+
+
+@dataclass(frozen=True)
+class Product:
+    """amplitude times a factor of each coordinate; a coordinate left out does not enter.
+
+    Product(2.0, x=sine(3.0), y=cosine(4.0)) is 2 sin(3x) cos(4y), an eigenfunction of the
+    Laplacian with eigenvalue -(9 + 16).
+    """
+
+    amplitude: float
+    x: Factor | None = None
+    y: Factor | None = None
+    z: Factor | None = None
+
+    @property
+    def factors(self) -> tuple[tuple[int, Factor], ...]:
+        """(axis, factor) of each coordinate that enters."""
+        named = enumerate((self.x, self.y, self.z))
+        return tuple((axis, factor) for axis, factor in named if factor is not None)
+
+
+@dataclass(frozen=True)
+class PlaneWave:
+    """amplitude * cos(wave_vector . p + phase), eigenvalue -|wave_vector|^2."""
+
+    amplitude: float
+    wave_vector: tuple[float, float, float]
+    phase: float = 0.0
+
+
+Term = Product | PlaneWave
+
+
+def checked_terms(terms: Iterable[Term]) -> tuple[Term, ...]:
+    """The terms as a tuple, of Python numbers.
+
+    Raises:
+        ValueError, TypeError: there is no term, or one will not do; the message names the first.
+    """
+    given, checked = tuple(terms), list[Term]()
+    if not given:
+        raise ValueError("a sum needs at least one term")
+    for n, term in enumerate(given):
+        if isinstance(term, PlaneWave):
+            numbers: Sequence[float] = (term.amplitude, *term.wave_vector, term.phase)
+            if len(numbers) != 5:
+                raise ValueError(f"term {n}: a wave vector is three numbers: {term.wave_vector}")
+        elif isinstance(term, Product):  # pyright: ignore[reportUnnecessaryIsInstance]
+            numbers = (term.amplitude,)
+        else:
+            raise TypeError(f"term {n} must be a Product or a PlaneWave, not {term!r}")
+        if not all(math.isfinite(v) for v in numbers):
+            raise ValueError(f"term {n} holds numbers that are not finite: {term}")
+        if isinstance(term, PlaneWave):
+            amplitude, x, y, z, phase = (float(v) for v in numbers)
+            checked.append(PlaneWave(amplitude, (x, y, z), phase))
+        else:
+            checked.append(replace(term, amplitude=float(term.amplitude)))
+    return tuple(checked)
+
+
+class _FactorRates:
+    """Factors and their derivatives at p; each sine and cosine is computed once."""
+
+    def __init__(self, p: Vec3) -> None:
+        self._p = p
+        self._known: dict[Any, tuple[Real, Real]] = {}
+
+    def __call__(self, axis: int, factor: Factor) -> tuple[Real, Real]:
+        """The factor and its derivative along the axis."""
+        key = (axis, factor.frequency, factor.phase)
+        if key not in self._known:
+            self._known[key] = sincos(_angle(factor.frequency * self._p[axis], factor.phase))
+        s, c = self._known[key]
+        return (c, -factor.frequency * s) if factor.is_cosine else (s, factor.frequency * c)
+
+
+def evaluate_terms(terms: Sequence[Term], p: Vec3) -> tuple[Real, list[Real]]:
+    """Value and the three gradient components of the sum at p, a vector of Dr.Jit arrays."""
+    rates = _FactorRates(p)
+    value, gradient = p[0] * 0.0, [p[0] * 0.0 for _ in range(3)]
+    for term in terms:
+        if isinstance(term, PlaneWave):
+            k = term.wave_vector
+            angle = _angle(k[0] * p[0] + k[1] * p[1] + k[2] * p[2], term.phase)
+            s, c = sincos(angle)
+            value += term.amplitude * c
+            for axis in range(3):
+                if k[axis] != 0:
+                    gradient[axis] -= term.amplitude * k[axis] * s
+            continue
+        values = [(axis, *rates(axis, factor)) for axis, factor in term.factors]
+        value += _product([f for _, f, _ in values], term.amplitude)
+        for axis, _, derivative in values:
+            others = [f for other, f, _ in values if other != axis]
+            gradient[axis] += _product([*others, derivative], term.amplitude)
+    return value, gradient
+
+
+def hessian_of_terms(terms: Sequence[Term], p: Vec3) -> list[list[Real]]:
+    """The matrix of second derivatives of the sum at p, three rows of three.
+
+    A plane wave has -k k^T times itself. A factor of a product has -frequency^2 times itself as
+    its second derivative, and another axis differentiates another factor.
+    """
+    rates = _FactorRates(p)
+    upper = {(i, j): p[0] * 0.0 for i in range(3) for j in range(i, 3)}
+    for term in terms:
+        if isinstance(term, PlaneWave):
+            k = term.wave_vector
+            angle = _angle(k[0] * p[0] + k[1] * p[1] + k[2] * p[2], term.phase)
+            wave = term.amplitude * sincos(angle)[1]
+            for i, j in upper:
+                if k[i] * k[j] != 0:
+                    upper[i, j] -= k[i] * k[j] * wave
+            continue
+        frequency = {axis: factor.frequency for axis, factor in term.factors}
+        value = {axis: rates(axis, factor) for axis, factor in term.factors}
+        for i, j in upper:
+            if i in value and j in value:
+                order = {axis: (axis == i) + (axis == j) for axis in value}
+                factors = [value[axis][1 if n == 1 else 0] for axis, n in order.items()]
+                product = _product(factors, term.amplitude)
+                upper[i, j] += -(frequency[i] ** 2) * product if i == j else product
+    return [[upper[min(i, j), max(i, j)] for j in range(3)] for i in range(3)]
+
+
+def _angle(angle: Real, phase: float) -> Real:
+    return angle + phase if phase else angle
+
+
+def _product(factors: Sequence[Real], amplitude: float) -> Real:
+    product: Real = None
+    for factor in factors:
+        product = factor if product is None else product * factor
+    if product is None:
+        return amplitude
+    return product if amplitude == 1.0 else amplitude * product
+
+
+@dataclass(frozen=True)
+class WaveBounds:
+    """A sum f = constant + sum_i A_i cos(k_i . p + phase_i), A_i > 0, and what is proved of it.
+
+    largest_value: |f - constant| <= sum A_i.
+    largest_curvature: |v . H v| <= sum A_i (k_i . v)^2 for the Hessian H and a unit v, at most
+        the largest eigenvalue of the matrix sum A_i k_i k_i^T.
+    largest_gradient: |v . grad f| <= sum A_i |k_i . v|, at most sum A_i |k_i|, and by
+        Cauchy-Schwarz at most sqrt(sum A_i) sqrt(sum A_i (k_i . v)^2).
+    The gyroid's three terms give 3, 2 and sqrt 6 (true: 3/2, 2, sqrt 3).
+    """
+
+    wavenumbers: tuple[float, ...]
+    amplitudes: tuple[float, ...]
+    constant: float
+    largest_value: float
+    largest_gradient: float
+    largest_curvature: float
+
+    @classmethod
+    def of(cls, terms: Iterable[Term]) -> WaveBounds:
+        """The bounds of a sum, equal wave vectors added up first.
+
+        Raises:
+            ValueError: the sum is constant.
+        """
+        waves: dict[tuple[float, ...], complex] = {}
+        for term in terms:
+            for k, amplitude in _plane_waves(term):
+                waves[k] = waves.get(k, 0.0) + amplitude
+        constant = waves.pop((0.0, 0.0, 0.0), 0j).real
+        waves = {k: amplitude for k, amplitude in waves.items() if amplitude != 0}
+        if not waves:
+            raise ValueError("the sum is constant: it has no level sets")
+        vectors = np.array(list(waves))
+        sizes = np.abs(np.array(list(waves.values())))
+        # All sums below are of positive numbers: a few roundings, covered by this factor.
+        up = 1.0 + 1e-12
+        matrix: npt.NDArray[np.float64] = np.einsum("n,ni,nj->ij", sizes, vectors, vectors)
+        curvature = float(np.linalg.eigvalsh(matrix)[-1]) * up
+        lengths = np.linalg.norm(vectors, axis=1)
+        value = float(sizes.sum()) * up
+        gradient = min(float(sizes @ lengths) * up, math.sqrt(value * curvature))
+        return cls(
+            tuple(float(v) for v in lengths),
+            tuple(float(v) for v in sizes),
+            constant,
+            value,
+            gradient,
+            curvature,
+        )
+
+
+def mean_wavelength(amplitudes: npt.ArrayLike, wavenumbers: npt.ArrayLike) -> float:
+    """2 pi over the root of the mean square wavenumber, by amplitudes: of one wave its length, and
+    of a sum that of the waves which make its shape, not of the shortest, however small."""
+    sizes, numbers = np.abs(amplitudes), np.asarray(wavenumbers, np.float64)
+    largest = float(numbers.max())
+    mean = float((sizes * (numbers / largest) ** 2).sum() / sizes.sum())
+    return 2 * math.pi / (largest * math.sqrt(mean))
+
+
+def _plane_waves(term: Term) -> list[tuple[tuple[float, ...], complex]]:
+    """(k, A) with term = sum of Re(A exp(i k . p)), k and -k written the same way.
+
+    A product cos a cos b cos c is the mean of cos(a +- b +- c) over the signs.
+    """
+    if isinstance(term, PlaneWave):
+        phasor = term.amplitude * complex(math.cos(term.phase), math.sin(term.phase))
+        return [_canonical(term.wave_vector, phasor)]
+    waves: list[tuple[tuple[float, ...], complex]] = [((0.0, 0.0, 0.0), complex(term.amplitude))]
+    for position, (axis, factor) in enumerate(term.factors):
+        phasor = complex(math.cos(factor.phase), math.sin(factor.phase))
+        phasor *= 1 if factor.is_cosine else -1j  # sin t = cos(t - pi/2)
+        signs = (1.0,) if position == 0 else (1.0, -1.0)
+        waves = [
+            (
+                tuple(v + sign * factor.frequency * (i == axis) for i, v in enumerate(k)),
+                amplitude * (phasor if sign > 0 else phasor.conjugate()) / len(signs),
+            )
+            for k, amplitude in waves
+            for sign in signs
+        ]
+    return [_canonical(k, amplitude) for k, amplitude in waves]
+
+
+def _canonical(k: Sequence[float], amplitude: complex) -> tuple[tuple[float, ...], complex]:
+    """cos(k.p + t) = cos(-k.p - t): the first component that is not zero is made positive."""
+    leading = next((v for v in k if v != 0), 0.0)
+    if leading < 0:
+        return tuple(-v + 0.0 for v in k), amplitude.conjugate()
+    return tuple(v + 0.0 for v in k), amplitude

@@ -1,1 +1,0 @@
-"""The solid angle of closed curves."""

@@ -1,1 +1,0 @@
-"""The solid angle of an edge: value, derivatives, and bounds of how they vary."""

@@ -1,1 +1,0 @@
-"""Far sums of dipoles as multipoles, with bounds of what they leave out."""

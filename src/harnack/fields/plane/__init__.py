@@ -1,1 +1,0 @@
-"""Functions of the plane: height fields, Riemann surfaces, level curves."""

@@ -1,1 +1,0 @@
-"""Harmonic polynomials and what is known of them near a point."""

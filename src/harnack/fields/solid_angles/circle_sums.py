@@ -1,0 +1,349 @@
+"""Sums over circles at a point: solid angles, derivatives, distances and what bounds them.
+
+For a circle of radius a, of which the nearest point is at distance d and the farthest at P, Biot
+and Savart's integrals are bounded by
+
+    |grad Omega| <= integral of |dp|/D^2 = 2 pi a/(P d)
+
+(D^2 = A - 2r cos(phi) has this integral exactly; attained at the center), and
+
+    integral of |dp|/D^3 = 4 a E/(P d^2) <= 2 pi a B,   B = sqrt((1/d^2 + 1/P^2)/2)/(P d),
+
+as E <= (pi/2) sqrt((1 + kc^2)/2) by Jensen's inequality for the root. What follows within d of a
+point is the same for all curves (`curve_promises`). Walking by t, both distances fall by at most t,
+and both bounds fall with both distances. Hence, for lines:
+
+- Lines. Points at r from the axis are at least |r - a| from the circle, which tells of a line that
+  passes beside it more than the distance of one of its points does. At height z above the circle's
+  plane the gradient's part along the plane is at most |z| times the integral of |dp|/D^3. A line
+  with the component w along the normal sees no more than |w| 2 pi a/(P d) + sqrt(1-w^2) |z| 2 pi a
+  B, which is small where it runs along the plane.
+
+The solid angle of a circle with its derivatives, by complete elliptic integrals.
+
+The circle has radius 1 and lies in the plane z = 0, run counter-clockwise as seen from above. The
+point is at r from the axis and z above the plane; Rm^2 = (1-r)^2 + z^2 and Rp^2 = (1+r)^2 + z^2 are
+its squared distances to the nearest and the farthest point of the circle, kc = Rm/Rp is the
+complementary modulus of all integrals, and A = 1 + r^2 + z^2.
+
+Value. Omega = -sgn(z) W, W = 2 pi [r < 1] - 4|z| cel/((1+r) Rp), where cel = integral over
+[0, pi/2] of (cos^2 + gamma sin^2)/(D (cos^2 + gamma^2 sin^2)), D^2 = cos^2 + kc^2 sin^2 and
+gamma = (1-r)/(1+r): Bulirsch's general complete integral cel(kc, gamma^2, 1, gamma) (Bulirsch 1969,
+Numer. Math. 13). On the cylinder r = 1, where gamma = 0, W = pi - 2|z| K/Rp.
+
+All integrals come from one loop of arithmetic-geometric means, which converges quadratically: six
+rounds for single precision and eight for double, unrolled, are a short stretch of plain arithmetic.
+Beside the means a_n it has the differences c_(n+1) = c_n^2/(4 a_(n+1)), c_1 = (1-kc)/2, and adds up
+S, the sum of 2^n c_(n+1)^2/(1-kc)^2 over n >= 1. Then E = K (1 - (1-kc^2)/2 - (1-kc)^2 (1/4 + S)).
+
+Derivatives. Biot and Savart's integrals over the circle, seen from the point at distance D,
+
+    I3 = integral of dphi/D^3 = 4E/(Rp Rm^2),   C3 = integral of cos(phi) dphi/D^3 = r J,
+
+give the gradient (z x J, z y J, I3 - r^2 J), where the known form of J,
+2 (A E/Rm^2 - K)/(r^2 Rp), cancels near the axis and far away. With E as above, 1 - kc = q r,
+q = 4/(Rp (Rp + Rm)), and A = Rp^2 (1 + kc^2)/2, the terms of order 0 and 1 in 1 - kc drop out, and
+
+    J = K q^2 [(1 + 4 kc + kc^2)/4 - (1 + kc^2) S]/(Rp kc^2)
+
+is left. I3 - r^2 J cancels beside the circle,
+where 2 [K + ((1-r)(1+r) - z^2) E/Rm^2]/Rp is the same and does not.
+
+Second derivatives need I5 and C5, with D^-5. As D^2 = A - 2r cos(phi), A I5 - 2r C5 = I3; and by
+parts, C3 = 3r times the integral of sin^2(phi)/D^5, that is 3 A C5 = 6 r I5 + C3. So, as
+A^2 - 4r^2 = Rm^2 Rp^2,
+
+    C5/r = (2 I3 + A J/3)/(Rm^2 Rp^2),   I5 = (I3 + 2r C5)/A,
+
+sums of positive terms, and Omega_zz = -3z (I5 - r C5), Omega_rz = C3 - 3 z^2 C5, Omega_r/r = z J;
+the trace is 0.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend.elementary import clamp, fmax, fmin
+from harnack.backend.records import Records
+from harnack.fields.batch import SymmetricSum
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, FloatArray, Mask, Real, Vec3
+    from harnack.fields.solid_angles.edge_trails import Line
+    from harnack.geometry.curves import Circle
+
+__all__ = ["CircleSums", "Circles", "UnitCircle"]
+
+_ROUNDS = {"single": 6, "double": 8}
+
+
+@dataclass(frozen=True)
+class UnitCircle:
+    """What is known of the unit circle at a point (r, z).
+
+    angle: Omega in (-2 pi, 2 pi).
+    nearest, farthest: Rm and Rp.
+    share: q, with q r = 1 - kc.
+    radial: J/q^2; the gradient along the axis is `axial`.
+    third: I3.
+    """
+
+    r: Real
+    z: Real
+    angle: Real
+    nearest: Real
+    farthest: Real
+    share: Real
+    radial: Real
+    axial: Real
+    third: Real
+
+    @classmethod
+    def at(cls, r: Real, z: Real) -> UnitCircle:
+        """r >= 0 and z: Dr.Jit numbers."""
+        real: Any = cast("Any", type(r))
+        rounds = _ROUNDS["double" if float(dr.epsilon(r)) < 1e-10 else "single"]
+        gap = 1 - r
+        square = dr.fma(gap, gap, z * z)
+        nearest, farthest = dr.sqrt(square), dr.sqrt(dr.fma(1 + r, 1 + r, z * z))
+        inverse = 1 / farthest
+        kc = nearest * inverse
+        q = 4 * inverse / (farthest + nearest)
+        gamma = gap / (1 + r)
+        # c, d, p are Bulirsch's numbers for cel, m and e those of the means.
+        c, d, p = real(1), dr.copysign(real(1), gamma), fmax(dr.abs(gamma), 1e-30)
+        k, e, m = kc, kc, real(1)
+        total, ratio, drop = real(0), real(0.5), q * r
+        for n in range(rounds):
+            before, g = c, e / p
+            c, d = c + d / p, 2 * dr.fma(before, g, d)
+            p, m = p + g, m + k
+            k = 2 * dr.sqrt(e)
+            e = k * m
+            if n >= 1:
+                ratio = ratio * ratio * drop / (4 * 0.5 ** (n + 1) * m)
+                total = dr.fma(2.0**n * ratio, ratio, total)
+        cel = (math.pi / 2) * dr.fma(c, m, d) / (m * (m + p))
+        first = (math.pi / 2 * 2.0**rounds) / m  # K
+        second = first * (1 - 0.5 * drop * (1 + kc) - drop * drop * (0.25 + total))  # E
+        height = dr.abs(z)
+        w = dr.select(r < 1, real(2 * math.pi), 0) - 4 * height * inverse / (1 + r) * cel
+        w = dr.select(r == 1, math.pi - 2 * height * inverse * first, w)
+        bracket = 0.25 * dr.fma(kc, 4 + kc, 1) - dr.fma(kc, kc, 1) * total
+        radial = first * inverse * bracket / (kc * kc)
+        third = 4 * second * inverse / square
+        beside = 2 * inverse * (first + (gap * (1 + r) - z * z) / square * second)
+        axial = dr.select(first * square < 2 * second, beside, third - drop * drop * radial)
+        return cls(r, z, -dr.mulsign(w, z), nearest, farthest, q, radial, axial, third)
+
+    @property
+    def across(self) -> Real:
+        """z J: the gradient at right angles to the axis is (x, y) times this."""
+        return (self.z * self.share) * (self.share * self.radial)
+
+    def second_derivatives(self) -> tuple[Real, Real, Real]:
+        """Omega_zz, Omega_rz/r and z J: the Hessian in the directions of axis, radius and circle.
+
+        Omega_rr is minus the sum of the first and the last.
+        """
+        r, z = self.r, self.z
+        squares = dr.fma(r, r, dr.fma(z, z, 1))  # A
+        j = self.share * self.share * self.radial
+        both = self.nearest * self.farthest
+        sums = 2 * self.third + squares * j / 3  # (Rm Rp)^2 C5/r
+        up, out = z / both, r / both
+        # I5 - r C5, with I5 = (I3 + 2 r C5)/A.
+        along = dr.fma(out * out * sums, 2 - squares, self.third) / squares
+        return -3 * z * along, dr.fma(-3 * up * up, sums, j), z * j
+
+
+@dataclass(frozen=True)
+class CircleSums:
+    """Sums over circles at x.
+
+    angle, gradient: of the solid angle; each circle's is in (-2 pi, 2 pi).
+    distance: to the nearest circle.
+    squares, cubes, fourths: of the integrals of |dp|/D^k, k = 2, 3 and (a bound) 4, D the distance.
+    lower, upper: a range of the lift on the ball of the radius `distance`: see `planar`.
+    """
+
+    angle: Real
+    gradient: Vec3
+    distance: Real
+    squares: Real
+    cubes: Real
+    fourths: Real
+    lower: Real
+    upper: Real
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """A circle of radius a as seen from x: outward is the part of x - center in its plane, of
+    length r a, and x is z a above it."""
+
+    a: Real
+    normal: Vec3
+    outward: Vec3
+    circle: UnitCircle
+
+    @property
+    def distance(self) -> Real:
+        return self.a * self.circle.nearest
+
+    @property
+    def farthest(self) -> Real:
+        return self.a * self.circle.farthest
+
+
+@dataclass(frozen=True)
+class Circles:
+    """Circles on a backend, as records of center, radius and normal, in units of order one."""
+
+    records: Records
+
+    @classmethod
+    def upload(
+        cls, backend: Backend, circles: Sequence[Circle], center: FloatArray, size: float
+    ) -> Circles:
+        """Circles in coordinates with another center, divided by a size."""
+        rows = [
+            [*(np.array(one.center) - center) / size, one.radius / size, *one.normal, 0.0]
+            for one in circles
+        ]
+        return cls(Records.upload(backend, np.array(rows)))
+
+    def sums(self, x: Vec3) -> CircleSums:
+        """All sums at x in one loop."""
+        real, vector = self._types
+        x = vector(x)
+
+        def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+            angle, gradient, distance, squares, cubes, fourths, lower = state
+            seen = self._seen(row, x)
+            circle, a = seen.circle, seen.a
+            # Lengths times 1/a here, divided out at the end: all of it stays of order one.
+            gradient = dr.fma(vector(circle.across / (a * a)), seen.outward, gradient)
+            gradient = dr.fma(vector(circle.axial / a), seen.normal, gradient)
+            near, far = circle.nearest, circle.farthest
+            cube = circle.third / (a * a)
+            # By height: far away the angle is lost in rounding, and its sign with it.
+            above = dr.mulsign(real(1), circle.z) > 0
+            window = dr.select(circle.r < 1, dr.select(above, real(-4 * math.pi), 0), -2 * math.pi)
+            return (
+                angle + circle.angle,
+                gradient,
+                fmin(seen.distance, distance),
+                squares + 2 * math.pi / (near * far * a),
+                cubes + cube,
+                fourths + cube / (near * a),
+                lower + window,
+            )
+
+        start = (real(0), vector(0), real(dr.inf), real(0), real(0), real(0), real(0))
+        angle, gradient, distance, squares, cubes, fourths, lower = self.records.for_each(
+            add, start, "circles"
+        )
+        upper = lower + 4 * math.pi * real(self.records.trips)
+        return CircleSums(angle, gradient, distance, squares, cubes, fourths, lower, upper)
+
+    def hessian(self, x: Vec3) -> SymmetricSum:
+        """The Hessian of the sum of solid angles."""
+        real, vector = self._types
+        x = vector(x)
+
+        def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+            seen = self._seen(row, x)
+            a, n, e = seen.a, seen.normal, seen.outward
+            along, mixed, around = seen.circle.second_derivatives()
+            share = dr.rcp(a * a)
+            length = dr.norm(e)
+            out = dr.select(length > 0, e / length, 0)
+            # f_tt (I - n n - out out) + f_rr out out + f_zz n n + f_rz (n out + out n)
+            total = SymmetricSum(*state)
+            total = total.plus(n, ((along - around) * share) * n)
+            total = total.plus(out, ((-along - 2 * around) * share) * out)
+            total = total.plus(n, (2 * mixed * share / a) * e)
+            return (*(one + around * share for one in total.parts()[:3]), *total.parts()[3:])
+
+        start = SymmetricSum.zero(real).parts()
+        return SymmetricSum(*self.records.for_each(add, start, "circle hessian"))
+
+    def rates_along(self, line: Line, lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
+        """For each length T, a bound of the derivative along the line up to T to both sides; inf
+        where a circle may be as near as that, and on lanes that are not active."""
+        real, vector = self._types
+
+        def add(row: list[Real], rates: tuple[Any, ...]) -> tuple[Any, ...]:
+            seen = self._seen(row, line.x)
+            slack, up = line.slack, fmin(dr.abs(dr.dot(seen.normal, line.v)), 1)
+            across = dr.sqrt(fmax(1 - up * up, 0))
+            # Of two numbers of order one: their rounding is not small beside them.
+            up += 4 * float(dr.epsilon(line.x))
+            height = dr.abs(seen.circle.z) * seen.a + slack
+            # The line seen along the axis: at s it is |outward + s along| from there.
+            along = dr.fma(vector(-dr.dot(seen.normal, line.v)), seen.normal, line.v)
+            square = dr.squared_norm(along)
+            foot = dr.select(square > 0, -dr.dot(seen.outward, along) / square, 0)
+            grown: list[Real] = []
+            for length, rate in zip(lengths, rates, strict=True):
+                ends = (clamp(foot, -length, length), -length, length)
+                low, one, other = (dr.norm(dr.fma(vector(s), along, seen.outward)) for s in ends)
+                passing = fmax(low - seen.a, seen.a - fmax(one, other))
+                near = fmax(seen.distance - length, passing) - slack
+                far = fmax(seen.farthest - length, near + slack) - slack
+                slope = 2 * math.pi * seen.a / (near * far)
+                mean = dr.sqrt(0.5 * (dr.rcp(near * near) + dr.rcp(far * far)))
+                highest = dr.fma(length, up, height)
+                term = slope * dr.fma(across * highest, mean, up)
+                grown.append(rate + dr.select(near > 0, term, dr.inf))
+            return tuple(grown)
+
+        start = tuple(real(0) for _ in lengths)
+        rates = self.records.for_each(add, start, "circles along", active)
+        return tuple(dr.select(active, rate, dr.inf) for rate in rates)
+
+    def closest(self, x: Vec3) -> tuple[Vec3, Real]:
+        """The point of the circles that is closest to x, and the square of its distance."""
+        real, vector = self._types
+        x = vector(x)
+
+        def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+            best, nearest = state
+            seen = self._seen(row, x)
+            # On the axis every point is as near: any direction in the plane will do.
+            length = dr.norm(seen.outward)
+            aside = dr.normalize(_across(vector, seen.normal))
+            out = dr.select(length > 0, seen.outward / length, aside)
+            foot = dr.fma(vector(seen.a), out, vector(*row[:3]))
+            square = dr.squared_norm(x - foot)
+            closer = square < nearest
+            return dr.select(closer, foot, best), dr.select(closer, square, nearest)
+
+        return self.records.for_each(add, (vector(0), real(dr.inf)), "nearest circle")
+
+    @property
+    def _types(self) -> tuple[Any, Any]:
+        return self.records.backend.Float, self.records.backend.Array3f
+
+    def _seen(self, row: list[Real], x: Vec3) -> _Seen:
+        vector = self.records.backend.Array3f
+        center, a, normal = vector(*row[:3]), row[3], vector(*row[4:7])
+        away = x - center
+        height = dr.dot(normal, away)
+        # A second projection takes out what the normal, rounded, has left of the first.
+        outward = dr.fma(vector(-height), normal, away)
+        outward = dr.fma(vector(-dr.dot(normal, outward)), normal, outward)
+        return _Seen(a, normal, outward, UnitCircle.at(dr.norm(outward) / a, height / a))
+
+
+def _across(vector: Any, n: Vec3) -> Vec3:
+    """A vector at right angles to n, not short."""
+    flat = dr.abs(n.z) < 0.7
+    return dr.select(flat, vector(-n.y, n.x, 0), vector(0, -n.z, n.y))

@@ -1,0 +1,266 @@
+"""The dipole potential of oriented point clouds: Poisson reconstruction without a grid.
+
+Sums of dipoles by a tree: far ones as multipoles, near ones one by one, with certificates.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import backend_of
+from harnack.backend.elementary import fmax
+from harnack.fields.batch import BatchedField, SymmetricSum, Values
+from harnack.fields.clearance import DetailedField, UnitCoordinates, epsilon_at, placed, single
+from harnack.fields.field import Sample, lengthened
+from harnack.fields.solid_angles.far_clusters import Treecode, dipole_rows, hierarchy_of, in_slots
+from harnack.fields.solid_angles.multipole import all_levels
+from harnack.fields.sums import FieldSums, Terms, rounding_of_dipole, rounding_of_sum
+from harnack.geometry import Box, CloudError, estimate_areas, estimate_normals, validate_cloud
+
+if TYPE_CHECKING:
+    from typing import Self
+
+    from harnack.backend import Backend, FloatArray, Mask, Real, Vec3
+    from harnack.geometry import Volume
+    from harnack.tree import Hierarchy
+
+# Beside a point means within this part (of its area, in squared distance).
+_BESIDE = 0.04
+
+
+@dataclass(frozen=True)
+class DipoleTree:
+    """sum_i m_i.(y_i - x)/|y_i - x|^3 on a backend; a record holds y_i, m_i and |m_i|."""
+
+    clusters: Treecode
+    rounding: Real
+
+    @property
+    def backend(self) -> Backend:
+        """The one it lies on."""
+        return self.clusters.backend
+
+    @classmethod
+    def of(
+        cls, backend: Backend, tree: Hierarchy, points: FloatArray, moments: FloatArray,
+        accuracy: float,
+    ) -> DipoleTree:  # fmt: skip
+        """From points (n, 3) of size about one and moments (n, 3), area times normal.
+
+        tree: `hierarchy_of` these points, or of where they were once.
+        """
+        levels = all_levels(tree, points[:, None], moments[:, None], points, points)
+        rows = dipole_rows(points, moments)
+        # Rounded terms, most of them of the size of their share of the whole, random in sign.
+        share = max(1.0, float(rows[:, 6].sum()))
+        rounding = rounding_of_sum(backend, len(points), 16, growth=1 / 8, size=share)
+        clusters = Treecode.of(backend, tree, levels, in_slots(tree, rows), accuracy)
+        return cls(clusters, rounding)
+
+    def at(self, x: Vec3, derivatives: int, closer: Real) -> Values:
+        """Value and derivatives (as asked for) at x; closer: the detail, at least 1."""
+        unit, detail = epsilon_at(x), fmax(self.backend.Float(closer), self.backend.Float(1))
+        sums, _ = self._sums(x, detail, unit, derivatives)
+        return self.clusters.values(sums, 1.0, unit, self.rounding)
+
+    def _sums(self, x: Vec3, detail: Real, unit: Real, derivatives: int) -> tuple[FieldSums, Vec3]:
+        """All sums, and the moment of the nearest dipole of a near leaf."""
+        vector = self.backend.Array3f
+
+        def add(
+            row: list[Real], active: Mask, sums: FieldSums, own: tuple[Any, ...]
+        ) -> tuple[FieldSums, tuple[Any, ...]]:
+            inverse, terms = _dipole(row, x, derivatives)
+            distance, some = dr.rcp(inverse), active & (row[6] > 0)
+            # A bound of one over the distance less what rounding may have done to it, 2 unit:
+            # 1/(1-z) <= 1 + 2z for z <= 1/2. Nearer to a dipole nothing is known, and all bounds
+            # are infinite. Padding has no area and no bounds.
+            z = 2 * unit * inverse
+            closer = dr.select(z <= 0.5, dr.fma(2 * z, inverse, inverse), dr.inf)
+            closer = dr.select(some, closer, 0)
+            fourth = row[6] * dr.square(closer * closer)
+            nearer = some & (distance <= sums.free_distance)
+            new = dataclasses.replace(
+                sums.plus(terms, active & (inverse < dr.inf)),
+                rounding=sums.rounding + rounding_of_dipole(row[6], closer, unit),
+                free_distance=dr.select(nearer, distance, sums.free_distance),
+                s4=sums.s4 + fourth,
+                s5=dr.fma(fourth, closer, sums.s5),
+            )
+            return new, (dr.select(nearer, vector(*row[3:6]), own[0]),)
+
+        sums, own = self.clusters.sums(x, detail, add, (vector(0),), derivatives=derivatives)
+        return sums, own[0]
+
+    def sample(self, x: Vec3, detail: Real) -> Sample:
+        """Value, gradient and certificate at x: see `FieldSums.sample`."""
+        unit = epsilon_at(x)
+        found, nearest = self._sums(x, detail, unit, 1)
+        # Where one point's own field drowns the others', the surface has that point's normal; f
+        # is larger on the other side.
+        weight = dr.norm(nearest)
+        beside = (found.free_distance * found.free_distance < _BESIDE * weight) & (weight > 0)
+        normal = dr.select(beside, -nearest / weight, dr.normalize(found.gradient))
+        return found.sample(1.0, unit, self.rounding, normal)
+
+
+def _dipole(row: list[Real], x: Vec3, derivatives: int) -> tuple[Real, Terms]:
+    """One over the distance to a dipole, and its value, gradient (paper, Eq. 12 and 15) and
+    Hessian, as far as they are asked for.
+
+    With z = y - x and u = 1/|z|: f = m.z u^3, grad f = 3 (m.z) u^5 z - m u^3, and
+    Hess f = 15 (m.z) u^7 z z^T - 3 u^5 (m z^T + z m^T + (m.z) I).
+    """
+    vector = cast("Any", type(x))
+    z, m = vector(*row[:3]) - x, vector(*row[3:6])
+    u = dr.rsqrt(dr.squared_norm(z))
+    u2 = u * u
+    along = dr.dot(m, z)
+    value = along * u * u2
+    if derivatives == 0:
+        return u, Terms(value)
+    gradient = (u * u2) * dr.fma(vector(3 * along * u2), z, -m)
+    if derivatives == 1:
+        return u, Terms(value, gradient)
+    # By the unit vector n = u z, so that powers of u do not overflow sooner than the result.
+    n, four = u * z, 3 * (u2 * u2)
+    along = dr.dot(m, n)
+    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+    hessian = (
+        four * (5 * along * n[i] * n[j] - m[i] * n[j] - n[i] * m[j] - (along if i == j else 0))
+        for i, j in pairs
+    )
+    return u, Terms(value, gradient, SymmetricSum(*hessian))
+
+
+_VALUES, _TRACED = 2.0, 4.0
+
+
+class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
+    """f(x) = sum a_i n_i.(p_i - x)/|p_i - x|^3 of oriented points (paper, Eq. 12).
+
+    With a_i the areas that the points stand for, f is about 4 pi inside and 0 outside: the
+    surface is f = 2 pi. It passes through every point, with the point's normal.
+
+    points: (n, 3). normals: (n, 3), outward, of any length; or "estimate", from neighbors,
+        oriented along a spanning tree (`geometry.estimate_normals`). areas: (n,), or None to
+        estimate them from neighbors (Barill et al. 2018, Sec. 3.1).
+    accuracy: a cluster of points is taken as a whole beyond `accuracy` times its radius; by
+        default 2 for values at points and 4 for tracing, which takes more where the tolerance asks
+        for it. At least 1.5.
+
+    `moved` gives the field of points that have moved.
+
+    Raises CloudError (a ValueError) for what is no oriented point cloud.
+    """
+
+    period: ClassVar[float | None] = None
+    default_level: float = 2 * math.pi
+
+    def __init__(
+        self,
+        points: Any,
+        normals: Any | Literal["estimate"] = None,
+        areas: Any = None,
+        *,
+        accuracy: float | None = None,
+    ) -> None:
+        super().__init__()
+        if normals is None:
+            raise CloudError(
+                "normals are missing, and without them inside and outside are not known: give "
+                'them, or normals="estimate" to estimate them from neighboring points'
+            )
+        if accuracy is not None and not 1.5 <= accuracy <= 100:
+            raise ValueError(f"accuracy must lie between 1.5 and 100, not {accuracy}")
+        self.estimated = [isinstance(normals, str), areas is None]
+        if isinstance(normals, str):
+            if normals != "estimate":
+                raise CloudError(f'normals must be (n, 3) or "estimate", not {normals!r}')
+            normals = estimate_normals(points)
+        some = np.ones(len(points)) if areas is None else areas
+        self.points, self.normals, self.areas = validate_cloud(points, normals, some)
+        if areas is None:
+            self.areas = estimate_areas(self.points, self.normals)
+        self.accuracy = accuracy
+        self._box = low, high = self.points.min(axis=0), self.points.max(axis=0)
+        self._center = single(0.5 * (low + high))
+        extent = max(0.5 * float((high - low).max()), math.sqrt(float(self.areas.sum())) / 4)
+        self._size = 2.0 ** math.ceil(math.log2(extent))
+        self._hierarchy: Hierarchy | None = None
+
+    def moved(
+        self, points: Any, normals: Any | Literal["estimate"] = None, areas: Any = None
+    ) -> DipolePotential:
+        """The potential of as many points (n, 3) elsewhere; normals and areas as for a new one.
+
+        The tree, if there is one, keeps its shape and gets new centers, radii, moments and bounds.
+        All that is promised is computed from where the points are now, so a tree whose points moved
+        far is slower than a new one, never wrong. Raises CloudError as for a new field.
+        """
+        field = DipolePotential(points, normals, areas, accuracy=self.accuracy)
+        if len(field.points) != len(self.points):
+            raise CloudError(
+                f"points: {len(field.points)} of them, where {len(self.points)} were before: "
+                "moving points keeps their number and their order"
+            )
+        field._hierarchy = self._hierarchy
+        return field
+
+    def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> Values:
+        on = self._batch(backend_of(x))
+        x = on.unit(x)
+        weight = float(self.areas.sum()) / self._size**2
+        return on.tree.at(x, derivatives, closer).far_away(x, 64, weight).rescaled(on.size)
+
+    def _upload(self, backend: Backend, *, traced: bool) -> _DipoleBuffers:
+        accuracy = self.accuracy or (_TRACED if traced else _VALUES)
+        unit = (self.points - self._center) / self._size
+        # Areas shrink with the square of lengths, and the potential knows no scale.
+        moments = (self.areas / self._size**2)[:, None] * self.normals
+        if self._hierarchy is None:
+            self._hierarchy = hierarchy_of(unit)
+        tree = DipoleTree.of(backend, self._hierarchy, unit, moments, accuracy)
+        return _DipoleBuffers(*placed(backend, self._center, self._size), tree)
+
+    def prepare(self, backend: Backend) -> Self:
+        prepared = super().prepare(backend)
+        if prepared._device is not None:
+            prepared.coarsest_detail = prepared._device.tree.clusters.coarsest
+        return prepared
+
+    def _sample(self, on: _DipoleBuffers, p: Vec3, detail: Real) -> Sample:
+        return on.sample(p, detail)
+
+    def check_levels(self, levels: tuple[float, ...]) -> None:
+        for level in levels:
+            if abs(level) < 1e-6:
+                raise ValueError(
+                    "level 0 of a dipole potential reaches to infinity; the surface is at 2 pi"
+                )
+
+    def extent(self, levels: tuple[float, ...]) -> Volume | None:
+        """A box around the points: at distance rho from all of them |f| <= (sum of areas)/rho^2."""
+        reach = 1.0001 * math.sqrt(float(self.areas.sum()) / min(abs(level) for level in levels))
+        low, high = self._box
+        return Box(low - reach, high + reach)
+
+    def describe(self) -> dict[str, Any]:
+        said = ("estimated" if one else "given" for one in self.estimated)
+        return {"points": len(self.points), **dict(zip(("normals", "areas"), said, strict=True))}
+
+
+@dataclass(frozen=True)
+class _DipoleBuffers(UnitCoordinates):
+    """A potential on a backend."""
+
+    tree: DipoleTree
+
+    def sample(self, p: Vec3, detail: Real) -> Sample:
+        return lengthened(self.tree.sample(self.unit(p), detail), self.size)

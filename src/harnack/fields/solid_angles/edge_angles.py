@@ -1,0 +1,174 @@
+"""The solid angle as one wide expression that Dr.Jit can differentiate in both directions.
+
+The loop of `edge_sums` is the fast way to a number; reverse mode cannot pass a recorded loop.
+Here every (point, edge) pair is a lane, and a block sum adds them up.
+
+The closest point of the curve in which the level sets of a solid angle end.
+
+How the solid angle of a curve changes along a straight segment, without any branch to choose.
+
+Biot and Savart's field, integrated along the segment from p to q, gives for each edge from a to b
+of the curve minus the solid angle of the parallelogram (a - p) + s (b - a) - t (q - p) at the
+origin: less than 2 pi in size, as it lies in a plane that misses the origin unless the segment
+meets the edge. As two triangles it is twice two arctangents (van Oosterom and Strackee 1983).
+
+What a solid angle promises near a point, by integrals over the curve.
+
+Along a unit direction v the derivative of the solid angle is the integral of v.(D x dp)/|D|^3 over
+the curve, D = p - x (Biot and Savart), and its second derivative that of 3 (v.D)(v.(D x dp))/|D|^5,
+as D changes by -v. D and D x dp are at right angles, so the product of their components along v is
+at most half of their lengths': the second derivative is at most 3/2 times the integral of
+|dp|/|D|^3. At x + s v, |D| is less by s at most. So by Taylor the rest after the linear term is,
+for t < d, the distance to the curve, at most
+
+    3/2 integral of |dp| integral over [0, t] of (t-s)/(|D|-s)^3 ds
+        = 3/4 t^2 integral of |dp|/(|D|^3 (1 - t/|D|)),
+
+and 1/(1 - u) <= 1 + u/(1 - q) for 0 <= u <= q. On the ball of radius q d that is `Curvature` with
+the constant 3/2 (I3 + q d I4/(1 - q)), I3 and I4 the integrals of |dp|/|D|^3 and |dp|/|D|^4. It
+holds for any piece of a curve, and adds up.
+
+The gradient. The second derivative in every direction being at most 3/2 times the integral of
+|dp|/|D|^3, so is the norm of the Hessian, and from x to x + t v the gradient moves by at most
+
+    3/2 integral of |dp| integral over [0, t] of ds/(|D|-s)^3
+        = 3/4 t integral of |dp|/|D|^3 (2 - u)/(1 - u)^2,    u = t/|D|.
+
+For 0 <= u <= q < 1 that fraction, which is convex in u, is at most 2 + u (3 - 2q)/(1 - q)^2, its
+chord. With q = t/d: at most 3/2 t I3 + 3/4 t^2 I4 (3 - 2q)/(1 - q)^2 (`slope_change`).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import FloatArray, to_vector3
+from harnack.backend.arrays import gather_vectors
+from harnack.backend.elementary import clamp
+from harnack.backend.records import Records
+from harnack.enclosures import Curvature, HarmonicBall
+from harnack.fields.solid_angles.edges import inner_product, single_edges, spinor
+from harnack.fields.sums import SUM_ROUNDING
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Real, Vec3
+    from harnack.fields.solid_angles.edges import LoopEdges
+
+__all__ = [
+    "bends",
+    "change_along_segments",
+    "closest_on_segments",
+    "segments",
+    "slope_change",
+    "swept_ball",
+]
+
+
+def differentiable_angle(backend: Backend, loops: tuple[Any, ...], x: Vec3) -> Real:
+    """Omega(x) in steradians, modulo 4 pi, of closed loops: (n, 3) arrays or Dr.Jit vectors.
+
+    Memory grows with points times vertices. The formula is that of `sum_over_edges`, with one
+    angle an edge instead of a product: an angle may jump by 4 pi, its derivative does not.
+    """
+    total = dr.zeros(backend.Float, dr.width(x))
+    for loop in loops:
+        vertices = loop if dr.is_array_v(type(loop)) else to_vector3(backend, np.asarray(loop))
+        total = total + _loop_angle(backend, vertices, backend.Array3f(x))
+    return total
+
+
+def _loop_angle(backend: Backend, vertices: Vec3, x: Vec3) -> Real:
+    points, edges = dr.width(x), dr.width(vertices)
+    lane = dr.arange(backend.UInt32, points * edges)
+    point, edge = lane // edges, lane % edges
+    following = dr.select(edge + 1 == edges, 0, edge + 1)
+    here = gather_vectors(backend, x, point)
+    a = gather_vectors(backend, vertices, edge) - here
+    b = gather_vectors(backend, vertices, following) - here
+    # The phase of a vertex's spinor is arbitrary; it enters its two edges with opposite signs.
+    re, im = inner_product(spinor(a)[2], spinor(b)[2])
+    return dr.block_sum(2 * dr.atan2(im, re), edges)
+
+
+def segments(backend: Backend, start: FloatArray, end: FloatArray) -> Records:
+    """Segments (k, 3) to (k, 3), k >= 1, of a size of about one. One whose ends are the same in
+    the backend's precision is a point."""
+    start, end = (q.astype(backend.dtype).astype(np.float64) for q in (start, end))
+    return Records.upload(backend, single_edges(start, end))
+
+
+def closest_on_segments(segments: Records, x: Vec3) -> Vec3:
+    """The point of the segments that is closest to x."""
+    vector = segments.backend.Array3f
+    x = vector(x)
+
+    def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+        nearest, best = state
+        p, q = vector(*row[:3]), vector(*row[4:7])
+        share = clamp(dr.dot(x - p, q - p) * row[7], 0, 1)
+        foot = dr.fma(vector(share), q - p, p)
+        square = dr.squared_norm(x - foot)
+        closer = square < nearest
+        return dr.select(closer, square, nearest), dr.select(closer, foot, best)
+
+    start = (segments.backend.Float(dr.inf), vector(0))
+    return segments.for_each(add, start, "nearest edge")[1]
+
+
+def change_along_segments(edges: LoopEdges, p: Vec3, q: Vec3) -> Real:
+    """The change of the lift of the solid angle from p to q, which differ."""
+    real = edges.backend.Float
+
+    def add(a: Vec3, b: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
+        del inverse
+        ap, bp, bq, aq = a - p, b - p, b - q, a - q
+        return (state[0] - _angle(ap, bp, bq) - _angle(ap, bq, aq),)
+
+    return edges.for_each(add, (real(0),), "swept angle")[0]
+
+
+def _angle(a: Vec3, b: Vec3, c: Vec3) -> Real:
+    """The signed solid angle of a triangle at the origin."""
+    la, lb, lc = dr.norm(a), dr.norm(b), dr.norm(c)
+    volume = dr.dot(a, dr.cross(b, c))
+    rest = dr.fma(dr.dot(a, b), lc, dr.fma(dr.dot(b, c), la, dr.dot(c, a) * lb))
+    # A triangle that is seen from its own plane has no solid angle, whatever rounding says.
+    return dr.select(volume == 0, 0, 2 * dr.atan2(volume, dr.fma(la * lb, lc, rest)))
+
+
+# Radii of the promises as parts of the distance to the curve, by experiment.
+_REACHES = (0.3, 0.6, 0.85)
+
+
+def bends(cubes: Real, fourths: Real, distance: Real) -> tuple[Curvature, ...]:
+    """The promises: see the module. cubes, fourths: I3 and I4; distance: d, or less."""
+    scale = 1.5 * (1 + SUM_ROUNDING)
+    return tuple(
+        Curvature(scale * dr.fma(q / (1 - q) * distance, fourths, cubes), q * distance)
+        for q in _REACHES
+    )
+
+
+def slope_change(cubes: Real, fourths: Real, distance: Real, radius: Real) -> Real:
+    """How far the gradient moves at most within `radius`: see the module; infinite where that is
+    not less than the distance."""
+    q = radius / distance
+    growth = (3 - 2 * q) / dr.square(1 - q)
+    change = radius * (1.5 * cubes + 0.75 * radius * growth * fourths)
+    return dr.select(radius < distance, (1 + SUM_ROUNDING) * change, dr.inf)
+
+
+def swept_ball(
+    value: Real, gradient: Vec3, squares: Real, bends: tuple[Curvature, ...]
+) -> HarmonicBall:
+    """The range of the lift on the ball of one of its promises, which itself proves longer steps.
+
+    squares: the integral of |dp|/|D|^2, to which the gradient is known but for its rounding.
+    """
+    bend = bends[1]
+    slope = dr.norm(gradient) + SUM_ROUNDING * squares
+    moved = (1 + SUM_ROUNDING) * bend.radius * dr.fma(0.5 * bend.radius, bend.constant, slope)
+    return HarmonicBall(bend.radius, value - moved, value + moved)

@@ -1,0 +1,339 @@
+"""Edges as records on a backend: edges one by one, and runs of edges of closed loops.
+
+What is known at a point x about one edge from p to q: its distance, field and derivatives.
+
+With a = p - x, b = q - x, e = q - p and c = a x e, the edge adds to the gradient of a solid angle
+Biot and Savart's field w c (paper, Eq. 11),
+
+    w = integral of |a + te|^-3 dt over [0, 1] = (|a|+|b|)/(|a||b| D),   D = |a||b| + a.b.
+
+D cancels beside the edge (a.b < 0), where it is |c|^2/(|a||b| - a.b) instead.
+
+Second derivatives. The derivative of w c along the axis j is c dw/dx_j - w (axis_j x e). The second
+term is antisymmetric. Around closed curves the fields add up to a gradient, whose derivative is
+symmetric: the antisymmetric parts cancel, and what is left is
+
+    Hessian = sum over edges of (c grad w^T + grad w c^T)/2,
+
+symmetric as it stands, and free of trace, for grad w lies in the plane of a and e.
+
+With h the vector from x to the nearest point of the edge's *line*, s the position on the line
+from there and L = |e|,
+
+    grad w = 3 integral of (a + te)/|a + te|^5 dt = J h + K e/L^2,
+    J = 3/L integral of (h^2+s^2)^(-5/2) ds,   K = 3 integral of s (h^2+s^2)^(-5/2) ds.
+
+K = 1/|a|^3 - 1/|b|^3 at once. J is -2 dw/d(h^2) at fixed ends, and the closed form of w gives it as
+a product and sums of positive terms:
+
+    J = w [ ((|a|-|b|)^2 + |a||b|)/(|a||b|)^2 + (|a|+|b|)^2/(|a||b| D) ],
+
+where the integral written out, s/h^2 (...) between two ends, loses all digits far away and in line
+with the edge. The difference of the cubes is taken from |b| - |a| = e.(a+b)/(|a|+|b|).
+h = a - (a.e) e/L^2 cancels where it is short: a fused multiply-add rounds it once, and what is left
+of the error lies along e, where a second projection finds it. With c = h x e, the three stay at
+right angles.
+
+One pass over the edges of a curve: solid angle, its gradient, distance and variation.
+
+The only loop that costs anything in a trace of a curve, so it is written for throughput: eight
+edges a trip, vertices fetched in aligned packets of eight floats, one square root, one division
+and about eighty additions and multiplications an edge.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import FloatArray
+from harnack.backend.elementary import fmin
+from harnack.backend.records import Records
+from harnack.fields.batch import SymmetricSum
+from harnack.tree.nearest import squared_distance_to_segment
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Mask, Real, Vec3
+
+__all__ = ["Edge", "edge_variation"]
+
+# Gives the state with the edge from p to q, of which the third is 1/length^2, taken into account.
+EachEdge: TypeAlias = "Callable[[Vec3, Vec3, Real, tuple[Any, ...]], tuple[Any, ...]]"
+
+# The largest 1/length^2 of a record, within the range of float32. Edges that have no length, for
+# padding or by rounding, have it too: no angle, no gradient, hardly any variation.
+_SHARPEST = 1e30
+
+
+def inverse_squares(edges: FloatArray) -> FloatArray:
+    """1/length^2 of edges (k, 3), (k,), or the largest number that records hold, if less.
+
+    Too small a number makes no distance too long: the foot of the perpendicular ends nearer to
+    the edge's start than it should by less than the edge's length, at most 1e-15, far below the
+    rounding of distances. Nor a variation too small: 1/sqrt(d^2 (1 + 4 d^2/length^2)) grows.
+    """
+    squared = (edges * edges).sum(axis=1)
+    return 1 / np.maximum(squared, 1 / _SHARPEST)
+
+
+def single_edges(start: FloatArray, end: FloatArray, direction: Any = 1.0) -> FloatArray:
+    """(k, 8) records of edges from (k, 3) to (k, 3): start, direction, end, 1/length^2.
+
+    direction: 1 or -1, (k,), as the edge runs from start to end or back.
+    """
+    direction = np.broadcast_to(direction, len(start))
+    return np.column_stack([start, direction, end, inverse_squares(end - start)])
+
+
+@dataclass(frozen=True)
+class LoopEdges:
+    """Records of `run` consecutive edges each, of closed loops.
+
+    A record holds run + 1 vertices as (x, y, z, 1/|edge to the next|^2). Records do not lean on
+    each other, so several loops need no special case.
+    """
+
+    records: Records
+    run: int
+
+    @classmethod
+    def upload(
+        cls, backend: Backend, loops: tuple[FloatArray, ...], run: int | None = None
+    ) -> LoopEdges:
+        """The edges of closed loops, each of shape (n, 3); run: None for what suits them."""
+        run, number = run or _run_for(loops), backend.dtype
+        rounded = (loop.astype(number).astype(np.float64) for loop in loops)
+        table = np.concatenate([_runs(loop, run) for loop in rounded])
+        return cls(Records.upload(backend, table), run)
+
+    @property
+    def backend(self) -> Backend:
+        """The one they lie on."""
+        return self.records.backend
+
+    def part(self, first: Any, trips: Any) -> LoopEdges:
+        """The edges of so many records from `first` on, others in each lane."""
+        return replace(self, records=self.records.part(first, trips))
+
+    def vertex(self, row: list[Real], k: int) -> Vec3:
+        """Vertex k of a record, at which its edge k starts."""
+        return self.backend.Array3f(*row[4 * k : 4 * k + 3])
+
+    def for_each(
+        self, body: EachEdge, state: tuple[Any, ...], label: str, active: Mask = True
+    ) -> tuple[Any, ...]:
+        """The state after `body` of all edges, as `Records.for_each` has it."""
+
+        def of_record(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+            for k in range(self.run):
+                p, q = self.vertex(row, k), self.vertex(row, k + 1)
+                state = body(p, q, row[4 * k + 3], state)
+            return state
+
+        return self.records.for_each(of_record, state, label, active)
+
+
+def _run_for(loops: tuple[FloatArray, ...]) -> int:
+    """Eight edges a record, or four where eight would be mostly padding."""
+    edges = sum(len(loop) for loop in loops)
+    padded = sum(-(-len(loop) // 8) * 8 for loop in loops)
+    return 8 if padded <= 1.2 * edges else 4
+
+
+def _runs(loop: FloatArray, run: int) -> FloatArray:
+    trips = -(-len(loop) // run)
+    stays = np.repeat(loop[:1], trips * run + 1 - len(loop), axis=0)
+    path = np.concatenate([loop, stays])  # back to the start, then edges without a length
+    inverse = inverse_squares(path[1:] - path[:-1])
+    rows = np.concatenate([path, np.append(inverse, 0.0)[:, None]], axis=1)
+    index = np.arange(trips)[:, None] * run + np.arange(run + 1)[None, :]
+    return rows[index].reshape(trips, -1)
+
+
+@dataclass(frozen=True)
+class Edge:
+    """The edge from p to q, seen from x: a = p - x and b = q - x.
+
+    e: q - p, which has no rounding of x. inverse: 1/|e|^2, anything finite for an edge without a
+    length: that has no field.
+    """
+
+    a: Vec3
+    b: Vec3
+    e: Vec3
+    inverse: Real
+
+    @classmethod
+    def between(cls, p: Vec3, q: Vec3, inverse: Real, x: Vec3) -> Edge:
+        """The edge from p to q, seen from x."""
+        return cls(p - x, q - x, q - p, inverse)
+
+    @functools.cached_property
+    def lengths(self) -> tuple[Real, Real]:
+        """|a| and |b|."""
+        return dr.norm(self.a), dr.norm(self.b)
+
+    @functools.cached_property
+    def square(self) -> Real:
+        """The square of the distance from x to the edge."""
+        return squared_distance_to_segment(self.a, self.e, self.inverse)
+
+    def field(self) -> tuple[Real, Vec3]:
+        """w and c of Biot and Savart's field w c, what the edge adds to the gradient; in line with
+        the edge w is 0."""
+        (la, lb), c = self.lengths, dr.cross(self.a, self.e)
+        square = dr.squared_norm(c)
+        return dr.select(square > 0, (la + lb) / (la * lb * self._bracket(square)), 0), c
+
+    def field_of_lengths(self, la: Real, lb: Real) -> tuple[Real, Vec3]:
+        """The same for given |a| and |b|, by one division."""
+        c, both, dot = dr.cross(self.a, self.e), la * lb, dr.dot(self.a, self.b)
+        square, beside = dr.squared_norm(c), dot < 0
+        above = (la + lb) * dr.select(beside, both - dot, 1)
+        below = both * dr.select(beside, square, both + dot)
+        return dr.select(square > 0, above / below, 0), c
+
+    def rates(self) -> tuple[Vec3, Vec3]:
+        """c and grad w: the edge's share of the Hessian is (c grad w^T + grad w c^T)/2.
+
+        Lengths should be of order one, to stay far from overflow: the terms fall like distance^-5
+        and grow like distance^-3.
+        """
+        a, e, vector = self.a, self.e, cast("Any", type(self.a))
+        h = dr.fma(vector(-dr.dot(a, e) * self.inverse), e, a)
+        h = dr.fma(vector(-dr.dot(h, e) * self.inverse), e, h)
+        c, (la, lb) = dr.cross(h, e), self.lengths
+        alpha, beta, total, apart = 1 / la, 1 / lb, la + lb, la - lb
+        both, share = alpha * beta, total / self._bracket(dr.squared_norm(c))
+        across = both * both * share * (dr.fma(apart * apart, both, 1) + total * share)
+        cubes = both * dr.fma(alpha, alpha, dr.fma(beta, beta, both))
+        along = dr.dot(e, a + self.b) / total * cubes * self.inverse
+        return c, across * h + along * e
+
+    def _bracket(self, square: Real) -> Real:
+        """D, square: |c|^2."""
+        (la, lb), dot = self.lengths, dr.dot(self.a, self.b)
+        return dr.select(dot < 0, square / (la * lb - dot), la * lb + dot)
+
+
+def edge_variation(square: Real, inverse: Real) -> tuple[Real, Real]:
+    """h/(d sqrt(d^2+h^2)) and the same over d, of an edge of half length h at distance d.
+
+    square: d^2. inverse: 1/(2h)^2. `SolidAngle` says what they bound.
+    """
+    first = dr.rsqrt(square * dr.fma(square, 4 * inverse, 1))
+    return first, first * dr.rsqrt(square)
+
+
+# Two complex numbers, as four reals.
+Spinor: TypeAlias = "tuple[Real, Real, Real, Real]"
+
+# Often, and without squares: beside a vertex or far away, the product of a few factors leaves the
+# range of float32.
+_RENORMALIZE_EVERY = 2
+
+
+@dataclass(frozen=True)
+class EdgeSums:
+    """Sums over all edges at x: Omega in (-2pi, 2pi], its gradient, distance to the nearest edge,
+    and of the integrals of |dp|/D^k along the edges, D the distance to p: squares is at least that
+    for k = 2, cubes is that for k = 3, fourths at least that for k = 4."""
+
+    angle: Real
+    gradient: Vec3
+    distance: Real
+    squares: Real
+    cubes: Real
+    fourths: Real
+
+
+def sum_over_edges(edges: LoopEdges, x: Vec3) -> EdgeSums:
+    """All sums at x in one loop.
+
+    Solid angle. For unit spinors chi(a) of the directions a = p_i - x, the product of
+    <chi(p_i), chi(p_{i+1})> around a closed loop has argument Omega/2 (the Berry phase of spin
+    1/2; it equals the fan formula of van Oosterom and Strackee 1983, Eq. 10, with the apex at
+    infinity). With s = |a| + |a_z| and A = a_x + i a_y, chi is (s, A) above and (conj A, s)
+    below: neither cancels, and the gauge drops out because each vertex enters once plain and
+    once conjugated. A factor vanishes only on its own edge: there is no apex to be in line with.
+
+    Gradient. Biot-Savart: each edge gives (1/|a|+1/|b|)/(|a||b|+a.b) a x b (Eq. 11). The
+    bracket cancels beside the edge; |factor|^2 = 2 s_a s_b (|a||b|+a.b) does not.
+
+    Integrals. Biot and Savart's field of an edge of length L at distance h from its line is h times
+    the integral of |dp|/D^3, and |a x b| = h L: so that integral is L times the weight of a x b in
+    the gradient. With d, the distance to the edge, the integral of |dp|/D^4 is at most 1/d of it,
+    and that of |dp|/D^2 at most 2d times it: in polar angles around the foot of x on the line, both
+    are integrals from t1, cos t1 = h/d, to t2, and 2 (sin t2 - sin t1) >= (t2 - t1) cos t1, since
+    the difference is concave in t2, 0 at t1, and at pi/2 not less than 0 (tan(u/2) >= u/2).
+    """
+    real, x = edges.backend.Float, edges.backend.Array3f(x)
+
+    def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+        zr, zi, g, d2, squares, cubes, fourths = state
+        p = edges.vertex(row, 0)
+        a = p - x
+        la, sa, ca = spinor(a)
+        for k in range(edges.run):
+            q, inverse = edges.vertex(row, k + 1), row[4 * k + 3]
+            b = q - x
+            lb, sb, cb = spinor(b)
+            re, im = inner_product(ca, cb)
+            zr, zi = dr.fma(zr, re, -(zi * im)), dr.fma(zr, im, zi * re)
+            if k % _RENORMALIZE_EVERY == _RENORMALIZE_EVERY - 1:
+                scale = dr.rcp(dr.abs(zr) + dr.abs(zi))
+                zr, zi = zr * scale, zi * scale
+            e = q - p
+            weight = (la + lb) * (sa * sb) / (la * lb * dr.fma(re, re, im * im))
+            g = dr.fma(type(g)(weight), dr.cross(a, e), g)
+            square = squared_distance_to_segment(a, e, inverse)
+            d2 = fmin(square, d2)
+            share = weight * dr.rsqrt(inverse)
+            near = dr.rsqrt(square)
+            cubes, fourths = cubes + share, dr.fma(share, near, fourths)
+            squares = dr.fma(share, square * near, squares)
+            p, a, la, sa, ca = q, b, lb, sb, cb
+        return zr, zi, g, d2, squares, cubes, fourths
+
+    start = (real(1), real(0), type(x)(0), real(dr.inf), real(0), real(0), real(0))
+    zr, zi, g, d2, squares, cubes, fourths = edges.records.for_each(add, start, "edges")
+    angle = 2 * dr.atan2(zi, zr)
+    # The weights are half of those in the gradient.
+    return EdgeSums(angle, 2 * g, dr.sqrt(d2), 4 * squares, 2 * cubes, 2 * fourths)
+
+
+def hessian_over_edges(edges: LoopEdges, x: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+    """Rows of the Hessian of the solid angle at x, in one loop over the edges."""
+    x = edges.backend.Array3f(x)
+
+    def add(p: Vec3, q: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
+        return SymmetricSum(*state).plus(*Edge.between(p, q, inverse, x).rates()).parts()
+
+    start = SymmetricSum.zero(edges.backend.Float).parts()
+    return SymmetricSum(*edges.for_each(add, start, "edge hessian")).rows(type(x))
+
+
+def inner_product(a: Spinor, b: Spinor) -> tuple[Real, Real]:
+    """<a, b> as (real, imaginary), conjugate-linear in a."""
+    re = dr.fma(a[0], b[0], dr.fma(a[1], b[1], dr.fma(a[2], b[2], a[3] * b[3])))
+    im = dr.fma(a[0], b[1], dr.fma(a[2], b[3], -dr.fma(a[1], b[0], a[3] * b[2])))
+    return re, im
+
+
+def spinor(a: Vec3) -> tuple[Real, Real, Spinor]:
+    """|a|, |a| + |a_z| and the (unnormalized) spinor of direction a as four reals."""
+    length = dr.sqrt(dr.fma(a.z, a.z, dr.fma(a.x, a.x, a.y * a.y)))
+    s = length + dr.abs(a.z)
+    up = a.z >= 0
+    chi = (
+        dr.select(up, s, a.x),
+        dr.select(up, 0, -a.y),
+        dr.select(up, a.x, s),
+        dr.select(up, a.y, 0),
+    )
+    return length, s, chi

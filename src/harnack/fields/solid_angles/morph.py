@@ -1,0 +1,169 @@
+"""Shape interpolation: slices of a solid angle in four dimensions."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from harnack.backend import FloatArray, IntArray
+from harnack.backend.numbers import positive
+from harnack.fields.batch import BatchedField, Values
+from harnack.fields.field import Field, Sample
+from harnack.fields.solid_angles.morph_slice import MorphSlice
+from harnack.fields.solid_angles.winding_number import WindingNumber
+from harnack.geometry.meshes import MeshError, validate_mesh
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from harnack.backend import Backend, Mask, Precision, Real, Vec3
+    from harnack.fields.sheets import Crossing, NearestSheet
+    from harnack.geometry import Volume
+    from harnack.tree.cells import OccupiedCells
+
+
+class Morph(BatchedField):
+    """What lies at height w between solid a, at height 0, and solid b, at height `gap`.
+
+    U_a(x, w) = w int_a dV/(|y-x|^2 + w^2)^2 is the solid angle at which a, as a flat solid in
+    four dimensions, is seen from (x, w): harmonic in both, half of all directions, pi^2, inside a
+    for w -> 0, and 0 outside. The morph is the solid f > 1/2,
+
+        f(x) = (U_a(x, w) + U_b(x, gap - w))/(2 pi^2).
+
+    For w -> 0 that is a, as 0 < U_b < pi^2, and for w -> gap it is b. (This is the 'solid angle in
+    four dimensions' of the talk on Gillespie et al. 2024, with level pi^2 of the sum.)
+
+    At w = 0 and w = gap the field is the winding number of the mesh itself, triangles and all.
+    Between the ends what is drawn is the surface of a *quadrature*: each mesh is replaced by
+    oriented points at the centroids of its triangles, cut so that their edges are at most `spacing`
+    times the height; of triangles much smaller than that, one point stands for several. The sum
+    over these is as harmonic as the integral, and it is that sum whose surface is found with
+    proof; `quadrature_displacement` bounds how far the surface of the integral is.
+
+    mesh_a, mesh_b: pairs (vertices (n, 3), faces (m, 3)), counter-clockwise seen from outside.
+        Holes are allowed: between the ends a dent reaches into the solid there, as the surface is
+        where both winding numbers, blurred, add up to 1; at the ends the level 1/2 spans them.
+    gap: how far apart the solids are, in the unit of the meshes. With a large one the slices in
+        the middle are small, or empty: for solids of half-diagonal 1, 0.1 to 0.2 is good.
+    w: in [0, gap]. Like `gap` it is data: other numbers compile nothing.
+    spacing: see above, at most 2. Less is sharper, and needs 1/spacing^2 times as many points.
+        Of real meshes surfaces were off by at most 0.02, 0.04 and 0.09 of w for 1, 1.4 and 2.
+    accuracy: of the tree between the ends: clusters of points are taken as a whole beyond
+        `accuracy` times their radius. Bounds of what that leaves out are part of every promise,
+        and tracing takes more where the tolerance asks for it. At least 2.
+
+    Raises:
+        MeshError: a ValueError, as `validate_mesh`; something that is no pair.
+        ValueError: gap, w, spacing or accuracy out of range; w so near to an end, but not at it,
+            that more than four million points would be needed.
+    """
+
+    default_level = 0.5
+
+    def __init__(
+        self,
+        mesh_a: tuple[npt.ArrayLike, npt.ArrayLike],
+        mesh_b: tuple[npt.ArrayLike, npt.ArrayLike],
+        *,
+        gap: float,
+        w: float,
+        spacing: float = 1.0,
+        accuracy: float = 6.0,
+    ) -> None:
+        gap = positive(gap, "gap")
+        if not 0 <= w <= gap:
+            raise ValueError(f"w must lie between 0 and the gap {gap!r}, not {w!r}")
+        if not 0 < spacing <= 2:
+            raise ValueError(f"spacing must be above 0 and at most 2, not {spacing!r}")
+        if not 2 <= accuracy <= 100:
+            raise ValueError(f"accuracy must lie between 2 and 100, not {accuracy!r}")
+        self.w, self.gap = float(w), float(gap)
+        meshes = [_checked(mesh_a, "mesh_a"), _checked(mesh_b, "mesh_b")]
+        self._slice: MorphSlice | WindingNumber
+        if 0 < w < gap:
+            corners = [vertices[faces] for vertices, faces in meshes]
+            self._slice = MorphSlice(
+                corners, w=self.w, gap=self.gap, spacing=spacing, accuracy=accuracy
+            )
+        else:
+            self._slice = WindingNumber(*meshes[int(w > 0)])
+        self.has_sheets, self.has_detail = self._slice.has_sheets, self._slice.has_detail
+
+    def quadrature_displacement(
+        self, points: Any, *, precision: Precision = "single"
+    ) -> FloatArray:
+        """How far the surface through points (n, 3) is, at most and to first order, from that of
+        the integral over the triangles: (n,), in the unit of the meshes; 0 at the ends.
+
+        A bound of what the quadrature leaves out of f, which far exceeds the error of meshes
+        whose triangles are regular, over the size of the gradient.
+        """
+        if isinstance(self._slice, MorphSlice):
+            return self._slice.quadrature_displacement(points, precision)
+        return np.zeros(len(np.asarray(points)))
+
+    def describe(self) -> dict[str, Any]:
+        place = {"w": self.w, "gap": self.gap}
+        if isinstance(self._slice, WindingNumber):
+            return {**place, "shows": "mesh " + "ab"[self.w > 0], **self._slice.describe()}
+        points = self._slice.point_counts
+        return {**place, "points of a": points[0], "points of b": points[1]}
+
+    # All else is that of the slice.
+
+    def prepare(self, backend: Backend) -> Field:
+        return self._slice.prepare(backend)
+
+    def evaluate(self, p: Vec3) -> Sample:
+        return self._slice.evaluate(p)
+
+    def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> Values:
+        return self._slice.values_at(x, derivatives, closer)
+
+    def at_detail(self, detail: Real) -> Field:
+        return self._slice.at_detail(detail)
+
+    def check_levels(self, levels: tuple[float, ...]) -> None:
+        self._slice.check_levels(levels)
+
+    def extent(self, levels: tuple[float, ...]) -> Volume | None:
+        return self._slice.extent(levels)
+
+    def occupied(self, levels: tuple[float, ...]) -> OccupiedCells | None:
+        return self._slice.occupied(levels)
+
+    def mesh_of_sheets(self) -> tuple[FloatArray, IntArray, bool] | None:
+        return self._slice.mesh_of_sheets()
+
+    def next_crossing(
+        self, o: Vec3, d: Vec3, after: Crossing, t_max: Real, active: Mask
+    ) -> Crossing:
+        return self._slice.next_crossing(o, d, after, t_max, active)
+
+    def offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
+        return self._slice.offset(o, d, t_min, active)
+
+    def between(self, o: Vec3, d: Vec3, behind: Crossing, ahead: Crossing, offset: Real) -> Field:
+        return self._slice.between(o, d, behind, ahead, offset)
+
+    def distance_to_sheets(self, p: Vec3) -> Real:
+        return self._slice.distance_to_sheets(p)
+
+    def nearest_sheet(
+        self, p: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
+    ) -> NearestSheet | None:
+        return self._slice.nearest_sheet(p, after, limit, active)
+
+
+def _checked(mesh: Any, name: str) -> tuple[FloatArray, IntArray]:
+    """A validated mesh; MeshError that names it."""
+    try:
+        vertices, faces = mesh
+    except (TypeError, ValueError):
+        raise MeshError(f"{name}: give a pair (vertices, faces)") from None
+    try:
+        return validate_mesh(vertices, faces)
+    except MeshError as wrong:
+        raise MeshError(f"{name}: {wrong}") from None

@@ -1,0 +1,427 @@
+"""A slice of the sum of two solid angles in four dimensions, strictly between its ends.
+
+Triangle meshes as oriented points: large triangles cut into pieces, small ones merged.
+
+The kernel of slices of four-dimensional solid angles: a Newton kernel seen from a height w.
+
+Kernel. 1/|X|^2 is harmonic in R^4. The solid angle of a flat solid A x {0} from (x, w) is
+U = w int_A dV/(r^2 + w^2)^2 with r = |y-x|; by the divergence theorem it is the integral over the
+boundary of A of -n.grad_y K, with
+
+    K(r, w) = (1/2) int_w^oo dv/(r^2 + v^2) = atan(r/w)/(2r),   pi/(4r) for w = 0.
+
+So each dipole -m.grad_y K is harmonic in (x, w) but at the dipole and below it. Here K is scaled by
+4/pi, such that it is 1/r for w = 0: sums over m = area n/(4 pi) are then U/pi^2, and for w = 0 the
+winding number. As -(1/r) d/dr (r^2+v^2)^-k = 2k (r^2+v^2)^-(k+1), with D^2 = r^2 + w^2, c = w/D,
+s = r/D,
+
+    psi_k = (2/pi) 2^k k! i_(k+1)/D^(2k+1),   i_k = D^(2k-1) int_w^oo dv/(r^2+v^2)^k,
+    i_k = (2k s^2 i_(k+1) + c)/(2k-1)   by parts: positive terms, which lose no digits.
+
+The last i_n = int_0^1 (sin(phi t)/sin phi)^(2n-2) dt phi/sin phi, cos phi = c, is a function of c
+that is analytic but for c <= -1: a polynomial on [0, 1].
+
+Bound. |d^m K[u_1, ..., u_m]| <= m!/D^(m+1) for unit vectors, as if 1/r were D away; attained for
+w = 0. Proof. Equal vectors u are the worst (Banach 1938). The m-th derivative of 1/|X|^2 along a
+line is (-1)^m m! U_m(cos)/|X|^(m+2) (Gegenbauer), so that, with x = D/sqrt(r^2 + v^2) and
+a = u.z/D, |a| <= s, that of K is +-m!/D^(m+1) times (2/pi) I,
+
+    I = int_0^1 U_m(a x) x^m (1 - s^2 x^2)^(-1/2) dx.
+
+For s = 1, that is w = 0, it is (pi/2) P_m(a), at most pi/2. For s < 1 the weight is that for s = 1
+times one that falls from 1, so that I is the same integral for s = 1 up to some b <= 1 (Bonnet).
+That is the largest for b = 1, or where U_m(a b) = 0 at an angle k pi/(m+1), k >= 1. Lobes between
+such angles alternate and grow with x, as x^m (1 - x^2)^(-1/2) does: the integral is at most its
+last lobe, which is the largest if it ends at b = 1, where it is below 0.4 for m <= 7 (quadrature in
+`tests/fields/test_morph.py`).
+
+In four dimensions the gradient of n.grad_x K is at most 2 * 1.1855/D^3: its square is
+cos^2 (K''^2 + (dw K')^2) + sin^2 (K'/r)^2, cos the angle of n to z, and so at most the larger of
+two functions of c alone (maximum at w = r; the same tests).
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+from numpy.polynomial import chebyshev, legendre
+
+from harnack.backend import backend_of
+from harnack.backend.elementary import fmax
+from harnack.enclosures import HarmonicBall
+from harnack.fields.batch import BatchedField, Values
+from harnack.fields.clearance import (
+    DetailedField,
+    UnitCoordinates,
+    epsilon_at,
+    occupied_cells,
+    placed,
+    single,
+    tight_extent,
+)
+from harnack.fields.field import Sample
+from harnack.fields.points import at_points
+from harnack.fields.solid_angles.far_clusters import dipole_rows
+from harnack.fields.solid_angles.radial_kernel import BALL, Radial, RadialKernel, RadialSums
+from harnack.fields.solid_angles.radial_tree import ClusteredDipoles, TreeSum
+from harnack.fields.sums import SLOPE_ROUNDINGS, SUM_ROUNDING
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from harnack.backend import Backend, FloatArray, IntArray, Precision, Real, Vec3
+    from harnack.geometry import Volume
+    from harnack.tree.cells import OccupiedCells
+
+GRADIENT = 1.1855
+"""Half the largest gradient of a dipole in four dimensions, times D^3: it serves for Q_2."""
+
+# Degrees of the polynomial for the last i_n in single and double precision: the singularity at
+# c = -1 makes coefficients fall as 5.8^-k.
+_DEGREES = {4: 12, 8: 22}
+
+
+class SlicedKernel(RadialKernel):
+    """(4/pi) K(r, w) on a backend, at a height w > 0."""
+
+    def __init__(self, backend: Backend, height: float) -> None:
+        self.height = dr.opaque(backend.Float, height)
+        self.height_square = dr.opaque(backend.Float, height * height)
+        self._degree = _DEGREES[np.dtype(backend.dtype).itemsize]
+
+    def at(self, distance: Real, inverse: Real, last: int) -> Radial:
+        del distance
+        c = self.height * inverse
+        s2 = dr.fma(-c, c, 1)
+        moment = _horner(dr.fma(2, c, -1), last_moment(last + 1, self._degree))
+        thetas = [_factor(last) * moment]
+        for k in range(last, 0, -1):
+            moment = dr.fma(2 * k * s2, moment, c) * (1 / (2 * k - 1))
+            thetas.insert(0, _factor(k - 1) * moment)
+        return Radial(inverse, thetas)
+
+    def bounds(self, distance: Real, last: int) -> list[Real]:
+        del distance
+        return [GRADIENT, *(1.0 for _ in range(3, last + 1))]
+
+    def growth(self, r: Real) -> Real:
+        del r
+        return 1.0
+
+    def accepting_distance(self, radius: FloatArray, accuracy: float) -> FloatArray:
+        return accuracy * radius + 1e-5
+
+
+@functools.cache
+def last_moment(n: int, degree: int) -> tuple[float, ...]:
+    """i_n as a polynomial in 2c - 1 on [-1, 1], coefficients from the constant on."""
+    t, weight = legendre.leggauss(48)
+    t, weight = 0.5 * (t + 1), 0.5 * weight
+
+    def moment(x: FloatArray) -> FloatArray:
+        phi = np.arccos(0.5 * (x + 1))[:, None]
+        ratio = np.sin(phi * t) / np.sin(phi)
+        return phi[:, 0] / np.sin(phi[:, 0]) * (ratio ** (2 * n - 2) @ weight)
+
+    nodes = chebyshev.chebpts1(2 * degree)
+    series = chebyshev.chebfit(nodes, moment(nodes), degree)
+    return tuple(float(one) for one in chebyshev.cheb2poly(series))
+
+
+def _horner(x: Real, coefficients: tuple[float, ...]) -> Real:
+    out: Real = coefficients[-1]
+    for one in coefficients[-2::-1]:
+        out = dr.fma(out, x, one)
+    return out
+
+
+def _factor(k: int) -> float:
+    """(2/pi) 2^k k!."""
+    return 2 / math.pi * 2.0**k * math.factorial(k)
+
+
+# Cells in which triangles are merged, and the longest edge of these, in the longest edge of pieces.
+_CELL = 0.54
+
+
+@dataclass(frozen=True)
+class Centroids:
+    """Points that stand for parts of triangles.
+
+    points: (n, 3) centroids. moments: (n, 3) area times normal, summed up.
+    farthest: no point of a triangle is farther from the point that stands for it.
+    spread: the largest integral of |d|^2 over the part that a point stands for, d the distance from
+        the point, over the length of its moment; slant: of the Frobenius norm of the sum of moment
+        times d, likewise.
+    """
+
+    points: FloatArray
+    moments: FloatArray
+    farthest: float
+    spread: float
+    slant: float
+
+
+def piece_counts(corners: FloatArray, longest: float) -> IntArray:
+    """In how many parts to cut each edge of triangles (m, 3, 3), so that none is longer: (m,)."""
+    return np.maximum(np.ceil(_longest_edges(corners) / longest), 1).astype(np.int64)
+
+
+def centroids(corners: FloatArray, longest: float) -> Centroids:
+    """Of triangles (m, 3, 3), cut in similar pieces with edges at most `longest`; of those much
+    smaller, one point for all in a cell that face the same way."""
+    small = _longest_edges(corners) <= _CELL * longest
+    parts = [
+        make(some, longest)
+        for make, some in ((_cut, corners[~small]), (_merged, corners[small]))
+        if len(some)
+    ]
+    return Centroids(
+        np.concatenate([one.points for one in parts]),
+        np.concatenate([one.moments for one in parts]),
+        max(one.farthest for one in parts),
+        max(one.spread for one in parts),
+        max(one.slant for one in parts),
+    )
+
+
+def _longest_edges(corners: FloatArray) -> FloatArray:
+    return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+
+
+def _farthest(corners: FloatArray, points: FloatArray) -> FloatArray:
+    """The largest distance of a corner (m, 3, 3) from points (m, 3): (m,)."""
+    return np.linalg.norm(corners - points[:, None], axis=2).max(axis=1)
+
+
+def _areas(corners: FloatArray) -> FloatArray:
+    """Area times normal, (m, 3)."""
+    a, b, c = np.moveaxis(corners, 1, 0)
+    return 0.5 * np.cross(b - a, c - a)
+
+
+def _mean_squares(corners: FloatArray) -> FloatArray:
+    """The mean square distance from the centroid over triangles: (m,)."""
+    return ((corners - np.roll(corners, 1, axis=1)) ** 2).sum(axis=(1, 2)) / 36
+
+
+def _cut(corners: FloatArray, longest: float) -> Centroids:
+    """Triangles cut in counts^2 similar pieces each: first moments vanish."""
+    counts = piece_counts(corners, longest)
+    points: list[FloatArray] = []
+    moments: list[FloatArray] = []
+    for count in np.unique(counts):
+        some = corners[counts == count]
+        a, b, c = np.moveaxis(some, 1, 0)
+        # Pieces that are turned as the triangle, and those that fill the gaps between them.
+        i, j = np.indices((count, count)).reshape(2, -1)
+        steps = [(i + j < count, 1 / 3), (i + j < count - 1, 2 / 3)]
+        u, v = (np.concatenate([k[one] + third for one, third in steps]) / count for k in (i, j))
+        middle = a[:, None] + u[:, None] * (b - a)[:, None] + v[:, None] * (c - a)[:, None]
+        points.append(middle.reshape(-1, 3))
+        moments.append(np.repeat(_areas(some) / count**2, count**2, axis=0))
+    spread = float((_mean_squares(corners) / counts**2).max())
+    farthest = float((_farthest(corners, corners.mean(axis=1)) / counts).max())
+    return Centroids(np.concatenate(points), np.concatenate(moments), farthest, spread, 0.0)
+
+
+def _merged(corners: FloatArray, longest: float) -> Centroids:
+    """One point for all triangles whose centroids are in a cell and whose normals have the same
+    largest component: their moments add up to at least 1/sqrt(3) of their area."""
+    moments, middles = _areas(corners), corners.mean(axis=1)
+    axis = np.abs(moments).argmax(axis=1)
+    side = np.take_along_axis(moments, axis[:, None], axis=1)[:, 0] > 0
+    cells = np.floor(middles / (_CELL * longest)).astype(np.int64)
+    keys = np.column_stack([cells, 2 * axis + side])
+    _, group = np.unique(keys, axis=0, return_inverse=True)
+    group = group.ravel()
+    area = np.linalg.norm(moments, axis=1)
+    points = _sums(group, area[:, None] * middles) / _sums(group, area[:, None])
+    d = middles - points[group]
+    total = _sums(group, moments)
+    length = np.linalg.norm(total, axis=1)
+    square = area * (_mean_squares(corners) + (d * d).sum(axis=1))
+    outer = np.einsum("ki,kj->kij", moments, d).reshape(-1, 9)
+    slant = np.linalg.norm(_sums(group, outer), axis=1)
+    spread = float((_sums(group, square[:, None])[:, 0] / length).max())
+    farthest = float(_farthest(corners, points[group]).max())
+    return Centroids(points, total, farthest, spread, float((slant / length).max()))
+
+
+def _sums(group: IntArray, values: FloatArray) -> FloatArray:
+    """Sums of rows (m, k) of the same group: (groups, k)."""
+    columns: list[FloatArray] = [np.bincount(group, one).astype(np.float64) for one in values.T]
+    return np.column_stack(columns)
+
+
+MOST_POINTS = 4_000_000
+"""Points of the quadrature of both meshes together."""
+
+_SMALLEST_LEVEL = 1e-6
+# Cells that an extent looks at in one round, at most.
+_MOST_CELLS = 40_000
+# Cells of the grid along its longest side, by experiment.
+_ACROSS = 128
+
+
+class MorphSlice(DetailedField["_SliceBuffers"], BatchedField):
+    """f(x) = (U_a(x, w) + U_b(x, gap - w))/(2 pi^2), 0 < w < gap: see `Morph`.
+
+    corners: two arrays (m, 3, 3) of triangles. w, gap, spacing, accuracy: as for `Morph`.
+
+    Promises, with the 4D distances D of all points, d the least of them (`SlicedKernel` has the
+    proof that terms bend no more than dipoles at a distance D): `Curvature` within 0.45 d, and a
+    `HarmonicBall` of dimension 4 and radius 0.35 d, which proves shorter steps.
+    """
+
+    default_level = 0.5
+    values_take_more = False
+
+    def __init__(
+        self, corners: Sequence[FloatArray], *, w: float, gap: float, spacing: float,
+        accuracy: float,
+    ) -> None:  # fmt: skip
+        super().__init__()
+        self.heights = (w, gap - w)
+        self.spacing, self.accuracy = spacing, accuracy
+        low = np.min([one.min(axis=(0, 1)) for one in corners], axis=0)
+        high = np.max([one.max(axis=(0, 1)) for one in corners], axis=0)
+        self._box = low, high
+        self._center = single(0.5 * (low + high))
+        # A power of two, so that lengths are scaled without rounding.
+        self._size = 2.0 ** math.ceil(math.log2(0.5 * float((high - low).max())))
+        longest = [spacing * height for height in self.heights]
+        _check_count([piece_counts(*one) for one in zip(corners, longest, strict=True)], w, gap)
+        self._pieces = tuple(centroids(*one) for one in zip(corners, longest, strict=True))
+        self._dipoles = tuple(self._clustered(one) for one in self._pieces)
+        self._extents: dict[tuple[float, ...], Volume] = {}
+        self._occupied: dict[tuple[float, ...], OccupiedCells] = {}
+
+    def _clustered(self, pieces: Centroids) -> ClusteredDipoles:
+        """The pieces in unit coordinates, scaled so that f is the sum of both."""
+        share = 1 / (8 * math.pi * self._size**2)
+        points = (pieces.points - self._center) / self._size
+        return ClusteredDipoles.of(dipole_rows(points, share * pieces.moments))
+
+    @property
+    def point_counts(self) -> tuple[int, ...]:
+        """Points of the quadrature of each mesh."""
+        return tuple(len(one.rows) for one in self._dipoles)
+
+    def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> Values:
+        on = self._batch(backend_of(x))
+        x = on.unit(x)
+        sums = on.sums(x, closer, derivatives).sums
+        rounding = 8 * on.backend.epsilon * dr.abs(sums.value)
+        values = sums.values(1.0, epsilon_at(x), rounding)
+        weight = sum(float(one.rows[:, 6].sum()) for one in self._dipoles)
+        return values.far_away(x, 64, weight).rescaled(on.size)
+
+    def quadrature_displacement(self, points: Any, precision: Precision = "single") -> FloatArray:
+        """As `Morph.quadrature_displacement`.
+
+        A part with moment m whose point is D away is off by at most 2 |T|_* /D^3, the nuclear norm
+        of T = sum of m_i times d_i, at most sqrt(3) times Frobenius', and by the remainder of
+        Taylor's formula: |m| times the mean of |d|^2 (3-2q)/((1-q)^2 D^4), q = |d|/D
+        (`RadialSums.remainder`). It is infinite where a part reaches farther than its point is.
+        """
+
+        def kernel(backend: Backend, x: Vec3) -> tuple[Real]:
+            on = self._batch(backend)
+            x = on.unit(x)
+            error, gradient = backend.Float(0), backend.Array3f(0)
+            for cloud, piece, height in zip(on.clouds, self._pieces, self.heights, strict=True):
+                sums = cloud.sums(x, 1.0, 1)
+                share = piece.farthest / height
+                bend = dr.inf
+                if share < 1:
+                    bend = sums.remainder(share, piece.farthest / self._size, 1.0)
+                error = dr.fma(piece.spread / self._size**2, bend, error)
+                error = dr.fma(2 * math.sqrt(3) * piece.slant / self._size, sums.steep, error)
+                gradient = gradient + sums.sums.gradient
+            return (error / dr.norm(gradient) * on.size,)
+
+        return at_points(points, kernel, precision)[0]
+
+    def _upload(self, backend: Backend, *, traced: bool) -> _SliceBuffers:
+        del traced
+        clouds = tuple(
+            TreeSum(backend, dipoles, SlicedKernel(backend, height / self._size), self.accuracy)
+            for dipoles, height in zip(self._dipoles, self.heights, strict=True)
+        )
+        return _SliceBuffers(*placed(backend, self._center, self._size), clouds)
+
+    def _sample(self, on: _SliceBuffers, p: Vec3, detail: Real) -> Sample:
+        return on.sample(p, detail)
+
+    def check_levels(self, levels: tuple[float, ...]) -> None:
+        for level in levels:
+            if abs(level) < _SMALLEST_LEVEL:
+                raise ValueError("level 0 of a morph reaches to infinity; the surface is at 0.5")
+
+    def extent(self, levels: tuple[float, ...]) -> Volume:
+        """A box without its cells that are proved empty (`tight_extent`): at a distance rho from
+        all points |f| is at most their weight over rho^2."""
+        if levels not in self._extents:
+            weight = sum(float(one.rows[:, 6].sum()) for one in self._dipoles)
+            reach = 1.0001 * self._size * math.sqrt(weight / min(abs(level) for level in levels))
+            low, high = self._box
+            self._extents[levels] = tight_extent(
+                self, levels, low - reach, high + reach, _MOST_CELLS
+            )
+        return self._extents[levels]
+
+    def occupied(self, levels: tuple[float, ...]) -> OccupiedCells:
+        if levels not in self._occupied:
+            self._occupied[levels] = occupied_cells(self, levels, self.extent(levels), _ACROSS)
+        return self._occupied[levels]
+
+
+@dataclass(frozen=True)
+class _SliceBuffers(UnitCoordinates):
+    """The points of both meshes on a backend, each seen from a height of its own."""
+
+    clouds: tuple[TreeSum, ...]
+
+    def sums(self, x: Vec3, closer: Real, derivatives: int) -> RadialSums:
+        """Over both."""
+        sums = RadialSums.zero(self.backend, derivatives)
+        for cloud in self.clouds:
+            sums = cloud.added(sums, x, closer)
+        return sums
+
+    def sample(self, p: Vec3, detail: Real) -> Sample:
+        """f at points p, in units of `size`."""
+        x = self.unit(p)
+        radial = self.sums(x, detail, 1)
+        sums = radial.sums
+        slope_error = dr.fma(SLOPE_ROUNDINGS * epsilon_at(x), sums.s4, sums.slope_truncation)
+        nearest = sums.free_distance * (1 - SUM_ROUNDING) - 8 * self.backend.epsilon
+        nearest = fmax(nearest, 0)
+        r = BALL * nearest
+        moved = radial.variation(r, 1.0)
+        ball = HarmonicBall(r * self.size, sums.value - moved, sums.value + moved, dimension=4)
+        return Sample(
+            sums.value,
+            sums.gradient / self.size,
+            radial.curvatures(lambda r: 1.0, nearest, self.size),
+            sums.truncation + sums.rounding,
+            slope_error / self.size,
+            truncation=sums.truncation,
+            weaker=(ball,),
+        )
+
+
+def _check_count(counts: Sequence[Any], w: float, gap: float) -> None:
+    count = sum(int((one.astype(float) ** 2).sum()) for one in counts)
+    if count > MOST_POINTS:
+        raise ValueError(
+            f"w = {w:g} is so near to an end of the gap {gap:g} that {count:,} points would be "
+            f"needed, more than {MOST_POINTS:,}: show the end itself (w = 0 or w = gap), or choose "
+            "a larger spacing"
+        )

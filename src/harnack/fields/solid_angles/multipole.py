@@ -1,0 +1,471 @@
+"""Multipole moments of dipoles about a point, and about another one.
+
+The potential of dipoles a_i n_i at y_i = c + d_i is, seen from x = c + r,
+
+    f(x) = sum_i a_i n_i.(y_i - x)/|y_i - x|^3 = -sum_i a_i n_i.grad_y 1/|x - y_i|
+         = -sum_{l>=1} sum_m conj(M_lm) I_lm(r),      M_lm = sum_i a_i n_i.grad R_lm(d_i)
+
+with solid harmonics R_lm = r^l P_lm(cos t) e^(im p)/(l+m)! and I_lm = (l-m)! P_lm e^(im p)/r^(l+1)
+(no Condon-Shortley phase; R_l,-m = (-1)^m conj R_lm). 1/|x-y| = sum conj(R_lm(y)) I_lm(x),
+R_lm(a+b) = sum R_l'm'(a) R_l-l',m-m'(b), d/dz R_lm = R_l-1,m, (d/dx + i d/dy) R_lm = -R_l-1,m+1,
+(d/dx - i d/dy) R_lm = R_l-1,m-1. All of these are held by tests.
+
+A complex number is a pair here, of numbers or arrays of any kind, NumPy's and Dr.Jit's alike.
+
+Moments of dipoles about the nodes of a tree.
+
+`moments` says what they are. All in double precision: sums over dipoles and over children in
+Dr.Jit, on many threads and without temporaries, the rest, of one row a node, in NumPy.
+
+How large the terms of a multipole expansion are at most, and what leaving terms out may cost.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+import numpy.typing as npt
+
+from harnack.backend import FloatArray, choose_backend, to_numpy
+from harnack.backend.arrays import aligned, aligned_integers
+from harnack.backend.elementary import fmax, fmin
+from harnack.fields.sums import longest_part, remainder_factor
+from harnack.tree import NO_PRIMITIVE, Hierarchy
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Real, Vec3
+
+# Harmonics have degree l.
+# ruff: noqa: E741
+
+
+Pair = tuple[Any, Any]
+Pairs = dict[tuple[int, int], Pair]
+
+# The largest l for which moments are computed.
+KNOWN = 5
+# What is kept of them: for all 1 <= l <= KNOWN and 0 <= m <= l.
+KEYS = tuple((l, m) for l in range(1, KNOWN + 1) for m in range(l + 1))
+
+
+def regular(x: Any, y: Any, z: Any, order: int) -> Pairs:
+    """R_lm for l <= order and 0 <= m <= l; the imaginary part is the number 0 if m = 0."""
+    r2 = x * x + y * y + z * z
+    out: Pairs = {(0, 0): (0 * x + 1, 0.0)}
+    for m in range(order + 1):
+        if m:
+            u, v = x * (1 / (2 * m)), y * (1 / (2 * m))
+            re, im = out[m - 1, m - 1]
+            out[m, m] = (re * u, re * v) if m == 1 else (re * u - im * v, re * v + im * u)
+        for l in range(m + 1, order + 1):
+            scale = 1 / ((l + m) * (l - m))
+            along, back = (scale * (2 * l - 1)) * z, scale * r2
+            re, im = out[l - 1, m]
+            re, im = along * re, along * im if m else 0.0
+            if l - 2 >= m:
+                last = out[l - 2, m]
+                re, im = re - back * last[0], im - back * last[1] if m else 0.0
+            out[l, m] = re, im
+    return out
+
+
+def of_dipole(harmonics: Pairs, nx: Any, ny: Any, nz: Any) -> Pairs:
+    """M_lm of a dipole n, its area in its length, at d, of which R_lm(d) are given for l < KNOWN.
+
+    Or of one that is spread out, from the means of R_lm.
+    """
+    r, x, y = _either_sign(harmonics), 0.5 * nx, 0.5 * ny
+    out: Pairs = {}
+    for l, m in KEYS:
+        re, im = (nz * part for part in r[l - 1, m]) if m < l else (0.0, 0.0)
+        if abs(m + 1) < l:  # less (x - iy) R_l-1,m+1
+            a, b = r[l - 1, m + 1]
+            re, im = re - (x * a + y * b), im - (x * b - y * a)
+        if abs(m - 1) < l:  # plus (x + iy) R_l-1,m-1
+            a, b = r[l - 1, m - 1]
+            re, im = re + (x * a - y * b), im + (x * b + y * a)
+        out[l, m] = re, im if m else 0.0
+    return out
+
+
+def moved(moments: Pairs, x: Any, y: Any, z: Any) -> Pairs:
+    """Moments about c of dipoles whose moments about c + (x, y, z) are given."""
+    r, given = _either_sign(regular(x, y, z, KNOWN - 1)), _either_sign(moments)
+    out: Pairs = {}
+    for l, m in KEYS:
+        re, im = moments[l, m]
+        for k in range(1, l):
+            for j in range(max(-k, m - l + k), min(k, m + l - k) + 1):
+                (a, b), (u, v) = given[k, j], r[l - k, m - j]
+                re = re + (a * u - b * v)
+                if m:
+                    im = im + (a * v + b * u)
+        out[l, m] = re, im
+    return out
+
+
+def _either_sign(values: Pairs) -> Pairs:
+    """R_lm or M_lm with those of m < 0 as well."""
+    turned = {
+        (l, -m): (re, -im) if m % 2 == 0 else (-re, im) for (l, m), (re, im) in values.items() if m
+    }
+    return values | turned
+
+
+# Harmonics have degree l.
+# ruff: noqa: E741
+
+
+Moments = dict[tuple[int, int], npt.NDArray[np.complex128]]
+# Degree, order, and 0 for the real or 1 for the imaginary part.
+_PARTS = tuple((l, m, part) for l, m in KEYS for part in range(2 if m else 1))
+# Numbers of `_powers`.
+_POWERS = 10
+
+
+@dataclass(frozen=True)
+class NodeMoments:
+    """The nodes of one level of the tree.
+
+    center: (k, 3) about which the moments are taken: the mean of the dipoles by area.
+    radius: (k,) of a ball around it that holds all the dipoles.
+    area: (k,) sum of a_i = |a_i n_i|.
+    second, third, fourth: (k, 3, 3), (k, 3) and (k,) sums of a_i d_i d_i^T, of a_i |d_i|^2 d_i and
+        of a_i |d_i|^4.
+    moments: M_lm, (k,) each, for 1 <= l <= 5 and m >= 0.
+    """
+
+    center: FloatArray
+    radius: FloatArray
+    area: FloatArray
+    second: FloatArray
+    third: FloatArray
+    fourth: FloatArray
+    moments: Moments
+
+
+def all_levels(
+    tree: Hierarchy, points: FloatArray, normals: FloatArray, low: FloatArray, high: FloatArray
+) -> list[NodeMoments]:
+    """Moments of the nodes of all levels, from the leaves to the root.
+
+    points, normals: (n, s, 3) dipoles of each of n primitives; a normal's length is its area.
+    low, high: (n, 3) boxes that hold the primitives.
+    """
+    backend, each = choose_backend("double"), points.shape[1]
+    p, n, lows, highs = (aligned(backend, x.ravel()) for x in (points, normals, low, high))
+
+    def primitive(i: Any) -> _Primitive:
+        dipoles = [
+            _Dipole(_row(backend, n, i * each + k), ((1.0, _row(backend, p, i * each + k)),))
+            for k in range(each)
+        ]
+        return _Primitive(dipoles, _row(backend, lows, i), _row(backend, highs, i))
+
+    return _levels(backend, tree, primitive)
+
+
+def triangle_levels(tree: Hierarchy, corners: FloatArray) -> list[NodeMoments]:
+    """Moments of the nodes of all levels, for triangles (n, 3, 3): exact up to rounding."""
+    backend = choose_backend("double")
+    buffer = aligned(backend, corners.ravel())
+    rule = tuple(zip(*(part.tolist() for part in triangle_rule()), strict=True))
+
+    def primitive(i: Any) -> _Primitive:
+        a, b, c = (_row(backend, buffer, 3 * i + k) for k in range(3))
+        points = [(weight, a * u + b * v + c * w) for (u, v, w), weight in rule]
+        dipole = _Dipole(0.5 * dr.cross(b - a, c - a), points)
+        return _Primitive([dipole], fmin(fmin(a, b), c), fmax(fmax(a, b), c))
+
+    return _levels(backend, tree, primitive)
+
+
+@dataclass(frozen=True)
+class _Dipole:
+    """A dipole that is spread over points, with weights of sum 1. Its area is its length."""
+
+    normal: Vec3
+    points: Sequence[tuple[float, Vec3]]
+
+
+@dataclass(frozen=True)
+class _Primitive:
+    """Its dipoles, and a box that holds it."""
+
+    dipoles: Sequence[_Dipole]
+    low: Vec3
+    high: Vec3
+
+
+def _row(backend: Backend, buffer: Real, i: Any) -> Vec3:
+    return backend.Array3f(*(dr.gather(backend.Float, buffer, 3 * i + k) for k in range(3)))
+
+
+def _levels(
+    backend: Backend, tree: Hierarchy, primitive: Callable[[Any], _Primitive]
+) -> list[NodeMoments]:
+    level, parts, low, high = _leaves(backend, tree, primitive)
+    levels = [level]
+    for arity in tree.arities:
+        low = low.reshape(-1, arity, 3).min(axis=1)
+        high = high.reshape(-1, arity, 3).max(axis=1)
+        level, parts = _parents(backend, level, parts, low, high)
+        levels.append(level)
+    return levels
+
+
+def _leaves(
+    backend: Backend, tree: Hierarchy, primitive: Callable[[Any], _Primitive]
+) -> tuple[NodeMoments, list[Real], FloatArray, FloatArray]:
+    """The leaves, their `_PARTS` on the backend, and boxes around them.
+
+    One lane a leaf, which looks at its primitives twice: for the center, and about it.
+    """
+    index, real, vector = backend.UInt32, backend.Float, backend.Array3f
+    filled = tree.slots != NO_PRIMITIVE
+    slots = aligned_integers(backend, np.where(filled, tree.slots, 0).ravel())
+    leaf = dr.arange(index, len(filled))
+    first = leaf * dr.opaque(index, tree.leaf_size)
+    end = first + dr.gather(index, aligned_integers(backend, filled.sum(axis=1)), leaf)
+
+    def visit(body: Callable[..., tuple[Any, ...]], state: tuple[Any, ...]) -> tuple[Any, ...]:
+        def step(slot: Any, *state: Any) -> tuple[Any, ...]:
+            return slot + 1, *body(primitive(dr.gather(index, slots, slot)), *state)
+
+        def more(slot: Any, *_: Any) -> Any:
+            return slot < end
+
+        return dr.while_loop((first, *state), more, step, label="slots")[1:]
+
+    def measured(of: _Primitive, low: Vec3, high: Vec3, area: Real, weighted: Vec3) -> Any:
+        for one in of.dipoles:
+            size = dr.norm(one.normal)
+            area, weighted = area + size, weighted + size * sum(w * p for w, p in one.points)
+        return fmin(low, of.low), fmax(high, of.high), area, weighted
+
+    def summed(of: _Primitive, *parts: Real) -> tuple[Any, ...]:
+        for one in of.dipoles:
+            away = [(weight, point - center) for weight, point in one.points]
+            more = _powers(dr.norm(one.normal), away) + _flat(_spread_out(one.normal, away))
+            parts = tuple(a + b for a, b in zip(parts, more, strict=True))
+        return parts
+
+    nothing = (vector(dr.inf), vector(-dr.inf), real(0), vector(0))
+    low, high, area, weighted = visit(measured, nothing)
+    # The mean of positions by area, or the box's middle where there is no area.
+    center = dr.select(area > 0, weighted / dr.select(area > 0, area, 1), 0.5 * (low + high))
+    sums = visit(summed, (real(0),) * (_POWERS + len(_PARTS)))
+    powers, parts = sums[:_POWERS], sums[_POWERS:]
+    dr.eval(low, high, area, center, *sums)
+    boxes = to_numpy(low), to_numpy(high)
+    at, (xx, yy, zz, xy, xz, yz, *third, fourth) = to_numpy(center), map(to_numpy, powers)
+    second = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
+    sizes = to_numpy(area), second, np.stack(third, axis=1), fourth
+    return NodeMoments(at, _reach(at, *boxes), *sizes, _moments_of(parts)), list(parts), *boxes
+
+
+def _powers(area: Real, points: Sequence[tuple[float, Vec3]]) -> list[Real]:
+    """A dipole's part of `second` (xx, yy, zz, xy, xz, yz), `third` and `fourth`."""
+    total: list[Real] = [area * 0] * _POWERS
+    for weight, d in points:
+        square, share = dr.squared_norm(d), weight * area
+        pairs = (d.x * d.x, d.y * d.y, d.z * d.z, d.x * d.y, d.x * d.z, d.y * d.z)
+        powers = (*pairs, *(square * d), square * square)
+        total = [dr.fma(share, one, old) for one, old in zip(powers, total, strict=True)]
+    return total
+
+
+def _spread_out(normal: Vec3, points: Sequence[tuple[float, Vec3]]) -> Pairs:
+    means: Pairs = {}
+    for weight, d in points:
+        for key, (re, im) in regular(d.x, d.y, d.z, KNOWN - 1).items():
+            a, b = means.get(key, (0.0, 0.0))
+            means[key] = a + weight * re, b + weight * im
+    return of_dipole(means, normal.x, normal.y, normal.z)
+
+
+def _flat(moments: Pairs) -> list[Any]:
+    """Real and imaginary parts, as many as there are in `_PARTS`."""
+    return [moments[l, m][part] for l, m, part in _PARTS]
+
+
+def _moments_of(parts: Sequence[Real]) -> Moments:
+    out = {key: np.zeros(dr.width(parts[0]), np.complex128) for key in KEYS}
+    for (l, m, part), values in zip(_PARTS, parts, strict=True):
+        if part:
+            out[l, m].imag = to_numpy(values)
+        else:
+            out[l, m].real = to_numpy(values)
+    return out
+
+
+def _parents(
+    backend: Backend, below: NodeMoments, parts: list[Real], low: FloatArray, high: FloatArray
+) -> tuple[NodeMoments, list[Real]]:
+    """The level above, whose boxes are given, and its `_PARTS`."""
+    count, arity = len(low), len(below.area) // len(low)
+    area = below.area.reshape(-1, arity).sum(axis=1)
+    weighted = (below.area[:, None] * below.center).reshape(-1, arity, 3).sum(axis=1)
+    some = (area > 0)[:, None]
+    center = np.where(some, weighted / np.where(some, area[:, None], 1), 0.5 * (low + high))
+    shift = below.center - np.repeat(center, arity, axis=0)
+    given: Pairs = dict.fromkeys(KEYS, (0.0, 0.0))
+    for (l, m, part), values in zip(_PARTS, parts, strict=True):
+        given[l, m] = (given[l, m][0], values) if part else (values, 0.0)
+    found = _flat(moved(given, *(aligned(backend, one) for one in shift.T)))
+    dr.eval(*found)
+    first = arity * dr.arange(backend.UInt32, count)
+    sums = [sum(dr.gather(backend.Float, one, first + k) for k in range(arity)) for one in found]
+    dr.eval(*sums)
+    second, third, fourth = (
+        one.reshape(count, arity, *one.shape[1:]).sum(axis=1) for one in _moved(below, shift)
+    )
+    reach, moments = _reach(center, low, high), _moments_of(sums)
+    return NodeMoments(center, reach, area, second, third, fourth, moments), sums
+
+
+def _moved(level: NodeMoments, s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Second, third and fourth about center - s: what they are of d + s. About its own center a
+    node has no first moment."""
+    a, square = level.area[:, None], (s * s).sum(axis=1)
+    trace, bent = np.einsum("kii->k", level.second), np.einsum("kij,kj->ki", level.second, s)
+    second = level.second + a[:, None] * s[:, :, None] * s[:, None]
+    third = level.third + trace[:, None] * s + 2 * bent + a * square[:, None] * s
+    fourth = level.fourth + 2 * trace * square + level.area * square * square
+    return second, third, fourth + 4 * ((level.third + bent) * s).sum(axis=1)
+
+
+def _reach(center: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Distance from the center to the farthest corner of the box."""
+    return np.linalg.norm(np.maximum(high - center, center - low), axis=1)
+
+
+def cartesian(moments: Moments, order: int = 2) -> FloatArray:
+    """(k, 15) coefficients of the terms l <= order + 1, as `multipole_kernel` reads them.
+
+    Term l is P_l(r)/r^(2l+1) with harmonic polynomials P_1 = D.r; P_2 with the coefficients of
+    xx, yy, 2xy, 2xz, 2yz (zz follows: the trace is zero); P_3 with those of xyy, xzz, xxy, yzz,
+    xxz, yyz, xyz (x^3, y^3, z^3 follow).
+    """
+    real = {key: value.real for key, value in moments.items()}
+    imag = {key: value.imag for key, value in moments.items()}
+    dipole = [2 * real[1, 1], 2 * imag[1, 1], real[1, 0]]
+    r20, r21, i21 = real[2, 0], 6 * real[2, 1], 6 * imag[2, 1]
+    r22, i22 = 6 * real[2, 2], 6 * imag[2, 2]
+    quadrupole = [-r20 + r22, -r20 - r22, i22, r21 / 2, i21 / 2]
+    r30, r31, i31 = 3 * real[3, 0], 6 * real[3, 1], 6 * imag[3, 1]
+    r32, i32 = 30 * real[3, 2], 30 * imag[3, 2]
+    r33, i33 = 30 * real[3, 3], 30 * imag[3, 3]
+    octupole = [
+        -r31 - 3 * r33,
+        4 * r31,
+        -i31 + 3 * i33,
+        4 * i31,
+        -3 * r30 + r32,
+        -3 * r30 - r32,
+        2 * i32,
+    ]
+    kept = -np.stack([*dipole, *quadrupole, *octupole], axis=1)
+    kept[:, (3, 8, 15)[order] :] = 0
+    return kept
+
+
+def triangle_rule() -> tuple[FloatArray, FloatArray]:
+    """Barycentric coordinates (6, 3) of points in a triangle, and their weights (6,), sum 1.
+
+    They integrate polynomials of degree at most four exactly, and so give exact moments for
+    l <= 5: Dunavant's six-point rule (1985).
+    """
+    rule = ((0.445948490915965, 0.223381589678011), (0.091576213509771, 0.109951743655322))
+    points: list[tuple[float, float, float]] = []
+    for corner, _ in rule:
+        apex = 1 - 2 * corner
+        points += [(apex, corner, corner), (corner, apex, corner), (corner, corner, apex)]
+    return np.array(points), np.repeat([weight for _, weight in rule], 3)
+
+
+# Harmonics have degree l.
+# ruff: noqa: E741
+
+
+# A bound that is rounded to single precision a few times, down each time, is one still.
+_ROOM = 1 + 2.0**-20
+
+
+def sup_norm(moments: Moments, l: int) -> FloatArray:
+    """A bound of |term l| r^(l+1) over all directions.
+
+    For unit x, y the addition theorem gives sum_m |I_lm(x)|^2 / ((l+m)!(l-m)!) = P_l(1) = 1, so
+    by Cauchy and Schwarz |sum_m conj(M_lm) I_lm|^2 <= sum_m (l+m)! (l-m)! |M_lm|^2.
+    """
+    total = 0.0
+    for m in range(l + 1):
+        weight = math.factorial(l + m) * math.factorial(l - m) * (1 if m == 0 else 2)
+        total = total + weight * np.abs(moments[l, m]) ** 2
+    return np.sqrt(np.asarray(total))
+
+
+def truncation(
+    level: NodeMoments, nearest: FloatArray, order: int = 2
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(E, G, H): seen from r >= nearest, what the terms l >= order + 2 =: k add to f is at most
+    E/r^(k+1) in value, G/r^(k+2) in gradient and H/r^(k+3) in second derivatives along lines.
+
+    A dipole of area a at d gives the term l at most a l |d|^(l-1)/r^(l+1): on the sphere
+    rho^l P_l is a trigonometric polynomial of degree l along each great circle, so by Bernstein's
+    and Szego's inequality its gradient is at most l rho^(l-1). Terms up to 5 are known exactly and
+    bounded by `sup_norm`; for the rest |d|^(l-1) <= R^(l-5) |d|^4 and
+    sum_{l>=6} l q^(l-5) = q (6 - 5q)/(1-q)^2 with q = R/r. A harmonic function of degree
+    -(l+1) has, by the same inequality, a gradient of at most l+1 times its largest value on the
+    sphere through the point; the rest is then sum_{l>=6} l (l+1) q^(l-5)
+    = q (42 - 70q + 30q^2)/(1-q)^3. Its derivatives along lines are harmonic of degree -(l+2), so
+    that second ones are at most (l+1)(l+2) times it, and sum_{l>=6} l (l+1) (l+2) q^(l-5)
+    = q (336 - 840q + 720q^2 - 210q^3)/(1-q)^4. Each term times r^(k+1) (r^(k+2), r^(k+3)) falls or
+    stays as r grows, so the value at `nearest` serves. A little is added, for single precision to
+    take away.
+    """
+    r = np.maximum(nearest, 1e-50)  # of which powers can be taken
+    q = np.minimum(level.radius / r, 0.99)
+    k = order + 2
+    rest = level.fourth * level.radius / r ** (6 - k)
+    value = rest * (6 - 5 * q) / (1 - q) ** 2
+    slope = rest * (42 - 70 * q + 30 * q * q) / (1 - q) ** 3
+    second = rest * (336 - 840 * q + 720 * q * q - 210 * q**3) / (1 - q) ** 4
+    for l in range(k, KNOWN + 1):
+        term = sup_norm(level.moments, l) / r ** (l - k)
+        value, slope, second = (
+            value + term,
+            slope + (l + 1) * term,
+            second + (l + 1) * (l + 2) * term,
+        )
+    return _ROOM * value, _ROOM * slope, _ROOM * second
+
+
+def bend_columns(level: NodeMoments, rough: float) -> tuple[FloatArray, FloatArray]:
+    """A and K (k,) of nodes that are seen from beyond r0 = `rough` times their radius R.
+
+    From there on a step by t = q r, q <= Q = `longest_part(rough)`, moves a node's field off the
+    linear by at most
+
+        (A + K/r^2) t^2/r^4 Phi_1(q),   Phi_l(q) = ((1-q)^-(l+1) - 1 - (l+1)q)/q^2.
+
+    The term l, a harmonic function of degree -(l+1), is at most B_l/r^(l+1), and its k-th
+    derivative along a line (l+k)!/l! B_l/r^(l+1+k) (`truncation.truncation`, k times). So Taylor's
+    remainder is at most B_l Phi_l(q) t^2/r^(l+3). In Phi_l/Phi_1 the ratio of coefficients,
+    (l+k)!/(l! (k+1)!), grows with k, so that the quotient grows with q: W_l = Phi_l(Q)/Phi_1(Q)
+    serves. With r >= r0: A = B_1 + W_2 B_2/r0 and K = sum_{l>=3} W_l B_l/r0^(l-3), for l >= 6 of
+    B_l <= l R^(l-5) sum a |d|^4, with Phi_l(Q) < (1-Q)^-(l+1)/Q^2.
+    """
+    r0, q = np.maximum(rough * level.radius, 1e-50), longest_part(rough)
+    first = q * q * remainder_factor(q)
+    ratio = [((1 - q) ** -(n + 1) - 1 - (n + 1) * q) / first for n in range(KNOWN + 1)]
+    terms = [ratio[n] * sup_norm(level.moments, n) for n in range(1, KNOWN + 1)]
+    x = 1 / (rough * (1 - q))
+    rest = x * (6 - 5 * x) / (1 - x) ** 2 / ((1 - q) ** 6 * first)
+    wide = rest * level.fourth / r0**2 + sum(term / r0**n for n, term in enumerate(terms[2:]))
+    return terms[0] + terms[1] / r0, wide

@@ -1,0 +1,211 @@
+"""Curves that bound a region of a plane, and the range of their solid angle near a point.
+
+Let disjoint simple loops of one plane have winding numbers 0 and 1 only, such as an outline with
+holes, each run against it: they bound a region S of the plane. Above the plane f is minus the
+solid angle of S and lies in (-2 pi, 0); below, it lies in (0, 2 pi). Let d be the distance from x
+to the curves and h that to the plane, h <= d. On the ball B(x, d), which meets no curve, f has a
+continuous lift; the ball meets the plane in a disk D of radius sqrt(d^2 - h^2), inside of S or
+outside of it.
+
+- Outside, the lift is f on either side: it lies in (-2 pi, 2 pi).
+- Inside, it continues f of the one side by f of the other less or plus 4 pi: from above it lies in
+  (-4 pi, 0), from below in (0, 4 pi), whichever side x is on.
+- B(x, h) does not meet the plane: there the lift lies in (-2 pi, 0) or in (0, 2 pi).
+
+f itself tells where D is. Seen from x, D has the solid angle 2 pi (1 - h/d). Inside, |f| is at
+least that, for S contains D; outside, |f| is at most 2 pi less that, for S is in the rest of the
+plane. If h < d/2, |f| = pi parts the two; else one of them may be known, and if none is, B(x, h)
+serves, whose radius is at least d/2. In rounded arithmetic f is not known well beside the curve:
+where h < d/2 and it is not known where D is, the lift lies in (-4 pi, 4 pi) in either case.
+
+The range is 4 pi wide, where that of a curve in convex position is 12 pi wide.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend.elementary import fmax, fmin
+from harnack.enclosures import HarmonicBall
+from harnack.geometry.convexity import is_simple, segment_clearance_lower
+
+if TYPE_CHECKING:
+    from harnack.backend import FloatArray, Real
+    from harnack.geometry.curves import Circle, Loops
+
+__all__ = ["PlanarRegion", "planar_region"]
+
+# All relative to the size of the curves.
+_FLAT = 1e-12  # how far a vertex may lie off the plane
+_APART = 1e-6  # how near two loops may come to each other
+_TILT = 1e-6  # and the slope of a loop's own plane, relative to the size of the loop
+_MOST_VERTICES = 2048  # the tests take quadratic time
+
+
+@dataclass(frozen=True)
+class PlanarRegion:
+    """The plane n.x = offset of a region, n (3,) such that the solid angle is negative above."""
+
+    normal: FloatArray
+    offset: float
+
+    def window(self, angle: Real, height: Real, distance: Real, slack: Real) -> HarmonicBall:
+        """A ball and a range of the lift on it: see the module.
+
+        angle: f modulo 4 pi. height: over the plane, along its normal, at most `slack` off.
+        distance: to the curves, at most as much as it is. slack: a length, which bounds the
+        rounding of positions.
+        """
+        turn = 2 * math.pi
+        f = angle - 2 * turn * dr.round(angle / (2 * turn))
+        above = dr.abs(height) + slack
+        share = above / distance
+        # Near the curve the rounding of positions moves f by up to about 2 slack/distance.
+        doubt = 1e-3 + 16 * slack / distance
+        is_inside = dr.abs(f) > turn * fmax(share, 0.5) + doubt
+        is_outside = dr.abs(f) < turn * fmin(1 - share, 0.5) - doubt
+        free = fmax(dr.abs(height) - slack, 0)
+        is_beside = ~(is_inside | is_outside) & (free >= 0.4 * distance)
+        zero = type(f)(0)
+        radius = dr.select(is_beside, free, distance)
+        lower = dr.select(is_outside, -turn, -2 * turn)
+        upper = dr.select(is_outside, turn, 2 * turn)
+        lower = dr.select(is_inside, dr.select(f < 0, lower, zero), lower)
+        upper = dr.select(is_inside, dr.select(f < 0, zero, upper), upper)
+        lower = dr.select(is_beside, dr.select(height > 0, -turn, zero), lower)
+        upper = dr.select(is_beside, dr.select(height > 0, zero, turn), upper)
+        # f itself was wrapped, and the promise is about the value that the sample states.
+        moved = angle - f
+        return HarmonicBall(radius, lower + moved, upper + moved)
+
+
+@dataclass(frozen=True)
+class _Loop:
+    """A simple loop in a plane: its points (k, 2) or, of a circle, center and radius; sign: 1 if it
+    runs counter-clockwise."""
+
+    points: FloatArray
+    radius: float
+    sign: int
+
+    def contains(self, point: FloatArray) -> bool:
+        """Whether a point (2,) that is not on it is inside."""
+        if self.radius > 0:
+            return bool(np.linalg.norm(point - self.points[0]) < self.radius)
+        a, b = self.points - point, np.roll(self.points, -1, axis=0) - point
+        upward, downward = (a[:, 1] <= 0) & (b[:, 1] > 0), (a[:, 1] > 0) & (b[:, 1] <= 0)
+        cross = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+        return int((upward & (cross > 0)).sum()) != int((downward & (cross < 0)).sum())
+
+    @property
+    def some_point(self) -> FloatArray:
+        """A point (2,) on it."""
+        return self.points[0] + (np.array([self.radius, 0.0]) if self.radius > 0 else 0.0)
+
+
+def planar_region(loops: Loops, circles: Sequence[Circle]) -> PlanarRegion | None:
+    """The region that the curves bound in their plane; None where this was not found so.
+
+    That is where the loops do not lie in one plane to 1e-12 of their size, cross or come as near to
+    each other as 1e-6 of it, have winding numbers other than 0 and 1 (or 0 and -1), or have more
+    than 2048 vertices.
+    """
+    if sum(map(len, loops)) > _MOST_VERTICES or len(loops) + len(circles) > _MOST_VERTICES // 8:
+        return None
+    plane = _plane_of(loops, circles)
+    if plane is None:
+        return None
+    normal, origin, size, axes = plane
+    flat: list[_Loop] = []
+    for loop in loops:
+        centered = (loop - origin) / size
+        edges = np.roll(centered, -1, axis=0) - centered
+        if len(loop) < 3 or not (edges * edges).sum(axis=1).all() or not is_simple(centered):
+            return None
+        points = centered @ axes.T
+        following = np.roll(points, -1, axis=0)
+        area = float((points[:, 0] * following[:, 1] - points[:, 1] * following[:, 0]).sum())
+        flat.append(_Loop(points, 0.0, 1 if area > 0 else -1))
+    for one in circles:
+        center = ((np.array(one.center) - origin) / size) @ axes.T
+        sign = 1 if float(np.dot(one.normal, normal)) > 0 else -1
+        flat.append(_Loop(center[None], one.radius / size, sign))
+    if not all(_apart(one, other) for one, other in itertools.combinations(flat, 2)):
+        return None
+    # Just inside of a loop: the signs of all loops around it. Just outside of all, 0.
+    inside = [
+        sum(other.sign for other in flat if other is one or other.contains(one.some_point))
+        for one in flat
+    ]
+    lowest, highest = min(0, *inside), max(0, *inside)
+    if highest - lowest != 1:
+        return None
+    side = 1.0 if highest == 1 else -1.0
+    return PlanarRegion(side * normal, side * float(normal @ origin))
+
+
+def _plane_of(
+    loops: Loops, circles: Sequence[Circle]
+) -> tuple[FloatArray, FloatArray, float, FloatArray] | None:
+    """Normal, origin, size and two axes (2, 3), right-handed, of a plane that holds all."""
+    points = np.concatenate([*loops, *(one.polygon(4) for one in circles)])
+    lower, upper = points.min(axis=0), points.max(axis=0)
+    size = float((upper - lower).max())
+    origin: FloatArray = 0.5 * (lower + upper)
+    if not 0.0 < size < np.inf:
+        return None
+    x: FloatArray = (points - origin) / size
+    if circles:
+        normal = np.array(circles[0].normal)
+        # Of all points the first circle's are meant exactly.
+        origin = np.array(circles[0].center)
+        x = (points - origin) / size
+    else:
+        normal = np.linalg.svd(x - x.mean(axis=0), full_matrices=False)[2][2]
+        origin = points.mean(axis=0)
+        x = (points - origin) / size
+    if not np.abs(x @ normal).max() <= _FLAT:
+        return None
+    # Small loops may be tilted by as little.
+    for loop in (*loops, *(one.polygon(4) for one in circles)):
+        span = loop - loop[0]
+        if not np.abs(span @ normal).max() <= _TILT * np.abs(span).max():
+            return None
+    first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    first = first / np.linalg.norm(first)
+    return normal, origin, size, np.stack([first, np.cross(normal, first)])
+
+
+def _apart(one: _Loop, other: _Loop) -> bool:
+    """Whether two loops are at least _APART from each other."""
+    if one.radius > 0 and other.radius > 0:
+        between = float(np.linalg.norm(one.points[0] - other.points[0]))
+        sum_gap = between - (one.radius + other.radius)
+        return max(sum_gap, abs(one.radius - other.radius) - between) >= _APART
+    if other.radius > 0:
+        one, other = other, one
+    p, q = other.points, np.roll(other.points, -1, axis=0)
+    if one.radius > 0:
+        e, away = q - p, one.points[0] - p
+        share = np.clip((away * e).sum(axis=1) / (e * e).sum(axis=1), 0, 1)
+        nearest = float(np.linalg.norm(away - share[:, None] * e, axis=1).min())
+        farthest = float(np.linalg.norm(away, axis=1).max())
+        return nearest - one.radius >= _APART or one.radius - farthest >= _APART
+    first, second = (_deep(x.points, np.roll(x.points, -1, axis=0)) for x in (one, other))
+    for a, b in zip(*first, strict=True):
+        many = (np.broadcast_to(end, second[0].shape) for end in (a, b))
+        if not segment_clearance_lower(*many, *second).min() >= _APART:
+            return False
+    return True
+
+
+def _deep(*ends: FloatArray) -> tuple[Any, ...]:
+    """Points (k, 2) of a plane as points (k, 3) of space."""
+    return tuple(np.column_stack([end, np.zeros(len(end))]) for end in ends)

@@ -1,0 +1,421 @@
+"""The closed curves of many faces on a backend, and the solid angle of one of them in each lane.
+
+Meshes of polygons that need not be flat, each spanned by a level set of its solid angle.
+
+Boxes proved to hold the surface of each face of a polygon mesh, all faces at once.
+
+In double precision, and done once for a mesh and its levels, before any ray.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import BoolArray, FloatArray, IntArray, choose_backend, to_numpy, to_vector3
+from harnack.backend.arrays import aligned, aligned_integers
+from harnack.backend.elementary import fmin
+from harnack.backend.records import Records
+from harnack.enclosures import HarmonicBall, Lipschitz
+from harnack.fields.boxed_parts import BoxedField, BoxedParts
+from harnack.fields.clearance import UnitCoordinates
+from harnack.fields.field import Field, Look, Path, Sample, lengthened
+from harnack.fields.solid_angles.edge_angles import bends, swept_ball
+from harnack.fields.solid_angles.edge_trails import Line, known_along, rates_along
+from harnack.fields.solid_angles.edges import Edge, LoopEdges, inner_product, spinor, sum_over_edges
+from harnack.fields.solid_angles.solid_angle import SolidAngle
+from harnack.fields.sums import SUM_ROUNDING
+from harnack.geometry.polygon_meshes import PolygonFaces, validate_polygons
+from harnack.tree.nearest import MOST_BOXES
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Mask, Real, Vec3
+
+__all__ = ["PERIOD", "FaceCurve", "FaceCurves", "FaceHead", "PolygonMesh", "face_boxes"]
+
+PERIOD = 4 * math.pi
+# Edges of a record. Always as many: another number is another kernel.
+RUN = 4
+# Records are counted in floats; single precision counts no further.
+_MOST_RECORDS = 2**24
+
+
+@dataclass(frozen=True)
+class FaceCurves:
+    """Records of all faces: where their edges are, and in which coordinates.
+
+    heads: of a face, its center and size, the first record of its edges, how many there are (less
+    than 0 if it is in convex position), and what rounding may do to a point, in units of the face,
+    and to the value.
+    """
+
+    heads: Records
+    edges: LoopEdges
+
+    @classmethod
+    def upload(cls, backend: Backend, faces: PolygonFaces) -> FaceCurves:
+        """All faces, each centered and scaled to unit size.
+
+        Centers are numbers of the backend, so that near a face they are subtracted exactly.
+        """
+        low, high = faces.boxes()
+        center = (0.5 * (low + high)).astype(backend.dtype).astype(np.float64)
+        face = faces.face_of_corner
+        x = faces.vertices[faces.corners] - center[face]
+        first = np.flatnonzero(np.diff(face, prepend=-1))
+        size = np.maximum.reduceat(np.linalg.norm(x, axis=1), first)
+        magnitude = np.maximum(np.abs(low), np.abs(high)).max(axis=1) / size
+        x /= size[face][:, None]
+        loops = tuple(np.split(x, faces.starts[1:]))
+        trips = np.bincount(faces.face_of_loop, -(-faces.sizes // RUN)).astype(np.int64)
+        if trips.sum() >= _MOST_RECORDS:
+            raise ValueError(
+                f"{len(x):,} corners of faces are too many: cut the mesh into parts, and give "
+                "them as a list to draw"
+            )
+        corners, signed = np.bincount(face), np.where(faces.in_convex_position, -trips, trips)
+        heads = np.column_stack(
+            [
+                center, size, np.cumsum(trips) - trips, signed,
+                backend.epsilon * (6 + 2 * magnitude),
+                backend.epsilon * (8 + 2 * np.sqrt(corners)),
+            ]
+        )  # fmt: skip
+        return cls(Records.upload(backend, heads), LoopEdges.upload(backend, loops, RUN))
+
+    def face(self, index: Any) -> FaceCurve:
+        """The solid angle of the face with that index, another in each lane."""
+        row = self.heads.row(index)
+        backend = self.heads.backend
+        count = backend.UInt32
+        edges = self.edges.part(count(row[4]), count(dr.abs(row[5])))
+        return FaceCurve(FaceHead(backend, backend.Array3f(*row[:3]), row[3], edges, *row[5:]))
+
+
+@dataclass(frozen=True)
+class FaceHead(UnitCoordinates):
+    """The head of a face, another in each lane, with its edges."""
+
+    edges: LoopEdges
+    trips: Real
+    rounding: Real
+    value_rounding: Real
+
+
+class FaceCurve(Field):
+    """The solid angle of a face, in each lane another: what `SolidAngle` is, and says why.
+
+    Its promises are the same. The ball is that of any curve, or where the face is convex, that of a
+    curve in convex position.
+    """
+
+    period: ClassVar[float | None] = PERIOD
+    default_level: float = 2 * math.pi
+
+    def __init__(self, face: FaceHead) -> None:
+        self.face = face
+
+    def evaluate(self, p: Vec3) -> Sample:
+        return self._sample(p, None)
+
+    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
+        del ahead, back
+        return path.look(self._sample(path.point(t), path.direction))
+
+    def _sample(self, p: Vec3, direction: Vec3 | None) -> Sample:
+        face = self.face
+        backend, x, rounding = face.backend, face.unit(p), face.rounding
+        sums = sum_over_edges(face.edges, x)
+        distance = sums.distance * (1 - SUM_ROUNDING) - rounding
+        known = bends(sums.cubes, sums.fourths, distance)
+        swept = swept_ball(sums.angle, sums.gradient, sums.squares, known)
+        convex = face.trips < 0
+        ball = HarmonicBall(
+            dr.select(convex, distance, swept.radius),
+            dr.select(convex, -1.5 * PERIOD, swept.lower),
+            dr.select(convex, 1.5 * PERIOD, swept.upper),
+        )
+        # On the curve itself, to rounding, every level meets, and no gradient exists.
+        met = sums.distance <= 2 * rounding
+        steep = backend.Array3f(0, 0, 4 * PERIOD / rounding)
+        gradient = dr.select(met, steep, sums.gradient)
+        error = dr.select(met, 0, 2 * backend.epsilon * sums.squares) + face.value_rounding
+        error = dr.select(met, 8 * PERIOD, error)
+        along: tuple[Lipschitz, ...] = ()
+        if direction is not None:
+            line = Line(x, backend.Array3f(direction), rounding)
+
+            def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
+                return rates_along(face.edges, line, lengths, active)
+
+            along = known_along(line, sums.gradient, sums.distance, rates)
+        value = dr.select(met, 0, sums.angle)
+        sample = Sample(value, gradient, known, error, weaker=(ball,), along=along)
+        return lengthened(sample, face.size)
+
+
+# All cells are split so many times, and those in which a box ends this many times altogether; in so
+# many rounds, as long as the pairs of edges and cells are not more than this.
+_COARSE, _FINEST, _ROUNDS, _MOST_PAIRS = 2, 7, 24, 30_000_000
+# Boxes are wider than proved by this part of the size of a face.
+_SLACK = 1e-4
+_CORNERS = np.array(list(itertools.product((0, 1), repeat=3)), dtype=np.float64)
+
+
+def face_boxes(faces: PolygonFaces, levels: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
+    """Lower and upper corners (m, 3) of boxes that hold the level sets of the faces' solid angles.
+
+    The 2 pi level of a face in convex position lies in its convex hull (paper, Theorem B.1), which
+    lies in the box of its vertices. Other surfaces lie in the isoperimetric box of
+    `SolidAngle.extent`, of which cells that are proved empty are cut away (`_are_empty`); what is
+    left is put in a box.
+    """
+    low, high = faces.boxes()
+    nearest = min(abs(math.remainder(level, PERIOD)) for level in levels)
+    size = 0.5 * np.linalg.norm(high - low, axis=1)[:, None]
+    in_hull = faces.in_convex_position & (nearest > 2 * math.pi * (1 - 1e-9))
+    reach = 1.0001 * faces.lengths()[:, None] / math.sqrt(nearest * (PERIOD - nearest))
+    lower = np.where(in_hull[:, None], low, low - reach)
+    upper = np.where(in_hull[:, None], high, high + reach)
+    carved = np.flatnonzero(~in_hull)
+    if carved.size:
+        lower[carved], upper[carved] = _carved(faces, carved, lower, upper, levels)
+    return lower - _SLACK * size, upper + _SLACK * size
+
+
+def _carved(
+    faces: PolygonFaces, carved: IntArray, lower: FloatArray, upper: FloatArray,
+    levels: tuple[float, ...],
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """Boxes of some faces, less the cells that are proved empty.
+
+    Only the cells in which a box ends can make it smaller, so only these are split further.
+    """
+    curves = FaceCurves.upload(choose_backend("double"), faces)
+    sides, pairs = upper - lower, 0
+    corners = np.bincount(faces.face_of_corner)
+    cells = _Cells(carved, lower[carved], np.zeros(len(carved), dtype=np.int64))
+    low, high = cells.boxes(sides)
+    for turn in range(_ROUNDS):
+        ends = cells.depth < _COARSE
+        if turn >= _COARSE:
+            place = np.searchsorted(carved, cells.face)
+            ends = cells.touch(low[place], high[place], sides) & (cells.depth < _FINEST)
+        pairs += 8 * int(corners[cells.face[ends]].sum())
+        if not ends.any() or pairs > _MOST_PAIRS:
+            break
+        parts = cells.taken(ends).split(sides)
+        size = parts.sizes(sides)
+        half = 0.5 * np.linalg.norm(size, axis=1)
+        empty = _are_empty(curves, parts.face, parts.corner + 0.5 * size, half, levels)
+        cells = cells.taken(~ends).joined(parts.taken(~empty))
+        low, high = cells.boxes(sides)
+    return low, high
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """Boxes within the boxes of faces: the face, the lower corner and how often it was split.
+
+    face: (k,) rising; every face that there was has a cell.
+    """
+
+    face: IntArray
+    corner: FloatArray
+    depth: IntArray
+
+    def sizes(self, sides: FloatArray) -> FloatArray:
+        """(k, 3), of cells in boxes with such sides (m, 3)."""
+        return sides[self.face] * (0.5**self.depth)[:, None]
+
+    def boxes(self, sides: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper corners of the boxes around the cells of each face."""
+        first = np.flatnonzero(np.diff(self.face, prepend=-1))
+        low = np.minimum.reduceat(self.corner, first)
+        return low, np.maximum.reduceat(self.corner + self.sizes(sides), first)
+
+    def touch(self, low: FloatArray, high: FloatArray, sides: FloatArray) -> BoolArray:
+        """(k,) whether a cell touches a side of the box from low to high (k, 3), to a part of its
+        size."""
+        size = self.sizes(sides)
+        at_low = self.corner < low + 0.25 * size
+        at_high: BoolArray = self.corner > high - 1.25 * size
+        return np.logical_or.reduce(at_low | at_high, axis=1)
+
+    def taken(self, chosen: BoolArray) -> _Cells:
+        """Some of them."""
+        return _Cells(self.face[chosen], self.corner[chosen], self.depth[chosen])
+
+    def split(self, sides: FloatArray) -> _Cells:
+        """Each cut in eight."""
+        depth = np.repeat(self.depth + 1, 8)
+        face = np.repeat(self.face, 8)
+        half = sides[face] * (0.5**depth)[:, None]
+        steps = np.tile(_CORNERS, (len(self.face), 1))
+        return _Cells(face, np.repeat(self.corner, 8, axis=0) + steps * half, depth)
+
+    def joined(self, others: _Cells) -> _Cells:
+        """These and others."""
+        face = np.concatenate([self.face, others.face])
+        order = np.argsort(face, kind="stable")
+        corner = np.concatenate([self.corner, others.corner])
+        return _Cells(face[order], corner[order], np.append(self.depth, others.depth)[order])
+
+
+def _are_empty(
+    curves: FaceCurves, face: IntArray, centers: FloatArray, half: FloatArray,
+    levels: tuple[float, ...],
+) -> BoolArray:  # fmt: skip
+    """Whether no level set of a face comes within `half` of points: (k,) faces, (k, 3), (k,).
+
+    Let h be `half`, less than the distance d_e to every edge e, of length 2a. A cell is empty if no
+    level lies in [f - S, f + S], where S bounds how far the lift moves within h. Two bounds, the
+    less of which counts:
+
+    - Walking by s, an edge's field is at most 2a/((d_e - s) sqrt((d_e - s)^2 + a^2))
+      (`SolidAngle`), whose integral is S = sum_e 2 [asinh(a/(d_e - h)) - asinh(a/d_e)].
+    - The second derivative along a line is at most 2 sum_e int rho^-3 over the edge, and that
+      integral at most 2a/((d_e - h)^2 sqrt((d_e - h)^2 + a^2)) (`LiftedEdge.bounds`): with the
+      slope here, S = |grad f| h + h^2 sum_e 2a/((d_e - h)^2 sqrt((d_e - h)^2 + a^2)).
+
+    A cell that holds a point of the curve is never empty.
+    """
+    backend = curves.heads.backend
+    real = backend.Float
+    index = aligned_integers(backend, face)
+    on = curves.face(index).face
+    x = (to_vector3(backend, centers) - on.center) / on.size
+    h = aligned(backend, half) / on.size
+
+    def add(p: Vec3, q: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
+        zr, zi, slope, nearest, moved, bend = state
+        edge = Edge.between(p, q, inverse, x)
+        re, im = inner_product(spinor(edge.a)[2], spinor(edge.b)[2])
+        zr, zi = dr.fma(zr, re, -(zi * im)), dr.fma(zr, im, zi * re)
+        scale = dr.rcp(dr.abs(zr) + dr.abs(zi))
+        weight, c = edge.field()
+        distance, a = dr.sqrt(edge.square), 0.5 * dr.rsqrt(inverse)
+        rest = distance - h
+        moved = moved + 2 * (dr.asinh(a / rest) - dr.asinh(a / distance))
+        bend = bend + 2 * a / (rest * rest * dr.sqrt(rest * rest + a * a))
+        slope = dr.fma(type(slope)(weight), c, slope)
+        return zr * scale, zi * scale, slope, fmin(distance, nearest), moved, bend
+
+    start = (real(1), real(0), backend.Array3f(0), real(dr.inf), real(0), real(0))
+    zr, zi, slope, nearest, moved, bend = on.edges.for_each(add, start, "face boxes")
+    variation = fmin(moved, h * dr.fma(h, bend, dr.norm(slope)))
+    f, far, s = (to_numpy(one) for one in (2 * dr.atan2(zi, zr), nearest > 1.001 * h, variation))
+    gap = np.full(len(f), math.inf)
+    for level in levels:
+        apart = np.remainder(f - level + 0.5 * PERIOD, PERIOD) - 0.5 * PERIOD
+        gap = np.minimum(gap, np.abs(apart))
+    return far & (gap > s * (1 + 1e-9) + 1e-9)
+
+
+# Levels as near as this to a multiple of 4 pi are those of no surface with bounds.
+_NARROW = 1e-9 * PERIOD
+
+
+class PolygonMesh(BoxedField["_MeshBuffers"]):
+    """Faces of any number of corners, flat or not, each spanned by a smooth surface: the level set
+    of the solid angle of its boundary curve (paper, Sections 4.2.1 and 4.2.4).
+
+    vertices: (n, 3). faces: a list of faces, each a list of at least three indices of vertices,
+    counter-clockwise seen from outside; or a list of such loops, of which holes run clockwise.
+    Faces may have different numbers of corners, and need not be joined.
+
+    The surface of a face is where its solid angle is 2 pi, modulo 4 pi; another `level` bulges it
+    to one side. The faces are separate surfaces that meet in their common edges: `Hits.sheet` is
+    the index of the face that was hit, the normal is that of its surface, to the positive side.
+    Each is traced alone, with the proofs of `SolidAngle`, so that a ray pays only for faces whose
+    boxes it enters (`harnack.fields.sheets`). `face(k)` gives the solid angle of one.
+
+    Raises:
+        MeshError: a ValueError, for what `geometry.validate_polygons` refuses.
+    """
+
+    period: ClassVar[float | None] = PERIOD
+    default_level: float = 2 * math.pi
+    overstep: float = 1.3  # as of `SolidAngle`
+
+    def __init__(self, vertices: Any, faces: Any) -> None:
+        super().__init__()
+        self.faces: PolygonFaces = validate_polygons(vertices, faces)
+        if self.faces.count >= MOST_BOXES:
+            raise ValueError(
+                f"{self.faces.count:,} faces are too many: at most {MOST_BOXES:,}; cut the mesh "
+                "into parts"
+            )
+        self._boxes: dict[tuple[float, ...], tuple[FloatArray, FloatArray]] = {}
+
+    @property
+    def vertices(self) -> FloatArray:
+        """(n, 3)."""
+        return self.faces.vertices
+
+    @property
+    def edges(self) -> IntArray:
+        """(e, 2) pairs of vertices joined by an edge of some face, each once."""
+        return self.faces.edges
+
+    def face(self, index: int) -> SolidAngle:
+        """The solid angle of the boundary of one face."""
+        if not 0 <= index < self.faces.count:
+            last = self.faces.count - 1
+            raise IndexError(f"there is no face {index}: they are counted from 0 to {last}")
+        return SolidAngle(self.faces.loops(index))
+
+    def boxes(self, levels: tuple[float, ...] | None = None) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper corners (m, 3) of boxes proved to hold the surface of each face.
+
+        levels: of the surfaces; None for the default.
+        """
+        levels = self.levels if levels is None else levels
+        if levels not in self._boxes:
+            self._boxes[levels] = face_boxes(self.faces, levels)
+        return self._boxes[levels]
+
+    def evaluate(self, p: Vec3) -> NoReturn:
+        """Raises TypeError: there is a function for each face, and none of them all."""
+        del p
+        raise TypeError(
+            "a polygon mesh is no level set of one function, but of one for each face: ask a "
+            "face, such as mesh.face(0), which is a harnack.SolidAngle"
+        )
+
+    def _upload(self, backend: Backend) -> _MeshBuffers:
+        boxes = BoxedParts.upload(backend, *self.boxes())
+        return _MeshBuffers(boxes, FaceCurves.upload(backend, self.faces))
+
+    def part_at(self, index: Any) -> Field:
+        return self._on().curves.face(index)
+
+    def check_levels(self, levels: tuple[float, ...]) -> None:
+        for level in levels:
+            if abs(math.remainder(float(level), PERIOD)) < _NARROW:
+                raise ValueError(
+                    f"level {level:g} is a multiple of 4 pi, which the solid angle of every face "
+                    "comes near far away: its surfaces have no bounds; choose another level, such "
+                    "as 2 pi"
+                )
+
+    def describe(self) -> dict[str, Any]:
+        return {
+            "faces": self.faces.count,
+            "vertices": len(self.vertices),
+            "corners": len(self.faces.corners),
+            "in convex position": int(self.faces.in_convex_position.sum()),
+        }
+
+
+@dataclass(frozen=True)
+class _MeshBuffers:
+    """The faces' boxes and curves on a backend."""
+
+    boxes: BoxedParts
+    curves: FaceCurves

@@ -1,0 +1,298 @@
+"""What a dipole, or a cluster of dipoles, of a radial potential K(r) adds to a sum, and its bounds.
+
+With psi_0 = K and psi_(k+1) = -psi_k'/r a dipole m at y = x + z gives -m.grad_y K = m.z psi_1, and
+a polynomial P(z) times psi_k has the gradient grad P psi_k - P psi_(k+1) z and the Hessian
+HP psi_k - (grad P z^T + z grad P^T) psi_(k+1) - P psi_(k+1) I + P psi_(k+2) z z^T (in z; the
+gradient in x has the opposite sign). What K is, and how fast its derivatives fall, a `RadialKernel`
+says: all else is shared by screened sums (`clouds.screened.YukawaKernel`) and by slices of four
+dimensions (`meshes.morph_slice.SlicedKernel`).
+
+Distances. A kernel may be regular at r = 0: it counts all lengths as D = sqrt(r^2 + height^2), from
+a point beside the space of the dipoles. Its bounds are |d^m K[u_1, ..., u_m]| <= m! Q_m/D^(m+1)
+for unit vectors u_i, with Q_m at most 1 and growing with m, and falling with D if not constant.
+"""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+
+from harnack.backend.elementary import fmin
+from harnack.enclosures import Curvature
+from harnack.fields.batch import SymmetricSum
+from harnack.fields.sums import SUM_ROUNDING, FieldSums, Terms
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from harnack.backend import Backend, FloatArray, Mask, Real, Vec3
+
+
+# Radii of curvature promises, in distances to the nearest dipole: each is the best somewhere.
+_REACHES = (0.1, 0.25, 0.45)
+# The part of the distance to the nearest dipole out to which `RadialSums.variation` holds.
+BALL = 0.35
+
+
+@dataclass(frozen=True)
+class Radial:
+    """A kernel at a distance D: psi_k = scale thetas[k]/D^(2k), for k as far as was asked."""
+
+    scale: Real
+    thetas: Sequence[Real]
+
+
+class RadialKernel(abc.ABC):
+    """A radial potential K on a backend, as sums over dipoles and their trees use it.
+
+    height_square: of the point beside the space of the dipoles; 0 for a point of that space.
+    """
+
+    height_square: Real = 0.0
+
+    @abc.abstractmethod
+    def at(self, distance: Real, inverse: Real, last: int) -> Radial:
+        """psi_0 to psi_last at a distance D; inverse: 1/D."""
+
+    @abc.abstractmethod
+    def bounds(self, distance: Real, last: int) -> list[Real]:
+        """Q_2 to Q_last, at least Q_3, at all distances from this one on; last is at most 6."""
+
+    @abc.abstractmethod
+    def growth(self, r: Real) -> Real:
+        """How many times larger Q_m may be at a distance shorter by r."""
+
+    @abc.abstractmethod
+    def accepting_distance(self, radius: FloatArray, accuracy: float) -> FloatArray:
+        """From which D on clusters of these radii are taken as a whole."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A term P(z) psi_k: P, its gradient and Hessian, all times D^(-2k), k = 1, 2, 3 by place."""
+
+    value: Real
+    gradient: Vec3
+    hessian: tuple[Real, ...] | None = None
+
+
+@dataclass(frozen=True)
+class RadialSums:
+    """Sums over all dipoles, weights w_i = |m_i|, distances d_i, with Q_m at d_i.
+
+    sums: value, derivatives and bounds; s4 and s5 are the sums of w Q_3/d^4 and w Q_3/d^5, which
+        for Q_3 = 1 are those of `FieldSums`.
+    steep, steeper: sums of w Q_2/d^3 and w Q_2/d^4.
+    ClusterMoments add the bounds of their sums.
+    """
+
+    sums: FieldSums
+    steep: Real
+    steeper: Real
+
+    @classmethod
+    def zero(cls, backend: Backend, derivatives: int) -> RadialSums:
+        """Of no dipoles; derivatives: as for `FieldSums.zero`."""
+        zero = backend.Float(0)
+        return cls(FieldSums.zero(backend, dr.inf, derivatives), zero, zero)
+
+    @classmethod
+    def of(cls, parts: tuple[Any, ...]) -> RadialSums:
+        """From `parts`."""
+        return cls(FieldSums.of(parts[0]), *parts[1:])
+
+    def parts(self) -> tuple[Any, ...]:
+        """In the order of the constructor, as loops want them."""
+        return self.sums.parts(), self.steep, self.steeper
+
+    def plus(self, source: Source, rounding: Real, active: Mask) -> RadialSums:
+        """With one more dipole or cluster, where active.
+
+        rounding: of a sum of so many terms, as part of the sum of their absolute values. That sum
+        is at most the one of w Q_2/d^2; and 6 epsilon w Q_2/d^3 is what positions do.
+        """
+        tail, sums = source.tail, self.sums.plus(source.terms, active)
+        steep = source.weight * tail.second * tail.cube
+        bent = source.weight * tail.third * tail.cube * tail.inverse
+        bounds = steep, steep * tail.inverse, bent, bent * tail.inverse
+        errors = source.error, source.gradient_error, source.hessian_error
+        steep, steeper, bent, more_bent, error, slope, second = (
+            dr.select(active, one, 0) for one in (*bounds, *errors)
+        )
+        nearer, old = fmin(tail.distance, sums.free_distance), sums.second_truncation
+        # Dr.Jit's epsilon is half the distance from 1 to the next number, ours is all of it.
+        positions = 6 * 2 * float(dr.epsilon(steep))
+        sums = dataclasses.replace(
+            sums,
+            truncation=sums.truncation + error,
+            slope_truncation=sums.slope_truncation + slope,
+            second_truncation=None if old is None else old + second,
+            rounding=dr.fma(steep, dr.fma(rounding, tail.distance, positions), sums.rounding),
+            free_distance=dr.select(active, nearer, sums.free_distance),
+            s4=sums.s4 + bent,
+            s5=sums.s5 + more_bent,
+        )
+        return RadialSums(sums, self.steep + steep, self.steeper + steeper)
+
+    def remainder(self, share: float, r: Real, growth: Real) -> Real:
+        """A bound of |f(y) - f(x) - grad f.(y-x)|/|y-x|^2 for |y-x| <= r = share times the distance
+        to the nearest dipole, or less; growth: of the kernel's bounds, for r.
+
+        Each term's second derivatives are at most |K^(3)| = 6 Q_3/(d_i-s)^4 at distance s from x,
+        and by Taylor the integral of (t-s) times that bounds its part, t = |y-x|. With t/d_i = q
+        it is at most growth Q_3 (3-2q)/(1-q)^2 t^2/d_i^4; (3-2q)/(1-q)^2 is convex, hence below
+        its chord on [0, share].
+        """
+        return (1 + SUM_ROUNDING) * growth * self.sums.remainder(share, r)
+
+    def curvatures(
+        self, growth: Callable[[Real], Real], most: Real, size: Real
+    ) -> tuple[Curvature, ...]:
+        """`remainder` as promises, in units of `size`; most: the distance to the nearest dipole, or
+        less."""
+        radii = [(share, share * most) for share in _REACHES]
+        return tuple(
+            Curvature(2 * self.remainder(share, r, growth(r)) / (size * size), r * size)
+            for share, r in radii
+        )
+
+    def variation(self, r: Real, growth: Real) -> Real:
+        """How far f moves from x on B(x, r) at most; r: `BALL` times the distance to the nearest
+        dipole, or less. By the integral of |K^(2)| = 2 Q_2/(d_i-s)^3: 1/(1-q)^2 - 1 = 2q + ... is
+        convex likewise."""
+        chord = (1 / (1 - BALL) ** 2 - 1 - 2 * BALL) / BALL**2
+        moved = dr.fma(chord * r, self.steeper, 2 * self.steep)
+        return (1 + SUM_ROUNDING) * growth * r * moved
+
+
+@dataclass(frozen=True)
+class Tail:
+    """Q_2 and Q_3 at a distance and beyond, and powers of that distance."""
+
+    distance: Real
+    inverse: Real
+    cube: Real
+    second: Real
+    third: Real
+
+    @classmethod
+    def of(cls, distance: Real, inverse: Real, bounds: Sequence[Real]) -> Tail:
+        """bounds: Q_2, Q_3, ... there."""
+        return cls(distance, inverse, inverse * inverse * inverse, bounds[0], bounds[1])
+
+
+def _type_of(vector: object) -> Any:
+    return type(vector)
+
+
+def combine(
+    parts: Sequence[Part], z: Vec3, inverse: Real, radial: Radial, derivatives: int
+) -> Terms:
+    """The sum of terms at z, inverse = 1/D, with psi_0 to psi_(len(parts) + derivatives).
+
+    derivatives: 0 for the value, 1 with the gradient, 2 with the Hessian. Powers of 1/D are spread
+    over the factors, so that none overflows.
+    """
+    vector = _type_of(z)
+    theta, scale, u2 = radial.thetas, radial.scale, inverse * inverse
+    value, along, twice = 0.0, 0.0, 0.0
+    gradient, slopes, matrix = vector(0), vector(0), [0.0] * 6
+    for k, part in enumerate(parts, start=1):
+        value = dr.fma(theta[k], part.value, value)
+        if derivatives == 0:
+            continue
+        along = dr.fma(theta[k + 1], part.value, along)
+        gradient = dr.fma(vector(theta[k]), part.gradient, gradient)
+        if derivatives == 2:
+            twice = dr.fma(theta[k + 2], part.value, twice)
+            slopes = dr.fma(vector(theta[k + 1]), part.gradient, slopes)
+            if part.hessian is not None:
+                matrix = [dr.fma(theta[k], h, m) for h, m in zip(part.hessian, matrix, strict=True)]
+    if derivatives == 0:
+        return Terms(scale * value)
+    along = along * u2
+    first = scale * dr.fma(vector(along), z, -gradient)
+    if derivatives < 2:
+        return Terms(scale * value, first, None)
+    rest = SymmetricSum(*(scale * m for m in matrix))
+    across = dr.fma(vector(twice * u2), z, -2 * slopes)
+    rest = rest.plus((scale * u2) * across, z)
+    along = scale * along
+    whole = dataclasses.replace(rest, xx=rest.xx - along, yy=rest.yy - along, zz=rest.zz - along)
+    return Terms(scale * value, first, whole)
+
+
+@dataclass(frozen=True)
+class Source:
+    """A dipole or a cluster seen from x, and how fast it changes.
+
+    weight: of all its dipoles, which are no nearer than `tail` is for.
+    error, gradient_error, hessian_error: of a cluster.
+    """
+
+    terms: Terms
+    weight: Real
+    tail: Tail
+    error: Real = 0.0
+    gradient_error: Real = 0.0
+    hessian_error: Real = 0.0
+
+
+def seen_dipole(row: Sequence[Real], x: Vec3, kernel: RadialKernel, derivatives: int) -> Source:
+    """A dipole (position, moment, weight = |moment|, 0: eight numbers) from x."""
+    vector = _type_of(x)
+    z, m = vector(row[0], row[1], row[2]) - x, vector(row[3], row[4], row[5])
+    squared = dr.squared_norm(z) + kernel.height_square
+    inverse = dr.rsqrt(squared)
+    distance = squared * inverse
+    u2 = inverse * inverse
+    part = Part(dr.dot(m, z) * u2, m * u2)
+    terms = combine([part], z, inverse, kernel.at(distance, inverse, 1 + derivatives), derivatives)
+    return Source(terms, row[6], Tail.of(distance, inverse, kernel.bounds(distance, 3)))
+
+
+def cluster_parts(c: Sequence[Real], z: Vec3, inverse: Real) -> list[Part]:
+    """The parts of a cluster with coefficients c (`radial_tree.coefficients`), center x + z;
+    inverse = 1/D.
+
+    P_1 = c0.z + c3; P_2 = z.(A z + b); P_3 = C[z, z, z] with symmetric A, C.
+    """
+    vector = _type_of(z)
+    u2 = inverse * inverse
+    u4 = u2 * u2
+    u6 = u4 * u2
+    dipole, b = vector(c[0], c[1], c[2]), vector(c[10], c[11], c[12])
+    axx, ayy, azz, axy, axz, ayz = c[4:10]
+    az = _times((axx, ayy, azz, axy, axz, ayz), z)
+    xxx, yyy, zzz, xxy, xxz, xyy, yyz, xzz, yzz, xyz = c[13:23]
+    cz = tuple(
+        dr.fma(i, z.x, dr.fma(j, z.y, k * z.z))
+        for i, j, k in (
+            (xxx, xxy, xxz), (xyy, yyy, yyz), (xzz, yzz, zzz),
+            (xxy, xyy, xyz), (xxz, xyz, xzz), (xyz, yyz, yzz),
+        )
+    )  # fmt: skip
+    czz = _times(cz, z)
+    return [
+        Part((dr.dot(dipole, z) + c[3]) * u2, dipole * u2),
+        Part(
+            dr.dot(az + b, z) * u4,
+            dr.fma(2, az, b) * u4,
+            tuple(2 * u4 * a for a in (axx, ayy, azz, axy, axz, ayz)),
+        ),
+        Part(dr.dot(czz, z) * u6, 3 * u6 * czz, tuple(6 * u6 * a for a in cz)),
+    ]
+
+
+def _times(matrix: Sequence[Real], z: Vec3) -> Vec3:
+    """A symmetric matrix (xx, yy, zz, xy, xz, yz) times z."""
+    xx, yy, zz, xy, xz, yz = matrix
+    return _type_of(z)(
+        dr.fma(xx, z.x, dr.fma(xy, z.y, xz * z.z)),
+        dr.fma(xy, z.x, dr.fma(yy, z.y, yz * z.z)),
+        dr.fma(xz, z.x, dr.fma(yz, z.y, zz * z.z)),
+    )

@@ -1,0 +1,267 @@
+"""Sums of dipoles of a radial potential: one by one, or far ones in clusters by a tree.
+
+Expansion. Dipoles m_i at c + d_i, |d_i| <= R, seen from x = c - z, r = D of z: by Taylor in d_i
+
+    w = -sum_i m_i.grad K(z + d_i) = -(T1[D] + T2[D^2] + T3[D^3]/2) K(z) + (rest),
+
+T1 = sum m, T2 = sym sum m d, T3 = sym sum m d d. With psi_k as in `radial_kernel`, D K = -z
+psi_1, T2[D^2] K = T2[z,z] psi_2 - tr T2 psi_1, T3[D^3] K = 3 z.tr T3 psi_2 - T3[z,z,z] psi_3.
+K is not harmonic in three dimensions, so that traces count: 19 numbers instead of 15.
+
+Truncation. The rest of Taylor's formula is an integral of the fourth derivative of K along the way,
+at most 4! Q_4/(r - s |d_i|)^5. In that, Q_4 is at most its value at r - R; what is
+left of the integral is the rest of the Taylor series of 1/(r - .)^2: with q = |d|/r
+
+    |rest| <= Q_4 |m| (1/(1-q)^2 - 1 - 2q - 3q^2)/r^2 = Q_4 |m| |d|^3 (4-3q)/((1-q)^2 r^5),
+
+for Q_4 = 1 attained by a dipole on the line to x that points along it. (4-3q)/(1-q)^2 grows with
+q, so R/r serves for all. For the gradient, likewise from 2/(r - .)^3,
+
+    Q_5 |m| |d|^3 (20 - 30q + 12q^2)/((1-q)^3 r^6),
+
+and for second derivatives from 6/(r - .)^4,
+
+    Q_6 |m| |d|^3 (120 - 270q + 216q^2 - 60q^3)/((1-q)^4 r^7).
+"""
+
+from __future__ import annotations
+
+import abc
+import itertools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import FloatArray
+from harnack.backend.elementary import fmax
+from harnack.backend.records import Records
+from harnack.fields.solid_angles.far_clusters import (
+    SeenCluster,
+    hierarchy_of,
+    in_slots,
+    padding_row,
+    walk_clusters,
+)
+from harnack.fields.solid_angles.radial_kernel import (
+    RadialKernel,
+    RadialSums,
+    Source,
+    Tail,
+    cluster_parts,
+    combine,
+    seen_dipole,
+)
+from harnack.fields.sums import rounding_of_sum
+from harnack.tree import Hierarchy, PackedTree, pack
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from harnack.backend import Backend, Mask, Real, Vec3
+
+
+# Dipoles a trip of the plain sum, by experiment.
+_CHUNK = 4
+
+
+class RadialDipoles(abc.ABC):
+    """Dipoles on a backend.
+
+    rounding: of sums of so many terms, as `RadialSums.plus` takes it.
+    """
+
+    def __init__(self, backend: Backend, rows: FloatArray, kernel: RadialKernel) -> None:
+        self.backend, self.kernel = backend, kernel
+        self.rounding = rounding_of_sum(backend, len(rows), 12)
+
+    def sums(self, x: Vec3, closer: Real, derivatives: int) -> RadialSums:
+        """Value, derivatives and bounds at x; clusters are taken as a whole from `closer` times
+        the `accepting_distance` on. derivatives: as for `FieldSums.zero`."""
+        return self.added(RadialSums.zero(self.backend, derivatives), x, closer)
+
+    @abc.abstractmethod
+    def added(self, sums: RadialSums, x: Vec3, closer: Real) -> RadialSums:
+        """Sums over other dipoles, with those over these at x; `closer` as for `sums`."""
+
+    def _with_dipole(
+        self, row: list[Real], x: Vec3, derivatives: int, state: tuple[Any, ...]
+    ) -> tuple[Any, ...]:
+        dipole = seen_dipole(row, x, self.kernel, derivatives)
+        return RadialSums.of(state).plus(dipole, self.rounding, True).parts()
+
+
+class DirectSum(RadialDipoles):
+    """All dipoles, one by one; no sum could be closer."""
+
+    def __init__(self, backend: Backend, rows: FloatArray, kernel: RadialKernel) -> None:
+        super().__init__(backend, rows, kernel)
+        self._records = Records.upload(backend, rows, padding_row(rows[0]), _CHUNK)
+
+    def added(self, sums: RadialSums, x: Vec3, closer: Real) -> RadialSums:
+        del closer
+        derivatives = sums.sums.derivatives
+
+        def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+            return self._with_dipole(row, x, derivatives, state)
+
+        return RadialSums.of(self._records.for_each(add, sums.parts(), "radial dipoles"))
+
+
+class TreeSum(RadialDipoles):
+    """Near dipoles one by one, far ones in clusters from the kernel's `accepting_distance` on."""
+
+    def __init__(
+        self, backend: Backend, dipoles: ClusteredDipoles, kernel: RadialKernel, accuracy: float
+    ) -> None:
+        super().__init__(backend, dipoles.rows, kernel)
+        self._tree = dipoles.packed(backend, kernel, accuracy)
+
+    def added(self, sums: RadialSums, x: Vec3, closer: Real) -> RadialSums:
+        closer = fmax(self.backend.Float(closer), self.backend.Float(1))
+        derivatives = sums.sums.derivatives
+
+        def near(row: list[Real], active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
+            del active
+            return self._with_dipole(row, x, derivatives, state)
+
+        def far(node: SeenCluster, state: tuple[Any, ...]) -> tuple[Any, ...]:
+            length = dr.sqrt(node.square)
+            cluster = seen_cluster(
+                node.head, node.payload, -node.r, length, self.kernel, derivatives
+            )
+            return RadialSums.of(state).plus(cluster, self.rounding, node.far).parts()
+
+        height = self.kernel.height_square
+        walked = walk_clusters(self._tree, x, closer, far, near, sums.parts(), height_square=height)
+        return RadialSums.of(walked)
+
+
+def seen_cluster(
+    head: Sequence[Real], c: Sequence[Real], z: Vec3, length: Real, kernel: RadialKernel,
+    derivatives: int,
+) -> Source:  # fmt: skip
+    """A node with numbers `columns`, its center at z, D = length, and what is left out."""
+    radius, weight = head[4], head[5]
+    inverse = dr.rcp(length)
+    parts = cluster_parts(c, z, inverse)
+    radial = kernel.at(length, inverse, len(parts) + derivatives)
+    terms = combine(parts, z, inverse, radial, derivatives)
+    nearest = length - radius
+    share = dr.rcp(nearest)
+    bounds = kernel.bounds(nearest, 6)
+    tail = Tail.of(nearest, share, bounds)
+    fourth, fifth, sixth = bounds[2:]
+    q = radius * inverse
+    common = c[23] * inverse * inverse * inverse * share * share
+    error = common * fourth * dr.fma(-3, q, 4)
+    slope = common * share * fifth * dr.fma(q, dr.fma(12, q, -30), 20)
+    rest = dr.fma(q, dr.fma(q, dr.fma(-60, q, 216), -270), 120)
+    second = common * share * share * sixth * rest
+    return Source(terms, weight, tail, error, slope, second)
+
+
+@dataclass(frozen=True)
+class ClusteredDipoles:
+    """Dipoles (n, 8) as `dipole_rows` has them, in the leaves of a tree, with the moments of its
+    levels: all that does not depend on the kernel."""
+
+    rows: FloatArray
+    tree: Hierarchy
+    levels: list[ClusterMoments]
+
+    @classmethod
+    def of(cls, rows: FloatArray) -> ClusteredDipoles:
+        """A tree over the dipoles."""
+        tree = hierarchy_of(rows[:, :3])
+        return cls(rows, tree, clusters(tree, rows))
+
+    def packed(self, backend: Backend, kernel: RadialKernel, accuracy: float) -> PackedTree:
+        """The tree on a backend; clusters are as far as the kernel says, for an accuracy."""
+        numbers = [
+            columns(level, kernel.accepting_distance(level.radius, accuracy))
+            for level in self.levels
+        ]
+        return pack(backend, self.tree, numbers, in_slots(self.tree, self.rows))
+
+
+@dataclass(frozen=True)
+class ClusterMoments:
+    """The nodes of one level: center (k, 3), radius, weight, third = sum w |d|^3 (k,) each, and
+    T1 (k, 3), T2 (k, 3, 3), T3 (k, 3, 3, 3), symmetric."""
+
+    center: FloatArray
+    radius: FloatArray
+    weight: FloatArray
+    third: FloatArray
+    t1: FloatArray
+    t2: FloatArray
+    t3: FloatArray
+
+
+def clusters(tree: Hierarchy, rows: FloatArray) -> list[ClusterMoments]:
+    """Moments of all levels, from the leaves to the root.
+
+    T1, T2, T3 move from a child's center to its parent's, d -> d + s: T2 gains sym(T1 s) and T3
+    sym(2 T2 s + T1 s s). The rest is taken from the dipoles themselves.
+    """
+    slots = in_slots(tree, rows)
+    levels: list[ClusterMoments] = []
+    for count, arity in zip(tree.counts, (0, *tree.arities), strict=True):
+        p, m, w = np.split(slots.reshape(count, -1, slots.shape[2])[..., :7], [3, 6], axis=2)
+        weight = w.sum(axis=(1, 2))
+        center = (w * p).sum(axis=1) / np.where(weight > 0, weight, 1)[:, None]
+        d = p - center[:, None]
+        length = np.where(w[..., 0] > 0, np.linalg.norm(d, axis=2), 0)
+        third = (w[..., 0] * length**3).sum(axis=1)
+        if not levels:
+            d = np.where(w > 0, d, 0)
+            moments = _symmetric(
+                m.sum(axis=1),
+                np.einsum("ksi,ksj->kij", m, d),
+                np.einsum("ksi,ksj,ksl->kijl", m, d, d),
+            )
+        else:
+            moments = _moved(levels[-1], center, arity)
+        levels.append(ClusterMoments(center, length.max(axis=1), weight, third, *moments))
+    return levels
+
+
+def _moved(
+    children: ClusterMoments, center: FloatArray, arity: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    s = children.center - np.repeat(center, arity, axis=0)
+    t1, t2, t3 = children.t1, children.t2, children.t3
+    first = np.einsum("ki,kj->kij", t1, s)
+    second = t3 + np.einsum("kij,kl->kijl", 2 * t2 + first, s)
+    sums = [a.reshape(-1, arity, *a.shape[1:]).sum(axis=1) for a in (t1, t2 + first, second)]
+    return _symmetric(*sums)
+
+
+def _symmetric(
+    t1: FloatArray, t2: FloatArray, t3: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    orders = itertools.permutations((1, 2, 3))
+    total = sum((t3.transpose(0, *order) for order in orders), start=np.zeros_like(t3))
+    return t1, 0.5 * (t2 + t2.transpose(0, 2, 1)), total / 6
+
+
+def coefficients(level: ClusterMoments) -> FloatArray:
+    """(k, 23) numbers as `cluster_parts` reads them: T1; tr T2; -T2; -3/2 tr T3; T3/2."""
+    t2, t3 = -level.t2, 0.5 * level.t3
+    i, j = np.array([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]).T
+    a, b, c = np.array(
+        [(0, 0, 0), (1, 1, 1), (2, 2, 2), (0, 0, 1), (0, 0, 2), (0, 1, 1), (1, 1, 2), (0, 2, 2),
+         (1, 2, 2), (0, 1, 2)]
+    ).T  # fmt: skip
+    trace2 = np.einsum("kii->k", level.t2)[:, None]
+    trace3 = -1.5 * np.einsum("kiij->kj", level.t3)
+    return np.concatenate([level.t1, trace2, t2[:, i, j], trace3, t3[:, a, b, c]], axis=1)
+
+
+def columns(level: ClusterMoments, accept: FloatArray) -> FloatArray:
+    """(k, 30): center, accepting distance, radius, weight | coefficients, third."""
+    # Rounding of center and radius must not let a dipole out.
+    head = np.stack([accept, level.radius * (1 + 1e-5) + 1e-6, level.weight], axis=1)
+    return np.concatenate([level.center, head, coefficients(level), level.third[:, None]], axis=1)

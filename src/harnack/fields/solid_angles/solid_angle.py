@@ -1,0 +1,523 @@
+"""The solid angle of closed curves: nonplanar polygons, holes, knots, links, coils."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import FloatArray, backend_of, choose_backend, to_numpy
+from harnack.backend.elementary import fmin
+from harnack.backend.tensors import is_tensor, vectors_of
+from harnack.enclosures import HarmonicBall, Lipschitz
+from harnack.fields.clearance import (
+    UnitCoordinates,
+    UploadedField,
+    epsilon_at,
+    placed,
+    tight_extent,
+)
+from harnack.fields.field import Look, Path, Sample, lengthened
+from harnack.fields.points import in_batches
+from harnack.fields.solid_angles.circle_sums import Circles, CircleSums
+from harnack.fields.solid_angles.edge_angles import (
+    bends,
+    change_along_segments,
+    closest_on_segments,
+    differentiable_angle,
+    segments,
+    slope_change,
+    swept_ball,
+)
+from harnack.fields.solid_angles.edge_trails import Line, known_along, rates_along
+from harnack.fields.solid_angles.edges import (
+    EdgeSums,
+    LoopEdges,
+    hessian_over_edges,
+    sum_over_edges,
+)
+from harnack.fields.solid_angles.planar import PlanarRegion, planar_region
+from harnack.fields.sums import SECOND_ROUNDINGS, SLOPE_ROUNDINGS, SUM_ROUNDING, rounding_of_sum
+from harnack.geometry import Circle, ConvexHull, is_convex_position, total_length
+from harnack.geometry.curves import CurveShapeError, Loops, net_circles, validate_curves
+from harnack.geometry.polygons import net_loops, uncanceled_edges
+from harnack.names import did_you_mean
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.geometry import Volume
+
+CertificateName = Literal["auto", "planar", "edges", "convex", "paper"]
+
+_PERIOD = 4 * math.pi
+# Levels as near as this to a multiple of 4 pi count as one.
+_NARROW = 1e-9 * _PERIOD
+# Cells times vertices that an extent looks at, at most.
+_MOST_PAIRS = 3_000_000
+# Of polygons that stand for circles where a boundary is drawn.
+_SIDES = 256
+
+
+class SolidAngle(UploadedField["_CurveBuffers"]):
+    """The signed solid angle of closed curves, in steradians, with period 4 pi (paper, Eq. 10).
+
+    loops: one (n, 3) array-like of vertices, n >= 3, a `Circle`, or a list of these. Every loop is
+    closed by itself. Orientation matters: a hole runs against its outer loop. A loop may be a
+    Dr.Jit 3-vector of n lanes or a tensor (n, 3): hits and values can be differentiated by its
+    vertices. Circles are exact, and cost about as much as nine vertices.
+
+    Edges that are run there and back, by one loop or by two neighbors, are taken out before
+    anything is computed (`net_loops`): f does not see them. If none is left, f is 0 everywhere,
+    every ray a proved miss, and levels that are multiples of 4 pi are refused.
+
+    Promises. Second derivatives are bounded near every curve (`curve_promises`), and steps rest on
+    that. The other proofs, chosen by `bound=`, need the range of the lift on a ball:
+    on wavy polygons and knots they take 1.4 to 2 times as many evaluations.
+
+    certificate: how the lift is bounded on a ball. "auto" takes "planar" where its hypothesis is
+    checked to hold, "convex" where that does, else "edges"; if loops are Dr.Jit arrays it takes
+    "edges" in any case, so that curves that are moved step by step do not change kernels.
+
+    - "edges" holds for **every** curve: |grad f| and the bound of second derivatives say how far f
+      moves (`swept_ball`).
+    - "planar": on B(x, d), d the distance to the curve, the lift stays in a window 4 pi wide if all
+      loops together bound a region of a plane (`planar`); else, for circles alone, in the sum of
+      one such window a circle.
+    - "convex": on B(x, d) the lift stays in (-6 pi, 6 pi) if the curve is one loop without
+      self-intersections on the boundary of a convex set: a segment crosses the 2 pi level, where
+      the principal value in (-2 pi, 2 pi) jumps by 4 pi, at most once net (paper, Theorem C.1).
+    - "paper" assumes that range for any curve and promises nothing else, as the paper does. It is
+      false for coils and links and exists for comparisons: hits can be missed.
+
+    Raises CurveError for loops that are not closed curves, ValueError for "convex" where the
+    hypothesis fails.
+    """
+
+    period: ClassVar[float | None] = _PERIOD
+    default_level: float = 2 * math.pi
+    overstep: float = 1.3  # by experiment
+
+    def __init__(self, loops: Any, *, certificate: CertificateName = "auto") -> None:
+        super().__init__()
+        self.loops: Loops
+        self.circles: tuple[Circle, ...]
+        curves, self._movable = _movable_loops(loops)
+        self.loops, self.circles = validate_curves(curves)
+        self._net: Loops = net_loops(self.loops) if self.loops else ()
+        self._net_circles = net_circles(self.circles)
+        is_circle = not self._net and len(self._net_circles) == 1
+        self.convex_position = is_circle or (
+            not self._net_circles and is_convex_position(self._net)
+        )
+        self._region: PlanarRegion | None = None
+        if not self._is_empty:
+            self._region = planar_region(self._net, self._net_circles)
+        self._asked = certificate
+        self.certificate = self._choose(certificate)
+        points = self._points_around()
+        self._center = 0.5 * (points.min(axis=0) + points.max(axis=0))
+        self._size = float(np.linalg.norm(points - self._center, axis=1).max())
+        self._extents: dict[tuple[float, ...], Volume | None] = {}
+
+    @property
+    def _is_empty(self) -> bool:
+        """Whether nothing is left of the curves."""
+        return not self._net and not self._net_circles
+
+    @property
+    def boundary_curves(self) -> tuple[FloatArray, ...]:
+        return (*self._net, *(one.polygon(_SIDES) for one in self._net_circles))
+
+    def _points_around(self) -> FloatArray:
+        """Points (n, 3) whose convex hull holds the curves: vertices, and polygons around circles;
+        those of curves that cancel where nothing else is left."""
+        loops, circles = self._net, self._net_circles
+        if self._is_empty:
+            loops, circles = self.loops, self.circles
+        return np.concatenate([*loops, *(one.polygon(64, around=True) for one in circles)])
+
+    def _choose(self, asked: CertificateName) -> Literal["edges", "planar", "range"]:
+        if asked == "auto":
+            if self._movable:
+                return "edges"
+            if self._region is not None or (self._net_circles and not self._net):
+                return "planar"
+            return "range" if self.convex_position else "edges"
+        if asked == "convex" and not self.convex_position:
+            raise ValueError(
+                'certificate="convex" needs one loop without self-intersections on the boundary '
+                'of its convex hull, and this is not one; use certificate="auto"'
+            )
+        if asked == "planar":
+            if self._region is None and (self._net or not self._net_circles):
+                raise ValueError(
+                    'certificate="planar" needs disjoint loops that bound a region of a plane, or '
+                    'circles alone, and this is neither; use certificate="auto"'
+                )
+            return "planar"
+        if asked not in ("edges", "convex", "paper"):
+            names = ("auto", "planar", "edges", "convex", "paper")
+            raise ValueError(
+                f"unknown certificate {asked!r}; use auto, planar, edges, convex or paper"
+                f"{did_you_mean(asked, names)}"
+            )
+        return "edges" if asked == "edges" else "range"
+
+    def _upload(self, backend: Backend, *, traced: bool) -> _CurveBuffers:
+        del traced
+        # Centered and scaled to unit size: products of eight lengths stay far from overflow. The
+        # center is a number of the backend, so that near the curve it is subtracted exactly.
+        cast = np.float64 if backend.precision == "double" else np.float32
+        if (size := float(np.abs(self._center).max()) + self._size) > 0.1 * float(
+            np.finfo(cast).max
+        ):
+            raise ValueError(
+                f"coordinates up to {size:g} are too large for {backend.precision} precision: "
+                "choose units nearer to 1"
+            )
+        center = self._center.astype(cast).astype(np.float64)
+        unit = tuple((loop - center) / self._size for loop in self._net)
+        edges = LoopEdges.upload(backend, unit) if unit else None
+        circles = None
+        if self._net_circles:
+            circles = Circles.upload(backend, self._net_circles, center, self._size)
+        plane = None
+        if self._region is not None:
+            height = (self._region.offset - float(self._region.normal @ center)) / self._size
+            numbers = (*self._region.normal.tolist(), height)
+            plane = tuple(dr.opaque(backend.Float, number) for number in numbers)
+        magnitude = float(np.abs(self._points_around()).max() / self._size)
+        factors = sum(len(loop) for loop in self._net)
+        return _CurveBuffers(
+            *placed(backend, center, self._size),
+            edges,
+            circles,
+            plane,
+            dr.opaque(backend.Float, backend.epsilon * (6 + 2 * magnitude)),
+            rounding_of_sum(backend, factors, own=8, growth=2),
+        )
+
+    def evaluate(self, p: Vec3) -> Sample:
+        return self._sample(p, None)
+
+    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
+        """With what edges promise along the ray, which is much beside a long edge along it."""
+        del ahead, back
+        knows_lines = not self._is_empty and self._asked != "paper"
+        direction = path.direction if knows_lines else None
+        return path.look(self._sample(path.point(t), direction))
+
+    def _sample(self, p: Vec3, direction: Vec3 | None) -> Sample:
+        """The sample at p; with promises along a unit direction, if one is given."""
+        on = self._on(p)
+        if self._is_empty:
+            return self._constant(on, p)
+        x = on.unit(p)
+        sums = on.sums(x)
+        epsilon = on.backend.epsilon
+        rounding = on.rounding
+        distance = sums.distance * (1 - SUM_ROUNDING) - rounding
+        known = bends(sums.cubes, sums.fourths, distance)
+        if self.certificate == "edges":
+            ball = swept_ball(sums.angle, sums.gradient, sums.squares, known)
+        elif self.certificate == "planar":
+            ball = self._planar_ball(on, x, sums, distance)
+        else:
+            ball = HarmonicBall(distance, -1.5 * _PERIOD, 1.5 * _PERIOD)
+        # On the curve itself, to rounding, every level meets (`uncanceled_edges`) and no gradient
+        # exists: give one so steep that the point counts as close to any level. A value that is
+        # not a number anywhere else stays one, and the tracer refuses it.
+        met = sums.distance <= 2 * rounding
+        steep = on.backend.Array3f(0, 0, 4 * _PERIOD / rounding)
+        gradient = dr.select(met, steep, sums.gradient)
+        error, gradient_error = on.value_rounding, 0.0
+        # Ends of edges, rounded, move each edge's angle by at most that times the integral of
+        # |dp|/D^2: where edges nearly cancel, the gradient does not show it.
+        error = error + dr.select(met, 0, 2 * epsilon * sums.squares)
+        if sums.circles is not None:
+            own = sums.circles
+            # Measured: 15 units in the last place of a circle's angle and 60 of its gradient (near
+            # it, 10 elsewhere). Its place is rounded by a few units besides.
+            place = epsilon * (4 + 4 * dr.max(dr.abs(x)))
+            value = 16 * epsilon * len(self._net_circles) + place * own.squares
+            error = error + dr.select(met, 0, value)
+            slope = 32 * epsilon * own.squares + 1.5 * place * own.cubes
+            gradient_error = dr.select(met, 0, slope)
+        error = dr.select(met, 8 * _PERIOD, error)  # that gradient times 2 rounding
+        along = _along_curves(on, x, sums, direction)
+        if self._asked == "paper":
+            known = (ball,)
+        value = dr.select(met, 0, sums.angle)
+        sample = Sample(value, gradient, known, error, gradient_error, weaker=(ball,), along=along)
+        return lengthened(sample, on.size)
+
+    def _planar_ball(
+        self, on: _CurveBuffers, x: Vec3, sums: CurveSums, distance: Real
+    ) -> HarmonicBall:
+        if self._region is None:
+            own = sums.circles
+            assert own is not None
+            return HarmonicBall(distance, own.lower, own.upper)
+        slack = on.rounding + on.backend.epsilon * 4 * dr.max(dr.abs(x))
+        return self._region.window(sums.angle, on.height(x), distance, slack)
+
+    def _constant(self, on: _CurveBuffers, p: Vec3) -> Sample:
+        """The sample of f = 0, for a curve of which nothing is left: it is true on any ball. The
+        range has a width, as bounds divide by it; no level lies in it (`check_levels`)."""
+        x = on.unit(p)
+        radius = 1e6 * (1 + dr.norm(x)) * on.size
+        zero = dr.zeros(on.backend.Float, dr.width(p))
+        ball = HarmonicBall(radius, zero - _NARROW, zero + _NARROW)
+        return Sample(zero, on.backend.Array3f(zero), (ball,))
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        """Rows of the Hessian, free of trace to rounding. It grows without limit at the curve."""
+        on = self._on(p)
+        if self._is_empty:
+            zero = dr.zeros(on.backend.Array3f, dr.width(p))
+            return zero, zero, zero
+        x, share = on.unit(p), 1 / (on.size * on.size)
+        rows = on.backend.Array3f(0), on.backend.Array3f(0), on.backend.Array3f(0)
+        if on.edges is not None:
+            rows = hessian_over_edges(on.edges, x)
+        if on.circles is not None:
+            more = on.circles.hessian(x).rows(on.backend.Array3f)
+            rows = tuple(one + other for one, other in zip(rows, more, strict=True))
+        first, second, third = (row * share for row in rows)
+        return first, second, third
+
+    def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
+        """Rounding of positions, as for sums over boundary edges (`sums.SLOPE_ROUNDINGS`), with
+        distances less by what it may have done to them. Without bound at the curve."""
+        del sample
+        on = self._on(p)
+        if self._is_empty:
+            return 0.0, 0.0
+        x = on.unit(p)
+        sums, unit = on.sums(x), epsilon_at(x)
+        distance = sums.distance - 4 * unit
+        known = (distance > 0) & (sums.distance > 2 * on.rounding)  # see `evaluate`
+        share = dr.select(known, dr.square(dr.square(sums.distance / distance)), dr.inf)
+        slope = SLOPE_ROUNDINGS / 3 * unit * sums.cubes * share / on.size
+        second = 0.25 * SECOND_ROUNDINGS * unit * sums.cubes / sums.distance * share
+        return slope, second / (on.size * on.size)
+
+    def slope_change(self, p: Vec3, radius: Real) -> Real:
+        """See `curve_promises`; positions may be off by rounding."""
+        on = self._on(p)
+        if self._is_empty:
+            return 0 * p.x
+        x, reach = on.unit(p), radius / on.size + on.rounding
+        sums = on.sums(x)
+        distance = sums.distance * (1 - SUM_ROUNDING) - on.rounding
+        return slope_change(sums.cubes, sums.fourths, distance, reach) / on.size
+
+    def closest_on_boundary(self, p: Vec3) -> Vec3 | None:
+        """The closest point of the curve, edges that cancel left out (`uncanceled_edges`)."""
+        if self._is_empty:
+            return None
+        on = self._on(p)
+        x = on.unit(p)
+        nearest, square = on.backend.Array3f(0), on.backend.Float(dr.inf)
+        if self._net:
+            center = to_numpy(on.center).reshape(3).astype(np.float64)
+            start, end = ((q - center) / self._size for q in uncanceled_edges(self._net))
+            nearest = closest_on_segments(segments(on.backend, start, end), x)
+            square = dr.squared_norm(x - nearest)
+        if on.circles is not None:
+            other, apart = on.circles.closest(x)
+            nearest = dr.select(apart < square, other, nearest)
+        return nearest * on.size + on.center
+
+    def parameters(self) -> tuple[Any, ...]:
+        return tuple(one for one in self._movable if _is_drjit(one))
+
+    def differentiable_value(self, p: Vec3) -> Real:
+        backend = backend_of(p)
+        # Vertices that can be moved one by one are all there: moved, edges cancel no longer.
+        loops = self._movable or self._net
+        angle = differentiable_angle(backend, loops, p)
+        on = self._on(p)
+        if on.circles is None:
+            return angle
+        # To first order in p, as its loop cannot be passed in reverse.
+        with dr.suspend_grad():
+            q = dr.detach(p)
+            own = on.circles.sums(on.unit(q))
+        return angle + own.angle + dr.dot(own.gradient / on.size, p - q)
+
+    def change_along(self, p: FloatArray, q: FloatArray) -> FloatArray | None:
+        if self._net_circles:
+            return None
+        backend = choose_backend("double")
+        on = self.prepare(backend)._on(backend.Array3f(0))
+        if on.edges is None:
+            return np.zeros(len(p))
+        edges = on.edges
+
+        def between(start: Vec3, end: Vec3) -> tuple[Real]:
+            return (change_along_segments(edges, on.unit(start), on.unit(end)),)
+
+        return in_batches(backend, between, p, q)[0]
+
+    def check_levels(self, levels: tuple[float, ...]) -> None:
+        for level in levels:
+            if self._is_empty and abs(math.remainder(float(level), _PERIOD)) < _NARROW:
+                raise ValueError(
+                    f"level {level:g}: all edges of this curve cancel each other, so that its "
+                    "solid angle is 0 everywhere modulo 4 pi, and no surface is where it takes "
+                    "that value: check the loops' orientations"
+                )
+
+    def extent(self, levels: tuple[float, ...]) -> Volume | None:
+        """Where the level sets must lie.
+
+        The 2 pi level of a curve in convex position lies in its convex hull (paper, Theorem B.1).
+        For any curves of total length L: seen from x at distance rho from all of them, a loop
+        has angular length at most L_i/rho =: t_i; a closed spherical curve of length t < 2 pi,
+        cut into simple loops, bounds |area| <= 2 pi - sqrt(4 pi^2 - t^2) =: phi(t) (isoperimetry
+        on the sphere; phi is convex with phi(0) = 0, so the pieces add up to at most phi of the
+        whole). So |Omega| < l wherever L/rho < sqrt(l (4 pi - l)): a level at distance l from
+        the multiples of 4 pi lies within rho = L/sqrt(l (4 pi - l)) of the curves. Cells of that
+        box that are proved to hold no level are then cut away (`tight_extent`).
+        """
+        if levels not in self._extents:
+            self._extents[levels] = self._extent(levels)
+        return self._extents[levels]
+
+    def _extent(self, levels: tuple[float, ...]) -> Volume | None:
+        points = self._points_around()
+        away = [abs(math.remainder(float(level), _PERIOD)) for level in levels]
+        nearest = min(away)
+        if nearest < _NARROW:
+            return None
+        if self._is_empty:
+            return ConvexHull.of(points)  # holds what there is: nothing
+        # Curves that are moved step by step share kernels: their extent is found in one way.
+        in_hull = self.convex_position and nearest > 2 * math.pi * (1 - 1e-9)
+        if in_hull and not self._movable:
+            return ConvexHull.of(points).padded(1e-4 * self._size)
+        length = sum(one.length for one in self._net_circles)
+        length += total_length(self._net) if self._net else 0.0
+        reach = 1.0001 * length / math.sqrt(nearest * (_PERIOD - nearest))
+        lower, upper = points.min(axis=0) - reach, points.max(axis=0) + reach
+        loops = [*self._net, *self._net_circles]
+        proved = self if self._asked != "paper" else SolidAngle(loops)
+        vertices = sum(map(len, self._net)) + 3 * len(self._net_circles)
+        return tight_extent(proved, levels, lower, upper, max(8, _MOST_PAIRS // vertices))
+
+    def describe(self) -> dict[str, Any]:
+        return {
+            "loops": len(self.loops) + len(self.circles),
+            **({"circles": len(self.circles)} if self.circles else {}),
+            "vertices": sum(len(loop) for loop in self.loops),
+            "canceled edges": sum(map(len, self.loops)) - sum(map(len, self._net)),
+            "convex position": self.convex_position,
+            "certificate": self.certificate,
+        }
+
+
+@dataclass(frozen=True)
+class _CurveBuffers(UnitCoordinates):
+    """The edges on a backend, None if there are none.
+
+    circles: likewise. plane: normal (x, y, z) and offset of the `PlanarRegion`, if there is one.
+    rounding: how far a point may be from where it was meant to be, in units of the curve. Near the
+        curve p - center is exact, division and the curve's own coordinates have a few roundings of
+        size 1, and p itself was rounded once, at the curve's distance from 0.
+    value_rounding: what rounding may do to a product of so many factors.
+    """
+
+    edges: LoopEdges | None
+    circles: Circles | None
+    plane: tuple[Real, ...] | None
+    rounding: Real
+    value_rounding: Real
+
+    def height(self, x: Vec3) -> Real:
+        """Of x over the plane."""
+        assert self.plane is not None
+        return dr.dot(self.backend.Array3f(*self.plane[:3]), x) - self.plane[3]
+
+    def sums(self, x: Vec3) -> CurveSums:
+        """All sums at x, in unit coordinates."""
+        parts: list[CurveSums] = []
+        if self.edges is not None:
+            parts.append(CurveSums.of(sum_over_edges(self.edges, x)))
+        if self.circles is not None:
+            own = self.circles.sums(x)
+            parts.append(dataclasses.replace(CurveSums.of(own), circles=own))
+        return functools.reduce(CurveSums.plus, parts)
+
+
+@dataclass(frozen=True)
+class CurveSums:
+    """Sums over edges and circles, as `EdgeSums`; circles: those over circles alone, None if there
+    are none."""
+
+    angle: Real
+    gradient: Vec3
+    distance: Real
+    squares: Real
+    cubes: Real
+    fourths: Real
+    circles: CircleSums | None = None
+
+    @classmethod
+    def of(cls, sums: EdgeSums | CircleSums) -> CurveSums:
+        """Those of edges or of circles alone."""
+        integrals = sums.squares, sums.cubes, sums.fourths
+        return cls(sums.angle, sums.gradient, sums.distance, *integrals)
+
+    def plus(self, other: CurveSums) -> CurveSums:
+        """The sums of both."""
+        return CurveSums(
+            self.angle + other.angle,
+            self.gradient + other.gradient,
+            fmin(self.distance, other.distance),
+            self.squares + other.squares,
+            self.cubes + other.cubes,
+            self.fourths + other.fourths,
+            other.circles if self.circles is None else self.circles,
+        )
+
+
+def _along_curves(
+    on: _CurveBuffers, x: Vec3, sums: CurveSums, direction: Vec3 | None
+) -> tuple[Lipschitz, ...]:
+    """What is known at x, in unit coordinates, along a direction, if one is given."""
+    if direction is None:
+        return ()
+    line = Line(x, on.backend.Array3f(direction), on.rounding)
+
+    def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
+        found: list[tuple[Real, ...]] = []
+        if on.edges is not None:
+            found.append(rates_along(on.edges, line, lengths, active))
+        if on.circles is not None:
+            found.append(on.circles.rates_along(line, lengths, active))
+        return tuple(sum(several) for several in zip(*found, strict=True))
+
+    return known_along(line, sums.gradient, sums.distance, rates)
+
+
+def _movable_loops(loops: Any) -> tuple[Any, tuple[Any, ...]]:
+    """Curves as `validate_curves` takes them; and, if some are Dr.Jit arrays, all loops, these as
+    3-vectors."""
+    several = isinstance(loops, list | tuple)
+    parts: list[Any] = [*loops] if several else [loops]
+    if not any(map(_is_drjit, parts)):
+        return loops, ()
+    parts = [vectors_of(one, "a loop", CurveShapeError) if is_tensor(one) else one for one in parts]
+    curves = [to_numpy(one) if _is_drjit(one) else one for one in parts]
+    movable = tuple(one for one in parts if not isinstance(one, Circle))
+    return curves if several else curves[0], movable
+
+
+def _is_drjit(value: Any) -> bool:
+    return dr.is_array_v(type(value))

@@ -1,0 +1,200 @@
+"""A mesh made ready for winding numbers: welded, duplicates canceled, scaled, in a tree."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from harnack.backend import FloatArray, IntArray
+from harnack.fields.clearance import single
+from harnack.fields.solid_angles.multipole import NodeMoments, triangle_levels
+from harnack.geometry import MeshError, validate_mesh
+from harnack.geometry.chains import net_faces, singular_edges, weld_vertices
+from harnack.tree import Hierarchy, build_hierarchy
+from harnack.tree.triangles import MOST_TRIANGLES, PARITY, triangle_records
+
+# Triangles of a leaf at most, and children of a node: by experiment.
+_LEAF_SIZE, _ARITY = 8, 4
+# What vertices may move under: properties that depend on faces, or that are as good for others.
+_SHARED = ("triangles", "tree", "ray_tree", "singular_flags")
+
+
+@dataclass(frozen=True)
+class WindingMesh:
+    """What the evaluators of a winding number are made of. Double precision, in NumPy.
+
+    vertices: (n, 3), as given. faces: (m, 3) indices of welded vertices, no two alike.
+    multiplicity: (m,) how often each is given, less the times that it is given turned round.
+    source: (m,) the face that it comes from.
+    singular: (k, 2) directed edges at which triangles do not cancel, an edge of weight 2 twice.
+    given: (g, 3) all faces, as given. welded: (n,) the vertex that stands for each.
+    center, size: `unit_vertices` = (vertices - center)/size, with a power of two for a size, so
+        that lengths can be scaled to and fro without rounding.
+    """
+
+    vertices: FloatArray
+    faces: IntArray
+    multiplicity: IntArray
+    source: IntArray
+    singular: IntArray
+    given: IntArray
+    welded: IntArray
+    center: FloatArray
+    size: float
+
+    @classmethod
+    def of(cls, vertices: npt.ArrayLike, faces: npt.ArrayLike) -> WindingMesh:
+        """From vertices (n, 3) and faces (m, 3).
+
+        Raises:
+            MeshError: as `validate_mesh`; or all faces cancel; or there are too many.
+        """
+        x, f = validate_mesh(vertices, faces)
+        welded = weld_vertices(x)
+        net = net_faces(welded[f])
+        if len(net.faces) == 0:
+            raise MeshError("faces: every face is canceled by its own copy turned round")
+        if net.multiplicity.sum() >= MOST_TRIANGLES:
+            raise MeshError(
+                f"faces: at most {MOST_TRIANGLES - 1} are possible; cut the mesh in parts"
+            )
+        edges, weights = singular_edges(net.faces, net.multiplicity)
+        return cls(
+            x,
+            net.faces,
+            net.multiplicity,
+            net.source,
+            np.repeat(edges, weights, axis=0),
+            f,
+            welded,
+            *_center_and_size(x, net.faces),
+        )
+
+    def moved(self, vertices: npt.ArrayLike) -> WindingMesh:
+        """The mesh with its vertices (n, 3) elsewhere. What follows from the faces alone is shared,
+        and so is the shape of the trees that there are; positions, boxes and moments are not.
+
+        Raises:
+            MeshError: as `validate_mesh`; another number of vertices; vertices that coincided, so
+                that faces were joined there, come apart.
+        """
+        x, given = validate_mesh(vertices, self.given)
+        if len(x) != len(self.vertices):
+            raise MeshError(
+                f"vertices: {len(x)} of them, where {len(self.vertices)} were before: moving "
+                "vertices keeps their number and their order"
+            )
+        apart = (x != x[self.welded]).any(axis=1)
+        if apart.any():
+            torn = given[apart[given]]
+            if len(torn):
+                i = int(torn[0])
+                raise MeshError(
+                    f"vertices: {i} and {self.welded[i]} were at the same place, where faces were "
+                    "joined, and now are not: make a new winding number of this mesh"
+                )
+        center, size = _center_and_size(x, self.faces)
+        mesh = dataclasses.replace(self, vertices=x, center=center, size=size)
+        made = vars(self)
+        vars(mesh).update({name: made[name] for name in _SHARED if name in made})
+        return mesh
+
+    @functools.cached_property
+    def unit_vertices(self) -> FloatArray:
+        """(n, 3) vertices about the origin, of size about one."""
+        return (self.vertices - self.center) / self.size
+
+    @functools.cached_property
+    def triangles(self) -> IntArray:
+        """(k, 3) faces, each as often as it counts."""
+        return np.repeat(self.faces, self.multiplicity, axis=0)
+
+    @functools.cached_property
+    def corners(self) -> FloatArray:
+        """(m, 3, 3) corners of the triangles, in unit coordinates."""
+        return self.unit_vertices[self.triangles]
+
+    @functools.cached_property
+    def tree(self) -> Hierarchy:
+        """Over the triangles' centroids."""
+        a, b, c = np.moveaxis(self.corners, 1, 0)
+        return build_hierarchy((a + b + c) / 3, leaf_size=_LEAF_SIZE, arity=_ARITY)
+
+    @functools.cached_property
+    def ray_tree(self) -> Hierarchy:
+        """Over the centroids of faces, each once: a ray crosses all of its copies at once."""
+        if len(self.faces) == len(self.triangles):
+            return self.tree
+        centroids = self.unit_vertices[self.faces].mean(axis=1)
+        return build_hierarchy(centroids, leaf_size=_LEAF_SIZE, arity=_ARITY)
+
+    @functools.cached_property
+    def ray_records(self) -> FloatArray:
+        """(m, 14) of the faces, as `tree.triangles` describes; turns count by multiplicity."""
+        records = triangle_records(self.unit_vertices, self.faces)
+        records[:, PARITY] *= self.multiplicity
+        return records
+
+    @functools.cached_property
+    def records(self) -> FloatArray:
+        """(k, 14) of the triangles, with the numbers of their faces."""
+        if len(self.faces) == len(self.triangles):
+            return self.ray_records
+        return np.repeat(
+            triangle_records(self.unit_vertices, self.faces), self.multiplicity, axis=0
+        )
+
+    @functools.cached_property
+    def levels(self) -> list[NodeMoments]:
+        """Moments of the nodes."""
+        return triangle_levels(self.tree, self.corners)
+
+    @functools.cached_property
+    def singular_flags(self) -> FloatArray:
+        """(m, 3): 1 for each edge 01, 12 and 02 of a record that is singular, else 0."""
+        count = len(self.vertices)
+        keys = np.sort(self.singular.min(axis=1) * count + self.singular.max(axis=1))
+        at_ends = np.zeros(count, np.bool_)
+        at_ends[self.singular] = True
+        flags = np.zeros((len(self.triangles), 3))
+        ends = np.sort(self.triangles, axis=1)
+        for k, (i, j) in enumerate(((0, 1), (1, 2), (0, 2))):
+            near = np.flatnonzero(at_ends[ends[:, i]] & at_ends[ends[:, j]])
+            edges: IntArray = ends[near, i] * count + ends[near, j]
+            flags[near, k] = keys.take(np.searchsorted(keys, edges), mode="clip") == edges
+        return flags
+
+    @functools.cached_property
+    def box(self) -> tuple[Any, Any]:
+        """Lowest and highest coordinates of the triangles."""
+        return _box(self.vertices, self.faces)
+
+    @functools.cached_property
+    def area(self) -> float:
+        """Of all triangles."""
+        p, q, r = np.moveaxis(self.corners, 1, 0)
+        cross = np.linalg.norm(np.cross(q - p, r - p), axis=1)
+        return float(0.5 * cross.sum() * self.size**2)
+
+    @functools.cached_property
+    def boundary_length(self) -> float:
+        """Of all singular edges."""
+        ends = self.vertices[self.singular]
+        return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum())
+
+
+def _box(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, FloatArray]:
+    used = np.zeros(len(vertices), np.bool_)
+    used[faces] = True
+    return vertices[used].min(axis=0), vertices[used].max(axis=0)
+
+
+def _center_and_size(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, float]:
+    low, high = _box(vertices, faces)
+    size = 2.0 ** np.ceil(np.log2(0.5 * float((high - low).max())))
+    return single(0.5 * (low + high)), float(size)

@@ -1,0 +1,209 @@
+"""Triangles near a point: what the edges of their union add to the winding number.
+
+By Stokes' theorem the field of a set of triangles is that of the boundary of their union, so only
+edges at which they do not cancel are summed up. `edge_lift` says how crossings and edges together
+make the winding number: both are decided by the same bits, so that nothing is rounded beside an
+edge that two triangles share.
+
+Winding numbers by a tree: clusters of far triangles as multipoles, near ones exactly.
+
+Barill et al. 2018 ("Fast winding numbers for soups and clouds") with orders 0 to 2, gradients and
+Hessians from the same moments, a bound of what the truncation costs, and certificates.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend.elementary import fmax
+from harnack.fields.clearance import epsilon_at
+from harnack.fields.solid_angles.edge_lift import LiftedEdge, LiftedProduct, LiftedSums
+from harnack.fields.solid_angles.edge_trails import Line, known_along, with_edge_rates
+from harnack.fields.solid_angles.far_clusters import Treecode
+from harnack.fields.sums import FieldSums, Terms, rounding_of_sum
+from harnack.tree.triangles import (
+    EDGES,
+    INDEX,
+    PARITY,
+    Frame,
+    Upwards,
+    corners_of,
+    crossing,
+    in_slots,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.fields.batch import Values
+    from harnack.fields.field import Sample
+    from harnack.fields.sheets import Crossing
+    from harnack.fields.solid_angles.edge_trails import Rates
+    from harnack.fields.solid_angles.winding_mesh import WindingMesh
+
+# The first column of a record behind those of `tree.triangles`: 1 where an edge is singular.
+SINGULAR = EDGES + 3
+# The corners that edges join, and whether they run as the triangle does.
+_EDGES = ((0, 1, 1.0), (1, 2, 1.0), (0, 2, -1.0))
+
+
+@dataclass(frozen=True)
+class NearEdge:
+    """An edge of a triangle. is_singular: whether the mesh ends there."""
+
+    edge: LiftedEdge
+    is_singular: Mask
+
+    def is_open(self, reach: Real) -> Mask:
+        """Whether the edge may be part of the boundary of the triangles near x.
+
+        It is not if it is nearer than (reach - 1)/2 times its length L and not singular: a far
+        node with a triangle at it has radius R >= L/2 and is farther than reach R, hence the edge
+        farther than (reach - 1) R. So all triangles at it are near, and they cancel there.
+        """
+        square, inverse = self.edge.edge.square, self.edge.edge.inverse
+        closed = ~self.is_singular & (square * inverse < dr.square(0.5 * (reach - 1)))
+        return (inverse > 0) & ~closed
+
+
+def edges_of(row: list[Real], x: Vec3, frame: Frame | Upwards) -> Iterator[NearEdge]:
+    """The edges of the triangle of a record, seen from x; there are none in an empty slot."""
+    ends = corners_of(row, cast("Any", type(x)))
+    for k, (i, j, sign) in enumerate(_EDGES):
+        inverse = dr.select(row[INDEX] >= 0, row[EDGES + k], 0)
+        edge = LiftedEdge.between(ends[i], ends[j], sign * row[PARITY], inverse, frame, x)
+        yield NearEdge(edge, row[SINGULAR + k] > 0)
+
+
+IsAhead: TypeAlias = "Callable[[list[Real], Real], Mask]"
+
+_SHARE = 1 / (4 * math.pi)
+
+
+@dataclass(frozen=True)
+class TreeWinding:
+    """w of a mesh on a backend, in units in which the mesh has a size of about one."""
+
+    clusters: Treecode
+    rounding: Real
+
+    @classmethod
+    def of(cls, backend: Backend, mesh: WindingMesh, accuracy: float, order: int) -> TreeWinding:
+        """Everything uploaded."""
+        records = np.concatenate([mesh.records, mesh.singular_flags], axis=1)
+        slots = in_slots(mesh.tree, records)
+        rounding = rounding_of_sum(backend, len(mesh.triangles))
+        levels = list(mesh.levels)
+        return cls(Treecode.of(backend, mesh.tree, levels, slots, accuracy, order), rounding)
+
+    @property
+    def has_detail(self) -> bool:
+        """Whether rough looks cost less."""
+        return True
+
+    @property
+    def backend(self) -> Backend:
+        """The one it lies on."""
+        return self.clusters.backend
+
+    @property
+    def coarsest_detail(self) -> float:
+        """`Field.coarsest_detail`."""
+        return self.clusters.coarsest
+
+    def at(self, x: Vec3, derivatives: int, closer: Real) -> Values:
+        """w, gradient and Hessian (as asked for) at points; closer: the detail, at least 1.
+
+        Near triangles: the crossings of the rays from x along z, and their open edges.
+        """
+        unit, detail = epsilon_at(x), fmax(self.backend.Float(closer), self.backend.Float(1))
+
+        def is_ahead(row: list[Real], t: Real) -> Mask:
+            del row
+            return t > 0
+
+        sums = self._sums(Upwards(x), x, detail, unit, is_ahead, derivatives)
+        return self.clusters.values(sums, _SHARE, unit, self.rounding)
+
+    def _sums(
+        self, frame: Frame | Upwards, x: Vec3, detail: Real, unit: Real, is_ahead: IsAhead,
+        derivatives: int,
+    ) -> FieldSums:  # fmt: skip
+        """4 pi w by far clusters, the crossings of near triangles that are ahead on rays of the
+        frame through x, and the open edges of near triangles (`is_open`).
+
+        is_ahead(row, t): whether a crossing at t with the triangle of a record is.
+        """
+        reach = self.clusters.ratio(detail)
+
+        def add(
+            row: list[Real], active: Mask, sums: FieldSums, own: tuple[Any, ...]
+        ) -> tuple[FieldSums, tuple[Any, ...]]:
+            t, turn = crossing(row, frame)
+            crossed = Terms(4 * math.pi * turn)
+            lifted = LiftedSums(sums.plus(crossed, active & is_ahead(row, t)), LiftedProduct(*own))
+            for near in edges_of(row, x, frame):
+                lifted = lifted.plus(near.edge, unit, active & near.is_open(reach))
+            return lifted.sums, lifted.product.parts()
+
+        one = LiftedProduct.one(self.backend.Float).parts()
+        sums, product = self.clusters.sums(x, detail, add, one, derivatives=derivatives)
+        return LiftedSums(sums, LiftedProduct(*product)).whole()
+
+    def start(self, frame: Frame, t: Real, active: Mask) -> Real:
+        """No crossings are counted: every sum is the whole of w."""
+        del frame, t, active
+        return self.backend.Float(0)
+
+    def on_stretch(
+        self, frame: Frame, x: Vec3, behind: Crossing, turns: Real, detail: Real
+    ) -> Sample:
+        """w on a stretch of a ray, with a certificate.
+
+        Near triangles: their crossings ahead of x along the ray, and their open edges
+        (`NearEdge.is_open`). Crossings passed up to the start of the stretch are behind x, all
+        others ahead, as the tracer has it: the sign of a triangle that x is on, to rounding, is
+        not asked for.
+
+        Certificate. Far dipoles: see `FieldSums.sample`. The near triangles' field is that of
+        their open edges, and f is harmonic as far as the nearest of them; what they add to the
+        remainder, says `LiftedEdge.bounds`.
+        """
+        del turns
+        index, unit = self.backend.UInt32, fmax(epsilon_at(frame.o), epsilon_at(x))
+
+        def is_ahead(row: list[Real], t: Real) -> Mask:
+            number = index(fmax(row[INDEX], self.backend.Float(0)))
+            return ~((t < behind.t) | ((t == behind.t) & (number <= behind.sheet)))
+
+        found = self._sums(frame, x, detail, unit, is_ahead, 1)
+        line = Line(x, frame.d, 8 * unit)
+        known = known_along(line, found.gradient, found.free_distance, self._rates(line))
+        return found.sample(_SHARE, unit, self.rounding, along=known)
+
+    def _rates(self, line: Line) -> Rates:
+        """The rates of `edge_passing` for 4 pi w on stretches of lines."""
+        reach = self.clusters.rough
+
+        def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
+            def add(
+                row: list[Real], active: Mask, sums: FieldSums, own: tuple[Any, ...]
+            ) -> tuple[FieldSums, tuple[Any, ...]]:
+                for near in edges_of(row, line.x, Upwards(line.x)):
+                    open_ = active & near.is_open(reach)
+                    new = with_edge_rates(line, near.edge.edge, lengths, own)
+                    own = tuple(dr.select(open_, a, b) for a, b in zip(new, own, strict=True))
+                return sums, own
+
+            start = tuple(self.backend.Float(0) for _ in lengths)
+            far, near = self.clusters.sums(line.x, 0, add, start, active)
+            return far.with_rates(line.v, line.slack, lengths, near, active)
+
+        return rates

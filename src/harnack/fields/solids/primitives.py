@@ -1,0 +1,399 @@
+"""Planes, and shapes that are round: sphere, ellipsoid, cylinder, cone, capsule, torus.
+
+Each is its signed distance, or a bound of it, with the Lipschitz constant 1 (Hart 1996, appendix
+A): negative inside, and no larger than the distance outside. Shapes lie at the origin with their
+axis along z; move and turn them.
+
+Boxes, superellipsoids and supertori, and shapes grown by a distance.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from harnack.arithmetic import cos, maximum, minimum, norm, sin
+from harnack.arithmetic.norms import corner
+from harnack.backend.numbers import finite, positive, triple
+from harnack.fields.formula import prepared_numbers
+from harnack.fields.solids.solid import Point, Shape, ball_around, box_around, set_checked
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend
+    from harnack.fields.field import Field
+    from harnack.geometry import Volume
+
+
+@dataclass(frozen=True)
+class Plane(Shape):
+    """The half-space n.x <= distance, n the normal made a unit vector.
+
+    The signed distance (Hart, equation 23): its gradient is n, so that its Lipschitz constant is 1.
+    """
+
+    is_convex = True
+
+    # The unit vector is rounded.
+    lipschitz = 1.0 + 1e-6
+
+    normal: Point = (0.0, 0.0, 1.0)
+    distance: float = 0.0
+
+    def __post_init__(self) -> None:
+        normal = triple(self.normal, "the normal of a plane")
+        length = math.hypot(*normal)
+        if length == 0.0:
+            raise ValueError("the normal of a plane must not be zero")
+        set_checked(self, "normal", tuple(v / length for v in normal))
+        set_checked(self, "distance", finite(self.distance, "the distance of a plane"))
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        a, b, c = self.normal
+        return x * a + y * b + z * c - self.distance
+
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        del level, above
+        return None
+
+
+@dataclass(frozen=True)
+class Sphere(Shape):
+    """The ball |x - center| <= radius.
+
+    The signed distance (Hart, equation 24): by the triangle inequality the constant is 1.
+    """
+
+    is_convex = True
+
+    radius: float = 1.0
+    center: Point = (0.0, 0.0, 0.0)
+
+    lipschitz = 1.0
+
+    def __post_init__(self) -> None:
+        set_checked(self, "radius", positive(self.radius, "the radius of a sphere"))
+        set_checked(self, "center", triple(self.center, "the center of a sphere"))
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        a, b, c = self.center
+        return norm(x - a, y - b, z - c) - self.radius
+
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        if above:
+            return None
+        return ball_around(self.center, self.radius + level)
+
+
+@dataclass(frozen=True)
+class Ellipsoid(Shape):
+    """The points with |(x/a, y/b, z/c)| <= 1, radii = (a, b, c).
+
+    f = m (|(x/a, y/b, z/c)| - 1) with m the least radius. Proof of the constant 1: the norm has the
+    constant 1 and the stretched coordinates 1/m; it is attained along the shortest axis. So f is no
+    larger than the distance, which no formula in closed form gives.
+    """
+
+    is_convex = True
+
+    radii: Point = (1.0, 1.0, 1.0)
+
+    lipschitz = 1.0 + 1e-6  # quotients of radii are rounded
+
+    def __post_init__(self) -> None:
+        radii = triple(self.radii, "the radii of an ellipsoid", all_positive=True)
+        set_checked(self, "radii", radii)
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        a, b, c = self.radii
+        return (norm(x / a, y / b, z / c) - 1.0) * minimum(a, b, c)
+
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        if above:
+            return None
+        a, b, c = self.radii
+        size = 1.0 + level / min(self.radii)
+        return box_around((size * a, size * b, size * c))
+
+
+@dataclass(frozen=True)
+class Cylinder(Shape):
+    """The points within `radius` of the z axis, and of |z| <= half_height if that is given.
+
+    Without ends the signed distance |(x, y)| - r (Hart, equation 25). With ends the distances to
+    the side and to the ends have gradients at right angles, so that `corner` gives the signed
+    distance; its Lipschitz constant is 1.
+    """
+
+    is_convex = True
+
+    radius: float = 1.0
+    half_height: float | None = None
+
+    lipschitz = 1.0
+
+    def __post_init__(self) -> None:
+        set_checked(self, "radius", positive(self.radius, "the radius of a cylinder"))
+        if self.half_height is not None:
+            height = positive(self.half_height, "half the height of a cylinder")
+            set_checked(self, "half_height", height)
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        side = norm(x, y) - self.radius
+        return side if self.half_height is None else corner(side, abs(z) - self.half_height)
+
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        if above:
+            return None
+        if self.half_height is None:
+            return None
+        r, most = self.radius, level
+        return box_around((r + most, r + most, self.half_height + most))
+
+
+@dataclass(frozen=True)
+class DoubleCone(Shape):
+    """The double cone around the z axis whose sides make an angle with it, in radians.
+
+    f = |(x, y)| cos(angle) - |z| sin(angle) (Hart, equation 26). Its gradient is a unit vector off
+    the axis and the plane z = 0: the constant is 1. It is the signed distance where the nearest
+    point of a side is not beyond the apex, and smaller elsewhere.
+    """
+
+    angle: float = math.pi / 6
+
+    lipschitz = 1.0 + 1e-6  # sine and cosine are rounded
+
+    def __post_init__(self) -> None:
+        angle = finite(self.angle, "the angle of a cone")
+        if not 0.0 < angle < math.pi / 2:
+            raise ValueError(
+                "the angle of a cone between axis and side must be between 0 and pi/2, "
+                f"not {self.angle!r}"
+            )
+        set_checked(self, "angle", angle)
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        return norm(x, y) * cos(self.angle) - abs(z) * sin(self.angle)
+
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        del level, above
+        return None
+
+
+@dataclass(frozen=True)
+class Capsule(Shape):
+    """The points within `radius` of the segment from start to end.
+
+    The signed distance |q - max(0, min(1, t)) (end - start)| - r, q = x - start, t the parameter of
+    the nearest point of the line. As a distance of a set it has the constant 1.
+    """
+
+    is_convex = True
+
+    start: Point = (0.0, 0.0, -1.0)
+    end: Point = (0.0, 0.0, 1.0)
+    radius: float = 0.5
+
+    lipschitz = 1.0
+
+    def __post_init__(self) -> None:
+        start = triple(self.start, "the start of a capsule")
+        end = triple(self.end, "the end of a capsule")
+        if start == end:
+            raise ValueError(f"a capsule from {start} to the same point is a sphere: use Sphere")
+        set_checked(self, "start", start)
+        set_checked(self, "end", end)
+        set_checked(self, "radius", positive(self.radius, "the radius of a capsule"))
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        axis = [b - a for a, b in zip(self.start, self.end, strict=True)]
+        q = [v - a for v, a in zip((x, y, z), self.start, strict=True)]
+        square = axis[0] * axis[0] + axis[1] * axis[1] + axis[2] * axis[2]
+        t = (q[0] * axis[0] + q[1] * axis[1] + q[2] * axis[2]) / square
+        # Along the axis what lies beyond the ends, and across it the distance from the line.
+        size = norm(*axis)
+        beyond = maximum(-t, t - 1.0, 0.0) * size
+        across = norm(*(v - t * a for v, a in zip(q, axis, strict=True)))
+        return norm(across, beyond) - self.radius
+
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        if above:
+            return None
+        r = self.radius + level
+        pairs = list(zip(self.start, self.end, strict=True))
+        half = [abs(b - a) / 2 + r for a, b in pairs]
+        middle = tuple((a + b) / 2 for a, b in pairs)
+        return box_around((half[0], half[1], half[2]), middle)
+
+
+@dataclass(frozen=True)
+class Torus(Shape):
+    """The points within `minor` of the circle of radius `major` around the z axis.
+
+    The signed distance | (|(x, y)| - R, z) | - r (Hart, equation 27); a distance of a set, so its
+    constant is 1. With minor > major (a spindle) it is a bound inside.
+    """
+
+    major: float = 1.0
+    minor: float = 0.25
+
+    lipschitz = 1.0
+
+    def __post_init__(self) -> None:
+        set_checked(self, "major", positive(self.major, "the major radius of a torus"))
+        set_checked(self, "minor", positive(self.minor, "the minor radius of a torus"))
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        return norm(norm(x, y) - self.major, z) - self.minor
+
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        if above:
+            return None
+        r = self.minor + level
+        return box_around((self.major + r, self.major + r, r))
+
+
+@dataclass(frozen=True)
+class Cuboid(Shape):
+    """The box |x| <= a, |y| <= b, |z| <= c of half sides (a, b, c), its edges rounded by `radius`.
+
+    The signed distance: that of the box smaller by the radius (`corner`), less the radius.
+    """
+
+    is_convex = True
+
+    half_sides: Point = (1.0, 1.0, 1.0)
+    radius: float = 0.0
+
+    lipschitz = 1.0
+
+    def __post_init__(self) -> None:
+        sides = triple(self.half_sides, "the half sides of a box", all_positive=True)
+        set_checked(self, "half_sides", sides)
+        radius = finite(self.radius, "the radius of the edges of a box")
+        if not 0.0 <= radius <= min(sides):
+            raise ValueError(
+                "the radius of the edges of a box must be between 0 and its least half side "
+                f"{min(sides):g}, not {self.radius!r}"
+            )
+        set_checked(self, "radius", radius)
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        sides = (
+            abs(v) - (a - self.radius) for v, a in zip((x, y, z), self.half_sides, strict=True)
+        )
+        return corner(*sides) - self.radius
+
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        if above:
+            return None
+        a, b, c = (one + level for one in self.half_sides)
+        return box_around((a, b, c))
+
+
+def lipschitz_of_norms(p: float, q: float) -> float:
+    """The Lipschitz constant of | (|(x, y)|_p, z) |_q, p, q >= 1.
+
+    Hart (1996, equation 31) prints one that is right only for p = q < 2 or p, q >= 2. Proof. The
+    gradient has the parts u^(q-1) grad |(x, y)|_p and v^(q-1), where (u, v) has the q-norm 1. The
+    gradient of the p-norm has the dual norm 1, so its length is at most c = 2^max(0, 1/p - 1/2).
+    So the square of the length is at most c^2 u^(2q-2) + v^(2q-2). For q >= 2 both powers are at
+    most u^q and v^q, whose sum is 1: it is at most c^2, for c >= 1. For q < 2, Hoelder's inequality
+    with the exponents q/(2q-2) and q/(2-q) gives (c^m + 1)^(2/m) with m = 2q/(2-q). All are
+    attained.
+    """
+    c = 2.0 ** max(0.0, 1.0 / p - 0.5)
+    if q >= 2.0:
+        return c
+    m = 2.0 * q / (2.0 - q)
+    return (c**m + 1.0) ** (1.0 / m)
+
+
+def _checked_powers(powers: Any, name: str) -> tuple[float, float]:
+    try:
+        p, q = (float(one) for one in powers)
+    except (TypeError, ValueError):
+        raise ValueError(f"the powers of a {name} must be two numbers, not {powers!r}") from None
+    if not (p >= 1.0 and q >= 1.0):
+        raise ValueError(
+            f"the powers of a {name} must be at least 1, not {powers!r}: below 1 no step can be "
+            "proved, for the slope has no bound"
+        )
+    return p, q
+
+
+class _Powered(Shape):
+    """A shape with powers, which are numbers of its kernel and no data."""
+
+    powers: tuple[float, float]
+
+    def prepare(self, backend: Backend) -> Field:
+        made = prepared_numbers(self, backend)
+        set_checked(made, "powers", self.powers)
+        return made
+
+
+@dataclass(frozen=True)
+class Superellipsoid(_Powered):
+    """The points with | (|(x/a, y/b)|_p, z/c) |_q <= 1, powers = (p, q), radii = (a, b, c).
+
+    f = m (that norm - 1) with m the least radius (Hart, equations 28 to 30), whose constant is that
+    of the norm for equal radii, and no larger for others: see `lipschitz_of_norms`.
+    """
+
+    is_convex = True
+
+    powers: tuple[float, float] = (4.0, 4.0)
+    radii: Point = (1.0, 1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        set_checked(self, "powers", _checked_powers(self.powers, "superellipsoid"))
+        radii = triple(self.radii, "the radii of a superellipsoid", all_positive=True)
+        set_checked(self, "radii", radii)
+
+    @property
+    def lipschitz(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return lipschitz_of_norms(*self.powers) * (1.0 + 1e-6)
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        (p, q), (a, b, c) = self.powers, self.radii
+        return (norm(norm(x / a, y / b, p=p), z / c, p=q) - 1.0) * minimum(a, b, c)
+
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        if above:
+            return None
+        a, b, c = self.radii
+        size = 1.0 + level / min(self.radii)
+        return box_around((size * a, size * b, size * c))
+
+
+@dataclass(frozen=True)
+class Supertorus(_Powered):
+    """The points with | (|(x, y)|_p - R, z) |_q <= r, powers = (p, q).
+
+    Its constant is that of the norms (`lipschitz_of_norms`): taking R away moves no gradient.
+    """
+
+    powers: tuple[float, float] = (4.0, 4.0)
+    major: float = 1.0
+    minor: float = 0.25
+
+    def __post_init__(self) -> None:
+        set_checked(self, "powers", _checked_powers(self.powers, "supertorus"))
+        set_checked(self, "major", positive(self.major, "the major radius of a supertorus"))
+        set_checked(self, "minor", positive(self.minor, "the minor radius of a supertorus"))
+
+    @property
+    def lipschitz(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return lipschitz_of_norms(*self.powers) * (1.0 + 1e-6)
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        p, q = self.powers
+        return norm(norm(x, y, p=p) - self.major, z, p=q) - self.minor
+
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        if above:
+            return None
+        r = self.minor + level
+        return box_around((self.major + r, self.major + r, r))

@@ -1,0 +1,156 @@
+"""The interface of a clipping volume: a convex part of space that rays are cut to."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import drjit as dr
+import numpy as np
+import numpy.typing as npt
+
+from harnack.backend.numbers import check_vectors, real, real_array, refuse_derivatives
+
+if TYPE_CHECKING:
+    from typing import Self
+
+    from harnack.backend import Backend, BoolArray, FloatArray, Mask, Real, Vec3
+
+Point: TypeAlias = tuple[float, float, float]
+
+
+class Volume(abc.ABC):
+    """A closed convex set of R^3, not empty.
+
+    What is cut away is certain to be outside: in any precision, `clip` and `contains` lose no
+    point of the volume. They may admit points that lie outside by a few roundings of the
+    coordinates involved (about 1e-6 of the distance to the ray's origin in single precision).
+
+    Methods that take Dr.Jit arrays can be called while a loop is being recorded.
+
+    `a & b` is what two volumes have in common, which is convex as well.
+    """
+
+    def __new__(cls, *given: Any, **named: Any) -> Self:
+        """Refuses numbers with derivatives, which would be dropped."""
+        refuse_derivatives(cls.__name__, given, named)
+        return super().__new__(cls)
+
+    def __and__(self, other: object) -> Volume:
+        from harnack.geometry.volumes import Intersection
+
+        if not isinstance(other, Volume):
+            return NotImplemented
+        return Intersection((*_parts(self), *_parts(other)))
+
+    @abc.abstractmethod
+    def clip(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real) -> tuple[Real, Real]:
+        """The part [t0, t1] of the rays o + t d, 0 <= t_min <= t <= t_max, inside the volume.
+
+        d need not have unit length, but neither be zero. Where a ray misses the volume
+        t0 = inf and t1 = -inf; everywhere else t0 < t1.
+        """
+
+    @abc.abstractmethod
+    def contains(self, p: Vec3) -> Mask:
+        """Whether p lies in the volume, boundary included."""
+
+    @abc.abstractmethod
+    def signed_distance(self, p: Vec3) -> Real:
+        """Distance to the boundary, negative inside; outside a lower bound of the distance."""
+
+    @abc.abstractmethod
+    def outward_normal(self, p: Vec3) -> Vec3:
+        """Unit outward normal of the boundary piece nearest to p, for p near the boundary."""
+
+    @abc.abstractmethod
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper corner, (3,) each, of an axis-aligned box around it; may be infinite."""
+
+    @abc.abstractmethod
+    def contains_points(self, points: npt.ArrayLike) -> BoolArray:
+        """Whether points (n, 3) lie in the volume, in double precision on the host: (n,)."""
+
+    @abc.abstractmethod
+    def padded(self, distance: float) -> Volume:
+        """A volume that holds every point within `distance` (>= 0, finite) of this one."""
+
+    def prepare(self, backend: Backend) -> Volume:
+        """An equal volume whose numbers are kernel parameters on the backend.
+
+        So another volume of the same kind does not compile another kernel.
+        """
+        del backend
+        return self
+
+
+def _parts(volume: Volume) -> tuple[Volume, ...]:
+    """The volumes that an intersection is made of; of another volume, itself."""
+    parts: tuple[Volume, ...] | None = getattr(volume, "volumes", None)
+    return (volume,) if parts is None else parts
+
+
+def rounding(backend: Backend) -> float:
+    """Relative error allowed for one clipping formula: ten roundings of half a unit.
+
+    The longest chain of roundings among volumes (a plane: normal rounded to the backend, three
+    products, three sums, one division) is nine.
+    """
+    return 10.0 * float(dr.epsilon(backend.Float))
+
+
+def emptied(t0: Real, t1: Real) -> tuple[Real, Real]:
+    """The interval, or (inf, -inf) where it holds at most a point."""
+    full = t0 < t1
+    return dr.select(full, t0, dr.inf), dr.select(full, t1, -dr.inf)
+
+
+def checked_point(value: Iterable[float], name: str, *, finite: bool = True) -> Point:
+    """Three numbers as a tuple of floats.
+
+    Raises:
+        ValueError: not three numbers, NaN, or infinite where it must not be.
+    """
+    try:
+        if isinstance(value, str | bytes):
+            raise TypeError
+        numbers = tuple(real(v, name) for v in value)
+    except TypeError:
+        raise ValueError(f"{name} must be three numbers, not {value!r}") from None
+    if len(numbers) != 3:
+        raise ValueError(f"{name} must be three numbers, not {numbers}")
+    if any(np.isnan(numbers)) or (finite and not all(np.isfinite(numbers))):
+        raise ValueError(f"{name} must be finite, not {numbers}")
+    return numbers
+
+
+def check_volume(given: object, name: str) -> None:
+    """Raise TypeError for what is neither a volume nor None."""
+    if given is not None and not isinstance(given, Volume):
+        raise TypeError(
+            f"{name} must be a volume, such as harnack.Ball((0, 0, 0), 1), harnack.Box(lower, "
+            f"upper) or harnack.HalfSpace(normal, offset), not {given!r}"
+        )
+
+
+def checked_distance(distance: float) -> float:
+    """A padding distance.
+
+    Raises:
+        ValueError: negative, infinite or NaN.
+    """
+    if not 0.0 <= distance < np.inf:
+        raise ValueError(f"the padding must be finite and not negative, not {distance!r}")
+    return float(distance)
+
+
+def as_points(points: npt.ArrayLike) -> FloatArray:
+    """Points as a float64 array (n, 3).
+
+    Raises:
+        ValueError: no real numbers, or another shape.
+    """
+    array = real_array(points, "points")
+    check_vectors(array, "points")
+    return np.asarray(array, dtype=np.float64)

@@ -1,0 +1,222 @@
+"""The largest part of a surface, and the largest body of a closed one, with its cavities.
+
+Open surfaces cut by volumes: triangles ended at planes and spheres.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+
+from harnack.backend import FloatArray
+from harnack.geometry import Ball, Box, ConvexHull, HalfSpace, Intersection, Volume
+from harnack.meshing.checks import MeshingError
+from harnack.meshing.edges import IntArray, boundary_edges, dots, edge_keys, lengths
+from harnack.meshing.lattice_surface import Surface
+
+__all__ = ["cut_by", "largest_body", "largest_part"]
+
+
+def largest_part(surface: Surface) -> Surface:
+    """The connected part with the largest area."""
+    part = _parts(surface)
+    areas = np.bincount(part, np.linalg.norm(_crosses(surface), axis=1))
+    return Surface.of(surface.vertices, surface.faces[part == areas.argmax()])
+
+
+def largest_body(surface: Surface) -> Surface:
+    """Of a closed surface the body with the largest volume: an outer shell and the shells of its
+    cavities, which are turned inwards, so that their volume is negative.
+
+    Proof. Shells are closed, connected and do not meet. Where the surface bounds a set, a shell
+    turned inwards has the set around it, whose part there has an outer shell; of those that hold
+    the cavity it is the innermost, the smallest one: another one in between would be
+    outside of the part, with nothing of the set between both. That a shell holds a point is told by
+    its winding number there, a whole one.
+
+    Raises:
+        MeshingError: a cavity that lies in no shell.
+    """
+    part = _parts(surface)
+    names, shell = np.unique(part, return_inverse=True)
+    cross, corner = _crosses(surface), surface.vertices[surface.faces]
+    center = surface.vertices.mean(axis=0)
+    volumes = np.bincount(shell, dots(cross, corner[:, 0] - center)) / 6
+    bodies = volumes.copy()
+    owner = np.arange(len(names))
+    outer = np.flatnonzero(volumes > 0)
+    outer = outer[np.argsort(volumes[outer])]
+    for cavity in np.flatnonzero(volumes <= 0):
+        point = corner[np.flatnonzero(shell == cavity)[0]].mean(axis=0)
+        holds = (one for one in outer if _winding(corner[shell == one], point) > 0.5)
+        if (found := next(holds, None)) is None:
+            raise MeshingError("a part of the mesh is inside out: choose a smaller `spacing`")
+        owner[cavity] = found
+        bodies[found] += volumes[cavity]
+    kept = outer[bodies[outer].argmax()] if len(outer) else -1
+    return Surface.of(surface.vertices, surface.faces[owner[shell] == kept])
+
+
+def _parts(surface: Surface) -> IntArray:
+    """(m,) of each face the number of its connected part."""
+    import scipy.sparse  # here: half a second that few need
+    import scipy.sparse.csgraph as csgraph_module
+
+    sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
+    faces, n = surface.faces, len(surface.vertices)
+    rows, columns = np.concatenate([faces[:, :2], faces[:, 1:]]).T
+    joined = sparse.coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(n, n))
+    return np.asarray(csgraph.connected_components(joined, directed=False)[1])[faces[:, 0]]
+
+
+def _crosses(surface: Surface) -> FloatArray:
+    """(m, 3) normals of faces, twice as long as their areas."""
+    corner = surface.vertices[surface.faces]
+    return np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+
+
+def _winding(corner: FloatArray, point: FloatArray) -> float:
+    """The winding number around a point of triangles (m, 3, 3), by their solid angles (Van Oosterom
+    and Strackee 1983)."""
+    a, b, c = (corner[:, k] - point for k in range(3))
+    x, y, z = lengths(a), lengths(b), lengths(c)
+    below = x * y * z + dots(a, b) * z + dots(b, c) * x + dots(c, a) * y
+    return float(np.arctan2(dots(a, np.cross(b, c)), below).sum()) / (2 * math.pi)
+
+
+# Vertices so near to a boundary, as a part of the size, count as on it.
+_NEAR = 1e-9
+# Those so near, as a part of the shortest edge there, are moved onto it: else slivers remain.
+_DRAWN = 0.25
+
+
+@dataclass(frozen=True)
+class _Side:
+    """One side of a volume's boundary: a plane normal.x = offset, or a sphere."""
+
+    center: FloatArray
+    normal: FloatArray
+    radius: float | None
+
+    def heights(self, x: FloatArray) -> FloatArray:
+        """(n,) distances of points (n, 3) from it, negative inside."""
+        if self.radius is None:
+            return (x - self.center) @ self.normal
+        return np.linalg.norm(x - self.center, axis=1) - self.radius
+
+    def slopes(self, x: FloatArray) -> FloatArray:
+        """(n, 3) the gradients of these."""
+        if self.radius is None:
+            return np.broadcast_to(self.normal, x.shape)
+        away = x - self.center
+        return away / np.maximum(np.linalg.norm(away, axis=1), 1e-300)[:, None]
+
+
+def cut_by(surface: Surface, volume: Volume) -> Surface:
+    """The part of a surface in a volume. Its new ends lie on planes exactly, and between points of
+    spheres; vertices that are kept stay in their order and come first.
+
+    Raises:
+        MeshingError: another kind of volume.
+    """
+    if isinstance(volume, Intersection):
+        for one in volume.volumes:
+            surface = cut_by(surface, one)
+        return surface
+    if isinstance(volume, Ball):
+        return _cut(surface, _Side(np.array(volume.center), np.zeros(3), volume.radius))
+    if not isinstance(volume, Box | HalfSpace | ConvexHull):
+        raise MeshingError(f"a {type(volume).__name__} cannot cut a mesh: give a box or a ball")
+    for row in volume.planes():
+        surface = _cut(surface, _Side(row[:3] * row[3], row[:3], None))
+    if isinstance(volume, Box):
+        return Surface(_onto(surface.vertices, volume), surface.faces)
+    return surface
+
+
+def _onto(vertices: FloatArray, box: Box) -> FloatArray:
+    """Vertices within rounding of a box's faces, put there."""
+    for end in box.bounds():
+        near = np.abs(vertices - end) <= _NEAR * (1 + np.abs(end))
+        vertices = np.where(near, end, vertices)
+    return vertices
+
+
+def _drawn(surface: Surface, side: _Side) -> tuple[FloatArray, FloatArray]:
+    """Vertices, and their heights, those near the side moved onto it within the surface's tangent
+    plane; those of the rim stay, and so do those that would have to go far."""
+    x, faces = surface.vertices, surface.faces
+    corner = x[faces]
+    edges = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).min(axis=1)
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    shortest, mean = np.full(len(x), np.inf), np.zeros_like(x)
+    for k in range(3):
+        np.minimum.at(shortest, faces[:, k], edges)
+        np.add.at(mean, faces[:, k], normal)
+    mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-300)[:, None]
+    h = side.heights(x)
+    there = x
+    for _ in range(4):
+        slope = side.slopes(there)
+        along = slope - (slope * mean).sum(axis=1)[:, None] * mean
+        square = np.maximum((along * along).sum(axis=1), 1e-3)
+        there = there - (side.heights(there) / square)[:, None] * along
+    near = np.linalg.norm(there - x, axis=1) < _DRAWN * shortest
+    near &= np.abs(side.heights(there)) <= 1e-9 * shortest
+    near[np.unique(boundary_edges(faces))] = False
+    return np.where(near[:, None], there, x), np.where(near, 0.0, h)
+
+
+def _cut(surface: Surface, side: _Side) -> Surface:
+    """The part where heights are not positive: linear along edges, or those above a sphere."""
+    faces = surface.faces
+    if not len(faces):
+        return surface
+    vertices, h = _drawn(surface, side)
+    h = np.where(np.abs(h) <= _NEAR * float(np.ptp(vertices, axis=0).max()), 0.0, h)
+    out = (h > 0)[faces]
+    # What lies on the boundary with no corner inside is left out.
+    keep = (h < 0)[faces].any(axis=1)
+    mixed = keep & out.any(axis=1)
+    pairs = np.concatenate([faces[mixed][:, [k, (k + 1) % 3]] for k in range(3)])
+    crossing = pairs[h[pairs[:, 0]] * h[pairs[:, 1]] < 0]
+    keys = np.unique(edge_keys(crossing, len(vertices)))
+    a, b = keys // len(vertices), keys % len(vertices)
+    share = (h[a] / (h[a] - h[b]))[:, None]
+    points = vertices[a] + share * (vertices[b] - vertices[a])
+    if side.radius is not None:
+        points = _on_sphere(vertices[a], vertices[b], side.center, side.radius)
+    first = len(vertices)
+
+    def at(i: IntArray, j: IntArray) -> IntArray:
+        """The end of edges between vertices inside and outside; a vertex on the boundary itself."""
+        index = np.searchsorted(keys, edge_keys(np.column_stack([i, j]), len(vertices)))
+        return np.where(h[i] == 0, i, first + index)
+
+    parts = [faces[keep & ~out.any(axis=1)]]
+    rows = faces[mixed]
+    number = out[mixed].sum(axis=1)
+    for k in range(3):
+        order = [k, (k + 1) % 3, (k + 2) % 3]
+        one = rows[(number == 1) & out[mixed][:, k]][:, order]  # a is outside
+        x, y = at(one[:, 1], one[:, 0]), at(one[:, 2], one[:, 0])
+        parts += [np.stack([one[:, 1], one[:, 2], x], axis=1), np.stack([one[:, 2], y, x], axis=1)]
+        two = rows[(number == 2) & ~out[mixed][:, k]][:, order]  # a is inside
+        parts.append(np.stack([two[:, 0], at(two[:, 0], two[:, 1]), at(two[:, 0], two[:, 2])], 1))
+    made = np.concatenate(parts)
+    whole = (made != np.roll(made, 1, axis=1)).all(axis=1)
+    return Surface.of(np.concatenate([vertices, points]), made[whole])
+
+
+def _on_sphere(a: FloatArray, b: FloatArray, center: FloatArray, radius: float) -> FloatArray:
+    """Where segments from a to b (n, 3), one inside and one outside, pass through the sphere."""
+    inside = np.linalg.norm(a - center, axis=1) < np.linalg.norm(b - center, axis=1)
+    start, end = np.where(inside[:, None], a, b), np.where(inside[:, None], b, a)
+    o, d = start - center, end - start
+    dd, od = (d * d).sum(axis=1), (o * d).sum(axis=1)
+    room = np.maximum(radius**2 - (o * o).sum(axis=1), 0)
+    share = room / (od + np.sqrt(od * od + dd * room))
+    return start + share[:, None] * d

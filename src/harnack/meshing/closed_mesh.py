@@ -1,0 +1,245 @@
+"""Closed meshes as manifold3d's solids, and back; clip volumes as such solids.
+
+Closed meshes whose files are closed as well.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import trimesh
+
+from harnack.backend import BoolArray, FloatArray
+from harnack.geometry import Ball, Box, ConvexHull, HalfSpace, Intersection
+from harnack.meshing.checks import (
+    LocalError,
+    MeshingError,
+    check_apart,
+    check_manifold,
+    intersecting_faces,
+)
+from harnack.meshing.edges import IntArray
+from harnack.meshing.lattice_surface import Surface
+
+if TYPE_CHECKING:
+    from manifold3d import Manifold
+
+    from harnack.geometry import Volume
+
+__all__ = ["ClosedMesh", "box_manifold", "manifold_of", "surface_of", "volume_manifold"]
+
+_MOST_SEGMENTS = 2000
+
+
+def manifold_of(surface: Surface) -> Manifold:
+    """A closed mesh whose faces are seen counter-clockwise from outside.
+
+    Raises:
+        MeshingError: it is not closed.
+    """
+    from manifold3d import Error, Manifold, Mesh64
+
+    if not len(surface.faces):
+        return Manifold()
+    vertices = np.ascontiguousarray(surface.vertices, np.float64)
+    made = Manifold(Mesh64(vertices, np.ascontiguousarray(surface.faces, np.uint64)))
+    if made.status() != Error.NoError:
+        raise MeshingError(
+            f"a surface of the solid is not closed ({made.status().name}): cells are too large for "
+            "it; choose a smaller `spacing`"
+        )
+    return made
+
+
+def surface_of(manifold: Manifold) -> Surface:
+    """The triangles of a solid."""
+    mesh = manifold.to_mesh64()
+    vertices = np.array(mesh.vert_properties, np.float64)[:, :3]
+    return Surface(vertices, np.array(mesh.tri_verts, np.int64))
+
+
+def box_manifold(lower: FloatArray, upper: FloatArray) -> Manifold:
+    """The box between two corners (3,)."""
+    from manifold3d import Manifold
+
+    x, y, z = (float(v) for v in upper - lower)
+    a, b, c = (float(v) for v in lower)
+    return Manifold.cube((x, y, z)).translate((a, b, c))
+
+
+def volume_manifold(
+    volume: Volume, lower: FloatArray, upper: FloatArray, tolerance: float
+) -> Manifold:
+    """The part of a volume in a box: polytopes as they are, balls as polyhedra whose vertices lie
+    on the sphere and whose faces are within `tolerance` of it.
+
+    Raises:
+        MeshingError: another volume, or a ball so fine that it has millions of faces.
+    """
+    from manifold3d import Manifold
+
+    around = box_manifold(lower, upper)
+    if isinstance(volume, Intersection):
+        for one in volume.volumes:
+            around ^= volume_manifold(one, lower, upper, tolerance)
+        return around
+    if isinstance(volume, Box):
+        low, high = (np.array(end, np.float64) for end in volume.bounds())
+        low, high = np.maximum(low, lower), np.minimum(high, upper)
+        return box_manifold(low, high) if (low < high).all() else Manifold()
+    if isinstance(volume, HalfSpace | ConvexHull):
+        for row in volume.planes():
+            x, y, z, h = (float(v) for v in row)
+            around = around.trim_by_plane((-x, -y, -z), -h)
+        return around
+    if isinstance(volume, Ball):
+        return around ^ _ball(volume, tolerance)
+    raise MeshingError(f"a {type(volume).__name__} cannot cut a mesh: give a box or a ball")
+
+
+def _ball(ball: Ball, tolerance: float) -> Manifold:
+    """A geodesic polyhedron of n segments around. The octahedron's faces are cut into equilateral
+    triangles and blown up: an edge is at most sqrt(3) times as long as the mean of those along its
+    sides, r pi/(2 n/4), and a circle through its corners of radius edge/sqrt(3) has a sagitta of
+    half its square over r."""
+    from manifold3d import Manifold
+
+    r = ball.radius
+    segments = 4 * math.ceil(0.25 * 2 * math.pi * math.sqrt(r / (2 * tolerance)))
+    if segments > _MOST_SEGMENTS:
+        raise MeshingError(
+            f"a ball of radius {r:g} within {tolerance:.3g} has {2 * segments**2:,} faces: choose "
+            "a larger `tolerance`"
+        )
+    x, y, z = ball.center
+    return Manifold.sphere(r, max(16, segments)).translate((x, y, z))
+
+
+# Readers take points for one that are nearer than 1e-8 in the file's unit (trimesh does).
+_LEAST_STEP = 2.0**-26
+# In these units larger numbers are beyond their integers.
+_LARGEST = 2.0**36
+# A part has to be so many steps long.
+_MOST_COARSE = 1e4
+# Where what is snapped is not right, triangles are left out within so many steps.
+_SIMPLER = (4, 32)
+
+
+class ClosedMesh(trimesh.Trimesh):
+    """A mesh of which `export` writes a closed file, or raises a MeshingError.
+
+    Files hold single precision, in which the ends of short edges are one point and slivers turn
+    over. Vertices are rounded to a grid that single precision holds, edges without a length are
+    contracted, and it is checked that what is left is closed and does not pass through itself. The
+    mesh itself stays as it is, in double precision; and what is not closed is written as trimesh
+    does.
+    """
+
+    @classmethod
+    def of(cls, mesh: trimesh.Trimesh) -> ClosedMesh:
+        """A copy of any mesh."""
+        made = trimesh.Trimesh.copy(mesh)
+        made.__class__ = cls
+        return cast("ClosedMesh", made)
+
+    def copy(self, *args: Any, **options: Any) -> trimesh.Trimesh:
+        made = super().copy(*args, **options)
+        made.__class__ = type(self)
+        return made
+
+    def export(self, file_obj: Any = None, file_type: str | None = None, **options: Any) -> Any:
+        """As of a trimesh.Trimesh. Metadata stays behind: its arrays fit in no file.
+
+        Raises:
+            MeshingError: the mesh is closed, and would not be in the file: parts that touch, or
+                that are too small or too far from the origin for single precision.
+        """
+        written = trimesh.Trimesh.copy(self)
+        written.metadata.clear()
+        if self.units is not None:
+            written.units = self.units
+        if self.is_watertight:
+            step = _step(np.asarray(self.vertices, np.float64))
+            written = _snapped(written, step)
+            name = file_type or str(getattr(file_obj, "name", file_obj))
+            if name.lower().endswith(("obj", "off")):  # exact decimals of a multiple of 2^-k
+                options.setdefault("digits", max(1, round(-math.log2(step))))
+        return cast("Any", written).export(file_obj, file_type, **options)
+
+
+def _step(x: FloatArray) -> float:
+    """The distance between neighbors of the grid that points are rounded to: a power of two, of
+    which single precision, with its 24 bits, holds all multiples as large as the points.
+
+    Raises:
+        MeshingError: it is too coarse for them.
+    """
+    largest, size = float(np.abs(x).max()), float(np.ptp(x, axis=0).max())
+    step = max(math.ldexp(1.0, math.frexp(largest)[1] - 24), _LEAST_STEP)
+    if size < _MOST_COARSE * step or not largest <= _LARGEST:
+        raise MeshingError(
+            f"the part is {size:.3g} long, at up to {largest:.3g} from the origin, where a file "
+            f"tells points apart that are {step:.2g} from each other, up to {_LARGEST:.2g}: move "
+            "it to the origin (apply_translation), or scale it (apply_scale), before it is written"
+        )
+    return step
+
+
+def _snapped(mesh: trimesh.Trimesh, step: float) -> trimesh.Trimesh:
+    """The mesh with vertices on the grid; where that is not right, with fewer triangles."""
+    given = Surface(np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64))
+    x, faces, kept = _contracted(given, step)
+    try:
+        _check(x, faces[kept], given)
+    except LocalError as error:
+        simpler = None if cast("Any", mesh.visual).defined else _simpler(given, step)
+        if simpler is None:
+            x, y, z = error.places[0]
+            raise MeshingError(
+                f"in a file, where points are {step:.2g} from each other at the least, parts touch "
+                f"or pass through each other, such as near ({x:.4g}, {y:.4g}, {z:.4g}): move them "
+                "apart or make them overlap, or choose another `tolerance`"
+            ) from error
+        return simpler
+    mesh.vertices, mesh.faces = x, faces
+    mesh.update_faces(kept)
+    mesh.remove_unreferenced_vertices()
+    return mesh
+
+
+def _simpler(given: Surface, step: float) -> trimesh.Trimesh | None:
+    """With slivers left out by manifold3d; None if that does not help either."""
+    for steps in _SIMPLER:
+        simpler = surface_of(manifold_of(given).simplify(steps * step))
+        x, faces, kept = _contracted(simpler, step)
+        if not kept.any():
+            return None
+        made = Surface.of(x, faces[kept])
+        try:
+            _check(made.vertices, made.faces, given)
+        except LocalError:
+            continue
+        return trimesh.Trimesh(made.vertices, made.faces, process=False, validate=False)
+    return None
+
+
+def _contracted(surface: Surface, step: float) -> tuple[FloatArray, IntArray, BoolArray]:
+    """Vertices on the grid, faces between the first of those that are one point, and which faces
+    are left."""
+    x = np.round(surface.vertices / step) * step
+    _, first, place = np.unique(x, axis=0, return_index=True, return_inverse=True)
+    faces = first[place.reshape(-1)][surface.faces]
+    return x, faces, (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+
+
+def _check(x: FloatArray, faces: IntArray, given: Surface) -> None:
+    """Raise a LocalError where faces are not closed, or pass through each other while those that
+    were given, such as the triangles of a mesh that was repaired, do not."""
+    check_manifold(faces, x)
+    try:
+        check_apart(x, faces)
+    except LocalError:
+        if not len(intersecting_faces(given.vertices, given.faces)):
+            raise

@@ -1,0 +1,268 @@
+"""Closed parts of a given thickness around a surface.
+
+Where the surface's reach is larger than half of the thickness t (no point that near has two closest
+points), the part is the surface moved by t/2 to both sides along its normals, and walls along its
+rim: straight between the sides, so that the rim stays where it is. Its volume is area x t up to the
+second order: (K t^2/12) of it, K the Gaussian curvature. Where that makes triangles turn over, or
+come nearer to the surface than t/2, or pass through each other, the part is the union of the convex
+hulls of three balls around the corners of each triangle: all points within t/2, with a round rim.
+
+The last steps of a mesh: fewer triangles, what is said of it.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from harnack.backend import FloatArray
+from harnack.backend.numbers import real
+from harnack.meshing.checks import MeshingError, euler_characteristic, intersecting_faces
+from harnack.meshing.closed_mesh import manifold_of, surface_of
+from harnack.meshing.edges import (
+    Edges,
+    IntArray,
+    boundary_edges,
+    directed_edges,
+    distinct,
+    dots,
+    edge_keys,
+    lengths,
+)
+from harnack.meshing.lattice_surface import Surface
+from harnack.meshing.samples import LevelFunction
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import trimesh
+
+__all__ = ["check_options", "finished", "normals_of", "simplified", "thickened"]
+
+# So much of the area may turn over where the two sides are made: slivers.
+_TURNED = 1e-2
+# More triangles than that are not each made a hull of.
+_MOST_HULLS = 20_000
+# A side that comes so near to the surface, in parts of t/2, is within its reach.
+_NEAR = 0.98
+
+
+def thickened(
+    surface: Surface, normals: FloatArray, thickness: float, tolerance: float
+) -> tuple[Surface, dict[str, Any]]:
+    """The closed part, and how it was made: `thickened_by` is "offset" or "hulls of balls".
+
+    normals: (n, 3), of unit length, on the side that faces are seen counter-clockwise from.
+    tolerance: of the balls' polyhedra, and of the triangles given, a length.
+
+    Raises:
+        MeshingError: the part is far thicker than triangles are large, of which there are too many.
+    """
+    area = 0.5 * float(np.linalg.norm(_crosses(surface.vertices, surface.faces), axis=1).sum())
+    facts: dict[str, Any] = {"thickness": thickness, "area": area}
+    why = _beyond_reach(surface, normals, thickness)
+    if why is None:
+        part = _offset(surface, normals, thickness)
+        crossing = intersecting_faces(part.vertices, part.faces)
+        if not len(crossing):
+            return part, {**facts, "thickened_by": "offset"}
+        why = f"{len(crossing)} triangles of the two sides pass through each other"
+    return _hulls(surface, 0.5 * thickness, tolerance, why), {
+        **facts, "thickened_by": "hulls of balls", "why": why
+    }  # fmt: skip
+
+
+def _crosses(vertices: FloatArray, faces: Any) -> FloatArray:
+    corner = vertices[faces]
+    return np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+
+
+def _offset(surface: Surface, normals: FloatArray, thickness: float) -> Surface:
+    """Both sides, and walls along the rim."""
+    n = len(surface.vertices)
+    move = 0.5 * thickness * normals / _slants(surface, normals)[:, None]
+    a, b = boundary_edges(surface.faces).T
+    # A face above the rim runs it from a to b, so the wall runs it from b to a.
+    walls = [np.stack([b, a, a + n], axis=1), np.stack([b, a + n, b + n], axis=1)]
+    vertices = np.concatenate([surface.vertices + move, surface.vertices - move])
+    return Surface(vertices, np.concatenate([surface.faces, surface.faces[:, ::-1] + n, *walls]))
+
+
+def _slants(surface: Surface, normals: FloatArray) -> FloatArray:
+    """(n,) cosines between normals at vertices and those of the faces there, means by area: as much
+    farther vertices are moved, so that faces are moved by the thickness."""
+    cross = _crosses(surface.vertices, surface.faces)
+    total, area = np.zeros(len(normals)), np.zeros(len(normals))
+    size = np.linalg.norm(cross, axis=1)
+    for k in range(3):
+        rows = surface.faces[:, k]
+        total += np.bincount(rows, (cross * normals[rows]).sum(axis=1), minlength=len(normals))
+        area += np.bincount(rows, size, minlength=len(normals))
+    return np.clip(total / np.maximum(area, 1e-300), 0.7, 1.0)
+
+
+def _beyond_reach(surface: Surface, normals: FloatArray, thickness: float) -> str | None:
+    """Why half of the thickness is more than the surface's reach; None if that was not seen."""
+    import scipy.spatial  # here: half a second that few need
+
+    searching: Any = scipy.spatial
+    half = 0.5 * thickness
+    flat = _crosses(surface.vertices, surface.faces)
+    areas = np.linalg.norm(flat, axis=1)
+    tree = searching.cKDTree(surface.vertices)
+    own = np.arange(len(surface.vertices))
+    few = min(16, len(own))
+    neighbors = distinct(edge_keys(directed_edges(surface.faces), len(own)))
+    for sign in (1, -1):
+        side = surface.vertices + sign * half * normals
+        turned = (_crosses(side, surface.faces) * flat).sum(axis=1) <= 0
+        if areas[turned].sum() > _TURNED * areas.sum():  # less are slivers
+            return f"{turned.sum()} triangles turn over: the surface bends more than 1/{half:.3g}"
+        # Nearer than the vertex that a point was moved from are at most its neighbors.
+        away, other = tree.query(side, k=few)
+        pairs = np.stack([np.broadcast_to(own[:, None], other.shape), other], axis=-1)
+        near = (away < _NEAR * half) & (pairs[..., 0] != pairs[..., 1])
+        found = distinct(edge_keys(pairs[near], len(own)))
+        count = int((~np.isin(found, neighbors)).sum())
+        if count:
+            return f"{count} points of a side are nearer to another place than to their own"
+    return None
+
+
+def _hulls(surface: Surface, radius: float, tolerance: float, why: str) -> Surface:
+    """The union of the hulls of three balls around the corners of each triangle.
+
+    Balls are polyhedra with corners on the sphere, so that the part is inside of what it should be,
+    by at most `tolerance` or a tenth of the radius.
+    """
+    from manifold3d import Manifold, OpType
+
+    if len(surface.faces) > _MOST_HULLS:
+        raise MeshingError(
+            f"{2 * radius:.3g} is thicker than the surface's reach allows ({why}), and there are "
+            f"{len(surface.faces):,} triangles, too many for a union of as many hulls: choose a "
+            "larger `tolerance`, or a smaller thickness"
+        )
+    allowed = max(tolerance, 0.1 * radius)
+    segments = int(np.clip(4 * np.ceil(np.pi / 2 * np.sqrt(radius / (2 * allowed))), 8, 16))
+    mesh = Manifold.sphere(radius, segments).to_mesh64()
+    ball = np.array(mesh.vert_properties, np.float64)[:, :3]
+    parts = [
+        Manifold.hull_points(np.ascontiguousarray((corners[:, None] + ball).reshape(-1, 3)))
+        for corners in surface.vertices[surface.faces]
+    ]
+    return surface_of(Manifold.batch_boolean(parts, OpType.Add))
+
+
+# The cosine of the angle between normals from which on an edge is a crease.
+_CREASE = math.cos(math.radians(30))
+# What simplification may move a surface by, as parts of the tolerance.
+_SIMPLER = (0.4, 0.2, 0.1)
+
+
+def check_options(tolerance: Any, spacing: Any, thickness: Any, seed: Any, most: Any) -> None:
+    """Raise ValueError or TypeError for numbers out of range."""
+    if not 0 < real(tolerance, "tolerance") < 0.5:
+        raise ValueError(
+            f"tolerance is a part of the size: it must lie in (0, 0.5), not {tolerance}"
+        )
+    for name, value in (("spacing", spacing), ("thickness", thickness)):
+        if value is not None and not 0 < real(value, name) < math.inf:
+            raise ValueError(f"{name} must be a positive length, not {value!r}")
+    if operator.index(seed) < 0:
+        raise ValueError(f"seed must not be negative, not {seed}")
+    if operator.index(most) < 1:
+        raise ValueError(f"max_triangles must be positive, not {most}")
+
+
+def normals_of(function: LevelFunction, surface: Surface) -> FloatArray:
+    """Unit normals (n, 3) at vertices: the slope of the field, and where it has none, as at the
+    curve that a surface ends on, the mean of the faces there by area."""
+    corner = surface.vertices[surface.faces]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    mean = np.zeros_like(surface.vertices)
+    for k in range(3):
+        np.add.at(mean, surface.faces[:, k], normal)
+    mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-300)[:, None]
+    slope = function.at(surface.vertices).gradient
+    steep: FloatArray = np.linalg.norm(slope, axis=1)
+    slope = slope / np.maximum(steep, 1e-300)[:, None]
+    # Beside the curve slopes turn within a triangle.
+    good = np.isfinite(steep) & (steep > 0) & ((slope * mean).sum(axis=1) > 0.7)
+    if function.period is not None:
+        good[np.unique(boundary_edges(surface.faces))] = False
+    chosen: FloatArray = np.where(good[:, None], slope, mean)
+    return chosen
+
+
+def simplified(
+    surface: Surface, tolerance: float, check: Callable[[Surface], None]
+) -> tuple[Surface, dict[str, Any]]:
+    """A closed surface with fewer triangles, or as it is where that cannot be.
+
+    manifold3d's simplification: vertices are a part of those before. It moves the surface by less
+    than a part of the tolerance, half of which is for all else, and what does not pass the check is
+    done with a smaller part.
+    """
+    facts = {"triangles_before_simplification": len(surface.faces)}
+    solid = manifold_of(surface)
+    for part in _SIMPLER:
+        made = surface_of(solid.simplify(part * tolerance))
+        if not 0 < len(made.faces) < len(surface.faces):
+            continue
+        try:
+            check(made)
+        except MeshingError:
+            continue
+        return made, facts
+    return surface, facts
+
+
+def finished(surface: Surface, facts: dict[str, Any], is_closed: bool) -> trimesh.Trimesh:
+    """The mesh, which is a manifold (`check_manifold`), with what is known of it in its metadata.
+    Without a rim it is turned so that its volume is positive.
+
+    Raises:
+        MeshingError: it ought to be closed and to have a positive volume, and is not.
+    """
+    from harnack.meshing.closed_mesh import ClosedMesh
+
+    made = ClosedMesh(surface.vertices, surface.faces, process=False, validate=False)
+    boundary = boundary_edges(surface.faces)
+    if is_closed:
+        volume = float(made.volume)
+        if len(boundary) or not volume > 0:
+            raise MeshingError(
+                "the part did not close, or is inside out: choose a smaller `spacing`"
+            )
+        facts = {**facts, "volume": volume}
+    elif not len(boundary) and made.volume < 0:  # f is larger inside
+        made.invert()
+    made.metadata["harnack"] = {
+        "proved": 0,
+        "integrated": 0,
+        **facts,
+        "euler_characteristic": euler_characteristic(surface.faces),
+        "boundary": boundary,
+        "creases": _creases(surface),
+    }
+    return made
+
+
+def _creases(surface: Surface) -> int:
+    """How many edges two faces meet at whose normals are more than 30 degrees apart."""
+    normals = _unit_normals(surface.vertices, surface.faces)
+    edges = Edges.of(directed_edges(surface.faces))
+    order = np.argsort(edges.index, kind="stable")
+    pairs = order[(edges.uses == 2)[edges.index[order]]].reshape(-1, 2) % len(surface.faces)
+    return int((dots(normals[pairs[:, 0]], normals[pairs[:, 1]]) < _CREASE).sum())
+
+
+def _unit_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
+    """(m, 3) of faces; 0 for those without an area."""
+    corner = vertices[faces]
+    cross = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    return cross / np.maximum(lengths(cross), 1e-300)[:, None]

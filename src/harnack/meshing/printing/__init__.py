@@ -1,1 +1,0 @@
-"""Closed meshes: solids with caps, thick surfaces, simplified meshes."""

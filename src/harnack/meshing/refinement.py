@@ -1,0 +1,394 @@
+"""Finer meshes: edges cut where the surface bulges from them, vertices moved onto it, and smoothed.
+
+Vertices and edges of the boundary stay as they are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from harnack.backend import BoolArray, FloatArray
+from harnack.meshing.checks import check_count
+from harnack.meshing.edges import Edges, IntArray, boundary_edges, directed_edges, dots, lengths
+from harnack.meshing.points import newton
+from harnack.meshing.relaxation import flipped, relaxed, without_slivers
+from harnack.meshing.samples import LevelFunction, Samples
+
+__all__ = ["far_places", "improved", "refined", "smoothed", "smoothed_within"]
+
+Walls = tuple[FloatArray, FloatArray] | None
+# Normals turn by so much across a crease, and by such a part of it at once.
+_BENT, _AT_ONCE = math.radians(20), 0.75
+# So near, in parts of the tolerance, a vertex counts as on the surface.
+_ON = 1e-5
+# So far from the middle, in parts of its edge, a crease may be.
+_BESIDE = 1.5
+# It is not looked for nearer to the ends than this, and by so many looks, twice.
+_FROM_ENDS, _LOOKS = 0.05, 33
+# So far the level is looked for, in parts of the way to where tangent planes meet; and three of
+# them meet in a point if their normals have such a determinant.
+_BEYOND, _INDEPENDENT = 1.25, 0.1
+# Edges shorter than this part of the tolerance are never cut.
+_SHORTEST = 0.5
+_MOST_ROUNDS = 12
+# Edges to be cut become more at first, and then fewer. If they are so many times as many as they
+# were, they run away: the surface bends within any triangle, as around each dipole of a cloud.
+_RUNS_AWAY = 3
+
+
+def refined(
+    function: LevelFunction,
+    vertices: FloatArray,
+    faces: IntArray,
+    tolerance: float,
+    walls: Walls,
+    report: Callable[[str], None],
+) -> tuple[FloatArray, IntArray]:
+    """Cut edges at their middles, and move these onto the surface, until the middles of all edges
+    but those of the boundary, and the centers of all faces, are within `tolerance` of it; or until
+    that is seen not to succeed, which whoever asks for it has to check (`check_near_level`).
+
+    Raises:
+        TooLargeError: it takes more triangles than the function allows.
+    """
+    least, before = math.inf, 0
+    for round_number in range(_MOST_ROUNDS):
+        report(f"refining, round {round_number + 1}: {len(faces):,} triangles")
+        far = _Far.of(function, vertices, faces, tolerance, walls)
+        marked = far.marked
+        if not marked.any() and not far.cuts_off.any():
+            break
+        count = int(marked.sum())
+        if count > _RUNS_AWAY * least:
+            break
+        least = min(least, count) if count < before else least
+        before = count
+        # Every edge that is cut makes one more triangle on each side.
+        check_count(len(faces) + 2 * count, function.most_faces)
+        samples, reach = far.samples.some(marked), 0.5 * far.span[marked]
+        moved = newton(function, far.middle[marked], samples, reach, walls)
+        if function.field.has_creases:
+            moved = _on_creases(function, vertices, far.ends[marked], moved, walls)
+        place = np.full(len(marked), -1, np.int64)
+        place[marked] = len(vertices) + np.arange(int(marked.sum()))
+        vertices = np.concatenate([vertices, moved])
+        cut_off = far.cuts_off & ~marked[far.edges].any(axis=1)
+        inner = len(vertices) + np.arange(np.count_nonzero(cut_off))
+        vertices = np.concatenate(
+            [vertices, _corners_in(function, vertices, faces[cut_off], walls)]
+        )
+        a, b, c = faces[cut_off].T
+        fans = [np.stack([*ends, inner], axis=1) for ends in ((a, b), (b, c), (c, a))]
+        whole = _split(vertices, faces[~cut_off], place[far.edges[~cut_off]])
+        faces = np.concatenate([whole, *fans])
+    if function.field.has_detail:
+        vertices = _settled(function, vertices, faces, tolerance, walls)
+    return vertices, faces
+
+
+def _settled(
+    function: LevelFunction, vertices: FloatArray, faces: IntArray, tolerance: float, walls: Walls
+) -> FloatArray:
+    """With more steps for vertices that Newton's method has not yet brought onto the surface, as
+    beside the dipoles of a cloud, where slopes change within a step."""
+    samples = function.at(vertices)
+    is_off = samples.distance > _ON * tolerance
+    if walls is None:
+        is_off[boundary_edges(faces)] = False
+    rows = np.flatnonzero(is_off)
+    if not len(rows):
+        return vertices
+    longest = np.full(len(rows), 0.5 * tolerance)
+    there = newton(function, vertices[rows], samples.some(rows), longest, walls, steps=20)
+    good = np.abs(function.at(there).value) < np.abs(samples.value[rows])
+    good &= lengths(there - vertices[rows]) < tolerance
+    vertices = vertices.copy()
+    vertices[rows[good]] = there[good]
+    return vertices
+
+
+def _on_creases(
+    function: LevelFunction, vertices: FloatArray, ends: IntArray, moved: FloatArray, walls: Walls
+) -> FloatArray:
+    """Middles (k, 3) of edges, given by their vertices (k, 2), that were moved onto the surface;
+    where edges cut off a sharp crease, onto that instead.
+
+    Newton's method leads to one of the two sides of a crease, and an edge along the normal of that
+    side back to its end: cut there again and again, it stays as long as it is. The point nearest to
+    the middle in the tangent planes of both ends is on the crease, as far as its sides are flat
+    (Kobbelt et al. 2001); the level is taken on the way there. There is one if normals turn by 20
+    degrees or more, and nearly all of it between the moved middle and one of the ends; on a smooth
+    surface about half of it.
+    """
+    used, place = np.unique(ends, return_inverse=True)
+    slope = function.at(vertices[used]).gradient
+    at_ends = (slope / np.maximum(lengths(slope), 1e-300)[:, None])[place.reshape(-1, 2)]
+    here = function.at(moved).gradient
+    here = here / np.maximum(lengths(here), 1e-300)[:, None]
+    one, other = at_ends[:, 0], at_ends[:, 1]
+    cosine = dots(one, other)
+    turn = np.arccos(np.clip(np.minimum(dots(one, here), dots(other, here)), -1, 1))
+    whole = np.arccos(np.clip(cosine, -1, 1))
+    rows = np.flatnonzero((whole > _BENT) & (turn > _AT_ONCE * whole) & (1 - cosine**2 > 0.01))
+    if not len(rows):
+        return moved
+    one, other, cosine = one[rows], other[rows], cosine[rows]
+    a, b = (vertices[ends[rows, k]] for k in (0, 1))
+    middle, span = 0.5 * (a + b), lengths(b - a)
+    high, low = dots(one, a - middle), dots(other, b - middle)
+    share = np.stack([high - cosine * low, low - cosine * high]) / (1 - cosine**2)
+    way = share[0][:, None] * one + share[1][:, None] * other
+    there, good = _level_towards(function, middle, way, _BESIDE * span, walls)
+    good &= np.minimum(lengths(there - a), lengths(there - b)) > _FROM_ENDS * span
+    moved = moved.copy()
+    moved[rows[good]] = there[good]
+    return moved
+
+
+def _corners_in(
+    function: LevelFunction, vertices: FloatArray, faces: IntArray, walls: Walls
+) -> FloatArray:
+    """A point on the surface within each of some faces (k, 3) that cut off a corner: where the
+    tangent planes of its vertices meet, or near the center."""
+    corner = vertices[faces]
+    center = corner.mean(axis=1)
+    span = np.stack([lengths(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
+    moved = newton(function, center, function.at(center), 0.5 * span, walls)
+    slope = function.at(corner.reshape(-1, 3)).gradient
+    normal = (slope / np.maximum(lengths(slope), 1e-300)[:, None]).reshape(-1, 3, 3)
+    rows = np.flatnonzero(np.abs(np.linalg.det(normal)) > _INDEPENDENT)
+    away = (normal * (corner - center[:, None])).sum(axis=2)
+    solve: Any = np.linalg.solve
+    way: FloatArray = solve(normal[rows], away[rows][:, :, None])[:, :, 0]
+    there, good = _level_towards(function, center[rows], way, _BESIDE * span[rows], walls)
+    moved[rows[good]] = there[good]
+    return moved
+
+
+def _level_towards(
+    function: LevelFunction, start: FloatArray, way: FloatArray, most: FloatArray, walls: Walls
+) -> tuple[FloatArray, BoolArray]:
+    """Points on the level from `start` (k, 3) along `way`, a little beyond its end at most and no
+    farther than `most`; and whether the level is passed there."""
+    way = way * np.minimum(1, most / np.maximum(lengths(way), 1e-300))[:, None]
+    low, high = np.zeros(len(start)), np.full(len(start), _BEYOND)
+    good = np.ones(len(start), np.bool_)
+    parts = np.linspace(0, 1, _LOOKS)
+    for _ in range(2):
+        t = low[:, None] + (high - low)[:, None] * parts
+        x = start[:, None] + t[:, :, None] * way[:, None]
+        x = x if walls is None else np.clip(x, *walls)
+        is_above = (function.at(x.reshape(-1, 3)).value > 0).reshape(t.shape)
+        passes = is_above[:, 1:] != is_above[:, :-1]
+        good &= passes.any(axis=1)
+        first = passes.argmax(axis=1)[:, None]
+        low, high = (np.take_along_axis(t, first + k, axis=1)[:, 0] for k in (0, 1))
+    there = start + low[:, None] * way
+    there = there if walls is None else np.clip(there, *walls)
+    longest = 4 * (high - low) * lengths(way)
+    return newton(function, there, function.at(there), longest, walls), good
+
+
+def far_places(
+    function: LevelFunction, vertices: FloatArray, faces: IntArray, tolerance: float
+) -> FloatArray:
+    """Middles (k, 3) of the edges that `refined` would still cut."""
+    far = _Far.of(function, vertices, faces, tolerance, None)
+    return far.middle[far.marked]
+
+
+@dataclass(frozen=True)
+class _Far:
+    """Edges and which of them are to be cut.
+
+    edges: (m, 3) of the faces. ends: (k, 2) vertices, middle: (k, 3), span: (k,) and marked: (k,)
+        of edges.
+    samples: at the middles. cuts_off: (m,) faces whose center alone is beyond, at a corner.
+    """
+
+    edges: IntArray
+    ends: IntArray
+    middle: FloatArray
+    span: FloatArray
+    samples: Samples
+    marked: BoolArray
+    cuts_off: BoolArray
+
+    @classmethod
+    def of(
+        cls,
+        function: LevelFunction,
+        vertices: FloatArray,
+        faces: IntArray,
+        tolerance: float,
+        walls: Walls,
+    ) -> _Far:
+        """Those whose middle, or the center of a face beside them, is beyond the tolerance."""
+        ends, edges, is_rim = _edges(faces)
+        if walls is not None:  # the rim lies in them, and so do the middles of its edges
+            is_rim = np.zeros_like(is_rim)
+        middle = 0.5 * (vertices[ends[:, 0]] + vertices[ends[:, 1]])
+        span = lengths(vertices[ends[:, 0]] - vertices[ends[:, 1]])
+        samples = function.at(middle)
+        marked = samples.distance > tolerance
+        off = function.at(vertices[faces].mean(axis=1)).distance > tolerance
+        off &= span[edges].max(axis=1) > _SHORTEST * tolerance
+        cuts_off = np.zeros(len(faces), np.bool_)
+        lone = np.flatnonzero(off & ~marked[edges].any(axis=1))
+        if function.field.has_creases:
+            cuts_off[lone] = _turns(function, vertices[faces[lone]])
+        off &= ~cuts_off
+        # Of a face that is off, the longest edge that may be cut.
+        free = np.where(is_rim[edges], 0.0, span[edges])
+        worst = edges[np.arange(len(faces)), free.argmax(axis=1)]
+        marked[worst[off]] = True
+        marked &= ~is_rim & (span > _SHORTEST * tolerance)
+        return cls(edges, ends, middle, span, samples, marked, cuts_off)
+
+
+def _turns(function: LevelFunction, corner: FloatArray) -> BoolArray:
+    """Whether normals at the corners (k, 3, 3) of faces turn as across a crease."""
+    slope = function.at(corner.reshape(-1, 3)).gradient
+    normal = (slope / np.maximum(lengths(slope), 1e-300)[:, None]).reshape(-1, 3, 3)
+    between = [dots(normal[:, k], normal[:, k - 1]) for k in range(3)]
+    return np.min(between, axis=0) < math.cos(_BENT)
+
+
+def _edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
+    """All edges (k, 2), those of each face (m, 3) (that of corners 0 and 1 first), and whether they
+    belong to one face only."""
+    edges = Edges.of(directed_edges(faces))
+    return edges.ends, edges.index.reshape(3, -1).T, edges.uses == 1
+
+
+def _split(vertices: FloatArray, faces: IntArray, middle: IntArray) -> IntArray:
+    """Faces cut at the middles (m, 3) of their edges, -1 for those that are not cut."""
+    cut = middle >= 0
+    number = cut.sum(axis=1)
+    parts = [faces[number == 0]]
+    three = number == 3
+    (a, b, c), (x, y, z) = faces[three].T, middle[three].T
+    parts += [np.stack(t, axis=1) for t in ((a, x, z), (x, b, y), (z, y, c), (x, y, z))]
+    for k in range(3):
+        order = [k, (k + 1) % 3, (k + 2) % 3]
+        one = (number == 1) & cut[:, k]
+        (a, b, c), x = faces[one][:, order].T, middle[one, k]
+        parts += [np.stack(t, axis=1) for t in ((a, x, c), (x, b, c))]
+        two = (number == 2) & ~cut[:, k]
+        # The edge from a to b is whole; y and z are the middles of the others.
+        (a, b, c), y, z = faces[two][:, order].T, middle[two, order[1]], middle[two, order[2]]
+        first = lengths(vertices[a] - vertices[y])
+        second = lengths(vertices[b] - vertices[z])
+        shorter = (first < second)[:, None]
+        parts.append(np.stack([z, y, c], axis=1))
+        parts.append(np.where(shorter, np.stack([a, b, y], 1), np.stack([a, b, z], 1)))
+        parts.append(np.where(shorter, np.stack([a, y, z], 1), np.stack([b, y, z], 1)))
+    return np.concatenate(parts)
+
+
+def improved(
+    function: LevelFunction,
+    vertices: FloatArray,
+    faces: IntArray,
+    tolerance: float,
+    walls: Walls,
+    report: Callable[[str], None],
+) -> tuple[FloatArray, IntArray]:
+    """Better angles: edges are flipped and vertices smoothed in turn, slivers are contracted; then
+    edges are cut again where triangles are no longer within `tolerance`."""
+    for _ in range(2):
+        faces = flipped(function, vertices, faces, tolerance)
+        vertices = smoothed(function, vertices, faces, walls, rounds=2)
+    fixed = np.zeros(len(vertices), np.bool_)
+    fixed[boundary_edges(faces)] = True
+    faces = without_slivers(function, vertices, faces, fixed, 2 * tolerance)
+    vertices, faces = refined(function, vertices, faces, tolerance, walls, report)
+    for _ in range(2):
+        faces = flipped(function, vertices, faces, tolerance)
+        vertices = relaxed(function, vertices, faces, tolerance, walls)
+    return vertices, flipped(function, vertices, faces, tolerance)
+
+
+def smoothed(
+    function: LevelFunction,
+    vertices: FloatArray,
+    faces: IntArray,
+    walls: Walls,
+    rounds: int = 3,
+) -> FloatArray:
+    """Vertices moved towards the mean of their neighbors and back onto the surface, a few times;
+    those of the boundary stay. Moves that turn a face by much are taken back."""
+    ends, _, _ = _edges(faces)
+    rim = np.unique(boundary_edges(faces))
+    free = np.zeros(len(vertices), np.bool_)
+    free[np.unique(faces)] = True
+    free[rim] = False
+    count = np.maximum(np.bincount(ends.ravel(), minlength=len(vertices)), 1)
+    rows = np.flatnonzero(free)
+    size = float(np.ptp(vertices[free], axis=0).max(initial=0.0)) if len(rows) else 0.0
+    for _ in range(rounds):
+        sums = np.zeros_like(vertices)
+        for one, other in ((0, 1), (1, 0)):
+            for axis in range(3):
+                sums[:, axis] += np.bincount(
+                    ends[:, one], vertices[ends[:, other], axis], minlength=len(vertices)
+                )
+        aim = 0.5 * (vertices + sums / count[:, None])
+        start = function.at(aim[rows])
+        # No farther than neighbors are: beside the curve gradients turn.
+        span = lengths(aim[rows] - vertices[rows]) + 1e-300
+        there = vertices.copy()
+        there[rows] = newton(function, aim[rows], start, 2 * span, walls)
+        after = function.at(there[rows])
+        worse = after.distance > 1e-7 * size + 1e-12 * lengths(there[rows])
+        there[rows[worse]] = vertices[rows[worse]]
+        vertices = _unfolded(vertices, there, faces)
+    return vertices
+
+
+def smoothed_within(
+    function: LevelFunction,
+    vertices: FloatArray,
+    faces: IntArray,
+    walls: Walls,
+    tolerance: float,
+) -> FloatArray:
+    """As `smoothed`, but for vertices of faces whose middles of edges or center would get farther
+    from the surface than `tolerance` by that, as beside a crease."""
+    after = smoothed(function, vertices, faces, walls)
+    for _ in range(8):
+        far = _Far.of(function, after, faces, tolerance, walls)
+        off = (far.samples.distance > tolerance)[far.edges].any(axis=1)
+        off |= function.at(after[faces].mean(axis=1)).distance > tolerance
+        back = np.zeros(len(vertices), np.bool_)
+        for _ in range(2):  # with neighbors, so that this ends soon
+            back[faces[off]] = True
+            off = back[faces].any(axis=1)
+        back = np.flatnonzero(back)
+        back = back[(after[back] != vertices[back]).any(axis=1)]
+        if not len(back):
+            return after
+        after = after.copy()
+        after[back] = vertices[back]
+    return vertices
+
+
+def _unfolded(before: FloatArray, after: FloatArray, faces: IntArray) -> FloatArray:
+    """`after`, but for vertices of faces that have turned over, which stay as before."""
+    for _ in range(8):
+        corner = after[faces]
+        normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        old = before[faces]
+        was = np.cross(old[:, 1] - old[:, 0], old[:, 2] - old[:, 0])
+        turned = dots(normal, was) <= 0.3 * lengths(normal) * lengths(was)
+        if not turned.any():
+            return after
+        after = after.copy()
+        back = np.unique(faces[turned])
+        after[back] = before[back]
+    return before

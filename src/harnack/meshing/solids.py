@@ -1,0 +1,431 @@
+"""The solid where a function is at most a level, as a closed mesh: smooth levels put together.
+
+A wall |g| <= w is not meshed as the level 0 of |g| - w, of which marching cubes makes hundreds of
+pieces where cells are thicker than the wall. It is {g <= w} less {g <= -w}, two smooth surfaces
+which do not meet, in a box a little larger than the clip; and it is cut by the clip itself. Unions,
+intersections and complements likewise are those of the parts' meshes, so that the creases where
+parts meet are edges of the mesh. Creases of a single function, such as a cylinder's, are chamfered
+within the tolerance.
+
+Closed meshes of solids, cut by volumes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from harnack.backend import FloatArray
+from harnack.fields import Field, Solid
+from harnack.fields.solid_angles.solid_angle import SolidAngle
+from harnack.fields.solids.affine import AffineImage
+from harnack.fields.solids.combined import Combined, Complement, Offset
+from harnack.fields.solids.primitives import Cuboid, Plane
+from harnack.fields.solids.region import Near, Region, bounded_side
+from harnack.fields.solids.region import solid as solid_of
+from harnack.geometry import Ball, Box, Intersection, Volume
+from harnack.meshing.checks import LocalError, MeshingError
+from harnack.meshing.closed_mesh import box_manifold, manifold_of, surface_of, volume_manifold
+from harnack.meshing.lattice import Lattice
+from harnack.meshing.lattice_surface import MissedError, Surface, closed_surface
+from harnack.meshing.samples import CELLS_PER_WAVE, LevelFunction, Samples, Uploads
+
+if TYPE_CHECKING:
+    from manifold3d import Manifold
+
+__all__ = ["RegionMesher", "Sheet", "SolidMesh", "is_smooth", "mesh_solid", "region_of"]
+
+# Mesh the level set of an angle, which ends at its curve: field, level -> vertices and faces.
+Sheet = Callable[[SolidAngle, float], Surface]
+
+
+@dataclass
+class RegionMesher:
+    """Meshes solids in a box from `lower` to `upper`, (3,) each.
+
+    tolerance: a length, of the middles of edges and faces. spacing: of cells, at most.
+    per_wave: cells along a wave (`Field.wavelength`) at the least; None for as many as there are.
+    sheet: meshes surfaces that end at a curve. most_faces: of each level set.
+    evaluations, levels, finest: of fields, in points, how many level sets were meshed so far, and
+        the smallest spacing of these.
+    uploads: of the fields that were meshed so far.
+    """
+
+    lower: FloatArray
+    upper: FloatArray
+    tolerance: float
+    spacing: float
+    per_wave: float | None
+    sheet: Sheet
+    most_faces: int
+    report: Callable[[str], None]
+    evaluations: int = 0
+    levels: int = 0
+    finest: float = math.inf
+    uploads: Uploads = dataclasses.field(default_factory=Uploads)
+
+    def below(self, solid: Solid, level: float) -> Manifold:
+        """The points of the box where a solid's function is at most `level`; what there is outside
+        of the box has no meaning.
+
+        Raises:
+            MeshingError: a part cannot be meshed.
+        """
+        from manifold3d import Manifold, OpType
+
+        if isinstance(solid, Combined):
+            parts = [self.below(one, level) for one in solid.parts]
+            how = OpType.Add if solid.is_union else OpType.Intersect
+            return Manifold.batch_boolean(parts, how)
+        if isinstance(solid, Complement):  # -f <= c where f >= -c
+            return self._space() - self.below(solid.inner, -level)
+        if isinstance(solid, Offset):
+            return self.below(solid.inner, level + solid.distance)
+        if isinstance(solid, Near):
+            return self._wall(solid, level)
+        if isinstance(solid, Region) and isinstance(solid.inner, Solid):
+            return self.below(solid.inner, level)
+        if isinstance(solid, AffineImage) and not is_smooth(solid.inner):
+            return self._image(solid, level)
+        if isinstance(solid, Cuboid) and solid.radius == 0 and level <= 0:
+            half = np.array(solid.half_sides) + level
+            return box_manifold(-half, half) if (half > 0).all() else Manifold()
+        if isinstance(solid, Plane):
+            x, y, z = solid.normal
+            return self._space().trim_by_plane((-x, -y, -z), -(solid.distance + level))
+        return manifold_of(self.smooth(solid, level)[0])
+
+    def smooth(self, field: Field, level: float) -> tuple[Surface, bool]:
+        """The boundary of {f <= level} as one level set, and whether it is all of it: if not, it is
+        closed outside of the box in a way that has no meaning."""
+        hull = _hull(field, level)
+        lower, upper = self.lower, self.upper
+        is_whole = False
+        if hull is not None:
+            low, high = hull.bounds()
+            is_whole = bool((low >= lower).all() and (high <= upper).all())
+            lower, upper = np.maximum(lower, low), np.minimum(upper, high)
+            if not (lower < upper).all():
+                return Surface(np.zeros((0, 3)), np.zeros((0, 3), np.int64)), is_whole
+        size = float((upper - lower).max())
+        spacing = min(self.spacing, size / 8)
+        if self.per_wave is not None and field.wavelength is not None:
+            spacing = min(spacing, field.wavelength / self.per_wave)
+        self.finest = min(self.finest, spacing)
+        function = self._function(_entire(field), level)
+        self.report(f"level {level:g} of {type(field).__name__} in cells of {spacing:.3g}")
+        lattice = Lattice.filling(lower, upper, spacing, layers=2)
+        made = closed_surface(function, lattice, self.tolerance, self.report)
+        self.evaluations += function.evaluations
+        self.levels += 1
+        return made, is_whole
+
+    def _function(self, field: Field, level: float) -> LevelFunction:
+        return _WithinDomain(field, level, most_faces=self.most_faces, uploads=self.uploads)
+
+    def _space(self) -> Manifold:
+        pad = 1e-3 * (self.upper - self.lower)
+        return box_manifold(self.lower - pad, self.upper + pad)
+
+    def _wall(self, wall: Near, level: float) -> Manifold:
+        """Where a field is within half_width + level of the wall's level."""
+        from manifold3d import Manifold
+
+        half = wall.half_width + level
+        if half <= 0:
+            return Manifold()
+        low, high = wall.level - half, wall.level + half
+        field = wall.inner
+        if field.period is None:
+            inside = Region(field)
+            if not isinstance(field, Solid):
+                self._check_wall(field, low, high)
+            return self.below(inside, high) - self.below(inside, low)
+        if 2 * half >= field.period:
+            return self._space()
+        if not isinstance(field, SolidAngle):
+            raise MeshingError(
+                f"a solid around a level of {type(field).__name__}, which is angle-valued, cannot "
+                "be meshed: only those of a SolidAngle"
+            )
+        return manifold_of(self._lens(field, low, high))
+
+    def _check_wall(self, field: Field, low: float, high: float) -> None:
+        """Raise if a wall is thinner than both of its sides' tolerance: they would meet."""
+        lattice = Lattice.filling(
+            self.lower, self.upper, float((self.upper - self.lower).max()) / 8
+        )
+        points = lattice.points(2 * np.argwhere(np.ones(lattice.counts)) + 1)
+        middle = 0.5 * (low + high)
+        samples = self._function(field, middle).at(points)
+        # Where the wall may be near.
+        near = samples.distance <= np.median(samples.distance)
+        steep = float(np.median(np.linalg.norm(samples.gradient[near], axis=1)))
+        self.evaluations += len(points)
+        if high - low < 2 * self.tolerance * steep:
+            raise MeshingError(
+                f"the wall is about {(high - low) / steep:.2g} thick, and its sides are made "
+                f"within {self.tolerance:.2g}: choose a smaller `tolerance`, or a thicker wall"
+            )
+
+    def _lens(self, field: SolidAngle, low: float, high: float) -> Surface:
+        """Between two levels of an angle: both end at the same vertices, those of the curve."""
+        inner, outer = self.sheet(field, low), self.sheet(field, high)
+        count = sum(map(len, field.loops))
+        if not np.array_equal(inner.vertices[:count], outer.vertices[:count]):
+            raise MeshingError("the two sides of the solid do not end at the same curve")
+        place = np.arange(len(inner.vertices)) - count + len(outer.vertices)
+        place[:count] = np.arange(count)
+        vertices = np.concatenate([outer.vertices, inner.vertices[count:]])
+        self.levels += 2
+        return Surface(vertices, np.concatenate([outer.faces, place[inner.faces][:, ::-1]]))
+
+    def _image(self, solid: AffineImage, level: float) -> Manifold:
+        """Of a solid under an affine map: the image of its mesh."""
+        matrix, offset = np.array(solid.map.matrix), np.array(solid.map.offset)
+        ends = np.stack([self.lower, self.upper])
+        corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3)
+        own = (corners - offset) @ solid.map.inverse.T
+        scale = float(np.linalg.norm(matrix, 2))
+        local = dataclasses.replace(
+            self, lower=own.min(axis=0), upper=own.max(axis=0), tolerance=self.tolerance / scale,
+            spacing=self.spacing / scale, evaluations=0, levels=0,
+            finest=math.inf,
+        )  # fmt: skip
+        made = local.below(solid.inner, level / solid.map.factor)
+        self.evaluations += local.evaluations
+        self.levels += local.levels
+        self.finest = min(self.finest, local.finest * scale)
+        return made.transform(np.column_stack([matrix, offset]))
+
+
+def is_smooth(solid: Solid) -> bool:
+    """Whether a solid is meshed as one level set."""
+    if isinstance(solid, Region):
+        return not isinstance(solid.inner, Solid) or is_smooth(solid.inner)
+    return not isinstance(solid, Combined | Complement | Offset | Near | Cuboid | Plane)
+
+
+def _hull(field: Field, level: float) -> Volume | None:
+    """A volume that holds {f <= level}, if it has bounds. A domain does not count: what ends there
+    is cut by it."""
+    if isinstance(field, Solid):
+        found = field.hull(level)
+    else:
+        found = bounded_side(field, (level,), lambda value: value <= level)
+    if found is None or found == field.domain:
+        return None
+    if isinstance(field, Region) and found == field.inner.domain:
+        return None
+    low, high = found.bounds()
+    return found if np.isfinite(low).all() and np.isfinite(high).all() else None
+
+
+def _entire(field: Field) -> Field:
+    return field.inner if isinstance(field, Region) else field
+
+
+@dataclass
+class _WithinDomain(LevelFunction):
+    """A field continued beyond its domain as it is at the domain's closest point.
+
+    The closest points of two points are no farther from each other than the two are, so that the
+    clearance of the closest point of p holds around p.
+    """
+
+    def at(self, points: FloatArray) -> Samples:
+        return super().at(self._closest(points))
+
+    def values(self, points: FloatArray) -> FloatArray:
+        return super().values(self._closest(points))
+
+    def clearance(self, points: FloatArray) -> FloatArray:
+        return super().clearance(self._closest(points))
+
+    def _closest(self, points: FloatArray) -> FloatArray:
+        domain = self.field.domain
+        if domain is None or self.field.is_entire:
+            return points
+        if isinstance(domain, Box):
+            return np.clip(points, *domain.bounds())
+        if isinstance(domain, Ball):
+            away = points - domain.center
+            length = np.linalg.norm(away, axis=1)
+            shrunk = np.minimum(1.0, domain.radius / np.maximum(length, 1e-300))
+            return np.array(domain.center) + away * shrunk[:, None]
+        low, high = domain.bounds()
+        if math.prod(high - low) < math.inf and domain.contains_points(points).all():
+            return points
+        raise MeshingError(
+            f"{type(self.field).__name__} ends at a {type(domain).__name__}, near which it cannot "
+            "be meshed: give the field a box or a ball as its domain"
+        )
+
+
+# Cells across a solid, if nothing is asked for.
+_ACROSS = 24
+# How many sizes of cells are tried, and what each is of the one before.
+_MOST_ATTEMPTS = 3
+_SMALLER = 0.6
+# Room around what has an extent, as a part of its size.
+_MARGIN = 0.01
+
+
+@dataclass(frozen=True)
+class SolidMesh:
+    """A closed surface; the spacing of cells, evaluations of fields in points, and how many level
+    sets it was made of. size: of its box, to which tolerances relate."""
+
+    surface: Surface
+    spacing: float
+    evaluations: int
+    levels: int
+    size: float
+
+
+def region_of(field: Field, solid: Any, level: float | None) -> tuple[Solid, float]:
+    """The solid that is asked for by `solid`, (low, high) or True, and its level.
+
+    Raises:
+        ValueError: it is none; levels that no solid has.
+        TypeError: neither.
+    """
+    if solid is True:
+        if not isinstance(field, Solid):
+            raise ValueError(
+                f"solid=True is for solids, and a {type(field).__name__} has two sides: give "
+                "solid=(low, high), the values inside, such as solid=(-math.inf, 0.0)"
+            )
+        level = field.default_level if level is None else float(level)
+        return field, level
+    if level is not None:
+        raise ValueError("give either level or solid: the ends of a solid are its levels")
+    try:
+        low, high = (float(one) for one in solid)
+    except (TypeError, ValueError):
+        raise TypeError(f"solid must be (low, high), two numbers, or True, not {solid!r}") from None
+    if not low < high or not (math.isfinite(low) or math.isfinite(high)):
+        raise ValueError(f"solid must be (low, high) with low < high, one finite, not {solid}")
+    field.check_levels(tuple(one for one in (low, high) if math.isfinite(one)))
+    if low == -math.inf:
+        return solid_of(field, below=high), 0.0
+    if high == math.inf:
+        return solid_of(field, above=low), 0.0
+    if field.period is not None:
+        return solid_of(field, around=(0.5 * (low + high), 0.5 * (high - low))), 0.0
+    return solid_of(field, between=(low, high)), 0.0
+
+
+def mesh_solid(
+    solid: Solid,
+    level: float,
+    volume: Volume | None,
+    tolerance: float,
+    spacing: float | None,
+    sheets: Callable[[float, float], Sheet],
+    most_faces: int,
+    check: Callable[[Surface, float], None],
+    report: Callable[[str], None],
+) -> SolidMesh:
+    """The boundary of the points of a volume where a solid's function is at most `level`.
+
+    volume: None for all of space. tolerance: a part of the size. sheets: given a tolerance and a
+    spacing, both lengths, how to mesh the level sets of an angle. most_faces: of a level set.
+    check: of the surface, given the size; where it fails in known places, smaller cells are tried,
+        and half the tolerance: beside a thin part triangles within it may be anywhere.
+
+    Raises:
+        MeshingError: it has no bounds; it is empty; a part cannot be meshed.
+    """
+    lower, upper = _bounds(solid, level, volume)
+    size = float((upper - lower).max())
+    cells = size / _ACROSS if spacing is None else spacing
+    error = 0.5 * tolerance * size
+    attempts = _MOST_ATTEMPTS if spacing is None else 1
+    per_wave = CELLS_PER_WAVE if spacing is None else None
+    uploads = Uploads()
+    while True:
+        mesher = RegionMesher(
+            lower, upper, error, cells, per_wave, sheets(error, cells), most_faces, report,
+            uploads=uploads,
+        )  # fmt: skip
+        try:
+            made = _put_together(mesher, solid, level, volume)
+            if not len(made.faces):
+                raise MeshingError("the solid is empty: no point of the box is inside")
+            check(made, size)
+            break
+        except (MissedError, LocalError) as wrong:
+            attempts -= 1
+            if not attempts:
+                raise
+            cells *= _SMALLER
+            per_wave = CELLS_PER_WAVE * size / (_ACROSS * cells)
+            if isinstance(wrong, LocalError):
+                error *= 0.5
+            report(f"{wrong}; so cells of {cells:.3g}")
+    return SolidMesh(made, min(cells, mesher.finest), mesher.evaluations, mesher.levels, size)
+
+
+def _put_together(
+    mesher: RegionMesher, solid: Solid, level: float, volume: Volume | None
+) -> Surface:
+    """The boundary of the solid in the volume."""
+    if volume is None and is_smooth(solid):
+        return mesher.smooth(solid, level)[0]
+    lower, upper = mesher.lower, mesher.upper
+    whole = mesher.below(solid, level)
+    mesher.report("putting the parts together")
+    if volume is None:
+        volume = Box(_point(lower), _point(upper))
+    cut = volume_manifold(volume, lower, upper, mesher.tolerance)
+    return _on_box(surface_of(whole ^ cut), volume)
+
+
+def _bounds(solid: Solid, level: float, volume: Volume | None) -> tuple[FloatArray, FloatArray]:
+    """A box that holds the solid within the volume.
+
+    Raises:
+        MeshingError: there is none.
+    """
+    lower, upper = np.full(3, -np.inf), np.full(3, np.inf)
+    if volume is not None:
+        lower, upper = (np.array(end, np.float64) for end in volume.bounds())
+    hull = solid.hull(level)
+    if hull is not None:
+        low, high = (np.array(end, np.float64) for end in hull.bounds())
+        pad = _MARGIN * float((high - low).max())
+        if math.isfinite(pad):
+            low, high = low - pad, high + pad
+        lower, upper = np.maximum(lower, low), np.minimum(upper, high)
+    if not (np.isfinite(lower).all() and np.isfinite(upper).all()):
+        raise MeshingError(
+            f"{type(solid).__name__} does not say where it ends (a solid does not end at the "
+            "domain of the field it is made of): give clip=harnack.Box(lower, "
+            "upper) or harnack.Ball(center, radius)"
+        )
+    if not (lower < upper).all():
+        raise MeshingError("the solid is empty: it lies outside of the clip")
+    return lower, upper
+
+
+def _point(x: FloatArray) -> tuple[float, float, float]:
+    return float(x[0]), float(x[1]), float(x[2])
+
+
+def _on_box(surface: Surface, volume: Volume) -> Surface:
+    """Vertices within rounding of a box's faces, put there."""
+    boxes = volume.volumes if isinstance(volume, Intersection) else (volume,)
+    vertices = surface.vertices
+    for box in boxes:
+        if isinstance(box, Box):
+            vertices = np.clip(vertices, *box.bounds())
+            for end in box.bounds():
+                near = np.abs(vertices - end) <= 1e-12 * (1 + np.abs(end))
+                vertices = np.where(near, end, vertices)
+    return Surface(vertices, surface.faces)

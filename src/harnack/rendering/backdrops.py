@@ -1,0 +1,261 @@
+"""The studio's ground and lights, placed around the camera's view of the stage.
+
+What stands behind the surfaces in place of the studio's wall: colors and images.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from harnack.backend import FloatArray
+from harnack.files.file_format import Place, read_bytes
+from harnack.names import did_you_mean
+from harnack.rendering.mitsuba import load_mitsuba
+from harnack.rendering.scales import NAMED_COLORS, Color, color_of
+
+# Radiances of the environment, linear sRGB: at the horizon, overhead, and of a soft strip of
+# light behind the stage that draws edges and gives metal something to reflect.
+_HORIZON = np.array([0.17, 0.17, 0.18])
+_ZENITH = np.array([0.36, 0.40, 0.46])
+_STRIP = np.array([0.70, 0.66, 0.60])
+_KEY = (4.7, 4.5, 4.25)
+# The height of the floor: a hair below what stands on it.
+FLOOR = -0.002
+# Reflectance of the ground, by the backdrop's name. Without a ground, what is behind the surfaces
+# is cut out of the picture.
+GROUNDS = {"light": (0.74, 0.73, 0.715), "dark": (0.055, 0.058, 0.065)}
+# (height, width) of the environment's bitmap.
+_ENVIRONMENT_SIZE = (64, 128)
+
+
+def reflectance_of(backdrop: str) -> FloatArray:
+    """Of the ground, (3,)."""
+    return np.array(GROUNDS[backdrop])
+
+
+def far_ground(backdrop: str, azimuth: float) -> FloatArray:
+    """Radiance (3,) of the ground far from the stage, which the environment alone lights."""
+    image = environment(azimuth)
+    z = np.cos(math.pi * (np.arange(len(image)) + 0.5) / len(image))
+    weight = np.clip(z, 0, None) * np.sqrt(1 - z * z)  # of rows, by the cosine
+    mean = np.average(image.mean(axis=1), axis=0, weights=weight)
+    return reflectance_of(backdrop) * mean
+
+
+def ground(mi: Any, backdrop: str) -> dict[str, Any]:
+    """A wide floor."""
+    floor = mi.ScalarTransform4f().translate([0, 0, FLOOR]).scale(100)
+    color = {"type": "rgb", "value": list(GROUNDS[backdrop])}
+    return {
+        "ground": {
+            "type": "disk",
+            "to_world": floor,
+            "bsdf": {"type": "diffuse", "reflectance": color},
+        }
+    }
+
+
+def lights(mi: Any, azimuth: float) -> dict[str, Any]:
+    """A large key light to the left of the camera and above, and an environment that fills.
+
+    azimuth: of the camera, in degrees.
+
+    The environment is smooth: paths that find it by themselves are less noisy than samples of
+    it, so it is not sampled.
+    """
+    key = 4.9 * _direction(azimuth - 52, 55)
+    look = mi.ScalarTransform4f().look_at(origin=key.tolist(), target=[0, 0, 0.3], up=[0, 0, 1])
+    y_to_z = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
+    return {
+        "key": {
+            "type": "disk",
+            "to_world": look.scale(2.2),
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": list(_KEY)}},
+        },
+        "fill": {
+            "type": "envmap",
+            "bitmap": mi.Bitmap(environment(azimuth)),
+            "to_world": y_to_z,
+            "sampling_weight": 0.0,
+        },
+    }
+
+
+def environment(azimuth: float) -> Any:
+    """Radiance of the environment as an equirectangular image (h, w, 3) of float32, z up."""
+    height, width = _ENVIRONMENT_SIZE
+    theta = math.pi * (np.arange(height) + 0.5) / height
+    phi = 2 * math.pi * (np.arange(width) + 0.5) / width
+    theta, phi = np.meshgrid(theta, phi, indexing="ij")
+    # Mitsuba's direction at these angles, after its y axis has been turned up to z.
+    x, y, z = np.sin(phi) * np.sin(theta), np.cos(phi) * np.sin(theta), np.cos(theta)
+    d = np.stack([x, y, z], axis=-1)
+    rise = np.clip(z, 0, 1)[..., None] ** 0.7
+    image = _HORIZON + (_ZENITH - _HORIZON) * rise
+    strip = _direction(azimuth + 125, 28)
+    image += _STRIP * np.exp((d @ strip - 1) / 0.14)[..., None]
+    return image.astype(np.float32)
+
+
+def _direction(azimuth: float, elevation: float) -> FloatArray:
+    a, e = math.radians(azimuth), math.radians(elevation)
+    return np.array([math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)])
+
+
+FloatImage = npt.NDArray[np.float32]
+
+TRANSPARENT = "transparent"
+BACKDROPS = (*GROUNDS, "white", TRANSPARENT)
+"""Names. Those of colors will do as well."""
+IMAGE_FILES = (".png", ".jpg", ".jpeg", ".exr")
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The studio's floor, going over into a wall. name: in GROUNDS."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class Gradient:
+    """From a color at the bottom of a picture to one at its top, both in sRGB."""
+
+    bottom: Color
+    top: Color
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    """An image, pixels (h, w, 3) of linear sRGB, first row at the top, that fills a picture."""
+
+    pixels: FloatImage
+
+
+Backdrop = Ground | Gradient | Photo | None
+"""None for nothing: the picture is transparent there."""
+
+
+def checked_backdrop(given: Any) -> Backdrop:
+    """What is to be behind the surfaces.
+
+    Raises:
+        TypeError, ValueError: none of what there is, naming what there is.
+        FileFormatError: an image's file that cannot be read.
+    """
+    if isinstance(given, os.PathLike):
+        return Photo(_read(Path(cast("os.PathLike[str]", given))))
+    if isinstance(given, np.ndarray) and given.ndim != 1:
+        return Photo(_pixels(cast("npt.NDArray[Any]", given)))
+    if isinstance(given, str):
+        return _named(given)
+    if isinstance(given, list | tuple) and len(pair := cast("list[Any]", given)) == 2:
+        return Gradient(*(color_of(one, "a color of the backdrop") for one in pair))
+    try:
+        color = color_of(given, "backdrop")
+    except TypeError:
+        raise TypeError(f"backdrop must be one of {_KNOWN}, not {given!r}") from None
+    return Gradient(color, color)
+
+
+_KNOWN = (
+    f"{', '.join(BACKDROPS)}, a color, (bottom, top) with two colors, an image (h, w, 3) or its "
+    f"file ({', '.join(IMAGE_FILES)})"
+)
+
+
+def _named(given: str) -> Backdrop:
+    if given in GROUNDS:
+        return Ground(given)
+    if given == TRANSPARENT:
+        return None
+    if Path(given).suffix.lower() in IMAGE_FILES:
+        return Photo(_read(Path(given)))
+    try:
+        color = color_of(given, "backdrop")
+    except ValueError:
+        known = (*BACKDROPS, *NAMED_COLORS)
+        raise ValueError(
+            f"backdrop must be one of {_KNOWN}, not {given!r}{did_you_mean(given, known)}"
+        ) from None
+    return Gradient(color, color)
+
+
+def _pixels(image: npt.NDArray[Any]) -> FloatImage:
+    """An array as an image: bytes are sRGB, other numbers linear."""
+    wrong = f"a backdrop's image must have the shape (h, w, 3), not {image.shape}"
+    if image.ndim != 3 or image.shape[-1] != 3 or not image.size:
+        raise ValueError(wrong)
+    if image.dtype == np.uint8:
+        return _decoded(load_mitsuba().Bitmap(np.ascontiguousarray(image)))
+    if image.dtype.kind not in "fiu":
+        raise TypeError(f"a backdrop's image must hold numbers, not {image.dtype}")
+    pixels = image.astype(np.float32)
+    if not (np.isfinite(pixels).all() and pixels.min() >= 0):
+        raise ValueError("a backdrop's image must hold finite numbers that are not negative")
+    if image.dtype.kind != "f" and pixels.max() > 1:
+        raise TypeError(f"a backdrop's image must hold bytes (uint8) or floats, not {image.dtype}")
+    return pixels
+
+
+def _read(path: Path) -> FloatImage:
+    """The image in a file; what is clear in it is white."""
+    if path.suffix.lower() not in IMAGE_FILES:
+        raise Place(path).error(f"a backdrop is an image: {', '.join(IMAGE_FILES)}")
+    data = read_bytes(path)
+    try:
+        return _of_exr(data) if path.suffix.lower() == ".exr" else _of_bytes(data)
+    except (RuntimeError, ValueError, KeyError, OSError) as error:
+        raise Place(path).error(
+            f"this is no image that can be read as {path.suffix.lower()}"
+        ) from error
+
+
+def _of_bytes(data: bytes) -> FloatImage:
+    mi = load_mitsuba()
+    stream = mi.MemoryStream()
+    stream.write(data)
+    stream.seek(0)
+    return _decoded(mi.Bitmap(stream))
+
+
+def _decoded(bitmap: Any) -> FloatImage:
+    """The pixels of one of Mitsuba's bitmaps."""
+    mi = load_mitsuba()
+    clear = bitmap.has_alpha()
+    kind = mi.Bitmap.PixelFormat.RGBA if clear else mi.Bitmap.PixelFormat.RGB
+    pixels = np.array(bitmap.convert(kind, mi.Struct.Type.Float32, False), dtype=np.float32)
+    if clear:
+        pixels = pixels[..., :3] * pixels[..., 3:] + (1 - pixels[..., 3:])
+    return np.ascontiguousarray(pixels)
+
+
+def _of_exr(data: bytes) -> FloatImage:
+    """Not by Mitsuba, which waits for ever where Dr.Jit has one thread."""
+    import OpenEXR  # here, since most pictures do without
+
+    library = cast("Any", OpenEXR)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "backdrop.exr")
+        path.write_bytes(data)
+        with library.File(str(path)) as file:
+            channels: dict[str, FloatImage] = {
+                name: np.array(one.pixels, dtype=np.float32)
+                for name, one in file.channels().items()
+            }
+    if "RGBA" in channels:  # colors are multiplied by alpha
+        both = channels["RGBA"]
+        pixels = both[..., :3] + (1 - np.clip(both[..., 3:], 0, 1))
+    elif "RGB" in channels:
+        pixels = channels["RGB"]
+    else:  # KeyError: no colors at all
+        pixels = np.repeat(channels["Y"][..., None], 3, axis=-1)
+    return np.maximum(np.nan_to_num(pixels, posinf=1e6), 0)

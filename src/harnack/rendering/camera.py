@@ -1,0 +1,207 @@
+"""A camera that frames what stands on the stage."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import numpy as np
+
+from harnack.backend import FloatArray
+from harnack.geometry import Box
+from harnack.geometry.volume import checked_point
+
+# The part of the picture that the surface fills at zoom 1.
+_FILLED = 0.86
+
+
+# The angle of view of a camera that chooses its distance, and of one that is among what it sees;
+# and how wide one may become to see all from where it stands.
+_USUAL, _AMONG, _WIDEST = 26.0, 60.0, 120.0
+_AZIMUTH, _ELEVATION = -50.0, 28.0
+
+Point = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A view of the stage.
+
+    azimuth, elevation: of the direction the camera looks from, in degrees; azimuth 0 is +x and
+        90 is +y, elevation 90 is straight from above. By default -50 and 28.
+    fov: the larger of the horizontal and vertical angle of view, in degrees. By default 26, or, of
+        a camera with a position or a distance, what frames the surface from there.
+    zoom: 1 frames the surface tightly with a margin; more comes closer or, of a camera with a
+        position or a distance, makes the angle of view smaller.
+    box: framed in place of what is to be seen, in the coordinates of the surfaces; it stands on the
+        ground. The pictures of a film, in which surfaces change, then fit each other, and nothing
+        has to be traced to find the frame.
+    position: (x, y, z), where the camera stands, in the coordinates of the surfaces, in place of
+        azimuth and elevation.
+    target: (x, y, z), what is in the middle of the picture, in the same coordinates; by default the
+        middle of what is framed.
+    distance: from the target, in the same unit; by default what frames the surface.
+    """
+
+    azimuth: float | None = None
+    elevation: float | None = None
+    fov: float | None = None
+    zoom: float = 1.0
+    box: Box | None = None
+    position: Point | None = None
+    target: Point | None = None
+    distance: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("azimuth", "elevation", "fov", "zoom", "distance"):
+            number = getattr(self, name)
+            if number is not None and (isinstance(number, bool | str) or not _is_number(number)):
+                raise TypeError(f"{name} of a camera must be a number, not {number!r}")
+        if self.fov is not None and not 0 < self.fov < 170:
+            raise ValueError(f"fov must lie between 0 and 170 degrees, not {self.fov}")
+        if not 0 < self.zoom < math.inf:
+            raise ValueError(f"zoom must be positive, not {self.zoom}")
+        if self.azimuth is not None and not math.isfinite(self.azimuth):
+            raise ValueError(f"azimuth must be a finite number of degrees, not {self.azimuth}")
+        if self.elevation is not None and not abs(self.elevation) <= 90:
+            raise ValueError(f"elevation must lie within -90 and 90 degrees, not {self.elevation}")
+        if self.box is not None and not isinstance(cast("object", self.box), Box):
+            raise TypeError(f"box must be a harnack.Box, not {type(self.box).__name__}")
+        if self.box is not None and not np.isfinite(self.box.bounds()).all():
+            raise ValueError("box must be finite")
+        if self.box is not None and not np.ptp(self.box.bounds(), axis=0).any():
+            raise ValueError(f"box must be larger than a point, and this one is not: {self.box}")
+        for name in ("position", "target"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, checked_point(getattr(self, name), name))
+        if self.distance is not None and not 0 < self.distance < math.inf:
+            raise ValueError(f"distance must be positive, not {self.distance}")
+        for name in ("azimuth", "elevation", "distance"):
+            if self.position is not None and getattr(self, name) is not None:
+                raise ValueError(f"a camera has a position or {name}, not both")
+        if self.position is not None and self.position == self.target:
+            raise ValueError(f"position and target are the same point, {self.position}")
+
+    @property
+    def angles(self) -> tuple[float, float]:
+        """Azimuth and elevation, in degrees, of a camera without a position."""
+        return (
+            _AZIMUTH if self.azimuth is None else self.azimuth,
+            _ELEVATION if self.elevation is None else self.elevation,
+        )
+
+    def frame(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Unit vectors of the world: to the right, up, and back to the camera."""
+        a, e = map(math.radians, self.angles)
+        back = np.array([math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)])
+        right = np.array([-math.sin(a), math.cos(a), 0.0])
+        return right, np.cross(back, right), back
+
+    def fit(self, points: FloatArray, size: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+        """Origin and target such that all points (n, 3) are in the picture of (width, height).
+
+        Along each image axis the picture's edges are planes through the origin; the points'
+        supports in the directions of these planes' normals give origin and distance.
+        """
+        right, up, back = self.frame()
+        x, y, z = points @ right, points @ up, points @ back
+        origin = np.zeros(3)
+        distance = -math.inf
+        for across, axis, slope in zip((x, y), (right, up), self._slopes(size), strict=True):
+            # |across - c| <= slope (distance - z) for all points.
+            high, low = (across + slope * z).max(), (across - slope * z).min()
+            origin = origin + (high + low) / 2 * axis
+            distance = max(distance, (high - low) / (2 * slope))
+        middle = float(z.max() + z.min()) / 2
+        origin = origin + (middle + (distance - middle) / self.zoom) * back
+        return origin, origin - back
+
+    def pose(
+        self,
+        points: FloatArray,
+        size: tuple[int, int],
+        to_world: Callable[[FloatArray], FloatArray],
+    ) -> Pose:
+        """Where the camera is in the world, to see points (n, 3) of the world.
+
+        to_world: from the coordinates of the surfaces, a map of one scale for all axes.
+        """
+        if self.position is None and self.target is None and self.distance is None:
+            origin, target = self.fit(points, size)
+            return Pose(origin, target, self.frame()[1], self.angle, self.angles[0])
+        middle = (points.min(axis=0) + points.max(axis=0)) / 2
+        target = middle if self.target is None else to_world(np.array([self.target]))[0]
+        if self.position is not None:
+            origin = to_world(np.array([self.position]))[0]
+            away = origin - target
+            length = float(np.linalg.norm(away))
+            if not length > 0:
+                raise ValueError(
+                    f"position {self.position} is in the middle of what is seen: say where to look "
+                    "with target=(x, y, z)"
+                )
+            azimuth = math.degrees(math.atan2(away[1], away[0]))
+            elevation = math.degrees(math.asin(max(-1.0, min(1.0, away[2] / length))))
+            turned = replace(self, azimuth=azimuth, elevation=elevation, position=None)
+        else:
+            turned, length = self, None
+            if self.distance is not None:
+                unit = np.diff(to_world(np.array([[0.0, 0, 0], [1, 0, 0]])), axis=0)
+                length = self.distance * float(np.linalg.norm(unit))
+        right, up, back = turned.frame()
+        seen = points - target
+        x, y, z = np.abs(seen @ right), np.abs(seen @ up), seen @ back
+        fov = self.angle
+        if length is None:  # |across| <= slope (length - z) for all points
+            slopes = self._slopes(size)
+            length = max(float((a / s + z).max()) for a, s in zip((x, y), slopes, strict=True))
+            length = max(length / self.zoom, 1e-3)
+        elif self.fov is None:
+            fov = self._framing(np.array([x, y]), length - z, size)
+        else:
+            fov = 2 * math.degrees(math.atan(math.tan(math.radians(fov) / 2) / self.zoom))
+        return Pose(target + length * back, target, up, fov, turned.angles[0])
+
+    def _framing(self, across: FloatArray, room: FloatArray, size: tuple[int, int]) -> float:
+        """The angle of view, in degrees, in which all points are that lie as far as `across` (2, n)
+        from the middle, to the right and upwards, and `room` (n,) before the camera."""
+        if room.min() <= 0:
+            return _AMONG
+        shape = max(size) / np.array(size)
+        wide = (across / room).max(axis=1) * shape
+        fov = 2 * math.degrees(math.atan(max(float(wide.max()), 1e-4) / _FILLED / self.zoom))
+        return min(fov, _WIDEST)
+
+    @property
+    def angle(self) -> float:
+        """The angle of view of a camera that chooses its distance, in degrees."""
+        return _USUAL if self.fov is None else self.fov
+
+    def _slopes(self, size: tuple[int, int]) -> tuple[float, float]:
+        """Of the edges of the part of the picture to fill, to the right and upwards."""
+        slope = math.tan(math.radians(self.angle) / 2) * _FILLED / max(size)
+        return slope * size[0], slope * size[1]
+
+
+def _is_number(value: Any) -> bool:
+    try:
+        float(value)
+    except (TypeError, ValueError):
+        return False
+    return True
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A camera in the world.
+
+    origin, target, up: (3,). fov: degrees. azimuth: of the direction it looks from, in degrees.
+    """
+
+    origin: FloatArray
+    target: FloatArray
+    up: FloatArray
+    fov: float
+    azimuth: float

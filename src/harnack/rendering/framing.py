@@ -1,0 +1,228 @@
+"""Which way is up.
+
+The box that a surface is proved to lie in, which pictures of it need.
+
+Where a surface really is: found by tracing it from all sides.
+
+The volume that a surface is proved to lie in can be many times larger than the surface. A
+picture wants to be filled by what there is to see.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import FloatArray, to_float, to_numpy, to_vector3
+from harnack.fields import Solid
+from harnack.fields.batch import FieldCache
+from harnack.geometry.volume import checked_point
+from harnack.names import did_you_mean
+from harnack.rendering.placement import PlacedSurface, Placement
+from harnack.tracer import Tolerance
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend
+    from harnack.tracer import LevelSet
+
+# Rotations that turn the named axis to z. From y, the front of a glTF model (z) turns to -y,
+# which is where the studio's camera stands.
+_UPRIGHT: dict[str, FloatArray] = {
+    "x": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
+    "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+    "z": np.eye(3),
+}
+UP_AXES: tuple[str, ...] = (*_UPRIGHT, *("-" + axis for axis in _UPRIGHT))
+
+
+def upright(up: Any) -> FloatArray:
+    """The rotation (3, 3) that turns an axis ("x", "-y", ...) or a vector to z.
+
+    Raises:
+        TypeError, ValueError: neither.
+    """
+    if isinstance(up, str):
+        if up not in UP_AXES:
+            raise ValueError(
+                f"up must be one of {', '.join(UP_AXES)} or a vector, not {up!r}"
+                f"{did_you_mean(up, UP_AXES)}"
+            )
+        axis = up.removeprefix("-")
+        over = np.diag([1.0, -1.0, -1.0]) if up.startswith("-") else np.eye(3)
+        return over @ _UPRIGHT[axis]
+    way = np.array(checked_point(up, "up"))
+    if not way.any():
+        raise ValueError("up must be a vector that is not zero")
+    way, z = way / float(np.abs(way).max()), np.array([0.0, 0.0, 1.0])
+    way = way / float(np.linalg.norm(way))
+    # Turned the shortest way, about the axis at right angles to both.
+    across = np.cross(way, z)
+    if float(np.linalg.norm(across)) < 1e-12:
+        return upright("z" if way[2] > 0 else "-z")
+    u = across / np.linalg.norm(across)
+    before, after = np.stack([u, np.cross(way, u), way]), np.stack([u, np.cross(z, u), z])
+    return after.T @ before
+
+
+class UnboundedSurfaceError(ValueError):
+    """A surface without a box around it cannot be drawn.
+
+    reason: what is wrong. usual: a level of the same field whose surface has a box, if known.
+    """
+
+    def __init__(self, reason: str, usual: float | None) -> None:
+        other = "" if usual is None else f", or choose another level, such as {usual:g}"
+        super().__init__(
+            f"{reason}: give it a clip, such as clip=harnack.Ball((0, 0, 0), 1){other}"
+        )
+        self.reason = reason
+        self.usual = usual
+
+
+def box_of(surface: LevelSet) -> FloatArray:
+    """Lower and upper corner (2, 3) of a box that holds the surface.
+
+    Raises:
+        UnboundedSurfaceError: no finite box is known.
+    """
+    volume = surface.volume
+    ends = None if volume is None else np.array(volume.bounds(), dtype=np.float64)
+    if ends is None or not np.isfinite(ends).all():
+        raise _unbounded(surface)
+    return ends
+
+
+def _unbounded(surface: LevelSet) -> UnboundedSurfaceError:
+    field = surface.field
+    levels = surface.numbers
+    shown = ", ".join(f"{level:g}" for level in levels)
+    reason = f"the surface of level {shown} reaches to infinity, as far as is known"
+    if field.period is not None and any(
+        abs(math.remainder(level, field.period)) < 1e-6 * field.period for level in levels
+    ):
+        reason += (
+            f" (far away, an angle comes near the multiples of its period, {field.period:g}, "
+            "and this is one)"
+        )
+    if isinstance(field, Solid):
+        reason += " (a solid made of a field does not end at that field's domain)"
+    usual = field.default_level
+    is_other = usual not in levels and field.extent((usual,)) is not None
+    return UnboundedSurfaceError(reason, usual if is_other else None)
+
+
+# Rays a side of the grid on each of the six faces of the box, and then of what is found there.
+_GRID, _CLOSER = 48, 32
+# Rays of one tile are followed together.
+_TILE = 8
+# Squares of lengths, divided by tolerances, stay far from the ends of single precision.
+_SMALLEST, _LARGEST = 1e-15, 1e16
+_POINTS: FieldCache[FloatArray] = FieldCache()
+
+
+def visible_points(surface: LevelSet, backend: Backend) -> FloatArray:
+    """Points (n, 3) of the surface, as seen from the six sides of the box it lies in.
+
+    Those of a field that is uploaded once are found once, as long as the settings are the same:
+    when only the camera moves, nothing is traced for it.
+
+    Raises:
+        ValueError: it has no bounds, or a size that single precision cannot draw; nothing is
+            found of it.
+    """
+    ends = box_of(surface)
+    check_size(ends)
+    prepared = surface.field_on(backend)
+
+    def found() -> FloatArray:
+        return _found(surface, backend, ends)
+
+    if prepared is surface.field:  # it may have changed in place
+        return found()
+    settings = (surface.numbers, surface.cut, surface.solid, surface.largest, surface.max_steps)
+    return _POINTS.get(prepared, (*settings, surface.bound, surface.overstep), found)
+
+
+def check_size(ends: FloatArray) -> None:
+    """Raise ValueError for a box (2, 3) that single precision cannot draw."""
+    if 0.0 < (ends[1] - ends[0]).max() < _SMALLEST or np.abs(ends).max() > _LARGEST:
+        raise ValueError(
+            f"the surface lies in a box from {_point(ends[0])} to {_point(ends[1])}: pictures are "
+            f"computed in single precision, for sizes from {_SMALLEST:g} and coordinates up to "
+            f"{_LARGEST:g}; choose units nearer to 1"
+        )
+
+
+def _found(surface: LevelSet, backend: Backend, ends: FloatArray) -> FloatArray:
+    """Points on a coarse grid, and on one as close as the surface fills."""
+    lower, upper = ends
+    points = _probe(surface, backend, lower, upper, _GRID)
+    if len(points) == 0:
+        if (lower > upper).any():
+            raise ValueError(
+                "nothing is to be seen of this surface: its domain, clip and section do not "
+                "overlap, so that nothing is left to draw"
+            )
+        raise ValueError(
+            "nothing is to be seen of this surface: no ray of a grid on the sides of its box "
+            f"{_point(ends[0])} to {_point(ends[1])} meets it; "
+            "try another level or clip"
+        )
+    margin = 0.6 * float((ends[1] - ends[0]).max()) / _GRID
+    lower = np.maximum(points.min(axis=0) - margin, ends[0])
+    upper = np.minimum(points.max(axis=0) + margin, ends[1])
+    closer = _probe(surface, backend, lower, upper, _CLOSER)
+    return np.concatenate([points, closer])
+
+
+def _point(corner: FloatArray) -> str:
+    return "(" + ", ".join(f"{c:.4g}" for c in corner) + ")"
+
+
+def _probe(
+    surface: LevelSet, backend: Backend, lower: FloatArray, upper: FloatArray, grid: int
+) -> FloatArray:
+    """First encounters of parallel rays, grid x grid from each of the six sides of a box."""
+    size = float(np.linalg.norm(upper - lower))
+    # A twentieth of the way between rays: sums over trees take long where more is asked for.
+    rough = replace(surface, tolerance=Tolerance(1e-3 * size))
+    placed = PlacedSurface.of(rough, Placement.identity(), backend)
+    o, d, length = _rays(lower, upper, 0.01 * size, grid)
+    met = placed.meet(
+        to_vector3(backend, o),
+        to_vector3(backend, d),
+        to_float(backend, length),
+        backend.Bool(True),
+    )
+    dr.eval(met.position, met.met)  # one by one, each would march anew
+    points: FloatArray = to_numpy(met.position)[to_numpy(met.met)]
+    return points.astype(np.float64)
+
+
+def _rays(
+    lower: FloatArray, upper: FloatArray, gap: float, grid: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Origins, directions and lengths of a grid of rays through the box along each axis, tile by
+    tile."""
+    rows = grid // _TILE
+    # Axes: tiles down and across, and rays down and across a tile.
+    index = np.indices((rows, rows, _TILE, _TILE), dtype=np.float64)
+    u = ((_TILE * index[1] + index[3] + 0.5) / grid).ravel()
+    v = ((_TILE * index[0] + index[2] + 0.5) / grid).ravel()
+    origins: list[FloatArray] = []
+    directions: list[FloatArray] = []
+    lengths: list[FloatArray] = []
+    for axis in range(3):
+        across = [(axis + 1) % 3, (axis + 2) % 3]
+        for sign in (1.0, -1.0):
+            o = np.empty((len(u), 3))
+            o[:, across] = lower[across] + np.column_stack([u, v]) * (upper - lower)[across]
+            o[:, axis] = lower[axis] - gap if sign > 0 else upper[axis] + gap
+            origins.append(o)
+            directions.append(np.tile(sign * np.eye(3)[axis], (len(u), 1)))
+            lengths.append(np.full(len(u), upper[axis] - lower[axis] + 2 * gap))
+    return np.concatenate(origins), np.concatenate(directions), np.concatenate(lengths)

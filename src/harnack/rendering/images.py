@@ -1,0 +1,202 @@
+"""Pictures as files: tone mapping, PNG and EXR.
+
+What `render` returns: the numbers of a picture, which know how they look.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from harnack.backend import FloatArray
+from harnack.files.file_format import check_writable, write_atomically
+from harnack.rendering.mitsuba import load_mitsuba
+
+FloatImage = npt.NDArray[np.float32]
+
+# Radiances up to here are shown as they are; brighter ones approach white smoothly.
+SHOULDER = 0.8
+_ROWS_AT_ONCE = 64
+
+
+def check_picture_path(path: Any) -> Path:
+    """The path of a picture to write.
+
+    Raises:
+        TypeError: it is no path.
+        ValueError: its extension is neither .png nor .exr.
+        OSError: no file can be created there, as `write_atomically` says.
+    """
+    if not isinstance(path, str | os.PathLike):
+        raise TypeError(f"path must name a picture to write, such as 'a.png', not {path!r}")
+    if path == "":
+        raise ValueError("the name of the picture to write is empty: give one, such as a.png")
+    path = Path(cast("str | os.PathLike[str]", path))
+    if path.suffix.lower() not in (".png", ".exr"):
+        raise ValueError(f"{path}: pictures are written as .png or .exr")
+    check_writable(path)
+    return path
+
+
+def tone_mapped(image: FloatImage, behind: FloatImage | None = None) -> npt.NDArray[np.uint8]:
+    """Linear sRGB radiance as 8-bit sRGB: a smooth shoulder, then the transfer function.
+
+    Of an image (h, w, 4) the last number is the part that is covered, by which the others are
+    multiplied. It stays, and the others are divided by it, as PNG wants it; or the rest of each
+    pixel becomes what is `behind`, linear sRGB (h, w, 3) without a shoulder, and three numbers are
+    left.
+    """
+    shape = image.shape if behind is None else behind.shape
+    shown = np.empty(shape, dtype=np.uint8)
+    for start in range(0, len(image), _ROWS_AT_ONCE):  # float64 is many times the picture
+        rows = slice(start, start + _ROWS_AT_ONCE)
+        shown[rows] = _tone_mapped(
+            image[rows].astype(np.float64), None if behind is None else behind[rows]
+        )
+    return shown
+
+
+def _tone_mapped(image: FloatArray, behind: FloatImage | None) -> npt.NDArray[np.uint8]:
+    if image.ndim < 3 or image.shape[-1] < 4:
+        return as_bytes(transferred(_shouldered(image)))
+    alpha = np.clip(image[..., 3:], 0.0, 1.0)
+    light = _shouldered(image[..., :3] / np.where(alpha > 0, alpha, 1.0))
+    if behind is not None:
+        return as_bytes(transferred(alpha * light + (1.0 - alpha) * behind))
+    return as_bytes(np.concatenate([transferred(light), alpha], axis=-1))
+
+
+def _shouldered(radiance: FloatArray) -> FloatArray:
+    x = np.clip(np.nan_to_num(radiance, nan=0.0, posinf=1e6), 0.0, None)
+    room = 1.0 - SHOULDER
+    return np.where(x <= SHOULDER, x, 1.0 - room * np.exp(-(x - SHOULDER) / room))
+
+
+def transferred(x: FloatArray) -> FloatArray:
+    """Linear sRGB in [0, 1] as sRGB."""
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
+
+
+def linear_of(x: FloatArray) -> FloatArray:
+    """sRGB in [0, 1] as linear sRGB: the inverse of `transferred`."""
+    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
+
+
+def as_bytes(image: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.uint8]:
+    """Numbers in [0, 1] as bytes."""
+    return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+
+
+def write_image(
+    mi: Any, path: Path, image: npt.NDArray[Any], names: Sequence[str] | None = None
+) -> None:
+    """Write (h, w), (h, w, 3) or (h, w, 4) floats as EXR or bytes as PNG, all or nothing.
+
+    names: of the channels of an EXR file, if they are others than Y, RGB or RGBA."""
+    with write_atomically(path) as partial:
+        if path.suffix.lower() == ".exr":
+            partial.write_bytes(exr_bytes(image, names))
+        else:
+            partial.write_bytes(png_bytes(mi, image))
+
+
+def png_bytes(mi: Any, image: npt.NDArray[np.uint8]) -> bytes:
+    """A PNG file of bytes (h, w), (h, w, 3) or (h, w, 4) with alpha."""
+    # Through memory: Mitsuba's own files do not say why they cannot be written.
+    packed = mi.MemoryStream()
+    mi.Bitmap(np.ascontiguousarray(image)).write(packed, mi.Bitmap.FileFormat.PNG)
+    return packed.raw_buffer()
+
+
+def exr_bytes(image: npt.NDArray[np.floating[Any]], names: Sequence[str] | None = None) -> bytes:
+    """An OpenEXR file of an image (h, w) with channel Y, (h, w, 3) with R, G and B, or (h, w, 4)
+    with A as well, by which these are multiplied; or with channels of these names."""
+    # Mitsuba writes them too, but waits for ever where Dr.Jit has one thread (OpenEXR 2.5 hands
+    # its work to a pool without threads).
+    import OpenEXR  # here, since most pictures do without
+
+    numbers = np.asarray(image, dtype=np.float32)
+    header: dict[str, Any] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    if names is None:
+        name = "Y" if image.ndim == 2 else {3: "RGB", 4: "RGBA"}[image.shape[-1]]
+        channels = {name: np.ascontiguousarray(numbers)}
+    else:
+        channels = {name: np.ascontiguousarray(numbers[..., k]) for k, name in enumerate(names)}
+    # Before version 3.5, which needs Python 3.11, it writes to named files only.
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "picture.exr")
+        OpenEXR.File(header, channels).write(str(path))
+        return path.read_bytes()
+
+
+class Picture(np.ndarray[Any, np.dtype[Any]]):
+    """The numbers of a picture, an array like any other, which notebooks show.
+
+    What is computed from it is an ordinary array: it has no looks of its own.
+    """
+
+    _shown: npt.NDArray[np.uint8] | None = None
+
+    @classmethod
+    def of(cls, numbers: npt.NDArray[Any], shown: npt.NDArray[np.uint8]) -> Picture:
+        """Numbers, and the pixels (h, w), (h, w, 3) or (h, w, 4) that they are shown as."""
+        picture = numbers.view(cls)
+        picture._shown = shown
+        return picture
+
+    def __array_finalize__(self, array: Any) -> None:
+        if isinstance(array, Picture) and array.shape == self.shape:  # a copy
+            self._shown = array._shown
+
+    def __reduce__(self) -> Any:
+        return _restored, (np.asarray(self), self._shown)
+
+    def __deepcopy__(self, memo: Any) -> Picture:
+        return self.copy()
+
+    def __array_wrap__(self, array: Any, context: Any = None, return_scalar: bool = False) -> Any:
+        return array[()] if return_scalar else np.asarray(array)
+
+    def __getitem__(self, key: Any) -> Any:
+        return np.asarray(self)[key]
+
+    @property
+    def shown(self) -> npt.NDArray[np.uint8]:
+        """The pixels that are shown: sRGB in bytes, (h, w, 3), or (h, w, 4) with alpha.
+
+        Raises:
+            AttributeError: this array was computed from that of a picture.
+        """
+        if self._shown is None:
+            raise AttributeError(
+                "this array was computed from a picture: only what `render` returned has `.shown`"
+            )
+        return self._shown
+
+    def to_pil(self) -> Any:
+        """As an image of Pillow's.
+
+        Raises:
+            ModuleNotFoundError: Pillow is not installed.
+        """
+        try:
+            from PIL import Image
+        except ModuleNotFoundError:
+            raise ModuleNotFoundError(
+                "to_pil needs Pillow: pip install pillow, or take the bytes in `.shown`"
+            ) from None
+        return Image.fromarray(self.shown)
+
+    def _repr_png_(self) -> bytes | None:
+        """For notebooks."""
+        return None if self._shown is None else png_bytes(load_mitsuba(), self._shown)
+
+
+def _restored(numbers: npt.NDArray[Any], shown: npt.NDArray[np.uint8] | None) -> Picture:
+    return numbers.view(Picture) if shown is None else Picture.of(numbers, shown)

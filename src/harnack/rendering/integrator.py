@@ -1,0 +1,420 @@
+"""Samples of light paths: Sobol' points, scrambled after Owen, computed from their index alone.
+
+A sampler with a state must be carried along with each path; these need the path's pixel, the
+index of the sample and the dimension, so that paths can be moved to other lanes, and the same path
+has the same numbers whatever else is drawn. Each pair of dimensions is the first two of Sobol' in
+an order of its own (Burley 2020, Practical Hash-based Owen Scrambling), which stratifies samples of
+a pixel as well as multi-jittering does, for any number of them.
+
+A path tracer that sees Mitsuba's shapes and ours.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+
+from harnack.backend.loops import gathered, leaves_of, rows_of, wide
+from harnack.rendering.mitsuba import load_mitsuba, transmittance
+from harnack.rendering.world import World, connecting_ray, leaving_ray
+
+if TYPE_CHECKING:
+    from harnack.backend import Mask, Real
+
+# Dimensions for camera rays, and for each vertex of a path.
+_CAMERA, _VERTEX = 8, 8
+# Sobol's second dimension is Pascal's triangle modulo 2, applied by halves.
+_PASCAL = ((0xAAAAAAAA, 1), (0xCCCCCCCC, 2), (0xF0F0F0F0, 4), (0xFF00FF00, 8), (0xFFFF0000, 16))
+# Multipliers of a permutation of 32 bits in which each depends on those below (Vegdahl 2021), and
+# of a hash of 32 bits (Wellons 2018).
+_OWEN = (0x6C50B47C, 0xB82F1E52, 0xC7AFE638, 0x8D22F6E6)
+_HASH = (0x21F0AAAD, 0xD35A2D97)
+
+
+@dataclass
+class SobolSampler:
+    """Numbers for paths, with Mitsuba's names of methods. Each call is another dimension.
+
+    pixel, index: UInt32 of each path, what its sample is of and which one it is.
+    seed: UInt32. dimension: UInt32, of the next call.
+    """
+
+    mi: Any
+    pixel: Any
+    index: Any
+    seed: Any
+    dimension: Any
+
+    def at_vertex(self, depth: Any, rows: Any) -> SobolSampler:
+        """For some of the paths, at their vertex number `depth` from 0."""
+        uint = self.mi.UInt32
+        pixel, index = dr.gather(uint, self.pixel, rows), dr.gather(uint, self.index, rows)
+        return SobolSampler(self.mi, pixel, index, self.seed, _CAMERA + _VERTEX * uint(depth))
+
+    def next_2d(self, active: Any = True) -> Any:
+        """Points in [0, 1)^2."""
+        del active
+        uint, mi = self.mi.UInt32, self.mi
+        key = _hashed(uint, self.pixel + _hashed(uint, self.dimension + _hashed(uint, self.seed)))
+        self.dimension = self.dimension + 1
+        shuffled = _owen(uint, self.index, key)
+        x, y = dr.brev(shuffled), shuffled
+        for mask, shift in _PASCAL:
+            y = y ^ ((y & uint(mask)) >> shift)
+        pair = (
+            _owen(uint, x, _hashed(uint, key + 1)),
+            _owen(uint, dr.brev(y), _hashed(uint, key + 2)),
+        )
+        below = 1 - dr.epsilon(mi.Float)
+        return mi.Point2f(*(dr.minimum(mi.Float(part) * 2.0**-32, below) for part in pair))
+
+    def next_1d(self, active: Any = True) -> Any:
+        """Numbers in [0, 1)."""
+        return self.next_2d(active).x
+
+
+def _hashed(uint: Any, x: Any) -> Any:
+    x = uint(x)
+    for multiplier, shift in zip(_HASH, (16, 15), strict=True):
+        x = (x ^ (x >> shift)) * uint(multiplier)
+    return x ^ (x >> 15)
+
+
+def _owen(uint: Any, x: Any, seed: Any) -> Any:
+    """Owen's scrambling: each bit flipped or not as the bits above it say."""
+    x = dr.brev(x) + seed
+    for multiplier in _OWEN:
+        x ^= x * uint(multiplier)
+    return dr.brev(x)
+
+
+PLUGIN = "harnack_path"
+INTEGRATOR = "HarnackPath"
+# What a ray that ran out of steps is drawn in: nothing in nature is this color.
+LOST_COLOR = (1.0, 0.0, 1.0)
+
+_UNLIMITED = 2**32 - 1
+
+
+@dataclass(frozen=True)
+class _Vertex:
+    """What is remembered of a path's last vertex: where it lies, how the surface faces there, and
+    whose it is. Not valid before the first."""
+
+    position: Any
+    normal: Any
+    shape: Any
+    is_valid: Mask
+
+    @classmethod
+    def none(cls, mi: Any) -> _Vertex:
+        """No vertex: the path comes from the camera."""
+        zero = dr.zeros(mi.SurfaceInteraction3f)
+        return cls(zero.p, zero.n, zero.shape, mi.Bool(False))
+
+    @classmethod
+    def of(cls, si: Any) -> _Vertex:
+        """Of an interaction."""
+        return cls(si.p, si.n, si.shape, si.is_valid())
+
+    def interaction(self, mi: Any) -> Any:
+        """As an interaction, of which nothing else is known."""
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        si.p, si.n, si.shape = self.position, self.normal, self.shape
+        si.t = dr.select(self.is_valid, mi.Float(0), dr.inf)
+        return si
+
+
+@dataclass(frozen=True)
+class _Paths:
+    """Paths on their way, and what each remembers.
+
+    number: of the path among all. previous, pdf, delta: the last vertex and how it sampled the ray,
+        for the weights of lights that the ray finds.
+    eta: product of relative refractive indices; keeps Russian roulette from ending paths in glass.
+    spread, spread_before: whether a rough surface has scattered the path up to the last vertex,
+        and up to the one before that.
+    """
+
+    number: Any
+    ray: Any
+    throughput: Any
+    eta: Real
+    previous: _Vertex
+    pdf: Real
+    delta: Mask
+    spread: Mask
+    spread_before: Mask
+
+
+@dataclass(frozen=True)
+class _Connection:
+    """Light that a vertex scatters along the path, if nothing lies on the ray to its emitter."""
+
+    ray: Any
+    light: Any
+    active: Mask
+
+
+@dataclass
+class Features:
+    """What paths meet first: the part of light that it reflects, in (0, 1), and its unit normal.
+    Both are 0 where they meet nothing."""
+
+    albedo: Any
+    normal: Any
+
+    def note(self, mi: Any, si: Any, numbers: Any, active: Mask) -> None:
+        """Keep those of interactions, at the numbers of their paths."""
+        bsdf, straight = si.bsdf(), mi.SurfaceInteraction3f(si)
+        straight.wi = mi.Vector3f(0, 0, dr.mulsign(mi.Float(1), si.wi.z))
+        albedo = bsdf.eval_diffuse_reflectance(straight, active)
+        # Mirrors reflect all at once straight on, in their hue; what is clear has no color.
+        albedo = albedo / dr.maximum(1, dr.max(albedo))
+        albedo = dr.select(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth), albedo, 1)
+        dr.scatter(self.albedo, mi.Spectrum(albedo), numbers, active)
+        dr.scatter(self.normal, mi.Vector3f(si.sh_frame.n), numbers, active)
+
+
+@dataclass
+class Radiance:
+    """What paths have found: radiance, whether they met a surface, whether a ray got lost; and
+    features of what they met first, if they were asked for."""
+
+    light: Any
+    valid: Mask
+    lost: Mask
+    features: Features | None = None
+
+
+class PathTracer:
+    """Path tracing with multiple importance sampling of lights and BSDFs (Veach 1997).
+
+    max_depth: longest path in edges, -1 for no limit. rr_depth: where Russian roulette begins.
+    hide_emitters: whether lights and environment are invisible to the camera.
+    clamp: the most that a path may bring of light that was spread by a rough surface before its
+        last scattering. A finite one takes some light away, and with it the white specks of
+        sharp reflections and caustics that paths find too rarely.
+    """
+
+    def __init__(
+        self,
+        mi: Any,
+        max_depth: int = 12,
+        rr_depth: int = 4,
+        hide_emitters: bool = False,
+        clamp: float = math.inf,
+    ) -> None:
+        if max_depth < -1 or rr_depth < 1:
+            raise ValueError(
+                "max_depth must be -1 (no limit) or >= 0 and rr_depth >= 1, "
+                f"not {max_depth} and {rr_depth}"
+            )
+        self.mi = mi
+        self.max_depth = _UNLIMITED if max_depth == -1 else max_depth
+        self.rr_depth = rr_depth
+        self.hide_emitters = hide_emitters
+        self.clamp = clamp
+        # Kernel parameters: other limits compile nothing.
+        self._deepest = dr.opaque(mi.UInt32, self.max_depth)
+        self._first_gamble = dr.opaque(mi.UInt32, rr_depth)
+        self._brightest = dr.opaque(mi.Float, clamp)
+        self.lost_color = mi.load_dict({"type": "srgb", "color": list(LOST_COLOR)}, parallel=False)
+
+    def with_depth(self, max_depth: int) -> PathTracer:
+        """The same with another longest path."""
+        return PathTracer(self.mi, max_depth, self.rr_depth, self.hide_emitters, self.clamp)
+
+    def trace(
+        self, scene: Any, sampler: SobolSampler, ray: Any, active: Mask, features: bool = False
+    ) -> Radiance:
+        """What paths find that begin with camera rays, one for each of the sampler's lanes.
+
+        Paths go on vertex by vertex, all together, and those that have ended are left out: what
+        each part of a vertex needs is evaluated for the paths that need it (`backend.lanes`).
+        """
+        mi, world = self.mi, World.of(self.mi, scene, queued=True)
+        width = dr.width(sampler.index)
+        found = Radiance(
+            dr.zeros(mi.Spectrum, width), dr.zeros(mi.Bool, width), dr.zeros(mi.Bool, width)
+        )
+        if features:
+            found.features = Features(dr.zeros(mi.Spectrum, width), dr.zeros(mi.Vector3f, width))
+            dr.make_opaque(found.features.albedo, found.features.normal)
+        paths = _Paths(
+            number=dr.arange(mi.UInt32, width),
+            ray=mi.Ray3f(dr.detach(ray)),
+            throughput=mi.Spectrum(1),
+            eta=mi.Float(1),
+            previous=_Vertex.none(mi),
+            pdf=mi.Float(1),
+            delta=mi.Bool(True),
+            spread=mi.Bool(False),
+            spread_before=mi.Bool(False),
+        )
+        paths = wide(paths, width, mi.UInt32)
+        dr.make_opaque(found.light, found.valid, found.lost)
+        going_on, depth = mi.Bool(active) & dr.full(mi.Bool, True, width), 0
+        while True:
+            rows, count = rows_of(going_on)
+            if not count:
+                return found
+            paths = gathered(paths, rows)
+            active = dr.arange(mi.UInt32, len(rows)) < dr.opaque(mi.UInt32, count)
+            # No number is a literal, so that all vertices run the same kernels.
+            dr.make_opaque(active, *leaves_of(paths))
+            paths, going_on = self._vertex(world, paths, active, sampler, depth, found)
+            depth += 1
+
+    def _vertex(
+        self, world: World, paths: _Paths, exist: Mask, sampler: SobolSampler, depth: int,
+        found: Radiance,
+    ) -> tuple[_Paths, Mask]:  # fmt: skip
+        """Finds the next vertex of paths, collects its light, and samples where to go on. Returns
+        the paths behind it, and which of them go on."""
+        mi, here = self.mi, dr.opaque(self.mi.UInt32, depth)
+        before = paths.previous.interaction(mi)
+        hidden = (here == 0) if self.hide_emitters else None
+        si, met = world.intersect(paths.ray, before, exist, hidden)
+        numbers = sampler.at_vertex(here, paths.number)
+        left = transmittance(mi, world.carriers, before, si, paths.ray.d)
+        paths = replace(paths, throughput=paths.throughput * left)
+        shows = exist & ~met.lost & (here < self._deepest)
+        if hidden is not None:
+            shows &= ~hidden
+        light = self._emitted(world.scene, paths, si, shows)
+        shown = paths.throughput * mi.Spectrum(self.lost_color.eval(si, met.lost))
+        light += dr.select(met.lost, shown, 0)
+        active = si.is_valid() & (here + 1 < self._deepest)
+        bsdf = si.bsdf()
+        connection = self._connection(world, paths, si, met.clearance, numbers, active)
+
+        sample, weight = bsdf.sample(
+            mi.BSDFContext(), si, numbers.next_1d(), numbers.next_2d(), active
+        )
+        delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+        throughput = paths.throughput * weight
+        eta = paths.eta * sample.eta
+        brightest = dr.max(throughput)
+        active &= brightest > 0
+        # Russian roulette, without the factor eta^-2 that radiance takes on in glass.
+        keep = dr.minimum(brightest * eta * eta, 0.95)
+        gamble = here + 1 >= self._first_gamble
+        active &= ~gamble | (numbers.next_1d() < keep)
+        behind = _Paths(
+            number=paths.number,
+            ray=leaving_ray(mi, si, met.clearance, si.to_world(sample.wo)),
+            throughput=dr.select(gamble, throughput / keep, throughput),
+            eta=eta,
+            previous=_Vertex.of(si),
+            pdf=sample.pdf,
+            delta=delta,
+            spread=paths.spread | ~delta,
+            spread_before=paths.spread,
+        )
+        first = (here == 0) & (si.is_valid() | met.lost)
+        dr.scatter(found.valid, mi.Bool(True), paths.number, first)
+        dr.scatter(found.lost, mi.Bool(True), paths.number, met.lost)
+        if found.features is not None:
+            found.features.note(mi, si, paths.number, first & si.is_valid())
+        # One kernel: what vertices are like is not computed again.
+        noted = (found.valid, found.lost, found.features)
+        dr.eval(active, light, noted, *leaves_of(behind), *leaves_of(connection))
+        blocked = world.occluded(connection.ray, connection.active)
+        light += dr.select(connection.active & ~blocked, connection.light, 0)
+        # Each path has a place of its own, so that the order of sums is fixed.
+        dr.scatter_add(found.light, light, paths.number, exist, mode=dr.ReduceMode.NoConflicts)
+        dr.eval(found.light)
+        return behind, active
+
+    def _emitted(self, scene: Any, paths: _Paths, si: Any, active: Mask) -> Any:
+        """Light that a vertex, or the environment behind no vertex, sends along the ray."""
+        mi, before = self.mi, paths.previous.interaction(self.mi)
+        found = mi.DirectionSample3f(scene, si, before)
+        other = scene.pdf_emitter_direction(before, found, active & ~paths.delta)
+        weight = _power_heuristic(paths.pdf, other)
+        light = paths.throughput * weight * found.emitter.eval(si, active)
+        return dr.select(active, self._limited(light, paths.spread_before), 0)
+
+    def _limited(self, light: Any, indirect: Mask) -> Any:
+        """Light, dimmed to at most `clamp` in every channel where it is indirect."""
+        if self.clamp == math.inf:
+            return light
+        excess = dr.max(light) / self._brightest
+        return dr.select(indirect & (excess > 1), light / excess, light)
+
+    def _connection(
+        self, world: World, paths: _Paths, si: Any, clearance: Real, numbers: SobolSampler,
+        active: Mask,
+    ) -> _Connection:  # fmt: skip
+        """To a sampled point of an emitter, with the light scattered if nothing is between."""
+        mi, bsdf = self.mi, si.bsdf()
+        active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        light, weight = world.scene.sample_emitter_direction(si, numbers.next_2d(), False, active)
+        active &= light.pdf > 0
+        scattered, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(light.d), active)
+        active &= dr.max(scattered) > 0
+        share = dr.select(light.delta, 1, _power_heuristic(light.pdf, pdf))
+        found = self._limited(paths.throughput * scattered * weight * share, paths.spread)
+        return _Connection(connecting_ray(mi, si, clearance, light.p), found, active)
+
+
+def _power_heuristic(a: Real, b: Real) -> Real:
+    """Veach's power heuristic with exponent 2."""
+    a, b = a * a, b * b
+    weight = a / (a + b)
+    return dr.select(dr.isfinite(weight), weight, 0)
+
+
+def _own_sampler(mi: Any, sampler: Any) -> SobolSampler:
+    """One seeded by a sampler of Mitsuba's, whose lanes are the samples of pixel after pixel."""
+    width, spp = sampler.wavefront_size(), max(int(sampler.sample_count()), 1)
+    lane = dr.arange(mi.UInt32, width)
+    seed = mi.UInt32(dr.gather(mi.Float, sampler.next_1d(), mi.UInt32(0)) * 2.0**24)
+    samples = dr.opaque(mi.UInt32, spp)
+    return SobolSampler(mi, lane // samples, lane % samples, seed, dr.opaque(mi.UInt32, 0))
+
+
+@functools.cache
+def integrator_class(variant: str) -> Any:
+    """The plugin's class; Mitsuba's classes differ from variant to variant."""
+    mi = load_mitsuba()
+    if mi.variant() != variant:
+        raise RuntimeError(f"the variant changed from {variant} to {mi.variant()}")
+
+    class HarnackPath(mi.SamplingIntegrator):
+        """Mitsuba's interface to `PathTracer`, whose arguments are the plug-in's properties."""
+
+        def __init__(self, props: Any) -> None:
+            mi.SamplingIntegrator.__init__(self, props)
+            self.tracer = PathTracer(
+                mi,
+                props.get("max_depth", 12),
+                props.get("rr_depth", 4),
+                props.get("hide_emitters", False),
+                props.get("clamp", math.inf),
+            )
+            self.lost = mi.UInt32(0)
+
+        def sample(
+            self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Mask = True
+        ) -> tuple[Any, Mask, list[Any]]:
+            del medium
+            found = self.tracer.trace(scene, _own_sampler(mi, sampler), ray, active)
+            self.lost = self.lost + dr.count(found.lost)
+            return found.light, found.valid, []
+
+        def take_lost(self) -> int:
+            """How many paths ran out of steps since the last call."""
+            count = int(self.lost[0])
+            self.lost = mi.UInt32(0)
+            return count
+
+        def to_string(self) -> str:
+            return f"{INTEGRATOR}[max_depth = {self.tracer.max_depth}]"
+
+    return HarnackPath

@@ -1,0 +1,276 @@
+"""Scalar functions on surfaces, for isolines and for pictures of values.
+
+Lines on a surface where another function takes given values: contour lines, isolines.
+
+A line is what lies within half its width of the curve {g = level} on the surface. Its distance from
+a point is |g - level| / |grad_T g| to first order, with the part grad_T g of the gradient along the
+surface: lines are as wide where g rises gently as where it is steep. They are compared without the
+quotient, |g - level| < width/2 |grad_T g|, so that nothing is drawn where g is constant along the
+surface, whatever its value there.
+
+Where g has a critical point on the surface, lines cannot widen without limit. Let its difference
+from the level be q(x) of degree n there, to leading order (2 at maxima, minima and saddles, where
+no more vanishes). Along a ray from the point q = c r^n, and |grad_T g| <= n |q|_max / r, where
+|q|_max is the largest |q| at the distance r (Kellogg 1928): in directions in which |q| is within a
+factor k of that, the line ends before r = k n/2 width. So a maximum at a level is a dot, as wide as
+two lines, and lines that cross at a saddle are joined by a fillet of that size. Around a maximum
+that is a little higher, with g - level = (R^2 - r^2)/2 at the distance r, the line is where
+|r^2 - R^2| < width r, which is r < width/2 + sqrt(width^2/4 + R^2) <= R + width: at most half a
+width too far.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, cast
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import aligned
+from harnack.backend.elementary import length as norm
+from harnack.backend.numbers import positive
+from harnack.fields import Field
+from harnack.fields.expressions import expression
+from harnack.rendering.scales import Color, color_of
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, FloatArray, Index, Mask, Real, Vec3
+    from harnack.geometry import Volume
+
+# A surface that is cut by the function's own domain reaches beyond it by rounding, a part of its
+# size.
+_PADDING = 1e-5
+
+
+def function_of(given: Any, what: str = "of") -> Field:
+    """A function on space: a field, or what `harnack.expression` takes: a function of three
+    coordinates, or a text such as "z".
+
+    Raises:
+        TypeError, ValueError: none of these, or a field that is many functions.
+    """
+    if isinstance(given, str):
+        try:
+            return expression(given)
+        except ValueError as error:
+            raise ValueError(f"{what.rstrip(',')}: {error}") from None
+    if isinstance(given, Field):
+        if given.has_parts:
+            raise ValueError(
+                f"{what} must be one function on space, and this {type(given).__name__} has one "
+                "for each part"
+            )
+        return given
+    if not callable(given):
+        raise TypeError(
+            f'{what} must be a text such as "z" or "x*y", a field, or a function of x, y and z, '
+            f"not {given!r}"
+        )
+    return expression(cast("Callable[[Any, Any, Any], Any]", given))
+
+
+def defined_in(function: Field, size: float) -> Volume | None:
+    """Where a function is defined, with room for rounding; None for all of space.
+
+    size: of the surface that it is looked at on.
+    """
+    if function.domain is None or function.is_entire:
+        return None
+    return function.domain.padded(_PADDING * size)
+
+
+# The width of a line unless one is given, as a part of the diagonal of the surface's box.
+_USUAL_WIDTH = 0.004
+# Where the part of the gradient along the surface is this much smaller than the gradient, it is
+# rounding, of the normal and of the position.
+_ROUNDING = 1e-4
+# How many lines an angle-valued function has unless asked otherwise.
+_USUAL_LINES = 12
+# Tables of levels have at least so many entries: kernels depend on how often that can be halved.
+_ENTRIES = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Isolines:
+    """Lines on a surface where a function takes given values.
+
+        hk.render(field, "a.png", isolines=hk.Isolines("z", spacing=0.1))
+        hk.render(field, "b.png", isolines=[hk.Isolines(other, [0, 1], color="white"), ...])
+
+    of: the function: "x", "y" or "z", which gives contour lines of height; a `Field`; or a Python
+        function of x, y and z as `harnack.expression` takes it. All are in the coordinates of the
+        surface, wherever it stands. There are no lines where the field is not defined: outside of
+        its `domain`, unless it `is_entire`.
+    levels: the values, or one; those of angle-valued fields count up to their period.
+    spacing: in place of levels, lines at all whole multiples of it. It must divide the period of an
+        angle-valued field, which has 12 lines if neither is given.
+    width: of the lines, along the surface, in the unit of its coordinates; by default 0.4 percent
+        of the diagonal of the surface's box.
+    color: a name of CSS, "#rrggbb", or three numbers of sRGB.
+    """
+
+    of: Any
+    levels: Any = None
+    spacing: float | None = None
+    width: float | None = None
+    color: Any = "black"
+    function: Field = field(init=False, repr=False)
+    rgb: Color = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        put: dict[str, Any] = {
+            "function": function_of(self.of, "of, whose isolines are drawn,"),
+            "rgb": color_of(self.color, "color of isolines"),
+        }
+        for name in ("spacing", "width"):
+            if getattr(self, name) is not None:
+                put[name] = positive(getattr(self, name), f"{name} of isolines")
+        if self.levels is not None:
+            if self.spacing is not None:
+                raise ValueError("isolines have either levels or a spacing, not both")
+            put["levels"] = _numbers(self.levels)
+        elif self.spacing is None and put["function"].period is None:
+            raise ValueError(
+                "say which isolines: levels=[...], or spacing= for all whole multiples of it"
+            )
+        for name, value in put.items():
+            object.__setattr__(self, name, value)
+        self._step()
+
+    def _step(self) -> float | None:
+        """The spacing, exactly a part of the period if there is one; None for lines at levels."""
+        period = self.function.period
+        if self.levels is not None or period is None:
+            return self.spacing
+        count = _USUAL_LINES if self.spacing is None else round(period / self.spacing)
+        if self.spacing is not None and abs(count * self.spacing - period) > 1e-4 * period:
+            raise ValueError(
+                f"the function has the period {period:.6g}, and a spacing of {self.spacing:g} does "
+                "not divide it: lines would end where it is passed. Give period / n, or levels"
+            )
+        return period / count
+
+    def prepare(self, backend: Backend, size: float) -> PreparedIsolines:
+        """Everything uploaded. size: diagonal of the surface's box, for the usual width."""
+        width = _USUAL_WIDTH * size if self.width is None else self.width
+        step, period = self._step(), self.function.period
+        volume = defined_in(self.function, size)
+        return PreparedIsolines(
+            self.function.prepare(backend),
+            None if volume is None else volume.prepare(backend),
+            dr.opaque(backend.Float, 0.5 * width),
+            None if step is None else dr.opaque(backend.Float, step),
+            None if step is not None else aligned(backend, _table(self.levels, period)),
+            None if period is None else dr.opaque(backend.Float, period),
+        )
+
+
+def _table(levels: tuple[float, ...], period: float | None) -> FloatArray:
+    """Levels in ascending order, of which the nearest is next to where a value belongs.
+
+    Those of an angle-valued function lie in [0, period), with the last before them once more and
+    the first after them. The rest of the table, of 2^k - 1 entries, is infinite.
+    """
+    ordered = np.unique(np.array(levels) if period is None else np.mod(levels, period))
+    if period is not None:
+        ordered = np.array([ordered[-1] - period, *ordered, ordered[0] + period])
+    entries = max(_ENTRIES, 2 ** len(ordered).bit_length()) - 1
+    return np.concatenate([ordered, np.full(entries - len(ordered), np.inf)])
+
+
+def _numbers(levels: Any) -> tuple[float, ...]:
+    try:
+        given = np.atleast_1d(np.asarray("none" if isinstance(levels, str) else levels, float))
+    except (TypeError, ValueError):
+        raise TypeError(f"levels of isolines must be numbers, not {levels!r}") from None
+    if given.ndim != 1 or not given.size or not np.isfinite(given).all():
+        raise ValueError(f"levels of isolines must be finite numbers, at least one, not {levels!r}")
+    return tuple(given.tolist())
+
+
+def checked_isolines(given: Any) -> tuple[Isolines, ...]:
+    """`Isolines`, or several, as a tuple; empty for None.
+
+    Raises:
+        TypeError: anything else.
+    """
+    if given is None:
+        return ()
+    listed: bool = isinstance(given, list | tuple)
+    several: list[Any] = [*given] if listed else [given]
+    for one in several:
+        if not isinstance(one, Isolines):
+            raise TypeError(
+                "isolines must be harnack.Isolines, or a list of them, such as "
+                f'hk.Isolines("z", spacing=0.1), not {one!r}'
+            )
+    return tuple(several)
+
+
+@dataclass(frozen=True)
+class PreparedIsolines:
+    """Isolines on a backend; all that a person changes is data.
+
+    volume: where the function is defined; None for all of space. spacing: of lines at its
+        multiples, or levels: a table for those at given ones.
+    """
+
+    function: Field
+    volume: Volume | None
+    half_width: Real
+    spacing: Real | None
+    levels: Real | None
+    period: Real | None
+
+    def cover(self, p: Vec3, normal: Vec3) -> Mask:
+        """Whether points of the surface, where it has a unit normal, are on a line."""
+        gap, along = self._rise(p, normal)
+        return gap < self.half_width * norm(along)
+
+    def pass_near(self, p: Vec3, normal: Vec3, across: Vec3, down: Vec3) -> Mask:
+        """Whether the edge of a line passes through a pixel, to first order, or near it.
+
+        across, down: from a pixel's middle on the surface to those of its neighbors.
+        """
+        gap, along = self._rise(p, normal)
+        reach = dr.abs(dr.dot(along, across)) + dr.abs(dr.dot(along, down))
+        return dr.abs(gap - self.half_width * norm(along)) < reach
+
+    def _rise(self, p: Vec3, normal: Vec3) -> tuple[Real, Vec3]:
+        """How far g is from the nearest level, and its gradient along the surface."""
+        sample = self.function.evaluate(p)
+        gradient = sample.gradient
+        along = gradient - dr.dot(gradient, normal) * normal
+        counts = norm(along) > _ROUNDING * norm(gradient)
+        if self.volume is not None:
+            counts &= self.volume.contains(p)
+        return self._gap(sample.value), dr.select(counts, along, 0)
+
+    def _gap(self, g: Real) -> Real:
+        if self.spacing is not None:
+            return dr.abs(g - self.spacing * dr.round(g / self.spacing))
+        if self.period is not None:
+            g = g - self.period * dr.floor(g / self.period)
+        table = cast("Any", self.levels)
+        index = dr.uint32_array_t(type(g))
+        # The number of entries below g, digit by digit; the table has one less than a power of 2.
+        below, step = index(0), (len(table) + 1) // 2
+        while step:
+            entry = dr.gather(type(g), table, below + (step - 1))
+            below, step = dr.select(entry < g, below + step, below), step // 2
+        before = dr.gather(type(g), table, dr.select(below > 0, below - 1, 0))
+        after = dr.gather(type(g), table, dr.minimum(below, len(table) - 1))
+        return dr.minimum(dr.abs(g - before), dr.abs(g - after))
+
+
+def line_at(lines: tuple[PreparedIsolines, ...], p: Vec3, normal: Vec3, index: Any) -> Index:
+    """The number of the line that points are on, counted from 1, the last of several; else 0.
+
+    index: the type of the numbers.
+    """
+    found = index(0)
+    for number, one in enumerate(lines, start=1):
+        found = dr.select(one.cover(p, normal), index(number), found)
+    return found

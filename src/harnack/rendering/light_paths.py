@@ -1,0 +1,353 @@
+"""Radiance of all pixels of a sensor, band by band.
+
+Each band of pixels gets all its samples at once, so that samplers can stratify them, and every
+pixel averages its own samples only. So there are no sums whose order threads could change: the
+same seed gives the same picture.
+
+How long a picture will take, told before it is begun.
+
+Noise taken out of pictures by Open Image Denoise, a neural network that runs on CPUs.
+
+It guesses: what comes out looks clean and is close to what more samples would have shown, but no
+number of it is a mean of samples any more.
+
+What shaded pictures show behind clear matter: rays go on through it, bent and tinted.
+
+Of the two ways that light takes at a boundary only the one through it is followed, and the one back
+where all of it is reflected; what else is reflected is the sky's light and a highlight. So a
+picture has no noise, and no caustics.
+"""
+
+from __future__ import annotations
+
+import importlib
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import numpy.typing as npt
+
+from harnack.backend import Mask, Real, to_numpy
+from harnack.rendering.integrator import PathTracer, Radiance, SobolSampler
+from harnack.rendering.mitsuba import index_of, refracted, transmittance
+from harnack.rendering.shading import Light, bands, film_places, uploaded
+from harnack.rendering.world import World, leaving_ray
+
+# Paths of one band at most: about two seconds on a CPU. Ctrl-C works between bands.
+PATHS_A_BAND = 2**21
+# The pixel's filter: samples are drawn from a Gaussian of this standard deviation, in pixels,
+# cut at two pixels from its middle (Ernst et al. 2006, filter importance sampling).
+_FILTER_DEVIATION = 0.45
+_FILTER_REACH = 2.0
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """Radiance of all pixels of a sensor.
+
+    image: linear sRGB and, last, the part that something covers (h, w, 4). lost: how many paths ran
+    out of steps. albedo, normal: means (h, w, 3) of what is met first, if they were asked for.
+    """
+
+    image: npt.NDArray[np.float32]
+    lost: int
+    albedo: npt.NDArray[np.float32] | None = None
+    normal: npt.NDArray[np.float32] | None = None
+
+
+def expose(
+    mi: Any,
+    scene: Any,
+    sensor: Any,
+    tracer: PathTracer,
+    *,
+    spp: int,
+    seed: int,
+    advance: Callable[[float], None],
+    features: bool = False,
+    paths_a_band: int = PATHS_A_BAND,
+) -> Exposure:
+    """All pixels, each with `spp` samples.
+
+    advance: told what part of the picture has been finished since the last call.
+    features: whether to find albedos and normals too.
+    """
+    width, height = (int(n) for n in sensor.film().crop_size())
+    image = np.empty((width * height, 10 if features else 4), dtype=np.float32)
+    lost = 0
+    for start, stop in bands(width * height, max(1, paths_a_band // spp)):
+        lane = dr.arange(mi.UInt32, (stop - start) * spp)
+        samples = dr.opaque(mi.UInt32, spp)
+        pixel, sample = lane // samples + dr.opaque(mi.UInt32, start), lane % samples
+        found, waves = follow(mi, scene, sensor, tracer, pixel, sample, seed, features)
+        covered = dr.select(found.valid, mi.Float(1), 0)
+        means = [mi.Vector4f(*as_rgb(mi, found.light, waves), covered)]
+        if found.features is not None:
+            means += [as_rgb(mi, found.features.albedo, waves), found.features.normal]
+        means = [to_numpy(mean_of_blocks(one, spp)) for one in means]
+        image[start:stop] = np.concatenate(means, axis=1)
+        lost += int(dr.count(found.lost)[0])
+        advance((stop - start) / (width * height))
+    image = image.reshape(height, width, -1)
+    if not features:
+        return Exposure(image, lost)
+    return Exposure(image[..., :4], lost, image[..., 4:7], image[..., 7:])
+
+
+def follow(
+    mi: Any, scene: Any, sensor: Any, tracer: PathTracer, pixel: Any, sample: Any, seed: int,
+    features: bool,
+) -> tuple[Radiance, Any]:  # fmt: skip
+    """What paths through samples of pixels find, as the sensor weighs it, and its wavelengths."""
+    width, height = (int(n) for n in sensor.film().crop_size())
+    zero, own = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, _mixed(seed))
+    sampler = SobolSampler(mi, pixel, sample, own, zero)
+    place = film_places(mi, pixel, _in_pixel(mi, sampler.next_2d()), (width, height))
+    ray, weight = _camera_ray(mi, sensor, sampler, place)
+    dr.eval(ray, weight)
+    found = tracer.trace(scene, sampler, ray, mi.Bool(True), features)
+    return replace(found, light=found.light * weight), ray.wavelengths
+
+
+def _mixed(seed: int) -> int:
+    """32 bits of any whole number: neighboring seeds have nothing in common."""
+    return int(np.random.SeedSequence(seed % 2**63).generate_state(1)[0])
+
+
+def _in_pixel(mi: Any, sample: Any) -> Any:
+    """A place in the pixel or near it, distributed as the filter."""
+    edge = float(dr.erf(_FILTER_REACH / _FILTER_DEVIATION / np.sqrt(2)))
+    gauss = dr.erfinv(edge * (2 * sample - 1)) * (np.sqrt(2) * _FILTER_DEVIATION)
+    return mi.Vector2f(gauss) + 0.5
+
+
+def _camera_ray(mi: Any, sensor: Any, sampler: Any, place: Any) -> tuple[Any, Any]:
+    time = sensor.shutter_open()
+    if sensor.shutter_open_time() > 0:
+        time = time + sampler.next_1d() * sensor.shutter_open_time()
+    wavelength = sampler.next_1d() if mi.is_spectral else 0
+    lens = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+    return sensor.sample_ray(time, wavelength, place, lens)
+
+
+def as_rgb(mi: Any, radiance: Any, wavelengths: Any) -> Any:
+    """A spectrum of the variant in linear sRGB."""
+    if mi.is_spectral:
+        matching = [mi.cie1931_xyz(wavelength) for wavelength in wavelengths]
+        xyz = sum(value * weights for value, weights in zip(radiance, matching, strict=True))
+        return mi.xyz_to_srgb(xyz * (mi.MI_CIE_Y_NORMALIZATION / len(matching)))
+    return mi.Color3f(radiance[0]) if mi.is_monochromatic else mi.Color3f(radiance)
+
+
+def mean_of_blocks(color: Any, spp: int) -> Any:
+    """The mean of each `spp` neighboring lanes."""
+    return type(color)(*(dr.block_sum(channel, spp) / spp for channel in color))
+
+
+# Paths that are tried: at first, how many times as many next, and no more than this part of all.
+_FIRST, _MORE, _PART = 2**12, 4, 1 / 16
+# So many times as long as the first can be told from what starting costs.
+_ENOUGH = 3.0
+# A picture that takes no longer is not told about, in seconds.
+SHORT = 15.0
+# Seconds between two moves of the progress bar, and the fewest paths of a band.
+_BAND, _FEWEST = 4.0, 2**14
+
+
+@dataclass(frozen=True)
+class Pace:
+    """Seconds for one path, and for all of a picture."""
+
+    path: float
+    picture: float
+
+    @property
+    def paths_a_band(self) -> int:
+        """Paths that take as long as a progress bar may stand still."""
+        return round(min(max(_BAND / max(self.path, 1e-9), _FEWEST), PATHS_A_BAND))
+
+    def __str__(self) -> str:
+        seconds = round(self.picture)
+        minutes, rest = divmod(seconds, 60)
+        hours, left = divmod(minutes, 60)
+        if seconds < 90:
+            return f"{seconds} s"
+        if minutes < 90:
+            return f"{minutes} min {rest // 10 * 10} s" if minutes < 10 else f"{minutes} min"
+        return f"{hours} h {left} min"
+
+
+def pace_of(
+    mi: Any, scene: Any, sensor: Any, tracer: PathTracer, *, spp: int, features: bool
+) -> Pace:
+    """Measured on a few paths all over the picture.
+
+    Starting costs the same however many paths there are, so what counts is how much longer four
+    times as many took. Of a picture of few paths nothing is measured, and its pace is 0.
+    """
+    width, height = (int(n) for n in sensor.film().crop_size())
+    pixels = width * height
+    whole = pixels * spp
+
+    def seconds(count: int) -> float:
+        # The golden ratio spreads any number of pixels evenly.
+        chosen = (np.arange(count) * 0.6180339887498949 % 1 * pixels).astype(np.int64)
+        pixel = uploaded(mi, np.minimum(chosen, pixels - 1))
+        sample = dr.opaque(mi.UInt32, 0, count)
+        began = time.perf_counter()
+        found, _ = follow(mi, scene, sensor, tracer, pixel, sample, 0, features)
+        dr.eval(found.light)
+        dr.sync_thread()
+        return time.perf_counter() - began
+
+    count, path = _FIRST, 0.0
+    if _MORE * count <= _PART * whole:
+        seconds(count)  # compiles
+        first = before = seconds(count)
+        while _MORE * count <= _PART * whole and before < _ENOUGH * first:
+            after = seconds(_MORE * count)
+            path = max(after - before, 0.0) / ((_MORE - 1) * count)
+            count, before = _MORE * count, after
+    return Pace(path, whole * path)
+
+
+def load_denoiser() -> Any:
+    """The package `pyoidn`.
+
+    Raises:
+        ModuleNotFoundError: it is not installed, or its library cannot be loaded.
+    """
+    try:
+        return importlib.import_module("pyoidn")
+    except ModuleNotFoundError:
+        raise ModuleNotFoundError(
+            "denoise needs Open Image Denoise: pip install 'harnack[denoise]'"
+        ) from None
+    except OSError as wrong:
+        raise ModuleNotFoundError(f"Open Image Denoise cannot be loaded: {wrong}") from None
+
+
+def denoised(found: Exposure) -> npt.NDArray[np.float32]:
+    """The image of an exposure with features, (h, w, 4), without noise. What part of each pixel is
+    covered stays as it is."""
+    if found.albedo is None or found.normal is None:
+        raise ValueError("an exposure without features cannot be denoised")
+    light = np.maximum(found.image[..., :3], 0)
+    features = (np.clip(found.albedo, 0, 1), np.clip(found.normal, -1, 1))
+    parts = [np.ascontiguousarray(part, dtype=np.float32) for part in (light, *features)]
+    clean = load_denoiser().denoise(parts[0], albedo=parts[1], normal=parts[2], hdr=True)
+    return np.concatenate([clean, found.image[..., 3:]], axis=-1)
+
+
+# Boundaries that a ray goes through; the next one is opaque.
+_MOST = 32
+# The highlight of matter with this reflectance straight on is that of other glossy materials.
+_USUAL = 0.04
+
+
+@dataclass
+class Sight:
+    """What rays see: the first thing that light does not pass through.
+
+    ray: the last part of their way. si, first: what it meets. throughput: what is left of the light
+    from there. gathered: the light that boundaries on the way reflect to the eye. traveled: the
+    length of the way before the last part.
+    """
+
+    ray: Any
+    si: Any
+    first: Any
+    throughput: Any
+    gathered: Any
+    traveled: Real
+    boundaries: Any
+    active: Mask
+
+
+class Through:
+    """Rays through the clear matter of a world.
+
+    indices: of refraction, of each carrier that is clear. hides_lights: whether shapes that shine
+        are not seen.
+    """
+
+    def __init__(self, world: World, light: Light, *, hides_lights: bool = False) -> None:
+        self.world, self.light = world, light
+        self.hidden = world.mi.Bool(True) if hides_lights else None
+        mi = world.mi
+        found = ((carrier, index_of(mi, carrier)) for carrier in world.carriers)
+        self.indices = tuple((carrier, index) for carrier, index in found if index is not None)
+
+    def look(self, ray: Any) -> Sight:
+        """What camera rays see."""
+        mi, world = self.world.mi, self.world
+        nothing = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray.d))
+        sight = Sight(
+            ray, nothing, world.nothing(nothing), mi.Spectrum(1), mi.Spectrum(0), mi.Float(0),
+            mi.UInt32(0), dr.full(mi.Bool, True, dr.width(ray.d)),
+        )  # fmt: skip
+        if not self.indices:
+            start = dr.zeros(mi.SurfaceInteraction3f)
+            sight.si, sight.first = world.intersect(ray, start, mi.Bool(True), self.hidden)
+            return sight
+
+        def running(sight: Sight) -> Mask:
+            return sight.active
+
+        def on(sight: Sight) -> tuple[Sight]:
+            return (self._on(sight),)
+
+        (sight,) = dr.while_loop((sight,), running, on, label="clear")
+        return sight
+
+    def _is_clear(self, si: Any) -> Mask:
+        clear = self.world.mi.Bool(False)
+        for carrier, _ in self.indices:
+            clear |= si.shape == self.world.mi.ShapePtr(carrier)
+        return clear
+
+    def _on(self, sight: Sight) -> Sight:
+        """The next thing that rays meet and, where it is clear, the way behind it."""
+        mi, world, d = self.world.mi, self.world, sight.ray.d
+        si, first = world.intersect(sight.ray, sight.si, sight.active, self.hidden)
+        throughput = sight.throughput * transmittance(mi, world.carriers, sight.si, si, d)
+        boundaries = sight.boundaries + 1
+        clear = self._is_clear(si) & (first.line == 0) & first.met & (boundaries <= _MOST)
+        index = mi.Float(1)
+        for carrier, own in self.indices:
+            index = dr.select(si.shape == mi.ShapePtr(carrier), own, index)
+        normal = mi.Vector3f(si.n)
+        onward, reflected = refracted(normal, d, index)
+        outside = clear & (dr.dot(normal, d) < 0)
+        gathered = dr.select(outside, throughput * self._reflected(si, d, index, reflected), 0)
+        part = dr.select(clear & (reflected < 1), 1 - reflected, 1)
+        way = leaving_ray(mi, si, first.clearance, onward)
+        return Sight(
+            ray=dr.select(clear, way, sight.ray),
+            si=si,
+            first=first,
+            throughput=throughput * part,
+            gathered=sight.gathered + gathered,
+            traveled=sight.traveled + dr.select(clear, first.t, 0),
+            boundaries=boundaries,
+            active=sight.active & clear,
+        )
+
+    def _reflected(self, si: Any, d: Any, index: Any, share: Real) -> Any:
+        """Light of the sky, and of the key light in a highlight, that boundaries send back."""
+        mi = self.world.mi
+        normal = mi.Vector3f(si.n)
+        back = d - 2 * dr.dot(normal, d) * normal
+        straight = dr.square((index - 1) / (index + 1))
+        black, one = dr.zeros(mi.Color3f), mi.Float(1)
+        gloss = self.light.on(black, normal, -d, mi.Bool(True), one) * (straight / _USUAL)
+        light = mi.Spectrum(gloss) if not mi.is_monochromatic else mi.Spectrum(mi.luminance(gloss))
+        sky = self.world.scene.environment()
+        if sky is not None:
+            seen = dr.zeros(mi.SurfaceInteraction3f)
+            seen.wi, seen.wavelengths = -back, si.wavelengths
+            light += share * sky.eval(seen)
+        return light

@@ -1,0 +1,260 @@
+"""Mitsuba, imported when it is first needed, with a variant that our surfaces can be drawn in.
+
+Mitsuba scenes in XML files: checked before, and errors told in words, after Mitsuba reads them.
+
+Mitsuba's parser looks at neither kind nor size of a file: it waits for ever at a pipe, and takes
+all memory for a file of many gigabytes.
+
+Clear matter: solids that light passes through, what they take away of it, and how they bend it.
+
+What a solid takes away follows Beer and Lambert: of light that travels a length t in it, the part
+tint^t is left. As going in and out of a solid alternate (`CappedSolid.meet`), a ray that leaves a
+point of its boundary against the outward normal is inside up to the next thing that it meets.
+"""
+
+from __future__ import annotations
+
+import codecs
+import importlib
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import Backend, backend_of, choose_backend
+from harnack.fields.expressions import looks_like_formula
+from harnack.files.file_format import MAX_BYTES, Place, read_bytes
+from harnack.files.surfaces import SURFACE_FILES
+
+_USABLE = re.compile(r"(llvm|cuda|metal)_ad_(mono|rgb|spectral)(_double)?")
+
+
+def load_mitsuba() -> Any:
+    """The `mitsuba` module, with a variant set.
+
+    A variant that was set before stays. If none was, it becomes cuda_ad_rgb, metal_ad_rgb or
+    llvm_ad_rgb, as `harnack.backend.choose_backend` finds a device.
+
+    Raises:
+        RuntimeError: Mitsuba lacks the device's variant, or the one that is set has no vectorised
+            arrays, or tracks polarization.
+        LLVMNotFoundError: LLVM is wanted and there is none that Dr.Jit can work with.
+    """
+    mi = importlib.import_module("mitsuba")
+    if mi.variant() is None:
+        wanted = f"{choose_backend().name}_ad_rgb"
+        if wanted not in mi.variants():
+            raise RuntimeError(
+                f"this Mitsuba has no variant {wanted}: set HARNACK_BACKEND=llvm to draw on the CPU"
+            )
+        mi.set_variant(wanted)
+    elif _USABLE.fullmatch(mi.variant()) is None:
+        raise RuntimeError(
+            f"the Mitsuba variant is {mi.variant()}, and surfaces are traced with Dr.Jit arrays "
+            "that have derivatives and no polarization: call "
+            'mitsuba.set_variant("llvm_ad_rgb") or ("cuda_ad_rgb") before the scene is made'
+        )
+    return mi
+
+
+def mitsuba_backend(mi: Any) -> Backend:
+    """Our name for the arrays of the variant that is set."""
+    return backend_of(mi.Float(0))
+
+
+_BYTE_ORDER_MARKS = {
+    codecs.BOM_UTF8: "utf-8", codecs.BOM_UTF32_LE: "utf-32", codecs.BOM_UTF32_BE: "utf-32",
+    codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16",
+    b"<\0": "utf-16-le", b"\0<": "utf-16-be",
+}  # fmt: skip
+# Elements that name files: <include filename="..."/>, <string name="filename" value="..."/>.
+_NAMES_A_FILE = re.compile(r"<(include|string)\b([^<>]*)>")
+_ATTRIBUTE = re.compile(r"""\b(filename|value)\s*=\s*(?:"([^"]*)"|'([^']*)')""")
+# What an error of Mitsuba says besides what is wrong: places in its own source, Python's traceback.
+_SOURCE_PLACE = re.compile(r"\[\w+\.(?:cpp|h):\d+\]\s*")
+_TRACEBACK = re.compile(r"Traceback \(most recent call last\):\n(?:[ \t]+.*\n)*(?:[\w.]+: )?")
+_REPEATED = re.compile(r"(?m)^(.*\n)(?:\1)+")
+
+
+def load_scene_file(mi: Any, path: str | os.PathLike[str]) -> Any:
+    """The scene in an XML file.
+
+    Raises:
+        FileFormatError: missing, no ordinary file, unreadable, empty, above 256 MiB, no XML; or
+            so for a file that it includes.
+        RuntimeError: Mitsuba cannot read it; the message says where.
+    """
+    path = Path(path)
+    check_scene_file(path)
+    try:
+        return mi.load_file(os.fspath(path), parallel=False)
+    except RuntimeError as error:
+        raise RuntimeError(without_traceback(str(error))) from error
+
+
+def load_dictionary(mi: Any, description: Mapping[str, Any]) -> Any:
+    """The scene, or another object of Mitsuba's, that a dictionary describes.
+
+    Raises:
+        RuntimeError: Mitsuba cannot make it; the message says which entry is wrong.
+    """
+    try:
+        return mi.load_dict({**description}, parallel=False)
+    except RuntimeError as error:
+        raise RuntimeError(without_traceback(str(error))) from error
+
+
+def check_scene_file(path: Path) -> None:
+    """Look at a scene file and the files that it names before Mitsuba does."""
+    if path.suffix.lower() in SURFACE_FILES:
+        raise Place(path).error(
+            "this is a surface file, not a Mitsuba scene (.xml): draw the field that "
+            "harnack.field_from_file.open_surface(path).field makes of it"
+        )
+    if looks_like_formula(str(path)) and not path.exists():
+        raise Place(path).error(
+            "there is no such file; of a formula, take the field harnack.expression(text)"
+        )
+    if not path.suffix and not path.exists():
+        raise Place(path).error(
+            "there is no such file; Mitsuba scenes are .xml files, and scenes of the gallery are "
+            "drawn by harnack.gallery.SCENES[name].render()"
+        )
+    seen = {path}
+    waiting = [path]
+    total = 0
+    while waiting:
+        text = _scene_text(waiting.pop())
+        total += len(text)
+        if total > MAX_BYTES:
+            raise Place(path).error(f"with what it includes it has more than {MAX_BYTES:,} bytes")
+        for element, name in _files_named(text):
+            file = path.parent / name
+            # What is not found here may lie where the scene tells Mitsuba to look.
+            if file in seen or not _exists(file):
+                continue
+            seen.add(file)
+            if element == "include":
+                waiting.append(file)
+            elif not file.is_file() and not file.is_dir():
+                raise Place(file).error("this is not an ordinary file")
+
+
+def _scene_text(path: Path) -> str:
+    """The text of a file that may be XML."""
+    data = read_bytes(path)
+    mark = next((mark for mark in _BYTE_ORDER_MARKS if data.startswith(mark)), b"")
+    text = data.decode(_BYTE_ORDER_MARKS.get(mark, "latin-1"), "replace")
+    if not text.lstrip("\ufeff \t\r\n").startswith("<"):
+        raise Place(path).error("this is no XML file: it does not begin with '<'")
+    if "\0" in text:
+        raise Place(path).error("this is binary data, not the text that its extension announces")
+    return text
+
+
+def _files_named(text: str) -> list[tuple[str, str]]:
+    """(element, name) of the files that a scene may name."""
+    return [
+        (element[1], attribute[2] or attribute[3])
+        for element in _NAMES_A_FILE.finditer(text)
+        for attribute in _ATTRIBUTE.finditer(element[2])
+        if attribute[2] or attribute[3]
+    ]
+
+
+def _exists(path: Path) -> bool:
+    try:
+        return path.exists()
+    except (OSError, ValueError):
+        return False
+
+
+def without_traceback(message: str) -> str:
+    """What an error of Mitsuba says is wrong, without Python's traceback and source lines."""
+    message = _SOURCE_PLACE.sub("", _TRACEBACK.sub("", message))
+    return _REPEATED.sub(r"\1", message).strip()
+
+
+# A solid whose index of refraction differs less from 1 does not bend light.
+_SAME = 1e-6
+
+
+def tint_of(mi: Any, tint: Any) -> Any:
+    """A texture of what is left of light after one unit of length; None where all of it is.
+
+    Raises:
+        TypeError, ValueError: not three numbers in (0, 1].
+    """
+    if tint is None:
+        return None
+    wrong = "tint is what is left of red, green and blue after one unit of length, in (0, 1]"
+    try:
+        color = [float(part) for part in tint]
+    except (TypeError, ValueError):
+        raise TypeError(f"{wrong}, such as (0.9, 0.5, 0.1), not {tint!r}") from None
+    if len(color) != 3 or not all(0 < part <= 1 for part in color):
+        raise ValueError(f"{wrong}, such as (0.9, 0.5, 0.1), not {tint!r}")
+    if min(color) == 1:
+        return None
+    return mi.load_dict({"type": "srgb", "color": color}, parallel=False)
+
+
+def index_of(mi: Any, carrier: Any) -> Any:
+    """The index of refraction of a solid that light passes through, relative to what is around it,
+    as a number that no kernel is compiled anew for; None for what is opaque, or no solid."""
+    bsdf = carrier.bsdf()
+    passes = (mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.GlossyTransmission)
+    if carrier.surface.solid is None or not any(mi.has_flag(bsdf.flags(), one) for one in passes):
+        return None
+    named = mi.traverse(bsdf)
+    for name, _ in named:
+        if name == "eta":
+            return dr.opaque(mi.Float, float(np.ravel(named[name])[0]))
+    return None
+
+
+def is_inside(mi: Any, carrier: Any, start: Any, d: Any) -> Any:
+    """Whether rays that leave interactions in directions d run inside a carrier's solid."""
+    leaves = start.is_valid() & (start.shape == mi.ShapePtr(carrier))
+    return leaves & (dr.dot(start.n, d) < 0)
+
+
+def transmittance(mi: Any, carriers: Any, start: Any, si: Any, d: Any) -> Any:
+    """What is left of light between interactions, along rays from `start` in directions d."""
+    left = mi.Spectrum(1)
+    for carrier in carriers:
+        if carrier.tint is None:
+            continue
+        inside = is_inside(mi, carrier, start, d) & si.is_valid()
+        # The spectrum of a reflectance of that color, at the ray's wavelengths.
+        once = mi.Spectrum(carrier.tint.eval(si, inside))
+        left *= dr.select(inside, dr.power(dr.maximum(once, 1e-6), si.t), 1)
+    return left
+
+
+def refracted(normal: Any, d: Any, index: Any) -> tuple[Any, Any]:
+    """Where rays in unit directions d go through a boundary with an outward unit normal, and how
+    much of unpolarized light is reflected there (Fresnel). All of it is where it is 1: then the
+    direction is that of the mirror.
+
+    index: of refraction, of the inside relative to the outside.
+    """
+    along = dr.dot(normal, d)
+    entering = along < 0
+    eta = dr.select(entering, 1 / index, index)
+    facing = dr.select(entering, 1, -1) * normal
+    cosine = dr.clip(dr.abs(along), 0, 1)
+    inner = 1 - eta * eta * (1 - cosine * cosine)
+    passes = inner > 0
+    inner = dr.sqrt(dr.maximum(inner, 0))
+    across = (eta * cosine - inner) / dr.maximum(eta * cosine + inner, 1e-9)
+    within = (cosine - eta * inner) / dr.maximum(cosine + eta * inner, 1e-9)
+    reflected = dr.select(passes, 0.5 * (across * across + within * within), 1)
+    reflected = dr.select(dr.abs(index - 1) < _SAME, 0, reflected)
+    through = eta * d + (eta * cosine - inner) * facing
+    away = d + 2 * cosine * facing
+    return dr.normalize(dr.select(passes, through, away)), reflected

@@ -1,0 +1,380 @@
+"""Colors as people give them: by the names of CSS, as hexadecimal numbers, or as three numbers.
+
+A bar of colors beside a picture, with ticks at nice numbers.
+
+Scales: which number has which color, and where ticks stand.
+
+Numbers as colors.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from harnack.names import did_you_mean
+from harnack.rendering.images import transferred
+
+Color = tuple[float, float, float]
+
+# The named colors of CSS Color Module Level 4, section 6.1, which are those of SVG.
+_NAMED = """
+    aliceblue=f0f8ff antiquewhite=faebd7 aqua=00ffff aquamarine=7fffd4 azure=f0ffff beige=f5f5dc
+    bisque=ffe4c4 black=000000 blanchedalmond=ffebcd blue=0000ff blueviolet=8a2be2 brown=a52a2a
+    burlywood=deb887 cadetblue=5f9ea0 chartreuse=7fff00 chocolate=d2691e coral=ff7f50
+    cornflowerblue=6495ed cornsilk=fff8dc crimson=dc143c cyan=00ffff darkblue=00008b
+    darkcyan=008b8b darkgoldenrod=b8860b darkgray=a9a9a9 darkgreen=006400 darkgrey=a9a9a9
+    darkkhaki=bdb76b darkmagenta=8b008b darkolivegreen=556b2f darkorange=ff8c00
+    darkorchid=9932cc darkred=8b0000 darksalmon=e9967a darkseagreen=8fbc8f darkslateblue=483d8b
+    darkslategray=2f4f4f darkslategrey=2f4f4f darkturquoise=00ced1 darkviolet=9400d3
+    deeppink=ff1493 deepskyblue=00bfff dimgray=696969 dimgrey=696969 dodgerblue=1e90ff
+    firebrick=b22222 floralwhite=fffaf0 forestgreen=228b22 fuchsia=ff00ff gainsboro=dcdcdc
+    ghostwhite=f8f8ff gold=ffd700 goldenrod=daa520 gray=808080 green=008000 greenyellow=adff2f
+    grey=808080 honeydew=f0fff0 hotpink=ff69b4 indianred=cd5c5c indigo=4b0082 ivory=fffff0
+    khaki=f0e68c lavender=e6e6fa lavenderblush=fff0f5 lawngreen=7cfc00 lemonchiffon=fffacd
+    lightblue=add8e6 lightcoral=f08080 lightcyan=e0ffff lightgoldenrodyellow=fafad2
+    lightgray=d3d3d3 lightgreen=90ee90 lightgrey=d3d3d3 lightpink=ffb6c1 lightsalmon=ffa07a
+    lightseagreen=20b2aa lightskyblue=87cefa lightslategray=778899 lightslategrey=778899
+    lightsteelblue=b0c4de lightyellow=ffffe0 lime=00ff00 limegreen=32cd32 linen=faf0e6
+    magenta=ff00ff maroon=800000 mediumaquamarine=66cdaa mediumblue=0000cd mediumorchid=ba55d3
+    mediumpurple=9370db mediumseagreen=3cb371 mediumslateblue=7b68ee mediumspringgreen=00fa9a
+    mediumturquoise=48d1cc mediumvioletred=c71585 midnightblue=191970 mintcream=f5fffa
+    mistyrose=ffe4e1 moccasin=ffe4b5 navajowhite=ffdead navy=000080 oldlace=fdf5e6 olive=808000
+    olivedrab=6b8e23 orange=ffa500 orangered=ff4500 orchid=da70d6 palegoldenrod=eee8aa
+    palegreen=98fb98 paleturquoise=afeeee palevioletred=db7093 papayawhip=ffefd5
+    peachpuff=ffdab9 peru=cd853f pink=ffc0cb plum=dda0dd powderblue=b0e0e6 purple=800080
+    rebeccapurple=663399 red=ff0000 rosybrown=bc8f8f royalblue=4169e1 saddlebrown=8b4513
+    salmon=fa8072 sandybrown=f4a460 seagreen=2e8b57 seashell=fff5ee sienna=a0522d silver=c0c0c0
+    skyblue=87ceeb slateblue=6a5acd slategray=708090 slategrey=708090 snow=fffafa
+    springgreen=00ff7f steelblue=4682b4 tan=d2b48c teal=008080 thistle=d8bfd8 tomato=ff6347
+    turquoise=40e0d0 violet=ee82ee wheat=f5deb3 white=ffffff whitesmoke=f5f5f5 yellow=ffff00
+    yellowgreen=9acd32
+"""
+NAMED_COLORS: Mapping[str, str] = MappingProxyType(
+    {name: number for name, _, number in (one.partition("=") for one in _NAMED.split())}
+)
+"""Hexadecimal numbers by name."""
+
+_HOW = 'a name of CSS such as "steelblue", "#4682b4", or three numbers from 0 to 1'
+
+
+def color_of(given: Any, what: str) -> Color:
+    """A color in sRGB, three numbers in [0, 1], as screens show them.
+
+    what: the color is of, for messages.
+
+    Raises:
+        TypeError: neither text nor three numbers.
+        ValueError: no known name, or numbers outside of [0, 1].
+    """
+    if isinstance(given, str):
+        return _from_text(given, what)
+    try:
+        numbers = [float("" if isinstance(one, str | bool) else one) for one in given]
+    except (TypeError, ValueError):
+        raise TypeError(f"{what} must be {_HOW}, not {given!r}") from None
+    if len(numbers) != 3:
+        raise TypeError(f"{what} must be {_HOW}, not {given!r}")
+    if not all(0 <= one <= 1 for one in numbers):
+        raise ValueError(f"{what} must be {_HOW}, not {given!r}")
+    return cast("Color", tuple(numbers))
+
+
+def _from_text(text: str, what: str) -> Color:
+    digits = NAMED_COLORS.get(text.strip().lower())
+    if digits is None:
+        found = re.fullmatch(r"#([0-9a-fA-F]{3}|[0-9a-fA-F]{6})", text.strip())
+        if found is None:
+            raise ValueError(
+                f"{what} must be {_HOW}, not {text!r}{did_you_mean(text, NAMED_COLORS)}"
+            )
+        digits = found[1] if len(found[1]) == 6 else "".join(2 * digit for digit in found[1])
+    red, green, blue = (int(digits[k : k + 2], 16) / 255 for k in (0, 2, 4))
+    return red, green, blue
+
+
+def linear(color: Color) -> Color:
+    """A color in sRGB as linear sRGB, which light adds up in (IEC 61966-2-1)."""
+    red, green, blue = (_linear(part) for part in color)
+    return red, green, blue
+
+
+def _linear(part: float) -> float:
+    return part / 12.92 if part <= 0.04045 else math.pow((part + 0.055) / 1.055, 2.4)
+
+
+# Least-squares polynomial of degree 6 to the map "viridis" (Smith and van der Walt, matplotlib,
+# 2015, CC0), lowest degree first; off by at most 0.017.
+_VIRIDIS = np.array(
+    [
+        [0.2745, 0.0058, 0.3327],
+        [0.1077, 1.3965, 1.3868],
+        [-0.3272, 0.2148, 0.0920],
+        [-4.5999, -5.7582, -19.2918],
+        [6.2037, 14.1540, 56.6563],
+        [4.7518, -13.7494, -65.3210],
+        [-5.4321, 4.6416, 26.2721],
+    ]
+)
+
+
+def viridis(x: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
+    """Colors (..., 3) in sRGB, in [0, 1], of numbers (...) in [0, 1]: dark blue to yellow.
+
+    Equal differences look equally large, and it reads well in gray and for the color-blind.
+    """
+    x = np.clip(np.nan_to_num(x), 0.0, 1.0).astype(np.float64)
+    colors = np.zeros((*x.shape, 3))
+    for coefficients in _VIRIDIS[::-1]:  # Horner
+        colors = colors * x[..., None] + coefficients
+    return np.clip(colors, 0.0, 1.0)
+
+
+# Of OKLab (Ottosson 2020): to the cube roots of cone responses, and from these to linear sRGB.
+_TO_CONES = np.array(
+    [
+        [1.0, 0.3963377774, 0.2158037573],
+        [1.0, -0.1055613458, -0.0638541728],
+        [1.0, -0.0894841775, -1.2914855480],
+    ]
+)
+_FROM_CONES = np.array(
+    [
+        [4.0767416621, -3.3077115913, 0.2309699292],
+        [-1.2684380046, 2.6097574011, -0.3413193965],
+        [-0.0041960863, -0.7034186147, 1.7076147010],
+    ]
+)
+# Of equally light colors in a circle: none leaves sRGB.
+_LIGHTNESS, _CHROMA = 0.72, 0.11
+
+
+def hues(x: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
+    """Colors (..., 3) in sRGB of numbers (...) of which 0 and 1 are the same: all hues, equally
+    light and equally far from gray."""
+    angle = 2 * np.pi * np.nan_to_num(x).astype(np.float64)
+    lab = np.stack(
+        [np.full_like(angle, _LIGHTNESS), _CHROMA * np.cos(angle), _CHROMA * np.sin(angle)], axis=-1
+    )
+    light = (lab @ _TO_CONES.T) ** 3 @ _FROM_CONES.T
+    return np.clip(transferred(light), 0.0, 1.0)
+
+
+def grays(x: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
+    """Grays (..., 3) of numbers (...) in [0, 1]: 0 is white, 1 is dark."""
+    gray = 0.25 + 0.75 * (1 - np.clip(np.nan_to_num(x), 0.0, 1.0).astype(np.float64))
+    return np.repeat(gray[..., None], 3, axis=-1)
+
+
+Numbers = npt.NDArray[np.floating[Any]]
+# Steps between ticks, as parts of a power of ten.
+_NICE = (1.0, 2.0, 5.0, 10.0)
+# Where ticks are closer than this, or numbers as large, they are written with an exponent.
+_SMALL, _LARGE = 1e-5, 1e7
+# Periods up to so many times pi have ticks at parts of it.
+_MOST_PI = 16
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Colors of numbers from `low` to `high`; others have those of the ends.
+
+    name: of what is shown, on color bars.
+    period: of numbers that count modulo `high` - `low` = period; None for others.
+    passed: whether numbers that are shown lie below `low`, and above `high`.
+    """
+
+    low: float
+    high: float
+    name: str
+    colors_of: Callable[[Numbers], npt.NDArray[np.float64]] = viridis
+    period: float | None = None
+    passed: tuple[bool, bool] = (False, False)
+
+    @classmethod
+    def cyclic(cls, period: float, name: str) -> Scale:
+        """Of numbers that count modulo a period: its ends have one color."""
+        return cls(0.0, period, name, hues, period)
+
+    def passed_by(self, numbers: Numbers) -> Scale:
+        """The same, for the bar of a picture that shows these."""
+        if self.period is not None or not numbers.size:
+            return self
+        slack = 1e-6 * max(abs(self.low), abs(self.high))
+        below, above = numbers.min() < self.low - slack, numbers.max() > self.high + slack
+        return replace(self, passed=(bool(below), bool(above)))
+
+    def colors(self, numbers: Numbers) -> npt.NDArray[np.float64]:
+        """Colors (..., 3) in sRGB, in [0, 1]."""
+        if self.period is not None:
+            return self.colors_of(np.mod(numbers, self.period) / self.period)
+        # The range of equal numbers is their rounding.
+        span = max(self.high - self.low, 1e-6 * abs(self.high), 1e-30)
+        return self.colors_of((numbers - self.low) / span)
+
+    def ticks(self, most: int) -> list[tuple[float, str]]:
+        """At most so many, but at least two: numbers and how they are written."""
+        period = 0.0 if self.period is None else self.period
+        turns = round(period / math.pi)
+        if 0 < turns <= _MOST_PI and math.isclose(period, turns * math.pi, rel_tol=1e-6):
+            return _parts_of_turns(turns, most)
+        if not self.high > self.low:
+            return [(self.low, f"{self.low:.4g}")]
+        step = _step((self.high - self.low) / max(most - 1, 1))
+        first, last = self._multiples(step)
+        if last - first < 1:  # one more than asked for, if that brings two
+            step = _step((self.high - self.low) / max(most + 1, 3))
+            first, last = self._multiples(step)
+        if last - first < 1:  # no room for two nice numbers
+            largest = max(abs(self.low), abs(self.high))
+            digits = 2 + max(2, math.ceil(math.log10(largest / (self.high - self.low))))
+            return [(end, f"{end:.{digits}g}") for end in (self.low, self.high)]
+        largest = max(abs(first), abs(last)) * step
+        return [(k * step, _written(k * step, step, largest)) for k in range(first, last + 1)]
+
+    def _multiples(self, step: float) -> tuple[int, int]:
+        """The first and the last multiple of a step in the range."""
+        return math.ceil(self.low / step - 1e-9), math.floor(self.high / step + 1e-9)
+
+
+def _step(least: float) -> float:
+    """The smallest nice number that is not less than a positive one."""
+    power = 10.0 ** math.floor(math.log10(least))
+    return next(part * power for part in _NICE if part * power >= least * (1 - 1e-9))
+
+
+def _written(number: float, step: float, largest: float) -> str:
+    """A multiple of a nice step, with the digits that it needs.
+
+    largest: of all that are written.
+    """
+    if number == 0:
+        return "0"
+    below = math.floor(math.log10(step) + 1e-9)  # the place of the last digit
+    if step >= _SMALL and largest < _LARGE:
+        return f"{number:.{max(0, -below)}f}"
+    digits = max(0, math.floor(math.log10(abs(number)) + 1e-9) - below)
+    mantissa, exponent = f"{number:.{digits}e}".split("e")
+    return f"{mantissa.rstrip('0').rstrip('.') if '.' in mantissa else mantissa}e{int(exponent)}"
+
+
+def _parts_of_turns(turns: int, most: int) -> list[tuple[float, str]]:
+    """Ticks of 0 to `turns` pi: at halves of pi, or at one, two, ... times pi."""
+    halves = next(
+        step for step in (1, 2, 4, 8, 16, 32)
+        if (2 * turns) // step + 1 <= max(most, 2) or step >= 2 * turns
+    )  # fmt: skip
+    return [(k * math.pi / 2, _as_pi(k)) for k in range(0, 2 * turns + 1, halves)]
+
+
+def _as_pi(halves: int) -> str:
+    """So many halves of pi."""
+    if halves == 0:
+        return "0"
+    times, below = (halves // 2, "") if halves % 2 == 0 else (halves, "/2")
+    return f"{'' if times == 1 else f'{times} '}pi{below}"
+
+
+Pixels = npt.NDArray[np.uint8]
+
+# Heights of letters and bar, and the bar's width, as parts of the picture's height; and the least
+# height of letters, in pixels.
+_LETTERS, _BAR, _WIDTH, _LEAST = 1 / 28, 0.78, 1 / 22, 10
+# Files that Pillow finds by name where they are installed, and a letter that none of them has.
+_TYPEFACES = (
+    "DejaVuSans.ttf", "NotoSans-Regular.ttf", "FreeSans.ttf", "LiberationSans-Regular.ttf",
+    "arial.ttf", "Arial.ttf", "Arial Unicode.ttf", "segoeui.ttf",
+)  # fmt: skip
+_NO_LETTER = "\uffff"
+_ON_DARK, _ON_LIGHT = (226, 226, 226), (26, 26, 28)
+
+
+def require_pillow() -> tuple[Any, Any, Any]:
+    """Pillow's images, drawings and typefaces.
+
+    Raises:
+        ModuleNotFoundError: it is not installed.
+    """
+    try:
+        from PIL import Image, ImageDraw, ImageFont
+    except ModuleNotFoundError:
+        raise ModuleNotFoundError(
+            "a color bar needs Pillow: pip install 'harnack[film]', or leave colorbar away"
+        ) from None
+    return Image, ImageDraw, ImageFont
+
+
+def typeface_for(text: str, size: int) -> Any:
+    """Pillow's own typeface, which has plain ASCII letters, or the first of this machine that has
+    all letters of a text.
+
+    Raises:
+        ValueError: none has them.
+    """
+    _, _, typefaces = require_pillow()
+    own = typefaces.load_default(size)
+    if text.isascii():
+        return own
+    for name in _TYPEFACES:
+        try:
+            one = typefaces.truetype(name, size)
+        except OSError:  # it is not installed
+            continue
+        none = bytes(one.getmask(_NO_LETTER))
+        if all(letter == " " or bytes(one.getmask(letter)) != none for letter in text):
+            return one
+    raise ValueError(
+        f"no typeface that was found here has all letters of {text!r}: install DejaVu Sans "
+        "(Debian's fonts-dejavu-core), or write the title in plain ASCII letters"
+    )
+
+
+def with_bar(pixels: Pixels, scale: Scale, background: Color) -> Pixels:
+    """A picture (h, w, 3) with the bar of its scale to the right: (h, w + more, 3).
+
+    An end of the bar is a point where the picture has numbers beyond it.
+    background: behind the bar, sRGB in [0, 1].
+    """
+    behind = tuple(round(255 * part) for part in background)
+    ink = _ON_LIGHT if sum(background) > 1.5 else _ON_DARK
+    images, drawings, _ = require_pillow()
+    height = len(pixels)
+    letters = max(_LEAST, round(_LETTERS * height))
+    font = typeface_for(scale.name, letters)
+    length = max(2, min(round(_BAR * height), height - 4 * letters))
+    thick, gap = max(3, round(_WIDTH * height)), max(2, letters // 2)
+    ticks = scale.ticks(max(2, min(6, length // (2 * letters))))
+    room = max(font.getlength(text) for _, text in ticks)
+    wide = max(thick + gap + room, font.getlength(scale.name))
+    strip = images.new("RGB", (math.ceil(wide) + 2 * letters, height), behind)
+    top = (height - length + letters) // 2
+    draw = drawings.Draw(strip)
+    point = gap if any(scale.passed) else 0  # its height
+    title = max(0, top - gap - point)
+    draw.text((letters, title), scale.name, font=font, fill=ink, anchor="ls")
+    values = scale.high - (np.arange(length) + 0.5) / length * (scale.high - scale.low)
+    if scale.period is not None:  # the upper end is the lower one
+        values = np.minimum(values, np.nextafter(scale.high, scale.low))
+    column = (scale.colors(values) * 255 + 0.5).astype(np.uint8)
+    for row, color in enumerate(column):
+        draw.line([(letters, top + row), (letters + thick - 1, top + row)], fill=tuple(color))
+    for is_passed, row, away, color in zip(
+        scale.passed, (top + length, top - 1), (point, -point), (column[-1], column[0]), strict=True
+    ):
+        if is_passed:
+            ends = [(letters, row), (letters + thick - 1, row), (letters + thick // 2, row + away)]
+            draw.polygon(ends, fill=tuple(color))
+    for value, text in ticks:
+        part = (value - scale.low) / (scale.high - scale.low) if scale.high > scale.low else 0.5
+        y = top + round((1 - part) * (length - 1))
+        right = letters + thick
+        draw.line([(right, y), (right + gap // 2, y)], fill=ink)
+        draw.text((right + gap, y), text, font=font, fill=ink, anchor="lm")
+    return np.concatenate([pixels, np.asarray(strip, dtype=np.uint8)], axis=1)

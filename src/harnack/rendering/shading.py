@@ -1,0 +1,374 @@
+"""Pixels in tiles and bands, and places within them.
+
+The light of shaded pictures: a formula, so that one ray a sample is all they need.
+
+A soft key light from the upper left of the camera, a hemisphere of light that is cooler above
+than below, and a gloss on what is glossy. `shaded.visible_sky` says how much
+of the hemisphere is hidden by what is near, `floor` where the studio's floor lies in shadow.
+
+The soft shadow on the studio's floor in shaded pictures: traced on a coarse grid, blurred.
+
+What is behind everything in a picture of the studio.
+
+The camera does not see the environment that lights the stage, but the ground going on to the
+horizon, and above it a wall of the same color that is darker higher up. So there is no edge at the
+horizon, however low the camera stands. Or it sees colors or an image, as they are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import drjit as dr
+import numpy as np
+import numpy.typing as npt
+
+from harnack.backend import BoolArray, FloatArray, IntArray, to_numpy
+from harnack.backend.arrays import aligned, aligned_integers
+from harnack.rendering.backdrops import FLOOR, Gradient, Ground, Photo, far_ground, reflectance_of
+from harnack.rendering.mitsuba import mitsuba_backend
+from harnack.rendering.scales import linear
+
+_TILE = 4
+# Neighbors that differ by more than this, of 255, are an edge.
+_EDGE = 16
+
+
+def bands(pixels: int, step: int) -> Iterator[tuple[int, int]]:
+    """(start, stop) of runs of at most `step` pixels: Ctrl-C works between them."""
+    for start in range(0, pixels, step):
+        yield start, min(start + step, pixels)
+
+
+def in_tiles(size: tuple[int, int]) -> IntArray:
+    """All pixels of a picture, counted by rows, one square of 4 x 4 after the other.
+
+    Rays that a processor follows together then have about the same length, whatever the size.
+    """
+    width, height = size
+    rows, columns = -(-height // _TILE), -(-width // _TILE)
+    y, x = np.indices((rows * _TILE, columns * _TILE))
+    inside = (x < width) & (y < height)
+    tiles = np.where(inside, y * width + x, -1).reshape(rows, _TILE, columns, _TILE)
+    order = tiles.swapaxes(1, 2).ravel()
+    return order[order >= 0]
+
+
+def uploaded(mi: Any, pixels: IntArray) -> Any:
+    """Pixels as one of Mitsuba's arrays."""
+    return aligned_integers(mitsuba_backend(mi), pixels)
+
+
+def film_places(mi: Any, pixel: Any, offset: Any, size: tuple[int, int]) -> Any:
+    """Places on the film, in [0, 1]^2, of offsets in [0, 1]^2 within pixels counted by rows."""
+    place = mi.Vector2f(pixel % size[0], pixel // size[0]) + offset
+    return mi.Point2f(place / mi.ScalarVector2f(*size))
+
+
+def stratified(spp: int) -> int:
+    """The samples a pixel, at least `spp`, that can be arranged in a nearly square grid."""
+    rows = max(1, math.isqrt(spp))
+    return rows * -(-spp // rows)
+
+
+def grid_offsets(count: int) -> FloatArray:
+    """At least `count` places (n, 2) in the unit square, always the same.
+
+    The canonical arrangement of multi-jittering (Kensler 2013): one in each cell of a grid, and
+    no two in the same row or column of the n x n grid, so that edges of any slope look smooth.
+    """
+    total = stratified(count)
+    rows = max(r for r in range(1, total + 1) if total % r == 0 and r * r <= total)
+    columns = total // rows
+    j, i = (index.ravel() for index in np.mgrid[:rows, :columns])
+    x = (i + (j + 0.5) / rows) / columns
+    y = (j + (i + 0.5) / columns) / rows
+    return np.column_stack([x, y])
+
+
+def edges_of(picture: npt.NDArray[np.uint8]) -> BoolArray:
+    """Pixels (h, w) of a picture (h, w, 3) that differ visibly from one of four neighbors."""
+    shown = picture.astype(np.int64)
+    edge = np.zeros(shown.shape[:2], dtype=np.bool_)
+    across = (np.abs(np.diff(shown, axis=1)) > _EDGE).any(axis=-1)
+    down = (np.abs(np.diff(shown, axis=0)) > _EDGE).any(axis=-1)
+    edge[:, 1:] |= across
+    edge[:, :-1] |= across
+    edge[1:] |= down
+    edge[:-1] |= down
+    return edge
+
+
+Color = tuple[float, float, float]
+
+# Irradiance over pi, linear sRGB: of the key light at its brightest, and of the hemisphere.
+_KEY: Color = (0.74, 0.71, 0.66)
+_ABOVE: Color = (0.36, 0.40, 0.46)
+_BELOW: Color = (0.25, 0.225, 0.20)
+# Towards the key light, along the camera's axes to the right, up and back.
+_TO_KEY = np.array([-0.52, 0.62, 0.59]) / np.linalg.norm([-0.52, 0.62, 0.59])
+# The key light reaches round to where its cosine is minus this.
+_WRAP = 0.25
+# How much of the key light is taken away where the whole hemisphere is hidden.
+_KEY_HIDDEN = 0.6
+_HIGHLIGHT = 0.22
+_SHARPNESS = 60.0
+_RIM = 0.45
+# What shines through is drawn in this; mirrors keep their hue.
+_CLEAR: Color = (0.52, 0.60, 0.64)
+_METAL = 0.78
+# The side of larger values of a surface that has one color for both.
+_INSIDE: Color = (0.52, 0.60, 0.74)
+# Where a level set spans what a mesh leaves open: this share of amber, or of teal on warm colors.
+_MENDED = 0.55
+_AMBER: Color = (0.92, 0.40, 0.06)
+_TEAL: Color = (0.05, 0.40, 0.46)
+
+
+@dataclass(frozen=True)
+class Light:
+    """Unit vectors, as lists of three numbers, to the key light and to the brighter hemisphere."""
+
+    key: Sequence[float]
+    up: Sequence[float]
+
+    @classmethod
+    def of(cls, world_from_camera: FloatArray) -> Light:
+        """The light that goes with a camera, from its matrix (4, 4): x left, y up, z forward."""
+        left, up, forward = (axis / np.linalg.norm(axis) for axis in world_from_camera[:3, :3].T)
+        key = np.stack([-left, up, -forward], axis=1) @ _TO_KEY
+        return cls(key.tolist(), up.tolist())
+
+    def on(
+        self, color: Any, normal: Any, eye: Any, glossy: Any, visible: Any, reached: Any = 1.0
+    ) -> Any:
+        """Radiance towards the eye; all are Dr.Jit arrays.
+
+        color: reflectance. normal, eye: unit, on the same side. glossy: mask. visible: the part
+        of the hemisphere over the normal that nothing near hides, and reached: the part of the
+        key light that is not in shadow, in [0, 1].
+        """
+        key, up = _parameter(normal, self.key), _parameter(normal, self.up)
+        wrapped = dr.clip((dr.dot(normal, key) + _WRAP) / (1 + _WRAP), 0, 1)
+        shown = (1 - _KEY_HIDDEN * (1 - visible)) * reached
+        share = 0.5 + 0.5 * dr.dot(normal, up)
+        sky = dr.lerp(_like(color, _BELOW), _like(color, _ABOVE), share) * visible
+        radiance = color * (_like(color, _KEY) * (wrapped * shown) + sky)
+        half = dr.normalize(key + eye)
+        # Where the light is below the horizon there is no highlight, and no edge to it either.
+        spot = _HIGHLIGHT * dr.power(dr.maximum(dr.dot(normal, half), 0), _SHARPNESS)
+        rim = _RIM * dr.power(1 - dr.clip(dr.dot(normal, eye), 0, 1), 5)
+        gloss = _like(color, _KEY) * (spot * wrapped * shown) + sky * rim
+        return radiance + dr.select(glossy, gloss, 0)
+
+
+def reflectance(color: Any, painted: Any) -> Any:
+    """What a surface is drawn in, from the reflectance that its BSDF reports straight on.
+
+    painted: mask of lines, which are of that reflectance, and black where it is 0.
+    """
+    own = color
+    top = dr.max(color)
+    metal = dr.square(color / top) * _METAL  # what is seen in a mirror has met it more than once
+    color = dr.select(top > 1, metal, color)
+    return dr.select(painted, own, dr.select(top > 0, color, _like(color, _CLEAR)))
+
+
+def of_side(color: Any, other: Any, inside: Any) -> Any:
+    """The color of a side: that of larger values is darker and cooler if the other is as it.
+
+    inside: mask of what is seen from the side of larger values.
+    """
+    same = dr.max(dr.abs(color - other)) < 1e-4
+    return dr.select(inside & same, color * _like(color, _INSIDE), color)
+
+
+def of_mended(color: Any, mended: Any) -> Any:
+    """The color, tinted where a level set spans what a mesh leaves open."""
+    tint = dr.select(color[0] > 1.6 * color[2], _like(color, _TEAL), _like(color, _AMBER))
+    return dr.select(mended, dr.lerp(color, tint, _MENDED), color)
+
+
+def _parameter(array: Any, numbers: Sequence[float]) -> Any:
+    """Numbers as a vector of the kind of another, which no kernel is compiled anew for."""
+    vector = _like(array, numbers)
+    dr.make_opaque(vector)
+    return vector
+
+
+def _like(array: Any, numbers: Sequence[float]) -> Any:
+    """Numbers as an array of the kind of another."""
+    return type(array)(*numbers)
+
+
+# Cells a side of a square of half this side, which holds what stands on the stage and its shadow.
+_CELLS = 64
+_REACH = 2.4
+# Rays of a cell to the key light and to the sky. Each of 4 x 4 neighboring cells has others.
+_RAYS = 8
+_BLOCK = 4
+# The tangent of the angle that the key light seems wide, and how far the rays look.
+_SPREAD = 0.34
+_FAR = 3.5
+# Weights of a cell and its neighbors along each axis: a block's cells count nearly alike.
+_BLUR = (0.05, 0.2, 0.25, 0.25, 0.2, 0.05)
+
+
+class Casting(Protocol):
+    """What casts shadows, such as a `World`."""
+
+    @property
+    def mi(self) -> Any: ...
+
+    def occluded(self, ray: Any, active: Any) -> Any:
+        """Whether rays of Mitsuba's meet anything."""
+        ...
+
+
+@dataclass(frozen=True)
+class Floor:
+    """What of the key light and of the sky reaches the floor: a texture of two channels."""
+
+    mi: Any
+    texture: Any
+
+    @classmethod
+    def of(cls, world: Casting, light: Light) -> Floor:
+        """Traced in a studio."""
+        mi = world.mi
+        cell = (np.arange(_CELLS) + 0.5) / _CELLS * 2 * _REACH - _REACH
+        y, x = np.meshgrid(cell, cell, indexing="ij")
+        seen = _parts_seen(world, x, y, np.stack([_to_key(light.key), _to_sky()]))
+        image = np.stack([_blurred(part) for part in seen], axis=-1)
+        numbers = mi.Float(aligned(mitsuba_backend(mi), image.ravel()))
+        tensor = mi.TensorXf(numbers, image.shape)
+        return cls(mi, mi.Texture2f(tensor, wrap_mode=dr.WrapMode.Clamp))
+
+    def at(self, position: Any) -> tuple[Any, Any]:
+        """The parts of key light and sky that reach points of the floor; 1 for other points."""
+        mi = self.mi
+        on_floor = position.z < 0.5 * FLOOR
+        place = mi.Point2f(position.x, position.y) / (2 * _REACH) + 0.5
+        key, sky = self.texture.eval(dr.select(on_floor, place, 0))
+        return dr.select(on_floor, key, 1), dr.select(on_floor, sky, 1)
+
+
+def _parts_seen(world: Casting, x: FloatArray, y: FloatArray, towards: FloatArray) -> FloatArray:
+    """What parts (k, n, n) of their directions (k, 16, rays, 3) points of the floor see free."""
+    mi = world.mi
+    j, i = np.indices(x.shape)
+    d = towards[:, (j % _BLOCK) * _BLOCK + i % _BLOCK]
+    o = np.stack([x, y, np.zeros_like(x)], axis=-1)[:, :, None]
+    o = np.broadcast_to(o, d.shape)
+    ray = mi.Ray3f(_vectors(mi.Point3f, o), _vectors(mi.Vector3f, d))
+    ray.maxt = mi.Float(_FAR)
+    free = to_numpy(~world.occluded(ray, mi.Bool(True)))
+    parts: FloatArray = free.reshape(d.shape[:-1]).mean(axis=-1)
+    return parts
+
+
+def _vectors(kind: Any, rows: FloatArray) -> Any:
+    return kind(np.ascontiguousarray(rows.reshape(-1, 3).T, dtype=np.float32))
+
+
+def _square() -> FloatArray:
+    """Places (16, rays, 2) in the unit square, spread evenly (Roberts 2018)."""
+    k = np.arange(_BLOCK * _BLOCK * _RAYS)
+    plastic = 1.32471795724474602596  # the real root of x^3 = x + 1
+    places = np.mod(0.5 + np.outer(k, [1 / plastic, 1 / plastic**2]), 1.0)
+    return places.reshape(_RAYS, _BLOCK * _BLOCK, 2).transpose(1, 0, 2)
+
+
+def _to_key(key: Any) -> FloatArray:
+    """Directions (16, rays, 3) to places on the round key light."""
+    axis = np.asarray(key, dtype=np.float64)
+    u = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    u /= np.linalg.norm(u)
+    radius, turn = _SPREAD * np.sqrt(_square()[..., :1]), 2 * math.pi * _square()[..., 1:]
+    d = axis + radius * (np.cos(turn) * u + np.sin(turn) * np.cross(axis, u))
+    d[..., 2] = np.maximum(d[..., 2], 0.05)  # the floor itself casts no shadow
+    return d / np.linalg.norm(d, axis=-1, keepdims=True)
+
+
+def _to_sky() -> FloatArray:
+    """Directions (16, rays, 3) to the sky, distributed with the cosine."""
+    s, turn = np.moveaxis(_square(), -1, 0)
+    across = np.sqrt(s)
+    return np.stack([across * np.cos(2 * math.pi * turn), across * np.sin(2 * math.pi * turn),
+                     np.sqrt(np.maximum(1 - s, 1e-3))], axis=-1)  # fmt: skip
+
+
+def _blurred(image: FloatArray) -> FloatArray:
+    """The image (n, n) of what is free, on both axes; outside of it everything is."""
+    kernel = np.convolve(_BLUR, [0.5, 0.5])  # of odd length: it stays in place
+    for _ in range(2):
+        rows = [np.convolve(row, kernel, mode="valid") for row in _framed(image, len(kernel) // 2)]
+        image = np.array(rows).T
+    return image
+
+
+def _framed(image: FloatArray, width: int) -> FloatArray:
+    return np.pad(image, ((0, 0), (width, width)), constant_values=1.0)
+
+
+# How much darker the wall is straight above.
+_DARKER = 0.45
+FloatImage = npt.NDArray[np.float32]
+
+
+def wall(mi: Any, sensor: Any, ground: Ground, azimuth: float, show: str) -> FloatImage:
+    """Radiance (h, w, 3) of a ground and the wall behind it, in the middle of each pixel.
+
+    azimuth: of the camera, in degrees. show: "color" or "shaded".
+    """
+    width, height = (int(n) for n in sensor.film().crop_size())
+    pixel = dr.arange(mi.UInt32, width * height)
+    place = film_places(mi, pixel, mi.Vector2f(0.5), (width, height))
+    ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, place, mi.Point2f(0.5))
+    rise = np.clip(to_numpy(ray.d)[:, 2], 0, 1) ** 0.7
+    far = far_ground(ground.name, azimuth)
+    if show == "shaded":
+        far = _far_shaded(mi, sensor, ground)
+    image = far * (1 - _DARKER * rise[:, None])
+    return image.astype(np.float32).reshape(height, width, 3)
+
+
+def _far_shaded(mi: Any, sensor: Any, ground: Ground) -> FloatArray:
+    """Radiance (3,) of the ground far away, in the light of shaded pictures."""
+    matrix = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
+    color = mi.Color3f(*reflectance_of(ground.name).tolist())
+    up, one = mi.Vector3f(0, 0, 1), mi.Float(1)
+    lit = Light.of(matrix).on(color, up, up, mi.Bool(False), one)
+    return to_numpy(lit).reshape(3).astype(np.float64)
+
+
+def flat(mi: Any, backdrop: Gradient | Photo, size: tuple[int, int]) -> FloatImage:
+    """Linear sRGB (h, w, 3) of colors or an image in a picture of (width, height) pixels."""
+    if isinstance(backdrop, Photo):
+        return _covering(mi, backdrop.pixels, size)
+    width, height = size
+    if backdrop.bottom == backdrop.top:
+        rows = np.array([[linear(backdrop.top)]], dtype=np.float32)
+    else:  # even steps in sRGB look even
+        rise = (height - 0.5 - np.arange(height)[:, None]) / height
+        shown = (1 - rise) * np.array(backdrop.bottom) + rise * np.array(backdrop.top)
+        rows = np.array([[linear(tuple(row))] for row in shown.tolist()], dtype=np.float32)
+    return np.broadcast_to(rows, (height, width, 3))
+
+
+def _covering(mi: Any, image: FloatImage, size: tuple[int, int]) -> FloatImage:
+    """The largest part of an image, around its middle, that has the shape of a picture of
+    (width, height) pixels, as large as that."""
+    height, width = image.shape[:2]
+    scale = max(size[0] / width, size[1] / height)
+    part = [min(round(side / scale), own) for side, own in zip(size, (width, height), strict=True)]
+    columns, rows = (max(one, 1) for one in part)
+    left, top = (width - columns) // 2, (height - rows) // 2
+    cut = np.ascontiguousarray(image[top : top + rows, left : left + columns])
+    if (columns, rows) == size:
+        return cut
+    bitmap = mi.Bitmap(cut).resample(mi.ScalarVector2u(*size), clamp=(0.0, np.inf))
+    return np.array(bitmap, dtype=np.float32)

@@ -1,0 +1,314 @@
+"""Named materials: Mitsuba BSDF dictionaries that look well in the studio.
+
+A small photo studio: ground, lights and a camera that frames what stands there.
+
+Surfaces are scaled to a stage of radius about 1 that stands on the ground z = 0, so that lights,
+shadows and tolerances of Mitsuba's rays suit every size.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import numpy as np
+
+from harnack.backend import FloatArray
+from harnack.names import did_you_mean
+from harnack.rendering.backdrops import FLOOR, Backdrop, Ground, ground, lights
+from harnack.rendering.camera import Camera, Pose
+from harnack.rendering.framing import check_size, upright, visible_points
+from harnack.rendering.isolines import Isolines
+from harnack.rendering.mitsuba import mitsuba_backend
+from harnack.rendering.placement import Placement
+from harnack.rendering.plugins import shape
+from harnack.rendering.scales import NAMED_COLORS, Color, color_of, linear
+from harnack.tracer import LevelSet, Tolerance
+
+Dictionary = dict[str, Any]
+
+# How rough a surface is that only a color is given of: between porcelain and eggshell. No paint
+# reflects all light, or none.
+_PAINT, _BLACK, _WHITE = 0.2, 0.005, 0.9
+
+
+def _rgb(color: Color) -> Dictionary:
+    """A color as linear sRGB reflectance."""
+    return {"type": "rgb", "value": list(color)}
+
+
+def _glazed(color: Color, roughness: float) -> Dictionary:
+    """A colored base under a clear coat."""
+    return {
+        "type": "roughplastic",
+        "diffuse_reflectance": _rgb(color),
+        "alpha": roughness,
+        "nonlinear": True,
+    }
+
+
+def _metal(name: str, roughness: float) -> Dictionary:
+    return {"type": "roughconductor", "material": name, "alpha": roughness, "distribution": "ggx"}
+
+
+@dataclass(frozen=True)
+class Material:
+    """What a surface is made of.
+
+    front: BSDF of the side of larger values (the normal's side); of a solid, its outside.
+    back: of the other side of an open surface; None for the same as the front.
+    two_sided: whether open surfaces are to be seen from both sides. A BSDF that takes care of
+        that itself does not want it.
+    transparent: light passes through it, so that only a solid can be made of it.
+    tint: what it leaves of red, green and blue light that passes through one unit of length on the
+        stage, where half the diagonal of all that stands there is 1; None for all.
+    """
+
+    front: Dictionary
+    back: Dictionary | None = None
+    two_sided: bool = True
+    transparent: bool = False
+    tint: Color | None = None
+
+    def __post_init__(self) -> None:
+        if self.tint is not None and not self.transparent:
+            raise ValueError(
+                "tint needs a material that light passes through: give transparent=True too"
+            )
+
+    def bsdf(self, *, solid: bool, traced_light: bool = True) -> Dictionary:
+        """The BSDF's dictionary for a solid or an open surface.
+
+        traced_light: whether light is to be traced at it; otherwise only its diffuse reflectance
+            and its kind are asked for, and the dictionary may be of a BSDF that is made sooner.
+
+        Raises:
+            ValueError: the material is transparent, and the surface is open.
+        """
+        front, back = self.front, self.back
+        if not traced_light:
+            front, back = _without_table(front), back and _without_table(back)
+        if solid:
+            return front
+        if self.transparent:
+            raise ValueError(
+                "light passes through this material, so what is made of it needs an inside: give "
+                "solid=(low, high), for instance solid=(-math.inf, level)"
+            )
+        if not self.two_sided:
+            return front
+        nested: Dictionary = {"type": "twosided", "front": front}
+        return nested if back is None else {**nested, "back": back}
+
+
+def _without_table(bsdf: Dictionary) -> Dictionary:
+    """A BSDF with the same diffuse reflectance, which takes no 0.07 s for a table of what a rough
+    coat lets through."""
+    if bsdf.keys() != _glazed((0, 0, 0), 0).keys() or bsdf["type"] != "roughplastic":
+        return bsdf
+    return {**{key: bsdf[key] for key in bsdf if key != "alpha"}, "type": "plastic"}
+
+
+def _tinted(tint: Color, index: float = 1.5) -> Material:
+    """Glass that takes some of the light away."""
+    glass: Dictionary = {"type": "dielectric", "int_ior": index, "ext_ior": 1.0}
+    return Material(glass, transparent=True, tint=tint)
+
+
+def _painted(color: Color) -> Material:
+    red, green, blue = (max(_WHITE * part, _BLACK) for part in color)
+    return Material(_glazed((red, green, blue), _PAINT))
+
+
+MATERIALS: Mapping[str, Material] = {
+    "two-tone": Material(_glazed((0.80, 0.255, 0.11), 0.22), _glazed((0.07, 0.25, 0.40), 0.22)),
+    "eggshell": Material(_glazed((0.66, 0.13, 0.06), 0.3), _glazed((0.80, 0.74, 0.64), 0.3)),
+    "clay": Material({"type": "diffuse", "reflectance": _rgb((0.72, 0.62, 0.53))}),
+    "porcelain": Material(_glazed((0.84, 0.83, 0.80), 0.06)),
+    "plastic": Material(_glazed((0.62, 0.05, 0.07), 0.10)),
+    "gold": Material(_metal("Au", 0.10)),
+    "copper": Material(_metal("Cu", 0.12)),
+    "silver": Material(_metal("Ag", 0.12)),
+    "glass": Material({"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}, transparent=True),
+    "frosted": Material(
+        {"type": "roughdielectric", "int_ior": 1.5, "ext_ior": 1.0, "alpha": 0.12}, transparent=True
+    ),
+    "amber": _tinted((0.86, 0.42, 0.06)),
+    "cobalt": _tinted((0.10, 0.24, 0.72)),
+    "jelly": _tinted((0.80, 0.12, 0.16), 1.35),
+}
+"""Materials by name."""
+
+
+def material_of(wanted: Any) -> Material:
+    """A material from its name, from a color, or from a BSDF dictionary used as it stands.
+
+    Raises:
+        TypeError: it is none of these.
+        ValueError: there is no material or color of that name.
+    """
+    if wanted is None:
+        return MATERIALS["two-tone"]
+    if isinstance(wanted, Material):
+        return wanted
+    if isinstance(wanted, Mapping):
+        return Material(dict(cast("Mapping[str, Any]", wanted)), two_sided=False)
+    if isinstance(wanted, str) and wanted.strip().lower() in MATERIALS:
+        return MATERIALS[wanted.strip().lower()]
+    try:
+        return _painted(linear(color_of(wanted, "material")))
+    except TypeError:
+        raise TypeError(
+            f"a material is a name, a color, a Material or a BSDF dictionary, not {wanted!r}; "
+            f"there are {', '.join(MATERIALS)}"
+        ) from None
+    except ValueError:
+        raise ValueError(
+            f"unknown material {wanted!r}; there are {', '.join(MATERIALS)}, and colors, by a "
+            f'name of CSS, "#rrggbb" or three numbers from 0 to 1'
+            f"{did_you_mean(wanted, (*MATERIALS, *NAMED_COLORS))}"
+        ) from None
+
+
+# Of fitted surfaces, on the stage. Those of many parts end inside the picture, in the edges of two:
+# what a ray meets within the tolerance of such an edge has the normal of neither.
+_TOLERANCE, _OF_PARTS = 1e-4, 1e-5
+# Light of one path, where white is 1.
+_CLAMP = 2.0
+# Rays begin at most twice _NEAR before the stage. Clip distances are literals of kernels: as whole
+# multiples they are the same for almost all cameras, whose pictures so share their kernels.
+_NEAR, _FAR = 60.0, 2e4
+_FARTHEST = 5e3
+_LIGHT = Ground("light")
+
+
+@dataclass(frozen=True)
+class StudioObject:
+    """A surface on the stage.
+
+    fitted: whether to give it a tolerance that suits its size in place of its own.
+    cut: the material of the faces on the section of a solid; None for that of the rest.
+    isolines: drawn on it.
+    """
+
+    surface: LevelSet
+    material: Material
+    fitted: bool = False
+    cut: Material | None = None
+    isolines: tuple[Isolines, ...] = ()
+
+
+@dataclass(frozen=True)
+class Studio:
+    """A scene dictionary, and what a picture of it needs besides.
+
+    placement: of the surfaces in it. backdrop: as asked for. azimuth: of the camera. has_ground:
+        whether the surfaces stand on a floor.
+    """
+
+    scene: dict[str, Any]
+    placement: Placement
+    backdrop: Backdrop
+    azimuth: float
+    has_ground: bool
+
+
+def studio(
+    mi: Any,
+    studio_objects: Sequence[StudioObject],
+    *,
+    size: tuple[int, int],
+    camera: Camera,
+    backdrop: Backdrop = _LIGHT,
+    up: Any = "z",
+    bare: bool = False,
+    traced_light: bool = True,
+) -> Studio:
+    """Surfaces on the stage, seen in a picture of (width, height) pixels.
+
+    up: the direction of the surfaces' coordinates that is up on the stage, as `upright` takes it.
+    bare: only surfaces and camera, without ground and lights.
+    traced_light: whether the picture follows light paths, and so needs whole materials.
+    """
+    backend = mitsuba_backend(mi)
+    if camera.box is None:
+        points = np.concatenate([visible_points(one.surface, backend) for one in studio_objects])
+    else:
+        points = _corners(np.array(camera.box.bounds()))
+    placement = on_ground(points, upright(up))
+    pose = camera.pose(placement.apply(points), size, placement.apply)
+    scene: dict[str, Any] = {
+        "type": "scene",
+        "integrator": {
+            "type": "harnack_path",
+            "clamp": _CLAMP,
+            "hide_emitters": True,
+        },
+        "sensor": _sensor(mi, pose, size),
+    }
+    for k, one in enumerate(studio_objects):
+        surface = one.surface
+        if one.fitted:
+            close = _OF_PARTS if surface.field.has_parts else _TOLERANCE
+            surface = replace(surface, tolerance=Tolerance(close / placement.scale))
+        bsdf = one.material.bsdf(solid=surface.solid is not None, traced_light=traced_light)
+        cut = None if one.cut is None else one.cut.bsdf(solid=True, traced_light=traced_light)
+        scene[f"surface{k}"] = shape(
+            surface, bsdf=bsdf, to_world=placement.matrix, tint=one.material.tint, cut_bsdf=cut,
+            isolines=one.isolines,
+        )  # fmt: skip
+    has_ground = False
+    if not bare:
+        scene |= lights(mi, pose.azimuth)
+        if isinstance(backdrop, Ground) and pose.origin[2] > FLOOR:
+            has_ground = True  # from below, it would hide everything
+            scene |= ground(mi, backdrop.name)
+    return Studio(scene, placement, backdrop, pose.azimuth, has_ground)
+
+
+def _corners(ends: FloatArray) -> FloatArray:
+    """Corners (8, 3) of a box (2, 3) of a size that can be drawn."""
+    check_size(ends)
+    return np.array(list(itertools.product(*ends.T)))
+
+
+def on_ground(points: FloatArray, turned: FloatArray | None = None) -> Placement:
+    """Turns points (n, 3), scales them to half a diagonal of 1 and puts them on the ground."""
+    turned = np.eye(3) if turned is None else turned
+    points = points @ turned.T
+    lower, upper = points.min(axis=0), points.max(axis=0)
+    scale = 2.0 / max(float(np.linalg.norm(upper - lower)), 1e-30)
+    foot = np.array([*(lower + upper)[:2] / 2, lower[2]])
+    return Placement(scale, turned, -scale * foot)
+
+
+def _sensor(mi: Any, pose: Pose, size: tuple[int, int]) -> dict[str, Any]:
+    # Rays begin near the stage, however far the camera is: their origins are rounded.
+    away = float(np.linalg.norm(pose.origin))
+    if away > _FARTHEST:
+        raise ValueError(
+            f"the camera is {away:,.0f} times as far away as the surface is large; pictures are "
+            f"computed in single precision, which reaches to {_FARTHEST:,.0f} times"
+        )
+    look = mi.ScalarTransform4f().look_at(
+        origin=pose.origin.tolist(), target=pose.target.tolist(), up=pose.up.tolist()
+    )
+    return {
+        "type": "perspective",
+        "fov": pose.fov,
+        "fov_axis": "larger",
+        "near_clip": max(1e-3, _NEAR * (away // _NEAR - 1)),
+        "far_clip": _FAR,
+        "to_world": look,
+        "film": {
+            "type": "hdrfilm",
+            "width": size[0],
+            "height": size[1],
+            "rfilter": {"type": "gaussian"},
+            "pixel_format": "luminance" if mi.is_monochromatic else "rgb",
+            "component_format": "float32",
+        },
+        "sampler": {"type": "multijitter", "sample_count": 64},
+    }

@@ -1,1 +1,0 @@
-"""A photo studio for surfaces: stage, camera, lights and materials."""

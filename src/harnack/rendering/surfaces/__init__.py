@@ -1,1 +1,0 @@
-"""Surfaces as rays meet them: where they are, their normals, solids. Knows no Mitsuba."""

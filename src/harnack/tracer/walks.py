@@ -1,0 +1,359 @@
+"""Rays through fields that jump: from one crossing of a sheet to the next.
+
+Between two crossings the field is continuous, and the marching loop proves that ray interval as it
+proves any ray. What is added here is which interval comes next.
+
+A smooth hit is a point within tolerance of a level of the function that continues the interval. Its
+level set may end at a sheet, so within tolerance of where it does a ray may hit although the sheet
+cuts the level off: mostly near singular edges, where gradients grow without limit.
+
+Rays through surfaces that are made of many level sets, each in a box: the first hit of all.
+
+Each part is marched as any field is. What is added here is which part comes next, and how far it
+need be followed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+
+from harnack.backend.elementary import fmax, fmin, largest_coordinate
+from harnack.backend.loops import while_active
+from harnack.fields.sheets import NO_PART, NO_SHEET, Crossing, PartEntry
+from harnack.tracer.contact import ON_SHEET, Status
+from harnack.tracer.march import March, MarchState
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.fields.field import Field
+    from harnack.fields.look import Path
+
+# Sheets are at the same place if they are no farther apart than so many roundings of coordinates,
+# and the cosine of the angle between them is larger than the second; of rays that graze them, as if
+# the third were the sine of the angle to them.
+_SAME, _PARALLEL, _STEEP = 2.0, 0.999, 1 / 64
+
+
+@dataclass(frozen=True)
+class SheetWalk:
+    """Where rays are: the field's offset, the crossing last passed, and the state of the march.
+
+    named: index of the sheet that was looked at last, of rays that look for crossings.
+    """
+
+    offset: Real
+    behind: Crossing
+    march: MarchState
+    named: Any | None = None
+
+    @property
+    def active(self) -> Mask:
+        return self.march.active
+
+
+@dataclass(frozen=True)
+class _Together:
+    """Crossings at the same place: the sum of their jumps, the last of them, and the first of those
+    that jump up and down."""
+
+    jump: Real
+    t: Real
+    last: Any
+    up: Any
+    down: Any
+    normal_up: Vec3
+    normal_down: Vec3
+    active: Mask
+
+
+@dataclass(frozen=True)
+class SheetTracer:
+    """Rays through a field with sheets, from `start` to `end`, and how to march one interval."""
+
+    march: March
+    field: Field
+    path: Path
+    start: Real
+    end: Real
+
+    @property
+    def backend(self) -> Backend:
+        return self.march.backend
+
+    def run(self, state: MarchState) -> tuple[MarchState, Any]:
+        """The end state of rays, and the index of the sheet that each hit (NO_SHEET: none).
+
+        Proof that no hit is missed: crossings come in order, so the intervals cover the ray. On
+        each of them the field is the continuous one that `march` sees, up to and including its
+        last point, where the value behind the sheet is compared with that before it; from there
+        it goes on with the step that the value behind the sheet allows. So the part of the ray
+        up to `proved_to` is free of smooth levels, and every sheet on it was looked at.
+
+        The walk begins just before `start`, so that a sheet on the very start is looked at.
+        """
+        return self.end_of(while_active(self.begin(state), self.next, "harnack intervals"))
+
+    def begin(self, state: MarchState) -> SheetWalk:
+        """Rays at their start."""
+        real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
+        o, d = self.path.origin, self.path.direction
+        before = real(self.start * (1 - self.backend.epsilon) - 1e-30)
+        offset = real(self.field.offset(o, d, before, state.active))
+        start = Crossing(before, count(NO_SHEET), real(0), vector(0))
+        named = None if state.contact is None else count(NO_SHEET)
+        return SheetWalk(offset, start, state, named)
+
+    def end_of(self, outer: SheetWalk) -> tuple[MarchState, Any]:
+        """The state of rays, and the index of the sheet that each is on, NO_SHEET for none."""
+        count, end = self.backend.UInt32, outer.march
+        on_sheet = end.status == ON_SHEET
+        status = dr.select(on_sheet, count(int(Status.HIT)), end.status)
+        named = outer.behind.sheet if outer.named is None else outer.named
+        sheet = dr.select(on_sheet, named, count(NO_SHEET))
+        return dataclasses.replace(end, status=status), sheet
+
+    def next(self, outer: SheetWalk) -> SheetWalk:
+        """One interval: to the next crossing or the end of the ray, or to a hit."""
+        count = self.backend.UInt32
+        o, d = self.path.origin, self.path.direction
+        behind, now = outer.behind, outer.march
+        ahead, last = self._together(self._next(behind, self.end, now.active), now.active)
+        stops = ahead.sheet != NO_SHEET
+        stop = dr.select(stops, ahead.t, self.end)
+        # The last step may already have proved the rest of the ray.
+        goes_on = now.proved_to + now.proved_step < stop
+        if now.contact is not None and self.march.hysteresis is not None:
+            undecided = now.contact.is_touching & self.march.hysteresis.is_free_after
+            goes_on |= undecided & (now.proved_to < stop)
+        active = now.active & (stops | goes_on)
+        step = fmin(self.march.overstep * now.proved_step, stop - now.proved_to)
+        now = dataclasses.replace(now, trial_step=step, active=active)
+        field = self.field.between(o, d, behind, ahead, outer.offset)
+        now = self.march.advance(field, self.path, stop, now, ahead)
+        passed = active & stops & (now.status == int(Status.MISS))
+        if now.contact is not None:
+            return self._passed(outer, now, ahead, last, passed, active & stops)
+        spent = passed & (now.evaluations >= self.march.max_steps)
+        status = dr.select(spent, count(int(Status.OUT_OF_STEPS)), now.status)
+        # A sheet that was hit is the one to be named; one that was passed, the last of all there.
+        crossing = Crossing(
+            dr.select(passed, last.t, ahead.t),
+            dr.select(passed, last.sheet, ahead.sheet),
+            ahead.jump,
+            ahead.normal,
+        )
+        return SheetWalk(
+            dr.select(passed, outer.offset + ahead.jump, outer.offset),
+            crossing,
+            dataclasses.replace(now, status=status, active=passed & ~spent),
+        )
+
+    def _passed(
+        self,
+        outer: SheetWalk,
+        now: MarchState,
+        ahead: Crossing,
+        last: Crossing,
+        passed: Mask,
+        stopped: Mask,
+    ) -> SheetWalk:
+        """The walk of rays that look for crossings: one that has crossed the level on a sheet has
+        passed the sheet, and may be made active again."""
+        spent = passed & (now.evaluations >= self.march.max_steps)
+        status = dr.select(spent, self.backend.UInt32(int(Status.OUT_OF_STEPS)), now.status)
+        through = passed | (stopped & (now.status == ON_SHEET))
+        behind = Crossing(
+            dr.select(through, last.t, outer.behind.t),
+            dr.select(through, last.sheet, outer.behind.sheet),
+            dr.select(through, ahead.jump, outer.behind.jump),
+            dr.select(through, ahead.normal, outer.behind.normal),
+        )
+        return SheetWalk(
+            dr.select(through, outer.offset + ahead.jump, outer.offset),
+            behind,
+            dataclasses.replace(now, status=status, active=passed & ~spent),
+            dr.select(through, ahead.sheet, outer.named),
+        )
+
+    def _together(self, first: Crossing, active: Mask) -> tuple[Crossing, Crossing]:
+        """All crossings at the t of the first as one, and the last of them.
+
+        A ray through an edge or a vertex crosses several sheets at once, in no order of theirs:
+        what they do to f there is the sum of their jumps, and between them there is nothing. So do
+        rays through sheets in one plane: those that lie closer behind each other than coordinates
+        are rounded are at the same t, for their order is that of rounding. The sheet named is the
+        first one that jumps as all of them together do.
+        """
+        real, count = self.backend.Float, self.backend.UInt32
+        size = largest_coordinate(self.path.origin)
+        close = _SAME * self.backend.epsilon * (size + first.t)
+        steep = fmax(dr.abs(dr.dot(first.normal, self.path.direction)), real(_STEEP))
+        furthest = fmax(fmin(first.t + close / steep, self.end), first.t)
+
+        def body(now: _Together) -> _Together:
+            one = self._next(Crossing(now.t, now.last, 0.0, first.normal), furthest, now.active)
+            # Sheets at an angle to each other are at the same t or apart.
+            level = dr.abs(dr.dot(one.normal, first.normal)) > _PARALLEL
+            found = now.active & (one.sheet != NO_SHEET) & ((one.t == first.t) | level)
+            new_up = found & (one.jump > 0) & (now.up == NO_SHEET)
+            new_down = found & (one.jump < 0) & (now.down == NO_SHEET)
+            return _Together(
+                jump=now.jump + dr.select(found, one.jump, 0),
+                t=dr.select(found, one.t, now.t),
+                last=dr.select(found, one.sheet, now.last),
+                up=dr.select(new_up, one.sheet, now.up),
+                down=dr.select(new_down, one.sheet, now.down),
+                normal_up=dr.select(new_up, one.normal, now.normal_up),
+                normal_down=dr.select(new_down, one.normal, now.normal_down),
+                active=found,
+            )
+
+        none = count(NO_SHEET)
+        start = _Together(
+            jump=first.jump,
+            t=first.t,
+            last=first.sheet,
+            up=dr.select(first.jump > 0, first.sheet, none),
+            down=dr.select(first.jump < 0, first.sheet, none),
+            normal_up=first.normal,
+            normal_down=first.normal,
+            active=self.backend.Bool(active) & (first.sheet != NO_SHEET),
+        )
+        all_there = while_active(start, body, "together")
+        up, down = all_there.jump > 0, all_there.jump < 0
+        sheet = dr.select(up, all_there.up, dr.select(down, all_there.down, first.sheet))
+        normal = dr.select(
+            up, all_there.normal_up, dr.select(down, all_there.normal_down, first.normal)
+        )
+        behind = Crossing(all_there.t, all_there.last, first.jump, first.normal)
+        return Crossing(first.t, sheet, real(all_there.jump), normal), behind
+
+    def _next(self, behind: Crossing, end: Real, active: Mask) -> Crossing:
+        """The field's answer as arrays of this backend; none if it lies beyond the end."""
+        real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
+        ahead = self.field.next_crossing(self.path.origin, self.path.direction, behind, end, active)
+        there = real(ahead.t) <= end
+        there &= count(ahead.sheet) != NO_SHEET
+        return Crossing(
+            dr.select(there, real(ahead.t), dr.inf),
+            dr.select(there, count(ahead.sheet), count(NO_SHEET)),
+            dr.select(there, real(ahead.jump), 0),
+            vector(*ahead.normal),
+        )
+
+
+@dataclass(frozen=True)
+class PartWalk:
+    """Where rays are among parts, and the nearest end of a march so far.
+
+    enter, box: of the box entered last. t: of the first hit, or the end of the ray; or to where a
+    ray out of steps is free. value, gradient, excess, status: of the march that ended there.
+    part: that of the hit, NO_PART for none. active: whether there may be more parts.
+    """
+
+    enter: Real
+    box: Any
+    t: Real
+    value: Real
+    gradient: Vec3
+    excess: Real
+    evaluations: Any
+    status: Any
+    part: Any
+    active: Mask
+
+
+@dataclass(frozen=True)
+class PartTracer:
+    """Rays through a field with parts, from `start` to `end`, and how to march one part.
+
+    any_hit: whether any hit will do, and not the first alone.
+    """
+
+    march: March
+    field: Field
+    path: Path
+    start: Real
+    end: Real
+    any_hit: bool = False
+
+    def run(self, state: MarchState) -> tuple[MarchState, Any]:
+        """The end state of rays, and the index of the part that each hit (NO_PART: none).
+
+        Proof that no hit is missed: a part's level set lies in its box, and boxes come in the order
+        in which the ray enters them, all that it meets. Each is marched from where the ray enters
+        it to where it leaves it, or to the first hit so far if that comes before; so up to a hit
+        the ray is free of every part whose box it entered before the hit, and all others come
+        behind. A ray that is out of steps in a part is proved free up to where it entered that.
+        """
+        walk = while_active(self.begin(state), self.next, "harnack parts")
+        return self.end_of(walk)
+
+    def begin(self, state: MarchState) -> PartWalk:
+        """Rays before the first box."""
+        real, count = self.march.backend.Float, self.march.backend.UInt32
+        return PartWalk(
+            enter=real(-1),
+            box=count(NO_PART),
+            t=real(self.end),
+            value=state.value,
+            gradient=state.gradient,
+            excess=state.excess,
+            evaluations=state.evaluations,
+            status=state.status,
+            part=count(NO_PART),
+            active=state.active,
+        )
+
+    def end_of(self, walk: PartWalk) -> tuple[MarchState, Any]:
+        """The state of rays, and the index of the part that each hit, NO_PART for none."""
+        backend = self.march.backend
+        before = MarchState.at(backend, self.start, self.end, walk.active, has_detail=False)
+        end = dataclasses.replace(
+            before,
+            proved_to=walk.t,
+            value=walk.value,
+            gradient=walk.gradient,
+            excess=walk.excess,
+            evaluations=walk.evaluations,
+            status=walk.status,
+            active=walk.active,
+        )
+        return end, walk.part
+
+    def next(self, walk: PartWalk) -> PartWalk:
+        """One part more: the next whose box is entered before the first hit so far."""
+        backend, path = self.march.backend, self.path
+        after = PartEntry(walk.enter, walk.enter, walk.box)
+        entry = self.field.next_part(
+            path.origin, path.direction, after, self.start, walk.t, walk.active
+        )
+        active = walk.active & (entry.part != NO_PART)
+        near, far = fmax(entry.enter, self.start), fmin(entry.leave, walk.t)
+        part = self.field.part_at(dr.select(active, entry.part, 0))
+        spent = active & (walk.evaluations >= self.march.max_steps)
+        now = MarchState.at(backend, near, far, active & ~spent, has_detail=False)
+        now = dataclasses.replace(now, evaluations=backend.UInt32(walk.evaluations))
+        now = self.march.advance(part, path, backend.Float(far), now)
+        out = backend.UInt32(int(Status.OUT_OF_STEPS))
+        hit = active & (now.status == int(Status.HIT))
+        lost = spent | (active & (now.status == int(Status.OUT_OF_STEPS)))
+        ended = hit | lost
+        looked = active & (ended | (walk.part == NO_PART))
+        goes_on = active & ~ended if self.any_hit else active & ~lost
+        return PartWalk(
+            enter=entry.enter,
+            box=entry.part,
+            t=dr.select(hit, now.proved_to, dr.select(lost, near, walk.t)),
+            value=dr.select(looked, now.value, walk.value),
+            gradient=dr.select(ended, now.gradient, walk.gradient),
+            excess=dr.select(ended, now.excess, walk.excess),
+            evaluations=dr.select(active, now.evaluations, walk.evaluations),
+            status=dr.select(hit, now.status, dr.select(lost, out, walk.status)),
+            part=dr.select(hit, entry.part, dr.select(lost, NO_PART, walk.part)),
+            active=goes_on,
+        )

@@ -1,0 +1,412 @@
+"""An octree over a box, of which cells that are proved empty are left out.
+
+Equal cubes, most of them empty, and how far a ray stays among the empty ones.
+
+Groups of cells that are separated by cells proved empty, and the largest of them.
+
+Equal cubes of which those that are proved to hold no level are known: rays jump across them.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, cast
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import BoolArray, FloatArray
+from harnack.backend.arrays import aligned_integers
+from harnack.backend.elementary import clamp, fmin, largest_coordinate
+from harnack.geometry import ConvexHull
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, IntArray, Mask, Real, Vec3
+
+__all__ = [
+    "Cells",
+    "Clearance",
+    "GridCell",
+    "GridLayout",
+    "OccupiedCells",
+    "Octree",
+    "UniformGrid",
+    "carve",
+    "distances_to_full",
+    "largest_connected_component",
+    "octree",
+    "short_length",
+    "union",
+    "wrapped_points",
+]
+
+Clearance: TypeAlias = Callable[[FloatArray], FloatArray]
+"""For points (n, 3) lengths (n,): no point of the set is nearer than that."""
+
+_OCTANTS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Boxes of one size, (3,) edges, at corners (n, 3), the least of their coordinates."""
+
+    corners: FloatArray
+    size: FloatArray
+
+    @property
+    def centers(self) -> FloatArray:
+        """(n, 3)."""
+        return self.corners + 0.5 * self.size
+
+    @property
+    def half_diagonal(self) -> float:
+        """The radius of the balls around them."""
+        return 0.5 * float(np.linalg.norm(self.size))
+
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """The least and the largest coordinates (3,) of all."""
+        return self.corners.min(axis=0), self.corners.max(axis=0) + self.size
+
+    def wrapped(self, slack: float) -> ConvexHull:
+        """A polytope around all of them, `slack` thicker, with the 26 directions of a cube's faces,
+        edges and corners."""
+        return _wrapped(self.centers, 0.5 * self.size + slack)
+
+    def split(self) -> Cells:
+        """Eight of each."""
+        half = 0.5 * self.size
+        return Cells((self.corners[:, None] + _OCTANTS * half).reshape(-1, 3), half)
+
+    def some(self, which: BoolArray) -> Cells:
+        """Those chosen by a mask (n,)."""
+        return Cells(self.corners[which], self.size)
+
+    def proved_empty(self, clearance: Clearance, margin: float = 0.0) -> BoolArray:
+        """(n,) whether a cell's ball is within the clearance of its center; that of the cell
+        enlarged on all sides by `margin` times its size."""
+        if not len(self.corners):
+            return np.zeros(0, np.bool_)
+        return clearance(self.centers) > self.half_diagonal * (1 + 2 * margin + 1e-9)
+
+
+def wrapped_points(points: FloatArray, slack: float) -> ConvexHull:
+    """A polytope around points (n, 3), `slack` thicker, with the directions of `Cells.wrapped`."""
+    return _wrapped(points, np.full(3, slack))
+
+
+def union(one: ConvexHull, other: ConvexHull) -> ConvexHull:
+    """The smallest polytope with the directions of `Cells.wrapped` around two such."""
+    return ConvexHull(
+        one.normals,
+        np.maximum(one.offsets, other.offsets),
+        np.minimum(one.lower, other.lower),
+        np.maximum(one.upper, other.upper),
+    )
+
+
+def _wrapped(centers: FloatArray, half: FloatArray) -> ConvexHull:
+    """The polytope around boxes of half sizes (3,)."""
+    normals = np.array([v for v in itertools.product((-1, 0, 1), repeat=3) if any(v)], float)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    offsets = (centers @ normals.T).max(axis=0) + np.abs(normals) @ half
+    return ConvexHull(normals, offsets, centers.min(axis=0) - half, centers.max(axis=0) + half)
+
+
+@dataclass(frozen=True)
+class Octree:
+    """Cells of a box: those of the finest size that may hold the set, and those proved empty on the
+    way there, coarsest first. Together they fill the box."""
+
+    leaves: Cells
+    empty: tuple[Cells, ...]
+
+
+def octree(
+    cells: Cells, clearance: Clearance, most: int, finest: int, margin: float = 0.0
+) -> Octree:
+    """Split `cells`, again and again, where they are not proved empty.
+
+    most: cells that are looked at in one round; when it would be more, no further round is made.
+    finest: rounds at most; each halves the edges.
+    margin: as for `Cells.proved_empty`.
+    """
+    empty: list[Cells] = []
+    for _ in range(finest):
+        if 8 * len(cells.corners) > most:
+            break
+        split = cells.split()
+        free = split.proved_empty(clearance, margin)
+        cells = split.some(~free)
+        empty.append(split.some(free))
+    return Octree(cells, tuple(empty))
+
+
+def carve(
+    lower: FloatArray, upper: FloatArray, clearance: Clearance, most: int, finest: int
+) -> Cells:
+    """The leaves of the octree of one box; there are none where the box is proved empty."""
+    root = Cells(np.array(lower)[None], np.array(upper) - np.array(lower))
+    return octree(root, clearance, most, finest).leaves
+
+
+# Of what is true beyond an empty cell, this part of a cell is left to the rounding of positions.
+_ROUNDING = 1 / 64
+
+
+Layout = TypeVar("Layout", bound="GridLayout")
+
+
+@dataclass(frozen=True)
+class GridLayout:
+    """A grid on the host.
+
+    origin: (3,) its lower corner, numbers of single precision. cell: the side of a cell
+        (`short_length`). shape: cells a side. The first cell's neighbor is the next along x.
+    free: (cells,) 0 where a cell is not empty, else the distance to the nearest that is not, in
+        cells, the largest of the three coordinates.
+    """
+
+    origin: FloatArray
+    cell: float
+    shape: tuple[int, int, int]
+    free: IntArray
+
+
+@dataclass(frozen=True)
+class UniformGrid:
+    """A grid on a backend, all numbers of it as data.
+
+    margin: in cells; the cube around an empty cell that is so much larger on all sides is empty.
+    Outside of the grid all is as in its nearest cell.
+    """
+
+    backend: Backend
+    origin: Vec3
+    size: Real
+    shape: Vec3
+    free: Any
+    margin: float
+
+    @staticmethod
+    def placed(backend: Backend, layout: GridLayout) -> tuple[Backend, Vec3, Real, Vec3, Any]:
+        """The first five numbers of a grid."""
+
+        def vector(numbers: Any) -> Vec3:
+            return backend.Array3f(*(dr.opaque(backend.Float, float(one)) for one in numbers))
+
+        return (
+            backend,
+            vector(layout.origin),
+            dr.opaque(backend.Float, layout.cell),
+            vector(layout.shape),
+            aligned_integers(backend, layout.free),
+        )
+
+    def cell(self, p: Vec3) -> GridCell:
+        """The cell in which p lies, or the nearest one."""
+        place = (p - self.origin) / self.size
+        corner = type(p)(*(clamp(dr.floor(place[k]), 0, self.shape[k] - 1) for k in range(3)))
+        x, y, z = (self.backend.UInt32(corner[k]) for k in range(3))
+        row, layer = self.backend.UInt32(self.shape.x), self.backend.UInt32(self.shape.y)
+        return GridCell(self, place, corner, x + row * (y + layer * z))
+
+    def run(self, p: Vec3, d: Vec3, length: Real) -> Real:
+        """How far p + s d stays in empty cells; about `length` if it is that at least.
+
+        Proof. The cell of a point and all fewer than `free` away are empty, and so is what is
+        within the margin around each: the cube of these cells, wider by the margin. A step
+        leaves that cube by `margin` less `_ROUNDING` at most, so that all of it is empty; the rest
+        of the margin is for the rounding of positions. Steps end where a cell is not empty.
+        """
+
+        def state_of(s: Real) -> tuple[Real, Mask]:
+            cell = self.cell(dr.fma(type(p)(s), d, p))
+            free = cell.free
+            return dr.select(free > 0, s + cell.exit(d, self.backend.Float(free)), s), free > 0
+
+        def body(s: Real, active: Mask) -> tuple[Real, Mask]:
+            further, empty = state_of(s)
+            return dr.select(active, further, s), active & empty & (further < length)
+
+        start = self.backend.Float(0) + 0 * p.x
+        active = dr.full(self.backend.Bool, True, 1) & (start == start) & (length > 0)
+
+        def running(s: Real, active: Mask) -> Mask:
+            del s
+            return active
+
+        return dr.while_loop((start, active), running, body, label="empty cells")[0]
+
+    def resolves(self, o: Vec3, end: Real) -> Mask:
+        """Whether rounding leaves points of rays up to `end` in their cells or close to them."""
+        rounding = 4 * self.backend.epsilon * (largest_coordinate(o) + end)
+        return (rounding < _ROUNDING * self.size) & dr.all(dr.isfinite(o))
+
+    def free_until(self, o: Vec3, d: Vec3, t: Real, end: Real) -> Real:
+        """A place up to which rays o + t d, |d| = 1, stay in empty cells from t on, at most `end`.
+
+        It is t itself where coordinates are so large that rounding might lead into another cell:
+        a point is off by at most four roundings of the largest number in it.
+        """
+        length = dr.select(self.resolves(o, end), end - t, 0)
+        run = self.run(dr.fma(type(o)(t), d, o), d, length)
+        return dr.select(length > 0, fmin(t + run, end), t)
+
+
+@dataclass(frozen=True)
+class GridCell:
+    """Where points lie: their place in units of cells, the cell's lower corner, and its index."""
+
+    grid: UniformGrid
+    place: Vec3
+    corner: Vec3
+    index: Any
+
+    @property
+    def free(self) -> Any:
+        """See `GridLayout`."""
+        return dr.gather(self.grid.backend.UInt32, self.grid.free, self.index)
+
+    def exit(self, d: Vec3, around: Real = 1.0) -> Real:
+        """How far the path with direction d stays among the cells fewer than `around` away, and a
+        little beyond; infinite where the grid ends there."""
+        length: Real = self.grid.backend.Float(dr.inf)
+        beyond = self.grid.margin - _ROUNDING
+        for k in range(3):
+            upper, lower = self.corner[k] + around, self.corner[k] + 1 - around
+            rising = d[k] > 0
+            gap = dr.select(rising, upper - self.place[k], self.place[k] - lower)
+            ends = dr.select(rising, upper >= self.grid.shape[k], lower <= 0)
+            reach = (gap + beyond) / dr.abs(d[k])
+            length = fmin(dr.select(ends | (d[k] == 0), dr.inf, reach), length)
+        return length * self.grid.size
+
+
+def distances_to_full(empty: BoolArray) -> IntArray:
+    """`GridLayout.free` of cells (nz, ny, nx)."""
+    if empty.all():
+        return np.full(empty.size, max(empty.shape), np.int64)
+    from scipy import ndimage  # here: a third of a second that few need
+
+    chessboard: Any = cast("Any", ndimage).distance_transform_cdt  # by its usual metric
+    return np.asarray(chessboard(empty), dtype=np.int64).ravel()
+
+
+def short_length(size: float) -> float:
+    """A length nearby, at most one part in 4,096 off, that is a power of two times an integer below
+    2^13, so that single precision holds its multiples."""
+    mantissa, exponent = math.frexp(size)
+    return math.ldexp(round(mantissa * 4096), exponent - 12)
+
+
+# Empty cells are proved to be empty so far beyond their faces, in cells; cubes of the octree's
+# first round have 2^_ROUNDS cells a side.
+_MARGIN, _ROUNDS = 1 / 16, 3
+
+
+@dataclass(frozen=True)
+class OccupiedCells(GridLayout):
+    """A grid whose empty cells hold no point of a set, nor does what is around them: see
+    `UniformGrid`."""
+
+    @classmethod
+    def of(
+        cls, lower: FloatArray, upper: FloatArray, clearance: Clearance, across: int
+    ) -> OccupiedCells:
+        """A grid over a box that holds the set, with about so many cells along its longest side.
+
+        Outside of the box there is nothing, so a cell at its faces is empty outwards as well.
+        There are fewer cells where they would be smaller than the spacing of single precision.
+        """
+        reach = np.abs([lower, upper]).max().astype(np.float32)
+        cell = max(float((upper - lower).max()) / across, float(np.spacing(reach)))
+        cell = short_length(cell)
+        # Room for rounding the corner down, and for the margin beyond what the set may reach.
+        room = (_MARGIN + 1e-3) * cell
+        origin = np.nextafter((lower - room).astype(np.float32), np.float32(-np.inf))
+        origin = origin.astype(np.float64)
+        side = cell * 2**_ROUNDS
+        nx, ny, nz = (int(count) for count in np.ceil((upper + room - origin) / side))
+        places = np.indices((nx, ny, nz)).reshape(3, -1).T
+        roots = Cells(origin + side * places, np.full(3, side))
+        roots = roots.some(~roots.proved_empty(clearance, _MARGIN))
+        cells = octree(roots, clearance, np.iinfo(np.int64).max, _ROUNDS, _MARGIN).leaves
+        nx, ny, nz = (count << _ROUNDS for count in (nx, ny, nz))
+        empty = np.ones((nz, ny, nx), np.bool_)
+        x, y, z = np.round((cells.corners - origin) / cell).astype(np.int64).T
+        empty[z, y, x] = False
+        return cls(origin, cell, (nx, ny, nz), distances_to_full(empty))
+
+    @classmethod
+    def none(cls) -> OccupiedCells:
+        """A grid around the empty set: one cell, and all is empty."""
+        return cls(np.zeros(3), 1.0, (1, 1, 1), distances_to_full(np.ones((1, 1, 1), np.bool_)))
+
+    def centers(self) -> FloatArray:
+        """Of the cells that are not empty, (n, 3)."""
+        x, y, z = self.shape
+        places = np.argwhere((self.free == 0).reshape(z, y, x))[:, ::-1]
+        return self.origin + self.cell * (places + 0.5)
+
+    def thinned(self, clearance: Clearance) -> OccupiedCells:
+        """The same grid without cells whose eight halves are proved empty, as far beyond the faces
+        of the cell."""
+        x, y, z = self.shape
+        full = (self.free == 0).reshape(z, y, x)
+        places = np.argwhere(full)[:, ::-1]
+        halves = Cells(self.origin + self.cell * places, np.full(3, self.cell)).split()
+        full[full] = ~halves.proved_empty(clearance, 2 * _MARGIN).reshape(-1, 8).all(axis=1)
+        return replace(self, free=distances_to_full(~full))
+
+    def upload(self, backend: Backend) -> UniformGrid:
+        """The grid on a backend."""
+        return UniformGrid(*UniformGrid.placed(backend, self), _MARGIN)
+
+
+# Cells that share a face, an edge or a corner are neighbors.
+_AROUND = np.ones((3, 3, 3), np.bool_)
+
+
+def largest_connected_component(cells: OccupiedCells) -> OccupiedCells:
+    """The grid in which only the cells of one group are not empty: that with the largest shadows,
+    in all, along the three axes.
+
+    A shadow is all rows of cells, along one axis, with a cell of the group. A count of cells would
+    be of areas, or of volumes, only if as many cells were left around each piece of a surface: but
+    more are left where its function vanishes to a higher order, and as few around both sides of a
+    plate that is thinner than a cell as around one. Shadows are the same for all of these, but for
+    the cells at their rims: those are more, by several, where a function vanishes to a higher
+    order, so that coarse cells may choose a smaller component for it. Of equal shadows, the first
+    along z, y and x is the largest.
+
+    Proof that no component of the set is cut in two. All of the set lies in cells that are not
+    empty, as closed cubes. A connected part of it cannot be covered by two unions of such cubes
+    that are closed and have no point in common; cubes have a point in common if they share at least
+    a corner, which is to be neighbors. So it lies in the cells of one group.
+
+    Proof that rays may jump across the other groups, with the margin that `UniformGrid.run` goes
+    beyond the cells that it jumps across. A neighbor of a cell of another group belongs to that
+    group or was empty before, and the margin is less than a cell, so it holds nothing of this
+    group; that of a cell that was empty before holds nothing of the set at all.
+    """
+    x, y, z = cells.shape
+    full = (cells.free == 0).reshape(z, y, x)
+    if not full.any():
+        return cells
+    from scipy import ndimage  # here: a third of a second that few need
+
+    groups, count = cast("Any", ndimage).label(full, _AROUND)
+    group, places = groups[full], np.argwhere(full)
+    sizes = sum(_shadows(group, np.delete(places, axis, 1), count) for axis in range(3))
+    wanted = groups == 1 + int(np.argmax(sizes))
+    return replace(cells, free=distances_to_full(~wanted))
+
+
+def _shadows(group: IntArray, places: IntArray, count: int) -> IntArray:
+    """(count,) how many different places (n, 2) there are of each group 1 to count."""
+    width = 1 + places.max(axis=0)
+    index = (group * width[0] + places[:, 0]) * width[1] + places[:, 1]
+    return np.bincount(np.unique(index) // (width[0] * width[1]), minlength=count + 1)[1:]
