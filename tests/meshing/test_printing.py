@@ -160,6 +160,22 @@ def test_boxes_are_exact_and_so_are_their_creases() -> None:
     assert mesh.euler_number == 0
 
 
+@pytest.mark.parametrize(
+    "part",
+    [
+        hk.Cuboid((0.5, 0.4, 0.3)).moved((1, 2, 3)),
+        hk.Cuboid((0.5, 0.4, 0.3)).rotated(30, (1, 1, 0)).moved((100, 0, 0)),
+        hk.Cuboid((0.5, 0.4, 0.3)).scaled(0.5).rotated(20, "x").scaled(2),
+    ],
+    ids=["moved", "rotated", "scaled"],
+)
+def test_boxes_anywhere_are_twelve_triangles(part: hk.Solid) -> None:
+    mesh = hk.mesh(part)
+    assert is_part(mesh)
+    assert len(mesh.faces) == 12
+    assert mesh.volume == pytest.approx(0.48, rel=1e-6)
+
+
 def test_balls_cut_solids() -> None:
     ball = hk.Ball((0.1, 0.2, 0.3), 0.7)
     mesh = hk.mesh(~hk.Sphere(0.3), clip=ball, tolerance=2e-3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 from pathlib import Path
 from typing import Any
@@ -53,6 +54,15 @@ def test_every_scene_of_the_gallery_comes_back() -> None:
             assert isinstance(other, hk.LevelSet)
             for part in ("numbers", "clip", "section", "solid", "tolerance", "largest"):
                 assert getattr(one, part) == getattr(other, part), (name, part)
+
+
+def test_scene_files_know_every_solid() -> None:
+    solids = [getattr(hk, name) for name in hk.__all__]
+    solids = [one for one in solids if inspect.isclass(one) and issubclass(one, hk.Shape)]
+    assert len(solids) > 10
+    for one in set(solids) - {hk.Shape}:
+        with pytest.raises(hk.SceneFileError, match="argument of"):
+            scene_of(json.dumps({"harnack": 1, "surfaces": [{"field": {one.__name__: {"q": 1}}}]}))
 
 
 def test_settings_and_sliders_come_back(tmp_path: Path) -> None:

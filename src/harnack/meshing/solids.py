@@ -208,6 +208,8 @@ def is_smooth(solid: Solid) -> bool:
     """Whether a solid is meshed as one level set."""
     if isinstance(solid, Region):
         return not isinstance(solid.inner, Solid) or is_smooth(solid.inner)
+    if isinstance(solid, AffineImage):
+        return is_smooth(solid.inner)
     return not isinstance(solid, Combined | Complement | Offset | Near | Cuboid | Plane)
 
 

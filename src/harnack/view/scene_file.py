@@ -25,7 +25,9 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
+from pkgutil import iter_modules
 from typing import Any, cast
 
 import numpy as np
@@ -33,21 +35,18 @@ import numpy as np
 from harnack import geometry
 from harnack.enclosures.proofs import choose_proofs
 from harnack.field_from_file import open_surface
-from harnack.fields import Field, Solid
+from harnack.fields import Field, Solid, solids
 from harnack.fields.analytic.periodic import Gyroid, SchwarzD, SchwarzP
 from harnack.fields.analytic.polynomial import SphericalHarmonic
 from harnack.fields.expressions import Expression, TextFormula, expression
 from harnack.fields.solid_angles.solid_angle import SolidAngle
-from harnack.fields.solids import affine, bends, combined, fractal, julia, region, tube
-from harnack.fields.solids import combined as blended
-from harnack.fields.solids import primitives as round
-from harnack.fields.solids import primitives as square
 from harnack.fields.solids.solid import Map
 from harnack.files.file_format import write_atomically
 from harnack.gallery import SCENES
 from harnack.geometry import Volume
 from harnack.names import did_you_mean
 from harnack.rendering import Camera, Isolines
+from harnack.rendering.arguments import SETTINGS
 from harnack.rendering.studio_scene import with_settings
 from harnack.tracer import LevelSet, Tolerance, level_set
 from harnack.view.sliders import Slider
@@ -72,16 +71,11 @@ SURFACE_SETTINGS = (
 """Of `level_set`."""
 STILL_SETTINGS = ("size", "spp", "antialias", "max_depth", "seed", "denoise")
 """Of `render`, of pictures that do not move."""
-_OF_PICTURE = (
-    "show", "material", "camera", "backdrop", "up", "boundary", "boundary_material",
-    "cut_material", "isolines", "thickness", *STILL_SETTINGS,
-)  # fmt: skip
+_UNWRITTEN = ("of", "value_range", "colorbar", "progress")
+_OF_PICTURE = tuple(name for name in SETTINGS if name not in _UNWRITTEN)
 # Fields that say all of themselves by their arguments, besides solids.
 _MORE: tuple[type[Field], ...] = (
     Gyroid, SchwarzD, SchwarzP, SphericalHarmonic,
-)  # fmt: skip
-_SOLIDS = (
-    affine, bends, blended, combined, fractal, julia, region, round, square, tube,
 )  # fmt: skip
 _FILE_OPTIONS = ("as", "boundary", "normals", "up")
 
@@ -511,7 +505,10 @@ def _kinds() -> dict[str, type]:
     """Fields and volumes that are their class and its arguments: solids, volumes, and some more.
     None of them reads files or calls what it is given."""
     found: dict[str, type] = {one.__name__: one for one in _MORE}
-    for room in (*_SOLIDS, geometry):
+    rooms = [
+        import_module(f"{solids.__name__}.{one.name}") for one in iter_modules(solids.__path__)
+    ]
+    for room in (*rooms, geometry):
         for name, one in vars(room).items():
             if (
                 inspect.isclass(one)
