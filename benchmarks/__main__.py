@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 import datetime
+import shutil
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 
 from rich.progress import track
@@ -21,6 +23,7 @@ from .growth import growth
 from .hart import hart
 from .inclusion import inclusion
 from .laplacian import laplacian
+from .live import live
 from .meshes import meshes
 from .pictures import pictures
 from .povray import compare_with_povray, has_povray
@@ -32,7 +35,7 @@ from .winding import throughput
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 SECTIONS = (
     "rays", "convergence", "winding", "agreement", "versions", "inclusion", "laplacian", "hart",
-    "povray", "antialiasing", "baselines", "formulas", "meshes", "distances", "pictures",
+    "povray", "antialiasing", "baselines", "formulas", "meshes", "distances", "pictures", "live",
 )  # fmt: skip
 
 
@@ -63,6 +66,12 @@ def main() -> None:
             parser.error(missing)
         print(f"skipped: {missing}")
         names = [name for name in names if name != "povray"]
+    if find_spec("playwright") is None or shutil.which("chromium") is None:
+        missing = "live needs Chromium: make test-browser installs it"
+        if arguments.only == "live":
+            parser.error(missing)
+        print(f"skipped: {missing}")
+        names = [name for name in names if name != "live"]
     write: dict[str, Callable[[], str]] = {
         "rays": _rays,
         "convergence": lambda: _convergence(arguments.out.with_name("convergence.png")),
@@ -75,6 +84,7 @@ def main() -> None:
         "baselines": baselines,
         "distances": distances,
         "formulas": formulas,
+        "live": live,
         "meshes": meshes,
         "pictures": pictures,
         "povray": compare_with_povray,

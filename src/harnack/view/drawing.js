@@ -26,7 +26,7 @@ export const SHOWS = ["shaded", "normal", "depth", "evaluations", "status"];
 const TILE = 1 << 17;
 const TILE_TIME = 60;
 // Milliseconds that a picture may take while something moves.
-export const QUICK = 50;
+export const QUICK = 40;
 const SAMPLES = 16;
 const GROUP = 64;
 // What other roundings explain: see `harnack.tracer.hits`.

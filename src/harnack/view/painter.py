@@ -62,9 +62,11 @@ class Painted:
 
 @dataclass
 class Painter:
-    """Draws surfaces where they stand. Keeps the shadow on the floor while things move."""
+    """Draws surfaces where they stand. Keeps the shadow on the floor while things move, and what
+    the rays of the last picture met, so that only its light is computed again."""
 
     floor: Floor | None = None
+    _met: tuple[Any, dict[str, Any]] | None = None
 
     def paint(
         self, painted: Sequence[Painted], eye: Eye, size: tuple[int, int], *, show: str,
@@ -75,8 +77,12 @@ class Painter:
         mi = register()
         light = Light.of(_matrix(eye))
         has_floor = show == "shaded" and eye.origin[2] > FLOOR
-        seen = self._look(mi, painted, eye, size, has_floor=has_floor)
-        dr.eval(seen)
+        numbers = [eye.origin, eye.right, eye.up, eye.forward]
+        key = painted, np.ravel(numbers).tolist(), eye.pixel, size, has_floor
+        if self._met is None or self._met[0][0] is not painted or self._met[0][1:] != key[1:]:
+            self._met = key, self._look(mi, painted, eye, size, has_floor=has_floor)
+            dr.eval(self._met[1])
+        seen = self._met[1]
         if show != "shaded":
             return _numbers(seen, show, _BEHIND[ground], size)
         # First: it evaluates, and what is recorded before that makes another kernel of the rest.
@@ -86,13 +92,13 @@ class Painter:
         sky = visible_sky(mi, seen["position"], seen["normal"], width, size)
         reflectance = reflectance_of(ground)
         color = seen["color"]
-        key: Any = mi.Float(1)
+        sun: Any = mi.Float(1)
         if self.floor is not None and has_floor:
-            key, above = self.floor.at(seen["position"])
-            key, above = dr.select(seen["ground"], key, 1), dr.select(seen["ground"], above, 1)
+            sun, above = self.floor.at(seen["position"])
+            sun, above = dr.select(seen["ground"], sun, 1), dr.select(seen["ground"], above, 1)
             sky = dr.minimum(sky, above)
             color = dr.select(seen["ground"], _vector(mi, reflectance, mi.Color3f), color)
-        lit = light.on(color, seen["normal"], -seen["d"], seen["glossy"], sky, key)
+        lit = light.on(color, seen["normal"], -seen["d"], seen["glossy"], sky, sun)
         far, z = _vector(mi, reflectance, mi.Color3f), mi.Vector3f(0, 0, 1)
         wall = light.on(far, z, z, mi.Bool(False), mi.Float(1))
         wall = wall * (1 - _DARKER * dr.power(dr.clip(seen["d"].z, 0, 1), 0.7))

@@ -368,19 +368,21 @@ export class Panel {
     drawing.draw();
   }
 
-  /** Pictures from Python: coarse ones, and a whole one when nothing moves any more. */
+  /** Pictures from Python: coarse ones, and when nothing moves any more a whole one, first with the
+   *  shadow that was there and then with its own. */
   async draw_remotely() {
     this.stale = true;
     if (this.fetching) return;
     this.fetching = true;
     try {
-      for (let rests = false; this.stale || !rests; ) {
-        rests = !this.stale;
+      for (let step = 0; this.stale || step < 3; step++) {
+        if (this.stale) step = 0;
         this.stale = false;
         const start = performance.now();
-        const image = await this.drawn(rests ? 1 : this.scale, rests);
+        const image = await this.drawn(step ? 1 : this.scale, step === 2);
         this.put(image);
-        if (rests) continue;
+        if (step === 1 && this.show !== "shaded") step = 2;  // no shadow
+        if (step) continue;
         const better = this.scale * Math.sqrt(QUICK / Math.max(performance.now() - start, 1));
         this.scale = Math.min(1, Math.max(0.06, 0.5 * (this.scale + better)));
       }
@@ -656,9 +658,7 @@ export class Panel {
     const { pressed } = this;
     if (this.probing && pressed && Math.hypot(e.clientX - pressed.clientX, e.clientY - pressed.clientY) < 3)
       this.probe(e);
-    if (!this.held) return;
     this.held = undefined;
-    this.change();
   }
 
   /** Asks Python what the ray through a pointer meets, and draws its proved steps.
