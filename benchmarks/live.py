@@ -13,8 +13,8 @@ from tests.view.browsers import Page, chromium
 VERTICES, SIZE, SECONDS, EVENTS = 64, 512, 4.0, 60
 # What has the panel let Python draw, or not.
 DRAWN_BY = {"the browser, SwiftShader": "", "Python, LLVM": "panel.let_python_draw('')"}
-# Drags a vertex along a circle. Of each event the time is kept, and of each picture the time and the
-# last event that it shows.
+# Drags a vertex along a circle. Of each event the time is kept, and of each picture the time and
+# the last event that it shows.
 _DRAG = """async ([seconds, rate]) => {
   const target = panel.is_remote ? panel.plain : panel.drawing.canvas;
   const events = [], pictures = [];
@@ -92,8 +92,8 @@ def live() -> str:
     lines = [
         f"A vertex of a trefoil of {VERTICES} vertices is dragged in Chromium, in a window of "
         f"{SIZE} x {SIZE} pixels, with {EVENTS} events a second. *Latency* is the time from an "
-        "event to the first picture that shows it. Pictures are as coarse as they must be; the last "
-        "column is the time from the last event to the first picture with a ray for every pixel. "
+        "event to the first picture that shows it. Pictures are as coarse as they must be; the "
+        "last column is the time from the last event to the first picture with a ray for every pixel. "
         "The panel measures who is quicker and lets it draw; no GPU takes part.\n",
         "| drawn by | pictures a second | median latency | 90 % of latencies | every pixel after |",
         "|---|---|---|---|---|",
