@@ -92,8 +92,8 @@ def live() -> str:
     lines = [
         f"A vertex of a trefoil of {VERTICES} vertices is dragged in Chromium, in a window of "
         f"{SIZE} x {SIZE} pixels, with {EVENTS} events a second. *Latency* is the time from an "
-        "event to the first picture that shows it. Pictures are as coarse as they must be; the "
-        "last column is the time from the last event to the first picture with a ray for every pixel. "
+        "event to the first picture that shows it. The last "
+        "column is the time from the last event to the first picture with a ray for every pixel. "
         "The panel measures who is quicker and lets it draw; no GPU takes part.\n",
         "| drawn by | pictures a second | median latency | 90 % of latencies | every pixel after |",
         "|---|---|---|---|---|",
