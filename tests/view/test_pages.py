@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import gzip
 import json
 import re
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 
 import harnack as hk
 from harnack.geometry import shapes
+from harnack.geometry.mesh_shapes import torus_mesh
 from harnack.view.sliders import Subject
 from harnack.webgpu import NoDeviceError, find_device
 from harnack.webgpu.device import Program
@@ -26,7 +28,7 @@ def scene_of(path: Path) -> dict[str, Any]:
 
 
 def words(text: str) -> Any:
-    return np.frombuffer(base64.b64decode(text), np.uint32)
+    return np.frombuffer(gzip.decompress(base64.b64decode(text)), np.uint32)
 
 
 def run(surface: dict[str, Any], data: Any) -> tuple[Any, Any]:
@@ -69,6 +71,15 @@ def test_the_kernel_of_a_page_finds_what_its_rays_say(name: str, tmp_path: Path)
     assert np.quantile(off, 0.9) <= 0.1 * surface["tolerance"] + 1e-5
 
 
+def test_a_page_of_a_mesh_of_fifty_thousand_faces_is_small(tmp_path: Path) -> None:
+    vertices, faces = torus_mesh(1.0, 0.4, 250, 100)
+    vertices += 0.002 * np.random.default_rng(0).normal(size=vertices.shape)
+    assert len(faces) == 50_000
+    path = tmp_path / "a.html"
+    hk.page(hk.WindingNumber(vertices, faces[:-100]), path, progress=False)
+    assert path.stat().st_size < 6e6
+
+
 def test_the_places_of_sliders_are_in_the_page(tmp_path: Path) -> None:
     path = tmp_path / "a.html"
     hk.page(
@@ -84,7 +95,7 @@ def test_the_places_of_sliders_are_in_the_page(tmp_path: Path) -> None:
     assert np.allclose(places["r"], [0.2, 0.3, 0.4])
     assert len(frames) == 17 * 3
     data = words(surface["data"]).copy()
-    (change,) = frames[-1]["changes"]
+    (change,) = frames[-1]["surfaces"]
     data[words(change["at"])] = words(change["to"])
     data[0] = 2048
     _, found = run(surface, data)

@@ -8,7 +8,7 @@ import { Camera, dot } from "./camera.js";
 /** @import {Pose} from "./camera.js" */
 /** @typedef {{lanes: string, results: string, count: number}} Check */
 /** @typedef {{
- *   key: string, code: string, data: string, lanes: number[], results: number[],
+ *   key: string, code: string, data: string | Uint32Array, lanes: number[], results: number[],
  *   paints: {front: number[], back: number[], glossy: boolean}[], tolerance: number, check?: Check
  * }} Surface */
 /** @typedef {{surfaces: Surface[], curves: number[][][]}} State */
@@ -37,10 +37,13 @@ const PAINTS = 128;
 const [CELLS, RAYS, BLOCK, SPREAD] = [64, 8, 4, 0.34];
 const BLUR = [0.025, 0.125, 0.225, 0.25, 0.225, 0.125, 0.025];
 
-/** The 32-bit words of a text in base64. @param {string} text */
-export function words(text) {
+/** The 32-bit words of a text, as `packed` of harnack.view.scene writes it; words as they are.
+ *  @param {string | Uint32Array} text @returns {Promise<Uint32Array>} */
+export async function words(text) {
+  if (typeof text !== "string") return text;
   const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
-  return new Uint32Array(bytes.buffer);
+  const unzipped = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+  return new Uint32Array(await new Response(unzipped).arrayBuffer());
 }
 
 /** Places in the unit square, spread evenly (Roberts 2018), as `floor._square` has them. */
@@ -161,6 +164,7 @@ export class Drawing {
    *  @param {State} state @param {boolean} [checks] */
   async set(state, checks = true) {
     const made = await Promise.all(state.surfaces.map((one) => this.traced(one)));
+    const data = await Promise.all(state.surfaces.map((one) => words(one.data)));
     const old = this.surfaces;
     let paints = 0;
     this.surfaces = state.surfaces.map((given, k) => {
@@ -169,7 +173,7 @@ export class Drawing {
       numbers.set(given.results, 8);
       numbers.set([paints, given.lanes.length], 16);
       paints += given.paints.length;
-      return { given, trace: made[k], data: this.buffer(words(given.data), GPUBufferUsage.STORAGE),
+      return { given, trace: made[k], data: this.buffer(data[k], GPUBufferUsage.STORAGE),
                numbers: this.buffer(numbers, GPUBufferUsage.UNIFORM) };
     });
     const colors = new Float32Array(8 * PAINTS);
@@ -224,8 +228,9 @@ export class Drawing {
     const { check, results, tolerance, lanes } = /** @type {Surface} */ (surface.given);
     if (!check) return "";
     const n = check.count;
+    const [asked, expected] = await Promise.all([words(check.lanes), words(check.results)]);
     this.device.queue.writeBuffer(surface.data, 0, new Uint32Array([n]));
-    this.device.queue.writeBuffer(this.lanes, 0, words(check.lanes));
+    this.device.queue.writeBuffer(this.lanes, 0, /** @type {any} */ (asked));
     const encoder = this.device.createCommandEncoder();
     const pass = encoder.beginComputePass();
     this.run(pass, surface.trace, { 0: surface.data, 1: this.lanes, 2: this.results }, n);
@@ -233,8 +238,7 @@ export class Drawing {
     this.device.queue.submit([encoder.finish()]);
     const bits = await this.read(this.results, 28 * n);
     const numbers = new Float32Array(bits.buffer);
-    const expected = words(check.results);
-    const [wanted, rays] = [new Float32Array(expected.buffer), new Float32Array(words(check.lanes).buffer)];
+    const [wanted, rays] = [new Float32Array(expected.buffer), new Float32Array(asked.buffer)];
     const at = (/** @type {number} */ k, /** @type {number} */ part) => rays[lanes.indexOf(part) * n + k];
     // The criteria are those of `harnack.tracer.hits`, with what was measured there.
     let [other, stray, alike, many, others] = [0, 0, 0, 0, 0];

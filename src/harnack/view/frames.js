@@ -1,42 +1,42 @@
-// The states of a page without Python behind it: those at the places of its sliders travel with it.
+// What has changed since the first state: Python's answers say it, and pages without Python behind
+// them hold it for each place of their sliders.
 // @ts-check
 
 import { words } from "./drawing.js";
 
-/** @import {State, Surface} from "./drawing.js" */
-/** What a choice of places changes: words of the data of each surface, or whole surfaces.
- * @typedef {{state?: State, changes?: {at: string, to: string}[], curves?: number[][][]}} Frame */
+/** @import {Check, State, Surface} from "./drawing.js" */
+/** Words of the data of each surface and whatever else has changed of it, or other surfaces.
+ * @typedef {{surfaces: (Surface | Partial<Surface> & {at: string, to: string, check?: Check})[],
+ *            curves?: number[][][]}} Change */
+
+/** The state after a change; see `difference` in harnack.view.scene. @param {State} first
+ *  @param {Change} change @returns {Promise<State>} */
+export async function changed(first, change) {
+  const surfaces = await Promise.all(change.surfaces.map(async (given, k) => {
+    if (!("at" in given)) return given;
+    const old = first.surfaces[k];
+    old.data = await words(old.data);
+    const { at, to, ...others } = given;
+    const [places, values] = await Promise.all([words(at), words(to)]);
+    const data = old.data.slice();
+    places.forEach((place, i) => { data[place] = values[i]; });
+    return { ...old, check: undefined, ...others, data };
+  }));
+  return { surfaces, curves: change.curves ?? first.curves };
+}
 
 export class Frames {
-  /** @param {State} state at the start @param {{places: Record<string, number[]>, frames: Frame[]}} given */
-  constructor(state, given) {
-    this.state = state;
-    this.given = given;
-  }
+  /** @param {{places: Record<string, number[]>, frames: Change[]}} given */
+  constructor(given) { this.given = given; }
 
-  /** What is drawn at the places that are nearest to these. @param {{sliders: Record<string, number>}}
-   *  wanted @returns {Promise<State>} */
+  /** What changes at the places that are nearest to these. @param {{sliders: Record<string, number>}}
+   *  wanted @returns {Promise<Change>} */
   async change({ sliders }) {
     let at = 0;
     for (const [name, places] of Object.entries(this.given.places)) {
       const far = places.map((x) => Math.abs(x - sliders[name]));
       at = at * places.length + far.indexOf(Math.min(...far));
     }
-    const { state, changes, curves } = this.given.frames[at];
-    if (state) return state;
-    const surfaces = this.state.surfaces.map((surface, k) => {
-      const data = words(surface.data);
-      const [places, to] = [changes?.[k].at ?? "", changes?.[k].to ?? ""].map(words);
-      places.forEach((place, i) => { data[place] = to[i]; });
-      return { ...surface, data: text(data), check: undefined };
-    });
-    return { surfaces, curves: curves ?? this.state.curves };
+    return this.given.frames[at];
   }
-}
-
-/** Words as base64. @param {Uint32Array} given */
-function text(given) {
-  let bytes = "";
-  for (const byte of new Uint8Array(given.buffer)) bytes += String.fromCharCode(byte);
-  return btoa(bytes);
 }

@@ -14,11 +14,9 @@ from importlib import resources
 from string import Template
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from harnack.files.file_format import write_atomically
 from harnack.rendering.picture import progress_bar
-from harnack.view.scene import Live, Moved
+from harnack.view.scene import Live, Moved, difference, packed
 
 if TYPE_CHECKING:
     from harnack.view.scene import Plain
@@ -31,7 +29,7 @@ _PLACES, _CHOICES, _MOST_CHOICES = 33, 300, 1000
 MODULES = ("camera.js", "drawing.js", "frames.js", "link.js", "panel.js")
 # What brings other states: those in the page, or Python's answers.
 _LINKS = {
-    "frames": "scene.sliders.length ? new Frames(scene.state, scene.frames) : null",
+    "frames": "scene.sliders.length ? new Frames(scene.frames) : null",
     "server": "new Server(`ws://${location.host}/questions${location.search}`)",
 }
 
@@ -78,7 +76,7 @@ def page(
     live = Live.of(what, settings)
     with progress_bar("page", progress) as advance:
         scene = live.scene(title or live.subject.name)
-        scene["frames"] = _frames(live, scene["state"], advance)
+        scene["frames"] = _frames(live, advance)
     text = document(scene, still_of(live))
     with write_atomically(target) as partial:
         partial.write_text(text, encoding="utf-8")
@@ -90,7 +88,7 @@ def still_of(live: Live) -> str:
     return base64.b64encode(still._repr_png_()).decode()
 
 
-def _frames(live: Live, base: Plain, advance: Any) -> Plain:
+def _frames(live: Live, advance: Any) -> Plain:
     """The places of the sliders, and what is drawn at each choice of places, the last slider's
     going fastest.
 
@@ -110,40 +108,11 @@ def _frames(live: Live, base: Plain, advance: Any) -> Plain:
     frames: list[Plain] = []
     for choice in itertools.product(*places.values()):
         state = live.state(Moved(dict(zip(sliders, choice, strict=True))))
-        frames.append(_frame(base, state))
+        for one in state["surfaces"]:
+            one.pop("check")
+        frames.append(packed(difference(live.first, state)))
         advance(1 / total)
     return {"places": places, "frames": frames}
-
-
-def _frame(base: Plain, state: Plain) -> Plain:
-    """What a state changes of another: words of the data, or all where the kernels differ."""
-    before, after = (
-        [(one["key"], _words(one["data"])) for one in s["surfaces"]] for s in (base, state)
-    )
-    alike = len(before) == len(after) and all(
-        a[0] == b[0] and len(a[1]) == len(b[1]) for a, b in zip(before, after, strict=True)
-    )
-    for one in state["surfaces"]:
-        if alike:
-            one.pop("check")
-    if not alike:
-        return {"state": state}
-    changes: list[Plain] = []
-    for (_, old), (_, new) in zip(before, after, strict=True):
-        at = np.flatnonzero(old != new).astype(np.uint32)
-        changes.append({"at": _text(at), "to": _text(new[at])})
-    frame: Plain = {"changes": changes}
-    if state["curves"] != base["curves"]:
-        frame["curves"] = state["curves"]
-    return frame
-
-
-def _words(text: str) -> Any:
-    return np.frombuffer(base64.b64decode(text), np.uint32)
-
-
-def _text(bits: Any) -> str:
-    return base64.b64encode(np.ascontiguousarray(bits).tobytes()).decode()
 
 
 def script(*names: str) -> str:

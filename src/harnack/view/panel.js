@@ -3,12 +3,14 @@
 
 import { Camera, along, dot } from "./camera.js";
 import { Drawing, QUICK, SHOWS } from "./drawing.js";
+import { changed } from "./frames.js";
 
-/** @import {Marks, Scene, Slider, State} from "./drawing.js" */
+/** @import {Marks, Scene, Slider} from "./drawing.js" */
+/** @import {Change} from "./frames.js" */
 /** What brings other states, and in a view with Python behind it what else can be asked for.
  * @typedef {{
  *   change(wanted: {sliders: Record<string, number>, loops: number[][][] | null, cut: Cut | null,
- *     checks: boolean}): Promise<State>,
+ *     checks: boolean}): Promise<Change>,
  *   ask?(kind: string, given: object, told?: (done: number, stop: () => void) => void): Promise<any>,
  * }} Link */
 /** A volume that cuts all surfaces: see `harnack.view.session`.
@@ -526,6 +528,11 @@ export class Panel {
     return { sliders: { ...this.values }, loops: this.edited ? this.curves : null, cut: this.cut() };
   }
 
+  /** @param {Link} link @param {boolean} checks */
+  async asked_for(link, checks) {
+    return changed(this.scene.state, await link.change({ ...this.state(), checks }));
+  }
+
   /** Asks for the state at the sliders and points, one after the other, the last one for sure. */
   async change() {
     this.wanted = true;
@@ -535,7 +542,7 @@ export class Panel {
       while (this.wanted) {
         this.wanted = false;
         if (this.is_remote) { this.mark(); continue; }
-        const state = await this.link.change({ ...this.state(), checks: false });
+        const state = await this.asked_for(this.link, false);
         if (!this.drawing) continue;
         const wrong = await this.drawing.set(state, state.surfaces.some((one) => one.check));
         if (wrong) return this.fall_back(`This GPU does not compute what the surface was proved with: ${wrong}`);
@@ -558,7 +565,7 @@ export class Panel {
   async confirm() {
     if (this.asking || !this.drawing || !this.link) return;
     try {
-      const state = await this.link.change({ ...this.state(), checks: true });
+      const state = await this.asked_for(this.link, true);
       if (this.asking || !this.drawing) return;
       const wrong = await this.drawing.set(state);
       if (wrong) this.fall_back(`This GPU does not compute what the surface was proved with: ${wrong}`);

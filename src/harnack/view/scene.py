@@ -6,10 +6,12 @@ Everything here is plain: numbers, lists and text, as `drawing.js` takes it.
 from __future__ import annotations
 
 import base64
+import gzip
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
@@ -58,6 +60,8 @@ _NOWHERE = 99
 # faces on a section, then those of isolines.
 _MENDED, _CUT = 1, 2
 _OF_STUDIO = ("boundary", "boundary_material", "thickness")
+# Of gzip: more takes longer, and gains little.
+_LEVEL = 5
 _OF_STAGE = ("camera", "backdrop", "up", "show")
 SHOWS = ("shaded", "normal", "depth", "evaluations", "status")
 """What a page can show."""
@@ -155,8 +159,13 @@ class Live:
             "editable": self.editable,
             "middle": self.middle.tolist(),
             "reach": self.reach,
-            "state": self.state(self.start),
+            "state": packed(self.first),
         }  # fmt: skip
+
+    @cached_property
+    def first(self) -> Plain:
+        """What is drawn at first, from which all that is drawn later differs in little."""
+        return self.state(self.start)
 
     @property
     def pose(self) -> Plain:
@@ -174,7 +183,7 @@ class Live:
         return Moved(self.subject.starts)
 
     def state(self, moved: Moved) -> Plain:
-        """The surfaces, and the curves that they end at."""
+        """The surfaces, and the curves that they end at. Arrays in it are NumPy's: see `packed`."""
         drawn = self.drawn(moved)
         surfaces = [
             _traced(one, self.placed(one), *self.rays[min(k, len(self.rays) - 1)])
@@ -348,14 +357,14 @@ def _traced(one: StudioObject, placed: PlacedSurface, o: FloatArray, d: FloatArr
     return {
         "key": hashlib.sha256(made.shader.code.encode()).hexdigest()[:16],
         "code": made.shader.code,
-        "data": _text(data_of(made.shader, made.data)),
+        "data": data_of(made.shader, made.data),
         "lanes": [_LANES.index(label.removeprefix("lane ")) for label in made.shader.lanes],
         "results": [_place(made, f"result {name}") for name in _RESULTS],
         "paints": paints_of(one),
         "tolerance": placed_tolerance(one, placed),
         "check": {
-            "lanes": _text(np.stack([bits_of(given[label]) for label in made.shader.lanes])),
-            "results": _text(np.stack(answers)),
+            "lanes": np.stack([bits_of(given[label]) for label in made.shader.lanes]),
+            "results": np.stack(answers),
             "count": len(o),
         },
     }
@@ -440,5 +449,34 @@ def _reflectances(bsdf: Mapping[str, Any]) -> tuple[Any, Any, bool]:
     return colors[0], colors[1], bool(glossy)
 
 
-def _text(bits: Any) -> str:
-    return base64.b64encode(np.ascontiguousarray(bits).tobytes()).decode()
+def packed(value: Any) -> Any:
+    """The same with arrays of 32-bit words as text, which `words` in drawing.js reads: base64 of
+    what gzip makes of them. The tables of meshes repeat themselves, and become a tenth."""
+    if isinstance(value, np.ndarray):
+        return base64.b64encode(gzip.compress(value.tobytes(), _LEVEL, mtime=0)).decode()
+    if isinstance(value, dict):
+        return {name: packed(one) for name, one in cast("Plain", value).items()}
+    if isinstance(value, list):
+        return [packed(one) for one in cast("list[Any]", value)]
+    return value
+
+
+def difference(first: Plain, state: Plain) -> Plain:
+    """What a state changes of the first: words of the data of its surfaces, and whatever else
+    differs; or all of it where there are other kernels. `changed` in frames.js is the way back."""
+    pairs = [*zip(first["surfaces"], state["surfaces"], strict=False)]
+    alike = len(first["surfaces"]) == len(state["surfaces"]) and all(
+        old["key"] == new["key"] and len(old["data"]) == len(new["data"]) for old, new in pairs
+    )
+    if not alike:
+        return state
+    surfaces: list[Plain] = []
+    for old, new in pairs:
+        own = {k: one for k, one in new.items() if k not in ("data", "check") and one != old[k]}
+        at = np.flatnonzero(old["data"] != new["data"]).astype(np.uint32)
+        own |= {"at": at, "to": new["data"][at]}
+        surfaces.append(own | ({"check": new["check"]} if "check" in new else {}))
+    made: Plain = {"surfaces": surfaces}
+    if state["curves"] != first["curves"]:
+        made["curves"] = state["curves"]
+    return made

@@ -23,7 +23,7 @@ from harnack.rendering.arguments import check_size
 from harnack.rendering.backdrops import GROUNDS
 from harnack.tracer import Status, trace
 from harnack.view.painter import Eye, Painted, Painter
-from harnack.view.scene import SHOWS, Live, Moved, paints_of
+from harnack.view.scene import SHOWS, Live, Moved, difference, packed, paints_of
 from harnack.view.scene_file import STILL_SETTINGS, scene_of
 
 if TYPE_CHECKING:
@@ -191,7 +191,7 @@ class Session:
         if question.get("checks") is not True:
             for one in state["surfaces"]:
                 one.pop("check")
-        return state
+        return packed(difference(self.live.first, state))
 
     def _probe(self, question: Mapping[str, Any], moved: Moved, tell: Tell) -> Plain:
         """The first hit of a ray of the surfaces' coordinates, and how far each step was proved."""
