@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from types import FrameType
 
 from harnack.rendering import UnboundedSurfaceError
+from harnack.rendering.arguments import SETTINGS
 
 # A terminal and a parent process may both pass on the same Ctrl-C.
 _SAME = 1.0
@@ -52,10 +53,10 @@ def interrupts_noticed() -> Generator[Interrupts]:
 
 
 # Arguments of Python that are options of the command line.
+_WRITTEN_OTHERWISE = ("backdrop", "camera", "isolines", "max_depth", "progress", "value_range")
 OPTIONS = (
-    "antialias", "as_", "bound", "boundary", "boundary_material", "colorbar", "confirm",
-    "cut_material", "denoise", "largest", "level", "material", "max_triangles", "normals", "of",
-    "seed", "show", "simplify", "size", "spacing", "spp", "thickness", "tolerance", "up",
+    *(name for name in SETTINGS if name not in _WRITTEN_OTHERWISE), "as_", "bound", "confirm",
+    "largest", "level", "max_triangles", "normals", "simplify", "spacing", "tolerance",
 )  # fmt: skip
 _PARAMETER = re.compile(r'parameters=\{"(\w+)": 1\.0\}')
 # One of them with a value, as messages write it, that is not inside of a call.

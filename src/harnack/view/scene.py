@@ -22,7 +22,7 @@ from harnack.fields import Solid
 from harnack.fields.solid_angles.solid_angle import SolidAngle
 from harnack.geometry import HalfSpace, Intersection, Volume
 from harnack.rendering import render
-from harnack.rendering.arguments import check_camera
+from harnack.rendering.arguments import OF_STUDIO, SETTINGS, check_camera
 from harnack.rendering.backdrops import FLOOR, Ground, checked_backdrop, reflectance_of
 from harnack.rendering.framing import box_of, upright, visible_points
 from harnack.rendering.isolines import checked_isolines
@@ -115,6 +115,12 @@ class Live:
             TypeError, ValueError: as `render` does; also for a transparent material, a `show` that
                 is not in `SHOWS`, and a backdrop that is not "light" or "dark".
         """
+        still = [name for name in given if name in SETTINGS and name not in (*OF_STUDIO, "show")]
+        if still:
+            raise TypeError(
+                f"{', '.join(still)}: of still pictures, which `harnack.render` draws; pages and "
+                "views do not take it"
+            )
         given = dict(given)
         camera, backdrop, up, show = (given.pop(name, None) for name in _OF_STAGE)
         show = "shaded" if show is None else show

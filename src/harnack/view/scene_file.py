@@ -46,7 +46,7 @@ from harnack.gallery import SCENES
 from harnack.geometry import Volume
 from harnack.names import did_you_mean
 from harnack.rendering import Camera, Isolines
-from harnack.rendering.arguments import SETTINGS
+from harnack.rendering.arguments import OF_STUDIO, SETTINGS
 from harnack.rendering.studio_scene import with_settings
 from harnack.tracer import LevelSet, Tolerance, level_set
 from harnack.view.sliders import Slider
@@ -69,10 +69,10 @@ SURFACE_SETTINGS = (
     "largest",
 )  # fmt: skip
 """Of `level_set`."""
-STILL_SETTINGS = ("size", "spp", "antialias", "max_depth", "seed", "denoise")
-"""Of `render`, of pictures that do not move."""
 _UNWRITTEN = ("of", "value_range", "colorbar", "progress")
 _OF_PICTURE = tuple(name for name in SETTINGS if name not in _UNWRITTEN)
+STILL_SETTINGS = tuple(name for name in _OF_PICTURE if name not in (*OF_STUDIO, "show"))
+"""Of `render`, of pictures that do not move."""
 # Fields that say all of themselves by their arguments, besides solids.
 _MORE: tuple[type[Field], ...] = (
     Gyroid, SchwarzD, SchwarzP, SphericalHarmonic,
