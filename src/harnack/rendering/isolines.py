@@ -1,6 +1,4 @@
-"""Scalar functions on surfaces, for isolines and for pictures of values.
-
-Lines on a surface where another function takes given values: contour lines, isolines.
+"""Isolines: lines on a surface where another function takes given values.
 
 A line is what lies within half its width of the curve {g = level} on the surface. Its distance from
 a point is |g - level| / |grad_T g| to first order, with the part grad_T g of the gradient along the
@@ -17,6 +15,8 @@ two lines, and lines that cross at a saddle are joined by a fillet of that size.
 that is a little higher, with g - level = (R^2 - r^2)/2 at the distance r, the line is where
 |r^2 - R^2| < width r, which is r < width/2 + sqrt(width^2/4 + R^2) <= R + width: at most half a
 width too far.
+
+`function_of` and `defined_in` serve pictures of values as well.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Index, Mask, Real, Vec3
     from harnack.geometry import Volume
 
-# A surface that is cut by the function's own domain reaches beyond it by rounding, a part of its
-# size.
+# A surface that is cut by the function's own domain reaches beyond it by rounding, at most by this
+# part of its size.
 _PADDING = 1e-5
 
 
@@ -225,7 +225,7 @@ class PreparedIsolines:
     period: Real | None
 
     def cover(self, p: Vec3, normal: Vec3) -> Mask:
-        """Whether points of the surface, where it has a unit normal, are on a line."""
+        """Whether points of a surface, with unit normals, are on a line."""
         gap, along = self._rise(p, normal)
         return gap < self.half_width * norm(along)
 
