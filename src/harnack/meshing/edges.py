@@ -1,6 +1,6 @@
-"""Edges of triangles and tetrahedra, each once, by numbers that stand for pairs of points.
+"""Edges of triangles and tetrahedra, each once, by integer keys; products and lengths of rows.
 
-Products and lengths of many vectors: numpy's own sums along an axis of three are slow.
+`dots` and `lengths` are here as numpy's own sums along an axis of three are slow.
 """
 
 from __future__ import annotations

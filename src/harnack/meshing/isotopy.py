@@ -36,9 +36,9 @@ by the field's own promise (`Field.slope_change`). So (b) holds if grad f(c) . g
 and f has no zero in T if |f(c)| > (|grad f(c)| + D) R. If neither holds T is halved, across its
 longest edge, a few times: grad F is the same in both halves, and (a) or (b) may hold in each.
 
-Beside the curve nothing is proved. It is about the first triangles, before these are refined. Of
-what follows, that the triangles do not meet (`intersections`) and face along the gradient is
-checked, and not that they were moved without meeting on the way.
+Near the curve nothing is proved. The proof is about the first triangles, before they are refined.
+Of the refined ones it is checked that they do not meet (`checks.intersecting_faces`) and face along
+the gradient, and not that they were moved without meeting on the way.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ Walls = tuple[FloatArray, FloatArray] | None
 _HALVINGS = 5
 _TRIALS = 20
 _UNKNOWN = 1e200
-# Tetrahedra that are looked at before all are.
+# Tetrahedra that are examined before all are.
 _FEW = 100
 # What is far from the curve is farther than this many cells.
 _FAR = 1.5

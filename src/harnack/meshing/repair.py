@@ -1,8 +1,8 @@
-"""Repair of triangle meshes: patches over holes, the triangles that there are kept as they are.
+"""Repair of triangle meshes: patches over holes; the triangles that are there stay as they are.
 
 The 1/2 level of the winding number w modulo 1 is the 2 pi level of the solid angle of the boundary
-edges (`geometry.singular`), a smooth surface that ends at them. It is meshed with these very edges
-in it, and joined to the mesh by index.
+edges (`geometry.chains`), a smooth surface that ends at them. It is meshed with these very edges in
+it, and joined to the mesh by index.
 """
 
 from __future__ import annotations
@@ -170,7 +170,7 @@ def _repaired(
             finer = (*finer, Places(error.points, 2 * cell * 0.5 ** len(finer)))
         except TooLargeError:
             raise
-        except MeshingError as error:  # a point lies where the function is known too badly
+        except MeshingError as error:  # a point lies where the function is too inaccurate
             if last:
                 raise
             report(f"{error}; once more, with points moved at random in another way")
@@ -189,13 +189,17 @@ class _LocalError(MeshingError):
 
 
 class _MetError(_LocalError):
-    """Patches meet the mesh."""
+    """Patches intersect the mesh."""
 
 
 @dataclass(frozen=True)
 class _Patches:
-    """What is added: vertices (k, 3), and faces (p, 3) whose indices below the number of vertices
-    given are of these. is_fine: whether they were refined to the tolerance."""
+    """What is added.
+
+    vertices: (k, 3).
+    faces: (p, 3); indices below the number of given vertices are of these.
+    is_fine: whether they were refined to the tolerance.
+    """
 
     vertices: FloatArray
     faces: IntArray
@@ -359,7 +363,7 @@ def _finished(
     smoothed, or as they are, whichever first does not pass through itself.
 
     Raises:
-        MeshingError: all do; triangles so small turn over each other beside sharp corners of holes.
+        MeshingError: all do, as small triangles turn over each other beside sharp corners of holes.
     """
     bad = x[:0]
     for way in ("improving", "smoothing", "refining alone"):
@@ -465,10 +469,10 @@ def _joined(
 def _check(
     vertices: FloatArray, faces: IntArray, result: Any, report: Callable[[str], None]
 ) -> None:
-    """What is promised of the result.
+    """Raise unless the result is what `repair` promises.
 
     Raises:
-        MeshingError: it does not hold.
+        MeshingError: it is not.
     """
     report("checking the patches")
     x = np.asarray(result.vertices, np.float64)
