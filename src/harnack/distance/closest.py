@@ -38,11 +38,11 @@ _TOLERANCE = 1e-6
 _BITS = 10
 # Radii about a foot in which it may be proved the nearest, in distances from it: powers of two.
 _FREE = range(8, -12, -1)
-# The cosine of the angle by which a surface may begin away from a point and yet come nearer.
+# The surface may leave its boundary at this cosine away from a point and yet come nearer to it.
 _AWAY = 0.2
 # Descents that Newton's method alone does not end.
 _UNFINISHED = 1.0
-# Sheets that are looked at for each point before cells are.
+# Sheets that are examined for each point before cells are.
 _SHEETS = 16
 
 
@@ -102,7 +102,8 @@ def _in_order(
     found = search(surface, x, Known(start, near), job, tolerance, progress)
     found.feet = job.refined(x, found.feet)
     distance = _length(x - found.feet)
-    # One foot may be no point of the surface but for rounding: a promise may not hold either.
+    # A foot nearer than the proof allows: either it is off the surface by rounding, or a promise of
+    # the field does not hold.
     short = distance < lower
     slack = np.zeros(len(x))
     slack[short] = 4 * job.noise(found.feet[short])

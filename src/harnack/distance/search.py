@@ -19,17 +19,18 @@ if TYPE_CHECKING:
 
 __all__ = ["Descents", "Found", "Known", "Tolerance", "search"]
 
-# Cells before points are asked which of them matter: so many for each point, and at least these;
-# with sheets, which are searched in turn as well, these.
+# How many cells there are before points are looked up in them: so many for each point, and at least
+# so many; and of fields with sheets, which are searched in turn as well, so many.
 _EACH, _FEWEST, _FEWEST_ON_SHEETS = 0.25, 10_000, 1500
-# Cells at most, and which share of that where evaluations are as dear as those of many terms.
-_MOST, _MOST_TO_PROVE, _MOST_ON_SHEETS, _DEAR = 60_000, 150_000, 20_000, 0.25
+# Cells at most, and which share of that where evaluations are as expensive as sums of many terms.
+_MOST, _MOST_TO_PROVE, _MOST_ON_SHEETS, _EXPENSIVE = 60_000, 150_000, 20_000, 0.25
 _FINEST = 40
 # Feet of other parts of the surface that are tried, from the same cells.
 _CHALLENGES = 4
 # In tolerances: how far to the side of its boundary the surface is looked for.
 _ASIDE = 100.0
-# Beside the boundary the surface was looked for there: how many times farther away feet are tried.
+# Beside the boundary the surface was looked for already: if the best point is on it, other feet are
+# tried only if they are so many times farther from it.
 _APART_FROM_BOUNDARY = 2.0
 # Descents begin at points that seem nearer to the surface than so many times the best.
 _NEARER = 0.9
@@ -173,19 +174,19 @@ def _most(surface: LevelSet, points: int, is_proved: bool) -> int:
     if surface.field.has_sheets:
         return _MOST_ON_SHEETS
     most = min(max(_MOST, points // 2), _MOST_TO_PROVE) if is_proved else _MOST
-    return int(most * (_DEAR if surface.field.has_detail else 1.0))
+    return int(most * (_EXPENSIVE if surface.field.has_detail else 1.0))
 
 
 def _split(
     proofs: CellProofs, root: _Cube, enough: int, progress: Callable[[str], None]
 ) -> SurfaceCells:
     """Cells of the root, split until there are enough: in each round the larger half of those where
-    the surface may be more than one sheet, and the others by how much it may bend."""
-    cells = proofs.kept(root.center[None], np.array([root.half]))
+    the surface may be in several pieces, and the others by how much it may bend."""
+    cells = proofs.not_empty(root.center[None], np.array([root.half]))
     for _ in range(_FINEST):
         if not 0 < len(cells) < enough:
             break
-        size = np.where(cells.is_sheet, 0.25 * cells.thickness, cells.half)
+        size = np.where(cells.is_one_piece, 0.25 * cells.thickness, cells.half)
         cells = _halved(proofs, cells, size >= np.median(size))
         progress(f"distances: {len(cells):,} cells")
     return cells
@@ -195,7 +196,7 @@ def _halved(proofs: CellProofs, cells: SurfaceCells, which: BoolArray) -> Surfac
     """The cells, those of a mask (n,) cut in eight."""
     half = 0.5 * cells.half[which]
     center = cells.center[which, None] + half[:, None, None] * _CORNERS
-    parts = proofs.kept(center.reshape(-1, 3), np.repeat(half, 8))
+    parts = proofs.not_empty(center.reshape(-1, 3), np.repeat(half, 8))
     return SurfaceCells.joined([cells.some(~which), parts])
 
 

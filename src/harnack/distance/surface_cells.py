@@ -1,7 +1,7 @@
-"""The closest points of the curve in which the field's domain cuts a level set.
+"""What is known of a level set in cells: that it is absent, or a slab that it lies in, and points.
 
-What is known of the level set in cells: that it is not there, or a slab that it lies in, and
-points of it.
+Some points are on the *rim*, the curve at which the field's domain cuts the level set: `RimDescent`
+searches for the closest.
 """
 
 from __future__ import annotations
@@ -166,9 +166,14 @@ class RimDescent:
 
 @dataclass(frozen=True)
 class _RimPlace:
-    """A place near the curve: whether it is on it, to `near`; the step back to it, to first order;
-    its unit tangent and second derivative; the normal of the domain, and
-    how far the place is inside it, less a margin."""
+    """A place near the rim.
+
+    is_on: whether it is on it, to `near`.
+    back: the step back to it, to first order.
+    tangent, bend: unit tangent and second derivative of the rim.
+    normal: of the domain.
+    inwards: how far the place is inside the domain, less a margin.
+    """
 
     is_on: Mask
     near: Real
@@ -178,6 +183,8 @@ class _RimPlace:
     normal: Vec3
     inwards: Real
 
+
+# Cells.
 
 _STEPS = 6
 # The radius of the ball around a cube of half size 1.
@@ -199,7 +206,7 @@ def remainder(sample: Sample, radius: Real) -> Real:
 
 @dataclass
 class CellProofs:
-    """Cells of a level set, looked at in double precision."""
+    """Cells of a level set, evaluated in double precision."""
 
     surface: LevelSet
 
@@ -217,7 +224,7 @@ class CellProofs:
     def _field(self) -> Field:
         return self._prepared.field
 
-    def kept(self, center: FloatArray, half: FloatArray) -> SurfaceCells:
+    def not_empty(self, center: FloatArray, half: FloatArray) -> SurfaceCells:
         """Of cubes (n, 3), half the length of an edge (n,), those that are not proved empty, with
         what is known of them."""
         radius = _WITHIN * half
@@ -234,15 +241,15 @@ class CellProofs:
         empty, cells.normal[inside], cells.offset[inside], cells.thickness[inside] = self._at(
             self._slab, center[inside], radius[inside]
         )
-        kept = np.ones(len(cells), np.bool_)
-        kept[inside] = empty == 0
-        cells, start, radius = cells.some(kept), start[kept], radius[kept]
+        not_empty = np.ones(len(cells), np.bool_)
+        not_empty[inside] = empty == 0
+        cells, start, radius = cells.some(not_empty), start[not_empty], radius[not_empty]
         cells.foot[:], cells.normal[:], cells.spread[:] = self._at(
             self._disk, start, radius, cells.normal
         )
         self._outside(cells.foot)
         if self._rim is not None and len(cells):
-            cut = np.flatnonzero(np.abs(away[kept]) <= radius)
+            cut = np.flatnonzero(np.abs(away[not_empty]) <= radius)
             cells.rim[cut], cells.rim_curvature[cut] = self._at(
                 self._on_rim, start[cut], radius[cut]
             )

@@ -1,9 +1,5 @@
-"""A frame of the tangent plane of a level set, and the second derivatives along it.
-
-Distances to a level set from what is known at the point alone, to first and second order.
-
-What searches compute at points, so many at a time: NumPy on both ends, in double precision.
-"""
+"""Level sets near a point: tangent plane, second derivatives along it, distances to second
+order."""
 
 from __future__ import annotations
 
@@ -27,7 +23,8 @@ __all__ = ["Eigen", "TangentPlane", "apply", "first_order", "in_batches", "secon
 
 @dataclass(frozen=True)
 class TangentPlane:
-    """Where grad f is not zero: its length, the unit normal n along it, two unit tangents u, v."""
+    """The tangent plane where grad f is not zero: the length of grad f, the unit normal n along it,
+    and two unit tangents u, v."""
 
     gradient_norm: Real
     n: Vec3
@@ -125,6 +122,8 @@ def second_order(above: Real, gradient: Vec3, rows: tuple[Vec3, Vec3, Vec3]) -> 
     quotient = first / fmax(1 - 0.5 * k * first, 0.5)
     return dr.select(dr.isfinite(first) & (first != 0), quotient, first)
 
+
+# What searches compute at points, so many at a time: NumPy on both ends, in double precision.
 
 # Bounds memory, and the time until an interrupt is noticed.
 _AT_ONCE = 1 << 18
