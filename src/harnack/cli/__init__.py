@@ -1,4 +1,4 @@
-"""The command line: arguments to calls to files."""
+"""The command line: it makes calls of arguments, and files of results."""
 
 from __future__ import annotations
 

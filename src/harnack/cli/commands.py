@@ -1,4 +1,4 @@
-"""What each command does."""
+"""The commands of the command line."""
 
 from __future__ import annotations
 
@@ -501,4 +501,4 @@ COMMANDS: Mapping[str, Callable[[Any], int]] = MappingProxyType(
         "doctor": _doctor,
     }
 )
-"""By name."""
+"""All commands by name."""

@@ -1,6 +1,6 @@
-"""Ctrl-C while a command runs.
+"""What a command prints of errors and names, and Ctrl-C while it runs.
 
-What a command prints of errors and names: one line, in the words of the command line.
+Errors and names are printed on one line, in the words of the command line.
 """
 
 from __future__ import annotations
@@ -15,6 +15,8 @@ from dataclasses import dataclass
 from types import FrameType
 
 from harnack.rendering import UnboundedSurfaceError
+
+# Ctrl-C.
 
 # A terminal and a parent process may both pass on the same Ctrl-C.
 _SAME = 1.0
@@ -50,6 +52,8 @@ def interrupts_noticed() -> Generator[Interrupts]:
     finally:
         signal.signal(signal.SIGINT, before)
 
+
+# Messages.
 
 # Arguments of Python that are options of the command line.
 OPTIONS = (

@@ -1,7 +1,5 @@
-"""Reading closed curves from files.
-
-Reading surfaces from files: meshes, clouds, curves, blobs; and saying which it was.
-"""
+"""Reading surface files: meshes, clouds, closed curves, blobs, molecules; and saying which it
+was."""
 
 from __future__ import annotations
 
@@ -55,6 +53,8 @@ __all__ = [
     "read_loops",
     "read_surface",
 ]
+
+# Closed curves.
 
 PlacedLoop = tuple[FloatArray, Place]
 
@@ -160,6 +160,8 @@ def _boundary_loops(contents: Contents) -> list[PlacedLoop]:
         raise place.error("its faces form a closed surface, which has no boundary")
     return [(contents.vertices[np.array(ids)], place) for ids in join(remaining)]
 
+
+# All surfaces.
 
 ReadAs: TypeAlias = Literal["winding", "dipole", "loops", "polygons"]
 

@@ -1,6 +1,6 @@
-"""Scenes of curves, harmonic polynomials and periodic surfaces.
+"""Scenes of curves, harmonic polynomials, periodic surfaces, and functions over the plane.
 
-Scenes over the plane: Riemann surfaces (the paper's Fig. 19), level curves, height fields.
+Those over the plane are Riemann surfaces (the paper's Fig. 19), level curves and height fields.
 """
 
 from __future__ import annotations
@@ -242,6 +242,9 @@ SOLIDS = (
         demo_spp=4,
     ),
 )
+
+
+# Over the plane.
 
 
 def _surface(function: Any, part: str = "imag", **settings: Any) -> list[LevelSet]:
