@@ -1,7 +1,4 @@
-"""`check_field`: everything that a field promises, sampled.
-
-What a field proves along paths, beyond its promises, sampled.
-"""
+"""`check_field` and `check_looks`: what a field promises, and proves along paths, sampled."""
 
 from __future__ import annotations
 
@@ -34,8 +31,11 @@ if TYPE_CHECKING:
 
 __all__ = ["check_field", "check_looks", "free_lengths"]
 
-# Places at which the movement along a step is looked at.
+# Places at which the movement along a step is sampled.
 _SAMPLES = 33
+
+
+# Enclosures along paths.
 
 
 def check_looks(
@@ -107,6 +107,9 @@ def free_lengths(
     enclosures = look.ahead if forwards else look.back
     steps = to_numpy(longest_step(enclosures, Gaps(down, up)) + 0 * down)
     return np.broadcast_to(steps, len(points)).astype(np.float64)
+
+
+# Promises.
 
 
 def check_field(
@@ -328,7 +331,7 @@ def _beyond_ball(
 
 
 def _check_extent(field: Field, level: float, rng: np.random.Generator, count: int) -> None:
-    """No crossing of the level on segments outside the extent."""
+    """That the level is not crossed on segments outside the extent."""
     volume = field.extent((level,))
     if volume is None:
         return

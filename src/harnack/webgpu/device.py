@@ -1,8 +1,6 @@
-"""A device behind WebGPU, driven from Python: shaders compiled and run, rays by the thousand.
+"""Computation on a GPU behind WebGPU: shaders compiled and run, a sample compared with Dr.Jit.
 
-The package `wgpu` speaks to Vulkan, Metal and Direct3D.
-
-A computation on a device behind WebGPU, of which a sample is compared with Dr.Jit's answers.
+The package `wgpu` drives the GPU through Vulkan, Metal or Direct3D.
 """
 
 from __future__ import annotations
@@ -168,6 +166,8 @@ def bits_of(array: Any) -> Bits:
         values = values.astype(np.uint32)
     return np.ascontiguousarray(values).view(np.uint32)
 
+
+# Whole computations.
 
 Arrays: TypeAlias = "dict[str, npt.NDArray[Any]]"
 # Lanes that Dr.Jit computes as well: spread evenly over all.

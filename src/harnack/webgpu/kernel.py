@@ -73,7 +73,7 @@ class Store:
 
 @dataclass(frozen=True)
 class Variable:
-    """Of a loop: what it is before the first turn, and after each."""
+    """A variable of a loop: its value before the first iteration, and after each."""
 
     name: str
     kind: Kind
@@ -83,7 +83,7 @@ class Variable:
 
 @dataclass
 class Loop:
-    """Turns of `test` and `body` while `condition`, which `test` computes, holds."""
+    """Iterations of `test` and `body` while `condition`, which `test` computes, holds."""
 
     variables: list[Variable] = field(default_factory=list[Variable])
     test: list[Statement] = field(default_factory=list["Statement"])
