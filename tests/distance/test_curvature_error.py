@@ -73,7 +73,9 @@ def test_no_derivatives_within_the_errors_bend_otherwise(precision: Any) -> None
         return backend.Float((values * (1 + 1e-6)).astype(kind))
 
     rows: Any = tuple(to_vector3(backend, row) for row in a.swapaxes(0, 1))
-    found = _Derivatives(backend, to_vector3(backend, g), rows, real(off_g), real(off_a)).curvatures()
+    found = _Derivatives(
+        backend, to_vector3(backend, g), rows, real(off_g), real(off_a)
+    ).curvatures()
     mean, gaussian, _, mean_error, gaussian_error, truncated = (
         to_numpy(one).astype(np.float64) for one in found
     )

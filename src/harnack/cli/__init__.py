@@ -1,4 +1,4 @@
-"""The command line: it makes calls of arguments, and files of results."""
+"""The command line: from arguments to calls, and from results to files."""
 
 from __future__ import annotations
 

@@ -260,7 +260,7 @@ def _section(options: Any) -> HalfSpace | None:
 
 
 def _check_source(name: str) -> None:
-    """That a name is that of a scene or, by its extension, of a file to draw.
+    """Check that a name is that of a scene or, by its extension, of a file to draw.
 
     Raises:
         ValueError: it is neither.

@@ -28,8 +28,8 @@ __all__ = ["FAR", "Best", "CellTree", "SurfaceCells"]
 FAR = 1e150
 """Coordinates of missing feet, and the thickness of slabs that bound nothing."""
 _LEAF_SIZE = 4
-# Feet closer to one another than so many half cells lead to the same place: where the surface in a
-# cell is in one piece and does not end, and elsewhere.
+# Feet closer to one another than this many half cells lead to the same place: where the surface in
+# a cell is in one piece and does not end, and elsewhere.
 _APART, _APART_ELSEWHERE = 4.0, 3.0
 # In half cells: the surface is in one piece in a slab that is thinner.
 _THIN = 0.5
@@ -188,7 +188,7 @@ class CellTree:
         return lower, foot
 
     def _walk(self, x: Vec3, each: Any, start: State, limit: Callable[[State], Real]) -> State:
-        """limit: the squared distance, given the state, beyond which boxes are passed by."""
+        """limit: the squared distance, given the state, beyond which boxes are left out."""
         vector = self.tree.backend.Array3f
 
         def visit(node: Node, state: State) -> tuple[Mask, State]:

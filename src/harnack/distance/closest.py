@@ -74,8 +74,7 @@ def find_closest(
 
     is_proved: whether `lower` is wanted as close as cells can prove it.
 
-    They are looked at cell by cell along a Morton curve, so that neighboring lanes walk a tree
-    together.
+    Points are sorted along a Morton curve, so that neighboring lanes traverse a tree together.
     """
     x = finite_vectors(points, "points")
     order = to_numpy(morton_order(backend, upload_vectors(backend, x), _BITS))
@@ -334,7 +333,7 @@ def _length(vectors: FloatArray) -> FloatArray:
 
 
 def _size(surface: LevelSet, points: FloatArray) -> float:
-    """Of the surface; of the points where nothing is known of it."""
+    """The size of the surface, or of the points where it is unknown."""
     if surface.volume is not None:
         lower, upper = surface.volume.bounds()
         if np.isfinite([lower, upper]).all():

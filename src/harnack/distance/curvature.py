@@ -369,7 +369,7 @@ class _Guide:
         return direction, is_known & (most * self.step < _PART * plane.gradient_norm)
 
     def _on_surface(self, x: Vec3, steps: int) -> Vec3:
-        """The point to which so many steps of Newton's method along the gradient lead."""
+        """The point to which Newton's method along the gradient leads in `steps` steps."""
 
         def step(x: Vec3) -> Vec3:
             sample = self.field.evaluate(x)
@@ -382,7 +382,7 @@ class _Guide:
 
 
 def _repeated(step: Callable[[Vec3], Vec3], x: Vec3, times: int, backend: Backend) -> Vec3:
-    """The step so many times, recorded once."""
+    """The step repeated `times` times, recorded once."""
     if times == 1:
         return step(x)
 
@@ -415,7 +415,7 @@ def _joined(ahead: FloatArray, back: FloatArray, step: float, clip: Volume | Non
 
 
 def _far(count: int) -> BoolArray:
-    """Not the first step, which starts in the seed."""
+    """Not one of the first two steps, which pass near the seed."""
     return np.arange(count) > 1
 
 

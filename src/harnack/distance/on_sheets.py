@@ -28,7 +28,7 @@ __all__ = ["SheetSearch", "close_in", "takes_level"]
 # Half the length of a ray through a point of a sheet, in epsilons of coordinates.
 _SHORT = 32.0
 # A regular tetrahedron about the origin, turned so that none of its edges lies in a plane that
-# meshes like to lie in; and its six edges.
+# triangles of meshes often lie in; and its six edges.
 _CORNERS = (
     (-1.271, -0.030, 1.177),
     (0.662, -1.591, -0.176),
@@ -120,7 +120,7 @@ class SheetSearch:
         way, length = (end - start) / dr.norm(end - start), dr.norm(end - start)
         seen = self.surface.first_hit(o, way, real(0), short * length, active)
         met = active & (seen.status == int(Status.HIT))
-        # To first order any level is near where the gradient has no bound, as at the sheet's rim.
+        # To first order any level is near where the gradient has no bound, as at the sheet's edge.
         met &= takes_level(self.surface, y, _WIDER * short, met)
         return met, seen.sheet, dr.fma(vector(seen.t), way, o)
 

@@ -232,7 +232,7 @@ class Descent:
         def more(*state: Any) -> Mask:
             return state[-1]
 
-        # Round 0 looks at the start.
+        # Round 0 evaluates the start.
         first = _Place(vector(start), vector(0), real(0), real(0))
         close = self.backend.Bool(False)
         state = (real(dr.inf), *first.parts(), real(1), close, count(0), self.backend.Bool(active))

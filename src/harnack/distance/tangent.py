@@ -1,5 +1,4 @@
-"""Level sets near a point: tangent plane, second derivatives along it, distances to second
-order."""
+"""Level sets near a point: tangent plane, second derivatives along it, and distances."""
 
 from __future__ import annotations
 
@@ -111,7 +110,7 @@ def second_order(above: Real, gradient: Vec3, rows: tuple[Vec3, Vec3, Vec3]) -> 
     Three have it: the polynomial, the smaller root 2 d1/(1 + sqrt(1 - 2 k d1)) of the parabola, and
     Halley's quotient above. The root does not exist for k d1 > 1/2; the polynomial changes sign at
     k d1 = -2; the quotient is exact for f = c/r + const along its rays (for every f = (a+bs)/(c+es)
-    on the line), as harmonic functions like to be, and bounded for k d1 < 0. For k d1 > 1, where
+    on the line), as harmonic functions often are, and bounded for k d1 < 0. For k d1 > 1, where
     Taylor's formula says nothing, its denominator is held at 1/2: the sign is always that of
     above, and the size at most 2 |d1|.
     """
@@ -123,7 +122,7 @@ def second_order(above: Real, gradient: Vec3, rows: tuple[Vec3, Vec3, Vec3]) -> 
     return dr.select(dr.isfinite(first) & (first != 0), quotient, first)
 
 
-# What searches compute at points, so many at a time: NumPy on both ends, in double precision.
+# What searches compute at points, in batches: NumPy on both ends, in double precision.
 
 # Bounds memory, and the time until an interrupt is noticed.
 _AT_ONCE = 1 << 18
@@ -138,7 +137,7 @@ def in_batches(
     """The results of `compute` for points of shape (n, 3), as float64 arrays (n,) or (n, 3).
 
     others: more vectors of the same shape that `compute` is given, one a lane; their values are
-        not looked at.
+        not checked.
 
     Raises:
         TypeError, ValueError: points that are not an (n, 3) array of finite numbers of at most

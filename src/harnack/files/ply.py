@@ -226,7 +226,7 @@ def _check_end(path: Path, left: bytes) -> None:
 
 
 def _polygons(table: Table, corners: npt.NDArray[Any], sizes: IntArray, count: int) -> Polygons:
-    """Polygons of these corners, which must be indices of so many vertices."""
+    """Polygons of these corners, which must be indices of `count` vertices."""
     found = Polygons(corners.astype(np.int64), sizes, table.places)
     if corners.dtype.kind == "f" and corners.size:
         k = int(np.argmax(corners != np.rint(corners)))

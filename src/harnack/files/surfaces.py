@@ -1,5 +1,4 @@
-"""Reading surface files: meshes, clouds, closed curves, blobs, molecules; and saying which it
-was."""
+"""Reading surface files: meshes, clouds, closed curves, blobs and molecules, and which it was."""
 
 from __future__ import annotations
 
@@ -280,7 +279,7 @@ def _read(path: Path, kind: str, as_: ReadAs | None) -> Surface:
 
 
 def _refuse(path: Path, as_: ReadAs | None, possible: tuple[str, ...], held: str) -> None:
-    """Raises unless what was asked for can be made of what the file holds."""
+    """Raise unless `as_` can be made of what the file holds."""
     needs = {
         "winding": "faces", "dipole": "points or faces", "loops": "polylines or faces",
         "polygons": "faces",

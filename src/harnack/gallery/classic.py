@@ -91,7 +91,7 @@ def _quartic() -> list[LevelSet]:
 
 
 def _fitted_knot() -> list[LevelSet]:
-    """Gaussians along a trefoil knot, by sixteen cosines a side."""
+    """Gaussians along a trefoil knot, by a series of 16 x 16 x 9 cosines."""
     curve = shapes.torus_knot(2, 3, 150)
     step = np.linalg.norm(np.roll(curve, -1, axis=0) - curve, axis=1)
     width = 0.15 * float(np.ptp(curve, axis=0).max()) / 2

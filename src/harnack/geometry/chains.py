@@ -53,7 +53,7 @@ Edge = tuple[int, int]
 
 
 class OpenChainError(ValueError):
-    """Edges that do not join to closed loops. vertex: where they end or meet in an odd way."""
+    """Edges that do not join to closed loops. vertex: where they end, or meet in too many."""
 
     def __init__(self, vertex: int, count: int) -> None:
         super().__init__(f"{count} edges meet at vertex {vertex}")

@@ -167,7 +167,7 @@ def _as_numbers(values: Any, name: str) -> FloatArray:
 
 
 def check_neighbors(neighbors: int) -> None:
-    """That there are enough neighbors to show a surface.
+    """Check that there are enough neighbors to show a surface.
 
     Raises:
         CloudError: there are fewer than 3.

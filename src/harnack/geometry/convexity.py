@@ -305,8 +305,8 @@ def _facet_normals(x: FloatArray) -> FloatArray | None:
 
 
 def _spread_first(normals: FloatArray) -> FloatArray:
-    """The same normals, the first of which lie far from each other: what misses the hull misses
-    a few of those planes."""
+    """The same normals, the first of which lie far from each other: a few of these planes show that
+    a ray misses the hull."""
     order, left = [0], np.full(len(normals), np.inf)
     for _ in range(min(len(normals), _SPREAD) - 1):
         left = np.minimum(left, 1.0 - normals @ normals[order[-1]])

@@ -38,7 +38,7 @@ _ON_A_LINE = 1e-9
 _TURN = 1e-6
 # Turns of a convex polygon add up to one revolution, to this many radians.
 _REVOLUTION = 1e-6
-# So many faces whose projections are not convex are examined further, at half a millisecond each.
+# At most so many faces with projections that are not convex are examined further, at 0.5 ms each.
 _MOST_EXAMINED = 20_000
 
 
@@ -281,7 +281,8 @@ def _first_double(keys: IntArray) -> int | None:
 
 
 def _check_breadth(found: PolygonFaces) -> None:
-    """That no face lies on a line: about the corner farthest from its middle, through that."""
+    """Raise MeshError for a face whose vertices lie on a line: that from the corner farthest from
+    its middle to the corner farthest from there."""
     x, face = found.vertices[found.corners], found.face_of_corner
     low, high = found.boxes()
     a = x - (0.5 * (low + high))[face]

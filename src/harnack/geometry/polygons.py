@@ -60,8 +60,8 @@ def _welded(loops: Loops, points: FloatArray) -> tuple[IntArray, IntArray]:
 
 # Triangles of polygons.
 
-# Corners squared, and so many more a polygon, summed over those of which ears are cut: some ten
-# seconds of work at worst.
+# Corners squared, and this constant more a polygon, summed over those of which ears are cut: some
+# ten seconds of work at worst.
 _MOST_WORK = 1_000_000_000
 _WORK_A_POLYGON = 1000
 # Twice the area of a triangle, in a polygon of size about 1, up to which it counts as flat.

@@ -89,9 +89,9 @@ def _winding(corner: FloatArray, point: FloatArray) -> float:
 
 # Surfaces cut by volumes.
 
-# Vertices so near to a boundary, as a part of the size, count as on it.
+# Vertices this near to a boundary, as a part of the size, count as on it.
 _NEAR = 1e-9
-# Vertices so near, as a part of the shortest edge there, are moved onto it: else slivers remain.
+# Vertices this near, as a part of the shortest edge there, are moved onto it: else slivers remain.
 _SNAPPED = 0.25
 
 
@@ -110,7 +110,7 @@ class _Side:
         return np.linalg.norm(x - self.center, axis=1) - self.radius
 
     def slopes(self, x: FloatArray) -> FloatArray:
-        """(n, 3) the gradients of these."""
+        """(n, 3) the gradients of these distances."""
         if self.radius is None:
             return np.broadcast_to(self.normal, x.shape)
         away = x - self.center

@@ -1,5 +1,4 @@
-"""Closed meshes: as manifold3d's solids and back, clip volumes as such solids, and files of
-them."""
+"""Closed meshes: manifold3d's solids, clip volumes as such, and files that are closed as well."""
 
 from __future__ import annotations
 
@@ -121,9 +120,9 @@ def _ball(ball: Ball, tolerance: float) -> Manifold:
 _LEAST_STEP = 2.0**-26
 # In units of that distance larger coordinates are beyond the integers of readers.
 _LARGEST = 2.0**36
-# A part has to be so many steps long.
+# A part has to be at least this many steps long.
 _MOST_COARSE = 1e4
-# Where the snapped mesh does not pass its checks, it is simplified within so many steps.
+# Where the snapped mesh does not pass its checks, it is simplified within these numbers of steps.
 _SIMPLER = (4, 32)
 
 

@@ -32,9 +32,9 @@ if TYPE_CHECKING:
 
 __all__ = ["check_options", "finished", "normals_of", "simplified", "thickened"]
 
-# So much of the area may turn over where the two sides are made: slivers.
+# This part of the area may turn over where the two sides are made: slivers.
 _TURNED = 1e-2
-# At most so many triangles are each made a hull of.
+# Hulls are made of at most this many triangles.
 _MOST_HULLS = 20_000
 # Half the thickness is beyond the reach if a side comes nearer to the surface than this part of it.
 _NEAR = 0.98
@@ -104,7 +104,7 @@ def _slants(surface: Surface, normals: FloatArray) -> FloatArray:
 
 
 def _beyond_reach(surface: Surface, normals: FloatArray, thickness: float) -> str | None:
-    """Why half of the thickness is more than the surface's reach; None if that was not seen."""
+    """Why half of the thickness is more than the surface's reach; None if nothing shows that."""
     import scipy.spatial  # here: half a second that few need
 
     searching: Any = scipy.spatial

@@ -157,7 +157,7 @@ def check_size(
         )
 
 
-# Points so near to the level, in parts of the length of a cell, are moved onto it.
+# Points this near to the level, in parts of the length of a cell, are moved onto it.
 _SNAPPED = 0.25
 _MOST_ROUNDS = 20
 

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 __all__ = ["mesh"]
 
-# Cells across the level set, if nothing is asked for; curves have their own length besides.
+# Cells across the level set, unless a spacing is given; curves have their own length besides.
 _ACROSS = 24
 _MOST_ATTEMPTS = 4
 # Room around what has an extent, and around a curve whose surface has none, as a part of the size.
@@ -414,4 +414,4 @@ def _common_bounds(volume: Volume | None) -> tuple[FloatArray, FloatArray]:
 
 
 def _silent(text: str) -> None:
-    """Tells nobody."""
+    """Reports nothing."""

@@ -23,10 +23,10 @@ __all__ = ["Boundary", "Places", "PointSet", "box_cells", "place_points"]
 
 # All in parts of the size of a cell, by experiment.
 _JITTER = 1e-3  # no five points on a sphere
-_SNAPPED = 0.3  # points so near to the level are moved onto it
+_SNAPPED = 0.3  # points this near to the level are moved onto it
 _FREE = 0.45  # no other points are so near to the curve
 _MOST_CELLS = 4_000_000
-# A step of Newton's method that is so short is the last: parts of the longest one.
+# A step of Newton's method that is shorter is the last: a part of the longest one.
 _CONVERGED = 1e-9
 _CORNERS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
 
@@ -140,9 +140,10 @@ def place_points(
     seed: int,
     finer: tuple[Places, ...] = (),
 ) -> PointSet:
-    """Points as the module says. walls: a box whose faces points on them do not leave.
+    """Points for the tetrahedra: see the module's docstring.
 
-    finer: where leaves of the octree are split again, once for each of the entries that they meet.
+    walls: a box whose faces points on them do not leave. finer: where leaves of the octree are
+    split again, once for each of the entries that they meet.
 
     Raises MemoryError for more than four million cells.
     """

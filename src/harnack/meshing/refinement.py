@@ -24,20 +24,21 @@ __all__ = ["far_places", "improved", "refined", "smoothed", "smoothed_within"]
 Walls = tuple[FloatArray, FloatArray] | None
 # Across a crease normals turn by at least this angle, and by this part of it between two points.
 _BENT, _AT_ONCE = math.radians(20), 0.75
-# So near, in parts of the tolerance, a vertex counts as on the surface.
+# A vertex this near, in parts of the tolerance, counts as on the surface.
 _ON = 1e-5
-# So far from the middle, in parts of its edge, a crease may be.
+# A crease may be this far from the middle of an edge, in parts of the edge.
 _BESIDE = 1.5
-# It is not looked for nearer to the ends than this, and by so many samples, twice.
+# It is not looked for nearer to the ends than this, and by this many samples, twice.
 _FROM_ENDS, _SAMPLES = 0.05, 33
-# So far the level is looked for, in parts of the way to where tangent planes meet; and three of
-# them meet in a point if their normals have such a determinant.
+# The level is looked for up to this part of the way to where tangent planes meet; and three planes
+# meet in a point if the determinant of their normals is larger.
 _BEYOND, _INDEPENDENT = 1.25, 0.1
 # Edges shorter than this part of the tolerance are never cut.
 _SHORTEST = 0.5
 _MOST_ROUNDS = 12
-# Edges to be cut become more at first, and then fewer. If they are so many times as many as they
-# were, they run away: the surface bends within any triangle, as around each dipole of a cloud.
+# The number of edges to be cut grows at first, and then falls. If it grows to this many times the
+# least before, refinement will not end: the surface bends within any triangle, as around each
+# dipole of a cloud.
 _RUNS_AWAY = 3
 
 

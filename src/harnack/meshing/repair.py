@@ -122,7 +122,7 @@ def repair(
 
 @dataclass(frozen=True)
 class _Asked:
-    """What `repair` was asked for. given: how many faces there were."""
+    """The arguments of `repair`. given: how many faces there were."""
 
     given: int
     tolerance: float
@@ -181,7 +181,7 @@ def _repaired(
 
 
 class _LocalError(MeshingError):
-    """What smaller cells about some points (n, 3) may mend."""
+    """Failures that smaller cells around some points (n, 3) may prevent."""
 
     def __init__(self, message: str, points: FloatArray) -> None:
         super().__init__(message)
@@ -209,7 +209,7 @@ class _Patches:
 
 
 def _silent(text: str) -> None:
-    """Tells nobody."""
+    """Reports nothing."""
 
 
 def _checked(mesh: Any) -> tuple[FloatArray, IntArray]:
@@ -233,10 +233,10 @@ def _checked(mesh: Any) -> tuple[FloatArray, IntArray]:
 
 
 def _open_edges(faces: IntArray) -> IntArray:
-    """(k, 2): edges of one face, as it runs them.
+    """(k, 2): edges of one face, in its direction.
 
     Raises:
-        MeshError: an edge of more than two faces, or of two that run it the same way.
+        MeshError: an edge of more than two faces, or of two that have it in the same direction.
     """
     pairs = directed_edges(faces)
     edges = Edges.of(pairs)
@@ -334,7 +334,7 @@ def _patches(
         faces = _collapsed(x, faces, k, ends)
     if not len(faces):
         raise _LocalError("no patch was found: choose a smaller `spacing`", boundary.points)
-    _check_rim(x, faces, boundary)
+    _check_boundary(x, faces, boundary)
     is_fine = True
     try:
         x, faces = _finished(function, x, faces, tolerance, report)
@@ -429,7 +429,7 @@ def _normals(corners: FloatArray) -> FloatArray:
     return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
 
 
-def _check_rim(x: FloatArray, faces: IntArray, boundary: Boundary) -> None:
+def _check_boundary(x: FloatArray, faces: IntArray, boundary: Boundary) -> None:
     """Raise unless patches end at the boundary, and run each of its edges as the mesh does: they
     are reversed afterwards."""
     directed = {(int(a), int(b)) for a, b in directed_edges(faces)}

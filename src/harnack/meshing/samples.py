@@ -27,7 +27,7 @@ MOST_FACES = 2_000_000
 """Triangles of a level set, unless a person chooses otherwise."""
 
 CELLS_PER_WAVE = 5.0
-"""Cells along a wave (`Field.wavelength`), at the least, if nothing is asked for."""
+"""Cells along a wave (`Field.wavelength`), at the least, unless a spacing is given."""
 
 _PROOFS = choose_proofs("curvature")
 

@@ -1,11 +1,11 @@
 """Closed meshes of solids, cut by volumes: the meshes of smooth level sets, put together.
 
-A solid is where a function is at most a level. A wall |g| <= w is not meshed as the level 0 of |g|
-- w, of which marching cubes makes hundreds of pieces where cells are thicker than the wall. It is
-{g <= w} less {g <= -w}, two smooth surfaces which do not meet, in a box a little larger than the
-clip; and it is cut by the clip itself. Unions, intersections and complements likewise are those of
-the parts' meshes, so that the creases where parts meet are edges of the mesh. Creases of a single
-function, such as a cylinder's, are chamfered within the tolerance.
+A solid is where a function is at most a level. A wall |g| <= w is not meshed as {|g| - w = 0}, of
+which marching cubes makes hundreds of pieces where cells are thicker than the wall. It is {g <= w}
+less {g <= -w}, two smooth surfaces which do not meet, in a box a little larger than the clip; and
+it is cut by the clip itself. Unions, intersections and complements likewise are those of the parts'
+meshes, so that the creases where parts meet are edges of the mesh. Creases of a single function,
+such as a cylinder's, are chamfered within the tolerance.
 """
 
 from __future__ import annotations
@@ -268,7 +268,7 @@ class _WithinDomain(LevelFunction):
 
 # Solids cut by volumes.
 
-# Cells across a solid, if nothing is asked for.
+# Cells across a solid, unless a spacing is given.
 _ACROSS = 24
 # How many sizes of cells are tried, and what each is of the one before.
 _MOST_ATTEMPTS = 3

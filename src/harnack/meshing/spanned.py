@@ -148,7 +148,7 @@ def _filling(chain: list[int]) -> list[tuple[int, int, int]]:
 _MOST_ATTEMPTS = 4
 # How often cells are made smaller where the first triangles fail, before that is done everywhere.
 _MOST_LOCAL = 4
-# Edges of a curve that are longer than so many cells are cut.
+# Edges of a curve that are longer than this many cells are cut.
 _LONGEST = 2.5
 # How often edges of a curve that are too near to others are halved.
 _MOST_CUTS = 4

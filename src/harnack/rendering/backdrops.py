@@ -28,7 +28,7 @@ _HORIZON = np.array([0.17, 0.17, 0.18])
 _ZENITH = np.array([0.36, 0.40, 0.46])
 _STRIP = np.array([0.70, 0.66, 0.60])
 _KEY = (4.7, 4.5, 4.25)
-# The height of the floor: a hair below what stands on it.
+# The height of the floor, just below what stands on it.
 FLOOR = -0.002
 # Reflectance of the ground, by the backdrop's name. With other backdrops there is no ground, and
 # the surfaces alone are laid over them.

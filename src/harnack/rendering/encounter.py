@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 _POLISH = 2.0
 # A ray leaves a surface this many tolerances away from it, so as not to meet it again there.
 CLEARANCE = 4.0
-# Normals are tilted towards the side that a ray comes from until their cosine with it is this.
+# Normals of grazing hits are tilted until their cosine with the ray is at least this.
 _GRAZING = 1e-3
 
 
@@ -139,7 +139,7 @@ def _described(prepared: PreparedLevelSet, ended: _Ended) -> SurfaceHit:
     uncertainty = _uncertainty(prepared, sample.gradient, t, sample.value, sample.error)
     rest = prepared.levels.to_nearest(sample.value) / length
     rest = dr.select(length > 0, dr.clip(rest, -reach, reach), 0)
-    if prepared.field.has_sheets:  # behind one, the value says nothing about this surface
+    if prepared.field.has_sheets:  # behind a sheet, the value says nothing about this surface
         rest = dr.select(dr.abs(rest) * length <= dr.abs(gap), rest, 0)
     hit = SurfaceHit(
         t=dr.select(met, t, trace.t),
@@ -273,7 +273,7 @@ class CappedSolid:
         start, end = self.prepared.clip(o, d, zero, t_max)
         through = active & (start < end)
         start = dr.select(through, start, 0)
-        known = self.prepared.resolves(o, end)  # other rays are lost among the levels
+        known = self.prepared.resolves(o, end)  # others run out of steps in `_meet_levels`
         within = through & known & self._holds(self._at(o, d, start))
         inside = within & (start <= 0)
         slipped = active & known & (((leaves < 0) & ~inside) | ((leaves > 0) & inside))

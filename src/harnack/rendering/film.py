@@ -138,8 +138,8 @@ def _at(value: Any, s: float) -> Any:
 def _cameras(
     moments: list[dict[str, Any]], steps: FloatArray, turn: float, size: tuple[int, int]
 ) -> list[Camera]:
-    """The camera of each picture: one box, target, distance and angle of view for all, but for what
-    they say themselves."""
+    """The camera of each picture: all have one box, target, distance and angle of view, except
+    where they set their own."""
     asked = [moment.get("camera") for moment in moments]
     cameras = [Camera() if one is None else check_camera(one) for one in asked]
     ups = [moment.get("up") for moment in moments]

@@ -183,7 +183,7 @@ def _probe(
 ) -> FloatArray:
     """First hits of parallel rays, grid x grid from each of the six sides of a box."""
     size = float(np.linalg.norm(upper - lower))
-    # A twentieth of the distance between rays; closer ones take long for sums over trees.
+    # A twentieth of the distance between rays; smaller tolerances are slow for sums over trees.
     coarse = replace(surface, tolerance=Tolerance(1e-3 * size))
     placed = PlacedSurface.of(coarse, Placement.identity(), backend)
     o, d, length = _rays(lower, upper, 0.01 * size, grid)

@@ -49,7 +49,7 @@ def function_of(given: Any, what: str = "of") -> Field:
     coordinates, or a text such as "z".
 
     Raises:
-        TypeError, ValueError: none of these, or a field that is many functions.
+        TypeError, ValueError: none of these, or a field with a function for each part.
     """
     if isinstance(given, str):
         try:
@@ -74,7 +74,7 @@ def function_of(given: Any, what: str = "of") -> Field:
 def defined_in(function: Field, size: float) -> Volume | None:
     """Where a function is defined, with room for rounding; None for all of space.
 
-    size: of the surface that it is looked at on.
+    size: of the surface on which it is evaluated.
     """
     if function.domain is None or function.is_entire:
         return None
@@ -88,7 +88,7 @@ _USUAL_WIDTH = 0.004
 _ROUNDING = 1e-4
 # How many lines an angle-valued function has unless asked otherwise.
 _USUAL_LINES = 12
-# Tables of levels have at least so many entries: kernels depend on how often that can be halved.
+# Tables of levels have at least so many entries, as kernels depend on the length's logarithm.
 _ENTRIES = 64
 
 

@@ -1,5 +1,7 @@
-"""Light on its way to a sensor: path-traced pixels, their time and noise, rays through clear
-matter."""
+"""Light on its way to a sensor: path-traced pixels, and rays through clear matter.
+
+How long a picture will take is told before it is begun; noise can be taken out of it.
+"""
 
 from __future__ import annotations
 
@@ -139,7 +141,7 @@ def mean_of_blocks(color: Any, spp: int) -> Any:
 
 # Paths that are tried: at first, how many times as many next, and no more than this part of all.
 _FIRST, _MORE, _PART = 2**12, 4, 1 / 16
-# Paths that take so many times as long as the first can be told from what starting costs.
+# Runs that take this many times as long as the first are long enough to be measured.
 _ENOUGH = 3.0
 # Seconds; of a picture that takes no longer the time is not told.
 SHORT = 15.0

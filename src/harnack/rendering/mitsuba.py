@@ -1,5 +1,7 @@
-"""Mitsuba: imported with a usable variant; its scene files, checked; solids that light passes
-through."""
+"""Mitsuba: imported with a usable variant, its scene files, and what clear matter does to light.
+
+Scene files in XML are checked before Mitsuba reads them, and its errors are told in words.
+"""
 
 from __future__ import annotations
 
@@ -77,7 +79,7 @@ def load_scene_file(mi: Any, path: str | os.PathLike[str]) -> Any:
 
     Raises:
         FileFormatError: missing, no ordinary file, unreadable, empty, above 256 MiB, no XML; or
-            so for a file that it includes.
+            the same of a file that it includes.
         RuntimeError: Mitsuba cannot read it; the message says where.
     """
     path = Path(path)

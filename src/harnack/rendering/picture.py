@@ -149,7 +149,7 @@ def render(
         of one that is shaded or shows values, by default 9. Others have one ray a pixel.
     antialias: of shaded pictures, which pixels get all their samples: "edges", the default, those
         that differ from a neighbor; "cones" also those that a surface covers in part, found by
-        a cone around each pixel. Wires thinner than a pixel then stay lines. It looks at fields
+        a cone around each pixel. Wires thinner than a pixel then stay lines. It evaluates fields
         about twice as often, goes by |f - level| / |grad f|, and takes no fields that jump, such as
         winding numbers of meshes.
     of: the function of which show="value" shows values on the surface: a field, "x", "y", "z", or

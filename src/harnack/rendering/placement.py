@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 class Placement:
     """x -> scale * rotation @ x + translation, from a surface's coordinates to the world's.
 
-    rotation: (3, 3) orthogonal; mirrors are welcome.
+    rotation: (3, 3) orthogonal, possibly with a reflection.
     """
 
     scale: float

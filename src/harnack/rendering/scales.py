@@ -228,7 +228,7 @@ class Scale:
             return [(self.low, f"{self.low:.4g}")]
         step = _step((self.high - self.low) / max(most - 1, 1))
         first, last = self._multiples(step)
-        if last - first < 1:  # one more than asked for, if that brings two
+        if last - first < 1:  # one more than asked for, if that gives two
             step = _step((self.high - self.low) / max(most + 1, 3))
             first, last = self._multiples(step)
         if last - first < 1:  # no room for two nice numbers

@@ -77,7 +77,8 @@ class Finder:
 
 
 def _prepared(mi: Any, carrier: Any) -> tuple[PlacedSurface, Any]:
-    """A surface that can be looked at outside its extent, and balls in and around the extent."""
+    """A surface that cones can be tested against outside its extent, and balls in and around the
+    extent."""
     surface, backend = carrier.surface, mitsuba_backend(mi)
     if surface.field.has_parts:
         raise ValueError(
@@ -203,7 +204,7 @@ class _Seen:
 
     @classmethod
     def nothing(cls, mi: Any, count: int) -> _Seen:
-        """Room for as many pixels, to scatter to."""
+        """Empty arrays for `count` pixels, to scatter to."""
         vectors, colors, masks = (mi.Vector3f,) * 3, (mi.Color3f,) * 3, (mi.Bool,) * 5
         kinds = (*vectors, mi.Float, *colors, *masks)
         return cls(*(dr.zeros(kind, count) for kind in kinds))

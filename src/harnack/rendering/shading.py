@@ -1,5 +1,4 @@
-"""What shaded pictures are made of: pixels in order, light, the floor's shadow, the studio's
-wall."""
+"""Parts of shaded pictures: the order of pixels, light, the floor's shadow, the studio's wall."""
 
 from __future__ import annotations
 
@@ -210,7 +209,7 @@ _REACH = 2.4
 # Rays of a cell to the key light and to the sky. Each of 4 x 4 neighboring cells has others.
 _RAYS = 8
 _BLOCK = 4
-# The tangent of the angle that the key light seems wide, and how far the rays look.
+# The tangent of the angle that the key light seems wide, and the length of the rays.
 _SPREAD = 0.34
 _FAR = 3.5
 # Weights of a cell and its neighbors along each axis: a block's cells count nearly alike.

@@ -80,7 +80,7 @@ class Material:
         """The BSDF's dictionary for a solid or an open surface.
 
         traced_light: whether light is to be traced at it; otherwise only its diffuse reflectance
-            and its kind are asked for, and the dictionary may be of a BSDF that is made sooner.
+        and its kind are needed, and the dictionary may be of a BSDF that is made faster.
 
         Raises:
             ValueError: the material is transparent, and the surface is open.
@@ -102,8 +102,8 @@ class Material:
 
 
 def _without_table(bsdf: Dictionary) -> Dictionary:
-    """A BSDF with the same diffuse reflectance, which takes no 0.07 s for a table of what a rough
-    coat lets through."""
+    """A BSDF with the same diffuse reflectance, which is made without the table of a rough coat's
+    transmittance (0.07 s)."""
     if bsdf.keys() != _glazed((0, 0, 0), 0).keys() or bsdf["type"] != "roughplastic":
         return bsdf
     return {**{key: bsdf[key] for key in bsdf if key != "alpha"}, "type": "plastic"}
@@ -202,7 +202,7 @@ class StudioObject:
 class Studio:
     """A scene dictionary, and what a picture of it needs besides.
 
-    placement: of the surfaces in it. backdrop: as asked for. azimuth: of the camera. has_ground:
+    placement: of the surfaces in it. backdrop: as given. azimuth: of the camera. has_ground:
         whether the surfaces stand on a floor.
     """
 

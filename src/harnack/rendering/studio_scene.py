@@ -56,7 +56,7 @@ def studio_objects(
 
     boundary: the radius of these tubes; None for no tubes. boundary_material: golden if None.
     cut: the material of the faces at which sections cut solids; None for their own.
-    thickness: of sheets to draw in place of surfaces; None for the surfaces.
+    thickness: of closed parts to draw in place of surfaces; None for the surfaces.
 
     Raises:
         TypeError, ValueError: there is nothing to draw, or something wrong with what is asked for.
@@ -86,7 +86,7 @@ def studio_objects(
     for (one, own_settings), name in zip(drawn, names, strict=True):
         material = material_of(name)
         surface = _surface(one, own_settings, material.transparent)
-        own = surface.solid is None and len(given) > 1  # then it is meant for the others
+        own = surface.solid is None and len(given) > 1  # then its isolines are meant for the others
         lines = tuple(line for line in isolines if not (own and line.function is surface.field))
         fits = fitted and isinstance(one, Field)
         made.append(StudioObject(surface, material, fits, isolines=lines))

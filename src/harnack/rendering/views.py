@@ -44,16 +44,16 @@ _STATUS_COLORS = {
 class View:
     """First hits of the rays through the middles of all pixels.
 
-    depth: (h, w) distance from the camera in the unit asked for, inf where nothing is met. Where
-        the ray ran out of steps, how far it is proved free.
-    normal: (h, w, 3) unit, zero where nothing is met; of a level set it points to larger values.
+    depth: (h, w) distance from the camera in the unit of the viewer's placement, inf without a hit.
+        Where the ray ran out of steps, how far it is proved free.
+    normal: (h, w, 3) unit, zero without a hit; of a level set it points to larger values.
     evaluations: (h, w) of all the scene's fields.
     status: (h, w) a `Status`; shapes of Mitsuba count as hits.
-    line: (h, w, 3) color in sRGB of the isoline that is met; NaN where none is.
+    line: (h, w, 3) color in sRGB of the isoline that is hit; NaN where none is.
     lined: (h, w) whether the edge of an isoline may pass through the pixel.
-    value: (h, w) of a function where something is met, NaN elsewhere; None if none was asked for.
+    value: (h, w) of a function at hits, NaN elsewhere; None without a function.
     period: of that function, if it is angle-valued.
-    background: sRGB in [0, 1], of pictures where nothing is met.
+    background: sRGB in [0, 1], of pictures without a hit.
     """
 
     depth: FloatArray

@@ -215,8 +215,8 @@ def _check_numbers(field: Field, points: FloatArray, look: FieldValues) -> None:
 
 
 def _check_rounding(field: Field, points: FloatArray) -> None:
-    """In single precision the value is off by `error`, eight units in its last place, and what
-    the rounding of the point does."""
+    """In single precision the value is off by at most `error`, eight units in its last place, and
+    what the rounding of the point does."""
     single = points.astype(np.float32).astype(np.float64)
     if field.domain is not None:
         single = single[field.domain.contains_points(single)]
@@ -267,7 +267,7 @@ def _check_promise(
 ) -> None:
     """Walk from each point to the border of the promise, or across the points' size.
 
-    A ball is one wherever it lies; the others are only asked for in the domain.
+    Promises of all space, such as harmonic balls, are tested outside the field's domain as well.
     """
     name = type(known).__name__
     reach = np.minimum(known.radius, 2 * float(np.ptp(points, axis=0).max()) + 1e-300)
@@ -331,7 +331,7 @@ def _beyond_ball(
 
 
 def _check_extent(field: Field, level: float, rng: np.random.Generator, count: int) -> None:
-    """That the level is not crossed on segments outside the extent."""
+    """Check that the level is not crossed on segments outside the extent."""
     volume = field.extent((level,))
     if volume is None:
         return

@@ -1,5 +1,4 @@
-"""Fields sampled as NumPy arrays, the worst places of their promises, and how one is reported
-broken."""
+"""Fields sampled as NumPy arrays, the worst places of promises, and reports of broken ones."""
 
 from __future__ import annotations
 

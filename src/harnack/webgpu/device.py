@@ -187,9 +187,10 @@ def evaluate(
 ) -> Arrays:
     """What `compute(**lanes)` gives, as NumPy arrays by name, computed on a device.
 
-    compute, data: as `recording.record` takes them. lanes: Dr.Jit arrays of n entries each.
-    differences: of some lanes, Dr.Jit's answers and the device's, says what is wrong with the last;
-        nothing if they agree.
+    compute, data: as `recording.record` takes them.
+    lanes: Dr.Jit arrays of n entries each.
+    differences: a function of some lanes, Dr.Jit's answers there and the device's, which says what
+        is wrong with the latter; nothing if they agree.
 
     Raises:
         UntranslatableError: the kernel holds what is not known.
