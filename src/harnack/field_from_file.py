@@ -1,4 +1,4 @@
-"""From a surface file to a field: which field, which way is up, how to draw it, and saying so."""
+"""From a surface file to a field: which field, which way is up, and how to draw it."""
 
 from __future__ import annotations
 
@@ -42,9 +42,10 @@ _LOOP_FILES = (".obj", ".ply", ".loops")
 class OpenedSurface:
     """A field made of a file.
 
-    said: what was decided and why, in one line. show, material: how it is drawn unless asked for
-    otherwise: surfaces of meshes and clouds shaded, which takes one ray a pixel, for each of them
-    costs many times what one through a curve's surface does.
+    said: what was decided and why, in one line.
+    show, material: how it is drawn unless asked for otherwise. Surfaces of meshes and clouds are
+        shaded, with one ray a pixel, as their rays cost many times what rays of a curve's surface
+        do.
     """
 
     field: Field

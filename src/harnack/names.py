@@ -1,4 +1,4 @@
-"""Names that users write: what to say of one that does not exist, and of one that is old."""
+"""Names that users write: messages about names that do not exist, and about old ones."""
 
 from __future__ import annotations
 
@@ -78,15 +78,15 @@ def _warn_of_old(old: str, new: str) -> None:
     warnings.warn(message, DeprecationWarning, stacklevel=3)
 
 
-def names_that_moved(room: str) -> Callable[[str], Any]:
-    """The `__getattr__` of a room whose fields or proofs are names of `harnack` alone."""
+def names_that_moved(subpackage: str) -> Callable[[str], Any]:
+    """The `__getattr__` of a subpackage whose fields or proofs are names of `harnack` alone."""
 
-    package: Any = sys.modules[room.partition(".")[0]]
+    package: Any = sys.modules[subpackage.partition(".")[0]]
 
     def getattr_(name: str) -> Any:
         if name.startswith("_") or name not in package.__all__:
-            raise AttributeError(f"module {room!r} has no attribute {name!r}")
-        _warn_of_old(f"{room}.{name}", f"harnack.{name}")
+            raise AttributeError(f"module {subpackage!r} has no attribute {name!r}")
+        _warn_of_old(f"{subpackage}.{name}", f"harnack.{name}")
         return getattr(package, name)
 
     return getattr_

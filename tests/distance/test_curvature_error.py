@@ -73,7 +73,9 @@ def test_no_derivatives_within_the_errors_bend_otherwise(precision: Any) -> None
         return backend.Float((values * (1 + 1e-6)).astype(kind))
 
     rows: Any = tuple(to_vector3(backend, row) for row in a.swapaxes(0, 1))
-    found = _Derivatives(backend, to_vector3(backend, g), rows, real(off_g), real(off_a)).bent()
+    found = _Derivatives(
+        backend, to_vector3(backend, g), rows, real(off_g), real(off_a)
+    ).curvatures()
     mean, gaussian, _, mean_error, gaussian_error, truncated = (
         to_numpy(one).astype(np.float64) for one in found
     )
@@ -92,13 +94,13 @@ def test_where_the_gradient_is_not_known() -> None:
     gradient = backend.Array3f(0, 0, 1)
     rows: Any = tuple(backend.Array3f(one) for one in np.eye(3).tolist())
     for error in (1.0, 2.0, math.inf, math.nan):
-        found = _Derivatives(backend, gradient, rows, backend.Float(error), 0.0).bent()
+        found = _Derivatives(backend, gradient, rows, backend.Float(error), 0.0).curvatures()
         parts = [to_numpy(one) for one in found]
         assert all(np.isnan(one).all() for one in parts[:3]), error
         assert all(np.isinf(one).all() for one in parts[3:5])
         assert parts[5].all()
     for error in (math.inf, math.nan):
-        found = _Derivatives(backend, gradient, rows, 0.0, backend.Float(error)).bent()
+        found = _Derivatives(backend, gradient, rows, 0.0, backend.Float(error)).curvatures()
         assert all(np.isinf(to_numpy(one)).all() for one in found[3:5])
 
 

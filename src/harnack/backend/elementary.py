@@ -1,15 +1,12 @@
-"""Minimum, maximum and clamp as one instruction each.
+"""Elementary functions of Dr.Jit arrays, where Dr.Jit's own are slow, inexact or overflow.
 
-`drjit.minimum` follows IEEE 754's NaN-propagating `minimum`, three instructions with AVX2 (and
-a crash with LLVM 15 and 16). A comparison and a select become a single `minps`. With a NaN in
-either place the *second* argument is returned: put the safe value there.
+Minimum, maximum and clamp are one instruction each. `drjit.minimum` follows IEEE 754's
+NaN-propagating `minimum`, three instructions with AVX2 (and a crash with LLVM 15 and 16). A
+comparison and a select become a single `minps`. With a NaN in either place the *second* argument is
+returned: put the safe value there.
 
-Lengths of vectors whose squares would overflow or vanish.
-
-Sine and cosine as accurate on every backend as what is promised of sums of waves assumes.
-
-Directions at right angles to a direction: Duff et al. 2017, "Building an Orthonormal Basis,
-Revisited".
+`length` is right for vectors whose squares would overflow or vanish. `sincos` is as accurate on
+every backend as what is promised of sums of waves assumes.
 """
 
 from __future__ import annotations
@@ -130,7 +127,8 @@ def _polynomial(coefficients: tuple[float, ...], x: Any) -> Any:
 
 
 def across(d: Vec3) -> tuple[Vec3, Vec3]:
-    """u and v with (u, v, d) orthonormal and right-handed, |d| = 1."""
+    """u and v with (u, v, d) orthonormal and right-handed, |d| = 1 (Duff et al. 2017, "Building an
+    Orthonormal Basis, Revisited")."""
     vector = cast("Any", type(d))
     sign = dr.select(d.z >= 0, type(d.z)(1), -1)
     a = -1 / (sign + d.z)

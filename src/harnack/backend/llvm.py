@@ -1,9 +1,9 @@
 """Which LLVM the CPU backend runs on, decided before Dr.Jit can load a wrong one.
 
 Dr.Jit compiles CPU kernels with an LLVM library that it finds and loads while `import drjit`
-runs; `DRJIT_LIBLLVM_PATH` in the environment names one. It does not mind much which version it
-gets, but the version decides whether anything works. Tried with Dr.Jit 1.5.0 on x86-64 (loops,
-packet gathers, elementary functions, gradients, scatters, a Mitsuba render):
+runs; `DRJIT_LIBLLVM_PATH` in the environment names one. It accepts nearly any version, but the
+version decides whether anything works. Tried with Dr.Jit 1.5.0 on x86-64 (loops, packet gathers,
+elementary functions, gradients, scatters, a Mitsuba render):
 
     up to 14   refused by Dr.Jit, which then has no CPU backend
     15, 16     abort the whole process at the first `dr.minimum` ("Cannot select ... fmaximum")
@@ -34,7 +34,7 @@ PATH_VARIABLE = "DRJIT_LIBLLVM_PATH"
 
 
 class LLVMNotFoundError(RuntimeError):
-    """No LLVM that Dr.Jit can work with; the message ends with the command that mends it."""
+    """No LLVM that Dr.Jit can work with; the message ends with the command that repairs it."""
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,10 @@
-"""Recorded loops whose state is a record with names.
+"""Recorded loops whose state is a record with names, and work on only the lanes that need it.
 
-Work on the lanes that need it: what is computed is evaluated, and lanes that are idle are left.
-
-A recorded loop follows the rays of one packet until the last of them has ended, and whatever lanes
-are masked costs as much as the others. Where arrays may be evaluated, outside of any recording,
+A recorded loop follows the rays of one packet until the last of them has ended, and lanes that are
+masked cost as much as the others. Where arrays may be evaluated, outside of any recording,
 `on_some` gathers the lanes of a mask, and in `while_queued` a lane that has finished a ray fetches
-the next. Both give what would be computed for each lane by itself, in any order of lanes.
+the next. Both evaluate what they compute, and give what would be computed for each lane by itself,
+in any order of lanes.
 """
 
 from __future__ import annotations
@@ -76,6 +75,8 @@ def _entries(record: Any) -> list[Any]:
     """The values of a record's fields, in order."""
     return [getattr(record, field.name) for field in dataclasses.fields(record)]
 
+
+# Some lanes.
 
 Lanes = TypeVar("Lanes")
 Result = TypeVar("Result")

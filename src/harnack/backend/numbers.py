@@ -67,7 +67,8 @@ def check_vectors(
     planar: str = "",
     transposed: str = "",
 ) -> None:
-    """That an array has shape (n, 3). planar, transposed: advice for shapes (n, 2) and (3, n)."""
+    """Check that an array has shape (n, 3). planar, transposed: advice for shapes (n, 2) and (3,
+    n)."""
     if array.ndim == 2 and array.shape[1] == 3:
         return
     hint = ""
@@ -83,7 +84,8 @@ def check_vectors(
 def check_finite(
     rows: FloatArray, name: str, error: type[Exception], advice: str = "coordinates must be finite"
 ) -> None:
-    """That all numbers of an array (n, k) are finite. name: of a row, with {} for its index."""
+    """Check that all numbers of an array (n, k) are finite. name: of a row, with {} for its
+    index."""
     bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
     if bad.size:
         raise error(
@@ -92,7 +94,7 @@ def check_finite(
 
 
 def check_size(x: FloatArray, error: type[Exception]) -> None:
-    """That no coordinate is larger than `LARGEST`."""
+    """Check that no coordinate is larger than `LARGEST`."""
     if (size := float(np.abs(x).max(initial=0.0))) > LARGEST:
         raise error(f"coordinates up to {size:g} are too large: choose units nearer to 1")
 
@@ -108,7 +110,7 @@ def and_more(count: int) -> str:
 
 
 def refuse_derivatives(name: str, *values: Any) -> None:
-    """That nothing carries derivatives, where they would be dropped.
+    """Check that nothing carries derivatives, where they would be dropped.
 
     Raises:
         NotImplementedError: something does (`carries_derivatives`). The message starts with `name`.

@@ -1,9 +1,8 @@
-"""Tensors (n, 3) and (n,), the shape in which arrays of other frameworks come to Dr.Jit and go.
+"""Tensors (n, 3) and (n,), in which arrays of other frameworks reach Dr.Jit; functions for JAX.
 
 `drjit.wrap` gives a function tensors and takes back tensors, while what is computed here runs on
-vectors, a lane a row. All conversions pass derivatives on, in both directions.
-
-Functions of Dr.Jit tensors for JAX: the direction of `drjit.wrap` that Dr.Jit lacks.
+vectors, a lane a row. All conversions pass derivatives on, in both directions. `wrap_for_jax` is
+the direction of `drjit.wrap` that Dr.Jit lacks.
 """
 
 from __future__ import annotations
@@ -86,6 +85,8 @@ def takes_tensors(method: Method) -> Method:
 
     return cast("Method", general)
 
+
+# JAX.
 
 _TRACED = (
     "wrap_for_jax(function) cannot run inside jax.jit, jax.vmap or the like, where shapes of "

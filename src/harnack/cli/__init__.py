@@ -1,4 +1,4 @@
-"""The command line: arguments to calls to files."""
+"""The command line: from arguments to calls, and from results to files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What each command does."""
+"""The commands of the command line."""
 
 from __future__ import annotations
 
@@ -260,7 +260,7 @@ def _section(options: Any) -> HalfSpace | None:
 
 
 def _check_source(name: str) -> None:
-    """That a name is that of a scene or, by its extension, of a file to draw.
+    """Check that a name is that of a scene or, by its extension, of a file to draw.
 
     Raises:
         ValueError: it is neither.
@@ -501,4 +501,4 @@ COMMANDS: Mapping[str, Callable[[Any], int]] = MappingProxyType(
         "doctor": _doctor,
     }
 )
-"""By name."""
+"""All commands by name."""

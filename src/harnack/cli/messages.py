@@ -1,6 +1,6 @@
-"""Ctrl-C while a command runs.
+"""What a command prints of errors and names, and Ctrl-C while it runs.
 
-What a command prints of errors and names: one line, in the words of the command line.
+Errors and names are printed on one line, in the words of the command line.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ from types import FrameType
 
 from harnack.rendering import UnboundedSurfaceError
 from harnack.rendering.arguments import SETTINGS
+
+# Ctrl-C.
 
 # A terminal and a parent process may both pass on the same Ctrl-C.
 _SAME = 1.0
@@ -51,6 +53,8 @@ def interrupts_noticed() -> Generator[Interrupts]:
     finally:
         signal.signal(signal.SIGINT, before)
 
+
+# Messages.
 
 # Arguments of Python that are options of the command line.
 _WRITTEN_OTHERWISE = ("backdrop", "camera", "isolines", "max_depth", "progress", "value_range")

@@ -1,7 +1,7 @@
 """A tree over cells that may hold a surface: which of them are near a point, and how near.
 
-What is known of the surface in a cell is either nothing, or that it lies in a slab; besides, some
-cells know a point of the surface, their foot.
+Of the surface in a cell either nothing is known, or that it lies in a slab. Besides, some cells
+have a *foot*: a known point of the surface.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ if TYPE_CHECKING:
 __all__ = ["FAR", "Best", "CellTree", "SurfaceCells"]
 
 FAR = 1e150
-"""Coordinates of feet that there are not, and the thickness of slabs that say nothing."""
+"""Coordinates of missing feet, and the thickness of slabs that bound nothing."""
 _LEAF_SIZE = 4
-# Feet closer to one another than so many half cells lead to the same place: where the surface in a
-# cell is one sheet that does not end, and elsewhere.
+# Feet closer to one another than this many half cells lead to the same place: where the surface in
+# a cell is in one piece and does not end, and elsewhere.
 _APART, _APART_ELSEWHERE = 4.0, 3.0
-# In half cells: what a slab is thin for, so that the surface in it is one sheet.
-_SHEET = 0.5
-# In half cells: so far from its point in a cell the rim is nearly a line.
+# In half cells: the surface is in one piece in a slab that is thinner.
+_THIN = 0.5
+# In half cells: within this distance of its point in a cell the rim is nearly a line.
 _RIM_SPREAD = 4.0
 
 
@@ -43,11 +43,12 @@ class SurfaceCells:
 
     center: (n, 3). half: (n,) half the length of an edge.
     foot: (n, 3) a point of the surface, no farther from the center than the cell is wide, or FAR.
-    normal: (n, 3), offset, thickness: (n,) the surface within the ball around the cell has
-        |normal . (y - center) - offset| <= thickness, which is FAR where nothing is known. The
-        normal is zero where no plane is known that is nearly the surface.
+    normal: (n, 3), offset, thickness: (n,) the surface within the ball around the cell has |normal
+        . (y - center) - offset| <= thickness, which is FAR where nothing is known. The normal is
+        zero where no plane is known that is nearly the surface.
     spread: (n,) within this radius about its foot the surface is nearly that plane.
-    rim: (n, 3) a point of the rim at which a domain cuts the surface, or FAR. rim_curvature: (n,).
+    rim: (n, 3) a point of the rim, the curve at which a domain cuts the surface, or FAR.
+    rim_curvature: (n,) of the rim there.
     """
 
     center: FloatArray
@@ -78,9 +79,9 @@ class SurfaceCells:
         return SurfaceCells(*(part[which] for part in vars(self).values()))
 
     @property
-    def is_sheet(self) -> BoolArray:
-        """(n,) whether the surface in a cell is one sheet, as far as its slab tells."""
-        return self.thickness < _SHEET * self.half
+    def is_one_piece(self) -> BoolArray:
+        """(n,) whether the surface in a cell is in one piece, as far as its slab tells."""
+        return self.thickness < _THIN * self.half
 
     @classmethod
     def joined(cls, parts: list[SurfaceCells]) -> SurfaceCells:
@@ -91,9 +92,12 @@ class SurfaceCells:
 
 @dataclass(frozen=True)
 class Best:
-    """The nearest point of the surface so far: its place, how far it is, and a radius about it
-    within which none is nearer. apart: how many times farther from it than from others feet are to
-    be."""
+    """The nearest point of the surface so far.
+
+    foot: its place. distance: how far it is.
+    free: a radius about it within which no point is nearer.
+    apart: how many times farther from it than from others feet have to be to be tried.
+    """
 
     foot: Vec3
     distance: Real
@@ -112,9 +116,9 @@ class CellTree:
         # Points of the rim are feet of cells of their own.
         cut = np.flatnonzero(cells.rim[:, 0] < FAR)
         n, both = len(cells), np.concatenate([np.arange(len(cells)), cut])
-        is_plain = cells.is_sheet & (cells.rim[:, 0] == FAR)
+        is_plain = cells.is_one_piece & (cells.rim[:, 0] == FAR)
         apart = np.where(is_plain, _APART, _APART_ELSEWHERE) * cells.half
-        doubt = np.where(cells.is_sheet, cells.thickness, 0.0)
+        doubt = np.where(cells.is_one_piece, cells.thickness, 0.0)
         records = np.column_stack([
             cells.center, cells.half, cells.foot, cells.thickness, cells.normal, cells.offset,
             np.arange(n, dtype=np.float64), cells.spread, doubt, apart,
@@ -184,7 +188,7 @@ class CellTree:
         return lower, foot
 
     def _walk(self, x: Vec3, each: Any, start: State, limit: Callable[[State], Real]) -> State:
-        """limit: the squared distance, given the state, beyond which boxes are passed by."""
+        """limit: the squared distance, given the state, beyond which boxes are left out."""
         vector = self.tree.backend.Array3f
 
         def visit(node: Node, state: State) -> tuple[Mask, State]:

@@ -38,11 +38,11 @@ _TOLERANCE = 1e-6
 _BITS = 10
 # Radii about a foot in which it may be proved the nearest, in distances from it: powers of two.
 _FREE = range(8, -12, -1)
-# The cosine of the angle by which a surface may begin away from a point and yet come nearer.
+# The surface may leave its boundary at this cosine away from a point and yet come nearer to it.
 _AWAY = 0.2
 # Descents that Newton's method alone does not end.
 _UNFINISHED = 1.0
-# Sheets that are looked at for each point before cells are.
+# Sheets that are examined for each point before cells are.
 _SHEETS = 16
 
 
@@ -74,8 +74,7 @@ def find_closest(
 
     is_proved: whether `lower` is wanted as close as cells can prove it.
 
-    They are looked at cell by cell along a Morton curve, so that neighboring lanes walk a tree
-    together.
+    Points are sorted along a Morton curve, so that neighboring lanes traverse a tree together.
     """
     x = finite_vectors(points, "points")
     order = to_numpy(morton_order(backend, upload_vectors(backend, x), _BITS))
@@ -102,7 +101,8 @@ def _in_order(
     found = search(surface, x, Known(start, near), job, tolerance, progress)
     found.feet = job.refined(x, found.feet)
     distance = _length(x - found.feet)
-    # One foot may be no point of the surface but for rounding: a promise may not hold either.
+    # A foot nearer than the proof allows: either it is off the surface by rounding, or a promise of
+    # the field does not hold.
     short = distance < lower
     slack = np.zeros(len(x))
     slack[short] = 4 * job.noise(found.feet[short])
@@ -333,7 +333,7 @@ def _length(vectors: FloatArray) -> FloatArray:
 
 
 def _size(surface: LevelSet, points: FloatArray) -> float:
-    """Of the surface; of the points where nothing is known of it."""
+    """The size of the surface, or of the points where it is unknown."""
     if surface.volume is not None:
         lower, upper = surface.volume.bounds()
         if np.isfinite([lower, upper]).all():

@@ -1,7 +1,4 @@
-"""Mean and Gaussian curvature of level sets, from first and second derivatives.
-
-Lines of curvature: curves on a level set along which it bends most, or least.
-"""
+"""Curvature of level sets: mean and Gaussian, from first and second derivatives; and its lines."""
 
 from __future__ import annotations
 
@@ -90,7 +87,7 @@ def curvature(field: Field, points: Any, *, precision: Precision = "double") -> 
             sample = prepared.evaluate(p)
             rows = prepared.hessian(p)
             errors = prepared.derivative_errors(p, sample)
-            return _Derivatives(backend, sample.gradient, rows, *errors).bent()
+            return _Derivatives(backend, sample.gradient, rows, *errors).curvatures()
 
         *found, _ = in_batches(backend, directly, points)
         return Curvatures(*found)
@@ -100,7 +97,8 @@ def curvature(field: Field, points: Any, *, precision: Precision = "double") -> 
         if at.gradient is None or at.hessian is None:
             raise RuntimeError(f"{type(field).__name__}: values_at(x, 2) gave no derivatives")
         rows = at.hessian.rows(backend.Array3f)
-        return _Derivatives(backend, at.gradient, rows, at.gradient_error, at.hessian_error).bent()
+        found = _Derivatives(backend, at.gradient, rows, at.gradient_error, at.hessian_error)
+        return found.curvatures()
 
     return _refined(backend, field, by_tree, points)
 
@@ -111,7 +109,7 @@ def _refined(
     by_tree: Callable[[Vec3, Real], tuple[Real | Vec3, ...]],
     points: Any,
 ) -> Curvatures:
-    """The curvatures by a tree that is looked at more closely where the error is too large."""
+    """The curvatures by a tree that is evaluated more closely where the error is too large."""
 
     def at(closer: float) -> Callable[[Vec3], tuple[Real | Vec3, ...]]:
         def compute(p: Vec3) -> tuple[Real | Vec3, ...]:
@@ -156,7 +154,7 @@ class _Derivatives:
     gradient_error: Real
     hessian_error: Real
 
-    def bent(self) -> tuple[Real | Vec3, ...]:
+    def curvatures(self) -> tuple[Real | Vec3, ...]:
         """Mean, Gaussian curvature and normal, the two errors, and 0 where the field states that
         its derivatives are exact, else 1.
 
@@ -223,6 +221,8 @@ def _or_infinite(known: Any, error: Real) -> Real:
     return dr.select(known & dr.isfinite(error), error * (1 + 1e-5), dr.inf)
 
 
+# Lines of curvature.
+
 Family = Literal["largest", "smallest"]
 
 # Newton steps that bring a seed to the surface.
@@ -250,6 +250,8 @@ def curvature_lines(
     precision: Precision = "double",
 ) -> list[FloatArray]:
     """The lines of curvature of a level set through seeds (n, 3): n polylines (k, 3), with k >= 1.
+
+    They are curves on the level set along which it bends most, or least.
 
     A line that comes back to its seed ends there, and its first point is its last.
 
@@ -367,7 +369,7 @@ class _Guide:
         return direction, is_known & (most * self.step < _PART * plane.gradient_norm)
 
     def _on_surface(self, x: Vec3, steps: int) -> Vec3:
-        """The point to which so many steps of Newton's method along the gradient lead."""
+        """The point to which Newton's method along the gradient leads in `steps` steps."""
 
         def step(x: Vec3) -> Vec3:
             sample = self.field.evaluate(x)
@@ -380,7 +382,7 @@ class _Guide:
 
 
 def _repeated(step: Callable[[Vec3], Vec3], x: Vec3, times: int, backend: Backend) -> Vec3:
-    """The step so many times, recorded once."""
+    """The step repeated `times` times, recorded once."""
     if times == 1:
         return step(x)
 
@@ -413,7 +415,7 @@ def _joined(ahead: FloatArray, back: FloatArray, step: float, clip: Volume | Non
 
 
 def _far(count: int) -> BoolArray:
-    """Not the first step, which starts in the seed."""
+    """Not one of the first two steps, which pass near the seed."""
     return np.arange(count) > 1
 
 

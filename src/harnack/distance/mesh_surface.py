@@ -1,7 +1,4 @@
-"""The level sets of the winding number of a closed mesh: triangles, the nearest of which a tree
-finds.
-
-The parts of a closed mesh that are the level set of its winding number, as triangles.
+"""The level sets of a closed mesh's winding number, as triangles, the nearest found by a tree.
 
 Off its triangles the winding number of a closed mesh is a whole number; so its level sets consist
 of triangles. One of them belongs to a level as a whole unless others pass through it: then it is
@@ -55,7 +52,7 @@ def pieces_of_faces(rays: TriangleRays, vertices: FloatArray, faces: IntArray) -
         return corners
     order = np.argsort(cut, kind="stable")
     cut, by = cut[order], by[order]
-    turn = np.arange(len(cut)) - np.searchsorted(cut, cut)  # the how manieth cut of its face
+    turn = np.arange(len(cut)) - np.searchsorted(cut, cut)  # number of the cut of its face
     whole = np.ones(len(faces), np.bool_)
     whole[cut] = False
     owner = np.flatnonzero(~whole)
@@ -235,8 +232,10 @@ def _meets(pieces: FloatArray, height: FloatArray, knives: FloatArray) -> BoolAr
     return low <= high
 
 
+# The surface.
+
 _LEAF_SIZE = 8
-# Of the mesh's size: how far from a triangle f is looked at on either side.
+# Of the mesh's size: the distance from a triangle at which f is evaluated on either side.
 _BESIDE = 1e-9
 
 

@@ -1,13 +1,8 @@
-"""The closest points of a surface that lie on sheets of its field, such as the triangles of a mesh.
+"""Closest points of surfaces of fields with sheets, such as meshes: on sheets, and by rays.
 
-A sheet is part of the surface where f passes a level from one side of it to the other. Whether it
-does at a point is what a short ray through the point tells, in the same arithmetic in which rays
-meet the surface anywhere else.
-
-Nearer points of a surface by rays from the point itself, in directions near the best so far.
-
-What other searches cannot follow, a ray sees: the crease in which two sheets meet, the rim at which
-a smooth part of the surface ends in a sheet, the edge along which a volume cuts it.
+A *sheet* is where a field jumps, such as a triangle of a mesh. It is part of the level set where f
+passes a level from one side of it to the other. Whether it does at a point is what a short ray
+through the point tells, in the same arithmetic in which rays meet the surface anywhere else.
 """
 
 from __future__ import annotations
@@ -33,7 +28,7 @@ __all__ = ["SheetSearch", "close_in", "takes_level"]
 # Half the length of a ray through a point of a sheet, in epsilons of coordinates.
 _SHORT = 32.0
 # A regular tetrahedron about the origin, turned so that none of its edges lies in a plane that
-# meshes like to lie in; and its six edges.
+# triangles of meshes often lie in; and its six edges.
 _CORNERS = (
     (-1.271, -0.030, 1.177),
     (0.662, -1.591, -0.176),
@@ -41,9 +36,9 @@ _CORNERS = (
     (-0.634, 0.533, -1.521),
 )
 _EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (0, 2), (1, 3))
-# In these lengths: how far about y f is looked at, where rounding of y does little to it.
+# In these lengths: the distance from y at which f is evaluated, where rounding of y hardly counts.
 _WIDER = 64.0
-# Of the way to a sheet: so far f is looked at before it.
+# Before a sheet f is evaluated at this part of the way to it.
 _BEFORE = 0.98
 
 Next: TypeAlias = "Callable[[tuple[Any, Any], Any, Any], NearestSheet]"
@@ -54,7 +49,7 @@ class SheetSearch:
     """The search for the closest point of a prepared surface that lies on a sheet.
 
     scale: at least the coordinates that the field computes with, for what rounding does.
-    most: sheets that are looked at for each point.
+    most: sheets that are examined for each point.
     """
 
     surface: PreparedLevelSet
@@ -63,16 +58,16 @@ class SheetSearch:
 
     def closest(self, x: Vec3, limit: Real) -> tuple[Vec3, Vec3]:
         """A point of the surface on a sheet, nearer to x than `limit` (NaN where none is found),
-        and the way from x to the nearest sheet, the surface or not, if it is nearer than that (else
-        infinite).
+        and the way from x to the nearest sheet, part of the surface or not, if that is nearer than
+        `limit` (else infinite).
 
-        Sheets are looked at in the order of their distance, each at its nearest point y to x. A
-        short ray through y along the sheet's normal meets the surface there, or the sheet is none
-        at y. Where y lies on the sheet's rim that ray may slip past, and the six edges of a small
-        tetrahedron about y follow: a surface through y separates its corners, and one that ends in
-        a curve through y leaves it through two faces, so that either crosses an edge.
+        Sheets are examined in the order of their distance, each at its nearest point y to x. A
+        short ray through y along the sheet's normal hits the surface there, or the sheet is not
+        part of it at y. Where y lies on the sheet's edge that ray may slip past, and the six edges
+        of a small tetrahedron about y follow: a surface through y separates its corners, and one
+        that ends in a curve through y leaves it through two faces, so that either crosses an edge.
 
-        The first sheet that is met is the closest point on sheets, unless a sheet nearer than that
+        The first sheet that is hit is the closest point on sheets, unless a sheet nearer than that
         belongs to the surface elsewhere than at y: the point is one of the surface in any case.
         """
         backend = self.surface.backend
@@ -125,12 +120,13 @@ class SheetSearch:
         way, length = (end - start) / dr.norm(end - start), dr.norm(end - start)
         seen = self.surface.first_hit(o, way, real(0), short * length, active)
         met = active & (seen.status == int(Status.HIT))
-        # To first order any level is near where the gradient has no bound, as at the sheet's rim.
+        # To first order any level is near where the gradient has no bound, as at the sheet's edge.
         met &= takes_level(self.surface, y, _WIDER * short, met)
         return met, seen.sheet, dr.fma(vector(seen.t), way, o)
 
     def _following(self, x: Vec3) -> Next:
-        """The sheets of the field in turn; where it does not tell them, the nearest alone."""
+        """The sheets of the field in turn; of a field that does not tell them, the nearest
+        alone."""
         field, backend = self.surface.field, self.surface.backend
         real, index = backend.Float, backend.UInt32
         probe = field.nearest_sheet(x, (real(-1), index(NO_SHEET)), real(0), backend.Bool(False))
@@ -156,12 +152,12 @@ class SheetSearch:
 
 
 def takes_level(surface: PreparedLevelSet, y: Vec3, radius: Real, active: Mask) -> Mask:
-    """Whether f is seen on both sides of a level about y, no farther than 1.74 radii away.
+    """Whether f is on both sides of a level about y, no farther than 1.74 radii away.
 
-    f is looked at in the corners of a tetrahedron and, on its edges, just before a sheet. Where two
-    of these places are on different sides of a level, the surface lies on the way between them:
-    f passes the level on it steadily, or by a jump. That needs no gradient, which has no bound at
-    the rims of sheets: f takes all values between those on both sides of the sheet there, and no
+    f is evaluated in the corners of a tetrahedron and, on its edges, just before a sheet. Where two
+    of these places are on different sides of a level, the surface lies on the way between them: f
+    passes the level on it steadily, or by a jump. That needs no gradient, which has no bound at the
+    edges of sheets: f takes all values between those on both sides of the sheet there, and no
     others.
     """
     backend, field = surface.backend, surface.field.without_truncation(surface.backend)
@@ -231,6 +227,8 @@ def _by_differences(backend: Backend, field: Field, x: Vec3) -> NearestSheet:
     return NearestSheet(d, backend.UInt32(0), offset, way, backend.Bool(False))
 
 
+# Nearer points by rays.
+
 _MOST_RAYS = 600
 # Rays of a turn, which all have to fail before the next turn is narrower: those to where planes
 # meet, then those near the best direction, about 137.5 degrees apart, so that however many there
@@ -242,7 +240,7 @@ _WIDEST, _CLOSER = 1.0, 0.25
 _AROUND = 128
 # Planes whose normals are closer than this, as the sine of an angle, count as the same.
 _APART = 1e-3
-# In epsilons, of coordinates: so far about a hit f is looked at on both sides of the level.
+# In epsilons, of coordinates: so far from a hit f is evaluated on both sides of the level.
 _ABOUT = 1024.0
 
 
@@ -340,9 +338,12 @@ class _TouchingPlanes:
 def close_in(surface: PreparedLevelSet, x: Vec3, foot: Vec3) -> Vec3:
     """Points of the surface no farther from x than `foot`: a compass search over directions.
 
-    Rays leave x at an angle to the best direction; the first that meets the surface nearer than
-    the best becomes the best. If all of a turn fail, the next turns are narrower, down to an angle
-    of sqrt(epsilon). A compass alone is slow along creases; so each hit adds the plane that touches
+    What other searches cannot follow, a ray sees: the crease in which two sheets meet, the curve at
+    which a smooth part of the surface ends in a sheet, the edge along which a volume cuts it.
+
+    Rays leave x at an angle to the best direction; the first that hits the surface nearer than the
+    best becomes the best. If all of a turn fail, the next turns are narrower, down to an angle of
+    sqrt(epsilon). A compass alone is slow along creases; so each hit adds the plane that touches
     the surface there, and a turn begins with rays to the nearest points where these planes meet.
     Every point taken is a first hit that f takes the level about (`takes_level`), hence one of the
     surface, whatever led there.
@@ -396,7 +397,7 @@ def close_in(surface: PreparedLevelSet, x: Vec3, foot: Vec3) -> Vec3:
 
 
 def _is_on_surface(surface: PreparedLevelSet, y: Vec3, hit: MarchResult, active: Mask) -> Mask:
-    """Whether hits y are on a sheet, or f takes the level about them: beside the rim of a sheet,
+    """Whether hits y are on a sheet, or f takes the level about them: beside the edge of a sheet,
     where its gradient has no bound, rays are within the tolerance of any level to first order."""
     is_smooth = active & (hit.sheet == NO_SHEET)
     radius = _ABOUT * surface.backend.epsilon * fmax(largest_coordinate(y), hit.t)

@@ -29,18 +29,22 @@ _STEPS_ALONG = 60
 _LEAST_SHARE = 1e-7  # of a step: shorter ones are given up
 _LEAST_EIGENVALUE = 0.05  # of B (`Descent.closest`): steps are no longer than 20 gradients
 _INDEFINITE = -1e-3
-# Of the size of coordinates or of the ball on which f is smooth: how far from the level rounding
-# may leave a point that is on it.
+# A place counts as on the level if rounding moves the level by at most this part of its coordinates
+# or of the radius of the ball on which f is smooth.
 _CLEAR = 1 / 16
-# No minimum is looked for within this share of the distance from where f is singular; what the
-# boundary of the surface is longer by is half its square.
+# No minimum is looked for nearer than this share of the distance to where f is singular, as the
+# surface ends there: its boundary is farther by a share of half the square.
 _RIM = 1e-5
 
 
 @dataclass(frozen=True)
 class _Place:
-    """A point y and the field there: gradient, the length by which rounding may have moved the
-    level, the radius of the ball on which f is smooth."""
+    """A point y and the field there.
+
+    gradient: of the field.
+    noise: the length by which rounding may have moved the level.
+    reach: the radius of the ball on which f is smooth.
+    """
 
     y: Vec3
     gradient: Vec3
@@ -89,7 +93,7 @@ class Descent:
         def body(
             y: Vec3, first: Real, found: Mask, singular: Mask, k: Any, active: Mask
         ) -> tuple[Any, ...]:
-            above, here = self._look(y)
+            above, here = self._evaluate(y)
             gradient_norm = lengths.length(here.gradient)
             move, settled = self._step_along(x, here, real(1))
             off = -above / gradient_norm
@@ -175,15 +179,15 @@ class Descent:
 
     def noise(self, y: Vec3) -> Real:
         """How far rounding and approximation may have moved the level at y, as a length."""
-        return self._look(y)[1].noise
+        return self._evaluate(y)[1].noise
 
-    def _look(self, y: Vec3) -> tuple[Real, _Place]:
+    def _evaluate(self, y: Vec3) -> tuple[Real, _Place]:
         """f - level at y, and the place."""
         sample, real = self.field.evaluate(y), self.backend.Float
         size = lengths.largest_coordinate(y)
         epsilon, gradient_norm = self.backend.epsilon, lengths.length(sample.gradient)
-        blur = dr.fma(8 * epsilon, dr.abs(sample.value), sample.error)
-        noise = dr.fma(4 * epsilon, size, blur / gradient_norm)
+        total_error = dr.fma(8 * epsilon, dr.abs(sample.value), sample.error)
+        noise = dr.fma(4 * epsilon, size, total_error / gradient_norm)
         reach = real(0)
         for known in sample.promises:
             if not known.is_smooth:
@@ -196,7 +200,7 @@ class Descent:
 
     @staticmethod
     def _is_close(above: Real, place: _Place) -> Mask:
-        """Whether a place is on the level, to rounding; not where that hardly says where it is."""
+        """Whether a place is on the level, to rounding; False where rounding leaves that open."""
         size = lengths.largest_coordinate(place.y)
         known = place.noise <= _CLEAR * fmax(size, place.reach)
         return known & (dr.abs(above) <= 2 * lengths.length(place.gradient) * place.noise)
@@ -216,7 +220,7 @@ class Descent:
             here, gradient_norm, first = _Place(y, g, noise, reach), lengths.length(g), n == 0
             length = share * clamp(-above / gradient_norm, -reach, reach)
             nearer = dr.fma(vector(length / gradient_norm), g, y)
-            above2, there = self._look(dr.select(first, y, nearer))
+            above2, there = self._evaluate(dr.select(first, y, nearer))
             better = active & (first | (dr.abs(above2) < dr.abs(above)))
             longer = dr.select(better, fmin(2 * share, 1), 0.25 * share)
             share = dr.select(first, share, longer)
@@ -228,7 +232,7 @@ class Descent:
         def more(*state: Any) -> Mask:
             return state[-1]
 
-        # Round 0 looks at the start.
+        # Round 0 evaluates the start.
         first = _Place(vector(start), vector(0), real(0), real(0))
         close = self.backend.Bool(False)
         state = (real(dr.inf), *first.parts(), real(1), close, count(0), self.backend.Bool(active))

@@ -19,21 +19,22 @@ if TYPE_CHECKING:
 
 __all__ = ["Descents", "Found", "Known", "Tolerance", "search"]
 
-# Cells before points are asked which of them matter: so many for each point, and at least these;
-# with sheets, which are searched in turn as well, these.
+# The number of cells before points are looked up in them: for each point, at least, and for fields
+# with sheets, which are searched in turn as well.
 _EACH, _FEWEST, _FEWEST_ON_SHEETS = 0.25, 10_000, 1500
-# Cells at most, and which share of that where evaluations are as dear as those of many terms.
-_MOST, _MOST_TO_PROVE, _MOST_ON_SHEETS, _DEAR = 60_000, 150_000, 20_000, 0.25
+# Cells at most, and which share of that where evaluations are as expensive as sums of many terms.
+_MOST, _MOST_TO_PROVE, _MOST_ON_SHEETS, _EXPENSIVE = 60_000, 150_000, 20_000, 0.25
 _FINEST = 40
 # Feet of other parts of the surface that are tried, from the same cells.
 _CHALLENGES = 4
 # In tolerances: how far to the side of its boundary the surface is looked for.
 _ASIDE = 100.0
-# Beside the boundary the surface was looked for there: how many times farther away feet are tried.
+# Beside the boundary the surface was looked for already: if the best point is on it, other feet are
+# tried only if they are this many times farther from it.
 _APART_FROM_BOUNDARY = 2.0
-# Descents begin at points that seem nearer to the surface than so many times the best.
+# Descents begin at points that seem nearer to the surface than this many times the best.
 _NEARER = 0.9
-# Points that are looked at together, so that memory is bounded.
+# Points that are searched for together, so that memory is bounded.
 _AT_ONCE = 1 << 18
 _GROWTHS = 6
 _CORNERS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
@@ -60,7 +61,7 @@ class Descents(Protocol):
         self, points: FloatArray, boundary: FloatArray, aside: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """From points (n, 3) of the curve that the surface ends in, along the surface if it begins
-        towards x; by how much (n,) to the side it is looked for."""
+        towards x. aside: (n,) how far from the curve it is looked for."""
         ...
 
 
@@ -81,7 +82,7 @@ class Known:
 
 @dataclass(frozen=True)
 class Tolerance:
-    """When a search is at an end.
+    """When a search ends.
 
     length: points that are nearer by less do not matter.
     is_proved: whether cells are split until none may hold a point that is nearer than the best by
@@ -94,7 +95,7 @@ class Tolerance:
 
 @dataclass(frozen=True)
 class _Cube:
-    """A cube that holds the surface, or the part of it that is looked at."""
+    """A cube that holds the surface, or the part of it that is searched."""
 
     center: FloatArray
     half: float
@@ -150,7 +151,7 @@ def _in_parts(
     surface: LevelSet, root: _Cube, points: FloatArray, known: Known, descents: Descents,
     tolerance: Tolerance, progress: Callable[[str], None],
 ) -> Found:  # fmt: skip
-    """The nearest points in a cube, for so many points at a time."""
+    """The nearest points in a cube, for some of the points at a time."""
     proofs = CellProofs(surface)
     most = _most(surface, len(points), tolerance.is_proved)
     enough = min(max(_FEWEST, int(_EACH * len(points))), _MOST, most)
@@ -173,19 +174,19 @@ def _most(surface: LevelSet, points: int, is_proved: bool) -> int:
     if surface.field.has_sheets:
         return _MOST_ON_SHEETS
     most = min(max(_MOST, points // 2), _MOST_TO_PROVE) if is_proved else _MOST
-    return int(most * (_DEAR if surface.field.has_detail else 1.0))
+    return int(most * (_EXPENSIVE if surface.field.has_detail else 1.0))
 
 
 def _split(
     proofs: CellProofs, root: _Cube, enough: int, progress: Callable[[str], None]
 ) -> SurfaceCells:
     """Cells of the root, split until there are enough: in each round the larger half of those where
-    the surface may be more than one sheet, and the others by how much it may bend."""
-    cells = proofs.kept(root.center[None], np.array([root.half]))
+    the surface may be in several pieces, and the others by how much it may bend."""
+    cells = proofs.not_empty(root.center[None], np.array([root.half]))
     for _ in range(_FINEST):
         if not 0 < len(cells) < enough:
             break
-        size = np.where(cells.is_sheet, 0.25 * cells.thickness, cells.half)
+        size = np.where(cells.is_one_piece, 0.25 * cells.thickness, cells.half)
         cells = _halved(proofs, cells, size >= np.median(size))
         progress(f"distances: {len(cells):,} cells")
     return cells
@@ -195,7 +196,7 @@ def _halved(proofs: CellProofs, cells: SurfaceCells, which: BoolArray) -> Surfac
     """The cells, those of a mask (n,) cut in eight."""
     half = 0.5 * cells.half[which]
     center = cells.center[which, None] + half[:, None, None] * _CORNERS
-    parts = proofs.kept(center.reshape(-1, 3), np.repeat(half, 8))
+    parts = proofs.not_empty(center.reshape(-1, 3), np.repeat(half, 8))
     return SurfaceCells.joined([cells.some(~which), parts])
 
 
@@ -234,9 +235,9 @@ class _Search:
         return Found(self.feet, self.lower)
 
     def _search_cells(self, has_sheets: bool, progress: Callable[[str], None]) -> None:
-        """First from the foot of the cell where the surface seems nearest, then from those of other
-        parts that may be nearer. If some may still be, and there are not too many cells, those
-        cells are split, and so on."""
+        """Descend first from the foot of the cell where the surface seems nearest, then from those
+        of other parts that may be nearer. If some may still be, and there are not too many cells,
+        those cells are split, and so on."""
         tree = CellTree.of(self.backend, self.cells)
         tried = self._first(tree)
         if not has_sheets:
@@ -266,7 +267,7 @@ class _Search:
         return (self.feet[rows] == self.known.feet[rows]).all(axis=1)
 
     def _first(self, tree: CellTree) -> FloatArray:
-        """To the nearest points from the feet that seem nearest, which are returned (n, 3)."""
+        """Descend from the feet that seem nearest, which are returned (n, 3)."""
         limit = aligned(self.backend, self._distance(slice(None)))
         start = to_numpy(tree.nearest(upload_vectors(self.backend, self.points), limit))
         rows = np.flatnonzero(start[:, 0] < 0.5 * FAR)
@@ -274,8 +275,8 @@ class _Search:
         return start
 
     def _challenge(self, tree: CellTree, rows: IntArray, first: FloatArray) -> BoolArray:
-        """To nearer points from the feet of other parts of the surface that may be nearer, one
-        after the other.
+        """Descend from the feet of other parts of the surface that may be nearer, one after the
+        other.
 
         first: (k, 3) feet that were tried. Returns which cells may hold points that are nearer than
         the best, of these points.
@@ -311,7 +312,7 @@ class _Search:
         return to_numpy(foot)
 
     def _leave_boundary(self) -> None:
-        """From the boundary of the surface, where that is the nearest."""
+        """Descend from the boundary of the surface, where the best point is on it."""
         rows = np.flatnonzero(self._is_boundary(slice(None)))
         distance = self._distance(rows)
         rows, distance = rows[distance > 0], distance[distance > 0]
@@ -320,13 +321,13 @@ class _Search:
         self._take(rows, *self.descents.leave_boundary(x, self.feet[rows], aside))
 
     def _descend(self, rows: IntArray, start: FloatArray) -> None:
-        """To nearer points from places (k, 3), points of the surface or the points themselves."""
+        """Descend from places (k, 3), points of the surface or the points themselves."""
         x = self.points[rows]
         on_surface = (start != x).any(axis=1, keepdims=True)
         self._take(rows, np.where(on_surface, start, np.nan), np.zeros(len(rows)))
         self._take(rows, *self.descents.polish(x, start))
 
     def _take(self, rows: IntArray, feet: FloatArray, free: FloatArray) -> None:
-        """Points of the surface (k, 3) or NaN, and their radii, where they are nearer."""
+        """Take points of the surface (k, 3) or NaN, and their radii, where they are nearer."""
         nearer = np.linalg.norm(self.points[rows] - feet, axis=1) < self._distance(rows)
         self.feet[rows[nearer]], self.free[rows[nearer]] = feet[nearer], free[nearer]

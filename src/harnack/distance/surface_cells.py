@@ -1,7 +1,7 @@
-"""The closest points of the curve in which the field's domain cuts a level set.
+"""What is known of a level set in cells: that it is absent, or a slab that it lies in, and points.
 
-What is known of the level set in cells: that it is not there, or a slab that it lies in, and
-points of it.
+Some points are on the *rim*, the curve at which the field's domain cuts the level set: `RimDescent`
+searches for the closest.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _ROUNDS, _LANDINGS = 80, 8
 _INSIDE, _MISS, _NEAR = 64.0, 48.0, 256.0
 # Of the way to another face: steps end there.
 _BEFORE = 0.999
-# At a corner of the domain, whether the search turns into the other face, or has.
+# States of a search at a corner of the domain: it turns into the other face, or has done so.
 _TURNING, _TURNED = 1, 2
 _LEAST_SHARE = 1e-9  # of a step: shorter ones are given up
 _LEAST_SLOPE = 0.05  # of (x - y) . t along the curve: steps are no longer than 20 times that
@@ -72,7 +72,7 @@ class RimDescent:
 
         def body(
             y: Vec3, best: Vec3, nearest: Real, w: Real, tangent: Vec3, bend: Vec3, normal: Vec3,
-            wall: Vec3, wall_height: Real, hop: Any, share: Real, landing: Any, k: Any,
+            wall: Vec3, wall_height: Real, corner: Any, share: Real, landing: Any, k: Any,
             active: Mask,
         ) -> tuple[Any, ...]:  # fmt: skip
             there = self._at(y)
@@ -80,11 +80,13 @@ class RimDescent:
             met = dr.isfinite(nearest)
             is_other = dr.dot(there.normal, normal) < 1 - _SAME
             gap = fmax(wall_height - dr.dot(wall, best), 0)
-            turns = (hop == _TURNING) & is_other & (distance < nearest + 8 * gap + 100 * there.near)
+            turns = (
+                (corner == _TURNING) & is_other & (distance < nearest + 8 * gap + 100 * there.near)
+            )
             counts = there.is_on & (~met | (distance < nearest) | turns)
             # Beyond another face: that is a wall. Else off the curve: back to it, for some rounds.
             is_free = ~(dr.squared_norm(wall) > 0)
-            crosses = met & is_other & is_free & ~counts & (hop != _TURNING)
+            crosses = met & is_other & is_free & ~counts & (corner != _TURNING)
             lands = ~there.is_on & ~crosses & (landing < _LANDINGS)
             lands &= dr.isfinite(dr.squared_norm(there.back))
             fails = ~counts & ~lands
@@ -111,15 +113,15 @@ class RimDescent:
             onward = dr.fma(vector(s), tangent, best) + vector(0.5 * s * s) * bend
             least = dr.select(is_limited, 0, _LEAST_STEP * nearest)
             is_short = dr.abs(s) <= fmax(least, there.near)
-            hop = dr.select((hop == _TURNING) & ~lands, _TURNED, hop)
-            ends = is_short & is_limited & ~lands & (hop == 0)
-            hop = dr.select(ends, _TURNING, hop)
+            corner = dr.select((corner == _TURNING) & ~lands, _TURNED, corner)
+            ends = is_short & is_limited & ~lands & (corner == 0)
+            corner = dr.select(ends, _TURNING, corner)
             onward = dr.select(ends, dr.fma(vector(gap + 8 * there.near), wall, best), onward)
             active &= (lands | counts | met) & (share > _LEAST_SHARE) & (k + 1 < _ROUNDS)
             active &= lands | ends | ~is_short
             y, landing = dr.select(lands, y + there.back, onward), dr.select(lands, landing + 1, 0)
             return (
-                y, best, nearest, w, tangent, bend, normal, wall, wall_height, hop, share,
+                y, best, nearest, w, tangent, bend, normal, wall, wall_height, corner, share,
                 landing, k + 1, active,
             )  # fmt: skip
 
@@ -166,9 +168,14 @@ class RimDescent:
 
 @dataclass(frozen=True)
 class _RimPlace:
-    """A place near the curve: whether it is on it, to `near`; the step back to it, to first order;
-    its unit tangent and second derivative; the normal of the domain, and
-    how far the place is inside it, less a margin."""
+    """A place near the rim.
+
+    is_on: whether it is on it, to `near`.
+    back: the step back to it, to first order.
+    tangent, bend: unit tangent and second derivative of the rim.
+    normal: of the domain.
+    inwards: how far the place is inside the domain, less a margin.
+    """
 
     is_on: Mask
     near: Real
@@ -178,6 +185,8 @@ class _RimPlace:
     normal: Vec3
     inwards: Real
 
+
+# Cells.
 
 _STEPS = 6
 # The radius of the ball around a cube of half size 1.
@@ -199,7 +208,7 @@ def remainder(sample: Sample, radius: Real) -> Real:
 
 @dataclass
 class CellProofs:
-    """Cells of a level set, looked at in double precision."""
+    """Cells of a level set, evaluated in double precision."""
 
     surface: LevelSet
 
@@ -217,7 +226,7 @@ class CellProofs:
     def _field(self) -> Field:
         return self._prepared.field
 
-    def kept(self, center: FloatArray, half: FloatArray) -> SurfaceCells:
+    def not_empty(self, center: FloatArray, half: FloatArray) -> SurfaceCells:
         """Of cubes (n, 3), half the length of an edge (n,), those that are not proved empty, with
         what is known of them."""
         radius = _WITHIN * half
@@ -234,15 +243,15 @@ class CellProofs:
         empty, cells.normal[inside], cells.offset[inside], cells.thickness[inside] = self._at(
             self._slab, center[inside], radius[inside]
         )
-        kept = np.ones(len(cells), np.bool_)
-        kept[inside] = empty == 0
-        cells, start, radius = cells.some(kept), start[kept], radius[kept]
+        not_empty = np.ones(len(cells), np.bool_)
+        not_empty[inside] = empty == 0
+        cells, start, radius = cells.some(not_empty), start[not_empty], radius[not_empty]
         cells.foot[:], cells.normal[:], cells.spread[:] = self._at(
             self._disk, start, radius, cells.normal
         )
         self._outside(cells.foot)
         if self._rim is not None and len(cells):
-            cut = np.flatnonzero(np.abs(away[kept]) <= radius)
+            cut = np.flatnonzero(np.abs(away[not_empty]) <= radius)
             cells.rim[cut], cells.rim_curvature[cut] = self._at(
                 self._on_rim, start[cut], radius[cut]
             )

@@ -1,9 +1,4 @@
-"""A frame of the tangent plane of a level set, and the second derivatives along it.
-
-Distances to a level set from what is known at the point alone, to first and second order.
-
-What searches compute at points, so many at a time: NumPy on both ends, in double precision.
-"""
+"""Level sets near a point: tangent plane, second derivatives along it, and distances."""
 
 from __future__ import annotations
 
@@ -27,7 +22,8 @@ __all__ = ["Eigen", "TangentPlane", "apply", "first_order", "in_batches", "secon
 
 @dataclass(frozen=True)
 class TangentPlane:
-    """Where grad f is not zero: its length, the unit normal n along it, two unit tangents u, v."""
+    """The tangent plane where grad f is not zero: the length of grad f, the unit normal n along it,
+    and two unit tangents u, v."""
 
     gradient_norm: Real
     n: Vec3
@@ -114,7 +110,7 @@ def second_order(above: Real, gradient: Vec3, rows: tuple[Vec3, Vec3, Vec3]) -> 
     Three have it: the polynomial, the smaller root 2 d1/(1 + sqrt(1 - 2 k d1)) of the parabola, and
     Halley's quotient above. The root does not exist for k d1 > 1/2; the polynomial changes sign at
     k d1 = -2; the quotient is exact for f = c/r + const along its rays (for every f = (a+bs)/(c+es)
-    on the line), as harmonic functions like to be, and bounded for k d1 < 0. For k d1 > 1, where
+    on the line), as harmonic functions often are, and bounded for k d1 < 0. For k d1 > 1, where
     Taylor's formula says nothing, its denominator is held at 1/2: the sign is always that of
     above, and the size at most 2 |d1|.
     """
@@ -125,6 +121,8 @@ def second_order(above: Real, gradient: Vec3, rows: tuple[Vec3, Vec3, Vec3]) -> 
     quotient = first / fmax(1 - 0.5 * k * first, 0.5)
     return dr.select(dr.isfinite(first) & (first != 0), quotient, first)
 
+
+# What searches compute at points, in batches: NumPy on both ends, in double precision.
 
 # Bounds memory, and the time until an interrupt is noticed.
 _AT_ONCE = 1 << 18
@@ -139,7 +137,7 @@ def in_batches(
     """The results of `compute` for points of shape (n, 3), as float64 arrays (n,) or (n, 3).
 
     others: more vectors of the same shape that `compute` is given, one a lane; their values are
-        not looked at.
+        not checked.
 
     Raises:
         TypeError, ValueError: points that are not an (n, 3) array of finite numbers of at most

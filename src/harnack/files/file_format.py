@@ -1,7 +1,4 @@
-"""What all file readers share: the error, reading with a limit, and what was found.
-
-Writing files so that none is ever left half done.
-"""
+"""What all readers and writers of files share: the error, limits, contents, and atomic writing."""
 
 from __future__ import annotations
 
@@ -22,7 +19,7 @@ from harnack.backend import FloatArray, IntArray
 __all__ = ["check_writable", "write_atomically"]
 
 MAX_BYTES = 1 << 28
-# Of files that must be gone through element by element, up to some microseconds each.
+# The most elements of files that are read one by one, at up to some microseconds each.
 MAX_ELEMENTS = 10_000_000
 
 
@@ -75,7 +72,7 @@ class Polygons:
         return len(self.sizes)
 
     def place_of(self, k: int | np.integer[Any]) -> Place:
-        """Where the polygon stands to which corner k of all belongs."""
+        """Where the polygon stands in the file that corner k of all belongs to."""
         return self.places[int(np.searchsorted(np.cumsum(self.sizes), k, side="right"))]
 
     def __iter__(self) -> Iterator[tuple[IntArray, Place]]:
@@ -179,6 +176,9 @@ def differ_in_size(polygons: Polygons) -> bool:
     """Whether polygons have different numbers of corners, or fewer than three."""
     sizes = polygons.sizes
     return bool(len(sizes)) and bool((sizes != max(3, int(sizes[0]))).any())
+
+
+# Writing files so that none is ever left half done.
 
 
 @contextlib.contextmanager

@@ -1,7 +1,7 @@
-"""Reading .glb and .gltf scenes through trimesh, after their promises were checked.
+"""Reading .glb and .gltf scenes through trimesh, after their headers were checked.
 
-A glTF file is a JSON header and buffers of bytes. The header says what to read where, and a
-hostile one can ask for more memory than there is; so it is compared with the bytes first.
+A glTF file is a JSON header and buffers of bytes. The header says what to read where, and a hostile
+one can ask for more memory than there is; so it is compared with the bytes first.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ def _check(place: Place, header: dict[str, Any], size: int) -> None:
     for name in header.get("extensionsUsed", []):
         if name in _MOVING:
             raise place.error(f"it uses the extension {name}, which is not read: save it without")
-    _check_still(place, header)
+    _check_static(place, header)
     views, accessors = header.get("bufferViews", []), header.get("accessors", [])
     asked = 0
     for view in views:
@@ -137,9 +137,9 @@ def _check(place: Place, header: dict[str, Any], size: int) -> None:
     _check_nodes(place, header, _drawn(place, header, accessors))
 
 
-def _check_still(place: Place, header: dict[str, Any]) -> None:
-    """What moves vertices but nodes is not read, nor triangles in fans, nor what is drawn besides
-    triangles."""
+def _check_static(place: Place, header: dict[str, Any]) -> None:
+    """Refuses scenes whose vertices are moved by more than nodes, triangles in fans, and points or
+    lines beside triangles: they are not read."""
     nodes: list[Any] = header.get("nodes", [])
     meshes: list[Any] = header.get("meshes", [])
     if any("skin" in node for node in nodes):
@@ -175,7 +175,7 @@ def _drawn(place: Place, header: dict[str, Any], accessors: list[Any]) -> list[i
 
 
 def _check_nodes(place: Place, header: dict[str, Any], drawn: list[int]) -> None:
-    """Nodes form trees of modest depth, and do not together draw one mesh a million times."""
+    """Refuses nodes that do not form trees of modest depth, or that together draw too much."""
     nodes: list[Any] = header.get("nodes", [])
     children = {k: node.get("children", []) for k, node in enumerate(nodes)}
     below = [child for found in children.values() for child in found]

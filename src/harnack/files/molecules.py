@@ -132,9 +132,9 @@ def _atom_lines(text: str) -> int:
 
 
 def _check_coordinates(path: Path, text: str) -> None:
-    """That columns 31 to 54 of all atoms are three numbers: gemmi takes what is none for 0, and the
-    digits before what is none for the number. It knows atoms by the first four letters of a line,
-    small or capital: serial numbers above 99,999 may begin right behind them.
+    """Check that columns 31 to 54 of all atoms are three numbers: gemmi takes what is none for 0,
+    and the digits before what is none for the number. It knows atoms by the first four letters of a
+    line, small or capital: serial numbers above 99,999 may begin right behind them.
 
     Raises:
         FileFormatError: naming the first line where they are not.

@@ -1,4 +1,4 @@
-"""Reading Stanford .ply, ascii and binary: vertices, faces and edges; all else is passed over.
+"""Reading Stanford .ply, ascii and binary: vertices, faces and edges; all else is ignored.
 
 All rows of an element are read at once, property by property: where a property begins in each row
 follows from the properties before it and the lengths of the lists among them.
@@ -205,7 +205,7 @@ def read_ply(path: Path, data: bytes) -> Contents:
 
 
 def _check_elements(path: Path, header: Header) -> None:
-    """No element holds what would be left out."""
+    """Refuses elements that hold surface in a form that is not read, or that are there twice."""
     names = [section.name for section in header.sections]
     for name in names:
         is_odd = name.lower() in ("vertex", "face", "edge") and name != name.lower()
@@ -218,7 +218,7 @@ def _check_elements(path: Path, header: Header) -> None:
 
 
 def _check_end(path: Path, left: bytes) -> None:
-    """Nothing follows the last row."""
+    """Refuses data after the last row."""
     if left.strip(_PADDING):
         raise Place(path).error(
             "more follows than the rows that its header promises: its counts are too small"
@@ -226,7 +226,7 @@ def _check_end(path: Path, left: bytes) -> None:
 
 
 def _polygons(table: Table, corners: npt.NDArray[Any], sizes: IntArray, count: int) -> Polygons:
-    """Polygons of these corners, which must be indices of so many vertices."""
+    """Polygons of these corners, which must be indices of `count` vertices."""
     found = Polygons(corners.astype(np.int64), sizes, table.places)
     if corners.dtype.kind == "f" and corners.size:
         k = int(np.argmax(corners != np.rint(corners)))

@@ -1,7 +1,4 @@
-"""Reading closed curves from files.
-
-Reading surfaces from files: meshes, clouds, curves, blobs; and saying which it was.
-"""
+"""Reading surface files: meshes, clouds, closed curves, blobs and molecules, and which it was."""
 
 from __future__ import annotations
 
@@ -55,6 +52,8 @@ __all__ = [
     "read_loops",
     "read_surface",
 ]
+
+# Closed curves.
 
 PlacedLoop = tuple[FloatArray, Place]
 
@@ -160,6 +159,8 @@ def _boundary_loops(contents: Contents) -> list[PlacedLoop]:
         raise place.error("its faces form a closed surface, which has no boundary")
     return [(contents.vertices[np.array(ids)], place) for ids in join(remaining)]
 
+
+# All surfaces.
 
 ReadAs: TypeAlias = Literal["winding", "dipole", "loops", "polygons"]
 
@@ -278,7 +279,7 @@ def _read(path: Path, kind: str, as_: ReadAs | None) -> Surface:
 
 
 def _refuse(path: Path, as_: ReadAs | None, possible: tuple[str, ...], held: str) -> None:
-    """Raises unless what was asked for can be made of what the file holds."""
+    """Raise unless `as_` can be made of what the file holds."""
     needs = {
         "winding": "faces", "dipole": "points or faces", "loops": "polylines or faces",
         "polygons": "faces",

@@ -1,20 +1,6 @@
-"""Reading text files of bare numbers: .xyz, a point a line, and .loops, a closed curve a line.
+"""Reading surface files that are text: .xyz, .loops, .blobs, .obj, .off and .stl.
 
-Reading metaball files: text that a person can write, a blob a line.
-
-    # x y z radius [weight [group]]
-    0.0  0.0  0.0  1.0
-    1.2  0.0  0.0  0.8
-    0.6  0.5  0.0  0.4  -1     # carves
-
-The radius is that of the ball which the blob is alone. Weights are 1 unless given. Blobs of one
-group flow together, groups meet in creases; without groups all flow together.
-
-Reading Wavefront .obj: vertices, normals, `f` faces and `l` polylines.
-
-Reading .off files: vertices and polygons as text.
-
-Reading .stl files, binary and ascii.
+Files .stl may be binary, too.
 """
 
 from __future__ import annotations
@@ -53,9 +39,10 @@ from harnack.names import renamed
 
 
 def read_xyz(path: Path, data: bytes) -> Contents:
-    """Points, from columns 1 to 3, and normals, from columns 4 to 6 if there are six or more.
+    """Points of an .xyz file, one a line, from columns 1 to 3, and normals, from columns 4 to 6 if
+    there are six or more.
 
-    Further columns are passed over. `#` begins a comment.
+    Further columns are ignored. `#` begins a comment.
 
     Raises:
         FileFormatError: lines with different numbers of columns or fewer than three, words, numbers
@@ -88,7 +75,8 @@ def read_xyz(path: Path, data: bytes) -> Contents:
 
 
 def read_loops_text(path: Path, data: bytes) -> list[tuple[FloatArray, Place]]:
-    """Loops (n, 3) of a .loops file, x y z repeated, and where they stand. `#` begins a comment.
+    """Loops (n, 3) of a .loops file, one a line, x y z repeated, and where they stand. `#` begins a
+    comment.
 
     Raises:
         FileFormatError: something that is no number, or a line whose count is no multiple of 3.
@@ -105,6 +93,8 @@ def read_loops_text(path: Path, data: bytes) -> list[tuple[FloatArray, Place]]:
     points = np.split(numbers.reshape(-1, 3), np.cumsum(counts // 3)[:-1])
     return [(loop, lines.places[k]) for k, loop in enumerate(points)]
 
+
+# Metaballs.
 
 _COLUMNS = "x y z radius [weight [group]]"
 
@@ -125,10 +115,17 @@ class Metaballs:
 
 
 def read_metaballs(path: Path, data: bytes) -> Metaballs:
-    """The blobs of a .blobs file, one a line: x y z radius [weight [group]]. `#` begins a comment.
+    """The blobs of a .blobs file: text that a person can write, a blob a line. `#` begins a
+    comment.
 
-    Lines may have different numbers of columns: a weight left out is 1. Either all lines name a
-    group or none does.
+        # x y z radius [weight [group]]
+        0.0  0.0  0.0  1.0
+        1.2  0.0  0.0  0.8
+        0.6  0.5  0.0  0.4  -1     # carves
+
+    The radius is that of the ball that the blob is by itself. Weights are 1 unless given. Blobs of
+    one group flow together, groups meet in creases; without groups all flow together. Lines may
+    have different numbers of columns. Either all lines name a group or none does.
 
     Raises:
         FileFormatError: nothing in it; words, numbers that are not finite, fewer than four or more
@@ -169,18 +166,21 @@ def read_metaballs(path: Path, data: bytes) -> Metaballs:
     return Metaballs(table[:, :3], radii, table[:, 4], whole, said)
 
 
+# Wavefront .obj.
+
 # Statements by which there is more of the surface: free forms, old faces, other files.
 _NOT_READ = (b"curv", b"curv2", b"surf", b"bzp", b"bsp", b"fo", b"call")
 
 
 def read_obj(path: Path, data: bytes) -> Contents:
-    """Vertices, faces and polylines of an .obj file, normals of a cloud if there is one a vertex.
+    """Vertices, faces (`f`) and polylines (`l`) of a Wavefront .obj file, normals of a cloud if
+    there is one a vertex.
 
     Points `p` choose vertices, and the normals of theirs. Statements of groups, materials and
-    textures are passed over; those by which there is more of the surface are refused.
+    textures are ignored; those by which there is more of the surface are refused.
 
-    Indices may be negative (counted back from the last vertex so far) and carry texture and
-    normal indices after slashes, which are not read.
+    Indices may be negative (counted back from the last vertex so far) and carry texture and normal
+    indices after slashes, which are not read.
 
     Raises:
         FileFormatError: a malformed statement, an index out of range.
@@ -274,8 +274,11 @@ def _polygons(lines: Lines, few: str, least: int, vertices: Lines) -> Polygons:
     return polygons
 
 
+# .off, vertices and polygons.
+
+
 def read_off(path: Path, data: bytes) -> Contents:
-    """Vertices and faces of an .off file. Colors, normals and textures are passed over.
+    """Vertices and faces of an .off file. Colors, normals and textures are ignored.
 
     Raises:
         FileFormatError: no .off file of points in space, truncated, malformed, an index out of
@@ -351,8 +354,10 @@ def _header(path: Path, lines: Lines) -> tuple[int, int, Lines]:
     return counts[0], counts[1], lines[at + 1 :]
 
 
+# .stl, binary and ascii.
+
 _HEADER = 84
-# Of UTF-8, before the text of some programs.
+# The byte order mark of UTF-8, before the text of some programs.
 _MARK = b"\xef\xbb\xbf"
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _KEYWORDS = (b"solid", b"facet", b"outer", b"vertex", b"endloop", b"endfacet", b"endsolid")

@@ -1,4 +1,4 @@
-"""Numbers in text files: all at once where all is well, line by line to find what is not."""
+"""Numbers in text files: parsed all at once, and word by word only where that fails."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def excerpt(word: bytes) -> str:
 def read_table(
     lines: Lines, columns: int, *, few: str = "{} numbers are too few: {} are expected"
 ) -> FloatArray:
-    """The first numbers of each line, all finite: (n, columns). Further words are passed over.
+    """The first numbers of each line, all finite: (n, columns). Further words are ignored.
 
     few: the error of a line with fewer.
 

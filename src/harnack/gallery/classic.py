@@ -1,6 +1,6 @@
-"""Scenes of curves, harmonic polynomials and periodic surfaces.
+"""Scenes of curves, harmonic polynomials, periodic surfaces, and functions over the plane.
 
-Scenes over the plane: Riemann surfaces (the paper's Fig. 19), level curves, height fields.
+Those over the plane are Riemann surfaces (the paper's Fig. 19), level curves and height fields.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def _quartic() -> list[LevelSet]:
 
 
 def _fitted_knot() -> list[LevelSet]:
-    """Gaussians along a trefoil knot, by sixteen cosines a side."""
+    """Gaussians along a trefoil knot, by a series of 16 x 16 x 9 cosines."""
     curve = shapes.torus_knot(2, 3, 150)
     step = np.linalg.norm(np.roll(curve, -1, axis=0) - curve, axis=1)
     width = 0.15 * float(np.ptp(curve, axis=0).max()) / 2
@@ -242,6 +242,9 @@ SOLIDS = (
         demo_spp=4,
     ),
 )
+
+
+# Over the plane.
 
 
 def _surface(function: Any, part: str = "imag", **settings: Any) -> list[LevelSet]:

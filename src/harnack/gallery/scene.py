@@ -1,4 +1,4 @@
-"""A named picture."""
+"""A named scene: what it shows, and how to draw it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DRAWN = Tolerance(2e-4)
 
 @dataclass(frozen=True)
 class Scene:
-    """A picture waiting to be made.
+    """A picture by name, and how to make it.
 
     surfaces: makes the level sets; materials: one name for each of them (or one for all).
     demo_spp: samples a pixel in `make demo`, 0 for not in it; few, to keep it to a few minutes.

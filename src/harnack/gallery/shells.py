@@ -1,12 +1,4 @@
-"""Scenes of meshes whose faces are large polygons that are not flat.
-
-Grid shells: solid angles of outlines with round holes, with their lines of curvature.
-
-After Fig. 17 of Gillespie et al. (2024), whose data are not public: outlines and holes are
-reconstructed. The level -2 pi + a leaves the ground at the angle a/2 everywhere, so that outline
-and holes are lines of curvature themselves (Joachimsthal), and lines of the other family meet them
-at right angles: beams that can be built.
-"""
+"""Scenes of meshes whose faces are large polygons that are not flat, and of grid shells."""
 
 from __future__ import annotations
 
@@ -70,16 +62,26 @@ EXOSKELETONS = (
 )
 
 
+# Grid shells.
+
 _FAMILIES: tuple[Family, Family] = ("largest", "smallest")
 
 
 @dataclass(frozen=True)
 class GridShell:
-    """A shell over the region of the ground between an outline and holes.
+    """A grid shell over the region of the ground between an outline and round holes: the solid
+    angle of these curves, with its lines of curvature.
 
-    outline: (n, 2), counter-clockwise. holes: (x, y, radius) each.
+    After Fig. 17 of Gillespie et al. (2024), whose data are not public: outlines and holes are
+    reconstructed. The level -2 pi + a leaves the ground at the angle a/2 everywhere, so that
+    outline and holes are lines of curvature themselves (Joachimsthal), and lines of the other
+    family meet them at right angles: beams that can be built.
+
+    outline: (n, 2), counter-clockwise.
+    holes: (x, y, radius) each.
     angle: a, twice the angle at which it leaves the ground.
-    spacing: of the beams, on the outline and the holes. thickness: radius of the beams.
+    spacing: of the beams, on the outline and the holes.
+    thickness: radius of the beams.
     """
 
     outline: FloatArray

@@ -1,6 +1,7 @@
-"""Scenes of blobs: metaballs, a surface through points with normals, and molecules.
+"""Scenes of blobs and of solids.
 
-Scenes of solids: distance surfaces, what is made of them, noise, and blobs to look through.
+Blobs are metaballs, a surface through points with normals, and molecules. Solids are distance
+surfaces, what is made of them, noise, and blobs to look through.
 """
 
 from __future__ import annotations
@@ -124,6 +125,9 @@ BLOBS = (
         demo_spp=25,
     ),
 )
+
+
+# Solids.
 
 
 def _drawn(*solids: Solid) -> list[LevelSet]:

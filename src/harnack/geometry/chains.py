@@ -1,9 +1,7 @@
-"""Joining edges to closed loops, by integer index.
+"""Edges by integer index: closed loops of them, and those at which faces of a mesh do not cancel.
 
-Where the winding number of a mesh is singular: the edges at which faces do not cancel.
-
-Let T be the triangles of a mesh, m_T integers, and Omega_T(x) the signed solid angle of T seen from
-x. Then
+At the latter the winding number is singular. Let T be the triangles of a mesh, m_T integers, and
+Omega_T(x) the signed solid angle of T seen from x. Then
 
     w = 1/(4 pi) sum_T m_T Omega_T
 
@@ -26,8 +24,9 @@ The n_e are the boundary of an integral chain, so at each vertex as much weight 
 S is made of closed loops, and 4 pi w is mod 4 pi the solid angle of these loops.
 
 Edges are compared by integer index, after equal positions were given one index (`weld_vertices`),
-never by distance: near edges do not cancel, however near they are. All functions here are linear
-but for one sort, and take about a second for a million triangles.
+never by distance: near edges do not cancel, however near they are. Functions of arrays are linear
+but for one sort, and take about a second for a million triangles; `boundary_edges`, `join` and
+`singular_loops` take one Python step an edge.
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ Edge = tuple[int, int]
 
 
 class OpenChainError(ValueError):
-    """Edges that do not join to closed loops. vertex: where they end or meet in an odd way."""
+    """Edges that do not join to closed loops. vertex: where they end, or meet in too many."""
 
     def __init__(self, vertex: int, count: int) -> None:
         super().__init__(f"{count} edges meet at vertex {vertex}")
@@ -128,7 +127,8 @@ def _walk(start: int, leaving: dict[int, list[int]]) -> list[list[int]]:
 
 
 def _with_common_direction(edges: Sequence[Edge]) -> list[Edge]:
-    """The edges turned so that each loop runs in the direction of its first edge."""
+    """The edges, reversed where need be so that each loop runs in the direction of its first
+    edge."""
     touching: defaultdict[int, list[int]] = defaultdict(list)
     for k, (a, b) in enumerate(edges):
         touching[a].append(k)

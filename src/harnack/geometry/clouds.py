@@ -1,10 +1,8 @@
-"""Point clouds with normals: what is accepted, and the area that each point stands for.
+"""Point clouds with normals: validation, the area of each point, and normals where there are none.
 
 A cloud is a sample of a surface: points (n, 3), unit normals (n, 3) to the positive (outer) side,
 and areas (n,) whose sum is about the area of the surface. Points at the same position are allowed:
 their dipoles add, which is what two layers of a surface that touch there should do.
-
-Normals of point clouds that have none: local planes, turned to agree with each other.
 """
 
 from __future__ import annotations
@@ -169,7 +167,7 @@ def _as_numbers(values: Any, name: str) -> FloatArray:
 
 
 def check_neighbors(neighbors: int) -> None:
-    """That there are enough neighbors to show a surface.
+    """Check that there are enough neighbors to show a surface.
 
     Raises:
         CloudError: there are fewer than 3.
@@ -267,6 +265,8 @@ def _disc_cut_by_lines(q: FloatArray, b: FloatArray) -> FloatArray:
     angles = (np.arctan2(high, h) - np.arctan2(low, h)).sum(axis=1)
     return triangles + 0.5 * np.maximum(2.0 * np.pi - angles, 0.0)
 
+
+# Normals of clouds that have none: local planes, turned to agree with each other.
 
 Indices = npt.NDArray[np.int64] | npt.NDArray[np.int32]
 

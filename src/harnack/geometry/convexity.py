@@ -1,11 +1,10 @@
-"""Whether a closed curve provably lies on the boundary of a convex body.
+"""Curves in convex position, and convex hulls as clipping volumes.
 
+`is_convex_position` says whether a closed curve provably lies on the boundary of a convex body.
 That is the hypothesis of Theorems B.1 and C.1 of Gillespie, Yang, Botsch and Crane, 'Ray Tracing
 Harmonic Functions' (2024): a connected curve P without self-intersections on the boundary of a
-convex set. Then the 2 pi level of its solid angle lies in the hull of P, and a segment crosses
-that level at most once, which gives the lower bound -4 pi.
-
-The convex hull of points as a clipping volume.
+convex set. Then the 2 pi level of its solid angle lies in the hull of P, and a segment crosses that
+level at most once, which gives the lower bound -4 pi.
 """
 
 from __future__ import annotations
@@ -63,7 +62,7 @@ def is_convex_position(loops: tuple[FloatArray, ...]) -> bool:
     if not 0.0 < size < np.inf:
         return False
     x = (loops[0] - 0.5 * (lower + upper)) / size
-    # All comparisons of this module are written so that NaN refuses.
+    # All comparisons here are written so that NaN makes them fail.
     if not _edge_lengths(x).min() >= MIN_SEPARATION:
         return False
     return (_is_flat(x) or _lies_on_hull(x)) and is_simple(x)
@@ -194,6 +193,8 @@ def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
     return (a * b).sum(axis=1)
 
 
+# Hulls.
+
 MAX_PLANES = 2048
 """Nearly parallel facets beyond this number are dropped; what is left is a little larger."""
 
@@ -304,8 +305,8 @@ def _facet_normals(x: FloatArray) -> FloatArray | None:
 
 
 def _spread_first(normals: FloatArray) -> FloatArray:
-    """The same normals, the first of which lie far from each other: what misses the hull misses
-    a few of those planes."""
+    """The same normals, the first of which lie far from each other: a few of these planes show that
+    a ray misses the hull."""
     order, left = [0], np.full(len(normals), np.inf)
     for _ in range(min(len(normals), _SPREAD) - 1):
         left = np.minimum(left, 1.0 - normals @ normals[order[-1]])

@@ -1,9 +1,8 @@
-"""Circles: closed curves that are no polygons.
+"""Closed curves in space, polygonal loops and circles: what is accepted, and simple measures.
 
-Closed polygonal curves in space: what is accepted, and their simplest measures.
-
-A loop is an array (n, 3) of vertices; its last vertex is joined to its first. A curve is a
-tuple of loops, which may be knotted, linked, nested or cross each other.
+A loop is an array (n, 3) of vertices; its last vertex is joined to its first. A curve is a tuple of
+loops, which may be knotted, linked, nested or cross each other. Circles are closed curves that are
+no polygons.
 """
 
 from __future__ import annotations
@@ -142,6 +141,8 @@ def net_circles(circles: Iterable[Circle]) -> tuple[Circle, ...]:
             surplus[one] += 1
     return tuple(surplus.elements())
 
+
+# Polygonal curves.
 
 MAX_VERTICES = 10_000_000
 

@@ -1,14 +1,8 @@
-"""Meshes of polygons that need not be flat: what is accepted, and their measures.
+"""Meshes of polygons that need not be flat: what is accepted, their measures, and how to make some.
 
-A face is a closed curve through vertices, or several, such as an outline and holes: it is given
-by the indices of its vertices, counted from 0. Its positive side is the one from which the outline
+A face is a closed curve through vertices, or several, such as an outline and holes: it is given by
+the indices of its vertices, counted from 0. Its positive side is the one from which the outline
 runs counter-clockwise and holes clockwise. Faces need not be joined, and may cross each other.
-
-Triangle meshes cut into patches: polygons with many corners that are not flat.
-
-They are made for pictures and tests: each triangle is a point (centroid, weight * normal) in six
-dimensions, patches are the clusters of Lloyd's algorithm, so that they are compact and bend little,
-and their boundaries are the polygons (Cohen-Steiner, Alliez and Desbrun 2004 do so with planes).
 """
 
 from __future__ import annotations
@@ -44,7 +38,7 @@ _ON_A_LINE = 1e-9
 _TURN = 1e-6
 # Turns of a convex polygon add up to one revolution, to this many radians.
 _REVOLUTION = 1e-6
-# So many faces whose shadows are not convex are examined further, at half a millisecond each.
+# At most so many faces with projections that are not convex are examined further, at 0.5 ms each.
 _MOST_EXAMINED = 20_000
 
 
@@ -110,20 +104,20 @@ class PolygonFaces:
     def in_convex_position(self) -> BoolArray:
         """(m,) whether each face is one loop without self-intersections that is proved to lie on
         the boundary of a convex set; False where no proof was found."""
-        found = self._have_convex_shadows()
+        found = self._have_convex_projections()
         single = np.bincount(self.face_of_loop, minlength=self.count) == 1
         rest = np.flatnonzero(single & ~found)[:_MOST_EXAMINED]
         for k in rest:
             found[k] = is_convex_position(tuple(self.loops(int(k))))
         return found
 
-    def _have_convex_shadows(self) -> BoolArray:
-        """(m,) whether each face is one loop whose shadow along its mean normal is a convex polygon
-        run round once.
+    def _have_convex_projections(self) -> BoolArray:
+        """(m,) whether each face is one loop whose projection along its mean normal is a convex
+        polygon, run around once.
 
-        Such a loop has no self-intersection, for its shadow has none, and it lies on the boundary
-        of a convex set, the cylinder over the shadow. A turn counts from a millionth of the lengths
-        of the edges on, far above rounding: a face that is called convex is.
+        Such a loop has no self-intersection, for its projection has none, and it lies on the
+        boundary of a convex set, the cylinder over the projection. A turn counts from a millionth
+        of the lengths of the edges on, far above rounding: a face that is called convex is.
         """
         x = self.vertices[self.corners]
         face, first = self.face_of_corner, self.first_corners
@@ -287,7 +281,8 @@ def _first_double(keys: IntArray) -> int | None:
 
 
 def _check_breadth(found: PolygonFaces) -> None:
-    """That no face lies on a line: about the corner farthest from its middle, through that."""
+    """Raise MeshError for a face whose vertices lie on a line: that from the corner farthest from
+    its middle to the corner farthest from there."""
     x, face = found.vertices[found.corners], found.face_of_corner
     low, high = found.boxes()
     a = x - (0.5 * (low + high))[face]
@@ -325,7 +320,13 @@ def polygon_patches(
     smoothing: int = 0,
     seed: int = 0,
 ) -> tuple[FloatArray, list[list[list[int]]]]:
-    """Vertices and polygon faces, a list of loops each, of about `count` patches of a mesh.
+    """A triangle mesh cut into about `count` patches, polygons with many corners that are not flat:
+    vertices, and polygon faces, a list of loops each.
+
+    They are made for pictures and tests: each triangle is a point (centroid, weight * normal) in
+    six dimensions, patches are the clusters of Lloyd's algorithm, so that they are compact and bend
+    little, and their boundaries are the polygons (Cohen-Steiner, Alliez and Desbrun 2004 do so with
+    planes).
 
     Corners of a patch are vertices of the mesh; vertices within patches are left out. smoothing:
     how often corners of just two edges are moved to the middle between where they are and the mean

@@ -1,11 +1,4 @@
-"""Closed curves without the edges that are run there and back.
-
-Seen from outside of an edge, its part in the solid angle of one loop is minus that in another
-which runs it the other way, so that the two drop out of the sum. Computed one by one they leave
-their rounding errors, and distances and convexity count a curve that is not there.
-
-Cutting polygons into triangles.
-"""
+"""Closed polygons: without the edges that are run there and back, and cut into triangles."""
 
 from __future__ import annotations
 
@@ -22,16 +15,20 @@ __all__ = ["net_loops", "triangulate", "uncanceled_edges"]
 def net_loops(loops: Loops) -> Loops:
     """Closed loops with the same solid angle modulo 4 pi, of which no edge runs another back.
 
-    Vertices at exactly the same position are one. Of edges that run both ways between two of
-    them the surplus is left, once for each time that it counts. Where nothing cancels, the loops
-    are returned as they are, and none where everything does. Edges are compared as wholes: of two
-    that overlap in part and run opposite ways, both stay.
+    Seen from outside of an edge, its part in the solid angle of one loop is minus that in another
+    which runs it the other way, so that the two drop out of the sum. Computed one by one they leave
+    their rounding errors, and distances and convexity count a curve that is not there.
 
-    Proof that the rest is closed: around a loop as many edges begin at a vertex as end there,
-    and so they do after one of each was taken away from both ends of an edge. The gradient of the
-    solid angle is the sum of the edges' fields, which cancel (Biot and Savart), and the integral
-    along closed paths is still a multiple of 4 pi, so that values change by a constant at most; far
-    away both vanish, modulo 4 pi.
+    Vertices at exactly the same position are one. Of edges that run both ways between two of them
+    the surplus is left, once for each time that it counts. Where nothing cancels, the loops are
+    returned as they are, and none where everything does. Edges are compared as wholes: of two that
+    overlap in part and run opposite ways, both stay.
+
+    Proof that the rest is closed: around a loop as many edges begin at a vertex as end there, and
+    so they do after one of each was taken away from both ends of an edge. The gradient of the solid
+    angle is the sum of the edges' fields, which cancel (Biot and Savart), and the integral along
+    closed paths is still a multiple of 4 pi, so that values change by a constant at most; far away
+    both vanish, modulo 4 pi.
     """
     points = np.concatenate(loops)
     begin, end = _welded(loops, points)
@@ -61,8 +58,10 @@ def _welded(loops: Loops, points: FloatArray) -> tuple[IntArray, IntArray]:
     return index, np.concatenate([np.roll(part, -1) for part in parts])
 
 
-# Corners squared, and so many more a polygon, summed over those of which ears are cut: some ten
-# seconds of work at worst.
+# Triangles of polygons.
+
+# Corners squared, and this constant more a polygon, summed over those of which ears are cut: some
+# ten seconds of work at worst.
 _MOST_WORK = 1_000_000_000
 _WORK_A_POLYGON = 1000
 # Twice the area of a triangle, in a polygon of size about 1, up to which it counts as flat.
@@ -76,8 +75,8 @@ def triangulate(vertices: FloatArray, corners: IntArray, sizes: IntArray) -> Int
     """Triangles (k, 3) of polygons, in their order.
 
     vertices: (n, 3). corners: of all polygons, one after the other. sizes: (m,), how many corners
-    each has; those with fewer than three give no triangles. A polygon that need not be quite flat
-    is judged by its shadow along its mean normal. Where the fans around its first two corners are
+    each has; those with fewer than three give no triangles. A polygon need not be quite flat: it is
+    judged by its projection along its mean normal. Where the fans around its first two corners are
     not proper triangulations, because the polygon has dents, ears are cut off it (Meisters 1975).
     The edges of the triangles always cancel to those of the polygon: polygons that cross themselves
     get triangles that overlap, and in a winding number these still add up to the polygon.
@@ -109,9 +108,9 @@ def triangulate(vertices: FloatArray, corners: IntArray, sizes: IntArray) -> Int
             )
         found.append(_fans(polygons[~bent]))
         owners.append(np.repeat(part[~bent], k - 2))
-        shadows = _shadows(vertices, polygons[bent])
-        for owner, polygon, shadow in zip(part[bent], polygons[bent], shadows, strict=True):
-            found.append(_cut_ears(polygon, shadow))
+        projections = _projections(vertices, polygons[bent])
+        for owner, polygon, projection in zip(part[bent], polygons[bent], projections, strict=True):
+            found.append(_cut_ears(polygon, projection))
             owners.append(np.full(len(found[-1]), owner))
     return np.concatenate(found)[np.argsort(np.concatenate(owners), kind="stable")]
 
@@ -148,7 +147,7 @@ def _has_dents(vertices: FloatArray, polygons: IntArray) -> BoolArray:
     return is_turned.any(axis=1) & (square > 0.0)
 
 
-def _shadows(vertices: FloatArray, polygons: IntArray) -> FloatArray:
+def _projections(vertices: FloatArray, polygons: IntArray) -> FloatArray:
     """Plane coordinates (m, k, 2) of polygons, counter-clockwise, along their mean normals."""
     p = vertices[polygons]
     p = p - p[:, :1]
@@ -162,14 +161,14 @@ def _shadows(vertices: FloatArray, polygons: IntArray) -> FloatArray:
     return np.stack([np.einsum("mkj,mj->mk", p, axis) for axis in axes], axis=2)
 
 
-def _cut_ears(polygon: IntArray, shadow: FloatArray) -> IntArray:
-    """Triangles of a polygon (k,) whose shadow (k, 2) has dents."""
+def _cut_ears(polygon: IntArray, projection: FloatArray) -> IntArray:
+    """Triangles of a polygon (k,) whose projection (k, 2) has dents."""
     import mapbox_earcut  # here, since most files do without
 
     ears = np.zeros((0, 3), dtype=np.int64)
-    if np.isfinite(shadow).all():
+    if np.isfinite(projection).all():
         ends = np.array([len(polygon)], dtype=np.uint32)
-        cut = mapbox_earcut.triangulate_float64(_bent_inward(shadow), ends)
+        cut = mapbox_earcut.triangulate_float64(_bent_inward(projection), ends)
         ears = polygon[cut.reshape(-1, 3)]
     if len(ears) == len(polygon) - 2:
         return ears
@@ -178,22 +177,25 @@ def _cut_ears(polygon: IntArray, shadow: FloatArray) -> IntArray:
     return np.concatenate([ears, *(_fans(np.array([loop])) for loop in remaining)])
 
 
-def _bent_inward(shadow: FloatArray) -> FloatArray:
+def _bent_inward(projection: FloatArray) -> FloatArray:
     """The polygon (k, 2), its straight edges with corners in their middle bent by next to nothing.
 
     Such a corner is then no ear, which would be a triangle without area.
     """
-    arriving, leaving = shadow - np.roll(shadow, 1, axis=0), np.roll(shadow, -1, axis=0) - shadow
+    arriving, leaving = (
+        projection - np.roll(projection, 1, axis=0),
+        np.roll(projection, -1, axis=0) - projection,
+    )
     turn = arriving[:, 0] * leaving[:, 1] - arriving[:, 1] * leaving[:, 0]
     is_straight = (np.abs(turn) <= _FLAT) & ((arriving * leaving).sum(axis=1) > 0.0)
     ends = np.flatnonzero(~is_straight)
-    if len(ends) in (0, len(shadow)):
-        return shadow
-    k = np.arange(len(shadow))
-    begin = shadow[ends[np.searchsorted(ends, k, side="right") - 1]]
-    end = shadow[ends[np.searchsorted(ends, k) % len(ends)]]
+    if len(ends) in (0, len(projection)):
+        return projection
+    k = np.arange(len(projection))
+    begin = projection[ends[np.searchsorted(ends, k, side="right") - 1]]
+    end = projection[ends[np.searchsorted(ends, k) % len(ends)]]
     edge = end - begin
     length = np.maximum(np.linalg.norm(edge, axis=1), 1e-300)
-    depth = np.linalg.norm(shadow - begin, axis=1) * np.linalg.norm(end - shadow, axis=1)
+    depth = np.linalg.norm(projection - begin, axis=1) * np.linalg.norm(end - projection, axis=1)
     inward = np.stack([-edge[:, 1], edge[:, 0]], axis=1) / length[:, None]
-    return shadow + _INWARD * depth[:, None] * inward
+    return projection + _INWARD * depth[:, None] * inward

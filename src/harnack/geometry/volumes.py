@@ -1,7 +1,4 @@
-"""Volumes bounded by planes, and the loop over their planes.
-
-Ball, box and half-space, and intersections of volumes.
-"""
+"""Clipping volumes: ball, box, half-space and their intersections; polytopes and their planes."""
 
 from __future__ import annotations
 

@@ -1,20 +1,10 @@
-"""Triangles of a mesh that meet in more than what they share, decided exactly.
+"""What a mesh of a level set has to satisfy, whatever made it, with exact predicates.
 
-Two triangles in different planes meet beyond their common corners if and only if an edge of one
-passes through the other, with its ends on both sides of that one's plane, or ends on it: corners
-that lie on other triangles are not looked for, since edges beyond them would pass through. Two
-triangles in one plane overlap unless the line of an edge has them on its two sides (separating
-axes), whatever they share: faces that are there twice, or folded back onto their neighbors, do.
-Pairs are looked for among those whose boxes overlap.
-
-Exact signs of determinants: on which side of a plane, or of a line in a plane, points lie.
-
-Determinants are computed in floating point, with a bound of what rounding may have done to them
-(Shewchuk, Adaptive Precision Floating-Point Arithmetic and Fast Robust Geometric Predicates, 1997).
-Where that leaves the sign open it is found in integers: all coordinates are integers times one
-power of two.
-
-What a mesh of a level set has to satisfy, whatever made it.
+The predicates are signs of determinants: on which side of a plane, or of a line in a plane, points
+lie. Determinants are computed in floating point, with a bound of what rounding may have done to
+them (Shewchuk, Adaptive Precision Floating-Point Arithmetic and Fast Robust Geometric Predicates,
+1997). Where that leaves the sign open it is found in integers: all coordinates are integers times
+one power of two.
 """
 
 from __future__ import annotations
@@ -51,6 +41,8 @@ __all__ = [
 ]
 
 SignArray = npt.NDArray[np.int8]
+
+# Exact signs.
 
 _UNIT = 2.0**-53
 # Shewchuk's bounds of the rounding of both determinants, over the sum of their terms' magnitudes.
@@ -93,8 +85,8 @@ def _scaled(points: FloatArray) -> FloatArray:
 def _decided(
     value: FloatArray, error: FloatArray, zero: BoolArray, points: FloatArray, exact: Any
 ) -> SignArray:
-    """Signs of values known up to errors, or to be 0; by `exact` of the points where that is not
-    enough."""
+    """Signs of values known up to errors, or to be 0; where that is not enough, by `exact` of the
+    points."""
     signs: SignArray = np.sign(value).astype(np.int8)
     signs[zero] = 0
     open_rows = np.flatnonzero(~zero & (np.abs(value) <= error + _UNDERFLOW))
@@ -124,12 +116,15 @@ def _exact_turns(points: Any) -> Any:
     return ax * by - ay * bx
 
 
+# Triangles that intersect.
+
 _EDGES = ((0, 1), (1, 2), (2, 0))
 _PAIRS_AT_ONCE = 1 << 18
 
 
 def turned_faces(function: LevelFunction, vertices: FloatArray, faces: IntArray) -> IntArray:
-    """Indices of faces whose normal does not point to where the function grows, at their center."""
+    """Indices of faces whose normal does not point to where the function grows, judged at their
+    center."""
     corner = vertices[faces]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     slope = function.at(corner.mean(axis=1)).gradient
@@ -139,8 +134,16 @@ def turned_faces(function: LevelFunction, vertices: FloatArray, faces: IntArray)
 def intersecting_faces(
     vertices: FloatArray, faces: IntArray, among: BoolArray | None = None
 ) -> IntArray:
-    """Indices of faces (m, 3) that an edge of another face passes through, or that lie on others
-    in their plane, and of those others.
+    """Indices of faces (m, 3) that meet others in more than what they share, decided exactly: that
+    an edge of another face passes through, or that lie on others in their plane, and of those
+    others.
+
+    Two triangles in different planes meet beyond their common corners if and only if an edge of one
+    passes through the other, with its ends on both sides of that one's plane, or ends on it:
+    corners that lie on other triangles are not looked for, since edges beyond them would pass
+    through. Two triangles in one plane overlap unless the line of an edge has them on its two sides
+    (separating axes), whatever they share: faces that are there twice, or folded back onto their
+    neighbors, do. Pairs are looked for among those whose boxes overlap.
 
     among: (m,) mask; pairs of which neither is chosen are not looked at.
     """
@@ -162,8 +165,8 @@ def intersecting_faces(
 
 
 def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
-    """Pairs (k, 2) of triangles (m, 3, 3) whose boxes overlap, each once; if not None, with one of
-    those of a mask.
+    """Pairs (k, 2) of triangles (m, 3, 3) whose boxes overlap, each once; given a mask, only those
+    with one of the chosen triangles.
 
     Triangles of one size (up to 2) at a time, with those no larger: of a large triangle and many
     small ones only what is near is looked at.
@@ -227,8 +230,8 @@ def _overlap(one: FloatArray, other: FloatArray) -> BoolArray:
     """(k,) whether triangles (k, 3, 3) in one plane have an area in common; seen along the axis in
     which they are thinnest."""
     normal = np.abs(np.cross(one[:, 1] - one[:, 0], one[:, 2] - one[:, 0]))
-    kept = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
-    flat = [np.take_along_axis(t, kept[:, None].repeat(3, axis=1), axis=2) for t in (one, other)]
+    axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
+    flat = [np.take_along_axis(t, axes[:, None].repeat(3, axis=1), axis=2) for t in (one, other)]
     found = np.ones(len(one), np.bool_)
     for a, b in (flat, flat[::-1]):
         turn = sides_of_lines(a[:, 0], a[:, 1], a[:, 2])
@@ -236,6 +239,9 @@ def _overlap(one: FloatArray, other: FloatArray) -> BoolArray:
             side = [turn * sides_of_lines(a[:, i], a[:, j], b[:, k]) for k in range(3)]
             found &= (np.stack(side) > 0).any(axis=0)
     return found
+
+
+# Checks of whole meshes.
 
 
 class MeshingError(ValueError):
@@ -300,7 +306,7 @@ def check_manifold(faces: IntArray, vertices: FloatArray | None = None) -> None:
 
 
 def check_apart(vertices: FloatArray, faces: IntArray) -> None:
-    """Raise if a vertex is no point, or if faces pass through each other or lie on each other;
+    """Raise if a vertex is not finite, or if faces pass through each other or lie on each other;
     decided exactly.
 
     Raises:
@@ -344,14 +350,15 @@ def check_near_level(
     tolerance: float,
     volume: Volume | None,
 ) -> None:
-    """Raise unless vertices and centers of faces are within `tolerance` of the level, by looks at
+    """Raise unless vertices and centers of faces are within `tolerance` of the level, by samples of
     the function.
 
-    A point is, if the slope says so, |f|/|grad f| <= tolerance; or if f changes its sign between
-    points that are as far from it, along the normal of the face and along the axes, for then a
-    continuous f has its level between them. On the volume's boundary a solid is cut: to be outside
-    of it counts as a positive sign. The rim of an angle is its curve, where it has no value; and
-    triangles smaller than half of the tolerance are as near as their corners.
+    A point is within it if the gradient says so, |f|/|grad f| <= tolerance; or if f changes its
+    sign between two points at that distance from it, along the normal of the face or along an axis,
+    for then a continuous f has its level between them. A solid is cut at the volume's boundary: to
+    be outside of the volume counts as a positive sign. Boundary vertices of an angle's level set
+    are on its curve, where it has no value, and are left out; and triangles smaller than half of
+    the tolerance are as near as their corners.
 
     Raises:
         LocalError: with the points that are not.

@@ -1,6 +1,6 @@
-"""The largest part of a surface, and the largest body of a closed one, with its cavities.
+"""Parts of surfaces: the largest part, the largest body with its cavities, and what a volume holds.
 
-Open surfaces cut by volumes: triangles ended at planes and spheres.
+Open surfaces are cut by volumes: triangles end at planes and spheres (`cut_by`).
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ def largest_body(surface: Surface) -> Surface:
     """Of a closed surface the body with the largest volume: an outer shell and the shells of its
     cavities, which are turned inwards, so that their volume is negative.
 
-    Proof. Shells are closed, connected and do not meet. Where the surface bounds a set, a shell
-    turned inwards has the set around it, whose part there has an outer shell; of those that hold
-    the cavity it is the innermost, the smallest one: another one in between would be
-    outside of the part, with nothing of the set between both. That a shell holds a point is told by
-    its winding number there, a whole one.
+    Proof. Shells are closed, connected and do not meet. Let the surface bound a set. A shell that
+    is turned inwards has the set around it, and that part of the set has an outer shell. Of the
+    shells that hold the cavity, this is the innermost and smallest one: another one in between
+    would be outside of the part, with nothing of the set between both. Whether a shell holds a
+    point is told by its winding number there, which is whole.
 
     Raises:
         MeshingError: a cavity that lies in no shell.
@@ -87,10 +87,12 @@ def _winding(corner: FloatArray, point: FloatArray) -> float:
     return float(np.arctan2(dots(a, np.cross(b, c)), below).sum()) / (2 * math.pi)
 
 
-# Vertices so near to a boundary, as a part of the size, count as on it.
+# Surfaces cut by volumes.
+
+# Vertices this near to a boundary, as a part of the size, count as on it.
 _NEAR = 1e-9
-# Those so near, as a part of the shortest edge there, are moved onto it: else slivers remain.
-_DRAWN = 0.25
+# Vertices this near, as a part of the shortest edge there, are moved onto it: else slivers remain.
+_SNAPPED = 0.25
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,7 @@ class _Side:
         return np.linalg.norm(x - self.center, axis=1) - self.radius
 
     def slopes(self, x: FloatArray) -> FloatArray:
-        """(n, 3) the gradients of these."""
+        """(n, 3) the gradients of these distances."""
         if self.radius is None:
             return np.broadcast_to(self.normal, x.shape)
         away = x - self.center
@@ -145,9 +147,9 @@ def _onto(vertices: FloatArray, box: Box) -> FloatArray:
     return vertices
 
 
-def _drawn(surface: Surface, side: _Side) -> tuple[FloatArray, FloatArray]:
-    """Vertices, and their heights, those near the side moved onto it within the surface's tangent
-    plane; those of the rim stay, and so do those that would have to go far."""
+def _snapped(surface: Surface, side: _Side) -> tuple[FloatArray, FloatArray]:
+    """Vertices, and their heights. Those near the side are moved onto it within the surface's
+    tangent plane, except those of the surface's boundary and those that would have to go far."""
     x, faces = surface.vertices, surface.faces
     corner = x[faces]
     edges = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).min(axis=1)
@@ -164,18 +166,19 @@ def _drawn(surface: Surface, side: _Side) -> tuple[FloatArray, FloatArray]:
         along = slope - (slope * mean).sum(axis=1)[:, None] * mean
         square = np.maximum((along * along).sum(axis=1), 1e-3)
         there = there - (side.heights(there) / square)[:, None] * along
-    near = np.linalg.norm(there - x, axis=1) < _DRAWN * shortest
+    near = np.linalg.norm(there - x, axis=1) < _SNAPPED * shortest
     near &= np.abs(side.heights(there)) <= 1e-9 * shortest
     near[np.unique(boundary_edges(faces))] = False
     return np.where(near[:, None], there, x), np.where(near, 0.0, h)
 
 
 def _cut(surface: Surface, side: _Side) -> Surface:
-    """The part where heights are not positive: linear along edges, or those above a sphere."""
+    """The part where heights are not positive. Heights are linear along edges, or those above a
+    sphere."""
     faces = surface.faces
     if not len(faces):
         return surface
-    vertices, h = _drawn(surface, side)
+    vertices, h = _snapped(surface, side)
     h = np.where(np.abs(h) <= _NEAR * float(np.ptp(vertices, axis=0).max()), 0.0, h)
     out = (h > 0)[faces]
     # What lies on the boundary with no corner inside is left out.

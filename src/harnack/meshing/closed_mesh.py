@@ -1,7 +1,4 @@
-"""Closed meshes as manifold3d's solids, and back; clip volumes as such solids.
-
-Closed meshes whose files are closed as well.
-"""
+"""Closed meshes: manifold3d's solids, clip volumes as such, and files that are closed as well."""
 
 from __future__ import annotations
 
@@ -117,13 +114,15 @@ def _ball(ball: Ball, tolerance: float) -> Manifold:
     return Manifold.sphere(r, max(16, segments)).translate((x, y, z))
 
 
-# Readers take points for one that are nearer than 1e-8 in the file's unit (trimesh does).
+# Closed files.
+
+# Readers such as trimesh merge points that are nearer than 1e-8 in the file's unit.
 _LEAST_STEP = 2.0**-26
-# In these units larger numbers are beyond their integers.
+# In units of that distance larger coordinates are beyond the integers of readers.
 _LARGEST = 2.0**36
-# A part has to be so many steps long.
+# A part has to be at least this many steps long.
 _MOST_COARSE = 1e4
-# Where what is snapped is not right, triangles are left out within so many steps.
+# Where the snapped mesh does not pass its checks, it is simplified within these numbers of steps.
 _SIMPLER = (4, 32)
 
 
@@ -188,7 +187,7 @@ def _step(x: FloatArray) -> float:
 
 
 def _snapped(mesh: trimesh.Trimesh, step: float) -> trimesh.Trimesh:
-    """The mesh with vertices on the grid; where that is not right, with fewer triangles."""
+    """The mesh with vertices on the grid; where that does not pass its checks, simplified."""
     given = Surface(np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64))
     x, faces, kept = _contracted(given, step)
     try:
@@ -210,7 +209,7 @@ def _snapped(mesh: trimesh.Trimesh, step: float) -> trimesh.Trimesh:
 
 
 def _simpler(given: Surface, step: float) -> trimesh.Trimesh | None:
-    """With slivers left out by manifold3d; None if that does not help either."""
+    """Without slivers, simplified by manifold3d; None if that does not help either."""
     for steps in _SIMPLER:
         simpler = surface_of(manifold_of(given).simplify(steps * step))
         x, faces, kept = _contracted(simpler, step)

@@ -1,6 +1,6 @@
-"""Edges of triangles and tetrahedra, each once, by numbers that stand for pairs of points.
+"""Edges of triangles and tetrahedra, each once, by integer keys; products and lengths of rows.
 
-Products and lengths of many vectors: numpy's own sums along an axis of three are slow.
+`dots` and `lengths` are here as numpy's own sums along an axis of three are slow.
 """
 
 from __future__ import annotations
@@ -61,13 +61,13 @@ def edge_keys(pairs: IntArray, count: int) -> IntArray:
 
 
 def directed_edges(faces: IntArray) -> IntArray:
-    """(3m, 2): the edges of faces (m, 3), as they are run: all first ones (corners 0 and 1), then
-    all second and all third ones."""
+    """(3m, 2): the edges of faces (m, 3), in their direction: all first ones (corners 0 and 1),
+    then all second and all third ones."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
 def boundary_edges(faces: IntArray) -> IntArray:
-    """(k, 2): edges of one face only, as it runs them."""
+    """(k, 2): edges of one face only, in its direction."""
     pairs = directed_edges(faces)
     edges = Edges.of(pairs)
     return pairs[edges.uses[edges.index] == 1]

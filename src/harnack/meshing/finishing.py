@@ -1,14 +1,4 @@
-"""Closed parts of a given thickness around a surface.
-
-Where the surface's reach is larger than half of the thickness t (no point that near has two closest
-points), the part is the surface moved by t/2 to both sides along its normals, and walls along its
-rim: straight between the sides, so that the rim stays where it is. Its volume is area x t up to the
-second order: (K t^2/12) of it, K the Gaussian curvature. Where that makes triangles turn over, or
-come nearer to the surface than t/2, or pass through each other, the part is the union of the convex
-hulls of three balls around the corners of each triangle: all points within t/2, with a round rim.
-
-The last steps of a mesh: fewer triangles, what is said of it.
-"""
+"""The last steps of a mesh: thickening, simplification, and the facts in its metadata."""
 
 from __future__ import annotations
 
@@ -42,18 +32,27 @@ if TYPE_CHECKING:
 
 __all__ = ["check_options", "finished", "normals_of", "simplified", "thickened"]
 
-# So much of the area may turn over where the two sides are made: slivers.
+# This part of the area may turn over where the two sides are made: slivers.
 _TURNED = 1e-2
-# More triangles than that are not each made a hull of.
+# Hulls are made of at most this many triangles.
 _MOST_HULLS = 20_000
-# A side that comes so near to the surface, in parts of t/2, is within its reach.
+# Half the thickness is beyond the reach if a side comes nearer to the surface than this part of it.
 _NEAR = 0.98
 
 
 def thickened(
     surface: Surface, normals: FloatArray, thickness: float, tolerance: float
 ) -> tuple[Surface, dict[str, Any]]:
-    """The closed part, and how it was made: `thickened_by` is "offset" or "hulls of balls".
+    """A closed part of a given thickness around a surface, and how it was made: `thickened_by` is
+    "offset" or "hulls of balls".
+
+    Where the surface's reach is larger than half of the thickness t (no point that near has two
+    closest points), the part is the surface moved by t/2 to both sides along its normals, and walls
+    along its boundary: straight between the sides, so that the boundary stays where it is. Its
+    volume is area x t up to the second order: (K t^2/12) of it, K the Gaussian curvature. Where
+    that makes triangles turn over, or come nearer to the surface than t/2, or pass through each
+    other, the part is the union of the convex hulls of three balls around the corners of each
+    triangle: all points within t/2, with a round boundary.
 
     normals: (n, 3), of unit length, on the side that faces are seen counter-clockwise from.
     tolerance: of the balls' polyhedra, and of the triangles given, a length.
@@ -81,19 +80,19 @@ def _crosses(vertices: FloatArray, faces: Any) -> FloatArray:
 
 
 def _offset(surface: Surface, normals: FloatArray, thickness: float) -> Surface:
-    """Both sides, and walls along the rim."""
+    """Both sides, and walls along the boundary."""
     n = len(surface.vertices)
     move = 0.5 * thickness * normals / _slants(surface, normals)[:, None]
     a, b = boundary_edges(surface.faces).T
-    # A face above the rim runs it from a to b, so the wall runs it from b to a.
+    # A face of the upper side runs the boundary edge from a to b, so the wall runs it from b to a.
     walls = [np.stack([b, a, a + n], axis=1), np.stack([b, a + n, b + n], axis=1)]
     vertices = np.concatenate([surface.vertices + move, surface.vertices - move])
     return Surface(vertices, np.concatenate([surface.faces, surface.faces[:, ::-1] + n, *walls]))
 
 
 def _slants(surface: Surface, normals: FloatArray) -> FloatArray:
-    """(n,) cosines between normals at vertices and those of the faces there, means by area: as much
-    farther vertices are moved, so that faces are moved by the thickness."""
+    """(n,) cosines between normals at vertices and those of the faces there, means by area:
+    vertices are moved farther by that, so that faces are moved by the thickness."""
     cross = _crosses(surface.vertices, surface.faces)
     total, area = np.zeros(len(normals)), np.zeros(len(normals))
     size = np.linalg.norm(cross, axis=1)
@@ -105,7 +104,7 @@ def _slants(surface: Surface, normals: FloatArray) -> FloatArray:
 
 
 def _beyond_reach(surface: Surface, normals: FloatArray, thickness: float) -> str | None:
-    """Why half of the thickness is more than the surface's reach; None if that was not seen."""
+    """Why half of the thickness is more than the surface's reach; None if nothing shows that."""
     import scipy.spatial  # here: half a second that few need
 
     searching: Any = scipy.spatial
@@ -157,6 +156,8 @@ def _hulls(surface: Surface, radius: float, tolerance: float, why: str) -> Surfa
     return surface_of(Manifold.batch_boolean(parts, OpType.Add))
 
 
+# Simplification and metadata.
+
 # The cosine of the angle between normals from which on an edge is a crease.
 _CREASE = math.cos(math.radians(30))
 # What simplification may move a surface by, as parts of the tolerance.
@@ -179,8 +180,8 @@ def check_options(tolerance: Any, spacing: Any, thickness: Any, seed: Any, most:
 
 
 def normals_of(function: LevelFunction, surface: Surface) -> FloatArray:
-    """Unit normals (n, 3) at vertices: the slope of the field, and where it has none, as at the
-    curve that a surface ends on, the mean of the faces there by area."""
+    """Unit normals (n, 3) at vertices: along the gradient of the field, and where it has none, as
+    at the curve that a surface ends on, the mean of the faces there by area."""
     corner = surface.vertices[surface.faces]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     mean = np.zeros_like(surface.vertices)
@@ -222,8 +223,8 @@ def simplified(
 
 
 def finished(surface: Surface, facts: dict[str, Any], is_closed: bool) -> trimesh.Trimesh:
-    """The mesh, which is a manifold (`check_manifold`), with what is known of it in its metadata.
-    Without a rim it is turned so that its volume is positive.
+    """The mesh, which is a manifold (`check_manifold`), with the facts about it in its metadata. A
+    mesh without a boundary is turned so that its volume is positive.
 
     Raises:
         MeshingError: it ought to be closed and to have a positive volume, and is not.

@@ -36,9 +36,9 @@ by the field's own promise (`Field.slope_change`). So (b) holds if grad f(c) . g
 and f has no zero in T if |f(c)| > (|grad f(c)| + D) R. If neither holds T is halved, across its
 longest edge, a few times: grad F is the same in both halves, and (a) or (b) may hold in each.
 
-Beside the curve nothing is proved. It is about the first triangles, before these are refined. Of
-what follows, that the triangles do not meet (`intersections`) and face along the gradient is
-checked, and not that they were moved without meeting on the way.
+Near the curve nothing is proved. The proof is about the first triangles, before they are refined.
+Of the refined ones it is checked that they do not meet (`checks.intersecting_faces`) and face along
+the gradient, and not that they were moved without meeting on the way.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ Walls = tuple[FloatArray, FloatArray] | None
 _HALVINGS = 5
 _TRIALS = 20
 _UNKNOWN = 1e200
-# Tetrahedra that are looked at before all are.
+# Tetrahedra that are examined before all are.
 _FEW = 100
 # What is far from the curve is farther than this many cells.
 _FAR = 1.5
@@ -70,11 +70,13 @@ _FAR = 1.5
 class Isotopy:
     """Shares of the tetrahedra that may hold a point of the level set, or hold one of the mesh.
 
-    proved: of all, those where (b) is proved. proved_far: of those farther than 1.5 cells from the
-        curve. If `proved` is 1, mesh and level set are isotopic.
+    proved: of all, those where (a), (b) or (c) is proved. If it is 1, mesh and level set are
+        isotopic.
+    proved_far: of those farther than 1.5 cells from the curve.
     count: how many there are; of fields that do not bound the changes of their gradient only those
         that hold a point of the mesh.
-    open_far: (k, 4) corners of those farther than 1.5 cells from the curve where it is not.
+    open_far: (k, 4) corners of those farther than 1.5 cells from the curve where nothing is
+        proved.
     """
 
     proved: float
@@ -135,7 +137,7 @@ def isotopy_of(
 
 def _has_bounds(function: LevelFunction, corners: FloatArray) -> bool:
     """Whether changes of the gradient are bounded on any of tetrahedra (n, 4, 3); without, all that
-    is cut stays unproved, and no other needs to be looked at."""
+    is cut stays unproved, and no other needs to be examined."""
     some = corners[:: max(1, len(corners) // _FEW)]
     center, radius = _balls(some)
     return not len(some) or bool((function.slopes(center, radius)[1] < _UNKNOWN).any())

@@ -29,7 +29,7 @@ __all__ = ["Lattice", "distinct_rows"]
 
 # More cells than that are refused: about five million triangles.
 MOST_CELLS = 2_000_000
-# Points of the whole lattice that are looked up in a table.
+# The points of a lattice that has fewer are found by a table.
 _MOST_LISTED = 20_000_000
 # Cells of the first round of the octree.
 _MOST_ROOTS = 200_000
@@ -51,7 +51,8 @@ class Lattice:
     def filling(
         cls, lower: FloatArray, upper: FloatArray, spacing: float, layers: int = 0
     ) -> Lattice:
-        """Cells as nearly cubes of edge `spacing` as fit a box, and so many layers around it.
+        """Cells that fill a box, as nearly cubes of edge `spacing` as possible, and `layers` around
+        it.
 
         Raises:
             MeshingError: a box without volume.
@@ -86,7 +87,7 @@ class Lattice:
         Raises:
             MeshingError: there are too many.
         """
-        # A surface across the box, at the least, meets so many cells.
+        # A surface across the box passes through at least this many cells.
         most = min(MOST_CELLS, most_faces)
         if (least := float(np.prod(np.sort(self.counts)[:2].astype(float)))) > most:
             raise too_large(least, most)
@@ -162,7 +163,7 @@ def distinct_rows(rows: IntArray) -> IntArray:
 
 
 def too_large(cells: float, most: int) -> TooLargeError:
-    """The error about so many cells."""
+    """The error about too many cells."""
     return TooLargeError(
         f"about {cells:.1e} cells hold the surface, which makes some {3 * cells:.0e} triangles; "
         f"at most {most:,} cells are made (max_triangles, and never more than {MOST_CELLS:,}): "

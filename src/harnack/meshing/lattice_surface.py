@@ -1,13 +1,9 @@
-"""Triangles of a real-valued level set in the tetrahedra of a lattice.
+"""Triangles of a real-valued level set in the tetrahedra of a lattice, and checks of them.
 
 Points of the lattice near the level set are moved onto it and become vertices, which makes most
-slivers go (Labelle and Shewchuk 2007). Where sheets then touch in a vertex or an edge, points are
-put back until they do not. With none moved the surface is a manifold: every tetrahedron is cut by
-one triangle or quadrilateral, and signs at its corners alone say how.
-
-How many triangles a tolerance will take, before they are made.
-
-Whether parts of a level set were missed by a lattice: thin walls, knife edges, small islands.
+slivers go (Labelle and Shewchuk 2007). Where parts of the surface then touch in a vertex or an
+edge, points are put back until they do not. With none moved the surface is a manifold: every
+tetrahedron is cut by one triangle or quadrilateral, and signs at its corners alone say how.
 """
 
 from __future__ import annotations
@@ -38,9 +34,10 @@ __all__ = [
     "open_surface",
 ]
 
-# Lengths in cells: how near the level seems to a point; how far it may be moved to it; how far what
-# is found has to be from all triangles, by their corners and centers, which are less than half a
-# cell from all that is on them; and from the faces of the box, beyond which there may be more.
+# Lengths in cells, for points of missed parts: how near the level seems to a lattice point; how far
+# the point may be moved to it; how far a point that is found has to be from all triangles, by their
+# corners and centers, which are less than half a cell from all that is on them; and from the faces
+# of the box, beyond which there may be more.
 _NEAR, _FOUND, _APART, _DEEP = 1.0, 1.5, 0.75, 0.5
 # Points nearer than the first belong together; parts at least as long as the second are missed.
 _TOGETHER, _LONG = 1.0, 2.0
@@ -61,14 +58,15 @@ def check_nothing_missed(
     size: float,
     box: tuple[FloatArray, FloatArray],
 ) -> None:
-    """Raise if the level set has parts, two cells long or longer, away from its triangles.
+    """Raise if the level set has parts, two cells long or longer, away from its triangles: thin
+    walls, knife edges, islands.
 
-    Signs at the points of a lattice do not see a wall between two of them. Its sides are found from
-    there by Newton's method: what it ends at, on the level, should be near triangles. So many
+    Signs at the points of a lattice do not show a wall between two of them. Its sides are found
+    from there by Newton's method: where that ends, on the level, should be near triangles. So many
     points are a dense sample, and no proof. Islands smaller than a cell may be missed.
 
     samples: at points (n, 3) of the lattice. is_beside: (n,) those of tetrahedra that are cut.
-        surface: vertices and faces. size: of a cell. box: where the level set counts.
+    surface: vertices and faces. size: of a cell. box: where the level set counts.
 
     Raises:
         MissedError: with one of the places.
@@ -125,10 +123,11 @@ def _longest_part(x: FloatArray, apart: float) -> FloatArray:
 def check_size(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, tolerance: float
 ) -> None:
-    """Raise if the triangles that refinement would make of these are more than the function allows.
+    """Raise if refinement would make more triangles of these than the function allows: an estimate,
+    before they are made.
 
     How far the middle of a triangle is from the surface falls with its area: one that is k times
-    the tolerance away takes about k others. Looked at is one triangle in several.
+    the tolerance away takes about k others. One triangle in several is examined.
 
     Raises:
         MeshingError: the function has no slope between the vertices.
@@ -158,7 +157,7 @@ def check_size(
         )
 
 
-# Points so near to the level, in parts of the length of a cell, are moved onto it.
+# Points this near to the level, in parts of the length of a cell, are moved onto it.
 _SNAPPED = 0.25
 _MOST_ROUNDS = 20
 
@@ -223,8 +222,8 @@ def closed_surface(
 
     On the box it is made of the faces of the cells whose centers are negative, as if the points of
     the lattice there were on the level. Triangles in the two outermost layers of cells are coarse
-    and may touch in vertices: they are to be cut away. There are no faces if
-    the function is nowhere negative.
+    and may touch in vertices: they are to be cut away. There are no faces if the function is
+    nowhere negative.
 
     Raises:
         MeshingError: too many cells.
@@ -321,7 +320,7 @@ def _wall_faces(
 
 
 def _sampled(function: LevelFunction, points: FloatArray) -> Samples:
-    """Raises MeshingError where f is no number."""
+    """The function at points; raises MeshingError where it is not finite."""
     samples = function.at(points)
     bad = ~np.isfinite(samples.value)
     if bad.any():

@@ -1,6 +1,4 @@
-"""Tetrahedra between points, with their edges numbered: Delaunay's, by Qhull.
-
-Triangles of a level set in tetrahedra, when its function may be an angle.
+"""Triangles of a level set in tetrahedra, when its function may be an angle; and the tetrahedra.
 
 Between two points the function moves from one value to another along the edge: its *lift*. The
 edge crosses the level as often as the lift does, with the sign of the way up, n = 0 or +-1 if cells
@@ -10,6 +8,8 @@ from one interval between levels to the next. In a tetrahedron the crossings on 
 corners off the level say on which side of the level each corner is, if they agree around every
 face; that is checked, and so is that no more than one level is between corners. A corner on the
 level, a vertex of the curve among them, is a vertex of the triangles as it is.
+
+Tetrahedra between points are Delaunay's, by Qhull (`delaunay`).
 """
 
 from __future__ import annotations
@@ -83,17 +83,14 @@ def delaunay(points: FloatArray) -> Tetrahedra:
     return Tetrahedra.of(points, corners)
 
 
-_ALL = tuple(itertools.combinations(range(4), 2))
-
-
 @dataclass(frozen=True)
 class Crossings:
-    """Of all edges of tetrahedra, between points off the level.
+    """Crossings of all edges of tetrahedra, between points off the level.
 
     count: (k,) how often an edge crosses the level, upwards less downwards.
     change: (k,) of the function along it.
-    proved: how many changes are proved to be the difference of wrapped values. integrated: how many
-        were integrated along the edge.
+    proved: how many changes are proved to be the difference of wrapped values.
+    integrated: how many were integrated along the edge.
     """
 
     count: IntArray
@@ -182,15 +179,15 @@ def triangles_of(
     for code in np.unique(pattern):
         rows = cut[pattern == code]
         up = [k for k in range(4) if code >> k & 1]
-        kept = [k for k in range(4) if code >> (4 + k) & 1]
-        down = [k for k in range(4) if k not in up and k not in kept]
+        level = [k for k in range(4) if code >> (4 + k) & 1]
+        down = [k for k in range(4) if k not in up and k not in level]
         corner = tets.corners[rows]
         rise = _mean(points.points, corner[:, up]) - _mean(points.points, corner[:, down])
 
         def at(i: int, j: int, rows: IntArray = rows) -> IntArray:
             return place[tets.edge_between(i, j, rows)[0]]
 
-        on_level = [corner[:, k] for k in kept]
+        on_level = [corner[:, k] for k in level]
         crossed = [at(i, j) for i in up for j in down]
         if len(crossed) == 4:  # two and two
             ring = [at(up[0], down[0]), at(up[0], down[1]), at(up[1], down[1]), at(up[1], down[0])]
@@ -227,7 +224,8 @@ def _halves(vertices: FloatArray, ring: list[IntArray]) -> tuple[IntArray, IntAr
 
 
 def _sides(points: PointSet, tets: Tetrahedra, crossings: Crossings) -> IntArray:
-    """(m, 4): levels between the first corner that is off the level, and each other one."""
+    """(m, 4): how many levels lie between the first corner that is off the level, and each other
+    one."""
     on = points.is_on[tets.corners]
     rows = np.arange(len(on))
     first = np.argmin(on, axis=1)
@@ -241,7 +239,7 @@ def _sides(points: PointSet, tets: Tetrahedra, crossings: Crossings) -> IntArray
         some = rows[(first == i) & ~on[:, j]]
         side[some, j] = between(i, j, some)
     wrong = np.zeros(len(rows), np.bool_)
-    for i, j in _ALL:
+    for i, j in _PAIRS:
         some = rows[~on[:, i] & ~on[:, j]]
         wrong[some] |= side[some, j] - side[some, i] != between(i, j, some)
     if wrong.any():

@@ -26,7 +26,7 @@ from harnack.meshing.finishing import check_options, finished, normals_of, simpl
 from harnack.meshing.lattice import Lattice
 from harnack.meshing.lattice_surface import Surface, open_surface
 from harnack.meshing.samples import CELLS_PER_WAVE, MOST_FACES, LevelFunction
-from harnack.meshing.solids import Sheet, mesh_solid, region_of
+from harnack.meshing.solids import AngleMesher, mesh_solid, region_of
 from harnack.meshing.spanned import spanned_surface
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 __all__ = ["mesh"]
 
-# Cells across the level set, if nothing is asked for; curves have their own length besides.
+# Cells across the level set, unless a spacing is given; curves have their own length besides.
 _ACROSS = 24
 _MOST_ATTEMPTS = 4
 # Room around what has an extent, and around a curve whose surface has none, as a part of the size.
@@ -93,17 +93,17 @@ def mesh(
         begun or given up, with a MeshingError. Cells are limited with them, to two millions.
     progress: told what is being done.
 
-    What is returned has been checked, all of it: every edge has two faces, or one at a rim, no two
+    All that is returned has been checked: every edge has two faces, or one at the boundary, no two
     triangles pass through each other, vertices and centers of triangles are within the tolerance of
-    the level by looks at the field, and inside the clip (of a thick part, the surface that it is
+    the level by samples of the field, and inside the clip (of a thick part, the surface that it is
     made of). Else a MeshingError is raised.
 
     Returns:
         A trimesh.Trimesh; if it is closed, `export` writes closed files, in single precision, or
         raises a MeshingError. Vertices of a curve come first, in order, bit by bit, and its edges
-        are the rim. Without a rim, faces are turned outwards: the volume is positive; else they
-        are turned towards larger values. `metadata["harnack"]` has level, spacing, evaluations,
-        the Euler characteristic,
+        are the boundary. Without a boundary, faces are turned outwards: the volume is positive;
+        else they are turned towards larger values. `metadata["harnack"]` has level, spacing,
+        evaluations, the Euler characteristic,
         boundary: indices (k, 2) of edges of one face,
         creases: how many edges have faces more than 30 degrees apart: a function with kinks, such
             as |x| or max(f, g), has them where its level set does. That these are within the
@@ -226,8 +226,8 @@ def _solid(
     solid, at, most_faces = cast("Solid", region.field), region.level, region.most_faces
     evaluations = [0]
 
-    def sheets(error: float, cells: float) -> Sheet:
-        def sheet(angle: SolidAngle, value: float) -> Surface:
+    def angle_mesher(error: float, cells: float) -> AngleMesher:
+        def mesh_angle(angle: SolidAngle, value: float) -> Surface:
             angle = cast("SolidAngle", _checked(angle))
             box = _box(angle, value, None)
             function = LevelFunction(angle, value, most_faces=most_faces)
@@ -235,7 +235,7 @@ def _solid(
             evaluations[0] += facts["evaluations"]
             return made
 
-        return sheet
+        return mesh_angle
 
     def check(made: Surface, size: float) -> None:
         report("checking")
@@ -243,7 +243,9 @@ def _solid(
         check_manifold(made.faces, made.vertices)
         check_apart(made.vertices, made.faces)
 
-    made = mesh_solid(solid, at, volume, tolerance, spacing, sheets, most_faces, check, report)
+    made = mesh_solid(
+        solid, at, volume, tolerance, spacing, angle_mesher, most_faces, check, report
+    )
     facts = {
         "level": at,
         "spacing": made.spacing,
@@ -412,4 +414,4 @@ def _common_bounds(volume: Volume | None) -> tuple[FloatArray, FloatArray]:
 
 
 def _silent(text: str) -> None:
-    """Tells nobody."""
+    """Reports nothing."""

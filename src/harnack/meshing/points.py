@@ -23,10 +23,10 @@ __all__ = ["Boundary", "Places", "PointSet", "box_cells", "place_points"]
 
 # All in parts of the size of a cell, by experiment.
 _JITTER = 1e-3  # no five points on a sphere
-_SNAPPED = 0.3  # points so near to the level are moved onto it
-_FREE = 0.45  # of points around the curve
+_SNAPPED = 0.3  # points this near to the level are moved onto it
+_FREE = 0.45  # no other points are so near to the curve
 _MOST_CELLS = 4_000_000
-# A step of Newton's method that is so short is the last: parts of the longest one.
+# A step of Newton's method that is shorter is the last: a part of the longest one.
 _CONVERGED = 1e-9
 _CORNERS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
 
@@ -80,7 +80,7 @@ class Boundary:
         return cls(np.concatenate([*points, *more, np.zeros((0, 3))]), pairs)
 
     def split(self, which: BoolArray) -> Boundary:
-        """With the middles of some edges (k,) as points more."""
+        """With the middles of some edges (k,) as additional points."""
         a, b = self.edges[which].T
         middle = len(self.points) + np.arange(len(a))
         points = np.concatenate([self.points, 0.5 * (self.points[a] + self.points[b])])
@@ -88,7 +88,7 @@ class Boundary:
         return Boundary(points, np.concatenate([self.edges[~which], halves]))
 
     def split_near(self, places: Places, longest: float) -> Boundary:
-        """With edges in some places cut until they are no longer than that."""
+        """With edges in some places cut until they are no longer than `longest`."""
         curve = self
         while True:
             ends = curve.points[curve.edges]
@@ -140,9 +140,10 @@ def place_points(
     seed: int,
     finer: tuple[Places, ...] = (),
 ) -> PointSet:
-    """Points as the module says. walls: a box whose faces points on them do not leave.
+    """Points for the tetrahedra: see the module's docstring.
 
-    finer: where leaves of the octree are split again, once for each of the entries that they meet.
+    walls: a box whose faces points on them do not leave. finer: where leaves of the octree are
+    split again, once for each of the entries that they meet.
 
     Raises MemoryError for more than four million cells.
     """

@@ -22,22 +22,23 @@ from harnack.meshing.samples import LevelFunction, Samples
 __all__ = ["far_places", "improved", "refined", "smoothed", "smoothed_within"]
 
 Walls = tuple[FloatArray, FloatArray] | None
-# Normals turn by so much across a crease, and by such a part of it at once.
+# Across a crease normals turn by at least this angle, and by this part of it between two points.
 _BENT, _AT_ONCE = math.radians(20), 0.75
-# So near, in parts of the tolerance, a vertex counts as on the surface.
+# A vertex this near, in parts of the tolerance, counts as on the surface.
 _ON = 1e-5
-# So far from the middle, in parts of its edge, a crease may be.
+# A crease may be this far from the middle of an edge, in parts of the edge.
 _BESIDE = 1.5
-# It is not looked for nearer to the ends than this, and by so many looks, twice.
-_FROM_ENDS, _LOOKS = 0.05, 33
-# So far the level is looked for, in parts of the way to where tangent planes meet; and three of
-# them meet in a point if their normals have such a determinant.
+# It is not looked for nearer to the ends than this, and by this many samples, twice.
+_FROM_ENDS, _SAMPLES = 0.05, 33
+# The level is looked for up to this part of the way to where tangent planes meet; and three planes
+# meet in a point if the determinant of their normals is larger.
 _BEYOND, _INDEPENDENT = 1.25, 0.1
 # Edges shorter than this part of the tolerance are never cut.
 _SHORTEST = 0.5
 _MOST_ROUNDS = 12
-# Edges to be cut become more at first, and then fewer. If they are so many times as many as they
-# were, they run away: the surface bends within any triangle, as around each dipole of a cloud.
+# The number of edges to be cut grows at first, and then falls. If it grows to this many times the
+# least before, refinement will not end: the surface bends within any triangle, as around each
+# dipole of a cloud.
 _RUNS_AWAY = 3
 
 
@@ -51,7 +52,7 @@ def refined(
 ) -> tuple[FloatArray, IntArray]:
     """Cut edges at their middles, and move these onto the surface, until the middles of all edges
     but those of the boundary, and the centers of all faces, are within `tolerance` of it; or until
-    that is seen not to succeed, which whoever asks for it has to check (`check_near_level`).
+    that is seen not to succeed, which the caller has to check (`check_near_level`).
 
     Raises:
         TooLargeError: it takes more triangles than the function allows.
@@ -178,7 +179,7 @@ def _level_towards(
     way = way * np.minimum(1, most / np.maximum(lengths(way), 1e-300))[:, None]
     low, high = np.zeros(len(start)), np.full(len(start), _BEYOND)
     good = np.ones(len(start), np.bool_)
-    parts = np.linspace(0, 1, _LOOKS)
+    parts = np.linspace(0, 1, _SAMPLES)
     for _ in range(2):
         t = low[:, None] + (high - low)[:, None] * parts
         x = start[:, None] + t[:, :, None] * way[:, None]
@@ -229,9 +230,9 @@ class _Far:
         walls: Walls,
     ) -> _Far:
         """Those whose middle, or the center of a face beside them, is beyond the tolerance."""
-        ends, edges, is_rim = _edges(faces)
-        if walls is not None:  # the rim lies in them, and so do the middles of its edges
-            is_rim = np.zeros_like(is_rim)
+        ends, edges, is_boundary = _edges(faces)
+        if walls is not None:  # the boundary lies in them, and so do the middles of its edges
+            is_boundary = np.zeros_like(is_boundary)
         middle = 0.5 * (vertices[ends[:, 0]] + vertices[ends[:, 1]])
         span = lengths(vertices[ends[:, 0]] - vertices[ends[:, 1]])
         samples = function.at(middle)
@@ -244,10 +245,10 @@ class _Far:
             cuts_off[lone] = _turns(function, vertices[faces[lone]])
         off &= ~cuts_off
         # Of a face that is off, the longest edge that may be cut.
-        free = np.where(is_rim[edges], 0.0, span[edges])
+        free = np.where(is_boundary[edges], 0.0, span[edges])
         worst = edges[np.arange(len(faces)), free.argmax(axis=1)]
         marked[worst[off]] = True
-        marked &= ~is_rim & (span > _SHORTEST * tolerance)
+        marked &= ~is_boundary & (span > _SHORTEST * tolerance)
         return cls(edges, ends, middle, span, samples, marked, cuts_off)
 
 
@@ -324,10 +325,10 @@ def smoothed(
     """Vertices moved towards the mean of their neighbors and back onto the surface, a few times;
     those of the boundary stay. Moves that turn a face by much are taken back."""
     ends, _, _ = _edges(faces)
-    rim = np.unique(boundary_edges(faces))
+    boundary = np.unique(boundary_edges(faces))
     free = np.zeros(len(vertices), np.bool_)
     free[np.unique(faces)] = True
-    free[rim] = False
+    free[boundary] = False
     count = np.maximum(np.bincount(ends.ravel(), minlength=len(vertices)), 1)
     rows = np.flatnonzero(free)
     size = float(np.ptp(vertices[free], axis=0).max(initial=0.0)) if len(rows) else 0.0

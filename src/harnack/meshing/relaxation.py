@@ -1,4 +1,4 @@
-"""Better triangles: edges turned within the two triangles beside them, slivers taken out.
+"""Better triangles: edges flipped, slivers contracted, vertices moved along the surface.
 
 Flips. Two triangles (a, b, c) and (b, a, d) become (c, d, b) and (d, c, a) where that makes the
 smaller of their least angles larger, where the new edge is as near to the surface as is asked for,
@@ -6,13 +6,11 @@ and where the new triangles face the way the surface does.
 
 Contractions. The ends of a sliver's shortest edge are merged: see `without_slivers`.
 
-Vertices of the worst triangles moved along the surface to where their least angle is larger.
-
-Means of neighbors, to which `smoothed` moves vertices, make thin triangles where lengths of edges
-change quickly, as beside the long edges of a rim that cannot be cut. Here some places are tried for
-each vertex of a thin triangle, and it moves to the best of them if the least angle of all triangles
-around it grows. No two neighbors move at once, so that what was measured is what is made: the
-least angle around a moved vertex never falls.
+Moves. Means of neighbors, to which `smoothed` moves vertices, make thin triangles where lengths of
+edges change quickly, as beside long boundary edges that cannot be cut. Here some places are tried
+for each vertex of a thin triangle, and it moves to the best of them if the least angle of all
+triangles around it grows. No two neighbors move at once, so that what was measured is what is made:
+the least angle around a moved vertex never falls.
 """
 
 from __future__ import annotations
@@ -36,13 +34,14 @@ from harnack.meshing.samples import LevelFunction
 
 __all__ = ["flipped", "least_angles", "relaxed", "without_slivers"]
 
-# Cosines: by how much a least angle has to grow, and how far normals may turn.
+# By how much a least angle has to grow: its cosine in flips, in radians in moves; and the least
+# cosine between normals of a triangle before and after, and between it and the gradient.
 _GAIN = 0.01
 _FACING = 0.5
 _MOST_ROUNDS_OF_FLIPS = 12
 # Triangles with a smaller angle, in radians, are slivers: 4 degrees.
 _SLIVER = 0.07
-# The least cosine between normals of the triangles around a contracted edge and the slope.
+# The least cosine between normals of the triangles around a contracted edge and the gradient.
 _STILL_FACING = 0.3
 
 
@@ -59,7 +58,7 @@ def flipped(
         surface, by the slope there.
     """
     refused = np.zeros(0, np.int64)
-    rim = edge_keys(boundary_edges(faces), len(vertices))
+    boundary = edge_keys(boundary_edges(faces), len(vertices))
     for _ in range(_MOST_ROUNDS_OF_FLIPS):
         pairs, quads = _quadrilaterals(faces)
         a, b, c, d = quads.T
@@ -72,7 +71,7 @@ def flipped(
         good = gain > _GAIN
         good[good] = ~np.isin(key[good], refused)
         taken = distinct(edge_keys(quads[:, :2], count))
-        good[good] = ~_holds(taken, key[good]) & ~np.isin(key[good], rim)
+        good[good] = ~_holds(taken, key[good]) & ~np.isin(key[good], boundary)
         rows = _independent_flips(np.flatnonzero(good), gain, pairs, key, len(faces))
         if not len(rows):
             break
@@ -129,7 +128,7 @@ def _flips_stay_near(
 
 
 def _holds(numbers: IntArray, wanted: IntArray) -> BoolArray:
-    """(k,) whether numbers in order (n,) hold those wanted (k,)."""
+    """(k,) whether ascending numbers (n,) hold those wanted (k,)."""
     place = np.searchsorted(numbers, wanted)
     return numbers[np.minimum(place, len(numbers) - 1)] == wanted if len(numbers) else place < 0
 
@@ -157,8 +156,8 @@ def without_slivers(
 
     An edge (u, v) can be contracted to u without a change of topology if u and v have just the two
     neighbors in common that are the third corners of its faces (the link condition), and v is not
-    `fixed` (n,), as vertices of the rim are. It is, if no new triangle is a sliver, all face the
-    way that the surface does, and their centers are within `tolerance` of it.
+    `fixed` (n,), as boundary vertices are. It is contracted if no new triangle is a sliver, all
+    face the way that the surface does, and their centers are within `tolerance` of it.
     """
     slivers = np.flatnonzero(least_angles(vertices, faces) < _SLIVER)
     gone = np.zeros(len(faces), np.bool_)
@@ -208,8 +207,6 @@ def _is_good(
 Walls = tuple[FloatArray, FloatArray] | None
 # Triangles with a smaller angle are thin, in radians: 30 degrees.
 _THIN = 0.52
-# By how much, in radians, an angle has to grow.
-# The least cosine between normals of a triangle before and after, and between it and the slope.
 _MOST_ROUNDS_OF_MOVES = 6
 # Parts of the way to each aim that are tried.
 _PARTS = (1.0, 0.5)
@@ -222,7 +219,8 @@ def relaxed(
     tolerance: float,
     walls: Walls,
 ) -> FloatArray:
-    """Vertices (n, 3), those of the rim where they were, of triangles with larger least angles.
+    """Vertices (n, 3), moved where that makes the least angles of triangles larger; those of the
+    boundary stay.
 
     tolerance: how far the centers of triangles around moved vertices may be from the surface.
     """
@@ -332,7 +330,7 @@ def _least_at(
 def _independent_moves(
     rows: IntArray, gain: FloatArray, stars: _Stars, faces: IntArray, count: int
 ) -> IntArray:
-    """Those of some vertices that gain more than all neighbors do."""
+    """Those vertices that gain more than all their neighbors do."""
     rank = np.full(count, len(rows))
     ordered = rows[np.argsort(-gain[rows], kind="stable")]
     rank[stars.centers[ordered]] = np.arange(len(rows))

@@ -1,8 +1,8 @@
-"""Repair of triangle meshes: patches over holes, the triangles that there are kept as they are.
+"""Repair of triangle meshes: patches over holes; the triangles that are there stay as they are.
 
 The 1/2 level of the winding number w modulo 1 is the 2 pi level of the solid angle of the boundary
-edges (`geometry.singular`), a smooth surface that ends at them. It is meshed with these very edges
-in it, and joined to the mesh by index.
+edges (`geometry.chains`), a smooth surface that ends at them. It is meshed with these very edges in
+it, and joined to the mesh by index.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ def repair(
 
 @dataclass(frozen=True)
 class _Asked:
-    """What `repair` was asked for. given: how many faces there were."""
+    """The arguments of `repair`. given: how many faces there were."""
 
     given: int
     tolerance: float
@@ -170,7 +170,7 @@ def _repaired(
             finer = (*finer, Places(error.points, 2 * cell * 0.5 ** len(finer)))
         except TooLargeError:
             raise
-        except MeshingError as error:  # a point lies where the function is known too badly
+        except MeshingError as error:  # a point lies where the function is too inaccurate
             if last:
                 raise
             report(f"{error}; once more, with points moved at random in another way")
@@ -181,7 +181,7 @@ def _repaired(
 
 
 class _LocalError(MeshingError):
-    """What smaller cells about some points (n, 3) may mend."""
+    """Failures that smaller cells around some points (n, 3) may prevent."""
 
     def __init__(self, message: str, points: FloatArray) -> None:
         super().__init__(message)
@@ -189,13 +189,17 @@ class _LocalError(MeshingError):
 
 
 class _MetError(_LocalError):
-    """Patches meet the mesh."""
+    """Patches intersect the mesh."""
 
 
 @dataclass(frozen=True)
 class _Patches:
-    """What is added: vertices (k, 3), and faces (p, 3) whose indices below the number of vertices
-    given are of these. is_fine: whether they were refined to the tolerance."""
+    """What is added.
+
+    vertices: (k, 3).
+    faces: (p, 3); indices below the number of given vertices are of these.
+    is_fine: whether they were refined to the tolerance.
+    """
 
     vertices: FloatArray
     faces: IntArray
@@ -205,7 +209,7 @@ class _Patches:
 
 
 def _silent(text: str) -> None:
-    """Tells nobody."""
+    """Reports nothing."""
 
 
 def _checked(mesh: Any) -> tuple[FloatArray, IntArray]:
@@ -229,10 +233,10 @@ def _checked(mesh: Any) -> tuple[FloatArray, IntArray]:
 
 
 def _open_edges(faces: IntArray) -> IntArray:
-    """(k, 2): edges of one face, as it runs them.
+    """(k, 2): edges of one face, in its direction.
 
     Raises:
-        MeshError: an edge of more than two faces, or of two that run it the same way.
+        MeshError: an edge of more than two faces, or of two that have it in the same direction.
     """
     pairs = directed_edges(faces)
     edges = Edges.of(pairs)
@@ -330,7 +334,7 @@ def _patches(
         faces = _collapsed(x, faces, k, ends)
     if not len(faces):
         raise _LocalError("no patch was found: choose a smaller `spacing`", boundary.points)
-    _check_rim(x, faces, boundary)
+    _check_boundary(x, faces, boundary)
     is_fine = True
     try:
         x, faces = _finished(function, x, faces, tolerance, report)
@@ -359,7 +363,7 @@ def _finished(
     smoothed, or as they are, whichever first does not pass through itself.
 
     Raises:
-        MeshingError: all do; triangles so small turn over each other beside sharp corners of holes.
+        MeshingError: all do, as small triangles turn over each other beside sharp corners of holes.
     """
     bad = x[:0]
     for way in ("improving", "smoothing", "refining alone"):
@@ -425,7 +429,7 @@ def _normals(corners: FloatArray) -> FloatArray:
     return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
 
 
-def _check_rim(x: FloatArray, faces: IntArray, boundary: Boundary) -> None:
+def _check_boundary(x: FloatArray, faces: IntArray, boundary: Boundary) -> None:
     """Raise unless patches end at the boundary, and run each of its edges as the mesh does: they
     are reversed afterwards."""
     directed = {(int(a), int(b)) for a, b in directed_edges(faces)}
@@ -465,10 +469,10 @@ def _joined(
 def _check(
     vertices: FloatArray, faces: IntArray, result: Any, report: Callable[[str], None]
 ) -> None:
-    """What is promised of the result.
+    """Raise unless the result is what `repair` promises.
 
     Raises:
-        MeshingError: it does not hold.
+        MeshingError: it is not.
     """
     report("checking the patches")
     x = np.asarray(result.vertices, np.float64)

@@ -27,7 +27,7 @@ MOST_FACES = 2_000_000
 """Triangles of a level set, unless a person chooses otherwise."""
 
 CELLS_PER_WAVE = 5.0
-"""Cells along a wave (`Field.wavelength`), at the least, if nothing is asked for."""
+"""Cells along a wave (`Field.wavelength`), at the least, unless a spacing is given."""
 
 _PROOFS = choose_proofs("curvature")
 
@@ -109,26 +109,26 @@ class LevelFunction:
 
     def at(self, points: FloatArray) -> Samples:
         """The function at points (n, 3)."""
-        value, gradient, reach = self._looked_at(points, self._look)
+        value, gradient, reach = self._in_batches(points, self._evaluated)
         return Samples(self.wrapped(value), gradient, reach)
 
     def values(self, points: FloatArray) -> FloatArray:
         """(n,) f - level alone."""
-        (value,) = self._looked_at(points, lambda p: (self._prepared.evaluate(p).value,))
+        (value,) = self._in_batches(points, lambda p: (self._prepared.evaluate(p).value,))
         return self.wrapped(value)
 
     def slopes(self, points: FloatArray, radius: FloatArray) -> tuple[Samples, FloatArray]:
         """The function at points (n, 3), its reach left out, and by how much at most its gradient
         changes within `radius` (n,) of each, rounding included: see `Field.slope_change`."""
 
-        def look(p: Vec3, r: Vec3) -> tuple[Real, Vec3, Real]:
+        def compute(p: Vec3, r: Vec3) -> tuple[Real, Vec3, Real]:
             sample = self._prepared.evaluate(p)
             change = self._prepared.slope_change(p, r.x) + sample.gradient_error
             return sample.value, sample.gradient, change
 
         self.evaluations += 2 * len(points)
         value, gradient, change = in_batches(
-            self._backend, look, points, np.column_stack([radius] * 3), at_once=1 << 18
+            self._backend, compute, points, np.column_stack([radius] * 3), at_once=1 << 18
         )
         return Samples(self.wrapped(value), gradient, np.zeros(len(points))), change
 
@@ -139,9 +139,9 @@ class LevelFunction:
             sample = self._prepared.evaluate(p)
             return (distance_below(self._backend, self._prepared, self._levels, p, sample),)
 
-        return self._looked_at(points, bound)[0]
+        return self._in_batches(points, bound)[0]
 
-    def _look(self, p: Vec3) -> tuple[Real, Vec3, Real]:
+    def _evaluated(self, p: Vec3) -> tuple[Real, Vec3, Real]:
         sample = self._prepared.evaluate(p)
         if self.period is None:
             return sample.value, sample.gradient, self._backend.Float(0)
@@ -154,7 +154,7 @@ class LevelFunction:
         quarter = self._backend.Float(0.2499 * self.period) - 2 * sample.error
         return sample.value, sample.gradient, longest_step(enclosures, Gaps(quarter, quarter))
 
-    def _looked_at(
+    def _in_batches(
         self, points: FloatArray, kernel: Callable[[Vec3], tuple[Any, ...]]
     ) -> tuple[FloatArray, ...]:
         self.evaluations += len(points)

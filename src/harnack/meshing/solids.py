@@ -1,13 +1,11 @@
-"""The solid where a function is at most a level, as a closed mesh: smooth levels put together.
+"""Closed meshes of solids, cut by volumes: the meshes of smooth level sets, put together.
 
-A wall |g| <= w is not meshed as the level 0 of |g| - w, of which marching cubes makes hundreds of
-pieces where cells are thicker than the wall. It is {g <= w} less {g <= -w}, two smooth surfaces
-which do not meet, in a box a little larger than the clip; and it is cut by the clip itself. Unions,
-intersections and complements likewise are those of the parts' meshes, so that the creases where
-parts meet are edges of the mesh. Creases of a single function, such as a cylinder's, are chamfered
-within the tolerance.
-
-Closed meshes of solids, cut by volumes.
+A solid is where a function is at most a level. A wall |g| <= w is not meshed as {|g| - w = 0}, of
+which marching cubes makes hundreds of pieces where cells are thicker than the wall. It is {g <= w}
+less {g <= -w}, two smooth surfaces which do not meet, in a box a little larger than the clip; and
+it is cut by the clip itself. Unions, intersections and complements likewise are those of the parts'
+meshes, so that the creases where parts meet are edges of the mesh. Creases of a single function,
+such as a cylinder's, are chamfered within the tolerance.
 """
 
 from __future__ import annotations
@@ -38,10 +36,10 @@ from harnack.meshing.samples import CELLS_PER_WAVE, LevelFunction, Samples, Uplo
 if TYPE_CHECKING:
     from manifold3d import Manifold
 
-__all__ = ["RegionMesher", "Sheet", "SolidMesh", "is_smooth", "mesh_solid", "region_of"]
+__all__ = ["AngleMesher", "RegionMesher", "SolidMesh", "is_smooth", "mesh_solid", "region_of"]
 
-# Mesh the level set of an angle, which ends at its curve: field, level -> vertices and faces.
-Sheet = Callable[[SolidAngle, float], Surface]
+# Meshes the level set of an angle, which ends at its curve: field, level -> vertices and faces.
+AngleMesher = Callable[[SolidAngle, float], Surface]
 
 
 @dataclass
@@ -50,7 +48,7 @@ class RegionMesher:
 
     tolerance: a length, of the middles of edges and faces. spacing: of cells, at most.
     per_wave: cells along a wave (`Field.wavelength`) at the least; None for as many as there are.
-    sheet: meshes surfaces that end at a curve. most_faces: of each level set.
+    mesh_angle: meshes level sets of angles, which end at a curve. most_faces: of each level set.
     evaluations, levels, finest: of fields, in points, how many level sets were meshed so far, and
         the smallest spacing of these.
     uploads: of the fields that were meshed so far.
@@ -61,7 +59,7 @@ class RegionMesher:
     tolerance: float
     spacing: float
     per_wave: float | None
-    sheet: Sheet
+    mesh_angle: AngleMesher
     most_faces: int
     report: Callable[[str], None]
     evaluations: int = 0
@@ -175,7 +173,7 @@ class RegionMesher:
 
     def _lens(self, field: SolidAngle, low: float, high: float) -> Surface:
         """Between two levels of an angle: both end at the same vertices, those of the curve."""
-        inner, outer = self.sheet(field, low), self.sheet(field, high)
+        inner, outer = self.mesh_angle(field, low), self.mesh_angle(field, high)
         count = sum(map(len, field.loops))
         if not np.array_equal(inner.vertices[:count], outer.vertices[:count]):
             raise MeshingError("the two sides of the solid do not end at the same curve")
@@ -229,6 +227,7 @@ def _hull(field: Field, level: float) -> Volume | None:
 
 
 def _entire(field: Field) -> Field:
+    """The field itself, of a region of a field."""
     return field.inner if isinstance(field, Region) else field
 
 
@@ -269,7 +268,9 @@ class _WithinDomain(LevelFunction):
         )
 
 
-# Cells across a solid, if nothing is asked for.
+# Solids cut by volumes.
+
+# Cells across a solid, unless a spacing is given.
 _ACROSS = 24
 # How many sizes of cells are tried, and what each is of the one before.
 _MOST_ATTEMPTS = 3
@@ -329,15 +330,15 @@ def mesh_solid(
     volume: Volume | None,
     tolerance: float,
     spacing: float | None,
-    sheets: Callable[[float, float], Sheet],
+    angle_mesher: Callable[[float, float], AngleMesher],
     most_faces: int,
     check: Callable[[Surface, float], None],
     report: Callable[[str], None],
 ) -> SolidMesh:
     """The boundary of the points of a volume where a solid's function is at most `level`.
 
-    volume: None for all of space. tolerance: a part of the size. sheets: given a tolerance and a
-    spacing, both lengths, how to mesh the level sets of an angle. most_faces: of a level set.
+    volume: None for all of space. tolerance: a part of the size. most_faces: of a level set.
+    angle_mesher: given a tolerance and a spacing, both lengths, how to mesh level sets of angles.
     check: of the surface, given the size; where it fails in known places, smaller cells are tried,
         and half the tolerance: beside a thin part triangles within it may be anywhere.
 
@@ -353,7 +354,7 @@ def mesh_solid(
     uploads = Uploads()
     while True:
         mesher = RegionMesher(
-            lower, upper, error, cells, per_wave, sheets(error, cells), most_faces, report,
+            lower, upper, error, cells, per_wave, angle_mesher(error, cells), most_faces, report,
             uploads=uploads,
         )  # fmt: skip
         try:

@@ -1,15 +1,7 @@
 """Triangles of an angle's level set that end at its curve, in Delaunay's tetrahedra.
 
-Where a check fails, and it is known where, cells are made smaller there alone and all is done
-again; where that does not help, or it is not known where, cells are made smaller everywhere.
-
-Edges of a curve in one piece again, where they were cut for the tetrahedra.
-
-A long edge of a curve is cut by points on it, so that cells near it need not be as large as it is.
-In the triangles these points are moved off the edge, into the surface, by no more than the
-tolerance, and the gap to the edge is filled: the mesh then ends at the curve as it was given. The
-triangles in the gap are thin. That cannot be helped: the surface winds about the edge, and a
-triangle on all of it is within the tolerance only if it is about as low as that.
+Where a check fails in known places, cells are made smaller there alone and all is done again. Where
+that does not help, or the places are not known, cells are made smaller everywhere.
 """
 
 from __future__ import annotations
@@ -60,10 +52,18 @@ def whole_edges(
     cut: int,
     height: float,
 ) -> tuple[FloatArray, IntArray]:
-    """Vertices and faces whose rim runs through the first `kept` vertices alone.
+    """Vertices and faces whose boundary runs through the first `kept` vertices alone: edges of a
+    curve in one piece again, where they were cut for the tetrahedra.
+
+    A long edge of a curve is cut by points on it, so that cells near it need not be as large as it
+    is. In the triangles these points are moved off the edge, into the surface, by no more than the
+    tolerance, and the gap to the edge is filled: the mesh then ends at the curve as it was given.
+    The triangles in the gap are thin. That cannot be helped: the surface winds about the edge, and
+    a triangle on all of it is within the tolerance only if it is about as low as that.
 
     kept, cut: vertices before `kept` are those of the curve, those from there to `cut` lie on its
-        edges. height: how far these are moved, at most.
+        edges.
+    height: how far these are moved, at most.
     """
     if cut == kept:
         return vertices, faces
@@ -97,8 +97,9 @@ def _moved_in(
     ends: IntArray,
     height: float,
 ) -> FloatArray:
-    """Points (k, 3) `inner` of the edges owner (k,) with these ends (m, 2), off them and on the
-    surface. The heights over an edge are one parabola, so that its filling lies below the chain."""
+    """Points (k, 3) `inner` of the edges owner (k,) with these ends (m, 2), moved off the edges and
+    onto the surface. The heights over an edge are one parabola, so that its filling lies below the
+    chain."""
     here = vertices[inner]
     a, along = vertices[ends[:, 0]], vertices[ends[:, 1]] - vertices[ends[:, 0]]
     length = np.linalg.norm(along, axis=1)
@@ -117,7 +118,7 @@ def _moved_in(
     way = _across(inward[inner], along)
     start = here + far[:, None] * way
     there = newton(function, start, function.at(start), 0.3 * far, None)
-    # Along the edge, and away from it, points stay where they are: about it they are turned.
+    # Points keep their place along the edge and their distance from it: they are turned about it.
     turned = _across(there - here, along)
     good = (turned * way).sum(axis=1) > 0.3
     return here + far[:, None] * np.where(good[:, None], turned, way)
@@ -141,15 +142,17 @@ def _filling(chain: list[int]) -> list[tuple[int, int, int]]:
     ]
 
 
+# The whole surface.
+
 # How often all is done again because finished triangles fail.
 _MOST_ATTEMPTS = 4
-# How often cells are made smaller where the first triangles fail, before they are everywhere.
+# How often cells are made smaller where the first triangles fail, before that is done everywhere.
 _MOST_LOCAL = 4
-# Edges of a curve that are longer than so many cells are cut.
+# Edges of a curve that are longer than this many cells are cut.
 _LONGEST = 2.5
 # How often edges of a curve that are too near to others are halved.
 _MOST_CUTS = 4
-# Of smaller cells everywhere.
+# The size of smaller cells everywhere, as a part of that before.
 _SMALLER = 0.6
 
 
@@ -174,8 +177,11 @@ class Spanned:
 
 @dataclass(frozen=True)
 class _Task:
-    """What is to be filled, with what. lower, upper: (3,) the box. walls: the same, where the
-    surface may end there, or None."""
+    """What is to be filled, with what.
+
+    lower, upper: (3,) the box.
+    walls: the same, where the surface may end there, or None.
+    """
 
     function: LevelFunction
     lower: FloatArray

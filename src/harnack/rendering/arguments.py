@@ -1,4 +1,4 @@
-"""What `render` is asked for, checked before anything is drawn."""
+"""The arguments of `render`, checked before anything is drawn."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ LINED = ("color", "shaded", "value")
 ANTIALIASING = ("edges", "cones")
 MAX_SIDE = 16384
 MAX_SPP = 1_000_000
-# Of the path tracer's counters.
+# The largest number that the path tracer's counters hold.
 _MAX_INTEGER = 2**31 - 1
-# What other programs call settings, and their names here.
+# Names of settings in other programs, and what they are called here.
 _CALLED_ELSEWHERE = {
     "color": '"material"', "colour": '"material"', "bsdf": '"material"', "samples": '"spp"',
     "resolution": '"size"', "width": '"size"', "height": '"size"',
@@ -38,13 +38,13 @@ _CALLED_ELSEWHERE = {
         "camera=harnack.Camera(...), which has it",
     ),
 }  # fmt: skip
-# Bytes a pixel at the peak, measured at 2048 x 2048 and 4096 x 4096, rounded up.
+# Peak memory in bytes per pixel, measured at 2048 x 2048 and 4096 x 4096, rounded up.
 _BYTES = {"color": 50, "shaded": 280, "value": 240}
 _BYTES_OF_VIEWS = 130
 
 
 def check_max_depth(max_depth: Any, show: str) -> int | None:
-    """The longest path, or None; ValueError for pictures without paths."""
+    """The longest light path, or None; ValueError for pictures without light paths."""
     if max_depth is None:
         return None
     _check_has_paths("max_depth", show)
@@ -66,7 +66,7 @@ def _check_has_paths(setting: str, show: str) -> None:
 
 
 def check_isolines(isolines: Any, show: str) -> tuple[Isolines, ...]:
-    """Isolines as a tuple; ValueError for pictures that have none."""
+    """Isolines as a tuple; ValueError for pictures that cannot have any."""
     lines = checked_isolines(isolines)
     if lines and show not in LINED:
         raise ValueError(f'isolines need a picture with show={_either(LINED)}, not "{show}"')
@@ -74,7 +74,8 @@ def check_isolines(isolines: Any, show: str) -> tuple[Isolines, ...]:
 
 
 def check_function(of: Any, show: str) -> Field | None:
-    """The function of which values are shown; ValueError where there is none, or no use for it."""
+    """The function whose values are shown; ValueError if it is missing, or given for another kind
+    of picture."""
     if show != "value":
         if of is not None:
             raise ValueError(f'of=... needs a picture with show="value", not show="{show}"')
@@ -88,7 +89,7 @@ def check_function(of: Any, show: str) -> Field | None:
 
 
 def check_value_range(value_range: Any, show: str) -> tuple[float, float] | None:
-    """The numbers at the ends of a scale, or None; ValueError for pictures that have none."""
+    """The ends of the color scale, or None; ValueError for pictures without such a scale."""
     if value_range is None:
         return None
     _check_scaled("value_range", show)
@@ -103,7 +104,7 @@ def check_value_range(value_range: Any, show: str) -> tuple[float, float] | None
 
 
 def check_colorbar(colorbar: Any, show: str) -> bool | str:
-    """Whether there is to be a bar, or its title; ValueError for pictures that have none."""
+    """Whether to draw a color bar, or its title; ValueError for pictures without a color scale."""
     if not isinstance(colorbar, bool | str):
         raise TypeError(f"colorbar must be True, False or the bar's title, not {colorbar!r}")
     if colorbar:
@@ -117,10 +118,10 @@ def check_colorbar(colorbar: Any, show: str) -> bool | str:
 
 
 def check_behind(backdrop: Any, show: str) -> Backdrop:
-    """What is behind the surfaces; of pictures of numbers, one color.
+    """What is behind the surfaces: any backdrop, or one color for pictures of numbers (`VIEWS`).
 
     Raises:
-        TypeError, ValueError: no backdrop, or none of such pictures.
+        TypeError, ValueError: it is no backdrop, or not one color where that is required.
     """
     if backdrop is None:
         return Ground("light")
@@ -145,7 +146,7 @@ def _either(names: Sequence[str]) -> str:
 
 
 def check_show(show: Any) -> str:
-    """A mode; ValueError for what is none."""
+    """The mode; ValueError if it is unknown."""
     if not isinstance(show, str) or show not in SHOW_MODES:
         raise ValueError(
             f"show must be one of {', '.join(SHOW_MODES)}, not {show!r}"
@@ -155,8 +156,8 @@ def check_show(show: Any) -> str:
 
 
 def check_antialias(antialias: Any, show: str) -> str | None:
-    """A way to choose pixels, or None; ValueError for what is none, or where there is none to
-    choose."""
+    """The way to choose pixels for more samples, or None; ValueError if it is unknown, or the
+    picture is not shaded."""
     if antialias is None:
         return None
     if not isinstance(antialias, str) or antialias not in ANTIALIASING:
@@ -187,7 +188,7 @@ def check_size(size: Any) -> tuple[int, int]:
 
 
 def check_spp(spp: Any, *, source: str = "") -> int:
-    """Samples a pixel. source: of what, if not of the call."""
+    """Samples per pixel. source: where the number is from, for messages, if not from the call."""
     number = check_integer("spp", spp)
     if not 1 <= number <= MAX_SPP:
         raise ValueError(f"spp must be at least 1 and at most {MAX_SPP}, not {number}{source}")
@@ -198,8 +199,8 @@ def check_integer(name: str, number: Any) -> int:
     """An integer of any sign.
 
     Raises:
-        TypeError: it is none.
-        ValueError: a max_depth beyond what is counted in.
+        TypeError: it is no integer.
+        ValueError: a max_depth too large for the path tracer's counters.
     """
     try:
         integer = operator.index(number)
@@ -211,7 +212,7 @@ def check_integer(name: str, number: Any) -> int:
 
 
 def check_camera(camera: Any) -> Camera:
-    """A camera, one at a position (x, y, z), or that of all pictures."""
+    """A `Camera`: the given one, one at a position (x, y, z), or the default for None."""
     if camera is None:
         return Camera()
     if isinstance(camera, Camera):
@@ -235,12 +236,12 @@ def _by(check: Callable[[Any], Any]) -> Check:
 
 
 def _if_given(check: Callable[[Any], Any]) -> Check:
-    """The same, of what may be left out."""
+    """A check, of a setting that may be None."""
     return lambda given, show: None if given is None else check(given)
 
 
 def _as_given(given: Any, show: str) -> Any:
-    """Of what is checked elsewhere, by what uses it."""
+    """No check: what uses the setting checks it."""
     del show
     return given
 
@@ -250,16 +251,18 @@ def _integer(name: str) -> Check:
 
 
 def _setting(check: Check = _as_given, **marks: bool) -> Mapping[str, Any]:
-    """How a setting is checked, from what is given and what is shown. of_studio: a scene that has
-    everything of its own does not take it. of_surfaces: it says where they are."""
+    """The metadata of a setting: its check, which gets the setting and `show`, and marks.
+
+    of_studio: it is for the studio alone; a Mitsuba scene does not take it.
+    of_surfaces: it changes where surfaces are.
+    """
     return {"check": check, **marks}
 
 
 @dataclass(frozen=True)
 class Request:
-    """The settings of pictures as they are used, each with its check: sizes and counts are
-    integers, None is for unset. The one table of them, which films read too.
-    """
+    """The settings of `render`, checked: sizes and counts are integers, None means not set. Each
+    field holds its check; films read this table too."""
 
     show: str = field(metadata=_setting(_by(check_show)))
     size: tuple[int, int] | None = field(metadata=_setting(_if_given(check_size)))
@@ -291,7 +294,7 @@ class Request:
 
     @classmethod
     def checked(cls, given: Mapping[str, Any]) -> Request:
-        """What was asked for, by name.
+        """The settings, from the arguments of `render` by name.
 
         Raises:
             TypeError, ValueError: naming the setting that is wrong, and what it should be.
@@ -322,7 +325,7 @@ def check_settings(settings: Mapping[str, Any]) -> None:
 
 
 def refuse_studio_settings(given: Mapping[str, Any]) -> None:
-    """Settings of the studio make no sense for a scene that has everything already."""
+    """Raise ValueError for settings of the studio, which a Mitsuba scene does not take."""
     wrong = [name for name, value in given.items() if value is not None]
     if wrong:
         raise ValueError(f"{', '.join(wrong)}: a Mitsuba scene is drawn as it is")
@@ -339,7 +342,7 @@ def check_memory(show: str, width: int, height: int) -> None:
 
 
 def _memory() -> float:
-    """Bytes of memory in this machine; infinite where that cannot be told."""
+    """Bytes of memory in this machine; infinite if unknown."""
     try:
         return float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError, OSError):

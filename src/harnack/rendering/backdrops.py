@@ -1,6 +1,7 @@
-"""The studio's ground and lights, placed around the camera's view of the stage.
+"""The surroundings of a picture in the studio: ground and lights, or colors and images.
 
-What stands behind the surfaces in place of the studio's wall: colors and images.
+Ground and lights are placed around the camera's view of the stage. A color or an image takes the
+place of the studio's wall behind the surfaces.
 """
 
 from __future__ import annotations
@@ -27,17 +28,17 @@ _HORIZON = np.array([0.17, 0.17, 0.18])
 _ZENITH = np.array([0.36, 0.40, 0.46])
 _STRIP = np.array([0.70, 0.66, 0.60])
 _KEY = (4.7, 4.5, 4.25)
-# The height of the floor: a hair below what stands on it.
+# The height of the floor, just below what stands on it.
 FLOOR = -0.002
-# Reflectance of the ground, by the backdrop's name. Without a ground, what is behind the surfaces
-# is cut out of the picture.
+# Reflectance of the ground, by the backdrop's name. With other backdrops there is no ground, and
+# the surfaces alone are laid over them.
 GROUNDS = {"light": (0.74, 0.73, 0.715), "dark": (0.055, 0.058, 0.065)}
 # (height, width) of the environment's bitmap.
 _ENVIRONMENT_SIZE = (64, 128)
 
 
 def reflectance_of(backdrop: str) -> FloatArray:
-    """Of the ground, (3,)."""
+    """Reflectance (3,) of the ground."""
     return np.array(GROUNDS[backdrop])
 
 
@@ -64,12 +65,12 @@ def ground(mi: Any, backdrop: str) -> dict[str, Any]:
 
 
 def lights(mi: Any, azimuth: float) -> dict[str, Any]:
-    """A large key light to the left of the camera and above, and an environment that fills.
+    """A large key light to the left of the camera and above, and an environment as fill light.
 
     azimuth: of the camera, in degrees.
 
-    The environment is smooth: paths that find it by themselves are less noisy than samples of
-    it, so it is not sampled.
+    The environment is smooth: paths that reach it by sampling BSDFs are less noisy than samples of
+    it, so it is not sampled itself.
     """
     key = 4.9 * _direction(azimuth - 52, 55)
     look = mi.ScalarTransform4f().look_at(origin=key.tolist(), target=[0, 0, 0.3], up=[0, 0, 1])
@@ -110,17 +111,19 @@ def _direction(azimuth: float, elevation: float) -> FloatArray:
     return np.array([math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)])
 
 
+# Colors and images behind the surfaces.
+
 FloatImage = npt.NDArray[np.float32]
 
 TRANSPARENT = "transparent"
 BACKDROPS = (*GROUNDS, "white", TRANSPARENT)
-"""Names. Those of colors will do as well."""
+"""Names of backdrops; names of colors are backdrops too."""
 IMAGE_FILES = (".png", ".jpg", ".jpeg", ".exr")
 
 
 @dataclass(frozen=True)
 class Ground:
-    """The studio's floor, going over into a wall. name: in GROUNDS."""
+    """The studio's floor, which turns into a wall far away. name: in GROUNDS."""
 
     name: str
 
@@ -141,15 +144,15 @@ class Photo:
 
 
 Backdrop = Ground | Gradient | Photo | None
-"""None for nothing: the picture is transparent there."""
+"""None for a transparent picture."""
 
 
 def checked_backdrop(given: Any) -> Backdrop:
     """What is to be behind the surfaces.
 
     Raises:
-        TypeError, ValueError: none of what there is, naming what there is.
-        FileFormatError: an image's file that cannot be read.
+        TypeError, ValueError: it is no backdrop; the message says what backdrops there are.
+        FileFormatError: an image file that cannot be read.
     """
     if isinstance(given, os.PathLike):
         return Photo(_read(Path(cast("os.PathLike[str]", given))))
@@ -207,7 +210,7 @@ def _pixels(image: npt.NDArray[Any]) -> FloatImage:
 
 
 def _read(path: Path) -> FloatImage:
-    """The image in a file; what is clear in it is white."""
+    """The image in a file, over white where it is transparent."""
     if path.suffix.lower() not in IMAGE_FILES:
         raise Place(path).error(f"a backdrop is an image: {', '.join(IMAGE_FILES)}")
     data = read_bytes(path)
@@ -239,7 +242,7 @@ def _decoded(bitmap: Any) -> FloatImage:
 
 
 def _of_exr(data: bytes) -> FloatImage:
-    """Not by Mitsuba, which waits for ever where Dr.Jit has one thread."""
+    """Read by OpenEXR: Mitsuba never returns where Dr.Jit has one thread."""
     import OpenEXR  # here, since most pictures do without
 
     library = cast("Any", OpenEXR)

@@ -17,8 +17,8 @@ from harnack.geometry.volume import checked_point
 _FILLED = 0.86
 
 
-# The angle of view of a camera that chooses its distance, and of one that is among what it sees;
-# and how wide one may become to see all from where it stands.
+# Angles of view in degrees: of a camera that chooses its distance, of one with points to be framed
+# beside or behind it, and the widest that is chosen to frame everything from a given position.
 _USUAL, _AMONG, _WIDEST = 26.0, 60.0, 120.0
 _AZIMUTH, _ELEVATION = -50.0, 28.0
 
@@ -164,13 +164,13 @@ class Camera:
             fov = 2 * math.degrees(math.atan(math.tan(math.radians(fov) / 2) / self.zoom))
         return Pose(target + length * back, target, up, fov, turned.angles[0])
 
-    def _framing(self, across: FloatArray, room: FloatArray, size: tuple[int, int]) -> float:
-        """The angle of view, in degrees, in which all points are that lie as far as `across` (2, n)
-        from the middle, to the right and upwards, and `room` (n,) before the camera."""
-        if room.min() <= 0:
+    def _framing(self, across: FloatArray, depth: FloatArray, size: tuple[int, int]) -> float:
+        """The angle of view, in degrees, that frames points as far as `across` (2, n) from the
+        middle, to the right and upwards, and `depth` (n,) in front of the camera."""
+        if depth.min() <= 0:
             return _AMONG
         shape = max(size) / np.array(size)
-        wide = (across / room).max(axis=1) * shape
+        wide = (across / depth).max(axis=1) * shape
         fov = 2 * math.degrees(math.atan(max(float(wide.max()), 1e-4) / _FILLED / self.zoom))
         return min(fov, _WIDEST)
 
@@ -180,7 +180,7 @@ class Camera:
         return _USUAL if self.fov is None else self.fov
 
     def _slopes(self, size: tuple[int, int]) -> tuple[float, float]:
-        """Of the edges of the part of the picture to fill, to the right and upwards."""
+        """Slopes of the edges of the part of the picture to fill, to the right and upwards."""
         slope = math.tan(math.radians(self.angle) / 2) * _FILLED / max(size)
         return slope * size[0], slope * size[1]
 

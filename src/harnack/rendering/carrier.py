@@ -1,11 +1,11 @@
-"""Our surfaces as members of a Mitsuba scene.
+"""Level sets in Mitsuba scenes: the meshes that carry them, and BSDFs with isolines.
 
-Mitsuba 3.9 has no shapes written in Python, except meshes. So a surface travels in a mesh of two
-triangles that are each a point, corners of its bounding box: no ray meets them, but the scene's
-bounding box is right, and the mesh holds the BSDF. `world.World` finds the carriers in a scene
-and traces what they carry.
+Mitsuba 3.9 has no shapes written in Python, except meshes. So a level set travels in a *carrier*, a
+mesh of two triangles that are each a point, at opposite corners of its bounding box: no ray hits
+them, but the scene's bounding box is right, and the mesh holds the BSDF. `world.World` finds the
+carriers in a scene and traces their level sets.
 
-Surfaces that have lines drawn on them: matter of other colors, chosen by the line's number.
+On isolines the BSDF is another one, chosen by the number of the isoline (`with_lines`).
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 
 
 def with_lines(mi: Any, bsdf: Any, colors: Sequence[Color]) -> Any:
-    """A BSDF that is another one off lines, and matt on both sides on them.
+    """A BSDF that is the given one off the isolines, and diffuse on both sides on them.
 
-    colors: of the lines, in sRGB.
+    colors: of the isolines, in sRGB.
     """
     paints = [load_dictionary(mi, _matt(color)) for color in colors]
     return _lined_class(mi.variant())(bsdf, paints)
@@ -50,7 +50,7 @@ def _lined_class(variant: str) -> Any:
     assert mi.variant() == variant
 
     class Lined(mi.BSDF):
-        """`interaction` puts the number of the line into the index of the primitive."""
+        """`world.surface_interaction` gives the isoline's number as the index of the primitive."""
 
         def __init__(self, base: Any, paints: Sequence[Any]) -> None:
             mi.BSDF.__init__(self, mi.Properties())
@@ -65,7 +65,7 @@ def _lined_class(variant: str) -> Any:
             self.m_flags = flags
 
         def _chosen(self, ask: Callable[[Any, Mask], Any], si: Any, active: Mask) -> Any:
-            """What `ask` is told by the part that is seen, of which it gets the mask."""
+            """The result of `ask(bsdf, mask)` for the BSDF that is seen in each lane."""
             line = si.prim_index
             found = ask(self.base, active & (line == 0))
             for number, paint in enumerate(self.paints, start=1):
@@ -126,8 +126,8 @@ def from_properties(
     """The shape of a surface with the `to_world` and the BSDF that a plug-in's properties hold.
 
     tint: of a solid, what is left of light after one unit of length in it, in the world.
-    cut_bsdf: of the faces of a solid on its section; None for that of the rest.
-    isolines: drawn on it.
+    cut_bsdf: of the faces at which a section cuts a solid; None for the BSDF of the rest.
+    isolines: to be drawn on the surface.
 
     Raises:
         ValueError: as `shape`; or the properties hold an emitter or a medium.
@@ -162,7 +162,7 @@ def from_properties(
 
 
 def _words(bsdf: Any) -> str:
-    """What a BSDF says of itself; nothing, if it was written in Python without `to_string`."""
+    """The text of a BSDF; empty if it was written in Python without `to_string`."""
     try:
         return str(bsdf)
     except RuntimeError:
@@ -182,7 +182,7 @@ def _carrier_class(variant: str) -> Any:
     assert mi.variant() == variant
 
     class Carrier(mi.Mesh):
-        """A mesh that no ray meets, with the surface that it stands for."""
+        """A mesh that no ray hits, with the surface that it stands for."""
 
         def __init__(
             self, props: Any, surface: LevelSet, placement: Placement, tint: Any, cut_bsdf: Any,
@@ -193,8 +193,8 @@ def _carrier_class(variant: str) -> Any:
             self.surface = surface
             self.placement = placement
             self.tint = tint_of(mi, tint)
-            # What is met on the section counts as a shape of its own, which no ray meets either.
-            self.cut_face = None if cut_bsdf is None else _bearer(mi, cut_bsdf)
+            # Hits on the section belong to a shape of their own, which no ray hits either.
+            self.cut_face = None if cut_bsdf is None else _bsdf_holder(mi, cut_bsdf)
             backend, size = mitsuba_backend(mi), float(np.linalg.norm(np.diff(ends, axis=0)))
             self.placed = PlacedSurface.of(surface, placement, backend, isolines, size)
             self.line_colors = tuple(one.rgb for one in isolines)
@@ -210,8 +210,8 @@ def _carrier_class(variant: str) -> Any:
     return Carrier
 
 
-def _bearer(mi: Any, bsdf: Any) -> Any:
-    """A mesh that is in no scene, to have a BSDF."""
+def _bsdf_holder(mi: Any, bsdf: Any) -> Any:
+    """A mesh in no scene, which only holds a BSDF."""
     props = mi.Properties()
     props["bsdf"] = bsdf
     return mi.Mesh(PLUGIN, 1, 1, props=props)

@@ -1,14 +1,7 @@
-"""Where a ray meets one of our surfaces: polished, with a normal that faces the right way.
+"""First hits of rays with level sets and closed solids: refined positions, oriented normals.
 
-Everything here is in the surface's own coordinates and knows no Mitsuba; `interaction` turns it
-into what a BSDF is asked with.
-
-Closed solids: the points of a volume where low <= f <= high, with caps where it is cut.
-
-The boundary consists of level sets inside the volume and of caps on the volume's own boundary.
-A ray meets a cap where it enters the volume at a point of the solid, or leaves it at one without
-having met a level before. Volumes are convex, so a ray enters and leaves at most once. A cap lies
-on the section if it is the section that ends the ray's part in the volume there.
+Everything here is in the surface's own coordinates and knows no Mitsuba;
+`world.surface_interaction` turns a hit into what a BSDF takes.
 """
 
 from __future__ import annotations
@@ -28,30 +21,31 @@ from harnack.tracer import Status
 if TYPE_CHECKING:
     from harnack.tracer import LevelSet, MarchResult, PreparedLevelSet
 
-# Polishing moves a hit by at most this many tolerances: along a ray that only grazes the surface
-# there is no crossing to converge to.
+# A hit is refined by at most this many tolerances: along a ray that only grazes the surface there
+# is no crossing to converge to.
 _POLISH = 2.0
 # A ray leaves a surface this many tolerances away from it, so as not to meet it again there.
 CLEARANCE = 4.0
-# A grazing ray's normal is turned until it faces the ray's side under this sine.
+# Normals of grazing hits are tilted until their cosine with the ray is at least this.
 _GRAZING = 1e-3
 
 
 @dataclass
 class SurfaceHit:
-    """What rays meet first. Lanes that meet nothing have met = lost = False and t = inf.
+    """What rays hit first. Lanes that hit nothing have met = lost = False and t = inf.
 
     t: ray parameter; of a lost ray, how far it is proved free.
     met: there is a surface at t.
     lost: the ray ran out of steps behind t.
-    position, normal: of the surface. The normal is unit and points to the side of larger values
-        or, of a solid, out of it.
+    position, normal: of the surface. The normal is unit and points to the side of larger values or,
+        of a solid, out of it.
     clearance: how far off the surface the next ray has to start.
-    value: of the field, close to the surface or, of a sheet, just before it; of no meaning where
-        nothing is met.
+    value: of the field, close to the surface or, of a sheet (where a field jumps), just before it;
+        undefined where nothing is hit.
     evaluations: of the field.
-    cut: it is a face of a solid on its section.
-    mended: of a field with sheets, met between them: there the surface spans what they leave open.
+    cut: the hit is on a face at which the section cuts a solid.
+    mended: of a field with sheets, the hit is on none: the surface closes a hole between them
+        there.
     line: the number of the isoline drawn there, counted from 1; 0 for none.
     """
 
@@ -71,16 +65,16 @@ class SurfaceHit:
 def meet_surface(
     prepared: PreparedLevelSet, o: Vec3, d: Vec3, t_max: Real, active: Mask
 ) -> SurfaceHit:
-    """Where rays o + t d, |d| = 1, 0 <= t <= t_max, first meet the level set.
+    """Where rays o + t d, |d| = 1, 0 <= t <= t_max, first hit the level set.
 
-    One Newton step along the ray, one evaluation there, and one projection along its gradient
-    take a hit from within tolerance to the surface. The proof tells which side of the surface
-    the ray comes from; a normal that says otherwise (the step went past the point where a
-    grazing ray is nearest) is turned to that side.
+    One Newton step along the ray, one evaluation there, and one projection along its gradient take
+    a hit from within tolerance to the surface. The proof tells which side of the surface the ray
+    comes from; a normal that says otherwise (the step went past the point where a grazing ray is
+    nearest) is turned to that side.
 
     A confirmed hit is at a root already, and its side is known.
 
-    A hit on a sheet of a field that jumps is where it is, and faces the side of larger values.
+    A hit on a sheet is not moved; the normal points to the side of larger values.
     """
     trace = prepared.first_hit(o, d, 0, t_max, active)
     if not prepared.queued:
@@ -103,7 +97,7 @@ class _Ended:
 
 
 def _no_hit(prepared: PreparedLevelSet, trace: MarchResult) -> SurfaceHit:
-    """What rays that hit nothing have met."""
+    """The `SurfaceHit` of rays that hit nothing."""
     backend = prepared.backend
     zero, vector, none = backend.Float(0), backend.Array3f(0), backend.Bool(False)
     return SurfaceHit(
@@ -122,7 +116,7 @@ def _no_hit(prepared: PreparedLevelSet, trace: MarchResult) -> SurfaceHit:
 
 
 def _described(prepared: PreparedLevelSet, ended: _Ended) -> SurfaceHit:
-    """What is where rays ended."""
+    """The `SurfaceHit` of rays, with hits refined."""
     vector, o, d, trace = prepared.backend.Array3f, ended.o, ended.d, ended.trace
     prepared = prepared.of_hit(trace)
     met = trace.status == int(Status.HIT)
@@ -145,9 +139,9 @@ def _described(prepared: PreparedLevelSet, ended: _Ended) -> SurfaceHit:
     uncertainty = _uncertainty(prepared, sample.gradient, t, sample.value, sample.error)
     rest = prepared.levels.to_nearest(sample.value) / length
     rest = dr.select(length > 0, dr.clip(rest, -reach, reach), 0)
-    if prepared.field.has_sheets:  # behind one, the value says nothing about this surface
+    if prepared.field.has_sheets:  # behind a sheet, the value says nothing about this surface
         rest = dr.select(dr.abs(rest) * length <= dr.abs(gap), rest, 0)
-    encounter = SurfaceHit(
+    hit = SurfaceHit(
         t=dr.select(met, t, trace.t),
         met=met,
         lost=trace.status == int(Status.OUT_OF_STEPS),
@@ -161,17 +155,17 @@ def _described(prepared: PreparedLevelSet, ended: _Ended) -> SurfaceHit:
         line=prepared.backend.UInt32(0),
     )
     if not prepared.field.has_sheets:
-        return encounter
-    return dr.select(trace.on_sheet, _on_sheet(prepared, o, d, trace, encounter), encounter)
+        return hit
+    return dr.select(trace.on_sheet, _on_sheet(prepared, o, d, trace, hit), hit)
 
 
 def _sample_where(prepared: PreparedLevelSet, p: Vec3, d: Vec3, active: Mask) -> Sample:
     """Value, error, gradient and normal at p where active, zeros elsewhere, and no promises.
 
-    d: of the ray; a point without a slope has the normal -d.
+    d: of the ray; a point with a zero gradient has the normal -d.
 
-    A loop of one trip or of none: of a broken mesh a look costs more than a ray that meets a
-    triangle or nothing, and most rays do.
+    A loop of at most one iteration, skipped where no lane is active: a sample of a broken mesh
+    costs more than a ray that hits a triangle or nothing, and most rays do.
     """
     real, vector = prepared.backend.Float, prepared.backend.Array3f
 
@@ -191,12 +185,12 @@ def _sample_where(prepared: PreparedLevelSet, p: Vec3, d: Vec3, active: Mask) ->
 
 
 def _on_sheet(
-    prepared: PreparedLevelSet, o: Vec3, d: Vec3, trace: MarchResult, encounter: SurfaceHit
+    prepared: PreparedLevelSet, o: Vec3, d: Vec3, trace: MarchResult, hit: SurfaceHit
 ) -> SurfaceHit:
-    """Encounters with sheets: t is exact to rounding, and so is the plane of the normal.
+    """Hits on sheets: t is exact to rounding, and so is the plane of the normal.
 
-    The ray comes from the side of smaller values if it runs along the normal. The next ray keeps
-    as far away as from a level set, and no less than several roundings of the position.
+    The ray comes from the side of smaller values if it runs along the normal. The next ray keeps as
+    far away as from a level set, and no less than several roundings of the position.
     """
     t = dr.select(trace.on_sheet, trace.t, 0)
     p = dr.fma(prepared.backend.Array3f(t), d, o)
@@ -204,7 +198,7 @@ def _on_sheet(
     rounding = 4 * prepared.backend.epsilon * (dr.max(dr.abs(o)) + t)
     tolerance = prepared.tolerance.in_value(prepared.backend.Float(1), t)
     return replace(
-        encounter,
+        hit,
         t=t,
         position=p,
         normal=facing(trace.gradient, d, side),
@@ -222,11 +216,11 @@ def _uncertainty(
     That is the tolerance, or what rounding of f (`Sample.error`) amounts to if that is more; the
     rounding of positions is far below what Mitsuba's rays keep off surfaces anyway.
     """
-    steepness = norm(gradient)
+    gradient_norm = norm(gradient)
     t = dr.select(dr.isfinite(t), t, 0)
     rounding = 2 * (error + 8 * prepared.backend.epsilon * dr.abs(f))
-    close = dr.maximum(prepared.tolerance.in_value(steepness, t), rounding)
-    return dr.select(steepness > 0, close / steepness, prepared.tolerance.distance)
+    close = dr.maximum(prepared.tolerance.in_value(gradient_norm, t), rounding)
+    return dr.select(gradient_norm > 0, close / gradient_norm, prepared.tolerance.distance)
 
 
 def facing(normal: Vec3, d: Vec3, side: Real) -> Vec3:
@@ -238,7 +232,15 @@ def facing(normal: Vec3, d: Vec3, side: Real) -> Vec3:
 
 @dataclass(frozen=True)
 class CappedSolid:
-    """A prepared level set whose levels are the finite ones of `low` and `high`."""
+    """A closed solid: the points of a volume where low <= f <= high, with caps where it is cut.
+
+    Its boundary consists of level sets inside the volume and of caps on the volume's own boundary.
+    A ray hits a cap where it enters the volume at a point of the solid, or leaves it at one without
+    having hit a level before. Volumes are convex, so a ray enters and leaves at most once. A cap
+    lies on the section if it is the section that ends the ray's part in the volume there.
+
+    prepared: a level set whose levels are the finite ones of `low` and `high`.
+    """
 
     prepared: PreparedLevelSet
     low: Real
@@ -261,17 +263,17 @@ class CappedSolid:
     def meet(self, o: Vec3, d: Vec3, t_max: Real, active: Mask, leaves: Real = 0.0) -> SurfaceHit:
         """Where rays o + t d, |d| = 1, 0 <= t <= t_max, first cross the boundary of the solid.
 
-        leaves: of a ray that starts at the boundary, 1 if it goes out of the solid there, -1 if
-            it goes in; else 0. Such a ray starts off the boundary by a clearance, and where the
-            solid or a gap in it is thinner than that, it slips through: it then crosses back at
-            once, straight on. So going in and going out always alternate, and no light is lost
-            at the sharp rims of caps.
+        leaves: of a ray that starts at the boundary, 1 if it goes out of the solid there, -1 if it
+            goes in; else 0. Such a ray starts off the boundary by a clearance. Where the solid or a
+            gap in it is thinner than that, it starts on the wrong side: then it crosses back at
+            once, straight on. So going in and going out always alternate, and no light is lost at
+            the sharp edges of caps.
         """
         zero = self.prepared.backend.Float(0)
         start, end = self.prepared.clip(o, d, zero, t_max)
         through = active & (start < end)
         start = dr.select(through, start, 0)
-        known = self.prepared.resolves(o, end)  # other rays are lost among the levels
+        known = self.prepared.resolves(o, end)  # others run out of steps in `_meet_levels`
         within = through & known & self._holds(self._at(o, d, start))
         inside = within & (start <= 0)
         slipped = active & known & (((leaves < 0) & ~inside) | ((leaves > 0) & inside))
@@ -300,7 +302,7 @@ class CappedSolid:
         return dr.select(capped, crossed, met)
 
     def occludes(self, o: Vec3, d: Vec3, t_max: Real, active: Mask) -> Mask:
-        """Whether the boundary lies on rays; what is not proved free counts as lying there."""
+        """Whether rays hit the boundary; those not proved to miss it count as hitting it."""
         start, end = self.prepared.clip(o, d, self.prepared.backend.Float(0), t_max)
         through = active & (start < end)
         start = dr.select(through, start, 0)

@@ -31,7 +31,7 @@ from harnack.rendering.studio_scene import surfaces_of
 FILM_FILES = (".gif", ".mp4")
 _SIZE = (320, 240)
 _MOST_FRAMES = 10_000
-# The color of a GIF that is none, behind all others.
+# The palette's last entry in a GIF, which stands for transparent.
 _CLEAR = 255
 Pixels = npt.NDArray[np.uint8]
 
@@ -131,15 +131,15 @@ def check_film_path(path: str | os.PathLike[str]) -> Path:
 
 
 def _at(value: Any, s: float) -> Any:
-    """A setting at a moment. Fields and materials that can be called are what they are."""
+    """A setting at the time s: functions of s are called, all else is constant."""
     return value(s) if callable(value) and not isinstance(value, type) else value
 
 
 def _cameras(
     moments: list[dict[str, Any]], steps: FloatArray, turn: float, size: tuple[int, int]
 ) -> list[Camera]:
-    """The camera of each picture: one box, target, distance and angle of view for all, but for what
-    they say themselves."""
+    """The camera of each picture: all have one box, target, distance and angle of view, except
+    where they set their own."""
     asked = [moment.get("camera") for moment in moments]
     cameras = [Camera() if one is None else check_camera(one) for one in asked]
     ups = [moment.get("up") for moment in moments]
@@ -172,7 +172,7 @@ def _cameras(
 
 
 def _turned(camera: Camera, turn: float, stand: FloatArray) -> Camera:
-    """The camera after it has gone around its target. stand: (3, 3), turns what is up to z."""
+    """The camera after it has gone around its target. stand: (3, 3), rotates up to z."""
     if camera.position is None:
         return replace(camera, azimuth=camera.angles[0] + turn)
     c, s = math.cos(math.radians(turn)), math.sin(math.radians(turn))
@@ -206,7 +206,7 @@ def _three(point: FloatArray) -> tuple[float, float, float]:
 
 @contextmanager
 def _encoder(path: Path, size: tuple[int, int], fps: float) -> Generator[Callable[[Pixels], None]]:
-    """Takes pictures and has written them to `path` at the end."""
+    """Yields a function that takes pictures; the film is in `path` when the block ends."""
     if path.suffix.lower() == ".gif":
         with _gif(path, fps) as add:
             yield add
@@ -228,7 +228,7 @@ def _gif(path: Path, fps: float) -> Generator[Callable[[Pixels], None]]:
     def add(pixels: Pixels) -> None:
         opaque = Image.fromarray(np.ascontiguousarray(pixels[..., :3]))
         chosen = opaque.quantize(_CLEAR, method=Image.Quantize.MEDIANCUT)
-        if pixels.shape[-1] == 4:  # a GIF knows nothing between clear and opaque
+        if pixels.shape[-1] == 4:  # a GIF has no partly transparent pixels
             clear = Image.fromarray(np.where(pixels[..., 3] < 128, np.uint8(255), np.uint8(0)))
             chosen.paste(_CLEAR, mask=clear)
             chosen.info["transparency"] = _CLEAR
@@ -250,7 +250,7 @@ def _mp4(path: Path, size: tuple[int, int], fps: float) -> Generator[Callable[[P
             "films in .mp4 files need PyAV: pip install 'harnack[film]', or write a .gif"
         ) from None
     library = cast("Any", av)
-    # H.264 has pairs of pixels.
+    # H.264 stores colors for pairs of pixels.
     if min(size) < 2:
         raise ValueError(f"a film in .mp4 has sides of at least 2 pixels, not {size}")
     with library.open(str(path), "w") as container:

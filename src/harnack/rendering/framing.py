@@ -1,11 +1,7 @@
-"""Which way is up.
+"""What a picture frames: which way is up, the box that holds a surface, and where the surface is.
 
-The box that a surface is proved to lie in, which pictures of it need.
-
-Where a surface really is: found by tracing it from all sides.
-
-The volume that a surface is proved to lie in can be many times larger than the surface. A
-picture wants to be filled by what there is to see.
+The box that a surface is proved to lie in can be many times larger than the surface. A picture
+should be filled by what is visible, so the surface is found by tracing it from all sides.
 """
 
 from __future__ import annotations
@@ -115,7 +111,7 @@ def _unbounded(surface: LevelSet) -> UnboundedSurfaceError:
     return UnboundedSurfaceError(reason, usual if is_other else None)
 
 
-# Rays a side of the grid on each of the six faces of the box, and then of what is found there.
+# Rays along a side of the grid on each of the six faces: of the box, then of the box of the hits.
 _GRID, _CLOSER = 48, 32
 # Rays of one tile are followed together.
 _TILE = 8
@@ -127,12 +123,11 @@ _POINTS: FieldCache[FloatArray] = FieldCache()
 def visible_points(surface: LevelSet, backend: Backend) -> FloatArray:
     """Points (n, 3) of the surface, as seen from the six sides of the box it lies in.
 
-    Those of a field that is uploaded once are found once, as long as the settings are the same:
-    when only the camera moves, nothing is traced for it.
+    They are cached for a field that is uploaded once, as long as the settings are the same: when
+    only the camera moves, nothing is traced for it.
 
     Raises:
-        ValueError: it has no bounds, or a size that single precision cannot draw; nothing is
-            found of it.
+        ValueError: it has no bounds, or a size that single precision cannot draw; no ray hits it.
     """
     ends = box_of(surface)
     check_size(ends)
@@ -158,7 +153,7 @@ def check_size(ends: FloatArray) -> None:
 
 
 def _found(surface: LevelSet, backend: Backend, ends: FloatArray) -> FloatArray:
-    """Points on a coarse grid, and on one as close as the surface fills."""
+    """Points found on a coarse grid, and on one around them."""
     lower, upper = ends
     points = _probe(surface, backend, lower, upper, _GRID)
     if len(points) == 0:
@@ -186,11 +181,11 @@ def _point(corner: FloatArray) -> str:
 def _probe(
     surface: LevelSet, backend: Backend, lower: FloatArray, upper: FloatArray, grid: int
 ) -> FloatArray:
-    """First encounters of parallel rays, grid x grid from each of the six sides of a box."""
+    """First hits of parallel rays, grid x grid from each of the six sides of a box."""
     size = float(np.linalg.norm(upper - lower))
-    # A twentieth of the way between rays: sums over trees take long where more is asked for.
-    rough = replace(surface, tolerance=Tolerance(1e-3 * size))
-    placed = PlacedSurface.of(rough, Placement.identity(), backend)
+    # A twentieth of the distance between rays; smaller tolerances are slow for sums over trees.
+    coarse = replace(surface, tolerance=Tolerance(1e-3 * size))
+    placed = PlacedSurface.of(coarse, Placement.identity(), backend)
     o, d, length = _rays(lower, upper, 0.01 * size, grid)
     met = placed.meet(
         to_vector3(backend, o),
@@ -198,7 +193,7 @@ def _probe(
         to_float(backend, length),
         backend.Bool(True),
     )
-    dr.eval(met.position, met.met)  # one by one, each would march anew
+    dr.eval(met.position, met.met)  # separately, each would trace the rays again
     points: FloatArray = to_numpy(met.position)[to_numpy(met.met)]
     return points.astype(np.float64)
 

@@ -1,7 +1,4 @@
-"""Pictures as files: tone mapping, PNG and EXR.
-
-What `render` returns: the numbers of a picture, which know how they look.
-"""
+"""Pictures as arrays and as files: the array that `render` returns, tone mapping, PNG and EXR."""
 
 from __future__ import annotations
 
@@ -47,10 +44,9 @@ def check_picture_path(path: Any) -> Path:
 def tone_mapped(image: FloatImage, behind: FloatImage | None = None) -> npt.NDArray[np.uint8]:
     """Linear sRGB radiance as 8-bit sRGB: a smooth shoulder, then the transfer function.
 
-    Of an image (h, w, 4) the last number is the part that is covered, by which the others are
-    multiplied. It stays, and the others are divided by it, as PNG wants it; or the rest of each
-    pixel becomes what is `behind`, linear sRGB (h, w, 3) without a shoulder, and three numbers are
-    left.
+    The last channel of an image (h, w, 4) is alpha, by which the others are multiplied. It stays,
+    and the others are divided by it, as PNG wants it. Or the image is laid over `behind`, linear
+    sRGB (h, w, 3) without a shoulder, and three channels are left.
     """
     shape = image.shape if behind is None else behind.shape
     shown = np.empty(shape, dtype=np.uint8)
@@ -136,9 +132,9 @@ def exr_bytes(image: npt.NDArray[np.floating[Any]], names: Sequence[str] | None 
 
 
 class Picture(np.ndarray[Any, np.dtype[Any]]):
-    """The numbers of a picture, an array like any other, which notebooks show.
+    """The numbers of a picture, an array like any other, which notebooks show as an image.
 
-    What is computed from it is an ordinary array: it has no looks of its own.
+    Arrays that are computed from it are ordinary ones and have no image.
     """
 
     _shown: npt.NDArray[np.uint8] | None = None

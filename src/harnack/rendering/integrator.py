@@ -1,13 +1,4 @@
-"""Samples of light paths: Sobol' points, scrambled after Owen, computed from their index alone.
-
-A sampler with a state must be carried along with each path; these need the path's pixel, the
-index of the sample and the dimension, so that paths can be moved to other lanes, and the same path
-has the same numbers whatever else is drawn. Each pair of dimensions is the first two of Sobol' in
-an order of its own (Burley 2020, Practical Hash-based Owen Scrambling), which stratifies samples of
-a pixel as well as multi-jittering does, for any number of them.
-
-A path tracer that sees Mitsuba's shapes and ours.
-"""
+"""A path tracer that sees Mitsuba's shapes and ours, and the sampler of its light paths."""
 
 from __future__ import annotations
 
@@ -37,7 +28,15 @@ _HASH = (0x21F0AAAD, 0xD35A2D97)
 
 @dataclass
 class SobolSampler:
-    """Numbers for paths, with Mitsuba's names of methods. Each call is another dimension.
+    """Sobol' points for light paths, scrambled after Owen, computed from their index alone.
+
+    A sampler with a state must be carried along with each path; this one needs the path's pixel,
+    the index of the sample and the dimension, so that paths can be moved to other lanes, and the
+    same path has the same numbers whatever else is drawn. Each pair of dimensions is the first two
+    of Sobol' in an order of its own (Burley 2020, Practical Hash-based Owen Scrambling), which
+    stratifies samples of a pixel as well as multi-jittering does, for any number of them.
+
+    Methods are called as Mitsuba's. Each call takes the next dimension.
 
     pixel, index: UInt32 of each path, what its sample is of and which one it is.
     seed: UInt32. dimension: UInt32, of the next call.
@@ -50,7 +49,7 @@ class SobolSampler:
     dimension: Any
 
     def at_vertex(self, depth: Any, rows: Any) -> SobolSampler:
-        """For some of the paths, at their vertex number `depth` from 0."""
+        """The sampler for some of the paths, at their vertex number `depth`, counted from 0."""
         uint = self.mi.UInt32
         pixel, index = dr.gather(uint, self.pixel, rows), dr.gather(uint, self.index, rows)
         return SobolSampler(self.mi, pixel, index, self.seed, _CAMERA + _VERTEX * uint(depth))
@@ -102,8 +101,8 @@ _UNLIMITED = 2**32 - 1
 
 @dataclass(frozen=True)
 class _Vertex:
-    """What is remembered of a path's last vertex: where it lies, how the surface faces there, and
-    whose it is. Not valid before the first."""
+    """The last vertex of a path: its position and normal, and the shape it lies on. Not valid
+    before the first."""
 
     position: Any
     normal: Any
@@ -118,11 +117,11 @@ class _Vertex:
 
     @classmethod
     def of(cls, si: Any) -> _Vertex:
-        """Of an interaction."""
+        """From an interaction."""
         return cls(si.p, si.n, si.shape, si.is_valid())
 
     def interaction(self, mi: Any) -> Any:
-        """As an interaction, of which nothing else is known."""
+        """As an interaction with nothing else in it."""
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.p, si.n, si.shape = self.position, self.normal, self.shape
         si.t = dr.select(self.is_valid, mi.Float(0), dr.inf)
@@ -131,13 +130,14 @@ class _Vertex:
 
 @dataclass(frozen=True)
 class _Paths:
-    """Paths on their way, and what each remembers.
+    """The state of paths.
 
-    number: of the path among all. previous, pdf, delta: the last vertex and how it sampled the ray,
-        for the weights of lights that the ray finds.
+    number: of the path among all.
+    previous, pdf, delta: the last vertex and how it sampled the ray, for the weights of lights that
+        the ray finds.
     eta: product of relative refractive indices; keeps Russian roulette from ending paths in glass.
-    spread, spread_before: whether a rough surface has scattered the path up to the last vertex,
-        and up to the one before that.
+    spread, spread_before: whether a rough surface has scattered the path up to the last vertex, and
+        up to the one before that.
     """
 
     number: Any
@@ -162,18 +162,18 @@ class _Connection:
 
 @dataclass
 class Features:
-    """What paths meet first: the part of light that it reflects, in (0, 1), and its unit normal.
-    Both are 0 where they meet nothing."""
+    """Features of what paths hit first, for denoising: albedo, in (0, 1), and unit normal. Both are
+    0 where paths hit nothing."""
 
     albedo: Any
     normal: Any
 
     def note(self, mi: Any, si: Any, numbers: Any, active: Mask) -> None:
-        """Keep those of interactions, at the numbers of their paths."""
+        """Stores those of interactions, at the numbers of their paths."""
         bsdf, straight = si.bsdf(), mi.SurfaceInteraction3f(si)
         straight.wi = mi.Vector3f(0, 0, dr.mulsign(mi.Float(1), si.wi.z))
         albedo = bsdf.eval_diffuse_reflectance(straight, active)
-        # Mirrors reflect all at once straight on, in their hue; what is clear has no color.
+        # Mirrors may give more than 1 straight on: their hue stays. Clear matter counts as white.
         albedo = albedo / dr.maximum(1, dr.max(albedo))
         albedo = dr.select(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth), albedo, 1)
         dr.scatter(self.albedo, mi.Spectrum(albedo), numbers, active)
@@ -182,8 +182,8 @@ class Features:
 
 @dataclass
 class Radiance:
-    """What paths have found: radiance, whether they met a surface, whether a ray got lost; and
-    features of what they met first, if they were asked for."""
+    """What paths have found: radiance, whether they hit a surface, whether a ray ran out of steps;
+    and features of what they hit first, if asked for."""
 
     light: Any
     valid: Mask
@@ -221,12 +221,12 @@ class PathTracer:
         self.clamp = clamp
         # Kernel parameters: other limits compile nothing.
         self._deepest = dr.opaque(mi.UInt32, self.max_depth)
-        self._first_gamble = dr.opaque(mi.UInt32, rr_depth)
+        self._first_roulette = dr.opaque(mi.UInt32, rr_depth)
         self._brightest = dr.opaque(mi.Float, clamp)
         self.lost_color = mi.load_dict({"type": "srgb", "color": list(LOST_COLOR)}, parallel=False)
 
     def with_depth(self, max_depth: int) -> PathTracer:
-        """The same with another longest path."""
+        """The same path tracer with another maximum depth."""
         return PathTracer(self.mi, max_depth, self.rr_depth, self.hide_emitters, self.clamp)
 
     def trace(
@@ -235,7 +235,7 @@ class PathTracer:
         """What paths find that begin with camera rays, one for each of the sampler's lanes.
 
         Paths go on vertex by vertex, all together, and those that have ended are left out: what
-        each part of a vertex needs is evaluated for the paths that need it (`backend.lanes`).
+        each part of a vertex needs is evaluated for the paths that need it (`backend.loops`).
         """
         mi, world = self.mi, World.of(self.mi, scene, queued=True)
         width = dr.width(sampler.index)
@@ -275,7 +275,7 @@ class PathTracer:
         found: Radiance,
     ) -> tuple[_Paths, Mask]:  # fmt: skip
         """Finds the next vertex of paths, collects its light, and samples where to go on. Returns
-        the paths behind it, and which of them go on."""
+        the paths after it, and which of them go on."""
         mi, here = self.mi, dr.opaque(self.mi.UInt32, depth)
         before = paths.previous.interaction(mi)
         hidden = (here == 0) if self.hide_emitters else None
@@ -303,12 +303,12 @@ class PathTracer:
         active &= brightest > 0
         # Russian roulette, without the factor eta^-2 that radiance takes on in glass.
         keep = dr.minimum(brightest * eta * eta, 0.95)
-        gamble = here + 1 >= self._first_gamble
-        active &= ~gamble | (numbers.next_1d() < keep)
-        behind = _Paths(
+        in_roulette = here + 1 >= self._first_roulette
+        active &= ~in_roulette | (numbers.next_1d() < keep)
+        onward = _Paths(
             number=paths.number,
             ray=leaving_ray(mi, si, met.clearance, si.to_world(sample.wo)),
-            throughput=dr.select(gamble, throughput / keep, throughput),
+            throughput=dr.select(in_roulette, throughput / keep, throughput),
             eta=eta,
             previous=_Vertex.of(si),
             pdf=sample.pdf,
@@ -321,15 +321,15 @@ class PathTracer:
         dr.scatter(found.lost, mi.Bool(True), paths.number, met.lost)
         if found.features is not None:
             found.features.note(mi, si, paths.number, first & si.is_valid())
-        # One kernel: what vertices are like is not computed again.
+        # In one kernel, so that nothing about vertices is computed twice.
         noted = (found.valid, found.lost, found.features)
-        dr.eval(active, light, noted, *leaves_of(behind), *leaves_of(connection))
+        dr.eval(active, light, noted, *leaves_of(onward), *leaves_of(connection))
         blocked = world.occluded(connection.ray, connection.active)
         light += dr.select(connection.active & ~blocked, connection.light, 0)
         # Each path has a place of its own, so that the order of sums is fixed.
         dr.scatter_add(found.light, light, paths.number, exist, mode=dr.ReduceMode.NoConflicts)
         dr.eval(found.light)
-        return behind, active
+        return onward, active
 
     def _emitted(self, scene: Any, paths: _Paths, si: Any, active: Mask) -> Any:
         """Light that a vertex, or the environment behind no vertex, sends along the ray."""
@@ -371,7 +371,7 @@ def _power_heuristic(a: Real, b: Real) -> Real:
 
 
 def _own_sampler(mi: Any, sampler: Any) -> SobolSampler:
-    """One seeded by a sampler of Mitsuba's, whose lanes are the samples of pixel after pixel."""
+    """Our sampler, seeded by one of Mitsuba's, whose lanes are the samples of pixel after pixel."""
     width, spp = sampler.wavefront_size(), max(int(sampler.sample_count()), 1)
     lane = dr.arange(mi.UInt32, width)
     seed = mi.UInt32(dr.gather(mi.Float, sampler.next_1d(), mi.UInt32(0)) * 2.0**24)

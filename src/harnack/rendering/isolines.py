@@ -1,6 +1,4 @@
-"""Scalar functions on surfaces, for isolines and for pictures of values.
-
-Lines on a surface where another function takes given values: contour lines, isolines.
+"""Isolines: lines on a surface where another function takes given values.
 
 A line is what lies within half its width of the curve {g = level} on the surface. Its distance from
 a point is |g - level| / |grad_T g| to first order, with the part grad_T g of the gradient along the
@@ -17,6 +15,8 @@ two lines, and lines that cross at a saddle are joined by a fillet of that size.
 that is a little higher, with g - level = (R^2 - r^2)/2 at the distance r, the line is where
 |r^2 - R^2| < width r, which is r < width/2 + sqrt(width^2/4 + R^2) <= R + width: at most half a
 width too far.
+
+`function_of` and `defined_in` serve pictures of values as well.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Index, Mask, Real, Vec3
     from harnack.geometry import Volume
 
-# A surface that is cut by the function's own domain reaches beyond it by rounding, a part of its
-# size.
+# A surface that is cut by the function's own domain reaches beyond it by rounding, at most by this
+# part of its size.
 _PADDING = 1e-5
 
 
@@ -49,7 +49,7 @@ def function_of(given: Any, what: str = "of") -> Field:
     coordinates, or a text such as "z".
 
     Raises:
-        TypeError, ValueError: none of these, or a field that is many functions.
+        TypeError, ValueError: none of these, or a field with a function for each part.
     """
     if isinstance(given, str):
         try:
@@ -74,7 +74,7 @@ def function_of(given: Any, what: str = "of") -> Field:
 def defined_in(function: Field, size: float) -> Volume | None:
     """Where a function is defined, with room for rounding; None for all of space.
 
-    size: of the surface that it is looked at on.
+    size: of the surface on which it is evaluated.
     """
     if function.domain is None or function.is_entire:
         return None
@@ -88,7 +88,7 @@ _USUAL_WIDTH = 0.004
 _ROUNDING = 1e-4
 # How many lines an angle-valued function has unless asked otherwise.
 _USUAL_LINES = 12
-# Tables of levels have at least so many entries: kernels depend on how often that can be halved.
+# Tables of levels have at least so many entries, as kernels depend on the length's logarithm.
 _ENTRIES = 64
 
 
@@ -225,7 +225,7 @@ class PreparedIsolines:
     period: Real | None
 
     def cover(self, p: Vec3, normal: Vec3) -> Mask:
-        """Whether points of the surface, where it has a unit normal, are on a line."""
+        """Whether points of a surface, with unit normals, are on a line."""
         gap, along = self._rise(p, normal)
         return gap < self.half_width * norm(along)
 

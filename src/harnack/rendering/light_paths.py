@@ -1,21 +1,6 @@
-"""Radiance of all pixels of a sensor, band by band.
+"""Light on its way to a sensor: path-traced pixels, and rays through clear matter.
 
-Each band of pixels gets all its samples at once, so that samplers can stratify them, and every
-pixel averages its own samples only. So there are no sums whose order threads could change: the
-same seed gives the same picture.
-
-How long a picture will take, told before it is begun.
-
-Noise taken out of pictures by Open Image Denoise, a neural network that runs on CPUs.
-
-It guesses: what comes out looks clean and is close to what more samples would have shown, but no
-number of it is a mean of samples any more.
-
-What shaded pictures show behind clear matter: rays go on through it, bent and tinted.
-
-Of the two ways that light takes at a boundary only the one through it is followed, and the one back
-where all of it is reflected; what else is reflected is the sky's light and a highlight. So a
-picture has no noise, and no caustics.
+How long a picture will take is told before it is begun; noise can be taken out of it.
 """
 
 from __future__ import annotations
@@ -48,8 +33,9 @@ _FILTER_REACH = 2.0
 class Exposure:
     """Radiance of all pixels of a sensor.
 
-    image: linear sRGB and, last, the part that something covers (h, w, 4). lost: how many paths ran
-    out of steps. albedo, normal: means (h, w, 3) of what is met first, if they were asked for.
+    image: linear sRGB and, last, the part that something covers (h, w, 4).
+    lost: how many paths ran out of steps.
+    albedo, normal: means (h, w, 3) of what paths hit first, if asked for.
     """
 
     image: npt.NDArray[np.float32]
@@ -70,7 +56,11 @@ def expose(
     features: bool = False,
     paths_a_band: int = PATHS_A_BAND,
 ) -> Exposure:
-    """All pixels, each with `spp` samples.
+    """Radiance of all pixels, each with `spp` samples, band by band.
+
+    Each band of pixels gets all its samples at once, so that samplers can stratify them, and every
+    pixel averages its own samples only. So there are no sums whose order threads could change: the
+    same seed gives the same picture.
 
     advance: told what part of the picture has been finished since the last call.
     features: whether to find albedos and normals too.
@@ -147,11 +137,13 @@ def mean_of_blocks(color: Any, spp: int) -> Any:
     return type(color)(*(dr.block_sum(channel, spp) / spp for channel in color))
 
 
+# How long a picture will take, told before it is begun.
+
 # Paths that are tried: at first, how many times as many next, and no more than this part of all.
 _FIRST, _MORE, _PART = 2**12, 4, 1 / 16
-# So many times as long as the first can be told from what starting costs.
+# Runs that take this many times as long as the first are long enough to be measured.
 _ENOUGH = 3.0
-# A picture that takes no longer is not told about, in seconds.
+# Seconds; of a picture that takes no longer the time is not told.
 SHORT = 15.0
 # Seconds between two moves of the progress bar, and the fewest paths of a band.
 _BAND, _FEWEST = 4.0, 2**14
@@ -183,10 +175,10 @@ class Pace:
 def pace_of(
     mi: Any, scene: Any, sensor: Any, tracer: PathTracer, *, spp: int, features: bool
 ) -> Pace:
-    """Measured on a few paths all over the picture.
+    """The pace of a picture, measured on a few paths all over it.
 
     Starting costs the same however many paths there are, so what counts is how much longer four
-    times as many took. Of a picture of few paths nothing is measured, and its pace is 0.
+    times as many took. A picture of few paths is not measured, and its pace is 0.
     """
     width, height = (int(n) for n in sensor.film().crop_size())
     pixels = width * height
@@ -231,8 +223,12 @@ def load_denoiser() -> Any:
 
 
 def denoised(found: Exposure) -> npt.NDArray[np.float32]:
-    """The image of an exposure with features, (h, w, 4), without noise. What part of each pixel is
-    covered stays as it is."""
+    """The image of an exposure with features, (h, w, 4), without noise.
+
+    Open Image Denoise, a neural network that runs on CPUs, takes the noise out. It guesses: the
+    result looks clean and is close to what more samples would have shown, but none of its numbers
+    is a mean of samples any more. What part of each pixel is covered stays as it is.
+    """
     if found.albedo is None or found.normal is None:
         raise ValueError("an exposure without features cannot be denoised")
     light = np.maximum(found.image[..., :3], 0)
@@ -241,6 +237,8 @@ def denoised(found: Exposure) -> npt.NDArray[np.float32]:
     clean = load_denoiser().denoise(parts[0], albedo=parts[1], normal=parts[2], hdr=True)
     return np.concatenate([clean, found.image[..., 3:]], axis=-1)
 
+
+# Rays through clear matter.
 
 # Boundaries that a ray goes through; the next one is opaque.
 _MOST = 32
@@ -252,9 +250,12 @@ _USUAL = 0.04
 class Sight:
     """What rays see: the first thing that light does not pass through.
 
-    ray: the last part of their way. si, first: what it meets. throughput: what is left of the light
-    from there. gathered: the light that boundaries on the way reflect to the eye. traveled: the
-    length of the way before the last part.
+    ray: the last part of their way.
+    si, first: what it hits, as an interaction and as a `SurfaceHit`.
+    throughput: what is left of the light from there.
+    gathered: the light that boundaries on the way reflect to the eye.
+    traveled: the length of the way before the last part.
+    boundaries: how many boundaries they have met.
     """
 
     ray: Any
@@ -268,10 +269,14 @@ class Sight:
 
 
 class Through:
-    """Rays through the clear matter of a world.
+    """What shaded pictures show behind clear matter: rays go on through it, bent and tinted.
 
-    indices: of refraction, of each carrier that is clear. hides_lights: whether shapes that shine
-        are not seen.
+    Of the two ways that light takes at a boundary only the one through it is followed, and the one
+    back where all of it is reflected; what else is reflected is the sky's light and a highlight. So
+    a picture has no noise, and no caustics.
+
+    indices: of refraction, of each carrier that is clear.
+    hides_lights: whether shapes that shine are not seen.
     """
 
     def __init__(self, world: World, light: Light, *, hides_lights: bool = False) -> None:
@@ -298,7 +303,7 @@ class Through:
             return sight.active
 
         def on(sight: Sight) -> tuple[Sight]:
-            return (self._on(sight),)
+            return (self._through_boundary(sight),)
 
         (sight,) = dr.while_loop((sight,), running, on, label="clear")
         return sight
@@ -309,8 +314,8 @@ class Through:
             clear |= si.shape == self.world.mi.ShapePtr(carrier)
         return clear
 
-    def _on(self, sight: Sight) -> Sight:
-        """The next thing that rays meet and, where it is clear, the way behind it."""
+    def _through_boundary(self, sight: Sight) -> Sight:
+        """The next thing that rays hit and, where it is clear, the way behind it."""
         mi, world, d = self.world.mi, self.world, sight.ray.d
         si, first = world.intersect(sight.ray, sight.si, sight.active, self.hidden)
         throughput = sight.throughput * transmittance(mi, world.carriers, sight.si, si, d)

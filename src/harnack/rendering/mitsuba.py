@@ -1,15 +1,6 @@
-"""Mitsuba, imported when it is first needed, with a variant that our surfaces can be drawn in.
+"""Mitsuba: imported with a usable variant, its scene files, and what clear matter does to light.
 
-Mitsuba scenes in XML files: checked before, and errors told in words, after Mitsuba reads them.
-
-Mitsuba's parser looks at neither kind nor size of a file: it waits for ever at a pipe, and takes
-all memory for a file of many gigabytes.
-
-Clear matter: solids that light passes through, what they take away of it, and how they bend it.
-
-What a solid takes away follows Beer and Lambert: of light that travels a length t in it, the part
-tint^t is left. As going in and out of a solid alternate (`CappedSolid.meet`), a ray that leaves a
-point of its boundary against the outward normal is inside up to the next thing that it meets.
+Scene files in XML are checked before Mitsuba reads them, and its errors are told in words.
 """
 
 from __future__ import annotations
@@ -34,13 +25,14 @@ _USABLE = re.compile(r"(llvm|cuda|metal)_ad_(mono|rgb|spectral)(_double)?")
 
 
 def load_mitsuba() -> Any:
-    """The `mitsuba` module, with a variant set.
+    """The `mitsuba` module, imported when it is first needed, with a variant that can draw
+    surfaces.
 
     A variant that was set before stays. If none was, it becomes cuda_ad_rgb, metal_ad_rgb or
     llvm_ad_rgb, as `harnack.backend.choose_backend` finds a device.
 
     Raises:
-        RuntimeError: Mitsuba lacks the device's variant, or the one that is set has no vectorised
+        RuntimeError: Mitsuba lacks the device's variant, or the one that is set has no vectorized
             arrays, or tracks polarization.
         LLVMNotFoundError: LLVM is wanted and there is none that Dr.Jit can work with.
     """
@@ -66,6 +58,8 @@ def mitsuba_backend(mi: Any) -> Backend:
     return backend_of(mi.Float(0))
 
 
+# Scene files.
+
 _BYTE_ORDER_MARKS = {
     codecs.BOM_UTF8: "utf-8", codecs.BOM_UTF32_LE: "utf-32", codecs.BOM_UTF32_BE: "utf-32",
     codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16",
@@ -85,7 +79,7 @@ def load_scene_file(mi: Any, path: str | os.PathLike[str]) -> Any:
 
     Raises:
         FileFormatError: missing, no ordinary file, unreadable, empty, above 256 MiB, no XML; or
-            so for a file that it includes.
+            the same of a file that it includes.
         RuntimeError: Mitsuba cannot read it; the message says where.
     """
     path = Path(path)
@@ -109,7 +103,11 @@ def load_dictionary(mi: Any, description: Mapping[str, Any]) -> Any:
 
 
 def check_scene_file(path: Path) -> None:
-    """Look at a scene file and the files that it names before Mitsuba does."""
+    """Check a scene file and the files that it names before Mitsuba reads them.
+
+    Mitsuba's parser looks at neither kind nor size of a file: it waits forever at a pipe, and takes
+    all memory for a file of many gigabytes.
+    """
     if path.suffix.lower() in SURFACE_FILES:
         raise Place(path).error(
             "this is a surface file, not a Mitsuba scene (.xml): draw the field that "
@@ -179,6 +177,8 @@ def without_traceback(message: str) -> str:
     return _REPEATED.sub(r"\1", message).strip()
 
 
+# Clear matter: solids that light passes through, what they take away of it, how they bend it.
+
 # A solid whose index of refraction differs less from 1 does not bend light.
 _SAME = 1e-6
 
@@ -205,7 +205,7 @@ def tint_of(mi: Any, tint: Any) -> Any:
 
 def index_of(mi: Any, carrier: Any) -> Any:
     """The index of refraction of a solid that light passes through, relative to what is around it,
-    as a number that no kernel is compiled anew for; None for what is opaque, or no solid."""
+    as a kernel parameter; None for what is opaque, or no solid."""
     bsdf = carrier.bsdf()
     passes = (mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.GlossyTransmission)
     if carrier.surface.solid is None or not any(mi.has_flag(bsdf.flags(), one) for one in passes):
@@ -224,7 +224,12 @@ def is_inside(mi: Any, carrier: Any, start: Any, d: Any) -> Any:
 
 
 def transmittance(mi: Any, carriers: Any, start: Any, si: Any, d: Any) -> Any:
-    """What is left of light between interactions, along rays from `start` in directions d."""
+    """What is left of light between interactions, along rays from `start` in directions d.
+
+    By Beer and Lambert's law the part tint^t is left of light that travels a length t in a solid.
+    As going in and out of a solid alternate (`CappedSolid.meet`), a ray that leaves a point of its
+    boundary against the outward normal is inside up to the next thing that it hits.
+    """
     left = mi.Spectrum(1)
     for carrier in carriers:
         if carrier.tint is None:

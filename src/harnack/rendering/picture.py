@@ -1,7 +1,4 @@
-"""How far a long task has come: a bar in a terminal, text in notebooks and log files.
-
-`render`: a field in, a picture out.
-"""
+"""`render`: a field in, a picture out; and the progress of long tasks."""
 
 from __future__ import annotations
 
@@ -60,9 +57,11 @@ _INTERVAL = 5.0
 def progress_bar(name: str, shown: bool | Advance) -> Generator[Advance]:
     """Progress of `name` on stderr; what it yields is told each part, of 1, that has been finished.
 
-    shown: whether to show it; or who is told in its place, and may raise an exception to end all.
+    shown: whether to show it; or a function that is told in its place, and may raise an exception
+    to stop the task.
 
-    In a notebook a bar would need ipywidgets, and control codes of terminals are shown as they are.
+    It is a bar in a terminal, and lines of text in notebooks and log files: in a notebook a bar
+    would need ipywidgets, and control codes of terminals are shown as they are.
     """
     console = Console(stderr=True)
     if callable(shown):
@@ -79,7 +78,7 @@ def progress_bar(name: str, shown: bool | Advance) -> Generator[Advance]:
 
 
 class _Lines:
-    """Writes a line of text now and then."""
+    """Prints a line of text now and then."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -98,8 +97,10 @@ class _Lines:
         print(text, file=sys.stderr, flush=True)
 
 
+# Pictures.
+
 ShowMode = Literal["color", "shaded", "normal", "evaluations", "status", "depth", "value"]
-# Modes with ground and lights, and what they send out.
+# Modes with ground and lights, and what they trace.
 _LIT = {"color": "light paths", "shaded": "rays"}
 _EDGE_SPP = 9
 _SIZE = (800, 600)
@@ -148,7 +149,7 @@ def render(
         of one that is shaded or shows values, by default 9. Others have one ray a pixel.
     antialias: of shaded pictures, which pixels get all their samples: "edges", the default, those
         that differ from a neighbor; "cones" also those that a surface covers in part, found by
-        a cone around each pixel. Wires thinner than a pixel then stay lines. It looks at fields
+        a cone around each pixel. Wires thinner than a pixel then stay lines. It evaluates fields
         about twice as often, goes by |f - level| / |grad f|, and takes no fields that jump, such as
         winding numbers of meshes.
     of: the function of which show="value" shows values on the surface: a field, "x", "y", "z", or

@@ -1,4 +1,4 @@
-"""A level set put somewhere in the world: moved, turned, scaled alike in all directions."""
+"""A level set placed in the world: translated, rotated or mirrored, scaled alike on all axes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 class Placement:
     """x -> scale * rotation @ x + translation, from a surface's coordinates to the world's.
 
-    rotation: (3, 3) orthogonal; mirrors are welcome.
+    rotation: (3, 3) orthogonal, possibly with a reflection.
     """
 
     scale: float
@@ -43,8 +43,8 @@ class Placement:
         """From a matrix (4, 4).
 
         Raises:
-            ValueError: not finite, or one that bends lengths: lengths along a ray have to keep
-                their ratios, or the proved steps would not hold.
+            ValueError: not finite, or no similarity: lengths along a ray have to keep their ratios,
+                or the proved steps would not hold.
         """
         matrix = np.asarray(world_from_local, dtype=np.float64)
         if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
@@ -87,7 +87,7 @@ class Placement:
 
 @dataclass(frozen=True)
 class _Spot:
-    """Where a surface is met, and how it faces there."""
+    """Where a surface is hit, and its normal there."""
 
     position: Vec3
     normal: Vec3
@@ -95,16 +95,16 @@ class _Spot:
 
 @dataclass(frozen=True)
 class _Number:
-    """Of an isoline."""
+    """The number of an isoline."""
 
     line: Index
 
 
 @dataclass(frozen=True)
 class PlacedSurface:
-    """A level set or solid on a backend, to be met by rays of the world.
+    """A level set or solid on a backend, to be hit by rays of the world.
 
-    rows: of the rotation; all numbers are kernel parameters. lines: drawn on it.
+    rows: of the rotation; all numbers are kernel parameters. lines: isolines drawn on it.
     """
 
     prepared: PreparedLevelSet
@@ -132,13 +132,13 @@ class PlacedSurface:
         return cls(prepared, solid, scale, rows, vector(placement.translation), lines)
 
     def queued(self) -> PlacedSurface:
-        """The same, whose rays are traced at once (`PreparedLevelSet.queued`)."""
+        """The same, whose rays are traced without delay (`PreparedLevelSet.queued`)."""
         prepared = replace(self.prepared, queued=True)
         solid = None if self.solid is None else replace(self.solid, prepared=prepared)
         return replace(self, prepared=prepared, solid=solid)
 
     def meet(self, o: Vec3, d: Vec3, t_max: Real, active: Mask, leaves: Real = 0.0) -> SurfaceHit:
-        """Where rays of the world, |d| = 1, first meet it, in coordinates of the world.
+        """Where rays of the world, |d| = 1, first hit it, in coordinates of the world.
 
         leaves: of a ray that starts on this very surface, 1 or -1 for the side of the normal that
             it goes to; else 0.
@@ -160,7 +160,7 @@ class PlacedSurface:
         )
 
     def _line(self, met: SurfaceHit) -> Index:
-        """The number of the line at hits in the surface's coordinates."""
+        """The number of the isoline at hits in the surface's coordinates."""
         index = self.prepared.backend.UInt32
 
         def numbers(spot: _Spot) -> _Number:
@@ -172,7 +172,7 @@ class PlacedSurface:
         return dr.select(met.met, numbers(spot).line, 0)
 
     def has_line_near(self, position: Vec3, normal: Vec3, across: Vec3, down: Vec3) -> Mask:
-        """Whether the edge of a line passes near points of the surface, in the world.
+        """Whether the edge of an isoline passes near points of the surface, in the world.
 
         across, down: how far it is to the points that neighboring pixels show.
         """
@@ -186,7 +186,7 @@ class PlacedSurface:
         return near
 
     def occludes(self, o: Vec3, d: Vec3, t_max: Real, active: Mask) -> Mask:
-        """Whether it lies on rays of the world; what is not proved free counts as lying there."""
+        """Whether rays of the world hit it; those not proved to miss it count as hitting it."""
         o, d, t_max = self._local_ray(o, d, t_max)
         if self.solid is not None:
             return self.solid.occludes(o, d, t_max, active)

@@ -1,11 +1,7 @@
-"""Mitsuba's own integrators: what stands in for them where a scene holds our surfaces.
+"""Plug-ins for Mitsuba: a shape, an integrator, and what stands in for Mitsuba's own integrators.
 
-They ask Mitsuba's shapes alone, for which a carrier is two points: they would draw nothing, and
-say nothing. No method of a shape is called while they render, so `mitsuba.render` looks first and
-warns. `harnack.render` follows paths itself where the integrator asks for the same light, leaves
-scenes without our surfaces to Mitsuba, and refuses the rest.
-
-Our plug-ins, made known to Mitsuba, so that scene files can name them.
+Scene files can name them once they are registered (`register`); `shape` makes surfaces for scenes
+that are put together in Python.
 
 <shape type="harnack">
     <string name="file" value="curve.loops"/>      curves of an .obj, .ply or .loops file, or
@@ -21,7 +17,10 @@ Our plug-ins, made known to Mitsuba, so that scene files can name them.
 </shape>
 <integrator type="harnack_path"/>                  max_depth, rr_depth, hide_emitters, clamp
 
-Surfaces as shapes, for scenes that are put together in Python.
+Mitsuba's own integrators ask Mitsuba's shapes alone, for which a carrier is two points: they would
+draw nothing, and say nothing. No method of a shape is called while they render, so `mitsuba.render`
+looks first and warns. `harnack.render` follows paths itself where the integrator asks for the same
+light, leaves scenes without our surfaces to Mitsuba, and refuses the rest.
 """
 
 from __future__ import annotations
@@ -129,7 +128,7 @@ def stand_in(mi: Any, scene: Any) -> PathTracer | None:
 
 
 def _with_settings(mi: Any, integrator: Any) -> PathTracer:
-    """A path tracer with the settings of one of Mitsuba's, which tells them in words alone."""
+    """A path tracer with the settings of one of Mitsuba's, which shows them in its text alone."""
     words = str(integrator)
     found = {name: int(n) for name, n in re.findall(r"(max_depth|rr_depth) = (\d+)", words)}
     depth = found.get("max_depth", 2**32 - 1)
@@ -139,8 +138,8 @@ def _with_settings(mi: Any, integrator: Any) -> PathTracer:
 
 
 def _sees_ours(integrator: Any) -> bool:
-    """Whether all that it finds comes from our integrator inside it: moments of its light do, and
-    channels of `aov` do not."""
+    """Whether all that it finds comes from our integrator inside it: so do moments of its light,
+    but not the channels of `aov`."""
     words = str(integrator)
     return INTEGRATOR in words and _CHANNELS not in words
 
@@ -258,7 +257,7 @@ def shape(
     to_world: matrix (4, 4) or Mitsuba transform of moves, turns and one scale for all axes.
     tint: of a solid of glass, what is left of red, green and blue light after one unit of length
         in it, in the world: (1, 1, 1) for clear (Beer and Lambert).
-    cut_bsdf: of the faces on the `section` of an opaque solid; by default that of the rest.
+    cut_bsdf: of the faces at which `section` cuts an opaque solid; by default that of the rest.
     isolines: `harnack.Isolines` to draw on it, or several; later ones cover earlier ones.
     settings: as `harnack.level_set` takes them: level, clip, tolerance, solid, ... Glass needs a
         `solid`.
@@ -286,7 +285,7 @@ def shape(
 
 
 def _of_cut(mi: Any, surface: LevelSet, bsdf: Any, cut_bsdf: Any) -> Any:
-    """The BSDF of the faces on a section; None for that of the rest."""
+    """The BSDF of the faces at which a section cuts a solid; None for that of the rest."""
     if cut_bsdf is None:
         return None
     if surface.solid is None or surface.section is None:

@@ -1,11 +1,4 @@
-"""Colors as people give them: by the names of CSS, as hexadecimal numbers, or as three numbers.
-
-A bar of colors beside a picture, with ticks at nice numbers.
-
-Scales: which number has which color, and where ticks stand.
-
-Numbers as colors.
-"""
+"""Colors and numbers as colors: names of colors, color maps, scales with ticks, and color bars."""
 
 from __future__ import annotations
 
@@ -23,6 +16,8 @@ from harnack.names import did_you_mean
 from harnack.rendering.images import transferred
 
 Color = tuple[float, float, float]
+
+# Colors are given by names of CSS, as hexadecimal numbers, or as three numbers.
 
 # The named colors of CSS Color Module Level 4, section 6.1, which are those of SVG.
 _NAMED = """
@@ -110,6 +105,8 @@ def _linear(part: float) -> float:
     return part / 12.92 if part <= 0.04045 else math.pow((part + 0.055) / 1.055, 2.4)
 
 
+# Color maps: numbers as colors.
+
 # Least-squares polynomial of degree 6 to the map "viridis" (Smith and van der Walt, matplotlib,
 # 2015, CC0), lowest degree first; off by at most 0.017.
 _VIRIDIS = np.array(
@@ -173,6 +170,8 @@ def grays(x: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
     return np.repeat(gray[..., None], 3, axis=-1)
 
 
+# Scales: which number has which color, and where ticks stand.
+
 Numbers = npt.NDArray[np.floating[Any]]
 # Steps between ticks, as parts of a power of ten.
 _NICE = (1.0, 2.0, 5.0, 10.0)
@@ -184,7 +183,7 @@ _MOST_PI = 16
 
 @dataclass(frozen=True)
 class Scale:
-    """Colors of numbers from `low` to `high`; others have those of the ends.
+    """Colors of numbers from `low` to `high`; numbers beyond an end have its color.
 
     name: of what is shown, on color bars.
     period: of numbers that count modulo `high` - `low` = period; None for others.
@@ -220,16 +219,16 @@ class Scale:
         return self.colors_of((numbers - self.low) / span)
 
     def ticks(self, most: int) -> list[tuple[float, str]]:
-        """At most so many, but at least two: numbers and how they are written."""
+        """At most `most` ticks, but at least two: numbers, and how they are written."""
         period = 0.0 if self.period is None else self.period
-        turns = round(period / math.pi)
-        if 0 < turns <= _MOST_PI and math.isclose(period, turns * math.pi, rel_tol=1e-6):
-            return _parts_of_turns(turns, most)
+        multiple = round(period / math.pi)
+        if 0 < multiple <= _MOST_PI and math.isclose(period, multiple * math.pi, rel_tol=1e-6):
+            return _ticks_at_parts_of_pi(multiple, most)
         if not self.high > self.low:
             return [(self.low, f"{self.low:.4g}")]
         step = _step((self.high - self.low) / max(most - 1, 1))
         first, last = self._multiples(step)
-        if last - first < 1:  # one more than asked for, if that brings two
+        if last - first < 1:  # one more than asked for, if that gives two
             step = _step((self.high - self.low) / max(most + 1, 3))
             first, last = self._multiples(step)
         if last - first < 1:  # no room for two nice numbers
@@ -265,22 +264,24 @@ def _written(number: float, step: float, largest: float) -> str:
     return f"{mantissa.rstrip('0').rstrip('.') if '.' in mantissa else mantissa}e{int(exponent)}"
 
 
-def _parts_of_turns(turns: int, most: int) -> list[tuple[float, str]]:
-    """Ticks of 0 to `turns` pi: at halves of pi, or at one, two, ... times pi."""
+def _ticks_at_parts_of_pi(multiple: int, most: int) -> list[tuple[float, str]]:
+    """Ticks of 0 to `multiple` pi: at halves of pi, or at one, two, ... times pi."""
     halves = next(
         step for step in (1, 2, 4, 8, 16, 32)
-        if (2 * turns) // step + 1 <= max(most, 2) or step >= 2 * turns
+        if (2 * multiple) // step + 1 <= max(most, 2) or step >= 2 * multiple
     )  # fmt: skip
-    return [(k * math.pi / 2, _as_pi(k)) for k in range(0, 2 * turns + 1, halves)]
+    return [(k * math.pi / 2, _as_pi(k)) for k in range(0, 2 * multiple + 1, halves)]
 
 
 def _as_pi(halves: int) -> str:
-    """So many halves of pi."""
+    """The text of a number of halves of pi."""
     if halves == 0:
         return "0"
     times, below = (halves // 2, "") if halves % 2 == 0 else (halves, "/2")
     return f"{'' if times == 1 else f'{times} '}pi{below}"
 
+
+# A bar of colors beside a picture, with ticks at nice numbers.
 
 Pixels = npt.NDArray[np.uint8]
 
@@ -312,8 +313,8 @@ def require_pillow() -> tuple[Any, Any, Any]:
 
 
 def typeface_for(text: str, size: int) -> Any:
-    """Pillow's own typeface, which has plain ASCII letters, or the first of this machine that has
-    all letters of a text.
+    """A typeface with all letters of a text: Pillow's own, which has plain ASCII letters, or the
+    first one found on this machine.
 
     Raises:
         ValueError: none has them.
@@ -339,7 +340,7 @@ def typeface_for(text: str, size: int) -> Any:
 def with_bar(pixels: Pixels, scale: Scale, background: Color) -> Pixels:
     """A picture (h, w, 3) with the bar of its scale to the right: (h, w + more, 3).
 
-    An end of the bar is a point where the picture has numbers beyond it.
+    An end of the bar is pointed where the picture has numbers beyond it.
     background: behind the bar, sRGB in [0, 1].
     """
     behind = tuple(round(255 * part) for part in background)

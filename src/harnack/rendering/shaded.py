@@ -1,17 +1,10 @@
 """Shaded pictures: one ray a pixel, more where the picture has edges, and no noise.
 
 The rays through the middles of all pixels are traced first. Pixels that differ visibly from a
-neighbor are then drawn again as the mean of a fixed grid of samples, and so are those that the
-edge of an isoline may pass through: outlines are smooth, lines thinner than a pixel have no gaps,
-and the inside of a surface costs one ray a pixel. Cones find more pixels to draw again, if asked
-for: those that a surface covers in part, though no ray through a middle tells.
-
-How much of the sky is hidden by what is near, from what the picture itself shows.
-
-Which pixels surfaces may cover in part: found by cones, so that no thin part is overlooked.
-
-The ray through the middle of a pixel misses what is thinner than the pixel more often than not, and
-so do those of its neighbors. The cone that holds the pixel does not.
+neighbor are then drawn again as the mean of a fixed grid of samples, and so are those that the edge
+of an isoline may pass through: outlines are smooth, lines thinner than a pixel have no gaps, and
+the inside of a surface costs one ray a pixel. Cones find more pixels to draw again, if asked for:
+those that a surface covers in part, though no ray through a middle tells.
 """
 
 from __future__ import annotations
@@ -52,7 +45,10 @@ if TYPE_CHECKING:
 
 
 class Finder:
-    """The surfaces of a world, to be met by cones.
+    """Finds pixels that surfaces may cover in part, by cones, so that no thin part is overlooked.
+
+    The ray through the middle of a pixel misses what is thinner than the pixel more often than not,
+    and so do those of its neighbors. The cone that holds the pixel does not.
 
     Raises:
         ValueError: a field that jumps, such as the winding number of a mesh: it is constant on both
@@ -81,7 +77,8 @@ class Finder:
 
 
 def _prepared(mi: Any, carrier: Any) -> tuple[PlacedSurface, Any]:
-    """A surface that can be looked at outside its extent, and balls in and around the extent."""
+    """A surface that cones can be tested against outside its extent, and balls in and around the
+    extent."""
     surface, backend = carrier.surface, mitsuba_backend(mi)
     if surface.field.has_parts:
         raise ValueError(
@@ -116,8 +113,8 @@ def balls_of(volume: Volume | None, backend: Backend) -> tuple[Vec3, Real, Real]
     return backend.Array3f(*numbers[:3]), numbers[3], numbers[4]
 
 
-# Ways across the picture, and taps along each, up to this share of its larger side.
-_WAYS = 16
+# Directions across the picture, and taps along each, up to this share of its larger side.
+_DIRECTIONS = 16
 _TAPS = 8
 _REACH = 0.16
 
@@ -125,12 +122,13 @@ _REACH = 0.16
 def visible_sky(mi: Any, position: Any, normal: Any, width: Any, size: tuple[int, int]) -> Any:
     """The part of the hemisphere over each pixel's point that nothing near it hides, in [0, 1].
 
-    position: points seen by the pixels, counted by rows; NaN where nothing is seen.
-    normal: unit, towards the eye. width: of a pixel, there. size: (width, height) in pixels.
+    position: points seen by the pixels, counted by rows; NaN where nothing is seen. normal: unit,
+    towards the eye. width: of a pixel, there. size: (width, height) in pixels.
 
-    Along each way across the picture the highest point over the tangent plane, at elevation h,
-    hides sin^2 h of the light with a cosine (Bavoil and Sainz 2008), less so the farther away
-    it is. It sees only what the picture shows. The ways are the same everywhere: no noise.
+    Along each direction across the picture the highest point over the tangent plane, at elevation
+    h, hides sin^2 h of the light with a cosine (Bavoil and Sainz 2008), less so the farther away it
+    is. Only what the picture shows can hide light. The directions are the same everywhere: no
+    noise.
     """
     columns, rows = size
     count = columns * rows
@@ -152,7 +150,7 @@ def visible_sky(mi: Any, position: Any, normal: Any, width: Any, size: tuple[int
         return dr.select(inside & (height > 0), height * fade, 0)
 
     def along(way: Any, hidden: Any) -> tuple[Any, Any]:
-        s, c = dr.sincos((mi.Float(way) + 0.5) * (dr.two_pi / _WAYS))
+        s, c = dr.sincos((mi.Float(way) + 0.5) * (dr.two_pi / _DIRECTIONS))
         highest = mi.Float(0)
         for k in range(_TAPS):
             highest = dr.maximum(highest, tap(k, mi.Vector2f(c, s)))
@@ -160,11 +158,11 @@ def visible_sky(mi: Any, position: Any, normal: Any, width: Any, size: tuple[int
 
     def more(way: Any, hidden: Any) -> Any:
         del hidden
-        return way < _WAYS
+        return way < _DIRECTIONS
 
     start = (mi.UInt32(0), dr.zeros(mi.Float, count))
     _, hidden = dr.while_loop(start, more, along, label="visible sky")
-    return 1 - hidden / _WAYS
+    return 1 - hidden / _DIRECTIONS
 
 
 # Rays of one band.
@@ -177,10 +175,16 @@ _FIRST = 0.6
 
 @dataclass
 class _Seen:
-    """What rays meet first, or first behind clear matter.
+    """What rays hit first, or first behind clear matter.
 
+    position, normal, eye: the point, its unit normal towards the eye, and the direction to the eye.
+    width: of a pixel, there.
+    color: reflectance.
     light: shone by an emitter or the environment and reflected by clear matter, or magenta for
-        lost. through: what clear matter leaves of the light from what is met.
+        lost.
+    through: what clear matter leaves of the light from what is hit.
+    glossy: whether the material is glossy. met, lost: whether there is a hit; and whether the ray
+        ran out of steps.
     covered: whether there is anything at all, and not the environment alone.
     lined: whether the edge of an isoline may pass through the pixel.
     """
@@ -200,7 +204,7 @@ class _Seen:
 
     @classmethod
     def nothing(cls, mi: Any, count: int) -> _Seen:
-        """Room for as many pixels, to scatter to."""
+        """Empty arrays for `count` pixels, to scatter to."""
         vectors, colors, masks = (mi.Vector3f,) * 3, (mi.Color3f,) * 3, (mi.Bool,) * 5
         kinds = (*vectors, mi.Float, *colors, *masks)
         return cls(*(dr.zeros(kind, count) for kind in kinds))
@@ -288,7 +292,7 @@ class _Painter:
         self.floor = Floor.of(world, self.light) if on_floor else None
 
     def look(self, pixel: Any, offset: Any) -> _Seen:
-        """What rays through places in pixels meet first."""
+        """What rays through places in pixels hit first."""
         mi, scene = self.mi, self.world.scene
         ray, weight = self.ray(pixel, offset)
         sight = self.through.look(mi.Ray3f(ray))
@@ -332,14 +336,14 @@ class _Painter:
         )
 
     def _reflectance(self, si: Any, side: int) -> Any:
-        """Of the side that is seen (1) or the other (-1), seen straight on."""
+        """Reflectance of the side that is seen (1) or the other (-1), seen straight on."""
         mi = self.mi
         straight = mi.SurfaceInteraction3f(si)
         straight.wi = mi.Vector3f(0, 0, dr.mulsign(mi.Float(side), si.wi.z))
         return si.bsdf().eval_diffuse_reflectance(straight, si.is_valid())
 
     def _is_open(self, si: Any) -> Any:
-        """Whether it is one of our surfaces, and has an inside to be looked at."""
+        """Whether it is one of our surfaces, and an open one, of which both sides can be seen."""
         found = self.mi.Bool(False)
         for carrier in self.world.carriers:
             surface = carrier.surface
@@ -372,7 +376,7 @@ class _Painter:
         return to_numpy(mean_of_blocks(color, spp)), int(dr.count(seen.lost)[0])
 
     def _nearest_sky(self, seen: _Seen, pixel: Any, position: Any, sky: Any) -> Any:
-        """The sky over what of the pixel's surroundings lies nearest to the sample."""
+        """The visible sky of the pixel around whose point lies nearest to the sample."""
         mi = self.mi
         columns, rows = self.size
         x, y = mi.Int32(pixel % columns), mi.Int32(pixel // columns)

@@ -1,19 +1,4 @@
-"""Pixels in tiles and bands, and places within them.
-
-The light of shaded pictures: a formula, so that one ray a sample is all they need.
-
-A soft key light from the upper left of the camera, a hemisphere of light that is cooler above
-than below, and a gloss on what is glossy. `shaded.visible_sky` says how much
-of the hemisphere is hidden by what is near, `floor` where the studio's floor lies in shadow.
-
-The soft shadow on the studio's floor in shaded pictures: traced on a coarse grid, blurred.
-
-What is behind everything in a picture of the studio.
-
-The camera does not see the environment that lights the stage, but the ground going on to the
-horizon, and above it a wall of the same color that is darker higher up. So there is no edge at the
-horizon, however low the camera stands. Or it sees colors or an image, as they are.
-"""
+"""Parts of shaded pictures: the order of pixels, light, the floor's shadow, the studio's wall."""
 
 from __future__ import annotations
 
@@ -31,6 +16,8 @@ from harnack.backend.arrays import aligned, aligned_integers
 from harnack.rendering.backdrops import FLOOR, Gradient, Ground, Photo, far_ground, reflectance_of
 from harnack.rendering.mitsuba import mitsuba_backend
 from harnack.rendering.scales import linear
+
+# Pixels in tiles and bands, and places within them.
 
 _TILE = 4
 # Neighbors that differ by more than this, of 255, are an edge.
@@ -102,6 +89,8 @@ def edges_of(picture: npt.NDArray[np.uint8]) -> BoolArray:
     return edge
 
 
+# Light.
+
 Color = tuple[float, float, float]
 
 # Irradiance over pi, linear sRGB: of the key light at its brightest, and of the hemisphere.
@@ -117,12 +106,12 @@ _KEY_HIDDEN = 0.6
 _HIGHLIGHT = 0.22
 _SHARPNESS = 60.0
 _RIM = 0.45
-# What shines through is drawn in this; mirrors keep their hue.
+# The color of transparent matter; and the reflectance of mirrors, which keep their hue.
 _CLEAR: Color = (0.52, 0.60, 0.64)
 _METAL = 0.78
 # The side of larger values of a surface that has one color for both.
 _INSIDE: Color = (0.52, 0.60, 0.74)
-# Where a level set spans what a mesh leaves open: this share of amber, or of teal on warm colors.
+# Where a level set closes a hole of a mesh: this share of amber, or of teal on warm colors.
 _MENDED = 0.55
 _AMBER: Color = (0.92, 0.40, 0.06)
 _TEAL: Color = (0.05, 0.40, 0.46)
@@ -130,7 +119,15 @@ _TEAL: Color = (0.05, 0.40, 0.46)
 
 @dataclass(frozen=True)
 class Light:
-    """Unit vectors, as lists of three numbers, to the key light and to the brighter hemisphere."""
+    """The light of shaded pictures: a formula, so that one ray a sample is all they need.
+
+    A soft key light from the upper left of the camera, a hemisphere of light that is cooler above
+    than below, and a gloss on what is glossy. `shaded.visible_sky` says how much of the hemisphere
+    is hidden by what is near, `Floor` where the studio's floor lies in shadow.
+
+    key, up: unit vectors, as lists of three numbers, to the key light and to the brighter
+    hemisphere.
+    """
 
     key: Sequence[float]
     up: Sequence[float]
@@ -178,7 +175,7 @@ def reflectance(color: Any, painted: Any) -> Any:
 
 
 def of_side(color: Any, other: Any, inside: Any) -> Any:
-    """The color of a side: that of larger values is darker and cooler if the other is as it.
+    """The color of a side: the side of larger values is darker and cooler if both have one color.
 
     inside: mask of what is seen from the side of larger values.
     """
@@ -187,7 +184,7 @@ def of_side(color: Any, other: Any, inside: Any) -> Any:
 
 
 def of_mended(color: Any, mended: Any) -> Any:
-    """The color, tinted where a level set spans what a mesh leaves open."""
+    """The color, tinted where a level set closes a hole of a mesh."""
     tint = dr.select(color[0] > 1.6 * color[2], _like(color, _TEAL), _like(color, _AMBER))
     return dr.select(mended, dr.lerp(color, tint, _MENDED), color)
 
@@ -204,13 +201,15 @@ def _like(array: Any, numbers: Sequence[float]) -> Any:
     return type(array)(*numbers)
 
 
+# The floor's shadow.
+
 # Cells a side of a square of half this side, which holds what stands on the stage and its shadow.
 _CELLS = 64
 _REACH = 2.4
 # Rays of a cell to the key light and to the sky. Each of 4 x 4 neighboring cells has others.
 _RAYS = 8
 _BLOCK = 4
-# The tangent of the angle that the key light seems wide, and how far the rays look.
+# The tangent of the angle that the key light seems wide, and the length of the rays.
 _SPREAD = 0.34
 _FAR = 3.5
 # Weights of a cell and its neighbors along each axis: a block's cells count nearly alike.
@@ -230,7 +229,8 @@ class Casting(Protocol):
 
 @dataclass(frozen=True)
 class Floor:
-    """What of the key light and of the sky reaches the floor: a texture of two channels."""
+    """The soft shadow on the studio's floor, traced on a coarse grid and blurred: what of the key
+    light and of the sky reaches the floor, a texture of two channels."""
 
     mi: Any
     texture: Any
@@ -257,7 +257,8 @@ class Floor:
 
 
 def _parts_seen(world: Casting, x: FloatArray, y: FloatArray, towards: FloatArray) -> FloatArray:
-    """What parts (k, n, n) of their directions (k, 16, rays, 3) points of the floor see free."""
+    """What parts (k, n, n) of directions (k, 16, rays, 3) are free, seen from points of the
+    floor."""
     mi = world.mi
     j, i = np.indices(x.shape)
     d = towards[:, (j % _BLOCK) * _BLOCK + i % _BLOCK]
@@ -302,7 +303,7 @@ def _to_sky() -> FloatArray:
 
 
 def _blurred(image: FloatArray) -> FloatArray:
-    """The image (n, n) of what is free, on both axes; outside of it everything is."""
+    """The image (n, n), blurred along both axes; outside of it everything is free (1)."""
     kernel = np.convolve(_BLUR, [0.5, 0.5])  # of odd length: it stays in place
     for _ in range(2):
         rows = [np.convolve(row, kernel, mode="valid") for row in _framed(image, len(kernel) // 2)]
@@ -314,6 +315,8 @@ def _framed(image: FloatArray, width: int) -> FloatArray:
     return np.pad(image, ((0, 0), (width, width)), constant_values=1.0)
 
 
+# What is behind the surfaces.
+
 # How much darker the wall is straight above.
 _DARKER = 0.45
 FloatImage = npt.NDArray[np.float32]
@@ -321,6 +324,10 @@ FloatImage = npt.NDArray[np.float32]
 
 def wall(mi: Any, sensor: Any, ground: Ground, azimuth: float, show: str) -> FloatImage:
     """Radiance (h, w, 3) of a ground and the wall behind it, in the middle of each pixel.
+
+    The camera does not see the environment that lights the stage, but the ground going on to the
+    horizon, and above it a wall of the same color that is darker higher up. So there is no edge at
+    the horizon, however low the camera stands.
 
     azimuth: of the camera, in degrees. show: "color" or "shaded".
     """
@@ -346,7 +353,8 @@ def _far_shaded(mi: Any, sensor: Any, ground: Ground) -> FloatArray:
 
 
 def flat(mi: Any, backdrop: Gradient | Photo, size: tuple[int, int]) -> FloatImage:
-    """Linear sRGB (h, w, 3) of colors or an image in a picture of (width, height) pixels."""
+    """Linear sRGB (h, w, 3) of colors or an image, as they are, in a picture of (width, height)
+    pixels."""
     if isinstance(backdrop, Photo):
         return _covering(mi, backdrop.pixels, size)
     width, height = size

@@ -1,6 +1,4 @@
-"""Named materials: Mitsuba BSDF dictionaries that look well in the studio.
-
-A small photo studio: ground, lights and a camera that frames what stands there.
+"""A small photo studio: ground, lights and a camera that frames what stands there; its materials.
 
 Surfaces are scaled to a stage of radius about 1 that stands on the ground z = 0, so that lights,
 shadows and tolerances of Mitsuba's rays suit every size.
@@ -29,8 +27,8 @@ from harnack.tracer import LevelSet, Tolerance
 
 Dictionary = dict[str, Any]
 
-# How rough a surface is that only a color is given of: between porcelain and eggshell. No paint
-# reflects all light, or none.
+# The roughness of a material given by its color alone, between porcelain and eggshell; and its
+# least and greatest reflectance, as no paint reflects no light, or all.
 _PAINT, _BLACK, _WHITE = 0.2, 0.005, 0.9
 
 
@@ -82,7 +80,7 @@ class Material:
         """The BSDF's dictionary for a solid or an open surface.
 
         traced_light: whether light is to be traced at it; otherwise only its diffuse reflectance
-            and its kind are asked for, and the dictionary may be of a BSDF that is made sooner.
+        and its kind are needed, and the dictionary may be of a BSDF that is made faster.
 
         Raises:
             ValueError: the material is transparent, and the surface is open.
@@ -104,8 +102,8 @@ class Material:
 
 
 def _without_table(bsdf: Dictionary) -> Dictionary:
-    """A BSDF with the same diffuse reflectance, which takes no 0.07 s for a table of what a rough
-    coat lets through."""
+    """A BSDF with the same diffuse reflectance, which is made without the table of a rough coat's
+    transmittance (0.07 s)."""
     if bsdf.keys() != _glazed((0, 0, 0), 0).keys() or bsdf["type"] != "roughplastic":
         return bsdf
     return {**{key: bsdf[key] for key in bsdf if key != "alpha"}, "type": "plastic"}
@@ -139,7 +137,7 @@ MATERIALS: Mapping[str, Material] = {
     "cobalt": _tinted((0.10, 0.24, 0.72)),
     "jelly": _tinted((0.80, 0.12, 0.16), 1.35),
 }
-"""Materials by name."""
+"""Materials by name, that look well in the studio."""
 
 
 def material_of(wanted: Any) -> Material:
@@ -172,10 +170,10 @@ def material_of(wanted: Any) -> Material:
         ) from None
 
 
-# Of fitted surfaces, on the stage. Those of many parts end inside the picture, in the edges of two:
-# what a ray meets within the tolerance of such an edge has the normal of neither.
+# Tolerances of fitted surfaces, on the stage. Surfaces of many parts have edges inside the picture,
+# where two parts meet: hits within the tolerance of such an edge have the normal of neither.
 _TOLERANCE, _OF_PARTS = 1e-4, 1e-5
-# Light of one path, where white is 1.
+# The most light of one path, where white is 1.
 _CLAMP = 2.0
 # Rays begin at most twice _NEAR before the stage. Clip distances are literals of kernels: as whole
 # multiples they are the same for almost all cameras, whose pictures so share their kernels.
@@ -189,7 +187,7 @@ class StudioObject:
     """A surface on the stage.
 
     fitted: whether to give it a tolerance that suits its size in place of its own.
-    cut: the material of the faces on the section of a solid; None for that of the rest.
+    cut: the material of the faces at which a section cuts a solid; None for that of the rest.
     isolines: drawn on it.
     """
 
@@ -204,7 +202,7 @@ class StudioObject:
 class Studio:
     """A scene dictionary, and what a picture of it needs besides.
 
-    placement: of the surfaces in it. backdrop: as asked for. azimuth: of the camera. has_ground:
+    placement: of the surfaces in it. backdrop: as given. azimuth: of the camera. has_ground:
         whether the surfaces stand on a floor.
     """
 

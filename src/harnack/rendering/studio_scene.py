@@ -1,4 +1,4 @@
-"""What `render` is given, as surfaces on the stage of the studio."""
+"""From what `render` is given to surfaces on the stage of the studio."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from harnack.rendering.scales import Color
 from harnack.rendering.stage import Material, StudioObject, material_of
 from harnack.tracer import LevelSet, level_set
 
-# What tubes around the ends of surfaces are made of.
-_RIM = "gold"
+# The material of tubes around the curves at which surfaces end.
+_TUBE_MATERIAL = "gold"
 
 MaterialLike = str | Color | Material | Mapping[str, Any]
 
@@ -55,8 +55,8 @@ def studio_objects(
     they end.
 
     boundary: the radius of these tubes; None for no tubes. boundary_material: golden if None.
-    cut: the material of the faces of solids on their section; None for their own.
-    thickness: of sheets to draw in place of surfaces; None for the surfaces.
+    cut: the material of the faces at which sections cut solids; None for their own.
+    thickness: of closed parts to draw in place of surfaces; None for the surfaces.
 
     Raises:
         TypeError, ValueError: there is nothing to draw, or something wrong with what is asked for.
@@ -86,7 +86,7 @@ def studio_objects(
     for (one, own_settings), name in zip(drawn, names, strict=True):
         material = material_of(name)
         surface = _surface(one, own_settings, material.transparent)
-        own = surface.solid is None and len(given) > 1  # then it is meant for the others
+        own = surface.solid is None and len(given) > 1  # then its isolines are meant for the others
         lines = tuple(line for line in isolines if not (own and line.function is surface.field))
         fits = fitted and isinstance(one, Field)
         made.append(StudioObject(surface, material, fits, isolines=lines))
@@ -95,15 +95,15 @@ def studio_objects(
         raise ValueError(
             "boundary_material needs the radius of the tubes as well, such as boundary=0.03"
         )
-    rim = material_of(_RIM if boundary_material is None else boundary_material)
-    if rim.transparent:
+    tube_material = material_of(_TUBE_MATERIAL if boundary_material is None else boundary_material)
+    if tube_material.transparent:
         raise ValueError("boundary_material: tubes have no inside, so light cannot pass through")
-    rims = [] if boundary is None else _rims(made, boundary, rim)
+    tubes = [] if boundary is None else _end_tubes(made, boundary, tube_material)
     if thickness is not None:
         made = [replace(one, surface=_thick(one.surface, thickness)) for one in made]
     if cut is not None:
         made = _with_faces(made, material_of(cut))
-    return made + rims
+    return made + tubes
 
 
 def _thick(surface: LevelSet, thickness: float) -> LevelSet:
@@ -121,7 +121,7 @@ def _thick(surface: LevelSet, thickness: float) -> LevelSet:
 
 
 def _with_faces(made: list[StudioObject], material: Material) -> list[StudioObject]:
-    """The same, with a material for the faces of solids on their sections."""
+    """The same, with a material for the faces at which sections cut solids."""
     if not any(one.surface.section and one.surface.solid for one in made):
         raise ValueError(
             "cut_material needs a solid with a section, whose faces are made of it: give "
@@ -164,11 +164,11 @@ def _is_cut_alike(one: LevelSet, other: LevelSet) -> bool:
     return same and one.clip == other.clip and one.section == other.section
 
 
-def _rims(made: list[StudioObject], radius: Any, material: Material) -> list[StudioObject]:
+def _end_tubes(made: list[StudioObject], radius: Any, material: Material) -> list[StudioObject]:
     """Tubes around the curves at which surfaces end."""
     if isinstance(radius, bool) or not isinstance(radius, Real) or not 0 < float(radius) < math.inf:
         raise ValueError(f"boundary is the radius of a tube, such as 0.03, not {radius!r}")
-    rims: list[StudioObject] = []
+    tubes: list[StudioObject] = []
     for k, one in enumerate(made):
         curves = one.surface.field.boundary_curves
         if any(_is_cut_alike(one.surface, other.surface) for other in made[:k]):
@@ -176,15 +176,15 @@ def _rims(made: list[StudioObject], radius: Any, material: Material) -> list[Stu
         if curves:
             closed = [np.vstack([curve, curve[:1]]) for curve in curves]
             tube = level_set(Tube.around(closed, float(radius)), clip=one.surface.cut)
-            rims.append(StudioObject(tube, material, fitted=True))
-    if not rims:
+            tubes.append(StudioObject(tube, material, fitted=True))
+    if not tubes:
         raise ValueError("boundary: none of these surfaces ends at a curve")
-    return rims
+    return tubes
 
 
 def _surface(one: Field | LevelSet, settings: Mapping[str, Any], clear: bool) -> LevelSet:
-    """A surface with settings. A `Solid` is drawn with its inside where that is seen: it is opened
-    by a section, or clear."""
+    """A surface with settings. A `Solid` is drawn as a solid where its inside can be seen: where a
+    section opens it, or it is clear."""
     made = with_settings(one, settings).in_one_call(begins=True)
     opened = isinstance(made.field, Solid) and made.solid is None
     opened &= clear or made.section is not None

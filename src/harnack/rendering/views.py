@@ -31,7 +31,7 @@ from harnack.tracer import Status
 _RAYS_A_BAND = 2**20
 _BACKGROUND = (0.10, 0.10, 0.11)
 GROUND_OF_VIEWS = {"dark": _BACKGROUND, "light": (0.90, 0.90, 0.89)}
-"""What is behind views before the studio's backdrops, which are no single color."""
+"""One color for each of the studio's backdrops, to be behind views."""
 _UNKNOWN = (0.45, 0.45, 0.45)
 _IDENTITY = Placement.identity()
 _STATUS_COLORS = {
@@ -44,16 +44,16 @@ _STATUS_COLORS = {
 class View:
     """First hits of the rays through the middles of all pixels.
 
-    depth: (h, w) distance from the camera in the unit asked for, inf where nothing is met. Where
-        the ray ran out of steps, how far it is proved free.
-    normal: (h, w, 3) unit, zero where nothing is met; of a level set it points to larger values.
+    depth: (h, w) distance from the camera in the unit of the viewer's placement, inf without a hit.
+        Where the ray ran out of steps, how far it is proved free.
+    normal: (h, w, 3) unit, zero without a hit; of a level set it points to larger values.
     evaluations: (h, w) of all the scene's fields.
     status: (h, w) a `Status`; shapes of Mitsuba count as hits.
-    line: (h, w, 3) color in sRGB of the isoline that is met; NaN where none is.
+    line: (h, w, 3) color in sRGB of the isoline that is hit; NaN where none is.
     lined: (h, w) whether the edge of an isoline may pass through the pixel.
-    value: (h, w) of a function where something is met, NaN elsewhere; None if none was asked for.
+    value: (h, w) of a function at hits, NaN elsewhere; None without a function.
     period: of that function, if it is angle-valued.
-    background: sRGB in [0, 1], of pictures where nothing is met.
+    background: sRGB in [0, 1], of pictures without a hit.
     """
 
     depth: FloatArray
@@ -71,8 +71,8 @@ class View:
 class Viewer:
     """A sensor in a world.
 
-    placement: of the surfaces, in whose coordinates depths are given. function: of the same
-    coordinates, to be evaluated at what is met; None for none.
+    placement: of the surfaces, in whose coordinates depths are given.
+    function: of the same coordinates, to be evaluated at hits; None for none.
     """
 
     mi: Any
@@ -102,7 +102,7 @@ class Viewer:
         return width, height
 
     def look(self) -> View:
-        """What the rays through the middles of all pixels meet first."""
+        """The first hits of the rays through the middles of all pixels."""
         width, height = self.size
         order = in_tiles((width, height))
         parts = [
@@ -118,7 +118,7 @@ class Viewer:
         return _each(by_rows, *parts)
 
     def look_again(self, pixels: IntArray, offsets: FloatArray) -> View:
-        """What rays through places (m, 2) in each of n pixels, counted by rows, meet first: arrays
+        """The first hits of rays through places (m, 2) in each of n pixels, counted by rows: arrays
         (n, m)."""
         mi, count = self.mi, len(offsets)
         pixel = uploaded(mi, np.repeat(pixels, count))
@@ -131,7 +131,7 @@ class Viewer:
         return _each(by_pixels, self._look_at(pixel, places))
 
     def _look_at(self, pixel: Any, offset: Any) -> View:
-        """What rays through places in pixels, counted by rows, meet first: arrays (n,)."""
+        """The first hits of rays through places in pixels, counted by rows: arrays (n,)."""
         mi, count = self.mi, dr.width(pixel)
         place = film_places(mi, pixel, offset, self.size)
         ray, _ = self.sensor.sample_ray_differential(
@@ -246,7 +246,7 @@ def value_scale(view: View) -> Scale:
 
 
 def value_of(view: View) -> FloatArray:
-    """Of the function that was asked for."""
+    """Values of the function that was asked for."""
     if view.value is None:
         raise ValueError("values of no function were looked at")
     return view.value
@@ -259,7 +259,7 @@ def _range(view: View, numbers: FloatArray) -> tuple[float, float]:
 
 
 def _of_surfaces(view: View, picture: FloatArray) -> npt.NDArray[np.uint8]:
-    """Colors where something is met, before the background."""
+    """Colors where something is hit, over the background."""
     met = (view.status == int(Status.HIT))[..., None]
     return _with_lost(view, np.where(met, picture, view.background))
 
@@ -274,7 +274,7 @@ class Show:
     """What to take from a view as numbers, and how to draw it.
 
     scale: of numbers that have one, which `picture` draws them by; None for others.
-    is_averaged: whether the picture, not the numbers, is that of several rays where it has edges.
+    is_averaged: whether the picture, not the numbers, averages several rays where it has edges.
     """
 
     numbers: Callable[[View], Any]

@@ -1,7 +1,4 @@
-"""Encounters as Mitsuba's surface interactions, and rays that leave them.
-
-A Mitsuba scene together with the level sets that travel in it.
-"""
+"""Mitsuba scenes with level sets in them: rays through both, and hits as surface interactions."""
 
 from __future__ import annotations
 
@@ -25,7 +22,8 @@ def surface_interaction(mi: Any, met: SurfaceHit, ray: Any, shape: Any) -> Any:
 
     shape: ShapePtr of the carrier, whose BSDF is asked. Texture coordinates are x and y of the
     position in the world: a level set has no parametrization of its own. The index of the primitive
-    is the number of the isoline that is drawn there, which `lined` looks at.
+    is the number of the isoline that is drawn there, by which a BSDF chooses
+    (`carrier.with_lines`).
     """
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.t = dr.select(met.met, met.t, dr.inf)
@@ -82,8 +80,8 @@ class World:
     def of(cls, mi: Any, scene: Any, *, queued: bool = False) -> World:
         """Finds the carriers in a scene.
 
-        queued: whether rays are traced at once, which is faster where they differ in length, and
-            cannot be done while a kernel is being recorded.
+        queued: whether rays are traced without delay, from a queue, which is faster where they
+            differ in length, and cannot be done while a kernel is being recorded.
         """
         return cls(mi, scene, tuple(s for s in scene.shapes() if is_carrier(s)), queued)
 
@@ -93,13 +91,13 @@ class World:
     def intersect(
         self, ray: Any, start: Any, active: Mask, hidden: Mask | None = None
     ) -> tuple[Any, SurfaceHit]:
-        """The first thing that rays meet, as interaction and as encounter.
+        """The first hit of rays, as a surface interaction and as a `SurfaceHit`.
 
-        start: the interaction that rays leave, not valid for rays that come from a camera.
-        hidden: rays that do not see shapes that shine; None for none.
+        start: the interaction that rays leave, not valid for rays that come from a camera. hidden:
+        rays that do not see shapes that shine; None for none.
 
-        Where the encounter is lost (the ray ran out of steps before anything that is known to be
-        there) the interaction is not valid.
+        Where the hit is lost (the ray ran out of steps before anything that is known to be there)
+        the interaction is not valid.
         """
         mi = self.mi
         preliminary = self.scene.ray_intersect_preliminary(ray, active=active)
@@ -132,7 +130,7 @@ class World:
         return si, dr.select(event, ours, first)
 
     def _behind_lights(self, ray: Any, first: Any, active: Mask) -> Any:
-        """What rays meet of the scene behind the shapes that shine."""
+        """What rays hit of the scene behind the shapes that shine."""
         mi = self.mi
 
         def shines(found: Any, active: Mask) -> Mask:
@@ -156,7 +154,7 @@ class World:
         return found
 
     def nothing(self, si: Any) -> SurfaceHit:
-        """What rays have met before they are traced, given as many interactions that are none."""
+        """The `SurfaceHit` of rays that hit nothing, given as many invalid interactions."""
         return self._of_scene(si, self.mi.Bool(False))
 
     def _of_scene(self, si: Any, active: Mask) -> SurfaceHit:
@@ -178,8 +176,8 @@ class World:
     def has_line_near(self, si: Any, ray: Any, d: Any, t: Any) -> Mask:
         """Whether the edge of an isoline may pass through the pixel of a ray with differentials.
 
-        d: in which the ray arrives, t: after that way. What neighboring rays would meet of the
-        tangent plane is laid along d.
+        d: the direction in which the ray arrives. t: the length of its way. Where neighboring rays
+        hit the tangent plane is found along d.
         """
         mi, near = self.mi, self.mi.Bool(False)
         normal = mi.Vector3f(si.n)
@@ -197,7 +195,7 @@ class World:
         return near
 
     def occluded(self, ray: Any, active: Mask) -> Mask:
-        """Whether anything lies on the rays. What is not proved free counts as lying there."""
+        """Whether rays hit anything; those not proved to hit nothing count as hitting."""
         blocked = self.scene.ray_test(ray, active)
         for carrier in self.carriers:
             blocked |= self._placed(carrier).occludes(ray.o, ray.d, ray.maxt, active & ~blocked)

@@ -1,10 +1,9 @@
-"""Promises with the levels asked for, as records that every proof can be tried on.
+"""`check_bound`: proofs tried on functions that keep a promise, with levels put where they go.
 
-`check_bound`: functions that keep a promise, and levels put where they go.
-
-A proof is right if no function that the promise allows meets a level within its step. The
-functions drawn here include the extremal ones of the proofs in `harnack.enclosures`, so a proof
-that is a thousandth too long is found out.
+A proof is right if no function that the promise allows meets a level within its step. The functions
+drawn here include the extremal ones of the proofs in `harnack.enclosures`, so a proof that is a
+thousandth too long is found out. A `Case` is a promise with the levels asked for, as a record that
+every proof can be tried on.
 """
 
 from __future__ import annotations
@@ -157,6 +156,7 @@ class CurvatureCase(_Case):
 
 Case: TypeAlias = BallCase | LaplacianCase | LipschitzCase | CurvatureCase
 
+# Functions that keep a promise.
 
 _SAMPLES = 48
 

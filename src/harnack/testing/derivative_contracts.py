@@ -1,4 +1,4 @@
-"""Derivatives that a field gives, held against differences of what they are derivatives of."""
+"""Derivatives that a field gives, compared with differences of what they are derivatives of."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _OFF_CREASES = 0.9
 
 
 def check_derivatives(field: Field, points: FloatArray, look: FieldValues) -> None:
-    """Gradient, Laplacian and Hessian at points (n, 3), where the field was looked at.
+    """Gradient, Laplacian and Hessian at points (n, 3), where `look` has the field's values.
 
     Differences are taken within the field's domain; points too close to its border for that are
     left out.
@@ -188,12 +188,12 @@ def _limits(
         changes = [np.linalg.norm(one.gradient - look.gradient, axis=1) for one in nearby]
         tolerance += 2 * np.max(changes, axis=0)
     else:
-        tolerance += 1e-6 * _bend(nearby) * h
+        tolerance += 1e-6 * _second_derivatives(nearby) * h
     return tolerance, allowance
 
 
-def _bend(nearby: list[_Nearby]) -> FloatArray:
-    """Sizes (n,) of the terms of the Laplacian."""
+def _second_derivatives(nearby: list[_Nearby]) -> FloatArray:
+    """(n,) sums of the sizes of the second derivatives along the axes."""
     return np.sum([np.abs(one.weight * one.gradient[:, one.axis]) for one in nearby], axis=0)
 
 
@@ -207,7 +207,7 @@ def _check_laplacian(points: FloatArray, look: FieldValues, nearby: list[_Nearby
     allowance = np.sum([np.abs(one.weight) * one.gradient_error for one in nearby], axis=0)
     length = np.linalg.norm(look.gradient, axis=1)
     wide = np.sum([one.wide * one.gradient[:, one.axis] for one in nearby], axis=0)
-    tolerance = 1e-6 * _bend(nearby) + _SHARE * np.abs(laplacian - wide)
+    tolerance = 1e-6 * _second_derivatives(nearby) + _SHARE * np.abs(laplacian - wide)
     tolerance += 1e-11 * length * (1 + _size(points) / h) / h
     if _is_harmonic(look):
         message = "HarmonicBall: f is not harmonic, its Laplacian is not 0"
@@ -231,7 +231,8 @@ def _agree(
     *,
     has_creases: bool = False,
 ) -> None:
-    """Everywhere within both together, at most points within the tolerance alone.
+    """Raise unless `off` is within both allowances together everywhere, and at most points within
+    the tolerance alone.
 
     has_creases: differences may cross one, at few points.
     """

@@ -1,7 +1,4 @@
-"""`check_field`: everything that a field promises, sampled.
-
-What a field proves along paths, beyond its promises, sampled.
-"""
+"""`check_field` and `check_looks`: what a field promises, and proves along paths, sampled."""
 
 from __future__ import annotations
 
@@ -34,8 +31,11 @@ if TYPE_CHECKING:
 
 __all__ = ["check_field", "check_looks", "free_lengths"]
 
-# Places at which the movement along a step is looked at.
+# Places at which the movement along a step is sampled.
 _SAMPLES = 33
+
+
+# Enclosures along paths.
 
 
 def check_looks(
@@ -107,6 +107,9 @@ def free_lengths(
     enclosures = look.ahead if forwards else look.back
     steps = to_numpy(longest_step(enclosures, Gaps(down, up)) + 0 * down)
     return np.broadcast_to(steps, len(points)).astype(np.float64)
+
+
+# Promises.
 
 
 def check_field(
@@ -212,8 +215,8 @@ def _check_numbers(field: Field, points: FloatArray, look: FieldValues) -> None:
 
 
 def _check_rounding(field: Field, points: FloatArray) -> None:
-    """In single precision the value is off by `error`, eight units in its last place, and what
-    the rounding of the point does."""
+    """In single precision the value is off by at most `error`, eight units in its last place, and
+    what the rounding of the point does."""
     single = points.astype(np.float32).astype(np.float64)
     if field.domain is not None:
         single = single[field.domain.contains_points(single)]
@@ -264,7 +267,7 @@ def _check_promise(
 ) -> None:
     """Walk from each point to the border of the promise, or across the points' size.
 
-    A ball is one wherever it lies; the others are only asked for in the domain.
+    Promises of all space, such as harmonic balls, are tested outside the field's domain as well.
     """
     name = type(known).__name__
     reach = np.minimum(known.radius, 2 * float(np.ptp(points, axis=0).max()) + 1e-300)
@@ -328,7 +331,7 @@ def _beyond_ball(
 
 
 def _check_extent(field: Field, level: float, rng: np.random.Generator, count: int) -> None:
-    """No crossing of the level on segments outside the extent."""
+    """Check that the level is not crossed on segments outside the extent."""
     volume = field.extent((level,))
     if volume is None:
         return

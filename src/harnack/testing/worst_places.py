@@ -1,16 +1,4 @@
-"""How a broken promise is reported.
-
-A proof made wrong on purpose: a test suite that accepts it is worth nothing.
-
-Fields looked at from outside: values, gradients and continuous lifts as NumPy arrays.
-
-The places where a promise is broken most, searched and not sampled.
-
-A promise that is wrong by a few percent is broken only near what makes it: beside a singularity
-that lies just inside the ball, or in the one direction in which a range is attained. Random places
-miss that. So places climb: pairs of a point p and a place y that the promise made at p speaks of
-move at random, farther as long as they succeed, to where the promise is closer to being broken.
-"""
+"""Fields sampled as NumPy arrays, the worst places of promises, and reports of broken ones."""
 
 from __future__ import annotations
 
@@ -58,7 +46,8 @@ def require(
 ) -> None:
     """Raise BrokenPromiseError for the worst of the points (n, 3) that are not good (n,).
 
-    amount: (n,) how wrong. there: (n, 3) where it shows, if not at the point.
+    amount: (n,) how wrong.
+    there: (n, 3) where it shows, if not at the point.
     """
     broken: BoolArray = ~np.asarray(good, dtype=np.bool_)
     bad = np.flatnonzero(broken)
@@ -73,8 +62,8 @@ def require(
 
 
 def scaled(kind: type[Enclosure], factor: float, *, covers: float | None = None) -> Any:
-    """The same proof with every step multiplied by `factor`, and every length that it covers by
-    `covers` (None: by the same)."""
+    """A proof made wrong on purpose, as a test suite that accepts it is worth nothing: with every
+    step multiplied by `factor`, and every length that it covers by `covers` (None: by the same)."""
     loose = factor if covers is None else covers
     base: Any = kind
 
@@ -96,6 +85,9 @@ def scaled(kind: type[Enclosure], factor: float, *, covers: float | None = None)
 def unscaled(kind: type[Enclosure]) -> type[Enclosure]:
     """The proof that `scaled` was given; any other as it is."""
     return getattr(kind, "original", kind)
+
+
+# Fields from outside: values, gradients and continuous lifts.
 
 
 @dataclass(frozen=True)
@@ -236,8 +228,10 @@ def _spread(value: object, n: int) -> FloatArray:
     return np.broadcast_to(array, (n,)).astype(np.float64)
 
 
+# The search for the worst places.
+
 # Pairs that climb: at most, and of the points given; how many moves each tries in a round, and
-# rounds. Where f is known along a way only, which costs as many looks as it has samples, fewer.
+# rounds. Where f is known along a path only, which costs one evaluation a sample, fewer.
 _MOST_PAIRS, _PAIRS_OF_POINTS = 48, 0.25
 _MOVES, _ROUNDS, _WALKED = 8, 36, 2
 # Of the radius: how near places come to the border of the ball.
@@ -246,7 +240,7 @@ _BORDER = 1 - 1e-6
 _FIRST, _LEAST, _FARTHER, _SHORTER = 0.25, 1e-9, 1.6, 0.6
 # Of the coordinates: radii below this are left out, for rounding moves places in them.
 _SMALLEST = 1e-6
-# Places looked at on the way to one, where f is known along it only: searching, and to be sure.
+# Samples on the path to a place, where f is known along it only: searching, and to be sure.
 _ON_THE_WAY, _SURE = 24, 600
 # What a ratio may be above one for rounding, and rounding of the values.
 _ALLOWED, _ROUNDING = 1e-6, 1e-9
@@ -283,6 +277,12 @@ def search_worst_places(
     field: Field, points: FloatArray, look: FieldValues, number: int, rng: np.random.Generator
 ) -> None:
     """Search for places that break a promise, the one of that number in `Sample.promises`.
+
+    A promise that is wrong by a few percent is broken only near what makes it: beside a singularity
+    that lies just inside the ball, or in the one direction in which a range is attained. Random
+    places miss that. So places climb: pairs of a point p and a place y that the promise made at p
+    speaks of move at random, farther as long as they succeed, to where the promise is closer to
+    being broken.
 
     points: (n, 3), and `look` the field there. The climb begins at those with the smallest radius
     and at others, towards the border along the gradient, against it, and in random directions.
@@ -335,7 +335,11 @@ def search_worst_places(
 
 @dataclass(frozen=True)
 class _Search:
-    """What is asked of pairs. longest: that is looked at of a radius without an end."""
+    """The promise that pairs are to break.
+
+    number: of the promise in `Sample.promises`.
+    longest: the length that stands for a radius without an end.
+    """
 
     field: Field
     number: int
@@ -343,7 +347,7 @@ class _Search:
 
     @property
     def is_walked(self) -> bool:
-        """Whether how f moves is known along a way only, jumps taken out."""
+        """Whether how f moves is known along a path only, jumps taken out."""
         return self.field.period is not None or self.field.has_sheets
 
     def pairs(self, p: FloatArray, w: FloatArray, samples: int = _ON_THE_WAY) -> _Pairs:

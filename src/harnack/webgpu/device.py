@@ -1,8 +1,6 @@
-"""A device behind WebGPU, driven from Python: shaders compiled and run, rays by the thousand.
+"""Computation on a GPU behind WebGPU: shaders compiled and run, a sample compared with Dr.Jit.
 
-The package `wgpu` speaks to Vulkan, Metal and Direct3D.
-
-A computation on a device behind WebGPU, of which a sample is compared with Dr.Jit's answers.
+The package `wgpu` drives the GPU through Vulkan, Metal or Direct3D.
 """
 
 from __future__ import annotations
@@ -169,6 +167,8 @@ def bits_of(array: Any) -> Bits:
     return np.ascontiguousarray(values).view(np.uint32)
 
 
+# Whole computations.
+
 Arrays: TypeAlias = "dict[str, npt.NDArray[Any]]"
 # Lanes that Dr.Jit computes as well: spread evenly over all.
 _SAMPLE = 4096
@@ -187,9 +187,10 @@ def evaluate(
 ) -> Arrays:
     """What `compute(**lanes)` gives, as NumPy arrays by name, computed on a device.
 
-    compute, data: as `recording.record` takes them. lanes: Dr.Jit arrays of n entries each.
-    differences: of some lanes, Dr.Jit's answers and the device's, says what is wrong with the last;
-        nothing if they agree.
+    compute, data: as `recording.record` takes them.
+    lanes: Dr.Jit arrays of n entries each.
+    differences: a function of some lanes, Dr.Jit's answers there and the device's, which says what
+        is wrong with the latter; nothing if they agree.
 
     Raises:
         UntranslatableError: the kernel holds what is not known.

@@ -2,7 +2,7 @@
 
 Dr.Jit writes kernels for LLVM as one function over packets of lanes. What a lane does is the same
 in all of them, so the packets go, and with them the masks that only keep lanes of a packet apart.
-Of LLVM's language exactly the part is known that Dr.Jit writes; anything else is refused by name.
+Only the part of LLVM's language that Dr.Jit writes is known; anything else is refused by name.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class Store:
 
 @dataclass(frozen=True)
 class Variable:
-    """Of a loop: what it is before the first turn, and after each."""
+    """A variable of a loop: its value before the first iteration, and after each."""
 
     name: str
     kind: Kind
@@ -83,7 +83,7 @@ class Variable:
 
 @dataclass
 class Loop:
-    """Turns of `test` and `body` while `condition`, which `test` computes, holds."""
+    """Iterations of `test` and `body` while `condition`, which `test` computes, holds."""
 
     variables: list[Variable] = field(default_factory=list[Variable])
     test: list[Statement] = field(default_factory=list["Statement"])
@@ -145,7 +145,7 @@ _VECTOR = r"<\d+ x (\w+)>"
 _NAME = r"%[\w.]+"
 # A result, a constant of a packet, or a number.
 _V = r"(%[\w.]+|<[^>]*>|[^,<>]+)"
-# Of each instruction what it looks like, without what only says how LLVM may compile it.
+# Flags of instructions that only say how LLVM may compile them.
 _FLAGS = re.compile(r"\b(?:fast|nnan|ninf|nsz|arcp|contract|afn|reassoc|nuw|nsw|exact)\b ?")
 _BINARY = [
     "fadd",

@@ -1,6 +1,6 @@
 """The kernel that Dr.Jit records for a computation, and which of its arrays is which.
 
-A kernel knows its arrays by the places of their pointers alone. Names come with it as comments:
+A kernel tells its arrays apart by the places of their pointers. Names come with it as comments:
 `drjit.set_label` gives a variable one, and `JitFlag.PrintIR` has them written. An array that a
 kernel reads at places which lanes compute is named by what `drjit.gather` returns of it.
 """
