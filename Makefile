@@ -69,6 +69,8 @@ format: $(STAMP)
 images: $(STAMP)
 	$(BIN)/harnack gallery --demo -o docs/images
 	$(BIN)/python scripts/view_images.py docs/images
+	$(BIN)/python scripts/bootstrap.py browser
+	$(BIN)/python scripts/live_image.py docs/images
 
 # Notebooks are run while the site is built.
 site: $(STAMP)
