@@ -1,7 +1,9 @@
-"""Sphinx extension: the directive `scene-gallery`, all scenes of the gallery with their pictures.
+"""Sphinx extension: the directive `scene-gallery`, all scenes of the gallery with their pictures,
+and for each of them a page in which it turns.
 
 It reads the scenes themselves, so a page cannot fall behind them; a scene without a picture is a
-warning, which ends the build. `make site-pictures` makes the pictures that are missing.
+warning, which ends the build. `make site-pictures` makes the pictures that are missing. Pages that
+turn are made by each build, in minutes, unless they are newer than the library.
 """
 
 from __future__ import annotations
@@ -11,11 +13,15 @@ from typing import Any
 
 from docutils import nodes
 from sphinx.util import logging
+from sphinx.util.display import status_iterator
 from sphinx.util.docutils import SphinxDirective
 
+import harnack
 from harnack.gallery import SCENES
+from harnack.rendering import MATERIALS
 
 LARGE, SMALL = "images/{}.png", "images/gallery/{}.jpg"
+TURNING = "live/{}.html"
 _LOG = logging.getLogger(__name__)
 
 
@@ -33,7 +39,8 @@ class SceneGallery(SphinxDirective):
             command = f"harnack render {scene.name} -o {scene.name}.png"
             entries.append(
                 f"::::{{figure}} {picture}\n:alt: {scene.title}\n:width: 100%\n\n"
-                f"**{scene.name}**: {scene.title}\n\n`{command}`\n::::\n"
+                f"**{scene.name}**: {scene.title}\n\n`{command}`\n\n"
+                f'<a href="{TURNING.format(scene.name)}">Turn it</a>\n::::\n'
             )
         return self.parse_text_to_nodes(
             ":::::{container} scenes\n" + "\n".join(entries) + "\n:::::\n"
@@ -46,6 +53,26 @@ def picture_of(name: str, docs: Path) -> str | None:
     return next((path for path in paths if (docs / path).exists()), None)
 
 
+def write_turning_pages(app: Any, error: Exception | None) -> None:
+    """A page of each scene, below docs, where the gallery is."""
+    if error is not None or app.builder.name != "html":
+        return
+    library = Path(harnack.__file__).parent
+    newest = max(path.stat().st_mtime for path in library.rglob("*.*") if path.suffix != ".pyc")
+    for name in status_iterator([*SCENES], "pages that turn... ", length=len(SCENES)):
+        target = Path(app.outdir, "docs", TURNING.format(name))
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if target.exists() and target.stat().st_mtime > newest:
+            continue
+        scene = SCENES[name]
+        surfaces = scene.surfaces()
+        settings = {**scene.settings(len(surfaces)), "show": "shaded"}
+        if any(MATERIALS[one].transparent for one in scene.materials):
+            settings["material"] = "clay"  # what turns is opaque
+        harnack.page(surfaces, target, title=scene.title, progress=False, **settings)
+
+
 def setup(app: Any) -> dict[str, bool]:
+    app.connect("build-finished", write_turning_pages)
     app.add_directive("scene-gallery", SceneGallery)
     return {"parallel_read_safe": True}
