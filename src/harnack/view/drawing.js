@@ -30,7 +30,7 @@ export const QUICK = 40;
 const SAMPLES = 16;
 const GROUP = 64;
 // What other roundings explain: see `harnack.tracer.hits`.
-const [GRAZING, OTHERWISE, APART, TURNED, ALIKE, MORE] = [0.1, 1e-3, 0.1, 2e-4, 0.9, 0.03];
+const [GRAZING, OTHERWISE, APART, TURNED, RECOUNTED] = [0.1, 1e-3, 0.1, 2e-4, 0.03];
 const VIEW_BYTES = 176;
 const PAINTS = 128;
 // Of the floor's light: see `harnack.rendering.shading`.
@@ -241,13 +241,13 @@ export class Drawing {
     const [wanted, rays] = [new Float32Array(expected.buffer), new Float32Array(asked.buffer)];
     const at = (/** @type {number} */ k, /** @type {number} */ part) => rays[lanes.indexOf(part) * n + k];
     // The criteria are those of `harnack.tracer.hits`, with what was measured there.
-    let [other, stray, alike, many, others] = [0, 0, 0, 0, 0];
+    let [other, stray, many, recounted] = [0, 0, 0, 0];
     /** @type {number[][]} */
     const [off, turned] = [[], []];
     for (let k = 0; k < n; k++) {
       const [found, looks] = [bits[results[0] * n + k], bits[results[5] * n + k]];
       const looked = expected[5 * n + k];
-      [many, others, alike] = [many + looked, others + looks, alike + (looks === looked ? 1 : 0)];
+      [many, recounted] = [many + looked, recounted + Math.abs(looks - looked)];
       const normal = [2, 3, 4].map((p) => wanted[p * n + k]);
       const climb = Math.abs(dot([3, 4, 5].map((p) => at(k, p)), normal));
       if (found !== expected[k]) {
@@ -266,7 +266,7 @@ export class Drawing {
     if (off.filter((one) => one > 2).length > OTHERWISE * n) return "hits lie off the surface";
     if (largest(off, 0.9) > APART) return "hits lie elsewhere, if within the tolerance";
     if (!(largest(turned, 0.9) <= TURNED)) return "normals differ";
-    if (alike < ALIKE * n || Math.abs(others - many) > MORE * many + 2)
+    if (recounted > RECOUNTED * many + 2)
       return "rays take another number of evaluations";
     return "";
   }
