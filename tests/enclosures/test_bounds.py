@@ -243,10 +243,11 @@ def test_bounds_hold_in_many_trials(bound: type[Enclosure], precision: str) -> N
         assert ratios(bound, certificate, slope, precision).max() <= 1
 
 
+@pytest.mark.parametrize("precision", ["double", "single"])
 @pytest.mark.parametrize("bound", BOUNDS, ids=name_of)
-def test_mutation_is_seen_by_check_bound(bound: type[Enclosure]) -> None:
+def test_mutation_is_seen_by_check_bound(bound: type[Enclosure], precision: str) -> None:
     with pytest.raises(BrokenPromiseError, match="a level is met within the step"):
-        check_bound(scaled(bound, 1.001))
+        check_bound(scaled(bound, 1.001), precision=precision)  # type: ignore[arg-type]
 
 
 @pytest.mark.few(4)

@@ -9,7 +9,6 @@ proof can be tried.
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -63,8 +62,8 @@ class Case:
         promise: Any = self.promise
         # Without what `of` takes off for rounding, so that steps can be compared exactly.
         if isinstance(promise, HarmonicBall) and issubclass(kind, Ball):
-            ranges = (None if _is_open(end) else end for end in (-promise.lower, promise.upper))
-            below, above = ranges
+            ends = -promise.lower, promise.upper
+            below, above = (None if _is_open(end) else end for end in ends)
             if not kind.applies(promise.dimension, below is not None, above is not None):
                 return None
             return kind(promise.radius, below, above, promise.dimension, slopes)
@@ -405,10 +404,9 @@ def _meets(trial: Trial, length: FloatArray, precision: Precision) -> BoolArray:
 
 
 def _size(trial: Trial) -> FloatArray:
-    size = np.abs(trial.slope) * trial.reach
-    for name in itertools.chain(*trial.case.promise.ends[:1]):
-        end: Any = getattr(trial.case.promise, name)
-        size = size if _is_open(end) else size + np.abs(end)
+    promise, size = trial.case.promise, np.abs(trial.slope) * trial.reach
+    for low, high in promise.ends[:1]:  # the nearer one: the other may be as good as open
+        size = size + np.minimum(np.abs(getattr(promise, low)), np.abs(getattr(promise, high)))
     return size
 
 
