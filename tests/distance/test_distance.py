@@ -18,12 +18,12 @@ import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.distance import closest_points, curvature, signed_distance, tangent
 from harnack.distance.tangent import second_order
-from harnack.enclosures import Enclosure
+from harnack.enclosures import Curvature, Enclosure, HarmonicBall, Lipschitz
 from harnack.enclosures.harmonic_ball import Caps, Classic, Slope
 from harnack.enclosures.parabola import Cone, Taylor
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.geometry import shapes
-from harnack.testing.bound_contracts import BallCase, Case, CurvatureCase, LipschitzCase
+from harnack.testing.bound_contracts import Case
 from harnack.testing.worst_places import look_at, movements
 from tests.oracles.exact import exact_step
 
@@ -621,17 +621,16 @@ def cases(rng: np.random.Generator, n: int) -> list[tuple[type[Enclosure], Case,
     down, up = (share * 10 ** rng.uniform(-2, 1, n) for share in (below, above))
     result: list[tuple[type[Enclosure], Case, np.ndarray]] = []
     for dimension in (2, 3, 4):
-        for ends in ((below, above), (below, None), (None, above)):
-            ball = BallCase(radius, *ends, down, up, dimension)
-            least = np.minimum(*(np.full(n, np.inf) if end is None else end for end in ends))
-            steepest = dimension * least / radius
-            if None not in [None if end is None else 0 for end in ends] and dimension == 3:
+        for low, high in ((-below, above), (-below, np.inf), (-np.inf, above)):
+            ball = Case(HarmonicBall(radius, low, high, dimension), down, up)
+            steepest = dimension * np.minimum(-low, high) / radius
+            if dimension == 3 and np.ndim(low) == np.ndim(high):
                 share = below / (below + above)
                 result.append((Caps, ball, 3 * (below + above) / radius * share * (1 - share)))
             result += [(Slope, ball, steepest), (Classic, ball, steepest)]
     constant, slopes = 10 ** rng.uniform(-2, 2, n), 10 ** rng.uniform(-2, 1, n)
-    result.append((Cone, LipschitzCase(constant, radius, down, up), constant))
-    result.append((Taylor, CurvatureCase(constant, radius, down, up), slopes))
+    result.append((Cone, Case(Lipschitz(constant, radius), down, up), constant))
+    result.append((Taylor, Case(Curvature(constant, radius), down, up), slopes))
     return result
 
 

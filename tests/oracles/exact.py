@@ -7,7 +7,6 @@ further is wrong and one that steps less far gives something away. Nothing here 
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -16,17 +15,18 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray, to_numpy
-from harnack.enclosures import Enclosure
+from harnack.enclosures import (
+    BoundedLaplacian,
+    Curvature,
+    Enclosure,
+    HarmonicBall,
+    Lipschitz,
+    Promise,
+)
 from harnack.enclosures.bounded_laplacian import GreenBall
 from harnack.enclosures.harmonic_ball import Caps, Classic, Slope
 from harnack.enclosures.parabola import Cone, Taylor
-from harnack.testing.bound_contracts import (
-    BallCase,
-    Case,
-    CurvatureCase,
-    LaplacianCase,
-    LipschitzCase,
-)
+from harnack.testing.bound_contracts import Case
 from harnack.testing.poisson import cap_movement, kernel_movement
 
 __all__ = ["BOUNDS", "exact_step", "on_host"]
@@ -40,9 +40,9 @@ def exact_step(kind: type[Enclosure], case: Case, slope: FloatArray) -> FloatArr
     """
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         for bound, (promised, step) in _EXACT.items():
-            if issubclass(kind, bound) and isinstance(case, promised):
-                return step(case, slope)
-    raise TypeError(f"no exact step is known for {kind.__name__} and {type(case).__name__}")
+            if issubclass(kind, bound) and isinstance(case.promise, promised):
+                return step(case.promise, case, slope)
+    raise TypeError(f"no exact step is known for {kind.__name__} and {case.promise}")
 
 
 def on_host(case: Case, lanes: int) -> Case:
@@ -52,12 +52,7 @@ def on_host(case: Case, lanes: int) -> Case:
         array = to_numpy(value) if dr.is_array_v(value) else np.asarray(value)
         return np.broadcast_to(array.astype(np.float64), (lanes,))
 
-    fields: dict[str, Any] = {
-        key: host(value)
-        for key, value in vars(case).items()
-        if value is not None and key != "dimension"
-    }
-    return dataclasses.replace(case, **fields)
+    return case.each(host)
 
 
 def largest_free(movement: Callable[[FloatArray], FloatArray], gap: FloatArray) -> FloatArray:
@@ -70,16 +65,16 @@ def largest_free(movement: Callable[[FloatArray], FloatArray], gap: FloatArray) 
     return low
 
 
-def _parabolas(c: CurvatureCase, slope: FloatArray) -> FloatArray:
+def _parabolas(known: Any, c: Case, slope: FloatArray) -> FloatArray:
     """Second derivatives of plus and minus the constant."""
-    h = c.constant
+    h = known.constant
     # An infinite radius is replaced by one within which a level is surely met.
     down, up = np.minimum(c.gap_down, 1e30), np.minimum(c.gap_up, 1e30)
     steep = np.abs(slope)
     with np.errstate(divide="ignore", invalid="ignore"):
         bent: FloatArray = 4 * (steep / h + np.sqrt(2 * np.minimum(down, up) / h))
         straight: FloatArray = 2 * np.maximum(down, up) / steep
-        r: FloatArray = np.minimum(c.radius, np.where(h > 0, bent, straight))
+        r: FloatArray = np.minimum(known.radius, np.where(h > 0, bent, straight))
 
     def rise(q: FloatArray) -> FloatArray:
         return slope * q * r + 0.5 * h * (q * r) ** 2
@@ -90,19 +85,19 @@ def _parabolas(c: CurvatureCase, slope: FloatArray) -> FloatArray:
     return r * np.minimum(largest_free(rise, c.gap_up), largest_free(fall, c.gap_down))
 
 
-def _green(c: LaplacianCase, slope: FloatArray) -> FloatArray:
+def _green(known: Any, c: Case, slope: FloatArray) -> FloatArray:
     """Mass at the poles, and a density of the kernel's sign, with the constant that is proved."""
-    square = c.radius**2
-    mean = 0.5 * square * (c.laplacian_lower + c.laplacian_upper)
-    spread = 0.5 * square * (c.laplacian_upper - c.laplacian_lower)
+    square, below, above = known.radius**2, -known.lower, known.upper
+    mean = 0.5 * square * (known.laplacian_lower + known.laplacian_upper)
+    spread = 0.5 * square * (known.laplacian_upper - known.laplacian_lower)
     norm = 0.1907  # of G(0,.) + d_v G(0,.)/3, rounded up: see `green_kernel.Proof.convex`
     reach: list[FloatArray] = []
     for u, most, sign, gap in (
-        (c.range_below, c.range_above, 1.0, c.gap_up),
-        (c.range_above, c.range_below, -1.0, c.gap_down),
+        (below, above, 1.0, c.gap_up),
+        (above, below, -1.0, c.gap_down),
     ):
         w, m = np.maximum(u + sign * mean / 6, 0), np.maximum(sign * mean, 0)
-        s = np.clip(sign * c.radius * slope / 3, -w - norm * spread, w + norm * spread)
+        s = np.clip(sign * known.radius * slope / 3, -w - norm * spread, w + norm * spread)
 
         def movement(
             q: FloatArray, w: FloatArray = w, m: FloatArray = m, s: FloatArray = s
@@ -113,56 +108,55 @@ def _green(c: LaplacianCase, slope: FloatArray) -> FloatArray:
             return top / (1 - square) ** 2 + m * square / 6
 
         reach.append(np.where(gap > most, 1.0, largest_free(movement, gap)))
-    return np.minimum(*reach)
+    return known.radius * np.minimum(*reach)
 
 
-def _sides(c: BallCase) -> list[tuple[FloatArray, float, FloatArray, FloatArray]]:
+def _sides(ball: Any, c: Case) -> list[tuple[FloatArray, float, FloatArray, FloatArray]]:
     """(u, sign, gap away from the end, gap towards it) of the positive functions u at p."""
     sides: list[tuple[FloatArray, float, FloatArray, FloatArray]] = []
-    if c.range_below is not None:
-        sides.append((c.range_below, 1.0, c.gap_up, c.gap_down))
-    if c.range_above is not None:
-        sides.append((c.range_above, -1.0, c.gap_down, c.gap_up))
+    if np.isfinite(ball.lower).any():
+        sides.append((-ball.lower, 1.0, c.gap_up, c.gap_down))
+    if np.isfinite(ball.upper).any():
+        sides.append((ball.upper, -1.0, c.gap_down, c.gap_up))
     return sides
 
 
-def _classic(c: BallCase, slope: FloatArray) -> FloatArray:
+def _classic(ball: Any, c: Case, slope: FloatArray) -> FloatArray:
     """Point masses at the poles."""
     del slope
-    best = np.zeros_like(c.radius)
-    for u, _, away, toward in _sides(c):
-        n = c.dimension
+    best = np.zeros_like(ball.radius)
+    for u, _, away, toward in _sides(ball, c):
+        n = ball.dimension
         up = largest_free(lambda q, n=n, u=u: u * _poles_movement(q, 1.0, n), away)
         down = largest_free(lambda q, n=n, u=u: -u * _poles_movement(q, -1.0, n), toward)
         best = np.maximum(best, np.minimum(up, down))
-    return best
+    return ball.radius * best
 
 
-def _slope(c: BallCase, slope: FloatArray) -> FloatArray:
+def _slope(ball: Any, c: Case, slope: FloatArray) -> FloatArray:
     """Two point masses at the poles; a ring of mass at one latitude."""
-    n = c.dimension
-    reach = {1.0: np.zeros_like(c.radius), -1.0: np.zeros_like(c.radius)}
-    for u, sign, away, toward in _sides(c):
-        m = np.where(u > 0, np.clip(sign * c.radius * slope / (n * u), -1, 1), 0.0)
+    n = ball.dimension
+    reach = {1.0: np.zeros_like(ball.radius), -1.0: np.zeros_like(ball.radius)}
+    for u, sign, away, toward in _sides(ball, c):
+        m = np.where(u > 0, np.clip(sign * ball.radius * slope / (n * u), -1, 1), 0.0)
         chord = largest_free(lambda q, m=m, u=u: u * _poles_movement(q, m, n), away)
         jensen = largest_free(lambda q, m=m, u=u: -u * kernel_movement(q, m, n), toward)
         reach[sign] = np.maximum(reach[sign], chord)
         reach[-sign] = np.maximum(reach[-sign], jensen)
-    return np.minimum(reach[1.0], reach[-1.0])
+    return ball.radius * np.minimum(reach[1.0], reach[-1.0])
 
 
-def _caps(c: BallCase, slope: FloatArray) -> FloatArray:
+def _caps(ball: Any, c: Case, slope: FloatArray) -> FloatArray:
     """Two caps on the axis, and all but two caps."""
-    assert c.range_below is not None
-    assert c.range_above is not None
-    span = c.range_below + c.range_above
+    below, above = -ball.lower, ball.upper
+    span = below + above
     reach: list[FloatArray] = []
-    for below, above, sign, gap in (
-        (c.range_below, c.range_above, 1.0, c.gap_up),
-        (c.range_above, c.range_below, -1.0, c.gap_down),
+    for near, far, sign, gap in (
+        (below, above, 1.0, c.gap_up),
+        (above, below, -1.0, c.gap_down),
     ):
-        p, rest = below / span, above / span
-        shift = np.where(rest > 0, sign * c.radius * slope / (3 * span * rest), 0.0)
+        p, rest = near / span, far / span
+        shift = np.where(rest > 0, sign * ball.radius * slope / (3 * span * rest), 0.0)
         shift = np.clip(shift, -p, p)
 
         def up(
@@ -173,7 +167,7 @@ def _caps(c: BallCase, slope: FloatArray) -> FloatArray:
             return span * np.where(is_thin, -_belt(q, -shift, rest), two_caps)
 
         reach.append(largest_free(up, gap))
-    return np.minimum(reach[0], reach[1])
+    return ball.radius * np.minimum(reach[0], reach[1])
 
 
 def _poles_movement(q: npt.ArrayLike, mean: npt.ArrayLike, dimension: int) -> FloatArray:
@@ -200,18 +194,21 @@ def _belt(q: FloatArray, middle: FloatArray, half: FloatArray) -> FloatArray:
     return total
 
 
-def _cone(c: LipschitzCase, slope: FloatArray) -> FloatArray:
+def _cone(known: Any, c: Case, slope: FloatArray) -> FloatArray:
     del slope
-    return np.minimum(np.minimum(c.gap_down, c.gap_up) / c.constant, c.radius)
+    return np.minimum(np.minimum(c.gap_down, c.gap_up) / known.constant, known.radius)
 
 
-# Of each proof the kind of case it is made of, and the longest step: a new proof goes in here.
-_EXACT: dict[type[Enclosure], tuple[type[Case], Callable[[Any, FloatArray], FloatArray]]] = {
-    Classic: (BallCase, lambda case, slope: case.radius * _classic(case, slope)),
-    Slope: (BallCase, lambda case, slope: case.radius * _slope(case, slope)),
-    Caps: (BallCase, lambda case, slope: case.radius * _caps(case, slope)),
-    GreenBall: (LaplacianCase, lambda case, slope: case.radius * _green(case, slope)),
-    Cone: (LipschitzCase, _cone),
-    Taylor: (CurvatureCase, _parabolas),
+# Of each proof the kind of promise it is made of, and the longest step from such a promise with
+# these gaps along these slopes: a new proof goes in here.
+_EXACT: dict[
+    type[Enclosure], tuple[type[Promise], Callable[[Any, Case, FloatArray], FloatArray]]
+] = {
+    Classic: (HarmonicBall, _classic),
+    Slope: (HarmonicBall, _slope),
+    Caps: (HarmonicBall, _caps),
+    GreenBall: (BoundedLaplacian, _green),
+    Cone: (Lipschitz, _cone),
+    Taylor: (Curvature, _parabolas),
 }
 BOUNDS = tuple(_EXACT)

@@ -2,30 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import numpy as np
 
 from harnack.backend import FloatArray, choose_backend, to_numpy, to_vector3
-from harnack.enclosures import (
-    BoundedLaplacian,
-    Curvature,
-    Gaps,
-    HarmonicBall,
-    Lipschitz,
-    Promise,
-    Slopes,
-)
-from harnack.enclosures.bounded_laplacian import GreenBall
-from harnack.enclosures.harmonic_ball import Slope
-from harnack.testing.bound_contracts import (
-    BallCase,
-    Case,
-    CurvatureCase,
-    LaplacianCase,
-    LipschitzCase,
-)
+from harnack.enclosures import Gaps, Promise
+from harnack.enclosures.ball import known_ranges
+from harnack.testing.bound_contracts import Case
 from harnack.testing.worst_places import (
     BrokenPromiseError,
     look_at,
@@ -112,7 +99,7 @@ def _check_step(
     directions: FloatArray, step: FloatArray, gaps: tuple[FloatArray, FloatArray],
 ) -> None:  # fmt: skip
     def require(good: Any, message: str) -> None:
-        _require(good, f"{type(case).__name__}: {message}", points, directions, step)
+        _require(good, f"{type(case.promise).__name__}: {message}", points, directions, step)
 
     require(np.isfinite(step) & (step >= 0), "the step is not a number >= 0")
     require(~_meets(field, points, directions, step, gaps), "a level lies within the step")
@@ -135,7 +122,7 @@ def _check_covers(
         return to_numpy(case.covers(kind, slope, real(length))) & np.ones(len(step), bool)
 
     def require(good: Any, message: str, length: FloatArray) -> None:
-        _require(good, f"{type(case).__name__}: {message}", points, directions, length)
+        _require(good, f"{type(case.promise).__name__}: {message}", points, directions, length)
 
     part = step * rng.uniform(0.1, 0.9, len(step))
     require(covered(part), "a part of the step is not covered", part)
@@ -169,23 +156,11 @@ def _require(
 
 
 def _case_of(promise: Promise, sample: Sample, gaps: Gaps) -> Case:
-    """A promise of a sample with levels these gaps away."""
-    zero = 0 * sample.value
-    given = promise, sample.value, sample.error, Slopes(zero, zero)
-    if isinstance(promise, HarmonicBall):
-        ball = Slope.of(*given)
-        assert ball is not None
-        return BallCase(
-            ball.radius, ball.range_below, ball.range_above, gaps.down, gaps.up, ball.dimension
-        )
-    if isinstance(promise, BoundedLaplacian):
-        green = GreenBall.of(*given)
-        assert green is not None
-        return LaplacianCase(
-            green.radius, green.range_below, green.range_above,
-            promise.laplacian_lower, promise.laplacian_upper, gaps.down, gaps.up,
-        )  # fmt: skip
-    if isinstance(promise, Curvature):
-        return CurvatureCase(promise.constant, promise.radius, gaps.down, gaps.up)
-    assert isinstance(promise, Lipschitz)
-    return LipschitzCase(promise.constant, promise.radius, gaps.down, gaps.up)
+    """A promise of a sample with levels these gaps away, less what proofs take off for rounding."""
+    if promise.ends:
+        radius, below, above = known_ranges(cast("Any", promise), sample.value, sample.error)
+        lower = -math.inf if below is None else -below
+        upper = math.inf if above is None else above
+        (low, high), *_ = promise.ends
+        promise = dataclasses.replace(promise, **{"radius": radius, low: lower, high: upper})
+    return Case(promise, gaps.down, gaps.up)

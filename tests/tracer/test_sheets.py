@@ -23,7 +23,14 @@ from harnack.backend import (
     to_numpy,
 )  # fmt: skip
 from harnack.backend.elementary import clamp, fmax, fmin
-from harnack.enclosures import Curvature, Enclosure, Slopes, TargetLevels, choose_proofs
+from harnack.enclosures import (
+    Curvature,
+    Enclosure,
+    HarmonicBall,
+    Slopes,
+    TargetLevels,
+    choose_proofs,
+)
 from harnack.enclosures.harmonic_ball import Caps, Slope
 from harnack.enclosures.parabola import Taylor
 from harnack.fields import Field, Sample
@@ -31,7 +38,7 @@ from harnack.fields.look import Path as RayPath
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.rendering.encounter import meet_surface
 from harnack.testing import scaled
-from harnack.testing.bound_contracts import BallCase, Case, CurvatureCase
+from harnack.testing.bound_contracts import Case
 from harnack.tracer.contact import compare_with_sheet
 from tests.oracles.exact import exact_step, on_host
 from tests.oracles.jump_oracle import first_side_changes, judge
@@ -636,10 +643,9 @@ def uncertain(rows: int, seed: int) -> list[tuple[type[Enclosure], Case, Any, An
     down, up = down * np.minimum(below, above), up * np.minimum(below, above)
     slope = 2 * rng.uniform(-1, 1, rows) * np.minimum(below, above) / radius
     error = around_one() * 0.2 * np.abs(slope)
-    ball = BallCase(
-        *map(real, (radius, below, above, np.minimum(down, below), np.minimum(up, above))), 3
-    )
-    curved = CurvatureCase(*map(real, (around_one(), radius, down, up)))
+    on_ball = HarmonicBall(*map(real, (radius, -below, above)))
+    ball = Case(on_ball, real(np.minimum(down, below)), real(np.minimum(up, above)))
+    curved = Case(Curvature(real(around_one()), real(radius)), real(down), real(up))
     return [
         (kind, case, real(slope), real(error))
         for kind, case in ((Slope, ball), (Caps, ball), (Taylor, curved))
@@ -666,7 +672,7 @@ def check_uncertain_steps(factor: float = 1.0, covers: float = 1.0) -> None:
             to_numpy(case.covers(wrong, slope, type(slope)(share * exact), error))
             for share in (0.999, 1.0001)
         ]
-        inside = exact < 0.999 * host.radius
+        inside = exact < 0.999 * host.promise.radius
         assert free[0].all(), kind
         assert not free[1][inside].any(), kind
 

@@ -28,8 +28,13 @@ if TYPE_CHECKING:
     from harnack.enclosures.enclosure import Restriction
     from harnack.enclosures.promises import Lipschitz
 
+# Of promises: from the sharpest proof to the one that all fall back on. `trace` takes `_CURVATURE`
+# unasked, and so do clearances.
+_FALLBACK = (Cone,)
+_SLOPE = (Slope, GreenBall, *_FALLBACK)
+_CURVATURE = (Taylor, Caps, *_SLOPE)
 _NAMED: dict[str, tuple[type[Enclosure], ...]] = {
-    "pieces": (Pieces, Tangent, Taylor, Caps, Slope, GreenBall, Cone),
+    "pieces": (Pieces, Tangent, *_CURVATURE),
     "quadratic-taylor": (QuadraticTaylor,),
     "linear-taylor": (LinearTaylor,),
     "segment": (Segment,),
@@ -38,12 +43,12 @@ _NAMED: dict[str, tuple[type[Enclosure], ...]] = {
     "mixed": (Mixed,),
     "affine": (AffineBand,),
     "interval": (IntervalRange,),
-    "curvature": (Taylor, Caps, Slope, GreenBall, Cone),
-    "caps": (Caps, Slope, GreenBall, Cone),
-    "slope": (Slope, GreenBall, Cone),
-    "classic": (Classic, Cone),
-    "laplacian": (GreenBall, Cone),
-    "lipschitz": (Cone,),
+    "curvature": _CURVATURE,
+    "caps": (Caps, *_SLOPE),
+    "slope": _SLOPE,
+    "classic": (Classic, *_FALLBACK),
+    "laplacian": (GreenBall, *_FALLBACK),
+    "lipschitz": _FALLBACK,
 }
 BOUNDS = tuple(sorted(_NAMED))
 
@@ -105,10 +110,10 @@ class Proofs:
         """Why no proof applies, and which would."""
         asked = ", ".join(kind.__name__ for kind in self.kinds)
         if not promises:
+            kinds = ", ".join(kind.__name__ for kind in Promise.__subclasses__())
             return (
                 f"the bounds asked for ({asked}) need a promise and the field makes none: "
-                "Sample.known is empty, return a HarmonicBall, BoundedLaplacian, Curvature or "
-                "Lipschitz in it"
+                f"Sample.known is empty, return one of these in it: {kinds}"
             )
         made = " and ".join(sorted({type(one).__name__ for one in promises}))
         usable = [

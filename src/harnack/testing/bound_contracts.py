@@ -2,18 +2,17 @@
 
 A proof is right if no function that the promise allows meets a level within its step. The functions
 drawn here include the extremal ones of the proofs in `harnack.enclosures`, so a proof that is a
-thousandth too long is found out. A `Case` is a promise with the levels asked for, as a record that
-every proof can be tried on.
+thousandth too long is found out. A `Case` is a promise with the levels asked for, on which every
+proof can be tried.
 """
 
 from __future__ import annotations
 
-import abc
 import dataclasses
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -25,6 +24,7 @@ from harnack.enclosures import (
     Gaps,
     HarmonicBall,
     Lipschitz,
+    Promise,
     Slopes,
 )
 from harnack.enclosures.ball import Ball
@@ -36,11 +36,7 @@ if TYPE_CHECKING:
     from harnack.backend import Mask, Precision, Real
 
 __all__ = [
-    "BallCase",
     "Case",
-    "CurvatureCase",
-    "LaplacianCase",
-    "LipschitzCase",
     "Trial",
     "check_bound",
     "trials",
@@ -48,113 +44,63 @@ __all__ = [
 
 
 @dataclass(frozen=True)
-class _Case(abc.ABC):
-    """gap_down, gap_up: how far in value the levels below and above are."""
+class Case:
+    """promise: what is known near p of a function with f(p) = 0. gap_down, gap_up: how far in value
+    the levels below and above are."""
 
-    @abc.abstractmethod
+    promise: Promise
+    gap_down: Real
+    gap_up: Real
+
+    def each(self, change: Callable[[Any], Any]) -> Case:
+        """The case with all its numbers changed, of Python, NumPy or Dr.Jit."""
+        promise = self.promise.each(lambda number, _, __: change(number))
+        return Case(promise, change(self.gap_down), change(self.gap_up))
+
     def enclosure(self, kind: type[Enclosure], slopes: Slopes) -> Enclosure | None:
         """The enclosure that a proof makes of this; None if it makes none."""
-
-    @property
-    def gaps(self) -> Gaps:
-        """The distances to the levels below and above."""
-        numbers = vars(self)
-        return Gaps(numbers["gap_down"], numbers["gap_up"])
+        promise: Any = self.promise
+        # Without what `of` takes off for rounding, so that steps can be compared exactly.
+        if isinstance(promise, HarmonicBall) and issubclass(kind, Ball):
+            ends = -promise.lower, promise.upper
+            below, above = (None if _is_open(end) else end for end in ends)
+            if not kind.applies(promise.dimension, below is not None, above is not None):
+                return None
+            return kind(promise.radius, below, above, promise.dimension, slopes)
+        if isinstance(promise, BoundedLaplacian) and issubclass(kind, GreenBall):
+            ranges = -promise.lower, promise.upper
+            ends = promise.laplacian_lower, promise.laplacian_upper
+            return kind.of_ranges(promise.radius, ranges, ends, slopes)
+        return kind.of(promise, type(slopes.low)(0), 0.0, slopes)
 
     def accepts(self, kind: type[Enclosure]) -> bool:
         """Whether a proof applies to this."""
-        given: dict[str, Any] = vars(self)
+        lows = [low for low, _ in self.promise.ends]
         plain = {
-            key: value if value is None or key == "dimension" else 1.0
-            for key, value in given.items()
+            name: -1.0 if name in lows else 1.0
+            for name, *_ in self.promise.units
+            if not _is_open(getattr(self.promise, name))
         }
-        return dataclasses.replace(self, **plain).enclosure(kind, Slopes(0.0, 0.0)) is not None
+        case = Case(dataclasses.replace(self.promise, **plain), 1.0, 1.0)
+        return case.enclosure(kind, Slopes(0.0, 0.0)) is not None
 
     def step(self, kind: type[Enclosure], slope: Real, error: Real = 0.0) -> Real:
         """The step along a direction with a slope known up to an error."""
         enclosure = self.enclosure(kind, Slopes.around(slope, error))
         assert enclosure is not None
-        return enclosure.step(self.gaps)
+        return enclosure.step(Gaps(self.gap_down, self.gap_up))
 
     def covers(self, kind: type[Enclosure], slope: Real, length: Real, error: Real = 0.0) -> Mask:
         """Whether a length along such a direction is proved free."""
         enclosure = self.enclosure(kind, Slopes.around(slope, error))
         assert enclosure is not None
-        return enclosure.covers(self.gaps, length)
+        return enclosure.covers(Gaps(self.gap_down, self.gap_up), length)
 
 
-@dataclass(frozen=True)
-class BallCase(_Case):
-    """f is harmonic on a ball of R^dimension and moves there by less than the ranges (None: not
-    bounded on that side)."""
+def _is_open(end: Any) -> bool:
+    """Whether this is no limit at all."""
+    return isinstance(end, float) and math.isinf(end)
 
-    radius: Real
-    range_below: Real | None
-    range_above: Real | None
-    gap_down: Real
-    gap_up: Real
-    dimension: int
-
-    def enclosure(self, kind: type[Enclosure], slopes: Slopes) -> Enclosure | None:
-        below, above = self.range_below, self.range_above
-        if not issubclass(kind, Ball):  # a proof of someone's own
-            ends = -math.inf if below is None else -below, math.inf if above is None else above
-            promise = HarmonicBall(self.radius, *ends, self.dimension)
-            return kind.of(promise, 0 * self.radius, 0.0, slopes)
-        # Without what `Ball.of` takes off for rounding, so that steps can be compared exactly.
-        if not kind.applies(self.dimension, below is not None, above is not None):
-            return None
-        return kind(self.radius, below, above, self.dimension, slopes)
-
-
-@dataclass(frozen=True)
-class LaplacianCase(_Case):
-    """f moves on a ball of space by less than the ranges, with a Laplacian between two ends."""
-
-    radius: Real
-    range_below: Real
-    range_above: Real
-    laplacian_lower: Real
-    laplacian_upper: Real
-    gap_down: Real
-    gap_up: Real
-
-    def enclosure(self, kind: type[Enclosure], slopes: Slopes) -> Enclosure | None:
-        ends = self.laplacian_lower, self.laplacian_upper
-        if issubclass(kind, GreenBall):  # without what is taken off for rounding, as above
-            ranges = self.range_below, self.range_above
-            return kind.of_ranges(self.radius, ranges, ends, slopes)
-        promise = BoundedLaplacian(self.radius, -self.range_below, self.range_above, *ends)
-        return kind.of(promise, 0 * self.radius, 0.0, slopes)
-
-
-@dataclass(frozen=True)
-class LipschitzCase(_Case):
-    """f moves by at most `constant` times the length within the radius."""
-
-    constant: Real
-    radius: Real
-    gap_down: Real
-    gap_up: Real
-
-    def enclosure(self, kind: type[Enclosure], slopes: Slopes) -> Enclosure | None:
-        return kind.of(Lipschitz(self.constant, self.radius), 0.0, 0.0, slopes)
-
-
-@dataclass(frozen=True)
-class CurvatureCase(_Case):
-    """f leaves its tangent by at most `constant` times half the square of the length."""
-
-    constant: Real
-    radius: Real
-    gap_down: Real
-    gap_up: Real
-
-    def enclosure(self, kind: type[Enclosure], slopes: Slopes) -> Enclosure | None:
-        return kind.of(Curvature(self.constant, self.radius), 0.0, 0.0, slopes)
-
-
-Case: TypeAlias = BallCase | LaplacianCase | LipschitzCase | CurvatureCase
 
 # Functions that keep a promise.
 
@@ -237,7 +183,7 @@ def _positive(rng: np.random.Generator, rows: int, n: int, *, mirrored: bool) ->
     shares /= shares.sum(axis=1, keepdims=True)
     u = AxialFunctions("points", places, shares * mass[:, None], radius, n)
     sign = -1.0 if mirrored else 1.0
-    ranges = (None, mass) if mirrored else (mass, None)
+    ends = (-math.inf, mass) if mirrored else (-mass, math.inf)
     return _with_gaps(
         rng,
         f"positive harmonic, n = {n}, {'upper' if mirrored else 'lower'} end known",
@@ -245,7 +191,7 @@ def _positive(rng: np.random.Generator, rows: int, n: int, *, mirrored: bool) ->
         radius,
         sign * u.slope,
         lambda t: sign * u.movement(t),
-        lambda down, up: BallCase(radius, *ranges, down, up, n),
+        HarmonicBall(radius, *ends, n),
     )
 
 
@@ -270,7 +216,7 @@ def _bounded(rng: np.random.Generator, rows: int, n: int) -> Trial:
         radius,
         u.slope,
         u.movement,
-        lambda down, up: BallCase(radius, below, above, down, up, n),
+        HarmonicBall(radius, -below, above, n),
     )
 
 
@@ -322,7 +268,7 @@ def _sourced(rng: np.random.Generator, rows: int, *, mirrored: bool) -> Trial:
         radius,
         sign * (u.slope - slope / radius),
         movement,
-        lambda down, up: LaplacianCase(radius * (1 - 1e-9), below, above, low, high, down, up),
+        BoundedLaplacian(radius * (1 - 1e-9), -below, above, low, high),
     )
 
 
@@ -345,7 +291,7 @@ def _lipschitz(rng: np.random.Generator, rows: int) -> Trial:
         radius,
         slopes[:, 0],
         movement,
-        lambda down, up: LipschitzCase(constant, radius, down, up),
+        Lipschitz(constant, radius),
     )
 
 
@@ -370,7 +316,7 @@ def _curved(rng: np.random.Generator, rows: int) -> Trial:
         radius,
         slope,
         movement,
-        lambda down, up: CurvatureCase(constant, radius, down, up),
+        Curvature(constant, radius),
     )
 
 
@@ -381,7 +327,7 @@ def _with_gaps(
     reach: FloatArray,
     slope: FloatArray,
     movement: Callable[[FloatArray], FloatArray],
-    case: Callable[[FloatArray, FloatArray], Case],
+    promise: Promise,
 ) -> Trial:
     """Levels where the function is at a random place, and others at random."""
     rows = len(scale)
@@ -394,7 +340,7 @@ def _with_gaps(
     far = rng.random(rows) < 0.5  # else the other level is often met first
     up = np.where(is_met & far & (met < 0), np.inf, up)
     down = np.where(is_met & far & (met > 0), np.inf, down)
-    return Trial(name, case(down, up), slope, reach, movement)
+    return Trial(name, Case(promise, down, up), slope, reach, movement)
 
 
 def _log_uniform(rng: np.random.Generator, rows: int, low: float, high: float) -> FloatArray:
@@ -403,12 +349,9 @@ def _log_uniform(rng: np.random.Generator, rows: int, low: float, high: float) -
 
 def _upload(trial: Trial, precision: Precision) -> tuple[Case, Any]:
     """The cases and slopes as Dr.Jit arrays."""
-    backend = choose_backend(precision)
-    fields = {
-        key: backend.Float(value) if isinstance(value, np.ndarray) else value
-        for key, value in vars(trial.case).items()
-    }
-    return type(trial.case)(**fields), backend.Float(trial.slope)
+    real = choose_backend(precision).Float
+    upload = trial.case.each(lambda one: real(one) if isinstance(one, np.ndarray) else one)
+    return upload, real(trial.slope)
 
 
 def _check_trial(
@@ -461,10 +404,9 @@ def _meets(trial: Trial, length: FloatArray, precision: Precision) -> BoolArray:
 
 
 def _size(trial: Trial) -> FloatArray:
-    size = np.abs(trial.slope) * trial.reach
-    for name in ("range_below", "range_above"):
-        most: FloatArray | None = vars(trial.case).get(name)
-        size = size if most is None else size + most
+    promise, size = trial.case.promise, np.abs(trial.slope) * trial.reach
+    for low, high in promise.ends[:1]:  # the nearer one: the other may be as good as open
+        size = size + np.minimum(np.abs(getattr(promise, low)), np.abs(getattr(promise, high)))
     return size
 
 
@@ -475,8 +417,7 @@ def _require(
     if not bad.size:
         return
     row = bad[0]
-    entries: dict[str, Any] = vars(trial.case)
-    numbers = {k: float(x[row]) if np.ndim(x) else x for k, x in entries.items()}
+    numbers = trial.case.each(lambda one: float(one[row]) if np.ndim(one) else one)
     what = promise.format(reach=float(trial.reach[row]), length=float(length[row]))
     raise BrokenPromiseError(
         f"{kind.__name__} does not keep its promise ({trial.name}): {what}. Wrong in "
