@@ -1,5 +1,7 @@
-"""`trace`: rays and a field in, a list of hits out. NumPy in, NumPy out; Dr.Jit stays Dr.Jit, and
-tensors stay tensors."""
+"""`trace`: rays and a field in, a list of hits out.
+
+NumPy in, NumPy out; Dr.Jit stays Dr.Jit, and tensors stay tensors.
+"""
 
 from __future__ import annotations
 

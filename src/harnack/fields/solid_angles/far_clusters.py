@@ -1,5 +1,4 @@
-"""Sums over a tree of dipoles: far clusters as multipoles, the primitives of near leaves one by
-one.
+"""Sums over a tree of dipoles: far clusters as multipoles, near primitives one by one.
 
 - `walk_clusters`: visits a tree so that far clusters are taken as a whole.
 - `Treecode`: the sums over such a tree; what triangles and points share. The caller adds the
