@@ -1,4 +1,7 @@
-"""Arithmetic of functions along a path: numbers that carry proved ranges. No fields, no proofs."""
+"""Arithmetic of functions along a path: numbers that carry proved ranges.
+
+Intervals, jets, parabolas and affine forms; formulas are written once and evaluated in any of them.
+"""
 
 from __future__ import annotations
 

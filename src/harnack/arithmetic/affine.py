@@ -1,8 +1,8 @@
-"""Revised affine arithmetic along a path: a line and an error that is constant.
+"""Revised affine arithmetic along a path: a line and a constant bound of the error.
 
-A function of 0 <= s <= h is c + l e + r, with e = 2s/h - 1 and |r| <= error. Sums keep what is
-linear in s, products and functions put the rest into the error. Unlike `Parabolas` it is not exact
-at s = 0, so a ray is cut into smaller parts where it proves nothing.
+A function of 0 <= s <= h is c + l e + r, with e = 2s/h - 1 and |r| <= error. Sums are exact;
+products and functions put what is not linear in s into the error. Unlike `Parabolas` it is not
+exact at s = 0, so the march tries shorter lengths where it proves nothing.
 
 Source: Vu, Sam-Haroud and Faltings 2009; Fryazinov, Pasko and Comninos 2010.
 """
@@ -49,7 +49,7 @@ class Affine(Operators):
 
     @property
     def range(self) -> Interval:
-        """Where the function stays."""
+        """The range of the function."""
         room = dr.abs(self.slope) + self.error
         slack = _slack(dr.abs(self.center) + room)
         return Interval(self.center - room - slack, self.center + room + slack)
@@ -81,7 +81,7 @@ class Affine(Operators):
         return Affine(c * d + both, c * m + d * l, error + _slack(size))
 
     def apply(self, function: Function) -> Affine:
-        """phi(f), by the best of three: its chord, its mean slope, its range.
+        """phi(f), by the best of three lines: its chord, its mean slope, a constant.
 
         Proof. On a range [x, y] of width w, phi lies above its chord by -phi''(z) (t - x)(y - t)/2
         for some z, so by at most -min phi'' w^2/8 and at least -max phi'' w^2/8, or 0. With D the
@@ -121,7 +121,7 @@ class Affine(Operators):
         return Affine(center + moved, rate * self.slope, error + dr.abs(rate) * self.error + slack)
 
     def larger(self, other: Any) -> Affine:
-        """max(f, g) = g + max(f - g, 0); the one that is surely larger where there is one."""
+        """max(f, g) = g + max(f - g, 0); f or g itself where it is proved to be the larger."""
         difference = self.sum(-other)
         x = difference.range
         one, two = x.low >= 0, x.high <= 0
@@ -148,7 +148,7 @@ def _entries(x: Affine) -> tuple[Real, Real, Real]:
 
 
 def _better(one: tuple[Real, Real, Real], two: tuple[Real, Real, Real]) -> tuple[Real, Real, Real]:
-    """The one with the smaller error; what is no number gives way."""
+    """The one with the smaller error; if one is not finite, the other."""
     known = dr.isfinite(one[0]) & dr.isfinite(one[1]) & dr.isfinite(one[2])
     other = dr.isfinite(two[0]) & dr.isfinite(two[1]) & dr.isfinite(two[2])
     first = known & ((one[2] <= two[2]) | ~other)
@@ -157,6 +157,6 @@ def _better(one: tuple[Real, Real, Real], two: tuple[Real, Real, Real]) -> tuple
 
 
 def _slack(size: Real) -> Real:
-    """What rounding and underflow may have done to a sum of numbers of this size together."""
+    """A bound of the rounding and underflow in a sum of numbers with this sum of sizes."""
     smallest = float(dr.smallest(cast("Any", type(size))))
     return dr.fma(size, _ROUNDINGS * unit_of(size), _ROUNDINGS * smallest)

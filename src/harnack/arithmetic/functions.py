@@ -1,10 +1,8 @@
-"""The usual functions: their ranges, and those of their derivatives, on intervals.
+"""Elementary functions: their ranges, and those of their first two derivatives, on intervals.
 
-One table entry serves every arithmetic: a `Function` tells what it is of plain numbers and where
-it and its first two derivatives stay on an interval. `sin(x)` and its like take numbers of any
+One `Function` serves every arithmetic: it knows the function for plain numbers, and the ranges of
+it and of its first two derivatives on an interval. `sin(x)` and its like take numbers of any
 arithmetic, Dr.Jit and NumPy arrays, and Python numbers.
-
-Powers that are cut off at zero: max(x, 0)^n, the kernels of compact blobs.
 """
 
 from __future__ import annotations
@@ -34,8 +32,8 @@ class Function:
     """A function of one number.
 
     ranges: of it, its derivative and its second derivative on an interval. Where the interval
-        holds a pole, or a point at which the function is not defined, the derivatives may be any
-        number: f(s) = f(0) + s f'(r) does not hold across such a point.
+        contains a pole, or a point at which the function is not defined, the ranges of derivatives
+        are all numbers: f(s) = f(0) + s f'(r) does not hold across such a point.
     plain: the function of Dr.Jit numbers.
     numpy: the function of NumPy arrays and Python numbers.
     """
@@ -55,7 +53,7 @@ class Function:
 
 
 def _rising(f: Callable[[Any], Any], x: Interval) -> Interval:
-    """The range of a function that rises and is right within `_UNITS`."""
+    """The range of an increasing function that is accurate to `_UNITS`."""
     low = f(x.low)
     high = low if x.low is x.high else f(x.high)
     return Interval(low, high).widened(_UNITS * unit_of(x.low), _tiny(x))
@@ -70,7 +68,7 @@ def _two(x: Interval) -> Interval:
 
 
 def _where(defined: Mask, ranges: Ranges) -> Ranges:
-    """The ranges, of which the derivatives are known only where the function is defined."""
+    """The ranges; where the function is not defined, those of derivatives are all numbers."""
     value, *rest = ranges
     slope, second = (
         Interval(
@@ -89,8 +87,8 @@ def _exp(x: Interval) -> Ranges:
 
 
 def _exponential(f: Callable[[Any], Any], x: Interval) -> Interval:
-    """The range of a rising function made of 2^y, whose exponent is rounded: on CUDA it is off by
-    |x| units besides."""
+    """The range of an increasing function computed from 2^y, whose exponent is rounded: on CUDA it
+    is off by |x| units more."""
 
     def end(v: Real, sign: int) -> Real:
         result = f(v)
@@ -122,7 +120,7 @@ def _half(x: Interval) -> Interval:
 
 
 def _positive_reciprocal(x: Interval) -> Interval:
-    """1/x of numbers >= 0; infinite above where 0 is one of them."""
+    """1/x for numbers >= 0; its upper end is infinite if 0 is one of them."""
     above = Interval(x.high, x.high).reciprocal()
     return Interval(fmax(above.low, 0), Interval(fmax(x.low, 0), x.high).reciprocal().high)
 
@@ -147,10 +145,11 @@ def _sine_and_cosine(x: Interval) -> tuple[Interval, Interval]:
     """Ranges of sin and cos.
 
     Proof. Both are monotone between the multiples of pi/2 at which they are 1 or -1: the range is
-    that of the ends, and of such points inside. Which are inside is asked of an interval widened by
-    the rounding of the question; if one is counted wrongly, it is that near to an end. Beyond
-    `largest_angle` sines are not known: on pieces the range is [-1, 1] there; at a point it has no
-    ends, as a value is half way between them, and 0 would look like one.
+    given by the ends, and by such points inside. Whether one is inside is tested for an interval
+    widened by the rounding of the test; if one is counted wrongly, it is that near to an end.
+    Beyond `largest_angle` sines are not known: on pieces the range is [-1, 1] there; at a point it
+    is all numbers, as the value at a point is taken half way between the ends, and 0 would look
+    like one.
     """
     unit, most = unit_of(x.low), largest_angle(type(x.low))
     s0, c0 = sincos(x.low)
@@ -204,14 +203,14 @@ def _tan(x: Interval) -> Ranges:
 
 
 def _hyperbolic_tangent(x: Real) -> Real:
-    """On CUDA, Dr.Jit's own is right to 11 bits alone. From 20 on it is 1 to rounding."""
+    """tanh; Dr.Jit's own is accurate to only 11 bits on CUDA. From 20 on it is 1 up to rounding."""
     x = clamp(x, -20.0, 20.0)
     return dr.sinh(x) / dr.cosh(x)
 
 
 def _tanh(x: Interval) -> Ranges:
     t = _rising(_hyperbolic_tangent, x).widened(_UNITS * unit_of(x.low))
-    high = dr.select(x.high == x.high, fmin(t.high, 1), 1)  # an end that is no number
+    high = dr.select(x.high == x.high, fmin(t.high, 1), 1)  # also if an end is NaN
     t = Interval(fmax(t.low, -1), high)
     slope = ONE - t.square()
     slope = Interval(fmax(slope.low, 0), slope.high)
@@ -254,7 +253,7 @@ def _cosh_range(x: Interval) -> Interval:
 
 
 def _abs(x: Interval) -> Ranges:
-    """|x|: its second derivative is an infinite impulse at 0, upwards."""
+    """|x|: its second derivative at 0 is a Dirac impulse, upwards."""
     positive, negative = x.low > 0, x.high < 0
     slope = Interval(select(positive, 1, -1, x.low), select(negative, -1, 1, x.low))
     kink = select(positive | negative, 0, dr.inf, x.low)
@@ -275,7 +274,7 @@ def integer_power(x: Interval, n: int) -> Interval:
         low, high = x.low, x.high
     a = _repeated(low, n)
     b = a if low is high else _repeated(high, n)
-    # Every product is off by half a unit, in the exact power of a number in between.
+    # Every product is off by at most half a unit.
     result = Interval(a, b).widened(n * unit_of(x.low), n * _tiny(x))
     return Interval(fmax(result.low, 0), result.high) if n % 2 == 0 else result
 
@@ -291,7 +290,7 @@ def _repeated(x: Real, n: int) -> Real:
 
 
 def power(n: float) -> Function:
-    """x -> x^n. An exponent that is no integer is for x >= 0."""
+    """x -> x^n; for x >= 0 if n is no integer."""
     if float(n).is_integer():
         k = int(n)
         if k < 0:
@@ -334,9 +333,9 @@ def _numpy_power(n: float) -> Callable[[Any], Any]:
 
 
 def _real_power(x: Interval, n: float) -> Interval:
-    """The range of x^n for x >= 0 and any n: exp2(n log2 x), so off by n log2(x) units and some.
+    """The range of x^n for x >= 0 and any n: exp2(n log2 x), so off by n log2(x) units and a few.
 
-    What is no normal number counts as the range from 0 to the smallest of those.
+    An x below the smallest normal number may be any number from 0 to that.
     """
     least = fmax(x.low, 0)
     most = fmax(_tiny(x), x.high) if x.high is not x.low else fmax(_tiny(x), least)
@@ -371,10 +370,11 @@ absolute = Function("abs", _abs, dr.abs, np.abs)
 
 @dataclass(frozen=True)
 class ClippedPower(Function):
-    """x -> max(x, 0)^n, n >= 1: convex, and n - 1 times continuously differentiable.
+    """x -> max(x, 0)^n, n >= 1: convex, and n - 1 times continuously differentiable. A kernel of
+    blobs with compact support.
 
     Written as maximum(x, 0)**n its second derivative would have no bound, since that of the maximum
-    has none. Arithmetics may make use of where it is zero.
+    has none. An arithmetic may use that it is 0 for x <= 0.
     """
 
     exponent: int = 1

@@ -1,8 +1,8 @@
 """Intervals: ranges of real numbers, rounded outwards.
 
-Every operation gives an interval that holds the result for all numbers of its operands, in the
-rounded arithmetic of the backend too. That is what makes ranges of a function, and of its
-derivatives, proofs (Moore 1966).
+Every operation gives an interval that contains the result for all numbers of its operands, in the
+rounded arithmetic of the backend too. So the ranges of a function and of its derivatives are proved
+(Moore 1966).
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ Number: TypeAlias = "Interval | float"
 class Interval:
     """All numbers from `low` to `high`, Dr.Jit numbers of one kind or Python floats.
 
-    An end that is not a number stands for an infinite one: nothing is known on that side. Python
-    floats are constants known while a kernel is recorded; with them, operations are left out.
+    An end that is NaN stands for an infinite one: nothing is known on that side. Python floats are
+    constants known while a kernel is recorded, so that some operations with them can be left out.
 
-    is_single: whether Python floats stand for numbers of single precision, so that they must be
-        such numbers themselves: they would be rounded, inwards perhaps, where they meet an array.
+    is_single: whether Python floats must be numbers of single precision, as they will meet arrays
+        of such numbers: they would be rounded there, perhaps inwards.
 
     Proof of the rounding. An operation of the backend is off by half a unit in the last place, or
     by less than the smallest normal number where the result is no normal number. Each end is moved
@@ -50,7 +50,8 @@ class Interval:
 
     @classmethod
     def constant(cls, x: float, like: Any) -> Interval:
-        """A Python number x, as far as numbers of the type `like` hold it."""
+        """The narrowest interval around a Python number x whose ends are numbers of the type
+        `like`."""
         if dr.is_array_v(like) and dr.type_v(like) == dr.VarType.Float32:
             return cls(*_single(float(x), float(x)), is_single=True)
         return cls(float(x), float(x))
@@ -74,7 +75,7 @@ class Interval:
 
     @property
     def radius(self) -> Real:
-        """How far numbers of the interval are from `middle` at most."""
+        """The largest distance of a number of the interval from `middle`."""
         if self.low is self.high:
             return 0.0
         return _up(0.5 * self.high - 0.5 * self.low)
@@ -94,14 +95,14 @@ class Interval:
         return ~((x < self.low) | (x > self.high))
 
     def hull(self, other: Interval) -> Interval:
-        """The smallest interval that holds both."""
+        """The smallest interval that contains both."""
         low = -_unknown_or_larger(-self.low, -other.low)
         high = _unknown_or_larger(self.high, other.high)
         return Interval(low, high, self.is_single or other.is_single)
 
     def meet(self, other: Interval) -> Interval:
-        """What both hold, of two that are known to hold a common number; an end that is not a
-        number gives way."""
+        """The intersection of two that are known to have a common number; where an end is NaN, that
+        of the other."""
         return Interval(
             _defined_larger(self.low, other.low),
             _defined_smaller(self.high, other.high),
@@ -148,14 +149,14 @@ class Interval:
         low = high = ends[0]
         for one in ends[1:]:
             low, high = _smaller(low, one), _larger(high, one)
-        # 0 times infinity is not a number: the smaller of others may then be wrong.
+        # 0 times infinity is NaN: the smallest of the other ends may then be wrong.
         known = _all_defined(ends)
         if known is not None:
             low, high = dr.select(known, low, -dr.inf), dr.select(known, high, dr.inf)
         return Interval(_down(_lost(low, -1)), _up(_lost(high, 1)))
 
     def _times(self, constant: Interval) -> Interval:
-        """The product with an interval of Python floats that hold no zero inside."""
+        """The product with an interval of Python floats."""
         a, b = cast("tuple[float, float]", (constant.low, constant.high))
         if a == b == 1.0:
             return self
@@ -166,7 +167,7 @@ class Interval:
             return self._outwards(-most, most, constant)
         if b <= 0.0:
             return -self._times(Interval(-b, -a, constant.is_single))
-        if a == b <= 1.0 and np.frexp(a)[0] == 0.5:  # exact, but for what underflows
+        if a == b <= 1.0 and np.frexp(a)[0] == 0.5:  # a power of two: exact, but for underflow
             low, high = _lost(self.low * a, -1), _lost(self.high * a, 1)
             return Interval(low, high, self.is_single or constant.is_single)
         low = self.low * a if a == b else _smaller(self.low * a, self.low * b)
@@ -174,7 +175,7 @@ class Interval:
         return self._outwards(_lost(low, -1), _lost(high, 1), constant)
 
     def square(self) -> Interval:
-        """The squares."""
+        """The range of the squares."""
         low, high = self.smallest, self.largest
         if self.low is self.high:
             low = high
@@ -194,7 +195,7 @@ class Interval:
         return Interval(dr.select(has_zero, -dr.inf, low), dr.select(has_zero, dr.inf, high))
 
     def _outwards(self, low: Real, high: Real, other: Interval | None = None) -> Interval:
-        """The result of an operation of this and another one, its ends moved outwards."""
+        """The result of an operation on this and another interval, its ends moved outwards."""
         single = self.is_single or (other is not None and other.is_single)
         low, high = _down(low), _up(high)
         if single and isinstance(low, float) and isinstance(high, float):
@@ -202,8 +203,8 @@ class Interval:
         return Interval(low, high, single)
 
     def widened(self, relative: float, absolute: float = 0.0) -> Interval:
-        """With each end moved outwards by a part of itself and an absolute length, for functions
-        of the backend that are accurate to so much."""
+        """The interval with each end moved outwards by a fraction of itself and by an absolute
+        length: for functions of the backend that are accurate to so much."""
         low, high = self.low, self.high
         return Interval(
             _down(low - relative * _absolute(low) - absolute),
@@ -221,30 +222,30 @@ def unit_of(x: Real) -> float:
 
 
 def select(condition: Mask, a: Real, b: Real, like: Real) -> Real:
-    """a or b, numbers of the kind of `like`: of two Python numbers Dr.Jit itself makes integers or
-    numbers of single precision."""
+    """a or b as numbers of the type of `like`: from two Python numbers Dr.Jit would make integers
+    or numbers of single precision."""
     kind = cast("Any", type(like))
     return dr.select(condition, kind(a) if dr.is_array_v(kind) else a, b)
 
 
 def _down(x: Real, units: float = 1.0) -> Real:
-    """A number below x, by a whole unit in the last place at least, or so many."""
+    """A number below x by at least so many units in the last place."""
     return dr.fma(dr.abs(x), -units * unit_of(x), x)
 
 
 def _up(x: Real, units: float = 1.0) -> Real:
-    """A number above x, by a whole unit in the last place at least, or so many."""
+    """A number above x by at least so many units in the last place."""
     return dr.fma(dr.abs(x), units * unit_of(x), x)
 
 
 def _lost(x: Real, sign: int) -> Real:
-    """x, moved by what underflow may have taken from a product."""
+    """A product x, moved outwards by what underflow may have cost it."""
     kind = cast("Any", type(x))
     return x + sign * float(dr.smallest(kind)) if dr.is_array_v(kind) else x
 
 
 def _single(low: float, high: float) -> tuple[float, float]:
-    """The numbers of single precision that hold both between them."""
+    """The nearest numbers of single precision, at most `low` and at least `high`."""
     with np.errstate(over="ignore"):
         a, b = np.float32(low), np.float32(high)
     if float(a) > low:
@@ -267,14 +268,14 @@ def _larger(a: Real, b: Real) -> Real:
 
 
 def _unknown_or_larger(a: Real, b: Real) -> Real:
-    """The larger; not a number where either is none."""
+    """The larger; NaN where either is."""
     if isinstance(a, float) and isinstance(b, float):
         return math.nan if a != a or b != b else max(a, b)
     return dr.select((a > b) | (a != a), a, b)
 
 
 def _defined_smaller(a: Real, b: Real) -> Real:
-    """The smaller; a where b is not a number, and b where a is not."""
+    """The smaller; a where b is NaN, and b where a is."""
     return dr.select((a <= b) | (b != b), a, b)
 
 

@@ -1,14 +1,8 @@
-"""Jets: ranges of a function and of its first two derivatives, over a point or a piece of a path.
+"""A function with its derivatives, as one number: `Jet`, with proved ranges, and `Dual`, without.
 
-Interval arithmetic of value, first and second derivatives at once (Moore 1966; the Taylor forms of
-Aydinlilar and Zanni 2023, section 6.1, are made of it). A formula that is given jets as its
-coordinates answers with the jet of its value. So one formula serves for values, gradients and
-Hessians at a point, with proved bounds of rounding, and for the ranges that steps are proved from.
-
-Dual numbers: values with their gradients, as plain numbers. No ranges, so nothing is proved.
-
-Where a formula has ties, as max(x, 0) has at x = 0, ranges of derivatives have all slopes nearby.
-A dual number has the slopes of one side, as each comparison is decided by the values.
+A formula that is given jets as its coordinates returns the jet of its value. So one formula serves
+for values, gradients and Hessians at a point, with proved bounds of rounding, and for the ranges
+that steps are proved from.
 """
 
 from __future__ import annotations
@@ -32,18 +26,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Jet(Operators):
-    """Ranges of a function of n variables on a box of them; mostly n = 1, the length along a path,
-    or n = 3 at a point.
+    """Ranges of a function of n variables and of its derivatives on a box of them; mostly n = 1,
+    the length along a path, or n = 3 at a point.
+
+    Interval arithmetic of value, first and second derivatives at once (Moore 1966; the Taylor forms
+    of Aydinlilar and Zanni 2023, section 6.1, are made of it).
 
     value: of the function.
     first: (n,) of the partial derivatives.
     second: (n (n+1) / 2,) of the second derivatives, rows of the upper triangle; empty if they are
         not asked for. In the sense of distributions: at a kink, where the first derivative jumps,
         the range has no upper or no lower end.
-    start: with n = 1, the jet at the start of the piece, from which ranges are narrowed; None where
-        the jet is that of a point.
-    width: the length of the piece; 0 at a point. A number of the backend, so that jets whose ranges
-        are Python numbers know of which kind those are.
+    start: with n = 1, the jet at the start of the piece, from which ranges are narrowed; None for
+        the jet at a point.
+    width: the length of the piece; 0 at a point. A number of the backend, which tells the precision
+        where all ranges are Python numbers.
     """
 
     value: Interval
@@ -99,7 +96,7 @@ class Jet(Operators):
         return Jet(value, *zeros, start, self.width)
 
     def kind(self) -> Any:
-        """A number of the kind in use; a Python number where none is known."""
+        """A number of the backend's type in use; a Python number if there is none."""
         for jet in (self.value, *self.first):
             if dr.is_array_v(cast("Any", type(jet.low))):
                 return jet.low
@@ -124,7 +121,7 @@ class Jet(Operators):
         )
 
     def product(self, other: Jet) -> Jet:
-        if other is self:  # a square: ranges of products know nothing of that
+        if other is self:  # a square, whose range is sharper than that of a product
             return self.apply(power(2))
         x, y = self.value, other.value
         first = tuple(x * v + y * u for u, v in zip(self.first, other.first, strict=True))
@@ -151,7 +148,7 @@ class Jet(Operators):
 
     def __pow__(self, exponent: Any) -> Jet:
         if isinstance(exponent, Jet):
-            if self.value.is_static:  # such a number does not know of which kind it is
+            if self.value.is_static:  # Python numbers: take the type from the exponent
                 base = exponent._constant(self.dynamic_value(exponent.kind()))
                 return (base.apply(log) * exponent).apply(exp)
             return (self.apply(log) * exponent).apply(exp)
@@ -173,11 +170,12 @@ class Jet(Operators):
         return jet if self.start is None else jet.anchored(self.start.apply(function), self.width)
 
     def larger(self, other: Jet) -> Jet:
-        """The larger of two functions at each place.
+        """The larger of two functions at each point.
 
-        Proof. Where one is larger everywhere, it is the maximum. Elsewhere the derivative is one of
-        the two, the second derivative too, but for the places where they cross: there the first
-        derivative jumps up, which has no upper bound.
+        Proof. If one is larger everywhere, it is the maximum. Else each derivative is that of one
+        of
+        the two, except where they cross: there the first derivative jumps up, so that the second
+        one has no upper bound.
         """
         x, y = self.dynamic_value(), other.dynamic_value(self.kind())
         left, right = x.low > y.high, y.low > x.high
@@ -207,7 +205,7 @@ class Jet(Operators):
         return jet.anchored(self.start.maximum(other.start), self.width)
 
     def selected(self, condition: Mask, other: Jet) -> Jet:
-        """This one where the condition holds, elsewhere the other; each lane is all of one."""
+        """This one on lanes where the condition holds, the other on all others."""
         kind = self.kind()
 
         def chosen(u: Interval, v: Interval) -> Interval:
@@ -228,7 +226,7 @@ class Jet(Operators):
         )
 
     def dynamic_value(self, like: Any = None) -> Interval:
-        """The value as numbers of the backend."""
+        """The range of the value as numbers of the backend."""
         if not self.value.is_static:
             return self.value
         kind = cast("Any", type(self.kind() if like is None else like))
@@ -244,7 +242,7 @@ class Jet(Operators):
         """The same, narrowed by what is known at the start of the piece.
 
         Proof. f(s) = f(0) + s f'(r) for some r in between, so f stays within f(0) + [0, w] f'; the
-        same holds of f' and f'', also where f' jumps by at most what f'' allows.
+        same holds for f' and f'', also where f' jumps, by at most what f'' allows.
         """
         if start is None:
             return self
@@ -258,10 +256,9 @@ class Jet(Operators):
 
 
 def spanned(slope: Interval, width: Real) -> Interval:
-    """s times numbers of an interval, for 0 <= s <= width.
+    """The range of s times numbers of an interval, for 0 <= s <= width.
 
-    Where the lower end overflows upwards, or the upper end downwards, it is no number, and 0 is
-    right.
+    An end that is NaN, as the product overflowed to the other side, becomes 0, which is right.
     """
     if slope.is_zero:
         return ZERO
@@ -281,7 +278,12 @@ _Partials = tuple[Any, Any, Any]
 
 @dataclass(frozen=True, eq=False)
 class Dual(Operators):
-    """A function at a point: its value, and its partial derivatives in x, y and z."""
+    """A function at a point: its value and partial derivatives, as plain numbers. No ranges, so
+    nothing is proved.
+
+    Where a formula has ties, as max(x, 0) has at x = 0, ranges of derivatives contain all slopes
+    nearby. A dual number has the slopes of one side, as each comparison is decided by the values.
+    """
 
     value: Real
     first: _Partials
@@ -309,8 +311,8 @@ class Dual(Operators):
         return Dual(-self.value, _each(operator.neg, self.first))
 
     def apply(self, function: Function) -> Dual:
-        """A function of this one. Where this one is constant, so is that, also at a pole of the
-        slope, as that of the root in a norm of zeros."""
+        """A function of this one. Where this one is constant, so is the result, also where the
+        function's slope is infinite, as that of the root in a norm of zeros."""
         slope = function.ranges(Interval.exactly(self.value))[1].middle
         real = cast("Any", type(self.value))
 

@@ -1,9 +1,7 @@
-"""Functions of several numbers: the larger, the smaller, and norms (Hart 1996, appendix B).
+"""Functions of several numbers: maxima, minima, norms and blends (Hart 1996, appendix B).
 
 They take jets, numbers of the other arithmetics, Dr.Jit and NumPy arrays and Python numbers, also
-mixed.
-
-Blends: how two or more distances are joined, with a sharp or with a rounded edge.
+mixed. Blends combine distances, with a sharp or with a rounded edge.
 """
 
 from __future__ import annotations
@@ -40,7 +38,7 @@ def _folded(name: str, values: tuple[Any, ...]) -> Any:
     if len(values) < 2:
         raise TypeError(f"{name} compares two numbers or more, and {len(values)} was given")
     if any(isinstance(one, Operators) for one in values):
-        # Jets and their like first, so that one of them takes each of the others.
+        # Jets and their like first: their methods accept numbers of the other kinds.
         ordered = sorted(values, key=lambda one: not isinstance(one, Operators))
         return functools.reduce(lambda a, b: getattr(a, name)(b), ordered)
     of_arrays, of_others = _PAIRS[name]
@@ -88,7 +86,7 @@ def norm(*values: Any, p: float = 2.0) -> Any:
     if not jets and any(isinstance(one, Operators) for one in values):
         sizes = [one if p == 2.0 else absolute(one) for one in values]
         powers = [one.apply(power(p)) if isinstance(one, Operators) else one**p for one in sizes]
-        # One of them first that takes numbers of other kinds.
+        # First one whose operators accept numbers of the other kinds.
         powers.sort(key=lambda one: not isinstance(one, Operators))
         total = functools.reduce(lambda a, b: a + b, powers)
         return total.apply(sqrt if p == 2.0 else power(1 / p))
@@ -99,7 +97,7 @@ def norm(*values: Any, p: float = 2.0) -> Any:
 
 
 def _plain_norm(values: tuple[Any, ...], p: float) -> Any:
-    """Of arrays and numbers, without a slope that is not finite at 0."""
+    """The norm of arrays and numbers, in a form whose derivative at 0 is finite."""
     if not any(dr.is_array_v(cast("Any", type(one))) for one in values):
         sizes = np.array(np.broadcast_arrays(*(np.abs(one) for one in values)))
         most = sizes.max(axis=0)
@@ -213,14 +211,14 @@ def _signed_power(x: Interval, q: float) -> Interval:
 
 
 def _one_over(length: Interval) -> Interval:
-    """1/N of N >= 0; no upper end where N may be 0."""
+    """1/N for N >= 0; infinite above where N may be 0."""
     over = reciprocal.ranges(length)[0]
     least = Interval.exactly(length.high).reciprocal()
     return Interval(fmax(least.low, 0), over.high)
 
 
 def _clipped(x: Interval, most: Interval) -> Interval:
-    """What of x is no larger than `most`."""
+    """x cut to the numbers that are no larger in size than `most`."""
     bound = most.high
     return Interval(fmax(x.low, -bound), fmin(x.high, bound))
 
@@ -245,8 +243,9 @@ def _dynamic(x: Interval, like: Any) -> Interval:
 def blend_union(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:
     """The union of {a <= 0} and {b <= 0}, its inner edge filled by a superellipse.
 
-    radius: from where on, in values of a and b, the other surface is felt. power: at least 1; with
-    2 the edge is a circular arc where the surfaces meet at right angles, larger ones are sharper.
+    radius: the blend changes the union where both a and b are less than this.
+    power: at least 1; with 2 the edge is a circular arc where the surfaces meet at right angles,
+        larger ones are sharper.
 
     With g_a = max(0, 1 - a/r) it is r (1 - |(g_a, g_b)|_p); Hart (1996, equation 43) prints the
     root around everything. Where both a and b are at least r it is their minimum. Between the two
@@ -264,7 +263,7 @@ def blend_union(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:
     both = near + maximum(least - radius, 0.0)
     if not isinstance(least, Jet) or not isinstance(both, Jet):
         return both
-    # Where it is known which one it is, the kinks of the other do not matter.
+    # Where only one of the two forms applies, the kinks of the other do not matter.
     far = least - radius
     both = near.selected(far.value.high < 0, both)
     return least.selected(far.value.low > 0, both)
@@ -279,8 +278,8 @@ def corner(*sides: Any) -> Any:
     """The signed distance of the set where all sides are <= 0, if these are signed distances with
     gradients at right angles to each other.
 
-    Proof. Outside, the nearest point is found in each of the directions by itself: the distance is
-    the norm of the positive ones (Pythagoras); inside, the nearest side decides.
+    Proof. Outside, the nearest point is found separately along each of the directions: the distance
+    is the norm of the positive ones (Pythagoras); inside, the nearest side decides.
     """
     most = maximum(*sides)
     outside = norm(*(maximum(one, 0.0) for one in sides))

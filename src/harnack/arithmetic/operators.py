@@ -1,6 +1,6 @@
-"""The operators of numbers of any arithmetic, from sums, products and functions of one number.
+"""Operators that numbers of every arithmetic share, so that any of them can evaluate a formula.
 
-How many operations a kernel for the ranges of a formula has, before it is recorded.
+`operations_of` estimates the size of a formula's kernel before it is recorded.
 """
 
 from __future__ import annotations
@@ -42,28 +42,27 @@ _UFUNCS = {
     "sinh": sinh, "cosh": cosh, "arctan": atan, "arcsin": asin, "arccos": acos,
     "absolute": absolute, "fabs": absolute, "square": power(2),
 }  # fmt: skip
-# With such a number on the left, and with one on the right alone.
+# The method for such a number on the left, and for one on the right only.
 _OPERATORS = {
     "add": ("__add__", "__radd__"), "subtract": ("__sub__", "__rsub__"),
     "multiply": ("__mul__", "__rmul__"), "divide": ("__truediv__", "__rtruediv__"),
     "true_divide": ("__truediv__", "__rtruediv__"), "power": ("__pow__", "__rpow__"),
     "maximum": ("maximum", "maximum"), "minimum": ("minimum", "minimum"),
 }  # fmt: skip
-# What those functions and operators are called in formulas.
+# The names of those functions in formulas.
 _NAMES = "sin, cos, tan, exp, log, sqrt, tanh, atan, asin, acos, sinh, cosh, maximum, minimum, norm"
 
 
 class Operators(abc.ABC):
-    """What `+ - * / **`, abs, NumPy's functions, maximum and minimum are, for numbers that know
-    sums, products, functions of one number, and the larger of two.
+    """`+ - * / **`, abs, NumPy's functions, maximum and minimum, from the sums, products, functions
+    of one number and the larger of two that a subclass defines.
 
-    Formulas are written once, as for `Jet`, and evaluated with any such number.
+    A formula is written once and evaluated with numbers of any subclass, such as `Jet`.
     """
 
     @abc.abstractmethod
     def constant(self, x: float | Real) -> Self:
-        """A number known while a kernel is recorded, or one of the backend, as a constant of the
-        same arithmetic."""
+        """A Python number, or one of the backend, as a constant of this arithmetic."""
 
     @abc.abstractmethod
     def sum(self, other: Any) -> Self: ...
@@ -82,7 +81,7 @@ class Operators(abc.ABC):
     def larger(self, other: Any) -> Self: ...
 
     def _operand(self, other: Any) -> Self | None:
-        """Another operand as a number of this arithmetic; None where it is none."""
+        """Another operand as a number of this arithmetic; None if it is no number."""
         if isinstance(other, type(self)):
             return other
         if dr.is_array_v(cast("Any", type(other))):
@@ -181,7 +180,7 @@ class Operators(abc.ABC):
         return -((-self).larger(-self.of(other)))
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **settings: Any) -> Any:
-        """NumPy's functions and operators, of these numbers."""
+        """NumPy's functions and operators, applied to these numbers."""
         name = ufunc.__name__
         if method == "__call__" and not settings:
             if name in _UFUNCS:
@@ -235,13 +234,16 @@ def exponent_of(n: Any) -> float:
         raise TypeError(f"the exponent of x**n must be a number, not of type {kind}") from None
 
 
-# Measured, for one piece of a path with its sample and slopes.
+# Operations of Dr.Jit, measured for one piece of a path with its sample and slopes.
 _SUM, _PRODUCT, _FUNCTION = 60, 220, 300
 
 
 @dataclass(frozen=True, eq=False)
 class Counted(Operators):
-    """A number that counts operations. tally: of all numbers together, one entry."""
+    """A number that counts operations.
+
+    tally: a list of one entry, the count, which all numbers of a formula share.
+    """
 
     tally: list[int]
 
@@ -278,8 +280,8 @@ class Counted(Operators):
 
 
 def operations_of(formula: Callable[[Any, Any, Any], Any]) -> int:
-    """About how many operations the ranges of a formula of three coordinates take; 0 where it asks
-    for numbers of a kind of its own."""
+    """About how many operations the ranges of a formula of three coordinates take; 0 for a formula
+    that does not accept numbers of this kind."""
     number = Counted([0])
     try:
         formula(number, number, number)

@@ -6,9 +6,9 @@ A number is a function f of the length s along a path, 0 <= s <= h, known by its
 
 Sums, products, functions and maxima of such numbers are such numbers again, so that a formula given
 the coordinates as such numbers proves its own parabolas (Aydinlilar and Zanni 2023, sections 5.2
-and 6.2, appendices B and C). Two things are better than published: functions by chords through the
-value itself, which need no validity interval, and both that and Taylor's formula where one is the
-tighter.
+and 6.2, appendices B and C). Two things improve on the published method: functions are bounded by
+chords through the value itself, which need no validity interval; and the tighter of chords and
+Taylor's formula is used.
 
 Rounding. Coefficients are computed in rounded arithmetic; each result is moved outwards by
 `_ROUNDINGS` units in the last place of the sum of the absolute values of everything added up in
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 Quadratic: TypeAlias = "tuple[Real, Real]"
 
 _ROUNDINGS = 32.0
-# Of the length: where two proofs are compared to choose the tighter.
+# Two bounds are compared at this fraction of the length to choose the tighter.
 _COMPARED_AT = 0.6
 
 
@@ -47,7 +47,7 @@ class Parabolas(Operators):
     value: at s = 0.
     lower, upper: (a, b) of the parabolas a s + b s^2 around f(s) - f(0).
     length: h; the bounds hold for 0 <= s <= h.
-    degree: 1 if the bounds are kept straight: bottom-up linear arithmetic; else 2.
+    degree: 1 if the bounds are lines (bottom-up linear arithmetic), else 2.
     polynomial: the degree of f, at most 2, if it is a polynomial: then the two parabolas differ by
         rounding alone. None for other functions.
     """
@@ -164,7 +164,7 @@ class Parabolas(Operators):
         )
 
     def _product_of_lines(self, other: Parabolas) -> tuple[Quadratic, Quadratic]:
-        """Of two polynomials of degree 1: exact, up to rounding."""
+        """The product of two polynomials of degree 1: exact, up to rounding."""
         a, ra = _middle(self.lower[0], self.upper[0])
         c, rc = _middle(other.lower[0], other.upper[0])
         v, rv, w, rw = *_ends(self.value), *_ends(other.value)
@@ -199,7 +199,7 @@ class Parabolas(Operators):
         if self is other and len(firsts) == 2:  # of a square, two of the four are the same
             pairs = [(firsts[0], firsts[0]), (firsts[0], firsts[1]), (firsts[1], firsts[1])]
         for (a, b, ra, rb), (c, d, rc, rd) in pairs:
-            # Of the derivative by r = s/h, divided by h: c0 + c1 r + c2 r^2 + c3 r^3.
+            # The derivative with respect to r = s/h: c0 + c1 r + c2 r^2 + c3 r^3.
             ah, bh, ch, dh = a * h, b * h * h, c * h, d * h * h
             terms = (
                 (v * ch, w * ah),
@@ -211,7 +211,7 @@ class Parabolas(Operators):
             size = sum(
                 ((k + 1) * dr.abs(one) for k, group in enumerate(terms) for one in group), 0 * h
             )
-            # What the values are not known by, and what the bounds of a polynomial differ by.
+            # The uncertainty of the values, and the difference of the bounds of a polynomial.
             size_f = dr.abs(ah) + 2 * dr.abs(bh)
             size_g = dr.abs(ch) + 2 * dr.abs(dh)
             loose = rv * size_g + rw * size_f
@@ -228,7 +228,7 @@ class Parabolas(Operators):
         )
 
     def _corners(self) -> list[tuple[Real, Real, Real, Real]]:
-        """The bounds as (a, b, 0, 0); one in the middle with radii, if they differ by rounding."""
+        """The two bounds as (a, b, 0, 0); of a polynomial one, (a, b, radius of a, radius of b)."""
         if self.polynomial is None:
             return [(*self.lower, 0.0, 0.0), (*self.upper, 0.0, 0.0)]
         a, ra = _middle(self.lower[0], self.upper[0])
@@ -242,10 +242,10 @@ class Parabolas(Operators):
 
         Chords. With x = f(s) - f(0) between x- and x+, phi(f(0) + x) - phi(f(0)) = m x, where m is
         the slope of a chord from f(0). It lies in the range of phi' and, for convex phi, between
-        the chords to x- and to x+; if only an upper bound is asked for, convex phi needs the two
-        chords themselves, and a lower one the tangent at f(0), as phi lies above it; for concave
-        phi the same upside down. So f's two parabolas times the ends of the range of m bound phi,
-        and one parabola bounds several (`_above`).
+        the slopes of the chords to x- and to x+. For an upper bound of a convex phi the two chords
+        themselves are enough, and for a lower one the tangent at f(0), as phi lies above it; for
+        concave phi the two are exchanged. So f's two parabolas times the ends of the range of m
+        bound phi, and one parabola bounds several (`_above`).
 
         Taylor. It is phi'(f(0)) x + phi''(z) x^2/2, and x^2 lies in s^2 times the squares of the
         slopes of f's own chords.
@@ -305,16 +305,16 @@ class Parabolas(Operators):
         """max(f, g).
 
         Proof. Above: f <= f(0) + F+ and g the same; with V = max(f(0), g(0)) both lie below V
-        + (f(0) - V) + F+, and one parabola bounds both (`_above`), unless one is larger all the
-        way. Below: max(f, g) is at least whichever is the larger at 0.
+        + (f(0) - V) + F+, and one parabola bounds both (`_above`), unless one is larger on the
+        whole length. Below: max(f, g) is at least whichever is the larger at 0.
         """
         f, g = self.value, other.value
         h = self.length
         (f_low, f_high), (g_low, g_high) = self.bounds, other.bounds
-        left, right = (f - g).low >= 0, (g - f).low >= 0  # surely, at 0
+        left, right = (f - g).low >= 0, (g - f).low >= 0  # proved to be larger at 0
         below = _below([f_low, g_low], h)
         below = _where(left, f_low, _where(right, g_low, below))
-        # Surely, all the way: where f's least is above g's largest.
+        # Proved to be larger on the whole length: f's least is above g's largest.
         f_least, f_most = -_peak(_negative(f_low), h), _peak(f_high, h)
         g_least, g_most = -_peak(_negative(g_low), h), _peak(g_high, h)
         always_f = (f - g).low + _rounded(f_least - g_most, -1, dr.abs(f_least) + g_most) >= 0
@@ -327,17 +327,16 @@ class Parabolas(Operators):
         return self._made(value, below, above)
 
     def _clipped_power(self, function: ClippedPower) -> Parabolas:
-        """max(f, 0)^n of a polynomial, where it is not zero.
+        """max(f, 0)^n for a polynomial f.
 
-        Proof. If f = v + a s + b s^2 bends down, f > 0 on one interval [s0, s1] of [0, h] at most.
+        Proof. If f = v + a s + b s^2 is concave, f > 0 on at most one interval [s0, s1] of [0, h].
         There f^n is a product, whose derivative lies between two lines. Elsewhere the derivative is
         0. A line above the first, raised to at least 0 at both ends of [0, h], is above both; its
         integral is the bound. Rounding may put s0 and s1 where f is as large as r, a few
         units of |v| + |a| h + |b| h^2: there the derivative is at most n r^(n-1) (|a| + 2 |b| h).
-        Where f bends up, the interval is [0, h] if f > 0 there and the bounds are those of a convex
-        function else.
+        Where f is convex, the general bounds of `apply` are used.
 
-        Source: Aydinlilar and Zanni 2023, section 6.2.1, with the extension that holds.
+        Source: Aydinlilar and Zanni 2023, section 6.2.1, with a corrected extension to [0, h].
         """
         h = self.length
         (a, ra), (b, rb) = (_middle(self.lower[k], self.upper[k]) for k in range(2))
@@ -387,7 +386,8 @@ class Parabolas(Operators):
     def _extended(
         self, start: Real, length: Real, is_cut: Any, tail: Real
     ) -> tuple[Quadratic, Quadratic]:
-        """Bounds of a function that is this one from `start` on and elsewhere constant."""
+        """Bounds, on all of [0, length], of a function that is this one on an interval that begins
+        at `start`, and constant elsewhere."""
         made: list[Quadratic] = []
         for sign, (a, b) in ((-1, self.lower), (1, self.upper)):
             at_start = a - 2 * b * start
@@ -424,9 +424,9 @@ class Parabolas(Operators):
 def _lines_around(c0: Real, c1: Real, c2: Real, c3: Real) -> tuple[Real, Real, Real, Real]:
     """Lines below and above c0 + c1 r + c2 r^2 + c3 r^3 on [0, 1]: their values at 0 and 1.
 
-    Proof. On either side of its inflection the cubic is convex or concave: between a chord and the
-    tangent at the nearer end to 0. The line through the larger values of two lines at 0 and 1
-    is above both. A bend that is taken for the wrong sign is as small as its rounding.
+    Proof. On either side of its inflection the cubic is convex or concave, so it lies between a
+    chord and the tangent at the end nearer to 0. The line through the larger values of two lines at
+    0 and 1 is above both. A second derivative whose sign is mistaken is as small as its rounding.
     """
     turn = -c2 / (3 * c3)
     two = (turn > 0) & (turn < 1)
@@ -452,8 +452,8 @@ def _lines_around(c0: Real, c1: Real, c2: Real, c3: Real) -> tuple[Real, Real, R
 
 
 def _straight(lower: Quadratic, upper: Quadratic, h: Real) -> tuple[Quadratic, Quadratic]:
-    """Lines below and above two parabolas: one through 0 lies between the lines of its slope at 0
-    and of its chord to h."""
+    """Lines below and above two parabolas: a parabola through 0 lies between its tangent at 0 and
+    its chord to h."""
     (a, b), (c, d) = lower, upper
     if _is_zero(b) and _is_zero(d):
         return lower, upper
@@ -463,7 +463,7 @@ def _straight(lower: Quadratic, upper: Quadratic, h: Real) -> tuple[Quadratic, Q
 
 
 def _integral(at_start: Real, at_end: Real, length: Real) -> Quadratic:
-    """The parabola with a straight derivative, given h times that derivative at 0 and at h."""
+    """The parabola through 0 whose derivative, times h, has these values at 0 and at h."""
     there = length > 0
     a = dr.select(there, at_start / length, 0)
     b = dr.select(there, (at_end - at_start) / (2 * length * length), 0)
@@ -498,8 +498,7 @@ def _below(several: list[Quadratic], length: Real) -> Quadratic:
 
 
 def _tighter(first: Quadratic, second: Quadratic, length: Real, sign: int) -> Quadratic:
-    """Of two bounds on one side, the nearer at a part of the length; one that is no number gives
-    way."""
+    """The tighter of two bounds on one side, compared at one point; if one is NaN, the other."""
     r = _COMPARED_AT * length
     one, two = (sign * r * (a + b * r) for a, b in (first, second))
     return _where((one <= two) | ~dr.isfinite(two), first, second)
@@ -552,7 +551,7 @@ def _ends(x: Interval) -> tuple[Real, Real]:
 
 
 def _radius(x: Interval) -> Real:
-    """How far numbers of an interval are from its middle, with the rounding of the middle."""
+    """How far numbers of an interval are from its middle, the rounding of the middle included."""
     if x.low is x.high or x.is_zero:
         return 0.0
     radius = x.radius
@@ -573,12 +572,12 @@ def _is_zero(x: Real) -> bool:
 
 
 def _rounded(x: Real, sign: int, size: Real) -> Real:
-    """A number above (sign 1) or below one that was computed from numbers of a size."""
+    """x, computed from numbers of that size, moved up (sign 1) or down by its rounding."""
     return x + sign * _slack(dr.abs(x) + size)
 
 
 def _slack(size: Real) -> Real:
-    """What rounding and underflow may have done to a sum of numbers of this size together."""
+    """A bound of the rounding and underflow in a sum of numbers with this sum of sizes."""
     if isinstance(size, float):
         assert size == 0.0
         return 0.0
@@ -587,7 +586,7 @@ def _slack(size: Real) -> Real:
 
 
 def _most(*numbers: Real) -> Real:
-    """The largest; infinite if one is not a number."""
+    """The largest; infinite if one is NaN."""
     largest, total = numbers[0], numbers[0]
     for one in numbers[1:]:
         largest, total = fmax(largest, one), total + one

@@ -1,6 +1,6 @@
-"""Enclosures: what is proved about f along a path. One proof a file; none knows a field by name.
+"""Enclosures: what is proved about f along a path. None of them knows a field by name.
 
-What all proofs share has its names here; a proof of its own is a name of `harnack` alone, which
+This package exports what all proofs share. The proofs themselves are names of `harnack`, which
 `harnack/__init__.pyi` lists.
 """
 

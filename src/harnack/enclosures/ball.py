@@ -1,14 +1,12 @@
-"""The largest length that a ball proves free, found from the safe side.
+"""What proofs on balls share: the solver for the proved length, and `Ball`, for harmonic functions.
 
-Every ball of this room proves that f meets no level at distance q R as long as
+Every proof on a ball B(p, R) shows that f meets no level at distance q R as long as
 
     q k(q) <= gap,
 
-with a k that has no poles on [0, 1] and a dimensionless gap: nothing large is ever subtracted,
-and an answer is accurate relative to itself. Near a surface the gap is tiny, and an answer found
-to an absolute accuracy would stall the march.
-
-Enclosures by harmonic balls: what `classic`, `slope` and `caps` prove from.
+with a k that has no poles on [0, 1] and a dimensionless gap. `largest_covered` finds the largest
+such q from the safe side: nothing large is ever subtracted, and q is accurate relative to itself.
+Near a surface the gap is tiny, and a q found to an absolute accuracy would stall the march.
 """
 
 from __future__ import annotations
@@ -28,15 +26,16 @@ if TYPE_CHECKING:
 
     from harnack.backend import Mask, Real
 
-# Answers are shortened by this much, for the roundings of the two sides of the comparison.
+# Lengths are multiplied by this, to cover the roundings of the two sides of the comparison.
 PULL_BACK = 1.0 - 2e-6
 # k is the difference of numbers of order one: so many units in the last place are added to it,
-# which covers their rounding and that of the slope that came in.
+# which covers their rounding and that of the given slope.
 _ROUNDINGS = 16.0
 
 
 class Condition(Protocol):
-    """q k(q) <= gap is proved free, and q k(q) crosses the gap upwards at most once on [0, 1]."""
+    """A condition q k(q) <= gap under which distance q is proved free; q k(q) crosses the gap
+    upwards at most once on [0, 1]."""
 
     @property
     def gap(self) -> Real: ...
@@ -62,15 +61,15 @@ def is_covered(condition: Condition, q: Real) -> Mask:
 
 
 def largest_covered(condition: Condition, rounds: int) -> Real:
-    """The largest covered q in [0, 1), never beyond it.
+    """The largest q in [0, 1) that is proved free, approached from below.
 
-    Four rounds end within 1e-5 of it for four balls in five, and within a few percent wherever
-    the extremal measure is not concentrated in 1e-3 of the sphere; twelve end within 1e-5.
+    Four rounds come within 1e-5 of it for four balls in five, and within a few percent wherever
+    the extremal measure is not concentrated in 1e-3 of the sphere; twelve come within 1e-5.
 
     Why it is safe: only a q at which q k(q) <= gap was *evaluated* is returned; by the single
-    crossing, all smaller q are then free too. The candidates only affect length: each solves
-    q (k_i + k' (q - q_i)) = gap, with k' the slope of k through the last two points (so the
-    parabola through them and the start), which converges like the secant method; the last one
+    crossing, all smaller q are then free too. The choice of candidates affects the length alone:
+    each solves q (k_i + k' (q - q_i)) = gap, with k' the slope of k through the last two points (so
+    the parabola through them and the start), which converges like the secant method; the last one
     is where the chord from the best covered to the best uncovered point reaches the gap, which
     is covered if q k(q) is convex.
     """
@@ -104,7 +103,7 @@ def largest_covered(condition: Condition, rounds: int) -> Real:
 def _root(gap: Real, constant: Real, slope: Real) -> Real:
     """The positive root of x (constant + slope x) = gap, or 1 if there is none."""
     root = dr.sqrt(fmax(dr.fma(constant, constant, 4 * slope * gap), 0))
-    # Both forms are the root; each cancels where the other is used.
+    # Two forms of the same root, each used where the other one cancels.
     rises = constant > 0
     above = dr.select(rises, 2 * gap, root - constant)
     below = dr.select(rises, constant + root, 2 * slope)
@@ -112,7 +111,7 @@ def _root(gap: Real, constant: Real, slope: Real) -> Real:
     return dr.select((below > 0) & dr.isfinite(candidate), candidate, 1)
 
 
-# Distances carry a few roundings of float32; a radius is shortened by this much.
+# A radius is multiplied by this, as distances carry a few roundings of float32.
 _RADIUS_SLACK = 1.0 - 1e-6
 
 
@@ -120,8 +119,8 @@ _RADIUS_SLACK = 1.0 - 1e-6
 class Ball(Enclosure):
     """f is harmonic on B(p, radius) of R^dimension and moves there by less than the two ranges.
 
-    range_below = f - lower and range_above = upper - f are how far the promise lets f move, so that
-    bounds never subtract two large numbers. None says that this side is not bounded.
+    range_below, range_above: f - lower and upper - f, how far the promise lets f move, so that
+        bounds never subtract two large numbers. None for a side that is not bounded.
     """
 
     radius: Real
@@ -149,7 +148,7 @@ class Ball(Enclosure):
 
     @classmethod
     def applies(cls, dimension: int, is_bounded_below: bool, is_bounded_above: bool) -> bool:
-        """Whether the proof is one for balls of this dimension, with these ends known."""
+        """Whether this proof holds for balls of this dimension with these ends bounded."""
         del dimension
         return is_bounded_below or is_bounded_above
 
@@ -159,9 +158,9 @@ def known_ranges(
 ) -> tuple[Real, Real | None, Real | None]:
     """Radius, and how far the promise lets f move down and up (None: that side is not bounded).
 
-    The ends of the promise are moved out by the error and eight units in the last place of f: a
-    promise that seems to leave f no range would otherwise prove f constant. A radius that is not a
-    positive number, or a NaN anywhere, proves nothing (radius 0).
+    The ends of the promise are moved outwards by the error and eight units in the last place of f:
+    a promise that leaves f no range, but for rounding, would otherwise prove f constant. A radius
+    that is not a positive number, or a NaN anywhere, proves nothing (radius 0).
     """
     total_error = dr.fma(8 * float(dr.epsilon(type(value))), dr.abs(value), error)
     known = promise.radius > 0

@@ -1,7 +1,7 @@
 """The bound for functions that are not harmonic but have a bounded Laplacian.
 
 The talk on Gillespie, Yang, Botsch, Crane 2024 names it as future work; the proof below and its
-constant are harnack's.
+constant are new in harnack.
 """
 
 from __future__ import annotations
@@ -25,9 +25,10 @@ KERNEL_NORM = 0.394
 """kappa <= KERNEL_NORM q^2 (2 + ln(1/q))/(1-q^2)^2, proved by `tests/oracles/green_kernel.py`."""
 
 SLOPE_NORM = 0.1907
-"""That of G(0,.) + d_v G(0,.)/3 on the unit ball, (19 - 6 ln 3 - 2 sqrt(3) pi)/8, rounded up."""
+"""The integral of |G(0,.) + d_v G(0,.)/3| over the unit ball, (19 - 6 ln 3 - 2 sqrt(3) pi)/8,
+rounded up."""
 
-# A bound whose gap is this many times its scale is not reached within the ball, but for 1e-6 of it.
+# A gap of this many times the scale of the bound is reached only within 1e-6 of the sphere.
 _NEVER = 1e18
 
 
@@ -49,8 +50,8 @@ class GreenBall(Enclosure):
         kappa(q) <= 0.394 q^2 (2 + ln(1/q))/(1-q^2)^2  for all 0 < q < 1,
 
     proved by a quadrature with an error bound (`tests/oracles/green_kernel.py`); numerically
-    none below 0.391 would do, and the logarithm is real. From below the same holds of -f, with
-    -C, -b and -a.
+    no constant below 0.391 would do, and the logarithm is needed. From below the same holds of -f,
+    with -C, -b and -a.
 
     The first crossing is unique. Let w = f(p)-c + m/6 be at least 0 and m q^2/6 at most 0 left out,
     both of which only raise the bound. As h-c is positive, |h_v(p)|/3 <= h(p)-c, that
@@ -70,7 +71,7 @@ class GreenBall(Enclosure):
     slopes: Slopes
 
     rounds: ClassVar[int] = 5
-    """Of the solver: see `largest_covered`."""
+    """Rounds of `largest_covered`."""
 
     @classmethod
     def of(cls, promise: Promise, value: Real, error: Real, slopes: Slopes) -> Self | None:
@@ -90,11 +91,12 @@ class GreenBall(Enclosure):
         laplacian: tuple[Real, Real],
         slopes: Slopes,
     ) -> Self:
-        """From how far f may move, down and up, and the ends of its Laplacian."""
+        """The enclosure of an f that may move so far, down and up, with these ends of its
+        Laplacian."""
         half = 0.5 * radius * radius
         low, high = half * laplacian[0], half * laplacian[1]
         mean, spread = low + high, high - low
-        # [mean - spread, mean + spread] holds both ends, whatever the roundings.
+        # [mean - spread, mean + spread] contains both ends, whatever the roundings.
         slack = 4 * float(dr.epsilon(type(spread))) if dr.is_array_v(spread) else 0.0
         spread = dr.select(spread >= 0, spread + slack * (spread + dr.abs(mean)), dr.nan)
         return cls(radius, *ranges, mean, spread, slopes)
@@ -119,7 +121,7 @@ class GreenBall(Enclosure):
         return known
 
     def _conditions(self, gaps: Gaps) -> tuple[_Growth, _Growth]:
-        """What keeps f from the level above, and from the level below."""
+        """The conditions for f not to reach the level above, and the level below."""
         below, above, slopes = self.range_below, self.range_above, self.slopes
         return (
             self._growth(gaps.up, below, above, self.mean, slopes.high),
@@ -127,7 +129,7 @@ class GreenBall(Enclosure):
         )
 
     def _growth(self, gap: Real, u: Real, most: Real, mean: Real, slope: Real) -> _Growth:
-        """u, most: how far f is above c and may rise. Everything in units of w + l."""
+        """The condition in units of w + l; u, most: how far f is above c, and may rise."""
         w = fmax(dr.fma(mean, 1 / 6, u), 0)
         scale = w + self.spread
         share = dr.select(scale > 0, 1 / scale, 0)
@@ -137,7 +139,7 @@ class GreenBall(Enclosure):
         # A slope that is not a number counts as the steepest.
         slope = fmin(slope * (self.radius / 3 * share) + slack, steepest)
         slope = fmax(slope, slack - steepest)
-        # Of a level outside the range there is nothing to prove, nor of a constant function.
+        # A level outside of the range is never met, and a constant function meets none.
         is_met = (gap <= most) & (scale > 0)
         gap = dr.select(is_met, fmin(gap * share, _NEVER), _NEVER)
         return _Growth(gap / (dr.sqrt(1 + gap) + 1), w, slope, spread, fmax(mean * share, 0))
@@ -158,7 +160,7 @@ class _Growth:
     mean: Real  # m where positive, else 0
 
     def start(self) -> tuple[Real, Real]:
-        # The logarithm at about the root of a level without slope.
+        # The logarithm, taken at about the root for slope 0.
         log = clamp(-0.5 * dr.log(fmax(self.gap, 1e-12)), 0, 14)
         first = 3 * self.slope
         bend = dr.fma(KERNEL_NORM * self.spread, 2 + log, 5 * self.weight - 2 * first)

@@ -1,20 +1,8 @@
-"""A function along a path, as far as enclosures ask for it: ranges, and not values at points.
+"""What an enclosure is: a proof of how far f can move along a path. And what it is given.
 
-What an enclosure is: a proof of how far f can move along the next stretch of a path.
-
-An enclosure is about F(s) = f(path(t+s)) - f(path(t)), the movement of f relative to its value
-where it was looked at, so that two large numbers are never subtracted: in float32 that is the
-difference between a march and a stall. Asked how far a level is in value (`Gaps`), it proves a
-length free of it (`step`), or says whether a given length is (`covers`), which costs one evaluation
-of the proof and no solve: the tracer asks it looking back.
-
-A new proof is one file of this room: a class derived from `Enclosure`.
-
-Which levels bracket a value: the question every enclosure is asked.
-
-An angle-valued function is known modulo its period, so its levels form a ladder: every
-asked-for level plus every multiple of the period (paper, Alg. 2, with the reduction that the
-printed algorithm leaves out: both bracketing levels are found from the reduced difference).
+- `Enclosure`: the base of all proofs. A new proof is a class derived from it, in this package.
+- `Restriction`: f along a path, for proofs that use ranges of its derivatives on `Piece`s of it.
+- `TargetLevels`: the levels to find, and their distances from a value (`Gaps`).
 """
 
 from __future__ import annotations
@@ -38,7 +26,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Piece:
-    """What F' and F'' are on one piece of the path.
+    """Ranges of F' and F'' on one piece of the path.
 
     length: of the piece.
     slopes: the range of F' on it.
@@ -53,9 +41,9 @@ class Piece:
 
 
 class Restriction(Protocol):
-    """A function along a path, as enclosures ask for it.
+    """A function along a path, of which ranges can be computed.
 
-    piece_count: how many pieces of the path take the least time, by experiment.
+    piece_count: into how many pieces to cut the path for the least time, by experiment.
     """
 
     @property
@@ -64,33 +52,35 @@ class Restriction(Protocol):
     def pieces(self, knots: Sequence[Real]) -> tuple[Piece, ...]:
         """Ranges of the derivatives of f(path(t+s)) between each knot and the next.
 
-        knots: lengths s, rising, the first of them 0.
+        knots: increasing lengths s, the first of them 0.
         """
         ...
 
 
 @runtime_checkable
 class Evaluable(Protocol):
-    """A restriction that is a formula: any arithmetic can be asked for what it makes of it."""
+    """A restriction given by a formula, which can be evaluated in any arithmetic."""
 
     def through(self, coordinates: Callable[[Vec3, Vec3], tuple[Any, Any, Any]]) -> Any:
-        """The formula of coordinates made from a point p and the direction d of the path."""
+        """The formula applied to the x, y and z that `coordinates` makes from a point p and the
+        direction d of the path."""
         ...
 
 
-# A length that is proved in exact arithmetic, times this, is proved in that of single precision:
-# the formulas of steps have some ten roundings.
+# A length that is proved in exact arithmetic, times this, is proved in single precision too: the
+# formulas of steps have some ten roundings.
 ROUND_DOWN = 1.0 - 1e-6
 
 
 @dataclass(frozen=True)
 class Gaps:
-    """How far f must move, down or up, to reach a level: lengths in value >= 0.
+    """How far f must move, down or up, to reach a level: differences of values, >= 0.
 
     Infinite where there is no level on that side.
 
-    is_one_sided: at most one of the two is finite, on every lane: there is one level alone. Known
-        while a kernel is being recorded, it spares the proof of the other side.
+    is_one_sided: whether at most one of the two is finite on every lane, as there is one level
+        alone. As this is known while a kernel is being recorded, it saves the proof of the other
+        side.
     """
 
     down: Real
@@ -103,25 +93,25 @@ class Gaps:
         return fmin(self.down, self.up)
 
     def less(self, error: Real) -> Gaps:
-        """The gaps that surely remain of a value known up to `error`."""
+        """The gaps that surely remain if the value is known up to `error`."""
         down, up = fmax(self.down - error, 0), fmax(self.up - error, 0)
         return Gaps(down, up, self.is_one_sided)
 
     def exchanged(self) -> Gaps:
-        """Those of the negative function."""
+        """The gaps of -f."""
         return Gaps(self.up, self.down, self.is_one_sided)
 
 
 @dataclass(frozen=True)
 class Slopes:
-    """An interval that holds the derivative of f along a unit direction, in f per length."""
+    """An interval that contains the derivative of f along a unit direction, in f per length."""
 
     low: Real
     high: Real
 
     @classmethod
     def around(cls, slope: Real, error: Real) -> Slopes:
-        """The slopes within `error` of one; an error of 0.0 costs nothing."""
+        """The slopes within `error` of one; an error that is the Python float 0.0 costs nothing."""
         if isinstance(error, float) and error == 0.0:
             return cls(slope, slope)
         return cls(slope - error, slope + error)
@@ -134,29 +124,37 @@ class Slopes:
 class Enclosure(abc.ABC):
     """A proof that F stays within a range for 0 <= s < reach.
 
+    F(s) = f(path(t+s)) - f(path(t)) is the movement of f relative to its value at a sample, so that
+    two large numbers are never subtracted: in float32 that is the difference between a march and a
+    stall. Given how far levels are in value (`Gaps`), an enclosure proves a length free of them
+    (`step`), or says whether a given length is free (`covers`), which takes one evaluation of the
+    proof and no solver: the tracer uses it looking back.
+
     Neither end of the range may fall as the slope grows, and every proof says why: then the range
-    at the upper end of `Slopes` bounds F from above and that at the lower end bounds it from below,
-    whatever the slope in between is. In particular slopes in [-|grad f|, |grad f|] bound F in every
-    direction.
+    for the upper end of `Slopes` bounds F from above and that for the lower end bounds it from
+    below, whatever the slope in between is. In particular slopes in [-|grad f|, |grad f|] bound F
+    in every direction.
     """
 
     @property
     def growth(self) -> float:
-        """How many times the last step an enclosure should reach next, by experiment."""
+        """How far an enclosure should reach at the next sample, as a multiple of the step that this
+        one proved; by experiment."""
         return 2.0
 
     @classmethod
     def of(cls, promise: Promise, value: Real, error: Real, slopes: Slopes) -> Self | None:
-        """The enclosure that this proof makes of a promise; None if it makes none of that kind.
+        """The enclosure that this proof makes of a promise; None if it uses no promise of that
+        kind.
 
-        value: f where it was looked at, known up to `error`. slopes: of f along the path.
+        value: f at the sample, known up to `error`. slopes: of f along the path.
         """
         del promise, value, error, slopes
         return None
 
     @classmethod
     def along(cls, function: Restriction, slopes: Slopes, length: Real) -> Self | None:
-        """The enclosure that this proof makes of ranges of f along the path; None if it makes none.
+        """The enclosure that this proof makes of ranges of f along the path; None if it uses none.
 
         length: how far it should reach. slopes: of f along the path, where it starts.
         """
@@ -165,8 +163,7 @@ class Enclosure(abc.ABC):
 
     @abc.abstractmethod
     def step(self, gaps: Gaps) -> Real:
-        """A length L >= 0 such that f meets no level for 0 < s < L. What is not a number proves
-        nothing."""
+        """A length L >= 0 such that f meets no level for 0 < s < L. NaN proves nothing."""
 
     def covers(self, gaps: Gaps, length: Real) -> Mask:
         """Whether f is proved to meet no level for 0 < s < length."""
@@ -177,8 +174,12 @@ class Enclosure(abc.ABC):
 class TargetLevels:
     """A finite set of target levels, repeated with `period` if there is one.
 
-    `values` may be Python floats or size-1 Dr.Jit arrays of the backend in use (so that a level
-    can change without a kernel being compiled again, or carry derivatives).
+    An angle-valued function is known modulo its period, so its levels form a ladder: every level
+    that was asked for plus every multiple of the period (paper, Alg. 2, with the reduction that the
+    printed algorithm leaves out: both bracketing levels are found from the reduced difference).
+
+    values: Python floats, or Dr.Jit arrays of size 1 of the backend in use (so that a level can
+        change without a kernel being compiled again, or carry derivatives).
     """
 
     values: tuple[Real, ...]
@@ -187,22 +188,21 @@ class TargetLevels:
     def gaps(self, f: Real) -> Gaps:
         """Distances in value from f to the next level below and above.
 
-        Either is infinite when there is no such level. A value on a level has both a gap of
-        zero on one side and, for a ladder, of at most one period on the other. Gaps of a value
-        that is not a number are not numbers.
+        Either is infinite when there is no such level. A value on a level has a gap of zero on one
+        side and, for a ladder, one of at most a period on the other. Gaps of NaN are NaN.
         """
         down: Real = math.inf
         up: Real = math.inf
         for level in self.values:
             above = f - level  # > 0: the level lies below f
             if self.period is not None:
-                # Within half a period of 0, so that neither side of a level is lost to rounding.
+                # Within half a period of 0, where rounding cannot confuse the sides of a level.
                 reduced = above - self.period * dr.round(above / self.period)
                 is_above = reduced >= 0
                 below_gap = dr.select(is_above, reduced, self.period + reduced)
                 above_gap = dr.select(is_above, self.period - reduced, -reduced)
             else:
-                # In this order a gap of what is not a number is none, and nothing is proved.
+                # Compared in this order, NaN gives NaN, which proves nothing.
                 below_gap = dr.select(above < 0, math.inf, above)
                 above_gap = dr.select(above > 0, math.inf, -above)
             down, up = fmin(down, below_gap), fmin(up, above_gap)

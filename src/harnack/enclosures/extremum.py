@@ -1,8 +1,9 @@
-"""The greatest of several functions: unions, intersections and differences of solids.
+"""Enclosures of functions that are the greatest or the nearest of several, and of maps of others.
 
-The nearest of several sheets: surfaces that a function with several branches makes.
-
-Branch points: all branches are close to one value there, and a ray may pass beside it.
+- `Greatest`, with `Negated` and `Stretched`: unions, intersections and differences of solids, and
+  solids that were moved and scaled.
+- `Nearest`: the surfaces of all branches of a multivalued function.
+- `Cusp`: the same near a branch point, where all branches are close to one value.
 """
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Part:
-    """One of several functions, where it was looked at.
+    """One of several functions, at a sample.
 
-    least_below, most_below: how far its value is below the greatest, up to rounding.
+    least_below, most_below: bounds, by rounding, of how far its value is below the greatest.
     enclosures: of its movement along the path.
     """
 
@@ -38,10 +39,10 @@ class Part:
 class Greatest(Enclosure):
     """The movement of max f_i, from enclosures of the movements of all f_i.
 
-    Proof. The greatest rises by a gap g only where some f_i rises by g plus what it is below the
-    greatest: as far as none of them does, each by its own proof, it does not. It falls by g only
-    where all f_i are that low: as far as one of them proves that it has not fallen so far, it has
-    not. Nothing is demanded of the proofs of the parts, which may be of different kinds.
+    Proof. The greatest rises by a gap g only where some f_i rises by g plus its distance below the
+    greatest: as far as none of them does, each by its own proof, the greatest does not. It falls by
+    g only where all f_i are that low: as far as one of them is proved not to have fallen so far,
+    the greatest has not. The proofs of the parts may be of any kind, and of different kinds.
     """
 
     parts: tuple[Part, ...]
@@ -53,7 +54,7 @@ class Greatest(Enclosure):
             rise, fall = self._gaps(gaps, part)
             up = fmin(longest_step(part.enclosures, rise), up)
             fallen = longest_step(part.enclosures, fall)
-            # A part that may be past the level already proves nothing, whatever its slope.
+            # A part that may lie below the level already proves nothing, whatever its slope.
             down = fmax(dr.select(fall.down > 0, fallen, 0), down)
         up = dr.select(gaps.up == dr.inf, none, up)
         down = dr.select(gaps.down == dr.inf, none, down)
@@ -69,7 +70,7 @@ class Greatest(Enclosure):
         return (up | (gaps.up == dr.inf)) & down
 
     def _reach(self, none: Real) -> Real:
-        """How far something is known at all."""
+        """How far the enclosures of all parts reach, if there is no level."""
         reach = none
         for part in self.parts:
             reach = fmin(longest_step(part.enclosures, Gaps(none, none)), reach)
@@ -100,10 +101,10 @@ class Negated(Enclosure):
 
 @dataclass(frozen=True)
 class Stretched(Enclosure):
-    """The movement of factor f along a path that is passed `speed` times as fast as `inner` says.
+    """The movement of factor * f(map(path)), where the map stretches the path by `speed`.
 
-    Proof. The length s of the path is the length speed s of the one that `inner` is about, and a
-    gap g of factor f is a gap g/factor of f. speed and factor, positive, are known to within a few
+    Proof. A length s of the path is a length speed s of the path that `inner` is about, and a gap g
+    of factor f is a gap g/factor of f. speed and factor, positive, are known to within a few
     roundings, by which steps are shortened.
     """
 
@@ -124,17 +125,17 @@ class Stretched(Enclosure):
 
 
 def _scaled(gap: Real, share: Real) -> Real:
-    """The gap times a positive number; a level stays one, however far away it comes to lie."""
+    """The gap times a positive number; a finite gap stays finite, also if the product overflows."""
     largest = type(gap)(dr.largest(type(gap)))
     return dr.select(gap == dr.inf, gap, fmin(largest, gap * share))
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """One of several functions phi_j, continued along the path from where it was looked at.
+    """One of several functions phi_j, continued along the path from a sample.
 
-    opening: slopes of |phi_j| there. beyond: by how much |phi_j| exceeds the smallest of them,
-        less what rounding may have added.
+    opening: slopes of |phi_j| there.
+    beyond: by how much |phi_j| exceeds the smallest of them, less what rounding may have added.
     """
 
     opening: Slopes
@@ -145,8 +146,8 @@ class Sheet:
 class Nearest(Enclosure):
     """The movement of f = s min_j |phi_j|, s the sign of the product of all phi_j.
 
-    Such an f is continuous and single-valued wherever the set of the phi_j is, whichever branch is
-    called which, for s changes only where the minimum is 0. It is zero where one of them is.
+    Such an f is continuous and single-valued wherever the set of all phi_j is, however the branches
+    are numbered, for s changes only where the minimum is 0. It is zero where one of them is.
 
     Let |phi_j''| <= bend along the path for 0 <= s < reach, for continuations without a jump; and
     g_j = phi_j with the sign for which it has that of f here.
@@ -156,11 +157,15 @@ class Nearest(Enclosure):
     has changed and f is the smallest g_j. Otherwise f - d < 0, and where f is negative an odd
     number of the g_j is, so one of them, and f >= -|g_j| > f - d. A g_j falls along its parabola at
     most.
-    Away from zero, to a level f + a: f < f + a as long as the nearest has |g_i| below that: as it
-    has not risen by a, nor fallen by 2 f + a. So a step is free of all sheets, not of the nearest
-    alone, and what is the nearest may change on the way.
+    Away from zero, to a level f + a: f stays below f + a as long as the phi_i that is nearest at
+    the start has |g_i| below f + a: as long as g_i has not risen by a, nor fallen by 2 f + a. So a
+    step is free of all sheets, not of the nearest alone, and another one may become the nearest on
+    the way.
 
-    sheets: all of them. nearest: that of the smallest. distance: |f|. is_positive: whether f is.
+    sheets: one for each phi_j.
+    nearest: that with the smallest |phi_j|.
+    distance: |f|.
+    is_positive: whether f is positive.
     """
 
     sheets: tuple[Sheet, ...]
@@ -188,27 +193,34 @@ class Nearest(Enclosure):
 
 
 _ROUND_DOWN = 1.0 - 1e-5
-# Which part of the room there is goes to the branches, the rest to the ray's own movement.
+# The values of q in the proof of `Cusp` that are tried.
 _PARTS = (0.5, 0.95)
 
 
 @dataclass(frozen=True)
 class Cusp(Enclosure):
-    """The movement of f = s min_j |h - u_j| near a line z = a about which branches u_j turn.
+    """The movement of f = s min_j |h - u_j| near a branch point a: around the line z = a the
+    branches u_j pass into each other.
 
-    Within the radius R of the line |u_j - c| <= C r^alpha, alpha > 0, of all branches (up to a
-    period); r is the distance from it. No parabola reaches far there, for second derivatives grow
-    without bound, though the branches hardly move.
+    Within the radius R of that line |u_j - c| <= C r^alpha, alpha > 0, for all branches (up to a
+    period), r the distance from the line. No parabola reaches far there, for second derivatives
+    grow without bound, though the branches hardly move.
 
     Proof. Let y = |h - c|, and v the most by which it falls per unit of the path. On a disk of
     radius r <= R about the line and for a length L of the path, all |h - u_j| are at least
-    y - v L - C r^alpha. For any part q of w = y - (|f| - gap), r = (q w/C)^(1/alpha) and L =
-    (1 - q) w/v leave |f| - gap of it: so f, whose sign changes only where one of them is 0, does
-    not fall that far up to L, or up to where the path leaves the disk if that is earlier.
+    y - v L - C r^alpha. For any 0 < q < 1 and w = y - (|f| - gap), r = (q w/C)^(1/alpha) and L =
+    (1 - q) w/v make that |f| - gap: so f, whose sign changes only where one of them is 0, does not
+    fall by the gap up to L, or up to where the path leaves the disk if that is earlier.
 
-    height: y. fall: v. foot, across: of the line's foot on the path in the plane, how far ahead it
-    is, and how far off the line, in the plane's lengths. speed: of the path in the plane.
-    inside: the largest r that may be used, R less rounding. distance: |f|.
+    height: y.
+    fall: v.
+    foot, across: how far ahead the path's closest point to the line is, and how far from it, both
+        as lengths in the plane.
+    speed: of the path in the plane.
+    power, constant: alpha and C.
+    inside: the largest r that may be used, R less rounding.
+    distance: |f|.
+    is_positive: whether f is positive.
     """
 
     height: Real
@@ -227,7 +239,7 @@ class Cusp(Enclosure):
         away = dr.select(self.is_positive, gaps.up, gaps.down)
         room = self.height - fmax(self.distance - towards, 0)
         together = room + self.distance + towards + self.fall + self.speed
-        room = dr.select(together == together, room, 0)  # what is not a number proves nothing
+        room = dr.select(together == together, room, 0)  # NaN proves nothing
         best = 0 * self.height
         for part in _PARTS:
             share = fmax(part * room / self.constant, 0)

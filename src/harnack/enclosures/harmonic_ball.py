@@ -1,13 +1,8 @@
-"""The published rule: Harnack's inequality with a lower bound alone.
+"""Proofs for functions that are harmonic and bounded on a ball: from the promise `HarmonicBall`.
 
-Source: Gillespie, Yang, Botsch, Crane 2024, Eq. 4-7 (n = 3) and Eq. 27 (n = 4).
-
-The slope bound: Harnack's inequality that also uses the directional derivative.
-
-The extremal measures are the equality cases of Jensen's inequality and of the chord bound for a
-convex function: a point mass ring at one latitude, and two point masses at the poles.
-
-The spherical-cap bound: the sharpest enclosure for a harmonic function with two known ends.
+- `Classic`: the published rule, Harnack's inequality with a lower bound alone.
+- `Slope`: Harnack's inequality that also uses the directional derivative.
+- `Caps`: spherical caps, the sharpest enclosure where both a lower and an upper bound are known.
 """
 
 from __future__ import annotations
@@ -42,8 +37,10 @@ class Classic(Ball):
         n = 2:  |v-u| / (u+v)         n = 3:  2 |v-u| / (u + 2v + sqrt(u (u + 8v)))
 
     and for n = 4 the cubic is solved by Newton's method from the safe side (`_quartic_growing`).
-    A level at or below `lower` cannot be reached inside the ball: the step is R. The slope does not
-    enter.
+    A level at or below `lower` cannot be reached inside the ball: the step is R. The slope is not
+    used.
+
+    Source: Gillespie, Yang, Botsch, Crane 2024, Eq. 4-7 (n = 3) and Eq. 27 (n = 4).
     """
 
     def step(self, gaps: Gaps) -> Real:
@@ -54,7 +51,7 @@ class Classic(Ball):
         below = above = None
         if self.range_below is not None:
             below = _one_sided(self.range_below, gaps.up, gaps.down, self.dimension)
-        if self.range_above is not None:  # upper - f is positive and harmonic: mirror
+        if self.range_above is not None:  # the same for upper - f, positive and harmonic
             above = _one_sided(self.range_above, gaps.down, gaps.up, self.dimension)
         if below is None or above is None:
             one = below if above is None else above
@@ -64,7 +61,7 @@ class Classic(Ball):
 
 
 def _one_sided(u: Real, gap_away: Real, gap_toward: Real, dimension: int) -> Real:
-    """Safe q for positive u, a level `gap_away` above u and one `gap_toward` below it."""
+    """A safe q for positive u, with levels `gap_away` above u and `gap_toward` below it."""
     growing, falling = _LEVEL_RULES[dimension]
     # u = 0 forces u to vanish identically: no level is ever reached.
     up = dr.select((gap_away == dr.inf) | (u <= 0), 1, growing(u, u + gap_away, gap_away))
@@ -78,15 +75,15 @@ def _plane(u: Real, v: Real, gap: Real) -> Real:
 
 
 def _space(u: Real, v: Real, gap: Real) -> Real:
-    # The product of the two roots, as u (u + 8v) may underflow or overflow.
+    # Two square roots, as the product u (u + 8v) may underflow or overflow.
     return 2 * gap / (u + 2 * v + dr.sqrt(u) * dr.sqrt(u + 8 * v))
 
 
 def _quartic_growing(u: Real, v: Real, gap: Real) -> Real:
-    """(1+q)/(1-q)^3 = w, w = v/u. Newton's method from the safe side, in two forms.
+    """(1+q)/(1-q)^3 = w, w = v/u, by Newton's method from the safe side, in two forms.
 
-    For w < 2: h(q) = gap - q (u + v (3 - 3q + q^2)) is decreasing and convex, from the left. That
-    cancels for large w, where y = 1-q is the root of the convex w y^3 + y - 2, from the right."""
+    For w < 2, from the left: h(q) = gap - q (u + v (3 - 3q + q^2)) is decreasing and convex. That
+    cancels for large w; there y = 1-q, from the right, is the root of the convex w y^3 + y - 2."""
     q = gap / (u + 3 * v)
     for _ in range(4):
         h = gap - q * (u + v * (3 - 3 * q + q * q))
@@ -117,7 +114,7 @@ _LEVEL_RULES = {
 }
 
 
-# A chord whose gap is this many times u is not reached within the ball, but for 1e-6 of it.
+# A gap of this many times u is reached only within 1e-6 of the sphere.
 _NEVER = 1e18
 
 
@@ -132,18 +129,19 @@ class Slope(Ball):
 
         u P(q, m) <= u(p+tv) <= u [(1+m)/2 P(q, 1) + (1-m)/2 P(q, -1)]
 
-    (Jensen; chord), both attained. The upper bound is convex in q. The lower one rises, then
+    (Jensen; chord), both attained: by a ring of mass at one latitude, and by two point masses at
+    the poles. The upper bound is convex in q. The lower one rises, then
     falls: its derivative has the sign of m q^2 - 2q + m (n = 2), q^3 + m q^2 - 5q + 3m (n = 3)
     or q^3 - 3q + 2m (n = 4), each decreasing on [0, 1]. So each first crossing is unique, and
     what is free at q is free before it. With upper - f > 0 the same holds for its negative
-    slope; the better of the two is kept on each side.
+    slope; on each side the better of the two is used.
 
     Neither end falls as the slope grows: the upper one rises with m as P(q, 1) >= P(q, -1), the
     lower one as P(q, .) does. For upper - f, whose slope is negated, they change places and signs.
     """
 
     rounds: ClassVar[int] = 4
-    """Of the solver: see `largest_covered`."""
+    """Rounds of `largest_covered`."""
 
     def step(self, gaps: Gaps) -> Real:
         q = type(gaps.up)(1)
@@ -167,7 +165,8 @@ class Slope(Ball):
         return (length <= 0) | (covered & self.is_known(gaps))
 
     def _conditions(self, gaps: Gaps) -> tuple[list[Condition], list[Condition]]:
-        """What keeps f from the level above, and from the level below."""
+        """The conditions for f not to reach the level above, and the level below; on each side one
+        of them is enough."""
         up: list[Condition] = []
         down: list[Condition] = []
         rising = self.slopes
@@ -183,7 +182,7 @@ class Slope(Ball):
             most = dr.select(u > 0, slopes.high * scale, 0)
             least = dr.select(u > 0, slopes.low * scale, 0)
             slack = rounding(type(gaps.up))
-            # A slope that is not a number counts as the worst one, in either place.
+            # NaN for a slope counts as the worst one, on both sides.
             steep, flat = fmax(fmin(most + slack, 1), -1), clamp(least - slack, -1, 1)
             away.append(_Chord.of(fmin(gap_away * share, _NEVER), steep, self.dimension))
             toward.append(_Jensen(fmin(gap_toward * share, 1), flat, self.dimension))
@@ -266,7 +265,8 @@ class _Jensen:
 
 @dataclass(frozen=True)
 class Caps(Ball):
-    """Bounded on both sides in space: the extremal boundary values are two spherical caps.
+    """The cap bound, for f bounded on both sides, in space: the extremal boundary values are the
+    indicator of two spherical caps.
 
     Proof. With values in [c, C], f = c + (C-c) g and g the Poisson integral of boundary values
     in [0, 1] with mean p = (f-c)/(C-c) and first moment mu = R f_v/(3 (C-c)) along v. For fixed
@@ -296,7 +296,7 @@ class Caps(Ball):
     """
 
     rounds: ClassVar[int] = 4
-    """Of the solver: see `largest_covered`."""
+    """Rounds of `largest_covered`."""
 
     @classmethod
     def applies(cls, dimension: int, is_bounded_below: bool, is_bounded_above: bool) -> bool:
@@ -315,7 +315,7 @@ class Caps(Ball):
         return (length <= 0) | (inside & is_covered(up, q) & is_covered(down, q))
 
     def _conditions(self, gaps: Gaps) -> tuple[_TwoCaps, _TwoCaps]:
-        """What keeps f from the level above, and from the level below."""
+        """The conditions for f not to reach the level above, and the level below."""
         below, above = self.range_below, self.range_above
         assert below is not None
         assert above is not None

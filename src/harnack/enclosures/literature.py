@@ -1,7 +1,7 @@
-"""Proofs of the literature from a formula's own arithmetic, for comparison with pieces of the path.
+"""Proofs of the literature for fields given by a formula, for comparison with `Pieces`.
 
 Parabolas come from the bottom-up arithmetic of `harnack.arithmetic.Parabolas`, bands from affine
-forms and from intervals. All of them prove steps; how many is what benchmarks measure.
+forms and from intervals. All of them prove steps; benchmarks measure how many a ray takes.
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ class BottomUpQuadratic(Parabola):
         return cls(Slopes(a, c), 2 * b, 2 * d, length)
 
     def step(self, gaps: Gaps) -> Real:
-        # All of the length without a pull-back, which would cost a ray that misses a look.
+        # All of the length, not shortened for rounding: else a ray that misses needs one more
+        # sample.
         nearer = Gaps(gaps.down * ROUND_DOWN, gaps.up * ROUND_DOWN)
         known = dr.isfinite(self.slopes.low + self.slopes.high)
         known &= dr.isfinite(self.least_curvature + self.most_curvature) & (self.reach > 0)
@@ -61,7 +62,7 @@ class BottomUpLinear(BottomUpQuadratic):
 
 @dataclass(frozen=True)
 class Mixed(Enclosure):
-    """The longest step of several proofs of one function.
+    """The longest step that one of several proofs gives for one function.
 
     Source: Aydinlilar and Zanni 2023, section 4 ("mixed"): bounds of derivatives where they are
     tight, bottom-up arithmetic where they are not.
@@ -90,8 +91,9 @@ class Mixed(Enclosure):
 class Band(Enclosure):
     """offsets.low + slopes.low s <= F(s) <= offsets.high + slopes.high s, for 0 <= s <= reach.
 
-    Proof of the step: before the upper line reaches the gap, F cannot. A band is not exact at
-    s = 0: a gap within its offset proves nothing, and the march asks for a third of the length.
+    Proof of the step: F cannot reach the gap before the upper line does. A band is not exact at
+    s = 0: where its offset exceeds the gap it proves nothing, and the march asks again for a third
+    of the length.
     """
 
     offsets: Interval
@@ -112,7 +114,8 @@ class Band(Enclosure):
 
 
 class AffineBand(Band):
-    """The band of revised affine arithmetic; its front is pruned where only the end is in doubt.
+    """The band of revised affine arithmetic: a front part of the length may be proved free where
+    the whole is not.
 
     Source: Fryazinov, Pasko and Comninos 2010, as Aydinlilar and Zanni 2023 compare with it.
     """
@@ -131,8 +134,7 @@ class AffineBand(Band):
 
 
 class IntervalRange(Band):
-    """The range of interval arithmetic on all of the length asked: all of it is free, or nothing
-    is known.
+    """The range of interval arithmetic on the whole length: all of it is free, or nothing is known.
 
     Source: Mitchell 1990.
     """

@@ -1,12 +1,8 @@
-"""Parabolas: Lipschitz constants, bounded second derivatives, and Taylor forms of a path's own.
+"""Proofs by lines and parabolas: `Parabola` and those derived from it, `Tangent` and `Arc`.
 
-The tangent: a convex function stays above it.
-
-Parabolas in the angle along a circle: for functions pulled back from a sphere.
-
-By stereographic projection a line of space becomes a circle of the unit sphere S^3, and what is a
-trigonometric polynomial on the circle has a bounded second derivative in its angle, from one end of
-the line to the other. A step in that angle, taken back to the line, may be infinite.
+- `Cone`: from a Lipschitz constant. `Taylor`: from a bound of the second derivatives.
+- `Tangent`: a convex function lies above its tangents.
+- `Arc`: a parabola in the angle along a circle, for functions on the sphere S^3.
 """
 
 from __future__ import annotations
@@ -35,12 +31,13 @@ class Parabola(Enclosure):
 
     For 0 <= s < reach. Curvatures are second derivatives, of either sign.
 
-    Proof of the step. The upper parabola starts a gap g > 0 below the level above; it can reach it
-    first at the smallest positive root of a s + c s^2/2 = g, which is, without cancellation,
+    Proof of the step. The upper parabola starts a gap g > 0 below the level above and first reaches
+    it at the smallest positive root of a s + c s^2/2 = g, which is, without cancellation,
     2g/(a + r) where a > 0 and (r - a)/c where a <= 0 < c, with r = sqrt(a^2 + 2 c g); there is none
     where a <= 0 and c <= 0, or where r is not real. For the level below the same holds of -F.
-    Exact to second order where the curvatures are, so it converges quadratically at the surface.
-    The upper end rises with the largest slope, the lower one with the least.
+    If the curvatures are exact the step is exact to second order, so that steps converge
+    quadratically at the surface. The upper end rises with the largest slope, the lower one with the
+    least.
     """
 
     slopes: Slopes
@@ -75,7 +72,7 @@ class Cone(Parabola):
         constant = _not_negative(promise.constant)
         return cls(Slopes(-constant, constant), 0.0, 0.0, promise.radius)
 
-    # Both sides in one formula, for speed: a ray beside an edge asks a dozen cones at each point.
+    # Both sides in one formula, for speed: a ray along an edge uses a dozen cones at each point.
 
     def step(self, gaps: Gaps) -> Real:
         length = gaps.smaller / self.slopes.high
@@ -93,7 +90,7 @@ class Taylor(Parabola):
     """Taylor's formula with a bound H of the second derivatives.
 
     Proof. With a slope in [low, high], F(s) lies between low s - H s^2/2 and high s + H s^2/2 for
-    s < radius: the promise, read along a line.
+    s < radius, by the promise along a line.
     """
 
     @classmethod
@@ -105,15 +102,15 @@ class Taylor(Parabola):
 
 
 def _not_negative(constant: Real) -> Real:
-    """The constant, or not a number where it can be none: then nothing is proved."""
+    """The constant; NaN where it is negative, so that nothing is proved."""
     return dr.select(constant >= 0, constant, dr.nan)
 
 
 def first_root(gap: Real, slope: Real, curvature: Real) -> Real:
     """The first s > 0 at which slope s + curvature s^2/2 reaches the gap; infinite if none does.
 
-    In a form whose squares neither overflow nor vanish: close to a zero of high order slope,
-    curvature and gap are all far below the root of the smallest number.
+    In a form whose squares neither overflow nor underflow: near a zero of high order, slope,
+    curvature and gap are all far below the square root of the smallest number.
     """
     none = gap == dr.inf  # there is no level on this side
     turns = curvature < 0
@@ -131,7 +128,7 @@ def first_root(gap: Real, slope: Real, curvature: Real) -> Real:
 def _stays_below(gap: Real, slope: Real, curvature: Real, length: Real) -> Mask:
     """Whether slope s + curvature s^2/2 <= gap for 0 <= s <= length.
 
-    The largest value lies at an end, or at the vertex of a parabola that rises and then turns."""
+    The largest value is at an end, or at the vertex of a parabola that rises and then falls."""
     bend = 0.5 * curvature * length
     turned = (slope > 0) & (slope + 2 * bend < 0)
     steepest = _steepest_that_turns(_rounded_down_where(turned, gap), curvature)
@@ -139,13 +136,13 @@ def _stays_below(gap: Real, slope: Real, curvature: Real, length: Real) -> Mask:
 
 
 def _steepest_that_turns(gap: Real, curvature: Real) -> Real:
-    """sqrt(2 |curvature| gap): a parabola with a smaller slope turns before the gap."""
+    """sqrt(2 |curvature| gap): a parabola with a smaller slope falls again before the gap."""
     return dr.sqrt(dr.abs(curvature)) * (_ROOT_OF_TWO * dr.sqrt(gap))
 
 
 def _rounded_down_where(turns: Mask, gap: Real) -> Real:
-    """The gap, smaller by eight roundings where a parabola turns: if it turns close to the level,
-    rounding decides whether a^2 + 2 c g is negative."""
+    """The gap, smaller by eight roundings where a parabola bends away from the level: if its vertex
+    is close to the level, rounding decides whether a^2 + 2 c g is negative."""
     return dr.select(turns, gap * (1 - 8 * float(dr.epsilon(type(gap)))), gap)
 
 
@@ -154,9 +151,9 @@ class Tangent(Enclosure):
     """F(s) >= slopes.low s for all s >= 0: f is convex along the path.
 
     Proof. A convex function lies above its tangents, so f does not fall to a level g below before
-    g/|slope|, and never if it rises here. Nothing is said of levels above. f itself must be convex;
-    that the solid is, and f a bound of its distance, is not enough (Hart 1996, equation 21: 1 -
-    e^-d is none). The lower end rises with the slope.
+    g/|slope|, and never if it rises here. Nothing is proved about levels above. f itself must be
+    convex; a convex solid, with f a bound of its distance, is not enough (Hart 1996, equation 21:
+    1 - e^-d is not convex). The lower end rises with the slope.
     """
 
     slopes: Slopes
@@ -168,7 +165,7 @@ class Tangent(Enclosure):
         return dr.select(gaps.up == dr.inf, fmax(down, 0), 0)
 
 
-# For roundings in single precision, of the angle and of the length that it becomes.
+# Covers the roundings, in single precision, of the angle and of the length that it becomes.
 _ROUND_DOWN = 1.0 - 1e-5
 _PI_BELOW = 3.14159
 
@@ -176,6 +173,11 @@ _PI_BELOW = 3.14159
 @dataclass(frozen=True)
 class Arc(Enclosure):
     """|F - slope psi| <= curvature psi^2/2, psi the angle traveled along the path's circle.
+
+    For functions of points on a sphere: by stereographic projection a line of space becomes a
+    circle of the unit sphere S^3, and a function that is a trigonometric polynomial on the circle
+    has a bounded second derivative in its angle, from one end of the line to the other. A step in
+    that angle, taken back to the line, may be infinite.
 
     slopes: of f along the path, in f per length, where it starts.
     curvature: a bound of the second derivative of f in the angle, on the whole circle.
@@ -212,7 +214,7 @@ class Arc(Enclosure):
         half = 0.5 * _ROUND_DOWN * fmin(up, down)
         known = (up >= 0) & (down >= 0) & (self.curvature >= 0)  # and not NaN
         known &= dr.isfinite(total)  # its square does not overflow
-        ends = half >= _PI_BELOW  # once around
+        ends = half >= _PI_BELOW  # once around the circle
         s, k = sincos(dr.select(ends, 0, half))
         left = dr.fma(c, k, -self.offset * s)
         length = dr.select((left > 0) & ~ends, total * s / left * _ROUND_DOWN, dr.inf)

@@ -28,12 +28,12 @@ class Pieces(Enclosure):
     Proof of the step. Let F <= A at the start of a piece, with F' <= D there, and F' <= k, F'' <= c
     on the piece. Then F <= A + min(k s, D s + c s^2/2) on it. The next piece starts with at most
     the value of that at its end, and with a slope of at most min(D + c w, k), w the length of the
-    piece. The first s at which that reaches the gap is the root of a line or of a parabola. The
-    level below is the same of -F. With exact ranges the bound converges to F with the third power
-    of the length of the pieces, so that one look may cross much of a ray.
+    piece. The first s at which that reaches the gap is the root of a line or of a parabola. For the
+    level below the same holds of -F. With exact ranges the bound converges to F with the third
+    power of the length of the pieces, so that one sample may prove much of a ray.
 
-    Source: our own; one piece is the linear and the quadratic Taylor form together (Aydinlilar and
-    Zanni 2023, section 6.1).
+    Source: new in harnack; one piece is the linear and the quadratic Taylor form together
+    (Aydinlilar and Zanni 2023, section 6.1).
     """
 
     slopes: Slopes
@@ -41,7 +41,8 @@ class Pieces(Enclosure):
 
     @classmethod
     def along(cls, function: Restriction, slopes: Slopes, length: Real) -> Self | None:
-        """Each piece is twice as long as the one before it, but for the first two."""
+        """The first two pieces are equally long, each of the others is twice as long as the one
+        before it."""
         count = cls._count(function)
         knots = [length * 2.0 ** (k + 1 - count) for k in range(count)]
         return cls(slopes, function.pieces([0.0, *knots]))
@@ -62,7 +63,8 @@ class Pieces(Enclosure):
             up, is_free_above = self._reach(gaps.up, True)
             down, is_free_below = self._reach(gaps.down, False)
             reach, is_free = fmin(up, down), is_free_above & is_free_below
-        # The end of the last piece is exact: pulled back, it would cost a ray that misses a look.
+        # The end of the last piece is exact: shortened, a ray that misses would need one more
+        # sample.
         reach = fmax(reach, 0)
         return dr.select(is_free, reach, reach * ROUND_DOWN)
 
@@ -75,7 +77,7 @@ class Pieces(Enclosure):
 
         slope = chosen(self.slopes.high, self.slopes.low)
         none = gap == dr.inf
-        left = dr.select(none, 0, gap)  # of the gap, at the start of the piece
+        left = dr.select(none, 0, gap)  # the rest of the gap at the start of the piece
         total = type(gap)(0)
         free = gap >= 0  # and not NaN
         for part in self.parts:
@@ -91,14 +93,14 @@ class Pieces(Enclosure):
     def _on_piece(
         cls, left: Real, slope: Real, most: Real, bend: Real, length: Real
     ) -> tuple[Real, Real, Real]:
-        """The slope at the end of a piece, how far it is free, and what is left of the gap."""
-        # What is not a number is not known.
+        """The slope at the end of a piece, how far it is free, and the rest of the gap there."""
+        # A range that is NaN is not known.
         slope = dr.select((slope <= most) | (most != most), slope, most)
         by_line = dr.select(most > 0, left / most, dr.select(most <= 0, dr.inf, 0))
         by_line = dr.select(left > 0, by_line, 0)
         by_parabola = first_root(left, slope, bend)
         reach = fmin(fmax(by_parabola, by_line) * ROUND_DOWN, length)
-        # Rises and falls may cancel: their rounding counts, not that of their sum.
+        # Both terms may cancel: the rounding is that of each, not that of their sum.
         unit = 4 * float(dr.epsilon(type(left)))
         bent, straight = 0.5 * length * length * bend, slope * length
         by_parabola = (bent + straight) + unit * (dr.abs(bent) + dr.abs(straight))
@@ -108,7 +110,7 @@ class Pieces(Enclosure):
 
 
 class OnePiece(Pieces, abc.ABC):
-    """Proofs from ranges on the whole length at once: those of the literature, for comparison."""
+    """Base of proofs from ranges on the whole length at once: those of the literature."""
 
     @classmethod
     def _count(cls, function: Restriction) -> int:
@@ -117,7 +119,7 @@ class OnePiece(Pieces, abc.ABC):
 
 
 class QuadraticTaylor(OnePiece):
-    """The slope here and the range of F'' ahead.
+    """The parabola from the slope at the start and the range of F''.
 
     Source: Aydinlilar and Zanni 2023, section 6.1. Proof: that of `Pieces`, without the line.
     """
@@ -131,7 +133,7 @@ class QuadraticTaylor(OnePiece):
 
 
 class LinearTaylor(OnePiece):
-    """The range of F' ahead.
+    """The line from the range of F'.
 
     Source: Aydinlilar and Zanni 2023, section 4.1, with the exact range. Proof: that of `Pieces`,
     without the parabola.
@@ -146,7 +148,7 @@ class LinearTaylor(OnePiece):
 
 
 class Segment(OnePiece):
-    """The largest |F'| ahead: segment tracing.
+    """The largest |F'| on the length: segment tracing.
 
     Source: Galin, Guerin, Paris and Peytavie 2020; Aydinlilar and Zanni 2023, equation 10. Proof:
     |F(s)| <= K s with K the bound of |F'| on the piece.

@@ -3,9 +3,9 @@
 A promise is stated in the field's own units and must be *true*: every step that the tracer takes
 rests on it. Enclosures are made of promises, once the slope along a direction is known.
 
-What follows from a promise of f for other functions is an algebra, written here and nowhere else:
-of f scaled, shifted, negated and lengthened it follows from the units of the promise's numbers. A
-new kind states those, what it says (`movement`), and what else is known to follow from it.
+What a promise of f says of other functions is derived here and nowhere else. For f scaled, shifted,
+negated and stretched in space it follows from the units of the promise's numbers. A new kind of
+promise states those units, what it says of f (`movement`), and what else follows from it.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ if TYPE_CHECKING:
     from harnack.backend import Real
     from harnack.enclosures.enclosure import Slopes
 
-# The largest |f''| at the center of a ball of radius 1 on which a harmonic f has a span of 1, and
-# half the largest |f'| on that half of the ball, for up to four dimensions: see `HarmonicBall`.
+# For a harmonic f on a ball of radius 1 with upper - lower = 1: the largest |f''| at the center, in
+# space, and a bound of |f'| within half the radius, for up to four dimensions. See `HarmonicBall`.
 _SECOND, _FIRST = 10 / (3 * math.sqrt(3)), 1.7001
 
 
 @dataclass(frozen=True)
 class Promise(abc.ABC):
-    """What all kinds of promises have. Subclasses are frozen dataclasses of their numbers, of which
-    `radius`, how far from the point it holds, is one."""
+    """Base of all kinds of promises. Subclasses are frozen dataclasses of their numbers, one of
+    which is `radius`: how far from the point the promise holds."""
 
     units: ClassVar[tuple[tuple[str, int, int], ...]]
     """The names of its numbers, and the powers of the units of f and of length that each is in."""
 
     ends: ClassVar[tuple[tuple[str, str], ...]] = ()
-    """The pairs of numbers that are a lower and an upper end: the first is that of the values."""
+    """The pairs of numbers that are a lower and an upper end; the first pair bounds f itself."""
 
     of_all_space: ClassVar[bool] = False
     """Whether it holds on the whole ball, also where that leaves the field's domain."""
@@ -56,11 +56,11 @@ class Promise(abc.ABC):
 
     @abc.abstractmethod
     def movement(self, value: Any, slopes: Slopes, length: Any) -> tuple[Any, Any]:
-        """The ends between which f(y) - f(p) is, for y at that length from p along a direction with
-        these slopes, less than the radius; value: f(p). Of NumPy or Dr.Jit arrays alike."""
+        """Lower and upper bound of f(y) - f(p), for y at that length, less than the radius, from p
+        along a direction with these slopes; value: f(p). For NumPy and Dr.Jit arrays alike."""
 
     def remainder(self, value: Real, length: Real) -> Real:
-        """A bound of |f(y) - f(p) - grad f(p) . (y - p)| for |y - p| <= length, which falls at
+        """A bound of |f(y) - f(p) - grad f(p) . (y - p)| for |y - p| <= length, which decreases at
         least as the square of the length; infinite where none follows."""
         del value, length
         return dr.inf
@@ -71,8 +71,8 @@ class Promise(abc.ABC):
         return None
 
     def of_any_map(self, value: Real) -> Promise:
-        """What is left of it where a linear map that is no similarity follows: all kinds but those
-        that speak of Laplacians."""
+        """A promise that follows from this one and holds, transformed, for f(A x) with any linear
+        map A. Laplacians do not survive a map that is no similarity; other kinds do."""
         del value
         return self
 
@@ -95,7 +95,7 @@ class Promise(abc.ABC):
         return dataclasses.replace(self, **numbers)
 
     def lengthened(self, size: Real) -> Self:
-        """The promise of x -> f(x / size), at the place that moves there."""
+        """The promise of x -> f(x / size), at size * p."""
 
         def longer(number: Real, power: int) -> Real:
             if power == 0:
@@ -153,7 +153,7 @@ class HarmonicBall(Promise):
         of Poisson's kernel P(q, s) = sum over l of the zonal harmonics, all largest at s = 1, with
         a measure of mass f(p) - c; those of degree 0 and 1 are the value and the gradient. The rest
         is between -(P - 1 - n q) and P - 1 - n q at s = 1, P = (1 + q)/(1 - q)^(n - 1), times
-        f(p) - c. The same holds for C - f, and the smaller of both counts.
+        f(p) - c. The same holds for C - f, and the smaller of the two bounds is returned.
         """
         mass = fmin(value - self.lower, self.upper - value)
         q = length / self.radius
@@ -175,16 +175,23 @@ class HarmonicBall(Promise):
         return Lipschitz(_FIRST * self._span(value) / self.radius, 0.5 * self.radius)
 
     def of_any_map(self, value: Real) -> Promise:
-        """Second derivatives on half the ball. Proof. On a ball of radius R about its center, f_vv
-        = R^-2 times the mean of f 5 (3 s^2 - 1) over the sphere, s the cosine of the angle to v; of
-        f between lower and upper that is at most 10/(3 sqrt 3) (upper - lower)/R^2. Points within
-        R/2 are centers of balls of radius R/2.
+        """`Curvature` on half the ball. Proof in space (and so in the plane). At the center of a
+        ball of radius R, f_vv = R^-2 times the mean of f 5 (3 s^2 - 1) over the sphere, s the
+        cosine of the angle to v; for f between lower and upper that is at most 10/(3 sqrt 3)
+        (upper - lower)/R^2. Points within R/2 are centers of balls of radius R/2.
+
+        In R^4 the factor is 6 (4 s^2 - 1), and c = 2.49 takes the place of 10/(3 sqrt 3) = 1.92.
+        There |f_vv| <= c (upper - lower)/(R - u)^2 at the distance u from p, and by Taylor's
+        formula the remainder at t <= R/2 is at most (upper - lower) times the integral of
+        c (t - u)/(R - u)^2 over [0, t]. As one factor falls and the other rises, that is at most
+        t^2/2 times the mean of c/(R - u)^2, which is c/(R (R - t)) <= 2 c/R^2: less than the
+        constant, 7.7/R^2.
         """
         half = 0.5 * self.radius
         return Curvature(1.0001 * _SECOND * self._span(value) / (half * half), half)
 
     def _span(self, value: Real) -> Real:
-        """upper - lower, as a sum of what is near the value."""
+        """upper - lower, as the sum of the distances of both from the value."""
         return (self.upper - value) + (value - self.lower)
 
 
@@ -194,9 +201,9 @@ class BoundedLaplacian(Promise):
     [laplacian_lower, laplacian_upper].
 
     f is continuously differentiable there and its Laplacian a bounded function, which may jump. All
-    four ends are needed: a subharmonic function is one with laplacian_lower = 0, of which nothing
-    follows unless laplacian_upper is known as well, for it may have spikes. Units: those of f, and
-    of f over length squared.
+    four ends are needed: a subharmonic function has laplacian_lower = 0, but nothing follows unless
+    laplacian_upper is known as well, for it may have spikes. Units: those of f, and of f over
+    length squared.
     """
 
     radius: Real
@@ -230,8 +237,8 @@ class BoundedLaplacian(Promise):
         return self.lipschitz(value)
 
     def shortened(self, stretch: Real) -> BoundedLaplacian:
-        """The Laplacian of f(A x) is that of f times the square of what A stretches all lengths by:
-        at most `stretch`, and less by at most some roundings."""
+        """For a similarity A: the Laplacian of f(A x) is that of f times the square of the factor
+        by which A stretches lengths, which is `stretch` up to some roundings."""
         slack = 5e-6 * (dr.abs(self.laplacian_lower) + dr.abs(self.laplacian_upper))
         low, high = self.laplacian_lower - slack, self.laplacian_upper + slack
         wider = dataclasses.replace(self, laplacian_lower=low, laplacian_upper=high)
@@ -242,7 +249,7 @@ class BoundedLaplacian(Promise):
 class Lipschitz(Promise):
     """|f(y) - f(p)| <= constant * |y - p| for every y with |y - p| < radius (default: all y).
 
-    Of a field with a domain: for every such y in it.
+    For a field with a domain: for every such y in it.
     """
 
     constant: Real
@@ -263,7 +270,7 @@ class Lipschitz(Promise):
 class Curvature(Promise):
     """|f(y) - f(p) - grad f(p).(y-p)| <= constant |y-p|^2/2 for every y with |y-p| < radius.
 
-    Of a field with a domain: for every such y in it.
+    For a field with a domain: for every such y in it.
     """
 
     constant: Real

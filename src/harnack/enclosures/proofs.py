@@ -1,4 +1,4 @@
-"""Which proofs are used: promises to enclosures, and of several enclosures the longest step."""
+"""The choice of proofs, by name or by class; the longest step that several enclosures prove."""
 
 from __future__ import annotations
 
@@ -55,20 +55,20 @@ BOUNDS = tuple(sorted(_NAMED))
 
 @dataclass(frozen=True)
 class Proofs:
-    """Of each promise the first of these enclosures that can be made of it is used.
+    """Kinds of enclosures. For each promise the first kind that can be made of it is used.
 
-    kinds: from the sharpest to the plainest: a later one would only repeat a weaker proof from the
-        same promise.
-    uses_weaker: whether promises are used of which the field says that they are weaker than its
-        others (`Sample.weaker`).
+    kinds: from the sharpest to the weakest: a later one would only prove less from the same
+        promise.
+    uses_weaker: whether to use promises that the field calls weaker than its others
+        (`Sample.weaker`).
     """
 
     kinds: tuple[type[Enclosure], ...]
     uses_weaker: bool = True
 
     def along(self, function: Restriction, slopes: Slopes, length: Real) -> tuple[Enclosure, ...]:
-        """The enclosures of a function whose ranges along the path are known; none if none of the
-        proofs is made of ranges."""
+        """The enclosures of a function whose ranges along the path are known; empty if none of the
+        proofs uses ranges."""
         for kind in self.kinds:
             enclosure = kind.along(function, slopes, length)
             if enclosure is not None:
@@ -138,15 +138,15 @@ Choice: TypeAlias = str | type[Enclosure] | Iterable[type[Enclosure]] | Proofs |
 
 
 def choose_proofs(bound: Choice = None) -> Proofs:
-    """The proofs asked for: a name, an enclosure's class or several, or None for all that pay.
+    """The proofs asked for: a name, one or several classes of enclosures, or None for all that pay.
 
     Names: "classic" (the published rule), "slope", "caps" (caps where both ends are known, the
     slope bound elsewhere), "laplacian" (where the Laplacian is bounded), "lipschitz", and
-    "curvature" (Taylor's formula where second derivatives are bounded, else as "caps"); of fields
-    with a formula, "pieces", and for comparison "quadratic-taylor", "linear-taylor", "segment", and
-    of the formula's own arithmetic "bottom-up-linear", "bottom-up-quadratic", "mixed", "affine",
-    "interval".
-    None is as "pieces", which is as "curvature" for fields without a formula, and without the
+    "curvature" (Taylor's formula where second derivatives are bounded, else as "caps"); for fields
+    with a formula "pieces", and for comparison "quadratic-taylor", "linear-taylor" and "segment",
+    and by the formula's own arithmetic "bottom-up-linear", "bottom-up-quadratic", "mixed", "affine"
+    and "interval".
+    None means "pieces", which for fields without a formula means "curvature", but without the
     promises that a field itself calls weaker than its others.
 
     Raises ValueError for another name, TypeError for what is no class of enclosures.
@@ -180,7 +180,7 @@ def _is_proof(kind: Any) -> bool:
 def longest_step(enclosures: tuple[Enclosure, ...], gaps: Gaps) -> Real:
     """The longest step that one of the enclosures proves: every one is safe, so their maximum is.
 
-    At least 0, also where an enclosure gives what is not a number.
+    At least 0, also where an enclosure gives NaN.
     """
     best: Real = type(gaps.up)(0)
     for one in enclosures:

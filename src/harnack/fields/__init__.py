@@ -1,6 +1,6 @@
-"""Fields: what f is. One family a file.
+"""Fields: what f is. One family a folder.
 
-What all fields share has its names here; a field of its own is a name of `harnack` alone, which
+This package exports what all fields share. The fields themselves are names of `harnack`, which
 `harnack/__init__.pyi` lists.
 """
 

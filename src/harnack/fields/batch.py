@@ -1,6 +1,7 @@
-"""Evaluating a field at many points: NumPy in, NumPy out.
+"""Fields that can be evaluated at many points at once, and caches that live as long as a field.
 
-What is computed or uploaded once for a field, and kept as long as the field is.
+- `BatchedField`: values, derivatives and error bounds at points: NumPy in, NumPy out.
+- `FieldCache`, `prepared_once`: what is computed or uploaded only once for a field.
 """
 
 from __future__ import annotations
@@ -26,14 +27,14 @@ from harnack.fields.points import at_points
 if TYPE_CHECKING:
     from harnack.backend import Backend, Precision, Real, Vec3
 
-# Of the total weight of dipoles: the rounding of their moments, which are summed up in double
-# precision.
+# The rounding of dipoles' moments, which are summed up in double precision, as a fraction of the
+# total weight.
 _MOMENTS = 32 * 2.0**-53
 
 
 @dataclass(frozen=True)
 class SymmetricSum:
-    """A symmetric matrix a lane, as it is summed up."""
+    """The state of a sum of symmetric matrices, one in each lane."""
 
     xx: Real
     yy: Real
@@ -60,7 +61,7 @@ class SymmetricSum:
         )
 
     def parts(self) -> tuple[Real, ...]:
-        """The entries in the order of the constructor, as loops want them."""
+        """The entries in the order of the constructor, for the state of a loop."""
         return self.xx, self.yy, self.zz, self.xy, self.xz, self.yz
 
     def rows(self, vector: Any) -> tuple[Vec3, Vec3, Vec3]:
@@ -74,11 +75,13 @@ class SymmetricSum:
 
 @dataclass(frozen=True)
 class Values:
-    """What a field is at points: value and, as far as they were asked for, gradient and Hessian,
-    in the field's own units, with bounds of their errors by truncation and rounding.
+    """Value and, if they were asked for, gradient and Hessian of a field at points, in the field's
+    own units, with bounds of their errors by truncation and rounding.
 
-    error: of the value. gradient_error: of the gradient, as a length. hessian_error: of second
-    derivatives along lines, which is the spectral norm of the Hessian's error.
+    error: of the value.
+    gradient_error: of the gradient, as a length.
+    hessian_error: of second derivatives along lines, which is the spectral norm of the Hessian's
+        error.
     """
 
     value: Real
@@ -91,11 +94,13 @@ class Values:
     def far_away(self, x: Vec3, terms: int, weight: float) -> Values:
         """The same values with error bounds that hold at points far away too.
 
-        x: the points, in unit lengths. terms: how many terms were summed up. weight: of all dipoles
-        together. Two errors count there alone. A term of a derivative is a product of a factor that
-        falls like |x|^-5 and one that grows like |x|^2, and the first may underflow. And where
-        dipoles nearly cancel, their summed moments are rounded in proportion to the weight of all
-        of them, not to the small sum.
+        x: the points, in coordinates in which the field's data have a size of about one. terms: how
+        many terms were summed up. weight: of all dipoles together.
+
+        Two errors matter only far away. A term of a derivative is a product of a factor that falls
+        like |x|^-5 and one that grows like |x|^2, and the first may underflow. And where dipoles
+        nearly cancel, their summed moments are rounded in proportion to the weight of all of them,
+        not to the small sum.
         """
         smallest = float(dr.smallest(type(x.x)))
         lost = 4 * smallest * terms * (1 + dr.squared_norm(x))
@@ -109,7 +114,7 @@ class Values:
         )
 
     def rescaled(self, size: Real) -> Values:
-        """Those of x -> f(x / size), at the points that move there. Where a number has overflowed
+        """The values of x -> f(x / size) at `size` times the points. Where a number has overflowed
         its error is infinite."""
         gradient, hessian, share = self.gradient, self.hessian, 1 / size
         gradient_error, hessian_error = self.gradient_error, self.hessian_error
@@ -126,7 +131,7 @@ class Values:
 
 
 class BatchedField(Field):
-    """A field whose values, derivatives and error bounds can be had at many points at once.
+    """A field that gives values, derivatives and error bounds at many points at once.
 
     Subclasses define `values_at`.
     """
@@ -135,16 +140,18 @@ class BatchedField(Field):
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> Values:
         """Everything at points x, a Dr.Jit 3-vector of any backend and precision.
 
-        derivatives: 0 for the value alone, 1 with the gradient, 2 with the Hessian. Not called
-        while a loop is recorded, unless derivatives is 2. closer: what is far is approximated only
-        beyond so many times the usual distance, at least 1; infinity approximates nothing.
+        Not called while a loop is being recorded, unless derivatives is 2.
+
+        derivatives: 0 for the value alone, 1 with the gradient, 2 with the Hessian.
+        closer: clusters of far terms are approximated only beyond so many times the usual distance,
+            at least 1; infinity approximates nothing.
         """
 
     def differentiable_value(self, p: Vec3) -> Real:
         """f to first order about p: its value and, in reverse and forward mode, its gradient."""
         with dr.suspend_grad():
             at = self.values_at(dr.detach(p), 1)
-        # Of a literal 0, as a closed mesh has it, Dr.Jit has no derivative at all.
+        # A literal 0, the gradient of a closed mesh, would have no derivative in Dr.Jit.
         return dr.replace_grad(at.value, dr.dot(as_data(at.gradient), p - dr.detach(p)))
 
     @takes_tensors
@@ -166,7 +173,7 @@ class BatchedField(Field):
     def value_and_gradient(
         self, points: Any, *, precision: Precision = "single"
     ) -> tuple[FloatArray, FloatArray]:
-        """Values (n,) and gradients (n, 3) together, for little more than one of them."""
+        """Values (n,) and gradients (n, 3) together, at little more cost than one of them."""
         value, gradient = self._at(points, precision, 1, lambda at: (at.value, at.gradient))
         return value, gradient
 
@@ -174,24 +181,21 @@ class BatchedField(Field):
         return _hessian(self.values_at(p, 2)).rows(backend_of(p).Array3f)
 
     def error_bound(self, points: Any, *, precision: Precision = "single") -> FloatArray:
-        """How far `value` may be from the field at most, at points (n, 3): (n,).
+        """Bounds (n,) of the error of `value` at points (n, 3).
 
-        Truncation, proved, and rounding. Rounding of the points themselves, which in single
-        precision are rounded on the way in, comes on top.
+        Proved truncation, and rounding. The rounding of the points themselves, in single precision,
+        is not included.
         """
         return self._at(points, precision, 0, lambda at: (at.error,))[0]
 
     def gradient_error_bound(self, points: Any, *, precision: Precision = "single") -> FloatArray:
-        """How far `gradient` may be from the field's at most, as a length, at points (n, 3): (n,).
-
-        As for `error_bound`.
-        """
+        """Bounds (n,) of the error of `gradient`, as a length, at points (n, 3): see
+        `error_bound`."""
         return self._at(points, precision, 1, lambda at: (at.gradient_error,))[0]
 
     def hessian_error_bound(self, points: Any, *, precision: Precision = "single") -> FloatArray:
-        """How far `hessian` may be from the field's at most, in the spectral norm, at points
-        (n, 3): (n,). As for `error_bound`.
-        """
+        """Bounds (n,) of the error of `hessian`, in the spectral norm, at points (n, 3): see
+        `error_bound`."""
         return self._at(points, precision, 2, lambda at: (at.hessian_error,))[0]
 
     def _at(
@@ -219,19 +223,19 @@ Value = TypeVar("Value")
 
 
 class FieldCache(Generic[Value]):
-    """One value for each field, the one that was asked for last. It goes when the field goes.
+    """One value for each field, the one that was asked for last, deleted with the field.
 
-    A value must not hold its field, or neither would ever go; the field itself is not kept.
+    A value must not refer to its field, or neither would ever be deleted.
     """
 
     def __init__(self) -> None:
-        # By identity: fields that anyone writes may be equal to others, or have no hash.
+        # By identity: users' fields may be equal to others, or have no hash.
         self._kept: dict[int, tuple[Any, dict[str, Any], Value]] = {}
 
     def get(self, field: Field, key: Any, make: Callable[[], Value]) -> Value:
-        """The value of a field under a key, from `make` where another key was asked for last.
+        """The value of a field for a key: the last one if that had the same key, else `make()`.
 
-        It is made anew if an attribute of the field has been set since.
+        It is made again if an attribute of the field has been set since.
         """
         if id(field) in self._kept:
             kept_key, attributes, value = self._kept[id(field)]
@@ -248,7 +252,7 @@ class FieldCache(Generic[Value]):
 
 
 def prepared_once(prepare: Prepare) -> Prepare:
-    """A field's method `prepare` that uploads the field to each backend only once.
+    """A decorator of a field's method `prepare`: the field is uploaded to each backend only once.
 
     Fields with parameters are uploaded each time: a parameter may change in place, and its
     derivatives belong to one trace.

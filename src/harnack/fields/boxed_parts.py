@@ -36,8 +36,8 @@ class BoxedParts(UnitCoordinates):
     def upload(cls, backend: Backend, lower: FloatArray, upper: FloatArray) -> BoxedParts:
         """Boxes from their corners (n, 3).
 
-        The size is a power of two, so that places along rays are scaled without rounding, and keep
-        their order.
+        The size is a power of two, so that positions along rays are scaled without rounding, and
+        keep their order.
         """
         low, high = lower.min(axis=0), upper.max(axis=0)
         center = single(0.5 * (low + high))
@@ -57,7 +57,7 @@ class BoxedParts(UnitCoordinates):
 
 
 class Buffers(Protocol):
-    """What a field with parts has on a backend: its boxes, and what its parts are made of."""
+    """The data of a field with parts on a backend: its boxes, and those of its parts."""
 
     @property
     def boxes(self) -> BoxedParts: ...
@@ -69,7 +69,7 @@ _Buffers = TypeVar("_Buffers", bound=Buffers)
 class BoxedField(Field, Generic[_Buffers]):
     """A field with parts in boxes, which depend on the levels.
 
-    levels: for which its boxes hold the surfaces once it is prepared.
+    levels: once the field is prepared, its boxes hold the surfaces of these levels.
     """
 
     has_parts: bool = True
@@ -88,7 +88,7 @@ class BoxedField(Field, Generic[_Buffers]):
 
     @abc.abstractmethod
     def _upload(self, backend: Backend) -> _Buffers:
-        """What is needed on a backend."""
+        """The data on a backend."""
 
     def for_levels(self, levels: tuple[float, ...]) -> Self:
         if levels == self.levels:

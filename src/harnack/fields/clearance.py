@@ -1,8 +1,8 @@
-"""A proved lower bound of the distance to a level set: the safe step of every direction at once.
+"""Clearances: proved lower bounds of the distance to a level set, and the extents they prove.
 
-And the extents that follow from it.
-
-Data on a backend, in coordinates in which they have a size of about one, and their fields.
+`clearance_of` gives them at points, `tight_extent` and `occupied_cells` prove where level sets are.
+Also here: `UploadedField`, the base of fields whose data lie on a backend, in coordinates in which
+they have a size of about one.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 __all__ = ["clearance_of", "distance_below", "occupied_cells", "tight_extent"]
 
-# All that a field promises: points are few, and the longest proof counts.
+# Uses all promises of a field: points are few, and the longest proof counts.
 _PROOFS = choose_proofs("curvature")
 
 
@@ -42,7 +42,7 @@ def clearance_of(
     """`distance_below` at points (n, 3)."""
     backend = choose_backend(precision)
     prepared = field.prepare(backend)
-    # Data, so that other levels compile nothing.
+    # Kernel parameters, so that other levels compile nothing.
     values = tuple(dr.opaque(backend.Float, level) for level in levels)
     targets = TargetLevels(values, field.period)
 
@@ -62,13 +62,14 @@ def tight_extent(
     finest: int = 5,
     points: FloatArray | None = None,
 ) -> ConvexHull:
-    """A polytope of few planes that holds every point of the level sets inside a box.
+    """A polytope of few planes that contains every point of the level sets inside a box.
 
-    Cells of the box are left out if their ball is within the clearance of its center; those left at
-    the end are wrapped. most, finest: as for `cells.carve`.
+    Cells of the box are left out if the ball around them is within the clearance of its center; the
+    polytope is around those that are left.
 
-    points: (n, 3) that the polytope is to hold in any case. What lies in the polytope around them
-    needs no look: a ball that is inside it is as good as empty.
+    most, finest: as for `carve`.
+    points: (n, 3) that the polytope is to contain in any case. The polytope around them need not be
+        tested: a ball inside of it may be left out as well.
     """
     clearance = clearance_of(field, levels)
     slack = 1e-4 * float(np.linalg.norm(upper - lower))
@@ -105,19 +106,17 @@ def occupied_cells(
 def distance_below(
     backend: Backend, field: Field, levels: TargetLevels, p: Vec3, sample: Sample
 ) -> Real:
-    """A length that the distance from p to the nearest level is proved not to fall short of.
-
-    sample: the field at p.
+    """A proved lower bound of the distance from p to the nearest level; sample: the field at p.
 
     Proof. An enclosure holds f(p + tv) within [L(t, s), U(t, s)], s the slope along a unit
-    direction v, and steps to where that first meets a level. Neither end falls as s grows: that is
-    what every enclosure has to say of itself (`Enclosure`).
+    direction v, and steps to where that first meets a level. Neither end falls as s grows, as every
+    enclosure has to prove (`Enclosure`).
 
     All slopes lie in [-G, G], G = |grad f(p)| and its error: one enclosure with that interval of
-    slopes holds in every direction. The level above and that below are proofs of their own, and so
-    is each promise: of each the longest counts.
+    slopes holds in every direction. The distances to the level above and to that below are proved
+    separately, each by the promise that proves most.
 
-    As in the tracer the levels are seen nearer by the rounding of value and position, and the
+    As in the tracer the levels count as nearer by the rounding of value and position, and the
     result is shortened by the rounding of p itself. Where f jumps, all this is about f with the
     jumps taken out, which is f up to the nearest sheet.
     """
@@ -140,14 +139,15 @@ def distance_below(
 
 @dataclass(frozen=True)
 class UnitCoordinates:
-    """The way to coordinates center + size times these; what lies there, subclasses say."""
+    """Data on a backend in unit coordinates x: the point is center + size * x. Subclasses add the
+    data."""
 
     backend: Backend
     center: Vec3
     size: Real
 
     def unit(self, p: Vec3) -> Vec3:
-        """A point in these coordinates."""
+        """A point p in unit coordinates."""
         return (self.backend.Array3f(p) - self.center) / self.size
 
 
@@ -155,7 +155,7 @@ Uploaded = TypeVar("Uploaded", bound=UnitCoordinates)
 
 
 class UploadedField(Field, Generic[Uploaded]):
-    """A field that is evaluated by data on a backend. Subclasses define `_upload`."""
+    """A field that is evaluated from data on a backend. Subclasses define `_upload`."""
 
     def __init__(self) -> None:
         self._device: Uploaded | None = None
@@ -174,31 +174,32 @@ class UploadedField(Field, Generic[Uploaded]):
         return prepared
 
     def _on(self, p: Vec3) -> Uploaded:
-        """The data for tracing, on the backend of p where `prepare` was not called."""
+        """The data for tracing; on the backend of p if `prepare` was not called."""
         if self._device is None:
             return self._upload(backend_of(p), traced=True)
         return self._device
 
     def _prepared(self) -> Uploaded:
-        """The data for tracing; RuntimeError where `prepare` was not called."""
+        """The data for tracing; RuntimeError if `prepare` was not called."""
         if self._device is None:
             raise RuntimeError("prepare(backend) comes first, before at_detail")
         return self._device
 
     def _batch(self, backend: Backend) -> Uploaded:
-        """The data for values at points, which are uploaded once a backend."""
+        """The data for values at points, uploaded once for each backend."""
         if backend not in self._batches:
             self._batches[backend] = self._upload(backend, traced=False)
         return self._batches[backend]
 
 
 class DetailedField(UploadedField[Uploaded]):
-    """One that is evaluated more coarsely or more closely. Subclasses define `_sample`."""
+    """An uploaded field with a choice of detail (`Field.at_detail`). Subclasses define
+    `_sample`."""
 
     has_detail = True
 
     values_take_more: ClassVar[bool] = True
-    """Whether `_upload` of values at points differs from that for tracing."""
+    """Whether the data for values at points differ from those for tracing."""
 
     @abc.abstractmethod
     def _sample(self, on: Uploaded, p: Vec3, detail: Real) -> Sample:
@@ -220,19 +221,19 @@ class DetailedField(UploadedField[Uploaded]):
 
 
 def single(center: FloatArray) -> FloatArray:
-    """The nearest center that single precision holds exactly: to subtract it from points nearby
-    then rounds nothing, however far the origin is."""
+    """The nearest center that single precision holds exactly: subtracting it from points nearby is
+    then exact, however far the origin is."""
     with np.errstate(over="ignore"):
         rounded = center.astype(np.float32).astype(np.float64)
     return np.where(np.isfinite(rounded), rounded, center)
 
 
 def placed(backend: Backend, center: FloatArray, size: float) -> tuple[Backend, Vec3, Real]:
-    """What `UnitCoordinates` consist of; neither becomes part of a kernel's code."""
+    """The attributes of `UnitCoordinates`, as kernel parameters."""
     opaque = (dr.opaque(backend.Float, float(c)) for c in center)
     return backend, backend.Array3f(*opaque), dr.opaque(backend.Float, size)
 
 
 def epsilon_at(x: Vec3) -> Real:
-    """What rounding may do to a coordinate of x, or of a vertex of size about one."""
+    """The rounding of a coordinate of x, or of a vertex of size about one."""
     return float(dr.epsilon(x)) * (1 + dr.max(dr.abs(x)))

@@ -1,7 +1,4 @@
-"""A user's own formula as a field.
-
-Formulas written as text, such as "x^2 + y^2 + z^2 = 1".
-"""
+"""A user's own formula as a field: a Python function, or a text such as "x^2 + y^2 + z^2 = 1"."""
 
 from __future__ import annotations
 
@@ -38,7 +35,7 @@ _FUNCTIONS: Mapping[str, Callable[..., Any]] = MappingProxyType(
         "min": lambda *several: functools.reduce(arithmetic.minimum, several),
     }
 )  # fmt: skip
-# How many arguments functions take that do not take one: at least, at most.
+# Functions with several arguments: the least and the largest number of them.
 _SEVERAL = {"max": (2, 99), "min": (2, 99), "norm": (2, 3)}
 _OPERATORS: Mapping[type[ast.operator], Callable[[Any, Any], Any]] = MappingProxyType(
     {
@@ -48,18 +45,19 @@ _OPERATORS: Mapping[type[ast.operator], Callable[[Any, Any], Any]] = MappingProx
         ast.Div: lambda a, b: a / b,
     }
 )
-# Characters, and operations within operations: Python's own depth of calls is some 1000.
+# Limits of the number of characters, and of nested operations: Python allows some 1000 nested
+# calls.
 _LONGEST, _DEEPEST = 4000, 200
 
 
 @dataclass(frozen=True)
 class TextFormula:
-    """f(x, y, z) of a text, that is called as any function of three coordinates.
+    """f(x, y, z) given as a text, called like any function of three coordinates.
 
     text: with + - * / ^ (or **), brackets, numbers, x, y, z, pi, e and the functions above. An
-        equation "left = right" means left - right. It is read as a tree and never run as Python,
-        so that a text from anywhere does no harm.
-    parameters: numbers by the names that the text calls them.
+        equation "left = right" means left - right. It is parsed to a tree and never run as Python,
+        so that texts from untrusted sources do no harm.
+    parameters: numbers by their names in the text.
     """
 
     text: str
@@ -108,7 +106,7 @@ class TextFormula:
 
     def __call__(self, x: Any, y: Any, z: Any) -> Any:
         try:
-            with np.errstate(all="ignore"):  # of constants; what comes of it is refused
+            with np.errstate(all="ignore"):  # in constants; a result that is not finite is refused
                 return _value(self.tree, {"x": x, "y": y, "z": z, **_CONSTANTS, **self.parameters})
         except ZeroDivisionError:
             raise _wrong(self.text, "it divides by zero") from None
@@ -121,7 +119,7 @@ class TextFormula:
 
 
 def looks_like_formula(text: str) -> bool:
-    """Whether a text that names nothing else is meant as a formula: an equation, or with powers."""
+    """Whether a text looks like a formula: an equation, or with powers."""
     return any(sign in text for sign in ("=", "^", "**"))
 
 
@@ -133,7 +131,7 @@ def _wrong(text: str, why: str) -> ValueError:
 
 
 def _check(text: str, node: ast.expr, own: Iterable[str], depth: int = 0) -> None:
-    """Raise ValueError for anything in a tree that is not allowed, or no function."""
+    """Raise ValueError for anything in a tree that is not allowed or not known."""
     if depth > _DEEPEST:
         raise _wrong(text, f"more than {_DEEPEST} operations are within each other")
     if isinstance(node, ast.BinOp):
@@ -196,7 +194,7 @@ def _value(node: ast.expr, names: Mapping[str, Any]) -> Any:
     """The value of a tree that was checked.
 
     Raises:
-        OverflowError: a part of constants is no finite number.
+        OverflowError: a part that is constant is not finite.
     """
     value = _computed(node, names)
     if isinstance(value, float) and not math.isfinite(value):
@@ -226,7 +224,7 @@ def _computed(node: ast.expr, names: Mapping[str, Any]) -> Any:
 
 
 def _power(base: Any, exponent: Any) -> Any:
-    """base^exponent, whole exponents as such: they are powers of negative numbers, too."""
+    """base^exponent, with whole exponents as integers: negative numbers have such powers too."""
     if isinstance(exponent, float) and exponent.is_integer():
         exponent = int(exponent) if abs(exponent) < 2**31 else exponent
     if isinstance(base, float) and isinstance(exponent, int | float):
@@ -239,7 +237,7 @@ def _power(base: Any, exponent: Any) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Expression(Formula):
-    """f(x, y, z) as a Python function, written with plain operators and `harnack.sin` and its like.
+    """f(x, y, z) given as a Python function, written with plain operators and `harnack.sin` etc.
 
     function: called with three coordinates while a kernel is being recorded; numbers in it are
         literals of that kernel.

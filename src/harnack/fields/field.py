@@ -1,8 +1,8 @@
-"""What a field is: the one-page interface between functions and the rest of the library.
+"""What a field is: the interface between functions and the rest of the library.
 
 A field gives, in one evaluation, its value, its gradient and what it promises near the point
 (`harnack.enclosures.promises`). Promises must be *true*: every step that the tracer takes rests on
-them. `harnack.testing.check_field` tests a field against this page.
+them. `harnack.testing.check_field` tests whether a field fulfills this interface.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ __all__ = [
     "lengthened",
 ]
 
-# Methods that solids have and other fields have not.
+# Methods that only solids have.
 _OF_SOLIDS = frozenset(
     ("moved", "rotated", "scaled", "transformed", "twisted", "tapered", "grown", "blended")
 )
@@ -56,8 +56,8 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
     """A scalar function on R^3 whose level sets can be traced with a proof.
 
     Subclasses define `evaluate`; the class attributes are defaults that an instance may override.
-    What only some fields are capable of (jumps across sheets, parts, detail, curves at which level
-    sets end) is in the base classes, whose defaults say that a field is not.
+    The base classes have what only some fields can do (jumps across sheets, parts, detail, curves
+    at which level sets end); their defaults are those of a field that cannot.
     """
 
     period: ClassVar[float | None] = None
@@ -67,16 +67,17 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
     """The level drawn when none is asked for."""
 
     overstep: float = 1.4
-    """The over-stepping factor that needs the fewest evaluations, by experiment; at least 1."""
+    """The over-stepping factor (`LevelSet.overstep`) that needs the fewest evaluations, by
+    experiment; at least 1."""
 
     domain: Volume | None = None
     """Where the field may be evaluated and is drawn; None for all of space. Rays are clipped to
     it, and what a sample promises need only hold for p in it. As it is convex, a ray from p stays
-    in it as far as it is looked at; `Lipschitz` and `Curvature` need not hold beyond."""
+    in it up to where it is clipped; `Lipschitz` and `Curvature` need not hold beyond."""
 
     is_entire: bool = False
-    """Whether f, and what it promises, is right in all of space, so that `domain` is only where it
-    is drawn."""
+    """Whether f and its promises are right in all of space, so that `domain` is only where it is
+    drawn."""
 
     wavelength: float | None = None
     """The shortest wavelength of f that matters, where it is known: code that samples f in cells
@@ -86,14 +87,15 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
     """Whether the gradient jumps somewhere, as it does where the surfaces of a union meet."""
 
     def __new__(cls, *given: Any, **named: Any) -> Self:
-        """Refuses parameters with derivatives, unless the class says that it has `parameters`."""
+        """Refuse arguments with derivatives enabled, unless the class defines `parameters`."""
         if cls.drops_derivatives():
             refuse_derivatives(cls.__name__, given, named)
         return super().__new__(cls)
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Has what `evaluate` returns checked, `hessian` take NumPy arrays too, and other ways to
-        make a field refuse derivatives as the constructor does."""
+        """Wrap methods of the subclass: the result of `evaluate` is checked, `hessian` takes NumPy
+        arrays too, and class methods that make a field refuse derivatives as the constructor
+        does."""
         super().__init_subclass__(**kwargs)
         if "__repr__" not in vars(cls):  # a dataclass would write out all numbers
             cls.__repr__ = Field.__repr__
@@ -104,14 +106,14 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
         if "evaluate" in vars(cls):
             checked: Any = checked_samples(cls.evaluate)
             cls.evaluate = checked
-            if "look" not in vars(cls):  # that of a base would pass it by
+            if "look" not in vars(cls):  # a base's `look` might not call this `evaluate`
                 cls.look = Field.look
         if "hessian" in vars(cls):
             general: Any = also_at_points(cls.hessian)
             cls.hessian = general
 
     def __repr__(self) -> str:
-        """The field as it was made, as far as it remembers, with arrays by their shapes."""
+        """The call that makes the field, of arguments it still has, with arrays by their shapes."""
         given = inspect.signature(type(self).__init__).parameters
         own = {key.removeprefix("_"): value for key, value in vars(self).items()}
         said = [
@@ -130,14 +132,15 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
 
     @abc.abstractmethod
     def evaluate(self, p: Vec3) -> Sample:
-        """Value, gradient and knowledge at p, a Dr.Jit 3-vector of any backend and precision.
+        """Value, gradient and promises at p, a Dr.Jit 3-vector of any backend and precision.
 
-        Called while a loop is being recorded: use `drjit` functions of p, no Python branches on
+        Called while a loop is being recorded: use `drjit` functions of p, and no Python branches on
         its values.
         """
 
     def prepare(self, backend: Backend) -> Field:
-        """A field equal to this one whose data lie on the backend: asked for once by each call.
+        """A field equal to this one whose data lie on the backend. Each call of the library asks
+        for it once.
 
         The default suits fields that hold only Python numbers.
         """
@@ -147,24 +150,24 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """A volume proved to hold every point of the level sets; None where none is known.
 
-        It may be smaller than `domain`; it is what lets a ray without an end be a proved miss.
+        It may be smaller than `domain`. With it a ray without an end can be a proved miss.
         """
         del levels
         return self.domain
 
     def occupied(self, levels: tuple[float, ...]) -> OccupiedCells | None:
-        """Cells that may hold points of the level sets; there are none elsewhere. None where a
-        field knows of none. First hits jump across the rest: for fields that are dear to evaluate.
+        """A grid of cells outside of which there are proved to be no points of the level sets; None
+        where none is known. First hits jump across empty cells: for fields that are expensive to
+        evaluate.
 
-        Of a field with sheets, cells elsewhere hold no level of any lift: the jumps do not count.
+        For a field with sheets, no lift has a level in the empty cells, whatever its jumps.
         """
         del levels
         return None
 
     def slope_change(self, p: Vec3, radius: Real) -> Real:
-        """A length that |grad f(y) - grad f(p)| is proved not to exceed for any y with
-        |y - p| <= radius; infinite where nothing is known, which is the default. Proofs that a mesh
-        has the surface's topology ask for it."""
+        """A proved bound of |grad f(y) - grad f(p)| for all y with |y - p| <= radius; infinite, the
+        default, where none is known. Proofs that a mesh has the surface's topology use it."""
         return 0 * p.x + radius + dr.inf
 
     def check_levels(self, levels: tuple[float, ...]) -> None:
@@ -174,7 +177,7 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
     def parameters(self) -> tuple[Any, ...]:
         """Dr.Jit arrays that the value depends on and that may carry derivatives.
 
-        A class that does not define this method is given none: its constructor refuses them.
+        A class that does not define this method has none: its constructor refuses them.
         """
         return ()
 
@@ -184,8 +187,9 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
         return cls.parameters is Field.parameters
 
     def check_parameters(self) -> None:
-        """Raise NotImplementedError for derivatives by parameters that the field does not name, as
-        by what its formula refers to: they would be dropped."""
+        """Raise NotImplementedError if numbers that the field does not name in `parameters`, such
+        as
+        those that its formula refers to, have derivatives enabled: they would be dropped."""
         if self.drops_derivatives():
             kind = type(self)
             is_own = not kind.__module__.startswith("harnack.")
@@ -194,10 +198,10 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
     def differentiable_value(self, p: Vec3) -> Real:
         """f(p) as an expression that Dr.Jit can differentiate in p and in the field's parameters.
 
-        In p it is of first order: the value, with the gradient as its derivative, so that no
-        derivative passes `evaluate`, which may run a recorded loop, and so that it is the gradient
-        that the field states where the formula of f has ties. A field with parameters overrides
-        it where `evaluate` cannot be differentiated in both modes.
+        In p it is of first order: the value, with the stated gradient as its derivative. So no
+        derivative passes through `evaluate`, which may run a recorded loop, and at ties of f's
+        formula the derivative is the stated gradient. A field with parameters overrides it if
+        `evaluate` cannot be differentiated in both modes.
         """
         if any(dr.grad_enabled(one) for one in self.parameters()):
             return self.evaluate(p).value
@@ -205,7 +209,7 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
         at = dr.detach(p)
         with dr.suspend_grad():
             sample = self.evaluate(at)
-        gradient = as_data(sample.gradient)  # of a literal 0, Dr.Jit has no derivative at all
+        gradient = as_data(sample.gradient)  # a literal 0 would have no derivative in Dr.Jit
         return dr.replace_grad(sample.value, dr.dot(gradient, p - at))
 
     @takes_tensors
@@ -214,7 +218,7 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
 
         A Dr.Jit 3-vector gives a Dr.Jit array, and a tensor (n, 3) one of shape (n,), with
         derivatives with respect to whatever has them enabled: the points and the field's
-        parameters. Of an angle-valued field up to its period.
+        parameters. Values of an angle-valued field are up to a multiple of its period.
 
         Raises TypeError or ValueError for other shapes, NaN or infinity.
         """
@@ -258,9 +262,9 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         """Rows of the symmetric matrix of second derivatives at p, in f per length squared.
 
-        Curvatures and second-order distances ask for it; tracing needs none. Fields define it for
-        Dr.Jit 3-vectors; called with points (n, 3) or (3,), and `precision`, as for `value`, it
-        then gives (n, 3, 3) or (3, 3).
+        Curvatures and second-order distances use it; tracing does not. Fields define it for Dr.Jit
+        3-vectors; called with points (n, 3) or (3,), and `precision`, as for `value`, it then gives
+        (n, 3, 3) or (3, 3).
         """
         del p
         raise NotImplementedError(
@@ -270,27 +274,30 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
         """Bounds of the errors of the gradient, as a length, and of `hessian`, in the spectral
-        norm, at the point p of a sample: what the sample states, and nothing for the Hessian."""
+        norm, at the point p of a sample. The default: what the sample states, and 0 for the
+        Hessian."""
         del p
         return sample.gradient_error, 0.0
 
     def describe(self) -> dict[str, Any]:
-        """What a person would want to know about the choices this field made by itself."""
+        """Names and values of what a user may want to know about choices that the field made."""
         return {}
 
     def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
         """What is proved about f along a path from its point at t, in both directions.
 
-        The default evaluates the field there and reads its promises along the slope. A field that
-        knows more of a direction than of all overrides this. ahead, back: how far an enclosure can
-        be of use; one that is sharper on a shorter length need reach no farther.
+        The default evaluates the field there and applies its promises to the slope along the path.
+        A field that knows more about one direction than about all overrides this.
+
+        ahead, back: the lengths up to which an enclosure can be of use; one that is sharper on a
+            shorter length need reach no farther.
         """
         del ahead, back
         return path.look(self.evaluate(path.point(t)))
 
 
 class AtDetail(Field):
-    """What `Field.at_detail` returns: another way to evaluate a field, at one detail."""
+    """A field as evaluated at one detail: what `Field.at_detail` returns."""
 
     def __init__(self, evaluate: Callable[[Vec3], Sample]) -> None:
         self._evaluate = evaluate
@@ -304,7 +311,7 @@ def check_in_range(
 ) -> None:
     """Raise ValueError for a level outside the range in which values are proved to lie.
 
-    what: stays within it.
+    what: the name of the function, for the message.
     """
     low, high = value_range
     for level in levels:
@@ -324,7 +331,7 @@ def check_is_field(given: Any) -> None:
 
 
 def instead_of_field(given: Any) -> str:
-    """What a thing is that is no field, and how to make a field of it."""
+    """For a message: what a thing is that is no field, and how to make a field of it."""
     kind, name = type(given).__name__, getattr(given, "__name__", "")
     if isinstance(getattr(given, "field", None), Field):
         return f"a {kind}: take its .field, and give its level and clip beside it"

@@ -1,8 +1,8 @@
 """Fields that are given by a formula of the coordinates: everything else follows from it.
 
-A formula is evaluated in two ways. Given jets of the coordinates at a point, it answers with value
-and gradient and how far rounding may have moved them; given jets along a piece of a path, with
-ranges of its derivatives there, from which steps are proved.
+A formula is evaluated in two ways. Given jets of the coordinates at a point, it returns value and
+gradient with bounds of their rounding; given jets along a piece of a path, it returns ranges of its
+derivatives there, from which steps are proved.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ if TYPE_CHECKING:
 
 # Radii of the balls on which a Lipschitz constant is promised, in multiples of |f|/|grad f|.
 _RADII, _LARGEST_RADIUS = (0.25, 1.0, 4.0), 1e12
-# Beside a tie is where the rounding of coordinates and value, times this, leads; the direction, a
-# unit vector or 0, is turned by another, so that it is along no tie.
+# At a tie the gradient is taken so many roundings of coordinates and value away, in the direction
+# of the middle gradient, a unit vector or 0, plus this vector, so that it is along no tie.
 _BESIDE, _ASIDE = 64.0, (0.31, 0.19, 0.13)
-# A gradient that is known to so many roundings is no tie.
+# Where the gradient is known up to so many roundings there is no tie.
 _TIE = 1024.0
-# Seconds of compilation from which on a warning comes before it.
+# A compilation that will take so many seconds is announced by a warning.
 _LONG = 10.0
 
 
@@ -55,30 +55,30 @@ class Formula(Field):
 
     is_convex: bool = False
     has_creases = True  # it may use abs, maximum and minimum
-    overstep = 1.0  # longer steps than proved cost looks: what is proved is long already
+    overstep = 1.0  # proved steps are long already; trying longer ones takes more samples
     lipschitz: Real | None = None
 
     @abc.abstractmethod
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         """f of the coordinates, which may be jets or Dr.Jit numbers: written with + - * / ** and
-        the functions of `harnack.arithmetic`. A Dr.Jit number stands behind what is made of the
-        coordinates: x * radius, for Dr.Jit's own operators refuse jets."""
+        the functions of `harnack.arithmetic`. A Dr.Jit number comes second, as in x * radius: with
+        it first, Dr.Jit's own operators would refuse jets."""
 
     def evaluate(self, p: Vec3) -> Sample:
         sample = self._one_sided(p, self.sample_alone(p))
         return dataclasses.replace(sample, weaker=self._lipschitz_near(p, sample))
 
     def _one_sided(self, p: Vec3, sample: Sample) -> Sample:
-        """The sample with a gradient that f has close by, where at p it is a range.
+        """The sample with a gradient that f has nearby, where at p the gradient is a range.
 
-        At ties of a formula, such as max(x, 0) at x = 0, the range of the gradient has all slopes
-        beside p, and more where terms of several ties are added, as on the faces of `corner`. Its
-        middle is the gradient of no point, if mostly across the tie. A few roundings away in about
-        its direction, values decide between them (`Dual`).
+        At ties of a formula, such as max(x, 0) at x = 0, the range of the gradient contains all
+        slopes nearby, and more where terms of several ties are added, as on the faces of `corner`.
+        Its middle is the gradient at no point, though its direction mostly leads across the tie. A
+        few roundings away in about this direction, values decide which slope holds (`Dual`).
 
-        Proof of the error. The gradient at p lies within `gradient_error` of the middle. One that
-        is farther off is no gradient of a tie at p, but f turns that much on the way to where it
-        was taken, as a sine of a large angle does: there the middle is kept.
+        Proof of the error. The gradient at p lies within `gradient_error` of the middle. A gradient
+        that is farther from it does not come from a tie at p: the gradient of f changes that much
+        over these few roundings, as that of a sine of a large angle does. There the middle is used.
         """
         epsilon = float(dr.epsilon(type(p.x)))
         middle, doubt = sample.gradient, sample.gradient_error
@@ -89,7 +89,7 @@ class Formula(Field):
         away = Dual.at_point(p + way * (_BESIDE * epsilon * size))
         try:
             beside = away[0].of(self.formula(*away))
-        except TypeError:  # a formula of ranges alone, as of noise
+        except TypeError:  # a formula that accepts only ranges, as that of noise
             return sample
         one_side = type(p)(*(0 * p.x + one for one in beside.first))
         off = length(one_side - middle)
@@ -101,7 +101,7 @@ class Formula(Field):
         )
 
     def sample_alone(self, p: Vec3) -> Sample:
-        """Value and gradient, without promises that a look along a path has no use for."""
+        """Value and gradient, without the promises that a look along a path does not use."""
         return self._sample_of(self._jet(Jet.at_point(p), p.x), p)
 
     def _sample_of(self, jet: Jet, p: Vec3) -> Sample:
@@ -139,7 +139,7 @@ class Formula(Field):
         return vector(xx, xy, xz), vector(xy, yy, yz), vector(xz, yz, zz)
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """That of the Hessian is what its ranges say: rounding, and ties of a formula."""
+        """The error of the Hessian is that of its ranges: rounding, and ties of the formula."""
         return sample.gradient_error, hessian_error(self._jet(Jet.at_point(p, order=2), p.x), p.x)
 
     def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
@@ -161,9 +161,9 @@ class Formula(Field):
         return Look(sample, enclosures, (), slope, growth, slope_error, least)
 
     def _slope(self, p: Vec3, direction: Vec3) -> tuple[Real, Real]:
-        """The derivative along a direction, and how far off it may be: in a crease, where the
-        gradient is a range, it is known of directions that keep to the crease. It is what pieces of
-        the path start from, so it costs nothing more."""
+        """The derivative along a direction and its error: in a crease, where the gradient is a
+        range, it is known for directions along the crease. Pieces of the path start from it, so it
+        takes no more work."""
         zero = 0 * p.x
         x, y, z = (
             Jet(Interval.exactly(p[k]), (Interval.exactly(direction[k]),), (), width=zero)
@@ -173,12 +173,12 @@ class Formula(Field):
         return zero + slope.middle, zero + slope.radius
 
     def restricted(self, p: Vec3, direction: Vec3) -> FormulaAlong:
-        """The field along the path from p, as enclosures ask for it."""
+        """The field along the path from p, for enclosures."""
         return FormulaAlong(self, p, direction)
 
     def prepare(self, backend: Backend) -> Field:
-        """The same formula with its numbers as data of the backend, so that other numbers compile
-        no other kernel."""
+        """The same formula with its numbers as kernel parameters, so that other numbers compile no
+        other kernel."""
         return prepared_numbers(self, backend)
 
     def _jet(self, coordinates: tuple[Jet, Jet, Jet], like: Real) -> Jet:
@@ -191,15 +191,16 @@ def probe() -> tuple[Jet, Jet, Jet]:
 
 
 def hessian_error(jet: Jet, like: Real) -> Real:
-    """How far a Hessian may be from the middles of its ranges at a point: no matrix has a spectral
-    norm above the sum of the sizes of its entries."""
+    """A bound of the distance of a Hessian from the middles of its ranges at a point: the spectral
+    norm of a matrix is at most the sum of the sizes of its entries."""
     xx, xy, xz, yy, yz, zz = (one.radius for one in jet.second)
     return 0 * like + xx + yy + zz + 2 * (xy + xz + yz)
 
 
 def warn_of_price(field: Formula) -> None:
-    """Warn where compiling takes long. LLVM took 0.9 s for 11,000 operations on an idle core, 2.7 s
-    for 32,000, 7.4 s for 53,000 and 30 s for 100,000: about as their number to the power 2.2."""
+    """Warn if compiling will take long. LLVM took 0.9 s for 11,000 operations on an idle core, 2.7
+    s for 32,000, 7.4 s for 53,000 and 30 s for 100,000: the time grows about as their number to the
+    power 2.2."""
     operations = operations_of(field.formula)
     seconds = 30 * (operations / 1e5) ** 2.2
     if seconds > _LONG:
@@ -213,7 +214,7 @@ def warn_of_price(field: Formula) -> None:
 
 
 def is_jet(x: Any, name: str) -> bool:
-    """Whether a coordinate is a jet, and no plain number, of a formula that knows nothing else.
+    """Whether a coordinate is a jet, and not a plain number; for formulas that accept no others.
 
     Raises:
         TypeError: it is a number of another arithmetic.
@@ -249,8 +250,8 @@ class FormulaAlong:
     field: Formula
     p: Vec3
     direction: Vec3
-    # Ranges of a formula cost as much as its value: one piece takes the least time, four take two
-    # thirds of the looks and twice the time.
+    # Ranges of a formula cost as much as its value: one piece takes the least time, four pieces
+    # take two thirds of the samples and twice the time.
     piece_count: int = 1
 
     def pieces(self, knots: Sequence[Real]) -> tuple[Piece, ...]:
@@ -277,7 +278,8 @@ class FormulaAlong:
 
 
 def prepared_numbers(field: Any, backend: Backend) -> Any:
-    """A copy of a dataclass whose numbers, and those of its fields, are data of the backend."""
+    """A copy of a dataclass whose numbers, and those of fields in it, are kernel parameters of the
+    backend."""
     other = copy.copy(field)
     for entry in dataclasses.fields(cast("Any", field)) if dataclasses.is_dataclass(field) else ():
         value = getattr(field, entry.name)
@@ -287,7 +289,8 @@ def prepared_numbers(field: Any, backend: Backend) -> Any:
 
 
 def as_data(value: Any, backend: Backend) -> Any:
-    """Numbers, those of tuples too, as data of the backend; fields prepared; all else as it is."""
+    """Numbers, also in tuples, as kernel parameters of the backend; fields prepared; all else
+    unchanged."""
     if isinstance(value, float):
         return dr.opaque(backend.Float, value)
     if isinstance(value, tuple):

@@ -1,4 +1,4 @@
-"""What a field answers: samples at points, and looks along a path."""
+"""What a field returns: a `Sample` at a point, or a `Look`, a sample with enclosures."""
 
 from __future__ import annotations
 
@@ -22,20 +22,23 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Sample:
-    """One evaluation at a point p: value f(p), gradient (3,), and what is known near p.
+    """One evaluation at a point p.
 
-    error: how far rounding may have moved `value` from f at the point given, beyond eight units
-        in its last place or eight times the smallest normal number (and beyond |gradient| times
-        the rounding of the point itself, which the tracer accounts for), or an approximation has.
-        Steps are shortened by it.
-    gradient_error: how far rounding and an approximation may have moved `gradient`, as a length;
-        0 where that is only the rounding of a few operations.
-    normal: (3,) unit, what to shade with where the gradient is no guide (beside a singular point
-        of the surface); None for the gradient's own direction. No step looks at it.
-    truncation: the part of `error` that a closer evaluation makes smaller (`Field.at_detail`).
+    value: f(p).
+    gradient: (3,) of f at p.
+    known: promises that hold near p.
+    error: a bound of the error of `value` by an approximation, and by rounding as far as that is
+        more than eight units in its last place or eight times the smallest normal number (and more
+        than |gradient| times the rounding of the point itself, which the tracer adds). Steps are
+        shortened by it.
+    gradient_error: a bound of the error of `gradient` by rounding and an approximation, as a
+        length; 0 where it is only the rounding of a few operations.
+    normal: (3,) unit normal to shade with, where the gradient is of no use (near a singular point
+        of the surface); None for the gradient's own direction. Steps do not depend on it.
+    truncation: the part of `error` that an evaluation at more detail reduces (`Field.at_detail`).
     weaker: promises that are as true as `known`, but proved shorter steps wherever that was
         measured. Only a bound that is asked for by name uses them.
-    along: what holds besides, but only for points of the path that f is looked at along.
+    along: more promises, which hold only for points of the path of a `Field.look`.
     """
 
     value: Real
@@ -54,7 +57,7 @@ class Sample:
         return self.known + self.weaker
 
     def with_promises(self, change: Callable[[Promise], Promise], **numbers: Any) -> Sample:
-        """The sample with each promise changed, and other numbers."""
+        """The sample with each promise changed, and with other attributes replaced."""
         known, weaker = (tuple(map(change, group)) for group in (self.known, self.weaker))
         return dataclasses.replace(self, known=known, weaker=weaker, **numbers)
 
@@ -109,7 +112,7 @@ def _named(value: Any) -> str:
 
 
 def lengthened(sample: Sample, size: Real) -> Sample:
-    """The sample of x -> f(x / size), at the place that moves there.
+    """Convert a sample of f at p to one of x -> f(x / size) at size * p.
 
     Values stay; radii are multiplied by the size, gradients and Lipschitz constants divided by it,
     curvatures and Laplacians by its square.
@@ -123,11 +126,11 @@ def lengthened(sample: Sample, size: Real) -> Sample:
 
 
 def value_error(sample: Sample, gradient_norm: Real, size: Real) -> Real:
-    """What rounding and truncation may have done to f at a point whose coordinates are at most
-    `size`, gradient_norm being |gradient|."""
+    """A bound of the error of f by rounding and truncation, at a point whose coordinates are at
+    most `size`; gradient_norm: |gradient|."""
     kind = cast("Any", type(sample.value))
     epsilon = 2 * float(dr.epsilon(kind))
-    # What is below the smallest normal number is lost.
+    # Numbers below the smallest normal one may underflow to 0.
     smallest = kind(float(dr.smallest(kind)))
     value = 8 * fmax(epsilon * dr.abs(sample.value), smallest)
     return dr.fma(gradient_norm, 4 * epsilon * size, value + sample.error)
@@ -140,12 +143,13 @@ class Look:
     ahead: enclosures of f(path(t+s)) - f(path(t)).
     back: enclosures of f(path(t-s)) - f(path(t)), from the same evaluation.
     slope: the derivative of f along the path, known up to `slope_error`.
-    growth: how many times the step from here the next look should be asked to reach.
-    slope_error: how far off `slope` may be, where that is known to be less than
+    growth: how far the enclosures of the next look should reach, as a multiple of the step that
+        this one proves.
+    slope_error: a bound of the error of `slope`, where one is known that is less than
         `Sample.gradient_error`: on a crease the gradient is a range, and the derivative along a ray
-        that runs in the crease may still be a number. None where nothing better is known.
-    least_gradient: a length that |grad f| is known to have at least, where that may be more than
-        `Sample.gradient_error` leaves of it, as on a crease; None where nothing better is known.
+        that runs in the crease may still be a number. Else None.
+    least_gradient: a lower bound of |grad f|, where one is known that may be more than |gradient|
+        less `Sample.gradient_error`, as on a crease. Else None.
     """
 
     sample: Sample
@@ -158,13 +162,13 @@ class Look:
 
     @property
     def slope_doubt(self) -> Real:
-        """How far off `slope` may be."""
+        """The bound of the error of `slope`."""
         return self.sample.gradient_error if self.slope_error is None else self.slope_error
 
 
 @dataclass(frozen=True)
 class Path:
-    """The rays o + t d, |d| = 1, along which a field is looked at, and the proofs to use."""
+    """The rays o + t d, |d| = 1, along which a field is sampled, and the proofs to use."""
 
     origin: Vec3
     direction: Vec3
@@ -175,7 +179,7 @@ class Path:
         return dr.fma(type(self.origin)(t), self.direction, self.origin)
 
     def look(self, sample: Sample) -> Look:
-        """What a sample proves along the path: its promises, seen along the slope.
+        """What the promises of a sample prove along the path, with the slope of f along it.
 
         A slope known up to an error enters as an interval: see `Enclosure`.
         """

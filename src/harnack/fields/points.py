@@ -1,4 +1,4 @@
-"""Kernels at many points: NumPy in, NumPy out, Dr.Jit between, so many points at a time."""
+"""Running Dr.Jit kernels at many points, batch by batch: NumPy in, NumPy out."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ __all__ = ["also_at_points", "at_points", "in_batches", "morton_order"]
 
 # Points in one kernel: enough to keep a GPU busy, few enough to keep memory small.
 _AT_ONCE = 1 << 20
-# Cells along an axis, as a power of two; three of them make a key of 15 bits, which NumPy sorts
-# by radix.
+# Cells along an axis, as a power of two. Three coordinates make a key of 15 bits, for which NumPy
+# uses radix sort.
 _BITS = 5
 
 
@@ -31,11 +31,11 @@ def at_points(
     kernel: Callable[[Backend, Vec3], tuple[Any, ...]],
     precision: Precision,
 ) -> tuple[npt.NDArray[Any], ...]:
-    """The arrays that `kernel` gives at points (n, 3), in their order; of a single point (3,) their
+    """The arrays that `kernel` gives at points (n, 3), in their order; for a single point (3,) the
     only entries.
 
-    The points are visited cell by cell along a Morton curve, so that neighboring lanes walk a
-    tree together, which halves the time.
+    The points are visited cell by cell along a Morton curve, so that neighboring lanes visit the
+    same nodes of a tree, which halves the time.
 
     Raises:
         TypeError, ValueError: points that are no (n, 3) array of finite numbers.
@@ -55,7 +55,8 @@ def at_points(
 
 
 def also_at_points(hessian: Callable[[Any, Vec3], Any]) -> Callable[..., Any]:
-    """The same method of a field, which also takes NumPy points and gives NumPy matrices."""
+    """A decorator of a field's method `hessian`: it also takes NumPy points and gives NumPy
+    matrices."""
 
     @functools.wraps(hessian)
     def general(self: Any, p: Any, *, precision: Precision = "single") -> Any:
@@ -81,7 +82,7 @@ def in_batches(
     """The results of `compute` for points (n, 3), as arrays (n,) or (n, 3) in its precision.
 
     points: an array-like, or a Dr.Jit 3-vector.
-    others: more vectors (n, 3) that `compute` is given, one a lane; their values are not looked at.
+    others: more vectors (n, 3) that `compute` is given, one in each lane; they may have any values.
     at_once: how many points make a batch.
 
     Raises:
@@ -93,7 +94,7 @@ def in_batches(
     )
     n = dr.width(vectors) if on_device else len(vectors)
     parts: list[tuple[npt.NDArray[Any], ...]] = []
-    # Once for no points at all: it tells shapes, and the errors of `compute`.
+    # One batch even for no points: it tells the shapes, and raises the errors of `compute`.
     for start in range(0, max(n, 1), at_once):
         lanes = min(at_once, n - start)
         with dr.suspend_grad():
@@ -111,7 +112,7 @@ def in_batches(
 
 
 def _part(backend: Backend, vectors: Any, start: int, lanes: int) -> Vec3:
-    """Vectors `start` to `start + lanes` of a Dr.Jit vector, or of an array of any values."""
+    """Vectors `start` to `start + lanes` of a Dr.Jit vector, or of an array."""
     if dr.is_array_v(cast("Any", type(vectors))):
         return dr.gather(backend.Array3f, vectors, dr.arange(backend.UInt32, lanes) + start)
     return upload_vectors(backend, vectors[start : start + lanes], "points")
@@ -122,7 +123,7 @@ def _spread(values: npt.NDArray[Any], n: int) -> npt.NDArray[Any]:
 
 
 def _back_in_place(values: Any, order: Any, n: int) -> Any:
-    """Values of the points in the order visited, in the order given."""
+    """Values that belong to the points in visiting order, brought into the given order."""
     kind = cast("Any", type(values))
     if dr.depth_v(kind) == 1:
         out = dr.zeros(kind, n)
@@ -132,7 +133,7 @@ def _back_in_place(values: Any, order: Any, n: int) -> Any:
 
 
 def morton_order(backend: Backend, x: Vec3, bits: int = _BITS) -> Any:
-    """An order that visits points cell by cell, cells along a Morton curve (a Dr.Jit UInt32).
+    """The indices (Dr.Jit UInt32) of points cell by cell, with the cells along a Morton curve.
 
     bits: cells along an axis, as a power of two, at most 10.
     """

@@ -1,7 +1,7 @@
-"""What sums over edges, dipoles and far nodes of trees tell about a field near a point.
+"""Sums over edges, dipoles and far nodes of trees at a point, and what follows for f near it.
 
-Every family of such fields adds up the same record, `FieldSums`, and makes of it values with error
-bounds, or a sample with a certificate.
+Every family of such fields accumulates the same record, `FieldSums`, from which come values with
+error bounds, or a sample with promises.
 """
 
 from __future__ import annotations
@@ -21,26 +21,29 @@ from harnack.fields.field import Sample
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
 
-# Parts of the free distance out to which curvatures are stated: the shorter, the smaller.
+# Radii of the `Curvature` promises, as fractions of the free distance: a smaller radius has a
+# smaller constant.
 _REACHES = (0.2, 0.4, 0.6)
-# The part of the way to the dipoles of far nodes out to which they are stated.
+# The same as a fraction of the distance to the dipoles of far nodes.
 _WAY = 0.65
-# Sums of rounded terms: bounds are lengthened, and distances shortened, by this part of them.
+# Sums of rounded terms: bounds are lengthened, and distances shortened, by this fraction of them.
 SUM_ROUNDING = 2e-5
-# Roundings of a coordinate within which a singular point is near.
+# A singular point within so many roundings of a coordinate counts as near.
 _BESIDE = 256.0
-# Rounding of positions and of terms moves the gradient by at most so many s4, and second
-# derivatives by so many s5, units in the last place of coordinates.
+# Rounding of positions and of terms changes the gradient by at most so many times s4, and second
+# derivatives by so many times s5, times the rounding of a coordinate.
 SLOPE_ROUNDINGS, SECOND_ROUNDINGS = 16.0, 320.0
 
 
 def longest_part(rough: float) -> float:
-    """Of the distance of a far node's center: the longest step that certificates cover."""
+    """The longest step that promises cover, as a fraction of the distance to a far node's center;
+    rough: far nodes are farther away than this many times their radius."""
     return _WAY * (1 - 1 / rough)
 
 
 def free_part(rough: float) -> float:
-    """Of the distance of a far node's center: what is counted as free of dipoles."""
+    """The radius that counts as free of dipoles, as a fraction of the distance to a far node's
+    center; rough: as for `longest_part`."""
     return longest_part(rough) / _REACHES[-1]
 
 
@@ -52,20 +55,20 @@ def remainder_factor(q: float) -> float:
 def rounding_of_sum(
     backend: Backend, terms: int, own: float = 16, growth: float = 1.0, size: float = 1.0
 ) -> Real:
-    """How far rounding may move a sum of so many terms, each rounded `own` times, of `size`.
+    """An estimate of the rounding of a sum of so many terms, each rounded `own` times, of `size`.
 
-    Errors are random in sign, so that they add up as the root of their number; `growth` times it
-    where most terms are small. No part of a kernel's code.
+    Errors are random in sign, so that they add up as the square root of their number; `growth`
+    times that where most terms are small. A kernel parameter.
     """
     return dr.opaque(backend.Float, backend.epsilon * (own + growth * math.sqrt(terms)) * size)
 
 
 def rounding_of_dipole(area: Real, inverse: Real, unit: Real) -> Real:
-    """What rounding may do to the value of a dipole at distance rho = 1/inverse.
+    """A bound of the rounding of the value of a dipole at distance rho = 1/inverse.
 
-    unit: the rounding of a coordinate, at least epsilon: it moves the value by at most
-    2 unit area/rho^3, twice in the difference of two coordinates; the four roundings of its term
-    do so by 4 epsilon area/rho^2.
+    unit: the rounding of a coordinate, at least epsilon. It changes the value by at most
+        2 unit area/rho^3, twice in the difference of two coordinates; the four roundings of the
+        term change it by 4 epsilon area/rho^2.
     """
     square = inverse * inverse
     return (unit * area) * dr.fma(4 * inverse, square, 4 * square)
@@ -73,8 +76,8 @@ def rounding_of_dipole(area: Real, inverse: Real, unit: Real) -> Real:
 
 @dataclass(frozen=True)
 class Terms:
-    """What one dipole, edge or far node adds to f and its derivatives, as far as those were asked
-    for."""
+    """What one dipole, edge or far node adds to f and to its derivatives; None for derivatives that
+    were not asked for."""
 
     value: Real
     gradient: Vec3 | None = None
@@ -86,13 +89,13 @@ class FieldSums:
     """Sums of terms of f at points x, and of what bounds them near x.
 
     value, gradient, hessian: of f, None where they were not asked for.
-    truncation, slope_truncation, second_truncation: bounds of what was left out of value, gradient
-        and second derivatives along lines; the last is None without a Hessian.
-    rounding: bound of what rounding has done to the value.
-    free_distance: of the nearest singular point, a dipole or an edge, or `free_part` of that to the
-        nearest far node's center if that is less.
-    s4, s5: sums of a/rho^4 and a/rho^5 over dipoles a at rho and, with A + K/r^2 of
-        `truncation.bend_columns` for a, over far nodes at r. Edges: see `LiftedEdge.bounds`.
+    truncation, slope_truncation, second_truncation: bounds of the truncation of value, gradient and
+        second derivatives along lines; the last is None without a Hessian.
+    rounding: bound of the rounding of the value.
+    free_distance: the distance to the nearest singular point, a dipole or an edge, or `free_part`
+        of the distance to the nearest far node's center if that is less.
+    s4, s5: sums of a/rho^4 and a/rho^5 over dipoles of area a at distance rho and, with A + K/r^2
+        of `multipole.bend_columns` for a, over far nodes at r. For edges see `LiftedEdge.bounds`.
     """
 
     value: Real
@@ -108,8 +111,8 @@ class FieldSums:
 
     @classmethod
     def zero(cls, backend: Backend, free_distance: Real, derivatives: int) -> FieldSums:
-        """Of nothing. free_distance: where nothing bounds it. derivatives: 0 for the value alone, 1
-        with the gradient, 2 with the Hessian."""
+        """Empty sums. free_distance: its value if there are no terms. derivatives: 0 for the value
+        alone, 1 with the gradient, 2 with the Hessian."""
         real, zero = backend.Float, backend.Float(0)
         gradient = backend.Array3f(0) if derivatives >= 1 else None
         hessian = SymmetricSum.zero(real) if derivatives == 2 else None
@@ -119,29 +122,29 @@ class FieldSums:
 
     @classmethod
     def of(cls, parts: tuple[Any, ...]) -> FieldSums:
-        """From `parts`."""
+        """The sums with these `parts`."""
         value, gradient, hessian, *bounds = parts
         return cls(value, gradient, None if hessian is None else SymmetricSum(*hessian), *bounds)
 
     def parts(self) -> tuple[Any, ...]:
-        """In the order of the constructor, as loops want them. (What no trip changes is left out: a
-        loop with such a state is recorded twice.)"""
+        """The attributes in the order of the constructor, for the state of a loop. (Sums that were
+        not asked for are None: Dr.Jit records a loop twice if a state in it never changes.)"""
         hessian = None if self.hessian is None else self.hessian.parts()
         bounds = self.truncation, self.slope_truncation, self.second_truncation, self.rounding
         return self.value, self.gradient, hessian, *bounds, self.free_distance, self.s4, self.s5
 
     def where(self, mask: Mask, other: FieldSums) -> FieldSums:
-        """The sums of another where the mask holds. Without Hessians."""
+        """The other sums where the mask holds, these elsewhere. Without Hessians."""
         pairs = zip(other.parts(), self.parts(), strict=True)
         return FieldSums(*(None if b is None else dr.select(mask, a, b) for a, b in pairs))
 
     @property
     def derivatives(self) -> int:
-        """How many were asked for."""
+        """The order of derivatives that were asked for: 0, 1 or 2."""
         return 0 if self.gradient is None else 1 if self.hessian is None else 2
 
     def plus(self, terms: Terms, active: Mask) -> FieldSums:
-        """With terms more, where active; derivatives that they do not have are 0."""
+        """The sums with terms added where active; derivatives that they do not have are 0."""
         gradient, hessian = self.gradient, self.hessian
         if gradient is not None and terms.gradient is not None:
             gradient = gradient + dr.select(active, terms.gradient, 0)
@@ -155,11 +158,11 @@ class FieldSums:
         self, terms: Terms, far: Mask, inverse: Real, size: Real, left_out: tuple[Real, Real, Real],
         free: Real, unit: Real,
     ) -> FieldSums:  # fmt: skip
-        """With a node of a tree more where it is far, at distance 1/inverse.
+        """The sums with a node of a tree added where it is far, at distance 1/inverse.
 
-        size: A + K/r^2 of `truncation.bend_columns`. left_out: of value, gradient and second
-        derivatives. free: as far as the node counts as free of dipoles. unit: the rounding of a
-        coordinate. left_out and inverse are 0 where it is not far.
+        size: A + K/r^2 of `multipole.bend_columns`. left_out: truncation of value, gradient and
+        second derivatives. free: the distance that counts as free of the node's dipoles. unit: the
+        rounding of a coordinate. left_out and inverse are 0 where it is not far.
         """
         fourth, second = size * dr.square(inverse * inverse), self.second_truncation
         second = None if second is None else second + left_out[2]
@@ -175,11 +178,12 @@ class FieldSums:
         )
 
     def values(self, share: float, unit: Real, rounding: Real, outside: float = 0.0) -> Values:
-        """`share` times f and its derivatives, as far as there are, with bounds of their errors.
+        """`share` times f and those derivatives that there are, with bounds of their errors.
 
-        unit: the rounding of a coordinate, at least epsilon. rounding: what there is of it in the
-        value besides. outside: roundings of gradients far outside the whole, where distances are
-        as long as coordinates: the powers of a distance, and the sums of moments, have their own.
+        unit: the rounding of a coordinate, at least epsilon.
+        rounding: of the value, from other sources.
+        outside: more roundings of gradients far from all terms, where distances are as long as
+            coordinates: those of powers of the distance and of sums of moments.
         """
         value, error = share * self.value, dr.fma(share, self.truncation + self.rounding, rounding)
         if self.gradient is None:
@@ -202,21 +206,21 @@ class FieldSums:
         normal: Vec3 | None = None,
         along: tuple[Lipschitz, ...] = (),
     ) -> Sample:
-        """`share` times f, with what is known of it.
+        """`share` times f as a sample with promises.
 
-        unit: the rounding of a coordinate. rounding: what there is of it in the value besides.
-        along: what is known of f along a line besides.
+        unit: the rounding of a coordinate. rounding: of the value, from other sources. along: more
+        promises, for f along a line.
 
-        Certificate. Along a line the k-th derivative of a dipole a at rho is at most
+        Proof of the promises. Along a line the k-th derivative of a dipole a at rho is at most
         (k+1)! a/rho^(k+2) (it is a mixed derivative of a/rho, whose tensor is symmetric and takes
         its largest value on equal vectors), so that Taylor's remainder after the linear term is at
         most a ((rho-t)^-2 - rho^-2 - 2t rho^-3) = a t^2 rho^-4 phi(t/rho), phi(q) =
         (3-2q)/(1-q)^2. That of a far node is at most that of a dipole of area A + K/r^2 in its
-        center, for t/r <= `longest_part` (`truncation.bend_columns`). phi is convex: on [0, b] it
+        center, for t/r <= `longest_part` (`multipole.bend_columns`). phi is convex: on [0, b] it
         lies below 3 + rise q, rise = (phi(b)-3)/b = (4-3b)/(1-b)^2. With t <= r = b free_distance,
         |f(y) - f(x) - g.(y-x)| <= t^2 (3 s4 + rise r s5).
-        A ball of that radius bounds f by |g| r more, and holds harmonic f: dipoles of far nodes
-        are farther away than 1 - 1/rough times the center, and `longest_part` is less.
+        On the ball of that radius f changes by at most |g| r more, and is harmonic: dipoles of far
+        nodes are farther away than 1 - 1/rough times the center, and `longest_part` is less.
         """
         g = share * self.gradient
         slope_error = share * dr.fma(SLOPE_ROUNDINGS * unit, self.s4, self.slope_truncation)
@@ -228,9 +232,9 @@ class FieldSums:
         variation = (1 + SUM_ROUNDING) * r * dr.fma(0.5 * r, widest.constant, slope)
         value = share * self.value
         ball = HarmonicBall(r, value - variation, value + variation)
-        # On a singular point itself all values meet: a gradient so steep that it is as near to any
-        # level as can be, and an error that says how far away such a level is. So it is beside one,
-        # where rounding leaves nothing of the gradient.
+        # At a singular point f has all values: the sample has a gradient so steep that every level
+        # is close to first order, and an error as large as the distance to such a level. Likewise
+        # near a singular point, where rounding leaves nothing of the gradient.
         reach, most = 16 * unit, share * 1.6e5 * math.pi
         apart = (self.free_distance > reach) & dr.isfinite(value) & dr.isfinite(dr.squared_norm(g))
         lost = ~(slope_error <= dr.norm(g)) & (self.free_distance <= _BESIDE * unit)
@@ -253,12 +257,12 @@ class FieldSums:
     def with_rates(
         self, v: Vec3, unit: Real, lengths: tuple[Real, ...], rates: tuple[Real, ...], active: Mask
     ) -> tuple[Real, ...]:
-        """The rates K of `edge_passing` for some edges, with those of all that is summed up here.
+        """The rates K of `edge_trails.rates_along` for some edges, plus those of these sums.
 
-        f moves by at most |s| |g . v| + s^2 (3 s4 + rise r s5) for |s| <= r (`sample`), if g is
-        known up to its truncation and rounding. Infinite for lengths above r.
+        f changes by at most |s| |g . v| + s^2 (3 s4 + rise r s5) for |s| <= r (`sample`), with |g .
+        v| raised by the truncation and rounding of g. Infinite for lengths above r.
 
-        v: directions of the lines; unit: the rounding of their points' coordinates.
+        v: directions of the lines. unit: the rounding of their points' coordinates.
         """
         slope = dr.abs(dr.dot(self.gradient, v)) + self.slope_truncation
         slope = dr.fma(SLOPE_ROUNDINGS * unit, self.s4, slope)

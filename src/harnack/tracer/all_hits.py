@@ -1,6 +1,7 @@
-"""All crossings of rays, as users get them: NumPy in, NumPy out; Dr.Jit stays Dr.Jit.
+"""All crossings of rays with level sets: `trace(..., all_hits=k)`.
 
-All crossings of rays with level sets, one after the other, while a kernel is recorded.
+`find_crossings` finds them one after the other while a kernel is recorded; `AllHits` is what users
+get: NumPy in, NumPy out; Dr.Jit stays Dr.Jit.
 """
 
 from __future__ import annotations
@@ -35,12 +36,12 @@ class CrossingsFound:
     """The first k crossings of n rays, as Dr.Jit arrays.
 
     t: (n k) of crossing j of ray i at i k + j; inf where there are fewer.
-    gradient: (n k, 3) of f there, of a sheet its normal; 0 where there is none.
+    gradient: (n k, 3) of f there, or the normal of the sheet; 0 where there is no crossing.
     sheet: (n k) index of the sheet that was crossed, NO_SHEET for none.
     side: (n k) 1 where f rises through the level along the ray, -1 where it falls, 0 for none.
     count: (n) how many there are, at most k.
     end: (n) how far the ray was followed; inf if it was to its end.
-    evaluations, status: (n). HIT: k crossings, and what follows was not looked at. MISS: there are
+    evaluations, status: (n). HIT: k crossings, and what follows was not examined. MISS: there are
         no others.
     """
 
@@ -56,10 +57,11 @@ class CrossingsFound:
 
 @dataclass(frozen=True)
 class _Walk:
-    """Where rays are, and how many crossings they have behind them.
+    """Where rays are, and how many crossings they have found.
 
-    sheets: where they are among sheets, whose state of the march is a part of it; None of a field
-        without sheets.
+    march: the state of the march; None for a field with sheets.
+    sheets: for a field with sheets the state of `SheetTracer`, which includes that of the march.
+    count: of the crossings.
     """
 
     march: MarchState | None
@@ -77,8 +79,7 @@ class _Walk:
         assert state is not None
         return state
 
-    def moved(self, now: MarchState, count: Any) -> _Walk:
-        """The same walk with another state of the march."""
+    def with_march(self, now: MarchState, count: Any) -> _Walk:
         if self.sheets is None:
             return _Walk(now, None, count)
         return _Walk(None, dataclasses.replace(self.sheets, march=now), count)
@@ -89,15 +90,15 @@ def find_crossings(
 ) -> CrossingsFound:
     """The first k crossings of rays o + t d, |d| = 1, for t_min <= t <= t_max.
 
-    What is guaranteed, and why, is in `Hysteresis`: between two crossings the ray is one march, in
-    which a contact may begin and end as often as it likes.
+    `Hysteresis` says what is guaranteed, and why: between two crossings the ray is one march, in
+    which contacts may begin and end any number of times.
     """
     backend = prepared.backend
     real, vector, count = backend.Float, backend.Array3f, backend.UInt32
     march, path, start, end, state = prepared.ready(o, d, t_min, t_max, True, crosses=True)
     n = max(dr.width(array) for array in (path.origin, path.direction, start, end))
     place = dr.arange(count, n) * k
-    # Filled in from within the loop, so they must lie in memory before it is recorded.
+    # The loop scatters into these arrays, so they must lie in memory before it is recorded.
     t, side = dr.full(real, dr.inf, n * k), dr.zeros(real, n * k)
     before, behind = dr.zeros(real, n * k), dr.zeros(real, n * k)
     gradient, sheets = dr.zeros(vector, n * k), dr.full(count, NO_SHEET, n * k)
@@ -130,7 +131,7 @@ def find_crossings(
             more &= after.proved_to + after.proved_step < end
         else:
             more |= after.active
-        return there.moved(dataclasses.replace(after, status=status, active=more), crossings)
+        return there.with_march(dataclasses.replace(after, status=status, active=more), crossings)
 
     begun = _Walk(state, None, dr.zeros(count, n))
     if prepared.field.has_sheets:
@@ -153,10 +154,9 @@ class AllHits:
     As NumPy arrays, or as tensors if the rays were; if they were Dr.Jit arrays, as Dr.Jit arrays,
     in which (n, k) is flat: crossing j of ray i is at i k + j.
 
-    t: (n, k) ray parameter of the crossing, inf where a ray has fewer. It lies between two points
-        that were looked at, with f on different sides of the level, where the cubic through their
-        values and slopes takes the level or, if there is a crease between them, where bisection
-        finds it.
+    t: (n, k) ray parameter of the crossing, inf where a ray has fewer. It lies between two samples
+        with f on different sides of the level: where the cubic through their values and slopes
+        takes the level or, if there is a crease between them, where bisection finds it.
     position: (n, k, 3) point at t, NaN where there is none.
     normal: (n, k, 3) unit normal grad f/|grad f|, to the side of larger f; zero where there is
         none.
@@ -167,7 +167,7 @@ class AllHits:
     end: (n,) how far the ray was followed: inf if to its end; else up to where the last crossing
         was noticed, just behind it, or to where the ray ran out of steps.
     status: (n,) a `Status`, of the end of the ray. MISS: it is proved that there are no other
-        crossings. HIT: there are k, and what follows was not looked at. OUT_OF_STEPS: what follows
+        crossings. HIT: there are k, and what follows was not examined. OUT_OF_STEPS: what follows
         `end` is not known.
     evaluations: (n,) how many times the field was evaluated.
     """
@@ -214,7 +214,7 @@ def trace_all(
     *,
     differentiable: bool,
 ) -> AllHits:
-    """The first k crossings, as Dr.Jit arrays."""
+    """The first k crossings as `AllHits` of Dr.Jit arrays."""
     prepared = surface.prepare(backend, crosses=True)
     with dr.suspend_grad():
         found = find_crossings(
@@ -245,14 +245,14 @@ def trace_all(
 
 
 def no_crossings(backend: Backend) -> AllHits:
-    """Of no rays."""
+    """The crossings of no rays."""
     number, vector = dr.zeros(backend.Float, 0), dr.zeros(backend.Array3f, 0)
     count, side = dr.zeros(backend.UInt32, 0), dr.zeros(backend.Int32, 0)
     return AllHits(number, vector, vector, side, side, count, number, count, count)
 
 
 def crossings_as_numpy(hits: AllHits, n: int, k: int) -> AllHits:
-    """The same as NumPy arrays, of n rays."""
+    """Crossings of n rays as NumPy arrays."""
 
     def each(array: Any) -> Any:
         values = to_numpy(array)

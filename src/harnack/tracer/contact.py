@@ -1,13 +1,9 @@
-"""When a point of a ray counts as a hit, and how a ray can end.
+"""When a point of a ray counts as a hit or as a crossing, and how a ray can end.
 
-Contact with a level: what makes crossings of hits, each of them counted once.
-
-A first hit ends a ray where f is within the tolerance of a level. A ray that goes on has to get off
-the surface with a proof, and rounding, or a ray that runs along the surface, must not make several
-crossings of one. So a level that has been reached counts as lying the tolerance *beyond*, until f
-has left the tolerance around it (hysteresis): there is always a gap to it, and steps stay long.
-
-What a look at the end of a ray interval tells about the sheet there.
+- First hits: a ray ends where f is within the `Tolerance` of a level, or at a sheet across which f
+  jumps past a level (`compare_with_sheet`).
+- Crossings: a ray goes on behind the level. `Contact` is its state near the level that it reached,
+  `Hysteresis` the rule by which each crossing is counted once.
 """
 
 from __future__ import annotations
@@ -52,9 +48,9 @@ class Tolerance:
         tolerance grow with its footprint.
     value: also a hit where |f - level| <= value, whatever the gradient.
 
-    Beside a pole of f, |f - level|/|grad f| is the distance to the pole and none to the level: rays
-    that pass a point charge within the tolerance are called hits of every level. The same holds
-    where the slope of f has no bound, as that of sqrt(|x|) beside x = 0.
+    Near a pole of f, |f - level|/|grad f| is about the distance to the pole, not to the level: rays
+    that pass a point charge within the tolerance count as hits of every level. The same holds where
+    the slope of f has no bound, as that of sqrt(|x|) near x = 0.
 
     Where rounding leaves the distance to the level less certain than this, that uncertainty is
     the tolerance: about 1e-6 of the coordinates' size in single precision, 1e-15 in double.
@@ -73,7 +69,7 @@ class Tolerance:
             raise ValueError("tolerance must be positive: a level set is never met exactly")
 
     def prepare(self, backend: Backend) -> PreparedTolerance:
-        """The same as numbers of a backend, which no kernel is compiled anew for."""
+        """As kernel parameters of a backend: another tolerance compiles no new kernel."""
         numbers = (self.distance, self.per_length, self.value)
         return PreparedTolerance(*(dr.opaque(backend.Float, number) for number in numbers))
 
@@ -86,9 +82,9 @@ class PreparedTolerance:
     per_length: Real
     value: Real
 
-    def in_value(self, steepness: Real, t: Real) -> Real:
-        """How far in value a level may be from f to be a hit, where |grad f| = steepness."""
-        return fmax(steepness * dr.fma(t, self.per_length, self.distance), self.value)
+    def in_value(self, gradient_norm: Real, t: Real) -> Real:
+        """By how much f may differ from a level at a hit, where |grad f| = gradient_norm."""
+        return fmax(gradient_norm * dr.fma(t, self.per_length, self.distance), self.value)
 
 
 ON_SHEET = max(Status) + 1
@@ -100,8 +96,8 @@ class SheetComparison:
     """Result of comparing a sample with the sheet at the end of its ray interval.
 
     has_crossing: the interval ends at a sheet.
-    at_crossing: the sample is accepted and lies there, at the end of the interval.
-    is_hit: besides, a level lies between the values on both sides, up to the total error.
+    at_crossing: the sample is accepted and lies at that sheet.
+    is_hit: also, a level lies between the values on both sides, up to the total error.
     gaps: to the levels below and above, of the value behind the sheet if `at_crossing`.
     normal: of the sheet.
     """
@@ -113,7 +109,7 @@ class SheetComparison:
     normal: Vec3
 
     def mark(self, status: Any, gradient: Vec3) -> tuple[Any, Vec3]:
-        """Status and gradient, those of the sheet where it was hit."""
+        """Status and gradient, replaced by those of the sheet where it was hit."""
         marked = type(status)(dr.select(self.is_hit, ON_SHEET, status))
         return marked, dr.select(self.is_hit, self.normal, gradient)
 
@@ -121,8 +117,11 @@ class SheetComparison:
 def compare_with_sheet(
     ahead: Crossing, there: Mask, value: Real, total_error: Real, levels: TargetLevels
 ) -> SheetComparison:
-    """Compare samples that are proved, at the crossing where `there` holds, with the value before
-    it.
+    """Compare the values on the two sides of a sheet with the levels.
+
+    ahead: the crossing at the end of the ray interval.
+    there: where samples are accepted and lie at that crossing.
+    value: f there, before the jump, known up to `total_error`.
 
     The sheet is the surface if a level lies between the values on its two sides. They are known
     up to `total_error`, and a level within that of either counts as between: such a sheet is the
@@ -139,19 +138,19 @@ def compare_with_sheet(
     return SheetComparison(has_crossing, at_crossing, is_hit, levels.gaps(behind), ahead.normal)
 
 
-# The tolerance is at least so many roundings of f, and at most this part of the distance in value
-# between two levels, so that there is no doubt which of them was reached.
+# The band around a level is at least so many roundings of f, and at most this fraction of the
+# difference between two levels, so that there is no doubt which of them was reached.
 _ROUNDINGS = 8.0
 _OF_SPACING = 0.25
-# The farthest that a ray in contact looks for the next level, as a part of that distance.
+# In contact, f may come as near to the next level as this fraction of that difference.
 _HALFWAY = 0.5
-# A crossing is over where f is beyond the level by this part of the tolerance. The rest is the gap
-# that a ray in contact always has.
+# A crossing is complete where f is beyond the level by this fraction of the band. The rest is the
+# gap that a ray in contact always has.
 _PASSED = 0.5
-# Trials aim at this part of the way that the level beyond is farther: where the crossing is over,
-# and the gap that is left tells by far on which side f is.
+# In contact, trials aim at where f is beyond the level by this fraction of the band: there the
+# crossing is complete, and it is clear on which side of the level f is.
 AIM = 0.75
-# A sample in contact has a truncation error this much smaller than what makes a hit.
+# In contact, truncation is judged by this fraction of the tolerance.
 CLOSER = 0.5
 # Rounds of the search for the root of a cubic.
 _ROUNDS = 4
@@ -161,16 +160,16 @@ _ROUNDS = 4
 class Contact:
     """What a ray knows of the level that it has reached last.
 
-    side: of that level, where the ray is: 1 where f is larger, -1 where it is smaller; 0 as long as
-        the ray has not been seen off the level at which it started. Of no meaning, but for being 0
-        or not, while there is no contact.
+    side: on which side of that level the ray is: 1 where f is larger, -1 where it is smaller; 0 as
+        long as no sample has been off the level at which the ray started. While there is no contact
+        only whether it is 0 has a meaning.
     is_touching: whether f is, or may still be, within the tolerance of that level.
-    root: where f took the level last, between two points looked at where it is on different
-        sides; where the contact began if it began beyond the level.
+    root: where f took the level last, between two samples on different sides of it; where the
+        contact began if it began beyond the level.
     gradient: of f at the root.
     excess: by how much f at the root may be farther from the level than the tolerance allows, where
-        rounding leaves f less certain than that: it lies between the two points.
-    before, behind: the two points, or the root itself.
+        rounding leaves f less certain than that: the root lies between the two samples.
+    before, behind: the places of the two samples, or the root itself.
     """
 
     side: Real
@@ -183,7 +182,7 @@ class Contact:
 
     @classmethod
     def none(cls, backend: Backend) -> Contact:
-        """Before anything was looked at."""
+        """Before the first sample."""
         zero = backend.Float(0)
         return cls(zero, backend.Bool(False), zero, backend.Array3f(0), zero, zero, zero)
 
@@ -192,11 +191,14 @@ class Contact:
 class Accepted:
     """A sample at an accepted point of a ray.
 
-    t, value, gradient, slope: there. before: the same of the last accepted point, as (t, value,
-    slope, gradient). excess: by how much f at the two may be farther from a level than the
-    tolerance allows, where its rounding is more than that; 0 elsewhere. total_error: of the value.
-    is_near: whether it would be a hit. band: the tolerance in value (`Hysteresis.band`). is_end:
-    whether the ray ends there.
+    t, value, gradient, slope: there.
+    before: (t, value, slope, gradient) of the accepted point before it.
+    excess: by how much f at the two may be farther from a level than the tolerance allows, where
+        the error of f is more than that; 0 elsewhere.
+    total_error: of the value.
+    is_near: whether it would be a hit.
+    band: the tolerance in value (`Hysteresis.band`).
+    is_end: whether the ray ends there.
     """
 
     t: Real
@@ -213,36 +215,44 @@ class Accepted:
 
 @dataclass(frozen=True)
 class Hysteresis:
-    """The rule by which contacts begin, are crossings, and end.
+    """The rule by which contacts begin, count as crossings, and end.
 
-    Let W be the largest of the tolerances in value (`band`) at the points of a contact that are
-    looked at. What is guaranteed:
+    A first hit ends a ray where f is within the tolerance of a level. A ray that goes on has to get
+    off the surface with a proof, and rounding, or a ray that runs along the surface, must not make
+    several crossings of one. So a level that has been reached counts as lying a tolerance *beyond*,
+    until f has left the tolerance around it (hysteresis): there is always a gap to it, and steps
+    stay long.
+
+    Let W be the largest of the tolerances in value (`band`) at the samples of a contact. What is
+    guaranteed:
 
     1. *Nothing is missed.* If f is farther than W from a level on one side at some point of the
        ray, and on the other side at a later one, there is a crossing between them. Proof: in
        contact on the side of larger values, the ray is proved free of `level - band`, the band
-       being that of the last point looked at, as a ray is proved free of a level before contact
+       being that of the last sample, as a ray is proved free of a level before contact
        (`March.advance`). So f > level - W as long as no crossing was noticed. Before the contact,
        f was proved not to take the level at all.
     2. *Nothing is counted twice.* A crossing is noticed at a point where f is proved to be on the
        other side of the level, `band/2` being more than its error; the next one only where it is
        proved to be on the first side again. So crossings of a level alternate, and between two that
        are noticed f takes the level. A ray that starts within the tolerance of a level is on
-       neither side until it is seen half the tolerance off it: that it leaves is no crossing.
-    3. *Nothing sticks.* In contact, f is `band/2` or more away from the level beyond and no further
-       than its error, so the gap that steps are solved for is at least a fifth of the band.
+       neither side until a sample is half the tolerance off it: leaving it is no crossing.
+    3. *Nothing sticks.* In contact, f is `band/2` or more away from the level beyond, up to its
+       error, so the gap that steps are solved for is at least a fifth of the band.
 
     The lift of an angle-valued f. Before contact, f lies between two neighboring levels of the
     ladder, and in contact it is proved to stay nearer to the level reached than to all others: the
     window is less than a period wide, and the value tells where in it f is. (Looking back from a
-    point takes the window there, and the two stretches proved share a point, so their lifts agree.)
+    point takes the window there, and the two proved intervals share a point, so their lifts agree.)
 
-    levels: all of them. spacing: the distance in value between the two closest, inf for one.
-    is_free_before, is_free_after: whether the ray is proved free before the part of it that is
-        marched and behind it, by where the surface lies. Then f stays on the side of a level that
-        it is on at that end, and that it is more than its error off the level there is enough.
-    start, rounding: where the part begins, and how far off a sheet rounding may have put a ray that
-        starts on it.
+    levels: all of them.
+    spacing: the difference between the two closest, inf for one level.
+    is_free_before, is_free_after: whether the ray is proved free before the interval that is
+        marched, and behind it, by where the surface lies. Then f stays on the side of a level on
+        which it is at that end of the interval, and there it need be off the level by no more than
+        its error.
+    start, rounding: where the interval begins, and how far off a sheet rounding may have put a ray
+        that starts on it.
     """
 
     levels: TargetLevels
@@ -260,7 +270,7 @@ class Hysteresis:
         start: Real,
         rounding: Real,
     ) -> Hysteresis:
-        """The rule for some levels. free: before and after the part of the ray."""
+        """The rule for some levels. free: `is_free_before` and `is_free_after`."""
         period = levels.period
         spacing: Real = dr.inf if period is None else period
         for k, one in enumerate(levels.values):
@@ -273,11 +283,12 @@ class Hysteresis:
         return cls(levels, spacing, *free, start, rounding)
 
     def within(self, within: Real) -> Real:
-        """How near in value a level must be for contact, where the tolerance asks for `within`."""
+        """How near in value a level must be for contact: `within`, which the tolerance asks for,
+        or less where levels are close together."""
         return fmin(within, _OF_SPACING * self.spacing)
 
     def band(self, within: Real, rounding: Real) -> Real:
-        """The tolerance in value around a level: `within`, or what rounding leaves open."""
+        """The tolerance in value around a level: `within`, or more where rounding asks for it."""
         return fmin(fmax(within, _ROUNDINGS * rounding), _OF_SPACING * self.spacing)
 
     def gaps(
@@ -285,8 +296,8 @@ class Hysteresis:
     ) -> Gaps:
         """How far f may move, given the gaps to the true levels.
 
-        In contact the level counts as lying the band beyond, and steps end halfway to the next
-        level; or that part of it.
+        In contact the level counts as lying `part` of the band beyond, and steps end within that
+        part of half the way to the next level.
         """
         x, far = -self.levels.to_nearest(value), part * _HALFWAY * self.spacing
         band = part * band
@@ -316,7 +327,7 @@ class Hysteresis:
         before = dr.select(passes, t, dr.select(begins, seen.t, now.before))
         behind = dr.select(passes | begins, seen.t, now.behind)
 
-        # Is it well beyond, or has it left?
+        # Is f far enough beyond the level to have crossed it, or has it left the band?
         is_first = (now.side == 0) & ~touching
         stays = (is_first & self.is_free_before) | (seen.is_end & self.is_free_after)
         enough = dr.select(stays, 0, _PASSED * seen.band)
@@ -341,7 +352,7 @@ class Hysteresis:
         """The contact behind the sheet `ahead`, and whether the jump of f there crosses the level.
 
         now: the contact at an accepted point just before the sheet. d: the direction of the ray.
-        Of a field with sheets there is one level. A ray that starts on a sheet is on neither side.
+        A field with sheets has one level here. A ray that starts on a sheet is on neither side.
         """
         x = -self.levels.to_nearest(seen.value)
         one = type(x)(1)
@@ -369,21 +380,21 @@ class Hysteresis:
         """From which side of the nearest level a ray comes that was not in contact with it.
 
         x: f less that level. The ray was proved free, so a real-valued f is on the side of the last
-        accepted value. On a ladder both sides may be the same value: there the value decides and,
-        where it is on the level up to its error, the slope.
+        accepted value. If f is periodic that value may lie on both sides: there the present value
+        decides and, where it is the level up to its error, the slope.
         """
         if self.levels.period is None:
             above = seen.before[1] > seen.value - x
         else:
             above = dr.select(dr.abs(x) > seen.total_error, x > 0, seen.slope < 0)
-        # Off all levels, that a ray was seen is all there is to know.
+        # 0 stays only for a ray of which every sample so far was near a level.
         known = (now.side != 0) | ~seen.is_near
         return dr.select(known, dr.select(above, type(x)(1), -1), 0)
 
 
 @dataclass(frozen=True)
 class _Settling:
-    """Roots on their way: f takes the level between before and behind."""
+    """The state of bisection: f takes the level between before and behind."""
 
     before: Real
     behind: Real
@@ -397,9 +408,9 @@ def settled(
     field: Field, levels: TargetLevels, tolerance: PreparedTolerance, path: Path, found: Contact,
     active: Mask,
 ) -> tuple[Real, Vec3, Any]:  # fmt: skip
-    """The root of a crossing, the gradient of f there, and how often f was looked at.
+    """The root of a crossing, the gradient of f there, and how many evaluations of f that took.
 
-    Between two points with a crease between them f is no cubic. So f is looked at in the root, and
+    Between two points with a crease between them f is no cubic. So f is evaluated at the root, and
     where it is farther from the level than the tolerance and its rounding, the two points are
     brought together by bisection: f stays on different sides of the level at both.
     """
@@ -433,10 +444,8 @@ def settled(
 
 
 def root_between(start: Real, end: Real, slope: Real, end_slope: Real) -> Any:
-    """A root in [0, 1] of the cubic with these values, of different signs, and slopes at 0 and 1.
-
-    Newton's method, and bisection where it leaves the bracket.
-    """
+    """A root in [0, 1] of the cubic with these values at 0 and 1, of different signs, and these
+    slopes: Newton's method, and bisection where it leaves the bracket."""
     # start + slope u + b u^2 + c u^3
     b = 3 * (end - start) - 2 * slope - end_slope
     c = slope + end_slope - 2 * (end - start)

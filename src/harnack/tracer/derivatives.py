@@ -27,12 +27,12 @@ if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
     from harnack.tracer.prepared import MarchResult, PreparedLevelSet
 
-# Newton steps from the tolerance to rounding before the derivative is taken; of sums over trees,
-# which are summed up one by one for it.
+# Newton steps that bring a hit from the tolerance to rounding before the derivative is taken; and
+# for sums over trees, which are then evaluated without truncation.
 _POLISH, _POLISH_OF_SUMS = 4, 3
 
 
-# Fields that will never carry derivatives unless an attribute is set: they are asked once.
+# Fields without Dr.Jit numbers, which are checked only once (until an attribute is set).
 _FIXED: FieldCache[bool] = FieldCache()
 
 
@@ -71,7 +71,7 @@ class _Undifferentiated(dr.CustomOp):
         self.set_grad_out(self.grad_out() + dr.nan)
 
     def backward(self) -> None:
-        if dr.any(self.grad_out() != 0, axis=None):  # zero where a result is there and not used
+        if dr.any(self.grad_out() != 0, axis=None):  # it is zero for a result that is not used
             raise NotImplementedError(
                 f"{self._what} of hits cannot be differentiated, only t and position can: detach "
                 "it where it is used (drjit.detach)"
@@ -79,8 +79,8 @@ class _Undifferentiated(dr.CustomOp):
 
 
 def refuse_derivative(prepared: PreparedLevelSet, o: Vec3, d: Vec3, what: str, value: Any) -> Any:
-    """A result of a trace that depends on what has derivatives enabled, but has none itself: that
-    is said when one is asked for (`_Undifferentiated`), since zero would be wrong."""
+    """A result of a trace whose derivative is not known: asking for it is an error
+    (`_Undifferentiated`), since zero would be wrong."""
     sources = [o, d, *prepared.levels.values, *prepared.field.parameters()]
     return dr.custom(_Undifferentiated, value, what, sources)
 
@@ -88,7 +88,7 @@ def refuse_derivative(prepared: PreparedLevelSet, o: Vec3, d: Vec3, what: str, v
 def attach(
     prepared: PreparedLevelSet, o: Vec3, d: Vec3, end: MarchResult, normal: Vec3
 ) -> tuple[Real, Vec3]:
-    """t polished to rounding with its derivative attached, and the normal at that point.
+    """t, refined up to rounding, with its derivative attached, and the normal at that point.
 
     normal: unit, as traced. Normals carry no derivative (they would need the Hessian). At hits
     on sheets t is exact already, and does not depend on the level.
@@ -113,7 +113,7 @@ def attach(
             miss = prepared.levels.to_nearest(sample.value)
             slope = dr.dot(sample.gradient, along)
             step = dr.select(hit & (slope != 0), miss / slope, 0)
-            # A grazing ray has no crossing to converge to; stay near the proved point.
+            # A grazing ray may have no root to converge to; stay near the proved point.
             limit = 4 * prepared.tolerance.distance
             at = at + dr.clip(step, -limit, limit)
         x = dr.fma(backend.Array3f(at), along, here)
@@ -142,8 +142,7 @@ def _on_plane(prepared: PreparedLevelSet, o: Vec3, d: Vec3, end: MarchResult) ->
 
 
 def _moved(t: Real, change: Real, slope: Real, where: Mask) -> Real:
-    """t with the derivative of -change/slope; where the slope is 0, so that t has none, it is
-    infinite or NaN."""
+    """t with the derivative of -change/slope, infinite or NaN where the slope is 0."""
     return dr.replace_grad(t, -change * dr.select(where, 1 / slope, 0))
 
 

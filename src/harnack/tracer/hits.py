@@ -1,5 +1,7 @@
-"""`trace`: rays and a field in, a list of hits out. NumPy in, NumPy out; Dr.Jit stays Dr.Jit, and
-tensors stay tensors."""
+"""`trace`: rays and a field in, a list of hits out.
+
+NumPy in, NumPy out; Dr.Jit stays Dr.Jit, and tensors stay tensors.
+"""
 
 from __future__ import annotations
 
@@ -45,14 +47,14 @@ class Hits:
 
     t: (n,) ray parameter of the hit, inf for a miss; for a ray that ran out of steps, how far
         it is proved free. A hit is within tolerance of the first root, mostly before it. One that
-        is confirmed is at a root: between two points that were looked at, with f on different
-        sides of the level, where the cubic through their values and slopes takes the level or, if
-        there is a crease between them, where bisection finds it.
+        is confirmed is at a root: between two samples with f on different sides of the level, where
+        the cubic through their values and slopes takes the level or, if there is a crease between
+        them, where bisection finds it.
     position: (n, 3) point at t, NaN for a miss.
     normal: (n, 3) unit normal grad f/|grad f|, or of the sheet that was hit, to its side of
         larger f; zero where there is no hit.
-    value: (n,) f at the last accepted point; of an angle-valued field up to its period. Where a
-        sheet was hit, f just before it.
+    value: (n,) f at the last accepted point; for an angle-valued field up to a multiple of its
+        period. Where a sheet was hit, f just before it.
     evaluations: (n,) how many times the field was evaluated.
     status: (n,) a `Status`.
     sheet: (n,) index of the sheet, such as a triangle, or of the part, such as a face of a
@@ -235,8 +237,8 @@ def _of_tensors(
     precision: Precision | None,
     k: int | None,
 ) -> Any:
-    """What `trace` gives for rays of which some are tensors, as tensors of the shapes of `Hits`, or
-    of `AllHits` for k crossings a ray."""
+    """The result of `trace` for rays that are tensors, or some of which are: tensors of the shapes
+    of `Hits`, or of `AllHits` for k crossings a ray."""
     rays = {"origins": origins, "directions": directions}
     vectors = [vectors_of(a, name) if is_tensor(a) else a for name, a in rays.items()]
     ends = {"t_min": t_min, "t_max": t_max}
@@ -317,7 +319,7 @@ def _trace(
 def _ends(
     prepared: PreparedLevelSet, o: Vec3, d: Vec3, near: Real, far: Real
 ) -> tuple[MarchResult, Hits]:
-    """How the marches of rays end, and what `trace` says of it, without derivatives."""
+    """Ends of rays, and the same as `Hits`, without derivatives."""
     backend = prepared.backend
     end = prepared.first_hit(o, d, near, far)
     hit = end.status == int(Status.HIT)
@@ -340,7 +342,7 @@ def _along(o: Vec3, d: Vec3, t: Real) -> Vec3:
     return dr.select(dr.isfinite(t), dr.fma(type(o)(t), d, o), dr.nan)
 
 
-# Other GPUs.
+# Tracing on other GPUs, by WebGPU.
 
 
 def _check_backend(
@@ -381,21 +383,24 @@ def _trace_on_device(
     return _as_numpy(Hits(**found), count)
 
 
-# Other roundings may find a hit elsewhere within the tolerance, and where a ray climbs less than so
-# much in a unit of length, anywhere along the surface.
+# Where the cosine of the angle between a ray and the normal is less than this, a device that rounds
+# differently may find the hit anywhere along the surface; elsewhere, within the tolerance.
 _GRAZING = 0.1
-# At most so many of the rays end otherwise, or farther off, as at an apex; nine in ten hits lie
-# within so much of the tolerance, with normals so near; and the numbers of evaluations of the rays
-# differ, all together, by so much of their sum. A device that computes as it should came to 0, 0.03,
-# 2e-5 and 0.021 at worst, over 110 surfaces (Mesa's, on a CPU).
+# What is asked of a device (in brackets: the worst of one that computes as it should, Mesa's on a
+# CPU, over 110 surfaces). At most this share of rays has another status, or hits farther off than the
+# tolerance, as at an apex (0);
 _OTHERWISE = 1e-3
-_APART, _TURNED, _RECOUNTED = 0.1, 2e-4, 0.03
+# nine in ten hits lie within this fraction of the tolerance (0.03), and their normals differ by no
+# more than this (2e-5);
+_APART, _TURNED = 0.1, 2e-4
+# the numbers of evaluations differ, summed over all rays, by no more than this fraction (0.021).
+_RECOUNTED = 0.03
 
 
 def _differences(expected: Hits, found: Hits, directions: FloatArray, tolerance: Tolerance) -> str:
-    """What of a device's hits is not explained by other roundings; nothing if all of it is.
+    """What differs in a device's hits by more than rounding explains; "" if nothing does.
 
-    Where a ray runs along the surface, within the tolerance, it may be hit anywhere there or not at
+    A ray that runs along the surface, within the tolerance, may hit it anywhere there or not at
     all, and may run out of steps.
     """
     hit, both = expected.hit | found.hit, expected.hit & found.hit

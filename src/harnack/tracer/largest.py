@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 
 __all__ = ["CELLS_ACROSS", "largest_cells"]
 
-# Cells along the longest side of the box around a surface, if nothing else is asked for.
+# Cells along the longest side of the box around a surface, unless users ask for another number.
 CELLS_ACROSS = 128
-# Centers so many cells away from the surface, to first order, are far from it; cells are useless if
-# more than this share of them is.
+# Centers so many cells away from the surface, to first order, are far from it; the cells tell
+# nothing if more than this share of them is far.
 _FAR, _MOST_FAR = 4.0, 0.5
 
 _Ends: TypeAlias = tuple[float, float]
@@ -36,15 +36,15 @@ _CELLS: FieldCache[OccupiedCells] = FieldCache()
 def largest_cells(
     field: Field, levels: tuple[float, ...], volume: Volume | None, solid: _Ends | None, across: int
 ) -> OccupiedCells:
-    """Cells that hold one component of a level set in a volume, or of a solid {low <= f <= high},
-    that with the largest sum of projected areas along x, y and z, and whatever no cells that are
-    proved empty separate from it (see `largest_connected_component`).
+    """Cells that hold the component of a level set in a volume, or of a solid {low <= f <= high},
+    with the largest sum of projected areas along x, y and z, and all that is not separated from it
+    by cells proved empty (see `largest_connected_component`).
 
-    A cell is left out if it, or each of its eight halves, is proved to have nothing of the level
-    set, as its ball is within the clearance of its center (or, where that is outside of the field's
-    domain, of a point at its boundary), or nothing of the volume, as its signed distance says. Of
-    solids, those without a level all of which is in the solid are kept. For the rest of the proof
-    see `largest_connected_component`.
+    A cell is left out if it, or each of its eight octants, is proved to have nothing of the level
+    set, as the ball around it is within the clearance of its center (or, where that is outside of
+    the field's domain, of a point at the domain's boundary), or nothing of the volume, as its
+    signed distance says. Of a solid, cells that hold no level but lie inside of it are kept too.
+    For the rest of the proof see `largest_connected_component`.
 
     Raises:
         ValueError: the volume is not bounded; or most of the cells that could not be proved empty
@@ -115,10 +115,11 @@ def _check_proved(
 
 
 def _into_domain(field: Field) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
-    """For points (n, 3), others where the field may be asked, and how far they are off, (n,),
-    infinite where none was found: what a field promises need only hold in its domain. If the
-    point found is at least c away from a set, the point given is at least c minus that distance
-    away from it."""
+    """For points (n, 3), points nearby in the field's domain, outside of which its promises need
+    not hold, and the distances between the two, (n,), infinite where none was found. If the point
+    found is at least c away from a set, the point given is at least c minus that distance away from
+    it.
+    """
     domain = None if field.is_entire else field.domain
     backend = choose_backend("double")
     prepared = None if domain is None else domain.prepare(backend)

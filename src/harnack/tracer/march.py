@@ -1,7 +1,7 @@
 """The only marching loop: the first point of a ray on a level set, with every step proved.
 
-It knows neither fields nor proofs. It looks at a field along the ray, and the enclosures that it
-gets say how far the ray is free.
+It knows neither fields nor proofs. It samples a field along the ray, and the enclosures that come
+with each sample say how far the ray is free.
 """
 
 from __future__ import annotations
@@ -36,24 +36,25 @@ if TYPE_CHECKING:
     from harnack.tree.cells import UniformGrid
 
 # A coarse sample is repeated at higher detail where a level is closer in value than this many times
-# its total error, to make truncation this part of that distance, or of what truncation may be
-# (`_finer`).
+# its total error. The detail is chosen to make truncation this fraction of that distance, or of
+# what truncation may be, whichever is larger (`_finer`).
 _REFINE_BELOW, _OF_GAP, _OF_ALLOWED = 2.0, 0.25, 0.85
-# Of the tolerance, less so many roundings, and of rounding: what truncation may be at a hit.
+# What truncation may be at a hit: this fraction of the tolerance, less this many times the
+# rounding; or this many times the rounding if that is larger.
 _OF_TOLERANCE, _LESS, _OF_ROUNDING = 0.4, 0.55, 0.6
-# The next sample may be so coarse that its truncation is this part of the distance to a level.
+# The next sample may be so coarse that its truncation is this fraction of the distance to a level.
 _COARSEN = 0.2
 # Trials stop short of where f is predicted to reach a level by this factor: by a parabola, or where
 # there is only a slope.
 _AIM, _AIM_BY_SLOPE = 0.999, 0.99
 # How far from the surface rounding may leave a point that is a hit: see `March._is_near`.
 _LARGEST_UNCERTAINTY = 1 / 16
-# Where rays without an end are given up as misses, as a power of the largest number: squares of
-# what lies beyond overflow.
+# Rays without an end that get as far as this power of the largest number end as misses: squares of
+# larger numbers overflow.
 _FARTHEST = 0.47
-# Of the gap to the cover of a cone, what the cone may widen by in a step.
+# The fraction of the gap to the cover of a cone by which the cone may widen in a step.
 _WIDENING = 0.1
-# A repeated sample is closer by these factors at least and at most.
+# The detail of a repeated sample is larger by these factors at least and at most.
 _CLOSER = 1.25, 16.0
 # Truncation falls like this power of detail; beyond the largest detail there is none.
 _POWER, _MOST_DETAIL = 3.2, 1e6
@@ -63,15 +64,15 @@ _POWER, _MOST_DETAIL = 3.2, 1e6
 class MarchState:
     """Where rays are.
 
-    proved_to: the ray is proved free up to here; a point that was accepted.
+    proved_to: the ray is proved free up to here; the last accepted point.
     proved_step: a length from there that is proved free too.
     trial_step: from there to the next trial point.
     look_ahead: how far enclosures are asked to reach next.
     value, gradient: f at `proved_to`.
     excess: by how much f there may be farther from a level than the tolerance allows.
-    evaluations: so far.
-    detail: of the next sample (`Field.at_detail`); None for fields that have none (Dr.Jit records
-        a loop twice in which a state never changes).
+    evaluations: of f, so far.
+    detail: of the next sample (`Field.at_detail`); None for fields without a choice of detail
+        (Dr.Jit records a loop twice if a state in it never changes).
     status: a `Status` once the ray has ended.
     active: whether it goes on.
     contact: what is known of the level reached last; None for rays that end where they reach one.
@@ -101,7 +102,7 @@ class MarchState:
         has_detail: bool,
         crosses: bool = False,
     ) -> MarchState:
-        """At the start of rays, before anything was looked at."""
+        """At the start of rays, before the first sample."""
         real, vector, count = backend.Float, backend.Array3f, backend.UInt32
         return cls(
             proved_to=real(start),
@@ -121,17 +122,18 @@ class MarchState:
 
 @dataclass(frozen=True)
 class _Seen:
-    """A look at the trial points of rays.
+    """What is known of f at the trial points of rays.
 
-    t: where, and `at_end`, whether the ray ends there. size: of coordinates there.
-    unproved: of the way there, the last part, which no step has proved before.
-    look, gradient_norm: what was seen, and how long its gradient is.
-    gaps: how far f is from the levels on both sides; in contact, where the hysteresis puts them.
+    t: of the points. at_end: whether the ray ends there. size: of coordinates there.
+    unproved: the length before the point that no step has proved yet.
+    look: the field's answer there. gradient_norm: the length of its gradient.
+    gaps: from f to the levels on both sides; in contact, to where the hysteresis puts them.
     total_error: what rounding and truncation may have done to f.
-    within: how near in value a level makes a hit; in contact, a crossing. band: as
-        `Hysteresis.band`, in contact.
-    is_near: whether a level is near enough for a hit, may_pass: and the point may be accepted
-        though on which side of it the point lies is not known.
+    within: how near in value a level makes a hit; in contact, a crossing.
+    band: in contact that of `Hysteresis.band`.
+    is_near: whether a level is near enough for a hit.
+    may_pass: whether a point may be accepted although it is not known on which side of a level
+        it lies.
     excess: as that of `MarchState`.
     is_smooth: whether value and slope predict f.
     """
@@ -153,20 +155,22 @@ class _Seen:
 
     @property
     def value(self) -> Real:
-        """Of f."""
+        """f at the points."""
         return self.look.sample.value
 
 
 @dataclass(frozen=True)
 class March:
-    """How to march: towards which levels, until when, and with which over-stepping factor.
+    """How to march: the levels to find, when to stop, and by how much to try longer steps.
 
+    overstep: trial steps are at most this many times as long as the proved ones.
     hysteresis: for rays that end where they have crossed a level, and not where they reach one.
     cover: for cones that end where they come near a level (`pixel_cones`): their radius per unit
         of t.
-    occupied: cells outside of which there is no level, not even behind a sheet, for rays that end
-        where they reach one; and `last`, where these rays end.
-    is_part: whether there may be levels outside of these cells that do not count.
+    occupied: for rays that end where they reach a level, cells outside of which there is no level,
+        not even behind a sheet.
+    last: where these rays end.
+    is_part: whether there may be levels outside of these cells, which do not count.
     """
 
     backend: Backend
@@ -188,7 +192,7 @@ class March:
         state: MarchState,
         ahead: Crossing | None = None,
     ) -> MarchState:
-        """Marches to the first level, or to the end.
+        """March to the first level, or to the end.
 
         Proof that no hit is missed: `proved_to` is a point up to which the ray is free, and
         `proved_step` a proved length from there. A trial point, `trial_step` from there, is
@@ -205,26 +209,29 @@ class March:
         hit, because the error is large, it is not accepted by looking back, and no step from it is
         proved: on which side of the point the level lies is not known.
 
-        In rounded arithmetic a surface could slip through between the two looks, so both see
-        it nearer by the rounding of value and position together (`value_error`).
+        In rounded arithmetic a surface could be missed between the enclosure that reaches ahead
+        from one point and the one that looks back from the next, so for both the levels are nearer
+        by the rounding of value and position together (`value_error`).
 
         With `hysteresis` a level that is reached is not the end: the ray goes on, towards levels
         that lie where the hysteresis puts them, and ends as a hit where it has crossed one. It may
         be made active again there, to go on to the next.
 
         With `cover` the levels lie nearer by |grad f| times the radius of a cone, which grows with
-        t: a tenth of the gap is left to that, and no step is longer than the cone takes to widen
-        by so much, unless the level is never met and f leaves it faster than the cone widens.
+        t: a tenth of the gap is set aside for that growth, and no step is longer than the cone
+            takes
+        to widen by so much, unless the level is never met and f leaves it faster than the cone
+        widens.
 
         With `occupied` what follows a proved step is passed as well, as far as it lies in cells
         that hold no level (`UniformGrid.run` has the proof): a union of free intervals is free.
 
-        With `is_part` the levels elsewhere are those of other parts of the surface. Proved steps
-        end in cells that count, and so do trials: one that would not is not made. So no hit lies
-        elsewhere, and what is passed elsewhere does not count.
+        With `is_part` levels outside of `occupied` belong to other components of the surface.
+        Proved steps end in occupied cells, and so do trials: one that would not is not made. So no
+        hit lies outside of them, and levels that are passed there do not count.
 
-        ahead: of a field with sheets, the crossing at `end`, on lanes where there is one. Those
-        lanes look at that point as well. Accepted there, they hit the sheet or have passed it: a
+        ahead: for a field with sheets, the crossing at `end`, on lanes where there is one. Those
+        lanes sample that point as well. Accepted there, they hit the sheet or have passed it: a
         miss, with the step that the value behind the sheet allows from there. With `hysteresis`
         `value` is then that behind the sheet.
         """
@@ -298,7 +305,7 @@ class March:
     def _look(
         self, field: Field, path: Path, end: Real, now: MarchState, ahead: Crossing | None
     ) -> _Seen:
-        """A look at the trial points of rays."""
+        """Sample f at the trial points of rays."""
         real = self.backend.Float
         t = now.proved_to + now.trial_step
         if ahead is not None or now.contact is not None:  # the end exactly
@@ -312,7 +319,7 @@ class March:
             gaps = gaps.less(self.cover * t * gradient_norm)
         total_error = value_error(sample, gradient_norm, size)
         steepness = fmax(gradient_norm - sample.gradient_error, real(0))
-        if look.slope_error is not None:  # the gradient is at least as long as its shadow
+        if look.slope_error is not None:  # the gradient is at least as long as its projection
             steepness = fmax(dr.abs(look.slope) - look.slope_error, steepness)
         if look.least_gradient is not None:
             steepness = fmax(look.least_gradient, steepness)
@@ -320,7 +327,7 @@ class March:
         knows_gradient = (sample.gradient_error <= gradient_norm) | (steepness > 0)
         if self.hysteresis is not None:
             within = self.hysteresis.within(within)
-        # Where not even the gradient is known, rounding makes no hits.
+        # Where not even the gradient is known, no hit is due to rounding.
         rounding = dr.select(knows_gradient, total_error - sample.truncation, 0)
         is_near = self._is_near(
             gaps.smaller, within, total_error, rounding, look, gradient_norm, size, end
@@ -343,11 +350,11 @@ class March:
         )
 
     def _in_contact(self, seen: _Seen, hysteresis: Hysteresis, contact: Contact) -> _Seen:
-        """The same, with levels where the hysteresis puts them. All that rounding does to f counts,
-        or a ray would stick in a crease."""
+        """The same, with levels where the hysteresis puts them. The band takes all rounding of f
+        into account, or a ray would stick in a crease."""
         band = hysteresis.band(seen.within, seen.total_error - seen.look.sample.truncation)
         may_pass = seen.may_pass & ~contact.is_touching
-        if self.levels.period is not None:  # the value alone tells its side of a level
+        if self.levels.period is not None:  # here only the value tells the side of a level
             may_pass = self.backend.Bool(False)
         gaps = hysteresis.gaps(contact, seen.value, seen.gaps, band)
         return replace(seen, gaps=gaps, within=CLOSER * seen.within, band=band, may_pass=may_pass)
@@ -355,8 +362,8 @@ class March:
     def _accept(
         self, field: Field, seen: _Seen, now: MarchState, ahead: Crossing | None
     ) -> tuple[Mask, Real | None, Mask]:
-        """Whether all up to the trial point is proved free by a sample that is fine enough to say
-        so, the detail of the next sample, and whether this one was too coarse."""
+        """Whether all up to the trial point is proved free, by a sample that is not too coarse; the
+        detail of the next sample; and whether this one was too coarse."""
         accepted = now.trial_step <= now.proved_step
         if self.overstep > 1:
             knows_side = seen.may_pass | (seen.gaps.smaller > seen.total_error)
@@ -385,8 +392,8 @@ class March:
         ahead: Crossing | None,
         sheet: SheetComparison | None,
     ) -> tuple[Contact, Mask, SheetComparison | None, Real]:
-        """The contact behind a look, whether rays have crossed the level, what is known of the
-        sheet, and f behind it."""
+        """The contact behind the trial point, whether rays have crossed the level, the comparison
+        with the sheet, and f behind it."""
         value = seen.value
         before = now.proved_to, now.value, dr.dot(now.gradient, path.direction), now.gradient
         last = seen.at_end if sheet is None else seen.at_end & ~sheet.has_crossing
@@ -397,7 +404,7 @@ class March:
         )  # fmt: skip
         contact, hit = hysteresis.update(contact, accepted, there)
         if ahead is not None and sheet is not None:
-            # What was crossed before the sheet comes first: the sheet is looked at again.
+            # A crossing before the sheet comes first: the sheet will be sampled again.
             passed = sheet.at_crossing & ~hit
             contact, jumps = hysteresis.jump(contact, passed, there, ahead, path.direction)
             sheet = replace(sheet, at_crossing=passed, is_hit=jumps)
@@ -405,7 +412,7 @@ class March:
         return contact, hit, sheet, value
 
     def _proved(self, seen: _Seen, gaps: Gaps) -> Real:
-        """How far from a look rays are proved free of levels so far away in value."""
+        """How far from the trial point rays are proved free of levels that far away in value."""
         spent = _WIDENING * seen.gaps.smaller
         if self.cover is not None:
             gaps = gaps.less(spent)
@@ -428,7 +435,7 @@ class March:
         forward: Real,
         trial: Real,
     ) -> tuple[Real, Real]:
-        """What is free and what to try, across cells that hold no level behind what is proved."""
+        """The proved and the trial step, made longer by cells without a level behind the proof."""
         free_to = dr.select(accepted, seen.t + forward, self.last)
         free_to = occupied.free_until(path.origin, path.direction, free_to, self.last)
         forward = fmax(forward, dr.select(free_to >= self.last, dr.inf, free_to - seen.t))
@@ -448,11 +455,11 @@ class March:
         hit: Mask,
     ) -> Real:
         """How far ahead enclosures are asked to reach next."""
-        # After a step of zero enclosures are asked for a third of the length: bisection.
+        # After a step of zero, enclosures are asked to reach a third as far: bisection.
         candidate = fmin(now.look_ahead, end - seen.t)
         shorter = dr.select(dr.isfinite(candidate), candidate / 3, 1 + 16 * seen.size)
         tried = dr.select(proved > 0, seen.look.growth * proved, shorter)
-        if now.contact is not None and contact is not None:  # off the surface, all lies ahead
+        if now.contact is not None and contact is not None:  # off the surface: the whole ray again
             leaves = now.contact.is_touching & ~contact.is_touching
             tried = dr.select(leaves | hit, end - seen.t, tried)
         return tried
@@ -471,7 +478,7 @@ class March:
         proved_to = dr.select(accepted, seen.t, now.proved_to)
         proved_step = dr.select(accepted, forward, now.proved_step)
         free = proved_to + proved_step >= dr.select(end == dr.inf, farthest, end)
-        if self.hysteresis is not None and contact is not None:  # a contact may end at the end
+        if self.hysteresis is not None and contact is not None:  # sample the end: contact may cease
             undecided = contact.is_touching & self.hysteresis.is_free_after
             free &= ~(accepted & undecided & (seen.t < end))
         return free
@@ -490,11 +497,12 @@ class March:
         """Whether a level is near enough in value for a hit; see `advance`.
 
         within: how near the tolerance asks it to be. rounding: what it may have done to f.
-        A point is no hit if it leaves the distance to the surface uncertain by more than a
-        sixteenth of the size of the coordinates or, if that is larger, of the radius on which f is
-        known to be smooth; nor, of a ray without an end, if rounding alone makes it one and leaves
-        the length of the ray uncertain by more than that size: far enough away rounding makes every
-        ray one that is parallel to the surface.
+
+        A point is no hit if rounding leaves the distance to the surface uncertain by more than a
+        sixteenth of a size: that of the coordinates or, if larger, the radius on which f is known
+        to be smooth. Nor is it on a ray without an end if rounding alone makes it one and leaves t
+        uncertain by more than that size: far enough away, rounding would make a hit of every ray
+        that is parallel to the surface.
         """
         sample = look.sample
         near = gap <= fmax(within - sample.truncation, 2 * rounding)
@@ -509,10 +517,11 @@ class March:
     def _trial(
         self, forward: Real, look: Look, gaps: Gaps, now: MarchState, path: Path, is_smooth: bool
     ) -> Real:
-        """How far to try, where `forward` is proved: longer, but not past where f is predicted to
-        reach a level. Whatever is tried must still be proved, looking back; the prediction is not.
+        """The next trial step, where `forward` is proved: longer, but not past where f is predicted
+        to reach a level. The prediction need not be right: a trial must still be proved, looking
+        back.
 
-        is_smooth: whether value and slope at the last accepted point predict f as well. Those of an
+        is_smooth: whether value and slope at the last accepted point help to predict f. Those of an
         approximate field, whose truncation differs from point to point, do not.
         """
         slope = look.slope
@@ -540,13 +549,13 @@ class March:
         return dr.select(known, 2 * (2 * slope + before - 3 * rise / h) / h, 0)
 
     def _status(self, hit: Mask, free: Mask) -> Any:
-        """Of a ray that goes no farther."""
+        """The status of a ray that goes no farther."""
         ended = dr.select(free, int(Status.MISS), int(Status.OUT_OF_STEPS))
         return self.backend.UInt32(dr.select(hit, int(Status.HIT), ended))
 
     def _deciding_gap(self, value: Real, ahead: Crossing | None, at_end: Mask | None) -> Real:
-        """The distance in value to the nearest level, of f or of what f is behind the crossing at
-        the end of the ray interval, where the sample lies there."""
+        """The distance in value from f to the nearest level; where the sample lies at a sheet, the
+        smaller of those of f before and behind the sheet."""
         gap = self.levels.gaps(value).smaller
         if ahead is not None:
             behind = self.levels.gaps(value + ahead.jump).smaller
@@ -561,13 +570,13 @@ def _has_detail(field: Field, now: MarchState) -> bool:
 def _finer(
     detail: Real, gap: Real, total_error: Real, truncation: Real, within: Real
 ) -> tuple[Real, Mask]:
-    """The detail to sample a point at again, and whether the sample at this one is too coarse.
+    """The detail to sample a point at again, and whether the sample at this detail is too coarse.
 
-    It is where its error shortens the step by much or decides about a hit, unless truncation is a
-    small part of it: of what a hit may be off, `within`, or of rounding, which no detail helps.
-    What is allowed leaves the march a way to a hit: its steps end where a level is as near as
-    `total_error`, and 1.25 times that is less than what makes a hit, within - truncation or twice
-    the rounding.
+    It is too coarse where its error shortens the step by much or decides about a hit, unless
+    truncation is a small part of `within`, by which a hit may be off, or of rounding, which more
+    detail does not reduce. With the truncation that is allowed the march still arrives at hits: its
+    steps end where a level is as near as `total_error`, and 1.25 times that is less than what makes
+    a hit, within - truncation or twice the rounding.
     """
     rounding = total_error - truncation
     allowed = fmax(_OF_TOLERANCE * within - _LESS * rounding, _OF_ROUNDING * rounding)
@@ -578,7 +587,8 @@ def _finer(
 
 
 def _coarser(detail: Real, gap: Real, truncation: Real, coarsest: float) -> Real:
-    """The detail for the next sample, no finer than that of this one, with its truncation and a gap
-    to the next level: 0 for as coarse as can be, or at least 1."""
+    """The detail for the next sample, at most that of this one, given the truncation of this one
+    and
+    its gap to the next level: 0 for the coarsest, or at least 1."""
     wanted = detail * dr.power(truncation / (_COARSEN * gap), 1 / _POWER)
     return dr.select(wanted > coarsest, fmin(fmax(wanted, 1), detail), 0)

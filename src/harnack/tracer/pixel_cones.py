@@ -1,9 +1,10 @@
-"""Where cones pass a surface: which pixels it may cover in part, though their rays miss it.
+"""Pixel cones near a surface: which pixels it may cover in part, though their rays miss it.
 
-A cover is the surface moved outwards by the radius of the cone (Thomas et al. 1989; Hart 1996,
-Section 3). A cone that enters it and leaves it again on the same side is covered in part; one whose
-ray gets a radius behind the surface is covered altogether. All this is to first order: the distance
-to a level is |f - level| / |grad f|, which is the distance only close to a smooth surface.
+The cover of a surface is the surface moved outwards by the radius of the cone (Thomas et al. 1989;
+Hart 1996, Section 3). A cone whose ray enters the cover and leaves it again on the same side is
+covered in part; one whose ray gets a radius behind the surface is covered completely. All this is
+to first order: the distance to a level is taken as |f - level| / |grad f|, which is right only
+close to a smooth surface.
 """
 
 from __future__ import annotations
@@ -23,17 +24,18 @@ if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
     from harnack.tracer.prepared import PreparedLevelSet
 
-# A passage begins within this part of the radius outside the cover, is over this many radii off the
-# surface, and steps are aimed a little farther than that, or than a radius behind the surface.
+# A passage through the cover begins within this fraction of a radius outside of it, and ends so
+# many radii off the surface; steps are aimed this many radii farther than that, or than a radius
+# behind the surface.
 _WITHIN, _AWAY, _BEYOND = 0.02, 1.1, 0.05
-# The first of them for approximate fields, which cost more the closer they are asked for.
+# The first of them for approximate fields, whose samples cost more the more exact they are.
 _WITHIN_APPROXIMATE = 0.25
-# Steps of a passage: the shortest and the longest of the first, in radii, and the longest of the
-# others, as a multiple of that before.
+# Steps of a passage: the shortest, and the longest first one, in radii; the longest of the others,
+# as a multiple of the step before.
 _SHORTEST, _FIRST, _LONGER = 0.25, 32.0, 4.0
-# Looks of a passage; a cone that has none left counts as covered in part.
+# Samples of a passage; a cone that has none left counts as covered in part.
 _MOST = 48
-# Less than any slope or bend that matters, in radii.
+# Less than any slope or second derivative that matters, in radii.
 _NONE = 1e-12
 
 
@@ -41,8 +43,10 @@ _NONE = 1e-12
 class _Passage:
     """Where a ray is in the cover.
 
-    t, height, slope: of the last look; the height over the surface is in radii, and less than 0
-        behind it. step: from there to the next.
+    t, height, slope: of the last sample; the height over the surface is in radii of the cone, and
+        less than 0 behind the surface.
+    step: from there to the next sample.
+    looks: the number of samples.
     """
 
     t: Real
@@ -58,8 +62,8 @@ class Cones:
     """Cones around rays o + t d, |d| = 1, that may touch a level set.
 
     radius: of a cone, per unit of t.
-    around: (middle, depth, size), the middle and the radii of a ball in the surface's extent and of
-        one around it; None for an extent that has no end.
+    around: (middle, depth, size): the center of two balls, one of the radius `depth` inside the
+        surface's extent and one of the radius `size` around it; None for an extent without end.
     solid: (low, high) of a solid {low <= f <= high}; None for a surface with two sides.
     """
 
@@ -71,8 +75,8 @@ class Cones:
     solid: tuple[Real, Real] | None = None
 
     def are_covered_in_part(self, t_max: Real, active: Mask) -> tuple[Mask, Any]:
-        """Whether the first passage of each cone that begins before t_max leaves some of it
-        uncovered, and how often the field was looked at.
+        """Whether the surface covers each cone in part, but not completely, in its first passage
+        that begins before t_max; and the number of evaluations of the field.
 
         The march to the cover is `March.advance`, for levels that lie nearer in value by
         |grad f| times the radius: a step that is proved for those keeps the ray a radius off the
@@ -138,12 +142,12 @@ class Cones:
         return dr.select(known, height / radius, dr.inf), slope
 
     def _clip(self) -> tuple[Real, Real]:
-        """The part of rays whose cones can touch the surface.
+        """The interval of rays on which their cones can touch the surface.
 
-        Its extent is made larger about a point in it, which a ray meets as one that is made smaller
-        meets the extent itself: by so much that it holds all points within the radius. Proof. A
-        convex C that holds the ball of radius h about m = 0 holds h u for every unit vector u, so
-        that (1 + a) C = C + a C holds C moved by any vector of length a h.
+        The surface's extent is scaled up about a point in it until it holds all points within the
+        radius of the cone; equally, the ray is scaled down. Proof that it holds them: a convex C
+        that holds the ball of radius h about m = 0 holds h u for every unit vector u, so that
+        (1 + a) C = C + a C holds C moved by any vector of length a h.
         """
         real = self.prepared.backend.Float
         start, end = real(0), real(dr.inf)
@@ -160,7 +164,8 @@ class Cones:
 
 
 def _next_step(height: Real, slope: Real, bend: Real, longest: Real) -> Real:
-    """To where the height is predicted to be lowest, a radius behind the surface, or outside."""
+    """The step to where the cone is predicted to be lowest, a radius behind the surface, or outside
+    of the cover, whichever comes first; bend: the second derivative of the height."""
     real = cast("Any", type(height))
     through = (height + 1 + _BEYOND) / fmax(-slope, real(_NONE))
     lowest = dr.select(bend > _NONE, (1 + _BEYOND) * -slope / fmax(bend, real(_NONE)), dr.inf)

@@ -1,10 +1,7 @@
-"""Many rays by few lanes: one that has followed a ray to its end fetches the next.
+"""A level set uploaded to a backend, and the ways in which its rays are advanced.
 
-Rays differ in length, and a packet of a processor waits for its longest. Bounces of light paths go
-in all directions: there the longest ray of a packet took three to six times as many looks as the
-mean one (measured).
-
-A level set on a backend: what can be asked of it while a kernel is being recorded.
+`PreparedLevelSet` is what renderers and `trace` call: first hits, occlusion and clipping, most of
+it while a kernel is being recorded. `trace_queued` traces many rays by few lanes.
 """
 
 from __future__ import annotations
@@ -35,14 +32,14 @@ __all__ = ["PlainTracer", "RayTracer", "TracerOf", "trace_queued"]
 
 
 class RayTracer(Protocol):
-    """A walk that advances each ray by one item a turn: a trial point, a sheet, or a part."""
+    """Advances rays, each call of `next` by one item: a trial point, a sheet, or a part."""
 
     def begin(self, state: MarchState) -> Any:
         """Rays at their start."""
         ...
 
     def next(self, walk: Any, /) -> Any:
-        """One station more."""
+        """Rays one item further."""
         ...
 
     def end_of(self, walk: Any, /) -> tuple[MarchState, Any]:
@@ -50,7 +47,7 @@ class RayTracer(Protocol):
         ...
 
     def run(self, state: MarchState) -> tuple[MarchState, Any]:
-        """The same, of rays that are followed to their end."""
+        """What `end_of` returns for rays followed to their end."""
         ...
 
 
@@ -60,7 +57,7 @@ TracerOf: TypeAlias = "Callable[[Path, Real, Real], RayTracer]"
 
 @dataclass(frozen=True)
 class PlainTracer:
-    """Rays through a field that is continuous and has no parts."""
+    """Rays through a field that has neither sheets nor parts."""
 
     march: March
     field: Field
@@ -72,7 +69,7 @@ class PlainTracer:
         return state
 
     def next(self, walk: MarchState) -> MarchState:
-        """One trial more."""
+        """Rays after one more trial point."""
         return self.march.next_trial(self.field, self.path, self.end, walk)
 
     def end_of(self, walk: MarchState) -> tuple[MarchState, Any]:
@@ -86,7 +83,7 @@ class PlainTracer:
 
 @dataclass(frozen=True)
 class _Ray:
-    """A ray from start to end, and where it is: all that a lane knows."""
+    """A ray from start to end, and how far it has got: all the state of a lane."""
 
     origin: Vec3
     direction: Vec3
@@ -102,7 +99,13 @@ class _Ray:
 def trace_queued(
     tracer_of: TracerOf, path: Path, start: Real, end: Real, state: MarchState
 ) -> tuple[MarchState, Any]:
-    """What `RayTracer.run` finds, with a queue: the same numbers, evaluated."""
+    """What `RayTracer.run` finds, evaluated, by few lanes: one that has followed a ray to its end
+    fetches the next.
+
+    Rays differ in length, and a packet of a processor waits for its longest. Bounces of light paths
+    go in all directions: there the longest ray of a packet took three to six times as many samples
+    as the mean one (measured).
+    """
     proofs: Proofs = path.proofs
 
     def tracer(ray: _Ray) -> RayTracer:
@@ -117,28 +120,27 @@ def trace_queued(
     return tracer(rays).end_of(walk)
 
 
-# Rays that look for crossings begin and end outside the proved extent of the surface by this part
-# of the size of coordinates, to be seen on one side of it.
+# Rays that look for crossings begin before the proved extent of the surface and end behind it, so
+# that f is sampled on one side of the level there: by this fraction of the size of coordinates,
 _AROUND = 1 / 64
-# And by this part of the length between, for rays that leave it at small angles.
+# or by this fraction of the length within the extent, for rays that leave it at small angles.
 _ALONG = 1 / 7
-# Rays that start so many roundings off a sheet start on it.
+# A ray that starts no farther than so many roundings from a sheet counts as starting on it.
 _ON_SHEET = 8.0
 
 
 @dataclass(frozen=True)
 class MarchResult:
-    """Ends of rays, as Dr.Jit arrays. t is where the proof of freedom ends (inf for a miss).
+    """Ends of rays, as Dr.Jit arrays.
 
-    A ray that hits a sheet (see `harnack.fields.sheets`) has its index in `sheet`, NO_SHEET
-    elsewhere; its t is that of the crossing, `value` is f just before it, and `gradient` is the
-    sheet's unit normal, to the side of larger f. excess: by how much f at t may be farther from
-    the level than the tolerance allows.
-
-    Where hits are confirmed, t and gradient are those of the crossing, f at which is the level;
-    `value` is f a little behind it, and `side` 1 where f rises through the level along the ray, -1
-    where it falls through it. Where they are not, `side` is None.
-
+    t: up to where the ray is proved free of levels; inf for a miss.
+    value, gradient: f at t. Where a sheet was hit, f just before it, and the sheet's unit normal,
+        to the side of larger f.
+    excess: by how much f at t may be farther from the level than the tolerance allows.
+    sheet: index of the sheet (see `harnack.fields.sheets`) that was hit, at t; NO_SHEET elsewhere.
+    side: where hits are confirmed, 1 where f rises through the level along the ray, -1 where it
+        falls through it; else None. Then t and gradient are those of the root, and `value` is f a
+        little behind it.
     part: of a field with parts, the index of the one that was hit, NO_PART elsewhere; else None.
     """
 
@@ -162,13 +164,16 @@ class MarchResult:
 class PreparedLevelSet:
     """A level set on a backend. Its methods can be called while a kernel is being recorded.
 
-    volume: what holds the surface. region: where the field may be looked at, only for rays that
-        look for crossings; it is all of space, or larger than `volume`. Both None for all of space.
+    volume: a volume that contains the surface; None for all of space.
+    region: where the field may be evaluated, for rays that look for crossings; it contains
+        `volume`. None for all of space.
     occupied: cells outside of which there is no level; None where none are known.
-    is_part: whether the levels outside of `occupied` do not count, where there may be some.
-    section: of the volume, that by which the surface is opened; None for none.
-    queued: whether rays are traced at once, by few lanes that share a queue, so that its methods
-        can not be called while a kernel is being recorded.
+    is_part: whether only the surface within `occupied` is traced: there may be levels outside,
+        which do not count.
+    section: the volume, one of those that `volume` is the intersection of, that cuts the surface
+        open; None for none.
+    queued: whether rays are traced at once, by few lanes that share a queue. Then its methods
+        cannot be called while a kernel is being recorded.
     """
 
     backend: Backend
@@ -191,20 +196,20 @@ class PreparedLevelSet:
         return self.field.evaluate(p)
 
     def of_hit(self, hit: MarchResult) -> PreparedLevelSet:
-        """The level set that was hit: of a field with parts that of the part, else this."""
+        """The level set that was hit: for a field with parts that of the part, else this one."""
         if hit.part is None:
             return self
         part = dr.select(hit.part == NO_PART, self.backend.UInt32(0), hit.part)
         return replace(self, field=self.field.part_at(part))
 
     def counts(self, p: Vec3) -> Mask:
-        """Whether points are where levels count."""
+        """Whether levels count at points p (see `is_part`)."""
         if self.occupied is None or not self.is_part:
             return self.backend.Bool(True)
         return self.occupied.cell(p).free == 0
 
     def resolves(self, o: Vec3, end: Real) -> Mask:
-        """Whether rounding leaves open nowhere on rays up to `end` whether levels count there."""
+        """Whether rounding leaves no doubt, anywhere on rays up to `end`, if levels count there."""
         if self.occupied is None or not self.is_part:
             return self.backend.Bool(True)
         return self.occupied.resolves(o, end)
@@ -244,8 +249,8 @@ class PreparedLevelSet:
         )
 
     def settled(self, o: Vec3, d: Vec3, found: Contact, active: Mask) -> tuple[Real, Vec3, Any]:
-        """Roots of crossings, the gradients there, and how often f was looked at for them: as they
-        are where f has no creases."""
+        """Roots of crossings, the gradients there, and how many evaluations of f that took. Those
+        that were found are kept where f has no creases."""
         if self.field.has_sheets or not self.field.has_creases:
             return found.root, found.gradient, dr.zeros(self.backend.UInt32, dr.width(found.root))
         path = Path(self.backend.Array3f(o), self.backend.Array3f(d), self.proofs)
@@ -254,7 +259,7 @@ class PreparedLevelSet:
     def ready(
         self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask, *, crosses: bool
     ) -> tuple[March, Path, Real, Real, MarchState]:
-        """How to march, along which path, from where to where, and the state before it.
+        """The march, its path, where that starts and ends, and the state at the start.
 
         crosses: whether rays end where they have crossed a level, and not where they reach one.
         """
@@ -270,11 +275,11 @@ class PreparedLevelSet:
         if occupied is not None:
             holds = backend.Bool(active) & (start < end)
             start, end = dr.select(holds, start, 0), dr.select(holds, end, 0)
-            if not self.field.has_sheets:  # a sheet on the start must be looked at
+            if not self.field.has_sheets:  # else a sheet at the very start would be skipped
                 start = occupied.free_until(path.origin, path.direction, start, end)
         state = MarchState.at(backend, start, end, active, has_detail=has_detail, crosses=crosses)
         if occupied is not None and self.is_part:
-            # Where rounding leaves open in which cell a point is, nothing is said.
+            # Where rounding leaves it open in which cell a point is, nothing can be proved.
             lost = state.active & ~self.resolves(path.origin, end)
             out = backend.UInt32(int(Status.OUT_OF_STEPS))
             status = dr.select(lost, out, state.status)
@@ -295,16 +300,17 @@ class PreparedLevelSet:
     def _around(
         self, path: Path, t_min: Real, t_max: Real, start: Real, end: Real
     ) -> tuple[Real, Real, Hysteresis]:
-        """The part of rays to look at for crossings, given the part that can hold the surface.
+        """The interval of rays to search for crossings, given the one that can hold the surface.
 
-        The surface may touch the ends of the latter, so that on it f is on one side only. Beyond
-        it the ray is free. So a little more of the ray is looked at, if there is more of it, and
-        behind a ray that leaves a flat solid at a small angle more than that.
+        The surface may touch the ends of the latter, so that within it f is on one side only.
+        Beyond it the ray is free. So the interval is made a little longer, as far as the ray goes,
+        and for a ray that leaves a flat solid at a small angle longer still.
 
-        Proof that it is enough where f is convex along the ray. Let f be W below the level in the
-        extent and pass it at its end, and e be the error of f there: W >= 8 e (`Hysteresis.band`).
-        Then f rises at least as steeply behind as on the way there, no longer than end - start: a
-        seventh of that behind the end it is 8/7 e above the level, and is seen there.
+        Proof that it is enough where f is convex along the ray. Let f be W below the level at some
+        point of the extent and pass the level at its end, and e be the error of f there: W >= 8 e
+        (`Hysteresis.band`). Behind the end f rises at least as steeply as on the way to it, which
+        is no longer than end - start: a seventh of that behind the end it is 8/7 e above the level,
+        which a sample there shows.
         """
         none, size = self.backend.Bool(False), largest_coordinate(path.origin)
         rounding = _ON_SHEET * self.backend.epsilon * (size + t_min)
@@ -335,7 +341,7 @@ class PreparedLevelSet:
     ) -> tuple[MarchState, Any]:
         """The end state of rays, and the index of the sheet or the part that each hit.
 
-        any_hit: whether any hit will do, if that is found with less work than the first.
+        any_hit: whether any hit will do if it is found with less work than the first.
         """
         march, path, start, end, state = self.ready(
             o, d, t_min, t_max, active, crosses=self.confirm

@@ -1,4 +1,4 @@
-"""A surface to trace: a field, its levels, a clip volume, and how closely to look."""
+"""A surface to trace: a field, its levels, clip volumes, and the settings of the tracer."""
 
 from __future__ import annotations
 
@@ -39,25 +39,27 @@ _FIRST_HITS = (
 
 @dataclass(frozen=True)
 class LevelSet:
-    """A surface: where a field takes one of some levels, and how closely to trace it.
+    """A surface: where a field takes one of some levels, and how to trace it.
 
-    field: the function. levels: one or more numbers, or Dr.Jit numbers; `level_set` fills in the
-        field's default. tolerance: see `Tolerance`. max_steps: evaluations that a ray may take.
+    field: the function.
+    levels: one or more numbers, or Dr.Jit numbers; `level_set` fills in the field's default.
+    tolerance: see `Tolerance`.
+    max_steps: evaluations of the field that a ray may take.
     bound: the proofs by which steps are made (`choose_proofs`).
     clip: a volume to cut the surface with, besides the field's own domain.
-    section: another one, that opens the surface to be looked into: the faces of a solid on it may
-        have a material of their own.
-    largest: 0, or how many cells along the longest side of its box to tell components apart by;
-        True for 128, which becomes that number. Then only one component is there, of what the
-        domain and the clip leave: the one whose shadows along x, y and z, added, are the largest
-        (`largest_cells`). Those that are not separated by cells proved empty count as one.
+    section: another one, that cuts the surface open: the faces of a solid on it may have a material
+        of their own.
+    largest: 0 for all of the surface. Else only one component of what the domain and the clip leave
+        is there: the one with the largest sum of projected areas along x, y and z
+        (`largest_cells`). Components are told apart by so many cells along the longest side of the
+        box, True for 128; those that are not separated by cells proved empty count as one.
     confirm: whether a ray hits only where f really changes sign about the level: where it passes
         to the other side, by at least half the tolerance. One that comes within the tolerance and
         turns back (a graze) goes on.
     solid: (low, high) makes it the closed solid {low <= f <= high} cut by its volume, whose
-        levels are the finite ends; only renderers look at it.
-    overstep: steps are this much longer than proved, and kept if the bound at the far end,
-        looking back, covers the rest (Keinert et al. 2014). 1 turns it off.
+        levels are the finite ends; only renderers use it.
+    overstep: steps are tried this many times as long as proved, and kept if the bound at the far
+        end, looking back, covers the rest (Keinert et al. 2014). 1 turns it off.
     """
 
     field: Field
@@ -71,7 +73,7 @@ class LevelSet:
     confirm: bool = False
     section: Volume | None = None
     largest: int = 0
-    # What `once` has made; None outside of a call of the library.
+    # Results of `once`; None outside of a call of the library.
     _made: dict[Any, Any] | None = dataclasses.field(
         default=None, repr=False, compare=False, kw_only=True
     )
@@ -122,25 +124,25 @@ class LevelSet:
 
     @property
     def cut(self) -> Volume | None:
-        """What it is cut by besides the field's own domain: clip and section together."""
+        """The intersection of clip and section; None for neither."""
         return _common([self.clip, self.section])
 
     def in_one_call(self, *, begins: bool = False) -> LevelSet:
-        """The same surface, which asks its field at most once for what it is on a backend, for its
-        extent and for its cells; and so do all that are made of it by `dataclasses.replace`.
+        """The same surface, which prepares its field, and asks for its extent and its cells, at
+        most once; copies made by `dataclasses.replace` share these results.
 
-        begins: whether this is the first use in a call of the library: between two calls, users
-            may have changed a field in place.
+        begins: whether this is the first use in a call of the library, so that earlier results do
+            not hold: between two calls, users may have changed a field in place.
         """
         return self if self._made is not None and not begins else replace(self, _made={})
 
     def once(self, what: Any, make: Callable[[], _T]) -> _T:
-        """What `make` gives of the field and the levels, made once in a call of the library."""
+        """The result of `make()`, which is called once for this field, these levels and `what`."""
         if self._made is None:
             return make()
         key = what, id(self.field), self.numbers
         if key not in self._made:
-            self._made[key] = make(), self.field  # kept, so that no other has its id
+            self._made[key] = make(), self.field  # a reference, so that no other field gets its id
         return self._made[key][0]
 
     @property
@@ -150,12 +152,12 @@ class LevelSet:
 
     @property
     def volume(self) -> Volume | None:
-        """What rays are clipped to: domain, proved extent, clip and section together; None for all
-        space."""
+        """What rays are clipped to: the intersection of domain, proved extent, clip and section;
+        None for all of space."""
         return _common([self.field.domain, self.extent, self.clip, self.section])
 
     def field_on(self, backend: Backend) -> Field:
-        """The field on a backend. Its derivatives are those of where it is asked for."""
+        """The field on a backend, one for uses with and one for uses without derivatives."""
         is_followed = any(dr.grad_enabled(one) for one in self.field.parameters())
         what = "field", backend, is_followed
         return self.once(what, lambda: self.field.for_levels(self.numbers).prepare(backend))
@@ -166,7 +168,7 @@ class LevelSet:
         return TargetLevels(levels, self.field.period)
 
     def _occupied(self) -> OccupiedCells | None:
-        """Outside of these cells no level counts."""
+        """The cells that can hold a level that counts; None where none are known."""
         if not self.largest:
             return self.once("cells", lambda: self.field.occupied(self.numbers))
         whole = _common([self.field.domain, self.extent, self.clip])
@@ -221,8 +223,7 @@ def level_set(
 ) -> LevelSet:
     """A `LevelSet` from what users write: a level or several, a tolerance, a bound's name.
 
-    largest: True for the largest component alone, by its shadows along x, y and z, told from
-        others by 128 cells along the longest side, or by so many.
+    largest: True or a number of cells for the largest component alone, as in `LevelSet`.
 
     Raises ValueError for a level that is not a finite number or that the field cannot have, and
     TypeError for what is no field.
@@ -262,7 +263,7 @@ def level_set(
 
 
 def _common(parts: Sequence[Volume | None]) -> Volume | None:
-    """The volume that some have in common; None for all of space."""
+    """The intersection of some volumes; None, for all of space, if there are none."""
     kept = list(dict.fromkeys(part for part in parts if part is not None))
     if not kept:
         return None

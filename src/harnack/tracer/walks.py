@@ -1,16 +1,7 @@
-"""Rays through fields that jump: from one crossing of a sheet to the next.
+"""Rays through fields with sheets or parts (see `harnack.fields.sheets`), by the loop of `March`.
 
-Between two crossings the field is continuous, and the marching loop proves that ray interval as it
-proves any ray. What is added here is which interval comes next.
-
-A smooth hit is a point within tolerance of a level of the function that continues the interval. Its
-level set may end at a sheet, so within tolerance of where it does a ray may hit although the sheet
-cuts the level off: mostly near singular edges, where gradients grow without limit.
-
-Rays through surfaces that are made of many level sets, each in a box: the first hit of all.
-
-Each part is marched as any field is. What is added here is which part comes next, and how far it
-need be followed.
+- `SheetTracer`: fields that jump. A ray goes from one crossing of a sheet to the next.
+- `PartTracer`: surfaces made of many level sets, each in a box. A ray finds the first hit of all.
 """
 
 from __future__ import annotations
@@ -32,17 +23,20 @@ if TYPE_CHECKING:
     from harnack.fields.field import Field
     from harnack.fields.look import Path
 
-# Sheets are at the same place if they are no farther apart than so many roundings of coordinates,
-# and the cosine of the angle between them is larger than the second; of rays that graze them, as if
-# the third were the sine of the angle to them.
+# Two sheets count as crossed at the same point if they are no farther apart than so many roundings
+# of coordinates, and the cosine of the angle between them is larger than the second number. The
+# sine of a ray's angle to a sheet counts as at least the third.
 _SAME, _PARALLEL, _STEEP = 2.0, 0.999, 1 / 64
 
 
 @dataclass(frozen=True)
 class SheetWalk:
-    """Where rays are: the field's offset, the crossing last passed, and the state of the march.
+    """State of rays through a field with sheets.
 
-    named: index of the sheet that was looked at last, of rays that look for crossings.
+    offset: the field's offset (`Field.offset`).
+    behind: the crossing passed last.
+    march: the state of the march.
+    named: for rays that look for crossings, index of the sheet to be named for the last crossing.
     """
 
     offset: Real
@@ -57,8 +51,11 @@ class SheetWalk:
 
 @dataclass(frozen=True)
 class _Together:
-    """Crossings at the same place: the sum of their jumps, the last of them, and the first of those
-    that jump up and down."""
+    """Crossings at the same point of a ray.
+
+    jump: the sum of their jumps. t, last: of the last of them.
+    up, down, normal_up, normal_down: the first sheet at which f jumps up, and down.
+    """
 
     jump: Real
     t: Real
@@ -72,7 +69,16 @@ class _Together:
 
 @dataclass(frozen=True)
 class SheetTracer:
-    """Rays through a field with sheets, from `start` to `end`, and how to march one interval."""
+    """Rays through a field with sheets, from `start` to `end`.
+
+    Between two crossings of sheets the field is continuous, and `March` proves that ray interval as
+    it proves any ray. What is added here is which interval comes next.
+
+    A smooth hit is a point within tolerance of a level of the function that continues the interval.
+    Its level set may end at a sheet, so within tolerance of where it does a ray may hit although
+    the
+    sheet cuts the level off: mostly near singular edges, where gradients grow without limit.
+    """
 
     march: March
     field: Field
@@ -91,9 +97,10 @@ class SheetTracer:
         each of them the field is the continuous one that `march` sees, up to and including its
         last point, where the value behind the sheet is compared with that before it; from there
         it goes on with the step that the value behind the sheet allows. So the part of the ray
-        up to `proved_to` is free of smooth levels, and every sheet on it was looked at.
+        up to `proved_to` is free of smooth levels, and every sheet on it was compared with the
+        level.
 
-        The walk begins just before `start`, so that a sheet on the very start is looked at.
+        Rays begin just before `start`, so that a sheet at the very start is not skipped.
         """
         return self.end_of(while_active(self.begin(state), self.next, "harnack intervals"))
 
@@ -117,7 +124,7 @@ class SheetTracer:
         return dataclasses.replace(end, status=status), sheet
 
     def next(self, outer: SheetWalk) -> SheetWalk:
-        """One interval: to the next crossing or the end of the ray, or to a hit."""
+        """Rays after one interval: at the next crossing, the end of the ray, or a hit."""
         count = self.backend.UInt32
         o, d = self.path.origin, self.path.direction
         behind, now = outer.behind, outer.march
@@ -139,7 +146,7 @@ class SheetTracer:
             return self._passed(outer, now, ahead, last, passed, active & stops)
         spent = passed & (now.evaluations >= self.march.max_steps)
         status = dr.select(spent, count(int(Status.OUT_OF_STEPS)), now.status)
-        # A sheet that was hit is the one to be named; one that was passed, the last of all there.
+        # Of several sheets at a point, a hit names `ahead`; a ray that passes goes on from `last`.
         crossing = Crossing(
             dr.select(passed, last.t, ahead.t),
             dr.select(passed, last.sheet, ahead.sheet),
@@ -161,8 +168,8 @@ class SheetTracer:
         passed: Mask,
         stopped: Mask,
     ) -> SheetWalk:
-        """The walk of rays that look for crossings: one that has crossed the level on a sheet has
-        passed the sheet, and may be made active again."""
+        """The state of rays that look for crossings. One that has crossed the level at a sheet has
+        passed that sheet; it may be made active again."""
         spent = passed & (now.evaluations >= self.march.max_steps)
         status = dr.select(spent, self.backend.UInt32(int(Status.OUT_OF_STEPS)), now.status)
         through = passed | (stopped & (now.status == ON_SHEET))
@@ -182,11 +189,11 @@ class SheetTracer:
     def _together(self, first: Crossing, active: Mask) -> tuple[Crossing, Crossing]:
         """All crossings at the t of the first as one, and the last of them.
 
-        A ray through an edge or a vertex crosses several sheets at once, in no order of theirs:
-        what they do to f there is the sum of their jumps, and between them there is nothing. So do
-        rays through sheets in one plane: those that lie closer behind each other than coordinates
-        are rounded are at the same t, for their order is that of rounding. The sheet named is the
-        first one that jumps as all of them together do.
+        A ray through an edge or a vertex crosses several sheets at once, in no particular order: f
+        jumps there by the sum of their jumps, and there is no interval between them. The same holds
+        for sheets in one plane: those that follow each other more closely than coordinates are
+        rounded count as at the same t, for rounding decides their order. The sheet named is the
+        first one whose jump has the sign of the sum.
         """
         real, count = self.backend.Float, self.backend.UInt32
         size = largest_coordinate(self.path.origin)
@@ -196,7 +203,7 @@ class SheetTracer:
 
         def body(now: _Together) -> _Together:
             one = self._next(Crossing(now.t, now.last, 0.0, first.normal), furthest, now.active)
-            # Sheets at an angle to each other are at the same t or apart.
+            # Sheets at an angle to each other count as one only at exactly the same t.
             level = dr.abs(dr.dot(one.normal, first.normal)) > _PARALLEL
             found = now.active & (one.sheet != NO_SHEET) & ((one.t == first.t) | level)
             new_up = found & (one.jump > 0) & (now.up == NO_SHEET)
@@ -233,7 +240,7 @@ class SheetTracer:
         return Crossing(first.t, sheet, real(all_there.jump), normal), behind
 
     def _next(self, behind: Crossing, end: Real, active: Mask) -> Crossing:
-        """The field's answer as arrays of this backend; none if it lies beyond the end."""
+        """The next crossing, as arrays of this backend; none if it lies beyond the end."""
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
         ahead = self.field.next_crossing(self.path.origin, self.path.direction, behind, end, active)
         there = real(ahead.t) <= end
@@ -248,11 +255,14 @@ class SheetTracer:
 
 @dataclass(frozen=True)
 class PartWalk:
-    """Where rays are among parts, and the nearest end of a march so far.
+    """State of rays through a field with parts: the box entered last, and the nearest hit so far.
 
-    enter, box: of the box entered last. t: of the first hit, or the end of the ray; or to where a
-    ray out of steps is free. value, gradient, excess, status: of the march that ended there.
-    part: that of the hit, NO_PART for none. active: whether there may be more parts.
+    enter, box: where the ray entered the last box, and its index.
+    t: of the nearest hit so far, or the end of the ray; of a ray out of steps, up to where it is
+        free.
+    value, gradient, excess, status: of the march that ended there.
+    part: that of the hit, NO_PART for none.
+    active: whether there may be more parts.
     """
 
     enter: Real
@@ -269,9 +279,12 @@ class PartWalk:
 
 @dataclass(frozen=True)
 class PartTracer:
-    """Rays through a field with parts, from `start` to `end`, and how to march one part.
+    """Rays through a field with parts, from `start` to `end`.
 
-    any_hit: whether any hit will do, and not the first alone.
+    Each part is marched as any field is. What is added here is which part comes next, and how far
+    the ray must be followed in it.
+
+    any_hit: whether any hit will do, and not only the first.
     """
 
     march: March
@@ -288,7 +301,7 @@ class PartTracer:
         in which the ray enters them, all that it meets. Each is marched from where the ray enters
         it to where it leaves it, or to the first hit so far if that comes before; so up to a hit
         the ray is free of every part whose box it entered before the hit, and all others come
-        behind. A ray that is out of steps in a part is proved free up to where it entered that.
+        behind. A ray that is out of steps in a part is proved free up to where it entered that box.
         """
         walk = while_active(self.begin(state), self.next, "harnack parts")
         return self.end_of(walk)
@@ -326,7 +339,7 @@ class PartTracer:
         return end, walk.part
 
     def next(self, walk: PartWalk) -> PartWalk:
-        """One part more: the next whose box is entered before the first hit so far."""
+        """Rays after one more part: the next whose box is entered before the first hit so far."""
         backend, path = self.march.backend, self.path
         after = PartEntry(walk.enter, walk.enter, walk.box)
         entry = self.field.next_part(

@@ -1,4 +1,7 @@
-"""Trees over points, segments and triangles: built in NumPy, walked in Dr.Jit. No formulas."""
+"""Trees over points, segments and triangles, and grids of cells.
+
+Built in NumPy, traversed in Dr.Jit. No formulas.
+"""
 
 from __future__ import annotations
 

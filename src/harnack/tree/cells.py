@@ -1,10 +1,10 @@
-"""An octree over a box, of which cells that are proved empty are left out.
+"""Cells of a box that are proved empty or not: octrees, uniform grids, and components of cells.
 
-Equal cubes, most of them empty, and how far a ray stays among the empty ones.
-
-Groups of cells that are separated by cells proved empty, and the largest of them.
-
-Equal cubes of which those that are proved to hold no level are known: rays jump across them.
+- `Octree`, from `octree` and `carve`: a box split where it is not proved empty.
+- `UniformGrid`: equal cubes on a backend, and how far a ray stays among the empty ones.
+- `OccupiedCells`: such a grid of the cells that may hold a set of points, made by an octree.
+- `largest_connected_component`: the largest group of cells that cells proved empty separate from
+  the others.
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ __all__ = [
 ]
 
 Clearance: TypeAlias = Callable[[FloatArray], FloatArray]
-"""For points (n, 3) lengths (n,): no point of the set is nearer than that."""
+"""From points (n, 3) to lengths (n,): no point of some set is nearer than that."""
 
 _OCTANTS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
 
 
 @dataclass(frozen=True)
 class Cells:
-    """Boxes of one size, (3,) edges, at corners (n, 3), the least of their coordinates."""
+    """Equal boxes: lower corners (n, 3), and the size (3,) of all."""
 
     corners: FloatArray
     size: FloatArray
@@ -63,20 +63,20 @@ class Cells:
 
     @property
     def half_diagonal(self) -> float:
-        """The radius of the balls around them."""
+        """The radius of the balls around the boxes."""
         return 0.5 * float(np.linalg.norm(self.size))
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """The least and the largest coordinates (3,) of all."""
+        """The least and the largest coordinates (3,) of all boxes."""
         return self.corners.min(axis=0), self.corners.max(axis=0) + self.size
 
     def wrapped(self, slack: float) -> ConvexHull:
-        """A polytope around all of them, `slack` thicker, with the 26 directions of a cube's faces,
-        edges and corners."""
+        """A polytope around all boxes, `slack` thicker, whose normals are the 26 directions of a
+        cube's faces, edges and corners."""
         return _wrapped(self.centers, 0.5 * self.size + slack)
 
     def split(self) -> Cells:
-        """Eight of each."""
+        """The eight octants of each box."""
         half = 0.5 * self.size
         return Cells((self.corners[:, None] + _OCTANTS * half).reshape(-1, 3), half)
 
@@ -85,20 +85,20 @@ class Cells:
         return Cells(self.corners[which], self.size)
 
     def proved_empty(self, clearance: Clearance, margin: float = 0.0) -> BoolArray:
-        """(n,) whether a cell's ball is within the clearance of its center; that of the cell
-        enlarged on all sides by `margin` times its size."""
+        """(n,) whether the ball around each cell, enlarged on all sides by `margin` times its size,
+        is within the clearance of its center."""
         if not len(self.corners):
             return np.zeros(0, np.bool_)
         return clearance(self.centers) > self.half_diagonal * (1 + 2 * margin + 1e-9)
 
 
 def wrapped_points(points: FloatArray, slack: float) -> ConvexHull:
-    """A polytope around points (n, 3), `slack` thicker, with the directions of `Cells.wrapped`."""
+    """A polytope around points (n, 3), `slack` thicker, with the normals of `Cells.wrapped`."""
     return _wrapped(points, np.full(3, slack))
 
 
 def union(one: ConvexHull, other: ConvexHull) -> ConvexHull:
-    """The smallest polytope with the directions of `Cells.wrapped` around two such."""
+    """The smallest polytope with the normals of `Cells.wrapped` around two such."""
     return ConvexHull(
         one.normals,
         np.maximum(one.offsets, other.offsets),
@@ -117,8 +117,11 @@ def _wrapped(centers: FloatArray, half: FloatArray) -> ConvexHull:
 
 @dataclass(frozen=True)
 class Octree:
-    """Cells of a box: those of the finest size that may hold the set, and those proved empty on the
-    way there, coarsest first. Together they fill the box."""
+    """Cells that fill a box.
+
+    leaves: those of the finest size, which may hold the set.
+    empty: those proved empty, coarsest first.
+    """
 
     leaves: Cells
     empty: tuple[Cells, ...]
@@ -129,7 +132,7 @@ def octree(
 ) -> Octree:
     """Split `cells`, again and again, where they are not proved empty.
 
-    most: cells that are looked at in one round; when it would be more, no further round is made.
+    most: cells tested in one round; a round that would test more is not made.
     finest: rounds at most; each halves the edges.
     margin: as for `Cells.proved_empty`.
     """
@@ -147,12 +150,12 @@ def octree(
 def carve(
     lower: FloatArray, upper: FloatArray, clearance: Clearance, most: int, finest: int
 ) -> Cells:
-    """The leaves of the octree of one box; there are none where the box is proved empty."""
+    """The leaves of the octree of one box; none if all of it is proved empty."""
     root = Cells(np.array(lower)[None], np.array(upper) - np.array(lower))
     return octree(root, clearance, most, finest).leaves
 
 
-# Of what is true beyond an empty cell, this part of a cell is left to the rounding of positions.
+# So much of the margin around an empty cell, in cells, is left to the rounding of positions.
 _ROUNDING = 1 / 64
 
 
@@ -161,12 +164,13 @@ Layout = TypeVar("Layout", bound="GridLayout")
 
 @dataclass(frozen=True)
 class GridLayout:
-    """A grid on the host.
+    """A grid of cells, in NumPy.
 
-    origin: (3,) its lower corner, numbers of single precision. cell: the side of a cell
-        (`short_length`). shape: cells a side. The first cell's neighbor is the next along x.
-    free: (cells,) 0 where a cell is not empty, else the distance to the nearest that is not, in
-        cells, the largest of the three coordinates.
+    origin: (3,) its lower corner, numbers of single precision.
+    cell: the side of a cell (`short_length`).
+    shape: cells along x, y and z.
+    free: (cells,), x fastest: 0 where a cell is not empty, else the distance to the nearest that is
+        not, in cells, in the largest of the three coordinates (chessboard distance).
     """
 
     origin: FloatArray
@@ -177,10 +181,11 @@ class GridLayout:
 
 @dataclass(frozen=True)
 class UniformGrid:
-    """A grid on a backend, all numbers of it as data.
+    """A grid on a backend, all numbers of it as kernel parameters.
 
-    margin: in cells; the cube around an empty cell that is so much larger on all sides is empty.
-    Outside of the grid all is as in its nearest cell.
+    Outside of the grid the same holds as in its nearest cell.
+
+    margin: in cells; an empty cell enlarged by so much on all sides is empty too.
     """
 
     backend: Backend
@@ -192,7 +197,7 @@ class UniformGrid:
 
     @staticmethod
     def placed(backend: Backend, layout: GridLayout) -> tuple[Backend, Vec3, Real, Vec3, Any]:
-        """The first five numbers of a grid."""
+        """The first five attributes of a grid."""
 
         def vector(numbers: Any) -> Vec3:
             return backend.Array3f(*(dr.opaque(backend.Float, float(one)) for one in numbers))
@@ -214,12 +219,13 @@ class UniformGrid:
         return GridCell(self, place, corner, x + row * (y + layer * z))
 
     def run(self, p: Vec3, d: Vec3, length: Real) -> Real:
-        """How far p + s d stays in empty cells; about `length` if it is that at least.
+        """A length s for which p + s d is proved to stay in empty cells; it may exceed `length`.
 
-        Proof. The cell of a point and all fewer than `free` away are empty, and so is what is
-        within the margin around each: the cube of these cells, wider by the margin. A step
-        leaves that cube by `margin` less `_ROUNDING` at most, so that all of it is empty; the rest
-        of the margin is for the rounding of positions. Steps end where a cell is not empty.
+        Proof. The cell of a point and all that are fewer than `free` cells away are empty, and so
+        is
+        the margin around each: together a cube, wider by the margin than these cells. A step leaves
+        the cells by at most `margin` less `_ROUNDING`, so that all of it is empty; the rest of the
+        margin is for the rounding of positions. Steps end where a cell is not empty.
         """
 
         def state_of(s: Real) -> tuple[Real, Mask]:
@@ -246,9 +252,9 @@ class UniformGrid:
         return (rounding < _ROUNDING * self.size) & dr.all(dr.isfinite(o))
 
     def free_until(self, o: Vec3, d: Vec3, t: Real, end: Real) -> Real:
-        """A place up to which rays o + t d, |d| = 1, stay in empty cells from t on, at most `end`.
+        """A t, at most `end`, up to which rays o + t d, |d| = 1, stay in empty cells from `t` on.
 
-        It is t itself where coordinates are so large that rounding might lead into another cell:
+        It is `t` itself where coordinates are so large that rounding might lead into another cell:
         a point is off by at most four roundings of the largest number in it.
         """
         length = dr.select(self.resolves(o, end), end - t, 0)
@@ -258,7 +264,12 @@ class UniformGrid:
 
 @dataclass(frozen=True)
 class GridCell:
-    """Where points lie: their place in units of cells, the cell's lower corner, and its index."""
+    """The cells in which points lie.
+
+    place: the coordinates of the points, in cells.
+    corner: the lower corner of the cell, in cells.
+    index: of the cell.
+    """
 
     grid: UniformGrid
     place: Vec3
@@ -271,8 +282,8 @@ class GridCell:
         return dr.gather(self.grid.backend.UInt32, self.grid.free, self.index)
 
     def exit(self, d: Vec3, around: Real = 1.0) -> Real:
-        """How far the path with direction d stays among the cells fewer than `around` away, and a
-        little beyond; infinite where the grid ends there."""
+        """How far the path with direction d stays among the cells fewer than `around` away, or in
+        the margin around them; infinite where the grid ends there."""
         length: Real = self.grid.backend.Float(dr.inf)
         beyond = self.grid.margin - _ROUNDING
         for k in range(3):
@@ -291,40 +302,40 @@ def distances_to_full(empty: BoolArray) -> IntArray:
         return np.full(empty.size, max(empty.shape), np.int64)
     from scipy import ndimage  # here: a third of a second that few need
 
-    chessboard: Any = cast("Any", ndimage).distance_transform_cdt  # by its usual metric
+    chessboard: Any = cast("Any", ndimage).distance_transform_cdt  # its default metric
     return np.asarray(chessboard(empty), dtype=np.int64).ravel()
 
 
 def short_length(size: float) -> float:
-    """A length nearby, at most one part in 4,096 off, that is a power of two times an integer below
-    2^13, so that single precision holds its multiples."""
+    """A length near `size`, off by at most one part in 4,096, that is a power of two times an
+    integer below 2^13, so that single precision holds its multiples exactly."""
     mantissa, exponent = math.frexp(size)
     return math.ldexp(round(mantissa * 4096), exponent - 12)
 
 
-# Empty cells are proved to be empty so far beyond their faces, in cells; cubes of the octree's
-# first round have 2^_ROUNDS cells a side.
+# The margin of `UniformGrid`; and the rounds of the octree, whose roots are 2^_ROUNDS cells wide.
 _MARGIN, _ROUNDS = 1 / 16, 3
 
 
 @dataclass(frozen=True)
 class OccupiedCells(GridLayout):
-    """A grid whose empty cells hold no point of a set, nor does what is around them: see
-    `UniformGrid`."""
+    """A grid whose empty cells, and the margins around them (`UniformGrid`), hold no point of a
+    set."""
 
     @classmethod
     def of(
         cls, lower: FloatArray, upper: FloatArray, clearance: Clearance, across: int
     ) -> OccupiedCells:
-        """A grid over a box that holds the set, with about so many cells along its longest side.
+        """A grid over a box that holds the set, with about `across` cells along its longest side.
 
-        Outside of the box there is nothing, so a cell at its faces is empty outwards as well.
-        There are fewer cells where they would be smaller than the spacing of single precision.
+        Outside of the box the set has no points, so an empty cell at the box's faces is empty
+        outwards as well. There are fewer cells where they would be smaller than the spacing of
+        numbers in single precision.
         """
         reach = np.abs([lower, upper]).max().astype(np.float32)
         cell = max(float((upper - lower).max()) / across, float(np.spacing(reach)))
         cell = short_length(cell)
-        # Room for rounding the corner down, and for the margin beyond what the set may reach.
+        # For rounding the corner down, and for the margin beyond the box.
         room = (_MARGIN + 1e-3) * cell
         origin = np.nextafter((lower - room).astype(np.float32), np.float32(-np.inf))
         origin = origin.astype(np.float64)
@@ -346,14 +357,14 @@ class OccupiedCells(GridLayout):
         return cls(np.zeros(3), 1.0, (1, 1, 1), distances_to_full(np.ones((1, 1, 1), np.bool_)))
 
     def centers(self) -> FloatArray:
-        """Of the cells that are not empty, (n, 3)."""
+        """The centers (n, 3) of the cells that are not empty."""
         x, y, z = self.shape
         places = np.argwhere((self.free == 0).reshape(z, y, x))[:, ::-1]
         return self.origin + self.cell * (places + 0.5)
 
     def thinned(self, clearance: Clearance) -> OccupiedCells:
-        """The same grid without cells whose eight halves are proved empty, as far beyond the faces
-        of the cell."""
+        """The same grid in which cells count as empty as well if their eight octants are proved
+        empty, with the same margin around the cell."""
         x, y, z = self.shape
         full = (self.free == 0).reshape(z, y, x)
         places = np.argwhere(full)[:, ::-1]
@@ -371,26 +382,27 @@ _AROUND = np.ones((3, 3, 3), np.bool_)
 
 
 def largest_connected_component(cells: OccupiedCells) -> OccupiedCells:
-    """The grid in which only the cells of one group are not empty: that with the largest shadows,
-    in all, along the three axes.
+    """The grid in which only the cells of one connected group are not empty: that with the largest
+    projections, in all, along the three axes.
 
-    A shadow is all rows of cells, along one axis, with a cell of the group. A count of cells would
-    be of areas, or of volumes, only if as many cells were left around each piece of a surface: but
-    more are left where its function vanishes to a higher order, and as few around both sides of a
-    plate that is thinner than a cell as around one. Shadows are the same for all of these, but for
-    the cells at their rims: those are more, by several, where a function vanishes to a higher
-    order, so that coarse cells may choose a smaller component for it. Of equal shadows, the first
-    along z, y and x is the largest.
+    A projection counts the rows of cells, along one axis, that have a cell of the group. The number
+    of cells would measure areas, or volumes, only if as many cells were left around each piece of a
+    surface: but more are left where its function vanishes to a higher order, and around the two
+    sides of a plate thinner than a cell no more than around one. Projections do not depend on that,
+    but for the cells at their outlines: there are several more where a function vanishes to a
+        higher
+    order, so that with coarse cells a smaller component may be chosen for it. Of equal groups the
+    first along z, y and x is chosen.
 
     Proof that no component of the set is cut in two. All of the set lies in cells that are not
     empty, as closed cubes. A connected part of it cannot be covered by two unions of such cubes
     that are closed and have no point in common; cubes have a point in common if they share at least
-    a corner, which is to be neighbors. So it lies in the cells of one group.
+    a corner, that is, if they are neighbors. So it lies in the cells of one group.
 
     Proof that rays may jump across the other groups, with the margin that `UniformGrid.run` goes
     beyond the cells that it jumps across. A neighbor of a cell of another group belongs to that
-    group or was empty before, and the margin is less than a cell, so it holds nothing of this
-    group; that of a cell that was empty before holds nothing of the set at all.
+    group or was empty before, and the margin is less than a cell, so the margin holds nothing of
+    this group; the margin of a cell that was empty before holds nothing of the set at all.
     """
     x, y, z = cells.shape
     full = (cells.free == 0).reshape(z, y, x)
@@ -406,7 +418,7 @@ def largest_connected_component(cells: OccupiedCells) -> OccupiedCells:
 
 
 def _shadows(group: IntArray, places: IntArray, count: int) -> IntArray:
-    """(count,) how many different places (n, 2) there are of each group 1 to count."""
+    """(count,) the number of different places (n, 2) of each group from 1 to count."""
     width = 1 + places.max(axis=0)
     index = (group * width[0] + places[:, 0]) * width[1] + places[:, 1]
     return np.bincount(np.unique(index) // (width[0] * width[1]), minlength=count + 1)[1:]

@@ -1,11 +1,8 @@
-"""The shape of a tree: which primitive lies in which leaf. Vectorised NumPy, no formulas.
+"""Balanced trees: built by median splits, stored as records, traversed without a stack.
 
-A balanced tree of median splits: every leaf holds w or w - 1 primitives, every level is complete,
-so that a level is a reshape and every sum over nodes a sum along an axis.
-
-A tree on a backend: nodes and primitives as records.
-
-Walking a tree without a stack: depth first, over a subtree or past it.
+- `Hierarchy`: which primitive lies in which leaf, from `build_hierarchy`, in vectorized NumPy.
+- `PackedTree`: nodes and primitives as records on a backend, from `pack`.
+- `walk`: visits nodes depth first, into a subtree or past it; `for_each`: the primitives of a leaf.
 
 What a node means, and when to go past it, is up to the caller.
 """
@@ -28,15 +25,18 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real
 
 NO_PRIMITIVE = -1
-# So many points and their indices stay in the cache.
+# So many points and their indices fit into the cache.
 _POINTS_AT_ONCE = 1 << 17
-# NumPy reduces rows that are not longer more slowly than column after column.
+# Rows up to this length are reduced faster by a loop over columns than by NumPy's reductions.
 _LONG_ROW = 48
 
 
 @dataclass(frozen=True)
 class Hierarchy:
-    """Primitives in leaves, leaves in levels.
+    """A balanced tree: primitives in leaves, and levels of nodes above them.
+
+    Every leaf holds w or w - 1 primitives and every level is complete, so that a level is a reshape
+    and every sum over nodes a sum along an axis.
 
     slots: (leaves, leaf_size) index of the primitive in each slot, NO_PRIMITIVE for an empty one
         (the last of a leaf, if any).
@@ -69,8 +69,8 @@ class Hierarchy:
         all are visited depth first (`node_count` for the last); each level by level, leaves first.
 
         Children of a node are numbered one after the other, then the children of the first of
-        them, and so on, so that a walk reads siblings, which it mostly visits all, side by side.
-        The first child of a leaf is 0, which is none: the root has that number.
+        them, and so on, so that siblings, of which mostly all are visited, lie side by side in
+        memory. The first child of a leaf is 0, the number of the root, which stands for none.
         """
         below = [0]  # nodes below one of each level
         for arity in self.arities:
@@ -89,7 +89,8 @@ class Hierarchy:
         return tuple(number), tuple(first), tuple(after)
 
     def gather(self, values: FloatArray, empty: float = 0.0) -> FloatArray:
-        """Values of primitives (n, ...) in slots: (leaves, leaf_size, ...), `empty` elsewhere."""
+        """Values of primitives (n, ...) in slots (leaves, leaf_size, ...); `empty` in empty
+        ones."""
         out = values.take(self.slots, axis=0, mode="clip")
         leaf, slot = np.nonzero(self.slots == NO_PRIMITIVE)
         out[leaf, slot] = empty
@@ -102,7 +103,7 @@ def build_hierarchy(points: FloatArray, *, leaf_size: int = 8, arity: int = 4) -
     arity: 2 or 4 (two splits at once; the root may have 2 children).
 
     O(n log n): each of log2(n / leaf_size) levels is one partial sort. Nodes that fit into the
-    cache are split down to their leaves, one after the other: threads would make it no faster.
+    cache are split down to their leaves, one after the other: threads would not make it faster.
     """
     if arity not in (2, 4):
         raise ValueError(f"arity must be 2 or 4, not {arity}")
@@ -127,7 +128,8 @@ def build_hierarchy(points: FloatArray, *, leaf_size: int = 8, arity: int = 4) -
 
 
 def _split(rows: IntArray, x: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Nodes' points, rows (k, w) of indices and positions x (3, k, w), halved: (2k, ceil(w/2)).
+    """The points of nodes, a row each, halved: indices (k, w) and positions x (3, k, w) become
+    (2k, ceil(w/2)) and (3, 2k, ceil(w/2)).
 
     The last of a row may be empty: NO_PRIMITIVE, at NaN, which sorts behind all numbers. If each
     row holds w or w - 1 points, each of the new ones holds ceil(w/2) or one less.
@@ -158,7 +160,7 @@ def _sides(x: FloatArray) -> FloatArray:
 
 
 def _halves(values: npt.NDArray[Any], order: IntArray, half: int, empty: float) -> Any:
-    """Rows (k, w) in an order, a flat index each, cut in two (2k, half), `empty` at the end."""
+    """Rows (k, w), reordered by flat indices and cut in two (2k, half), with `empty` at the end."""
     count, width = order.shape
     out = np.empty((count, 2, half), values.dtype)
     flat = values.reshape(-1)
@@ -169,8 +171,8 @@ def _halves(values: npt.NDArray[Any], order: IntArray, half: int, empty: float) 
     return out.reshape(-1, half)
 
 
-_HEAD = 6  # numbers of the first packet of a node that its owner chooses; then skip and leaf
-# Links are stored as floats, and single precision counts no further.
+_HEAD = 6  # numbers in the first packet of a node that are the caller's; two links follow
+# Links are stored as floats, and single precision holds no larger integers without gaps.
 _MOST_NODES = 2**24
 
 
@@ -178,9 +180,11 @@ _MOST_NODES = 2**24
 class PackedTree:
     """Nodes with links, siblings side by side (`Hierarchy.links`); primitives leaf by leaf.
 
-    The head of a node holds six numbers of its owner's, the node that follows its subtree, and
-    the number of its leaf or, for an inner node, minus that of its first child. The owner's other
-    packets lie elsewhere: a walk reads many heads in a row, and few of those.
+    heads: of each node six numbers of the caller's, the node that follows its subtree, and the
+        number of its leaf or, for an inner node, minus that of its first child.
+    payloads: the caller's other numbers of each node, kept apart because a walk reads many heads in
+        a row and few of these; None for none.
+    primitives: `leaf_size` rows for each leaf.
     """
 
     backend: Backend
@@ -240,9 +244,11 @@ State: TypeAlias = "tuple[Any, ...]"
 
 @dataclass(frozen=True)
 class Node:
-    """A node on a walk; all lanes may be at different ones.
+    """The node that a walk visits; each lane may be at a different one.
 
-    head: its owner's six numbers that every visit reads. leaf: number of its leaf, if it is_leaf.
+    index: number of the node.
+    head: the six numbers of the caller's that every visit reads.
+    leaf: number of its leaf, if it is one.
     """
 
     tree: PackedTree
@@ -263,8 +269,10 @@ EachPrimitive: TypeAlias = "Callable[[list[Real], Mask, State], State]"
 def walk(tree: PackedTree, visit: Visit, state: State, active: Mask = True) -> State:
     """The state after visiting nodes from the root on.
 
-    visit(node, state) gives the new state, and whether to go into the node's children: where it
-    does not, the walk goes on behind the subtree. May be called while a loop is recorded.
+    visit: from a node and the state, whether to go into the node's children, and the new state.
+        Else the walk goes on behind the subtree.
+
+    May be called while a loop is being recorded.
     """
     index, mask = tree.backend.UInt32, tree.backend.Bool
 
@@ -286,7 +294,7 @@ def walk(tree: PackedTree, visit: Visit, state: State, active: Mask = True) -> S
 def for_each(node: Node, active: Mask, body: EachPrimitive, state: State) -> State:
     """The state after visiting the primitives of a leaf, where active; costs nothing elsewhere.
 
-    Empty slots are visited as well: whoever packed the tree filled them with what does no harm.
+    Empty slots are visited as well: the caller of `pack` has filled them with harmless numbers.
     """
     tree = node.tree
     index = tree.backend.UInt32

@@ -1,7 +1,4 @@
-"""Boxes in a tree, and the order in which rays enter them.
-
-The nearest triangles to a point, by a tree of boxes: how far they are and where.
-"""
+"""Queries of trees: the boxes that a ray enters, in order, and the triangles nearest to a point."""
 
 from __future__ import annotations
 
@@ -30,7 +27,7 @@ if TYPE_CHECKING:
 
 __all__ = ["MOST_BOXES", "NO_BOX", "BoxTree"]
 
-# Boxes are numbered in floats; single precision counts no further.
+# Boxes are numbered in floats; single precision holds no larger integers without gaps.
 MOST_BOXES = 2**24
 NO_BOX = 0xFFFFFFFF
 # Column of a record behind its box.
@@ -58,11 +55,14 @@ class BoxTree:
     ) -> tuple[Real, Real, Any]:
         """The first box behind `after` = (t, number) that rays o + t d, |d| = 1, enter by t <= end.
 
-        Boxes are ordered by (t, number), where t is the place that a ray enters it, at least
-        `start`; those that it has left by then are not entered. Gives t there and where the ray
-        leaves the box, and its number (NO_BOX for none). After (start, NO_BOX) with start less than
-        `start`, all come up, each once. A box is a little wider than given, so that no ray that
-        meets it passes by for rounding.
+        Boxes are ordered by (t, number), where t is where a ray enters the box, at least `start`;
+        boxes that it has left by then are not entered. From after = (t, NO_BOX) with t < start on,
+        each comes up once. A box is a little wider than given, so that rounding lets no ray pass by
+        a box that it meets.
+
+        Returns:
+            The t where the ray enters, the t where it leaves, and the box's number (NO_BOX for
+            none).
         """
         real, index = self.tree.backend.Float, self.tree.backend.UInt32
         t_after, n_after = real(after[0]), index(after[1])
@@ -92,7 +92,7 @@ class BoxTree:
         return near, far, number
 
     def _spans(self, o: Vec3, d: Vec3) -> Any:
-        """Where rays enter and leave a box, a little early and late for rounding.
+        """Where rays enter and leave a box, a little earlier and later to cover rounding.
 
         Each plane of the box is moved outwards by 16 roundings of the size of coordinates, and t is
         widened by 8 roundings of itself: (x - o)/d has three roundings, of which that of x - o is
@@ -116,13 +116,13 @@ class BoxTree:
         return span
 
 
-# In epsilons, of coordinates and of the mesh's size: how far rounding may move a distance.
+# How far rounding may move a distance, in epsilons of the coordinates and of the mesh's size.
 _ROUNDING = 16.0
 
 
 @dataclass(frozen=True)
 class NearestTriangle:
-    """The nearest triangle to points x, of those that were asked about.
+    """The nearest triangle to points x, of those that a query considers.
 
     square: squared distance; inf where there is no triangle.
     number: of the triangle; NO_TRIANGLE where there is none.
@@ -139,12 +139,12 @@ class NearestTriangle:
 
 
 def distance_to_triangles(rays: TriangleRays, x: Vec3) -> Real:
-    """A length that the distance from x to the triangles is proved not to fall short of, less than
-    the distance by rounding alone; the triangles have coordinates of at most about one.
+    """A proved lower bound of the distance from x to the triangles, exact up to rounding; the
+    triangles have coordinates of at most about one.
 
-    Proof. `NearestPoint` is off by a few epsilons of |x| + 1, by its docstring; boxes are only
-    passed by if they are farther than the best so far by that much. 16 epsilons of |x| + 1 are
-    taken off, several times what random needles and random triangles have shown.
+    Proof. `NearestPoint` is off by a few epsilons of |x| + 1, by its docstring; boxes are skipped
+    only if they are farther than the best so far by that much. 16 epsilons of |x| + 1 are
+    subtracted, several times the largest error found with random needles and random triangles.
     """
     real, vector = rays.tree.backend.Float, rays.tree.backend.Array3f
     x = vector(x)
@@ -165,16 +165,17 @@ def distance_to_triangles(rays: TriangleRays, x: Vec3) -> Real:
 
 def square_to_some_vertex(rays: TriangleRays, x: Vec3) -> Real:
     """The squared distance from x to a vertex of a triangle nearby, rounded up: walks that begin
-    with it pass by most boxes."""
+    with it skip most boxes."""
     square, pad = square_to_some_point(rays.tree, x, 0), _pad(rays, x)
     return square + 2 * pad * (dr.sqrt(square) + pad)
 
 
 def square_to_some_point(tree: PackedTree, x: Vec3, column: int) -> Real:
-    """The least squared distance from x to the points of a leaf nearby, whose coordinates begin at
-    a column of their records.
+    """The least squared distance from x to the points of a leaf nearby.
 
-    From the root on, the child whose box has the nearest center, down to a leaf.
+    The leaf is found from the root on by the child whose box has the nearest center.
+
+    column: where in a record the coordinates of its point begin.
     """
     backend = tree.backend
     real, index, vector = backend.Float, backend.UInt32, backend.Array3f
@@ -187,7 +188,7 @@ def square_to_some_point(tree: PackedTree, x: Vec3, column: int) -> Real:
         nearer, following = square < best, index(head[6])
         best = dr.select(nearer, square, best)
         is_leaf, number = head[7] >= 0, index(dr.abs(head[7]))
-        # A leaf, or the first child of an inner node, and the end of its children.
+        # Of the nearest sibling so far: its leaf if it is one, or its first child and their end.
         found = dr.select(nearer, dr.select(is_leaf, number, NO_TRIANGLE), found)
         first = dr.select(nearer, number, first)
         after = dr.select(nearer, following, after)
@@ -261,8 +262,8 @@ def _pad(rays: TriangleRays, x: Vec3) -> Real:
 
 
 def _boxes(rays: TriangleRays, x: Vec3, pad: Real) -> Any:
-    """Whether a node comes within a squared distance of x: its box widened by `pad`, and, where
-    the tree has them, its slab (`slab_levels`) as well."""
+    """A test whether a node comes within a squared distance of x: its box widened by `pad` and,
+    if the tree has them, its slab (`slab_levels`) as well."""
     vector = rays.tree.backend.Array3f
 
     def within(node: Node, square: Real) -> Mask:
@@ -285,13 +286,19 @@ def _boxes(rays: TriangleRays, x: Vec3, pad: Real) -> Any:
 
 @dataclass(frozen=True)
 class NearestPoint:
-    """The nearest point of a record's triangle to x; offset: (3,) from x to it.
+    """The nearest point of a record's triangle to x.
 
-    The nearest point of the plane where that lies in the triangle, else that of the edges. Both
-    are taken along the longest edge e, of length L, and along the altitude h on it, made
-    orthogonal to e twice. Proof that the distance is off by a few epsilons of l = L + |x - a| only,
-    however thin the triangle (a cross product's direction is off by epsilon L/|h|, which a needle
-    turns into an error of any size): x - a less its part along e, done twice, is right up to
+    square: the squared distance.
+    offset: (3,) from x to the point.
+    is_inner: whether the point lies inside the triangle, not on its edges.
+
+    It is the nearest point of the plane where that lies in the triangle, else that of the edges.
+    That of the plane is found along the longest edge e, from a and of length L, and along the
+    altitude h on it, made orthogonal to e twice.
+
+    Proof that the distance is off by only a few epsilons of l = L + |x - a|, however thin the
+    triangle (a cross product's direction is off by epsilon L/|h|, which for a needle is an error of
+    any size): x - a less its part along e, done twice, is right up to
     epsilon l and orthogonal to e up to epsilon^2 l, and so is h, whose direction within the plane
     normal to e is off by d <= epsilon L/|h|. So the point a + alpha e + s h lies off the plane by
     at most s|h| d <= epsilon L, and off the nearest point within it by k <= epsilon l + min(d H,
@@ -319,13 +326,13 @@ class NearestPoint:
         by_qr = ~by_pr & (squares[1] > squares[0])
 
         def chosen(one: Any, two: Any, three: Any) -> Any:
-            """Of the edges pq, qr and pr, that for the longest."""
+            """The one that belongs to the longest of the edges pq, qr and pr."""
             return dr.select(by_pr, three, dr.select(by_qr, two, one))
 
         a, e, inverse = chosen(p, q, p), chosen(pq, qr, pr), chosen(first, second, third)
         alpha, away = _split(-a, e, inverse)
         beta, h = _split(chosen(r, p, q) - a, e, inverse)
-        s = dr.dot(away, h) / dr.squared_norm(h)  # not a number without an area: not inside
+        s = dr.dot(away, h) / dr.squared_norm(h)  # NaN for a triangle without an area: not inside
         inside = (s >= 0) & (s <= 1) & (alpha >= s * beta) & (1 - alpha >= s * (1 - beta))
         across = dr.fma(vector(s), h, -away)
         square = dr.squared_norm(across)
@@ -334,7 +341,8 @@ class NearestPoint:
 
 
 def _split(v: Vec3, e: Vec3, inverse: Real) -> tuple[Real, Vec3]:
-    """v = share e + rest, the rest orthogonal to e, also where it is short; inverse = 1/|e|^2."""
+    """share and rest of v = share e + rest, with the rest orthogonal to e, even if it is short;
+    inverse = 1/|e|^2."""
     vector = cast("Any", type(v))
     share = dr.dot(v, e) * inverse
     rest = dr.fma(vector(-share), e, v)
@@ -359,12 +367,14 @@ def _smaller(*vectors: Vec3) -> tuple[Real, Vec3]:
 
 
 def squared_distance_to_segment(a: Vec3, e: Vec3, inverse: Real) -> Real:
-    """From the origin to the segment from a to a + e; inverse = 1/|e|^2, anything finite for 0."""
+    """From the origin to the segment from a to a + e; inverse: 1/|e|^2, any finite number if e =
+    0."""
     return dr.squared_norm(_on_segment(a, e, inverse))
 
 
 def jumps_within(rays: TriangleRays, x: Vec3, distance: Real) -> Real:
-    """The sum of what the winding number jumps by across triangles that are so near to x."""
+    """The sum of the sizes of the winding number's jumps across triangles within a distance of
+    x."""
     real, vector = rays.tree.backend.Float, rays.tree.backend.Array3f
     x, distance = vector(x), real(distance)
     reach, inside = distance * distance, _boxes(rays, x, distance)

@@ -1,8 +1,9 @@
 """Triangles as records of a tree, and the rays that cross them.
 
 A record (16 numbers) holds the corners in the order of their vertices' indices, so that an edge
-shared by two triangles has the same two ends in the same order in both: what is decided about the
-edge is decided alike, to the last bit, and no ray slips through between them or counts one twice.
+shared by two triangles has the same two ends in the same order in both: every decision about the
+edge is the same for both, to the last bit, so that no ray slips through between them or crosses
+both.
 """
 
 from __future__ import annotations
@@ -25,16 +26,16 @@ if TYPE_CHECKING:
 
 # Columns of a record; 0 to 8 are the corners.
 PARITY, INDEX, EDGES = 9, 10, 11
-# Roundings of a coordinate by which a ray passes an edge and counts as passing through it.
+# A ray that is so many roundings of a coordinate from an edge counts as passing through the edge.
 _CLOSE = 4.0
-# Triangles are numbered in floats; single precision counts no further.
+# Triangles are numbered in floats; single precision holds no larger integers without gaps.
 MOST_TRIANGLES = 2**24
 NO_TRIANGLE = 0xFFFFFFFF
 
 
 def triangle_records(vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """(m, 14): corners ordered by index; +1 or -1 for whether that keeps or turns the face;
-    the face's number; 1/length^2 of the edges 01, 12 and 02."""
+    """(m, 14): corners ordered by index; +1, or -1 if that order reverses the face; the face's
+    number; 1/length^2 of the edges 01, 12 and 02."""
     order = np.argsort(faces, axis=1, kind="stable")
     corners = vertices[np.take_along_axis(faces, order, axis=1)]
     even = np.isin(order @ np.array([9, 3, 1]), (5, 15, 19))  # 012, 120, 201 in base three
@@ -73,9 +74,9 @@ def slab_levels(tree: Hierarchy, corners: FloatArray, boxes: list[FloatArray]) -
     radius. With c the center of a node's box, the triangles' points are c + h n + r, r at right
     angles to n, with |h - offset| <= thickness and |r| <= radius.
 
-    A patch of a smooth surface is much thinner than its box, and seen from far away what counts is
-    how thin it is: with boxes alone, a walk visits the whole cap of the surface whose bulge is less
-    than a box is wide.
+    A patch of a smooth surface is much thinner than its box, which matters for points far away:
+    with boxes alone, a walk visits the whole cap of the surface whose bulge is less than a box is
+    wide.
     """
     points = tree.gather(corners, np.nan).reshape(len(tree.slots), -1, 3)
     edges = corners - corners[:, :1]
@@ -96,7 +97,7 @@ def slab_levels(tree: Hierarchy, corners: FloatArray, boxes: list[FloatArray]) -
 
 @dataclass(frozen=True)
 class Frame:
-    """Rays o + t d seen along themselves: right-handed unit vectors u, v and d."""
+    """Coordinates along and across rays o + t d: right-handed unit vectors u, v and d."""
 
     o: Vec3
     u: Vec3
@@ -105,29 +106,29 @@ class Frame:
 
     @classmethod
     def along(cls, backend: Backend, o: Vec3, d: Vec3) -> Frame:
-        """A frame of rays, |d| = 1."""
+        """The frame of rays o + t d, |d| = 1."""
         vector = backend.Array3f
         o, d = vector(o), vector(d)
         u, v = across(d)
         return cls(o, u, v, d)
 
     def across(self, p: Vec3) -> tuple[Real, Real]:
-        """Where p is in the plane that the rays are normal to."""
+        """The coordinates of p in the plane normal to the rays."""
         a = p - self.o
         return _plain(dr.dot(a, self.u)), _plain(dr.dot(a, self.v))
 
     def depth(self, p: Vec3) -> Real:
-        """Where p is along the rays."""
+        """The coordinate of p along the rays."""
         return dr.dot(p - self.o, self.d)
 
     def component(self, a: Vec3) -> Real:
-        """How far a vector reaches along the rays."""
+        """The component of a vector along the rays."""
         return dr.dot(a, self.d)
 
 
 @dataclass(frozen=True)
 class Upwards:
-    """The frame of rays from points o along the z axis, for which there is nothing to compute."""
+    """The frame of rays from points o along the z axis, which takes no computation."""
 
     o: Vec3
 
@@ -156,7 +157,7 @@ def _plain(u: Real) -> Real:
 def side(a: tuple[Real, Real], b: tuple[Real, Real]) -> Real:
     """Twice the area of (0, a, b): its sign says on which side of the edge ab a ray passes.
 
-    The same bits wherever it is asked about the same edge, if a and b come in the same order.
+    The same bits for every triangle at the edge, if a and b come in the same order.
     """
     return dr.fma(a[0], b[1], -(a[1] * b[0]))
 
@@ -187,9 +188,10 @@ class TriangleRays:
     ) -> tuple[Real, Any, Real, Vec3]:
         """The first crossing behind `after` = (t, number) with t <= t_max, ordered by (t, number).
 
-        Gives t (inf for none), the triangle's number (NO_TRIANGLE), the turn (1 where its normal
-        by the right-hand rule looks along the ray, -1 where it looks back, 0) and that normal
-        (unit).
+        Returns:
+            t (inf for none), the triangle's number (NO_TRIANGLE for none), the sign of the crossing
+            (1 where the triangle's normal by the right-hand rule points along the ray, -1 where it
+            points back, 0 for none), and that normal (unit).
         """
         real, index, vector = (
             self.tree.backend.Float,
@@ -223,7 +225,7 @@ class TriangleRays:
         return best, number, turn, normal * dr.rsqrt(fmax(dr.squared_norm(normal), real(1e-37)))
 
     def turns_ahead(self, frame: Frame, t_min: Real, active: Mask = True) -> Real:
-        """The sum of turns of all crossings with t > t_min."""
+        """The sum of the signs of all crossings with t > t_min."""
         real, inside = self.tree.backend.Float, self._boxes(frame)
 
         def visit(node: Node, state: State) -> tuple[Mask, State]:
@@ -237,9 +239,10 @@ class TriangleRays:
         return walk(self.tree, visit, (real(0),), active)[0]
 
     def turns_along(self, x: Vec3, way: Real) -> Real:
-        """The sum of turns of all crossings of rays from x up (way 1) or down (-1) the z axis.
+        """The sum of the signs of all crossings of rays from x up (way 1) or down (-1) the z axis.
 
-        Turns are those about the axis upwards, either way. To tell boxes apart costs less here.
+        For both the signs are those with respect to the upward direction. Testing boxes costs less
+        than for other directions.
         """
         real = self.tree.backend.Float
         up, height = way > 0, way * x.z
@@ -261,7 +264,8 @@ class TriangleRays:
         return walk(self.tree, visit, (real(0),))[0]
 
     def _boxes(self, frame: Frame) -> Any:
-        """A test whether rays meet a node's box between two t; it errs towards yes only."""
+        """A test whether rays meet a node's box between two t. Rounding may turn a no into a yes,
+        never a yes into a no."""
         backend = self.tree.backend
         vector = backend.Array3f
         d = frame.d
@@ -295,17 +299,17 @@ def normal_of(row: list[Real], vector: Any) -> Vec3:
 
 
 def crossing(row: list[Real], frame: Frame | Upwards) -> tuple[Real, Real]:
-    """t and turn of a ray with the triangle of a record; the turn is 0 where it passes by.
+    """t and the sign of the crossing of a ray with the triangle of a record; 0 where there is none.
 
-    In the plane across the ray, the turn is the winding number of the triangle about the ray:
+    In the plane across the ray, the sign is the winding number of the triangle about the ray:
     over its edges, +1 for each that crosses the half-line v = 0, u > 0 upwards and -1 downwards.
     Upwards means from v <= 0 to v > 0, which v alone decides; that u > 0 there is the sign of
-    `side`. Both are the same for all triangles around a vertex or an edge, so that what one of
-    them counts its neighbor discounts: the sum over a closed surface is right whatever the
-    rounding did, and rays through edges and vertices need no special case.
+    `side`. Both are the same for all triangles around a vertex or an edge, so that a rounding error
+    that adds a crossing to one of them takes it from its neighbor: the sum over a closed surface is
+    right whatever the rounding did, and rays through edges and vertices need no special case.
 
-    t is where a point of the triangle lies that is next to the ray to a few roundings of
-    coordinates, however thin the triangle is (`_depth`).
+    t is the depth of a point of the triangle within a few roundings of coordinates of the ray,
+    however thin the triangle is (`_depth`).
     """
     vector = cast("Any", type(frame.o))
     p, q, r = corners_of(row, vector)
@@ -328,17 +332,20 @@ def crossing(row: list[Real], frame: Frame | Upwards) -> tuple[Real, Real]:
 
 
 def _depth(corners: tuple[Seen, Seen, Seen], sides: tuple[Real, Real, Real], close: Real) -> Real:
-    """How far along a ray a triangle lies that it passes through, seen as (u, v, depth) each.
+    """The t at which a ray passes through a triangle.
 
-    The weight of a corner is an area over that of the triangle, which is all rounding where that is
-    thin. So the weight w of the corner off the longest edge is cut to what the ray's place along
-    that edge allows, and the place s of the point on the edge is then chosen for w: the ray is at
-    s + w s', with s' the place of that corner, 0 <= s <= 1 - w, and places along the longest edge
-    are well known. A wrong w moves the point across that edge only, by no more than the rounding of
-    an area over the edge's length.
+    corners: (u, v, depth) of each, in the frame of the ray. sides: `side` of the edges.
+
+    The barycentric weight of a corner is an area divided by that of the triangle, which is all
+    rounding where the triangle is thin. So the weight w of the corner off the longest edge is cut
+    to what the ray's coordinate along that edge allows, and the coordinate s of the point on the
+    edge
+    is then chosen for w: the ray is at s + w s', with s' the coordinate of that corner, 0 <= s <=
+    1 - w, and coordinates along the longest edge are accurate. A wrong w moves the point across
+    that edge only, by no more than the rounding of an area over the edge's length.
 
     A ray that is as close as `close` to an edge or a vertex passes all triangles there at the depth
-    of that edge or vertex, the same bits for all: what they do to w there, they do at once.
+    of that edge or vertex, the same bits for all: their jumps of w are at exactly the same t.
     """
     (a, b, c), (ab, bc, ac) = corners, sides
     squares = _square(a, b), _square(b, c), _square(a, c)

@@ -19,16 +19,17 @@ if TYPE_CHECKING:
 
     from harnack.backend import Backend, Real
 
-# A Dr.Jit complex number, one a lane.
+# A Dr.Jit complex number, one in each lane.
 Complex = Any
 
-# Points as close to a singular one are moved off it: the squares of such numbers still exist.
+# Points nearer than this to a singular point are moved away from it: squares of such distances do
+# not underflow.
 _LEAST = 1e-12
-# And the least number whose square and its inverse do, in single precision.
+# About the least number whose square, and the inverse of that, exist in single precision.
 _LEAST_SQUARED = 1e-18
-# What is taken for the distance to a singular point where there is none.
+# The distance to the nearest singular point, if there is none.
 _NO_POINT = 2.0
-# What bounds of second derivatives are widened by: logarithms and powers of them are rounded.
+# Bounds of second derivatives are multiplied by this, for the rounding of logarithms and powers.
 _WIDENED = 1 + 2e-4
 
 
@@ -44,7 +45,7 @@ def complex_of(x: Real, y: Real) -> Complex:
 
 
 def derivatives(number: Complex, part: str) -> tuple[Real, Real]:
-    """d/dx and d/dy of the part, "imag" or "real", of a function with this derivative."""
+    """d/dx and d/dy of the part, "imag" or "real", of an analytic function with this derivative."""
     if part == "imag":
         return number.imag, number.real
     return number.real, -number.imag
@@ -54,9 +55,10 @@ def derivatives(number: Complex, part: str) -> tuple[Real, Real]:
 class BranchPoint:
     """A point of the plane where branches are not analytic.
 
+    at: the point.
     power, constant, radius, value: within the radius of the point, all branches g have |g - value|
         <= constant |z - at|^power, with a power > 0 (up to the period of the part that is drawn).
-        None where no such bound is known, as at poles and logarithms.
+        The power is None where no such bound is known, as at poles and logarithms.
     """
 
     at: complex
@@ -80,7 +82,7 @@ class BranchPoint:
 
 @dataclass(frozen=True)
 class PreparedPoint:
-    """A `BranchPoint` as numbers of a backend, which no kernel is compiled anew for."""
+    """A `BranchPoint` as kernel parameters of a backend."""
 
     at: Complex
     power: float | None
@@ -90,14 +92,14 @@ class PreparedPoint:
 
     @classmethod
     def of(cls, point: BranchPoint, number: Callable[[float], Real], made: Any) -> PreparedPoint:
-        """number: makes a number of the backend, made: a complex one of two."""
+        """number: makes a number of the backend. made: makes a complex one of two."""
         at, value = (made(number(one.real), number(one.imag)) for one in (point.at, point.value))
         return cls(at, point.power, number(point.constant), number(point.radius), value)
 
 
 @dataclass(frozen=True)
 class Branch:
-    """One branch at z: its value, its derivative, and its second derivative where it is known."""
+    """One branch at z: its value, derivative and, if it is known, second derivative."""
 
     value: Complex
     first: Complex
@@ -105,7 +107,8 @@ class Branch:
 
 
 class Part(abc.ABC):
-    """A part of the plane, by what bounds on it need to know. Everything is rounded outwards."""
+    """A region of the plane on which second derivatives are bounded. All its numbers are rounded
+    outwards."""
 
     @abc.abstractmethod
     def distances(self, at: Complex) -> tuple[Real, Real]:
@@ -113,14 +116,14 @@ class Part(abc.ABC):
 
     @abc.abstractmethod
     def disk(self) -> tuple[Complex, Real]:
-        """Center and radius of a disk that holds it."""
+        """Center and radius of a disk that contains it."""
 
 
 @dataclass(frozen=True)
 class Stretch(Part):
-    """The straight stretch from z to z + length w, w a Dr.Jit complex number.
+    """The segment from z to z + length w, w a Dr.Jit complex number.
 
-    rounding: how far rounding may have moved z.
+    rounding: of z.
     """
 
     z: Complex
@@ -129,8 +132,8 @@ class Stretch(Part):
     rounding: Real
 
     def distances(self, at: Complex) -> tuple[Real, Real]:
-        """The smallest is that of the foot, or of the end nearer to it; the largest is that of an
-        end, for distances are convex."""
+        """The smallest is that of the foot of the perpendicular, or of the end nearer to it; the
+        largest is that of an end, as distances are convex."""
         x, y = self.z.real - at.real, self.z.imag - at.imag
         speed = dr.square(self.w.real) + dr.square(self.w.imag)
         foot = -(x * self.w.real + y * self.w.imag) / speed
@@ -149,7 +152,7 @@ class Stretch(Part):
 
 @dataclass(frozen=True)
 class Disk(Part):
-    """The disk of some radius about z, which rounding may have moved by so much."""
+    """The disk of a radius about z; rounding: of z."""
 
     z: Complex
     radius: Real
@@ -175,20 +178,21 @@ class Branches(abc.ABC):
     @property
     @abc.abstractmethod
     def points(self) -> tuple[BranchPoint, ...]:
-        """Where branches are not analytic: everywhere else each can be continued."""
+        """The points where branches are not analytic; everywhere else each can be continued."""
 
     def period(self, imaginary: bool) -> float | None:
-        """By what each branch may be shifted, in the part that is drawn, and still be one."""
+        """A number by which each branch may be shifted, in the part that is drawn, to give a branch
+        again; None for none."""
         del imaginary
         return None
 
     @property
     def count(self) -> int:
-        """How many branches there are, up to the period."""
+        """The number of branches, up to the period."""
         return 1
 
     def prepare(self, backend: Backend) -> Branches:
-        """The same with its numbers as data of the backend."""
+        """The same with its numbers as kernel parameters of the backend."""
 
         def number(value: float) -> Real:
             return dr.opaque(backend.Float, value)
@@ -211,10 +215,10 @@ class Branches(abc.ABC):
 
     @abc.abstractmethod
     def bend(self, part: Part) -> Real:
-        """A bound of |g''|, of all branches, on a part of the plane."""
+        """A bound of |g''| for all branches on a region of the plane."""
 
     def moved_off(self, z: Complex, rounding: Real) -> Complex:
-        """z, moved by its rounding off singular points, where no derivative is a number."""
+        """z, moved by its rounding away from singular points, where derivatives are NaN."""
         least = rounding + _LEAST
         for point in self.points_on(z):
             beside = type(z)(point.at.real + least, point.at.imag)
@@ -234,7 +238,8 @@ class Branches(abc.ABC):
         return math.inf
 
     def roundings(self, z: Complex, branches: tuple[Branch, ...]) -> Real:
-        """How many units of rounding (2^-23 in single precision) values may be off, as a number."""
+        """A bound of the rounding of values, in units (2^-23 in single precision) of the number
+        1."""
         del z
         most: Real = 0.0
         for one in branches:
@@ -247,14 +252,15 @@ class PowerProduct(Branches):
     """The product of (z - a_i)^alpha_i, with rational exponents: q branches, q the least common
     denominator.
 
-    A turn about a_i multiplies g by exp(2 pi i alpha_i): these generate the q-th roots of unity.
+    A full turn around a_i multiplies g by exp(2 pi i alpha_i): these generate the q-th roots of
+    unity.
 
     Bound of g'': with e_i = alpha_i/(z - a_i), g'' = g ((sum e_i)^2 - sum alpha_i/(z - a_i)^2), so
 
         |g''|/|g| <= sum_i |alpha_i (alpha_i - 1)|/d_i^2 + 2 sum_(i<j) |alpha_i alpha_j|/(d_i d_j),
 
     d_i the distances from the a_i. Times |g| each term is a product of powers of them: powers below
-    0 are largest at the smallest d_i of the part and the others at the largest. Equality for a
+    0 are largest at the smallest d_i of the region and the others at the largest. Equality for a
     single factor.
     """
 
@@ -293,7 +299,7 @@ class PowerProduct(Branches):
         return self._on or tuple(type(z)(a.real, a.imag) for a in self.places)
 
     def moved_off(self, z: Complex, rounding: Real) -> Complex:
-        """Also off zeros, where the logarithm of the product is not a number: by one rounding."""
+        """Also away from zeros, where the logarithm of the product is infinite, by one rounding."""
         z = super().moved_off(z, rounding)
         unit = 4 * float(dr.epsilon(z.real))
         for a, alpha in zip(self._centers(z), self.exponents, strict=True):
@@ -357,7 +363,7 @@ class PowerProduct(Branches):
         return most
 
     def roundings(self, z: Complex, branches: tuple[Branch, ...]) -> Real:
-        """Of exp and of the angle: by a few units of their arguments."""
+        """That of exp and of the angle: a few units of their arguments."""
         most = 12 + 4 * math.pi * sum(abs(alpha) for alpha in self.exponents)
         for a, alpha in zip(self._centers(z), self.exponents, strict=True):
             most = most + 4 * abs(alpha) * dr.abs(dr.log(abs(z - a)))
@@ -369,7 +375,7 @@ class Logarithm(Branches):
     """sum n_i log(z - a_i), the logarithm of a product of integer powers: its imaginary part is
     known up to 2 pi.
 
-    |g''| = |sum n_i/(z - a_i)^2| <= sum |n_i|/d_i^2, with the smallest distances of the part.
+    |g''| = |sum n_i/(z - a_i)^2| <= sum |n_i|/d_i^2, with the smallest distances of the region.
     """
 
     places: tuple[complex, ...] = (0j,)
@@ -416,7 +422,7 @@ class Logarithm(Branches):
 
 @dataclass(frozen=True)
 class ArcSine(Branches):
-    """asin: its branches are g and pi - g, with g the principal one, modulo 2 pi.
+    """asin: its branches are g and pi - g modulo 2 pi, with g the principal one.
 
     g' = (1 - z^2)^(-1/2) and g'' = z g'^3, so |g''| <= |z|/(d_1 d_2)^(3/2), d_i the distances from
     1 and -1. At either, asin(1 - w) = pi/2 - 2 asin sqrt(w/2), whose series has positive
@@ -438,7 +444,7 @@ class ArcSine(Branches):
         return None if imaginary else 2 * math.pi
 
     def at(self, z: Complex) -> tuple[Branch, ...]:
-        """By Kahan's formulas (1987), which nothing cancels in."""
+        """By Kahan's formulas (1987), in which nothing cancels."""
         below, above = dr.sqrt(1 - z), dr.sqrt(1 + z)
         product = below * above
         real = dr.atan2(z.real, product.real)
@@ -460,8 +466,8 @@ class ArcSine(Branches):
 class OwnBranches(Branches):
     """Branches that a user gives: see `RiemannSurface`.
 
-    On a part of the plane g'' is bounded as on a disk that holds it, if no singular point lies in
-    that: of a stretch, the disk about its middle that its ends lie on.
+    On a region g'' is bounded by the user's bound on a disk around it, if no singular point lies in
+    that disk; around a segment, the smallest disk.
     """
 
     function: Callable[[Any], Any]

@@ -1,16 +1,9 @@
-"""Cosine series on a box: fitting, values on grids, and what is proved of them between nodes.
+"""Cosine series on a box: fitting, proved bounds, and evaluation on a backend.
 
     f(p) = sum a_ijk cos(i u) cos(j v) cos(k w),   (u, v, w) = pi (p - lower)/(upper - lower),
 
-0 <= i < K_x and so on. All of this is NumPy in double precision, made once for a series.
-
-Cosine series on a backend: sum factorization, with its derivatives, and local bounds.
-
-The sum over k is made for each i and j, that over j for each i, that over i last: about 2 K^3
-products in all where a sum of terms would need 7 K^3. i runs in a recorded loop over rows of a
-table, j and k are written out, so that the coefficients are data: another function fitted by as
-many terms compiles no other kernel. Each sum begins with the highest frequency, so that what is
-large, the low ones, takes part in the fewest roundings.
+0 <= i < K_x and so on. `fit_cosines` and `CosineBounds` are NumPy in double precision, computed
+once for a series; `CosineSums` evaluates it.
 """
 
 from __future__ import annotations
@@ -33,20 +26,21 @@ if TYPE_CHECKING:
 
 __all__ = ["CellBounds", "CosineBounds", "fit_cosines", "midpoints", "on_nodes"]
 
-# Nodes for each half wave of the highest frequency: at least so many, and as many as make about so
-# many along an axis, up to the last number.
+# Nodes for each half wave of the highest frequency: at least the first number, at most the last,
+# and between them as many as make about the second number along an axis.
 _FINE, _ALONG_AXIS, _FINEST = 8, 112, 32
-# Sides, in cells, of the grids that local bounds are tabulated on, and the share of the global
-# bound that they must be below on average to pay for the time of looking them up.
+# Sides, in cells, of the grids of local bounds. A grid is used if its bounds are on average below
+# this fraction of the global one, so that they are worth the time of a lookup.
 _CELLS, _PAYS = (16, 8, 4), 0.9
-# Cells of the grid by which the extent of a level is bounded.
+# Cells along a side of the grid by which the extent of a level is bounded.
 _EXTENT_CELLS = 32
-# Bounds are moved by this much for the rounding of double precision.
+# Bounds are moved outwards by this fraction for the rounding of double precision.
 _ROUNDING = 1e-9
 
 
 def midpoints(lower: FloatArray, upper: FloatArray, shape: tuple[int, ...]) -> FloatArray:
-    """The middles (n, 3) of the cells of a box, in the order of a flattened array of this shape."""
+    """The midpoints (n, 3) of the cells of a box, in the order of a flattened array of this
+    shape."""
     axes = [
         lower[a] + (upper[a] - lower[a]) * (np.arange(n) + 0.5) / n for a, n in enumerate(shape)
     ]
@@ -87,9 +81,10 @@ def on_nodes(
 
 @dataclass(frozen=True)
 class CellBounds:
-    """Bounds of all second derivatives around each cell of a grid of n^3 over the box.
+    """Bounds of all second derivatives around each cell of a grid of n^3 cells over the box.
 
-    count: n. bounds: (n^3,), x first: on the cell and all its neighbors.
+    count: n.
+    bounds: (n^3,), x fastest: on the cell and all its neighbors.
     """
 
     count: int
@@ -98,10 +93,11 @@ class CellBounds:
 
 @dataclass(frozen=True)
 class CosineBounds:
-    """What is proved of a cosine series.
+    """Proved bounds of a cosine series.
 
-    low, high: f stays within them. curvature: |v.H v| for unit v never exceeds it, H the Hessian.
-    cells: the same locally, finest first; none where that is not worth looking up.
+    low, high: f stays within them.
+    curvature: |v.H v| for unit v never exceeds it, H the Hessian.
+    cells: local bounds of |v.H v|, finest grid first; only grids that are worth a lookup.
     cell_low, cell_high: (32, 32, 32) ranges of f on the cells of the box.
 
     Proof. Along each axis f is a trigonometric polynomial of the angle of degree n = K - 1, and so
@@ -161,7 +157,8 @@ class CosineBounds:
         )
 
     def extent(self, levels: tuple[float, ...]) -> tuple[FloatArray, FloatArray] | None:
-        """Corners, as fractions of the box, of a box that holds the level sets; None for none."""
+        """Corners, as fractions of the box, of a box that holds the level sets; None if there are
+        none."""
         met = np.zeros(self.cell_low.shape, dtype=bool)
         for level in levels:
             met |= (self.cell_low <= level) & (level <= self.cell_high)
@@ -204,7 +201,7 @@ def _spectral_norms(
         angle = np.arccos(np.clip(half, -1, 1)) / 3
         top = mean + 2 * spread * np.cos(angle)
         bottom = mean + 2 * spread * np.cos(angle + 2 * math.pi / 3)
-        # The arccosine is off by the root of what its argument is, where that is near 1.
+        # Near 1, the error of the arccosine is the square root of that of its argument.
         norms[start : start + slab] = np.maximum(np.abs(top), np.abs(bottom)) + 1e-7 * spread
     return norms
 
@@ -226,7 +223,7 @@ def _over_cells(
     return values
 
 
-# Constants are moved up, and radii down, by this much for the roundings of float32.
+# Constants are moved up, and radii down, by this fraction for the roundings of float32.
 _KERNEL_ROUNDING = 1e-5
 
 
@@ -234,8 +231,16 @@ _KERNEL_ROUNDING = 1e-5
 class CosineSums:
     """The coefficients and local bounds of a series on a backend.
 
-    lower: corner of the box. rate: pi over its size, angles per length.
-    rounding: of value and gradient, in units of u, but for what moves the point.
+    The sum over k is made for each i and j, that over j for each i, that over i last (sum
+    factorization): about 2 K^3 products in all where a sum of terms would need 7 K^3. i runs in a
+    recorded loop over rows of a table, j and k are unrolled, so that the coefficients are kernel
+    parameters: another function fitted by as many terms compiles no other kernel. Each sum begins
+    with the highest frequency, so that the large terms, of low frequency, take part in the fewest
+    roundings.
+
+    lower: corner of the box.
+    rate: pi over its size, angles per length.
+    rounding: of value and gradient, in units of u, without that which moves the point.
     """
 
     backend: Backend
@@ -273,7 +278,7 @@ class CosineSums:
         )
 
     def angles(self, p: Vec3) -> Vec3:
-        """From 0 to pi on the box."""
+        """The angles (u, v, w) of points, from 0 to pi on the box."""
         return (self.backend.Array3f(p) - self.lower) * self.rate
 
     def value(self, p: Vec3) -> tuple[Real, Vec3]:
@@ -318,7 +323,8 @@ class CosineSums:
         )
 
     def curvatures(self, p: Vec3) -> tuple[Curvature, ...]:
-        """Around p, the one of the smallest ball first; the last holds everywhere."""
+        """Bounds of second derivatives around p, that on the smallest ball first; the last one
+        holds everywhere."""
         everywhere = Curvature(self.curvature + 0 * p.x, dr.inf)
         if not self.cells:
             return (everywhere,)
@@ -328,7 +334,7 @@ class CosineSums:
 
 @dataclass(frozen=True)
 class _Cells:
-    """Local bounds of the curvature on a backend; sides: of a cell, as lengths."""
+    """Local bounds of second derivatives on a backend; sides: those of a cell."""
 
     backend: Backend
     count: int
@@ -341,7 +347,7 @@ class _Cells:
         return cls(backend, cells.count, _data(backend, size / cells.count), bounds)
 
     def curvature(self, share: Vec3) -> Curvature:
-        """Of the cell in which a point lies, on a ball that stays within its neighbors."""
+        """The bound of the cell in which a point lies, on a ball within the cell's neighbors."""
         place, index = share * float(self.count), self.backend.UInt32(0)
         free: Real = dr.inf
         for axis in (2, 1, 0):

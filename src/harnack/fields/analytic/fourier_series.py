@@ -1,4 +1,4 @@
-"""Any function on a box, by a cosine series that is fitted to it (paper, section 4.7.1)."""
+"""Any function on a box, as a cosine series that is fitted to it (paper, section 4.7.1)."""
 
 from __future__ import annotations
 
@@ -29,13 +29,14 @@ if TYPE_CHECKING:
 __all__ = ["Displacement", "FourierSeries"]
 
 _MOST_TERMS = 24
-# Samples a side by default, for each term and at least; they must not be more in all than the last.
+# Samples along a side by default: for each term, and at least; and the most samples in all.
 _SAMPLES, _LEAST_SAMPLES, _MOST_SAMPLES = 4, 64, 1 << 25
-# Points at which the error of a fit is looked at, and how they are brought to the surface.
+# Points at which the error of a fit is measured; the Newton steps that bring them to the surface,
+# and the tolerance of these.
 _CHECKED, _NEWTON_STEPS, _CONVERGED = 20_000, 12, 1e-9
-# Coefficients as small as this beside the values fitted are the rounding of their sums.
+# Coefficients that are so small against the values fitted are rounding.
 _NOTHING = 1e-13
-# What is of second order in the unit roundoff.
+# Covers terms of second order in the unit roundoff.
 _SECOND_ORDER = 1.05
 
 # f of points (n, 3): (n,).
@@ -44,10 +45,11 @@ Function: TypeAlias = Callable[["FloatArray"], Any]
 
 @dataclass(frozen=True)
 class Displacement:
-    """How far the surface of a series lies from that of the function it was fitted to: sampled, and
-    to first order, |function - level|/|gradient of the series| at points of its surface.
+    """The distance of the surface of a series from that of the function it was fitted to: sampled,
+    and to first order, |function - level|/|gradient of the series| at points of its surface.
 
-    mean, largest: lengths. count: how many points were looked at.
+    mean, largest: lengths.
+    count: the number of points.
     """
 
     mean: float
@@ -65,12 +67,13 @@ class FourierSeries(Field):
     has no slope across the walls; kinks, such as those of distances, cost accuracy, and so do
     functions that are very steep far from the surface: compress those first, say by tanh.
 
-    coefficients: (K_x, K_y, K_z), at most 24 each. box: a finite `Box`.
+    coefficients: (K_x, K_y, K_z), at most 24 each.
+    box: a finite `Box`.
 
-    Promises: bounds of the second derivatives (`CosineBounds` has the proof), on the whole box and
-    on balls around the cells of grids laid over it, where those are smaller. Rounding, in units of
-    u: an angle k u is off by 3 roundings of u, which move the point, and one of the product, k pi
-    at most; a sine or cosine by 2; a coefficient by 1; a term takes part in i + j + k + 3 sums.
+    Promises: bounds of the second derivatives (`CosineBounds` has the proof), on the whole box and,
+    where those are smaller, on balls around the cells of grids over it. Rounding, in units of u: an
+    angle k u is off by 3 roundings of u, which move the point, and one of the product, k pi at
+    most; a sine or cosine by 2; a coefficient by 1; a term takes part in i + j + k + 3 sums.
 
     Raises:
         ValueError: coefficients of another shape, not finite, or all zero but the first; a box
@@ -80,8 +83,8 @@ class FourierSeries(Field):
     overstep = 1.5
 
     fit_error: float | None = None
-    """The largest difference of values between series and function that was seen; None where the
-    series was made from coefficients."""
+    """The largest sampled difference of values between series and function; None for a series made
+    from coefficients."""
 
     def __init__(self, coefficients: Any, box: Box | tuple[Any, Any]) -> None:
         a = real_array(coefficients, "coefficients").astype(np.float64)
@@ -172,9 +175,10 @@ class FourierSeries(Field):
         return self._bounds.curvature
 
     def displacement(self, level: float | None = None, *, rng: int = 0) -> Displacement:
-        """How far the surface at a level lies from that of the function fitted: an estimate.
+        """An estimate of the distance of the surface at a level from that of the function fitted.
 
-        Of a function at random points of the surface, of a grid at its points next to the surface.
+        For a function, at random points of the surface; for a grid, at its points next to the
+        surface.
 
         Raises:
             ValueError: the series was not made by `fit`, or no point of the level was found.
@@ -190,7 +194,7 @@ class FourierSeries(Field):
         return Displacement(float(away.mean()), float(away.max()), len(points))
 
     def _near(self, level: float, rng: int) -> tuple[FloatArray, FloatArray]:
-        """Points of the surface, or next to it, and what the function differs from the series."""
+        """Points of the surface, or next to it, and the function less the series there."""
         if not callable(self._source):
             grid = cast("FloatArray", self._source)
             points = midpoints(self._lower, self._lower + self._size, grid.shape)
@@ -214,7 +218,7 @@ class FourierSeries(Field):
         return x, (_values(self._source, x) if len(x) else np.zeros(0)) - level
 
     def _largest_difference(self) -> float:
-        """Between series and function: at random points, or at all of a grid."""
+        """The largest difference between series and function at random points, or all of a grid."""
         if callable(self._source):
             x = self._lower + self._size * np.random.default_rng(0).random((_CHECKED, 3))
             given = _values(self._source, x)
@@ -339,7 +343,8 @@ def _values(function: Function, points: FloatArray) -> FloatArray:
 
 
 def _rounding(a: FloatArray, size: FloatArray) -> tuple[float, float]:
-    """Of value and gradient, in units of u, without what moves the point: see the class."""
+    """The rounding of value and gradient, in units of u, without that which moves the point: see
+    `FourierSeries`."""
     i, j, k = np.indices(a.shape)
     each = (i + j + k) * (math.pi + 1) + 10
     sizes = np.abs(a)

@@ -1,4 +1,4 @@
-"""Hyperspherical harmonics, seen in space by stereographic projection (paper, section 4.7)."""
+"""Hyperspherical harmonics, mapped to space by stereographic projection (paper, section 4.7)."""
 
 from __future__ import annotations
 
@@ -41,22 +41,23 @@ if TYPE_CHECKING:
 
 __all__ = ["HypersphericalHarmonic"]
 
-# Constants are moved up by this much for the roundings of float32.
+# Constants are moved up by this fraction for the roundings of float32.
 _ROUNDING = 1e-5
 # Radii of the balls on which the Hessian is bounded, in units of sqrt(1 + |p|^2).
 _SHARES = _NEAR, _WIDE = 0.2, 0.6
-# Beside zeros of high order: radii in units of the distance to them over the order less 2, and at
-# most, as above; and what a radius is of the chord of the sphere that it leads to, over 1 + |p|^2.
+# Near zeros of high order: the chord of the ball on the sphere, in units of the distance to the
+# zero over (order - 2); the largest radius, in the units above; and the radius of a ball in space
+# whose image lies within a chord, in units of the chord times 1 + |p|^2.
 _BESIDE, _MOST_BESIDE, _OF_CHORD = 0.5, 0.3, 0.349
-# What is of second order in the unit roundoff, and roundings of the bounds themselves.
+# Covers terms of second order in the unit roundoff, and the rounding of the bounds themselves.
 _SECOND_ORDER = 1.05
-# Roundings, in units of u: of 1/(1 + |p|^2), relative; of w; of operations that join the parts.
+# Roundings, in units of u: the relative one of 1/(1 + |p|^2), and that of w.
 _OF_SCALE, _OF_HEIGHT = 6.0, 13.0
 
 
 @dataclass(frozen=True)
 class _Order:
-    """The terms of one j: the sum of solid harmonics times C_n^k(w), with what bounds both."""
+    """The terms of one j: a sum of solid harmonics times C_n^k(w), with bounds of both."""
 
     j: int
     n: int
@@ -92,8 +93,8 @@ class HypersphericalHarmonic(Field):
 
     P_ljm(X) = N S_jm(y) |X|^(l-j) C_(l-j)^(j+1)(w/|X|) with X = (y, w): S_jm the solid harmonic of
     `SphericalHarmonic`, C a Gegenbauer polynomial, the integral of P^2 over S^3 being 1. The origin
-    is seen at w = -1, the unit sphere at w = 0, and far away f tends to the value at w = 1, which
-    is 0 for j > 0. No level set needs to be clipped: rays that leave are proved to meet nothing.
+    is at w = -1, the unit sphere at w = 0, and far away f tends to the value at w = 1, which is 0
+    for j > 0. No level set needs to be clipped: rays that leave are proved to meet nothing.
 
     l, j, m: degree 0 <= l <= 6, and 0 <= j <= l, -j <= m <= j: (l+1)^2 functions for each l.
         For more general ones see `from_polynomial`.
@@ -109,10 +110,11 @@ class HypersphericalHarmonic(Field):
       |f''| <= M l (4 (l-1)/S^2 + 4/S^1.5) with the least S on the ball, and |grad f| <= 2 l A/S
       (Bernstein on the great circle along the line).
     - Where f vanishes to an order above 2, at y = 0 or for |m| > 2 on the circle y_1 = y_2 = 0,
-      another `Curvature`, on a ball that is a share of the distance there. With bounds of S_jm, its
-      gradient and its Hessian at such distances (`AxialBound`), and 2ab <= 1 for the parts (a, b)
-      of unit vectors, it is the same chain rule for S_jm(y) C(w). The ball: R <= 0.3 sqrt(S) leaves
-      1 + |q|^2 >= 0.49 S at q, so that on the sphere it is within the chord 2R/(0.7 S).
+      another `Curvature`, on a ball whose radius is a fraction of the distance to that zero. With
+      bounds of S_jm, its gradient and its Hessian at such distances (`AxialBound`), and 2ab <= 1
+      for the components (a, b) of unit vectors, it is the same chain rule for S_jm(y) C(w). The
+      ball: R <= 0.3 sqrt(S) leaves 1 + |q|^2 >= 0.49 S at q, so that on the sphere it is within the
+      chord 2R/(0.7 S).
     - Along a ray: `Arc`. On the circle of radius 1/c, in its angle, the first derivative of the
       point has length 1/c and the second too, so |f_aa| <= M l ((l-1)/c^2 + 1/c); and f is a
       trigonometric polynomial of degree l of the angle, so |f_aa| <= l^2 A (Bernstein).
@@ -139,7 +141,7 @@ class HypersphericalHarmonic(Field):
     def from_polynomial(
         cls, coefficients: Monomials, *, domain: Volume | None = None
     ) -> HypersphericalHarmonic:
-        """Of a homogeneous harmonic polynomial of R^4, by its coefficients.
+        """The function of a homogeneous harmonic polynomial of R^4, by its coefficients.
 
         coefficients: (a, b, c, d) -> that of x^a y^b z^c w^d, a + b + c + d = l for all, l <= 6;
             x, y, z are 2p/(1 + |p|^2) and w = (|p|^2 - 1)/(1 + |p|^2).
@@ -242,7 +244,7 @@ class HypersphericalHarmonic(Field):
         return [*made, Curvature(0 * square + max(size * 4.0 * l, 0.0), dr.inf)]
 
     def _beside(self, p: Vec3, square: Real) -> tuple[Curvature, ...]:
-        """The bound of the Hessian beside a zero of high order; none where there is none."""
+        """The bound of the Hessian near a zero of high order; empty if there is no such zero."""
         by_axis = min(abs(m) for one in self._orders for _, m in one.weights)
         by_center = min(one.j for one in self._orders)
         if by_center < 3:
@@ -262,7 +264,7 @@ class HypersphericalHarmonic(Field):
         return (Curvature(bent * (1 + _ROUNDING), radius),)
 
     def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
-        """The sample, with arcs of circles where the sharpest proofs are asked for."""
+        """The sample, with `Arc` enclosures if the sharpest proofs are asked for."""
         del ahead, back
         p = path.point(t)
         sample = self.evaluate(p)
@@ -291,7 +293,7 @@ class HypersphericalHarmonic(Field):
         return Look(sample, (forward, *around), (backward, *behind), slope)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """Rows of the Hessian: f is harmonic on S^3 and not in space, so it has a trace.
+        """Rows of the Hessian, whose trace is not 0: f is harmonic on S^3 and not in space.
 
         By the chain rule with dy_i/dx_k = 2s (d_ik - 2s x_i x_k), dw/dx_k = 4 s^2 x_k, and
         second derivatives 4 s^2 (4s x_i x_k x_m - x_m d_ik - x_k d_im - x_i d_km) of y_i and
@@ -337,7 +339,7 @@ class HypersphericalHarmonic(Field):
         return out[0], out[1], out[2]
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """A ball about the origin; None for levels that the surface may follow to infinity."""
+        """A ball about the origin; None for levels whose surface may reach to infinity."""
         if self.domain is not None:
             return self.domain
         radius = max((self._known.radius(level) for level in levels), default=0.0)

@@ -197,15 +197,17 @@ class HypersphereRange:
 
     @property
     def largest(self) -> float:
-        """|P| <= this on S^3."""
+        """A bound of |P| on S^3."""
         return max(-self.low, self.high)
 
     def radius(self, level: float) -> float:
-        """Of a ball about the origin that holds all points with this level; inf for no such ball.
+        """The radius of a ball about the origin that contains all points with this level; inf if
+        there is none.
 
-        Angles a from the pole are distances cot(a/2) from the origin. Where the first sphere is not
-        free of the level, P = A cos(b) on the way from the pole, A >= |P|, moves b no faster than
-        l (Szego): the level is |b(level) - b(pole)|/l away at least.
+        An angle a from the pole is a distance cot(a/2) from the origin. Where the first sphere is
+        not free of the level, write P = A cos(b) along a great circle from the pole, A >= |P|: b
+        changes at a rate of at most l (Szego), so the level is at least |b(level) - b(pole)|/l
+        away.
         """
         met = np.flatnonzero((self.lower <= level) & (level <= self.upper))
         if met.size and met[0] > 0:

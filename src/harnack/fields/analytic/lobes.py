@@ -34,11 +34,11 @@ __all__ = ["Lobes"]
 
 Part = Literal["both", "positive", "negative"]
 _PARTS: tuple[Part, ...] = ("both", "positive", "negative")
-# Promised ends are moved out by this much of their distance for the roundings of float32.
+# Promised ends are moved outwards by this fraction for the roundings of float32.
 _ROUNDING = 1e-5
-# Scales and harmonics from 1/this to this have fourth powers that a precision has room for.
+# Fourth powers of scales and harmonics from 1/this to this stay in the range of a precision.
 _REACH = {"single": 1e6, "double": 1e60}
-# Of a bound of second derivatives, where all else is 0.
+# The least bound of second derivatives, so that it is not 0.
 _SMALLEST = 1e-20
 
 
@@ -183,14 +183,16 @@ class Lobes(Field):
         return Sample(value, gradient, tuple(known), error, gradient_error)
 
     def _close_by(self, r: Real, y: Real, slope: Real) -> Curvature:
-        """A bound of second derivatives on a small ball, where Y and its slope may be far less than
-        anywhere: between lobes that come close to each other.
+        """A bound of second derivatives on a small ball, on which Y and its slope may be far
+        smaller
+        than elsewhere: between lobes that come close to each other.
 
-        Proof, for B(x, q r) with q <= 1/4, seen from the origin within the angle 1.05 q. With M and
-        L as for Y itself, second derivatives along the sphere are at most L^2 M, so slopes are at
-        most G = |slope| + 1.05 q L^2 M there, and |Y| <= H = |Y(u)| + 1.05 q G. Second derivatives
-        of r^2 Y^2 are 2 Y^2 + 2 Y (2 c q Y' + q^2 Y") + 2 q^2 Y'^2 with c, q of the class, so at
-        most 2 H^2 + 2 H b + 2 G^2, b being N^2 A of Y. Those of r^4 are at most 12 r^2.
+        Proof, for B(x, q r) with q <= 1/4, whose directions from the origin are within the angle
+        1.05 q of u. With M and L as for Y itself, second derivatives along the sphere are at most
+        L^2 M, so slopes are at most G = |slope| + 1.05 q L^2 M there, and |Y| <= H = |Y(u)| +
+        1.05 q G. Second derivatives of r^2 Y^2 are 2 Y^2 + 2 Y (2 c q Y' + q^2 Y") + 2 q^2 Y'^2
+        with the c and q of `Lobes`, so at most 2 H^2 + 2 H b + 2 G^2, b being N^2 A of Y. Those of
+        r^4 are at most 12 r^2.
         """
         most, degree = max(map(abs, self.value_range)), self.degree
         q = fmin(0.8 * dr.sqrt(r / most), 0.25) / degree
@@ -203,7 +205,7 @@ class Lobes(Field):
         return Curvature(constant * (1 + _ROUNDING) + _SMALLEST, q * r)
 
     def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
-        """The sample, and the range of second derivatives as far as the path is looked at."""
+        """The sample, with parabolas from ranges of second derivatives as far as is asked."""
         p = path.point(t)
         sample = self.evaluate(p)
         look = path.look(sample)
@@ -221,7 +223,8 @@ class Lobes(Field):
         return Look(sample, (*look.ahead, forward), (*look.back, backward), look.slope)
 
     def _second_derivatives(self, farthest: Real) -> tuple[Real, Real]:
-        """Least and largest along any line within r <= farthest, for scale 1; see the class."""
+        """The least and the largest second derivative along any line within r <= farthest, for
+        scale 1: see `Lobes`."""
         low, high = self.value_range
         if self.part == "both":
             most, degree = max(low * low, high * high), 2 * self.degree
@@ -236,11 +239,12 @@ class Lobes(Field):
         return least - room, most + room
 
     def _errors(self, r: Real, y: Real, steep: Real, rho: Real) -> tuple[Real, Real]:
-        """How far rounding may move value and gradient, to first order in the unit roundoff e.
+        """Bounds of the rounding of value and gradient, to first order in the unit roundoff e.
 
-        The unit vector is off by 4 e of itself: that moves Y by at most 4 e L M, M = max |Y|, its
+        The unit vector is off by 4 e of itself: that changes Y by at most 4 e L M, M = max |Y|, its
         radial continuation by as much, and its gradient by 4 e L^2 M each. Y itself is evaluated
-        with an error of `HarmonicRounding`. What follows is products, a few roundings each.
+        with an error of `HarmonicRounding`. After that there are products, with a few roundings
+        each.
         """
         unit = float(dr.epsilon(type(r)))
         most, degree = max(map(abs, self.value_range)), self.degree
@@ -255,8 +259,8 @@ class Lobes(Field):
         return r * r * (off + 8 * unit * r), r * (slope + 2 * off + 24 * unit * r)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """Rows of the Hessian of f; see `_of_power`. At the origin it depends on the direction from
-        which one comes: it is that of the direction z there."""
+        """Rows of the Hessian of f; see `_of_power`. At the origin its limit depends on the
+        direction of approach: it is that along z."""
         distance = length(p)
         at_origin = distance == 0
         u = dr.select(at_origin, type(p)(0, 0, 1), p / dr.select(at_origin, 1, distance))

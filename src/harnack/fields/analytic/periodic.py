@@ -1,6 +1,7 @@
 """Sums of Laplacian eigenfunctions, periodic minimal surfaces among them (paper, section 4.7).
 
-The harmonic extension of a sum of waves to four dimensions (paper, section 4.7.1).
+`EigenfunctionSum` is the field; `ExtensionRange` bounds the harmonic extension of such a sum to
+four dimensions (paper, section 4.7.1).
 """
 
 from __future__ import annotations
@@ -49,13 +50,13 @@ __all__ = [
     "sine",
 ]
 
-# Promised ends are moved out by this much for the roundings of float32.
+# Promised ends are moved outwards by this fraction for the roundings of float32.
 _ROUNDING_EXTENSION = 1e-5
 
 
 @dataclass(frozen=True)
 class ExtensionRange:
-    """What the harmonic extension of a sum of waves stays within on B(p, R) of R^4.
+    """Bounds of the harmonic extension of a sum of waves on B(p, R) of R^4.
 
     With f = sum f_i, Laplacian f_i = -kappa_i^2 f_i and |f_i| <= A_i, the extension is
     F(y, w) = sum cosh(kappa_i w) f_i(y): harmonic, F(., 0) = f, and smaller than the paper's
@@ -157,9 +158,9 @@ class ExtensionRange:
         return min(float(falling.max()), self.largest)
 
 
-# Constants are moved up by this much for the roundings of float32.
+# Constants are moved up by this fraction for the roundings of float32.
 _ROUNDING = 1e-5
-# And the bound of the Hessian by this much for the rounding of the gradient.
+# The bound of the Hessian is moved up by this fraction more for the rounding of the gradient.
 _SLOPE_SHARE = 1e-5
 
 
@@ -171,19 +172,20 @@ class EigenfunctionSum(Field):
         longest wavelength.
 
     Each term is an eigenfunction of the Laplacian, so cosh(kappa w) f with kappa^2 = -eigenvalue
-    is harmonic in R^4 and equals f at w = 0: see `ExtensionRange` for what it is bounded by. The
-    Lipschitz constant is local, |grad f(p)| + H r / 2 on the ball of radius r (Taylor), where
-    `curvature` H bounds the Hessian, and never above `steepness`.
+    is harmonic in R^4 and equals f at w = 0: see `ExtensionRange` for its bounds. The Lipschitz
+    constant is local, |grad f(p)| + H r / 2 on the ball of radius r (Taylor), where `curvature` H
+    bounds the Hessian, and never above `steepness`.
 
-    The rounding of the value is bounded at the point (`WaveRounding`). That of the gradient, E, is
-    part of it. `Curvature` is promised as (1 + h) H, h = `_SLOPE_SHARE`, and for all t
+    The rounding of the value is bounded at the point (`WaveRounding`). The rounding of the
+    gradient, E, is included in `Sample.error`. `Curvature` is promised as (1 + h) H, h =
+    `_SLOPE_SHARE`, and for all t
 
         E t <= E^2/(2 h H) + h H t^2/2   (2 a b <= a^2 + b^2):
 
-    the larger H and E^2/(2 h H) cover what Taylor's formula says with a rounded gradient. On the
-    harmonic ball of radius R it is E R, of which `balls.solve.rounding` pays for 16 u of the
-    mean 4 (f - lower)/R that the slope is measured by, f - lower being about H R^2/2 or more; only
-    what that leaves is added.
+    the larger H and E^2/(2 h H) cover the error of Taylor's formula with a rounded gradient. On the
+    harmonic ball of radius R it is E R, of which `enclosures.ball.rounding` covers 16 u of the mean
+    4 (f - lower)/R in units of which the slope enters, f - lower being about H R^2/2 or more; only
+    the rest is added.
 
     Raises:
         ValueError: terms that are not finite, or a sum that is constant.
@@ -246,14 +248,14 @@ class EigenfunctionSum(Field):
         return self._rounding.derivative_errors(p)
 
     def slope_change(self, p: Vec3, radius: Real) -> Real:
-        """As no second derivative exceeds `curvature`, nor does the norm of the Hessian."""
+        """radius * `curvature`, which bounds the norm of the Hessian."""
         return 0 * p.x + radius * (self.curvature * (1 + _ROUNDING))
 
     def check_levels(self, levels: tuple[float, ...]) -> None:
         check_in_range(levels, self.value_range)
 
     def wall_levels(self, half_width: float, *, level: float | None = None) -> tuple[float, float]:
-        """The two levels of the wall |f - level| <= half_width, as `solid=` wants them.
+        """The two levels of the wall |f - level| <= half_width, to be given as `solid=`.
 
         half_width is a difference of values of f, not a length: see `levels_of_thickness`.
         level: the middle of the wall, by default `default_level`.

@@ -1,8 +1,9 @@
-"""Names and mappings that stand for functions with branches.
+"""Functions of the plane: level curves of analytic functions, height fields, and functions by name.
 
-Level curves of harmonic functions of the plane, as walls: Harnack tracing in two dimensions.
-
-Height fields: the graph of a formula over the plane.
+- `branches_of`: the `Branches` that a name, a mapping or a user's function stands for.
+- `LevelCurves`: level curves of harmonic functions of the plane, extended to walls: Harnack tracing
+  in two dimensions.
+- `HeightField`: the graph of a formula over the plane.
 """
 
 from __future__ import annotations
@@ -49,10 +50,11 @@ if TYPE_CHECKING:
 __all__ = ["branches_of", "power_product"]
 
 _NAMES = ("log", "sqrt", "cbrt", "power", "asin")
-# Exponents are fractions with denominators up to this: so many sheets can still be told apart.
+# The largest denominator of an exponent, which is the number of sheets: more cannot be told apart.
 _MOST_SHEETS = 24
+# The largest exponent.
 _LARGEST = 6
-# A point at which a function of one's own is tried.
+# A point at which a user's function is tried.
 _PROBE = 0.31, 0.17
 
 
@@ -131,7 +133,11 @@ def power_product(exponents: Mapping[complex, Any]) -> PowerProduct:
 
 
 def _fraction(value: Any) -> Fraction:
-    """A number as the fraction with a small denominator that it is."""
+    """A number as a fraction with a small denominator.
+
+    Raises:
+        TypeError, ValueError: it is none.
+    """
     try:
         exact = Fraction(value)
     except (TypeError, ValueError, OverflowError):
@@ -214,8 +220,8 @@ def _refuse(what: str, **settings: Any) -> None:
         raise ValueError(f"{' and '.join(given)} cannot be given for {what}")
 
 
-# Radii of the disks on which the function is bounded, as parts of the distance to the nearest
-# singular point.
+# Radii of the disks on which the function is bounded, as fractions of the distance to the nearest
+# singular point, and the longest of them.
 _PARTS = (0.4, 0.8)
 _LONGEST = 1e6
 
@@ -231,9 +237,9 @@ class LevelCurves(Field):
     domain: the volume it is drawn in; by default the box |x|, |y| <= 2, |z| <= 1/4.
 
     Re g is harmonic in the plane: Harnack's inequality of dimension 2 holds in disks up to the
-    nearest singular point, and as |g''| is bounded there (`Branches.bend`) f moves by at most
-    |g'| r + |g''| r^2/2 on a disk of radius r. It promises that, as a ball of dimension 2, and the
-    second derivatives themselves.
+    nearest singular point, and as |g''| is bounded there (`Branches.bend`) f changes by at most
+    |g'| r + |g''| r^2/2 on a disk of radius r. The promises are that, as a ball of dimension 2, and
+    the bound of second derivatives.
 
     Raises:
         TypeError, ValueError: no such function, or one with several branches.
@@ -315,7 +321,7 @@ class LevelCurves(Field):
         return rounding, z, self.branches.at(z)[0]
 
 
-# The heights over the domain are bounded on so many cells a side.
+# Cells along a side of the grid on which the heights over the domain are bounded.
 _CELLS = 32
 
 
@@ -331,8 +337,8 @@ class HeightField(Formula):
         called while a kernel is being recorded, its numbers are literals of that kernel.
     domain: the volume it is drawn in, by default the box of all points with coordinates up to 1.
 
-    Along a ray f'' is that of u alone, and all that is proved is made of its ranges. Rays are
-    clipped to the heights that u has over the domain, as ranges of u on its cells prove.
+    Along a ray f'' is that of u alone, and steps are proved from its ranges. Rays are clipped to
+    the range of heights that u has over the domain, which is proved on a grid of cells.
 
         hk.HeightField(lambda x, y: 0.3 * hk.sin(3 * x) * hk.cos(3 * y))
 
@@ -363,7 +369,7 @@ class HeightField(Formula):
         return self
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """The domain, between the least and the largest height that a level can have over it."""
+        """The domain, cut to the heights that the levels can have over it."""
         assert self.domain is not None
         lower, upper = self.domain.bounds()
         low, high = self._heights(lower, upper)
@@ -371,7 +377,6 @@ class HeightField(Formula):
         low, high = low + min(levels) - slack, high + max(levels) + slack
         if not (np.isfinite([low, high]).all() and (low > lower[2] or high < upper[2])):
             return self.domain
-        # Where no surface is left, a box that holds none of the domain's.
         bottom, top = max(low, lower[2] - slack), min(high, upper[2] + slack)
         if bottom >= top:
             return self.domain
@@ -381,7 +386,7 @@ class HeightField(Formula):
         return Intersection((self.domain, slab))
 
     def _heights(self, lower: FloatArray, upper: FloatArray) -> tuple[float, float]:
-        """Proved: u stays within these over the domain's box."""
+        """Proved bounds of u over the domain's box."""
         backend = choose_backend("double")
         size = (upper - lower)[:2] / _CELLS
         cells = np.indices((_CELLS, _CELLS)).reshape(2, -1).T + 0.5

@@ -1,18 +1,7 @@
 """Harmonic polynomials and spherical harmonics, clipped to a ball (paper, section 4.1).
 
-What a sum of solid harmonics promises on balls about a point of the unit ball.
-
-The promise at p is for a ball B(p, R), in the ball of radius |p| + R about the origin, where
-`BallRange` bounds the polynomial. The paper takes the fixed ball |y| <= 1.25; near level 0 a step
-loses to the second-order term of the bound, proportional to (range on |y| <= |p|+R)/R^2, so R is
-chosen to make that least: 2|p|/(l-2) for a single degree l > 2. With the slope bound Y_(8,4) took
-19 evaluations a ray, with the fixed ball 30 (27 at best, for 1.15); Y_(12,5) took 24 and 61 (50).
-
-Where f vanishes to a high order, at the origin or along the z axis, R goes to zero with the
-distance from there, and what is promised on the ball as f does: every step is then a share of that
-distance. With any other radius or range steps would fall behind it, and rays that pass by would
-never arrive. Levels other than that at the origin need a wide ball there: one promise (`Curvature`;
-`Lipschitz` for bounds that know none) keeps a least radius.
+`SphericalHarmonic` and `HarmonicPolynomial` are sums of solid harmonics; `HarmonicPromises` are
+what such a sum promises near a point.
 """
 
 from __future__ import annotations
@@ -57,28 +46,45 @@ if TYPE_CHECKING:
 
 __all__ = ["HarmonicPolynomial", "SphericalHarmonic"]
 
-# Promised ends are moved out by this much of their distance for the roundings of float32.
+# Promised ends are moved outwards by this fraction for the roundings of float32.
 _ROUNDING = 1e-5
-# Bounds of the Hessian are larger by this much, which pays for the rounding of the gradient.
+# Bounds of the Hessian are larger by this fraction, which covers the rounding of the gradient.
 _SLOPE_SHARE = 1e-5
-# Radii of harmonic balls tried, in units of the ball about the domain.
+# Radii of harmonic balls that are tried, in units of the radius of the ball about the domain.
 _RADII = np.geomspace(0.1, 8.0, 200)
-# Radii of the balls on which the Hessian is bounded, by experiment: two of unlike size, in
-# |p|/(l-2), the larger one at least so much; near an axis of high order m, in rho/(m-2).
+# Radii of the balls on which the Hessian is bounded, by experiment: a smaller and a larger one in
+# units of |p|/(l-2), and the least value of the larger; near an axis of high order m, in rho/(m-2).
 _NEAR, _WIDE, _LEAST, _BESIDE_AXIS = 0.4, 0.75, 0.1, 0.5
-# Balls at a zero of high order have a radius nonetheless, that of such a distance.
+# The distance to a zero of high order counts as at least this, so that no ball has the radius 0.
 _ORIGIN = 1e-9
 
 
 @dataclass(frozen=True)
 class HarmonicPromises:
-    """Promises of a sum of solid harmonics at a point with distances rho and r.
+    """Promises of a sum of solid harmonics at a point of the unit ball, at the distances rho from
+    the z axis and r from the origin.
 
+    The promise at p is for a ball B(p, R), in the ball of radius |p| + R about the origin, where
+    `BallRange` bounds the polynomial. The paper takes the fixed ball |y| <= 1.25. Near level 0
+    steps are shortened by the second-order term of the bound, which is proportional to
+    (range on |y| <= |p|+R)/R^2, so R is chosen to make that least: 2|p|/(l-2) for a single degree
+    l > 2. With the slope bound Y_(8,4) took 19 evaluations a ray, with the fixed ball 30 (27 at
+    best, for 1.15); Y_(12,5) took 24 and 61 (50).
+
+    Where f vanishes to a high order, at the origin or along the z axis, R goes to zero with the
+    distance from there, and the range on the ball as f does: every step is then a fraction of that
+    distance. With any other radius or range, steps would become smaller than such a fraction, and
+    rays that pass by would never arrive. Levels other than that at the origin need a wide ball
+    there: one promise (`Curvature`, or `Lipschitz` for proofs that do not use it) has a least
+    radius.
+
+    known: ranges on balls about the origin.
     degree, lowest: the largest degree of a term, and the smallest above 0.
     order: to which the sum, less its constant, vanishes along the z axis.
     inner, outer: radii of harmonic balls at r = 0 and r = 1.
-    axis_share: the share of r below which rho says how large a ball is.
-    value, gradient, hessian: bounds near an axis of order 3 or more, None where the order is less.
+    axis_share: where rho is less than this fraction of r, rho decides how large a ball is.
+    axial: bounds of value, gradient and Hessian near an axis of order 3 or more; None if the order
+        is less.
     rounding: of value and gradient as they are evaluated.
     """
 
@@ -157,18 +163,18 @@ class HarmonicPromises:
         return Lipschitz(dr.fma(constant, 1 + _ROUNDING, self._smallest(r)), radius)
 
     def error(self, rho: Real, r: Real, curvature: Curvature) -> Real:
-        """How far rounding may have moved the value, and the gradient in what follows from it.
+        """A bound of the rounding of the value, with the effect of the rounding of the gradient.
 
         curvature: the promise of the smallest ball. With E, a bound of the rounding of the
         gradient, and H, of the Hessian, promised as (1 + h) H with h = `_SLOPE_SHARE`,
 
             E t <= E^2/(2 h H) + h H t^2/2   for all t   (2 a b <= a^2 + b^2),
 
-        so what the exact Taylor polynomial does beyond the rounded one is covered by the larger
-        promise and by E^2/(2 h H) added to the error of the value. Without second derivatives the
-        gradient is constant and right to a few u of itself, less than the tracer allows for the
-        rounding of points (8 u |grad f| times their size). For a harmonic ball E R is a few u of
-        the range, of which `enclosures.balls.solve.rounding` covers 16 u.
+        so the difference of the exact Taylor polynomial from the rounded one is covered by the
+        larger promise and by E^2/(2 h H) added to the error of the value. Without second
+        derivatives the gradient is constant and right to a few u of itself, less than the tracer
+        allows for the rounding of points (8 u |grad f| times their size). For a harmonic ball E R
+        is a few u of the range, of which `enclosures.ball.rounding` covers 16 u.
         """
         unit = float(dr.epsilon(type(r)))  # u, half the distance from 1 to the next number
         error = dr.fma(self.rounding.value(rho, r), unit, self._smallest(r))
@@ -195,7 +201,7 @@ class HarmonicPromises:
         return fmax(radius, _ORIGIN * self.outer)
 
     def _smallest(self, r: Real) -> float:
-        """What numbers too small for the exponent may have lost of any sum here."""
+        """A bound of what underflow may have cost any sum here."""
         return self.rounding.lost * max(1, self.degree) ** 2 * float(dr.smallest(type(r)))
 
 
@@ -213,7 +219,8 @@ class _SolidHarmonics(Field):
     def __init__(
         self, weights: Weights, known: BallRange, size: float, domain: Volume, axis: int = 2
     ) -> None:
-        """axis: of p, that is z of the solid harmonics; x and y follow it cyclically."""
+        """axis: the coordinate of p that is the z of the solid harmonics; x and y follow it
+        cyclically."""
         self.domain = domain
         self._axis = axis
         self._weights = weights
@@ -244,7 +251,7 @@ class _SolidHarmonics(Field):
         return type(p)(*_turned((p.x, p.y, p.z), self._axis + 1)) / self._size
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """Rows of the Hessian, free of trace to rounding."""
+        """Rows of the Hessian, whose trace is 0 up to rounding."""
         s, share, k = self._local(p), 1 / self._size**2, -self._axis - 1
         xx, yy, zz, xy, xz, yz = (share * one for one in hessian(self._weights, s.x, s.y, s.z))
         rows = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
@@ -325,7 +332,7 @@ class HarmonicPolynomial(_SolidHarmonics):
 
 
 def _turned(three: Sequence[Any], n: int) -> tuple[Any, Any, Any]:
-    """Three things moved n places to the front, cyclically: (x, y, z) becomes (y, z, x) for 1."""
+    """Three things rotated by n places: (x, y, z) becomes (y, z, x) for n = 1."""
     return three[n % 3], three[(n + 1) % 3], three[(n + 2) % 3]
 
 

@@ -29,21 +29,25 @@ if TYPE_CHECKING:
     from harnack.fields.analytic.branches import Branch, Complex, PreparedPoint
     from harnack.geometry import Volume
 
-# Second derivatives are bounded on the way ahead as far as is asked, and to these parts of the
-# distance to the nearest singular point; the best of several sets by experiment.
+# Second derivatives along the ray are bounded on the whole length asked for, and on these fractions
+# of the distance to the nearest singular point; the best of several sets by experiment.
 _PARTS = (0.4, 0.8)
-# Promises hold in disks of this part of that distance.
+# Promises hold in disks whose radius is this fraction of that distance.
 _DISK = 0.5
-# No part of a path is longer than this.
+# The longest length of a path on which anything is proved.
 _LONGEST = 1e6
-# Second derivatives are widened by this much for the rounding of slopes.
+# Bounds of second derivatives are multiplied by this, for the rounding of slopes.
 _WIDENED = 1 + 1e-4
 
 
 @dataclass(frozen=True)
 class _Graph:
-    """One sheet at a point: its phi = h - u, with its gradient in the plane, that of -u, and the
-    sign that it gives to the product of all."""
+    """One sheet at a point.
+
+    phi: h - u.
+    x, y: the gradient of phi in the plane, that of -u.
+    side: the sign that it contributes to the product of all phi.
+    """
 
     phi: Real
     x: Real
@@ -59,16 +63,20 @@ class _Graph:
         return dr.fma(self.x, direction.x, dr.fma(self.y, direction.y, direction.z))
 
     def touches(self, other: _Graph) -> Mask:
-        """Whether phi and its gradient are those of the other, as of a sheet and itself. On a line
+        """Whether phi and its gradient are those of the other, as for a sheet and itself. On a line
         of symmetry those of two sheets agree in all but y, and f has a crease."""
         return (self.phi == other.phi) & (self.x == other.x) & (self.y == other.y)
 
 
 @dataclass(frozen=True)
 class _Place:
-    """Everything at a point: all sheets, which of them is the nearest, and f = sign phi.
+    """All sheets at a point.
 
-    error: of phi, all sheets, by arithmetic. rounding: how far the point may have been moved.
+    z, h: the point: in the plane, and the height.
+    nearest: the sheet with the smallest |phi|.
+    sign: f is sign times its phi.
+    error: of all phi, by arithmetic.
+    rounding: of the position of the point.
     """
 
     z: Complex
@@ -104,22 +112,22 @@ class RiemannSurface(Field):
         radius 4 for "log" and 2 for "asin".
 
     With several branches f = s min_j |phi_j|, phi_j = h - Im g_j, s the sign of the product of all
-    phi_j: it is continuous and single-valued, as the product is, and zero on the surface alone.
-    With one branch f = phi, of a logarithm up to its period. solid=(-w, w) makes the surface a wall
+    phi_j: it is continuous and single-valued, as the product is, and zero only on the surface. With
+    one branch f = phi, for a logarithm up to its period. solid=(-w, w) makes the surface a wall
     whose points are at most w above or below it.
 
-    Proof. Along a ray the set of branches is continued as long as no singular point is met: so no
-    cut matters, and no branch is called the first. `Nearest` takes the minimum over all of the
-    steps in which one can be reached, from their slopes and a bound of |g''| on the stretch of the
-    plane below the ray, which all share (`Branches.bend`): |d^2 phi_j/ds^2| <= |g''| |w|^2, w the
-    ray's shadow, for h is linear. So what is the nearest sheet may change between two points looked
-    at: from each of them, ahead or back, all are proved to be out of reach. Beside branch points
-    with a power > 0 all branches are near one value, and a ray that passes at another height is
-    taken through by `Cusp`.
+    Proof. Along a ray the set of branches is continued as long as no singular point is met: so
+    branch cuts and the numbering of branches do not matter. `Nearest` takes the minimum over all
+    sheets of the step in which it could be reached, from their slopes and a bound of |g''| on the
+    segment of the plane below the ray, which all share (`Branches.bend`): |d^2 phi_j/ds^2| <=
+    |g''| |w|^2, w the projection of the ray's direction to the plane, for h is linear. So the
+    nearest sheet may change between two samples: from each of them, ahead or back, all sheets are
+    proved to be out of reach. Near branch points with a power > 0 all branches are near one value,
+    and for a ray that passes at another height `Cusp` proves the step.
 
-    A point is a hit if f is within the tolerance times |grad f| of 0 and, beside such a branch
-    point, if the surface is not proved to be farther away: where the slope grows without bound,
-    f/|grad f| is no distance. Beside poles and logarithms every height is near the surface.
+    A point is a hit if f is within the tolerance times |grad f| of 0 and, near such a branch point,
+    if the surface is not proved to be farther away: where the slope grows without bound, f/|grad f|
+    is no distance. Near poles and logarithms every height is near the surface.
 
     Raises:
         TypeError, ValueError: settings that do not belong together, or that are no such function.
@@ -168,7 +176,7 @@ class RiemannSurface(Field):
         return made
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """The domain, and the heights that the surface can have over it."""
+        """The domain, cut to the heights that the surface can have over it."""
         if self.domain is None or self._shift is not None:
             return self.domain
         most = self._highest()
@@ -202,9 +210,9 @@ class RiemannSurface(Field):
         steepest: Real = 0.0
         for sheet in place.sheets:
             steepest = fmax(sheet.steepness, steepest)
-        # Where another sheet may become the nearest: |phi_j| - |phi_i| may fall by so much.
-        # Sheets that touch there have one value and gradient, and stay within one parabola; but the
-        # nearest of two is not harmonic.
+        # The radius within which no other sheet can become the nearest: |phi_j| - |phi_i| > 0.
+        # Sheets that touch here have the same value and gradient, and stay within the same
+        # parabola; but the nearest of two is not harmonic.
         same, touching = radius, 0 * radius
         for sheet in place.sheets:
             lead = fmax(dr.abs(sheet.phi) - dr.abs(place.nearest.phi), 0)
@@ -228,7 +236,7 @@ class RiemannSurface(Field):
         )
 
     def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
-        """With all sheets along the ray, and not in all directions."""
+        """The look with proofs from all sheets along the ray, instead of from promises."""
         p, d = path.point(t), path.direction
         if Pieces not in path.proofs.kinds:
             return path.look(self.evaluate(p))
@@ -243,7 +251,7 @@ class RiemannSurface(Field):
         forwards = [self._enclosure(place, d, shadow, length) for length in lengths]
         if not self._is_single:
             forwards += self._cusps(place, d, shadow)
-        # A little longer than asked, as steps are rounded down.
+        # A little longer than asked for, as steps are rounded down.
         back = fmin(back, _LONGEST) * (1 + 1e-5)
         backwards = (self._enclosure(place, -d, -shadow, back),)
         return Look(sample, tuple(forwards), backwards, slope)
@@ -288,13 +296,15 @@ class RiemannSurface(Field):
         return dr.abs(self._height)
 
     def _rounding(self, p: Vec3) -> Real:
-        """How far rounding may have moved a point in the plane, generously."""
+        """A generous bound of the rounding of a point in the plane."""
         return 4 * backend_of(p).epsilon * largest_coordinate(p)
 
     def _graphs(self, p: Vec3, branches: tuple[Branch, ...]) -> list[_Graph]:
-        """phi of all sheets; with a period and several branches, of two next to the point each.
+        """phi of all sheets; with a period and several branches, of the two sheets of each branch
+        next to the point.
 
-        There the product is that of sin(pi phi/period), of unshifted phi: sin u - sin h of asin.
+        Then the product is that of sin(pi phi/period), with phi not shifted: sin u - sin h for
+        asin.
         """
         made: list[_Graph] = []
         others: list[_Graph] = []
@@ -318,13 +328,13 @@ class RiemannSurface(Field):
         branches = self.branches.at(z)
         units = self._size * self.branches.roundings(z, branches) + 4 * dr.abs(p.z)
         error = backend_of(p).epsilon * units
-        for point in self.branches.points_on(z):  # values are not rounded there as slopes say
+        for point in self.branches.points_on(z):  # slopes do not bound the rounding of values there
             if point.power is not None:
                 close = abs(z - point.at) <= 2 * rounding
                 jump = 2 * self._size * point.constant * dr.power(3 * rounding, point.power)
                 error += dr.select(close, jump, 0)
         graphs = self._graphs(p, branches)
-        for sheet in graphs:  # of which one that is not a number is never the nearest
+        for sheet in graphs:  # NaN would never be chosen as the nearest
             error = dr.select(dr.isnan(sheet.phi), dr.nan, error)
         return self._choose(z, p.z, graphs, error, rounding)
 
@@ -351,16 +361,16 @@ class RiemannSurface(Field):
         nearest, sign = place.nearest, place.sign
         vector = backend_of(nearest.phi).Array3f
         gradient = vector(sign * nearest.x, sign * nearest.y, sign)
-        # Only a hit if the surface is not proved to be farther away than f/|grad f|.
+        # No hit if the surface is proved to be farther away than f/|grad f|.
         norm, beyond = dr.norm(gradient), self._proved_distance(place)
         slower = dr.abs(nearest.phi) / beyond
         doubt = dr.select(beyond > 0, fmax(norm - slower, 0), 0)
         return Sample(place.value, gradient, (), place.error, doubt)
 
-    # Beside branch points.
+    # Near branch points.
 
     def _ends_of_branches(self, place: _Place) -> list[tuple[PreparedPoint, Complex, Real]]:
-        """Branch points with a power, where z lies from them, and the height over their value."""
+        """Branch points with a power, z relative to each, and the height over their value."""
         made: list[tuple[PreparedPoint, Complex, Real]] = []
         if self._is_single:
             return made
@@ -375,7 +385,7 @@ class RiemannSurface(Field):
         return made
 
     def _cusps(self, place: _Place, d: Vec3, shadow: Complex) -> list[Enclosure]:
-        """What is proved beside branch points where all branches meet."""
+        """Enclosures near branch points where all branches meet."""
         made: list[Enclosure] = []
         speed = abs(shadow)
         for point, away, y in self._ends_of_branches(place):
@@ -394,11 +404,12 @@ class RiemannSurface(Field):
         return made
 
     def _proved_distance(self, place: _Place) -> Real:
-        """A length that the surface is proved to be away beside a branch point; 0 for none.
+        """A proved lower bound of the distance to the surface near a branch point; 0 if there is
+        none.
 
-        With y the height over the value there, a ball of radius r about p holds nothing of the
+        With y the height over the value there, a ball of radius r about p contains nothing of the
         surface if C (|z - a| + r)^alpha <= y - r: so if r <= m and that power is y - m, for any m.
-        Tried are m = y/2, and the m by which that power is y at r = m, for which it is nearly sharp
+        Two m are tried: y/2, and the one for which that power is y at r = m, which is nearly sharp
         where the surface is steep.
         """
         beyond = 0 * place.h
@@ -415,11 +426,12 @@ class RiemannSurface(Field):
     # Along a ray.
 
     def _enclosure(self, place: _Place, d: Vec3, shadow: Complex, length: Real) -> Enclosure:
-        """What is proved for a length along a ray with direction d and its shadow in the plane."""
+        """The enclosure for a length along a ray with direction d; shadow: the projection of d to
+        the plane."""
         stretch = Stretch(place.z, shadow, length, place.rounding)
         bend = self._size * self.branches.bend(stretch)
         speed = abs(shadow)
-        # Slopes are rounded, and the point is where rounding has put it.
+        # For the rounding of slopes, and of the position of the point.
         epsilon = backend_of(d).epsilon
         moved = dr.select(speed > 0, bend * place.rounding, 0)
         bend = dr.select(speed > 0, bend * dr.square(speed) * _WIDENED, 0)
@@ -445,5 +457,5 @@ class RiemannSurface(Field):
 
     @staticmethod
     def _extra(sheet: _Graph, place: _Place) -> Real:
-        """By how much more than the nearest a sheet may be off by the rounding of the point."""
+        """How much more the rounding of the point may change phi of a sheet than of the nearest."""
         return fmax(sheet.steepness - place.nearest.steepness, 0) * place.rounding

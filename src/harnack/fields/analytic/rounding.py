@@ -1,41 +1,11 @@
-"""How far rounding moves `solid_harmonics.evaluate` at a point, from its distances rho and r.
+"""Bounds of the rounding of sums of solid harmonics, and of sums of waves.
 
 Everything here is to first order in u, the unit roundoff (eps/2 of the precision in use): each
-operation is right up to a factor 1 + d, |d| <= u, so errors of factors add up. What is of second
-order is below 1e-4 of it in single precision and covered by `_SECOND_ORDER`. With z = r c:
+operation is right up to a factor 1 + d, |d| <= u, so errors of factors add up. Terms of second
+order are below 1e-4 of that in single precision and covered by `_SECOND_ORDER`.
 
-- r^2 = x^2 + y^2 + z^2 is off by 3u of itself.
-- q_l = A z q_(l-1) - B r^2 q_(l-2), A and B the rounded coefficients of the recurrence: a step
-  commits up to g_l = 4u |A z q_(l-1)| + 7u |B r^2 q_(l-2)| and passes on what earlier steps did by
-  the same recurrence, so the error of q_l is at most the sum over k of |G_lk| g_k, where G_lk is
-  the recurrence begun with G_kk = 1 and 0 before. In units of u r^(l-m) it is a function of c
-  alone, whose largest value is found by sampling: `growth`.
-- (x + iy)^m: a product of complex numbers is off by at most 2 sqrt(2) u of its size (each component
-  by 2u (|x c| + |y s|) or 2u (|x s| + |y c|), and 4 |x c y s| <= rho^2 |w|^2), the first by
-  nothing: 2 sqrt(2) (m-1) u rho^m.
-- A term of the sum: 3u for its weight and two products; then u for each further term of its order
-  and for each further order.
-- A point divided by the size of the domain: 3u of each coordinate, that is 3u (rho |f_rho| +
-  |z f_z|).
-
-Numbers too small for the exponent are lost altogether: the smallest normal number for each
-operation, times what the recurrence makes of it.
-
-How far rounding moves `waves.evaluate_terms` at a point p, in units of u (the unit roundoff).
-
-Everything is to first order in u, as in `harmonic_rounding`. A sine or cosine is right to 2u
-(`backend.sines`).
-
-- The angle of a factor, fl(fl(k) x + phase), is off by c u |k x|, c = 2 for the two roundings of
-  the product, 0 where k is a power of two; where there is a phase by 2u |phase| and u |k x| more.
-  Where all factors of an axis have one |k|, the first is the same for all of them: a move of the
-  point by c u |x|, after which value *and* gradient are those of the moved point.
-- The angle of a plane wave is off by 5u sum |k_i x_i| + 2u |phase|.
-- A product of n factors is off by n times that of a sine, by u for each product with a factor and
-  2u for an amplitude other than 1; a partial sum by u of its size.
-- A derivative along one axis carries the frequency as well: 2u more; a second derivative 6u.
-  Of an entry i, j of the Hessian the error is at most d |k_i| |k_j|, which as a matrix has the
-  norm d |k|^2.
+- `HarmonicRounding`: of `solid_harmonics.evaluate`.
+- `WaveRounding`: of `waves.evaluate_terms`.
 """
 
 from __future__ import annotations
@@ -64,20 +34,42 @@ from harnack.fields.analytic.waves import Factor, PlaneWave, Term
 if TYPE_CHECKING:
     from harnack.backend import Real, Vec3
 
-# Sums of products of sizes of polynomials in cos(a), of degree 24 at most, are sampled this
-# finely in a; between samples each factor moves by 24 pi/2/_SAMPLES of its largest size at most
-# (Bernstein), which together with what is of second order in u is covered by the factor.
+# Sums of products of sizes of polynomials in cos(a), of degree 24 at most, are sampled at so many
+# a; between samples each factor changes by at most 24 pi/2/_SAMPLES of its largest size
+# (Bernstein), which the second number covers, together with terms of second order in u.
 _SAMPLES = 4000
 _SECOND_ORDER = 1.03
 
 
 @dataclass(frozen=True)
 class HarmonicRounding:
-    """Rounding of value and gradient of a sum, in units of u, at a point of the unit ball.
+    """Rounding of value and gradient of a sum of solid harmonics, in units of u, at a point of the
+    unit ball with the distances rho from the z axis and r from the origin.
 
-    Of each the smaller of two bounds counts: one that is sharp near the axis, in powers of rho and
-    r, and one in powers of r alone (the largest of c rho^m on the sphere, and not the largest c).
-    lost: what numbers too small for the exponent add to the value, in smallest normal numbers.
+    value_bounds, gradient_bounds: two bounds each, the smaller of which is used: one that is sharp
+        near the axis, in powers of rho and r, and one in powers of r alone (the largest of c rho^m
+        on the sphere, and not the largest c).
+    lost: what underflow adds to the value, in smallest normal numbers.
+
+    With z = r c:
+
+    - r^2 = x^2 + y^2 + z^2 is off by 3u of itself.
+    - q_l = A z q_(l-1) - B r^2 q_(l-2), A and B the rounded coefficients of the recurrence: a step
+      adds an error of up to g_l = 4u |A z q_(l-1)| + 7u |B r^2 q_(l-2)|, and propagates those of
+      earlier steps by the same recurrence, so the error of q_l is at most the sum over k of
+      |G_lk| g_k, where G_lk is the recurrence begun with G_kk = 1 and 0 before. In units of
+      u r^(l-m) it is a function of c alone, whose largest value is found by sampling
+      (`_recurrence`).
+    - (x + iy)^m: a product of complex numbers is off by at most 2 sqrt(2) u of its size (each
+      component by 2u (|x c| + |y s|) or 2u (|x s| + |y c|), and 4 |x c y s| <= rho^2 |w|^2), the
+      first by nothing: 2 sqrt(2) (m-1) u rho^m.
+    - A term of the sum: 3u for its weight and two products; then u for each further term of its
+      order and for each further order.
+    - A point divided by the size of the domain: 3u of each coordinate, that is 3u (rho |f_rho| +
+      |z f_z|).
+
+    Numbers that underflow are lost altogether: the smallest normal number for each operation, times
+    the factor by which the recurrence may enlarge it.
     """
 
     value_bounds: tuple[AxialBound, AxialBound]
@@ -86,7 +78,7 @@ class HarmonicRounding:
 
     @classmethod
     def of(cls, weights: Weights, *, is_divided: bool) -> HarmonicRounding:
-        """is_divided: whether points are divided by a size other than 1 before."""
+        """is_divided: whether points are divided by a size other than 1 first."""
         tables: list[dict[tuple[int, int], float]] = [{}, {}, {}, {}]
         orders = len({m for _, m in weights})
         lost = 1.0
@@ -111,19 +103,20 @@ class HarmonicRounding:
         return cls((a, b), (c, d), lost)
 
     def value(self, rho: Real, r: Real) -> Real:
-        """Of the value, in units of u."""
+        """The bound for the value, in units of u."""
         near, anywhere = self.value_bounds
         return fmin(near(rho, r), anywhere(rho, r))
 
     def gradient(self, rho: Real, r: Real) -> Real:
-        """Of the gradient, a length, in units of u."""
+        """The bound for the gradient, as a length, in units of u."""
         near, anywhere = self.gradient_bounds
         return fmin(near(rho, r), anywhere(rho, r))
 
 
 @functools.cache
 def _recurrence(l: int, m: int) -> tuple[FloatArray, FloatArray, float]:  # noqa: E741
-    """|Q|, its error in units of u, and the sum of |G_lk| times coefficients, on the grid of c."""
+    """|Q| and its error in units of u, on the grid of c; and the sum over k of the largest |G_lk|
+    times coefficients."""
     c, _ = polar_samples(_SAMPLES)
     q = Legendre(c, 1.0)
     zero, one = 0.0 * c, 0.0 * c + 1.0
@@ -150,7 +143,7 @@ def _product(m: int) -> float:
 
 
 def _of_value(l: int, m: int, sums: int, is_divided: bool) -> tuple[float, float]:  # noqa: E741
-    """In units of u rho^m r^(l-m), and of u r^l."""
+    """The two bounds for the value of a term, in units of u rho^m r^(l-m), and of u r^l."""
     q, error, _ = _recurrence(l, m)
     c, s = polar_samples(_SAMPLES)
     total = error + (3 + sums + _product(m)) * q
@@ -161,11 +154,13 @@ def _of_value(l: int, m: int, sums: int, is_divided: bool) -> tuple[float, float
 
 
 def _of_gradient(l: int, m: int, sums: int, is_divided: bool) -> tuple[float, float]:  # noqa: E741
-    """Of (gx, gy, gz) in units of u rho^(m-1) r^(l-m) (m = 0: u r^(l-1)), and of u r^(l-1).
+    """The two bounds for the gradient of a term, in units of u rho^(m-1) r^(l-m) (m = 0: u
+    r^(l-1)), and of u r^(l-1).
 
-    As `evaluate` sums it up: 4u for weights, coefficients and products in each part, 2u for the two
-    terms of gx and gy, then the sums. The point divided by the size: 3u (rho |H| + |z grad f_z|),
-    f_z = (l+m) Q_(l-1)^m B being of degree l-1 and order m; and 3u for the gradient divided by it.
+    In the order in which `evaluate` computes it: 4u for weights, coefficients and products in each
+    component, 2u for the two terms of gx and gy, then the sums. If the point is divided by a size,
+    3u (rho |H| + |z grad f_z|), f_z = (l+m) Q_(l-1)^m B being of degree l-1 and order m; and 3u for
+    the gradient divided by the size.
     """
     _, s = polar_samples(_SAMPLES)
     each = 4 + 2 + 2 * sums + _product(m) + (3 if is_divided else 0)
@@ -197,6 +192,7 @@ def _lost(l: int, m: int) -> float:  # noqa: E741
     return spread + (2 * m + 2) * float(q.max()) + 2
 
 
+# The rounding of a sine or cosine in units of u (`backend.elementary.sincos`).
 _SINE = 2.0
 
 Share: TypeAlias = tuple[float, float, float, float]
@@ -204,13 +200,27 @@ Share: TypeAlias = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class WaveRounding:
-    """Rounding of a sum of waves in units of u.
+    """Rounding of a sum of waves at a point p, in units of u.
 
-    move: (x, y, z) by how much of each coordinate rounding moves the point for all terms alike.
-    value, gradient: (constant, x, y, z), the rest of the rounding: the constant plus those times
-        the sizes of the coordinates.
-    slopes, hessian: the same, of all that is done to the gradient and the Hessian at the point
-        that was given: no part of it is a move.
+    move: (x, y, z): the rounding that is the same for all terms moves the point by so much of each
+        coordinate.
+    value, gradient: (constant, x, y, z), the rest of the rounding: the constant, plus x, y and z
+        times the sizes of the coordinates.
+    slopes, hessian: the same for the whole rounding of the gradient and the Hessian, without taking
+        any of it for a move of the point.
+
+    A sine or cosine is right to 2u (`backend.elementary.sincos`).
+
+    - The angle of a factor, fl(fl(k) x + phase), is off by c u |k x|, c = 2 for the two roundings
+      of the product, 0 where k is a power of two; with a phase by 2u |phase| and u |k x| more.
+      Where all factors of an axis have the same |k|, the first is the same for all of them: a move
+      of the point by c u |x|, after which value *and* gradient are those of the moved point.
+    - The angle of a plane wave is off by 5u sum |k_i x_i| + 2u |phase|.
+    - A product of n factors is off by n times that of a sine, by u for each product with a factor
+      and 2u for an amplitude other than 1; a partial sum by u of its size.
+    - A derivative along one axis contains the frequency as well: 2u more; a second derivative 6u.
+      The error of an entry i, j of the Hessian is at most d |k_i| |k_j|, which as a matrix has the
+      norm d |k|^2.
     """
 
     move: tuple[float, float, float]
@@ -221,7 +231,7 @@ class WaveRounding:
 
     @classmethod
     def of(cls, terms: Sequence[Term]) -> WaveRounding:
-        """What the operations of `evaluate_terms` add up to."""
+        """The rounding of the operations of `evaluate_terms`."""
         common = [_common(terms, axis) for axis in range(3)]
         value, gradient, alone, second = ([0.0] * 4 for _ in range(4))
         sizes, slopes, bends = 0.0, 0.0, 0.0
@@ -247,7 +257,7 @@ class WaveRounding:
         return cls((moves[0], moves[1], moves[2]), a, b, c, d)
 
     def errors(self, p: Vec3, gradient: Vec3) -> tuple[Real, Real]:
-        """Errors of value and gradient at p; the latter once the point is moved as `move` says."""
+        """Errors of value and gradient at p; of the gradient after the point is moved by `move`."""
         size = [dr.abs(p.x), dr.abs(p.y), dr.abs(p.z)]
         value, slope = self.value[0], self.gradient[0]
         for axis in range(3):
@@ -277,7 +287,7 @@ def _vector(term: Term) -> tuple[float, ...]:
 
 
 def _common(terms: Sequence[Term], axis: int) -> float | None:
-    """The one |frequency| of all terms along an axis; None where there are more."""
+    """The |frequency| that all terms share along an axis; None if they have several."""
     found: set[float] = set()
     for term in terms:
         if isinstance(term, PlaneWave):
@@ -289,13 +299,13 @@ def _common(terms: Sequence[Term], axis: int) -> float | None:
 
 
 def _rounded(frequency: float) -> float:
-    """The rounding of frequency and product together; none for powers of two."""
+    """The rounding of frequency and product together: none for powers of two."""
     return 0.0 if abs(math.frexp(frequency)[0]) == 0.5 else 2.0
 
 
 def _of_term(term: Term, common: Sequence[float | None]) -> tuple[float, list[float], float]:
-    """Of a term of amplitude 1: the rounding of its angles, constant and by the coordinates' sizes,
-    and that of its operations."""
+    """For a term of amplitude 1: the rounding of its angles, the constant part and that in units of
+    the coordinates' sizes, and the rounding of its operations."""
     if isinstance(term, PlaneWave):
         operations = _SINE + 2
         return 2 * abs(term.phase), [5 * abs(k) for k in term.wave_vector], operations

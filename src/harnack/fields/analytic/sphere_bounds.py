@@ -1,21 +1,7 @@
-"""Bounds of sums of solid harmonics by the distances rho and r to the z axis and to the origin.
+"""Proved bounds of sums of solid harmonics, from samples and Bernstein's inequality.
 
-r^l Y_lm vanishes to order |m| along the z axis and to order l at the origin. There it, its
-derivatives and the rounding of both are far smaller than anywhere else on the sphere of radius r,
-and a bound that is to be of use there must shrink with both distances: it is a sum of terms
-c rho^i r^j with c >= 0. As such a sum rises with rho and r, its value at (rho(p) + R, |p| + R)
-bounds whatever it bounds on the whole ball B(p, R).
-
-Every r^l Y_lm is homogeneous, so a constant c need only be found on the unit sphere. With Q = Q_l^m
-of `solid_harmonics`, x + iy = sin(a) exp(i b) and z = cos(a), the functions to be bounded are
-trigonometric polynomials of degree at most l in the polar angle a once the power of sin(a) is taken
-out, and of degree 1 in m b: samples and Bernstein's inequality prove their largest values, as in
-`sphere_range.proved_range`.
-
-Proved ranges of harmonic polynomials on spheres and balls about the origin.
-
-By the maximum principle a range on a sphere is one on its ball. Sampling alone proves nothing;
-sampling with Bernstein's inequality does.
+- `AxialBound`: by the distances rho and r to the z axis and to the origin.
+- `BallRange`: ranges on spheres and balls about the origin.
 """
 
 from __future__ import annotations
@@ -54,14 +40,26 @@ __all__ = [
 ]
 
 _ANGLES = 720  # intervals of the polar angle from pole to pole
-_TURNS = 24  # azimuths over half a turn of m b
+_TURNS = 24  # samples of m b over half a turn
 
 
 @dataclass(frozen=True)
 class AxialBound:
-    """The sum of c rho^i r^j, c >= 0.
+    """A bound that is a sum of terms c rho^i r^j, c >= 0, rho and r the distances to the z axis and
+    to the origin.
 
-    rows: (i, ((j, c), ...)) with i and j falling.
+    rows: (i, ((j, c), ...)) with i and j decreasing.
+
+    r^l Y_lm vanishes to order |m| along the z axis and to order l at the origin. There it, its
+    derivatives and the rounding of both are far smaller than anywhere else on the sphere of radius
+    r, and a bound that is of use there must shrink with both distances. As such a sum grows with
+    rho and r, its value at (rho(p) + R, |p| + R) is a bound on the whole ball B(p, R).
+
+    Every r^l Y_lm is homogeneous, so a constant c need only be found on the unit sphere. With
+    Q = Q_l^m of `solid_harmonics`, x + iy = sin(a) exp(i b) and z = cos(a), the functions to be
+    bounded are trigonometric polynomials of degree at most l in the polar angle a once the power of
+    sin(a) is divided out, and of degree 1 in m b: samples and Bernstein's inequality prove their
+    largest values, as in `proved_range`.
     """
 
     rows: tuple[tuple[int, tuple[tuple[int, float], ...]], ...]
@@ -83,13 +81,13 @@ class AxialBound:
         )
 
     def __call__(self, rho: Real, r: Real) -> Real:
-        """Its value, by Horner's rule in both variables."""
+        """The value, by Horner's rule in both variables."""
         outer = [(i, _horner([(j, 0.0 * r + c) for j, c in row], r)) for i, row in self.rows]
         return _horner(outer, rho) if outer else 0.0 * r
 
 
 def _horner(terms: list[tuple[int, Real]], x: Real) -> Real:
-    """The sum of c x^i over terms (i, c), i falling."""
+    """The sum of c x^i over terms (i, c), i decreasing."""
     (i, total), *rest = terms
     for j, c in rest:
         total, i = total * _power(x, i - j) + c, j
@@ -196,8 +194,8 @@ def largest_gradient(l: int, m: int) -> float:  # noqa: E741
 def largest_hessian(l: int, m: int) -> float:  # noqa: E741
     """The largest |v . H v| / sin(a)^(m-2) on the unit sphere, v a unit vector (m < 2: |v . H v|).
 
-    For fixed v in the frame of the cylinder it is of degree l in a, and A cos(m b) + B sin(m b),
-    which samples a spacing w of m b apart find up to cos(w/2).
+    For fixed v in cylindrical coordinates it is of degree l in a, and A cos(m b) + B sin(m b) in b,
+    whose largest value is at most that of samples of m b at a spacing w, divided by cos(w/2).
     """
     if l < 2:
         return 0.0
@@ -213,7 +211,8 @@ def largest_hessian(l: int, m: int) -> float:  # noqa: E741
     return worst / math.cos(0.5 * math.pi / _TURNS)
 
 
-# The product of degree and grid spacing: ranges are proved to (this)^2/2 of their half width.
+# The product of degree and grid spacing: proved ranges are too wide by (this)^2/2 of the half
+# width.
 _RESOLUTION = 0.1
 # Spheres on which the whole polynomial is bounded, as fractions of the largest.
 _FRACTIONS = (0.25, 0.4, 0.55, 0.7, 0.85, 1.0)
@@ -278,10 +277,13 @@ def range_of_harmonic(l: int, m: int) -> tuple[float, float]:  # noqa: E741
 class BallRange:
     """Bounds of a harmonic polynomial f = f_0 + f_1 + ... (f_l homogeneous) on |y| <= s.
 
+    By the maximum principle a range on a sphere is one on its ball. Sampling alone proves nothing;
+    sampling with Bernstein's inequality does.
+
     ends: (l, lower, upper) of f_l on the unit sphere. f_l has mean 0 there, so lower <= 0 <=
         upper, and f lies in f_0 + [sum s^l lower_l, sum s^l upper_l] for |y| <= s.
-    spheres: (s, lower, upper) of f itself on some spheres; as the terms seldom peak together
-        this is tighter. By the maximum principle it holds on the smaller balls too.
+    spheres: (s, lower, upper) of f itself on some spheres. As the terms seldom have their extremes
+        at one point, this is tighter. It holds on the smaller balls too.
     """
 
     constant: float
@@ -302,7 +304,7 @@ class BallRange:
         return cls(constant, tuple(ends))
 
     def with_spheres(self, weights: Weights, largest: float) -> BallRange:
-        """Itself with the range of the whole on spheres up to a radius; nothing new for one f_l."""
+        """The same with the ranges of f on spheres up to a radius; unchanged for a single f_l."""
         if len(self.ends) < 2:
             return self
         points, covering = _points(weights)
@@ -345,7 +347,7 @@ class BallRange:
         return total
 
     def at(self, s: Real) -> tuple[Real, Real]:
-        """Lower and upper bound on |y| <= s, a Dr.Jit array, from everything known."""
+        """Lower and upper bound on |y| <= s, a Dr.Jit array, from `ends` and `spheres`."""
         lower, upper = self.by_degree(s)
         for radius, low, high in self.spheres:
             inside = s <= radius

@@ -1,8 +1,8 @@
 """Sums of sine waves: their terms, values and gradients, and proved bounds of the sum.
 
 Every Laplacian eigenfunction that separates in Cartesian coordinates is a product of sines and
-cosines, and every such product is a sum of plane waves: terms are evaluated as they are written
-(a product needs one sine and cosine a coordinate), and bounded as plane waves.
+cosines, and every such product is a sum of plane waves: terms are evaluated as they are given (a
+product needs one sine and one cosine for each coordinate), and bounded as plane waves.
 """
 
 from __future__ import annotations
@@ -244,8 +244,8 @@ class WaveBounds:
 
 
 def mean_wavelength(amplitudes: npt.ArrayLike, wavenumbers: npt.ArrayLike) -> float:
-    """2 pi over the root of the mean square wavenumber, by amplitudes: of one wave its length, and
-    of a sum that of the waves which make its shape, not of the shortest, however small."""
+    """2 pi over the root mean square wavenumber, weighted by amplitudes: for one wave its length,
+    for a sum that of the waves which dominate its shape, and not that of the shortest."""
     sizes, numbers = np.abs(amplitudes), np.asarray(wavenumbers, np.float64)
     largest = float(numbers.max())
     mean = float((sizes * (numbers / largest) ** 2).sum() / sizes.sum())

@@ -1,6 +1,6 @@
 """Blobs: metaballs, soft objects and densities of molecules, as level sets of sums of kernels.
 
-Molecules: atoms as Gaussian blobs of their van der Waals radii.
+`Blobs` is the field, `Molecule` that of a molecule's atoms, by their van der Waals radii.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
     from harnack.geometry import Volume
 
-# From so many blobs on, a grid is quicker than a sum over all, by experiment.
+# From so many blobs on, a grid is faster than a sum over all, by experiment.
 _MANY = 64
 
 
@@ -63,17 +63,18 @@ class Blobs(Formula):
     A single blob of weight 1 is the ball with its radius; where blobs meet, they flow together.
     Inside f is larger.
 
-    centers: (n, 3). radii: (n,) or one number, > 0. weights: (n,), or None for 1; negative ones
-        carve.
+    centers: (n, 3).
+    radii: (n,) or one number, > 0.
+    weights: (n,), or None for 1; negative ones carve.
     kernel: "compact" (a polynomial of the sixth degree), "gaussian", or the soft objects "cubic"
-        and "sextic"; or one with numbers of one's own, such as `Gaussian(sharpness=2.0)`. Each ends
-        at `Kernel.support` times the radius.
+        and "sextic"; or one with other parameters, such as `Gaussian(sharpness=2.0)`. Each ends at
+        `Kernel.support` times the radius.
     groups: (n,) integers: f is then the largest of the sums of each group, so that groups meet in
         creases; None for one sum.
 
-    A look costs what is near: many blobs are kept in a uniform grid of lists.
+    Many blobs are kept in a uniform grid of lists, so that a sample takes only those nearby.
 
-    Raises BlobError (a ValueError) for what are no blobs.
+    Raises BlobError (a ValueError) for numbers that are no blobs.
     """
 
     default_level: float = 1.0
@@ -103,14 +104,14 @@ class Blobs(Formula):
         return self.radii * self.kernel.support
 
     def cell_lists(self) -> CellLists | None:
-        """The lists of blobs near each cell of a grid, made once; None for few blobs."""
+        """The lists of blobs near each cell of a grid, built once; None for few blobs."""
         if self._lists is None and len(self) >= _MANY:
             self._lists = CellLists.of(self.centers, self._supports)
         return self._lists
 
     @prepared_once
     def prepare(self, backend: Backend) -> Blobs:
-        """The blobs as records of the backend; others compile no other kernel."""
+        """The blobs as records of the backend; other blobs compile no other kernel."""
         prepared = copy.copy(self)
         prepared._on = _BlobData.upload(backend, self)
         prepared.kernel = self.kernel.prepare(backend)
@@ -118,7 +119,7 @@ class Blobs(Formula):
         return prepared
 
     def largest_gradient(self) -> float:
-        """A bound of |grad f|: the largest sum of the largest gradients of blobs that meet."""
+        """A bound of |grad f|: the largest sum of the largest gradients of overlapping blobs."""
         steep = np.abs(self.weights) * (self.kernel.amplitude * self.kernel.steepness.slope)
         steep /= self._supports
         lists = self.cell_lists()
@@ -150,10 +151,11 @@ class Blobs(Formula):
         return Sample(found.value, found.gradient, known, found.error, found.gradient_error)
 
     def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
-        """Value and ranges by one loop over the blobs near; looking back nothing is proved.
+        """Value and ranges by one loop over the blobs nearby; looking back nothing is proved.
 
-        In a grid a look reaches to the end of its cell. In an empty one f is 0 until the path comes
-        to the first cell that is not: what follows from there is proved from that cell's list.
+        In a grid, enclosures reach to the end of the point's cell. From an empty cell, f is 0 until
+        the path comes to the first cell that is not empty: steps from there are proved from that
+        cell's list.
         """
         del back
         p, d = path.point(t), path.direction
@@ -196,7 +198,7 @@ class Blobs(Formula):
         return Look(self._sample(start), enclosures, (), slope, float(count))
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        """f of jets of the coordinates, or of Dr.Jit numbers: a sum over all blobs, near or not."""
+        """f of jets of the coordinates, or of Dr.Jit numbers: a sum over all blobs."""
         if not is_jet(x, type(self).__name__):
             return self.differentiable_value(backend_of(x).Array3f(x, y, z))
         on = self._prepared_for(backend_of(_number_of(x, y, z)))
@@ -207,7 +209,7 @@ class Blobs(Formula):
         return largest_jet(term, x, zero, on.grouped(None))
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """Of the sum, or of the largest sum."""
+        """Rows of the Hessian of the sum, or of the largest sum."""
         on = self._prepared(p)
         if on.groups is not None:
             return super().hessian(p)
@@ -234,9 +236,10 @@ class Blobs(Formula):
 
 @dataclass(frozen=True)
 class _BlobData:
-    """Blobs on a backend.
+    """The data of blobs on a backend.
 
-    groups: of each blob, and how many there are; None where all are one sum.
+    groups: the group of each blob, and the number of groups; None if all are one sum.
+    signed: whether amplitudes may be negative.
     across: longer than any path through all supports.
     """
 
@@ -266,13 +269,13 @@ class _BlobData:
         )
 
     def near(self, p: Vec3) -> ForEach:
-        """The blobs whose supports may hold p: those of its cell."""
+        """The blobs whose supports may contain p: those of its cell."""
         if self.grid is None:
             return over(self.records)
         return over_list(self.records, self.grid.entries, *self.grid.list_at(p))
 
     def grouped(self, p: Vec3 | None) -> GroupedList:
-        """The same by groups; all blobs where p is None."""
+        """The same, by groups; all blobs if p is None."""
         assert self.groups is not None
         of, count = self.groups
         if self.grid is None or p is None:
@@ -289,7 +292,7 @@ class _BlobData:
 
 
 def _rows(backend: Backend, blobs: Blobs) -> FloatArray:
-    """Records (n, 8): the center, what of it the precision leaves over, 1/R, and the amplitude."""
+    """Records (n, 8): the center, rounded; the rest of the center; 1/R; and the amplitude."""
     supports = blobs.radii * blobs.kernel.support
     info = np.finfo(backend.dtype)
     largest, smallest = float(info.max), float(info.smallest_normal)
@@ -317,7 +320,7 @@ def _rows(backend: Backend, blobs: Blobs) -> FloatArray:
 
 @dataclass(frozen=True)
 class _After(Enclosure):
-    """F = 0 for 0 <= s <= run, then what another enclosure says of the path from there."""
+    """F = 0 for 0 <= s <= run; from there on the path is that of another enclosure."""
 
     run: Real
     then: Enclosure
@@ -327,7 +330,7 @@ class _After(Enclosure):
 
 
 def _zero_where(mask: Any, found: BlobValue) -> BlobValue:
-    """The sum, 0 where no support is near."""
+    """The sum, replaced by 0 where the mask holds."""
     zero = 0 * found.value
     return BlobValue(
         dr.select(mask, zero, found.value),
@@ -338,7 +341,7 @@ def _zero_where(mask: Any, found: BlobValue) -> BlobValue:
 
 
 def _number_of(*jets: Jet) -> Any:
-    """A number of the backend among those of jets.
+    """Some number of the backend from the ranges of jets.
 
     Raises:
         TypeError: they are all constants.
@@ -354,7 +357,7 @@ def _number_of(*jets: Jet) -> Any:
 def _checked(
     centers: Any, radii: Any, weights: Any, groups: Any
 ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray | None]:
-    """Arrays of what was given.
+    """The arguments as arrays, sorted by groups.
 
     Raises:
         BlobError: wrong shapes, or numbers that no blob can have.
@@ -398,17 +401,17 @@ def _numbers(values: Any, name: str, count: int) -> FloatArray:
 
 
 class Molecule(Blobs):
-    """The surface of a molecule: the level 1 of a sum of A exp(-s (d/r)^2) over its atoms, less
-    what makes each end (see `Gaussian`), where r is the van der Waals radius of the atom.
+    """The surface of a molecule: the level 1 of a sum of A exp(-s (d/r)^2) over its atoms, each
+    less a tangent that makes it end (see `Gaussian`); r is the van der Waals radius of the atom.
 
     source: a .pdb, .ent, .cif or .mmcif file, or `Atoms`.
     sharpness: s; the larger, the closer the surface follows the single atoms.
-    tail: where an atom ends: where so much of its Gaussian is left, in parts of what it is at its
-        radius. With 1/32 about ten atoms reach a point, with 1/1000 about twenty.
+    tail: an atom ends where its Gaussian is this fraction of its value at the radius. With 1/32
+        about ten atoms reach a point, with 1/1000 about twenty.
 
-    The usual viewers cut Gaussians off where 1/32 is left: then f jumps by that, and the surface
-    has seams. Here the tangent is taken off, so that atoms end smoothly and ranges of f along a
-    ray are exact; a single atom is still a ball of its radius.
+    The usual viewers cut Gaussians off at 1/32: then f jumps by that, and the surface has seams.
+    Here the tangent is subtracted, so that atoms end smoothly and ranges of f along a ray are
+    exact; a single atom is still a ball of its radius.
 
     Raises FileFormatError for what is no file of a molecule.
     """

@@ -1,8 +1,8 @@
-"""A uniform grid with a list of blobs in each cell, so that a look costs what is near.
+"""A uniform grid with a list of blobs in each cell, so that a sample takes only those nearby.
 
 A cell's list holds every blob whose support meets the cell, enlarged by a margin on all sides: the
-function is that of the list until a path has left the enlarged cell. Cells with an empty list know
-how many cells around them are empty too, so that a path passes them in few jumps.
+function is that of the list until a path has left the enlarged cell. For cells with an empty list
+it is stored how many cells around them are empty too, so that a path passes them in few jumps.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from harnack.tree.cells import GridLayout, UniformGrid, distances_to_full, short
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, IntArray, Vec3
 
-# Of a cell: how far lists are right beyond it.
+# The margin, in cells, within which a cell's list is valid.
 _MARGIN = 1 / 4
-# Spheres times cells that are compared at once.
+# Pairs of a sphere and a cell that are compared at once.
 _AT_ONCE = 4_000_000
-# Cells at most, and entries of all lists for each blob at most: beyond, cells get larger.
+# The most cells, and the most entries of all lists for each blob; beyond that, cells become larger.
 _MOST_CELLS, _MOST_ENTRIES = 1 << 24, 200.0
 
 
 @dataclass(frozen=True)
 class CellLists(GridLayout):
-    """A grid on the host, in which a cell is empty if its list is.
+    """A grid in NumPy, in which a cell is empty if its list is.
 
     starts: (cells + 1,) where each cell's list begins among `entries`.
     entries: blobs, by their index, in order within each list.
@@ -42,7 +42,7 @@ class CellLists(GridLayout):
     def of(cls, centers: FloatArray, supports: FloatArray, cell: float | None = None) -> CellLists:
         """The lists of balls with centers (n, 3) and radii (n,).
 
-        cell: about how large a cell is; None for 3/5 of the median radius.
+        cell: about the size of a cell; None for 3/5 of the median radius.
         """
         size = float(np.median(supports)) * 0.6 if cell is None else cell
         low, high = (centers - supports[:, None]).min(0), (centers + supports[:, None]).max(0)
@@ -74,7 +74,7 @@ def _pairs(
     size: float,
     shape: tuple[int, int, int],
 ) -> tuple[IntArray, IntArray]:
-    """Cells, enlarged by the margin, and balls that meet; balls in order for each cell."""
+    """Pairs of a cell, enlarged by the margin, and a ball that meets it, sorted by balls."""
     wide = radii * (1 + 1e-6)
     first = np.floor((centers - wide[:, None] - origin) / size - _MARGIN).astype(np.int64)
     last = np.floor((centers + wide[:, None] - origin) / size + _MARGIN).astype(np.int64)
@@ -120,7 +120,7 @@ class Grid(UniformGrid):
         )
 
     def list_at(self, p: Vec3) -> tuple[Any, Any]:
-        """Where the list of the cell in which p lies begins and ends. Outside of the grid that of
-        the nearest cell is right too, since no support reaches beyond the grid."""
+        """Where the list of the cell of p begins and ends. Outside of the grid that of the nearest
+        cell is valid too, since no support reaches beyond the grid."""
         kind, index = self.backend.UInt32, self.cell(p).index
         return dr.gather(kind, self.starts, index), dr.gather(kind, self.starts, index + 1)

@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from harnack.geometry import Volume
 
 
-# Points at most: the linear system has four unknowns for each of them.
+# The most points: the linear system has four unknowns for each of them.
 _MOST_POINTS = 5000
-# Of the box around the points, this is added on each side for the domain.
+# The domain is the box around the points, with this fraction of its size added on each side.
 _MARGIN = 0.25
 
 
@@ -41,7 +41,8 @@ class HRBF(Formula):
     points p_i: the surface passes through the points, along the normals (Aydinlilar and Zanni 2023,
     eq. 9; Wendland 2005).
 
-    points: (n, 3). normals: (n, 3) of any length but 0, outward: f is negative inside.
+    points: (n, 3).
+    normals: (n, 3) of any length but 0, outward: f is negative inside.
     domain: the volume it is drawn in; None for the box around the points and a quarter more on each
         side. Far from all points such functions may have other zeros.
 
@@ -62,7 +63,7 @@ class HRBF(Formula):
 
     @prepared_once
     def prepare(self, backend: Backend) -> HRBF:
-        """The points as records of the backend; others compile no other kernel."""
+        """The points as records of the backend; other points compile no other kernel."""
         prepared = copy.copy(self)
         prepared._on = self._uploaded(backend)
         if self.lipschitz is not None:
@@ -151,21 +152,21 @@ class HRBF(Formula):
         """The sum along p + s d.
 
         With b_i three times the vector of the point, h the distance of the line from it, c = b.w
-        for w from the point to the nearest point of the line, x the place from there, r^2 = h^2 +
-        x^2, u = x/r and B = b.d, a term and its derivatives are
+        for w from the point to the nearest point of the line, x the position from there, r^2 = h^2
+        + x^2, u = x/r and B = b.d, a term and its derivatives are
 
             a r^3 + r (c + B x),
             3 a r x + c u + B (h^2 + 2x^2)/r,
             3 a (h^2 + 2x^2)/r + c h^2/r^3 + B (3u - u^3).
 
-        r x, u and 3u - u^3 rise; (h^2 + 2x^2)/r and -h^2/r^3 fall until x = 0 and rise from there.
-        So each has its extreme values at the ends of a piece, or at 0.
+        r x, u and 3u - u^3 increase; (h^2 + 2x^2)/r and -h^2/r^3 decrease until x = 0 and increase
+        from there. So each has its extreme values at the ends of a piece, or at 0.
 
-        Rounding. Places are right within e = 8 roundings of the largest distance m on the path, as
-        in `harnack.fields.blobs.sums`. By that the three lines change by at most 3 |a| m^2 e + 2
-        |b| m e, 6 |a| m e + 4 |b| e and 10 |a| e + 8 |b| min(1, e/r), r the least distance on the
-        path. Sums of n terms add n roundings of the sum of |a| m^3 + |b| m^2, 3 |a| m^2 + 3 |b| m
-        and 6 |a| m + 3 |b|.
+        Rounding. Positions are right within e = 8 roundings of the largest distance m on the path,
+        as in `harnack.fields.blobs.sums`. That changes the three expressions by at most 3 |a| m^2 e
+        + 2 |b| m e, 6 |a| m e + 4 |b| e and 10 |a| e + 8 |b| min(1, e/r), r the least distance on
+        the path. Sums of n terms add n roundings of the sum of |a| m^3 + |b| m^2, 3 |a| m^2 +
+        3 |b| m and 6 |a| m + 3 |b|.
         """
         backend, records = self._prepared_for(backend_of(p))
         real = backend.Float
@@ -194,7 +195,7 @@ class HRBF(Formula):
             h = dr.sqrt(h2)
             c, rate = dr.dot(b, w), dr.dot(b, d)
             begin = _shapes(h2, at, tiny)
-            # At x = 0: what does not rise or fall all along.
+            # The values at x = 0 of the functions that are not monotone.
             valley = (h, h2 / fmax(h2 * h, tiny))
             for k in range(count):
                 place = at + knots[k + 1]
@@ -253,7 +254,7 @@ class HRBF(Formula):
 
 @dataclass(frozen=True)
 class _Shapes:
-    """The functions of one point along a line: see `HRBF._along`."""
+    """The functions for one point along a line: see `HRBF._along`."""
 
     lift: Real  # r x
     sine: Real  # u
@@ -274,7 +275,7 @@ def _shapes(h2: Real, x: Real, tiny: float) -> _Shapes:
 
 
 def _term(p: Vec3, row: list[Real]) -> tuple[Vec3, Vec3, Real, Real]:
-    """The vector from a point to p, its b, their distance and what it is the inverse of."""
+    """The vector from a point to p, its b, its length, and the inverse of that."""
     v = type(p)(*((p[k] - row[k]) - row[3 + k] for k in range(3)))
     b = type(p)(row[7], row[8], row[9])
     r = dr.norm(v)
@@ -282,7 +283,7 @@ def _term(p: Vec3, row: list[Real]) -> tuple[Vec3, Vec3, Real, Real]:
 
 
 def _solved(points: FloatArray, normals: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Factors (n,) and vectors (n, 3) of the function: see `HRBF`.
+    """Factors a (n,) and vectors b (n, 3) of the function: see `HRBF`.
 
     Raises:
         ValueError: the system cannot be solved.

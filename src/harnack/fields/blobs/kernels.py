@@ -1,7 +1,7 @@
-"""Kernels: how much of a blob is left at a distance from its center, and along a line.
+"""Kernels of blobs: functions of the distance from the center, with their derivatives along lines.
 
 Lengths are in units of the support: a kernel is a function k(q) of the squared distance q, falling
-from its center to 0 at q = 1, where it ends with k' = 0. Along a line that passes the center at the
+from the center to 0 at q = 1, where it ends with k' = 0. Along a line that passes the center at the
 distance h, x from the nearest point, it is k(h^2 + x^2): a function of x on the chord |x| <= S,
 S^2 = 1 - h^2. Its derivatives in x all have the same shape, and that is what proofs rest on:
 
@@ -35,9 +35,11 @@ if TYPE_CHECKING:
 class Chord:
     """A kernel along a line.
 
-    half: S, half the length of the chord; 0 where the line passes by.
-    turn: c1. steepest: the first derivative at -c1, its largest.
-    bend: c2. most, least: the second derivative at c2 and at 0.
+    half: S, half the length of the chord; 0 where the line misses the support.
+    turn: c1.
+    steepest: the first derivative at -c1, its largest.
+    bend: c2.
+    most, least: the second derivative at c2 and at 0.
     """
 
     half: Real
@@ -50,9 +52,10 @@ class Chord:
 
 @dataclass(frozen=True)
 class Steepness:
-    """Lipschitz constants of k and of its first two derivatives along a line, with respect to
-    where the line and the point on it are, in units of the support (`slope` also bounds |grad k|):
-    what rounding of these can do. The jump of the second derivative at S is not counted."""
+    """Lipschitz constants of k and of its first two derivatives along a line, with respect to the
+    positions of the line and of the point on it, in units of the support (`slope` also bounds
+    |grad k|). They bound the effect of rounding. The jump of the second derivative at S is not
+    included."""
 
     value: float
     slope: float
@@ -70,7 +73,7 @@ class Kernel(abc.ABC):
     @property
     @abc.abstractmethod
     def support(self) -> float:
-        """Where a blob ends, in parts of its radius."""
+        """The distance at which a blob ends, in units of its radius."""
 
     @property
     @abc.abstractmethod
@@ -79,7 +82,7 @@ class Kernel(abc.ABC):
 
     @abc.abstractmethod
     def height(self, q: FloatArray) -> FloatArray:
-        """k(q), in double precision on the host."""
+        """k(q) in NumPy, in double precision."""
 
     @abc.abstractmethod
     def profile(self, q: Real) -> tuple[Real, Real, Real]:
@@ -98,7 +101,8 @@ class Kernel(abc.ABC):
         """The first two derivatives along such lines at |x| <= S."""
 
     def share(self, inside: Real, nearest: Real) -> Real:
-        """What part of `steepness` is enough on lines with S^2 = `inside`, for x^2 >= `nearest`."""
+        """The fraction of `steepness` that is enough on lines with S^2 = `inside`, for
+        x^2 >= `nearest`."""
         del inside, nearest
         return 1.0
 
@@ -107,7 +111,7 @@ class Kernel(abc.ABC):
         """Ranges of k and of its first two derivatives in q, on an interval of q >= 0."""
 
     def prepare(self, backend: Backend) -> Kernel:
-        """The same with its numbers as data of the backend."""
+        """The same with its numbers as kernel parameters of the backend."""
         del backend
         return self
 
@@ -315,7 +319,7 @@ class Gaussian(Kernel):
 
     A Gaussian that is only cut off jumps, and no step across the jump could be proved. Less its
     tangent it ends as smoothly as the other kernels, differs from the Gaussian by a parabola that
-    is small where the tail is, and its ranges are exact.
+    is small if the tail is, and its ranges are exact.
 
     sharpness: s of exp(-s d^2/radius^2).
     tail: what is left of the Gaussian where the blob ends, in parts of what it is at the radius.
@@ -424,7 +428,7 @@ KERNELS: dict[str, type[Kernel]] = {
 
 
 def choose_kernel(kernel: str | Kernel) -> Kernel:
-    """A kernel by its name, with its usual numbers, or as it is given.
+    """A kernel by its name, with its default parameters, or as it is given.
 
     Raises ValueError for another name, TypeError for what is neither.
     """
@@ -459,7 +463,7 @@ def _rising(low: Real, high: Real, unit: float) -> Interval:
 
 
 def _ended(bend: Interval, q: Interval) -> Interval:
-    """A positive second derivative on an interval, 0 where the support has ended."""
+    """The range of a positive second derivative on an interval, 0 beyond the support."""
     return Interval(
         dr.select(q.high < 1, fmax(bend.low, 0), 0), dr.select(q.low <= 1, bend.high, 0)
     )

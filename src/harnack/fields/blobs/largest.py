@@ -1,11 +1,5 @@
 """The largest of several sums of blobs: groups that do not flow together but meet in creases.
 
-Along a path the largest sum reaches a level above as soon as one of the sums does, and falls to a
-level below only when the last of them has: so a step upwards is the shortest of those of the
-groups, and a step downwards the longest. That is sharper than ranges of the maximum itself, which
-know nothing of how far each group is from the level (Aydinlilar and Zanni 2023, equation 20, take
-the maximum of two inclusion functions).
-
 A group of which no blob is near is 0 there and stays 0.
 """
 
@@ -43,9 +37,10 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class GroupedList:
     """Records in the order of their groups: those of `entries` from begin to end, or of the table
-    itself where entries is None.
+    itself if entries is None.
 
-    of: the group of each record. count: of groups in all.
+    of: the group of each record.
+    count: the number of groups in all.
     """
 
     records: Records
@@ -56,20 +51,20 @@ class GroupedList:
     count: Any
 
     def record(self, i: Any) -> Any:
-        """The index of the record at a place of the list."""
+        """The index of the record at position i of the list."""
         if self.entries is None:
             return i
         return dr.gather(self.records.backend.UInt32, self.entries, i)
 
     def group(self, i: Any) -> Any:
-        """The group at a place of the list."""
+        """The group at position i of the list."""
         kind = self.records.backend.UInt32
         return dr.gather(kind, self.of, self.record(i), i < self.end)
 
     def each_group(self, body: Any, state: State, label: str) -> tuple[Any, State]:
-        """The state after body(for_each, state) of each group, and how many there were.
+        """The number of groups in the list, and the state after body(for_each, state) for each.
 
-        for_each: runs over the blobs of the group.
+        for_each: the loop over the blobs of the group.
         """
         kind = self.records.backend.UInt32
 
@@ -88,7 +83,7 @@ class GroupedList:
 
 
 class _OneGroup:
-    """Runs over the blobs of the group that begins at a place of the list."""
+    """The loop over the blobs of the group that begins at a position of the list."""
 
     def __init__(self, blobs: GroupedList, begin: Any) -> None:
         self._blobs, self._begin = blobs, begin
@@ -112,7 +107,7 @@ class _OneGroup:
 
 
 def largest_at(kernel: Kernel, backend: Backend, p: Vec3, blobs: GroupedList) -> BlobValue:
-    """The largest sum at points p, with its gradient. The errors are the largest of all."""
+    """The largest sum at points p, with its gradient. The errors are the largest of all groups'."""
     real = backend.Float
 
     def body(for_each: ForEach, state: State) -> State:
@@ -131,7 +126,7 @@ def largest_at(kernel: Kernel, backend: Backend, p: Vec3, blobs: GroupedList) ->
     none = (real(-dr.inf), *(real(0) for _ in range(5)))
     groups, found = blobs.each_group(body, none, "groups")
     value, x, y, z, error, gradient_error = found
-    flat = (groups < blobs.count) & ~(value > 0)  # the largest is a group of which none is near
+    flat = (groups < blobs.count) & ~(value > 0)  # the largest is 0, that of a group that is far
     gradient = dr.select(flat, backend.Array3f(0), backend.Array3f(x, y, z))
     return BlobValue(dr.select(flat, 0, value), gradient, error, gradient_error)
 
@@ -143,7 +138,7 @@ def largest_jet(term: Term, like: Jet, zero: Real, blobs: GroupedList) -> Jet:
         one = summed(term, like, zero, for_each)
         before = jet_of(like, iter(state[1:]))
         both = before.maximum(one)
-        first = state[0] > 0  # nothing before
+        first = state[0] > 0  # the first group
         return (
             real(0) + 0 * zero,
             *(dr.select(first, a, b) for a, b in zip(
@@ -161,7 +156,14 @@ def largest_jet(term: Term, like: Jet, zero: Real, blobs: GroupedList) -> Jet:
 class LargestAlong(Enclosure):
     """The largest sum along the path from p, for a length.
 
-    value: at p. knots: which pieces the proofs want. run: a length before p on which all is 0.
+    value: at p.
+    knots: of the pieces that the proofs use.
+
+    Along a path the largest sum reaches a level above as soon as one of the sums does, and falls to
+    a level below only when the last of them has: so a step upwards is the shortest of those of the
+    groups, and a step downwards the longest. That is sharper than ranges of the maximum itself,
+    which do not use how far each group is from the level (Aydinlilar and Zanni 2023, equation 20,
+    take the maximum of two inclusion functions).
     """
 
     kernel: Kernel
@@ -174,9 +176,9 @@ class LargestAlong(Enclosure):
     signed: bool
 
     def step(self, gaps: Gaps) -> Real:
-        """Proof. See above. Of a group whose sum is lower by g, the level above is farther by g and
-        the level below nearer by g; g is known up to the errors of both sums, of which the gaps
-        are clear by at least the larger (`look.value_error`)."""
+        """Proof. See `LargestAlong`. For a group whose sum is lower by g, the level above is
+        farther by g and the level below nearer by g; g is known up to the errors of both sums, the
+        larger of which the tracer has subtracted from the gaps already (`look.value_error`)."""
         backend = self.blobs.records.backend
         real = backend.Float
 
@@ -198,7 +200,7 @@ class LargestAlong(Enclosure):
 
         start = (real(0) + self.length, real(0))
         groups, (up, down) = self.blobs.each_group(body, start, "steps of groups")
-        # What is not near stays 0.
+        # Groups that are far stay 0.
         stays = (groups < self.blobs.count) & (gaps.down > self.value)
         down = dr.select(stays, self.length, down)
         down = dr.select(gaps.down == dr.inf, self.length, down)

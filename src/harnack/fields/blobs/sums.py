@@ -1,19 +1,17 @@
-"""Sums of blobs: at a point, and along a path with ranges of both derivatives on all its pieces.
+"""Sums of blobs: at a point, along a path with ranges of both derivatives on its pieces, as jets.
 
-One loop over the blobs. Each is seen from the point in units of its own support, so that one set of
-bounds serves blobs of every size.
+One loop over the blobs. Positions are relative to each blob and in units of its own support, so
+that the same bounds hold for blobs of every size. Jets let blobs be deformed and blended.
 
-What rounding does. Let u be the unit roundoff, v the vector from the point to a center in units of
-the support, t = v.d. Centers are stored as the sum of two numbers, so that v is right within 4u|v|;
-then so are t, the distance h of the line from the center (as a length), and the places x = s - t,
-within 8u(2 + |t|) where they matter: that is a displacement of the blob beside the path, in which
-also falls that |d| is 1 up to 2u only. A displacement by e changes f' by at most `Steepness.slope`
-times e, and f'' by `Steepness.bend` times e (its jumps at the end of the support are looked for
-within a margin), or by `Kernel.share` of that. A sum of n terms adds n u times the sum of their
-largest absolute values. Both are added to the ranges, outwards. The value at the point is right
-within 8u |dk/dq|, by the rounding of q, and (16 + n)u m, with m as in `Kernel.profile`.
-
-Sums over records as jets: what lets blobs be deformed and blended by formulas of others.
+Rounding. Let u be the unit roundoff, v the vector from the point to a center in units of the
+support, t = v.d. Centers are stored as the sum of two numbers, so that v is right within 4u|v|;
+then so are t, the distance h of the line from the center (as a length), and the positions
+x = s - t, within 8u(2 + |t|) where they matter: that is a displacement of the blob relative to the
+path, which also covers that |d| is 1 only up to 2u. A displacement by e changes f' by at most
+`Steepness.slope` times e, and f'' by `Steepness.bend` times e (its jumps at the end of the support
+are searched for within a margin), or by `Kernel.share` of that. A sum of n terms adds n u times the
+sum of their largest absolute values. Both are added to the ranges, outwards. The value at the point
+is right within 8u |dk/dq|, by the rounding of q, and (16 + n)u m, with m as in `Kernel.profile`.
 """
 
 from __future__ import annotations
@@ -36,15 +34,15 @@ if TYPE_CHECKING:
     from harnack.fields.blobs.kernels import Chord, Kernel
 
 State: TypeAlias = "tuple[Any, ...]"
-# Gives the state with the record of one blob taken into account.
+# From the record of a blob and a state: the state with that blob added.
 EachBlob: TypeAlias = "Callable[[list[Real], State], State]"
-# Runs it over the blobs that matter.
+# Applies that to all blobs that matter, beginning with a state.
 ForEach: TypeAlias = "Callable[[EachBlob, State], State]"
 
 
 @dataclass(frozen=True)
 class BlobValue:
-    """A sum at points: value and gradient, and how far rounding may have moved them."""
+    """A sum at points: value and gradient, and bounds of their rounding."""
 
     value: Real
     gradient: Vec3
@@ -52,38 +50,38 @@ class BlobValue:
     gradient_error: Real
 
 
-# Pieces of a path that take the least time, for sums over all blobs and over those of a cell, which
-# is left soon: finding what is near costs more than ranges.
+# The number of pieces of a path that takes the least time, for sums over all blobs, and for those
+# over the blobs of a cell, where lengths are short. Finding the blobs costs more than ranges.
 PIECES, PIECES_IN_CELL = 4, 3
 
 
 @dataclass(frozen=True)
 class Along:
-    """A sum along the path from p: what it is there, and ranges on pieces (see `Restriction`)."""
+    """A sum along the path from p: its value at p, and ranges on pieces (a `Restriction`)."""
 
     start: BlobValue
     parts: tuple[Piece, ...]
 
     @property
     def piece_count(self) -> int:
-        """How many there are."""
+        """The number of pieces."""
         return len(self.parts)
 
     def pieces(self, knots: Sequence[Real]) -> tuple[Piece, ...]:
-        """The ranges between the knots that it was made with."""
+        """The ranges, for the same knots that they were computed with."""
         assert len(knots) == len(self.parts) + 1
         return self.parts
 
 
 class Knots:
-    """A function along a path that is asked in advance which ranges will be wanted."""
+    """A stand-in for a `Restriction` that records which knots a proof asks for."""
 
     def __init__(self, piece_count: int = PIECES) -> None:
         self.piece_count = piece_count
         self.knots: tuple[Real, ...] | None = None
 
     def pieces(self, knots: Sequence[Real]) -> tuple[Piece, ...]:
-        """Remembers the knots, and says nothing."""
+        """Record the knots; the ranges returned have no meaning."""
         self.knots = tuple(knots)
         ends = itertools.pairwise(knots)
         return tuple(Piece(b - a, Slopes(0.0, 0.0), 0.0, 0.0) for a, b in ends)
@@ -195,8 +193,8 @@ def hessian_at(kernel: Kernel, backend: Backend, p: Vec3, for_each: ForEach) -> 
     return for_each(body, tuple(backend.Float(0) for _ in range(6)))
 
 
-# Numbers of the state that belong to the value at the point: the value, the gradient, the sums that
-# errors are made of, and the number of terms.
+# The length of the part of the state for the value at the point: the value, the gradient, the sums
+# for the errors, and the number of terms.
 _VALUE = 8
 
 
@@ -253,8 +251,8 @@ def _bends(chord: Chord, a: Real, b: Real, at_a: Real, at_b: Real) -> tuple[Real
 def _with_jumps(
     bends: tuple[Real, Real], inside: Real, margin: Real, begin: Real, end: Real
 ) -> tuple[Real, Real]:
-    """The range with 0 in it where the piece leaves the support, and nothing else where it does not
-    meet it."""
+    """The range, with 0 included where the piece leaves the support, and 0 alone where it does not
+    meet the support."""
     low, high = bends
     nearest = fmax(fmax(begin, -end), 0)
     meets = nearest * nearest < inside + margin
@@ -265,7 +263,7 @@ def _with_jumps(
 
 
 def over(records: Records, *, active: Mask = True) -> ForEach:
-    """All records, one after the other."""
+    """A loop over all records."""
 
     def for_each(body: EachBlob, state: State) -> State:
         return records.for_each(body, state, "blobs", active)
@@ -274,7 +272,7 @@ def over(records: Records, *, active: Mask = True) -> ForEach:
 
 
 def over_list(records: Records, entries: Any, begin: Any, end: Any) -> ForEach:
-    """The records of a list: `entries` from begin to end."""
+    """A loop over the records of a list: `entries` from begin to end."""
     kind = records.backend.UInt32
 
     def for_each(body: EachBlob, state: State) -> State:

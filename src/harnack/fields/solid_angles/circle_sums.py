@@ -1,62 +1,7 @@
-"""Sums over circles at a point: solid angles, derivatives, distances and what bounds them.
+"""Circles: the solid angle of one at a point, and sums over many with what bounds them.
 
-For a circle of radius a, of which the nearest point is at distance d and the farthest at P, Biot
-and Savart's integrals are bounded by
-
-    |grad Omega| <= integral of |dp|/D^2 = 2 pi a/(P d)
-
-(D^2 = A - 2r cos(phi) has this integral exactly; attained at the center), and
-
-    integral of |dp|/D^3 = 4 a E/(P d^2) <= 2 pi a B,   B = sqrt((1/d^2 + 1/P^2)/2)/(P d),
-
-as E <= (pi/2) sqrt((1 + kc^2)/2) by Jensen's inequality for the root. What follows within d of a
-point is the same for all curves (`curve_promises`). Walking by t, both distances fall by at most t,
-and both bounds fall with both distances. Hence, for lines:
-
-- Lines. Points at r from the axis are at least |r - a| from the circle, which tells of a line that
-  passes beside it more than the distance of one of its points does. At height z above the circle's
-  plane the gradient's part along the plane is at most |z| times the integral of |dp|/D^3. A line
-  with the component w along the normal sees no more than |w| 2 pi a/(P d) + sqrt(1-w^2) |z| 2 pi a
-  B, which is small where it runs along the plane.
-
-The solid angle of a circle with its derivatives, by complete elliptic integrals.
-
-The circle has radius 1 and lies in the plane z = 0, run counter-clockwise as seen from above. The
-point is at r from the axis and z above the plane; Rm^2 = (1-r)^2 + z^2 and Rp^2 = (1+r)^2 + z^2 are
-its squared distances to the nearest and the farthest point of the circle, kc = Rm/Rp is the
-complementary modulus of all integrals, and A = 1 + r^2 + z^2.
-
-Value. Omega = -sgn(z) W, W = 2 pi [r < 1] - 4|z| cel/((1+r) Rp), where cel = integral over
-[0, pi/2] of (cos^2 + gamma sin^2)/(D (cos^2 + gamma^2 sin^2)), D^2 = cos^2 + kc^2 sin^2 and
-gamma = (1-r)/(1+r): Bulirsch's general complete integral cel(kc, gamma^2, 1, gamma) (Bulirsch 1969,
-Numer. Math. 13). On the cylinder r = 1, where gamma = 0, W = pi - 2|z| K/Rp.
-
-All integrals come from one loop of arithmetic-geometric means, which converges quadratically: six
-rounds for single precision and eight for double, unrolled, are a short stretch of plain arithmetic.
-Beside the means a_n it has the differences c_(n+1) = c_n^2/(4 a_(n+1)), c_1 = (1-kc)/2, and adds up
-S, the sum of 2^n c_(n+1)^2/(1-kc)^2 over n >= 1. Then E = K (1 - (1-kc^2)/2 - (1-kc)^2 (1/4 + S)).
-
-Derivatives. Biot and Savart's integrals over the circle, seen from the point at distance D,
-
-    I3 = integral of dphi/D^3 = 4E/(Rp Rm^2),   C3 = integral of cos(phi) dphi/D^3 = r J,
-
-give the gradient (z x J, z y J, I3 - r^2 J), where the known form of J,
-2 (A E/Rm^2 - K)/(r^2 Rp), cancels near the axis and far away. With E as above, 1 - kc = q r,
-q = 4/(Rp (Rp + Rm)), and A = Rp^2 (1 + kc^2)/2, the terms of order 0 and 1 in 1 - kc drop out, and
-
-    J = K q^2 [(1 + 4 kc + kc^2)/4 - (1 + kc^2) S]/(Rp kc^2)
-
-is left. I3 - r^2 J cancels beside the circle,
-where 2 [K + ((1-r)(1+r) - z^2) E/Rm^2]/Rp is the same and does not.
-
-Second derivatives need I5 and C5, with D^-5. As D^2 = A - 2r cos(phi), A I5 - 2r C5 = I3; and by
-parts, C3 = 3r times the integral of sin^2(phi)/D^5, that is 3 A C5 = 6 r I5 + C3. So, as
-A^2 - 4r^2 = Rm^2 Rp^2,
-
-    C5/r = (2 I3 + A J/3)/(Rm^2 Rp^2),   I5 = (I3 + 2r C5)/A,
-
-sums of positive terms, and Omega_zz = -3z (I5 - r C5), Omega_rz = C3 - 3 z^2 C5, Omega_r/r = z J;
-the trace is 0.
+`UnitCircle` has the formulas, by complete elliptic integrals; `Circles` are circles on a backend
+and the sums over them.
 """
 
 from __future__ import annotations
@@ -85,13 +30,53 @@ _ROUNDS = {"single": 6, "double": 8}
 
 @dataclass(frozen=True)
 class UnitCircle:
-    """What is known of the unit circle at a point (r, z).
+    """The solid angle Omega of the unit circle at a point, and its derivatives.
 
+    r, z: the point: its distance from the axis, and its height above the plane.
     angle: Omega in (-2 pi, 2 pi).
     nearest, farthest: Rm and Rp.
     share: q, with q r = 1 - kc.
-    radial: J/q^2; the gradient along the axis is `axial`.
+    radial: J/q^2.
+    axial: the gradient along the axis.
     third: I3.
+
+    The circle has radius 1 and lies in the plane z = 0, run counter-clockwise as seen from above.
+    Rm^2 = (1-r)^2 + z^2 and Rp^2 = (1+r)^2 + z^2 are the squared distances of the point to the
+    nearest and the farthest point of the circle, kc = Rm/Rp is the complementary modulus of all
+    integrals, and A = 1 + r^2 + z^2.
+
+    Value. Omega = -sgn(z) W, W = 2 pi [r < 1] - 4|z| cel/((1+r) Rp), where cel = integral over
+    [0, pi/2] of (cos^2 + gamma sin^2)/(D (cos^2 + gamma^2 sin^2)), D^2 = cos^2 + kc^2 sin^2 and
+    gamma = (1-r)/(1+r): Bulirsch's general complete integral cel(kc, gamma^2, 1, gamma) (Bulirsch
+    1969, Numer. Math. 13). On the cylinder r = 1, where gamma = 0, W = pi - 2|z| K/Rp.
+
+    All integrals come from one loop of arithmetic-geometric means, which converges quadratically:
+    six rounds for single precision and eight for double, unrolled to plain arithmetic. Besides the
+    means a_n it computes the differences c_(n+1) = c_n^2/(4 a_(n+1)), c_1 = (1-kc)/2, and S, the
+    sum of 2^n c_(n+1)^2/(1-kc)^2 over n >= 1. Then E = K (1 - (1-kc^2)/2 - (1-kc)^2 (1/4 + S)).
+
+    Derivatives. Biot and Savart's integrals over the circle, D the distance from the point,
+
+        I3 = integral of dphi/D^3 = 4E/(Rp Rm^2),   C3 = integral of cos(phi) dphi/D^3 = r J,
+
+    give the gradient (z x J, z y J, I3 - r^2 J), where the known form of J,
+    2 (A E/Rm^2 - K)/(r^2 Rp), cancels near the axis and far away. With E as above, 1 - kc = q r,
+    q = 4/(Rp (Rp + Rm)), and A = Rp^2 (1 + kc^2)/2, the terms of order 0 and 1 in 1 - kc drop out,
+    and
+
+        J = K q^2 [(1 + 4 kc + kc^2)/4 - (1 + kc^2) S]/(Rp kc^2)
+
+    is left. I3 - r^2 J cancels near the circle, where the equal form
+    2 [K + ((1-r)(1+r) - z^2) E/Rm^2]/Rp does not.
+
+    Second derivatives need I5 and C5, with D^-5. As D^2 = A - 2r cos(phi), A I5 - 2r C5 = I3; and
+    by parts, C3 = 3r times the integral of sin^2(phi)/D^5, that is 3 A C5 = 6 r I5 + C3. So, as
+    A^2 - 4r^2 = Rm^2 Rp^2,
+
+        C5/r = (2 I3 + A J/3)/(Rm^2 Rp^2),   I5 = (I3 + 2r C5)/A,
+
+    sums of positive terms, and Omega_zz = -3z (I5 - r C5), Omega_rz = C3 - 3 z^2 C5,
+    Omega_r/r = z J; the trace is 0.
     """
 
     r: Real
@@ -185,7 +170,7 @@ class CircleSums:
 
 @dataclass(frozen=True)
 class _Seen:
-    """A circle of radius a as seen from x: outward is the part of x - center in its plane, of
+    """A circle of radius a relative to x: outward is the component of x - center in its plane, of
     length r a, and x is z a above it."""
 
     a: Real
@@ -204,7 +189,7 @@ class _Seen:
 
 @dataclass(frozen=True)
 class Circles:
-    """Circles on a backend, as records of center, radius and normal, in units of order one."""
+    """Circles on a backend, as records of center, radius and normal, with lengths of order one."""
 
     records: Records
 
@@ -212,7 +197,7 @@ class Circles:
     def upload(
         cls, backend: Backend, circles: Sequence[Circle], center: FloatArray, size: float
     ) -> Circles:
-        """Circles in coordinates with another center, divided by a size."""
+        """Circles in unit coordinates: relative to a center, divided by a size."""
         rows = [
             [*(np.array(one.center) - center) / size, one.radius / size, *one.normal, 0.0]
             for one in circles
@@ -228,12 +213,12 @@ class Circles:
             angle, gradient, distance, squares, cubes, fourths, lower = state
             seen = self._seen(row, x)
             circle, a = seen.circle, seen.a
-            # Lengths times 1/a here, divided out at the end: all of it stays of order one.
+            # In units of the circle's radius, so that all numbers are of order one.
             gradient = dr.fma(vector(circle.across / (a * a)), seen.outward, gradient)
             gradient = dr.fma(vector(circle.axial / a), seen.normal, gradient)
             near, far = circle.nearest, circle.farthest
             cube = circle.third / (a * a)
-            # By height: far away the angle is lost in rounding, and its sign with it.
+            # The sign by height: far away the angle is all rounding.
             above = dr.mulsign(real(1), circle.z) > 0
             window = dr.select(circle.r < 1, dr.select(above, real(-4 * math.pi), 0), -2 * math.pi)
             return (
@@ -277,17 +262,36 @@ class Circles:
 
     def rates_along(self, line: Line, lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
         """For each length T, a bound of the derivative along the line up to T to both sides; inf
-        where a circle may be as near as that, and on lanes that are not active."""
+        where a circle may be as near as that, and on lanes that are not active.
+
+        For a circle of radius a, of which the nearest point is at distance d and the farthest at P,
+        Biot and Savart's integrals are bounded by
+
+            |grad Omega| <= integral of |dp|/D^2 = 2 pi a/(P d)
+
+        (D^2 = A - 2r cos(phi) has this integral exactly; attained at the center), and
+
+            integral of |dp|/D^3 = 4 a E/(P d^2) <= 2 pi a B,   B = sqrt((1/d^2 + 1/P^2)/2)/(P d),
+
+        as E <= (pi/2) sqrt((1 + kc^2)/2) by Jensen's inequality for the square root. Going a length
+        t, both distances fall by at most t, and both bounds fall as the distances grow. Points at r
+        from the axis are at least |r - a| from the circle, which is a better bound for a line that
+        passes by the circle than the distance of one of its points. At height z above the circle's
+        plane the gradient's component along the plane is at most |z| times the integral of
+        |dp|/D^3. So for a line with the component w along the normal the derivative is at most
+        |w| 2 pi a/(P d) + sqrt(1-w^2) |z| 2 pi a B, which is small where it runs along the plane.
+        """
         real, vector = self._types
 
         def add(row: list[Real], rates: tuple[Any, ...]) -> tuple[Any, ...]:
             seen = self._seen(row, line.x)
             slack, up = line.slack, fmin(dr.abs(dr.dot(seen.normal, line.v)), 1)
             across = dr.sqrt(fmax(1 - up * up, 0))
-            # Of two numbers of order one: their rounding is not small beside them.
+            # `up` is a sum of numbers of order one, whose rounding need not be small against it.
             up += 4 * float(dr.epsilon(line.x))
             height = dr.abs(seen.circle.z) * seen.a + slack
-            # The line seen along the axis: at s it is |outward + s along| from there.
+            # The line projected along the axis: at s its distance from the axis is
+            # |outward + s along|.
             along = dr.fma(vector(-dr.dot(seen.normal, line.v)), seen.normal, line.v)
             square = dr.squared_norm(along)
             foot = dr.select(square > 0, -dr.dot(seen.outward, along) / square, 0)
@@ -317,7 +321,7 @@ class Circles:
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
             best, nearest = state
             seen = self._seen(row, x)
-            # On the axis every point is as near: any direction in the plane will do.
+            # From the axis all points are equally far: any direction in the plane will do.
             length = dr.norm(seen.outward)
             aside = dr.normalize(_across(vector, seen.normal))
             out = dr.select(length > 0, seen.outward / length, aside)
@@ -337,7 +341,7 @@ class Circles:
         center, a, normal = vector(*row[:3]), row[3], vector(*row[4:7])
         away = x - center
         height = dr.dot(normal, away)
-        # A second projection takes out what the normal, rounded, has left of the first.
+        # A second projection removes the error of the first, which the rounded normal has caused.
         outward = dr.fma(vector(-height), normal, away)
         outward = dr.fma(vector(-dr.dot(normal, outward)), normal, outward)
         return _Seen(a, normal, outward, UnitCircle.at(dr.norm(outward) / a, height / a))

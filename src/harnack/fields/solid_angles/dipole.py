@@ -1,6 +1,6 @@
 """The dipole potential of oriented point clouds: Poisson reconstruction without a grid.
 
-Sums of dipoles by a tree: far ones as multipoles, near ones one by one, with certificates.
+`DipolePotential` is the field, `DipoleTree` its sum by a tree, with far dipoles as multipoles.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from harnack.geometry import Volume
     from harnack.tree import Hierarchy
 
-# Beside a point means within this part (of its area, in squared distance).
+# A point counts as near if the squared distance is less than this fraction of its area.
 _BESIDE = 0.04
 
 
@@ -43,7 +43,6 @@ class DipoleTree:
 
     @property
     def backend(self) -> Backend:
-        """The one it lies on."""
         return self.clusters.backend
 
     @classmethod
@@ -53,18 +52,18 @@ class DipoleTree:
     ) -> DipoleTree:  # fmt: skip
         """From points (n, 3) of size about one and moments (n, 3), area times normal.
 
-        tree: `hierarchy_of` these points, or of where they were once.
+        tree: `hierarchy_of` these points, or of the same points at earlier positions.
         """
         levels = all_levels(tree, points[:, None], moments[:, None], points, points)
         rows = dipole_rows(points, moments)
-        # Rounded terms, most of them of the size of their share of the whole, random in sign.
+        # The rounding of terms, most of which are about their share of the total weight in size.
         share = max(1.0, float(rows[:, 6].sum()))
         rounding = rounding_of_sum(backend, len(points), 16, growth=1 / 8, size=share)
         clusters = Treecode.of(backend, tree, levels, in_slots(tree, rows), accuracy)
         return cls(clusters, rounding)
 
     def at(self, x: Vec3, derivatives: int, closer: Real) -> Values:
-        """Value and derivatives (as asked for) at x; closer: the detail, at least 1."""
+        """Value and the derivatives asked for at x; closer: the detail, at least 1."""
         unit, detail = epsilon_at(x), fmax(self.backend.Float(closer), self.backend.Float(1))
         sums, _ = self._sums(x, detail, unit, derivatives)
         return self.clusters.values(sums, 1.0, unit, self.rounding)
@@ -78,9 +77,9 @@ class DipoleTree:
         ) -> tuple[FieldSums, tuple[Any, ...]]:
             inverse, terms = _dipole(row, x, derivatives)
             distance, some = dr.rcp(inverse), active & (row[6] > 0)
-            # A bound of one over the distance less what rounding may have done to it, 2 unit:
+            # An upper bound of 1/(distance - 2 unit), 2 unit being the rounding of the distance:
             # 1/(1-z) <= 1 + 2z for z <= 1/2. Nearer to a dipole nothing is known, and all bounds
-            # are infinite. Padding has no area and no bounds.
+            # are infinite. Padding has no area and adds nothing.
             z = 2 * unit * inverse
             closer = dr.select(z <= 0.5, dr.fma(2 * z, inverse, inverse), dr.inf)
             closer = dr.select(some, closer, 0)
@@ -99,11 +98,11 @@ class DipoleTree:
         return sums, own[0]
 
     def sample(self, x: Vec3, detail: Real) -> Sample:
-        """Value, gradient and certificate at x: see `FieldSums.sample`."""
+        """Value, gradient and promises at x: see `FieldSums.sample`."""
         unit = epsilon_at(x)
         found, nearest = self._sums(x, detail, unit, 1)
-        # Where one point's own field drowns the others', the surface has that point's normal; f
-        # is larger on the other side.
+        # Where the field of one point dominates, shade with that point's normal, reversed, as f
+        # is larger inside.
         weight = dr.norm(nearest)
         beside = (found.free_distance * found.free_distance < _BESIDE * weight) & (weight > 0)
         normal = dr.select(beside, -nearest / weight, dr.normalize(found.gradient))
@@ -111,8 +110,8 @@ class DipoleTree:
 
 
 def _dipole(row: list[Real], x: Vec3, derivatives: int) -> tuple[Real, Terms]:
-    """One over the distance to a dipole, and its value, gradient (paper, Eq. 12 and 15) and
-    Hessian, as far as they are asked for.
+    """One over the distance to a dipole, and its value and, if asked for, gradient (paper, Eq. 12
+    and 15) and Hessian.
 
     With z = y - x and u = 1/|z|: f = m.z u^3, grad f = 3 (m.z) u^5 z - m u^3, and
     Hess f = 15 (m.z) u^7 z z^T - 3 u^5 (m z^T + z m^T + (m.z) I).
@@ -128,7 +127,7 @@ def _dipole(row: list[Real], x: Vec3, derivatives: int) -> tuple[Real, Terms]:
     gradient = (u * u2) * dr.fma(vector(3 * along * u2), z, -m)
     if derivatives == 1:
         return u, Terms(value, gradient)
-    # By the unit vector n = u z, so that powers of u do not overflow sooner than the result.
+    # In terms of the unit vector n = u z, so that no power of u overflows unless the result does.
     n, four = u * z, 3 * (u2 * u2)
     along = dr.dot(m, n)
     pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
@@ -148,9 +147,10 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
     With a_i the areas that the points stand for, f is about 4 pi inside and 0 outside: the
     surface is f = 2 pi. It passes through every point, with the point's normal.
 
-    points: (n, 3). normals: (n, 3), outward, of any length; or "estimate", from neighbors,
-        oriented along a spanning tree (`geometry.estimate_normals`). areas: (n,), or None to
-        estimate them from neighbors (Barill et al. 2018, Sec. 3.1).
+    points: (n, 3).
+    normals: (n, 3), outward, of any length; or "estimate", from neighbors, oriented along a
+        spanning tree (`geometry.estimate_normals`).
+    areas: (n,), or None to estimate them from neighbors (Barill et al. 2018, Sec. 3.1).
     accuracy: a cluster of points is taken as a whole beyond `accuracy` times its radius; by
         default 2 for values at points and 4 for tracing, which takes more where the tolerance asks
         for it. At least 1.5.
@@ -198,11 +198,12 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
     def moved(
         self, points: Any, normals: Any | Literal["estimate"] = None, areas: Any = None
     ) -> DipolePotential:
-        """The potential of as many points (n, 3) elsewhere; normals and areas as for a new one.
+        """The potential of the same points at other positions (n, 3); normals and areas as for a
+        new one.
 
         The tree, if there is one, keeps its shape and gets new centers, radii, moments and bounds.
-        All that is promised is computed from where the points are now, so a tree whose points moved
-        far is slower than a new one, never wrong. Raises CloudError as for a new field.
+        All promises are computed from the new positions, so a tree whose points moved far is slower
+        than a new one, never wrong. Raises CloudError as for a new field.
         """
         field = DipolePotential(points, normals, areas, accuracy=self.accuracy)
         if len(field.points) != len(self.points):
@@ -222,7 +223,7 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
     def _upload(self, backend: Backend, *, traced: bool) -> _DipoleBuffers:
         accuracy = self.accuracy or (_TRACED if traced else _VALUES)
         unit = (self.points - self._center) / self._size
-        # Areas shrink with the square of lengths, and the potential knows no scale.
+        # Areas scale with the square of lengths; the potential is invariant under scaling.
         moments = (self.areas / self._size**2)[:, None] * self.normals
         if self._hierarchy is None:
             self._hierarchy = hierarchy_of(unit)
@@ -258,7 +259,7 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
 
 @dataclass(frozen=True)
 class _DipoleBuffers(UnitCoordinates):
-    """A potential on a backend."""
+    """The data of a potential on a backend."""
 
     tree: DipoleTree
 

@@ -1,41 +1,9 @@
-"""The solid angle as one wide expression that Dr.Jit can differentiate in both directions.
+"""What else is computed from the edges of a curve: derivatives, closest points, changes, promises.
 
-The loop of `edge_sums` is the fast way to a number; reverse mode cannot pass a recorded loop.
-Here every (point, edge) pair is a lane, and a block sum adds them up.
-
-The closest point of the curve in which the level sets of a solid angle end.
-
-How the solid angle of a curve changes along a straight segment, without any branch to choose.
-
-Biot and Savart's field, integrated along the segment from p to q, gives for each edge from a to b
-of the curve minus the solid angle of the parallelogram (a - p) + s (b - a) - t (q - p) at the
-origin: less than 2 pi in size, as it lies in a plane that misses the origin unless the segment
-meets the edge. As two triangles it is twice two arctangents (van Oosterom and Strackee 1983).
-
-What a solid angle promises near a point, by integrals over the curve.
-
-Along a unit direction v the derivative of the solid angle is the integral of v.(D x dp)/|D|^3 over
-the curve, D = p - x (Biot and Savart), and its second derivative that of 3 (v.D)(v.(D x dp))/|D|^5,
-as D changes by -v. D and D x dp are at right angles, so the product of their components along v is
-at most half of their lengths': the second derivative is at most 3/2 times the integral of
-|dp|/|D|^3. At x + s v, |D| is less by s at most. So by Taylor the rest after the linear term is,
-for t < d, the distance to the curve, at most
-
-    3/2 integral of |dp| integral over [0, t] of (t-s)/(|D|-s)^3 ds
-        = 3/4 t^2 integral of |dp|/(|D|^3 (1 - t/|D|)),
-
-and 1/(1 - u) <= 1 + u/(1 - q) for 0 <= u <= q. On the ball of radius q d that is `Curvature` with
-the constant 3/2 (I3 + q d I4/(1 - q)), I3 and I4 the integrals of |dp|/|D|^3 and |dp|/|D|^4. It
-holds for any piece of a curve, and adds up.
-
-The gradient. The second derivative in every direction being at most 3/2 times the integral of
-|dp|/|D|^3, so is the norm of the Hessian, and from x to x + t v the gradient moves by at most
-
-    3/2 integral of |dp| integral over [0, t] of ds/(|D|-s)^3
-        = 3/4 t integral of |dp|/|D|^3 (2 - u)/(1 - u)^2,    u = t/|D|.
-
-For 0 <= u <= q < 1 that fraction, which is convex in u, is at most 2 + u (3 - 2q)/(1 - q)^2, its
-chord. With q = t/d: at most 3/2 t I3 + 3/4 t^2 I4 (3 - 2q)/(1 - q)^2 (`slope_change`).
+- `differentiable_angle`: the solid angle as an expression that Dr.Jit differentiates.
+- `closest_on_segments`: the closest point of the curve, at which the level sets end.
+- `change_along_segments`: the change of the solid angle along a straight segment.
+- `bends`, `slope_change`, `swept_ball`: what the solid angle promises near a point.
 """
 
 from __future__ import annotations
@@ -68,10 +36,14 @@ __all__ = [
 
 
 def differentiable_angle(backend: Backend, loops: tuple[Any, ...], x: Vec3) -> Real:
-    """Omega(x) in steradians, modulo 4 pi, of closed loops: (n, 3) arrays or Dr.Jit vectors.
+    """Omega(x) in steradians, modulo 4 pi, of closed loops: (n, 3) arrays or Dr.Jit vectors. One
+    wide expression that Dr.Jit can differentiate in both directions.
 
-    Memory grows with points times vertices. The formula is that of `sum_over_edges`, with one
-    angle an edge instead of a product: an angle may jump by 4 pi, its derivative does not.
+    The loop of `sum_over_edges` is the fastest way to a number, but reverse mode cannot pass a
+    recorded loop. Here every pair of a point and an edge is a lane, and a block sum adds them up,
+    so that memory grows with points times vertices. The formula is that of `sum_over_edges`, with
+    one angle for each edge instead of a product: an angle may jump by 4 pi, its derivative does
+        not.
     """
     total = dr.zeros(backend.Float, dr.width(x))
     for loop in loops:
@@ -94,8 +66,8 @@ def _loop_angle(backend: Backend, vertices: Vec3, x: Vec3) -> Real:
 
 
 def segments(backend: Backend, start: FloatArray, end: FloatArray) -> Records:
-    """Segments (k, 3) to (k, 3), k >= 1, of a size of about one. One whose ends are the same in
-    the backend's precision is a point."""
+    """Records of segments from (k, 3) to (k, 3), k >= 1, of a size of about one. One whose ends are
+    the same in the backend's precision is a point."""
     start, end = (q.astype(backend.dtype).astype(np.float64) for q in (start, end))
     return Records.upload(backend, single_edges(start, end))
 
@@ -119,7 +91,14 @@ def closest_on_segments(segments: Records, x: Vec3) -> Vec3:
 
 
 def change_along_segments(edges: LoopEdges, p: Vec3, q: Vec3) -> Real:
-    """The change of the lift of the solid angle from p to q, which differ."""
+    """The change of the solid angle, followed continuously from p to q, which differ.
+
+    Biot and Savart's field, integrated along the segment from p to q, gives for each edge from a to
+    b of the curve minus the solid angle of the parallelogram (a - p) + s (b - a) - t (q - p) at the
+    origin: less than 2 pi in size, as it lies in a plane that misses the origin unless the segment
+    meets the edge. As two triangles it is twice two arctangents (van Oosterom and Strackee 1983),
+    so there is no branch to choose.
+    """
     real = edges.backend.Float
 
     def add(a: Vec3, b: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -135,16 +114,32 @@ def _angle(a: Vec3, b: Vec3, c: Vec3) -> Real:
     la, lb, lc = dr.norm(a), dr.norm(b), dr.norm(c)
     volume = dr.dot(a, dr.cross(b, c))
     rest = dr.fma(dr.dot(a, b), lc, dr.fma(dr.dot(b, c), la, dr.dot(c, a) * lb))
-    # A triangle that is seen from its own plane has no solid angle, whatever rounding says.
+    # A triangle has no solid angle at points of its own plane, whatever rounding does.
     return dr.select(volume == 0, 0, 2 * dr.atan2(volume, dr.fma(la * lb, lc, rest)))
 
 
-# Radii of the promises as parts of the distance to the curve, by experiment.
+# Radii of the promises as fractions of the distance to the curve, by experiment.
 _REACHES = (0.3, 0.6, 0.85)
 
 
 def bends(cubes: Real, fourths: Real, distance: Real) -> tuple[Curvature, ...]:
-    """The promises: see the module. cubes, fourths: I3 and I4; distance: d, or less."""
+    """Promises of the second derivatives of the solid angle, by integrals over the curve.
+
+    cubes, fourths: I3 and I4, the integrals of |dp|/|D|^3 and |dp|/|D|^4. distance: d, or less.
+
+    Proof. Along a unit direction v the derivative of the solid angle is the integral of
+    v.(D x dp)/|D|^3 over the curve, D = p - x (Biot and Savart), and its second derivative that of
+    3 (v.D)(v.(D x dp))/|D|^5, as D changes by -v. D and D x dp are at right angles, so the product
+    of their components along v is at most half of that of their lengths: the second derivative is
+    at most 3/2 times the integral of |dp|/|D|^3. At x + s v, |D| is less by s at most. So by Taylor
+    the remainder after the linear term is, for t < d, the distance to the curve, at most
+
+        3/2 integral of |dp| integral over [0, t] of (t-s)/(|D|-s)^3 ds
+            = 3/4 t^2 integral of |dp|/(|D|^3 (1 - t/|D|)),
+
+    and 1/(1 - u) <= 1 + u/(1 - q) for 0 <= u <= q. On the ball of radius q d that is `Curvature`
+    with the constant 3/2 (I3 + q d I4/(1 - q)). It holds for any piece of a curve, and adds up.
+    """
     scale = 1.5 * (1 + SUM_ROUNDING)
     return tuple(
         Curvature(scale * dr.fma(q / (1 - q) * distance, fourths, cubes), q * distance)
@@ -153,8 +148,18 @@ def bends(cubes: Real, fourths: Real, distance: Real) -> tuple[Curvature, ...]:
 
 
 def slope_change(cubes: Real, fourths: Real, distance: Real, radius: Real) -> Real:
-    """How far the gradient moves at most within `radius`: see the module; infinite where that is
-    not less than the distance."""
+    """A bound of the change of the gradient within `radius`; infinite unless that is less than the
+    distance.
+
+    Proof. The second derivative in every direction is at most 3/2 times the integral of |dp|/|D|^3
+    (`bends`). So is the norm of the Hessian, and from x to x + t v the gradient changes by at most
+
+        3/2 integral of |dp| integral over [0, t] of ds/(|D|-s)^3
+            = 3/4 t integral of |dp|/|D|^3 (2 - u)/(1 - u)^2,    u = t/|D|.
+
+    For 0 <= u <= q < 1 that fraction, which is convex in u, is at most 2 + u (3 - 2q)/(1 - q)^2,
+    its chord. With q = t/d: at most 3/2 t I3 + 3/4 t^2 I4 (3 - 2q)/(1 - q)^2.
+    """
     q = radius / distance
     growth = (3 - 2 * q) / dr.square(1 - q)
     change = radius * (1.5 * cubes + 0.75 * radius * growth * fourths)
@@ -164,9 +169,10 @@ def slope_change(cubes: Real, fourths: Real, distance: Real, radius: Real) -> Re
 def swept_ball(
     value: Real, gradient: Vec3, squares: Real, bends: tuple[Curvature, ...]
 ) -> HarmonicBall:
-    """The range of the lift on the ball of one of its promises, which itself proves longer steps.
+    """The range of the lift on the ball of one of the promises, which themselves prove longer
+    steps.
 
-    squares: the integral of |dp|/|D|^2, to which the gradient is known but for its rounding.
+    squares: the integral of |dp|/|D|^2, to which the rounding of the gradient is proportional.
     """
     bend = bends[1]
     slope = dr.norm(gradient) + SUM_ROUNDING * squares

@@ -1,16 +1,16 @@
-"""The solid angle of edges as a real number that follows a direction: no jumps along rays.
+"""The lifted solid angle of boundary edges: a real number that has no jumps along a ray.
 
 The antipodal method (Martens, Trettner and Bessmeltsev 2026): with the apex of every edge's
-triangle at infinity against the direction d, an edge e from a to b (seen from x) has the solid
-angle Omega_e = 2 arg F_e with F_e = (s_a s_b + a'.b') - i (a' x b'), where a' is a seen along d
-(two numbers) and s_a = |a| - a.d. Then
+triangle at infinity, opposite to the direction d, an edge e from a to b (relative to x) has the
+solid angle Omega_e = 2 arg F_e with F_e = (s_a s_b + a'.b') - i (a' x b'), where a' is a projected
+along d (two numbers) and s_a = |a| - a.d. Then
 
-    w(x) = turns of all crossings of the ray from x along d  +  1/(4 pi) sum_e Omega_e(x)
+    w(x) = signs of all crossings of the ray from x along d  +  1/(4 pi) sum_e Omega_e(x)
 
 is the winding number of *any* triangles with these boundary edges: F_e crosses the negative axis
-exactly where the ray from x along d passes through e, and there the crossings change by as much.
-As x moves along d itself, that ray only gets shorter, so that sum_e Omega_e is continuous on the
-whole ray off the edges, and the jumps of w are those of the triangles passed.
+exactly where the ray from x along d passes through e, and there the sum of the signs changes by as
+much. As x moves along d itself, that ray only gets shorter, so that sum_e Omega_e is continuous on
+the whole ray off the edges, and the jumps of w are those of the triangles passed.
 """
 
 from __future__ import annotations
@@ -35,21 +35,21 @@ if TYPE_CHECKING:
     from harnack.tree.hierarchy import FloatArray, IntArray
     from harnack.tree.triangles import Frame
 
-# Edges a trip of the loop; those that fill the last one have no length and no direction.
+# Edges in a trip of the loop; those that pad the last one have no length and no direction.
 _CHUNK = 4
-# Where an edge is nowhere near the ray, its factor has this for an imaginary part of zero.
+# The size of the imaginary part of a factor where it would be zero.
 _TINY = 1e-36
 
 
 @dataclass(frozen=True)
 class LiftedEdges:
-    """Directed edges on the device, one packet each: see `edge_records`."""
+    """Directed edges on a backend, one packet each: see `edge_records`."""
 
     records: Records
 
     @classmethod
     def upload(cls, backend: Backend, vertices: FloatArray, edges: IntArray) -> LiftedEdges:
-        """Edges (k, 2) between vertices (n, 3); weights are repetitions."""
+        """Edges (k, 2) between vertices (n, 3); an edge of weight w is repeated w times."""
         table = edge_records(vertices, edges)
         nothing = np.concatenate([table[0, :3], [0.0], table[0, :3], table[0, 7:]])
         return cls(Records.upload(backend, table, nothing, _CHUNK))
@@ -69,10 +69,13 @@ def edge_records(vertices: FloatArray, edges: IntArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class LiftedEdge:
-    """An edge as it is seen from x along rays of one direction.
+    """An edge relative to a point x, and to rays of one direction.
 
-    ends: where it begins and ends. frame: of the rays. direction: 1 or -1, as the edge runs from
-    the one to the other or back; it counts so in everything.
+    edge: relative to x.
+    ends: its end points, in the order of their indices.
+    frame: of the rays.
+    direction: 1 or -1: whether the boundary runs from the first end to the second or back; the sign
+        of all that the edge adds.
     """
 
     edge: Edge
@@ -84,11 +87,11 @@ class LiftedEdge:
     def between(
         cls, p: Vec3, q: Vec3, direction: Real, inverse: Real, frame: Frame | Upwards, x: Vec3
     ) -> LiftedEdge:
-        """The edge from p to q, inverse = 1/|q-p|^2, seen from x on a ray of the frame."""
+        """The edge from p to q, inverse = 1/|q-p|^2, relative to x on a ray of the frame."""
         return cls(Edge.between(p, q, inverse, x), (p, q), frame, direction)
 
     def factor(self) -> tuple[Real, Real]:
-        """F_e, by its real and imaginary part."""
+        """F_e: real and imaginary part."""
         vector, frame, edge = cast("Any", type(self.edge.a)), self.frame, self.edge
         pairs = zip(self.ends, (edge.a, edge.b), strict=True)
         a, b = (vector(*frame.across(p), frame.component(a)) for p, a in pairs)
@@ -96,8 +99,8 @@ class LiftedEdge:
         return re, self.direction * im
 
     def terms(self, derivatives: int, active: Mask) -> Terms:
-        """What it adds to the derivatives of the sum of angles, as far as they are asked for; 0
-        where it is not active."""
+        """What the edge adds to the derivatives of the sum of angles that are asked for; 0 where it
+        is not active."""
         if derivatives == 0:
             return Terms(0.0)
         weight, c = self.edge.field()
@@ -109,22 +112,22 @@ class LiftedEdge:
         return Terms(0.0, gradient, SymmetricSum.zero(type(c.x)).plus(c, rate))
 
     def bounds(self, unit: Real) -> tuple[Real, Real, Real]:
-        """What rounding may do to Omega_e, and what the edge adds to s4 and s5 of `FieldSums`.
+        """A bound of the rounding of Omega_e, and what the edge adds to s4 and s5 of `FieldSums`.
 
-        unit: the rounding of a coordinate, `epsilon_at`, which is twice what correct rounding does.
+        unit: the rounding of a coordinate, `epsilon_at`, which is twice that of correct rounding.
 
         Rounding. The ends of the edge, x and their differences are off by half a unit together, and
         the angle by that times Biot and Savart's field, which is at most twice the first number of
         `edge_variation`; the roundings of the factor F_e are as if its ends had moved by another
         half, for those of its terms are |F_e| times a few over the cosine of half the angle that
-        the edge is seen at, and the same bits of an end serve both edges there. It is less than
-        4 pi in any case.
+        the edge subtends, and the same bits of an end serve both edges there. It is less than 4 pi
+        in any case.
 
         Variation. Taylor's remainder after the linear term is at most 3/4 t^2 times the integral of
-        |dp|/(rho^3 (1-t/rho)) (`curve_promises`). With a = L/2 and distance d an edge has
+        |dp|/(rho^3 (1-t/rho)) (`edge_angles.bends`). With a = L/2 and distance d an edge has
         int rho^-3 <= 2a/(d^2 sqrt(d^2+a^2)) =: 2e, int rho^-4 <= 2e/d; and 1/(1-q) <= 1 + q/(1-b)
         <= 1 + q rise/4 on [0, b] (`FieldSums.sample`). So an edge adds to the remainder what
-        s4 += e/2 and s5 += 3e/(8d) do. d is less by what rounding may have done to it.
+        s4 += e/2 and s5 += 3e/(8d) do. d is reduced by its rounding.
         """
         distance = fmax(dr.sqrt(self.edge.square) - 2 * unit, 0)
         first, e = edge_variation(distance * distance, self.edge.inverse)
@@ -133,27 +136,27 @@ class LiftedEdge:
 
 @dataclass(frozen=True)
 class LiftedSums:
-    """Sums over terms and edges, of which the edges' angles are a product yet."""
+    """Sums over terms and edges, in which the edges' angles are still a product of factors."""
 
     sums: FieldSums
     product: LiftedProduct
 
     @classmethod
     def zero(cls, backend: Backend, derivatives: int) -> LiftedSums:
-        """Of nothing; derivatives: as for `FieldSums.zero`."""
+        """Empty sums; derivatives: as for `FieldSums.zero`."""
         return cls(FieldSums.zero(backend, dr.inf, derivatives), LiftedProduct.one(backend.Float))
 
     @classmethod
     def of(cls, parts: tuple[Any, ...]) -> LiftedSums:
-        """From `parts`."""
+        """The sums with these `parts`."""
         return cls(FieldSums.of(parts[0]), LiftedProduct(*parts[1]))
 
     def parts(self) -> tuple[Any, ...]:
-        """Those of the sums and those of the product, as loops want them."""
+        """The parts of the sums and those of the product, for the state of a loop."""
         return self.sums.parts(), self.product.parts()
 
     def plus(self, edge: LiftedEdge, unit: Real, active: Mask) -> LiftedSums:
-        """With an edge more, where active; unit as for its `bounds`."""
+        """The sums with an edge added where active; unit: as for `LiftedEdge.bounds`."""
         (re, im), terms = edge.factor(), edge.terms(self.sums.derivatives, active)
         sums = self.sums.plus(terms, True)
         rounding, s4, s5 = (dr.select(active, one, 0) for one in edge.bounds(unit))
@@ -174,15 +177,15 @@ class LiftedSums:
         return self.product.angle()
 
     def whole(self) -> FieldSums:
-        """The sums with the edges' angles in their value."""
+        """The sums with the edges' angles added to the value."""
         return dataclasses.replace(self.sums, value=self.sums.value + self.angle)
 
 
 def lifted_sums(edges: LiftedEdges, x: Vec3, derivatives: int) -> LiftedSums:
     """All sums at points x in one loop over the edges, for the direction d = z.
 
-    derivatives: 0 for the angle alone, 1 with the gradient, 2 with the Hessian. What of the result
-    nobody uses is not computed.
+    derivatives: 0 for the angle alone, 1 with the gradient, 2 with the Hessian. Results that are
+        not used are not computed.
     """
     backend, unit = edges.records.backend, epsilon_at(x)
     vector = backend.Array3f
@@ -198,10 +201,12 @@ def lifted_sums(edges: LiftedEdges, x: Vec3, derivatives: int) -> LiftedSums:
 
 @dataclass(frozen=True)
 class Sight:
-    """A vertex seen from x along rays.
+    """A vertex relative to x and to rays.
 
-    offset: from x to it. length: of that. u, v: where it is across the rays. s: length less the
-    component of the offset along them.
+    offset: from x to the vertex.
+    length: of the offset.
+    u, v: the vertex's coordinates across the rays.
+    s: the length less the component of the offset along the rays.
     """
 
     offset: Vec3
@@ -212,7 +217,7 @@ class Sight:
 
 
 def sight_of(p: Vec3, frame: Frame, x: Vec3) -> Sight:
-    """A vertex p as seen from x on rays of a frame."""
+    """A vertex p relative to x and to rays of a frame."""
     offset = p - x
     length = dr.norm(offset)
     u, v = frame.across(p)
@@ -223,7 +228,7 @@ def sight_of(p: Vec3, frame: Frame, x: Vec3) -> Sight:
 def ends_factor(a: Sight, b: Sight, direction: Real) -> tuple[Real, Real]:
     """F_e of the edge from a to b; direction: positive if a has the lower index, else negative.
 
-    `side` is asked for the ends in the order of their indices, as everywhere.
+    `side` is given the ends in the order of their indices, as everywhere.
     """
     rises = direction > 0
     low, high = (dr.select(rises, a.u, b.u), dr.select(rises, a.v, b.v)), (
@@ -234,18 +239,18 @@ def ends_factor(a: Sight, b: Sight, direction: Real) -> tuple[Real, Real]:
 
 
 def edge_factor(a: Vec3, b: Vec3, la: Real, lb: Real) -> tuple[Real, Real]:
-    """F_e of the edge from a to b, seen as (u, v, z): across the direction, and along it.
+    """F_e of the edge from a to b, each (u, v, z) across the direction and along it.
 
-    s_a is taken as |a'|^2/(|a| + a.d) where a.d > 0, so that nothing cancels.
+    s_a is computed as |a'|^2/(|a| + a.d) where a.d > 0, so that nothing cancels.
     """
     return _factor((a.x, a.y), (b.x, b.y), _s(a, la), _s(b, lb))
 
 
 def _factor(a: tuple[Real, Real], b: tuple[Real, Real], sa: Real, sb: Real) -> tuple[Real, Real]:
-    """F_e of ends seen across the direction, with s of each.
+    """F_e from the ends' coordinates across the direction, and s of each.
 
-    A ray exactly through an edge or a vertex is decided as `tree.triangles.crossing` does: as if
-    it passed at v, and then u, infinitely little below zero.
+    A ray exactly through an edge or a vertex is treated as by `tree.triangles.crossing`: as if it
+    passed at a v, and then a u, infinitely little below zero.
     """
     real, (au, av), (bu, bv) = cast("Any", type(sa)), a, b
     in_line = (au == 0) & (av == 0), (bu == 0) & (bv == 0)
@@ -253,8 +258,8 @@ def _factor(a: tuple[Real, Real], b: tuple[Real, Real], sa: Real, sb: Real) -> t
     im = -side((ax, av), (bx, bv))
     re = dr.fma(sa, sb, dr.fma(ax, bx, av * bv))
     tie = dr.select(av == bv, ax - bx, bv - av)
-    # Of a real factor the sign counts alone. Left as small as it may be, it would be no longer than
-    # what stands for its imaginary part.
+    # Only the sign of a real factor matters. It may be so small that it would be no longer than the
+    # number that stands for its imaginary part.
     straight = im == 0
     re = dr.select(straight, dr.select((re < 0) & ~(in_line[0] & in_line[1]), real(-1), 1), re)
     return re, dr.select(straight, dr.mulsign(real(_TINY), tie), im)
@@ -267,7 +272,8 @@ def _s(a: Vec3, length: Real) -> Real:
 
 @dataclass(frozen=True)
 class LiftedProduct:
-    """A product re + i im of factors, of length about one, and how often it has gone round."""
+    """A product re + i im of factors, scaled to a length of about one, and the number of its full
+    turns."""
 
     re: Real
     im: Real
@@ -275,26 +281,27 @@ class LiftedProduct:
 
     @classmethod
     def one(cls, real: Any) -> LiftedProduct:
-        """Of no factors; real: the type of its numbers."""
+        """The product of no factors; real: the type of its numbers."""
         return cls(real(1), real(0), real(0))
 
     def parts(self) -> tuple[Real, Real, Real]:
-        """In the order of the constructor, as loops want them."""
+        """The attributes in the order of the constructor, for the state of a loop."""
         return self.re, self.im, self.turns
 
     def times(self, re: Real, im: Real) -> LiftedProduct:
-        """With one factor more.
+        """The product with one factor more.
 
-        Arguments lie in (-pi, pi]; that of the product is their sum if they have different signs;
+        Arguments lie in (-pi, pi]. That of the product is their sum if they have different signs;
         otherwise the sum has left the interval exactly if its imaginary part has the other sign.
-        That of two factors of -pi/2 has: it is -pi, which is pi and a turn less.
+        For two factors of argument -pi/2 it has: the sum -pi is pi and one turn less.
         """
         pr = dr.fma(self.re, re, -(self.im * im))
         pi = dr.fma(self.re, im, self.im * re)
         scale = dr.rcp(dr.abs(pr) + dr.abs(pi))
         one = type(pr)(1)
         pi = dr.select(pi == 0, 0, pi)  # no zero with a sign, which would be -pi
-        # One of them is then no shorter than pi/2; to ask for it keeps an underflow from counting.
+        # Then one of the two arguments is at least pi/2; testing for it keeps underflow from
+        # counting.
         left = (self.re <= 0) | (re <= 0)
         over = dr.select((self.im >= 0) & (im >= 0) & (pi < 0) & left, one, 0)
         under = dr.select((self.im < 0) & (im < 0) & (pi >= 0) & left, one, 0)

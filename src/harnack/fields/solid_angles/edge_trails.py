@@ -1,41 +1,8 @@
-"""How little the solid angle of closed curves moves along a line that runs beside an edge.
+"""Sums over the edges of closed curves, for rays that run along edges and for many points.
 
-A ball about a point near the curve is as small as the distance to it, so a ray that runs beside a
-long edge would need thousands of them. Along a *given* line much more is known. With a = p - x, e
-the edge from p to q and v the unit direction, an edge's share of df/ds at x + s v is
-
-    v . (a - s v) x e  w(s) = c w(s),   c = v . (a x e),   w(s) = integral over [0, 1] of
-                                                           |a - s v + t e|^-3 dt:
-
-c does not depend on s, and is zero where the line is parallel to the edge. If rho bounds the
-distance of the edge from the points of a stretch of the line from below, and |e| = 2h,
-
-    w <= 1/(rho^2 sqrt(rho^2 + h^2)),
-
-for a point of the edge at length l from the nearest one is at least sqrt(rho^2 + l^2) away, and
-the integral over an interval of l of length 2h is largest if it is centered. Walking from x by at
-most T, rho falls no faster than one walks, and nowhere below the distance rho' of the edge from the
-whole line, nor below the distance rho" of the stretch from the line through the edge (a ray may
-meet that one at a small angle, far ahead). So for |s| <= T
-
-    |f(x + s v) - f(x)| <= |s| K,   K = sum_e |c| / (rho^2 sqrt(rho^2 + h^2)),
-                                    rho = max(d_e - T, rho', rho").
-
-The solid angle of boundary edges at many points: values alone, and as fast as they will go.
-
-The formula is that of `edge_lift`, arranged so that little is done twice. The boundary of a chain
-of triangles enters every vertex as often as it leaves it, so that its edges make up closed
-trails, and what a factor needs of a vertex is computed once and not once for each of its edges;
-a record of edges is fetched once for eight points; nothing is divided. Points about which rounding
-could have decided wrongly are told apart, for `edge_lift` to do again.
-
-The solid angle of closed trails of edges along rays, edge by edge, and as fast as it will go.
-
-The formula is that of `edge_lift`, and its decisions are made by the same bits. A close sum over a
-tree of chains (`EdgeChains`) goes down to most of its leaves, on other ways in neighboring lanes,
-so that up to some thousands of edges a plain loop over all of them is faster, and exact. What is
-needed of a vertex is computed once and not once for each of its edges, and roots and divisions,
-which cost most, are shared by edges where a bound allows it.
+- `rates_along`: how little a solid angle changes along a line that runs along an edge.
+- `EdgeTrails`: boundary parts of winding numbers at many points; values alone, fast.
+- `LiftedTrails`: the same along rays, with derivatives and bounds.
 """
 
 from __future__ import annotations
@@ -64,12 +31,13 @@ if TYPE_CHECKING:
 
 __all__ = ["LiftedTrails", "Line", "known_along", "rates_along", "with_edge_rates"]
 
-# Nearer to the curve than this part of its size, and with a slope below this part of the
-# gradient, a ray may run along the curve and asks what is known along its line; elsewhere only
-# with a slope so small that it may run along a flat part of the surface.
+# Bounds along the line of a ray are computed where the ray may run along the curve: where it is
+# nearer to it than the first fraction of the curve's size, and its slope is below the second
+# fraction of the gradient. Elsewhere only where the ray may run along a flat part of the surface:
+# where the slope is below the third fraction of the gradient.
 _BESIDE, _FLAT, _GRAZING = 0.001, 0.25, 1e-3
-# Of the distance to the curve, the powers that are the lengths asked about: from half of it to the
-# size of the curve.
+# The number of lengths for which bounds are computed: in geometric progression from half the
+# distance to the curve towards the size of the curve.
 _LENGTHS = 6
 
 # The rates for lengths, on lanes that are active.
@@ -78,7 +46,7 @@ Rates: TypeAlias = "Callable[[tuple[Real, ...], Mask], tuple[Real, ...]]"
 
 @dataclass(frozen=True)
 class Line:
-    """Lines x + s v and how far their points may be off by rounding; lengths of order one."""
+    """Lines x + s v, with lengths of order one; rounding: that of their points."""
 
     x: Vec3
     v: Vec3
@@ -86,15 +54,15 @@ class Line:
 
     @property
     def slack(self) -> Real:
-        """Beyond the rounding of the points, that of differences p - x, which are as long as x."""
+        """The rounding of the points and of differences p - x, which are about as long as x."""
         return dr.fma(8 * float(dr.epsilon(self.x)), dr.norm(self.x), self.rounding)
 
 
 def known_along(line: Line, gradient: Vec3, distance: Real, rates: Rates) -> tuple[Lipschitz, ...]:
-    """How fast f moves along lines through points so far from the curve, for lengths that lead from
-    half that distance to the curve's size; only on lanes where it may be worth its cost.
+    """Lipschitz constants of f along lines, for lengths from half the distance to the curve towards
+    its size; finite only on lanes where they may be worth their cost.
 
-    Beside a straight edge the longest will do, and others near its ends; along a flat part of the
+    Along a straight edge the longest is of use, near its ends the others; along a flat part of the
     surface, bounded by a plane curve, the shortest.
     """
     slope, steepness = dr.dot(gradient, line.v), dr.norm(gradient)
@@ -111,10 +79,32 @@ def known_along(line: Line, gradient: Vec3, distance: Real, rates: Rates) -> tup
 def rates_along(
     edges: LoopEdges, line: Line, lengths: tuple[Real, ...], active: Mask
 ) -> tuple[Real, ...]:
-    """For each length T a constant K of the module's bound on the line for |s| <= T.
+    """For each length T a constant K with |f(x + s v) - f(x)| <= |s| K for |s| <= T.
 
-    Infinite on lanes that are not active, which cost nothing where their neighbors are not
-    either, and where the line meets the curve within T, to rounding.
+    Infinite where the line meets the curve within T, up to rounding, and on lanes that are not
+    active, which cost nothing if their neighbors are not active either.
+
+    A ball about a point near the curve is as small as the distance to it, so a ray that runs along
+    a long edge would need thousands of them. Along a *given* line much more is known. With
+    a = p - x, e the edge from p to q and v the unit direction, an edge's share of df/ds at x + s v
+    is
+
+        v . (a - s v) x e  w(s) = c w(s),   c = v . (a x e),   w(s) = integral over [0, 1] of
+                                                               |a - s v + t e|^-3 dt:
+
+    c does not depend on s, and is zero where the line is parallel to the edge. Let rho be a lower
+    bound of the distance of the edge from the points of a segment of the line, and |e| = 2h. Then
+
+        w <= 1/(rho^2 sqrt(rho^2 + h^2)),
+
+    for a point of the edge at length l from the nearest one is at least sqrt(rho^2 + l^2) away, and
+    the integral over an interval of l of length 2h is largest if it is centered. From x to x + s v,
+    |s| <= T, the distance falls by at most T, and nowhere below the distance rho' of the edge from
+    the whole line, nor below the distance rho" of the segment from the line through the edge (a ray
+    may meet that one at a small angle, far ahead). So for |s| <= T
+
+        |f(x + s v) - f(x)| <= |s| K,   K = sum_e |c| / (rho^2 sqrt(rho^2 + h^2)),
+                                        rho = max(d_e - T, rho', rho").
     """
 
     def add(p: Vec3, q: Vec3, inverse: Real, rates: tuple[Real, ...]) -> tuple[Real, ...]:
@@ -128,11 +118,12 @@ def rates_along(
 def with_edge_rates(
     line: Line, edge: Edge, lengths: tuple[Real, ...], rates: tuple[Real, ...]
 ) -> tuple[Real, ...]:
-    """The rates with an edge added, seen from the line's x.
+    """The rates with an edge added, relative to the line's x.
 
-    m = a x v and n = e x v are a and e as seen along the line, turned by a right angle. Distances
-    on the line's plane are taken from them, and c = v . m x n, so that it is small where both are,
-    whatever the lengths of a and e: its error is at most 8 epsilon |m| |e| and slack |n|.
+    m = a x v and n = e x v are a and e projected along the line and turned by a right angle.
+    Distances in the plane across the line are computed from them, and so is c = v . m x n, which is
+    then small where both are, whatever the lengths of a and e: its error is at most 8 epsilon |m|
+    |e| and slack |n|.
     """
     a, e, inverse, slack = edge.a, edge.e, edge.inverse, line.slack
     epsilon = float(dr.epsilon(type(inverse)))
@@ -154,22 +145,24 @@ def with_edge_rates(
         rho = fmax(fmax(distance - length, passing), through)
         square = rho * rho
         term = c * dr.rcp(square) * dr.rsqrt(square + quarter)
-        # Not where the edge may be met: nothing is known then.
+        # Infinite where the line may meet the edge.
         grown.append(rate + dr.select(rho > 0, term, dr.inf))
     return tuple(grown)
 
+
+# Values at many points.
 
 # Edges of a record: its five vertices and the number of its edges fill two packets of eight.
 _EDGES = 4
 # Points of a lane: as many as registers hold, by experiment.
 _POINTS = 3
-# Sides closer to zero than this many rounding errors of their products are not trusted; theirs
-# are six at most, those of `tree.triangles.side` one.
+# Signs of `side` are not trusted where it is closer to zero than this many rounding errors of its
+# products; its own are six at most, those of `tree.triangles.side` one.
 _UNSURE = 16
 # Beyond this distance, in sizes of the mesh, the products of lengths could leave float32.
 _FAR = 1024.0
 
-# A point, and 1 or -1 for the way that its ray goes along the z axis.
+# A point, and 1 or -1 for the direction of its ray along the z axis.
 Point: TypeAlias = "tuple[Vec3, Real]"
 Complex: TypeAlias = "tuple[Real, Real]"
 # u (|a| + |z|), v (|a| + |z|) and s of a vertex.
@@ -178,7 +171,7 @@ Seen: TypeAlias = "tuple[Real, Real, Real]"
 
 @dataclass(frozen=True)
 class _Bits:
-    """What the formats of floating-point numbers differ in."""
+    """The parameters of a floating-point format, for operations on its bits."""
 
     integer: Any
     mantissa: int
@@ -202,11 +195,10 @@ class _Bits:
 
 @dataclass(frozen=True)
 class _Product:
-    """A product of factors whose arguments are counted on.
+    """A product z = x + iy of complex factors, of any length, with the sum of their arguments.
 
-    z = x + iy, of any length; half: how many half planes round it is, so that the sum theta of
-    the factors' principal arguments lies in [half pi, (half + 1) pi]. The sign bit of y is
-    half's parity.
+    half: the number of half turns: the sum theta of the factors' principal arguments lies in
+        [half pi, (half + 1) pi]. The sign bit of y is half's parity.
     """
 
     x: Real
@@ -220,12 +212,13 @@ class _Product:
     def times(self, bits: _Bits, factor: Complex) -> _Product:
         """The product with one factor more.
 
-        Its argument, in [-pi, pi], takes theta at most one half plane on, or one back if the sign
-        bit of its imaginary part is set; and on (or back) it is exactly if the sign of y changes.
-        That holds for the computed y as well: it has a sign other than its exact value's only
-        if its two terms cancel, and then the exact theta is about the very multiple of pi that
-        the count takes it over (arguments of like signs and y x' < 0: about +-pi; of unlike
-        signs: about 0). A term that underflows keeps its sign bit.
+        The factor's argument, in [-pi, pi], takes theta at most one half plane forward, or one back
+        if the sign bit of its imaginary part is set; and it does so exactly if the sign of y
+        changes. That holds for the computed y as well: its sign differs from that of the exact
+        value only if its two terms cancel, and then the exact theta is close to the very multiple
+        of pi that the count says it has crossed (arguments of like signs and y x' < 0: about +-pi;
+        of
+        unlike signs: about 0). A term that underflows keeps its sign bit.
         """
         x = dr.fma(self.x, factor[0], -(self.y * factor[1]))
         y = dr.fma(self.x, factor[1], self.y * factor[0])
@@ -233,12 +226,13 @@ class _Product:
         return _Product(x, y, self.half + (changes & (bits.sign(factor[1]) | 1)))
 
     def times_product(self, bits: _Bits, other: _Product) -> _Product:
-        """The product with another, whose own turns are added."""
+        """The product with another one, whose half turns are added."""
         z = self.times(bits, (other.x, other.y))
         return _Product(z.x, z.y, z.half + ((other.half + 1) & -2))
 
     def scaled(self, bits: _Bits) -> tuple[_Product, Real]:
-        """The same of length about one, and how long it was; a power of two rounds nothing."""
+        """The same with length about one, and the length it had. Scaling by a power of two is
+        exact."""
         length = dr.abs(self.x) + dr.abs(self.y)
         scale = bits.about_one_over(length)
         return _Product(self.x * scale, self.y * scale, self.half), length
@@ -246,14 +240,23 @@ class _Product:
     def turns(self) -> Real:
         """theta/(2 pi)."""
         real = cast("Any", type(self.x))
-        # atan2 takes no notice of the sign of a zero.
+        # atan2 ignores the sign of a zero.
         y = dr.copysign(fmax(dr.abs(self.y), real(1e-30)), self.y)
         return dr.fma(dr.atan2(y, self.x), 0.5 / dr.pi, real((self.half + 1) >> 1))
 
 
 @dataclass(frozen=True)
 class EdgeTrails:
-    """Directed edges on the device, as records of consecutive edges of closed trails."""
+    """Directed edges on a backend, as records of consecutive edges of closed trails.
+
+    For values of `edge_lift`'s sum at many points. The formula is the same, arranged so that little
+    is computed twice. The boundary of a chain of triangles enters every vertex as often as it
+    leaves
+    it, so that its edges make up closed trails: the part of a factor that belongs to a vertex is
+    computed once and not for each of its edges; a record of edges is fetched once for several
+    points; there are no divisions. Points at which rounding could have changed a sign are marked,
+    for `edge_lift` to compute again.
+    """
 
     records: Records
 
@@ -271,11 +274,13 @@ class EdgeTrails:
         return cls(Records.upload(backend, np.concatenate(rows)))
 
     def turns(self, x: Vec3, way: Real) -> tuple[Real, Mask]:
-        """1/(4 pi) times the sum of Omega_e at points x, and whether to doubt it.
+        """1/(4 pi) times the sum of Omega_e at points x, and a mask of points to compute again.
 
         way: 1 for the direction d = z; -1 for x and the edges mirrored in a plane z = const.
-        Each lane of the kernel takes several points. Doubt is where a side is nearer to zero
-        than rounding can tell, where a factor is (beside an edge or a short one), and far away.
+
+        Each lane of the kernel takes several points. The mask holds where rounding could have
+        changed the sign of a `side`, where a product of factors nearly underflows (near an edge or
+        a short one), and farther than 1024 mesh sizes away along any axis.
         """
         dr.eval(x, way)
         backend, n = self.records.backend, dr.width(x)
@@ -295,13 +300,14 @@ class EdgeTrails:
         return dr.gather(real, dr.concat(turns), order), some | far
 
     def _over_records(self, points: list[Point]) -> tuple[list[_Product], list[Real]]:
-        """For each point the product of all factors, and a number below 0 where it is in doubt."""
+        """For each point the product of all factors, and a number that is at most 0 where it is
+        uncertain."""
         backend = self.records.backend
         real, bits = backend.Float, _Bits.of(backend)
         slack = real(-_UNSURE * 0.5 * backend.epsilon)
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            # Edges that fill a record up are from a vertex to itself: no doubt about those.
+            # Edges that pad a record lead from a vertex to itself: they are never uncertain.
             slacks = [dr.select(row[15] > k, slack, 1) for k in range(_EDGES)]
             pairs = zip(points, state, strict=True)
             return tuple(_with_record(bits, row, slacks, x, old) for x, old in pairs)
@@ -314,10 +320,10 @@ class EdgeTrails:
 def _with_record(
     bits: _Bits, row: list[Real], slacks: list[Real], x: Point, state: tuple[Any, ...]
 ) -> tuple[Any, ...]:
-    """The product (x, y, half) and the doubt with the four edges of a record.
+    """The product (x, y, half) and the number of `_over_records` with the four edges of a record.
 
-    They are multiplied among themselves first: that product has an argument of nearly zero, at
-    which rounding costs least.
+    The four are multiplied among themselves first: that product has an argument of nearly zero,
+    where rounding has the least effect.
     """
     z, doubt = _Product(*state[:3]), state[3]
     smallest = 2.0**-100 if bits.mantissa < 50 else 2.0**-800
@@ -337,9 +343,9 @@ def _with_record(
 
 
 def _seen(bits: _Bits, vertex: list[Real], point: Point) -> Seen:
-    """A vertex from a point: (u t, v t, s t) with t = |a| + |z| and s = |a| - way z.
+    """A vertex relative to a point: (u t, v t, s t) with t = |a| + |z| and s = |a| - way z.
 
-    s t is (|a| + |z|)^2 or u^2 + v^2: there is no difference that could cancel.
+    s t is (|a| + |z|)^2 or u^2 + v^2, so that no difference cancels.
     """
     x, way = point
     u, v, z = vertex[0] - x[0], vertex[1] - x[1], vertex[2] - x[2]
@@ -351,7 +357,8 @@ def _seen(bits: _Bits, vertex: list[Real], point: Point) -> Seen:
 
 
 def _factor(a: Seen, b: Seen, slack: Real) -> tuple[Complex, Real]:
-    """The conjugate of F_e times something positive; and a number below 0 where it is in doubt."""
+    """The conjugate of F_e times a positive number; and a number that is at most 0 where its sign
+    is uncertain."""
     back = a[1] * b[0]
     im = dr.fma(a[0], b[1], -back)
     re = dr.fma(a[2], b[2], dr.fma(a[0], b[0], a[1] * b[1]))
@@ -362,7 +369,7 @@ def closed_trails(edges: IntArray) -> list[IntArray]:
     """Directed edges (k, 2) as trails of vertices, each ending where it begins; each edge once.
 
     Raises:
-        ValueError: an edge leads to where none goes on.
+        ValueError: an edge leads to a vertex from which none goes on.
     """
     onwards: defaultdict[int, list[int]] = defaultdict(list)
     for a, b in edges.tolist():
@@ -379,13 +386,22 @@ def closed_trails(edges: IntArray) -> list[IntArray]:
     return trails
 
 
-# Edges of a record, whichever of these wastes less: five numbers each and three more fill packets.
+# Sums along rays.
+
+# Edges of a record: of these two, that which wastes less memory for padding.
 _RUNS = 3, 4
 
 
 @dataclass(frozen=True)
 class LiftedTrails:
     """Closed trails of edges on a backend, as records of `run` consecutive edges.
+
+    For `edge_lift`'s sum along rays, edge by edge, with decisions made by the same bits. At points
+    close to the curve a sum over a tree of chains (`EdgeChains`) visits most of its leaves, in
+    neighboring lanes along different paths, so that up to some thousands of edges a plain loop over
+    all of them is faster, and exact. The part of a factor that belongs to a vertex is computed once
+    and not for each of its edges, and roots and divisions, which cost most, are shared by edges
+    where a bound allows it.
 
     A record holds run + 1 vertices, run numbers 1/length^2, and run lengths: negative where the
     edge runs from a higher to a lower index, 0 where there is no edge.
@@ -403,17 +419,17 @@ class LiftedTrails:
         return cls(Records.upload(backend, np.concatenate(rows)), run)
 
     def near(self, frame: Frame, x: Vec3, active: Mask = True) -> FieldSums:
-        """The sum of Omega_e at points x of rays, where active, and what a certificate needs.
+        """The sum of Omega_e at points x of rays, where active, and what promises are made of.
 
-        Derivatives. With w of `edge`, L w is the integral of |dp|/rho^3 over an edge, and 1/d times
-        that bounds the integral of |dp|/rho^4, d the distance to it; for edges of a record at most
-        1/d of the nearest. So they add to the remainder what s4 += L w/4 and s5 += 3 L w/(16 d) do
-        (`LiftedEdge.bounds`).
+        Derivatives. With w of `Edge`, L w is the integral of |dp|/rho^3 over an edge, and 1/d times
+        that bounds the integral of |dp|/rho^4, d the distance to it; for all edges of a record the
+        d of the nearest serves. So they add to the remainder what s4 += L w/4 and s5 += 3 L w/(16
+        d) do (`LiftedEdge.bounds`).
 
         Rounding. An angle is off by `unit` times Biot and Savart's field, which is at most d L w:
         |a x e| is the length of e times the distance from its line. By Cauchy and Schwarz these add
-        up over a record to at most the root of (sum of L w) (sum of d^2 L w). d is less by what
-        rounding may have done to it, for all bounds.
+        up over a record to at most the root of (sum of L w) (sum of d^2 L w). In all bounds d is
+        reduced by its rounding.
         """
         backend = self.records.backend
         real, unit = backend.Float, fmax(epsilon_at(frame.o), epsilon_at(x))
@@ -469,7 +485,7 @@ class LiftedTrails:
 
 
 def _rows(vertices: FloatArray, trail: IntArray, run: int) -> FloatArray:
-    """Records of a trail; edges that fill the last one up have no length."""
+    """Records of a trail; edges that pad the last one have no length."""
     count = len(trail) - 1
     trips = -(-count // run)
     index = np.minimum(run * np.arange(trips)[:, None] + np.arange(run + 1), count)

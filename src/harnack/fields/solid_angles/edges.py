@@ -1,44 +1,9 @@
-"""Edges as records on a backend: edges one by one, and runs of edges of closed loops.
+"""The edges of curves on a backend, and sums over them at a point.
 
-What is known at a point x about one edge from p to q: its distance, field and derivatives.
-
-With a = p - x, b = q - x, e = q - p and c = a x e, the edge adds to the gradient of a solid angle
-Biot and Savart's field w c (paper, Eq. 11),
-
-    w = integral of |a + te|^-3 dt over [0, 1] = (|a|+|b|)/(|a||b| D),   D = |a||b| + a.b.
-
-D cancels beside the edge (a.b < 0), where it is |c|^2/(|a||b| - a.b) instead.
-
-Second derivatives. The derivative of w c along the axis j is c dw/dx_j - w (axis_j x e). The second
-term is antisymmetric. Around closed curves the fields add up to a gradient, whose derivative is
-symmetric: the antisymmetric parts cancel, and what is left is
-
-    Hessian = sum over edges of (c grad w^T + grad w c^T)/2,
-
-symmetric as it stands, and free of trace, for grad w lies in the plane of a and e.
-
-With h the vector from x to the nearest point of the edge's *line*, s the position on the line
-from there and L = |e|,
-
-    grad w = 3 integral of (a + te)/|a + te|^5 dt = J h + K e/L^2,
-    J = 3/L integral of (h^2+s^2)^(-5/2) ds,   K = 3 integral of s (h^2+s^2)^(-5/2) ds.
-
-K = 1/|a|^3 - 1/|b|^3 at once. J is -2 dw/d(h^2) at fixed ends, and the closed form of w gives it as
-a product and sums of positive terms:
-
-    J = w [ ((|a|-|b|)^2 + |a||b|)/(|a||b|)^2 + (|a|+|b|)^2/(|a||b| D) ],
-
-where the integral written out, s/h^2 (...) between two ends, loses all digits far away and in line
-with the edge. The difference of the cubes is taken from |b| - |a| = e.(a+b)/(|a|+|b|).
-h = a - (a.e) e/L^2 cancels where it is short: a fused multiply-add rounds it once, and what is left
-of the error lies along e, where a second projection finds it. With c = h x e, the three stay at
-right angles.
-
-One pass over the edges of a curve: solid angle, its gradient, distance and variation.
-
-The only loop that costs anything in a trace of a curve, so it is written for throughput: eight
-edges a trip, vertices fetched in aligned packets of eight floats, one square root, one division
-and about eighty additions and multiplications an edge.
+- `LoopEdges`: records of runs of consecutive edges of closed loops; `single_edges`: records of one
+  edge each.
+- `Edge`: distance, field and derivatives of one edge at a point.
+- `sum_over_edges`: solid angle, gradient, distance and integrals in one pass.
 """
 
 from __future__ import annotations
@@ -62,20 +27,21 @@ if TYPE_CHECKING:
 
 __all__ = ["Edge", "edge_variation"]
 
-# Gives the state with the edge from p to q, of which the third is 1/length^2, taken into account.
+# From p, q, 1/length^2 of the edge from p to q, and a state: the state with that edge added.
 EachEdge: TypeAlias = "Callable[[Vec3, Vec3, Real, tuple[Any, ...]], tuple[Any, ...]]"
 
-# The largest 1/length^2 of a record, within the range of float32. Edges that have no length, for
-# padding or by rounding, have it too: no angle, no gradient, hardly any variation.
+# The largest 1/length^2 of a record, within the range of float32. Edges without a length, used as
+# padding or made so by rounding, have it too: they have no angle, no gradient, hardly any
+# variation.
 _SHARPEST = 1e30
 
 
 def inverse_squares(edges: FloatArray) -> FloatArray:
-    """1/length^2 of edges (k, 3), (k,), or the largest number that records hold, if less.
+    """1/length^2 (k,) of edges (k, 3), or the largest number that records hold, if less.
 
-    Too small a number makes no distance too long: the foot of the perpendicular ends nearer to
-    the edge's start than it should by less than the edge's length, at most 1e-15, far below the
-    rounding of distances. Nor a variation too small: 1/sqrt(d^2 (1 + 4 d^2/length^2)) grows.
+    Too small a number harms neither distances, as the foot of the perpendicular is off by less than
+    the edge's length, at most 1e-15, far below the rounding of distances; nor bounds of the
+    variation, as 1/sqrt(d^2 (1 + 4 d^2/length^2)) grows.
     """
     squared = (edges * edges).sum(axis=1)
     return 1 / np.maximum(squared, 1 / _SHARPEST)
@@ -84,7 +50,7 @@ def inverse_squares(edges: FloatArray) -> FloatArray:
 def single_edges(start: FloatArray, end: FloatArray, direction: Any = 1.0) -> FloatArray:
     """(k, 8) records of edges from (k, 3) to (k, 3): start, direction, end, 1/length^2.
 
-    direction: 1 or -1, (k,), as the edge runs from start to end or back.
+    direction: 1 or -1, (k,): whether the edge runs from start to end or back.
     """
     direction = np.broadcast_to(direction, len(start))
     return np.column_stack([start, direction, end, inverse_squares(end - start)])
@@ -94,7 +60,7 @@ def single_edges(start: FloatArray, end: FloatArray, direction: Any = 1.0) -> Fl
 class LoopEdges:
     """Records of `run` consecutive edges each, of closed loops.
 
-    A record holds run + 1 vertices as (x, y, z, 1/|edge to the next|^2). Records do not lean on
+    A record holds run + 1 vertices as (x, y, z, 1/|edge to the next|^2). Records do not depend on
     each other, so several loops need no special case.
     """
 
@@ -105,7 +71,7 @@ class LoopEdges:
     def upload(
         cls, backend: Backend, loops: tuple[FloatArray, ...], run: int | None = None
     ) -> LoopEdges:
-        """The edges of closed loops, each of shape (n, 3); run: None for what suits them."""
+        """The edges of closed loops, each of shape (n, 3); run: None to choose it by the loops."""
         run, number = run or _run_for(loops), backend.dtype
         rounded = (loop.astype(number).astype(np.float64) for loop in loops)
         table = np.concatenate([_runs(loop, run) for loop in rounded])
@@ -113,11 +79,10 @@ class LoopEdges:
 
     @property
     def backend(self) -> Backend:
-        """The one they lie on."""
         return self.records.backend
 
     def part(self, first: Any, trips: Any) -> LoopEdges:
-        """The edges of so many records from `first` on, others in each lane."""
+        """The edges of `trips` records from `first` on, which may differ from lane to lane."""
         return replace(self, records=self.records.part(first, trips))
 
     def vertex(self, row: list[Real], k: int) -> Vec3:
@@ -127,7 +92,7 @@ class LoopEdges:
     def for_each(
         self, body: EachEdge, state: tuple[Any, ...], label: str, active: Mask = True
     ) -> tuple[Any, ...]:
-        """The state after `body` of all edges, as `Records.for_each` has it."""
+        """The state after `body` has been applied to all edges: see `Records.for_each`."""
 
         def of_record(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
             for k in range(self.run):
@@ -157,10 +122,42 @@ def _runs(loop: FloatArray, run: int) -> FloatArray:
 
 @dataclass(frozen=True)
 class Edge:
-    """The edge from p to q, seen from x: a = p - x and b = q - x.
+    """The edge from p to q, relative to a point x: a = p - x and b = q - x.
 
-    e: q - p, which has no rounding of x. inverse: 1/|e|^2, anything finite for an edge without a
-    length: that has no field.
+    e: q - p, which has no rounding of x.
+    inverse: 1/|e|^2; any finite number for an edge without a length, which has no field.
+
+    With c = a x e, the edge adds to the gradient of a solid angle Biot and Savart's field w c
+    (paper, Eq. 11),
+
+        w = integral of |a + te|^-3 dt over [0, 1] = (|a|+|b|)/(|a||b| D),   D = |a||b| + a.b.
+
+    D cancels near the edge (a.b < 0), where it is |c|^2/(|a||b| - a.b) instead.
+
+    Second derivatives. The derivative of w c along the axis j is c dw/dx_j - w (axis_j x e). The
+    second term is antisymmetric. Around closed curves the fields add up to a gradient, whose
+    derivative is symmetric: the antisymmetric parts cancel, and what is left is
+
+        Hessian = sum over edges of (c grad w^T + grad w c^T)/2,
+
+    symmetric as it stands, and free of trace, for grad w lies in the plane of a and e.
+
+    With h the vector from x to the nearest point of the edge's *line*, s the position on the line
+    from there and L = |e|,
+
+        grad w = 3 integral of (a + te)/|a + te|^5 dt = J h + K e/L^2,
+        J = 3/L integral of (h^2+s^2)^(-5/2) ds,   K = 3 integral of s (h^2+s^2)^(-5/2) ds.
+
+    Directly, K = 1/|a|^3 - 1/|b|^3. J is -2 dw/d(h^2) at fixed ends, and the closed form of w gives
+    it as a product and sums of positive terms:
+
+        J = w [ ((|a|-|b|)^2 + |a||b|)/(|a||b|)^2 + (|a|+|b|)^2/(|a||b| D) ],
+
+    where the integral written out, s/h^2 (...) between two ends, loses all digits far away and in
+    line with the edge. The difference of the cubes is taken from |b| - |a| = e.(a+b)/(|a|+|b|).
+    h = a - (a.e) e/L^2 cancels where it is short: a fused multiply-add rounds it once, and the rest
+    of the error lies along e, where a second projection removes it. With c = h x e, the three stay
+    at right angles.
     """
 
     a: Vec3
@@ -170,7 +167,7 @@ class Edge:
 
     @classmethod
     def between(cls, p: Vec3, q: Vec3, inverse: Real, x: Vec3) -> Edge:
-        """The edge from p to q, seen from x."""
+        """The edge from p to q, relative to x."""
         return cls(p - x, q - x, q - p, inverse)
 
     @functools.cached_property
@@ -184,14 +181,14 @@ class Edge:
         return squared_distance_to_segment(self.a, self.e, self.inverse)
 
     def field(self) -> tuple[Real, Vec3]:
-        """w and c of Biot and Savart's field w c, what the edge adds to the gradient; in line with
-        the edge w is 0."""
+        """w and c of Biot and Savart's field w c, which the edge adds to the gradient; w = 0 at
+        points in line with the edge."""
         (la, lb), c = self.lengths, dr.cross(self.a, self.e)
         square = dr.squared_norm(c)
         return dr.select(square > 0, (la + lb) / (la * lb * self._bracket(square)), 0), c
 
     def field_of_lengths(self, la: Real, lb: Real) -> tuple[Real, Vec3]:
-        """The same for given |a| and |b|, by one division."""
+        """The same as `field`, for given |a| and |b|, with one division."""
         c, both, dot = dr.cross(self.a, self.e), la * lb, dr.dot(self.a, self.b)
         square, beside = dr.squared_norm(c), dot < 0
         above = (la + lb) * dr.select(beside, both - dot, 1)
@@ -216,15 +213,15 @@ class Edge:
         return c, across * h + along * e
 
     def _bracket(self, square: Real) -> Real:
-        """D, square: |c|^2."""
+        """D; square: |c|^2."""
         (la, lb), dot = self.lengths, dr.dot(self.a, self.b)
         return dr.select(dot < 0, square / (la * lb - dot), la * lb + dot)
 
 
 def edge_variation(square: Real, inverse: Real) -> tuple[Real, Real]:
-    """h/(d sqrt(d^2+h^2)) and the same over d, of an edge of half length h at distance d.
+    """h/(d sqrt(d^2+h^2)), and that divided by d, for an edge of half length h at distance d.
 
-    square: d^2. inverse: 1/(2h)^2. `SolidAngle` says what they bound.
+    square: d^2. inverse: 1/(2h)^2. `LiftedEdge.bounds` says what they bound.
     """
     first = dr.rsqrt(square * dr.fma(square, 4 * inverse, 1))
     return first, first * dr.rsqrt(square)
@@ -233,16 +230,20 @@ def edge_variation(square: Real, inverse: Real) -> tuple[Real, Real]:
 # Two complex numbers, as four reals.
 Spinor: TypeAlias = "tuple[Real, Real, Real, Real]"
 
-# Often, and without squares: beside a vertex or far away, the product of a few factors leaves the
-# range of float32.
+# Products are scaled after so many factors, without squares: near a vertex or far away, the product
+# of a few factors leaves the range of float32.
 _RENORMALIZE_EVERY = 2
 
 
 @dataclass(frozen=True)
 class EdgeSums:
-    """Sums over all edges at x: Omega in (-2pi, 2pi], its gradient, distance to the nearest edge,
-    and of the integrals of |dp|/D^k along the edges, D the distance to p: squares is at least that
-    for k = 2, cubes is that for k = 3, fourths at least that for k = 4."""
+    """Sums over all edges at x.
+
+    angle, gradient: Omega in (-2pi, 2pi], and its gradient.
+    distance: to the nearest edge.
+    squares, cubes, fourths: integrals of |dp|/D^k along the edges, D the distance to p: an upper
+        bound of that for k = 2, that for k = 3, and an upper bound of that for k = 4.
+    """
 
     angle: Real
     gradient: Vec3
@@ -255,15 +256,20 @@ class EdgeSums:
 def sum_over_edges(edges: LoopEdges, x: Vec3) -> EdgeSums:
     """All sums at x in one loop.
 
+    It is the only loop that costs anything in a trace of a curve, so it is written for throughput:
+    eight edges a trip, vertices fetched in aligned packets of eight floats, one square root, one
+    division and about eighty additions and multiplications for each edge.
+
     Solid angle. For unit spinors chi(a) of the directions a = p_i - x, the product of
     <chi(p_i), chi(p_{i+1})> around a closed loop has argument Omega/2 (the Berry phase of spin
     1/2; it equals the fan formula of van Oosterom and Strackee 1983, Eq. 10, with the apex at
     infinity). With s = |a| + |a_z| and A = a_x + i a_y, chi is (s, A) above and (conj A, s)
     below: neither cancels, and the gauge drops out because each vertex enters once plain and
-    once conjugated. A factor vanishes only on its own edge: there is no apex to be in line with.
+    once conjugated. A factor vanishes only on its own edge, whereas a fan of triangles is singular
+    on lines through its apex.
 
-    Gradient. Biot-Savart: each edge gives (1/|a|+1/|b|)/(|a||b|+a.b) a x b (Eq. 11). The
-    bracket cancels beside the edge; |factor|^2 = 2 s_a s_b (|a||b|+a.b) does not.
+    Gradient. Biot-Savart: each edge gives (1/|a|+1/|b|)/(|a||b|+a.b) a x b (Eq. 11). The sum
+    |a||b|+a.b cancels near the edge; |factor|^2 = 2 s_a s_b (|a||b|+a.b) does not.
 
     Integrals. Biot and Savart's field of an edge of length L at distance h from its line is h times
     the integral of |dp|/D^3, and |a x b| = h L: so that integral is L times the weight of a x b in

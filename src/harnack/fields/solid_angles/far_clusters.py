@@ -1,12 +1,10 @@
-"""Walking a tree of clusters: far ones as a whole, the primitives of near leaves one by one.
+"""Sums over a tree of dipoles: far clusters as multipoles, near primitives one by one.
 
-Oriented points as records, one by one and in the leaves of a tree.
-
-What a node of a tree of dipoles adds to a field far from it: value, gradient, Hessian.
-
-Sums over a tree of dipoles: far nodes as multipoles, leaves by whoever knows what is in them.
-
-What the trees of triangles and of points share: which nodes count as far, and what they add.
+- `walk_clusters`: visits a tree so that far clusters are taken as a whole.
+- `Treecode`: the sums over such a tree; what triangles and points share. The caller adds the
+  primitives of near leaves.
+- `far_terms`: what a far node adds to value, gradient and Hessian.
+- `dipole_rows`, `in_slots`: oriented points as records, also in the leaves of a tree.
 """
 
 from __future__ import annotations
@@ -39,11 +37,14 @@ State: TypeAlias = "tuple[Any, ...]"
 
 @dataclass(frozen=True)
 class SeenCluster:
-    """A node of the tree from points x.
+    """A node of the tree relative to points x.
 
-    head: its numbers that every visit reads. payload: the others, fetched where it is far.
-    r: x from its center. square: |r|^2, plus that of the height. inverse: 1/sqrt(square), or 0
-    where the node is not far. far: whether it is far enough to be taken as a whole.
+    head: its numbers that every visit reads.
+    payload: its other numbers, fetched where it is far.
+    r: from its center to x.
+    square: |r|^2, plus the square of the height.
+    inverse: 1/sqrt(square), or 0 where the node is not far.
+    far: whether it is far enough to be taken as a whole.
     """
 
     head: tuple[Real, ...]
@@ -62,11 +63,13 @@ def walk_clusters(
     add_primitive: EachPrimitive, state: State, active: Mask = True, height_square: Real = 0.0,
 ) -> State:  # fmt: skip
     """The state after a walk over a tree whose nodes begin with their center and the distance from
-    which on they may be taken as a whole; `closer` times that is asked for.
+    which on they may be taken as a whole.
 
-    add_cluster(cluster, state): the state with a node added where it is far. add_primitive: as
-    for `tree.for_each`, of the leaves that are not. height_square: added to the squares of all
-    distances, which are then those of a point beside the space of the tree.
+    closer: nodes are taken as a whole from so many times that distance on.
+    add_cluster: from a cluster and the state, the state with the node added where it is far.
+    add_primitive: as for `tree.for_each`, for the leaves that are not far.
+    height_square: added to the squares of all distances: in four dimensions, the square of the
+        distance of the point from the space of the tree.
     """
     vector = tree.backend.Array3f
 
@@ -82,12 +85,12 @@ def walk_clusters(
     return walk(tree, visit, state, active)
 
 
-# Dipoles of a leaf at most, and children of a node: by experiment.
+# The most dipoles in a leaf, and the children of a node: by experiment.
 _LEAF_SIZE, _ARITY = 8, 4
 
 
 def hierarchy_of(points: FloatArray) -> Hierarchy:
-    """Which of the points (n, 3) lie in which leaf."""
+    """The tree over points (n, 3)."""
     return build_hierarchy(points, leaf_size=_LEAF_SIZE, arity=_ARITY)
 
 
@@ -98,14 +101,14 @@ def dipole_rows(points: FloatArray, moments: FloatArray) -> FloatArray:
 
 
 def padding_row(row: FloatArray) -> FloatArray:
-    """(..., 8) records of dipoles (..., 8) without a moment, which add nothing."""
+    """Records (..., 8) at the places of dipoles (..., 8), without a moment, which add nothing."""
     empty = np.zeros_like(row)
     empty[..., :3] = row[..., :3]
     return empty
 
 
 def in_slots(tree: Hierarchy, rows: FloatArray) -> FloatArray:
-    """Records (leaves, leaf_size, 8); empty slots are without a moment, at the leaf's first."""
+    """Records (leaves, leaf_size, 8); in empty slots the padding of the leaf's first record."""
     slots = tree.gather(rows)
     empty = tree.slots == NO_PRIMITIVE
     slots[empty] = np.broadcast_to(padding_row(slots[:, :1]), slots.shape)[empty]
@@ -161,7 +164,8 @@ def far_terms(c: Sequence[Real], r: Vec3, inverse: Real, derivatives: int) -> Te
 def _hessian(
     c: Sequence[Real], r: Vec3, g: tuple[Vec3, ...], p: tuple[Real, ...], u: tuple[Real, Real]
 ) -> SymmetricSum:
-    """The Hessian of `far_terms`; g and p are scaled by powers of u to the size of the first."""
+    """The Hessian of `far_terms`; g and p are scaled by powers of u to the size of those of l =
+    1."""
     x, y, z = r
     (g1, g2, g3), (p1, p2, p3), (u2, u3) = g, p, u
     u4 = u2 * u2
@@ -195,21 +199,24 @@ def _hessian(
 
 Own: TypeAlias = "tuple[Any, ...]"
 
-# A rough look takes nodes as a whole beyond this many times their radius.
+# Coarse evaluations take nodes as a whole beyond this many times their radius.
 _ROUGH = 2.5
 # Roundings of a far node's gradient itself.
 _OUTSIDE = 64.0
-# The free distance, in units of coordinates, where nothing bounds it.
+# The free distance, in units of coordinates, if no term bounds it.
 _FAR = 1e4
 
-# Gives the sums and the caller's own with the primitive of a record added, where active.
+# From a record, a mask, the sums, and a state of the caller's own: the latter two with the record's
+# primitive added where the mask holds.
 AddPrimitive: TypeAlias = "Callable[[list[Real], Mask, FieldSums, Own], tuple[FieldSums, Own]]"
 
 
 def node_columns(level: NodeMoments, order: int, rough: float, error: FloatArray) -> FloatArray:
-    """Numbers of nodes as the walk below reads them, that may be taken as a whole beyond `rough`
-    times their radius: center, accepting distance, A and K of `bend_columns` | 15 coefficients,
-    value error E (k,), as given."""
+    """Numbers of nodes that may be taken as a whole beyond `rough` times their radius, as
+    `Treecode`
+    reads them: center, accepting distance, A and K of `bend_columns`, 15 coefficients, and the
+        value
+    error E (k,)."""
     head = [rough * level.radius, *bend_columns(level, rough)]
     parts = (level.center, *head, cartesian(level.moments, order), error)
     return np.column_stack(parts)
@@ -217,11 +224,14 @@ def node_columns(level: NodeMoments, order: int, rough: float, error: FloatArray
 
 @dataclass(frozen=True)
 class Treecode:
-    """The walk over a tree of nodes as `node_columns` lays them out.
+    """Sums over a tree of nodes as `node_columns` lays them out.
 
-    looser: the errors of a rough look are at most this many times those stored. steeper, bent:
-    errors of gradients (second derivatives) are at most this many times those of values, over r
-    (r^2).
+    accuracy: at detail 1 nodes are taken as a whole beyond this many times their radius.
+    rough: the same in a coarse evaluation.
+    order: of the multipoles.
+    looser: the truncation of a coarse evaluation is at most this many times the stored bound.
+    steeper, bent: the truncation of the gradient is at most `steeper` times that of the value over
+        r, that of second derivatives `bent` times it over r^2.
     """
 
     backend: Backend
@@ -245,8 +255,8 @@ class Treecode:
     ) -> Treecode:
         """Everything uploaded. primitives: records in their slots, as `tree.pack` takes them.
 
-        E is stored once for both looks: as large as the closer one needs, and no less than what
-        the rough one needs over `looser`, the middle of the ratio of both.
+        One E is stored for both kinds of evaluation: as large as that at detail 1 needs, and at
+        least what the coarse one needs divided by `looser`, the median of the ratio of both.
         """
         rough = min(accuracy, _ROUGH)
         close = [truncation(level, accuracy * level.radius, order) for level in levels]
@@ -269,22 +279,22 @@ class Treecode:
 
     @property
     def coarsest(self) -> float:
-        """The detail that nodes taken as a whole beyond `rough` times their radius amount to."""
+        """The detail of coarse evaluations (`Field.coarsest_detail`)."""
         return self.rough / self.accuracy
 
     def ratio(self, detail: Real) -> Real:
-        """How many times their radius nodes must be away to be taken as a whole."""
+        """The distance from which on nodes are taken as a whole, in radii of the node."""
         return fmax(self.accuracy * detail, self.backend.Float(self.rough))
 
     def sums(
         self, x: Vec3, detail: Real, add: AddPrimitive, own: Own = (), active: Mask = True,
         derivatives: int = 1,
     ) -> tuple[FieldSums, Own]:  # fmt: skip
-        """All sums at points x, and those of the caller's own.
+        """All sums at points x, and the caller's own state.
 
-        detail: `Field.at_detail`; infinity adds up everything one by one. add(row, active, sums,
-        own): the sums with a primitive of a near leaf added. derivatives: 0 for the value alone, 1
-        with the gradient, 2 with the Hessian.
+        detail: `Field.at_detail`; infinity adds up all terms one by one.
+        add: adds a primitive of a near leaf (`AddPrimitive`).
+        derivatives: 0 for the value alone, 1 with the gradient, 2 with the Hessian.
         """
         free, closer = free_part(self.rough), self.ratio(detail) / self.rough
         unit = epsilon_at(x)
@@ -326,7 +336,7 @@ class Treecode:
         return sums.values(share, unit, rounding, _OUTSIDE)
 
     def _decay(self, inverse: Real) -> Real:
-        """r^-(order + 3), as the first term left out."""
+        """r^-(order + 3), which the first term left out is proportional to."""
         power = inverse * inverse * inverse
         for _ in range(self.order):
             power = power * inverse
@@ -334,6 +344,6 @@ class Treecode:
 
 
 def _middle(larger: FloatArray, smaller: FloatArray) -> float:
-    """The median of their ratio, at least 1."""
+    """The median of the ratio larger/smaller, at least 1."""
     some = smaller > 0
     return max(1.0, float(np.median(larger[some] / smaller[some]))) if some.any() else 1.0

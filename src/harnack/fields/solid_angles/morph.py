@@ -24,35 +24,35 @@ if TYPE_CHECKING:
 
 
 class Morph(BatchedField):
-    """What lies at height w between solid a, at height 0, and solid b, at height `gap`.
+    """The slice at height w of a shape between solid a, at height 0, and solid b, at height `gap`.
 
-    U_a(x, w) = w int_a dV/(|y-x|^2 + w^2)^2 is the solid angle at which a, as a flat solid in
-    four dimensions, is seen from (x, w): harmonic in both, half of all directions, pi^2, inside a
-    for w -> 0, and 0 outside. The morph is the solid f > 1/2,
+    U_a(x, w) = w int_a dV/(|y-x|^2 + w^2)^2 is the solid angle that a, as a flat solid in four
+    dimensions, subtends at (x, w): harmonic in (x, w); for w -> 0 half of all directions, pi^2,
+    inside a, and 0 outside. The morph is the solid f > 1/2,
 
         f(x) = (U_a(x, w) + U_b(x, gap - w))/(2 pi^2).
 
     For w -> 0 that is a, as 0 < U_b < pi^2, and for w -> gap it is b. (This is the 'solid angle in
     four dimensions' of the talk on Gillespie et al. 2024, with level pi^2 of the sum.)
 
-    At w = 0 and w = gap the field is the winding number of the mesh itself, triangles and all.
-    Between the ends what is drawn is the surface of a *quadrature*: each mesh is replaced by
-    oriented points at the centroids of its triangles, cut so that their edges are at most `spacing`
-    times the height; of triangles much smaller than that, one point stands for several. The sum
-    over these is as harmonic as the integral, and it is that sum whose surface is found with
-    proof; `quadrature_displacement` bounds how far the surface of the integral is.
+    At w = 0 and w = gap the field is the winding number of the mesh itself, with jumps across its
+    triangles. Between the ends what is drawn is the surface of a *quadrature*: each mesh is
+    replaced by oriented points at the centroids of its triangles, cut so that their edges are at
+    most `spacing` times the height; where triangles are much smaller than that, one point stands
+    for several. The sum over these is as harmonic as the integral, and the surface of that sum is
+    found with proof; `quadrature_displacement` bounds how far the surface of the integral is.
 
     mesh_a, mesh_b: pairs (vertices (n, 3), faces (m, 3)), counter-clockwise seen from outside.
         Holes are allowed: between the ends a dent reaches into the solid there, as the surface is
         where both winding numbers, blurred, add up to 1; at the ends the level 1/2 spans them.
     gap: how far apart the solids are, in the unit of the meshes. With a large one the slices in
         the middle are small, or empty: for solids of half-diagonal 1, 0.1 to 0.2 is good.
-    w: in [0, gap]. Like `gap` it is data: other numbers compile nothing.
+    w: in [0, gap]. Like `gap` it is a kernel parameter: other numbers compile nothing.
     spacing: see above, at most 2. Less is sharper, and needs 1/spacing^2 times as many points.
-        Of real meshes surfaces were off by at most 0.02, 0.04 and 0.09 of w for 1, 1.4 and 2.
-    accuracy: of the tree between the ends: clusters of points are taken as a whole beyond
-        `accuracy` times their radius. Bounds of what that leaves out are part of every promise,
-        and tracing takes more where the tolerance asks for it. At least 2.
+        For real meshes surfaces were off by at most 0.02, 0.04 and 0.09 of w for 1, 1.4 and 2.
+    accuracy: between the ends, clusters of points are taken as a whole beyond `accuracy` times
+        their radius. Bounds of the truncation are part of every promise, and tracing uses more
+        detail where the tolerance asks for it. At least 2.
 
     Raises:
         MeshError: a ValueError, as `validate_mesh`; something that is no pair.
@@ -94,11 +94,11 @@ class Morph(BatchedField):
     def quadrature_displacement(
         self, points: Any, *, precision: Precision = "single"
     ) -> FloatArray:
-        """How far the surface through points (n, 3) is, at most and to first order, from that of
-        the integral over the triangles: (n,), in the unit of the meshes; 0 at the ends.
+        """A bound (n,), to first order, of the distance of the surface through points (n, 3) from
+        the surface of the integral over the triangles, in the unit of the meshes; 0 at the ends.
 
-        A bound of what the quadrature leaves out of f, which far exceeds the error of meshes
-        whose triangles are regular, over the size of the gradient.
+        It is a bound of the error of the quadrature, far above the true error for meshes of regular
+        triangles, over the size of the gradient.
         """
         if isinstance(self._slice, MorphSlice):
             return self._slice.quadrature_displacement(points, precision)
@@ -111,7 +111,7 @@ class Morph(BatchedField):
         points = self._slice.point_counts
         return {**place, "points of a": points[0], "points of b": points[1]}
 
-    # All else is that of the slice.
+    # All other methods are those of the slice.
 
     def prepare(self, backend: Backend) -> Field:
         return self._slice.prepare(backend)

@@ -1,43 +1,8 @@
 """A slice of the sum of two solid angles in four dimensions, strictly between its ends.
 
-Triangle meshes as oriented points: large triangles cut into pieces, small ones merged.
-
-The kernel of slices of four-dimensional solid angles: a Newton kernel seen from a height w.
-
-Kernel. 1/|X|^2 is harmonic in R^4. The solid angle of a flat solid A x {0} from (x, w) is
-U = w int_A dV/(r^2 + w^2)^2 with r = |y-x|; by the divergence theorem it is the integral over the
-boundary of A of -n.grad_y K, with
-
-    K(r, w) = (1/2) int_w^oo dv/(r^2 + v^2) = atan(r/w)/(2r),   pi/(4r) for w = 0.
-
-So each dipole -m.grad_y K is harmonic in (x, w) but at the dipole and below it. Here K is scaled by
-4/pi, such that it is 1/r for w = 0: sums over m = area n/(4 pi) are then U/pi^2, and for w = 0 the
-winding number. As -(1/r) d/dr (r^2+v^2)^-k = 2k (r^2+v^2)^-(k+1), with D^2 = r^2 + w^2, c = w/D,
-s = r/D,
-
-    psi_k = (2/pi) 2^k k! i_(k+1)/D^(2k+1),   i_k = D^(2k-1) int_w^oo dv/(r^2+v^2)^k,
-    i_k = (2k s^2 i_(k+1) + c)/(2k-1)   by parts: positive terms, which lose no digits.
-
-The last i_n = int_0^1 (sin(phi t)/sin phi)^(2n-2) dt phi/sin phi, cos phi = c, is a function of c
-that is analytic but for c <= -1: a polynomial on [0, 1].
-
-Bound. |d^m K[u_1, ..., u_m]| <= m!/D^(m+1) for unit vectors, as if 1/r were D away; attained for
-w = 0. Proof. Equal vectors u are the worst (Banach 1938). The m-th derivative of 1/|X|^2 along a
-line is (-1)^m m! U_m(cos)/|X|^(m+2) (Gegenbauer), so that, with x = D/sqrt(r^2 + v^2) and
-a = u.z/D, |a| <= s, that of K is +-m!/D^(m+1) times (2/pi) I,
-
-    I = int_0^1 U_m(a x) x^m (1 - s^2 x^2)^(-1/2) dx.
-
-For s = 1, that is w = 0, it is (pi/2) P_m(a), at most pi/2. For s < 1 the weight is that for s = 1
-times one that falls from 1, so that I is the same integral for s = 1 up to some b <= 1 (Bonnet).
-That is the largest for b = 1, or where U_m(a b) = 0 at an angle k pi/(m+1), k >= 1. Lobes between
-such angles alternate and grow with x, as x^m (1 - x^2)^(-1/2) does: the integral is at most its
-last lobe, which is the largest if it ends at b = 1, where it is below 0.4 for m <= 7 (quadrature in
-`tests/fields/test_morph.py`).
-
-In four dimensions the gradient of n.grad_x K is at most 2 * 1.1855/D^3: its square is
-cos^2 (K''^2 + (dw K')^2) + sin^2 (K'/r)^2, cos the angle of n to z, and so at most the larger of
-two functions of c alone (maximum at w = r; the same tests).
+- `MorphSlice`: the field.
+- `SlicedKernel`: its kernel, with the proof of its bounds.
+- `centroids`: triangle meshes as oriented points; large triangles are cut, small ones merged.
 """
 
 from __future__ import annotations
@@ -79,7 +44,7 @@ if TYPE_CHECKING:
     from harnack.tree.cells import OccupiedCells
 
 GRADIENT = 1.1855
-"""Half the largest gradient of a dipole in four dimensions, times D^3: it serves for Q_2."""
+"""Half the largest gradient of a dipole in four dimensions, times D^3, used as Q_2."""
 
 # Degrees of the polynomial for the last i_n in single and double precision: the singularity at
 # c = -1 makes coefficients fall as 5.8^-k.
@@ -87,7 +52,44 @@ _DEGREES = {4: 12, 8: 22}
 
 
 class SlicedKernel(RadialKernel):
-    """(4/pi) K(r, w) on a backend, at a height w > 0."""
+    """(4/pi) K(r, w) on a backend, at a height w > 0: a Newton kernel of four dimensions,
+    restricted to a slice.
+
+    Kernel. 1/|X|^2 is harmonic in R^4. The solid angle of a flat solid A x {0} at (x, w) is
+    U = w int_A dV/(r^2 + w^2)^2 with r = |y-x|; by the divergence theorem it is the integral over
+    the boundary of A of -n.grad_y K, with
+
+        K(r, w) = (1/2) int_w^oo dv/(r^2 + v^2) = atan(r/w)/(2r),   pi/(4r) for w = 0.
+
+    So each dipole -m.grad_y K is harmonic in (x, w) except at the dipole and below it. Here K is
+    scaled by 4/pi, so that it is 1/r for w = 0: sums over m = area n/(4 pi) are then U/pi^2, and
+    for w = 0 the winding number. As -(1/r) d/dr (r^2+v^2)^-k = 2k (r^2+v^2)^-(k+1), with
+    D^2 = r^2 + w^2, c = w/D, s = r/D,
+
+        psi_k = (2/pi) 2^k k! i_(k+1)/D^(2k+1),   i_k = D^(2k-1) int_w^oo dv/(r^2+v^2)^k,
+        i_k = (2k s^2 i_(k+1) + c)/(2k-1)   by parts: positive terms, which lose no digits.
+
+    The last i_n = int_0^1 (sin(phi t)/sin phi)^(2n-2) dt phi/sin phi, cos phi = c, is a function of
+    c that is analytic but for c <= -1: on [0, 1] it is computed as a polynomial.
+
+    Bound. |d^m K[u_1, ..., u_m]| <= m!/D^(m+1) for unit vectors, as for 1/r at the distance D;
+    attained for w = 0. Proof. Equal vectors u are the worst (Banach 1938). The m-th derivative of
+    1/|X|^2 along a line is (-1)^m m! U_m(cos)/|X|^(m+2) (Gegenbauer), so that, with
+    x = D/sqrt(r^2 + v^2) and a = u.z/D, |a| <= s, that of K is +-m!/D^(m+1) times (2/pi) I,
+
+        I = int_0^1 U_m(a x) x^m (1 - s^2 x^2)^(-1/2) dx.
+
+    For s = 1, that is w = 0, it is (pi/2) P_m(a), at most pi/2. For s < 1 the weight is that for
+    s = 1 times one that falls from 1, so that I is the same integral for s = 1 up to some b <= 1
+    (Bonnet). That is the largest for b = 1, or where U_m(a b) = 0 at an angle k pi/(m+1), k >= 1.
+    Lobes between such angles alternate and grow with x, as x^m (1 - x^2)^(-1/2) does: the integral
+    is at most its last lobe, which is the largest if it ends at b = 1, where it is below 0.4 for
+    m <= 7 (quadrature in `tests/fields/test_morph.py`).
+
+    In four dimensions the gradient of n.grad_x K is at most 2 * 1.1855/D^3: its square is
+    cos^2 (K''^2 + (dw K')^2) + sin^2 (K'/r)^2, cos the cosine of the angle from n to z, and so at
+    most the larger of two functions of c alone (maximum at w = r; the same tests).
+    """
 
     def __init__(self, backend: Backend, height: float) -> None:
         self.height = dr.opaque(backend.Float, height)
@@ -145,19 +147,21 @@ def _factor(k: int) -> float:
     return 2 / math.pi * 2.0**k * math.factorial(k)
 
 
-# Cells in which triangles are merged, and the longest edge of these, in the longest edge of pieces.
+# The size of the cells in which triangles are merged, and the longest edge of such triangles, as a
+# fraction of the longest edge of pieces.
 _CELL = 0.54
 
 
 @dataclass(frozen=True)
 class Centroids:
-    """Points that stand for parts of triangles.
+    """Points that stand for pieces of triangles, or for several small ones.
 
-    points: (n, 3) centroids. moments: (n, 3) area times normal, summed up.
-    farthest: no point of a triangle is farther from the point that stands for it.
-    spread: the largest integral of |d|^2 over the part that a point stands for, d the distance from
-        the point, over the length of its moment; slant: of the Frobenius norm of the sum of moment
-        times d, likewise.
+    points: (n, 3) centroids.
+    moments: (n, 3) area times normal, summed up.
+    farthest: the largest distance of a point of a triangle from the point that stands for it.
+    spread: the largest ratio, over all points, of the integral of |d|^2 over what the point stands
+        for, d the offset from the point, to the length of its moment.
+    slant: the same for the Frobenius norm of the sum of moment times d.
     """
 
     points: FloatArray
@@ -168,13 +172,14 @@ class Centroids:
 
 
 def piece_counts(corners: FloatArray, longest: float) -> IntArray:
-    """In how many parts to cut each edge of triangles (m, 3, 3), so that none is longer: (m,)."""
+    """The number of pieces (m,) to cut each edge of triangles (m, 3, 3) into, so that none is
+    longer than `longest`."""
     return np.maximum(np.ceil(_longest_edges(corners) / longest), 1).astype(np.int64)
 
 
 def centroids(corners: FloatArray, longest: float) -> Centroids:
-    """Of triangles (m, 3, 3), cut in similar pieces with edges at most `longest`; of those much
-    smaller, one point for all in a cell that face the same way."""
+    """Centroids of triangles (m, 3, 3), cut into similar pieces with edges of at most `longest`;
+    for those much smaller, one point for all in a cell that face the same way."""
     small = _longest_edges(corners) <= _CELL * longest
     parts = [
         make(some, longest)
@@ -211,14 +216,14 @@ def _mean_squares(corners: FloatArray) -> FloatArray:
 
 
 def _cut(corners: FloatArray, longest: float) -> Centroids:
-    """Triangles cut in counts^2 similar pieces each: first moments vanish."""
+    """Triangles cut into counts^2 similar pieces each, whose first moments vanish."""
     counts = piece_counts(corners, longest)
     points: list[FloatArray] = []
     moments: list[FloatArray] = []
     for count in np.unique(counts):
         some = corners[counts == count]
         a, b, c = np.moveaxis(some, 1, 0)
-        # Pieces that are turned as the triangle, and those that fill the gaps between them.
+        # Pieces with the orientation of the triangle, and the rotated ones between them.
         i, j = np.indices((count, count)).reshape(2, -1)
         steps = [(i + j < count, 1 / 3), (i + j < count - 1, 2 / 3)]
         u, v = (np.concatenate([k[one] + third for one, third in steps]) / count for k in (i, j))
@@ -263,7 +268,7 @@ MOST_POINTS = 4_000_000
 """Points of the quadrature of both meshes together."""
 
 _SMALLEST_LEVEL = 1e-6
-# Cells that an extent looks at in one round, at most.
+# The most cells that are tested in one round for an extent.
 _MOST_CELLS = 40_000
 # Cells of the grid along its longest side, by experiment.
 _ACROSS = 128
@@ -275,8 +280,9 @@ class MorphSlice(DetailedField["_SliceBuffers"], BatchedField):
     corners: two arrays (m, 3, 3) of triangles. w, gap, spacing, accuracy: as for `Morph`.
 
     Promises, with the 4D distances D of all points, d the least of them (`SlicedKernel` has the
-    proof that terms bend no more than dipoles at a distance D): `Curvature` within 0.45 d, and a
-    `HarmonicBall` of dimension 4 and radius 0.35 d, which proves shorter steps.
+    proof that second derivatives are no larger than those of dipoles at a distance D): `Curvature`
+    within 0.45 d, and a `HarmonicBall` of dimension 4 and radius 0.35 d, which proves shorter
+    steps.
     """
 
     default_level = 0.5
@@ -325,10 +331,11 @@ class MorphSlice(DetailedField["_SliceBuffers"], BatchedField):
     def quadrature_displacement(self, points: Any, precision: Precision = "single") -> FloatArray:
         """As `Morph.quadrature_displacement`.
 
-        A part with moment m whose point is D away is off by at most 2 |T|_* /D^3, the nuclear norm
-        of T = sum of m_i times d_i, at most sqrt(3) times Frobenius', and by the remainder of
-        Taylor's formula: |m| times the mean of |d|^2 (3-2q)/((1-q)^2 D^4), q = |d|/D
-        (`RadialSums.remainder`). It is infinite where a part reaches farther than its point is.
+        Let a point at distance D stand for a part of the mesh with moment m. Its error is at most
+        2 |T|_*/D^3, |T|_* the nuclear norm of T = sum of m_i times d_i, at most sqrt(3) times the
+        Frobenius norm, plus the remainder of Taylor's formula: |m| times the mean of
+        |d|^2 (3-2q)/((1-q)^2 D^4), q = |d|/D (`RadialSums.remainder`). It is infinite where the
+        part may reach as far as D from its point.
         """
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Real]:
@@ -384,12 +391,12 @@ class MorphSlice(DetailedField["_SliceBuffers"], BatchedField):
 
 @dataclass(frozen=True)
 class _SliceBuffers(UnitCoordinates):
-    """The points of both meshes on a backend, each seen from a height of its own."""
+    """The points of both meshes on a backend, each mesh with a height of its own."""
 
     clouds: tuple[TreeSum, ...]
 
     def sums(self, x: Vec3, closer: Real, derivatives: int) -> RadialSums:
-        """Over both."""
+        """The sums over the points of both meshes."""
         sums = RadialSums.zero(self.backend, derivatives)
         for cloud in self.clouds:
             sums = cloud.added(sums, x, closer)

@@ -1,6 +1,6 @@
-"""Multipole moments of dipoles about a point, and about another one.
+"""Multipole moments of dipoles, those of the nodes of a tree, and bounds of truncated expansions.
 
-The potential of dipoles a_i n_i at y_i = c + d_i is, seen from x = c + r,
+The potential of dipoles a_i n_i at y_i = c + d_i at a point x = c + r is
 
     f(x) = sum_i a_i n_i.(y_i - x)/|y_i - x|^3 = -sum_i a_i n_i.grad_y 1/|x - y_i|
          = -sum_{l>=1} sum_m conj(M_lm) I_lm(r),      M_lm = sum_i a_i n_i.grad R_lm(d_i)
@@ -8,16 +8,13 @@ The potential of dipoles a_i n_i at y_i = c + d_i is, seen from x = c + r,
 with solid harmonics R_lm = r^l P_lm(cos t) e^(im p)/(l+m)! and I_lm = (l-m)! P_lm e^(im p)/r^(l+1)
 (no Condon-Shortley phase; R_l,-m = (-1)^m conj R_lm). 1/|x-y| = sum conj(R_lm(y)) I_lm(x),
 R_lm(a+b) = sum R_l'm'(a) R_l-l',m-m'(b), d/dz R_lm = R_l-1,m, (d/dx + i d/dy) R_lm = -R_l-1,m+1,
-(d/dx - i d/dy) R_lm = R_l-1,m-1. All of these are held by tests.
+(d/dx - i d/dy) R_lm = R_l-1,m-1. Tests check all of these.
+
+- `regular`, `of_dipole`, `moved`: harmonics, moments of a dipole, and moments about another point.
+- `NodeMoments`, from `all_levels` or `triangle_levels`: the moments of all nodes of a tree.
+- `truncation`, `bend_columns`: bounds of the terms that are left out, and of those that are not.
 
 A complex number is a pair here, of numbers or arrays of any kind, NumPy's and Dr.Jit's alike.
-
-Moments of dipoles about the nodes of a tree.
-
-`moments` says what they are. All in double precision: sums over dipoles and over children in
-Dr.Jit, on many threads and without temporaries, the rest, of one row a node, in NumPy.
-
-How large the terms of a multipole expansion are at most, and what leaving terms out may cost.
 """
 
 from __future__ import annotations
@@ -49,7 +46,7 @@ Pairs = dict[tuple[int, int], Pair]
 
 # The largest l for which moments are computed.
 KNOWN = 5
-# What is kept of them: for all 1 <= l <= KNOWN and 0 <= m <= l.
+# The (l, m) for which moments are stored: 1 <= l <= KNOWN and 0 <= m <= l.
 KEYS = tuple((l, m) for l in range(1, KNOWN + 1) for m in range(l + 1))
 
 
@@ -75,10 +72,8 @@ def regular(x: Any, y: Any, z: Any, order: int) -> Pairs:
 
 
 def of_dipole(harmonics: Pairs, nx: Any, ny: Any, nz: Any) -> Pairs:
-    """M_lm of a dipole n, its area in its length, at d, of which R_lm(d) are given for l < KNOWN.
-
-    Or of one that is spread out, from the means of R_lm.
-    """
+    """M_lm of a dipole n, whose length is its area, at d, from R_lm(d) for l < KNOWN; or those of
+    one that is spread out, from the means of R_lm."""
     r, x, y = _either_sign(harmonics), 0.5 * nx, 0.5 * ny
     out: Pairs = {}
     for l, m in KEYS:
@@ -94,7 +89,7 @@ def of_dipole(harmonics: Pairs, nx: Any, ny: Any, nz: Any) -> Pairs:
 
 
 def moved(moments: Pairs, x: Any, y: Any, z: Any) -> Pairs:
-    """Moments about c of dipoles whose moments about c + (x, y, z) are given."""
+    """Moments about c, from the moments of the same dipoles about c + (x, y, z)."""
     r, given = _either_sign(regular(x, y, z, KNOWN - 1)), _either_sign(moments)
     out: Pairs = {}
     for l, m in KEYS:
@@ -110,21 +105,20 @@ def moved(moments: Pairs, x: Any, y: Any, z: Any) -> Pairs:
 
 
 def _either_sign(values: Pairs) -> Pairs:
-    """R_lm or M_lm with those of m < 0 as well."""
+    """R_lm or M_lm with those for m < 0 added."""
     turned = {
         (l, -m): (re, -im) if m % 2 == 0 else (-re, im) for (l, m), (re, im) in values.items() if m
     }
     return values | turned
 
 
-# Harmonics have degree l.
-# ruff: noqa: E741
-
+# Moments of nodes. All in double precision: sums over dipoles and over children in Dr.Jit, on many
+# threads and without temporaries; the rest, one row for each node, in NumPy.
 
 Moments = dict[tuple[int, int], npt.NDArray[np.complex128]]
 # Degree, order, and 0 for the real or 1 for the imaginary part.
 _PARTS = tuple((l, m, part) for l, m in KEYS for part in range(2 if m else 1))
-# Numbers of `_powers`.
+# How many numbers `_powers` gives.
 _POWERS = 10
 
 
@@ -132,8 +126,9 @@ _POWERS = 10
 class NodeMoments:
     """The nodes of one level of the tree.
 
-    center: (k, 3) about which the moments are taken: the mean of the dipoles by area.
-    radius: (k,) of a ball around it that holds all the dipoles.
+    center: (k, 3) about which the moments are taken: the mean position of the dipoles, weighted by
+        area.
+    radius: (k,) of a ball around it that contains all the dipoles.
     area: (k,) sum of a_i = |a_i n_i|.
     second, third, fourth: (k, 3, 3), (k, 3) and (k,) sums of a_i d_i d_i^T, of a_i |d_i|^2 d_i and
         of a_i |d_i|^4.
@@ -187,7 +182,7 @@ def triangle_levels(tree: Hierarchy, corners: FloatArray) -> list[NodeMoments]:
 
 @dataclass(frozen=True)
 class _Dipole:
-    """A dipole that is spread over points, with weights of sum 1. Its area is its length."""
+    """A dipole that is spread over points, with weights of sum 1. Its length is its area."""
 
     normal: Vec3
     points: Sequence[tuple[float, Vec3]]
@@ -195,7 +190,7 @@ class _Dipole:
 
 @dataclass(frozen=True)
 class _Primitive:
-    """Its dipoles, and a box that holds it."""
+    """The dipoles of a primitive, and a box that contains it."""
 
     dipoles: Sequence[_Dipole]
     low: Vec3
@@ -224,7 +219,8 @@ def _leaves(
 ) -> tuple[NodeMoments, list[Real], FloatArray, FloatArray]:
     """The leaves, their `_PARTS` on the backend, and boxes around them.
 
-    One lane a leaf, which looks at its primitives twice: for the center, and about it.
+    One lane for each leaf, which visits its primitives twice: for the center, and for the moments
+    about it.
     """
     index, real, vector = backend.UInt32, backend.Float, backend.Array3f
     filled = tree.slots != NO_PRIMITIVE
@@ -257,7 +253,7 @@ def _leaves(
 
     nothing = (vector(dr.inf), vector(-dr.inf), real(0), vector(0))
     low, high, area, weighted = visit(measured, nothing)
-    # The mean of positions by area, or the box's middle where there is no area.
+    # The mean position weighted by area, or the box's center if there is no area.
     center = dr.select(area > 0, weighted / dr.select(area > 0, area, 1), 0.5 * (low + high))
     sums = visit(summed, (real(0),) * (_POWERS + len(_PARTS)))
     powers, parts = sums[:_POWERS], sums[_POWERS:]
@@ -270,7 +266,7 @@ def _leaves(
 
 
 def _powers(area: Real, points: Sequence[tuple[float, Vec3]]) -> list[Real]:
-    """A dipole's part of `second` (xx, yy, zz, xy, xz, yz), `third` and `fourth`."""
+    """What a dipole adds to `second` (xx, yy, zz, xy, xz, yz), `third` and `fourth`."""
     total: list[Real] = [area * 0] * _POWERS
     for weight, d in points:
         square, share = dr.squared_norm(d), weight * area
@@ -290,7 +286,7 @@ def _spread_out(normal: Vec3, points: Sequence[tuple[float, Vec3]]) -> Pairs:
 
 
 def _flat(moments: Pairs) -> list[Any]:
-    """Real and imaginary parts, as many as there are in `_PARTS`."""
+    """Real and imaginary parts, in the order of `_PARTS`."""
     return [moments[l, m][part] for l, m, part in _PARTS]
 
 
@@ -330,8 +326,8 @@ def _parents(
 
 
 def _moved(level: NodeMoments, s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Second, third and fourth about center - s: what they are of d + s. About its own center a
-    node has no first moment."""
+    """Second, third and fourth about center - s, that is, with d + s for d. About its own center a
+    node's first moment is 0."""
     a, square = level.area[:, None], (s * s).sum(axis=1)
     trace, bent = np.einsum("kii->k", level.second), np.einsum("kij,kj->ki", level.second, s)
     second = level.second + a[:, None] * s[:, :, None] * s[:, None]
@@ -346,7 +342,7 @@ def _reach(center: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
 
 
 def cartesian(moments: Moments, order: int = 2) -> FloatArray:
-    """(k, 15) coefficients of the terms l <= order + 1, as `multipole_kernel` reads them.
+    """(k, 15) coefficients of the terms l <= order + 1, as `far_clusters.far_terms` reads them.
 
     Term l is P_l(r)/r^(2l+1) with harmonic polynomials P_1 = D.r; P_2 with the coefficients of
     xx, yy, 2xy, 2xz, 2yz (zz follows: the trace is zero); P_3 with those of xyy, xzz, xxy, yzz,
@@ -389,11 +385,9 @@ def triangle_rule() -> tuple[FloatArray, FloatArray]:
     return np.array(points), np.repeat([weight for _, weight in rule], 3)
 
 
-# Harmonics have degree l.
-# ruff: noqa: E741
+# Bounds of the terms.
 
-
-# A bound that is rounded to single precision a few times, down each time, is one still.
+# A bound times this is still a bound after it was rounded down to single precision a few times.
 _ROOM = 1 + 2.0**-20
 
 
@@ -413,8 +407,8 @@ def sup_norm(moments: Moments, l: int) -> FloatArray:
 def truncation(
     level: NodeMoments, nearest: FloatArray, order: int = 2
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """(E, G, H): seen from r >= nearest, what the terms l >= order + 2 =: k add to f is at most
-    E/r^(k+1) in value, G/r^(k+2) in gradient and H/r^(k+3) in second derivatives along lines.
+    """(E, G, H): at distances r >= nearest, the terms l >= order + 2 =: k add to f at most
+    E/r^(k+1), to its gradient G/r^(k+2) and to second derivatives along lines H/r^(k+3).
 
     A dipole of area a at d gives the term l at most a l |d|^(l-1)/r^(l+1): on the sphere
     rho^l P_l is a trigonometric polynomial of degree l along each great circle, so by Bernstein's
@@ -425,11 +419,11 @@ def truncation(
     sphere through the point; the rest is then sum_{l>=6} l (l+1) q^(l-5)
     = q (42 - 70q + 30q^2)/(1-q)^3. Its derivatives along lines are harmonic of degree -(l+2), so
     that second ones are at most (l+1)(l+2) times it, and sum_{l>=6} l (l+1) (l+2) q^(l-5)
-    = q (336 - 840q + 720q^2 - 210q^3)/(1-q)^4. Each term times r^(k+1) (r^(k+2), r^(k+3)) falls or
-    stays as r grows, so the value at `nearest` serves. A little is added, for single precision to
-    take away.
+    = q (336 - 840q + 720q^2 - 210q^3)/(1-q)^4. Each term times r^(k+1) (r^(k+2), r^(k+3)) does not
+    grow with r, so the value at `nearest` serves. A little is added for the rounding to single
+    precision.
     """
-    r = np.maximum(nearest, 1e-50)  # of which powers can be taken
+    r = np.maximum(nearest, 1e-50)  # so that powers do not underflow
     q = np.minimum(level.radius / r, 0.99)
     k = order + 2
     rest = level.fourth * level.radius / r ** (6 - k)
@@ -447,19 +441,19 @@ def truncation(
 
 
 def bend_columns(level: NodeMoments, rough: float) -> tuple[FloatArray, FloatArray]:
-    """A and K (k,) of nodes that are seen from beyond r0 = `rough` times their radius R.
+    """A and K (k,) of nodes for points beyond r0 = `rough` times their radius R.
 
-    From there on a step by t = q r, q <= Q = `longest_part(rough)`, moves a node's field off the
-    linear by at most
+    At such points, over a step of length t = q r, q <= Q = `longest_part(rough)`, a node's field
+    differs from its linear part by at most
 
         (A + K/r^2) t^2/r^4 Phi_1(q),   Phi_l(q) = ((1-q)^-(l+1) - 1 - (l+1)q)/q^2.
 
     The term l, a harmonic function of degree -(l+1), is at most B_l/r^(l+1), and its k-th
-    derivative along a line (l+k)!/l! B_l/r^(l+1+k) (`truncation.truncation`, k times). So Taylor's
-    remainder is at most B_l Phi_l(q) t^2/r^(l+3). In Phi_l/Phi_1 the ratio of coefficients,
-    (l+k)!/(l! (k+1)!), grows with k, so that the quotient grows with q: W_l = Phi_l(Q)/Phi_1(Q)
-    serves. With r >= r0: A = B_1 + W_2 B_2/r0 and K = sum_{l>=3} W_l B_l/r0^(l-3), for l >= 6 of
-    B_l <= l R^(l-5) sum a |d|^4, with Phi_l(Q) < (1-Q)^-(l+1)/Q^2.
+    derivative along a line (l+k)!/l! B_l/r^(l+1+k) (the argument of `truncation`, k times). So
+    Taylor's remainder is at most B_l Phi_l(q) t^2/r^(l+3). In Phi_l/Phi_1 the ratio of
+    coefficients, (l+k)!/(l! (k+1)!), grows with k, so that the quotient grows with q: W_l =
+    Phi_l(Q)/Phi_1(Q) serves. With r >= r0: A = B_1 + W_2 B_2/r0 and K = sum_{l>=3} W_l
+    B_l/r0^(l-3), for l >= 6 of B_l <= l R^(l-5) sum a |d|^4, with Phi_l(Q) < (1-Q)^-(l+1)/Q^2.
     """
     r0, q = np.maximum(rough * level.radius, 1e-50), longest_part(rough)
     first = q * q * remainder_factor(q)

@@ -1,21 +1,21 @@
 """Curves that bound a region of a plane, and the range of their solid angle near a point.
 
 Let disjoint simple loops of one plane have winding numbers 0 and 1 only, such as an outline with
-holes, each run against it: they bound a region S of the plane. Above the plane f is minus the
-solid angle of S and lies in (-2 pi, 0); below, it lies in (0, 2 pi). Let d be the distance from x
-to the curves and h that to the plane, h <= d. On the ball B(x, d), which meets no curve, f has a
+holes, each of opposite orientation: they bound a region S of the plane. Above the plane f is minus
+the solid angle of S and lies in (-2 pi, 0); below, it lies in (0, 2 pi). Let d be the distance from
+x to the curves and h that to the plane, h <= d. On the ball B(x, d), which meets no curve, f has a
 continuous lift; the ball meets the plane in a disk D of radius sqrt(d^2 - h^2), inside of S or
 outside of it.
 
-- Outside, the lift is f on either side: it lies in (-2 pi, 2 pi).
-- Inside, it continues f of the one side by f of the other less or plus 4 pi: from above it lies in
+- Outside, the lift is f on both sides of the plane: it lies in (-2 pi, 2 pi).
+- Inside, it continues f of the one side by f of the other minus or plus 4 pi: from above it lies in
   (-4 pi, 0), from below in (0, 4 pi), whichever side x is on.
 - B(x, h) does not meet the plane: there the lift lies in (-2 pi, 0) or in (0, 2 pi).
 
-f itself tells where D is. Seen from x, D has the solid angle 2 pi (1 - h/d). Inside, |f| is at
-least that, for S contains D; outside, |f| is at most 2 pi less that, for S is in the rest of the
-plane. If h < d/2, |f| = pi parts the two; else one of them may be known, and if none is, B(x, h)
-serves, whose radius is at least d/2. In rounded arithmetic f is not known well beside the curve:
+f itself tells where D is. At x, D has the solid angle 2 pi (1 - h/d). Inside, |f| is at least that,
+for S contains D; outside, |f| is at most 2 pi less that, for S is in the rest of the plane. If
+h < d/2, |f| = pi separates the two cases; else one of them may be proved, and if none is, B(x, h)
+is used, whose radius is at least d/2. In rounded arithmetic f is not known well near the curve:
 where h < d/2 and it is not known where D is, the lift lies in (-4 pi, 4 pi) in either case.
 
 The range is 4 pi wide, where that of a curve in convex position is 12 pi wide.
@@ -43,9 +43,9 @@ if TYPE_CHECKING:
 __all__ = ["PlanarRegion", "planar_region"]
 
 # All relative to the size of the curves.
-_FLAT = 1e-12  # how far a vertex may lie off the plane
-_APART = 1e-6  # how near two loops may come to each other
-_TILT = 1e-6  # and the slope of a loop's own plane, relative to the size of the loop
+_FLAT = 1e-12  # the largest distance of a vertex from the plane
+_APART = 1e-6  # the least distance of two loops
+_TILT = 1e-6  # the largest slope of a loop's own plane, relative to the size of the loop
 _MOST_VERTICES = 2048  # the tests take quadratic time
 
 
@@ -59,9 +59,10 @@ class PlanarRegion:
     def window(self, angle: Real, height: Real, distance: Real, slack: Real) -> HarmonicBall:
         """A ball and a range of the lift on it: see the module.
 
-        angle: f modulo 4 pi. height: over the plane, along its normal, at most `slack` off.
-        distance: to the curves, at most as much as it is. slack: a length, which bounds the
-        rounding of positions.
+        angle: f modulo 4 pi.
+        height: over the plane, along its normal, off by at most `slack`.
+        distance: to the curves, or less.
+        slack: a length that bounds the rounding of positions.
         """
         turn = 2 * math.pi
         f = angle - 2 * turn * dr.round(angle / (2 * turn))
@@ -81,22 +82,26 @@ class PlanarRegion:
         upper = dr.select(is_inside, dr.select(f < 0, zero, upper), upper)
         lower = dr.select(is_beside, dr.select(height > 0, -turn, zero), lower)
         upper = dr.select(is_beside, dr.select(height > 0, zero, turn), upper)
-        # f itself was wrapped, and the promise is about the value that the sample states.
+        # f was reduced modulo 4 pi; the promise is about the value that the sample states.
         moved = angle - f
         return HarmonicBall(radius, lower + moved, upper + moved)
 
 
 @dataclass(frozen=True)
 class _Loop:
-    """A simple loop in a plane: its points (k, 2) or, of a circle, center and radius; sign: 1 if it
-    runs counter-clockwise."""
+    """A simple loop in a plane.
+
+    points: (k, 2) of a polygon, or the center of a circle.
+    radius: of a circle, 0 for a polygon.
+    sign: 1 if it runs counter-clockwise, else -1.
+    """
 
     points: FloatArray
     radius: float
     sign: int
 
     def contains(self, point: FloatArray) -> bool:
-        """Whether a point (2,) that is not on it is inside."""
+        """Whether a point (2,), not on the loop, is inside."""
         if self.radius > 0:
             return bool(np.linalg.norm(point - self.points[0]) < self.radius)
         a, b = self.points - point, np.roll(self.points, -1, axis=0) - point
@@ -106,15 +111,15 @@ class _Loop:
 
     @property
     def some_point(self) -> FloatArray:
-        """A point (2,) on it."""
+        """A point (2,) on the loop."""
         return self.points[0] + (np.array([self.radius, 0.0]) if self.radius > 0 else 0.0)
 
 
 def planar_region(loops: Loops, circles: Sequence[Circle]) -> PlanarRegion | None:
-    """The region that the curves bound in their plane; None where this was not found so.
+    """The region that the curves bound in their plane; None if they are not found to bound one.
 
-    That is where the loops do not lie in one plane to 1e-12 of their size, cross or come as near to
-    each other as 1e-6 of it, have winding numbers other than 0 and 1 (or 0 and -1), or have more
+    That is if the loops do not lie in one plane up to 1e-12 of their size, cross or come nearer to
+    each other than 1e-6 of it, have winding numbers other than 0 and 1 (or 0 and -1), or have more
     than 2048 vertices.
     """
     if sum(map(len, loops)) > _MOST_VERTICES or len(loops) + len(circles) > _MOST_VERTICES // 8:
@@ -139,7 +144,7 @@ def planar_region(loops: Loops, circles: Sequence[Circle]) -> PlanarRegion | Non
         flat.append(_Loop(center[None], one.radius / size, sign))
     if not all(_apart(one, other) for one, other in itertools.combinations(flat, 2)):
         return None
-    # Just inside of a loop: the signs of all loops around it. Just outside of all, 0.
+    # The winding number just inside each loop: the sum of the signs of all loops around it.
     inside = [
         sum(other.sign for other in flat if other is one or other.contains(one.some_point))
         for one in flat
@@ -154,7 +159,8 @@ def planar_region(loops: Loops, circles: Sequence[Circle]) -> PlanarRegion | Non
 def _plane_of(
     loops: Loops, circles: Sequence[Circle]
 ) -> tuple[FloatArray, FloatArray, float, FloatArray] | None:
-    """Normal, origin, size and two axes (2, 3), right-handed, of a plane that holds all."""
+    """Normal, origin, size and two axes (2, 3), right-handed, of a plane that contains all curves;
+    None if there is none."""
     points = np.concatenate([*loops, *(one.polygon(4) for one in circles)])
     lower, upper = points.min(axis=0), points.max(axis=0)
     size = float((upper - lower).max())
@@ -164,7 +170,7 @@ def _plane_of(
     x: FloatArray = (points - origin) / size
     if circles:
         normal = np.array(circles[0].normal)
-        # Of all points the first circle's are meant exactly.
+        # The plane of the first circle is given exactly.
         origin = np.array(circles[0].center)
         x = (points - origin) / size
     else:
@@ -173,7 +179,7 @@ def _plane_of(
         x = (points - origin) / size
     if not np.abs(x @ normal).max() <= _FLAT:
         return None
-    # Small loops may be tilted by as little.
+    # Small loops must not be tilted more than large ones.
     for loop in (*loops, *(one.polygon(4) for one in circles)):
         span = loop - loop[0]
         if not np.abs(span @ normal).max() <= _TILT * np.abs(span).max():
@@ -207,5 +213,5 @@ def _apart(one: _Loop, other: _Loop) -> bool:
 
 
 def _deep(*ends: FloatArray) -> tuple[Any, ...]:
-    """Points (k, 2) of a plane as points (k, 3) of space."""
+    """Points (k, 2) of the plane as points (k, 3) of space, with z = 0."""
     return tuple(np.column_stack([end, np.zeros(len(end))]) for end in ends)

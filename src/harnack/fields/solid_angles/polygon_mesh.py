@@ -1,10 +1,9 @@
-"""The closed curves of many faces on a backend, and the solid angle of one of them in each lane.
+"""Meshes of polygons that need not be flat, each spanned by a level set of its solid angle.
 
-Meshes of polygons that need not be flat, each spanned by a level set of its solid angle.
-
-Boxes proved to hold the surface of each face of a polygon mesh, all faces at once.
-
-In double precision, and done once for a mesh and its levels, before any ray.
+- `PolygonMesh`: the field, with a part for each face.
+- `FaceCurves`: the boundary curves of all faces on a backend; `FaceCurve`: the solid angle of a
+  face, in each lane another.
+- `face_boxes`: boxes proved to hold the surface of each face.
 """
 
 from __future__ import annotations
@@ -39,19 +38,20 @@ if TYPE_CHECKING:
 __all__ = ["PERIOD", "FaceCurve", "FaceCurves", "FaceHead", "PolygonMesh", "face_boxes"]
 
 PERIOD = 4 * math.pi
-# Edges of a record. Always as many: another number is another kernel.
+# Edges of a record; a fixed number, so that all meshes share kernels.
 RUN = 4
-# Records are counted in floats; single precision counts no further.
+# Records are counted in floats; single precision holds no larger integers without gaps.
 _MOST_RECORDS = 2**24
 
 
 @dataclass(frozen=True)
 class FaceCurves:
-    """Records of all faces: where their edges are, and in which coordinates.
+    """Records of all faces of a mesh, and of their edges.
 
-    heads: of a face, its center and size, the first record of its edges, how many there are (less
-    than 0 if it is in convex position), and what rounding may do to a point, in units of the face,
-    and to the value.
+    heads: for each face its center and size, the first record of its edges, the number of these
+        records (negative if the face is in convex position), and bounds of the rounding of a point,
+        in units of the face, and of the value.
+    edges: of all faces, each in its own unit coordinates.
     """
 
     heads: Records
@@ -61,7 +61,8 @@ class FaceCurves:
     def upload(cls, backend: Backend, faces: PolygonFaces) -> FaceCurves:
         """All faces, each centered and scaled to unit size.
 
-        Centers are numbers of the backend, so that near a face they are subtracted exactly.
+        Centers are numbers that the backend's precision holds exactly, so that subtracting them
+        near a face is exact.
         """
         low, high = faces.boxes()
         center = (0.5 * (low + high)).astype(backend.dtype).astype(np.float64)
@@ -89,7 +90,7 @@ class FaceCurves:
         return cls(Records.upload(backend, heads), LoopEdges.upload(backend, loops, RUN))
 
     def face(self, index: Any) -> FaceCurve:
-        """The solid angle of the face with that index, another in each lane."""
+        """The solid angle of the face with that index, which may differ from lane to lane."""
         row = self.heads.row(index)
         backend = self.heads.backend
         count = backend.UInt32
@@ -99,7 +100,7 @@ class FaceCurves:
 
 @dataclass(frozen=True)
 class FaceHead(UnitCoordinates):
-    """The head of a face, another in each lane, with its edges."""
+    """The head of a face, in each lane another, with its edges."""
 
     edges: LoopEdges
     trips: Real
@@ -108,10 +109,10 @@ class FaceHead(UnitCoordinates):
 
 
 class FaceCurve(Field):
-    """The solid angle of a face, in each lane another: what `SolidAngle` is, and says why.
+    """The solid angle of a face, in each lane another.
 
-    Its promises are the same. The ball is that of any curve, or where the face is convex, that of a
-    curve in convex position.
+    Its promises are those of `SolidAngle`, which proves them. The ball is that of "convex" if the
+    face is in convex position, else that of "edges".
     """
 
     period: ClassVar[float | None] = PERIOD
@@ -140,7 +141,7 @@ class FaceCurve(Field):
             dr.select(convex, -1.5 * PERIOD, swept.lower),
             dr.select(convex, 1.5 * PERIOD, swept.upper),
         )
-        # On the curve itself, to rounding, every level meets, and no gradient exists.
+        # On the curve itself, up to rounding: as in `SolidAngle`.
         met = sums.distance <= 2 * rounding
         steep = backend.Array3f(0, 0, 4 * PERIOD / rounding)
         gradient = dr.select(met, steep, sums.gradient)
@@ -159,10 +160,10 @@ class FaceCurve(Field):
         return lengthened(sample, face.size)
 
 
-# All cells are split so many times, and those in which a box ends this many times altogether; in so
-# many rounds, as long as the pairs of edges and cells are not more than this.
+# All cells are split so many times, those at the sides of a box up to this many times; in at most
+# so many rounds, and for at most so many pairs of an edge and a cell.
 _COARSE, _FINEST, _ROUNDS, _MOST_PAIRS = 2, 7, 24, 30_000_000
-# Boxes are wider than proved by this part of the size of a face.
+# Boxes are wider than proved by this fraction of the size of a face.
 _SLACK = 1e-4
 _CORNERS = np.array(list(itertools.product((0, 1), repeat=3)), dtype=np.float64)
 
@@ -170,10 +171,12 @@ _CORNERS = np.array(list(itertools.product((0, 1), repeat=3)), dtype=np.float64)
 def face_boxes(faces: PolygonFaces, levels: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
     """Lower and upper corners (m, 3) of boxes that hold the level sets of the faces' solid angles.
 
+    In double precision, for all faces at once; computed once for a mesh and its levels.
+
     The 2 pi level of a face in convex position lies in its convex hull (paper, Theorem B.1), which
     lies in the box of its vertices. Other surfaces lie in the isoperimetric box of
-    `SolidAngle.extent`, of which cells that are proved empty are cut away (`_are_empty`); what is
-    left is put in a box.
+    `SolidAngle.extent`; of its cells those that are proved empty are removed (`_are_empty`), and
+    the box is that around the others.
     """
     low, high = faces.boxes()
     nearest = min(abs(math.remainder(level, PERIOD)) for level in levels)
@@ -192,9 +195,9 @@ def _carved(
     faces: PolygonFaces, carved: IntArray, lower: FloatArray, upper: FloatArray,
     levels: tuple[float, ...],
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-    """Boxes of some faces, less the cells that are proved empty.
+    """Boxes of some faces, around the cells that are not proved empty.
 
-    Only the cells in which a box ends can make it smaller, so only these are split further.
+    Only the cells at the sides of a box can make it smaller, so only these are split further.
     """
     curves = FaceCurves.upload(choose_backend("double"), faces)
     sides, pairs = upper - lower, 0
@@ -220,9 +223,11 @@ def _carved(
 
 @dataclass(frozen=True)
 class _Cells:
-    """Boxes within the boxes of faces: the face, the lower corner and how often it was split.
+    """Cells of the boxes of faces.
 
-    face: (k,) rising; every face that there was has a cell.
+    face: (k,) the face of each cell, increasing; every face has at least one.
+    corner: (k, 3) lower corners.
+    depth: (k,) how often the face's box was split to get the cell.
     """
 
     face: IntArray
@@ -230,7 +235,7 @@ class _Cells:
     depth: IntArray
 
     def sizes(self, sides: FloatArray) -> FloatArray:
-        """(k, 3), of cells in boxes with such sides (m, 3)."""
+        """(k, 3) sizes of the cells, if the boxes of the faces have these sides (m, 3)."""
         return sides[self.face] * (0.5**self.depth)[:, None]
 
     def boxes(self, sides: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -240,19 +245,19 @@ class _Cells:
         return low, np.maximum.reduceat(self.corner + self.sizes(sides), first)
 
     def touch(self, low: FloatArray, high: FloatArray, sides: FloatArray) -> BoolArray:
-        """(k,) whether a cell touches a side of the box from low to high (k, 3), to a part of its
-        size."""
+        """(k,) whether a cell lies at a side of the box from low to high (k, 3), within a quarter
+        of the cell's size."""
         size = self.sizes(sides)
         at_low = self.corner < low + 0.25 * size
         at_high: BoolArray = self.corner > high - 1.25 * size
         return np.logical_or.reduce(at_low | at_high, axis=1)
 
     def taken(self, chosen: BoolArray) -> _Cells:
-        """Some of them."""
+        """The cells chosen by a mask (k,)."""
         return _Cells(self.face[chosen], self.corner[chosen], self.depth[chosen])
 
     def split(self, sides: FloatArray) -> _Cells:
-        """Each cut in eight."""
+        """The eight octants of each cell."""
         depth = np.repeat(self.depth + 1, 8)
         face = np.repeat(self.face, 8)
         half = sides[face] * (0.5**depth)[:, None]
@@ -260,7 +265,7 @@ class _Cells:
         return _Cells(face, np.repeat(self.corner, 8, axis=0) + steps * half, depth)
 
     def joined(self, others: _Cells) -> _Cells:
-        """These and others."""
+        """These cells and others."""
         face = np.concatenate([self.face, others.face])
         order = np.argsort(face, kind="stable")
         corner = np.concatenate([self.corner, others.corner])
@@ -271,19 +276,21 @@ def _are_empty(
     curves: FaceCurves, face: IntArray, centers: FloatArray, half: FloatArray,
     levels: tuple[float, ...],
 ) -> BoolArray:  # fmt: skip
-    """Whether no level set of a face comes within `half` of points: (k,) faces, (k, 3), (k,).
+    """Whether no level set of a face comes within `half` of points: faces (k,), centers (k, 3),
+    half (k,).
 
     Let h be `half`, less than the distance d_e to every edge e, of length 2a. A cell is empty if no
-    level lies in [f - S, f + S], where S bounds how far the lift moves within h. Two bounds, the
-    less of which counts:
+    level lies in [f - S, f + S], where S bounds the change of the lift within h. The smaller of two
+    bounds is used:
 
-    - Walking by s, an edge's field is at most 2a/((d_e - s) sqrt((d_e - s)^2 + a^2))
-      (`SolidAngle`), whose integral is S = sum_e 2 [asinh(a/(d_e - h)) - asinh(a/d_e)].
+    - At distance s from the center, an edge's field is at most
+      2a/((d_e - s) sqrt((d_e - s)^2 + a^2)) (`LiftedEdge.bounds`), whose integral is
+      S = sum_e 2 [asinh(a/(d_e - h)) - asinh(a/d_e)].
     - The second derivative along a line is at most 2 sum_e int rho^-3 over the edge, and that
       integral at most 2a/((d_e - h)^2 sqrt((d_e - h)^2 + a^2)) (`LiftedEdge.bounds`): with the
       slope here, S = |grad f| h + h^2 sum_e 2a/((d_e - h)^2 sqrt((d_e - h)^2 + a^2)).
 
-    A cell that holds a point of the curve is never empty.
+    A cell that contains a point of the curve is never empty.
     """
     backend = curves.heads.backend
     real = backend.Float
@@ -317,7 +324,7 @@ def _are_empty(
     return far & (gap > s * (1 + 1e-9) + 1e-9)
 
 
-# Levels as near as this to a multiple of 4 pi are those of no surface with bounds.
+# Levels nearer than this to a multiple of 4 pi are refused: their surfaces are unbounded.
 _NARROW = 1e-9 * PERIOD
 
 
@@ -325,9 +332,10 @@ class PolygonMesh(BoxedField["_MeshBuffers"]):
     """Faces of any number of corners, flat or not, each spanned by a smooth surface: the level set
     of the solid angle of its boundary curve (paper, Sections 4.2.1 and 4.2.4).
 
-    vertices: (n, 3). faces: a list of faces, each a list of at least three indices of vertices,
-    counter-clockwise seen from outside; or a list of such loops, of which holes run clockwise.
-    Faces may have different numbers of corners, and need not be joined.
+    vertices: (n, 3).
+    faces: a list of faces, each a list of at least three indices of vertices, counter-clockwise
+        seen from outside; or a list of such loops, of which holes run clockwise. Faces may have
+        different numbers of corners, and need not be joined.
 
     The surface of a face is where its solid angle is 2 pi, modulo 4 pi; another `level` bulges it
     to one side. The faces are separate surfaces that meet in their common edges: `Hits.sheet` is
@@ -341,7 +349,7 @@ class PolygonMesh(BoxedField["_MeshBuffers"]):
 
     period: ClassVar[float | None] = PERIOD
     default_level: float = 2 * math.pi
-    overstep: float = 1.3  # as of `SolidAngle`
+    overstep: float = 1.3  # that of `SolidAngle`
 
     def __init__(self, vertices: Any, faces: Any) -> None:
         super().__init__()
@@ -355,7 +363,7 @@ class PolygonMesh(BoxedField["_MeshBuffers"]):
 
     @property
     def vertices(self) -> FloatArray:
-        """(n, 3)."""
+        """(n, 3) vertices."""
         return self.faces.vertices
 
     @property
@@ -381,7 +389,7 @@ class PolygonMesh(BoxedField["_MeshBuffers"]):
         return self._boxes[levels]
 
     def evaluate(self, p: Vec3) -> NoReturn:
-        """Raises TypeError: there is a function for each face, and none of them all."""
+        """Raises TypeError: there is a function for each face, and none for the mesh."""
         del p
         raise TypeError(
             "a polygon mesh is no level set of one function, but of one for each face: ask a "

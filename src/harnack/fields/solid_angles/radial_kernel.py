@@ -3,13 +3,14 @@
 With psi_0 = K and psi_(k+1) = -psi_k'/r a dipole m at y = x + z gives -m.grad_y K = m.z psi_1, and
 a polynomial P(z) times psi_k has the gradient grad P psi_k - P psi_(k+1) z and the Hessian
 HP psi_k - (grad P z^T + z grad P^T) psi_(k+1) - P psi_(k+1) I + P psi_(k+2) z z^T (in z; the
-gradient in x has the opposite sign). What K is, and how fast its derivatives fall, a `RadialKernel`
-says: all else is shared by screened sums (`clouds.screened.YukawaKernel`) and by slices of four
-dimensions (`meshes.morph_slice.SlicedKernel`).
+gradient in x has the opposite sign). A `RadialKernel` defines K and bounds of its derivatives; all
+else is shared by screened sums (`screened.YukawaKernel`) and by slices of four dimensions
+(`morph_slice.SlicedKernel`).
 
-Distances. A kernel may be regular at r = 0: it counts all lengths as D = sqrt(r^2 + height^2), from
-a point beside the space of the dipoles. Its bounds are |d^m K[u_1, ..., u_m]| <= m! Q_m/D^(m+1)
-for unit vectors u_i, with Q_m at most 1 and growing with m, and falling with D if not constant.
+Distances. A kernel may be regular at r = 0: it uses D = sqrt(r^2 + height^2) for all distances,
+those in four dimensions to a point at that height over the space of the dipoles. Its bounds are
+|d^m K[u_1, ..., u_m]| <= m! Q_m/D^(m+1) for unit vectors u_i, with Q_m at most 1, growing with m,
+and falling with D if not constant.
 """
 
 from __future__ import annotations
@@ -32,24 +33,25 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Mask, Real, Vec3
 
 
-# Radii of curvature promises, in distances to the nearest dipole: each is the best somewhere.
+# Radii of the `Curvature` promises, in distances to the nearest dipole: each is the best somewhere.
 _REACHES = (0.1, 0.25, 0.45)
-# The part of the distance to the nearest dipole out to which `RadialSums.variation` holds.
+# `RadialSums.variation` holds within this fraction of the distance to the nearest dipole.
 BALL = 0.35
 
 
 @dataclass(frozen=True)
 class Radial:
-    """A kernel at a distance D: psi_k = scale thetas[k]/D^(2k), for k as far as was asked."""
+    """A kernel at a distance D: psi_k = scale thetas[k]/D^(2k), for as many k as were asked for."""
 
     scale: Real
     thetas: Sequence[Real]
 
 
 class RadialKernel(abc.ABC):
-    """A radial potential K on a backend, as sums over dipoles and their trees use it.
+    """A radial potential K on a backend, for sums over dipoles and their trees.
 
-    height_square: of the point beside the space of the dipoles; 0 for a point of that space.
+    height_square: the square of the height of the points over the space of the dipoles; 0 for
+        points of that space.
     """
 
     height_square: Real = 0.0
@@ -64,16 +66,17 @@ class RadialKernel(abc.ABC):
 
     @abc.abstractmethod
     def growth(self, r: Real) -> Real:
-        """How many times larger Q_m may be at a distance shorter by r."""
+        """The factor by which Q_m may be larger at a distance shorter by r."""
 
     @abc.abstractmethod
     def accepting_distance(self, radius: FloatArray, accuracy: float) -> FloatArray:
-        """From which D on clusters of these radii are taken as a whole."""
+        """The D from which on clusters of these radii are taken as a whole."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """A term P(z) psi_k: P, its gradient and Hessian, all times D^(-2k), k = 1, 2, 3 by place."""
+    """A term P(z) psi_k: P, its gradient and Hessian, all times D^(-2k); k = 1, 2, 3 is its
+    position in a list."""
 
     value: Real
     gradient: Vec3
@@ -82,12 +85,12 @@ class Part:
 
 @dataclass(frozen=True)
 class RadialSums:
-    """Sums over all dipoles, weights w_i = |m_i|, distances d_i, with Q_m at d_i.
+    """Sums over all dipoles, weights w_i = |m_i|, distances d_i, with Q_m at d_i; clusters add
+    bounds of the sums over their dipoles.
 
     sums: value, derivatives and bounds; s4 and s5 are the sums of w Q_3/d^4 and w Q_3/d^5, which
         for Q_3 = 1 are those of `FieldSums`.
     steep, steeper: sums of w Q_2/d^3 and w Q_2/d^4.
-    ClusterMoments add the bounds of their sums.
     """
 
     sums: FieldSums
@@ -96,24 +99,25 @@ class RadialSums:
 
     @classmethod
     def zero(cls, backend: Backend, derivatives: int) -> RadialSums:
-        """Of no dipoles; derivatives: as for `FieldSums.zero`."""
+        """The sums over no dipoles; derivatives: as for `FieldSums.zero`."""
         zero = backend.Float(0)
         return cls(FieldSums.zero(backend, dr.inf, derivatives), zero, zero)
 
     @classmethod
     def of(cls, parts: tuple[Any, ...]) -> RadialSums:
-        """From `parts`."""
+        """The sums with these `parts`."""
         return cls(FieldSums.of(parts[0]), *parts[1:])
 
     def parts(self) -> tuple[Any, ...]:
-        """In the order of the constructor, as loops want them."""
+        """The attributes in the order of the constructor, for the state of a loop."""
         return self.sums.parts(), self.steep, self.steeper
 
     def plus(self, source: Source, rounding: Real, active: Mask) -> RadialSums:
-        """With one more dipole or cluster, where active.
+        """The sums with one more dipole or cluster, where active.
 
-        rounding: of a sum of so many terms, as part of the sum of their absolute values. That sum
-        is at most the one of w Q_2/d^2; and 6 epsilon w Q_2/d^3 is what positions do.
+        rounding: of the sum of all terms, as a fraction of the sum of their absolute values. The
+            latter is at most the sum of w Q_2/d^2; the rounding of positions adds
+            6 epsilon w Q_2/d^3.
         """
         tail, sums = source.tail, self.sums.plus(source.terms, active)
         steep = source.weight * tail.second * tail.cube
@@ -124,7 +128,8 @@ class RadialSums:
             dr.select(active, one, 0) for one in (*bounds, *errors)
         )
         nearer, old = fmin(tail.distance, sums.free_distance), sums.second_truncation
-        # Dr.Jit's epsilon is half the distance from 1 to the next number, ours is all of it.
+        # Dr.Jit's epsilon is half the distance from 1 to the next number, that of the bounds is
+        # all.
         positions = 6 * 2 * float(dr.epsilon(steep))
         sums = dataclasses.replace(
             sums,
@@ -139,13 +144,13 @@ class RadialSums:
         return RadialSums(sums, self.steep + steep, self.steeper + steeper)
 
     def remainder(self, share: float, r: Real, growth: Real) -> Real:
-        """A bound of |f(y) - f(x) - grad f.(y-x)|/|y-x|^2 for |y-x| <= r = share times the distance
-        to the nearest dipole, or less; growth: of the kernel's bounds, for r.
+        """A bound of |f(y) - f(x) - grad f.(y-x)|/|y-x|^2 for |y-x| <= r, r being `share` times the
+        distance to the nearest dipole, or less; growth: that of the kernel for r.
 
         Each term's second derivatives are at most |K^(3)| = 6 Q_3/(d_i-s)^4 at distance s from x,
-        and by Taylor the integral of (t-s) times that bounds its part, t = |y-x|. With t/d_i = q
-        it is at most growth Q_3 (3-2q)/(1-q)^2 t^2/d_i^4; (3-2q)/(1-q)^2 is convex, hence below
-        its chord on [0, share].
+        and by Taylor the integral of (t-s) times that bounds the term's remainder, t = |y-x|. With
+        t/d_i = q it is at most growth Q_3 (3-2q)/(1-q)^2 t^2/d_i^4; (3-2q)/(1-q)^2 is convex, hence
+        below its chord on [0, share].
         """
         return (1 + SUM_ROUNDING) * growth * self.sums.remainder(share, r)
 
@@ -161,9 +166,9 @@ class RadialSums:
         )
 
     def variation(self, r: Real, growth: Real) -> Real:
-        """How far f moves from x on B(x, r) at most; r: `BALL` times the distance to the nearest
-        dipole, or less. By the integral of |K^(2)| = 2 Q_2/(d_i-s)^3: 1/(1-q)^2 - 1 = 2q + ... is
-        convex likewise."""
+        """A bound of |f(y) - f(x)| on B(x, r); r: `BALL` times the distance to the nearest dipole,
+        or less. It is the integral of |K^(2)| = 2 Q_2/(d_i-s)^3, where 1/(1-q)^2 - 1 = 2q + ... is
+        convex as well."""
         chord = (1 / (1 - BALL) ** 2 - 1 - 2 * BALL) / BALL**2
         moved = dr.fma(chord * r, self.steeper, 2 * self.steep)
         return (1 + SUM_ROUNDING) * growth * r * moved
@@ -228,10 +233,11 @@ def combine(
 
 @dataclass(frozen=True)
 class Source:
-    """A dipole or a cluster seen from x, and how fast it changes.
+    """What a dipole or a cluster adds at x, and what bounds its derivatives near x.
 
-    weight: of all its dipoles, which are no nearer than `tail` is for.
-    error, gradient_error, hessian_error: of a cluster.
+    weight: of all its dipoles.
+    tail: bounds of the kernel at the distance of the nearest of them, or less.
+    error, gradient_error, hessian_error: the truncation, for a cluster.
     """
 
     terms: Terms
@@ -243,7 +249,7 @@ class Source:
 
 
 def seen_dipole(row: Sequence[Real], x: Vec3, kernel: RadialKernel, derivatives: int) -> Source:
-    """A dipole (position, moment, weight = |moment|, 0: eight numbers) from x."""
+    """A dipole, given as eight numbers (position, moment, weight = |moment|, 0), at x."""
     vector = _type_of(x)
     z, m = vector(row[0], row[1], row[2]) - x, vector(row[3], row[4], row[5])
     squared = dr.squared_norm(z) + kernel.height_square
@@ -256,7 +262,7 @@ def seen_dipole(row: Sequence[Real], x: Vec3, kernel: RadialKernel, derivatives:
 
 
 def cluster_parts(c: Sequence[Real], z: Vec3, inverse: Real) -> list[Part]:
-    """The parts of a cluster with coefficients c (`radial_tree.coefficients`), center x + z;
+    """The terms of a cluster with coefficients c (`radial_tree.coefficients`) and center x + z;
     inverse = 1/D.
 
     P_1 = c0.z + c3; P_2 = z.(A z + b); P_3 = C[z, z, z] with symmetric A, C.

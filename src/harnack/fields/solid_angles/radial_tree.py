@@ -1,6 +1,6 @@
 """Sums of dipoles of a radial potential: one by one, or far ones in clusters by a tree.
 
-Expansion. Dipoles m_i at c + d_i, |d_i| <= R, seen from x = c - z, r = D of z: by Taylor in d_i
+Expansion. Dipoles m_i at c + d_i, |d_i| <= R, at the point x = c - z, r = D of z: by Taylor in d_i
 
     w = -sum_i m_i.grad K(z + d_i) = -(T1[D] + T2[D^2] + T3[D^3]/2) K(z) + (rest),
 
@@ -8,9 +8,10 @@ T1 = sum m, T2 = sym sum m d, T3 = sym sum m d d. With psi_k as in `radial_kerne
 psi_1, T2[D^2] K = T2[z,z] psi_2 - tr T2 psi_1, T3[D^3] K = 3 z.tr T3 psi_2 - T3[z,z,z] psi_3.
 K is not harmonic in three dimensions, so that traces count: 19 numbers instead of 15.
 
-Truncation. The rest of Taylor's formula is an integral of the fourth derivative of K along the way,
-at most 4! Q_4/(r - s |d_i|)^5. In that, Q_4 is at most its value at r - R; what is
-left of the integral is the rest of the Taylor series of 1/(r - .)^2: with q = |d|/r
+Truncation. The rest of Taylor's formula is an integral of the fourth derivative of K along the
+segment from c to c + d_i, which is at most 4! Q_4/(r - s |d_i|)^5. In that, Q_4 is at most its
+value at r - R; the integral of the other factor is the rest of the Taylor series of 1/(r - .)^2:
+with q = |d|/r
 
     |rest| <= Q_4 |m| (1/(1-q)^2 - 1 - 2q - 3q^2)/r^2 = Q_4 |m| |d|^3 (4-3q)/((1-q)^2 r^5),
 
@@ -62,14 +63,14 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
 
 
-# Dipoles a trip of the plain sum, by experiment.
+# Dipoles in a trip of the direct sum, by experiment.
 _CHUNK = 4
 
 
 class RadialDipoles(abc.ABC):
-    """Dipoles on a backend.
+    """Dipoles on a backend, and sums over them.
 
-    rounding: of sums of so many terms, as `RadialSums.plus` takes it.
+    rounding: of sums over all dipoles, as `RadialSums.plus` takes it.
     """
 
     def __init__(self, backend: Backend, rows: FloatArray, kernel: RadialKernel) -> None:
@@ -83,7 +84,7 @@ class RadialDipoles(abc.ABC):
 
     @abc.abstractmethod
     def added(self, sums: RadialSums, x: Vec3, closer: Real) -> RadialSums:
-        """Sums over other dipoles, with those over these at x; `closer` as for `sums`."""
+        """Sums over other dipoles, with those over these at x added; `closer` as for `sums`."""
 
     def _with_dipole(
         self, row: list[Real], x: Vec3, derivatives: int, state: tuple[Any, ...]
@@ -93,7 +94,7 @@ class RadialDipoles(abc.ABC):
 
 
 class DirectSum(RadialDipoles):
-    """All dipoles, one by one; no sum could be closer."""
+    """All dipoles one by one, without truncation."""
 
     def __init__(self, backend: Backend, rows: FloatArray, kernel: RadialKernel) -> None:
         super().__init__(backend, rows, kernel)
@@ -142,7 +143,7 @@ def seen_cluster(
     head: Sequence[Real], c: Sequence[Real], z: Vec3, length: Real, kernel: RadialKernel,
     derivatives: int,
 ) -> Source:  # fmt: skip
-    """A node with numbers `columns`, its center at z, D = length, and what is left out."""
+    """A node with the numbers of `columns`, its center at z, D = length, with its truncation."""
     radius, weight = head[4], head[5]
     inverse = dr.rcp(length)
     parts = cluster_parts(c, z, inverse)
@@ -164,7 +165,7 @@ def seen_cluster(
 
 @dataclass(frozen=True)
 class ClusteredDipoles:
-    """Dipoles (n, 8) as `dipole_rows` has them, in the leaves of a tree, with the moments of its
+    """Dipoles (n, 8), the rows of `dipole_rows`, in the leaves of a tree, with the moments of its
     levels: all that does not depend on the kernel."""
 
     rows: FloatArray
@@ -178,7 +179,8 @@ class ClusteredDipoles:
         return cls(rows, tree, clusters(tree, rows))
 
     def packed(self, backend: Backend, kernel: RadialKernel, accuracy: float) -> PackedTree:
-        """The tree on a backend; clusters are as far as the kernel says, for an accuracy."""
+        """The tree on a backend; the kernel decides from which distance on clusters are taken as a
+        whole."""
         numbers = [
             columns(level, kernel.accepting_distance(level.radius, accuracy))
             for level in self.levels
@@ -203,8 +205,8 @@ class ClusterMoments:
 def clusters(tree: Hierarchy, rows: FloatArray) -> list[ClusterMoments]:
     """Moments of all levels, from the leaves to the root.
 
-    T1, T2, T3 move from a child's center to its parent's, d -> d + s: T2 gains sym(T1 s) and T3
-    sym(2 T2 s + T1 s s). The rest is taken from the dipoles themselves.
+    T1, T2, T3 are translated from a child's center to its parent's, d -> d + s: T2 gains sym(T1 s)
+    and T3 sym(2 T2 s + T1 s s). All else is computed from the dipoles themselves.
     """
     slots = in_slots(tree, rows)
     levels: list[ClusterMoments] = []
@@ -262,6 +264,6 @@ def coefficients(level: ClusterMoments) -> FloatArray:
 
 def columns(level: ClusterMoments, accept: FloatArray) -> FloatArray:
     """(k, 30): center, accepting distance, radius, weight | coefficients, third."""
-    # Rounding of center and radius must not let a dipole out.
+    # The ball must contain all dipoles in spite of the rounding of center and radius.
     head = np.stack([accept, level.radius * (1 + 1e-5) + 1e-6, level.weight], axis=1)
     return np.concatenate([level.center, head, coefficients(level), level.third[:, None]], axis=1)

@@ -1,26 +1,6 @@
 """The winding number of oriented points with a screened (Yukawa) kernel.
 
-The screened (Yukawa) potential as a kernel of radial sums: its derivatives, and their bounds.
-
-Kernel. K(rho) = exp(-kappa rho)/rho is the Yukawa potential: Delta K = kappa^2 K away from 0. With
-psi_0 = K and psi_(k+1) = -psi_k'/rho one has psi_k = theta_k(kappa rho) exp(-kappa rho)/
-rho^(2k+1), where theta_0 = 1, theta_1 = 1 + t, theta_k = (2k-1) theta_(k-1) + t^2 theta_(k-2) are
-the reverse Bessel polynomials: sums of positive terms, which lose no digits for any t. A dipole m
-at y = x + z gives
-
-    -m.grad_y K = m.z psi_1 = (1 + kappa rho) exp(-kappa rho) m.z/rho^3.
-
-Bound. |d^m K[u_1, ..., u_m]| <= |K^(m)(rho)| for unit vectors: a derivative of K along a line is no
-larger than along the line to its pole. Proof: d^m K is a symmetric form, so equal vectors u are the
-worst (Banach 1938). Write s^m as sum_j b_mj P_j(s) in Legendre polynomials, b_mj >= 0; then
-(u.grad)^m = sum_j b_mj |grad|^(m-j) Y_j(grad) with j = m, m-2, ... and solid harmonics Y_j about u.
-On K, |grad|^2 is kappa^2, and Y_j(grad) K = (-1)^j psi_j Y_j(z) = (-1)^j rho^j psi_j P_j(cos)
-(Hobson 1892). Every coefficient has the sign (-1)^m, and |P_j| <= 1 = P_j(1).
-
-    |K^(m)(rho)| = m! Q_m(kappa rho)/rho^(m+1),   Q_m(t) = exp(-t) sum_(j<=m) t^j/j!,
-
-decreases in rho, as K is completely monotone; Q_m decreases from 1 to 0 and grows with m, and
-Q_m(t - s) <= exp(s) Q_m(t).
+`ScreenedWindingNumber` is the field, `YukawaKernel` its kernel with the proof of its bounds.
 """
 
 from __future__ import annotations
@@ -65,19 +45,43 @@ if TYPE_CHECKING:
     from harnack.geometry import Volume
 
 LONGEST = 80.0
-"""Beyond this many screening lengths exponentials stay at exp(-80) = 2e-35, as single precision
-cannot go on: bounds are then too large, and values off by less than 1e-33 area/(4 pi rho^2)."""
+"""Beyond this many screening lengths exponentials are held at exp(-80) = 2e-35, near the end of the
+range of single precision: bounds are then too large, and values off by less than
+1e-33 area/(4 pi rho^2)."""
 
-# The ball of the harmonic certificate shrinks where the kernel falls fast.
+# By how much the harmonic ball is smaller where the kernel falls fast.
 _SHRINK = 0.1
 # A cluster is never taken as a whole nearer than this many radii.
 _LEAST = 1.5
-# Pairs of points and dipoles looked at for the default level.
+# For the default level: the number of pairs of a point and a dipole, and the most and the fewest
+# points.
 _PAIRS, _MOST_PROBES, _LEAST_PROBES = 8_000_000, 512, 24
 
 
 class YukawaKernel(RadialKernel):
-    """exp(-kappa r)/r on a backend; kappa: one over the screening length."""
+    """exp(-kappa r)/r on a backend; kappa: one over the screening length.
+
+    Kernel. K(rho) = exp(-kappa rho)/rho is the Yukawa potential: Delta K = kappa^2 K away from 0.
+    With psi_0 = K and psi_(k+1) = -psi_k'/rho one has psi_k = theta_k(kappa rho) exp(-kappa rho)/
+    rho^(2k+1), where theta_0 = 1, theta_1 = 1 + t, theta_k = (2k-1) theta_(k-1) + t^2 theta_(k-2)
+    are the reverse Bessel polynomials: sums of positive terms, which lose no digits for any t. A
+    dipole m at y = x + z gives
+
+        -m.grad_y K = m.z psi_1 = (1 + kappa rho) exp(-kappa rho) m.z/rho^3.
+
+    Bound. |d^m K[u_1, ..., u_m]| <= |K^(m)(rho)| for unit vectors: a derivative of K along a line
+    is no larger than along the line to its pole. Proof: d^m K is a symmetric form, so equal vectors
+    u are the worst (Banach 1938). Write s^m as sum_j b_mj P_j(s) in Legendre polynomials, b_mj >=
+    0; then (u.grad)^m = sum_j b_mj |grad|^(m-j) Y_j(grad) with j = m, m-2, ... and solid harmonics
+    Y_j about u. On K, |grad|^2 is kappa^2, and Y_j(grad) K = (-1)^j psi_j Y_j(z) =
+    (-1)^j rho^j psi_j P_j(cos) (Hobson 1892). Every coefficient has the sign (-1)^m, and
+    |P_j| <= 1 = P_j(1).
+
+        |K^(m)(rho)| = m! Q_m(kappa rho)/rho^(m+1),   Q_m(t) = exp(-t) sum_(j<=m) t^j/j!,
+
+    decreases in rho, as K is completely monotone; Q_m decreases from 1 to 0 and grows with m, and
+    Q_m(t - s) <= exp(s) Q_m(t).
+    """
 
     def __init__(self, backend: Backend, kappa: float) -> None:
         self._number = kappa
@@ -118,8 +122,8 @@ def thetas(t: Real, last: int) -> list[Real]:
 def promises(
     radial: RadialSums, f: Real, gradient: Vec3, kernel: YukawaKernel, size: Real, epsilon: float
 ) -> tuple[tuple[Curvature, ...], HarmonicBall]:
-    """What `ScreenedWindingNumber` proves: how it bends, and a ball, which proves shorter steps.
-    f, gradient: at the point, in units of `size`.
+    """What `ScreenedWindingNumber` promises: second derivatives, and a ball, which proves shorter
+    steps. f, gradient: at the point, in units of `size`.
 
     Radii stay below 36 lengths, so that exp(kappa r) times sums in which exponentials are held at
     exp(-80) neither overflows nor grows.
@@ -137,16 +141,18 @@ def promises(
     ends = (f - moved, f + moved)
     products = [end * least for end in ends]
     lower, upper = fmin(ends[0], products[0]), fmax(ends[1], products[1])
-    # A negative cosine turns the interval round.
+    # A negative cosine exchanges the ends of the interval.
     lower, upper = fmin(lower, products[1]), fmax(upper, products[0])
     return known, HarmonicBall(r * size, lower, upper, dimension=4)
 
 
 def accepting_distance(radius: FloatArray, kappa: float, accuracy: float) -> FloatArray:
-    """From where on a cluster is taken as a whole: accuracy R Q_4(kappa (r-R))^(1/5) <= r.
+    """The distance r from which on a cluster is taken as a whole:
+    accuracy R Q_4(kappa (r-R))^(1/5) <= r.
 
-    Clusters of radius R on a surface cost 1/R^2 and err by R^3/r^5 Q_4 an area; the sum of errors
-    is smallest at a given cost if R is proportional to r Q_4^(-1/5). Bisection, from the safe side.
+    For each unit of area, clusters of radius R on a surface cost 1/R^2 and have an error of
+    R^3/r^5 Q_4; the sum of errors is smallest at a given cost if R is proportional to
+    r Q_4^(-1/5). Found by bisection, from the safe side.
     """
     low, high = _LEAST * radius, accuracy * radius
     for _ in range(40):
@@ -159,7 +165,8 @@ def accepting_distance(radius: FloatArray, kappa: float, accuracy: float) -> Flo
 
 
 def mean_at_dipoles(rows: FloatArray, kappa: float) -> float:
-    """The mean of w over (some of) the dipoles by weight, each without those at its own place."""
+    """The mean of w over (some of) the dipoles, weighted, each without those at its own
+    position."""
     n = len(rows)
     count = min(n, max(_LEAST_PROBES, min(_MOST_PROBES, _PAIRS // n)))
     probes = np.unique(np.linspace(0, n - 1, count).astype(np.int64))
@@ -178,13 +185,12 @@ def mean_at_dipoles(rows: FloatArray, kappa: float) -> float:
 
 MethodName = Literal["auto", "sum", "tree"]
 
-# Where a tree becomes faster than the plain sum.
+# The largest number of dipoles for which the direct sum is faster than a tree.
 _MOST_SUMMED = 2000
-# Cells that an extent looks at in one round, at most.
+# The most cells that are tested in one round for an extent.
 _MOST_CELLS = 4096
 _SMALLEST_LEVEL = 1e-20
-# Nearer to a dipole than so many roundings w is not known, and any level up to the second number
-# may be there.
+# Nearer to a dipole than so many roundings w is not known; it may be any number up to the second.
 _ON_DIPOLE, _ANY_LEVEL = 32, 1e5
 
 
@@ -197,22 +203,24 @@ class ScreenedWindingNumber(DetailedField["_ScreenedBuffers"], BatchedField):
 
         Laplacian w = w/l^2:   w is not harmonic.
 
-    What it means. For dense samples of a closed surface, outward normals, w is 1 - u inside and
-    -u outside, where u, between 0 and 1, is the inside blurred: u - l^2 Laplacian u = 1 inside, 0
-    outside (Green's second identity). So w falls from 1 - u to -u at the surface and decays like
-    exp(-distance/l) on both sides: far points are forgotten, holes wider than a few l stay open,
-    and deep inside w is near 0 again. The level that lies on the surface is the mean of the two
-    limits: 1/2 for l much larger than the surface, 0 for l much smaller. `default_level` is the
-    mean of w over (some of) the points, each without its own term, by area, as Kazhdan et al.
-    2006 choose theirs. l should be longer than the distance between neighboring points: else
+    What it means. For dense samples of a closed surface with outward normals, w is 1 - u inside and
+    -u outside, where u, between 0 and 1, is the blurred indicator of the inside: u - l^2 Laplacian
+    u = 1 inside, 0 outside (Green's second identity). So w falls from 1 - u to -u at the surface
+    and decays like exp(-distance/l) on both sides: far points have no effect, holes wider than a
+    few l stay open, and deep inside w is near 0 again. The level that lies on the surface is the
+    mean of
+    the two limits: 1/2 for l much larger than the surface, 0 for l much smaller. `default_level` is
+    the mean of w over (some of) the points, each without its own term, weighted by area, as Kazhdan
+    et al. 2006 choose theirs. l should be longer than the distance between neighboring points: else
     the level sets are those of single dipoles.
 
-    points, normals: (n, 3), normals of any length, to the outside. areas: (n,) that each point
-    stands for; None estimates them. length: l, in the points' unit.
+    points, normals: (n, 3), normals of any length, to the outside.
+    areas: (n,) that each point stands for; None estimates them.
+    length: l, in the points' unit.
     method: "sum" (all dipoles), "tree" (far ones in clusters), "auto".
-    accuracy: of the tree: a cluster of radius R is taken as a whole where the screening leaves its
-        error as small as that of an unscreened one at distance accuracy * R. The error is bounded
-        and part of every promise. Tracing takes more where the tolerance asks for it.
+    accuracy: for the tree, a cluster of radius R is taken as a whole where its screened error is as
+        small as that of an unscreened one at distance accuracy * R. The error is bounded and part
+        of every promise. Tracing uses more detail where the tolerance asks for it.
 
     Promises (`promises` has the formulas), for d_i the distances from x, d the least of them:
 
@@ -224,8 +232,9 @@ class ScreenedWindingNumber(DetailedField["_ScreenedBuffers"], BatchedField):
       its chord on [0, r/d].
     - HarmonicBall of dimension 4. w(y) cos(s/l) is harmonic in (y, s). For |y-x|^2 + s^2 < R^2 <
       d^2 it is the product of a number in [w-S, w+S] and one in [cos(min(R/l, pi)), 1], so it lies
-      between the least and the largest product of ends. S bounds how w moves on B(x, R): by the
-      integral of |K''|(d_i-s) = 2 Q_2/(d_i-s)^3, 1/(1-q)^2 - 1 = 2q + ... bounded likewise.
+      between the least and the largest product of ends. S bounds the change of w on B(x, R), by the
+      integral of |K''|(d_i-s) = 2 Q_2/(d_i-s)^3, where 1/(1-q)^2 - 1 = 2q + ... is bounded by its
+      chord too.
 
     The first alone is used by default: it took 14 to 30 evaluations a ray where the second took
     20 to 65 (spheres and tori of 270 to 2000 points, l from 0.03 to 100).
@@ -286,13 +295,13 @@ class ScreenedWindingNumber(DetailedField["_ScreenedBuffers"], BatchedField):
     ) -> ScreenedWindingNumber:
         """Dipoles at the centroids of triangles, each cut into 4 `subdivide` times first.
 
-        This is quadrature by the midpoint rule, not the integral over the triangles. Seen from a
-        distance r > R, R that of the centroid to the farthest corner, a triangle of area a and
-        edges e is off by at most a (e1^2+e2^2+e3^2)/36 (3-2q)/((1-q)^2 r^4)/(4 pi), q = R/r (the
-        first moment about the centroid vanishes; `radial_tree`, with one order less). Nearer
-        than about an edge's length the result is not that of the mesh at all: w is smooth where a
-        triangle would make it jump and infinite at the centroids. Each subdivision divides that
-        range by 2 and the error beyond it by 4.
+        This is quadrature by the midpoint rule, not the integral over the triangles. At a distance
+        r > R, R the distance from the centroid to the farthest corner, a triangle of area a and
+        edges e contributes an error of at most a (e1^2+e2^2+e3^2)/36 (3-2q)/((1-q)^2 r^4)/(4 pi),
+        q = R/r (the first moment about the centroid vanishes; `radial_tree`, with one order less).
+        Nearer than about an edge's length the result is not that of the mesh at all: w is smooth
+        where a triangle would make it jump, and infinite at the centroids. Each subdivision divides
+        that range by 2 and the error beyond it by 4.
 
         Raises MeshError (a ValueError) as `validate_mesh`.
         """
@@ -328,7 +337,7 @@ class ScreenedWindingNumber(DetailedField["_ScreenedBuffers"], BatchedField):
         return values.far_away(x, 64, weight).rescaled(on.size)
 
     def _held(self, on: _ScreenedBuffers, sums: FieldSums, unit: Real) -> tuple[Real, Real, Real]:
-        """What the screening adds to the rounding of value, gradient and second derivatives.
+        """What screening adds to the rounding of value, gradient and second derivatives.
 
         Exponentials are held at exp(-80) = 2e-35 (`LONGEST`), times at most
         Q_3(80) exp(80) = 9e4. Fourth derivatives of the kernel have Q_4(t) <= (1 + t/4) Q_3(t), and
@@ -356,8 +365,8 @@ class ScreenedWindingNumber(DetailedField["_ScreenedBuffers"], BatchedField):
         held, slope, _ = self._held(on, sums, unit)
         error = sums.truncation + sums.rounding + held
         slope_error = sums.slope_truncation + dr.fma(SLOPE_ROUNDINGS * unit, sums.s4, slope)
-        # On a dipole itself, to rounding, all levels meet: a gradient that says so, and an error
-        # that says how far away they may be.
+        # At a dipole, up to rounding, f has all values: the sample has a gradient so steep that
+        # every level is close, and an error as large as the distance to such a level.
         apart = (sums.free_distance > _ON_DIPOLE * epsilon) & dr.isfinite(sums.value)
         steep = on.backend.Array3f(0, 0, _ANY_LEVEL / (_ON_DIPOLE * epsilon))
         value = dr.select(apart, sums.value, 0)
@@ -374,7 +383,7 @@ class ScreenedWindingNumber(DetailedField["_ScreenedBuffers"], BatchedField):
         )
 
     def check_levels(self, levels: tuple[float, ...]) -> None:
-        """ValueError for a level lost in rounding. Any other is taken next to every dipole."""
+        """ValueError for a level too small for rounding. All others occur next to every dipole."""
         for level in levels:
             if 0 < abs(level) < _SMALLEST_LEVEL:
                 raise ValueError(f"level {level:g} is too small to be told from 0")
@@ -382,8 +391,9 @@ class ScreenedWindingNumber(DetailedField["_ScreenedBuffers"], BatchedField):
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """A box proved to hold the level sets; None for level 0, which may have no end.
 
-        At distance D from the points |w| <= sum_i w_i Q_1(D/l)/D^2 <= least |level|, which falls
-        with D. Of that box, cells proved empty are cut away (`tight_extent`).
+        At distance D from the points |w| <= sum_i w_i Q_1(D/l)/D^2, which falls with D: beyond the
+        D where that is the least |level| there is no level. Cells of that box that are proved empty
+        are removed (`tight_extent`).
         """
         if levels not in self._extents:
             self._extents[levels] = self._extent(levels)
@@ -415,7 +425,7 @@ class ScreenedWindingNumber(DetailedField["_ScreenedBuffers"], BatchedField):
 
 @dataclass(frozen=True)
 class _ScreenedBuffers(UnitCoordinates):
-    """The dipoles on a backend."""
+    """The kernel and the dipoles on a backend."""
 
     kernel: YukawaKernel
     dipoles: RadialDipoles

@@ -55,11 +55,11 @@ if TYPE_CHECKING:
 CertificateName = Literal["auto", "planar", "edges", "convex", "paper"]
 
 _PERIOD = 4 * math.pi
-# Levels as near as this to a multiple of 4 pi count as one.
+# Levels nearer than this to a multiple of 4 pi count as one.
 _NARROW = 1e-9 * _PERIOD
-# Cells times vertices that an extent looks at, at most.
+# The most pairs of a cell and a vertex in one round for an extent.
 _MOST_PAIRS = 3_000_000
-# Of polygons that stand for circles where a boundary is drawn.
+# Sides of the polygons that stand for circles where a boundary is drawn.
 _SIDES = 256
 
 
@@ -67,27 +67,27 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
     """The signed solid angle of closed curves, in steradians, with period 4 pi (paper, Eq. 10).
 
     loops: one (n, 3) array-like of vertices, n >= 3, a `Circle`, or a list of these. Every loop is
-    closed by itself. Orientation matters: a hole runs against its outer loop. A loop may be a
-    Dr.Jit 3-vector of n lanes or a tensor (n, 3): hits and values can be differentiated by its
-    vertices. Circles are exact, and cost about as much as nine vertices.
+        closed by itself. Orientation matters: a hole runs against its outer loop. A loop may be a
+        Dr.Jit 3-vector of n lanes or a tensor (n, 3): hits and values can be differentiated by its
+        vertices. Circles are exact, and cost about as much as nine vertices.
 
-    Edges that are run there and back, by one loop or by two neighbors, are taken out before
-    anything is computed (`net_loops`): f does not see them. If none is left, f is 0 everywhere,
-    every ray a proved miss, and levels that are multiples of 4 pi are refused.
+    Edges that are traversed in both directions, by one loop or by two neighbors, are removed before
+    anything is computed (`net_loops`): they do not contribute to f. If none is left, f is 0
+    everywhere, every ray a proved miss, and levels that are multiples of 4 pi are refused.
 
-    Promises. Second derivatives are bounded near every curve (`curve_promises`), and steps rest on
-    that. The other proofs, chosen by `bound=`, need the range of the lift on a ball:
+    Promises. Second derivatives are bounded near every curve (`edge_angles.bends`), and steps rest
+    on that. The other proofs, chosen by `bound=`, need the range of the lift on a ball:
     on wavy polygons and knots they take 1.4 to 2 times as many evaluations.
 
     certificate: how the lift is bounded on a ball. "auto" takes "planar" where its hypothesis is
     checked to hold, "convex" where that does, else "edges"; if loops are Dr.Jit arrays it takes
     "edges" in any case, so that curves that are moved step by step do not change kernels.
 
-    - "edges" holds for **every** curve: |grad f| and the bound of second derivatives say how far f
-      moves (`swept_ball`).
-    - "planar": on B(x, d), d the distance to the curve, the lift stays in a window 4 pi wide if all
+    - "edges" holds for **every** curve: |grad f| and the bound of second derivatives bound the
+      change of f (`swept_ball`).
+    - "planar": on B(x, d), d the distance to the curve, the lift stays in a range 4 pi wide if all
       loops together bound a region of a plane (`planar`); else, for circles alone, in the sum of
-      one such window a circle.
+      one such range for each circle.
     - "convex": on B(x, d) the lift stays in (-6 pi, 6 pi) if the curve is one loop without
       self-intersections on the boundary of a convex set: a segment crosses the 2 pi level, where
       the principal value in (-2 pi, 2 pi) jumps by 4 pi, at most once net (paper, Theorem C.1).
@@ -126,7 +126,7 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
 
     @property
     def _is_empty(self) -> bool:
-        """Whether nothing is left of the curves."""
+        """Whether all edges and circles cancel."""
         return not self._net and not self._net_circles
 
     @property
@@ -134,8 +134,8 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         return (*self._net, *(one.polygon(_SIDES) for one in self._net_circles))
 
     def _points_around(self) -> FloatArray:
-        """Points (n, 3) whose convex hull holds the curves: vertices, and polygons around circles;
-        those of curves that cancel where nothing else is left."""
+        """Points (n, 3) whose convex hull contains the curves: vertices, and polygons around
+        circles. If all curves cancel, those of the curves as given."""
         loops, circles = self._net, self._net_circles
         if self._is_empty:
             loops, circles = self.loops, self.circles
@@ -171,7 +171,8 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
     def _upload(self, backend: Backend, *, traced: bool) -> _CurveBuffers:
         del traced
         # Centered and scaled to unit size: products of eight lengths stay far from overflow. The
-        # center is a number of the backend, so that near the curve it is subtracted exactly.
+        # backend's precision holds the center exactly, so that subtracting it near the curve is
+        # exact.
         cast = np.float64 if backend.precision == "double" else np.float32
         if (size := float(np.abs(self._center).max()) + self._size) > 0.1 * float(
             np.finfo(cast).max
@@ -206,7 +207,8 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         return self._sample(p, None)
 
     def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
-        """With what edges promise along the ray, which is much beside a long edge along it."""
+        """The look with promises along the ray, which prove long steps where it runs along an
+        edge."""
         del ahead, back
         knows_lines = not self._is_empty and self._asked != "paper"
         direction = path.direction if knows_lines else None
@@ -229,26 +231,26 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
             ball = self._planar_ball(on, x, sums, distance)
         else:
             ball = HarmonicBall(distance, -1.5 * _PERIOD, 1.5 * _PERIOD)
-        # On the curve itself, to rounding, every level meets (`uncanceled_edges`) and no gradient
-        # exists: give one so steep that the point counts as close to any level. A value that is
-        # not a number anywhere else stays one, and the tracer refuses it.
+        # At the curve itself, up to rounding, f has all values (`uncanceled_edges`) and no
+        # gradient: give one so steep that the point counts as close to any level. Anywhere else NaN
+        # stays NaN, and the tracer accepts no such point.
         met = sums.distance <= 2 * rounding
         steep = on.backend.Array3f(0, 0, 4 * _PERIOD / rounding)
         gradient = dr.select(met, steep, sums.gradient)
         error, gradient_error = on.value_rounding, 0.0
-        # Ends of edges, rounded, move each edge's angle by at most that times the integral of
-        # |dp|/D^2: where edges nearly cancel, the gradient does not show it.
+        # The rounding of its ends changes an edge's angle by at most that rounding times the
+        # integral of |dp|/D^2: where edges nearly cancel, that is more than the gradient tells.
         error = error + dr.select(met, 0, 2 * epsilon * sums.squares)
         if sums.circles is not None:
             own = sums.circles
             # Measured: 15 units in the last place of a circle's angle and 60 of its gradient (near
-            # it, 10 elsewhere). Its place is rounded by a few units besides.
+            # it, 10 elsewhere). Its position is rounded by a few units too.
             place = epsilon * (4 + 4 * dr.max(dr.abs(x)))
             value = 16 * epsilon * len(self._net_circles) + place * own.squares
             error = error + dr.select(met, 0, value)
             slope = 32 * epsilon * own.squares + 1.5 * place * own.cubes
             gradient_error = dr.select(met, 0, slope)
-        error = dr.select(met, 8 * _PERIOD, error)  # that gradient times 2 rounding
+        error = dr.select(met, 8 * _PERIOD, error)  # the steep gradient times 2 rounding
         along = _along_curves(on, x, sums, direction)
         if self._asked == "paper":
             known = (ball,)
@@ -267,8 +269,8 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         return self._region.window(sums.angle, on.height(x), distance, slack)
 
     def _constant(self, on: _CurveBuffers, p: Vec3) -> Sample:
-        """The sample of f = 0, for a curve of which nothing is left: it is true on any ball. The
-        range has a width, as bounds divide by it; no level lies in it (`check_levels`)."""
+        """The sample of f = 0, if all edges cancel: it holds on any ball. The range has a positive
+        width, as bounds divide by it; no level lies in it (`check_levels`)."""
         x = on.unit(p)
         radius = 1e6 * (1 + dr.norm(x)) * on.size
         zero = dr.zeros(on.backend.Float, dr.width(p))
@@ -276,7 +278,8 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         return Sample(zero, on.backend.Array3f(zero), (ball,))
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """Rows of the Hessian, free of trace to rounding. It grows without limit at the curve."""
+        """Rows of the Hessian, whose trace is 0 up to rounding. It grows without limit at the
+        curve."""
         on = self._on(p)
         if self._is_empty:
             zero = dr.zeros(on.backend.Array3f, dr.width(p))
@@ -292,8 +295,9 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         return first, second, third
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """Rounding of positions, as for sums over boundary edges (`sums.SLOPE_ROUNDINGS`), with
-        distances less by what it may have done to them. Without bound at the curve."""
+        """Bounds of the effect of the rounding of positions, as for sums over boundary edges
+        (`sums.SLOPE_ROUNDINGS`), with distances reduced by their rounding. Infinite at the
+        curve."""
         del sample
         on = self._on(p)
         if self._is_empty:
@@ -308,7 +312,7 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         return slope, second / (on.size * on.size)
 
     def slope_change(self, p: Vec3, radius: Real) -> Real:
-        """See `curve_promises`; positions may be off by rounding."""
+        """See `edge_angles.slope_change`; the rounding of positions is included."""
         on = self._on(p)
         if self._is_empty:
             return 0 * p.x
@@ -318,7 +322,7 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         return slope_change(sums.cubes, sums.fourths, distance, reach) / on.size
 
     def closest_on_boundary(self, p: Vec3) -> Vec3 | None:
-        """The closest point of the curve, edges that cancel left out (`uncanceled_edges`)."""
+        """The closest point of the curve, without edges that cancel (`uncanceled_edges`)."""
         if self._is_empty:
             return None
         on = self._on(p)
@@ -339,13 +343,13 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
 
     def differentiable_value(self, p: Vec3) -> Real:
         backend = backend_of(p)
-        # Vertices that can be moved one by one are all there: moved, edges cancel no longer.
+        # If vertices can move one by one, all edges are summed: after a move they may not cancel.
         loops = self._movable or self._net
         angle = differentiable_angle(backend, loops, p)
         on = self._on(p)
         if on.circles is None:
             return angle
-        # To first order in p, as its loop cannot be passed in reverse.
+        # To first order in p, as reverse mode cannot pass a recorded loop.
         with dr.suspend_grad():
             q = dr.detach(p)
             own = on.circles.sums(on.unit(q))
@@ -378,8 +382,8 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         """Where the level sets must lie.
 
         The 2 pi level of a curve in convex position lies in its convex hull (paper, Theorem B.1).
-        For any curves of total length L: seen from x at distance rho from all of them, a loop
-        has angular length at most L_i/rho =: t_i; a closed spherical curve of length t < 2 pi,
+        For any curves of total length L: at x, at distance rho from all of them, a loop has angular
+        length at most L_i/rho =: t_i; a closed spherical curve of length t < 2 pi,
         cut into simple loops, bounds |area| <= 2 pi - sqrt(4 pi^2 - t^2) =: phi(t) (isoperimetry
         on the sphere; phi is convex with phi(0) = 0, so the pieces add up to at most phi of the
         whole). So |Omega| < l wherever L/rho < sqrt(l (4 pi - l)): a level at distance l from
@@ -397,8 +401,8 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         if nearest < _NARROW:
             return None
         if self._is_empty:
-            return ConvexHull.of(points)  # holds what there is: nothing
-        # Curves that are moved step by step share kernels: their extent is found in one way.
+            return ConvexHull.of(points)  # there is no surface: any volume will do
+        # Curves whose vertices may move share kernels: their extent is always found the same way.
         in_hull = self.convex_position and nearest > 2 * math.pi * (1 - 1e-9)
         if in_hull and not self._movable:
             return ConvexHull.of(points).padded(1e-4 * self._size)
@@ -424,13 +428,14 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
 
 @dataclass(frozen=True)
 class _CurveBuffers(UnitCoordinates):
-    """The edges on a backend, None if there are none.
+    """The data of curves on a backend.
 
-    circles: likewise. plane: normal (x, y, z) and offset of the `PlanarRegion`, if there is one.
-    rounding: how far a point may be from where it was meant to be, in units of the curve. Near the
-        curve p - center is exact, division and the curve's own coordinates have a few roundings of
-        size 1, and p itself was rounded once, at the curve's distance from 0.
-    value_rounding: what rounding may do to a product of so many factors.
+    edges, circles: None if there are none.
+    plane: normal (x, y, z) and offset of the `PlanarRegion`, if there is one.
+    rounding: that of a point's position, in units of the curve. Near the curve p - center is exact,
+        division and the curve's own coordinates have a few roundings of size 1, and p itself was
+        rounded once, at the curve's distance from 0.
+    value_rounding: that of the product of all factors.
     """
 
     edges: LoopEdges | None
@@ -440,7 +445,7 @@ class _CurveBuffers(UnitCoordinates):
     value_rounding: Real
 
     def height(self, x: Vec3) -> Real:
-        """Of x over the plane."""
+        """The height of x over the plane."""
         assert self.plane is not None
         return dr.dot(self.backend.Array3f(*self.plane[:3]), x) - self.plane[3]
 
@@ -470,7 +475,7 @@ class CurveSums:
 
     @classmethod
     def of(cls, sums: EdgeSums | CircleSums) -> CurveSums:
-        """Those of edges or of circles alone."""
+        """The sums over edges or circles alone."""
         integrals = sums.squares, sums.cubes, sums.fourths
         return cls(sums.angle, sums.gradient, sums.distance, *integrals)
 
@@ -490,7 +495,7 @@ class CurveSums:
 def _along_curves(
     on: _CurveBuffers, x: Vec3, sums: CurveSums, direction: Vec3 | None
 ) -> tuple[Lipschitz, ...]:
-    """What is known at x, in unit coordinates, along a direction, if one is given."""
+    """Promises at x, in unit coordinates, along a direction, if one is given."""
     if direction is None:
         return ()
     line = Line(x, on.backend.Array3f(direction), on.rounding)
@@ -507,8 +512,8 @@ def _along_curves(
 
 
 def _movable_loops(loops: Any) -> tuple[Any, tuple[Any, ...]]:
-    """Curves as `validate_curves` takes them; and, if some are Dr.Jit arrays, all loops, these as
-    3-vectors."""
+    """Curves as `validate_curves` takes them; and all loops, with Dr.Jit arrays as 3-vectors, if
+    some are Dr.Jit arrays."""
     several = isinstance(loops, list | tuple)
     parts: list[Any] = [*loops] if several else [loops]
     if not any(map(_is_drjit, parts)):

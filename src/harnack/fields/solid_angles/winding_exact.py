@@ -2,25 +2,11 @@
 
 See `edge_lift` for the formula. At points the cost is that of one ray through a tree of boxes plus
 one pass over the edges at which the triangles do not cancel, however many triangles there are.
-Along rays a tree of chains of these edges takes less than all of them (`EdgeChains`).
 
-The solid angle of long boundaries along rays: far chains of edges as a chord and a small loop.
-
-The chord of a chain from a to b and the loop that runs along the chain and back along the chord
-have the same edges as the chain together. So, in the terms of `edge_lift`,
-
-    sum_{e in chain} Omega_e(x) = Omega_ab(x) + sum_{e in loop} Omega_e(x),
-
-and for any triangles P with the loop for a boundary the last sum is their solid angle less 4 pi
-times the turns of their crossings with the ray from x along d. P can lie in the convex hull of the
-chain. Where that ray misses a ball around it there are no crossings, and where x is far from the
-ball the solid angle is a multipole expansion: one node of a tree does for all of its edges, and
-their number costs only where the ray passes the boundary closely.
-
-A tree of the edges of closed trails in which every node is one chain, or whole trails.
-
-A trail takes up 2^j leaves and begins at a multiple of that: a node of 2^i leaves lies within a
-trail or holds some entirely.
+- `ExactWinding`: the winding number of a mesh, at points and along rays.
+- `EdgeChains`: long boundaries along rays, by a tree of chains of edges, with less work than all
+  edges take.
+- `chain_leaves`, `chain_columns`: that tree, in NumPy.
 """
 
 from __future__ import annotations
@@ -82,13 +68,14 @@ if TYPE_CHECKING:
     from harnack.fields.sheets import Crossing
     from harnack.fields.solid_angles.winding_mesh import WindingMesh
 
-# A chain is taken as a whole beyond this many times its radius.
+# A chain is taken as a whole beyond this many times its radius,
 RATIO = 2.5
-# And where what it leaves out is at most so much: in a rough look, and over epsilon in a close one.
+# and where its truncation is at most so much: in a coarse evaluation, and, in epsilons, at detail
+# 1.
 _ROUGH, _CLOSE = 1e-2, 1.0
-# Edges of a leaf at most.
+# The most edges in a leaf.
 _LEAF_SIZE = 4
-# Where nodes without edges are, far from everything, in units of about the mesh's size.
+# The position of nodes without edges, far from everything, in units of about the mesh's size.
 _NOWHERE = 1e6
 
 
@@ -96,8 +83,13 @@ _NOWHERE = 1e6
 class ChainLeaves:
     """Edges in the order of their trails, and leaves as ranges of them.
 
-    edges: (k, 2) vertices. first: (k,) the first vertex of an edge's trail, span: (k,) the number
-    of its leaves. ends: (leaves + 1,) where each leaf begins, and the last one ends.
+    The leaves belong to a tree in which every node is one chain of edges, or some whole trails: a
+    trail takes up 2^j leaves and begins at a multiple of that, so that a node of 2^i leaves lies
+    within a trail or contains some entirely.
+
+    edges: (k, 2) vertices.
+    first, span: (k,) the first vertex of each edge's trail, and the number of the trail's leaves.
+    ends: (leaves + 1,) where each leaf begins, and the last one ends.
     """
 
     edges: IntArray
@@ -106,18 +98,19 @@ class ChainLeaves:
     ends: IntArray
 
     def hierarchy(self) -> Hierarchy:
-        """The tree over the leaves, a power of two."""
+        """The tree over the leaves, whose number is a power of two."""
         depth = (len(self.ends) - 2).bit_length()
         slots = _ranges(self.ends[:-1], self.ends[1:], _LEAF_SIZE)
         return Hierarchy(slots, (4,) * (depth // 2) + (2,) * (depth % 2))
 
 
 def chain_leaves(vertices: FloatArray, trails: list[IntArray]) -> ChainLeaves:
-    """Trails of vertices, each ending where it begins, laid out; neighbors next to each other.
+    """Trails of vertices, each ending where it begins, in an order in which neighbors in space are
+    next to each other.
 
-    Trails of as many leaves are the primitives of a tree of their own. Its empty slots stay empty
-    leaves, so that its nodes are nodes here. The largest such tree comes first, and so each begins
-    at a multiple of its own size.
+    Trails with the same number of leaves are the primitives of a tree of their own. Its empty slots
+    become empty leaves, so that its nodes are nodes here. The largest such tree comes first, and so
+    each begins at a multiple of its own size.
     """
     middles = np.array([vertices[trail].mean(axis=0) for trail in trails])
     counts = np.array([len(trail) - 1 for trail in trails])
@@ -150,12 +143,13 @@ def chain_leaves(vertices: FloatArray, trails: list[IntArray]) -> ChainLeaves:
 
 
 def _shares(start: int, count: int, parts: int) -> IntArray:
-    """(parts + 1,) where each of so many parts of `count` numbers begins, and the last one ends."""
+    """(parts + 1,) where each of `parts` equal shares of `count` numbers begins, and the last one
+    ends."""
     return start + np.arange(parts + 1, dtype=np.int64) * count // parts
 
 
 def _ranges(start: IntArray, end: IntArray, width: int) -> IntArray:
-    """(n, width): start, start + 1, .. up to end, then NO_PRIMITIVE."""
+    """(n, width) rows start, start + 1, ..., end - 1, padded with NO_PRIMITIVE."""
     index = start[:, None] + np.arange(width)
     return np.where(index < end[:, None], index, NO_PRIMITIVE)
 
@@ -163,11 +157,12 @@ def _ranges(start: IntArray, end: IntArray, width: int) -> IntArray:
 def chain_columns(
     leaves: ChainLeaves, nodes: int, vertices: FloatArray, epsilon: float
 ) -> FloatArray:
-    """Numbers of the nodes of a level: center, radius, accepting distances of rough and close looks
-    | 15 coefficients, errors of value and gradient, A and K of `bend_columns`, chord from and to,
-    1/its length^2 or 0 for whole trails, which have none.
+    """Numbers of the nodes of a level. The head: center, radius, accepting distances for coarse
+    evaluations and for detail 1. The payload: 15 coefficients, errors of value and gradient, A and
+    K of `bend_columns`, the two ends of the chord, and 1/length^2 of the chord, or 0 for whole
+    trails, which have none.
 
-    The triangles of a chain are a fan from its first vertex, those of trails one for each.
+    The triangles for a chain are a fan from its first vertex; for trails, one fan for each.
     """
     size = (len(leaves.ends) - 1) // nodes
     begin, end = leaves.ends[:-1:size], leaves.ends[size::size]
@@ -195,13 +190,26 @@ def chain_columns(
     return table
 
 
-# An edge, and where it counts, added to a state.
+# From an edge, a mask and a state: the state with the edge added where the mask holds.
 AddEdge: TypeAlias = "Callable[[LiftedEdge, Mask, State], State]"
 
 
 @dataclass(frozen=True)
 class EdgeChains:
-    """Closed trails of edges on a backend, in a tree of chains, in units of about their size."""
+    """Closed trails of edges on a backend, in a tree of chains, in units of about their size.
+
+    The chord of a chain from a to b and the loop that runs along the chain and back along the chord
+    have together the same edges as the chain. So, in the terms of `edge_lift`,
+
+        sum_{e in chain} Omega_e(x) = Omega_ab(x) + sum_{e in loop} Omega_e(x),
+
+    and for any triangles P with the loop for a boundary the last sum is their solid angle less 4 pi
+    times the signs of their crossings with the ray from x along d. P can lie in the convex hull of
+    the chain. Where that ray misses a ball around it there are no crossings, and where x is far
+    from the ball the solid angle is a multipole expansion. So a far chain is taken as its chord and
+    one node of a tree, and the number of its edges matters only where the ray passes close to the
+    boundary.
+    """
 
     backend: Backend
     tree: PackedTree
@@ -216,9 +224,9 @@ class EdgeChains:
         return cls(backend, pack(backend, tree, levels, records))
 
     def near(self, frame: Frame, x: Vec3, detail: Real, active: Mask = True) -> FieldSums:
-        """The sum of Omega_e at points x of rays, where active, and what a certificate needs.
+        """The sum of Omega_e at points x of rays, where active, and what promises are made of.
 
-        detail: `Field.at_detail`; 1 leaves out no more than rounding does. Edges add to the
+        detail: `Field.at_detail`; at 1 truncation is no more than rounding. Edges add to the
         remainder what `LiftedEdge.bounds` says, and so do chords: none is nearer than the ball
         around its chain.
         """
@@ -233,7 +241,7 @@ class EdgeChains:
     def rates(
         self, frame: Frame, line: Line, lengths: tuple[Real, ...], active: Mask
     ) -> tuple[Real, ...]:
-        """The constants of `edge_passing` for the sum of Omega_e along the rays from points x."""
+        """The constants of `edge_trails.rates_along` for the sum of Omega_e on the line."""
 
         def add(edge: LiftedEdge, active: Mask, state: State) -> State:
             old = state[1]
@@ -249,8 +257,8 @@ class EdgeChains:
     def _walk(
         self, frame: Frame, x: Vec3, detail: Real, add: AddEdge, own: State, active: Mask = True
     ) -> State:
-        """The sums over far nodes without their chords, and the caller's own, with all edges and
-        chords added by `add`, where it is told to."""
+        """The sums over far nodes without their chords; and the caller's own state, to which `add`
+        has added all edges of near leaves and the chords of far nodes."""
         real, vector = self.backend.Float, self.backend.Array3f
         unit = fmax(epsilon_at(frame.o), epsilon_at(x))
         pad, close = 16 * unit, fmax(real(detail), real(1))
@@ -288,8 +296,8 @@ class EdgeChains:
     def _with_chord(
         self, frame: Frame, x: Vec3, c: list[Real], active: Mask, add: AddEdge, state: State
     ) -> State:
-        """The state with the chord of a node of payload c, where active. Whole trails have none:
-        in a loop of one trip, or of none, chords cost nothing where no lane has one."""
+        """The state with the chord of a node of payload c added, where active. It is a loop of at
+        most one trip, so that chords cost nothing where no lane has one, as for whole trails."""
 
         def once(trip: Any, *state: Any) -> State:
             chord = LiftedEdge.between(type(x)(*c[19:22]), type(x)(*c[22:25]), 1, c[25], frame, x)
@@ -301,8 +309,8 @@ class EdgeChains:
         return dr.while_loop((self.backend.UInt32(0), *state), is_first, once, label="chord")[1:]
 
 
-# Up to so many edges close sums along rays run over all of them: at 4 ns an edge and point, where a
-# tree of chains takes 13 to 30 us a point, measured with 1,585 edges.
+# Up to so many edges, sums at detail 1 along rays run over all of them: that takes 4 ns for each
+# edge and point, and a tree of chains 13 to 30 us for each point, measured with 1,585 edges.
 _MOST_EDGES = 4000
 _SHARE = 1 / (4 * math.pi)
 
@@ -311,7 +319,7 @@ _SHARE = 1 / (4 * math.pi)
 class ExactWinding:
     """w of a mesh on a backend, in units in which the mesh has a size of about one.
 
-    rounding: what rounding may add to w.
+    rounding: of w, by the number of its terms.
     """
 
     backend: Backend
@@ -326,7 +334,7 @@ class ExactWinding:
     def of(
         cls, backend: Backend, mesh: WindingMesh, rays: TriangleRays, traced: bool
     ) -> ExactWinding:
-        """Everything uploaded; traced: for `on_stretch` as well."""
+        """Everything uploaded; traced: also what `on_stretch` needs."""
         if not len(mesh.singular):
             return cls(backend, rays, None, None, None, None, rounding_of_sum(backend, 0))
         vertices, edges = mesh.unit_vertices, mesh.singular
@@ -352,17 +360,18 @@ class ExactWinding:
 
     @property
     def coarsest_detail(self) -> float:
-        """`Field.coarsest_detail`: of chains, by how much less is left out in a close sample."""
+        """`Field.coarsest_detail`."""
         return 0.5
 
     def values(self, x: Vec3) -> Real:
-        """w at points, not while a loop is recorded: as `at`, for a third of the work.
+        """w at points, as by `at`, for a third of the work; not while a loop is being recorded.
 
-        Crossings are decided by `tree.triangles.crossing`, and wherever the trails are in doubt
-        about an edge, the sum over edges is done again by `lifted_sums`, which decides alike.
+        Crossings are decided by `tree.triangles.crossing`. Wherever `EdgeTrails` is uncertain about
+        an edge, the sum over edges is computed again by `lifted_sums`, which decides by the same
+        bits.
         """
-        # Away from the middle of the mesh, where less of it lies ahead. Mirrored, it winds the
-        # other way.
+        # Rays lead away from the middle of the mesh, so that less of it lies ahead. For a mirrored
+        # mesh the winding number changes its sign.
         way = dr.select(x.z >= 0, self.backend.Float(1), -1)
         turns = self.rays.turns_along(x, way)
         if self.trails is None or self.edges is None:
@@ -377,7 +386,7 @@ class ExactWinding:
         return value
 
     def at(self, x: Vec3, derivatives: int) -> Values:
-        """w, gradient and Hessian (as asked for) at points."""
+        """w and the derivatives asked for at points."""
         real = self.backend.Float
         turns = self.rays.turns_along(x, real(1))
         if self.edges is None:
@@ -388,13 +397,13 @@ class ExactWinding:
         return sums.values(_SHARE, unit, self.rounding)
 
     def start(self, frame: Frame, t: Real, active: Mask) -> Real:
-        """The part of w that counts crossings, for t at the start of a ray."""
+        """The part of w that counts crossings, at the start t of a ray."""
         return self.rays.turns_ahead(frame, t, active)
 
     def on_stretch(
         self, frame: Frame, x: Vec3, behind: Crossing, turns: Real, detail: Real
     ) -> Sample:
-        """w continued along a stretch of a ray, certified as `FieldSums.sample` says."""
+        """w continued along a ray interval, with the promises of `FieldSums.sample`."""
         del behind
         if self.edges is None:
             nothing = self.backend.Array3f(0)
@@ -413,10 +422,8 @@ class ExactWinding:
         return found.sample(_SHARE, unit, self.rounding, along=known)
 
     def _near(self, chains: EdgeChains, frame: Frame, x: Vec3, detail: Real) -> FieldSums:
-        """The sum over boundary edges: coarse by chains, close over all edges if they are few.
-
-        Close sums over chains go down to the leaves nearly everywhere.
-        """
+        """The sum over boundary edges: below detail 1 by chains, else over all edges if they are
+        few, as at detail 1 the tree of chains is visited down to its leaves nearly everywhere."""
         if self.all_edges is None:
             return chains.near(frame, x, detail)
         is_close = self.backend.Float(detail) >= 1

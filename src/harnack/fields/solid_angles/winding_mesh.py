@@ -1,4 +1,4 @@
-"""A mesh made ready for winding numbers: welded, duplicates canceled, scaled, in a tree."""
+"""A mesh prepared for winding numbers: welded, duplicates canceled, scaled, in a tree."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ from harnack.geometry.chains import net_faces, singular_edges, weld_vertices
 from harnack.tree import Hierarchy, build_hierarchy
 from harnack.tree.triangles import MOST_TRIANGLES, PARITY, triangle_records
 
-# Triangles of a leaf at most, and children of a node: by experiment.
+# The most triangles in a leaf, and the children of a node: by experiment.
 _LEAF_SIZE, _ARITY = 8, 4
-# What vertices may move under: properties that depend on faces, or that are as good for others.
+# Properties that stay valid when vertices move: they depend on faces alone, or need not be the
+# best.
 _SHARED = ("triangles", "tree", "ray_tree", "singular_flags")
 
 
@@ -28,13 +29,15 @@ _SHARED = ("triangles", "tree", "ray_tree", "singular_flags")
 class WindingMesh:
     """What the evaluators of a winding number are made of. Double precision, in NumPy.
 
-    vertices: (n, 3), as given. faces: (m, 3) indices of welded vertices, no two alike.
-    multiplicity: (m,) how often each is given, less the times that it is given turned round.
-    source: (m,) the face that it comes from.
+    vertices: (n, 3), as given.
+    faces: (m, 3) indices of welded vertices, no two alike.
+    multiplicity: (m,) how often each face is given, less how often it is given reversed.
+    source: (m,) the face, as given, that each comes from.
     singular: (k, 2) directed edges at which triangles do not cancel, an edge of weight 2 twice.
-    given: (g, 3) all faces, as given. welded: (n,) the vertex that stands for each.
-    center, size: `unit_vertices` = (vertices - center)/size, with a power of two for a size, so
-        that lengths can be scaled to and fro without rounding.
+    given: (g, 3) all faces, as given.
+    welded: (n,) the vertex that stands for each.
+    center, size: `unit_vertices` = (vertices - center)/size; the size is a power of two, so that
+        scaling lengths is exact.
     """
 
     vertices: FloatArray
@@ -76,8 +79,9 @@ class WindingMesh:
         )
 
     def moved(self, vertices: npt.ArrayLike) -> WindingMesh:
-        """The mesh with its vertices (n, 3) elsewhere. What follows from the faces alone is shared,
-        and so is the shape of the trees that there are; positions, boxes and moments are not.
+        """The mesh with other positions of its vertices (n, 3). It shares what follows from the
+        faces alone, and the shape of trees that have been built; positions, boxes and moments are
+        new.
 
         Raises:
             MeshError: as `validate_mesh`; another number of vertices; vertices that coincided, so
@@ -111,7 +115,7 @@ class WindingMesh:
 
     @functools.cached_property
     def triangles(self) -> IntArray:
-        """(k, 3) faces, each as often as it counts."""
+        """(k, 3) faces, each repeated by its multiplicity."""
         return np.repeat(self.faces, self.multiplicity, axis=0)
 
     @functools.cached_property
@@ -121,13 +125,14 @@ class WindingMesh:
 
     @functools.cached_property
     def tree(self) -> Hierarchy:
-        """Over the triangles' centroids."""
+        """The tree over the triangles' centroids."""
         a, b, c = np.moveaxis(self.corners, 1, 0)
         return build_hierarchy((a + b + c) / 3, leaf_size=_LEAF_SIZE, arity=_ARITY)
 
     @functools.cached_property
     def ray_tree(self) -> Hierarchy:
-        """Over the centroids of faces, each once: a ray crosses all of its copies at once."""
+        """The tree over the centroids of faces, each once: a ray crosses all copies of a face at
+        once."""
         if len(self.faces) == len(self.triangles):
             return self.tree
         centroids = self.unit_vertices[self.faces].mean(axis=1)
@@ -135,14 +140,15 @@ class WindingMesh:
 
     @functools.cached_property
     def ray_records(self) -> FloatArray:
-        """(m, 14) of the faces, as `tree.triangles` describes; turns count by multiplicity."""
+        """(m, 14) records of the faces (`tree.triangles`), with the sign of crossings times the
+        multiplicity."""
         records = triangle_records(self.unit_vertices, self.faces)
         records[:, PARITY] *= self.multiplicity
         return records
 
     @functools.cached_property
     def records(self) -> FloatArray:
-        """(k, 14) of the triangles, with the numbers of their faces."""
+        """(k, 14) records of the triangles, with the numbers of their faces."""
         if len(self.faces) == len(self.triangles):
             return self.ray_records
         return np.repeat(
@@ -176,14 +182,14 @@ class WindingMesh:
 
     @functools.cached_property
     def area(self) -> float:
-        """Of all triangles."""
+        """The area of all triangles."""
         p, q, r = np.moveaxis(self.corners, 1, 0)
         cross = np.linalg.norm(np.cross(q - p, r - p), axis=1)
         return float(0.5 * cross.sum() * self.size**2)
 
     @functools.cached_property
     def boundary_length(self) -> float:
-        """Of all singular edges."""
+        """The length of all singular edges."""
         ends = self.vertices[self.singular]
         return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum())
 

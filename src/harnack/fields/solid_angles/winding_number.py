@@ -1,10 +1,10 @@
 """The generalized winding number of triangle meshes: holes, soups, overlaps, all repaired.
 
-Where the level sets of a winding number can be: its triangles, and what spans its holes.
-
-Modulo 1 a winding number does not jump, and it takes a level only on the surfaces that span holes.
-Cells in which it is proved not to are empty, triangles or not: rays pass them without a look at the
-winding number, but for where they cross triangles.
+`WindingNumber` is the field. `winding_extent` and `winding_cells` prove where its level sets can
+be: on its triangles, and on the surfaces that span its holes. Modulo 1 a winding number does not
+jump, and it takes a level only on the latter. Cells in which it is proved not to count as empty,
+whether or not there are triangles in them: there rays sample the winding number only where they
+cross triangles.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 __all__ = ["winding_box", "winding_cells", "winding_extent"]
 
-# Cells that an extent looks at in one round at most, and how often the box is halved.
+# The most cells that are tested in one round for an extent, and how often the box is halved.
 _MOST_CELLS = 20_000
 _FINEST = 6
 # Cells of the grid along its longest side, by experiment.
@@ -56,7 +56,7 @@ _ACROSS = 192
 
 
 class WindingField(Protocol):
-    """What is needed of a `WindingNumber`."""
+    """The methods of `WindingNumber` that proofs about its level sets use."""
 
     def prepare(self, backend: Backend) -> WindingField:
         """See `Field.prepare`."""
@@ -68,11 +68,11 @@ class WindingField(Protocol):
 
 
 class _WindingModuloOne(Field):
-    """A winding number modulo 1: continuous off the singular edges, sheets or not.
+    """A winding number modulo 1: continuous off the singular edges, also across sheets.
 
-    winding: samples of it promise what they do of its lift, with all jumps taken out; the lift and
-        w differ by whole numbers. They are coarse, which costs half as much: with close ones 2 %
-        fewer cells are full.
+    winding: the field. The promises of its samples are about its lift, with all jumps taken out;
+        the lift and w differ by whole numbers. Coarse samples are used, which cost half as much: at
+        detail 1, 2 % fewer cells are full.
     """
 
     period: ClassVar[float | None] = 1.0
@@ -99,12 +99,13 @@ def winding_cells(
 def winding_extent(
     winding: WindingField, mesh: WindingMesh, levels: tuple[float, ...]
 ) -> Volume | None:
-    """A polytope that holds the level sets of the winding number of a mesh; of a closed one a box.
+    """A polytope that holds the level sets of the winding number of a mesh; for a closed mesh a
+    box.
 
     A point of a level set lies on a triangle, where w jumps over the level, or off the triangles,
-    and then w has the level there modulo 1 too. All triangles are in the polytope; so are all
-    cells of `winding_box` outside of it in which w modulo 1, to which triangles are nothing, is not
-    proved to be off the level.
+    and then w has the level there modulo 1 too. The polytope contains all triangles, and all cells
+    of `winding_box` in which w modulo 1, which does not jump at triangles, is not proved to be off
+    the level.
     """
     box = winding_box(mesh, levels)
     if not len(mesh.singular):
@@ -117,7 +118,7 @@ def winding_extent(
 
 
 def winding_box(mesh: WindingMesh, levels: tuple[float, ...]) -> Box:
-    """A box around the mesh that holds the level sets, wider by the less of two distances.
+    """A box around the mesh that holds the level sets, wider by the smaller of two distances.
 
     (a) At distance rho from the mesh |w| <= area/(4 pi rho^2). (b) Off the triangles 4 pi w
     is the solid angle of the singular edges mod 4 pi, and a level at distance l from the
@@ -140,13 +141,14 @@ def winding_box(mesh: WindingMesh, levels: tuple[float, ...]) -> Box:
 
 MethodName = Literal["auto", "exact", "tree"]
 
-# One boundary edge costs about a nanosecond, a tree two to three microseconds.
+# Up to so many boundary edges the exact method is used: an edge costs about a nanosecond, a tree
+# two to three microseconds.
 _MOST_EDGES = 2048
-# Of fewer edges samples cost so little that no cells are made for them.
+# With fewer edges samples cost so little that no cells are made for them.
 _FEW_EDGES = 64
 # The accuracy of values at points, and of traces, by experiment.
 _VALUES, _TRACED = 2.0, 4.0
-# Roundings of a coordinate within which a point may be on either side of a triangle.
+# A point within so many roundings of a coordinate of a triangle may be on either side of it.
 _ON_TRIANGLE = 8.0
 
 
@@ -155,17 +157,18 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
 
     For a closed mesh 1 inside and 0 outside; for a mesh with holes, cracks, duplicated or flipped
     faces, self-intersections, or a triangle soup, a function that is harmonic off the triangles
-    and jumps by whole numbers across them. Its 1/2-surface is the mesh where the mesh is sound and
+    and jumps by whole numbers across them. Its 1/2-surface is the mesh where the mesh is sound, and
     spans its holes. Faces are counter-clockwise seen from outside.
 
-    vertices: (n, 3). faces: (m, 3) indices into them.
+    vertices: (n, 3).
+    faces: (m, 3) indices into them.
     method: "exact" (`edge_lift`: no truncation, cost by boundary edges; along rays `EdgeChains`,
         no more truncation than rounding), "tree" (`winding_tree`), or "auto": exact up to 2048
         boundary edges.
-    accuracy: of the tree: a cluster of triangles is taken as a whole beyond `accuracy` times its
+    accuracy: for the tree, a cluster of triangles is taken as a whole beyond `accuracy` times its
         radius; more is slower and sharper. At least 1.5; by default 2 for values at points and 4
-        for tracing, which takes more where the tolerance asks for it. order: of the tree: 0
-        (dipoles), 1 or 2 (octupoles).
+        for tracing, which uses more detail where the tolerance asks for it.
+    order: of the multipoles of the tree: 0 (dipoles), 1 or 2 (octupoles).
 
     Hits on triangles have `Hits.sheet`; `faces_of_sheets` gives the face of each. `moved` gives the
     field for the same faces when vertices have moved.
@@ -204,11 +207,12 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
         self._occupied: dict[tuple[float, ...], OccupiedCells] = {}
 
     def moved(self, vertices: Any) -> WindingNumber:
-        """The winding number of the same faces with their vertices (n, 3) elsewhere, for less work.
+        """The winding number of the same faces with other positions of their vertices (n, 3), for
+        less work than a new one.
 
         Faces are not joined and sorted into a tree again: the tree keeps its shape, and gets new
-        centers, radii, moments and bounds. All that is promised is computed from where the vertices
-        are now, so a tree whose vertices moved far is slower than a new one, never wrong.
+        centers, radii, moments and bounds. All promises are computed from the new positions, so a
+        tree whose vertices moved far is slower than a new one, never wrong.
 
         Raises MeshError as for a new mesh, and for vertices that coincided and come apart.
         """
@@ -232,7 +236,7 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
             values = winding.at(x, derivatives)
             if derivatives == 0:
                 values = dataclasses.replace(values, value=winding.values(x))
-        # The side of a triangle that x is on, to rounding, is not known.
+        # Within rounding of a triangle, it is not known on which side of it x is.
         on_triangle = jumps_within(on.rays, x, _ON_TRIANGLE * epsilon_at(x))
         values = dataclasses.replace(values, error=values.error + on_triangle)
         weight = self.mesh.area / (4 * math.pi * self.mesh.size**2)
@@ -249,7 +253,7 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
         return _MeshBuffers(*placed(backend, mesh.center, mesh.size), winding, rays)
 
     def occupied(self, levels: tuple[float, ...]) -> OccupiedCells | None:
-        """Where edges are summed up exactly, and are not few."""
+        """Cells by `winding_cells`, for the exact method if edges are not few."""
         if self.method != "exact" or len(self.mesh.singular) < _FEW_EDGES:
             return None
         extent = self.extent(levels)
@@ -260,17 +264,17 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
         return self._occupied[levels]
 
     def evaluate(self, p: Vec3) -> Sample:
-        """w as it is, jumps and all, with what is known of it as a lift."""
+        """w itself, jumps included, with promises of its lift."""
         on, frame = self._upward(p)
         return _at_start(on, frame, on.winding.start(frame, 0, True), 1.0)
 
     def evaluate_modulo_one(self, p: Vec3) -> Sample:
-        """w less a whole number, other ones at other points, as coarsely as can be."""
+        """w less a whole number, which differs from point to point; the coarsest sample."""
         on, frame = self._upward(p)
         return _at_start(on, frame, on.backend.Float(0), 0.0)
 
     def _upward(self, p: Vec3) -> tuple[_MeshBuffers, Frame]:
-        """Rays from p: everything lies ahead, nothing has been passed."""
+        """The data, and rays from p, on which all triangles lie ahead."""
         on = self._on(p)
         return on, Frame.along(on.backend, on.unit(p), on.backend.Array3f(0, 0, 1))
 
@@ -281,7 +285,7 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
         frame = Frame.along(on.backend, on.unit(o), d)
         behind = (after.t / on.size, after.sheet)
         t, sheet, turn, normal = on.rays.next(frame, behind, t_max / on.size, active)
-        # w is larger on the side that the normal does not point to.
+        # w is larger on the side opposite to the normal.
         return Crossing(t * on.size, sheet, -turn, -normal)
 
     def offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
@@ -336,21 +340,21 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
 
 @dataclass(frozen=True)
 class _MeshBuffers(UnitCoordinates):
-    """A winding number on a backend."""
+    """The data of a winding number on a backend."""
 
     winding: ExactWinding | TreeWinding
     rays: TriangleRays
 
 
 def _at_start(on: _MeshBuffers, frame: Frame, turns: Real, detail: float) -> Sample:
-    """The sample where rays begin; turns: the crossings that are ahead."""
+    """The sample where rays begin; turns: the sum of the signs of all crossings ahead."""
     nowhere = Crossing(0.0, on.backend.UInt32(NO_SHEET), 0.0, on.backend.Array3f(0, 0, 1))
     sample = on.winding.on_stretch(frame, frame.o, nowhere, turns, on.backend.Float(detail))
     return lengthened(dataclasses.replace(sample, along=()), on.size)
 
 
 class _Stretch(Field):
-    """A winding number as seen on a stretch of rays; behind: where it starts, in unit lengths."""
+    """A winding number on a ray interval; behind: the crossing where it starts, in unit lengths."""
 
     def __init__(
         self, on: _MeshBuffers, frame: Frame, behind: Crossing, offset: Real, detail: Real = 1.0

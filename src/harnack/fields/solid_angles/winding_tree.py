@@ -1,14 +1,12 @@
-"""Triangles near a point: what the edges of their union add to the winding number.
-
-By Stokes' theorem the field of a set of triangles is that of the boundary of their union, so only
-edges at which they do not cancel are summed up. `edge_lift` says how crossings and edges together
-make the winding number: both are decided by the same bits, so that nothing is rounded beside an
-edge that two triangles share.
-
-Winding numbers by a tree: clusters of far triangles as multipoles, near ones exactly.
+"""Winding numbers by a tree: clusters of far triangles as multipoles, near ones exactly.
 
 Barill et al. 2018 ("Fast winding numbers for soups and clouds") with orders 0 to 2, gradients and
-Hessians from the same moments, a bound of what the truncation costs, and certificates.
+Hessians from the same moments, a bound of the truncation, and promises.
+
+Near triangles. By Stokes' theorem the field of a set of triangles is that of the boundary of their
+union, so only edges at which they do not cancel are summed up. `edge_lift` says how crossings and
+edges together make the winding number: both are decided by the same bits, so that an edge that two
+triangles share contributes no rounding error.
 """
 
 from __future__ import annotations
@@ -48,15 +46,16 @@ if TYPE_CHECKING:
     from harnack.fields.solid_angles.edge_trails import Rates
     from harnack.fields.solid_angles.winding_mesh import WindingMesh
 
-# The first column of a record behind those of `tree.triangles`: 1 where an edge is singular.
+# The first of three columns of a record after those of `tree.triangles`: 1 where an edge is
+# singular.
 SINGULAR = EDGES + 3
-# The corners that edges join, and whether they run as the triangle does.
+# The corners that edges join, and 1 or -1 for whether they run in the triangle's direction.
 _EDGES = ((0, 1, 1.0), (1, 2, 1.0), (0, 2, -1.0))
 
 
 @dataclass(frozen=True)
 class NearEdge:
-    """An edge of a triangle. is_singular: whether the mesh ends there."""
+    """An edge of a triangle. is_singular: whether the triangles at it do not cancel."""
 
     edge: LiftedEdge
     is_singular: Mask
@@ -74,7 +73,8 @@ class NearEdge:
 
 
 def edges_of(row: list[Real], x: Vec3, frame: Frame | Upwards) -> Iterator[NearEdge]:
-    """The edges of the triangle of a record, seen from x; there are none in an empty slot."""
+    """The edges of the triangle of a record, relative to x; they have no length in an empty
+    slot."""
     ends = corners_of(row, cast("Any", type(x)))
     for k, (i, j, sign) in enumerate(_EDGES):
         inverse = dr.select(row[INDEX] >= 0, row[EDGES + k], 0)
@@ -105,12 +105,11 @@ class TreeWinding:
 
     @property
     def has_detail(self) -> bool:
-        """Whether rough looks cost less."""
+        """Whether coarse samples cost less."""
         return True
 
     @property
     def backend(self) -> Backend:
-        """The one it lies on."""
         return self.clusters.backend
 
     @property
@@ -119,9 +118,9 @@ class TreeWinding:
         return self.clusters.coarsest
 
     def at(self, x: Vec3, derivatives: int, closer: Real) -> Values:
-        """w, gradient and Hessian (as asked for) at points; closer: the detail, at least 1.
+        """w and the derivatives asked for at points; closer: the detail, at least 1.
 
-        Near triangles: the crossings of the rays from x along z, and their open edges.
+        Near triangles add their crossings with the rays from x along z, and their open edges.
         """
         unit, detail = epsilon_at(x), fmax(self.backend.Float(closer), self.backend.Float(1))
 
@@ -136,10 +135,10 @@ class TreeWinding:
         self, frame: Frame | Upwards, x: Vec3, detail: Real, unit: Real, is_ahead: IsAhead,
         derivatives: int,
     ) -> FieldSums:  # fmt: skip
-        """4 pi w by far clusters, the crossings of near triangles that are ahead on rays of the
-        frame through x, and the open edges of near triangles (`is_open`).
+        """4 pi w: far clusters, the crossings of near triangles that are ahead of x on rays of the
+        frame, and the open edges of near triangles (`NearEdge.is_open`).
 
-        is_ahead(row, t): whether a crossing at t with the triangle of a record is.
+        is_ahead(row, t): whether a crossing at t with the triangle of a record is ahead.
         """
         reach = self.clusters.ratio(detail)
 
@@ -158,23 +157,23 @@ class TreeWinding:
         return LiftedSums(sums, LiftedProduct(*product)).whole()
 
     def start(self, frame: Frame, t: Real, active: Mask) -> Real:
-        """No crossings are counted: every sum is the whole of w."""
+        """0: this method does not count crossings along rays, as every sum gives all of w."""
         del frame, t, active
         return self.backend.Float(0)
 
     def on_stretch(
         self, frame: Frame, x: Vec3, behind: Crossing, turns: Real, detail: Real
     ) -> Sample:
-        """w on a stretch of a ray, with a certificate.
+        """w on a ray interval, with promises.
 
-        Near triangles: their crossings ahead of x along the ray, and their open edges
-        (`NearEdge.is_open`). Crossings passed up to the start of the stretch are behind x, all
-        others ahead, as the tracer has it: the sign of a triangle that x is on, to rounding, is
-        not asked for.
+        Near triangles add their crossings ahead of x along the ray, and their open edges
+        (`NearEdge.is_open`). Crossings that the tracer has passed up to the start of the interval
+        count as behind x, all others as ahead: so it does not matter on which side of a triangle
+        rounding puts x.
 
-        Certificate. Far dipoles: see `FieldSums.sample`. The near triangles' field is that of
-        their open edges, and f is harmonic as far as the nearest of them; what they add to the
-        remainder, says `LiftedEdge.bounds`.
+        Promises. For far dipoles see `FieldSums.sample`. The near triangles' field is that of
+        their open edges, and f is harmonic up to the nearest of them; what they add to the
+        remainder is in `LiftedEdge.bounds`.
         """
         del turns
         index, unit = self.backend.UInt32, fmax(epsilon_at(frame.o), epsilon_at(x))
@@ -189,7 +188,7 @@ class TreeWinding:
         return found.sample(_SHARE, unit, self.rounding, along=known)
 
     def _rates(self, line: Line) -> Rates:
-        """The rates of `edge_passing` for 4 pi w on stretches of lines."""
+        """The rates of `edge_trails.rates_along` for 4 pi w on a line."""
         reach = self.clusters.rough
 
         def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:

@@ -1,4 +1,4 @@
-"""Solids moved, turned, scaled and sheared."""
+"""Solids moved, rotated, scaled and sheared."""
 
 from __future__ import annotations
 
@@ -31,9 +31,10 @@ from harnack.fields.solids.solid import Map, axis_index
 class Affine(Map):
     """u -> matrix u + offset, in double precision.
 
-    matrix: (3, 3), rows, not singular. offset: (3,).
-    factor: by which f is multiplied. Of one map it is that by which all lengths grow, if they grow
-        alike, else 1; of several in turn it is the product of theirs.
+    matrix: (3, 3), rows, not singular.
+    offset: (3,).
+    factor: f is multiplied by it. For a similarity it is the factor by which lengths grow, for
+        other maps 1; for several maps in turn it is the product of theirs.
     """
 
     matrix: tuple[tuple[float, ...], ...]
@@ -80,7 +81,7 @@ class Affine(Map):
 
     @classmethod
     def rotation(cls, degrees: float, axis: str | Sequence[float]) -> Affine:
-        """The turn about an axis through the origin (Rodrigues' formula)."""
+        """The rotation about an axis through the origin (Rodrigues' formula)."""
         if isinstance(axis, str):
             unit = np.eye(3)[axis_index(axis)]
         else:
@@ -121,11 +122,11 @@ class Affine(Map):
 
     @property
     def similarity(self) -> float | None:
-        """The factor by which all lengths grow; None if they do not grow alike."""
+        """The factor by which all lengths grow; None if it is no similarity."""
         return _similarity(np.array(self.matrix))
 
     def volume(self, volume: Volume | None) -> Volume | None:
-        """A volume that holds the image of another one; None if that has no bounds."""
+        """A volume that contains the image of another one; None if that has no bounds."""
         if volume is None:
             return None
         m, b = np.array(self.matrix), np.array(self.offset)
@@ -145,7 +146,7 @@ class Affine(Map):
 
 
 def _similarity(m: FloatArray) -> float | None:
-    """The factor by which a matrix makes all lengths grow; None if they do not grow alike."""
+    """The factor by which a matrix makes all lengths grow; None if it is no similarity."""
     factor = abs(float(np.linalg.det(m))) ** (1 / 3)
     grown = np.abs(m.T @ m - factor**2 * np.eye(3)).max()
     return factor if grown <= 1e-14 * factor**2 else None
@@ -155,9 +156,9 @@ def _similarity(m: FloatArray) -> float | None:
 class AffineImage(Derived):
     """A solid under an affine map.
 
-    Proof. A ray o + t d is the image of the straight path M^-1 (o - b) + t M^-1 d, on which the
-    solid is looked at; it is passed at the speed |M^-1 d| (`Stretched`). Coordinates there are
-    rounded by a few units of the sum of the sizes that they are summed from, which enters the error
+    Proof. A ray o + t d is the image of the straight path M^-1 (o - b) + t M^-1 d, along which the
+    solid is sampled; lengths on it are |M^-1 d| times as large (`Stretched`). The rounding of
+    coordinates there is a few units of the sum of the sizes of their terms, which enters the error
     of the value. f is multiplied by the factor of the map.
     """
 
@@ -211,8 +212,8 @@ class AffineImage(Derived):
         return x, y, z
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """Of a formula, by its ranges. Of another field, its own errors at the local coordinates:
-        what the rounding of those does to its derivatives is not known, nor in these."""
+        """For a formula, by its ranges. For another field, its own errors at the local coordinates,
+        without the effect of the rounding of these coordinates, which is not known."""
         del sample
         numbers = self.numbers
         local = type(p)(*numbers.local(p.x, p.y, p.z))
@@ -222,7 +223,7 @@ class AffineImage(Derived):
             return slope, bend * numbers.stretch * numbers.stretch * numbers.factor
         coordinates = Jet.at_point(p, order=2)
         jet = as_jet(self.formula(*coordinates), coordinates[0], type(self.inner).__name__)
-        # The gradient is the middle of no range (`Formula.evaluate`): both are added.
+        # The gradient need not be the middle of its range (`Formula._one_sided`): both are added.
         return slope + sum(one.radius for one in jet.first), hessian_error(jet, p.x)
 
     def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
@@ -243,7 +244,7 @@ class AffineImage(Derived):
         return Look(sample, ahead_, back_, slope, look.growth, error)
 
     def _size(self, p: Vec3, t: Real) -> Real:
-        """The size of what the local coordinates of p + t d are summed from."""
+        """A bound of the terms that the local coordinates of p + t d are sums of."""
         numbers = self.numbers
         return numbers.stretch * (largest_coordinate(p) + numbers.offset_size + t) * math.sqrt(3)
 
@@ -274,7 +275,11 @@ class AffineImage(Derived):
 class _AffineNumbers:
     """The inverse of an affine map as a kernel uses it.
 
-    rows: of M^-1. offset: b. stretch: the largest singular value of M^-1. factor: of f.
+    rows: of M^-1.
+    offset: b.
+    stretch: the largest singular value of M^-1.
+    factor: that of f.
+    offset_size: the largest component of b.
     """
 
     rows: tuple[tuple[Any, ...], ...]
@@ -296,7 +301,7 @@ class _AffineNumbers:
         )
 
     def prepare(self, backend: Backend) -> _AffineNumbers:
-        """With numbers of the backend, but for 0 and 1: they spare most of the work."""
+        """The numbers as kernel parameters, except 0 and 1, which save most of the work."""
         prepared = prepared_numbers(self, backend)
         rows = tuple(
             tuple(a if a in (0.0, 1.0) else b for a, b in zip(old, new, strict=True))
@@ -307,7 +312,7 @@ class _AffineNumbers:
         return replace(prepared, rows=rows[:3], offset=rows[3])
 
     def local(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
-        """M^-1 (p - b), of coordinates of any kind."""
+        """M^-1 (p - b), for coordinates of any kind."""
         a, b, c = (
             one if _is(shift, 0.0) else one - shift
             for one, shift in zip((x, y, z), self.offset, strict=True)
@@ -320,13 +325,13 @@ class _AffineNumbers:
         return u, v, w
 
     def pulled(self, g: Vec3) -> Vec3:
-        """The gradient outside, M^-T g."""
+        """M^-T g, the gradient of f(M^-1 p) if g is that of f."""
         columns = (tuple(row[i] for row in self.rows) for i in range(3))
         return type(g)(*(_combined(column, (g.x, g.y, g.z)) for column in columns))
 
 
 def _combined(weights: tuple[Any, ...], terms: tuple[Any, ...]) -> Any:
-    """The weighted sum, without what is known to be nothing."""
+    """The weighted sum, without terms of weight 0."""
     total: Any = None
     for weight, term in zip(weights, terms, strict=True):
         if _is(weight, 0.0):

@@ -28,19 +28,20 @@ from harnack.fields.solids.solid import AXES, Map, axis_index
 
 
 class Bend(Map):
-    """A map that does not keep lines straight, of solids with a formula.
+    """A map that does not keep lines straight, for solids with a formula.
 
     axis: the coordinate along which it changes.
     """
 
     def of(self, solid: Solid) -> Solid:
-        solid.formula(*probe())  # says early what has no formula
+        solid.formula(*probe())  # raises TypeError for a solid without a formula
         return Bent(solid, self)
 
     @property
     def least(self) -> float:
-        """What lengths are multiplied by at the least, where that is not 1 or left to the place: a
-        twist presses waves together the more the farther from its axis."""
+        """The least factor by which lengths are multiplied, by which wavelengths shrink; 1 where it
+        depends on the point, as for a twist, which compresses waves the more the farther they are
+        from its axis."""
         return 1.0
 
     @abc.abstractmethod
@@ -49,7 +50,7 @@ class Bend(Map):
 
     @abc.abstractmethod
     def volume(self, volume: Volume | None) -> Volume | None:
-        """A volume that holds the image of another one; None if none is known."""
+        """A volume that contains the image of another one; None if none is known."""
 
     @abc.abstractmethod
     def stretch(self, p: Vec3) -> tuple[Real, Real]:
@@ -57,12 +58,12 @@ class Bend(Map):
 
     @abc.abstractmethod
     def prepare(self, backend: Backend) -> Bend:
-        """With numbers of the backend."""
+        """The same with its numbers as kernel parameters of the backend."""
 
 
 @dataclass(frozen=True, eq=False)
 class Bent(Shape):
-    """A solid under a map that bends lines: its formula at the points that are mapped there.
+    """A solid under a map that bends lines: its formula at the points that are mapped to p.
 
     No Lipschitz constant of the map is needed for a step: ranges of the local coordinates and of
     their derivatives along the ray are passed on to the formula.
@@ -79,7 +80,7 @@ class Bent(Shape):
         object.__setattr__(self, "wavelength", None if waves is None else waves * self.map.least)
 
     def promises(self, p: Vec3) -> tuple[Promise, ...]:
-        """The Lipschitz constant of the solid times that of the map as far as a little away."""
+        """The Lipschitz constant of the solid times that of the map on a ball about p."""
         inner = self.inner.lipschitz
         if inner is None:
             return ()
@@ -101,7 +102,8 @@ class Bent(Shape):
 
 @dataclass(frozen=True)
 class Twist(Bend):
-    """Turns by `rate` radians a unit of length along an axis (Hart 1996, equation 50).
+    """Rotates cross sections by `rate` radians for each unit of length along an axis (Hart 1996,
+    equation 50).
 
     Proof of `stretch`. The derivative of the inverse is a rotation times [[1, 0, -y a], [0, 1, x
     a], [0, 0, 1]], whose largest singular value is (m + sqrt(m^2 + 4))/2, m = |a| times the
@@ -132,7 +134,7 @@ class Twist(Bend):
         radius = 0.25 * rho + 0.25 / rate
         m = (rho + radius) * rate
         constant = 0.5 * (m + dr.sqrt(m * m + 4)) * (1 + 1e-5)
-        # Without a twist m is no number.
+        # Without a twist m is NaN.
         return dr.select(rate > 0, constant, 1), dr.select(rate > 0, radius, dr.inf)
 
     def prepare(self, backend: Backend) -> Twist:
@@ -141,7 +143,7 @@ class Twist(Bend):
 
 @dataclass(frozen=True)
 class Taper(Bend):
-    """Scales cross sections by r, linear along an axis between two places and constant beyond.
+    """Scales cross sections by r, linear along an axis between two positions and constant beyond.
 
     Proof of `stretch`. The derivative of the inverse acts on the radial and the axial direction as
     [[k, m], [0, 1]], k = 1/r, m = rho |r'|/r^2 at the distance rho from the axis, and on the third

@@ -1,7 +1,4 @@
-"""Combinations of solids: unions, intersections, complements, blends and offsets.
-
-Two solids joined with a rounded edge.
-"""
+"""Combinations of solids: unions, intersections, complements, offsets, and blends."""
 
 from __future__ import annotations
 
@@ -31,8 +28,8 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
     from harnack.geometry import Volume
 
-# What other parts must leave out of the range of a value, in parts of its error, to count: at
-# creases it is less, nearly always.
+# Other parts are used to narrow the range of the value if that shifts it by more than this fraction
+# of its error; at creases the shift is nearly always smaller.
 _WORTH = 0.25
 
 
@@ -64,9 +61,9 @@ def _parts(solids: tuple[Solid, ...], *, is_union: bool) -> tuple[Solid, ...]:
 class Combined(Solid):
     """The union, min f_i, or the intersection, max f_i, of solids.
 
-    Of distances the minimum is exact outside and a bound only inside, the maximum a bound only;
-    Hart 1996, equation 16, calls the union exact inside too. Unit discs at -1/2 and 1/2 show that
-    it is not: the distance at 0 is 0.866, and not 0.5.
+    If the f_i are distances, the minimum is exact outside and only a bound inside, and the maximum
+    is only a bound. Hart 1996, equation 16, calls the union exact inside too; unit discs at -1/2
+    and 1/2 show that it is not: the distance at 0 is 0.866, and not 0.5.
     """
 
     parts: tuple[Solid, ...]
@@ -107,7 +104,7 @@ class Combined(Solid):
         return self._of([one.at_detail(detail) for one in self.parts])
 
     def _of(self, parts: list[Field]) -> Solid:
-        """The same of other parts, which need not be solids any more."""
+        """The same combination of other parts, which need not be solids."""
         other = copy.copy(self)
         object.__setattr__(other, "parts", tuple(parts))
         return other
@@ -136,8 +133,9 @@ class Combined(Solid):
         return rows
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """The largest of the parts that may be the one whose derivatives are taken. Where rounding
-        leaves open which of two that is, nothing is known: derivatives jump there."""
+        """The largest errors of the parts that may be the extreme one. Infinite where rounding
+        leaves
+        it open which of two parts that is: derivatives jump there."""
         size = largest_coordinate(p)
         sign = -1.0 if self.is_union else 1.0
         whole = value_error(sample, length(sample.gradient), size)
@@ -148,14 +146,14 @@ class Combined(Solid):
             is_open = ~(sign * (sample.value - own.value) > doubt + whole)
             near = near + dr.select(is_open, 1.0, 0.0)
             slope, bend = one.derivative_errors(p, own)
-            # What is no number is kept: it bounds nothing.
+            # NaN is kept, as it bounds nothing.
             slopes = dr.select(is_open & ~(slope <= slopes), slope, slopes)
             bends = dr.select(is_open & ~(bend <= bends), bend, bends)
         is_one = near <= 1
         return dr.select(is_one, slopes, dr.inf), dr.select(is_one, bends, dr.inf)
 
     def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
-        """Looks at every part; what they prove together is `Greatest`."""
+        """The look made of the looks of all parts, by `Greatest`."""
         looks = [one.look(path, t, ahead, back) for one in self.parts]
         size = largest_coordinate(path.origin) + t
         sample, below, extreme = self._joined([one.sample for one in looks], size)
@@ -184,16 +182,17 @@ class Combined(Solid):
     def _joined(
         self, samples: list[Sample], size: Real
     ) -> tuple[Sample, list[tuple[Real, Real]], Real]:
-        """The sample of the whole, how far each part is below it, least and most, and the greatest
-        (for a union, the least) of the values.
+        """The sample of the combination; for each part the least and the most that it is below the
+        greatest; and the greatest (for a union, the least) of the values.
 
-        Proof of the errors. Let v_i be values with errors e_i (everything that rounding may have
-        done, `value_error`), v = v_k the greatest. max f_i <= max(v_i + e_i) = v + max(e_i - (v -
-        v_i)), and max f_i >= v_k - e_k. So the first is the error of the whole. As max f_i >= v_j -
-        e_j for every j, a part that is known better may leave out most of that range: then the
-        value of the whole is the middle of what is left, or a ray would hit, by the rounding of
-        one part, what lies inside of another. The tracer takes the errors of the whole off its
-        gaps; where that of a part is larger, the rest comes off what the part is below.
+        Proof of the errors. Let v_i be values with errors e_i (all rounding, `value_error`), v =
+        v_k the greatest. max f_i <= max(v_i + e_i) = v + max(e_i - (v - v_i)), and max f_i >= v_k -
+        e_k. So max(e_i - (v - v_i)) is the error of the combination. As max f_i >= v_j - e_j for
+        every j,
+        a part that is known better may exclude most of that range: then the value is the middle of
+        the rest, for else a ray would hit, by the rounding of one part, a surface that lies inside
+        of another part. The tracer subtracts the error of the combination from its gaps; where that
+        of a part is larger, the difference is subtracted from how far the part is below.
         """
         sign = -1.0 if self.is_union else 1.0
         values = [sign * one.value for one in samples]
@@ -221,7 +220,7 @@ class Combined(Solid):
         shift = dr.select(shift > _WORTH * error, shift, 0)
         extreme, value = value, value + sign * shift
         greatest, error = greatest + shift, error - shift
-        # The whole states what its own value and gradient do not already say.
+        # `Sample.error` leaves out the rounding that follows from value and gradient.
         plain = Sample(value, gradient, ())
         stated = value_error(plain, length(gradient), size)
         joined = Sample(
@@ -242,7 +241,7 @@ class Combined(Solid):
         )
 
     def _known(self, samples: list[Sample]) -> tuple[Lipschitz, ...]:
-        """A Lipschitz constant of the whole is the largest of the parts'."""
+        """The largest of the Lipschitz constants of the parts, which is one of the combination."""
         constant: Any = 0.0
         radius: Any = math.inf
         for sample in samples:
@@ -260,7 +259,7 @@ def shortest_wave(parts: Iterable[Solid]) -> float | None:
 
 
 def lipschitz_of(sample: Sample) -> Lipschitz | None:
-    """A Lipschitz constant that a sample promises or, failing that, that follows from a promise."""
+    """A Lipschitz constant that a sample promises, or one that follows from another promise."""
     found = [one.lipschitz(sample.value) for one in sample.promises]
     stated = (one for one in sample.promises if isinstance(one, Lipschitz))
     return next(stated, None) or next((one for one in found if one is not None), None)
@@ -361,7 +360,7 @@ class Offset(Derived):
         return self._shifted(self.inner.evaluate(p))
 
     def _shifted(self, sample: Sample) -> Sample:
-        """The sample, its value rounded once more."""
+        """The sample of f - distance, with the rounding of the difference."""
         size = dr.abs(sample.value) + abs(self.distance)
         return sample.with_promises(
             lambda one: one.shifted(-self.distance),
@@ -379,11 +378,10 @@ class Offset(Derived):
 
 @dataclass(frozen=True, eq=False)
 class Blend(Shape):
-    """The union or intersection of two solids with a fillet: see `arithmetic.blends`.
+    """The union or intersection of two solids with a fillet: see `arithmetic.norms.blend_union`.
 
-    Its Lipschitz constant is 2^(1/p) times the larger of the solids' own. A union's fillet stays
-    within the union of the solids where both are at most the radius: within that of the solids
-    grown by the radius.
+    Its Lipschitz constant is 2^(1/p) times the larger of the solids' own. A union's fillet lies
+    where both functions are at most the radius: within the union of the solids grown by the radius.
     """
 
     parts: tuple[Solid, Solid]
@@ -401,7 +399,7 @@ class Blend(Shape):
         for one in self.parts:
             if not isinstance(one, Solid):  # pyright: ignore[reportUnnecessaryIsInstance]
                 raise TypeError(not_a_solid(one))
-            one.formula(*probe())  # says early what has no formula
+            one.formula(*probe())  # raises TypeError for a solid without a formula
         constants = [one.lipschitz for one in self.parts]
         known = all(one is not None for one in constants)
         lipschitz = 2 ** (1 / self.power) * max(constants) * (1 + 1e-6) if known else None
@@ -416,7 +414,7 @@ class Blend(Shape):
         return whole.hull(-self._reached(-level), above=True) if above else whole.hull(level)
 
     def _reached(self, level: float) -> float:
-        """What the lesser of both is at most where their blended union is at most `level`.
+        """A bound of the smaller of both functions where their blended union is at most `level`.
 
         Proof. The blend grows with both, so it is at least that of the lesser value m taken twice:
         r - 2^(1/p) (r - m) for m < r, and m beyond.
@@ -434,6 +432,6 @@ class Blend(Shape):
         other = copy.copy(self)
         parts = tuple(one.prepare(backend) for one in self.parts)
         object.__setattr__(other, "parts", parts)
-        # The power stays a literal: ranges of x^p are found by what p is.
+        # The power stays a literal: the ranges of x^p depend on the kind of number that p is.
         object.__setattr__(other, "radius", as_data(self.radius, backend))
         return other

@@ -1,6 +1,6 @@
 """Noise and fractal noise as fields, and shapes that are displaced by them.
 
-Lattice noise: gradients at the points of a lattice, and what is proved about them.
+`NoiseConstants` has the proved bounds of noise from gradients at the points of a lattice.
 """
 
 from __future__ import annotations
@@ -35,7 +35,9 @@ CORNERS = tuple(itertools.product((0, 1), repeat=3))
 class NoiseConstants:
     """Bounds of noise on a lattice of unit length, with any unit vectors at its points.
 
-    largest: of |noise|. slope: of |grad noise|. curvature: of all second derivatives.
+    largest: of |noise|.
+    slope: of |grad noise|.
+    curvature: of all second derivatives.
 
     Proof. With weights w_c of the corners c of a cell and r_c = x - c, noise is sum w_c g_c.r_c.
     |noise| <= sum w_c |r_c| <= sqrt(sum w_c |r_c|^2), which is the root of three terms of at most
@@ -47,8 +49,9 @@ class NoiseConstants:
     With the spectral norms of the A_c as weights the root of the largest eigenvalue is at most
     2.183 for the cubic and sqrt(499)/8 = 2.7923 for the quintic fade on a grid of the cell, and
     changes slowly between its points: 2.2 and 2.82 leave room for that. In the middle sqrt(19)/2 =
-    2.1794 and sqrt(499)/8 are attained. Hart's 3 (1996, appendix F) is a bound, but its reason (3/2
-    of the fade times 2 of the vectors) is none: values of a table have no Lipschitz constant.
+    2.1794 and sqrt(499)/8 are attained. Hart's 3 (1996, appendix F) is a bound, but his argument
+    (3/2 of the fade times 2 of the vectors) does not prove it: values of a table have no Lipschitz
+    constant.
 
     A second derivative d_ij is, in the same way along the other axes, at most a sum over the
     corners of one or two axes; the largest sum of a row of these bounds is one of the spectral norm
@@ -81,7 +84,8 @@ def fade(kind: Fade, t: Any) -> tuple[Any, Any, Any]:
 def cell_noise(kind: Fade, t: Any, vectors: Any) -> tuple[Any, list[Any], list[Any]]:
     """Noise in a cell: value, gradient (3,) and Hessian (6,), rows of the upper triangle.
 
-    t: (3,) where in the cell, 0 to 1. vectors: (8,) unit vectors (3,) at the corners, as `CORNERS`.
+    t: (3,) the position in the cell, 0 to 1. vectors: (8,) unit vectors (3,) at the corners, in the
+    order of `CORNERS`.
     """
     weights: list[tuple[tuple[Any, Any], ...]] = []
     for one in t:
@@ -112,7 +116,7 @@ def cell_noise(kind: Fade, t: Any, vectors: Any) -> tuple[Any, list[Any], list[A
 
 
 def lattice_vector(x: Any, y: Any, z: Any, seed: Any, like: Real) -> list[Any]:
-    """A unit vector that looks random, for integers (Dr.Jit, 32 bits without a sign)."""
+    """A pseudo-random unit vector for integers (Dr.Jit, 32 bits, unsigned)."""
     h = x * 0x8DA6B343 + y * 0xD8163841 + z * 0xCB1AB31F + seed * 0x9E3779B1
     for shift, factor in ((16, 0x7FEB352D), (15, 0x846CA68B)):
         h = (h ^ (h >> shift)) * factor
@@ -128,8 +132,11 @@ def lattice_vector(x: Any, y: Any, z: Any, seed: Any, like: Real) -> list[Any]:
 class FractalNoise(Shape):
     """The sum of a_i noise(2^i k p), a_i = amplitude 2^(-beta i), over a number of octaves.
 
-    octaves: how many. beta: how fast they fall: 0 for white noise, 1 for 1/f noise, 2 for Brownian
-        motion. frequency: k, points of the lattice a unit of length. seed: which noise; 32 bits.
+    octaves: their number.
+    beta: how fast amplitudes fall: 0 for white noise, 1 for 1/f noise, 2 for Brownian motion.
+    frequency: k, points of the lattice in a unit of length.
+    amplitude: that of the first octave.
+    seed: an integer of 32 bits that chooses the noise.
     fade: "quintic", with a continuous second derivative, or "cubic", which is Hart's.
 
     Hart 1996, equations 52 to 55. Its Lipschitz constant is at most the sum of those of the
@@ -205,7 +212,7 @@ class FractalNoise(Shape):
         return self._octaves([x, y, z])[0][0]
 
     def _octaves(self, q: list[Real], *, each: bool = False) -> list[tuple[Any, Any, Any]]:
-        """Value, gradient and Hessian of the sum, or of each octave with its own."""
+        """Value, gradient and Hessian of the sum, or of each octave."""
         data = self._data(q[0])
         scale, amplitude = data["frequency"], data["amplitude"]
         found: list[tuple[Any, list[Any], list[Any]]] = []
@@ -243,7 +250,7 @@ class FractalNoise(Shape):
         return [total]
 
     def _ranges(self, coordinates: list[Jet]) -> Jet:
-        """The jet of the sum, of jets of the coordinates: the sum of those of the octaves."""
+        """The jet of the sum for jets of the coordinates: the sum of the octaves' jets."""
         like = coordinates[0].kind()
         like = like if coordinates[0].start is None else coordinates[0].width
         starts = [one if one.start is None else one.start for one in coordinates]
@@ -254,8 +261,8 @@ class FractalNoise(Shape):
         scale, amplitude = data["frequency"], data["amplitude"]
         total: Jet | None = None
         for value, gradient, hessian in self._octaves(at, each=True):
-            # Thirty operations a corner; the place in the cell is off by a rounding of the
-            # coordinate, and nothing is known where the lattice is finer than numbers are.
+            # Thirty operations for each corner. The position in the cell is off by a rounding of
+            # the coordinate, and nothing is known where the lattice is finer than the numbers are.
             place = fmax(fmax(dr.abs(at[0]), dr.abs(at[1])), dr.abs(at[2])) * scale
             lost = dr.select(place < 2.0**30, unit * place, dr.inf)
             octave = _Octave(
@@ -325,8 +332,10 @@ class Displaced(Shape):
 class _Octave:
     """One octave around a point.
 
-    at: the point. value, gradient, hessian: there, off by error, slope_error. slope, bend: bounds
-        of the first and second derivatives everywhere.
+    at: the point.
+    value, gradient, hessian: there.
+    slope, bend: bounds of the first and second derivatives everywhere.
+    error, slope_error: bounds of the errors of value and gradient.
     """
 
     at: list[Real]
@@ -339,11 +348,11 @@ class _Octave:
     slope_error: Real
 
     def jet(self, coordinates: list[Jet], starts: list[Jet], off: Real) -> Jet:
-        """The jet, of jets of the coordinates and of their starts, which are within `off` of the
-        point.
+        """The octave's jet, from jets of the coordinates and from their starts, which are within
+        `off` of the point.
 
-        Proof. At a place within m of the point the gradient differs from that there by at most bend
-        m (mean value theorem), and derivatives along a path follow by the chain rule. The value is
+        Proof. Within m of the point the gradient differs from that at the point by at most bend m
+        (mean value theorem), and derivatives along a path follow by the chain rule. The value is
         that at the start plus the integral of the slope.
         """
         wide = self.error + self.slope * off * (1 + 1e-5)

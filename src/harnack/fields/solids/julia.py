@@ -1,4 +1,4 @@
-"""Quaternion Julia sets, with a proved ball around every point that holds none of it."""
+"""Quaternion Julia sets, with proved empty balls around points outside of them."""
 
 from __future__ import annotations
 
@@ -22,9 +22,10 @@ if TYPE_CHECKING:
 
 Quaternion = tuple[float, float, float, float]
 
-# Radii of balls to be proved, as parts of the longest step there could be.
+# Radii of the balls, as fractions of the longest possible step.
 _RADII = (0.8, 0.6, 0.45, 0.3, 0.15)
-# Iterates of that absolute value have escaped, and go on as their logarithms.
+# Iterates beyond this absolute value have escaped; from there on only their logarithms are
+# computed.
 _FAR = {"single": 1e4, "double": 1e8}
 
 
@@ -37,18 +38,18 @@ class Julia(Solid):
     slice: the fourth coordinate; points of space are q = x + y i + z j + slice k.
 
     f = 2^-N max(log(|q_N|/B), -1), with B = (1 + sqrt(1 + 4 |c|))/2: from |q| > B on an orbit
-    escapes, for |q|^2 - |c| > |q| there. So f <= 0 holds of the filled Julia set whatever N is.
+    escapes, for |q|^2 - |c| > |q| there. So f <= 0 on the filled Julia set, for any N.
 
-    Proof of the balls. In a ball of radius r, q_n moves by at most e_n, with e_0 = r and e_(n+1) =
-    2 |q_n| e_n + e_n^2, for squares of quaternions differ by d q + q d + d^2; and its derivative
+    Proof of the balls. In a ball of radius r, q_n changes by at most e_n, with e_0 = r and e_(n+1)
+    = 2 |q_n| e_n + e_n^2, for squares of quaternions differ by d q + q d + d^2; and its derivative
     in any direction is at most d_n, with d_0 = 1 and d_(n+1) = 2 (|q_n| + e_n) d_n. So d_n/(|q_n| -
     e_n) is a bound g_n of the derivative of log|q_n| there. Besides, |q_n| >= m_n implies |q_(n+1)|
     >= m_n^2 - |c|, and g_(n+1) <= 2 g_n/(1 - |c|/m_n^2), for |q q' + q' q| <= 2 |q| |q'|; the
     better one is used. 2^-N g_N is a Lipschitz constant of f in the ball, and so is 2^-N d_N e/B,
     as f is cut off at |q| = B/e; one is promised for each of a few radii. The rounding of an
-    iterate is one more such movement: e_n with r = 0 is how far q_n is off. A ball with |q_n| - e_n
-    > B for some n <= N holds nothing of the solid. The usual |z| log|z| / (2 |z'|) is no bound of
-    the distance.
+    iterate is one more such change: e_n with r = 0 bounds the error of q_n. A ball with |q_n| - e_n
+    > B for some n <= N contains nothing of the solid. The usual |z| log|z| / (2 |z'|) is no bound
+    of the distance.
 
     Where |q_n| > R (a large number) at n < N, f = 2^-n log|q_n| - 2^-N log B within 2^-n 2
     |c|/|q_n|^2: each later iterate adds 2^-(j+1) log|1 + c/q_j^2|, and these fall. If m_n >= 2 B
@@ -77,14 +78,14 @@ class Julia(Solid):
 
     @property
     def escape_radius(self) -> float:
-        """B: an orbit that has left this radius never comes back."""
+        """B: an orbit that has left this radius never returns."""
         return 0.5 + math.sqrt(0.25 + math.hypot(*self.c))
 
     def leaves(self, change: Callable[[Solid], Solid]) -> Solid:
         return change(self)
 
     def prepare(self, backend: Backend) -> Julia:
-        """The same with its numbers as data of the backend."""
+        """The same with its numbers as kernel parameters of the backend."""
         made = copy.copy(self)
         size = math.hypot(*self.c)
         for name, value in (
@@ -111,7 +112,7 @@ class Julia(Solid):
             return self.prepare(backend_of(p)).evaluate(p)
         zero = 0 * p.x
         value, gradient, error, (steepest,) = self._orbit(p, (zero,))
-        # No step is longer than this, for no ball has a smaller constant than its center.
+        # No step is longer than this, as the constant of a ball is at least that at its center.
         longest = dr.abs(value) / steepest
         longest = clamp(dr.select(dr.isfinite(longest), longest, 1), 1e-6, self._number("_b"))
         radii = tuple(longest * one for one in _RADII)

@@ -1,10 +1,8 @@
-"""Planes, and shapes that are round: sphere, ellipsoid, cylinder, cone, capsule, torus.
+"""Primitive solids: plane, sphere, ellipsoid, cylinder, cone, capsule, torus, box, superquadrics.
 
-Each is its signed distance, or a bound of it, with the Lipschitz constant 1 (Hart 1996, appendix
-A): negative inside, and no larger than the distance outside. Shapes lie at the origin with their
-axis along z; move and turn them.
-
-Boxes, superellipsoids and supertori, and shapes grown by a distance.
+Each is its signed distance, or a bound of it (Hart 1996, appendix A): negative inside and, with the
+Lipschitz constant 1, no larger than the distance outside. Superquadrics have a larger constant.
+Shapes lie at the origin with their axis along z, to be moved and rotated.
 """
 
 from __future__ import annotations
@@ -211,7 +209,7 @@ class Capsule(Shape):
         q = [v - a for v, a in zip((x, y, z), self.start, strict=True)]
         square = axis[0] * axis[0] + axis[1] * axis[1] + axis[2] * axis[2]
         t = (q[0] * axis[0] + q[1] * axis[1] + q[2] * axis[2]) / square
-        # Along the axis what lies beyond the ends, and across it the distance from the line.
+        # The distance beyond the ends, along the axis; and the distance from the line, across it.
         size = norm(*axis)
         beyond = maximum(-t, t - 1.0, 0.0) * size
         across = norm(*(v - t * a for v, a in zip(q, axis, strict=True)))
@@ -324,7 +322,7 @@ def _checked_powers(powers: Any, name: str) -> tuple[float, float]:
 
 
 class _Powered(Shape):
-    """A shape with powers, which are numbers of its kernel and no data."""
+    """A shape with powers, which are literals of its kernel and no kernel parameters."""
 
     powers: tuple[float, float]
 
@@ -372,7 +370,7 @@ class Superellipsoid(_Powered):
 class Supertorus(_Powered):
     """The points with | (|(x, y)|_p - R, z) |_q <= r, powers = (p, q).
 
-    Its constant is that of the norms (`lipschitz_of_norms`): taking R away moves no gradient.
+    Its constant is that of the norms (`lipschitz_of_norms`): subtracting R changes no gradient.
     """
 
     powers: tuple[float, float] = (4.0, 4.0)

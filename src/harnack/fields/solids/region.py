@@ -37,6 +37,8 @@ def solid(
 ) -> Solid:
     """The solid where a field's values are below or above a level, or between two.
 
+    below, above: a level.
+    between: (low, high).
     around: (level, half_width): where the value is at most half_width from the level. It is the
         one for angle-valued fields, such as a thickened surface that spans a knot.
 
@@ -83,7 +85,7 @@ def solid(
 
 
 def _levels(given: Any, count: int) -> tuple[float, ...] | None:
-    """So many finite numbers; None where they are not."""
+    """`count` finite numbers; None if they are not."""
     try:
         numbers = tuple(float(one) for one in given)
     except (TypeError, ValueError):
@@ -131,14 +133,14 @@ class Region(Derived):
 def bounded_side(
     field: Field, levels: tuple[float, ...], is_inside: Callable[[float], bool]
 ) -> Volume | None:
-    """A volume that holds all points inside, if there is one; where not, the domain outside of
-    which the field is not known.
+    """A volume that contains all points inside, if one is proved; else the domain, outside of which
+    the field is not known.
 
-    Proof. Level sets lie in `extent`, which is convex; if it has bounds, what is outside of it is
-    connected and meets no level, so that one point tells on which side all of it is.
+    Proof. Level sets lie in `extent`, which is convex; if it has bounds, its complement is
+    connected and meets no level, so that one point tells on which side of the levels all of it is.
     """
     extent = field.extent(levels)
-    if field.is_entire and extent is field.domain:  # where it is drawn, and no bound of its levels
+    if field.is_entire and extent is field.domain:  # only where it is drawn: it bounds no level set
         return None
     if extent is None or (field.domain is not None and not field.is_entire):
         return field.domain
@@ -158,10 +160,10 @@ def jet_of_field(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
     """The jet of a field whose second derivatives are bounded near a point.
 
     Proof. Let |f''| <= H within r of q, the point where the piece starts (or the point itself), and
-    let coordinates be within m of q, on the piece and where they are known up to rounding. If m <=
-    r, the gradient on the piece differs from that at q by at most H m, by the mean value theorem,
-    and derivatives along the path follow by the chain rule; the value is that at the start plus the
-    length times the derivative. Where m > r nothing is known of derivatives.
+    let coordinates be within m of q on the piece, rounding included. If m <= r, the gradient on the
+    piece differs from that at q by at most H m, by the mean value theorem, and derivatives along
+    the path follow by the chain rule; the value is that at the start plus the length times the
+    derivative. Where m > r derivatives are not bounded.
 
     Raises:
         TypeError: the field promises no bound of its second derivatives.
@@ -220,7 +222,7 @@ def _sum(terms: Iterable[Interval]) -> Interval:
 
 
 def _pairs(n: int, count: int) -> list[tuple[int, int]]:
-    """The places of `Jet.second`."""
+    """The pairs of variables of the entries of `Jet.second`."""
     return [(i, j) for i in range(n) for j in range(i, n)][:count]
 
 
@@ -243,10 +245,11 @@ def _second_derivatives(field: Field, sample: Sample) -> tuple[Real, Real]:
 class Near(Derived):
     """The points where a field is at most half_width from a level: |f - level| - half_width.
 
-    Of an angle-valued field from the level plus any multiple of the period.
+    For an angle-valued field, from the level plus any multiple of the period.
 
-    Proof. It moves as f does but for its sign, so it has a value v as long as f keeps off level + v
-    + half_width and level - v - half_width, and these plus multiples of the period (`Folded`).
+    Proof. It changes as f does, up to the sign, so it does not reach a value v as long as f stays
+    away from level + v + half_width and level - v - half_width, and from these plus multiples of
+    the period (`Folded`).
     """
 
     inner: Field
@@ -322,11 +325,13 @@ class Near(Derived):
 
 @dataclass(frozen=True)
 class Folded(Enclosure):
-    """The movement of |r| from that of r, r known modulo a period (reduced to half of it about 0).
+    """The movement of |r| from that of r, r known modulo a period and reduced to within half of it
+    around 0.
 
-    Proof. |r| rises to |r| + g, or falls to |r| - g >= 0, only where r reaches plus or minus that,
-    or either plus a multiple of the period. Those nearest to r above and below are levels of r.
-    Where |r| - g < 0, or |r| + g is beyond half a period, there is no such place.
+    Proof. |r| rises to |r| + g, or falls to |r| - g >= 0, only where r reaches plus or minus that
+    value, or either plus a multiple of the period. Those nearest to r above and below are the
+    levels of r. Where |r| - g < 0, or |r| + g is beyond half a period, r never reaches such a
+    value.
     """
 
     inner: Enclosure
@@ -340,8 +345,8 @@ class Folded(Enclosure):
         return self.inner.covers(self._gaps(gaps), length)
 
     def _gaps(self, gaps: Gaps) -> Gaps:
-        """As far as r must go, for r >= 0 with s = |r| (else mirrored), to A = s + up or B = s -
-        down: upwards to A or P - B, downwards to B or -A."""
+        """How far r must move, for r >= 0 with s = |r| (else mirrored), for |r| to reach A = s + up
+        or B = s - down: upwards to A or P - B, downwards to B or -A, P the period."""
         size, none = dr.abs(self.offset), type(self.offset)(dr.inf)
         has_below = gaps.down <= size * _SLACK
         upwards, downwards = gaps.up, 2 * size + gaps.up
@@ -351,7 +356,7 @@ class Folded(Enclosure):
             around = self.period - 2 * size + gaps.down
             upwards = dr.select(has_below, fmin(around, upwards), upwards)
         downwards = dr.select(has_below, fmin(gaps.down, downwards), downwards)
-        # What is not a number proves nothing.
+        # NaN proves nothing.
         known = (gaps.down >= 0) & (gaps.up >= 0) & (size >= 0)
         upwards, downwards = (dr.select(known, one, dr.nan) for one in (upwards, downwards))
         positive = self.offset >= 0
@@ -360,5 +365,5 @@ class Folded(Enclosure):
         )
 
 
-# What rounding may have done to the question whether there is such a place.
+# Covers the rounding in the tests whether r can reach such a value.
 _SLACK = 1.0 + 1e-5

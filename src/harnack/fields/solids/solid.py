@@ -1,8 +1,7 @@
-"""What a solid is: the points where a function is not positive, and what can be done with one.
+"""What a solid is: the points where a function is not positive; and how solids are combined.
 
-What a map of space is, for solids.
-
-Volumes around shapes.
+`Solid` is the base of all, `Shape` of those with a formula, `Derived` of those made of another
+field, `Map` of maps of space.
 """
 
 from __future__ import annotations
@@ -25,15 +24,15 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
     from harnack.fields.look import Sample
 
-# Extents are widened by this part of the coordinates: numbers of a shape are rounded to the
-# precision in which it is traced.
+# Extents are widened by this fraction of the coordinates, as the numbers of a shape are rounded to
+# the precision in which it is traced.
 _ROUNDED = 1e-6
 
 Point = tuple[float, float, float]
 
 
 def box_around(half: tuple[float, float, float], center: Any = (0.0, 0.0, 0.0)) -> Volume:
-    """The box of the half sides given; one with no side >= 0 holds no surface."""
+    """The box with these half sides, which count as 0 if they are negative."""
     sizes = [max(h, 0.0) + _ROUNDED * (abs(h) + abs(c)) for h, c in zip(half, center, strict=True)]
     lower = [c - s for c, s in zip(center, sizes, strict=True)]
     upper = [c + s for c, s in zip(center, sizes, strict=True)]
@@ -41,13 +40,13 @@ def box_around(half: tuple[float, float, float], center: Any = (0.0, 0.0, 0.0)) 
 
 
 def ball_around(center: tuple[float, float, float], radius: float) -> Volume:
-    """The ball of the radius given; where that is not positive, one that holds no surface."""
+    """The ball with this radius, which counts as 0 if it is negative."""
     slack = _ROUNDED * (abs(radius) + sum(abs(c) for c in center)) + 1e-30
     return Ball(center, max(radius, 0.0) + slack)
 
 
 def set_checked(shape: Any, name: str, value: Any) -> None:
-    """Puts a number that was checked in the place of the one given."""
+    """Set an attribute of a frozen shape to a value that was checked."""
     object.__setattr__(shape, name, value)
 
 
@@ -69,7 +68,7 @@ def axis_index(axis: str) -> int:
 
 
 def not_a_solid(other: Any) -> str:
-    """What to do with something that is no solid."""
+    """For a message: what to do with something that is no solid."""
     kind = type(other).__name__
     if isinstance(other, Field):
         return (
@@ -93,13 +92,12 @@ def _remembering(prepare: Callable[[Any, Backend], Field]) -> Callable[[Any, Bac
 class Solid(Field):
     """The points where f <= 0; its boundary is the level 0.
 
-    Solids are put together by operators, `a | b` (union), `a & b` (intersection), `a - b`
-    (difference), `~a` (complement), and are moved and bent by methods. What is proved about the
-    parts holds of the whole: every step is proved from enclosures of the parts, never from a
-    distance that the whole does not have.
+    Solids are combined by operators, `a | b` (union), `a & b` (intersection), `a - b` (difference),
+    `~a` (complement), and are moved and deformed by methods. Every step is proved from enclosures
+    of the parts, never from a distance, which f of a combination is not.
 
-    lipschitz: a proved bound of |grad f| everywhere, so that f/lipschitz is a bound of the distance
-        from outside (Hart 1996, definition 3); None where none is known.
+    lipschitz: a proved bound of |grad f| everywhere, so that outside f/lipschitz is a lower bound
+        of the distance (Hart 1996, definition 3); None where none is known.
     """
 
     overstep = 1.0
@@ -117,7 +115,8 @@ class Solid(Field):
         return own.hull(max(levels)) or own.hull(min(levels), above=True)
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Has a prepared solid, whose numbers lie on a backend, remember the one that it is of."""
+        """Wrap `prepare`: a prepared solid, whose numbers lie on a backend, keeps a reference to
+        the original."""
         super().__init_subclass__(**kwargs)
         if "prepare" in vars(cls):
             cls.prepare = _remembering(cls.prepare)  # type: ignore[method-assign]
@@ -136,9 +135,9 @@ class Solid(Field):
 
     @abc.abstractmethod
     def leaves(self, change: Callable[[Solid], Solid]) -> Solid:
-        """The same combination of changed parts: a map of space is one of each part."""
+        """The same combination with each part changed, as a map of space maps each part."""
 
-    # Combinations. What is no solid is refused on either side.
+    # Combinations. Operands that are no solids are refused.
 
     def __or__(self, other: Any) -> Solid:
         from harnack.fields.solids.combined import union
@@ -191,7 +190,7 @@ class Solid(Field):
 
         return Offset(self, distance)
 
-    # Maps of space. Those that bend are for solids with a formula.
+    # Maps of space. Those that bend lines need a formula.
 
     @refuses_derivatives
     def moved(self, offset: Sequence[float]) -> Solid:
@@ -202,18 +201,20 @@ class Solid(Field):
 
     @refuses_derivatives
     def rotated(self, degrees: float, axis: str | Sequence[float] = "z") -> Solid:
-        """The solid, turned by so many degrees about an axis through the origin, anticlockwise as
-        seen from its end. axis: "x", "y", "z" or a vector (3,)."""
+        """The solid, rotated by so many degrees about an axis through the origin, counter-clockwise
+        as seen from the end of the axis.
+
+        axis: "x", "y", "z" or a vector (3,)."""
         from harnack.fields.solids.affine import Affine
 
         return self._mapped(Affine.rotation(degrees, axis))
 
     @refuses_derivatives
     def scaled(self, factors: float | Sequence[float]) -> Solid:
-        """The solid, made so many times as large about the origin, along all axes or along each.
+        """The solid, scaled about the origin, by one factor or by one for each axis.
 
-        f is measured in the new unit of length if all factors are equal, so that a distance stays
-        one; else it is left as it is."""
+        If all factors are equal f is multiplied by them, so that a distance stays a distance; else
+        it is left as it is."""
         from harnack.fields.solids.affine import Affine
 
         return self._mapped(Affine.scaling(factors))
@@ -227,7 +228,7 @@ class Solid(Field):
 
     @refuses_derivatives
     def twisted(self, rate: float, axis: str = "z") -> Solid:
-        """The solid, turned about an axis by `rate` radians for each unit of length along it."""
+        """The solid, twisted about an axis by `rate` radians for each unit of length along it."""
         from harnack.fields.solids.bends import Twist
 
         return self._mapped(Twist(float(rate), axis))
@@ -238,7 +239,7 @@ class Solid(Field):
     ) -> Solid:
         """The solid, its cross sections scaled along an axis.
 
-        start, end: (coordinate along the axis, scale), two places; the scale is linear between
+        start, end: (coordinate along the axis, scale) at two positions; the scale is linear between
         them and constant beyond. Scales are positive."""
         from harnack.fields.solids.bends import Taper
 
@@ -249,12 +250,12 @@ class Solid(Field):
 
 
 class Derived(Solid):
-    """A solid made of one other field, `inner`, which needs what that one needs."""
+    """A solid made of another field, `inner`, whose settings for the tracer it takes over."""
 
     inner: Any
 
     def _take_over(self, *names: str) -> None:
-        """Has these attributes of the inner field as well as what marching needs."""
+        """Copy the inner field's settings for the tracer, and these attributes."""
         for name in ("has_detail", "coarsest_detail", "overstep", "wavelength", *names):
             object.__setattr__(self, name, getattr(self.inner, name))
 
@@ -273,7 +274,7 @@ class Derived(Solid):
         return other
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """Those of the inner field, whose derivatives these are but for their sign."""
+        """Those of the inner field, which has the same derivatives up to their sign."""
         del sample
         return self.inner.derivative_errors(p, self.inner.evaluate(p))
 

@@ -1,7 +1,4 @@
-"""Tubes around polylines and chains of cubic Bezier curves.
-
-Tubes around many segments, such as the edges of a mesh: each a part in a box of its own.
-"""
+"""Tubes: `Tube` around polylines and cubic Bezier curves, `Tubes` around many separate segments."""
 
 from __future__ import annotations
 
@@ -35,11 +32,11 @@ if TYPE_CHECKING:
 __all__ = ["Tubes"]
 
 _MOST_SEGMENTS = 1_000_000
-# Segments in a group, and how many there are at least where groups are made.
+# Segments in a group, and the number of segments from which on they are grouped.
 _GROUP, _MANY = 8, 64
-# Where the broken line bends before its end, in parts of the length looked ahead.
+# The inner knots of the piecewise linear bound, as fractions of the length asked for.
 _KNOTS = (0.125, 0.25, 0.5)
-# The length of which these are parts where there is no end: so many times the size of everything.
+# For a ray without an end, that length is so many times the size of the tube and of coordinates.
 _FAR = 8.0
 
 
@@ -48,10 +45,10 @@ class Tube(Solid):
     """The points within `radius` of a polyline.
 
     points: (n, 3) its vertices, one after the other; repeat the first to close it.
-    starts: indices of vertices at which another polyline starts, that the one before does not lead
-        to: see `around`.
-    flattening: how far the polyline is at most from the curve that it stands for, so that the
-        surface is as far from that of the curve: see `bezier`.
+    starts: indices of vertices at which another polyline starts, not joined to the one before: see
+        `around`.
+    flattening: a bound of the distance of the polyline from the curve that it stands for, and so of
+        the distance between the surfaces: see `bezier`.
 
     f is the signed distance, whose Lipschitz constant is 1 (Hart 1996, equations 32 to 35, for
     cubic Bezier curves). Along a path more is proved: see `TubeAhead`.
@@ -90,7 +87,7 @@ class Tube(Solid):
         """The points within `radius` of any of several polylines (n_i, 3): one distance for all.
 
         Raises:
-            ValueError: no polylines, or one that is none; TypeError: not numbers.
+            ValueError: there is none, or one is no polyline; TypeError: not numbers.
         """
         parts: list[FloatArray] = []
         for k, one in enumerate(polylines):
@@ -210,7 +207,7 @@ class Tube(Solid):
             t = clamp(dr.dot(from_start, side) * row[6], 0, 1)
             away = dr.fma(side, -t, from_start)
             distance = dr.norm(away)
-            # The vector is off by a few roundings of what it is made of.
+            # The error of the vector is a few roundings of its terms.
             off = 8 * unit * (dr.norm(from_start) + dr.norm(side))
             if direction is not None:
                 slope = dr.dot(away, direction) / distance - off / distance * 2
@@ -244,8 +241,8 @@ class Tube(Solid):
 
 
 def _grouped(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Records of segments in groups of `_GROUP`, the last filled up with copies, and a ball
-    (center, radius) around each group."""
+    """Records of segments in groups of `_GROUP`, the last padded with copies, and a ball (center,
+    radius) around each group."""
     missing = -len(rows) % _GROUP
     rows = np.concatenate([rows, np.repeat(rows[-1:], missing, axis=0)])
     ends = np.concatenate([rows[:, :3], rows[:, :3] + rows[:, 3:6]], axis=1)
@@ -264,7 +261,7 @@ def _by_groups(
     body: Callable[[list[Real], tuple[Any, ...]], tuple[Any, ...]],
     start: tuple[Any, ...],
 ) -> tuple[Any, ...]:
-    """As `body` for all segments, but groups that are far away stand for theirs as balls.
+    """The state after `body` for all segments, where the ball of a far group replaces its segments.
 
     Proof. A segment in a ball of radius r about c is at least |p - c| - r and at most |p - c| + r
     away. So the nearest segment is in no group whose ball begins farther away than another one
@@ -317,12 +314,14 @@ def _lowered(
     rounding: Real,
     unit: float,
 ) -> list[Real]:
-    """The least of `lows` and of what a tangent is at the knots, of which the last may be infinite.
+    """The smaller of `lows` and of the values of a tangent at the knots, the last of which may be
+    infinite.
 
-    start: the tangent at 0, known up to `rounding`. slope: of the tangent, at least -1; if it is
-        none, as on the segment itself, the tangent falls as fast as any.
-    A slope is lowered by four roundings for that of the product with a knot. It is never 0, so
-    that at infinity the tangent is infinite, of the slope's sign, and never 0 times infinity.
+    start: the tangent's value at 0, known up to `rounding`.
+    slope: of the tangent, at least -1; NaN, as on the segment itself, counts as -1.
+
+    The slope is lowered by four roundings, for that of the product with a knot. It is never 0, so
+    that at infinity the tangent is infinite, with the slope's sign, and never 0 times infinity.
     """
     slope = fmax(slope, -1) - 4 * unit
     slope = dr.select(slope == 0, -unit, slope)
@@ -334,18 +333,21 @@ def _lowered(
 class TubeAhead(Enclosure):
     """The distance from a set of segments along a path.
 
-    distance, slope: from the nearest segment, and a bound of how fast that grows. knots: lengths s,
-    rising. lows: of F at these, lower bounds by the tangents of the distances.
+    distance: from the nearest segment.
+    slope: a bound of the rate at which that grows.
+    knots: increasing lengths s.
+    lows: lower bounds of F at these, by the tangents of the distances.
 
     Proof. The distance from one segment is a convex function of s, so it lies above its tangent at
-    s = 0 (Hart 1996, theorem 4). The least of all tangents is a concave function, which lies above
-    the chord between two of its points: so F lies above the broken line through 0 and the lows at
-    the knots. The last knot may be infinite: if the low there is -inf, nothing is known beyond the
-    knot before; if it is +inf, no tangent falls, and F never comes below the low before.
+    s = 0 (Hart 1996, theorem 4). The smallest of all tangents is a concave function, which lies
+    above the chord between two of its points: so F lies above the piecewise linear function through
+    0 and the lows at the knots. The last knot may be infinite: if the low there is -inf, nothing is
+    known beyond the knot before; if it is +inf, no tangent falls, and F never falls below the low
+    before.
 
     From above, the distance from the polyline is at most that from the nearest point c,
-    sqrt(D^2 + 2 D m s + s^2), with D the distance and m its slope; so F reaches g first where s^2 +
-    2 D m s = g^2 + 2 D g. Where these squares overflow, as a distance it does not before s = g.
+    sqrt(D^2 + 2 D m s + s^2), with D the distance and m its slope; so F does not reach g before
+    s^2 + 2 D m s = g^2 + 2 D g. Where these squares overflow: a distance does not before s = g.
     """
 
     distance: Real
@@ -373,16 +375,18 @@ class TubeAhead(Enclosure):
         return dr.select(known, fmin(total, up) * (1 - 1e-6), 0)
 
 
-# Boxes are wider than the tubes by this part of their size.
+# Boxes are wider than the tubes by this fraction of their size.
 _SLACK = 1e-5
-# The radius on which second derivatives are bounded, as a part of the distance to the segment.
+# The radius on which second derivatives are bounded, as a fraction of the distance to the segment.
 _REACH = 0.5
 
 
 class Tubes(BoxedField["_TubeBuffers"]):
     """The surfaces at distance `radius` from many segments: edges of meshes, wires, struts.
 
-    points: (n, 3). segments: (m, 2) indices of points, counted from 0. radius: a number, or (m,).
+    points: (n, 3).
+    segments: (m, 2) indices of points, counted from 0.
+    radius: a number, or (m,).
 
     Each segment is a part with rounded ends (`harnack.fields.sheets`): a ray pays only for those
     whose boxes it enters, so that thousands cost little more than one, and `Hits.sheet` is the
@@ -415,7 +419,7 @@ class Tubes(BoxedField["_TubeBuffers"]):
         return low - slack, high + slack
 
     def evaluate(self, p: Vec3) -> NoReturn:
-        """Raises TypeError: there is a function for each segment, and none of them all."""
+        """Raises TypeError: there is a function for each segment, and none for all together."""
         del p
         raise TypeError(
             "tubes are no level set of one function, but of one for each segment: take "
@@ -458,9 +462,9 @@ class _TubeBuffers:
 class _Segment(Field):
     """The distance from a segment, in each lane another, less its radius.
 
-    It is convex, as the distance from a convex set is, and grows no faster than by 1. Its second
+    It is convex, as the distance from a convex set is, with the Lipschitz constant 1. Its second
     derivative along a line is at most 1/D at distance D (Hart 1996): the distance from a point or a
-    line has that across the gradient, and a segment has one or the other. So it is at most
+    line has that across the gradient, and that from a segment is one or the other. So it is at most
     1/(D - r) within r.
     """
 
@@ -475,7 +479,7 @@ class _Segment(Field):
         along = clamp(dr.dot(from_start, side) * row[7], 0, 1)
         away = dr.fma(side, vector(-along), from_start)
         distance = dr.norm(away)
-        # The vector is off by a few roundings of what it is made of.
+        # The error of the vector is a few roundings of its terms.
         off = 8 * unit * (dr.norm(from_start) + dr.norm(side) + dr.norm(vector(*row[:3])))
         error = off + 4 * unit * (distance + row[3])
         gradient = dr.select(distance > 0, away / distance, vector(0))
