@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -652,3 +652,17 @@ def test_a_lipschitz_promise_becomes_a_cone() -> None:
     enclosures = proofs.enclose((Lipschitz(real(2), real(5)),), (), real(0.3), 0.0, slopes)
     step = longest_step(enclosures, Gaps(real(0.3), real(0.7)))
     assert to_numpy(step)[0] == pytest.approx(0.15, rel=1e-5)
+
+
+@pytest.mark.parametrize("dimension", [3, 4])
+def test_second_derivatives_are_bounded_by_the_extremal_function(dimension: int) -> None:
+    """f is 0 or 1 on the sphere, where the kernel of f_vv at the center is negative or positive:
+    n (n + 2) (s^2 - 1/n), averaged with the weight (1 - s^2)^((n - 3)/2)."""
+    s = np.cos((np.arange(200_000) + 0.5) * math.pi / 200_000)
+    weight = (1 - s * s) ** (0.5 * dimension - 1)
+    kernel = dimension * (dimension + 2) * (s * s - 1 / dimension)
+    attained = (weight * np.maximum(kernel, 0)).sum() / weight.sum()
+    ball = HarmonicBall(2.0, 0.0, 1.0, dimension)
+    bound, reach = cast("Any", ball.second_derivatives(cast("Any", 0.5)))
+    assert attained <= bound <= attained * 1.0002
+    assert reach == 1.0

@@ -28,8 +28,9 @@ if TYPE_CHECKING:
     from harnack.enclosures.enclosure import Slopes
 
 # For a harmonic f on a ball of radius 1 with upper - lower = 1: the largest |f''| at the center, in
-# space, and a bound of |f'| within half the radius, for up to four dimensions. See `HarmonicBall`.
-_SECOND, _FIRST = 10 / (3 * math.sqrt(3)), 1.7001
+# up to three and in four dimensions, and a bound of |f'| within half the radius, in up to four. See
+# `HarmonicBall`.
+_SECOND, _SECOND_IN_4D, _FIRST = 10 / (3 * math.sqrt(3)), 9 * math.sqrt(3) / (2 * math.pi), 1.7001
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,11 @@ class Promise(abc.ABC):
         """A Lipschitz constant that follows from it; None where none does."""
         del value
         return None
+
+    def second_derivatives(self, value: Real) -> tuple[Real, Real] | None:
+        """A bound of |f_vv| for all unit vectors v, and the distance within which it holds at every
+        point; None where none follows. A remainder is less: it is seen from one point alone."""
+        del value
 
     def of_any_map(self, value: Real) -> Promise:
         """A promise that follows from this one and holds, transformed, for f(A x) with any linear
@@ -190,6 +196,16 @@ class HarmonicBall(Promise):
         half = 0.5 * self.radius
         return Curvature(1.0001 * _SECOND * self._span(value) / (half * half), half)
 
+    def second_derivatives(self, value: Real) -> tuple[Real, Real] | None:
+        """As for `of_any_map`, at the centers of balls of radius R/2. In R^4, where f_vv is R^-2
+        times the mean of f 6 (4 s^2 - 1), the mean of the positive part of that kernel is
+        9 sqrt(3)/(2 pi) = 2.48, which is half the mean of its absolute value."""
+        if _is_open(self.lower) or _is_open(self.upper):
+            return None
+        half = 0.5 * self.radius
+        most = _SECOND_IN_4D if self.dimension == 4 else _SECOND
+        return 1.0001 * most * self._span(value) / (half * half), half
+
     def _span(self, value: Real) -> Real:
         """upper - lower, as the sum of the distances of both from the value."""
         return (self.upper - value) + (value - self.lower)
@@ -249,7 +265,8 @@ class BoundedLaplacian(Promise):
 class Lipschitz(Promise):
     """|f(y) - f(p)| <= constant * |y - p| for every y with |y - p| < radius (default: all y).
 
-    For a field with a domain: for every such y in it.
+    For a field with a domain: for every such y in it. Without a radius the constant is that of the
+    field, the same at every point, so that it bounds all second derivatives.
     """
 
     constant: Real
@@ -281,6 +298,11 @@ class Curvature(Promise):
     def movement(self, value: Any, slopes: Slopes, length: Any) -> tuple[Any, Any]:
         bend = 0.5 * self.constant * length * length
         return slopes.low * length - bend, slopes.high * length + bend
+
+    def second_derivatives(self, value: Real) -> tuple[Real, Real] | None:
+        """By definition, at every point that promises it; without a radius all do."""
+        del value
+        return (self.constant, self.radius) if _is_open(self.radius) else None
 
     def remainder(self, value: Real, length: Real) -> Real:
         return dr.select(length < self.radius, 0.5 * self.constant * length * length, dr.inf)

@@ -8,7 +8,15 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import FloatArray, choose_backend, to_numpy, to_vector3
-from harnack.enclosures import Choice, Gaps, HarmonicBall, Slopes, choose_proofs, longest_step
+from harnack.enclosures import (
+    Choice,
+    Curvature,
+    Gaps,
+    HarmonicBall,
+    Slopes,
+    choose_proofs,
+    longest_step,
+)
 from harnack.fields.field import Field
 from harnack.fields.look import Path
 from harnack.testing.derivative_contracts import check_derivatives
@@ -202,6 +210,10 @@ def _check_numbers(field: Field, points: FloatArray, look: FieldValues) -> None:
             require(ordered, f"{name}: {low} exceeds {high}", points)
         if "constant" in vars(known):
             require(vars(known)["constant"] >= 0, f"{name}: the constant is negative", points)
+        if isinstance(known, Curvature) and np.isinf(known.radius).all():
+            varies = np.ptp(known.constant) > 1e-6 * np.max(known.constant)
+            message = "a Curvature without a radius has the same constant at every point"
+            require(np.full(len(points), not varies), message, points)
         if isinstance(known, HarmonicBall):
             if known.dimension not in (2, 3, 4):
                 raise BrokenPromiseError(f"HarmonicBall has dimension {known.dimension!r}")

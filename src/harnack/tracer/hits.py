@@ -387,8 +387,8 @@ def _trace_on_device(
 # differently may find the hit anywhere along the surface; elsewhere, within the tolerance.
 _GRAZING = 0.1
 # What is asked of a device (in brackets: the worst of one that computes as it should, Mesa's on a
-# CPU, over 110 surfaces). At most this share of rays has another status, or hits farther off than the
-# tolerance, as at an apex (0);
+# CPU, over 110 surfaces). At most this share of rays has another status, or hits farther off than
+# the tolerance, as at an apex (0);
 _OTHERWISE = 1e-3
 # nine in ten hits lie within this fraction of the tolerance (0.03), and their normals differ by no
 # more than this (2e-5);

@@ -14,7 +14,7 @@ from harnack.arithmetic import Interval, Jet
 from harnack.backend import backend_of
 from harnack.backend.elementary import fmax, fmin, length
 from harnack.backend.numbers import refuses_derivatives
-from harnack.enclosures import Curvature, Enclosure, Gaps
+from harnack.enclosures import Enclosure, Gaps
 from harnack.fields.field import Field, check_is_field
 from harnack.fields.formula import Formula, as_data, is_jet
 from harnack.fields.look import Look, Path, Sample
@@ -229,11 +229,9 @@ def _pairs(n: int, count: int) -> list[tuple[int, int]]:
 def _second_derivatives(field: Field, sample: Sample) -> tuple[Real, Real]:
     """A bound of all second derivatives, and the radius within which it holds."""
     for promise in sample.promises:
-        one = promise.of_any_map(sample.value)
-        if isinstance(one, Curvature):
-            everywhere = isinstance(one.radius, float) and math.isinf(one.radius)
-            if one is not promise or everywhere:
-                return one.constant, one.radius
+        found = promise.second_derivatives(sample.value)
+        if found is not None:
+            return found
     raise TypeError(
         f"{type(field).__name__} promises neither a HarmonicBall with both ends nor a Curvature "
         "without a radius, and has no formula, so it cannot be blended, twisted or tapered; "
