@@ -218,6 +218,46 @@ def count(view: hk.View) -> int:
         return int(json.load(answer)["clients"])
 
 
+def test_messages_that_make_no_sense_are_answered_and_harm_nobody(page: Page) -> None:
+    right = page.picture()
+    answers = page.do("""async () => {
+      const socket = new WebSocket(panel.link.address);
+      await new Promise((done) => { socket.onopen = done; });
+      const answers = [];
+      const wrong = ["", "[", "[]", "{}", '{"id": -1}', '{"id": 1e99, "kind": "draw"}',
+        '{"id": 1, "kind": "\\u0000"}', '{"id": 2, "kind": "draw", "size": [1e9, 1e9]}',
+        '{"id": 3, "kind": "change", "loops": [[[1e999, 0, 0]]]}', "[".repeat(100000)];
+      for (const one of wrong) {
+        const answer = new Promise((done) => { socket.onmessage = (e) => done(e.data); });
+        socket.send(one);
+        answers.push(JSON.parse(await answer).error);
+      }
+      socket.send(new Uint8Array(8));  // no question, and not answered
+      const closed = new Promise((done) => { socket.onclose = (e) => done(e.code); });
+      socket.send("x".repeat(5 * 2 ** 20));
+      return [answers, await closed];
+    }""")
+    assert all(answers[0])
+    assert answers[1] == 1009  # too long
+    page.set("level", 6.0)
+    assert change(right, page.picture()) < 0.01
+    assert page.said == ""
+
+
+def test_a_tab_that_is_closed_ends_its_work(browser: Any, view: hk.View) -> None:
+    page = Page(browser, view.address, SIZE, samples=1)
+    page.do("() => { panel.picture(4000, 'color').catch(() => {}); }")
+    page.tab.wait_for_function("() => panel.root.querySelector('progress')?.value > 0")
+    page.close()
+    page = Page(browser, view.address, SIZE, samples=1)
+    page.tick("Probe by click")
+    page.tab.mouse.click(150, 125)
+    page.tab.wait_for_function(
+        "() => panel.said.textContent.includes('evaluations')", timeout=20_000
+    )
+    page.close()
+
+
 def test_without_webgpu_python_draws_and_the_page_says_so(browser: Any, view: hk.View) -> None:
     flags = ("--no-sandbox", "--disable-gpu", "--disable-features=WebGPU")
     with closing(launched(browser.browser_type, *flags)) as plain:

@@ -258,7 +258,7 @@ export class Panel {
   /** Shows another scene in this place. @param {Scene} scene */
   replace(scene) {
     this.close();
-    const next = new Panel(this.root, scene, this.passes, this.link, this.still.src);
+    const next = new Panel(this.root, scene, this.passes, this.link, "");
     this.root.dispatchEvent(new CustomEvent("panel", { detail: next }));
     next.open();
   }
