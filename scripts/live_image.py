@@ -20,7 +20,7 @@ def main(folder: Path) -> None:
         chromium() as browser,
         hk.view(knot, level=level, title="A trefoil's surface", opens=False, waits=False) as view,
     ):
-        page = Page(browser, view.address, (960, 600))
+        page = Page(browser, view.address, (960, 600), samples=2)
         page.tick("Edit points")
         page.rest()
         page.do("() => { panel.controls.open = true; }")
