@@ -266,7 +266,7 @@ export class Drawing {
     if (off.filter((one) => one > 2).length > OTHERWISE * n) return "hits lie off the surface";
     if (largest(off, 0.9) > APART) return "hits lie elsewhere, if within the tolerance";
     if (!(largest(turned, 0.9) <= TURNED)) return "normals differ";
-    if (recounted > RECOUNTED * many + 2)
+    if (recounted > RECOUNTED * (many + n) + 2)
       return "rays take another number of evaluations";
     return "";
   }
