@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import functools
 import gzip
 import json
 import re
@@ -114,6 +115,39 @@ def test_the_places_of_sliders_are_in_the_page(tmp_path: Path) -> None:
     assert np.quantile(off, 0.9) < 1e-4
 
 
+def test_a_kernel_that_is_not_the_first_one_brings_rays_to_check(tmp_path: Path) -> None:
+    path = tmp_path / "a.html"
+
+    def lens(c: float) -> hk.Field:
+        return hk.Sphere(1.0) & hk.Sphere(1.0).moved((c, 0, 0))
+
+    hk.page(lens, path, c=hk.Slider(0, 9, 1, step=1), progress=False)
+    first, *_, last = scene_of(path)["frames"]["frames"]
+    assert ["code" in one for one in (*first["surfaces"], *last["surfaces"])] == [True, True]
+    for frame in scene_of(path)["frames"]["frames"]:
+        for one in frame["surfaces"]:
+            assert ("check" in one) == ("code" in one)
+
+
+def test_a_page_says_at_which_place_nothing_can_be_drawn(tmp_path: Path) -> None:
+    def torus(r: float) -> hk.Field:
+        if r > 0.35:
+            raise ZeroDivisionError("too thick")
+        return hk.Torus(1.0, r)
+
+    r = hk.Slider(0.2, 0.4, step=0.1)
+    with pytest.raises(ValueError, match=r"at the place r=0\.4 .*: ZeroDivisionError: too thick"):
+        hk.page(torus, tmp_path / "a.html", r=r, progress=False)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_title_does_not_end_the_script(tmp_path: Path) -> None:
+    path, title = tmp_path / "a.html", "<!--<script>\n</script>"
+    hk.page(hk.Sphere(1.0), path, title=title, progress=False)
+    assert "<!--" not in path.read_text("utf-8")
+    assert scene_of(path)["title"] == title
+
+
 def test_too_many_choices_of_places_are_refused(tmp_path: Path) -> None:
     one = hk.Slider(1, 2, step=0.01)
     with pytest.raises(ValueError, match="a, b have 10,201 choices of places"):
@@ -141,6 +175,8 @@ def test_sliders() -> None:
     assert hk.Slider(1, 8, step=2).places(99) == [1, 3, 5, 7]
     assert hk.Slider(1, 8, step=2).start == 3
     assert hk.Slider(0, 1, step=0.1).places(9)[3] == pytest.approx(0.3)
+    tenths = hk.Slider(0, 0.3, step=0.1)
+    assert (tenths.nearest(0.3), tenths.nearest(0.2999), max(tenths.places(9))) == (0.3, 0.2, 0.3)
     for wrong in ((1, 1), (0, 1, 2), (0, 1, 0.5, 0), (0, 1, 0.5, 2)):
         with pytest.raises(ValueError, match=r"slider goes|step must|start must"):
             hk.Slider(*wrong)
@@ -149,6 +185,14 @@ def test_sliders() -> None:
     subject = Subject.of(lambda r: hk.Sphere(r), {"level": hk.Slider(0, 1), "r": hk.Slider(1, 2)})
     what, settings = subject.at({"level": 0.25, "r": 2.0})
     assert (what.radius, settings) == (2.0, {"level": 0.25})
+    for function in (
+        lambda r, other=2: hk.Sphere(r),
+        lambda r, /: hk.Sphere(r),
+        lambda other=2, r=1, /, *more, **named: hk.Sphere(r),
+        functools.partial(lambda center, r: hk.Sphere(r, center), center=(0, 0, 0)),
+    ):
+        what, _ = Subject.of(function, {"r": hk.Slider(1, 2)}).at({"r": 2.0})
+        assert what.radius == 2.0
     with pytest.raises(TypeError, match=r"a function of 'q'.*no such slider"):
         Subject.of(lambda q: hk.Sphere(q), {"r": hk.Slider(1, 2)})
     with pytest.raises(TypeError, match="nothing depends on the slider 'r'"):

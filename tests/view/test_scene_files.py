@@ -82,6 +82,7 @@ def test_settings_and_sliders_come_back(tmp_path: Path) -> None:
     assert kept == {name: one for name, one in settings.items() if name != "isolines"} | {
         "level": 5.0
     }
+    assert scene_of(text_of(CURVE, {"level": np.float32(0.5)})).settings == {"level": 0.5}
     surface = hk.level_set(hk.Gyroid(0.5), solid=(-np.inf, 0.1), clip=hk.Ball())
     (found,) = scene_of(text_of([surface], {})).surfaces
     assert isinstance(found, hk.LevelSet)
@@ -110,6 +111,9 @@ WRONG = {
     "[]": "must be an object",
     "{}": 'must say "harnack": 1',
     '{"harnack": 2, "surfaces": []}': 'must say "harnack": 1',
+    '{"harnack": true, "surfaces": []}': 'must say "harnack": 1',
+    '{"harnack": 1, "surfaces": [], "surfaces": []}': "'surfaces' is said twice",
+    '{"harnack": 1, "surfaces": [' + "[" * 900 + "]" * 900 + "]}": "must be an object",
     '{"harnack": 1, "surfaces": []}': "one surface at least",
     '{"harnack": 1, "surfaces": [3]}': "must be an object",
     '{"harnack": 1, "surfaces": [{}]}': r"surfaces\[0\] has no field",
@@ -130,6 +134,11 @@ WRONG_FIELDS = {
     """{"formula": "__import__('os')"}""": "no formula",
     '{"formula": 3}': "a formula is a text",
     '{"formula": "x=1", "parameters": {"a": 1}}': "no parameter 'a'",
+    '{"Offset": {"distance": 0.1, "inner": ' * 450 + '{"Sphere": {}}' + "}}" * 450: "each other",
+    '{"Sphere": {}}, "level": ' + "[" * 900 + "]" * 900: "within each other",
+    '{"Complement": {"inner": null}}': "Complement",
+    '{"Gyroid": {"cell": 1e308}}': "Gyroid",
+    '{"scene": []}': "no scene is named",
     '{"curves": [[1, 2]]}': "surfaces",
     '{"curves": [], "level": 1}': "nothing",
     '{"Sphere": {}}, "levle": 1': 'mean "level"',
@@ -178,6 +187,8 @@ def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
         )
     with pytest.raises(hk.SceneFileError, match="material"):
         hk.write_scene(tmp_path / "a.json", CURVE, material={"type": "diffuse"})
+    with pytest.raises(hk.SceneFileError, match="nothing to write"):
+        hk.write_scene(tmp_path / "a.json", [])
     assert list(tmp_path.iterdir()) == []
 
 

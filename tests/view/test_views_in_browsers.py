@@ -302,6 +302,18 @@ def test_a_device_that_lies_is_not_believed(browser: Any, view: hk.View) -> None
     page.close()
 
 
+def test_a_change_during_a_check_neither_accuses_the_device_nor_is_lost(page: Page) -> None:
+    """The data that was checked was freed under the check."""
+    page.rest()
+    found = page.do("""async () => {
+      const { drawing } = panel;
+      const later = structuredClone(panel.scene.state);
+      const wrong = await Promise.all([drawing.set(panel.scene.state), drawing.set(later, false)]);
+      return [...wrong, drawing.surfaces[0].given === later.surfaces[0]];
+    }""")
+    assert found == ["", "", True]
+
+
 def test_others_are_not_answered(view: hk.View) -> None:
     assert view.address.startswith("http://127.0.0.1:")
     for headers in ({"Host": "elsewhere.example"}, {"Origin": "http://elsewhere.example"}):
@@ -314,6 +326,8 @@ def test_others_are_not_answered(view: hk.View) -> None:
         assert urllib.request.urlopen(address).status == 200
         with pytest.raises(urllib.error.HTTPError, match="403"):
             urllib.request.urlopen(address.replace(token, "x"))
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(address.replace(token, "%C3%A9"))  # no ASCII
     with pytest.raises(OSError, match="cannot be served at"):
         hk.view(field, host="203.0.113.1", opens=False, waits=False)
 

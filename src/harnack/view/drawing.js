@@ -32,7 +32,8 @@ const GROUP = 64;
 // What other roundings explain: see `harnack.tracer.hits`.
 const [GRAZING, OTHERWISE, APART, TURNED, RECOUNTED] = [0.1, 1e-3, 0.1, 2e-4, 0.03];
 const VIEW_BYTES = 176;
-const PAINTS = 128;
+// What passes.wgsl has room for beside a pixel.
+const PAINTS = 2048;
 // Of the floor's light: see `harnack.rendering.shading`.
 const [CELLS, RAYS, BLOCK, SPREAD] = [64, 8, 4, 0.34];
 const BLUR = [0.025, 0.125, 0.225, 0.25, 0.225, 0.125, 0.025];
@@ -92,6 +93,8 @@ export class Drawing {
     this.pipelines = {};
     /** @type {any[]} */
     this.surfaces = [];
+    /** The last change of surfaces. @type {Promise<any>} */
+    this.setting = Promise.resolve();
     this.context = /** @type {GPUCanvasContext} */ (canvas.getContext("webgpu"));
     this.format = navigator.gpu.getPreferredCanvasFormat();
     this.context.configure({ device, format: this.format, alphaMode: "opaque" });
@@ -160,14 +163,21 @@ export class Drawing {
     return made;
   }
 
-  /** Draws other surfaces from now on. What is wrong with them on this device, if anything is.
-   *  @param {State} state @param {boolean} [checks] */
-  async set(state, checks = true) {
+  /** Draws other surfaces from now on, one change after the other; not those with which something is
+   *  wrong on this device: what, if anything.
+   *  @param {State} state @param {boolean} [checks] @returns {Promise<string>} */
+  set(state, checks = true) {
+    const made = this.setting.then(() => this.replace(state, checks));
+    this.setting = made.catch(() => "");
+    return made;
+  }
+
+  /** @param {State} state @param {boolean} checks */
+  async replace(state, checks) {
     const made = await Promise.all(state.surfaces.map((one) => this.traced(one)));
     const data = await Promise.all(state.surfaces.map((one) => words(one.data)));
-    const old = this.surfaces;
     let paints = 0;
-    this.surfaces = state.surfaces.map((given, k) => {
+    const next = state.surfaces.map((given, k) => {
       const numbers = new Uint32Array(20);
       numbers.set(given.lanes, 0);
       numbers.set(given.results, 8);
@@ -176,17 +186,18 @@ export class Drawing {
       return { given, trace: made[k], data: this.buffer(data[k], GPUBufferUsage.STORAGE),
                numbers: this.buffer(numbers, GPUBufferUsage.UNIFORM) };
     });
-    const colors = new Float32Array(8 * PAINTS);
-    colors.set(state.surfaces.flatMap((one) => one.paints).slice(0, PAINTS).flatMap(
-      ({ front, back, glossy }) => [...front, glossy ? 1 : 0, ...back, glossy ? 1 : 0]));
-    this.device.queue.writeBuffer(this.colors, 0, colors);
+    let wrong = "";
+    if (checks) for (const one of next) wrong ||= await this.check(one);
+    const old = wrong ? next : this.surfaces;
+    if (!wrong) {
+      const colors = new Float32Array(8 * PAINTS);
+      colors.set(state.surfaces.flatMap((one) => one.paints).slice(0, PAINTS).flatMap(
+        ({ front, back, glossy }) => [...front, glossy ? 1 : 0, ...back, glossy ? 1 : 0]));
+      this.device.queue.writeBuffer(this.colors, 0, colors);
+      this.surfaces = next;
+    }
     for (const one of old) { one.data.destroy(); one.numbers.destroy(); }
-    if (checks)
-      for (const one of this.surfaces) {
-        const wrong = await this.check(one);
-        if (wrong) return wrong;
-      }
-    return "";
+    return wrong;
   }
 
   /** @param {GPUComputePassEncoder} pass @param {GPUComputePipeline} pipeline

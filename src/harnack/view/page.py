@@ -66,7 +66,8 @@ def page(
 
     Raises:
         ValueError: a path that does not end in .html; a surface without bounds; a transparent
-            material; sliders with too many combinations of places.
+            material; sliders with too many combinations of places; a place of the sliders at which
+            nothing can be drawn, with what is wrong there.
         UntranslatableError: the kernel holds an operation that is not translated.
         TypeError: what is no field; an unknown setting; a slider that nothing depends on.
     """
@@ -107,10 +108,16 @@ def _frames(live: Live, advance: Any) -> Plain:
         )
     frames: list[Plain] = []
     for choice in itertools.product(*places.values()):
-        state = live.state(Moved(dict(zip(sliders, choice, strict=True))))
-        for one in state["surfaces"]:
-            one.pop("check")
-        frames.append(packed(difference(live.first, state)))
+        values = dict(zip(sliders, choice, strict=True))
+        try:
+            state = live.state(Moved(values))
+        except Exception as wrong:
+            if not values:
+                raise
+            place = ", ".join(f"{name}={value:g}" for name, value in values.items())
+            said = f"at the place {place} of the sliders: {type(wrong).__name__}: {wrong}"
+            raise ValueError(said) from wrong
+        frames.append(packed(difference(live.first, state, checks=False)))
         advance(1 / total)
     return {"places": places, "frames": frames}
 
@@ -130,7 +137,7 @@ def document(scene: Mapping[str, Any], still: str, link: str = "frames") -> str:
         style=resource("panel.css"),
         script=script(*MODULES).replace("</script", "<\\/script"),
         passes=passes.replace("</", "<\\/"),
-        scene=json.dumps(scene).replace("</", "<\\/"),
+        scene=json.dumps(scene).replace("<", "\\u003c"),
         still=still,
         link=_LINKS[link],
     )

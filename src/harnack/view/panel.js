@@ -342,7 +342,7 @@ export class Panel {
         this.show = /** @type {string} */ (value);
         if (this.shows) this.shows.value = this.show;
         this.redraw();
-      } else if (name === "points") this.edit(/** @type {number[][][]} */ (value));
+      } else if (name === "points") this.scene.editable && this.edit(/** @type {number[][][]} */ (value));
       else this.slide(/** @type {Record<string, number>} */ (value));
     }
   }
@@ -565,9 +565,10 @@ export class Panel {
   /** Has the device checked against Dr.Jit for what is drawn now. */
   async confirm() {
     if (this.asking || !this.drawing || !this.link) return;
+    const now = JSON.stringify(this.state());
     try {
       const state = await this.asked_for(this.link, true);
-      if (this.asking || !this.drawing) return;
+      if (this.asking || !this.drawing || JSON.stringify(this.state()) !== now) return;
       const wrong = await this.drawing.set(state);
       if (wrong) this.fall_back(`This GPU does not compute what the surface was proved with: ${wrong}`);
       else this.redraw();

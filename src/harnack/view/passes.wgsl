@@ -96,7 +96,7 @@ fn gather(@builtin(global_invocation_id) id: vec3u) {
   if (id.x >= view.count) { return; }
   let pixel = view.first + id.x;
   let before = seen[8u * pixel + 7u];
-  let looks = min((before >> 10u) + result(5u, id.x), 0x3fffffu) << 10u;
+  let looks = min((before >> 14u) + result(5u, id.x), 0x3ffffu) << 14u;
   let status = result(0u, id.x);
   let d = direction(pixel);
   let t = number(1u, id.x);
@@ -105,11 +105,11 @@ fn gather(@builtin(global_invocation_id) id: vec3u) {
   let in_front = (before & 3u) == GROUND || t < bitcast<f32>(seen[8u * pixel + 3u]);
   if (status == HIT && (before & 3u) != LOST && in_front) {
     let n = vec3f(number(2u, id.x), number(3u, id.x), number(4u, id.x));
-    let paint = min(surface.number + result(6u, id.x), 127u);
+    let paint = min(surface.number + result(6u, id.x), 2047u);
     put(pixel, t, d, n, MET | select(0u, 4u, dot(n, d) < 0.0) | (paint << 3u) | looks);
     return;
   }
-  seen[8u * pixel + 7u] = (before & 0x3ffu) | looks;
+  seen[8u * pixel + 7u] = (before & 0x3fffu) | looks;
 }
 
 fn position(pixel: u32) -> vec3f {
@@ -213,7 +213,7 @@ fn painted(pixel: u32) -> vec4f {
   let kind = info & 3u;
   let n = normal_to_eye(pixel, d);
   if (view.show == EVALUATIONS) {
-    let x = (log2(f32(info >> 10u) + 1.0) - view.scale.x) * view.scale.y;
+    let x = (log2(f32(info >> 14u) + 1.0) - view.scale.x) * view.scale.y;
     return vec4f(select(viridis(x), vec3f(1.0, 0.0, 1.0), kind == LOST), 1.0);
   }
   if (kind == LOST) { return vec4f(1.0, 0.0, 1.0, 1.0); }
@@ -232,7 +232,7 @@ fn painted(pixel: u32) -> vec4f {
     let reached = floor_at(position(pixel));
     return vec4f(lit(view.ground.rgb, n, -d, false, min(sky[pixel], reached.y), reached.x), 1.0);
   }
-  let color = colors[2u * ((info >> 3u) & 127u) + select(1u, 0u, (info & 4u) != 0u)];
+  let color = colors[2u * ((info >> 3u) & 2047u) + select(1u, 0u, (info & 4u) != 0u)];
   return vec4f(lit(color.rgb, n, -d, color.w > 0.5, sky[pixel], 1.0), 1.0);
 }
 

@@ -467,9 +467,13 @@ def packed(value: Any) -> Any:
     return value
 
 
-def difference(first: Plain, state: Plain) -> Plain:
+def difference(first: Plain, state: Plain, *, checks: bool = True) -> Plain:
     """What a state changes of the first: words of the data of its surfaces, and whatever else
-    differs; or all of it where there are other kernels. `changed` in frames.js is the way back."""
+    differs; or all of it where there are other kernels. `changed` in frames.js is the way back.
+
+    checks: whether rays with answers go along; with other kernels they always do, as no device has
+        been asked about these.
+    """
     pairs = [*zip(first["surfaces"], state["surfaces"], strict=False)]
     alike = len(first["surfaces"]) == len(state["surfaces"]) and all(
         old["key"] == new["key"] and len(old["data"]) == len(new["data"]) for old, new in pairs
@@ -481,7 +485,7 @@ def difference(first: Plain, state: Plain) -> Plain:
         own = {k: one for k, one in new.items() if k not in ("data", "check") and one != old[k]}
         at = np.flatnonzero(old["data"] != new["data"]).astype(np.uint32)
         own |= {"at": at, "to": new["data"][at]}
-        surfaces.append(own | ({"check": new["check"]} if "check" in new else {}))
+        surfaces.append(own | ({"check": new["check"]} if checks else {}))
     made: Plain = {"surfaces": surfaces}
     if state["curves"] != first["curves"]:
         made["curves"] = state["curves"]

@@ -77,6 +77,8 @@ STILL_SETTINGS = tuple(name for name in _OF_PICTURE if name not in (*OF_STUDIO, 
 _MORE: tuple[type[Field], ...] = (
     Gyroid, SchwarzD, SchwarzP, SphericalHarmonic,
 )  # fmt: skip
+# What Python says of arguments that are something else.
+_WRONG = (ValueError, TypeError, ArithmeticError, AttributeError, LookupError, NotImplementedError)
 _FILE_OPTIONS = ("as", "boundary", "normals", "up")
 
 Plain = dict[str, Any]
@@ -164,6 +166,8 @@ def text_of(what: Any, settings: Mapping[str, Any], origins: Origins = ()) -> st
         SceneFileError: as `write_scene`.
     """
     several: list[Any] = [*what] if isinstance(what, list | tuple) else [what]
+    if not several:
+        raise SceneFileError("there is nothing to write: give at least one field")
     made: Plain = {"harnack": VERSION, "surfaces": [_surface_text(one, origins) for one in several]}
     sliders = {name: one for name, one in settings.items() if isinstance(one, Slider)}
     for name in sliders:
@@ -276,8 +280,8 @@ def _plain(value: Any) -> Any:
     """Numbers, names, lists, volumes and fields as JSON has them."""
     if value is None or isinstance(value, bool | int | str):
         return value
-    if isinstance(value, float):  # NumPy's double as well
-        return _number(float(value))
+    if isinstance(value, float | np.floating):
+        return _number(float(cast("Any", value)))
     if isinstance(value, np.ndarray):
         return _plain(cast("Any", value).tolist())
     if isinstance(value, np.integer):
@@ -334,11 +338,18 @@ def scene_of(text: str, find: Callable[[str], Path] | None = None) -> SavedScene
         SceneFileError: as `read_scene`.
     """
     try:
-        given = json.loads(text, parse_constant=_no_number)
+        given = json.loads(text, parse_constant=_no_number, object_pairs_hook=_once_each)
     except (ValueError, RecursionError) as wrong:
         raise SceneFileError(f"it is no JSON: {wrong}") from None
+    try:
+        return _scene_of(given, find)
+    except RecursionError:
+        raise SceneFileError("more things are within each other than can be read") from None
+
+
+def _scene_of(given: Any, find: Callable[[str], Path] | None) -> SavedScene:
     whole = _object(given, "a scene")
-    if whole.get("harnack") != VERSION:
+    if whole.get("harnack") != VERSION or whole["harnack"] is True:
         raise SceneFileError(f'it must say "harnack": {VERSION}, the version of scene files')
     for name in whole:
         _check_name(name, ("harnack", "surfaces", "settings", "sliders"), "part")
@@ -366,6 +377,15 @@ def _known_settings() -> tuple[str, ...]:
 
 def _no_number(name: str) -> float:
     raise ValueError(f"{name} is no number of JSON")
+
+
+def _once_each(pairs: list[tuple[str, Any]]) -> Plain:
+    made: Plain = {}
+    for name, one in pairs:
+        if name in made:
+            raise ValueError(f"{name!r:.60} is said twice in one object")
+        made[name] = one
+    return made
 
 
 def _object(given: Any, where: str) -> Plain:
@@ -396,7 +416,7 @@ def _surface_of(
         return with_settings(one, settings) if settings else one
     except SceneFileError:
         raise
-    except (ValueError, TypeError, OverflowError, NotImplementedError, OSError) as wrong:
+    except (*_WRONG, OSError) as wrong:
         raise SceneFileError(f"{where}: {wrong}") from None
 
 
@@ -409,7 +429,7 @@ def _origin_of(
         for name in about:
             _check_name(name, ("scene", "number"), "part of a field")
         scene, number = about["scene"], about.get("number", 0)
-        if scene not in SCENES:
+        if not isinstance(scene, str) or scene not in SCENES:
             raise SceneFileError(
                 f"no scene is named {scene!r:.60}{did_you_mean(str(scene), SCENES)}"
             )
@@ -480,7 +500,7 @@ def _called(kind: type, given: Any, where: str) -> Any:
         return kind(**{name: _value_of(one, where) for name, one in about.items()})
     except SceneFileError:
         raise
-    except (ValueError, TypeError, OverflowError, NotImplementedError) as wrong:
+    except _WRONG as wrong:
         raise SceneFileError(f"{where}: {wrong}") from None
 
 

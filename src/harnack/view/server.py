@@ -202,7 +202,8 @@ class _Server:
         name = request.host.rsplit(":", 1)[0].strip("[]")
         if self.token:
             given = request.query.get("token", "")
-            return "" if secrets.compare_digest(given, self.token) else "the token is wrong"
+            same = secrets.compare_digest(given.encode("utf-8", "replace"), self.token.encode())
+            return "" if same else "the token is wrong"
         if name not in _LOCAL:
             return "this view is for its own machine alone"
         origin = request.headers.get("Origin")

@@ -188,10 +188,8 @@ class Session:
 
     def _change(self, question: Mapping[str, Any], moved: Moved, tell: Tell) -> Plain:
         state = self.live.state(moved)
-        if question.get("checks") is not True:
-            for one in state["surfaces"]:
-                one.pop("check")
-        return packed(difference(self.live.first, state))
+        checks = question.get("checks") is True
+        return packed(difference(self.live.first, state, checks=checks))
 
     def _probe(self, question: Mapping[str, Any], moved: Moved, tell: Tell) -> Plain:
         """The first hit of a ray of the surfaces' coordinates, and how far each step was proved."""

@@ -49,18 +49,21 @@ class Slider:
             raise ValueError(f"start must lie between {self.low} and {self.high}: {self.start}")
 
     def nearest(self, number: float) -> float:
-        """The place that is nearest to a number, and not above it between two steps."""
+        """The place that is nearest to a number, and not above it between two steps; the number as
+        it is where only rounding lies between."""
         number = min(max(number, self.low), self.high)
         if self.step is None:
             return number
-        return self.low + self.step * math.floor((number - self.low) / self.step + 1e-9)
+        steps = math.floor((number - self.low) / self.step + 1e-9)
+        place = min(self.low + self.step * steps, self.high)
+        return number if abs(number - place) <= 1e-9 * self.step else place
 
     def places(self, count: int) -> list[float]:
         """All its places, or `count` places evenly spread where it has no step."""
         if self.step is None:
             return [self.low + (self.high - self.low) * k / (count - 1) for k in range(count)]
         steps = math.floor((self.high - self.low) / self.step + 1e-9)
-        return [self.low + self.step * k for k in range(steps + 1)]
+        return [min(self.low + self.step * k, self.high) for k in range(steps + 1)]
 
 
 @dataclass(frozen=True)
@@ -89,15 +92,15 @@ class Subject:
         asked: set[str] = set(settings) & set(sliders)
         for name, one in {"the first argument": what, **settings}.items():
             if _is_function(one):
-                needs = list(inspect.signature(one).parameters)
-                for argument in needs:
-                    if argument not in sliders:
+                arguments = _arguments(one)
+                for argument, about in arguments.items():
+                    if argument not in sliders and about.default is about.empty:
                         raise TypeError(
                             f"{name} is a function of {argument!r}, and there is no such "
                             f"slider{did_you_mean(argument, sliders)}: give "
                             f"{argument}=harnack.Slider(...)"
                         )
-                asked |= set(needs)
+                asked |= set(arguments)
         for name in sliders:
             if name not in asked:
                 raise TypeError(
@@ -128,7 +131,21 @@ class Subject:
             return values[name]
         if not _is_function(one):
             return one
-        return one(**{argument: values[argument] for argument in inspect.signature(one).parameters})
+        by_place: list[Any] = []
+        by_name: dict[str, Any] = {}
+        for argument, about in _arguments(one).items():
+            if about.kind is about.POSITIONAL_ONLY:
+                by_place.append(values.get(argument, about.default))
+            elif argument in values:
+                by_name[argument] = values[argument]
+        return one(*by_place, **by_name)
+
+
+def _arguments(function: Any) -> dict[str, inspect.Parameter]:
+    """Those that have a name."""
+    several = inspect.signature(function).parameters
+    kinds = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    return {name: about for name, about in several.items() if about.kind not in kinds}
 
 
 def _is_function(one: Any) -> bool:
