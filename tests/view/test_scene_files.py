@@ -56,6 +56,19 @@ def test_every_scene_of_the_gallery_comes_back() -> None:
                 assert getattr(one, part) == getattr(other, part), (name, part)
 
 
+@pytest.mark.parametrize(
+    ("settings", "wrong"),
+    [
+        ({"level": "x"}, "level"), ({"size": [1e9, 1e9]}, "size"),
+        ({"material": {"Sphere": {}}}, "material"), ({"show": "nothing"}, "show"), ({"spp": -1}, "spp"),
+    ],
+)  # fmt: skip
+def test_settings_are_checked_when_they_are_read(settings: dict[str, Any], wrong: str) -> None:
+    about = {"harnack": 1, "surfaces": [{"field": {"Sphere": {}}}], "settings": settings}
+    with pytest.raises(hk.SceneFileError, match=f"settings: .*{wrong}"):
+        scene_of(json.dumps(about))
+
+
 def test_scene_files_know_every_solid() -> None:
     solids = [getattr(hk, name) for name in hk.__all__]
     solids = [one for one in solids if inspect.isclass(one) and issubclass(one, hk.Shape)]

@@ -12,9 +12,10 @@ import re
 from collections.abc import Mapping
 from importlib import resources
 from string import Template
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from harnack.files.file_format import write_atomically
+from harnack.rendering.camera import Camera
 from harnack.rendering.picture import progress_bar
 from harnack.view.scene import Live, Moved, difference, packed
 
@@ -72,6 +73,8 @@ def page(
         TypeError: what is no field; an unknown setting; a slider that nothing depends on.
     """
     target = os.fspath(path)
+    if not isinstance(cast("Any", title), str):
+        raise TypeError(f"title must be text, not {title!r:.60}")
     if not target.lower().endswith((".html", ".htm")):
         raise ValueError(f"{target}: a page is written as .html")
     live = Live.of(what, settings)
@@ -85,7 +88,8 @@ def page(
 
 def still_of(live: Live) -> str:
     """A picture of what is drawn at first, as base64 of a PNG file."""
-    still: Any = live.rendered(live.start, show="shaded", size=_STILL)
+    camera = Camera(**live.pose)
+    still: Any = live.rendered(live.start, show=live.show, size=_STILL, camera=camera)
     return base64.b64encode(still._repr_png_()).decode()
 
 

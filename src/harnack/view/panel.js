@@ -218,13 +218,16 @@ export class Panel {
       maxStorageBufferBindingSize, maxBufferSize, maxStorageBuffersPerShaderStage } });
     device.lost.then((e) => { if (!this.is_closed) this.fall_back(`The GPU was lost (${e.message})`); });
     device.addEventListener("uncapturederror", (e) => console.error(e.error.message));
+    if (this.is_closed) return device.destroy();
     this.say("Compiling the surface for this GPU ...");
     const drawing = new Drawing(device, this.scene, this.canvas, this.passes);
     try {
       await drawing.compile();
       const wrong = await drawing.set(this.scene.state);
+      if (this.is_closed) return device.destroy();
       if (wrong) return this.fall_back(`This GPU does not compute what the surface was proved with: ${wrong}`);
     } catch (wrong) {
+      if (this.is_closed) return device.destroy();
       return this.fall_back(`This GPU cannot compile the surface (${wrong})`);
     }
     this.drawing = drawing;

@@ -46,7 +46,8 @@ from harnack.gallery import SCENES
 from harnack.geometry import Volume
 from harnack.names import did_you_mean
 from harnack.rendering import Camera, Isolines
-from harnack.rendering.arguments import OF_STUDIO, SETTINGS
+from harnack.rendering.arguments import OF_STUDIO, SETTINGS, Request
+from harnack.rendering.stage import material_of
 from harnack.rendering.studio_scene import with_settings
 from harnack.tracer import LevelSet, Tolerance, level_set
 from harnack.view.sliders import Slider
@@ -362,6 +363,7 @@ def _scene_of(given: Any, find: Callable[[str], Path] | None) -> SavedScene:
         for k, one in enumerate(cast("list[Any]", listed))
     )
     settings = _settings_of(_object(whole.get("settings", {}), "settings"), _known_settings())
+    _check_values(settings, surfaces)
     sliders = _object(whole.get("sliders", {}), "sliders")
     made: dict[str, Slider] = {}
     for name, one in sliders.items():
@@ -369,6 +371,24 @@ def _scene_of(given: Any, find: Callable[[str], Path] | None) -> SavedScene:
         made[name] = _called(Slider, one, f"sliders: {name}")
         settings[name] = made[name].start
     return SavedScene(surfaces, settings, made, tuple(origins))
+
+
+def _check_values(settings: Plain, surfaces: Sequence[Field | LevelSet]) -> None:
+    """Raise SceneFileError for values that `render` or `level_set` would refuse later."""
+    own = {name: one for name, one in settings.items() if name in SURFACE_SETTINGS}
+    show = settings.get("show", "shaded")
+    try:
+        for one in surfaces:
+            with_settings(one, own)
+        for one in dataclasses.fields(Request):
+            if one.name in settings:
+                one.metadata["check"](settings[one.name], show)
+        for name in ("material", "boundary_material", "cut_material"):
+            given: Any = settings.get(name, [])
+            for each in cast("list[Any]", given) if isinstance(given, list) else [given]:
+                material_of(each)
+    except (ValueError, TypeError, OverflowError, NotImplementedError) as wrong:
+        raise SceneFileError(f"settings: {wrong}") from None
 
 
 def _known_settings() -> tuple[str, ...]:
