@@ -56,11 +56,21 @@ def test_every_scene_of_the_gallery_comes_back() -> None:
                 assert getattr(one, part) == getattr(other, part), (name, part)
 
 
+def test_a_scene_is_traced_at_its_level(tmp_path: Path) -> None:
+    hk.write_scene(
+        tmp_path / "a.json", hk.Sphere(1.0), level=0.5, clip=hk.HalfSpace((0, 0, 1), 0.0)
+    )
+    (surface,) = hk.read_scene(tmp_path / "a.json").level_sets
+    hits = hk.trace(surface, [[0, 0, 5.0]], [[0, 0, -1.0]])
+    assert hits.t[0] == pytest.approx(6.5, abs=1e-3)
+
+
 @pytest.mark.parametrize(
     ("settings", "wrong"),
     [
         ({"level": "x"}, "level"), ({"size": [1e9, 1e9]}, "size"),
-        ({"material": {"Sphere": {}}}, "material"), ({"show": "nothing"}, "show"), ({"spp": -1}, "spp"),
+        ({"material": {"Sphere": {}}}, "material"), ({"show": "nothing"}, "show"),
+        ({"spp": -1}, "spp"),
     ],
 )  # fmt: skip
 def test_settings_are_checked_when_they_are_read(settings: dict[str, Any], wrong: str) -> None:

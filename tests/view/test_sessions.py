@@ -11,6 +11,7 @@ import pytest
 
 import harnack as hk
 from harnack.geometry import shapes
+from harnack.geometry.mesh_shapes import icosphere
 from harnack.view.scene import Live, difference
 from harnack.view.session import Client, QuestionError, Session
 
@@ -58,6 +59,35 @@ def test_nothing_is_compiled_for_numbers_of_surfaces(name: str) -> None:
     session = Session(Live.of(what, {**settings, "a": hk.Slider(0.1, 0.5)}))
     questions = [{"sliders": {"a": one}} for one in (0.1, 0.23, 0.5)]
     assert compiled(session, questions) == set()
+
+
+def test_the_tube_follows_the_curve() -> None:
+    live = Live.of(hk.SolidAngle(LOOP), {"boundary": 0.05, "level": 6.0}, edits=True)
+    session = Session(live)
+    moved = LOOP.copy()
+    moved[0] *= 1.5
+    assert compiled(session, [{"loops": [moved.tolist()]}]) == set()
+    _, tube = live.drawn(session.moved({"loops": [moved.tolist()]}))
+    assert abs(float(tube.surface.field.value(moved[0]))) < 0.06
+    _, before = live.drawn(live.start)
+    assert float(before.surface.field.value(moved[0])) > 0.2
+
+
+def test_a_probe_of_a_triangle_says_no_derivatives() -> None:
+    vertices, faces = icosphere(1)
+    session = Session(Live.of(hk.WindingNumber(vertices, faces[5:]), {}))
+    middle = vertices[faces[20]].mean(axis=0)
+    ray = {"origin": (3 * middle).tolist(), "direction": (-middle).tolist()}
+    found = session.answer({"kind": "probe", **ray})
+    assert found["triangle"] == 15
+    assert not {"value", "mean", "gaussian"} & set(found)
+
+
+def test_a_probe_says_the_value_next_to_the_level(live: Live) -> None:
+    found = Session(live).answer(
+        {"kind": "probe", "origin": [0.3, 0.2, 6.0], "direction": [0, 0, -1]}
+    )
+    assert found["value"] == pytest.approx(6.0, abs=0.01)
 
 
 def test_what_is_sent_is_what_has_changed(live: Live) -> None:

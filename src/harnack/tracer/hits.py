@@ -393,8 +393,8 @@ _OTHERWISE = 1e-3
 # nine in ten hits lie within this fraction of the tolerance (0.03), and their normals differ by no
 # more than this (2e-5);
 _APART, _TURNED = 0.1, 2e-4
-# the numbers of evaluations differ, summed over all rays, by no more than this fraction of their sum
-# and one for each ray (0.020).
+# the numbers of evaluations differ, summed over all rays, by no more than this fraction of their
+# sum and one for each ray (0.020).
 _RECOUNTED = 0.03
 
 

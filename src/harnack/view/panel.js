@@ -791,8 +791,9 @@ function said_of(found) {
   const point = (/** @type {number[]} */ p) => `(${p.map(format).join(", ")})`;
   const bent = found.mean === undefined ? ""
     : `, mean curvature ${format(found.mean)}, Gaussian ${format(found.gaussian)}`;
-  return `at ${point(found.position)}, normal ${point(found.normal)}, f = ${format(found.value)}`
-    + `${bent}, ${looks}`;
+  const what = found.triangle === undefined ? `f = ${format(found.value)}`
+    : `on triangle ${found.triangle}, where f jumps`;
+  return `at ${point(found.position)}, normal ${point(found.normal)}, ${what}${bent}, ${looks}`;
 }
 
 /** @param {number} x */

@@ -203,10 +203,17 @@ class Live:
 
     def drawn(self, moved: Moved) -> list[StudioObject]:
         """The same as objects of the studio."""
-        drawn = [self._fitted(one) for one in _drawn(self.subject, moved.values)]
+        what, settings = self.subject.at(moved.values)
+        drawn = _objects(what, settings)
+        curve = _curve_of(drawn) if self.editable else None
+        if curve is not None and moved.loops is not None and settings.get("boundary") is not None:
+            # The tube around the curve is that of the moved one.
+            several: list[Any] = [*what] if isinstance(what, list | tuple) else [what]
+            drawn = _objects([_with_loops(one, curve, moved.loops) for one in several], settings)
+            curve = _curve_of(drawn)
+        drawn = [self._fitted(one) for one in drawn]
         if moved.cut is not None:
             drawn = [replace(one, surface=cut_by(one.surface, moved.cut)) for one in drawn]
-        curve = _curve_of(drawn) if self.editable else None
         if curve is None:
             return drawn
         # As Dr.Jit's arrays: those of NumPy decide which proof is taken.
@@ -298,7 +305,11 @@ def _with_loops(one: Any, curve: SolidAngle, loops: Any) -> Any:
 
 
 def _drawn(subject: Subject, values: Mapping[str, float]) -> list[StudioObject]:
-    what, settings = subject.at(values)
+    return _objects(*subject.at(values))
+
+
+def _objects(what: Any, given: Mapping[str, Any]) -> list[StudioObject]:
+    settings = dict(given)
     studio = {name: settings.pop(name) for name in _OF_STUDIO if name in settings}
     material, cut = (settings.pop(name, None) for name in ("material", "cut_material"))
     isolines = checked_isolines(settings.pop("isolines", None))

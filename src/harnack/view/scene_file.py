@@ -105,6 +105,13 @@ class SavedScene:
     sliders: Mapping[str, Slider] = field(default_factory=dict[str, Slider])
     origins: Origins = field(default=(), repr=False)
 
+    @property
+    def level_sets(self) -> tuple[LevelSet, ...]:
+        """The surfaces with the settings of the scene that are theirs (level, clip, ...), for
+        `harnack.trace` and whatever else takes a `LevelSet`."""
+        own = {name: one for name, one in self.settings.items() if name in SURFACE_SETTINGS}
+        return tuple(with_settings(one, own) for one in self.surfaces)
+
 
 def read_scene(path: str | os.PathLike[str]) -> SavedScene:
     """The scene of a file that `write_scene` or a view has written.

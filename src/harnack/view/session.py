@@ -216,8 +216,16 @@ class Session:
             "t": float(hits.t[0]),
             "position": point[0].tolist(),
             "normal": hits.normal[0].tolist(),
-            "value": float(surface.field.value(point)[0]),
         }
+        if hits.sheet[0] >= 0:  # f jumps there, and has no derivatives
+            return there | {"triangle": int(hits.sheet[0])}
+        value, period = float(surface.field.value(point)[0]), surface.field.period
+        if period is not None and len(surface.numbers):
+            # The one of its values that is nearest to a level.
+            levels = np.asarray(surface.numbers, np.float64)
+            away = np.round((levels - value) / period) * period
+            value += float(away[np.argmin(np.abs(value + away - levels))])
+        there["value"] = value
         try:
             bent = curvature(surface.field, point)
         except NotImplementedError:
