@@ -23,6 +23,7 @@ from harnack.rendering.arguments import ANTIALIASING, MAX_SIDE, MAX_SPP
 from harnack.rendering.backdrops import IMAGE_FILES, checked_backdrop
 from harnack.rendering.scales import color_of
 from harnack.rendering.stage import material_of
+from harnack.view.scene import SHOWS
 from harnack.view.sliders import Slider
 
 # Of what was typed, this much is repeated in messages.
@@ -144,7 +145,7 @@ def _add_live(commands: Any) -> None:
     view.add_argument("--no-browser", action="store_true", help="open no browser")
     view.set_defaults(quiet=True)
     for one in (page, view):
-        one.set_defaults(show=None)
+        _add_choice(one, "--show", SHOWS, "what to show at first (shaded)")
         one.add_argument("--title", metavar="TEXT", help="of the page")
         one.add_argument(
             "--slider", type=_slider, metavar="NAME=LOW:HIGH[:STEP]", action="append", default=[],

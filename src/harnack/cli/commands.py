@@ -125,7 +125,12 @@ def _live(options: Any, source: Path) -> _Drawn:
         )
     starts = {name: cast("float", sliders[name].start) for name in names}
     drawn, settings, origins = _drawn(options, source, starts)
-    settings = {**settings, "show": "shaded", "title": options.title or "", **sliders}
+    settings = {
+        **settings,
+        "show": options.show or "shaded",
+        "title": options.title or "",
+        **sliders,
+    }
     for name in STILL_SETTINGS:
         settings.pop(name, None)
     if not names:
@@ -325,7 +330,10 @@ def _of_scene(scene: Scene, options: Any, settings: dict[str, Any]) -> _Drawn:
     surfaces = scene.surfaces()
     if options.level is not None:
         if len(surfaces) != 1 or (surfaces[0].solid is not None and options.solid is None):
-            raise ValueError(f"scene {scene.name} has levels of its own; --level does not apply")
+            raise ValueError(
+                f"scene {scene.name} has levels of its own; --level does not apply, nor does a "
+                "slider of it"
+            )
         settings["level"] = options.level
     if options.solid is not None and len(surfaces) != 1:
         raise ValueError(f"scene {scene.name} has several surfaces; --solid does not apply")

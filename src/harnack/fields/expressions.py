@@ -119,8 +119,8 @@ class TextFormula:
 
 
 def looks_like_formula(text: str) -> bool:
-    """Whether a text looks like a formula: an equation, or with powers."""
-    return any(sign in text for sign in ("=", "^", "**"))
+    """Whether a text looks like a formula: an equation, or with powers, products or functions."""
+    return any(sign in text for sign in ("=", "^", "*", "("))
 
 
 def _wrong(text: str, why: str) -> ValueError:

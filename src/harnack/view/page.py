@@ -49,9 +49,9 @@ def page(
         hk.page(field, "levels.html", level=hk.Slider(1, 12))
         hk.page(lambda w: hk.Morph(a, b, w=w), "morph.html", w=hk.Slider(0, 1))
 
-    It opens in any browser with WebGPU, without Python and without a network, from https or
-    127.0.0.1; elsewhere it shows a still picture and says why. The kernel that Dr.Jit records for
-    each surface is in it, translated to WGSL, as it stands: the same proofs on another GPU.
+    It opens in any browser with WebGPU, without Python and without a network; some want it from
+    https or 127.0.0.1. Where there is none it shows a still picture and says why. The kernel that
+    Dr.Jit records for each surface is in it, translated to WGSL: the same proofs on another GPU.
     Rounding is not proved there, so that 2,048 rays with Dr.Jit's answers are in the file, too.
     They are traced first, and if the visitor's device does not agree, nothing of what it says is
     drawn.

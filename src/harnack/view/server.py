@@ -88,8 +88,8 @@ def view(
     """Show surfaces live in the browser: turned, moved by sliders, their curves dragged.
 
         hk.view(hk.SolidAngle(vertices))
-        hk.view(lambda l, m: hk.SphericalHarmonic(int(l), int(m)), level=0.1,
-                l=hk.Slider(1, 8, 5, step=1), m=hk.Slider(0, 5, 3, step=1))
+        hk.view(lambda l, m: hk.SphericalHarmonic(int(l), int(min(l, m))), level=0.1,
+                l=hk.Slider(1, 8, 5, step=1), m=hk.Slider(0, 8, 3, step=1))
 
     The visitor's browser traces all rays by the kernels that Dr.Jit recorded, as a page of `page`
     does; Python prepares what has changed and sends it. While a point or a slider moves no kernel
