@@ -152,8 +152,9 @@ export class Panel {
       );
     }
     this.asked = element("div", { className: "buttons" }, ...buttons);
+    this.about = element("small");
     return element("details", { open: innerWidth > 600 && scene.sliders.length > 0 },
-      element("summary", {}, "Controls"), ...rows, this.asked);
+      element("summary", {}, "Controls"), ...rows, this.asked, this.about);
   }
 
   /** What cuts the surfaces, and sliders of it. */
@@ -232,6 +233,10 @@ export class Panel {
     }
     this.drawing = drawing;
     this.say("");
+    const { vendor = "", architecture = "", description = "" } = adapter.info ?? {};
+    const name = description || `${vendor} ${architecture}`.trim() || "this browser's device";
+    const rays = this.scene.state.surfaces.reduce((sum, one) => sum + (one.check?.count ?? 0), 0);
+    this.tell_who(`Traced by ${name}: ${rays} rays agree with Dr.Jit's.`);
     this.listen(this.canvas);
     this.observe(this.canvas, () => drawing.resize());
     this.mark();
@@ -291,8 +296,12 @@ export class Panel {
     this.say(`${why}: this is a still picture.`, false);
   }
 
+  /** Says who traces. @param {string} words */
+  tell_who(words) { if (this.about) this.about.textContent = words; }
+
   /** @param {string} why */
   let_python_draw(why) {
+    this.tell_who("Traced by Python.");
     const camera = this.camera();
     this.drawing?.stop();
     this.drawing = undefined;
