@@ -232,3 +232,12 @@ def test_every_command_reads_a_scene_file(
     (tmp_path / "b.json").write_text("{}")
     assert main(["render", str(tmp_path / "b.json")]) == 1
     assert '"harnack": 1' in capsys.readouterr().err
+
+
+def test_a_file_is_found_beside_the_scene_that_was_sent_with_it(tmp_path: Path) -> None:
+    path = tmp_path / "curve.loops"
+    path.write_text(" ".join(map(str, shapes.wavy_polygon(8).ravel().tolist())))
+    about = {"harnack": 1, "surfaces": [{"field": {"file": "/elsewhere/curve.loops"}}]}
+    (tmp_path / "a.json").write_text(json.dumps(about))
+    (field,) = hk.read_scene(tmp_path / "a.json").surfaces
+    assert isinstance(field, hk.SolidAngle)

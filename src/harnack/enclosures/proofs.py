@@ -51,6 +51,11 @@ _NAMED: dict[str, tuple[type[Enclosure], ...]] = {
     "lipschitz": _FALLBACK,
 }
 BOUNDS = tuple(sorted(_NAMED))
+# Those that need no promise: they are made of ranges of a formula.
+_OF_RANGES = [
+    f'"{name}"' for name, (sharpest, *_) in _NAMED.items()
+    if sharpest.along.__func__ is not Enclosure.along.__func__
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -113,7 +118,8 @@ class Proofs:
             kinds = ", ".join(kind.__name__ for kind in Promise.__subclasses__())
             return (
                 f"the bounds asked for ({asked}) need a promise and the field makes none: "
-                f"Sample.known is empty, return one of these in it: {kinds}"
+                f"Sample.known is empty, return one of these in it: {kinds}. Formulas are bounded "
+                f"by ranges: leave bound out, or choose one of {', '.join(_OF_RANGES)}"
             )
         made = " and ".join(sorted({type(one).__name__ for one in promises}))
         usable = [

@@ -133,9 +133,16 @@ def read_scene(path: str | os.PathLike[str]) -> SavedScene:
     except UnicodeDecodeError:
         raise SceneFileError(f"{source}: a scene file is text in UTF-8") from None
     try:
-        return scene_of(text, lambda name: source.parent / name)
+        return scene_of(text, lambda name: _beside(source.parent, name))
     except SceneFileError as wrong:
         raise SceneFileError(f"{source}: {wrong}") from None
+
+
+def _beside(folder: Path, name: str) -> Path:
+    """A file by its name, or where there is none one of that name in the folder, for scenes that
+    were sent to somebody else together with their files."""
+    found = folder / name
+    return found if found.exists() or not (folder / found.name).exists() else folder / found.name
 
 
 def write_scene(
