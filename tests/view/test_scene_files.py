@@ -227,7 +227,9 @@ def test_every_command_reads_a_scene_file(
     assert main(["render", path, "-o", str(tmp_path / "b.png"), "--azimuth", "90", *small]) == 0
     assert main(["mesh", path, "-o", str(tmp_path / "a.stl"), "--spacing", "0.2", "--quiet"]) == 0
     assert main(["page", path, "-o", str(tmp_path / "a.html"), "--quiet"]) == 0
-    assert '"name": "level", "low": -0.1' in (tmp_path / "a.html").read_text()
+    written = (tmp_path / "a.html").read_text()
+    assert '"name": "level", "low": -0.1' in written
+    assert '"show": "normal"' in written
     assert len(list(tmp_path.iterdir())) == 5
     (tmp_path / "b.json").write_text("{}")
     assert main(["render", str(tmp_path / "b.json")]) == 1

@@ -29,10 +29,9 @@ from harnack.rendering import Camera, Isolines, animate, render
 from harnack.rendering.arguments import OF_STUDIO, SETTINGS
 from harnack.rendering.film import check_film_path
 from harnack.rendering.images import check_picture_path
-from harnack.rendering.studio_scene import surfaces_of
-from harnack.tracer import LevelSet
 from harnack.view import SavedScene, page, read_scene, view
-from harnack.view.scene_file import STILL_SETTINGS, SURFACE_SETTINGS, Origins
+from harnack.view.scene import live_settings
+from harnack.view.scene_file import Origins
 
 _DEMO_SIZE = (480, 360)
 
@@ -125,14 +124,9 @@ def _live(options: Any, source: Path) -> _Drawn:
         )
     starts = {name: cast("float", sliders[name].start) for name in names}
     drawn, settings, origins = _drawn(options, source, starts)
-    settings = {
-        **settings,
-        "show": options.show or "shaded",
-        "title": options.title or "",
-        **sliders,
-    }
-    for name in STILL_SETTINGS:
-        settings.pop(name, None)
+    settings = {**live_settings(settings), "title": options.title or "", **sliders}
+    if options.show is not None:
+        settings["show"] = options.show
     if not names:
         return drawn, settings, origins
     text, fixed = options.scene, dict(options.parameters)
@@ -403,7 +397,8 @@ def _meshed(options: Any, source: Path) -> tuple[Field, dict[str, Any]]:
         _say(f"{source}: {in_options(opened.said)}")
         return opened.field, {}
     is_saved = _is_saved(source)
-    surfaces = _surfaces_of(read_scene(source)) if is_saved else SCENES[options.scene].surfaces()
+    scene = read_scene(source) if is_saved else None
+    surfaces = SCENES[options.scene].surfaces() if scene is None else scene.level_sets
     if len(surfaces) != 1:
         raise ValueError(
             f"scene {source} has {len(surfaces)} surfaces, and a mesh can be made of one only"
@@ -415,11 +410,6 @@ def _meshed(options: Any, source: Path) -> tuple[Field, dict[str, Any]]:
             return surface.field, cut
         return surface.field, {"solid": surface.solid, **cut}
     return surface.field, {"level": surface.numbers[0], **cut}
-
-
-def _surfaces_of(saved: SavedScene) -> list[LevelSet]:
-    own = {name: one for name, one in saved.settings.items() if name in SURFACE_SETTINGS}
-    return surfaces_of([*saved.surfaces], **own)
 
 
 def _repair(options: Any) -> int:

@@ -192,7 +192,8 @@ class Nearest(Enclosure):
         return fmax(dr.select(known, fmin(length, self.reach), 0) * ROUND_DOWN, 0)
 
 
-_ROUND_DOWN = 1.0 - 1e-5
+# What powers may round by is more than `ROUND_DOWN` takes off.
+_ROUND_POWERS_DOWN = 1.0 - 1e-5
 # The values of q in the proof of `Cusp` that are tried.
 _PARTS = (0.5, 0.95)
 
@@ -243,7 +244,7 @@ class Cusp(Enclosure):
         best = 0 * self.height
         for part in _PARTS:
             share = fmax(part * room / self.constant, 0)
-            radius = dr.power(share, 1 / self.power) * _ROUND_DOWN
+            radius = dr.power(share, 1 / self.power) * _ROUND_POWERS_DOWN
             radius = dr.select(dr.isfinite(share) & (radius >= 0), fmin(radius, self.inside), 0)
             chord = (radius - self.across) * (radius + self.across)
             leaves = self.foot + dr.sqrt(fmax(chord, 0))
@@ -253,4 +254,4 @@ class Cusp(Enclosure):
             start = self.across * self.across + self.foot * self.foot < radius * radius
             known = start & (room > 0) & (chord > 0) & dr.isfinite(chord)  # squares may overflow
             best = fmax(dr.select(known, length, 0), best)
-        return dr.select(away == dr.inf, best * _ROUND_DOWN, 0)
+        return dr.select(away == dr.inf, best * _ROUND_POWERS_DOWN, 0)

@@ -20,6 +20,7 @@ from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.geometry import MeshError, validate_mesh
 from harnack.geometry.chains import singular_loops, weld_vertices
 from harnack.meshing.checks import (
+    LocalError,
     MeshingError,
     TooLargeError,
     check_manifold,
@@ -158,16 +159,16 @@ def _repaired(
             )
             result = _joined(vertices, faces, patches, asked.given)
             _check(vertices, faces, result, report)
-        except _LocalError as error:
+        except LocalError as error:
             times_met += isinstance(error, _MetError)
             if last or times_met > _MOST_MET:
-                place = ", ".join(f"{c:.4g}" for c in error.points[0])
+                place = ", ".join(f"{c:.4g}" for c in error.places[0])
                 raise MeshingError(
-                    f"{error} (cells were {cell:.3g} wide, and smaller in {len(error.points)} "
+                    f"{error} (cells were {cell:.3g} wide, and smaller in {len(error.places)} "
                     f"places, such as near ({place}))"
                 ) from None
-            report(f"{error} ({len(error.points)} places)")
-            finer = (*finer, Places(error.points, 2 * cell * 0.5 ** len(finer)))
+            report(f"{error} ({len(error.places)} places)")
+            finer = (*finer, Places(error.places, 2 * cell * 0.5 ** len(finer)))
         except TooLargeError:
             raise
         except MeshingError as error:  # a point lies where the function is too inaccurate
@@ -180,15 +181,7 @@ def _repaired(
     raise AssertionError("unreachable: the last attempt returns or raises")
 
 
-class _LocalError(MeshingError):
-    """Failures that smaller cells around some points (n, 3) may prevent."""
-
-    def __init__(self, message: str, points: FloatArray) -> None:
-        super().__init__(message)
-        self.points = points
-
-
-class _MetError(_LocalError):
+class _MetError(LocalError):
     """Patches intersect the mesh."""
 
 
@@ -323,7 +316,7 @@ def _patches(
         tets = delaunay(points.points)
     lacks = ~tets.has_edges(cut.edges)
     if lacks.any():
-        raise _LocalError(
+        raise LocalError(
             f"{int(lacks.sum())} boundary edges of the mesh are too near to others for a patch "
             "that ends at them: subdivide the mesh there, or choose a smaller `spacing`",
             cut.points[cut.edges[lacks]].mean(axis=1),
@@ -333,12 +326,12 @@ def _patches(
     for k, ends in reversed(list(enumerate(middles.tolist(), start=len(rim)))):
         faces = _collapsed(x, faces, k, ends)
     if not len(faces):
-        raise _LocalError("no patch was found: choose a smaller `spacing`", boundary.points)
+        raise LocalError("no patch was found: choose a smaller `spacing`", boundary.points)
     _check_boundary(x, faces, boundary)
     is_fine = True
     try:
         x, faces = _finished(function, x, faces, tolerance, report)
-    except _LocalError:
+    except LocalError:
         if not last or len(intersecting_faces(x, faces)):
             raise
         is_fine = False
@@ -372,7 +365,7 @@ def _finished(
         finer, split = refined(function, finer, split, 0.5 * tolerance, None, report)
         far = far_places(function, finer, split, 0.5 * tolerance)
         if len(far):  # the patch takes another way than the surface, or connects two of its sheets
-            raise _LocalError(
+            raise LocalError(
                 f"{len(far):,} triangles of patches do not come near the surface, however they are "
                 "cut: subdivide the mesh there, or choose a smaller `spacing`",
                 far,
@@ -385,7 +378,7 @@ def _finished(
         bad = np.concatenate([met, finer[_new_singular(faces, split)]])
         if not len(bad):
             return finer, split
-    raise _LocalError("the patches meet each other: choose a smaller `spacing`", bad)
+    raise LocalError("the patches meet each other: choose a smaller `spacing`", bad)
 
 
 def _new_singular(before: IntArray, after: IntArray) -> IntArray:
@@ -415,7 +408,7 @@ def _collapsed(x: FloatArray, faces: IntArray, middle: int, ends: list[int]) -> 
         is_moved = np.arange(len(made)) >= len(rest)
         found.append((len(intersecting_faces(x, made, is_moved)), -turned, made))
     if not found:
-        raise _LocalError(
+        raise LocalError(
             "boundary edges of the mesh are too near to others for patches that end at them: "
             "subdivide the mesh there, or choose a smaller `spacing`",
             x[[middle]],
@@ -436,7 +429,7 @@ def _check_boundary(x: FloatArray, faces: IntArray, boundary: Boundary) -> None:
     rim = {(a, b) for a, b in directed if (b, a) not in directed}
     wrong = rim ^ {(int(a), int(b)) for a, b in boundary.edges}
     if wrong:
-        raise _LocalError(
+        raise LocalError(
             "the patches do not end at the edges of the holes: cells are too large for them; "
             "choose a smaller `spacing`",
             x[np.array(sorted(wrong))].mean(axis=1),
@@ -480,12 +473,12 @@ def _check(
     try:
         check_manifold(together)
     except MeshingError as error:
-        raise _LocalError(str(error), x[singular_vertices(together)]) from None
+        raise LocalError(str(error), x[singular_vertices(together)]) from None
     added = x[len(vertices) :]
     w = WindingNumber(vertices, faces).value(added, precision="double")
     off = np.abs(w - np.floor(w) - 0.5)
     if not (off <= _NEAR).all():
-        raise _LocalError(
+        raise LocalError(
             f"the winding number is off 1/2 by {off.max():.2g} at a vertex of the patches: choose "
             "a smaller `spacing`",
             added[off > _NEAR],
@@ -496,7 +489,7 @@ def _check(
         return
     places = x[together[met[is_patch[met]]]].mean(axis=1)
     if is_patch[met].all():
-        raise _LocalError("the patches meet each other: choose a smaller `spacing`", places)
+        raise LocalError("the patches meet each other: choose a smaller `spacing`", places)
     raise _MetError(
         f"the patches meet {int((~is_patch[met]).sum()):,} triangles of the mesh, where the "
         "winding number jumps: the hole cannot be closed by its 1/2 level alone; remove the "

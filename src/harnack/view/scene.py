@@ -33,7 +33,7 @@ from harnack.rendering.shading import of_mended, of_side, reflectance
 from harnack.rendering.stage import StudioObject, on_ground
 from harnack.rendering.studio_scene import studio_objects
 from harnack.tracer import LevelSet, Status, Tolerance
-from harnack.view.scene_file import SURFACE_SETTINGS, Origins, text_of
+from harnack.view.scene_file import STILL_SETTINGS, Origins, of_surfaces, text_of
 from harnack.view.sliders import Subject
 from harnack.webgpu import bits_of, data_of, leaves, record
 
@@ -45,7 +45,18 @@ if TYPE_CHECKING:
     from harnack.rendering.placement import Placement
     from harnack.webgpu import Recording
 
-__all__ = ["SHOWS", "Live", "Moved", "Plain", "paint_of", "paints_of", "status_of"]
+__all__ = [
+    "SHOWS",
+    "Live",
+    "Moved",
+    "Plain",
+    "difference",
+    "live_settings",
+    "packed",
+    "paint_of",
+    "paints_of",
+    "status_of",
+]
 
 Plain = dict[str, Any]
 # Rays that travel with a surface, and are traced first on the visitor's device.
@@ -118,8 +129,8 @@ class Live:
         still = [name for name in given if name in SETTINGS and name not in (*OF_STUDIO, "show")]
         if still:
             raise TypeError(
-                f"{', '.join(still)}: of still pictures, which `harnack.render` draws; pages and "
-                "views do not take it"
+                f"{', '.join(still)}: for still pictures only, as `harnack.render` draws them; "
+                "pages and views have no such setting"
             )
         given = dict(given)
         camera, backdrop, up, show = (given.pop(name, None) for name in _OF_STAGE)
@@ -208,8 +219,7 @@ class Live:
         curve = _curve_of(drawn) if self.editable else None
         if curve is not None and moved.loops is not None and settings.get("boundary") is not None:
             # The tube around the curve is that of the moved one.
-            several: list[Any] = [*what] if isinstance(what, list | tuple) else [what]
-            drawn = _objects([_with_loops(one, curve, moved.loops) for one in several], settings)
+            drawn = _objects(_with_loops(what, curve, moved.loops), settings)
             curve = _curve_of(drawn)
         drawn = [self._fitted(one) for one in drawn]
         if moved.cut is not None:
@@ -232,16 +242,10 @@ class Live:
         _, settings = self.subject.at(moved.values)
         own = {name: settings[name] for name in ("isolines", "cut_material") if name in settings}
         drawn = self.drawn(moved)
-        asked: dict[str, Any] = {
-            "backdrop": self.ground,
-            "up": self.up,
-            "progress": False,
-            **own,
-            **others,
-        }
+        usual: dict[str, Any] = {"backdrop": self.ground, "up": self.up, "progress": False}
         materials = [one.material for one in drawn]
         return render(
-            [one.surface for one in drawn], material=materials, **{**asked, **own, **others}
+            [one.surface for one in drawn], material=materials, **{**usual, **own, **others}
         )
 
     def saved(self, moved: Moved, **others: Any) -> tuple[str, list[str]]:
@@ -254,11 +258,12 @@ class Live:
         """
         what, settings = self.subject.at(moved.values)
         several: list[Any] = [*what] if isinstance(what, list | tuple) else [what]
-        curve = _curve_of(_drawn(self.subject, moved.values)) if moved.loops else None
+        curve = _curve_of(_objects(what, settings)) if moved.loops else None
         if curve is not None:
-            several = [_with_loops(one, curve, moved.loops) for one in several]
+            several = _with_loops(what, curve, moved.loops)
         if moved.cut is not None:
-            own = {name: settings.pop(name) for name in SURFACE_SETTINGS if name in settings}
+            own = of_surfaces(settings)
+            settings = {name: one for name, one in settings.items() if name not in own}
             made = studio_objects(several, settings.get("material"), own)
             several = [cut_by(one.surface, moved.cut) for one in made]
         lost: list[str] = []
@@ -283,6 +288,13 @@ class Live:
         return PlacedSurface.of(one.surface, self.placement, backend, one.isolines, size)
 
 
+def live_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Those of a picture that pages and views take: without what only still pictures have, such as
+    a size, and with "shaded" in the place of a `show` that cannot follow a mouse."""
+    taken = {name: one for name, one in settings.items() if name not in STILL_SETTINGS}
+    return {**taken, "show": taken["show"] if taken.get("show") in SHOWS else "shaded"}
+
+
 def cut_by(surface: LevelSet, volume: Volume) -> LevelSet:
     """A surface cut by one more volume; by a half-space, it is opened to be looked into."""
     name = "section" if isinstance(volume, HalfSpace) else "clip"
@@ -295,13 +307,17 @@ def cut_by(surface: LevelSet, volume: Volume) -> LevelSet:
     return replace(made, solid=(-math.inf, made.numbers[0]))
 
 
-def _with_loops(one: Any, curve: SolidAngle, loops: Any) -> Any:
-    """A field or a surface with other vertices of a curve."""
-    if one is curve:
-        return SolidAngle([*loops])
-    if isinstance(one, LevelSet) and one.field is curve:
-        return replace(one, field=SolidAngle([*loops]))
-    return one
+def _with_loops(what: Any, curve: SolidAngle, loops: Any) -> list[Any]:
+    """Fields and surfaces with other vertices of one curve."""
+    moved = SolidAngle([*loops])
+
+    def edited(one: Any) -> Any:
+        if isinstance(one, LevelSet) and one.field is curve:
+            return replace(one, field=moved)
+        return moved if one is curve else one
+
+    several: list[Any] = [*what] if isinstance(what, list | tuple) else [what]
+    return [edited(one) for one in several]
 
 
 def _drawn(subject: Subject, values: Mapping[str, float]) -> list[StudioObject]:

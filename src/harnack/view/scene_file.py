@@ -56,6 +56,7 @@ __all__ = [
     "Origins",
     "SavedScene",
     "SceneFileError",
+    "of_surfaces",
     "read_scene",
     "scene_of",
     "text_of",
@@ -69,11 +70,12 @@ SURFACE_SETTINGS = (
     "level", "solid", "clip", "section", "tolerance", "max_steps", "bound", "overstep", "confirm",
     "largest",
 )  # fmt: skip
-"""Of `level_set`."""
+"""Names of the settings that `level_set` takes."""
 _UNWRITTEN = ("of", "value_range", "colorbar", "progress")
 _OF_PICTURE = tuple(name for name in SETTINGS if name not in _UNWRITTEN)
+_KNOWN = (*SURFACE_SETTINGS, *_OF_PICTURE)
 STILL_SETTINGS = tuple(name for name in _OF_PICTURE if name not in (*OF_STUDIO, "show"))
-"""Of `render`, of pictures that do not move."""
+"""Names of the settings that `render` takes for still pictures alone."""
 # Fields that say all of themselves by their arguments, besides solids.
 _MORE: tuple[type[Field], ...] = (
     Gyroid, SchwarzD, SchwarzP, SphericalHarmonic,
@@ -109,8 +111,13 @@ class SavedScene:
     def level_sets(self) -> tuple[LevelSet, ...]:
         """The surfaces with the settings of the scene that are theirs (level, clip, ...), for
         `harnack.trace` and whatever else takes a `LevelSet`."""
-        own = {name: one for name, one in self.settings.items() if name in SURFACE_SETTINGS}
+        own = of_surfaces(self.settings)
         return tuple(with_settings(one, own) for one in self.surfaces)
+
+
+def of_surfaces(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Those settings that `level_set` takes."""
+    return {name: one for name, one in settings.items() if name in SURFACE_SETTINGS}
 
 
 def read_scene(path: str | os.PathLike[str]) -> SavedScene:
@@ -318,7 +325,7 @@ def _number(value: float) -> Any:
 
 
 def _setting_text(name: str, value: Any, origins: Origins) -> Any:
-    _check_name(name, (*SURFACE_SETTINGS, *_OF_PICTURE), "setting")
+    _check_name(name, _KNOWN, "setting")
     if isinstance(value, Tolerance):
         usual = Tolerance(value.distance)
         if value != usual:
@@ -376,8 +383,8 @@ def _scene_of(given: Any, find: Callable[[str], Path] | None) -> SavedScene:
         _surface_of(one, f"surfaces[{k}]", find, origins)
         for k, one in enumerate(cast("list[Any]", listed))
     )
-    settings = _settings_of(_object(whole.get("settings", {}), "settings"), _known_settings())
-    _check_values(settings, surfaces)
+    settings = _settings_of(_object(whole.get("settings", {}), "settings"), _KNOWN)
+    _check_values(SavedScene(surfaces, settings))
     sliders = _object(whole.get("sliders", {}), "sliders")
     made: dict[str, Slider] = {}
     for name, one in sliders.items():
@@ -387,13 +394,12 @@ def _scene_of(given: Any, find: Callable[[str], Path] | None) -> SavedScene:
     return SavedScene(surfaces, settings, made, tuple(origins))
 
 
-def _check_values(settings: Plain, surfaces: Sequence[Field | LevelSet]) -> None:
+def _check_values(scene: SavedScene) -> None:
     """Raise SceneFileError for values that `render` or `level_set` would refuse later."""
-    own = {name: one for name, one in settings.items() if name in SURFACE_SETTINGS}
+    settings = scene.settings
     show = settings.get("show", "shaded")
     try:
-        for one in surfaces:
-            with_settings(one, own)
+        _ = scene.level_sets
         for one in dataclasses.fields(Request):
             if one.name in settings:
                 one.metadata["check"](settings[one.name], show)
@@ -401,12 +407,8 @@ def _check_values(settings: Plain, surfaces: Sequence[Field | LevelSet]) -> None
             given: Any = settings.get(name, [])
             for each in cast("list[Any]", given) if isinstance(given, list) else [given]:
                 material_of(each)
-    except (ValueError, TypeError, OverflowError, NotImplementedError) as wrong:
+    except _WRONG as wrong:
         raise SceneFileError(f"settings: {wrong}") from None
-
-
-def _known_settings() -> tuple[str, ...]:
-    return (*SURFACE_SETTINGS, *_OF_PICTURE)
 
 
 def _no_number(name: str) -> float:

@@ -23,8 +23,16 @@ from harnack.rendering.arguments import check_size
 from harnack.rendering.backdrops import GROUNDS
 from harnack.tracer import Status, trace
 from harnack.view.painter import Eye, Painted, Painter
-from harnack.view.scene import SHOWS, Live, Moved, difference, packed, paints_of
-from harnack.view.scene_file import STILL_SETTINGS, scene_of
+from harnack.view.scene import (
+    SHOWS,
+    Live,
+    Moved,
+    difference,
+    live_settings,
+    packed,
+    paints_of,
+)
+from harnack.view.scene_file import scene_of
 
 if TYPE_CHECKING:
     from harnack.backend import FloatArray
@@ -295,18 +303,13 @@ class Session:
     def _load(self, question: Mapping[str, Any], moved: Moved, tell: Tell) -> Plain:
         """Replaces the scene by that of a scene file, and returns it as `Live.scene` does.
 
-        Settings that only still pictures have (`STILL_SETTINGS`) are dropped.
+        See `live_settings` for what of its settings is taken.
         """
         text = question.get("text")
         if not isinstance(text, str):
             raise QuestionError("text must be that of a scene file")
         saved = scene_of(text)
-        settings = {**saved.settings, **saved.sliders}
-        for name in STILL_SETTINGS:
-            settings.pop(name, None)
-        show = settings.get("show")
-        if show not in SHOWS:
-            settings.pop("show", None)
+        settings = {**live_settings(saved.settings), **saved.sliders}
         self.live = Live.of([*saved.surfaces], settings, edits=True, origins=saved.origins)
         self._painter, self._painted = Painter(), (None, [])
         return self.live.scene(self.live.subject.name)

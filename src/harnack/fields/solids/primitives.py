@@ -83,6 +83,14 @@ class Sphere(Shape):
         return ball_around(self.center, self.radius + level)
 
 
+def _box_of_radii(radii: tuple[float, float, float], level: float) -> Volume:
+    """Around the points where m (g - 1) <= level, for the least radius m and a norm g that is 1
+    on a surface which reaches these radii along the axes, and lies in the box of them."""
+    a, b, c = radii
+    size = 1.0 + level / min(radii)
+    return box_around((size * a, size * b, size * c))
+
+
 @dataclass(frozen=True)
 class Ellipsoid(Shape):
     """The points with |(x/a, y/b, z/c)| <= 1, radii = (a, b, c).
@@ -107,11 +115,7 @@ class Ellipsoid(Shape):
         return (norm(x / a, y / b, z / c) - 1.0) * minimum(a, b, c)
 
     def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
-        if above:
-            return None
-        a, b, c = self.radii
-        size = 1.0 + level / min(self.radii)
-        return box_around((size * a, size * b, size * c))
+        return None if above else _box_of_radii(self.radii, level)
 
 
 @dataclass(frozen=True)
@@ -359,11 +363,7 @@ class Superellipsoid(_Powered):
         return (norm(norm(x / a, y / b, p=p), z / c, p=q) - 1.0) * minimum(a, b, c)
 
     def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
-        if above:
-            return None
-        a, b, c = self.radii
-        size = 1.0 + level / min(self.radii)
-        return box_around((size * a, size * b, size * c))
+        return None if above else _box_of_radii(self.radii, level)
 
 
 @dataclass(frozen=True)
