@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -77,6 +78,21 @@ def test_settings_are_checked_when_they_are_read(settings: dict[str, Any], wrong
     about = {"harnack": 1, "surfaces": [{"field": {"Sphere": {}}}], "settings": settings}
     with pytest.raises(hk.SceneFileError, match=f"settings: .*{wrong}"):
         scene_of(json.dumps(about))
+
+
+@pytest.mark.parametrize(
+    ("settings", "wrong"),
+    [
+        ({"level": math.inf}, "level"), ({"clip": hk.Slider(0, 1)}, "clip"),
+        ({"level": "x"}, "level"), ({"size": (10**9, 10**9)}, "size"),
+    ],
+)  # fmt: skip
+def test_what_could_not_be_read_is_not_written(
+    settings: dict[str, Any], wrong: str, tmp_path: Path
+) -> None:
+    with pytest.raises(hk.SceneFileError, match=wrong):
+        hk.write_scene(tmp_path / "a.json", hk.Sphere(1.0), **settings)
+    assert not any(tmp_path.iterdir())
 
 
 def test_scene_files_know_every_solid() -> None:

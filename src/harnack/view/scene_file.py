@@ -200,6 +200,9 @@ def text_of(what: Any, settings: Mapping[str, Any], origins: Origins = ()) -> st
         for name, one in settings.items()
         if one is not None and name not in sliders
     }
+    starts = {name: one.start for name, one in sliders.items()}
+    given = {name: one for name, one in settings.items() if one is not None}
+    _check_values(SavedScene(tuple(several), {**given, **starts}))
     if written:
         made["settings"] = written
     if sliders:
@@ -384,14 +387,15 @@ def _scene_of(given: Any, find: Callable[[str], Path] | None) -> SavedScene:
         for k, one in enumerate(cast("list[Any]", listed))
     )
     settings = _settings_of(_object(whole.get("settings", {}), "settings"), _KNOWN)
-    _check_values(SavedScene(surfaces, settings))
     sliders = _object(whole.get("sliders", {}), "sliders")
     made: dict[str, Slider] = {}
     for name, one in sliders.items():
         _check_name(name, SURFACE_SETTINGS, "slider")
         made[name] = _called(Slider, one, f"sliders: {name}")
         settings[name] = made[name].start
-    return SavedScene(surfaces, settings, made, tuple(origins))
+    scene = SavedScene(surfaces, settings, made, tuple(origins))
+    _check_values(scene)
+    return scene
 
 
 def _check_values(scene: SavedScene) -> None:
