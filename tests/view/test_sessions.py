@@ -12,6 +12,7 @@ import pytest
 import harnack as hk
 from harnack.geometry import shapes
 from harnack.geometry.mesh_shapes import icosphere
+from harnack.view import scene
 from harnack.view.scene import Live, difference
 from harnack.view.session import Client, QuestionError, Session
 
@@ -88,6 +89,14 @@ def test_a_probe_says_the_value_next_to_the_level(live: Live) -> None:
         {"kind": "probe", "origin": [0.3, 0.2, 6.0], "direction": [0, 0, -1]}
     )
     assert found["value"] == pytest.approx(6.0, abs=0.01)
+
+
+def test_more_colors_than_are_drawn_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    live = Live.of([hk.Sphere(1.0), hk.Sphere(0.5)], {})
+    assert len(live.first["surfaces"]) == 2
+    monkeypatch.setattr(scene, "_MOST_PAINTS", 5)
+    with pytest.raises(ValueError, match="have 6 colors"):
+        live.state(live.start)
 
 
 def test_what_is_sent_is_what_has_changed(live: Live) -> None:

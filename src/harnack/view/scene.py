@@ -70,6 +70,8 @@ _NOWHERE = 99
 # Paints of a surface: the first is its own, then those of what spans what a mesh leaves open and of
 # faces on a section, then those of isolines.
 _MENDED, _CUT = 1, 2
+# `PAINTS` in drawing.js.
+_MOST_PAINTS = 2048
 _OF_STUDIO = ("boundary", "boundary_material", "thickness")
 # Of gzip: more takes longer, and gains little.
 _LEVEL = 5
@@ -206,6 +208,12 @@ class Live:
             _traced(one, self.placed(one), *self.rays[min(k, len(self.rays) - 1)])
             for k, one in enumerate(drawn)
         ]
+        colors = sum(len(one["paints"]) for one in surfaces)
+        if colors > _MOST_PAINTS:
+            raise ValueError(
+                f"the surfaces and their isolines have {colors:,} colors, and what moves is drawn "
+                f"with {_MOST_PAINTS:,} at most: draw fewer surfaces at once"
+            )
         curves: list[Any] = []
         for k, one in enumerate(drawn):
             if all(one.surface.field is not other.surface.field for other in drawn[:k]):
