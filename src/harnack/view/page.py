@@ -127,7 +127,7 @@ def _frames(live: Live, advance: Any) -> Plain:
 
 
 def script(*names: str) -> str:
-    """JavaScript modules of this folder as one."""
+    """The JavaScript modules of this folder, joined into one script."""
     parts = [resource(name) for name in names]
     text = "\n".join(re.sub(r"^import .*?;\n", "", one, flags=re.M | re.S) for one in parts)
     return re.sub(r"^export ", "", text, flags=re.M)

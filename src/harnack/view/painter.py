@@ -159,7 +159,7 @@ class Painter:
 
 @dataclass(frozen=True)
 class _Casting:
-    """Surfaces as what casts the shadow on the floor."""
+    """Surfaces that cast shadows on the floor."""
 
     mi: Any
     painted: Sequence[Painted]
@@ -175,7 +175,7 @@ class _Casting:
 def _color(
     mi: Any, paints: Sequence[Mapping[str, Any]], paint: Any, in_front: Any
 ) -> tuple[Any, Any]:
-    """The colors of paints, and whether they are glossy."""
+    """For each ray the color of the paint that it meets, and whether that is glossy."""
     color, glossy = mi.Color3f(0), mi.Bool(False)
     for k, one in enumerate(paints):
         sides = (_vector(mi, one[name], mi.Color3f) for name in ("front", "back"))
@@ -185,7 +185,7 @@ def _color(
 
 
 def _vector(mi: Any, numbers: Any, kind: Any = None) -> Any:
-    """Numbers that no kernel is compiled anew for."""
+    """Three numbers as parameters of kernels, so that other numbers compile no other kernel."""
     return (mi.Vector3f if kind is None else kind)(
         *(dr.opaque(mi.Float, float(x)) for x in numbers)
     )
@@ -201,7 +201,7 @@ def _matrix(eye: Eye) -> FloatArray:
 def _numbers(
     seen: dict[str, Any], show: str, behind: Sequence[float], size: tuple[int, int]
 ) -> Pixels:
-    """Numbers as colors."""
+    """A picture of normals, depths, evaluations or outcomes, as colors."""
     met, lost = to_numpy(seen["met"]), to_numpy(seen["lost"])
     picture = np.empty((len(met), 3))
     picture[:] = behind

@@ -1,4 +1,4 @@
-"""What is drawn live: surfaces on the studio's stage, each a kernel for other GPUs and its data.
+"""Live scenes: surfaces on the studio's stage, each as a kernel for other GPUs with its data.
 
 Everything here is plain: numbers, lists and text, as `drawing.js` takes it.
 """
@@ -77,13 +77,13 @@ _OF_STUDIO = ("boundary", "boundary_material", "thickness")
 _LEVEL = 5
 _OF_STAGE = ("camera", "backdrop", "up", "show")
 SHOWS = ("shaded", "normal", "depth", "evaluations", "status")
-"""What a page can show."""
+"""The values of `show` that pages and views have."""
 _SIZE = (4, 3)
 
 
 @dataclass(frozen=True)
 class Moved:
-    """What a person has moved.
+    """The state of a live scene: its sliders, its edited curve and its cut.
 
     values: of all sliders. loops: vertices (n, 3) in the place of those of the field's curve.
     cut: a volume that cuts all surfaces; a half-space opens them, as `section` of `level_set` does.
@@ -96,7 +96,8 @@ class Moved:
 
 @dataclass(frozen=True)
 class Live:
-    """What is drawn live, where it stands, and rays to each of its surfaces as it was at first.
+    """A live scene: what is drawn as a function of sliders, where it stands on the stage, and the
+    rays by which devices are checked.
 
     editable: whether the vertices of its curve can be moved. up: as `render` takes it. show: what
     is shown at first. middle, reach: a ball around what is seen at first, in the surfaces' own
@@ -160,7 +161,7 @@ class Live:
         )  # fmt: skip
 
     def scene(self, title: str) -> Plain:
-        """All that a page has to know at first."""
+        """All that a page is given when it opens, as plain data for `drawing.js`."""
         place = self.placement
         return {
             "title": title,
@@ -183,7 +184,7 @@ class Live:
 
     @cached_property
     def first(self) -> Plain:
-        """What is drawn at first, from which all that is drawn later differs in little."""
+        """The state at the start. Later states are sent as differences from it."""
         return self.state(self.start)
 
     @property
@@ -198,11 +199,12 @@ class Live:
 
     @property
     def start(self) -> Moved:
-        """Nothing has been moved yet."""
+        """The state in which nothing has been moved yet."""
         return Moved(self.subject.starts)
 
     def state(self, moved: Moved) -> Plain:
-        """The surfaces, and the curves that they end at. Arrays in it are NumPy's: see `packed`."""
+        """The surfaces of a state as plain data, and the curves at which they end. Its arrays are
+        NumPy's; `packed` makes them text."""
         drawn = self.drawn(moved)
         surfaces = [
             _traced(one, self.placed(one), *self.rays[min(k, len(self.rays) - 1)])
@@ -221,7 +223,7 @@ class Live:
         return {"surfaces": surfaces, "curves": [np.asarray(one).tolist() for one in curves]}
 
     def drawn(self, moved: Moved) -> list[StudioObject]:
-        """The same as objects of the studio."""
+        """The surfaces of a state as objects of the studio."""
         what, settings = self.subject.at(moved.values)
         drawn = _objects(what, settings)
         curve = _curve_of(drawn) if self.editable else None
@@ -246,7 +248,7 @@ class Live:
         ]
 
     def rendered(self, moved: Moved, **others: Any) -> Picture:
-        """A picture of it by `render`. others: its settings besides those of what is drawn."""
+        """A still picture of a state by `render`. others: settings of `render`."""
         _, settings = self.subject.at(moved.values)
         own = {name: settings[name] for name in ("isolines", "cut_material") if name in settings}
         drawn = self.drawn(moved)
@@ -290,7 +292,7 @@ class Live:
         return replace(one, surface=replace(one.surface, tolerance=tolerance))
 
     def placed(self, one: StudioObject) -> PlacedSurface:
-        """On the stage, prepared."""
+        """A surface on the stage, with its data on the backend."""
         size = float(np.linalg.norm(np.diff(box_of(one.surface), axis=0)))
         backend = choose_backend("single")
         return PlacedSurface.of(one.surface, self.placement, backend, one.isolines, size)
@@ -374,7 +376,8 @@ def _seen(camera: Camera, placement: Placement, points: FloatArray) -> Plain:
 
 
 def _traced(one: StudioObject, placed: PlacedSurface, o: FloatArray, d: FloatArray) -> Plain:
-    """A surface as its kernel, the data of it, its colors, and rays with Dr.Jit's answers."""
+    """A surface as plain data: its shader, the words that the shader reads, its colors, and rays
+    with Dr.Jit's answers."""
     backend = choose_backend("single")
     lanes = {
         "o": to_vector3(backend, o),
@@ -412,7 +415,7 @@ def _traced(one: StudioObject, placed: PlacedSurface, o: FloatArray, d: FloatArr
 
 
 def status_of(met: SurfaceHit) -> Any:
-    """A `Status` each."""
+    """The `Status` of each ray."""
     hit, out, miss = (
         type(met.evaluations)(int(one)) for one in (Status.HIT, Status.OUT_OF_STEPS, Status.MISS)
     )
@@ -420,19 +423,19 @@ def status_of(met: SurfaceHit) -> Any:
 
 
 def paint_of(met: SurfaceHit) -> Any:
-    """Which of `paints_of` is met."""
+    """The index in `paints_of` of the color that each ray meets."""
     index = cast("Any", type(met.evaluations))
     plain = dr.select(met.cut, index(_CUT), dr.select(met.mended, index(_MENDED), index(0)))
     return dr.select(met.line > 0, index(met.line) + _CUT, plain)
 
 
 def placed_tolerance(one: StudioObject, placed: PlacedSurface) -> float:
-    """On the stage."""
+    """The tolerance as a length of the stage."""
     return one.surface.tolerance.distance * float(placed.scale[0])
 
 
 def _place(made: Recording, label: str) -> int:
-    """Where a result is; that of no lane's behind all others."""
+    """The place of a result in the shader's output, or `_NOWHERE` if it is 0 for all rays."""
     if label in made.constants:
         return _NOWHERE
     return made.shader.results.index(label)
@@ -476,7 +479,8 @@ def _paint(front: Any, back: Any, glossy: bool) -> Plain:
 
 
 def _reflectances(bsdf: Mapping[str, Any]) -> tuple[Any, Any, bool]:
-    """Of both sides, as `shaded` draws them, and whether it is glossy."""
+    """The reflectances of a BSDF's two sides, as shaded pictures use them, and whether it is
+    glossy."""
     mi = register()
     made = mi.load_dict(dict(bsdf), parallel=False)
     colors: list[Any] = []

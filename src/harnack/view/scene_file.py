@@ -90,7 +90,7 @@ Origins = Sequence[tuple[Field, Plain]]
 
 
 class SceneFileError(ValueError):
-    """What is no scene file, or cannot be written into one."""
+    """A text that is no scene file, or something that no scene file can hold."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ class SavedScene:
 
 
 def of_surfaces(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Those settings that `level_set` takes."""
+    """Of some settings those that `level_set` takes."""
     return {name: one for name, one in settings.items() if name in SURFACE_SETTINGS}
 
 
@@ -146,8 +146,8 @@ def read_scene(path: str | os.PathLike[str]) -> SavedScene:
 
 
 def _beside(folder: Path, name: str) -> Path:
-    """A file by its name, or where there is none one of that name in the folder, for scenes that
-    were sent to somebody else together with their files."""
+    """The path of a file that a scene names. If it does not exist, a file of the same name beside
+    the scene is taken: scenes are sent to others together with their files."""
     found = folder / name
     return found if found.exists() or not (folder / found.name).exists() else folder / found.name
 
@@ -321,9 +321,9 @@ def _plain(value: Any) -> Any:
 
 
 def _number(value: float) -> Any:
-    """Infinite ends are "inf" and "-inf": JSON has numbers for neither."""
+    """A number for JSON, which has no infinities: they become "inf" and "-inf"."""
     if math.isnan(value):
-        raise SceneFileError("a number that is none (NaN) cannot be written")
+        raise SceneFileError("NaN cannot be written")
     return value if math.isfinite(value) else ("inf" if value > 0 else "-inf")
 
 

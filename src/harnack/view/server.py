@@ -1,4 +1,4 @@
-"""`view`: a small server on this machine, to whose page Python sends what has changed."""
+"""`view`: a small server on this machine; its page asks Python for whatever changes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 __all__ = ["View", "view"]
 
 _LOCAL = ("127.0.0.1", "::1", "localhost")
-# Bytes of a message, and messages of a client that wait.
+# The longest message in bytes, and the most questions of a client that may wait.
 _LONGEST = 4 * 2**20
 _WAITING = 8
 
@@ -44,13 +44,13 @@ class View:
     _thread: threading.Thread
 
     def close(self) -> None:
-        """Serve it no longer."""
+        """Stop serving the page."""
         if self._thread.is_alive():
             self._loop.call_soon_threadsafe(self._loop.stop)
             self._thread.join()
 
     def wait(self) -> None:
-        """Until Ctrl-C, or until it is closed elsewhere."""
+        """Wait until Ctrl-C is pressed, or until the view is closed elsewhere."""
         try:
             while self._thread.is_alive():
                 self._thread.join(0.2)
@@ -197,8 +197,8 @@ class _Server:
         return View(f"http://{shown}:{bound}/{query}", loop, thread)
 
     def _refuse(self, request: web.Request) -> str:
-        """Why a request is not answered; nothing if it is. A page of somebody else's must not ask
-        this server, by whatever name it calls it."""
+        """The reason to refuse a request, or "" to answer it. Pages of other servers must not
+        reach this one under any host name."""
         name = request.host.rsplit(":", 1)[0].strip("[]")
         if self.token:
             given = request.query.get("token", "")

@@ -1,4 +1,4 @@
-"""What Python answers to whoever looks at a live surface, by whatever way the questions come.
+"""Answers to the questions of a page about its live scene, whichever way they come.
 
 A question is {"kind": ..., ...}, plain numbers, lists and text from outside, none of it trusted.
 """
@@ -42,11 +42,11 @@ if TYPE_CHECKING:
 
 __all__ = ["Client", "QuestionError", "Session", "pose_of"]
 
-# Of all curves of a message together, so that no message fills the memory.
+# Points of all curves of one message, so that no message fills the memory.
 _MOST_POINTS = 20_000
 # Steps of a ray that are drawn.
 _MOST_STEPS = 200
-# Seconds between words about how much is done.
+# Seconds between two messages about progress.
 _TELL_EVERY = 0.1
 _LARGEST_PICTURE = 8192
 
@@ -55,19 +55,19 @@ Tell = Callable[[float], None]
 
 
 def _nobody(part: float) -> None:
-    """Nobody is told."""
+    """Progress that nobody asked for."""
 
 
 class QuestionError(ValueError):
-    """A question that makes no sense."""
+    """A question that is malformed or asks for something impossible."""
 
 
 class Ended(Exception):
-    """Nobody waits for the answer any more."""
+    """Work was stopped, because nobody waits for its answer any more."""
 
 
 class Client:
-    """One client's questions as texts, and the answers as what is sent back."""
+    """Translates between one client's messages and the questions and answers of a `Session`."""
 
     def __init__(self, live: Live) -> None:
         self.session = Session(live)
@@ -127,7 +127,7 @@ class Client:
 
 
 class Session:
-    """Answers about what is drawn live."""
+    """Answers questions about a live scene, as one client sees it."""
 
     def __init__(self, live: Live) -> None:
         self.live = live
@@ -158,7 +158,7 @@ class Session:
         return kinds[kind](question, self.moved(question), tell)
 
     def moved(self, question: Mapping[str, Any]) -> Moved:
-        """What a person has moved.
+        """The state that a question asks about.
 
         Raises:
             QuestionError: it makes no sense.
@@ -286,14 +286,14 @@ class Session:
         return {"png": base64.b64encode(made._repr_png_()).decode()}
 
     def _camera(self, question: Mapping[str, Any]) -> Camera:
-        """Of a pose on the stage, in the surfaces' coordinates."""
+        """The camera of a question, in the surfaces' coordinates."""
         place = self.live.placement
         eye, target, fov = pose_of(question.get("camera"))
         eye, target = (place.undo(one[None])[0] for one in (eye, target))
         return Camera(position=tuple(eye.tolist()), target=tuple(target.tolist()), fov=fov)
 
     def _save(self, question: Mapping[str, Any], moved: Moved, tell: Tell) -> Plain:
-        """What is seen as the text of a scene file, and what of it a text cannot hold."""
+        """The text of a scene file, and the names of sliders that it cannot hold."""
         text, lost = self.live.saved(
             moved, camera=self._camera(question), show=question.get("show", "shaded"),
             backdrop=question.get("ground", self.live.ground), up=self.live.up,

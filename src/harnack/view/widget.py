@@ -1,4 +1,4 @@
-"""A view as a widget of a notebook, by anywidget: Jupyter, VS Code, Colab, marimo."""
+"""A view as a widget of a notebook, by anywidget."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Widget(anywidget.AnyWidget):
         self.on_msg(self._hear)
 
     def close(self) -> None:
-        """Ends it here and in the page."""
+        """Stop answering, and remove the widget from the page."""
         self._client.is_gone = True
         self._worker.shutdown(wait=False, cancel_futures=True)
         super().close()
@@ -102,5 +102,5 @@ class Widget(anywidget.AnyWidget):
 
 
 def _listed(value: Any) -> Any:
-    """NumPy's arrays and numbers as JSON has them."""
+    """NumPy's arrays and numbers as Python's lists and numbers."""
     return value.tolist()
