@@ -212,6 +212,7 @@ export class Panel {
   async open() {
     if (!navigator.gpu) return this.fall_back("This browser has no WebGPU here (the page must come "
       + "from https, or from 127.0.0.1)");
+    this.say("Compiling the surface for this GPU ...");
     const adapter = await navigator.gpu.requestAdapter({ powerPreference: "high-performance" });
     if (!adapter) return this.fall_back("No GPU was found for WebGPU");
     const { maxStorageBufferBindingSize, maxBufferSize, maxStorageBuffersPerShaderStage } = adapter.limits;
@@ -220,7 +221,6 @@ export class Panel {
     device.lost.then((e) => { if (!this.is_closed) this.fall_back(`The GPU was lost (${e.message})`); });
     device.addEventListener("uncapturederror", (e) => console.error(e.error.message));
     if (this.is_closed) return device.destroy();
-    this.say("Compiling the surface for this GPU ...");
     const drawing = new Drawing(device, this.scene, this.canvas, this.passes);
     try {
       await drawing.compile();
