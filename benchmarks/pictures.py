@@ -13,7 +13,7 @@ import numpy as np
 import harnack as hk
 from harnack.rendering import Camera, register
 from harnack.rendering.integrator import PathTracer
-from harnack.rendering.light_paths import expose
+from harnack.rendering.light_paths import Exposing, expose
 from harnack.rendering.stage import StudioObject, material_of, studio
 
 _SIZE, _SPP, _ROUNDS = (400, 300), 16, 3
@@ -79,7 +79,7 @@ def _radiance(mi: Any, scene: Any, clamp: float | None = None) -> Callable[[], n
 
     def draw() -> np.ndarray:
         sensor = scene.sensors()[0]
-        image = expose(mi, scene, sensor, tracer, spp=_SPP, seed=0, advance=lambda _: None).image
+        image = expose(Exposing(mi, scene, sensor, tracer, _SPP, 0), lambda _: None).image
         return image[..., :3]
 
     return draw

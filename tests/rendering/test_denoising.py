@@ -12,7 +12,7 @@ import harnack as hk
 from harnack.geometry import shapes
 from harnack.rendering import register, shape
 from harnack.rendering.integrator import PathTracer
-from harnack.rendering.light_paths import Exposure, Pace, expose, pace_of
+from harnack.rendering.light_paths import Exposing, Exposure, Pace, expose, pace_of
 
 mi = register()
 POLYGON = hk.SolidAngle(shapes.wavy_polygon(24))
@@ -52,10 +52,8 @@ def exposed(features: bool, bsdf: dict[str, Any], **settings: Any) -> Exposure:
             "ball": shape(hk.Sphere(1.0), bsdf=bsdf),
         }
     )
-    return expose(
-        mi, scene, scene.sensors()[0], PathTracer(mi), spp=16, seed=1, advance=lambda _: None,
-        features=features, **settings,
-    )  # fmt: skip
+    exposing = Exposing(mi, scene, scene.sensors()[0], PathTracer(mi), 16, 1, features, **settings)
+    return expose(exposing, lambda _: None)
 
 
 CLAY = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.7, 0.5, 0.2]}}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import subprocess
 import sys
@@ -16,6 +17,7 @@ import harnack as hk
 from harnack.geometry import shapes
 from harnack.rendering import MATERIALS, SHOW_MODES, Camera, Material, picture, register, render
 from harnack.rendering.images import exr_bytes, tone_mapped
+from harnack.rendering.light_paths import Exposing
 from harnack.rendering.scales import viridis
 from harnack.rendering.stage import on_ground
 
@@ -85,7 +87,8 @@ def test_the_same_seed_draws_the_same_picture() -> None:
 @pytest.mark.slow
 def test_bands_leave_no_seam(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = draw(spp=64)
-    monkeypatch.setattr("harnack.rendering.picture.PATHS_A_BAND", 64 * 50)
+    narrow = functools.partial(Exposing, paths_a_band=64 * 50)
+    monkeypatch.setattr("harnack.rendering.picture_job.Exposing", narrow)
     bands = draw(spp=64)
     np.testing.assert_array_equal(whole, bands)
 

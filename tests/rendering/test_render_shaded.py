@@ -285,13 +285,13 @@ def test_what_first_rays_have_seen_is_not_traced_again(monkeypatch: pytest.Monke
     """Edges are the mean of nine samples, one of which is that of the first ray: the same picture
     as if all nine were traced anew."""
     counts: list[int] = []
-    own = shaded._Painter.refine
+    own = shaded.Shading.refine
 
-    def refine(self: Any, chosen: Any, offsets: Any, *rest: Any) -> Any:
-        counts.append(len(offsets))
-        return own(self, chosen, offsets, *rest)
+    def refine(self: Any, *part: Any) -> Any:
+        counts.append(len(self.offsets))
+        return own(self, *part)
 
-    monkeypatch.setattr(shaded._Painter, "refine", refine)
+    monkeypatch.setattr(shaded.Shading, "refine", refine)
     image = drawn(shape(Sphere()), spp=9)
     monkeypatch.setattr(shaded, "grid_offsets", lambda spp: grid_offsets(spp) + 1e-12)
     again = drawn(shape(Sphere()), spp=9)

@@ -211,6 +211,18 @@ def check_integer(name: str, number: Any) -> int:
     return integer
 
 
+def check_tiles(tiles: Any, *, divided: bool) -> int | None:
+    """How many parts a task is cut into, or None; divided: whether it is cut at all."""
+    if tiles is None:
+        return None
+    count = check_integer("tiles", tiles)
+    if isinstance(tiles, bool) or count < 1:
+        raise ValueError(f"tiles must be a number of parts, at least 1, not {tiles!r}")
+    if not divided:
+        raise ValueError("tiles: parts are drawn one by one with a client or a checkpoint only")
+    return count
+
+
 def check_camera(camera: Any) -> Camera:
     """A `Camera`: the given one, one at a position (x, y, z), or the default for None."""
     if camera is None:

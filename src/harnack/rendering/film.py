@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from harnack.backend import FloatArray
 from harnack.backend.numbers import finite
+from harnack.cluster.parts import Arrays, crew
 from harnack.files.file_format import check_writable, write_atomically
 from harnack.geometry import Box
 from harnack.rendering.arguments import OF_PICTURES, check_camera, check_integer, check_size
@@ -66,6 +67,8 @@ def animate(
     size: tuple[int, int] = _SIZE,
     show: str = "shaded",
     progress: bool = True,
+    client: Any = None,
+    checkpoint: str | os.PathLike[str] | None = None,
     **settings: Any,
 ) -> Film:
     """Draw a film and write it to `path`; notebooks show what is returned.
@@ -82,6 +85,8 @@ def animate(
     turn: degrees that the camera goes around during the film.
     camera: as `render` takes it. What it does not say (target, distance, angle of view) is the same
         for all pictures, and such that all is always in view. It goes around its target.
+    client, checkpoint: as `render` takes them; workers draw whole pictures, and a film with more of
+        them, or at another speed, draws only those that the folder does not have.
     settings: of `render`; `size` and `show` are the same for all pictures.
 
     Raises what `render` raises; ValueError for no or too many frames, and for another file type;
@@ -107,13 +112,37 @@ def animate(
         given = {"what": what, "camera": camera, **settings}
         moments = [{name: _at(value, s) for name, value in given.items()} for s in steps.tolist()]
         cameras = _cameras(moments, steps, turn, size)
-        with progress_bar("film", progress) as advance:
-            for moment, one in zip(moments, cameras, strict=True):
-                frame: dict[str, Any] = {**moment, "camera": one}
-                picture = render(frame.pop("what"), size=size, show=show, progress=False, **frame)
-                add(picture.shown)
+        frames_of = [
+            {**moment, "camera": one} for moment, one in zip(moments, cameras, strict=True)
+        ]
+        job, parts = _job(frames_of, {"size": size, "show": show, "progress": False})
+        with progress_bar("film", progress) as advance, crew(client, checkpoint) as workers:
+            for found in workers.each(job, "frame", parts):
+                add(found["shown"])
                 advance(1 / count)
     return Film(target, size)
+
+
+@dataclass(frozen=True)
+class _FilmJob:
+    """What all pictures of a film have in common, as arguments of `render`."""
+
+    arguments: dict[str, Any]
+
+    def frame(self, others: dict[str, Any]) -> Arrays:
+        """The pixels of one picture. others: its other arguments."""
+        given = {**self.arguments, **others}
+        return {"shown": render(given.pop("what"), **given).shown}
+
+
+def _job(
+    frames: list[dict[str, Any]], same: dict[str, Any]
+) -> tuple[_FilmJob, list[tuple[dict[str, Any]]]]:
+    """The job of a film, and what each picture has of its own."""
+    first = frames[0]
+    moving = [name for name in first if any(one[name] is not first[name] for one in frames)]
+    same = {**same, **{name: first[name] for name in first if name not in moving}}
+    return _FilmJob(same), [({name: one[name] for name in moving},) for one in frames]
 
 
 def check_film_path(path: str | os.PathLike[str]) -> Path:

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from harnack.backend import Mask, Real, to_numpy
 from harnack.rendering.integrator import PathTracer, Radiance, SobolSampler
 from harnack.rendering.mitsuba import index_of, refracted, transmittance
-from harnack.rendering.shading import Light, bands, film_places, uploaded
+from harnack.rendering.shading import Hands, Light, OwnHands, bands, film_places, uploaded
 from harnack.rendering.world import World, leaving_ray
 
 # Paths of one band at most: about two seconds on a CPU. Ctrl-C works between bands.
@@ -44,42 +44,74 @@ class Exposure:
     normal: npt.NDArray[np.float32] | None = None
 
 
-def expose(
-    mi: Any,
-    scene: Any,
-    sensor: Any,
-    tracer: PathTracer,
-    *,
-    spp: int,
-    seed: int,
-    advance: Callable[[float], None],
-    features: bool = False,
-    paths_a_band: int = PATHS_A_BAND,
-) -> Exposure:
-    """Radiance of all pixels, each with `spp` samples, band by band.
+@dataclass(frozen=True)
+class Exposing:
+    """A sensor, and who follows light paths for it: what is done pixel by pixel.
 
-    Each band of pixels gets all its samples at once, so that samplers can stratify them, and every
-    pixel averages its own samples only. So there are no sums whose order threads could change: the
-    same seed gives the same picture.
+    features: whether to find albedos and normals too. paths_a_band: at once, at most.
+    """
+
+    mi: Any
+    scene: Any
+    sensor: Any
+    tracer: PathTracer
+    spp: int
+    seed: int
+    features: bool = False
+    paths_a_band: int = PATHS_A_BAND
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+        width, height = (int(n) for n in self.sensor.film().crop_size())
+        return width, height
+
+    def pixels(self, start: int, stop: int) -> tuple[npt.NDArray[np.float32], int]:
+        """Means (n, 4) of the paths of pixels from `start` to `stop`, counted by rows, as in an
+        `Exposure`, with features (n, 10); and how many paths ran out of steps.
+
+        Each band of pixels gets all its samples at once, so that samplers can stratify them, and
+        every pixel averages its own samples only. So there are no sums whose order threads could
+        change: the same seed gives the same picture, in whatever parts it is drawn.
+        """
+        mi, spp = self.mi, self.spp
+        rows: list[npt.NDArray[np.float32]] = []
+        lost = 0
+        for first, last in bands(stop - start, max(1, self.paths_a_band // spp)):
+            lane = dr.arange(mi.UInt32, (last - first) * spp)
+            samples = dr.opaque(mi.UInt32, spp)
+            pixel = lane // samples + dr.opaque(mi.UInt32, start + first)
+            found, waves = follow(
+                mi, self.scene, self.sensor, self.tracer, pixel, lane % samples, self.seed,
+                self.features,
+            )  # fmt: skip
+            covered = dr.select(found.valid, mi.Float(1), 0)
+            means = [mi.Vector4f(*as_rgb(mi, found.light, waves), covered)]
+            if found.features is not None:
+                means += [as_rgb(mi, found.features.albedo, waves), found.features.normal]
+            means = [to_numpy(mean_of_blocks(one, spp)) for one in means]
+            rows.append(np.concatenate(means, axis=1))
+            lost += int(dr.count(found.lost)[0])
+        return np.concatenate(rows), lost
+
+
+def expose(
+    exposing: Exposing, advance: Callable[[float], None], hands: Hands | None = None
+) -> Exposure:
+    """Radiance of all pixels.
 
     advance: told what part of the picture has been finished since the last call.
-    features: whether to find albedos and normals too.
+    hands: call the method `pixels`, in the place of `exposing` itself.
     """
-    width, height = (int(n) for n in sensor.film().crop_size())
+    hands = OwnHands(exposing) if hands is None else hands
+    width, height = exposing.size
+    features = exposing.features
     image = np.empty((width * height, 10 if features else 4), dtype=np.float32)
     lost = 0
-    for start, stop in bands(width * height, max(1, paths_a_band // spp)):
-        lane = dr.arange(mi.UInt32, (stop - start) * spp)
-        samples = dr.opaque(mi.UInt32, spp)
-        pixel, sample = lane // samples + dr.opaque(mi.UInt32, start), lane % samples
-        found, waves = follow(mi, scene, sensor, tracer, pixel, sample, seed, features)
-        covered = dr.select(found.valid, mi.Float(1), 0)
-        means = [mi.Vector4f(*as_rgb(mi, found.light, waves), covered)]
-        if found.features is not None:
-            means += [as_rgb(mi, found.features.albedo, waves), found.features.normal]
-        means = [to_numpy(mean_of_blocks(one, spp)) for one in means]
-        image[start:stop] = np.concatenate(means, axis=1)
-        lost += int(dr.count(found.lost)[0])
+    parts = hands.cut(width * height, max(1, exposing.paths_a_band // exposing.spp))
+    for (start, stop), (means, gone) in zip(parts, hands.each("pixels", parts), strict=True):
+        image[start:stop] = means
+        lost += int(gone)
         advance((stop - start) / (width * height))
     image = image.reshape(height, width, -1)
     if not features:

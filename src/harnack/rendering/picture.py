@@ -9,42 +9,33 @@ import warnings
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
+from harnack.cluster.parts import crew
 from harnack.fields import Field
-from harnack.fields.field import instead_of_field
-from harnack.rendering.arguments import (
-    OF_STUDIO,
-    Request,
-    check_memory,
-    check_spp,
-    refuse_studio_settings,
-)
-from harnack.rendering.backdrops import Gradient, Ground
+from harnack.rendering.arguments import OF_STUDIO, Request, check_tiles, refuse_studio_settings
+from harnack.rendering.backdrops import Ground
 from harnack.rendering.camera import Camera
 from harnack.rendering.images import Picture, check_picture_path, tone_mapped, write_image
-from harnack.rendering.integrator import PathTracer
 from harnack.rendering.isolines import Isolines
 from harnack.rendering.light_paths import (
-    PATHS_A_BAND,
     SHORT,
+    Exposing,
     denoised,
     expose,
     load_denoiser,
     pace_of,
 )
-from harnack.rendering.mitsuba import load_dictionary, load_scene_file
-from harnack.rendering.placement import Placement
-from harnack.rendering.plugins import register, stand_in
-from harnack.rendering.shaded import shaded
-from harnack.rendering.shading import flat, wall
-from harnack.rendering.stage import Studio, StudioObject, studio
-from harnack.rendering.studio_scene import MaterialLike, studio_objects
+from harnack.rendering.picture_job import EDGE_SPP, Elsewhere, PictureJob
+from harnack.rendering.shaded import Shading, shaded
+from harnack.rendering.shading import Hands, OwnHands, flat, wall
+from harnack.rendering.stage import Studio
+from harnack.rendering.studio_scene import MaterialLike
 from harnack.rendering.views import VIEWS, Viewer, drawn
 from harnack.tracer import LevelSet
 
@@ -102,11 +93,8 @@ class _Lines:
 ShowMode = Literal["color", "shaded", "normal", "evaluations", "status", "depth", "value"]
 # Modes with ground and lights, and what they trace.
 _LIT = {"color": "light paths", "shaded": "rays"}
-_EDGE_SPP = 9
-_SIZE = (800, 600)
 _IN_AOV = (".R", ".G", ".B", ".A")
 Image = npt.NDArray[Any]
-Draw = Callable[[Advance], tuple[Image, int]]
 
 
 def render(
@@ -133,6 +121,9 @@ def render(
     seed: int = 0,
     denoise: bool = False,
     progress: bool | Advance = True,
+    client: Any = None,
+    checkpoint: str | os.PathLike[str] | None = None,
+    tiles: int | None = None,
     **settings: Any,
 ) -> Picture:
     """Draw fields or a Mitsuba scene, and write the picture to `path` if there is one.
@@ -167,6 +158,14 @@ def render(
     progress: whether a bar on stderr shows how far the picture is, and a line before it how long a
         long one will take; or a function that is told each part, of 1, that is done, in its place.
         What it raises ends the picture.
+    client: a `dask.distributed.Client`, or the address of a scheduler, whose workers draw parts of
+        the picture: the same picture bit for bit, whatever the parts and however many the workers.
+        What is made of the whole picture (outlines, hidden sky, noise taken out) is made here.
+        Needs `pip install harnack[cluster]`, here and there.
+    checkpoint: a folder, in which parts that are done are kept, so that a picture that was stopped
+        goes on from there. It is not emptied when the picture is done.
+    tiles: how many parts a picture is cut into, with a client or a checkpoint; by default as suits
+        the workers.
 
     In the studio only:
 
@@ -212,83 +211,84 @@ def render(
     arguments = locals()  # the settings by name
     target = None if path is None else check_picture_path(path)
     asked = Request.checked(arguments)
+    tiles = check_tiles(tiles, divided=client is not None or checkpoint is not None)
     if asked.denoise:
         load_denoiser()
     if target is not None and asked.colorbar and target.suffix.lower() == ".exr":
         raise ValueError(f"{target}: EXR files hold the numbers; a color bar is drawn in .png")
-    mi = register()
-    in_studio = isinstance(what, Field | LevelSet | list | tuple)
-    if in_studio:
-        check_memory(asked.show, *(asked.size or _SIZE))
-        on_stage = studio_objects(
-            what, material, settings, boundary=boundary, boundary_material=boundary_material,
-            cut=cut_material, isolines=asked.isolines, thickness=thickness,
-        )  # fmt: skip
-        stage, scene = _staged(mi, asked, on_stage, up)
-    else:
+    if not _is_of_studio(what):
         refuse_studio_settings({name: arguments[name] for name in OF_STUDIO} | settings)
-        stage, scene = None, _loaded(mi, what, asked.size)
-        check_memory(asked.show, *map(int, scene.sensors()[0].film().crop_size()))
-    names: list[str] | None = None
-    tracer = stand_in(mi, scene) if show == "color" else None
-    if show in VIEWS:
-        placement = Placement.identity() if stage is None else stage.placement
-        viewer = Viewer.of(mi, scene, scene.sensors()[0], placement, asked.of)
-        if isinstance(asked.backdrop, Gradient):
-            viewer = replace(viewer, background=asked.backdrop.bottom)
-        view = viewer.look()
-        image = VIEWS[show].numbers(view)
-        bar = str(of) if asked.colorbar is True and isinstance(of, str) else asked.colorbar
-        shown = drawn(show, viewer, view, asked.value_range, bar, asked.spp or _EDGE_SPP)
-    elif show == "color" and tracer is None:
-        image, shown, names = _by_mitsuba(mi, scene, asked)
-    else:
-        draw = (
-            _shaded(mi, scene, asked, stage)
-            if tracer is None
-            else _radiance(mi, scene, asked, tracer, progress)
-        )
-        with progress_bar("rendering", progress) as advance:
-            image, lost = draw(advance)
-        _warn_of(lost, _LIT[show])
-        image, shown = _before_backdrop(mi, scene.sensors()[0], image, stage, show)
+    job = PictureJob(what, replace(asked, progress=None), settings)
+    drawing = job.drawing
+    if client is not None or checkpoint is not None:
+        _check_can_be_sent(what, drawing)
+    with crew(client, checkpoint, tiles) as workers:
+        own = workers.client is None and workers.folder is None
+        hands = OwnHands(drawing) if own else Elsewhere(workers, job)
+        image, shown, names = _drawn(job, hands, of, progress, alone=client is None)
     if target is not None:
         exact = target.suffix.lower() == ".exr"
-        write_image(mi, target, image if exact else shown, names)
+        write_image(job.mi, target, image if exact else shown, names)
     return Picture.of(image, shown)
 
 
-def _staged(mi: Any, asked: Request, drawn: list[StudioObject], up: Any) -> tuple[Studio, Any]:
-    """What is drawn, in the studio, and the scene of it."""
-    made = studio(
-        mi, drawn, size=asked.size or _SIZE, camera=asked.camera, backdrop=asked.backdrop,
-        up="z" if up is None else up, bare=asked.show not in _LIT,
-        traced_light=asked.show == "color",
+def _drawn(
+    job: PictureJob, hands: Hands, of: Any, progress: bool | Advance, *, alone: bool
+) -> tuple[Image, npt.NDArray[np.uint8], list[str] | None]:
+    """The numbers of a picture, its pixels, and the names of its channels if it has its own.
+
+    of: as it was given, the title of a color bar. alone: whether this process draws everything.
+    """
+    mi, asked, drawing, sensor = job.mi, job.asked, job.drawing, job.scene.sensors()[0]
+    if drawing is None:
+        return _by_mitsuba(mi, job.scene, asked)
+    if isinstance(drawing, Viewer):
+        with progress_bar("rendering", progress and not isinstance(hands, OwnHands)) as advance:
+            view = drawing.look(hands, advance)
+        bar = str(of) if asked.colorbar is True and isinstance(of, str) else asked.colorbar
+        samples = asked.spp or EDGE_SPP
+        shown = drawn(asked.show, drawing, view, asked.value_range, bar, samples, hands)
+        return VIEWS[asked.show].numbers(view), shown, None
+    if isinstance(drawing, Exposing) and alone and progress:
+        drawing = _paced(job, drawing, progress)
+        hands = OwnHands(drawing) if isinstance(hands, OwnHands) else hands
+    with progress_bar("rendering", progress) as advance:
+        if isinstance(drawing, Shading):
+            image, lost = shaded(drawing, hands, advance)
+        else:
+            found = expose(drawing, advance, hands)
+            image, lost = denoised(found) if asked.denoise else found.image, found.lost
+    _warn_of(lost, _LIT[asked.show])
+    return *_before_backdrop(mi, sensor, image, job.stage, asked.show), None
+
+
+def _paced(job: PictureJob, drawing: Exposing, progress: bool | Advance) -> Exposing:
+    """The same in bands after which a progress bar can move; says how long a long picture takes."""
+    pace = pace_of(
+        job.mi, job.scene, drawing.sensor, drawing.tracer, spp=drawing.spp,
+        features=drawing.features,
     )  # fmt: skip
-    return made, mi.load_dict(made.scene, parallel=False)
-
-
-def _loaded(mi: Any, what: Any, size: tuple[int, int] | None) -> Any:
-    if isinstance(what, mi.Scene):
-        if size is not None:
-            raise ValueError("size: a loaded scene has its own; set film.size of its sensor")
-        scene = what
-    elif isinstance(what, Mapping):
-        scene = load_dictionary(mi, cast("Mapping[str, Any]", what))
-    elif isinstance(what, str | os.PathLike):
-        scene = load_scene_file(mi, cast("str | os.PathLike[str]", what))
-    else:
-        raise TypeError(
-            "draw a field, a LevelSet, a list of them, or a Mitsuba scene, its dictionary or the "
-            f"path of its file, not what is {instead_of_field(what)}"
+    if progress is True and pace.picture > SHORT:
+        Console(stderr=True, highlight=False).print(
+            f"this picture will take about {pace}, with {drawing.spp} samples a pixel"
         )
-    if not scene.sensors():
-        raise ValueError("the scene has no sensor to look through")
-    if size is not None:
-        params = mi.traverse(scene.sensors()[0])
-        params["film.size"] = size
-        params.update()
-    return scene
+    return replace(drawing, paths_a_band=pace.paths_a_band)
+
+
+def _is_of_studio(what: Any) -> bool:
+    return isinstance(what, Field | LevelSet | list | tuple)
+
+
+def _check_can_be_sent(what: Any, drawing: Any) -> None:
+    if drawing is None:
+        raise ValueError(
+            "client, checkpoint: Mitsuba draws this scene, by an integrator of its own"
+        )
+    if not _is_of_studio(what) and not isinstance(what, Mapping):
+        raise TypeError(
+            "client, checkpoint: a loaded scene cannot be sent, and the files of one may change or "
+            "be elsewhere: give the scene as a dictionary"
+        )
 
 
 def _by_mitsuba(
@@ -312,46 +312,6 @@ def _warn_of(lost: int, what: str) -> None:
         warnings.warn(
             f"{lost} {what} ran out of steps and are drawn magenta; raise max_steps", stacklevel=3
         )
-
-
-def _radiance(
-    mi: Any, scene: Any, asked: Request, tracer: PathTracer, progress: bool | Advance
-) -> Draw:
-    sensor = scene.sensors()[0]
-    if asked.max_depth is not None:
-        tracer = tracer.with_depth(asked.max_depth)
-    spp = asked.spp or check_spp(
-        int(sensor.sampler().sample_count()), source=", which the scene's sampler asks for"
-    )
-    paths_a_band = PATHS_A_BAND
-    if progress:
-        pace = pace_of(mi, scene, sensor, tracer, spp=spp, features=asked.denoise)
-        paths_a_band = pace.paths_a_band
-        if progress is True and pace.picture > SHORT:
-            Console(stderr=True, highlight=False).print(
-                f"this picture will take about {pace}, with {spp} samples a pixel"
-            )
-
-    def draw(advance: Advance) -> tuple[Image, int]:
-        found = expose(
-            mi, scene, sensor, tracer, spp=spp, seed=asked.seed, advance=advance,
-            features=asked.denoise, paths_a_band=paths_a_band,
-        )  # fmt: skip
-        return denoised(found) if asked.denoise else found.image, found.lost
-
-    return draw
-
-
-def _shaded(mi: Any, scene: Any, asked: Request, stage: Studio | None) -> Draw:
-    sensor, spp, cones = scene.sensors()[0], asked.spp or _EDGE_SPP, asked.antialias == "cones"
-
-    def draw(advance: Advance) -> tuple[Image, int]:
-        return shaded(
-            mi, scene, sensor, spp=spp, on_floor=stage is not None and stage.has_ground,
-            cut_out=stage is not None, cones=cones, advance=advance,
-        )  # fmt: skip
-
-    return draw
 
 
 def _before_backdrop(

@@ -9,7 +9,7 @@ those that a surface covers in part, though no ray through a middle tells.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +17,7 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend import BoolArray, aligned, choose_backend, to_numpy
+from harnack.backend import FloatArray, IntArray, aligned, choose_backend, to_numpy
 from harnack.fields import Solid
 from harnack.rendering.images import tone_mapped
 from harnack.rendering.integrator import LOST_COLOR
@@ -27,7 +27,6 @@ from harnack.rendering.placement import PlacedSurface
 from harnack.rendering.shading import (
     Floor,
     Light,
-    bands,
     edges_of,
     film_places,
     grid_offsets,
@@ -42,6 +41,7 @@ from harnack.rendering.world import World
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
     from harnack.geometry import Volume
+    from harnack.rendering.shading import Hands
 
 
 class Finder:
@@ -59,7 +59,7 @@ class Finder:
         self.mi = mi
         self.placed = tuple(_prepared(mi, carrier) for carrier in world.carriers)
 
-    def find(self, ray: Any, position: Any) -> BoolArray:
+    def find(self, ray: Any, position: Any) -> Any:
         """Whether the cones of pixels are covered in part before the points that rays see.
 
         ray: through the middles, with differentials. position: seen; NaN where nothing is.
@@ -72,8 +72,7 @@ class Finder:
         found = dr.zeros(mi.Bool, dr.width(ray.d))
         for placed, around in self.placed:
             found |= placed.covers_in_part(ray.o, ray.d, radius, t, around)
-        found_there: BoolArray = to_numpy(found)
-        return found_there
+        return found
 
 
 def _prepared(mi: Any, carrier: Any) -> tuple[PlacedSurface, Any]:
@@ -166,7 +165,7 @@ def visible_sky(mi: Any, position: Any, normal: Any, width: Any, size: tuple[int
 
 
 # Rays of one band.
-_RAYS_A_BAND = 2**17
+RAYS_A_BAND = 2**17
 # Where in its pixel the first ray goes through.
 _MIDDLE = 0.5
 # The share of the time that is spent on the first rays, as the progress bar guesses.
@@ -174,7 +173,7 @@ _FIRST = 0.6
 
 
 @dataclass
-class _Seen:
+class Seen:
     """What rays hit first, or first behind clear matter.
 
     position, normal, eye: the point, its unit normal towards the eye, and the direction to the eye.
@@ -186,7 +185,8 @@ class _Seen:
     glossy: whether the material is glossy. met, lost: whether there is a hit; and whether the ray
         ran out of steps.
     covered: whether there is anything at all, and not the environment alone.
-    lined: whether the edge of an isoline may pass through the pixel.
+    marked: whether to draw the pixel again, as the edge of an isoline may pass through it, or a
+        cone found that a surface covers a part of it.
     """
 
     position: Any
@@ -200,98 +200,81 @@ class _Seen:
     met: Any
     lost: Any
     covered: Any
-    lined: Any
+    marked: Any
 
     @classmethod
-    def nothing(cls, mi: Any, count: int) -> _Seen:
+    def nothing(cls, mi: Any, count: int) -> Seen:
         """Empty arrays for `count` pixels, to scatter to."""
         vectors, colors, masks = (mi.Vector3f,) * 3, (mi.Color3f,) * 3, (mi.Bool,) * 5
         kinds = (*vectors, mi.Float, *colors, *masks)
         return cls(*(dr.zeros(kind, count) for kind in kinds))
 
+    def numbers(self) -> dict[str, npt.NDArray[Any]]:
+        """As arrays of NumPy, by name."""
+        return {name: to_numpy(value) for name, value in vars(self).items()}
 
-def shaded(
-    mi: Any,
-    scene: Any,
-    sensor: Any,
-    *,
-    spp: int,
-    on_floor: bool,
-    cut_out: bool = False,
-    cones: bool = False,
-    advance: Callable[[float], None],
-) -> tuple[npt.NDArray[np.float32], int]:
-    """Linear sRGB radiance and, last, the part that something covers (h, w, 4); and how many rays
-    ran out of steps.
+    @classmethod
+    def from_numbers(cls, mi: Any, numbers: Mapping[str, npt.NDArray[Any]]) -> Seen:
+        """From what `numbers` gave, here or in another process."""
+        empty = vars(cls.nothing(mi, 0))
+        return cls(**{name: _of_numbers(type(kind), numbers[name]) for name, kind in empty.items()})
+
+
+def _of_numbers(kind: Any, numbers: npt.NDArray[Any]) -> Any:
+    """A Dr.Jit array of a type, from numbers (n,) or (n, 3)."""
+    return kind(np.ascontiguousarray(numbers.T))
+
+
+class Shading:
+    """A sensor in a world, its light, and what of a shaded picture can be done pixel by pixel.
 
     spp: rays of a pixel on an edge, at least; 1 for one ray a pixel everywhere.
     on_floor: whether the scene is a studio's, whose floor shows shadows.
     cut_out: whether to leave out the light of what is behind everything.
     cones: whether cones find pixels to draw again, besides the edges in the picture.
-    advance: told what part of the picture has been finished since the last call.
 
     Raises:
         ValueError: the Mitsuba variant is spectral, whose four wavelengths a ray are no color;
             or cones are asked to find a field that jumps.
     """
-    if mi.is_spectral:
-        raise ValueError(
-            f"shaded pictures know red, green and blue, and the Mitsuba variant is {mi.variant()}: "
-            'set one such as "llvm_ad_rgb", or draw in color'
-        )
-    painter = _Painter(mi, World.of(mi, scene), sensor, on_floor=on_floor, cut_out=cut_out)
-    finder = Finder(mi, painter.world) if cones else None
-    count = painter.size[0] * painter.size[1]
-    order = in_tiles(painter.size)
-    seen = _Seen.nothing(mi, count)
-    for start, stop in bands(count, _RAYS_A_BAND):
-        pixel = uploaded(mi, order[start:stop])
-        part = painter.look(pixel, mi.Vector2f(_MIDDLE))
-        dr.scatter(seen, part, pixel)
-        dr.eval(seen)
-        dr.sync_thread()
-        advance(_FIRST * (stop - start) / count)
-    sky = visible_sky(mi, seen.position, seen.normal, seen.width, painter.size)
-    dr.eval(sky)
-    image = to_numpy(painter.paint(seen, sky)).reshape(*painter.size[::-1], 4)
-    lost = int(dr.count(seen.lost)[0])
-    again = edges_of(tone_mapped(image[..., :3] + (1 - image[..., 3:]))).ravel()
-    again |= to_numpy(seen.lined)
-    if finder is not None:
-        for start, stop in bands(count, _RAYS_A_BAND):
-            pixel = uploaded(mi, order[start:stop])
-            ray, _ = painter.ray(pixel, mi.Vector2f(_MIDDLE))
-            there = dr.gather(mi.Vector3f, seen.position, pixel)
-            again[order[start:stop]] |= finder.find(ray, there)
-    edges = order[again[order]] if spp > 1 else order[:0]
-    offsets = grid_offsets(spp)
-    traced = (offsets == _MIDDLE).all(axis=1)  # what a pixel's first ray has seen
-    rest, share = offsets[~traced], float(traced.mean())
-    for start, stop in bands(len(edges), max(1, _RAYS_A_BAND // max(1, len(rest)))):
-        chosen = edges[start:stop]
-        color, gone = painter.refine(chosen, rest, seen.position, sky)
-        first = image.reshape(-1, 4)[chosen]
-        image.reshape(-1, 4)[chosen] = color + share * (first - color)
-        lost += gone
-        advance((1 - _FIRST) * (stop - start) / len(edges))
-    return image, lost
-
-
-class _Painter:
-    """A sensor in a world, and its light."""
 
     def __init__(
-        self, mi: Any, world: World, sensor: Any, *, on_floor: bool, cut_out: bool
-    ) -> None:
+        self, mi: Any, scene: Any, sensor: Any, *, spp: int, on_floor: bool,
+        cut_out: bool = False, cones: bool = False,
+    ) -> None:  # fmt: skip
+        if mi.is_spectral:
+            raise ValueError(
+                "shaded pictures know red, green and blue, and the Mitsuba variant is "
+                f'{mi.variant()}: set one such as "llvm_ad_rgb", or draw in color'
+            )
+        world = World.of(mi, scene)
         self.mi, self.world, self.sensor, self.cut_out = mi, world, sensor, cut_out
         width, height = (int(n) for n in sensor.film().crop_size())
         self.size = (width, height)
+        self.order = in_tiles(self.size)
+        self.finder = Finder(mi, world) if cones else None
+        offsets = grid_offsets(spp)
+        traced = (offsets == _MIDDLE).all(axis=1)  # what a pixel's first ray has seen
+        self.offsets, self.share_of_first = offsets[~traced], float(traced.mean())
+        self.refines = spp > 1
         matrix = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
         self.light = Light.of(matrix)
         self.through = Through(world, self.light, hides_lights=cut_out)
         self.floor = Floor.of(world, self.light) if on_floor else None
 
-    def look(self, pixel: Any, offset: Any) -> _Seen:
+    def look(self, start: int, stop: int) -> Seen:
+        """What the rays through the middles of some pixels hit first; `order` counts pixels."""
+        mi = self.mi
+        pixel = uploaded(mi, self.order[start:stop])
+        seen = self._look(pixel, mi.Vector2f(_MIDDLE))
+        dr.eval(seen)
+        if self.finder is not None:
+            ray, _ = self.ray(pixel, mi.Vector2f(_MIDDLE))
+            seen.marked |= self.finder.find(ray, seen.position)
+            dr.eval(seen)
+        return seen
+
+    def _look(self, pixel: Any, offset: Any) -> Seen:
         """What rays through places in pixels hit first."""
         mi, scene = self.mi, self.world.scene
         ray, weight = self.ray(pixel, offset)
@@ -323,7 +306,7 @@ class _Painter:
         glossy &= plain
         lined = met & self.world.has_line_near(si, ray, d, t)
         position = dr.select(met, mi.Vector3f(si.p), dr.nan)
-        return _Seen(
+        return Seen(
             position, normal, -d, width, color, light, through, glossy, met, lost, covered, lined
         )
 
@@ -351,7 +334,7 @@ class _Painter:
                 found |= si.shape == self.mi.ShapePtr(carrier)
         return found
 
-    def paint(self, seen: _Seen, sky: Any) -> Any:
+    def paint(self, seen: Seen, sky: Any) -> Any:
         """Radiance towards the eye, and whether there is anything."""
         key = 1.0
         if self.floor is not None:
@@ -362,30 +345,78 @@ class _Painter:
         return self.mi.Vector4f(*light, dr.select(seen.covered, self.mi.Float(1), 0))
 
     def refine(
-        self, chosen: Any, offsets: Any, position: Any, sky: Any
+        self, chosen: IntArray, position: FloatArray, sky: FloatArray
     ) -> tuple[npt.NDArray[np.float32], int]:
-        """Means (n, 4) of samples in chosen pixels, and how many of them were lost."""
-        mi, spp = self.mi, len(offsets)
+        """Means (n, 4) of samples in chosen pixels, and how many of them were lost.
+
+        position, sky: seen by the pixels and their neighbors, (n, 5, 3) and (n, 5) (`around`).
+        """
+        mi, spp = self.mi, len(self.offsets)
         lane = dr.arange(mi.UInt32, len(chosen) * spp)
         many = dr.opaque(mi.UInt32, spp)
         pixel = dr.gather(mi.UInt32, uploaded(mi, chosen), lane // many)
-        table = mi.Vector2f(*(aligned(mitsuba_backend(mi), one) for one in offsets.T))
-        seen = self.look(pixel, dr.gather(mi.Vector2f, table, lane % many))
-        color = self.paint(seen, self._nearest_sky(seen, pixel, position, sky))
+        table = mi.Vector2f(*(aligned(mitsuba_backend(mi), one) for one in self.offsets.T))
+        seen = self._look(pixel, dr.gather(mi.Vector2f, table, lane % many))
+        color = self.paint(seen, _nearest_sky(mi, seen, lane // many, position, sky))
         dr.eval(color, seen.lost)
         return to_numpy(mean_of_blocks(color, spp)), int(dr.count(seen.lost)[0])
 
-    def _nearest_sky(self, seen: _Seen, pixel: Any, position: Any, sky: Any) -> Any:
-        """The visible sky of the pixel around whose point lies nearest to the sample."""
-        mi = self.mi
+    def around(self, chosen: IntArray, *arrays: Any) -> tuple[npt.NDArray[Any], ...]:
+        """Entries (n, 5, ...) of arrays of all pixels, counted by rows, at chosen pixels and their
+        four neighbors; at the picture's border some are there twice."""
         columns, rows = self.size
-        x, y = mi.Int32(pixel % columns), mi.Int32(pixel // columns)
-        nearest, found = mi.Float(dr.inf), mi.Float(1)
-        for dx, dy in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)):
-            u, v = dr.clip(x + dx, 0, columns - 1), dr.clip(y + dy, 0, rows - 1)
-            other = mi.UInt32(v * columns + u)
-            away = dr.norm(dr.gather(mi.Vector3f, position, other) - seen.position)
-            nearer = away < nearest  # not where NaN: nothing is there
-            nearest = dr.select(nearer, away, nearest)
-            found = dr.select(nearer, dr.gather(mi.Float, sky, other), found)
-        return found
+        x, y = chosen % columns, chosen // columns
+        u = np.clip(x[:, None] + np.array([0, 1, -1, 0, 0]), 0, columns - 1)
+        v = np.clip(y[:, None] + np.array([0, 0, 0, 1, -1]), 0, rows - 1)
+        other = uploaded(self.mi, (v * columns + u).ravel())
+        found = [to_numpy(dr.gather(type(one), one, other)) for one in arrays]
+        return tuple(one.reshape(len(chosen), 5, *one.shape[1:]) for one in found)
+
+
+def _nearest_sky(mi: Any, seen: Seen, row: Any, position: FloatArray, sky: FloatArray) -> Any:
+    """The visible sky of the pixel around whose point lies nearest to the sample; row: of the
+    sample's pixel among those that were chosen."""
+    nearest, found = mi.Float(dr.inf), mi.Float(1)
+    for k in range(position.shape[1]):
+        there = dr.gather(mi.Vector3f, _of_numbers(mi.Vector3f, position[:, k]), row)
+        away = dr.norm(there - seen.position)
+        nearer = away < nearest  # not where NaN: nothing is there
+        nearest = dr.select(nearer, away, nearest)
+        found = dr.select(nearer, dr.gather(mi.Float, _of_numbers(mi.Float, sky[:, k]), row), found)
+    return found
+
+
+def shaded(
+    shading: Shading, hands: Hands, advance: Callable[[float], None]
+) -> tuple[npt.NDArray[np.float32], int]:
+    """Linear sRGB radiance and, last, the part that something covers (h, w, 4); and how many rays
+    ran out of steps.
+
+    hands: call methods of `shading`.
+    advance: told what part of the picture has been finished since the last call.
+    """
+    mi, order, size = shading.mi, shading.order, shading.size
+    count = len(order)
+    seen = Seen.nothing(mi, count)
+    parts = hands.cut(count, RAYS_A_BAND)
+    for (start, stop), part in zip(parts, hands.each("look", parts), strict=True):
+        dr.scatter(seen, part, uploaded(mi, order[start:stop]))
+        dr.eval(seen)
+        dr.sync_thread()
+        advance(_FIRST * (stop - start) / count)
+    sky = visible_sky(mi, seen.position, seen.normal, seen.width, size)
+    dr.eval(sky)
+    image = to_numpy(shading.paint(seen, sky)).reshape(*size[::-1], 4)
+    lost = int(dr.count(seen.lost)[0])
+    again = edges_of(tone_mapped(image[..., :3] + (1 - image[..., 3:]))).ravel()
+    again |= to_numpy(seen.marked)
+    edges = order[again[order]] if shading.refines else order[:0]
+    pixels = image.reshape(-1, 4)
+    at_once = max(1, RAYS_A_BAND // max(1, len(shading.offsets)))
+    chosen = [edges[start:stop] for start, stop in hands.cut(len(edges), at_once)]
+    around = ((one, *shading.around(one, seen.position, sky)) for one in chosen)
+    for one, (color, gone) in zip(chosen, hands.each("refine", list(around)), strict=True):
+        pixels[one] = color + shading.share_of_first * (pixels[one] - color)
+        lost += int(gone)
+        advance((1 - _FIRST) * len(one) / len(edges))
+    return image, lost

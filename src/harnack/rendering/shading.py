@@ -30,6 +30,34 @@ def bands(pixels: int, step: int) -> Iterator[tuple[int, int]]:
         yield start, min(start + step, pixels)
 
 
+class Hands(Protocol):
+    """Those who do the parts of a picture."""
+
+    def cut(self, count: int, most: int) -> list[tuple[int, int]]:
+        """(start, stop) of runs of things that are counted from 0, at most `most` a run."""
+        ...
+
+    def each(self, step: str, parts: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
+        """What a method, given by its name, returns for the arguments of each part, in order."""
+        ...
+
+
+@dataclass(frozen=True)
+class OwnHands:
+    """This process, which calls the methods of an object."""
+
+    drawing: Any
+
+    def cut(self, count: int, most: int) -> list[tuple[int, int]]:
+        """As few runs as there may be."""
+        return list(bands(count, most))
+
+    def each(self, step: str, parts: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
+        """One after the other."""
+        method = getattr(self.drawing, step)
+        return (method(*part) for part in parts)
+
+
 def in_tiles(size: tuple[int, int]) -> IntArray:
     """All pixels of a picture, counted by rows, one square of 4 x 4 after the other.
 

@@ -7,6 +7,7 @@ pictures, but that of values: where it has edges, the colors of several rays are
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -23,7 +24,15 @@ from harnack.rendering.isolines import defined_in
 from harnack.rendering.mitsuba import mitsuba_backend
 from harnack.rendering.placement import Placement
 from harnack.rendering.scales import Color, Scale, grays, viridis, with_bar
-from harnack.rendering.shading import bands, edges_of, film_places, grid_offsets, in_tiles, uploaded
+from harnack.rendering.shading import (
+    Hands,
+    OwnHands,
+    edges_of,
+    film_places,
+    grid_offsets,
+    in_tiles,
+    uploaded,
+)
 from harnack.rendering.world import World
 from harnack.tracer import Status
 
@@ -101,14 +110,31 @@ class Viewer:
         width, height = (int(n) for n in self.sensor.film().crop_size())
         return width, height
 
-    def look(self) -> View:
-        """The first hits of the rays through the middles of all pixels."""
+    @functools.cached_property
+    def order(self) -> IntArray:
+        """All pixels, as `in_tiles` visits them."""
+        return in_tiles(self.size)
+
+    def view(self, start: int, stop: int) -> View:
+        """The first hits of the rays through the middles of some pixels, (n,); `order` counts."""
+        return self._look_at(uploaded(self.mi, self.order[start:stop]), self.mi.Vector2f(0.5))
+
+    def look(
+        self, hands: Hands | None = None, advance: Callable[[float], None] | None = None
+    ) -> View:
+        """The first hits of the rays through the middles of all pixels.
+
+        hands: call methods of a viewer like this one, in the place of this one's. advance: told
+        what part has been finished since the last call.
+        """
+        hands = OwnHands(self) if hands is None else hands
         width, height = self.size
-        order = in_tiles((width, height))
-        parts = [
-            self._look_at(uploaded(self.mi, order[start:stop]), self.mi.Vector2f(0.5))
-            for start, stop in bands(width * height, _RAYS_A_BAND)
-        ]
+        order = self.order
+        cut, parts = hands.cut(width * height, _RAYS_A_BAND), list[View]()
+        for (start, stop), part in zip(cut, hands.each("view", cut), strict=True):
+            parts.append(part)
+            if advance is not None:
+                advance((stop - start) / (width * height))
 
         def by_rows(*column: Any) -> Any:
             image = np.empty((height, width, *column[0].shape[1:]), column[0].dtype)
@@ -310,11 +336,13 @@ def drawn(
     value_range: tuple[float, float] | None,
     bar: str | bool,
     spp: int,
+    hands: Hands | None = None,
 ) -> npt.NDArray[np.uint8]:
     """The pixels of what a viewer has seen.
 
     value_range: of the scale, in place of what is seen. bar: whether to put a color bar beside
     it, or what to write over that. spp: rays of a pixel on an edge, of pictures that are averaged.
+    hands: as for `Viewer.look`.
     """
     one = VIEWS[show]
     scale = None if one.scale is None else one.scale(view)
@@ -327,7 +355,7 @@ def drawn(
         scale = replace(scale, name=bar)
     picture = one.picture(view, scale)
     if one.is_averaged and spp > 1:
-        _average(viewer, view, picture, lambda part: one.picture(part, scale), spp)
+        _average(viewer, view, picture, lambda part: one.picture(part, scale), spp, hands)
     if not bar:
         return picture
     numbers = np.asarray(one.numbers(view), dtype=np.float64)
@@ -343,13 +371,16 @@ def _average(
     picture: npt.NDArray[np.uint8],
     colors: Callable[[View], npt.NDArray[np.uint8]],
     spp: int,
+    hands: Hands | None,
 ) -> None:
     """Make pixels that differ visibly from a neighbor, or that the edge of an isoline may pass
     through, the mean light of a grid of rays."""
     order = in_tiles(viewer.size)
     again = order[(edges_of(picture) | view.lined).ravel()[order]]
     offsets = grid_offsets(spp)
-    for start, stop in bands(len(again), max(1, _RAYS_A_BAND // len(offsets))):
-        chosen = again[start:stop]
-        light = linear_of(colors(viewer.look_again(chosen, offsets)) / 255)
+    hands = OwnHands(viewer) if hands is None else hands
+    cut = hands.cut(len(again), max(1, _RAYS_A_BAND // len(offsets)))
+    parts = [(again[start:stop], offsets) for start, stop in cut]
+    for (chosen, _), seen in zip(parts, hands.each("look_again", parts), strict=True):
+        light = linear_of(colors(seen) / 255)
         picture.reshape(-1, 3)[chosen] = as_bytes(transferred(light.mean(axis=1)))

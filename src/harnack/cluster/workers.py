@@ -1,0 +1,136 @@
+"""The workers of a Dask cluster: whether they can work, told before anything is sent to them."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import importlib.metadata
+import os
+import socket
+import warnings
+from collections.abc import Generator
+from contextlib import contextmanager
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import choose_backend, to_numpy
+from harnack.cluster.packing import load_module
+
+# Bits of kernels and of pictures depend on these.
+_PACKAGES = ("drjit", "mitsuba", "numpy")
+_INSTALL = "install the same there as here, such as by pip install 'harnack[cluster]=={version}'"
+
+
+@contextmanager
+def connected(client: Any) -> Generator[Any]:
+    """A Dask client, given as one or by the address of a scheduler, all of whose workers can work.
+    What was opened here is closed when the block ends.
+
+    Workers that come later are looked at when they get their first task.
+
+    Raises:
+        ModuleNotFoundError: Dask is not installed.
+        TypeError: it is neither a client nor an address.
+        OSError: there is no scheduler at the address.
+        RuntimeError: a worker has no harnack, another version of it, or no LLVM that Dr.Jit can
+            work with. The message names it.
+    """
+    distributed = load_module("distributed", "client")
+    opened = None
+    if isinstance(client, str):
+        try:
+            client = opened = distributed.Client(client, timeout="10s", set_as_default=False)
+        except (OSError, ValueError, TimeoutError) as error:
+            raise OSError(
+                f"no scheduler answers at {client!r} ({error}); start one by `dask scheduler`, "
+                "which prints its address, such as tcp://127.0.0.1:8786"
+            ) from None
+    if not isinstance(client, distributed.Client) or client.asynchronous:
+        raise TypeError(
+            "client must be a dask.distributed.Client that is not asynchronous, or the address of "
+            f"a scheduler such as tcp://127.0.0.1:8786, not {client!r}"
+        )
+    try:
+        _check_workers(client)
+        yield client
+    finally:
+        if opened is not None:
+            opened.close()
+
+
+def home() -> tuple[str, int]:
+    """Host and number of this process."""
+    return socket.gethostname(), os.getpid()
+
+
+def worker_threads(client: Any) -> dict[str, int]:
+    """The threads of each worker, by its address."""
+    found: dict[str, int] = client.nthreads()
+    return found
+
+
+def _check_workers(client: Any) -> None:
+    # A function of Python's own library, which workers have whatever else they lack.
+    versions = client.run(importlib.metadata.version, "harnack", on_error="return")
+    here = importlib.metadata.version("harnack")
+    for address, version in versions.items():
+        if version != here:
+            found = f"harnack {version}" if isinstance(version, str) else "no harnack"
+            raise RuntimeError(
+                f"worker {address} has {found}, and here it is {here}: "
+                f"{_INSTALL.format(version=here)}"
+            )
+    states = client.run(_state, home(), on_error="return")
+    for address, state in states.items():
+        if isinstance(state, BaseException):
+            raise RuntimeError(f"worker {address} cannot work: {state}") from state
+        if state[0] != packages():
+            raise RuntimeError(
+                f"worker {address} has {state[0]}, and here it is {packages()}: "
+                f"{_INSTALL.format(version=here)}"
+            )
+    strange = [address for address, state in states.items() if state[1] != fingerprint()]
+    if strange:
+        warnings.warn(
+            f"the processors of {', '.join(sorted(strange))} round differently from this one: "
+            "results are right, but not the same bit for bit as without them",
+            stacklevel=3,
+        )
+
+
+def _state(client: tuple[str, int], dask_worker: Any = None) -> tuple[str, str]:
+    """`packages` and `fingerprint` of a worker."""
+    take_threads(client, dask_worker.state.nthreads)
+    return packages(), fingerprint()
+
+
+@functools.cache
+def take_threads(client: tuple[str, int], threads: int) -> None:
+    """Let Dr.Jit have the threads that Dask gave this worker, unless it is the client's process.
+
+    client: the `home` of the client.
+
+    Raises:
+        LLVMNotFoundError: Dr.Jit has nothing to work with.
+    """
+    choose_backend()
+    if client != home():
+        dr.set_thread_count(threads)
+
+
+def packages() -> str:
+    """Versions of the packages on which the bits of results depend."""
+    return ", ".join(f"{name} {importlib.metadata.version(name)}" for name in _PACKAGES)
+
+
+def fingerprint() -> str:
+    """What this machine makes of some numbers, the same where kernels give the same bits."""
+    backend = choose_backend()
+    x = dr.linspace(backend.Float, 0.01, 40, 4096)
+    s, c = dr.sincos(x)
+    results = (dr.rcp(x), dr.rsqrt(x), s, c, dr.exp(-x), dr.log(x), dr.fma(s, c, x), dr.sqrt(x),
+               dr.atan2(s, x), x / c)  # fmt: skip
+    numbers = np.concatenate([to_numpy(one) for one in results])
+    return f"{backend.name} {hashlib.blake2b(numbers.tobytes(), digest_size=8).hexdigest()}"
