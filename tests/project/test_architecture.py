@@ -14,10 +14,12 @@ FILES = sorted(SOURCE.rglob("*.py"))
 # Each room imports from itself and from the rooms before it.
 ROOMS = (
     "names",
+    "progress",
     "backend",
     "webgpu",
     "geometry",
     "files",
+    "cluster",
     "tree",
     "arithmetic",
     "enclosures",

@@ -109,7 +109,7 @@ def _pickler(base: Any) -> Callable[..., Any]:
             kind: type = obj.__class__
             remembered = _remembered(kind)
             if not remembered:
-                return super().reducer_override(obj)
+                return base.reducer_override(self, obj)
             make, arguments, state, *rest = (*obj.__reduce_ex__(_PROTOCOL), None)[:6]
             if isinstance(state, dict):
                 given = cast("dict[str, Any]", state)

@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.cluster.packing import Packed, load_module, name_of
-from harnack.cluster.workers import connected, home, take_threads, worker_threads
+from harnack.cluster.workers import alone, as_client, worker_threads
 from harnack.files.file_format import check_writable, write_atomically
 
 Arrays = dict[str, npt.NDArray[Any]]
@@ -143,16 +143,13 @@ def crew(client: Any = None, checkpoint: Any = None, tiles: int | None = None) -
     """A crew, from the arguments of those who have something done.
 
     Raises:
-        ModuleNotFoundError, TypeError, OSError, RuntimeError: as `connected` and `Folder.at`.
+        ModuleNotFoundError, TypeError, OSError, RuntimeError: as `as_client` and `Folder.at`.
     """
     folder = None
     if checkpoint is not None:
         load_module("cloudpickle", "checkpoint")
         folder = Folder.at(checkpoint)
-    if client is None:
-        yield Crew(None, folder, tiles)
-        return
-    with connected(client) as one:
+    with as_client(client) as one:
         yield Crew(one, folder, tiles)
 
 
@@ -194,7 +191,7 @@ class _There:
 
     def begin(self, name: str, part: tuple[Any, ...]) -> None:
         """Have a part done."""
-        future = self.client.submit(_done, self.packed, self.step, part, home(), key=name)
+        future = self.client.submit(_done, self.packed, self.step, part, key=name)
         self.names[future] = name
         self.done.add(future)
 
@@ -300,17 +297,8 @@ def _same(packed: Packed) -> Packed:
     return packed
 
 
-def _done(packed: Packed, step: str, part: tuple[Any, ...], client: tuple[str, int]) -> Arrays:
+def _done(packed: Packed, step: str, part: tuple[Any, ...]) -> Arrays:
     """A part, done by this worker."""
-    from dask.utils import SerializableLock
-    from distributed import get_worker
-
-    worker = get_worker()
-    try:
-        take_threads(client, worker.state.nthreads)
-    except RuntimeError as error:
-        raise RuntimeError(f"worker {worker.address} cannot work: {error}") from None
-    # One at a time: Dr.Jit itself uses all threads that the worker has.
-    with SerializableLock("harnack"):
+    with alone():
         do: Step = getattr(packed.open(), step)
         return do(*part)

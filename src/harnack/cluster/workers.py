@@ -5,11 +5,10 @@ from __future__ import annotations
 import functools
 import hashlib
 import importlib.metadata
-import os
-import socket
+import sys
 import warnings
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import drjit as dr
@@ -60,9 +59,37 @@ def connected(client: Any) -> Generator[Any]:
             opened.close()
 
 
-def home() -> tuple[str, int]:
-    """Host and number of this process."""
-    return socket.gethostname(), os.getpid()
+@contextmanager
+def as_client(client: Any) -> Generator[Any]:
+    """What `connected` yields; None for None."""
+    if client is None:
+        yield None
+        return
+    with connected(client) as one:
+        yield one
+
+
+@contextmanager
+def alone() -> Generator[None]:
+    """Lets one task at a time compute in this process, as Dr.Jit itself uses all threads that a
+    worker has.
+
+    Raises:
+        RuntimeError: it is a worker that cannot work.
+    """
+    distributed = sys.modules.get("distributed")
+    worker = None
+    if distributed is not None:
+        with suppress(ValueError):  # this is no worker
+            worker = distributed.get_worker()
+    try:
+        choose_backend()
+    except RuntimeError as error:
+        raise RuntimeError(f"worker {worker and worker.address} cannot work: {error}") from None
+    if worker is not None:
+        take_threads(worker.nanny is not None, worker.state.nthreads)
+    with load_module("dask.utils", "client").SerializableLock("harnack"):
+        yield
 
 
 def worker_threads(client: Any) -> dict[str, int]:
@@ -82,7 +109,7 @@ def _check_workers(client: Any) -> None:
                 f"worker {address} has {found}, and here it is {here}: "
                 f"{_INSTALL.format(version=here)}"
             )
-    states = client.run(_state, home(), on_error="return")
+    states = client.run(_state, on_error="return")
     for address, state in states.items():
         if isinstance(state, BaseException):
             raise RuntimeError(f"worker {address} cannot work: {state}") from state
@@ -100,23 +127,21 @@ def _check_workers(client: Any) -> None:
         )
 
 
-def _state(client: tuple[str, int], dask_worker: Any = None) -> tuple[str, str]:
-    """`packages` and `fingerprint` of a worker."""
-    take_threads(client, dask_worker.state.nthreads)
+def _state(dask_worker: Any = None) -> tuple[str, str]:
+    """`packages` and `fingerprint` of a worker; LLVMNotFoundError if Dr.Jit has nothing to work
+    with."""
+    choose_backend()
+    take_threads(dask_worker.nanny is not None, dask_worker.state.nthreads)
     return packages(), fingerprint()
 
 
 @functools.cache
-def take_threads(client: tuple[str, int], threads: int) -> None:
-    """Let Dr.Jit have the threads that Dask gave this worker, unless it is the client's process.
+def take_threads(has_nanny: bool, threads: int) -> None:
+    """Let Dr.Jit have the threads that Dask gave this worker.
 
-    client: the `home` of the client.
-
-    Raises:
-        LLVMNotFoundError: Dr.Jit has nothing to work with.
+    has_nanny: whether a process watches over this one, which so is the worker's alone.
     """
-    choose_backend()
-    if client != home():
+    if has_nanny:
         dr.set_thread_count(threads)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from harnack.backend import FloatArray, choose_backend
 from harnack.backend.numbers import refuses_derivatives
+from harnack.cluster.lazy import takes_blocks
 from harnack.distance.closest import Closest, find_closest
 from harnack.distance.tangent import first_order, in_batches, second_order
 from harnack.enclosures import TargetLevels
@@ -31,6 +32,7 @@ Method = Literal["first", "second", "newton", "lower"]
 _CLOSE = 1e-15
 
 
+@takes_blocks("points")
 @refuses_derivatives
 def signed_distance(
     field: Field,
@@ -94,6 +96,7 @@ def signed_distance(
     return result
 
 
+@takes_blocks("points")
 @refuses_derivatives
 def closest_points(
     field: Field,
@@ -134,6 +137,7 @@ class DistanceBounds:
     lower: FloatArray
 
 
+@takes_blocks("points")
 @refuses_derivatives
 def distance_bounds(
     field: Field,

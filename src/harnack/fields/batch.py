@@ -21,6 +21,7 @@ from harnack.backend import FloatArray, backend_of
 from harnack.backend.arrays import as_data
 from harnack.backend.elementary import fmax
 from harnack.backend.tensors import takes_tensors
+from harnack.cluster.lazy import takes_blocks
 from harnack.fields.field import Field
 from harnack.fields.points import at_points
 
@@ -154,6 +155,7 @@ class BatchedField(Field):
         # A literal 0, the gradient of a closed mesh, would have no derivative in Dr.Jit.
         return dr.replace_grad(at.value, dr.dot(as_data(at.gradient), p - dr.detach(p)))
 
+    @takes_blocks("points")
     @takes_tensors
     def value(self, points: Any, *, precision: Precision = "single") -> Any:
         if dr.is_array_v(type(points)):
@@ -162,6 +164,7 @@ class BatchedField(Field):
             return self.values_at(points, 0).value
         return self._at(points, precision, 0, lambda at: (at.value,))[0]
 
+    @takes_blocks("points")
     @takes_tensors
     def gradient(self, points: Any, *, precision: Precision = "single") -> Any:
         if dr.is_array_v(type(points)):
@@ -180,6 +183,7 @@ class BatchedField(Field):
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         return _hessian(self.values_at(p, 2)).rows(backend_of(p).Array3f)
 
+    @takes_blocks("points")
     def error_bound(self, points: Any, *, precision: Precision = "single") -> FloatArray:
         """Bounds (n,) of the error of `value` at points (n, 3).
 
@@ -188,11 +192,13 @@ class BatchedField(Field):
         """
         return self._at(points, precision, 0, lambda at: (at.error,))[0]
 
+    @takes_blocks("points")
     def gradient_error_bound(self, points: Any, *, precision: Precision = "single") -> FloatArray:
         """Bounds (n,) of the error of `gradient`, as a length, at points (n, 3): see
         `error_bound`."""
         return self._at(points, precision, 1, lambda at: (at.gradient_error,))[0]
 
+    @takes_blocks("points")
     def hessian_error_bound(self, points: Any, *, precision: Precision = "single") -> FloatArray:
         """Bounds (n,) of the error of `hessian`, in the spectral norm, at points (n, 3): see
         `error_bound`."""

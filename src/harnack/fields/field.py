@@ -19,6 +19,7 @@ import numpy.typing as npt
 from harnack.backend.arrays import as_data
 from harnack.backend.numbers import is_same, refuse_derivatives, refuses_derivatives, short_text
 from harnack.backend.tensors import takes_tensors
+from harnack.cluster.lazy import takes_blocks
 from harnack.enclosures import BoundedLaplacian, Curvature, HarmonicBall, Lipschitz
 from harnack.fields.look import Look, Path, Sample, checked_samples, lengthened
 from harnack.fields.points import also_at_points, at_points
@@ -212,6 +213,7 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
         gradient = as_data(sample.gradient)  # a literal 0 would have no derivative in Dr.Jit
         return dr.replace_grad(sample.value, dr.dot(gradient, p - at))
 
+    @takes_blocks("points")
     @takes_tensors
     def value(self, points: Any, *, precision: Precision = "single") -> Any:
         """f at points (n, 3): (n,); at a single point (3,): a number.
@@ -229,6 +231,7 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
             return self.evaluate(points).value
         return self._samples_at(points, precision, lambda sample: sample.value)
 
+    @takes_blocks("points")
     @takes_tensors
     def gradient(self, points: Any, *, precision: Precision = "single") -> Any:
         """The gradients of f at points (n, 3): (n, 3); at a single point (3,): (3,).

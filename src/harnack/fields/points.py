@@ -13,6 +13,7 @@ import numpy.typing as npt
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.backend.arrays import aligned_integers, finite_vectors, upload_vectors
 from harnack.backend.numbers import refuse_derivatives
+from harnack.cluster.lazy import takes_blocks
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Precision, Vec3
@@ -58,6 +59,7 @@ def also_at_points(hessian: Callable[[Any, Vec3], Any]) -> Callable[..., Any]:
     """A decorator of a field's method `hessian`: it also takes NumPy points and gives NumPy
     matrices."""
 
+    @takes_blocks("p")
     @functools.wraps(hessian)
     def general(self: Any, p: Any, *, precision: Precision = "single") -> Any:
         if dr.is_array_v(type(p)):

@@ -21,11 +21,12 @@ from harnack.backend.numbers import finite
 from harnack.cluster.parts import Arrays, crew
 from harnack.files.file_format import check_writable, write_atomically
 from harnack.geometry import Box
+from harnack.progress import progress_bar
 from harnack.rendering.arguments import OF_PICTURES, check_camera, check_integer, check_size
 from harnack.rendering.camera import Camera
 from harnack.rendering.framing import UnboundedSurfaceError, upright, visible_points
 from harnack.rendering.mitsuba import mitsuba_backend
-from harnack.rendering.picture import progress_bar, render
+from harnack.rendering.picture import render
 from harnack.rendering.plugins import register
 from harnack.rendering.studio_scene import surfaces_of
 

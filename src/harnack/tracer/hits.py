@@ -17,6 +17,7 @@ from harnack.backend.arrays import as_data
 from harnack.backend.elementary import largest_coordinate, unit
 from harnack.backend.elementary import length as norm
 from harnack.backend.tensors import is_tensor, numbers_of, tensor_of, vectors_of
+from harnack.cluster.lazy import takes_blocks
 from harnack.tracer.all_hits import (
     AllHits,
     check_all_hits,
@@ -126,6 +127,7 @@ def trace(
 ) -> AllHits: ...
 
 
+@takes_blocks("origins", "directions", "t_min", "t_max")
 def trace(
     field: Field | LevelSet,
     origins: Any,

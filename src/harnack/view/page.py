@@ -15,8 +15,8 @@ from string import Template
 from typing import TYPE_CHECKING, Any, cast
 
 from harnack.files.file_format import write_atomically
+from harnack.progress import progress_bar
 from harnack.rendering.camera import Camera
-from harnack.rendering.picture import progress_bar
 from harnack.view.scene import Live, Moved, difference, packed
 
 if TYPE_CHECKING:
