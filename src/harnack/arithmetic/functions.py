@@ -43,6 +43,9 @@ class Function:
     plain: Callable[[Any], Any]
     numpy: Callable[[Any], Any]
 
+    def __reduce__(self) -> str:
+        return self.name  # there is one of each name, in this module
+
     def __call__(self, x: Any) -> Any:
         """The function of a number of any kind."""
         if hasattr(x, "apply"):

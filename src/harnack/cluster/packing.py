@@ -1,11 +1,13 @@
 """Objects as bytes to send, and names that say what is in them.
 
-What an object has only computed and remembers (`functools.cached_property`) is left out: it would
-be sent for nothing, and two equal objects would differ.
+What an object has only computed and remembers is left out: it would be sent for nothing, and two
+equal objects would differ. It is what `functools.cached_property` and a `Remembered` keep, and
+fields of dataclasses that are not compared.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import hashlib
 import importlib
@@ -13,10 +15,14 @@ import io
 import pickle
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 from harnack._version import __version__
 
+Key = TypeVar("Key")
+Value = TypeVar("Value")
+# In the place of an attribute: none.
+_LEFT_OUT = object()
 # The newest protocol of the oldest Python that is supported.
 _PROTOCOL = 5
 _MISSING = (
@@ -35,6 +41,13 @@ def load_module(name: str, what: str) -> Any:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(_MISSING.format(what=what)) from error
+
+
+class Remembered(dict[Key, Value]):
+    """Results that an object keeps by what they were asked for; it is packed and copied empty."""
+
+    def __reduce__(self) -> Any:
+        return Remembered, ()
 
 
 @dataclass(frozen=True)
@@ -80,7 +93,7 @@ def name_of(thing: Any, what: str) -> str:
     """
     try:
         data = _bytes_of(thing, what, share=False)
-    except (RecursionError, ValueError):  # an object that holds itself
+    except (RecursionError, TypeError, ValueError):  # an object that holds itself
         data = _bytes_of(thing, what, share=True)
     return hashlib.blake2b(__version__.encode() + data, digest_size=16).hexdigest()
 
@@ -113,18 +126,24 @@ def _pickler(base: Any) -> Callable[..., Any]:
             make, arguments, state, *rest = (*obj.__reduce_ex__(_PROTOCOL), None)[:6]
             if isinstance(state, dict):
                 given = cast("dict[str, Any]", state)
-                state = {key: one for key, one in given.items() if key not in remembered}
+                state = {key: remembered.get(key, one) for key, one in given.items()}
+                state = {key: one for key, one in state.items() if one is not _LEFT_OUT}
             return make, arguments, state, *rest[:3]
 
     return Lean
 
 
 @functools.lru_cache(maxsize=1024)
-def _remembered(kind: type) -> frozenset[str]:
-    """Names of the attributes that objects of a class compute once and then remember."""
-    return frozenset(
-        name
+def _remembered(kind: type) -> dict[str, Any]:
+    """What to put in the place of attributes that objects of a class compute and remember."""
+    found: dict[str, Any] = {
+        name: _LEFT_OUT
         for one in kind.__mro__
         for name, value in vars(one).items()
         if isinstance(value, functools.cached_property)
-    )
+    }
+    if dataclasses.is_dataclass(kind):
+        for one in dataclasses.fields(kind):
+            if not one.compare and one.default is not dataclasses.MISSING:
+                found[one.name] = one.default
+    return found

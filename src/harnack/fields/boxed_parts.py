@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
 import numpy as np
 
+from harnack.cluster.packing import Remembered
 from harnack.fields.batch import prepared_once
 from harnack.fields.clearance import UnitCoordinates, placed, single
 from harnack.fields.field import Field
@@ -76,7 +77,7 @@ class BoxedField(Field, Generic[_Buffers]):
 
     def __init__(self) -> None:
         self.levels: tuple[float, ...] = (self.default_level,)
-        self._for_levels: dict[tuple[float, ...], Self] = {}
+        self._for_levels: Remembered[tuple[float, ...], Self] = Remembered()
         self._device: _Buffers | None = None
 
     @abc.abstractmethod

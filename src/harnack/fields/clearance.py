@@ -17,6 +17,7 @@ import numpy as np
 
 from harnack.backend import FloatArray, backend_of, choose_backend, to_numpy, to_vector3
 from harnack.backend.elementary import fmax, fmin, largest_coordinate, length
+from harnack.cluster.packing import Remembered
 from harnack.enclosures import Gaps, Slopes, TargetLevels, choose_proofs, longest_step
 from harnack.fields.batch import prepared_once
 from harnack.fields.field import AtDetail, Field
@@ -159,7 +160,7 @@ class UploadedField(Field, Generic[Uploaded]):
 
     def __init__(self) -> None:
         self._device: Uploaded | None = None
-        self._batches: dict[Backend, Uploaded] = {}
+        self._batches: Remembered[Backend, Uploaded] = Remembered()
 
     @abc.abstractmethod
     def _upload(self, backend: Backend, *, traced: bool) -> Uploaded:

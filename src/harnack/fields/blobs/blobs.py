@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, cast
@@ -94,7 +95,6 @@ class Blobs(Formula):
         )
         self.kernel = choose_kernel(kernel)
         self._on: _BlobData | None = None
-        self._lists: CellLists | None = None
 
     def __len__(self) -> int:
         return len(self.centers)
@@ -103,11 +103,10 @@ class Blobs(Formula):
     def _supports(self) -> FloatArray:
         return self.radii * self.kernel.support
 
+    @functools.cached_property
     def cell_lists(self) -> CellLists | None:
-        """The lists of blobs near each cell of a grid, built once; None for few blobs."""
-        if self._lists is None and len(self) >= _MANY:
-            self._lists = CellLists.of(self.centers, self._supports)
-        return self._lists
+        """The lists of blobs near each cell of a grid; None for few blobs."""
+        return CellLists.of(self.centers, self._supports) if len(self) >= _MANY else None
 
     @prepared_once
     def prepare(self, backend: Backend) -> Blobs:
@@ -122,7 +121,7 @@ class Blobs(Formula):
         """A bound of |grad f|: the largest sum of the largest gradients of overlapping blobs."""
         steep = np.abs(self.weights) * (self.kernel.amplitude * self.kernel.steepness.slope)
         steep /= self._supports
-        lists = self.cell_lists()
+        lists = self.cell_lists
         if lists is None:
             return float(steep.sum())
         ends = np.concatenate([[0.0], np.cumsum(steep[lists.entries])])
@@ -227,7 +226,7 @@ class Blobs(Formula):
 
     def describe(self) -> dict[str, Any]:
         facts: dict[str, Any] = {"blobs": len(self), "kernel": self.kernel.name}
-        lists = self.cell_lists()
+        lists = self.cell_lists
         if lists is not None:
             nx, ny, nz = lists.shape
             facts["grid"] = f"{nx} x {ny} x {nz} cells of {lists.cell:.3g}"
@@ -253,7 +252,7 @@ class _BlobData:
     @classmethod
     def upload(cls, backend: Backend, blobs: Blobs) -> _BlobData:
         """The blobs on a backend."""
-        lists = blobs.cell_lists()
+        lists = blobs.cell_lists
         groups = None
         if blobs.groups is not None:
             count = dr.opaque(backend.UInt32, int(blobs.groups.max()) + 1)

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
@@ -193,7 +194,7 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
         self._center = single(0.5 * (low + high))
         extent = max(0.5 * float((high - low).max()), math.sqrt(float(self.areas.sum())) / 4)
         self._size = 2.0 ** math.ceil(math.log2(extent))
-        self._hierarchy: Hierarchy | None = None
+        self._given_hierarchy: Hierarchy | None = None
 
     def moved(
         self, points: Any, normals: Any | Literal["estimate"] = None, areas: Any = None
@@ -211,7 +212,7 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
                 f"points: {len(field.points)} of them, where {len(self.points)} were before: "
                 "moving points keeps their number and their order"
             )
-        field._hierarchy = self._hierarchy
+        field._given_hierarchy = vars(self).get("_hierarchy", self._given_hierarchy)
         return field
 
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> Values:
@@ -220,13 +221,16 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
         weight = float(self.areas.sum()) / self._size**2
         return on.tree.at(x, derivatives, closer).far_away(x, 64, weight).rescaled(on.size)
 
+    @functools.cached_property
+    def _hierarchy(self) -> Hierarchy:
+        """The tree's shape, from these points or, of moved ones, from where they were."""
+        return self._given_hierarchy or hierarchy_of((self.points - self._center) / self._size)
+
     def _upload(self, backend: Backend, *, traced: bool) -> _DipoleBuffers:
         accuracy = self.accuracy or (_TRACED if traced else _VALUES)
         unit = (self.points - self._center) / self._size
         # Areas scale with the square of lengths; the potential is invariant under scaling.
         moments = (self.areas / self._size**2)[:, None] * self.normals
-        if self._hierarchy is None:
-            self._hierarchy = hierarchy_of(unit)
         tree = DipoleTree.of(backend, self._hierarchy, unit, moments, accuracy)
         return _DipoleBuffers(*placed(backend, self._center, self._size), tree)
 

@@ -18,6 +18,7 @@ from numpy.polynomial import chebyshev, legendre
 
 from harnack.backend import backend_of
 from harnack.backend.elementary import fmax
+from harnack.cluster.packing import Remembered
 from harnack.enclosures import HarmonicBall
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.clearance import (
@@ -305,8 +306,8 @@ class MorphSlice(DetailedField["_SliceBuffers"], BatchedField):
         _check_count([piece_counts(*one) for one in zip(corners, longest, strict=True)], w, gap)
         self._pieces = tuple(centroids(*one) for one in zip(corners, longest, strict=True))
         self._dipoles = tuple(self._clustered(one) for one in self._pieces)
-        self._extents: dict[tuple[float, ...], Volume] = {}
-        self._occupied: dict[tuple[float, ...], OccupiedCells] = {}
+        self._extents: Remembered[tuple[float, ...], Volume] = Remembered()
+        self._occupied: Remembered[tuple[float, ...], OccupiedCells] = Remembered()
 
     def _clustered(self, pieces: Centroids) -> ClusteredDipoles:
         """The pieces in unit coordinates, scaled so that f is the sum of both."""

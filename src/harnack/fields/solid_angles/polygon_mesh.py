@@ -20,6 +20,7 @@ from harnack.backend import BoolArray, FloatArray, IntArray, choose_backend, to_
 from harnack.backend.arrays import aligned, aligned_integers
 from harnack.backend.elementary import fmin
 from harnack.backend.records import Records
+from harnack.cluster.packing import Remembered
 from harnack.enclosures import HarmonicBall, Lipschitz
 from harnack.fields.boxed_parts import BoxedField, BoxedParts
 from harnack.fields.clearance import UnitCoordinates
@@ -359,7 +360,7 @@ class PolygonMesh(BoxedField["_MeshBuffers"]):
                 f"{self.faces.count:,} faces are too many: at most {MOST_BOXES:,}; cut the mesh "
                 "into parts"
             )
-        self._boxes: dict[tuple[float, ...], tuple[FloatArray, FloatArray]] = {}
+        self._boxes: Remembered[tuple[float, ...], tuple[FloatArray, FloatArray]] = Remembered()
 
     @property
     def vertices(self) -> FloatArray:

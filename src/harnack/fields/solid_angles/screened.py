@@ -16,6 +16,7 @@ import numpy as np
 from harnack.backend import FloatArray, backend_of
 from harnack.backend.elementary import fmax, fmin
 from harnack.backend.numbers import positive
+from harnack.cluster.packing import Remembered
 from harnack.enclosures import Curvature, HarmonicBall
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.clearance import (
@@ -280,7 +281,7 @@ class ScreenedWindingNumber(DetailedField["_ScreenedBuffers"], BatchedField):
         self._rows = dipole_rows((self.points - self._center) / self._size, share * self.normals)
         self._kappa = self._size / self.length
         self.default_level = mean_at_dipoles(self._rows, self._kappa)
-        self._extents: dict[tuple[float, ...], Volume | None] = {}
+        self._extents: Remembered[tuple[float, ...], Volume | None] = Remembered()
 
     @classmethod
     def of_mesh(

@@ -14,6 +14,7 @@ import numpy as np
 from harnack.backend import FloatArray, backend_of, choose_backend, to_numpy
 from harnack.backend.elementary import fmin
 from harnack.backend.tensors import is_tensor, vectors_of
+from harnack.cluster.packing import Remembered
 from harnack.enclosures import HarmonicBall, Lipschitz
 from harnack.fields.clearance import (
     UnitCoordinates,
@@ -122,7 +123,7 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         points = self._points_around()
         self._center = 0.5 * (points.min(axis=0) + points.max(axis=0))
         self._size = float(np.linalg.norm(points - self._center, axis=1).max())
-        self._extents: dict[tuple[float, ...], Volume | None] = {}
+        self._extents: Remembered[tuple[float, ...], Volume | None] = Remembered()
 
     @property
     def _is_empty(self) -> bool:

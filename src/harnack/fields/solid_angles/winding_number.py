@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray, IntArray, backend_of
+from harnack.cluster.packing import Remembered
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.clearance import (
     UnitCoordinates,
@@ -203,8 +204,8 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
             ("exact" if few else "tree") if method == "auto" else method
         )
         self.accuracy, self.order = accuracy, order
-        self._extents: dict[tuple[float, ...], Volume | None] = {}
-        self._occupied: dict[tuple[float, ...], OccupiedCells] = {}
+        self._extents: Remembered[tuple[float, ...], Volume | None] = Remembered()
+        self._occupied: Remembered[tuple[float, ...], OccupiedCells] = Remembered()
 
     def moved(self, vertices: Any) -> WindingNumber:
         """The winding number of the same faces with other positions of their vertices (n, 3), for
@@ -218,8 +219,8 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
         """
         field = copy.copy(self)
         field.mesh = self.mesh.moved(vertices)
-        field._batches, field._device = {}, None
-        field._extents, field._occupied = {}, {}
+        field._batches, field._device = Remembered(), None
+        field._extents, field._occupied = Remembered(), Remembered()
         return field
 
     @property
