@@ -220,7 +220,7 @@ def test_functions(name: str, precision: Any) -> None:
 
 @pytest.mark.parametrize("precision", QUICK_PRECISIONS)
 def test_angles(precision: Any) -> None:
-    """Ranges on boxes, many of which meet the cut: there [-pi, pi], and derivatives of all sizes."""
+    """Ranges on boxes, many of which meet the cut: there [-pi, pi], and any derivative."""
     backend, rng, n = choose_backend(precision), np.random.default_rng(4), 20_000
     y, x = (ranges(rng, backend.dtype, n) for _ in range(2))
     for exact in (False, True):

@@ -1,8 +1,9 @@
 """The angle of a point of the plane, `atan2`: in (-pi, pi], with a cut along the negative x axis.
 
 On the cut, {y = 0, x <= 0}, the angle jumps by 2 pi, and at the origin it has no value at all
-(there it counts as 0). A range that meets the cut is [-pi, pi], with derivatives that are all numbers: so
-no arithmetic takes the angle for a continuous function there, and no step leads across the cut.
+(there it counts as 0). A range that meets the cut is [-pi, pi], with
+derivatives that are all numbers: so no arithmetic takes the angle for a continuous function there,
+and no step leads across the cut.
 """
 
 from __future__ import annotations

@@ -51,7 +51,10 @@ _OPERATORS = {
     "arctan2": ("atan2", "_atan2_of"),
 }  # fmt: skip
 # The names of those functions in formulas.
-_NAMES = "sin, cos, tan, exp, log, sqrt, tanh, atan, atan2, asin, acos, sinh, cosh, maximum, minimum, norm"
+_NAMES = (
+    "sin, cos, tan, exp, log, sqrt, tanh, atan, atan2, asin, acos, sinh, cosh, "
+    "maximum, minimum, norm"
+)
 
 
 class Operators(abc.ABC):
