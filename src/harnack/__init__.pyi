@@ -86,6 +86,7 @@ from .fields.solids.primitives import (
 )
 from .fields.solids.region import solid
 from .fields.solids.solid import Shape, Solid
+from .fields.solids.swept import Extruded, Revolved
 from .fields.solids.tube import Tube, Tubes
 from .geometry import Ball, Box, Circle, ConvexHull, HalfSpace, Intersection
 from .meshing import MeshingError, mesh, repair
@@ -121,6 +122,7 @@ __all__ = [
     "EigenfunctionSum",
     "Ellipsoid",
     "Enclosure",
+    "Extruded",
     "Field",
     "FourierSeries",
     "FractalNoise",
@@ -150,6 +152,7 @@ __all__ = [
     "PlaneWave",
     "PolygonMesh",
     "Product",
+    "Revolved",
     "RiemannSurface",
     "Sample",
     "SavedScene",

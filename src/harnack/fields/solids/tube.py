@@ -211,7 +211,7 @@ class Tube(Solid):
             off = 8 * unit * (dr.norm(from_start) + dr.norm(side))
             if direction is not None:
                 slope = dr.dot(away, direction) / distance - off / distance * 2
-                lows = _lowered(lows, knots, distance - off, slope, 4 * unit * distance, unit)
+                lows = lowered(lows, knots, distance - off, slope, 4 * unit * distance, unit)
             nearer = distance < nearest
             return (
                 dr.select(nearer, distance, nearest),
@@ -287,7 +287,7 @@ def _by_groups(
             off = 8 * unit * (dr.norm(p) + distance + row[3])
             slope = dr.dot(away, direction) / distance - 2 * off / distance
             start = dr.select(is_near, dr.inf, distance - row[3] - off)
-            found[5:] = _lowered(found[5:], knots, start, slope, 4 * unit * distance, unit)
+            found[5:] = lowered(found[5:], knots, start, slope, 4 * unit * distance, unit)
 
         def each(j: Any, *inner: Any) -> tuple[Any, ...]:
             return j + 1, *body(records.row(i * _GROUP + j), inner)
@@ -306,7 +306,7 @@ def _by_groups(
     return dr.while_loop((index, *start), more_groups, visit, label="tube by groups")[1:]
 
 
-def _lowered(
+def lowered(
     lows: Sequence[Real],
     knots: tuple[Real, ...],
     start: Real,
