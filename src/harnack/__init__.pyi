@@ -88,6 +88,7 @@ from .fields.solids.region import solid
 from .fields.solids.solid import Shape, Solid
 from .fields.solids.swept import Extruded, Revolved
 from .fields.solids.tube import Tube, Tubes
+from .files import outline
 from .geometry import Ball, Box, Circle, ConvexHull, HalfSpace, Intersection
 from .meshing import MeshingError, mesh, repair
 from .rendering import Camera, Isolines, animate, render
@@ -209,6 +210,7 @@ __all__ = [
     "meshing",
     "minimum",
     "norm",
+    "outline",
     "page",
     "read_scene",
     "render",

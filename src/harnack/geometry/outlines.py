@@ -193,7 +193,10 @@ def _resolved(loops: list[FloatArray], rule: Rule) -> Outline:
 
     fill = FillRule.EvenOdd if rule == "even-odd" else FillRule.NonZero
     points = np.concatenate(loops)
-    center = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    low, high = points.min(axis=0), points.max(axis=0)
+    unit = 2.0 ** (math.frexp(float((high - low).max()))[1] - 10)
+    # A multiple of the unit, so that the rounded loops have the same one.
+    center: FloatArray = np.rint(0.5 * (low + high) / unit) * unit
     scaled, scale = for_clipper([one - center for one in loops])
     found = cast("list[FloatArray]", CrossSection(scaled, fill).to_polygons())
     made = [np.array(one, np.float64) for one in found]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NoReturn, cast
@@ -23,6 +22,7 @@ from harnack.fields.boxed_parts import BoxedField, BoxedParts
 from harnack.fields.field import Field
 from harnack.fields.look import Look, Path, Sample
 from harnack.fields.solids.solid import Solid, box_around
+from harnack.geometry.beziers import flattened
 from harnack.tree.nearest import MOST_BOXES
 
 if TYPE_CHECKING:
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Tubes"]
 
-_MOST_SEGMENTS = 1_000_000
 # Segments in a group, and the number of segments from which on they are grouped.
 _GROUP, _MANY = 8, 64
 # The inner knots of the piecewise linear bound, as fractions of the length asked for.
@@ -109,8 +108,7 @@ class Tube(Solid):
         tolerance: how far the surface may be from the exact one, in units of length; by default a
             thousandth of the radius. The number of segments grows like its square root.
 
-        Proof. A chord between two parameters h apart is within h^2/8 max |B''| of the curve, taken
-        at equal parameters, and |B''| <= 6 max |second difference of the control points|.
+        Proof: `harnack.geometry.beziers.flattened`.
 
         Raises:
             ValueError: another number of points, or numbers that are not finite.
@@ -129,15 +127,9 @@ class Tube(Solid):
         made = [points[:1]]
         off = 0.0
         for start in range(0, len(points) - 1, 3):
-            curve = points[start : start + 4]
-            bend = 6.0 * float(np.linalg.norm(np.diff(curve, 2, axis=0), axis=1).max())
-            count = max(1, math.ceil(math.sqrt(bend / (8.0 * allowed))))
-            if count > _MOST_SEGMENTS:
-                raise ValueError(f"{count:,} segments for one curve: allow a larger tolerance")
-            t = np.linspace(0.0, 1.0, count + 1)[1:, None]
-            weights = np.hstack([(1 - t) ** 3, 3 * t * (1 - t) ** 2, 3 * t**2 * (1 - t), t**3])
-            made.append(weights @ curve)
-            off = max(off, bend / (8.0 * count**2))
+            more, error = flattened(points[start : start + 4], allowed)
+            made.append(more)
+            off = max(off, error)
         return cls(np.concatenate(made), radius, flattening=off)
 
     def leaves(self, change: Callable[[Solid], Solid]) -> Solid:
