@@ -87,6 +87,7 @@ from .fields.solids.primitives import (
 from .fields.solids.region import solid
 from .fields.solids.solid import Shape, Solid
 from .fields.solids.swept import Extruded, Revolved
+from .fields.solids.thread import Thread, thread
 from .fields.solids.tube import Tube, Tubes
 from .files import outline
 from .geometry import Ball, Box, Circle, ConvexHull, HalfSpace, Intersection
@@ -173,6 +174,7 @@ __all__ = [
     "Superellipsoid",
     "Supertorus",
     "Taylor",
+    "Thread",
     "Tolerance",
     "Torus",
     "Tube",
@@ -225,6 +227,7 @@ __all__ = [
     "tan",
     "tanh",
     "testing",
+    "thread",
     "trace",
     "tracer",
     "union",

@@ -71,6 +71,16 @@ def extruded(x: Any, loops: Any, height: float, twist: float = 0.0, taper: float
     return pair(np.maximum(d, 0), np.maximum(w, 0)) + np.minimum(np.maximum(d, w), 0)
 
 
+def screw(x: Any, thread: Any) -> Any:
+    pitch, points = thread.pitch, np.array(thread.profile)
+    lead = thread.starts * pitch * (-1 if thread.left_handed else 1)
+    r = norm(x[..., :2])
+    u = (x[..., 2] - lead * np.arctan2(x[..., 1], x[..., 0]) / (2 * np.pi)) % pitch
+    curve = np.concatenate([points + np.array([k * pitch, 0]) for k in range(-3, 5)])
+    d = segments(np.stack([u, r], -1), curve)
+    return np.maximum(np.where(r < np.interp(u, *curve.T), -d, d), -points[:, 1].min() / 2)
+
+
 def julia(x: Any, c: Any, count: int, w: float) -> Any:
     q = np.concatenate([x, np.full((*x.shape[:-1], 1), w)], -1).astype(np.longdouble)
     log, share = np.zeros(x.shape[:-1]), np.ones(x.shape[:-1])
@@ -127,6 +137,7 @@ NOISE = hk.Noise(2.0, 0.7, seed=5)
 FRACTAL = hk.FractalNoise(3, 1.0, 2.0, 0.15, fade="cubic")
 TUBE = hk.Tube.bezier(CURVE, 0.2, tolerance=2e-3)
 C = (-0.2, 0.8, 0.0, 0.0)
+SCREW = hk.Thread([(0, 0.8), (0.1, 0.8), (0.25, 0.5)], 0.4, starts=2, left_handed=True)
 TURN = np.linspace(0, 2 * np.pi, 90, endpoint=False)
 STAR = (0.8 + 0.25 * np.cos(5 * TURN))[:, None] * np.column_stack([np.cos(TURN), np.sin(TURN)])
 # A hole, which runs the same way around, and an island in it.
@@ -194,6 +205,7 @@ SHAPES: dict[str, tuple[Any, Oracle]] = {
             [np.concatenate([CUP, np.array(CUP)[-2:0:-1] * [-1, 1]])],
         ),
     ),
+    "thread": (SCREW, lambda x: screw(x, SCREW)),
     "noise": (NOISE, lambda x: noise(x, NOISE)),
     "displaced": (
         hk.Displaced(hk.Sphere(), FRACTAL),
@@ -266,7 +278,7 @@ def test_no_level_within_a_step(name: str, precision: Any) -> None:
         )
 
     assert not passes(1.0).any()
-    never_that_long = ("julia", "turned outline")
+    never_that_long = ("julia", "turned outline", "thread")
     if precision == "double" and name not in never_that_long:
         assert passes(1.001).any()
 
@@ -275,7 +287,7 @@ CONSTANTS = [
     *[
         name
         for name in SHAPES
-        if name not in ("tube", "turned outline", "noise", "displaced", "julia")
+        if name not in ("tube", "turned outline", "thread", "noise", "displaced", "julia")
     ],
 ]
 
@@ -330,7 +342,7 @@ def test_constants_of_norms_are_attained(powers: tuple[float, float]) -> None:
 def test_hulls_hold_the_solid(name: str, level: float) -> None:
     shape, oracle = SHAPES[name]
     hull = shape.hull(level)
-    if name in ("plane", "cylinder", "double cone", "noise"):
+    if name in ("plane", "cylinder", "double cone", "thread", "noise"):
         assert hull is None
         return
     rng = np.random.default_rng(6)

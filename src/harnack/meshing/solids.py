@@ -27,6 +27,7 @@ from harnack.fields.solids.primitives import Cuboid, Plane
 from harnack.fields.solids.region import Near, Region, bounded_side
 from harnack.fields.solids.region import solid as solid_of
 from harnack.fields.solids.swept import Extruded, Revolved
+from harnack.fields.solids.thread import Thread
 from harnack.geometry import Ball, Box, Intersection, Volume
 from harnack.meshing.checks import LocalError, MeshingError
 from harnack.meshing.closed_mesh import (
@@ -40,6 +41,7 @@ from harnack.meshing.closed_mesh import (
 from harnack.meshing.lattice import Lattice
 from harnack.meshing.lattice_surface import MissedError, Surface, closed_surface
 from harnack.meshing.samples import CELLS_PER_WAVE, LevelFunction, Samples, Uploads
+from harnack.meshing.thread_mesh import thread_manifold
 
 if TYPE_CHECKING:
     from manifold3d import Manifold
@@ -107,6 +109,9 @@ class RegionMesher:
             )
         if isinstance(solid, Revolved) and level == 0:
             return revolved_manifold(solid.loops, self.tolerance)
+        if isinstance(solid, Thread) and level == 0:
+            low, high = float(self.lower[2]), float(self.upper[2])
+            return thread_manifold(solid, low, high, self.tolerance)
         if isinstance(solid, Plane):
             x, y, z = solid.normal
             return self._space().trim_by_plane((-x, -y, -z), -(solid.distance + level))
@@ -222,8 +227,8 @@ def is_smooth(solid: Solid) -> bool:
         return not isinstance(solid.inner, Solid) or is_smooth(solid.inner)
     if isinstance(solid, AffineImage):
         return is_smooth(solid.inner)
-    whole = Combined | Complement | Offset | Near | Cuboid | Plane | Extruded | Revolved
-    return not isinstance(solid, whole)
+    with_edges = Cuboid | Plane | Extruded | Revolved | Thread
+    return not isinstance(solid, Combined | Complement | Offset | Near | with_edges)
 
 
 def _hull(field: Field, level: float) -> Volume | None:

@@ -25,7 +25,7 @@ from harnack.fields.look import Look, Path, Sample
 from harnack.fields.solids.bends import Taper, Twist
 from harnack.fields.solids.outline_distance import Nearest, OutlineBuffers, SignedAhead
 from harnack.fields.solids.solid import Solid, box_around, set_checked
-from harnack.geometry.outlines import Outline, outline_loops
+from harnack.geometry.outlines import outline_loops
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
@@ -65,7 +65,7 @@ class Extruded(Solid):
         ValueError: loops that enclose no area; a height or a taper that is not positive.
     """
 
-    loops: Outline
+    loops: Any
     height: float
     twist: float = 0.0
     taper: float = 1.0
@@ -328,7 +328,7 @@ class Revolved(Solid):
         ValueError: loops that enclose no area, or with points of r < 0.
     """
 
-    loops: Outline
+    loops: Any
 
     lipschitz = 1.0
 

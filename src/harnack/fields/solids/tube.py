@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NoReturn, cast
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Tubes"]
 
+_MOST_SEGMENTS = 1_000_000
 # Segments in a group, and the number of segments from which on they are grouped.
 _GROUP, _MANY = 8, 64
 # The inner knots of the piecewise linear bound, as fractions of the length asked for.
@@ -131,6 +133,38 @@ class Tube(Solid):
             made.append(more)
             off = max(off, error)
         return cls(np.concatenate(made), radius, flattening=off)
+
+    @classmethod
+    def helix(
+        cls, radius: float, pitch: float, turns: float, wire: float, *,
+        left_handed: bool = False, tolerance: float | None = None,
+    ) -> Tube:  # fmt: skip
+        """A coil of round wire about the z axis, from (radius, 0, 0) to z = pitch turns; its ends
+        are round.
+
+        radius: of the helix that is the middle of the wire. pitch: along the axis, of one turn.
+        wire: its radius. left_handed: whether it turns clockwise as it rises.
+        tolerance: how far the surface may be from the exact one, in units of length; by default a
+            thousandth of the radius of the wire.
+
+        Proof. A chord between two angles h apart is within h^2/8 max |c''| of the helix c, taken at
+        equal angles, and |c''| is the radius.
+
+        Raises:
+            ValueError: numbers that are not positive, or more than a million segments.
+        """
+        radius, wire = positive(radius, "the radius of a helix"), positive(wire, "the wire")
+        pitch, turns = positive(pitch, "the pitch of a helix"), positive(turns, "its turns")
+        allowed = 1e-3 * wire if tolerance is None else positive(tolerance, "the tolerance")
+        angle = 2 * math.pi * turns
+        count = max(1.0, angle * math.sqrt(radius / (8.0 * allowed)))
+        if not count <= _MOST_SEGMENTS:
+            raise ValueError(f"{count:,.0f} segments: allow a larger tolerance")
+        t = np.linspace(0.0, angle, math.ceil(count) + 1)
+        y = np.sin(t) * (-radius if left_handed else radius)
+        points = np.column_stack([radius * np.cos(t), y, pitch * t / (2 * math.pi)])
+        off = radius * (angle / math.ceil(count)) ** 2 / 8.0
+        return cls(points, wire, flattening=off)
 
     def leaves(self, change: Callable[[Solid], Solid]) -> Solid:
         return change(self)
