@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
@@ -54,8 +54,9 @@ class Extruded(Solid):
     plane, exact over all edges, and that from the ends, at right angles (`corner`). So its constant
     is 1. Along a path more is proved: see `ExtrudedAhead`.
 
-    Else f is that function of the point that is mapped to p, which has the same z. Proof of the
-    promise: on a ball about p the inverse of the taper has the constant c within R, the inverse of
+    Else f is that function of the point that is mapped to p, which has the same z. Along a path it
+    moves no faster than that point, whose speed is bounded by ranges. Proof of the promise in all
+    directions: on a ball about p the inverse of the taper has the constant c within R, the inverse of
     the twist, which acts on what the first returns, the constant b within S (proofs: `Taper`,
     `Twist`); so both together have b c within min(R, S/c), and f, of constant 1, has it too. Steps
     get short where a twist is strong and far from its axis: b is about the angle per length times
@@ -161,7 +162,14 @@ class Extruded(Solid):
     def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
         del back
         p, d = path.point(t), path.direction
-        if not self.is_straight or Pieces not in path.proofs.kinds:
+        if not self.is_straight:
+            sample = self.evaluate(p)
+            least = self._least_slope(sample)
+            along = _on(self, p)._speed(p, d, fmin(ahead, 2 * dr.abs(sample.value)))
+            look = path.look(replace(sample, along=(along,)))
+            # Nothing is known of the speed looking back.
+            return replace(look, back=(), least_gradient=least)
+        if Pieces not in path.proofs.kinds:
             return path.look(self.evaluate(p))
         on = _on(self, p)
         outline: OutlineBuffers = on._outline
@@ -188,6 +196,26 @@ class Extruded(Solid):
             if bend is not None:
                 x, y, z = bend.local(x, y, z)
         return x, y, z
+
+    def _speed(self, p: Vec3, direction: Vec3, length: Real) -> Lipschitz:
+        """The largest speed of the point that is mapped to a path, up to a length: as f has the
+        constant 1 there, it is one along the path."""
+        local = self._local(*Jet.along(p, direction, 0.0, length))
+        parts = [0 * p.x + one.first[0].largest for one in local]
+        speed = dr.norm(cast("Any", type(p))(*parts)) * (1 + 1e-5)
+        known = dr.isfinite(speed) & (length > 0)
+        return Lipschitz(dr.select(known, speed, dr.inf), dr.select(known, length, 0))
+
+    def _least_slope(self, sample: Sample) -> Real:
+        """A lower bound of |grad f|, from the constant c that a sample promises.
+
+        Proof. It is at least the least singular value of the inverse map's derivative. That of a
+        twist, whose singular values are s, 1 and 1/s, is 1/s; that of a taper, k and those of a
+        2 x 2 matrix of determinant k, is k/s, for s >= k, 1. c is at least the product of both s,
+        and k is at least 1/max(1, taper).
+        """
+        (known,) = sample.known
+        return _STEEP / (max(1.0, self.taper) * cast("Lipschitz", known).constant)
 
     def _stretch(self, p: Vec3) -> tuple[Real, Real]:
         """A Lipschitz constant of `_local` on a ball about p, and its radius."""
