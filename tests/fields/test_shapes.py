@@ -449,6 +449,49 @@ def test_flattening_is_as_stated() -> None:
     assert finer.describe()["segments"] > 5 * TUBE.describe()["segments"]
 
 
+def test_metric_threads_have_their_sizes() -> None:
+    """M8: 8 mm across crests, 6.647 mm across roots (ISO 724), 7.188 mm across the pitch line."""
+    pitch = 1.25
+    screw, cut = hk.thread("M8", 20.0), hk.thread("M8", 20.0, internal=True)
+    z = 10.0 + pitch * np.linspace(0, 1, 2001)
+    for solid in (screw, cut):
+        angle = 0.7
+        r = np.linspace(2.9, 4.3, 1401)
+        x = np.stack(np.broadcast_arrays(r[:, None] * math.cos(angle), r[:, None] * math.sin(angle),
+                                         z[None]), -1)  # fmt: skip
+        inside = solid.value(x.reshape(-1, 3), precision="double").reshape(x.shape[:2]) <= 0
+        edge = r[inside.sum(axis=0) - 1]  # a profile r(z)
+        assert 2 * edge.max() == pytest.approx(8.0, abs=4e-3)
+        assert 2 * edge.min() == pytest.approx(6.647, abs=4e-3)
+        assert np.mean(edge > 7.188 / 2) == pytest.approx(0.5, abs=5e-3)
+        assert np.mean(edge > 3.998) == pytest.approx(1 / 8, abs=5e-3)
+        assert np.mean(edge < 6.65 / 2) == pytest.approx(1 / 4, abs=5e-3)
+    # A screw and its nut are twice the clearance apart, across crests, roots and flanks.
+    loose, wide = hk.thread("M8", 20.0, clearance=0.05), hk.thread(
+        "M8", 20.0, internal=True, clearance=0.05
+    )  # fmt: skip
+    points = x.reshape(-1, 3)
+    off = [
+        a.value(points, precision="double") - b.value(points, precision="double")
+        for a, b in ((loose.parts[0], screw.parts[0]), (screw.parts[0], wide.parts[0].parts[0]))
+    ]
+    near = np.abs(screw.value(points, precision="double")) < 0.05
+    for one in off:
+        assert np.median(one[near]) == pytest.approx(0.05, abs=1e-9)
+        assert (one[near] > 0.025).all()
+    # Counter-clockwise as it rises: a quarter of a turn up, the same a quarter of a pitch higher.
+    rise = screw.parts[0].value([[0.0, 3.9, 5.0 + pitch / 4]], precision="double")
+    assert rise == pytest.approx(screw.parts[0].value([[3.9, 0.0, 5.0]], precision="double"))
+
+
+def test_coils_stay_within_their_flattening() -> None:
+    coil = hk.Tube.helix(2.0, 0.5, 3.0, 0.2, left_handed=True)
+    t = np.linspace(0, 6 * np.pi, 5000)
+    curve = np.column_stack([2 * np.cos(t), -2 * np.sin(t), 0.5 * t / (2 * np.pi)])
+    off = np.abs(coil.value(curve, precision="double") + 0.2).max()
+    assert 0.9 * coil.flattening < off <= coil.flattening <= 2e-4
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [
@@ -467,6 +510,26 @@ def test_flattening_is_as_stated() -> None:
         (lambda: hk.Tube(np.zeros((3, 3)), 0.1), "two points or more"),
         (lambda: hk.Tube(np.zeros((3, 2)), 0.1), "must have shape"),
         (lambda: hk.Tube.bezier(np.zeros((5, 3)), 0.1), "3 n \\+ 1"),
+        (lambda: hk.Extruded(CUP, 0.0), "height of an extruded outline"),
+        (lambda: hk.Extruded(CUP, 1.0, twist=math.inf), "twist of an extruded outline"),
+        (lambda: hk.Extruded(CUP, 1.0, taper=-1.0), "taper of an extruded outline"),
+        (lambda: hk.Extruded([(0, 0), (1, 1)], 1.0), "three points or more"),
+        (lambda: hk.Revolved([(-0.1, 0), (1, 0), (1, 1)]), "lies in r >= 0"),
+        (lambda: hk.Tube.helix(1.0, 1.0, 0.0, 0.1), "its turns must be positive"),
+        (lambda: hk.Tube.helix(1.0, 1.0, 1.0, 0.1, tolerance=1e-30), "larger tolerance"),
+        (lambda: hk.Thread([(0, 1), (1, 1)], 1.0), "rises from 0 to less than the pitch"),
+        (lambda: hk.Thread([(0.1, 1)], 1.0), "rises from 0"),
+        (lambda: hk.Thread([(0, -1)], 1.0), "must be positive"),
+        (lambda: hk.Thread([(0, math.nan)], 1.0), "finite"),
+        (lambda: hk.Thread([0, 1], 1.0), "has shape"),
+        (lambda: hk.Thread([(0, 1)], 1.0, starts=0), "starts of a thread"),
+        (lambda: hk.thread("8", 10.0), "named as"),
+        (lambda: hk.thread(8, 10.0), "named as"),
+        (lambda: hk.thread("M13", 10.0), "no coarse thread M13"),
+        (lambda: hk.thread("M8x7", 10.0), "leaves no core"),
+        (lambda: hk.thread("M8", 1.0), "must be longer"),
+        (lambda: hk.thread("M8", 10.0, clearance=0.2), "clearance of M8"),
+        (lambda: hk.thread("M8", 10.0, clearance=-0.1), "clearance of M8"),
         (lambda: hk.Noise(0.0), "frequency of noise"),
         (lambda: hk.Noise(fade="linear"), "quintic"),
         (lambda: hk.FractalNoise(0), "octaves"),

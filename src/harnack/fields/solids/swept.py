@@ -56,11 +56,9 @@ class Extruded(Solid):
 
     Else f is that function of the point that is mapped to p, which has the same z. Along a path it
     moves no faster than that point, whose speed is bounded by ranges. Proof of the promise in all
-    directions: on a ball about p the inverse of the taper has the constant c within R, the inverse of
-    the twist, which acts on what the first returns, the constant b within S (proofs: `Taper`,
-    `Twist`); so both together have b c within min(R, S/c), and f, of constant 1, has it too. Steps
-    get short where a twist is strong and far from its axis: b is about the angle per length times
-    the distance from the axis.
+    directions: on a ball about p the inverse of the taper has the constant c within R, the inverse
+    of the twist, which acts on what the first returns, the constant b within S (proofs: `Taper`,
+    `Twist`); so both together have b c within min(R, S/c), and f, of constant 1, has it too.
 
     Raises:
         ValueError: loops that enclose no area; a height or a taper that is not positive.
