@@ -277,7 +277,7 @@ class ExtrudedAhead(Enclosure):
         down = fmax(gaps.down, self._fall(gaps.down - below))
         aside = gaps.down - beside
         down = fmax(dr.select(aside > 0, self.side.step(Gaps(aside, none)), 0), down)
-        inside = self.value + gaps.up <= 0
+        inside = self.value + gaps.up + self.error <= 0  # also for unrounded numbers
         more = 2 * self.error
         up = fmin(
             self._rise(gaps.up + below - more),
@@ -289,15 +289,15 @@ class ExtrudedAhead(Enclosure):
 
     def _fall(self, gap: Real) -> Real:
         """The length on which w stays less than `gap` below its value."""
-        falls = self.height * self.rate < 0
-        free = dr.select(falls & (gap <= dr.abs(self.height)), gap / dr.abs(self.rate), dr.inf)
-        return dr.select(gap > 0, free, 0)
+        never = (self.height * self.rate >= 0) | (gap > dr.abs(self.height))
+        free = dr.select(never, dr.inf, gap / dr.abs(self.rate))
+        return dr.select((gap > 0) & (free >= 0), free, 0)
 
     def _rise(self, gap: Real) -> Real:
         falls = self.height * self.rate < 0
         way = gap + dr.select(falls, 2 * dr.abs(self.height), 0)
         free = dr.select(self.rate == 0, dr.inf, way / dr.abs(self.rate))
-        return dr.select(gap > 0, free, 0)
+        return dr.select((gap > 0) & (free >= 0), free, 0)
 
 
 def jet_of_distance(nearest: Callable[[Real, Real], Nearest], x: Jet, y: Jet) -> Jet:

@@ -226,8 +226,9 @@ class Beside(Enclosure):
         squared, product = self.slope * self.slope, self.square * left
         room = squared - product + 1e-5 * (squared + dr.abs(product))
         root = left / (dr.sqrt(fmax(room, 0)) - self.slope)
-        free = dr.select((self.slope < 0) & (room >= 0), root, dr.inf)
-        known = (level >= 0) & (left > 1e-5 * target * target) & (gaps.up >= 0)
+        free = dr.select((self.slope >= 0) | (room < 0), dr.inf, root)
+        known = (gaps.down <= self.value) & (left > 1e-5 * target * target) & (gaps.up >= 0)
+        known &= (free >= 0) & dr.isfinite(left + squared + product)
         free = dr.select(gaps.down == dr.inf, dr.inf, dr.select(known, free, 0))
         return fmax(fmin(free, gaps.up / self.constant), 0) * (1 - 1e-5)
 
