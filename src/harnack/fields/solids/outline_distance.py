@@ -38,6 +38,7 @@ class Nearest:
     """What is known of the signed distance d at points of the plane.
 
     value: d, negative inside. gradient: (d_x, d_y), a unit vector. error, gradient_error: of them.
+    bend: the second derivative across the gradient: 1/d beside a vertex, else 0.
     lows: lower bounds of |d| along the line at knots, less |d| here, rounding included.
     """
 
@@ -45,7 +46,8 @@ class Nearest:
     gradient: tuple[Real, Real]
     error: Real
     gradient_error: Real
-    lows: tuple[Real, ...]
+    bend: Real = 0.0
+    lows: tuple[Real, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -146,7 +148,8 @@ class OutlineBuffers:
         )
         doubt = dr.select(on_edge, 8 * unit, fmin(2 * error / distance, 2))
         lower = tuple(low - distance - error for low in lows)
-        return Nearest(sign * distance, (gradient[0], gradient[1]), error, doubt, lower)
+        bend = dr.select(on_edge, 0, sign / distance)
+        return Nearest(sign * distance, (gradient[0], gradient[1]), error, doubt, bend, lower)
 
     def _by_chains(self, chains: Records, query: _Query, state: tuple[Any, ...]) -> tuple[Any, ...]:
         (most,) = chains.for_each(query.bounded, (query.x + dr.inf,), "outline chains")

@@ -135,7 +135,7 @@ class Extruded(Solid):
         gradient = cast("Any", type(p))(*(zero + one.middle for one in slopes))
         stretch, radius = on._stretch(p)
         doubt = sum((one.radius for one in slopes), zero) + side.gradient_error * stretch
-        moved = Nearest(side.value, side.gradient, side.error + 2 * off, doubt, ())
+        moved = Nearest(side.value, side.gradient, side.error + 2 * off, doubt)
         return on._joined(p, moved, gradient, Lipschitz(stretch, radius))
 
     def _joined(
@@ -304,8 +304,9 @@ def jet_of_distance(nearest: Callable[[Real, Real], Nearest], x: Jet, y: Jet) ->
     """The jet of a signed distance in the plane, of jets of coordinates.
 
     Proof. The distance has the constant 1, so a derivative in any variable is at most the length of
-    that of (x, y), and the value is off by at most what the coordinates are at the start; where the
-    distance has kinks, second derivatives have no bound.
+    that of (x, y), and the value is off by at most what the coordinates are at the start. On a
+    piece there may be kinks, so that second derivatives have no bound; at a point they are those of
+    the distance from the nearest edge or vertex, as its gradient is.
     """
     starts = [one if one.start is None else one.start for one in (x, y)]
     zero = 0 * x.width
@@ -320,20 +321,24 @@ def jet_of_distance(nearest: Callable[[Real, Real], Nearest], x: Jet, y: Jet) ->
         most = dr.sqrt(dr.fma(a, a, b * b)) * (1 + 1e-5)
         return Interval(-most, most)
 
-    unknown = Interval(zero - dr.inf, zero + dr.inf)
-    second = (unknown,) * len(x.second)
-    count = range(len(x.first))
     doubt = Interval(zero - there.gradient_error, zero + there.gradient_error)
     gx, gy = (Interval.exactly(one) + doubt for one in there.gradient)
-    slopes = tuple(
-        (gx * starts[0].first[i] + gy * starts[1].first[i]).meet(limits(i, *starts)) for i in count
+    count = range(len(x.first))
+    u, v = starts
+    slopes = tuple((gx * u.first[i] + gy * v.first[i]).meet(limits(i, u, v)) for i in count)
+    across = [gx * v.first[i] - gy * u.first[i] for i in count]
+    bend = Interval.exactly(zero + there.bend).widened(1e-5 + there.gradient_error)
+    second = tuple(
+        bend * across[i] * across[j] + gx * u.second[k] + gy * v.second[k]
+        for k, (i, j) in enumerate(u.pairs())
     )
-    start = Jet(value, slopes, second, width=starts[0].width)
+    start = Jet(value, slopes, second, width=u.width)
     if x.start is None:
         return start
     first = tuple(limits(i, x, y) for i in count)
     moved = value + spanned(first[0], x.width)
-    return Jet(moved, first, second, start, x.width)
+    unknown = (Interval(zero - dr.inf, zero + dr.inf),) * len(x.second)
+    return Jet(moved, first, unknown, start, x.width)
 
 
 @dataclass(frozen=True, eq=False)
@@ -420,7 +425,7 @@ class Revolved(Solid):
         off = 8 * unit * r
         side = Nearest(
             side.value, side.gradient, side.error + off, side.gradient_error + 8 * unit,
-            tuple(low - off for low in lows),
+            side.bend, tuple(low - off for low in lows),
         )  # fmt: skip
         sample = self._sample(p, r, (x, y), side)
         slope = dr.dot(sample.gradient, d)
