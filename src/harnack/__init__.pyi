@@ -19,6 +19,7 @@ from .arithmetic import (
     acos,
     asin,
     atan,
+    atan2,
     cos,
     cosh,
     exp,
@@ -85,7 +86,10 @@ from .fields.solids.primitives import (
 )
 from .fields.solids.region import solid
 from .fields.solids.solid import Shape, Solid
+from .fields.solids.swept import Extruded, Revolved
+from .fields.solids.thread import Thread, thread
 from .fields.solids.tube import Tube, Tubes
+from .files import outline
 from .geometry import Ball, Box, Circle, ConvexHull, HalfSpace, Intersection
 from .meshing import MeshingError, mesh, repair
 from .rendering import Camera, Isolines, animate, render
@@ -120,6 +124,7 @@ __all__ = [
     "EigenfunctionSum",
     "Ellipsoid",
     "Enclosure",
+    "Extruded",
     "Field",
     "FourierSeries",
     "FractalNoise",
@@ -149,6 +154,7 @@ __all__ = [
     "PlaneWave",
     "PolygonMesh",
     "Product",
+    "Revolved",
     "RiemannSurface",
     "Sample",
     "SavedScene",
@@ -168,6 +174,7 @@ __all__ = [
     "Superellipsoid",
     "Supertorus",
     "Taylor",
+    "Thread",
     "Tolerance",
     "Torus",
     "Tube",
@@ -181,6 +188,7 @@ __all__ = [
     "arithmetic",
     "asin",
     "atan",
+    "atan2",
     "backend",
     "closest_points",
     "cos",
@@ -204,6 +212,7 @@ __all__ = [
     "meshing",
     "minimum",
     "norm",
+    "outline",
     "page",
     "read_scene",
     "render",
@@ -218,6 +227,7 @@ __all__ = [
     "tan",
     "tanh",
     "testing",
+    "thread",
     "trace",
     "tracer",
     "union",

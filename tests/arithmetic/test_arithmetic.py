@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.arithmetic import Interval, Jet, maximum, minimum, norm, power
+from harnack.arithmetic import ZERO, Interval, Jet, maximum, minimum, norm, power
 from harnack.arithmetic.functions import Function
 from harnack.backend import choose_backend
 
@@ -218,6 +218,45 @@ def test_functions(name: str, precision: Any) -> None:
                 check(one, right, True, f"{name}, derivative {k}, exact={exact}")
 
 
+@pytest.mark.parametrize("precision", QUICK_PRECISIONS)
+def test_angles(precision: Any) -> None:
+    """Ranges on boxes, many of which meet the cut: there [-pi, pi], and any derivative."""
+    backend, rng, n = choose_backend(precision), np.random.default_rng(4), 20_000
+    y, x = (ranges(rng, backend.dtype, n) for _ in range(2))
+    for exact in (False, True):
+        ys, xs = ((finite(one[0]),) * 2 if exact else one for one in (y, x))
+        boxes = [interval(backend, *one, exact=exact) for one in (ys, xs)]
+        one = Interval.exactly(backend.Float(1))
+        jets = [Jet(box, (one,), (ZERO,), width=backend.Float(0)) for box in boxes]
+        made = hk.atan2(*jets)
+        for v, u in zip(inside(rng, *ys), inside(rng, *xs), strict=True):
+            v, u = (part.astype(Long) + 0 for part in (v, u))  # no -0
+            with np.errstate(all="ignore"):
+                square = u * u + v * v
+                first = (u - v) / square
+                second = -2 * (u - v) * (u + v) / square**2
+            check(made.value, np.arctan2(v, u), True, "angle")
+            check(made.first[0], first, True, "angle, first derivative")
+            check(made.second[0], second, True, "angle, second derivative")
+        meets = (ys[0] <= 0) & (ys[1] >= 0) & (xs[0] <= 0)
+        low, high = (np.array(end) for end in (made.value.low, made.value.high))
+        if not exact:
+            assert (low[meets] <= -math.pi).all()
+            assert (high[meets] >= math.pi).all()
+        assert np.isinf(np.array(made.first[0].low))[meets].all()
+        assert np.isinf(np.array(made.first[0].high))[meets].all()
+        assert (np.abs([low, high]) <= math.pi * (1 + 1e-6)).all()
+
+
+def test_angles_on_the_cut() -> None:
+    """-0 is 0, of which the angle is pi; the origin has none, and counts as 0."""
+    field = hk.expression("atan2(y, x)")
+    points = [[-1, 0, 0], [-1, -0.0, 0], [1, 0, 0], [0, -1, 0], [0, 0, 0], [0, -0.0, 1]]
+    for precision in PRECISIONS:
+        values = field.value(np.array(points), precision=precision)
+        assert values == pytest.approx([math.pi, math.pi, 0, -math.pi / 2, 0, 0])
+
+
 # Formulas as functions of jets, and of long doubles.
 FORMULAS: dict[str, tuple[Callable[..., Any], Callable[..., Any]]] = {
     "polynomial": (
@@ -237,6 +276,10 @@ FORMULAS: dict[str, tuple[Callable[..., Any], Callable[..., Any]]] = {
     "torus": (
         lambda x, y, z: norm(norm(x, y) - 1, z) - 0.3,
         lambda x, y, z: np.sqrt((np.sqrt(x * x + y * y) - 1) ** 2 + z * z) - Long(0.3),
+    ),
+    "angle": (
+        lambda x, y, z: hk.atan2(y * z + 0.1, x - y) + 0.3 * hk.atan2(2.0, x),
+        lambda x, y, z: np.arctan2(y * z + Long(0.1), x - y) + Long(0.3) * np.arctan2(Long(2), x),
     ),
     **{
         f"norm {p}": (

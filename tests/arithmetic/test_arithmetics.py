@@ -18,6 +18,7 @@ from harnack.arithmetic import (
     Jet,
     Parabolas,
     absolute,
+    atan2,
     clipped_power,
     exp,
     log,
@@ -59,6 +60,7 @@ FORMULAS: dict[str, Formula] = {
     "clipped by hand": lambda x, y, z: larger(1 - (x * x + y * y + z * z) * 0.3, 0.0) ** 3,
     "gaussians": lambda x, y, z: exp(-(x * x + y * y + z * z)) + exp(-2 * (y * y + x * z)) - 0.3,
     "quotient": lambda x, y, z: (x * y + 1) / (2 + x * x + z * z) - 0.2 * tanh(y),
+    "angle": lambda x, y, z: atan2(y + 0.3 * z, x - 0.2) - 0.4 * atan2(1 + y * y, z),
     "kinks": lambda x, y, z: absolute(x * y) - larger(-z, -x) + sqrt(1 + y * y),
     "powers": lambda x, y, z: (1 + x * x + y * y) ** 1.7 - (2 + z * z) ** -2.0 + log(3 + x * x),
 }
@@ -275,7 +277,7 @@ def test_proofs_of_formulas_say_what_they_need() -> None:
 def test_formulas_with_what_has_no_ranges_are_refused() -> None:
     x, y, _ = Parabolas.along(*paths("single", 3, 8)[:3])
     with pytest.raises(TypeError, match="no proved ranges"):
-        np.arctan2(x, y)
+        np.fmod(x, y)
     with pytest.raises(TypeError, match="plain numbers"):
         float(x)
     with pytest.raises(TypeError, match="cannot decide"):

@@ -35,7 +35,10 @@ from harnack.enclosures.parabola import Arc, Cone, Parabola, Tangent
 from harnack.enclosures.pieces import OnePiece, Pieces
 from harnack.fields.blobs.blobs import _After  # pyright: ignore[reportPrivateUsage]
 from harnack.fields.blobs.largest import LargestAlong
+from harnack.fields.solids.outline_distance import SignedAhead
 from harnack.fields.solids.region import Folded
+from harnack.fields.solids.swept import ExtrudedAhead
+from harnack.fields.solids.thread import Beside
 from harnack.fields.solids.tube import TubeAhead
 
 SIZES = [0.0, 1e-12, 1e-4, 0.3, 1.0, 7.0, 1e5, 1e12, 1e25, np.inf]
@@ -89,6 +92,27 @@ def tube(draw: Draw) -> TubeAhead:
     return TubeAhead(sizes(draw), draw([-1.0, -0.3, 0.0, 1e-12, 1.0]), knots, lows)
 
 
+def signed(draw: Draw) -> SignedAhead:
+    size = tube(draw)
+    return SignedAhead(size.distance * draw(SIGNS), size)
+
+
+def extruded(kind: Any, draw: Draw) -> Any:
+    """f is the larger of both distances, or more."""
+    side, height, half = signed(draw), draw(NUMBERS), sizes(draw)
+    least = dr.maximum(side.value, dr.abs(height) - half)
+    value = least + sizes(draw)
+    error = sizes(draw) + 1e-6 * (dr.abs(value) + dr.abs(side.value) + dr.abs(height) + half)
+    return kind(value, error, side, height, half, draw([-1.0, -0.3, 0.0, 1.0]))
+
+
+def beside(kind: Any, draw: Draw) -> Any:
+    """The direction's part across the axis is at most 1, and at least its part away from there."""
+    r, slope = sizes(draw), draw([-1.0, -0.3, 0.0, 1.0])
+    square = dr.maximum(slope * slope, draw([0.0, 1e-12, 0.3, 1.0]))
+    return kind(sizes(draw), sizes(draw), r, r * slope, square, sizes(draw), 1 + sizes(draw))
+
+
 def cone(kind: Any, draw: Draw) -> Any:
     constant = sizes(draw)
     return kind(Slopes(-constant, constant), 0.0, 0.0, sizes(draw))
@@ -139,6 +163,9 @@ MAKERS: dict[type[Enclosure], Callable[[Any, Draw], Any]] = {
     Negated: lambda kind, draw: kind(tube(draw)),
     Stretched: lambda kind, draw: kind(parabola(Parabola, draw), sizes(draw), sizes(draw)),
     Folded: lambda kind, draw: kind(parabola(Parabola, draw), draw(NUMBERS), 1.0),
+    SignedAhead: lambda _, draw: signed(draw),
+    ExtrudedAhead: extruded,
+    Beside: beside,
     TubeAhead: lambda _, draw: tube(draw),
     _After: lambda kind, draw: kind(sizes(draw), parabola(Parabola, draw)),
 }

@@ -14,6 +14,7 @@ from harnack.enclosures import Gaps, Slopes
 from harnack.enclosures.extremum import Greatest, Negated, Part
 from harnack.enclosures.parabola import Parabola
 from harnack.testing import check_field
+from tests.fields.test_shapes import CUP, LOOPS, SCREW, SHAPES, extruded, screw
 
 Values = Callable[[FloatArray], FloatArray]
 
@@ -56,6 +57,9 @@ TURN = np.array(hk.Sphere(1.0).rotated(40, (1, 2, 3)).map.matrix)  # type: ignor
 CURVE = np.stack(
     [f(np.arange(24) * np.pi / 12) for f in (np.cos, np.sin, lambda t: 0.3 * np.sin(2 * t))], axis=1
 )
+TILT = np.array(hk.Sphere(1.0).rotated(50, "x").map.matrix)  # type: ignore[attr-defined]
+FRAME = [[[-0.9, -0.7], [0.9, -0.8], [0.7, 0.8], [-0.6, 0.9]], *LOOPS[1:]]
+FACTORS = np.array([-1.0, 0.8, 1.4])
 SPANNING = hk.SolidAngle(CURVE)
 
 
@@ -119,6 +123,27 @@ CASES: dict[str, tuple[Callable[[], hk.Solid], Values]] = {
         lambda p: blended(
             np.maximum(gyroid(p) - 0.2, sphere(p, 1.1)), torus(p, 1.2, 0.2), 0.2, 3.0
         ),
+    ),
+    "outlines cut, mirrored and scaled": (
+        lambda: (
+            (hk.Extruded(FRAME, 0.6) - hk.Extruded(LOOPS[1:2], 2.0).moved((0.5, 0.1, -1.0)))
+            .transformed(np.diag([-1.0, 1.0, 1.0])).scaled((1.0, 0.8, 1.4))
+            | hk.Revolved(CUP).scaled(0.5).moved((0.0, 0.0, -0.4))
+        ),
+        lambda p: np.minimum(
+            np.maximum(extruded(p / FACTORS, FRAME, 0.6),
+                       -extruded(p / FACTORS - [0.5, 0.1, -1.0], LOOPS[1:2], 2.0)),
+            0.5 * SHAPES["cup"][1](2 * (p - [0.0, 0.0, -0.4])),
+        ),
+    ),
+    "outline blended and bent": (
+        lambda: hk.Extruded(FRAME, 0.6).twisted(1.0).blended(hk.Sphere(0.4), 0.2),
+        lambda p: blended(extruded(untwisted(p, 1.0), FRAME, 0.6), sphere(p, 0.4), 0.2, 2.0),
+    ),
+    "thread in a block": (
+        lambda: hk.Cuboid((0.9, 0.9, 0.5)) - SCREW.rotated(50.0, "x"),
+        lambda p: np.maximum(np.maximum(np.abs(p[..., 0]) - 0.9, np.maximum(
+            np.abs(p[..., 1]) - 0.9, np.abs(p[..., 2]) - 0.5)), -screw(p @ TILT, SCREW)),
     ),
     "spanning surface and tube": (
         lambda: hk.solid(SPANNING, around=(2 * np.pi, 0.4)) | hk.Torus(1.0, 0.1),

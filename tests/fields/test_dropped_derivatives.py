@@ -112,8 +112,8 @@ WITH_DERIVATIVES = {
 }  # fmt: skip
 # Functions of any numbers, of solids, and of scenes and files, whose results carry nothing.
 OTHERS = {
-    "maximum", "minimum", "norm", "union", "intersection", "animate", "render", "page", "mesh",
-    "read_scene", "repair", "view", "wrap_for_jax", "write_scene",
+    "atan2", "maximum", "minimum", "norm", "union", "intersection", "animate", "render", "page",
+    "mesh", "read_scene", "repair", "view", "wrap_for_jax", "write_scene",
 }  # fmt: skip
 FUNCTIONS = {
     name: getattr(hk, name)

@@ -48,6 +48,39 @@ def segments(x: Any, points: Any) -> Any:
     return best
 
 
+def region(x: Any, loops: Any) -> Any:
+    """The signed distance in the plane, inside by the even-odd rule: rays towards +y."""
+    best, inside = np.full(x.shape[:-1], np.inf), np.zeros(x.shape[:-1], bool)
+    for loop in loops:
+        closed = np.array([*loop, loop[0]])
+        best = np.minimum(best, segments(x, closed))
+        for a, b in itertools.pairwise(closed):
+            spans = (a[0] > x[..., 0]) != (b[0] > x[..., 0])
+            if spans.any():
+                at = a[1] + (x[..., 0] - a[0]) / (b[0] - a[0]) * (b[1] - a[1])
+                inside ^= spans & (at > x[..., 1])
+    return np.where(inside, -best, best)
+
+
+def extruded(x: Any, loops: Any, height: float, twist: float = 0.0, taper: float = 1.0) -> Any:
+    z = x[..., 2]
+    share = np.clip(z / height, 0, 1)
+    q = (x[..., 0] + 1j * x[..., 1]) / (1 + share * (taper - 1))
+    q = q * np.exp(-1j * math.radians(twist) * z / height)
+    d, w = region(np.stack([q.real, q.imag], -1), loops), np.abs(z - height / 2) - height / 2
+    return pair(np.maximum(d, 0), np.maximum(w, 0)) + np.minimum(np.maximum(d, w), 0)
+
+
+def screw(x: Any, thread: Any) -> Any:
+    pitch, points = thread.pitch, np.array(thread.profile)
+    lead = thread.starts * pitch * (-1 if thread.left_handed else 1)
+    r = norm(x[..., :2])
+    u = (x[..., 2] - lead * np.arctan2(x[..., 1], x[..., 0]) / (2 * np.pi)) % pitch
+    curve = np.concatenate([points + np.array([k * pitch, 0]) for k in range(-3, 5)])
+    d = segments(np.stack([u, r], -1), curve)
+    return np.maximum(np.where(r < np.interp(u, *curve.T), -d, d), -points[:, 1].min() / 2)
+
+
 def julia(x: Any, c: Any, count: int, w: float) -> Any:
     q = np.concatenate([x, np.full((*x.shape[:-1], 1), w)], -1).astype(np.longdouble)
     log, share = np.zeros(x.shape[:-1]), np.ones(x.shape[:-1])
@@ -104,6 +137,12 @@ NOISE = hk.Noise(2.0, 0.7, seed=5)
 FRACTAL = hk.FractalNoise(3, 1.0, 2.0, 0.15, fade="cubic")
 TUBE = hk.Tube.bezier(CURVE, 0.2, tolerance=2e-3)
 C = (-0.2, 0.8, 0.0, 0.0)
+SCREW = hk.Thread([(0, 0.8), (0.1, 0.8), (0.25, 0.5)], 0.4, starts=2, left_handed=True)
+TURN = np.linspace(0, 2 * np.pi, 90, endpoint=False)
+STAR = (0.8 + 0.25 * np.cos(5 * TURN))[:, None] * np.column_stack([np.cos(TURN), np.sin(TURN)])
+# A hole, which runs the same way around, and an island in it.
+LOOPS = [STAR, [[-0.4, -0.3], [0.45, -0.3], [0.3, 0.4]], [[0.0, -0.2], [0.25, -0.2], [0.2, 0.1]]]
+CUP = [[0.0, -0.6], [0.5, -0.6], [0.9, 0.6], [0.8, 0.65], [0.4, -0.4], [0.0, -0.4]]
 
 SHAPES: dict[str, tuple[Any, Oracle]] = {
     "plane": (
@@ -149,6 +188,24 @@ SHAPES: dict[str, tuple[Any, Oracle]] = {
         for p, q in ((4.0, 4.0), (1.2, 1.5))
     },
     "tube": (TUBE, lambda x: segments(x, TUBE.points) - 0.2),
+    "outline": (hk.Extruded(LOOPS, 0.6), lambda x: extruded(x, LOOPS, 0.6)),
+    "few edges": (
+        hk.Extruded(LOOPS[1:], 0.6),
+        lambda x: extruded(x, LOOPS[1:], 0.6),
+    ),
+    "turned outline": (
+        hk.Extruded(LOOPS, 0.8, twist=70.0, taper=0.6),
+        lambda x: extruded(x, LOOPS, 0.8, 70.0, 0.6),
+    ),
+    "cup": (
+        hk.Revolved(CUP),
+        # Mirrored at the axis, where the edges on it are none.
+        lambda x: region(
+            np.stack([norm(x[..., :2]), x[..., 2]], -1),
+            [np.concatenate([CUP, np.array(CUP)[-2:0:-1] * [-1, 1]])],
+        ),
+    ),
+    "thread": (SCREW, lambda x: screw(x, SCREW)),
     "noise": (NOISE, lambda x: noise(x, NOISE)),
     "displaced": (
         hk.Displaced(hk.Sphere(), FRACTAL),
@@ -221,12 +278,17 @@ def test_no_level_within_a_step(name: str, precision: Any) -> None:
         )
 
     assert not passes(1.0).any()
-    if precision == "double" and name != "julia":  # whose steps are never that long
+    never_that_long = ("julia", "turned outline", "thread")
+    if precision == "double" and name not in never_that_long:
         assert passes(1.001).any()
 
 
 CONSTANTS = [
-    *[name for name in SHAPES if name not in ("tube", "noise", "displaced", "julia")],
+    *[
+        name
+        for name in SHAPES
+        if name not in ("tube", "turned outline", "thread", "noise", "displaced", "julia")
+    ],
 ]
 
 
@@ -280,7 +342,7 @@ def test_constants_of_norms_are_attained(powers: tuple[float, float]) -> None:
 def test_hulls_hold_the_solid(name: str, level: float) -> None:
     shape, oracle = SHAPES[name]
     hull = shape.hull(level)
-    if name in ("plane", "cylinder", "double cone", "noise"):
+    if name in ("plane", "cylinder", "double cone", "thread", "noise"):
         assert hull is None
         return
     rng = np.random.default_rng(6)
@@ -387,6 +449,49 @@ def test_flattening_is_as_stated() -> None:
     assert finer.describe()["segments"] > 5 * TUBE.describe()["segments"]
 
 
+def test_metric_threads_have_their_sizes() -> None:
+    """M8: 8 mm across crests, 6.647 mm across roots (ISO 724), 7.188 mm across the pitch line."""
+    pitch = 1.25
+    screw, cut = hk.thread("M8", 20.0), hk.thread("M8", 20.0, internal=True)
+    z = 10.0 + pitch * np.linspace(0, 1, 2001)
+    for solid in (screw, cut):
+        angle = 0.7
+        r = np.linspace(2.9, 4.3, 1401)
+        x = np.stack(np.broadcast_arrays(r[:, None] * math.cos(angle), r[:, None] * math.sin(angle),
+                                         z[None]), -1)  # fmt: skip
+        inside = solid.value(x.reshape(-1, 3), precision="double").reshape(x.shape[:2]) <= 0
+        edge = r[inside.sum(axis=0) - 1]  # a profile r(z)
+        assert 2 * edge.max() == pytest.approx(8.0, abs=4e-3)
+        assert 2 * edge.min() == pytest.approx(6.647, abs=4e-3)
+        assert np.mean(edge > 7.188 / 2) == pytest.approx(0.5, abs=5e-3)
+        assert np.mean(edge > 3.998) == pytest.approx(1 / 8, abs=5e-3)
+        assert np.mean(edge < 6.65 / 2) == pytest.approx(1 / 4, abs=5e-3)
+    # A screw and its nut are twice the clearance apart, across crests, roots and flanks.
+    loose, wide = hk.thread("M8", 20.0, clearance=0.05), hk.thread(
+        "M8", 20.0, internal=True, clearance=0.05
+    )  # fmt: skip
+    points = x.reshape(-1, 3)
+    off = [
+        a.value(points, precision="double") - b.value(points, precision="double")
+        for a, b in ((loose.parts[0], screw.parts[0]), (screw.parts[0], wide.parts[0].parts[0]))
+    ]
+    near = np.abs(screw.value(points, precision="double")) < 0.05
+    for one in off:
+        assert np.median(one[near]) == pytest.approx(0.05, abs=1e-9)
+        assert one[near].min() > 0.0249  # beside a corner, where another edge is nearest
+    # Counter-clockwise as it rises: a quarter of a turn up, the same a quarter of a pitch higher.
+    rise = screw.parts[0].value([[0.0, 3.9, 5.0 + pitch / 4]], precision="double")
+    assert rise == pytest.approx(screw.parts[0].value([[3.9, 0.0, 5.0]], precision="double"))
+
+
+def test_coils_stay_within_their_flattening() -> None:
+    coil = hk.Tube.helix(2.0, 0.5, 3.0, 0.2, left_handed=True)
+    t = np.linspace(0, 6 * np.pi, 5000)
+    curve = np.column_stack([2 * np.cos(t), -2 * np.sin(t), 0.5 * t / (2 * np.pi)])
+    off = np.abs(coil.value(curve, precision="double") + 0.2).max()
+    assert 0.9 * coil.flattening < off <= coil.flattening <= 2e-4
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [
@@ -405,6 +510,26 @@ def test_flattening_is_as_stated() -> None:
         (lambda: hk.Tube(np.zeros((3, 3)), 0.1), "two points or more"),
         (lambda: hk.Tube(np.zeros((3, 2)), 0.1), "must have shape"),
         (lambda: hk.Tube.bezier(np.zeros((5, 3)), 0.1), "3 n \\+ 1"),
+        (lambda: hk.Extruded(CUP, 0.0), "height of an extruded outline"),
+        (lambda: hk.Extruded(CUP, 1.0, twist=math.inf), "twist of an extruded outline"),
+        (lambda: hk.Extruded(CUP, 1.0, taper=-1.0), "taper of an extruded outline"),
+        (lambda: hk.Extruded([(0, 0), (1, 1)], 1.0), "three points or more"),
+        (lambda: hk.Revolved([(-0.1, 0), (1, 0), (1, 1)]), "lies in r >= 0"),
+        (lambda: hk.Tube.helix(1.0, 1.0, 0.0, 0.1), "its turns must be positive"),
+        (lambda: hk.Tube.helix(1.0, 1.0, 1.0, 0.1, tolerance=1e-30), "larger tolerance"),
+        (lambda: hk.Thread([(0, 1), (1, 1)], 1.0), "rises from 0 to less than the pitch"),
+        (lambda: hk.Thread([(0.1, 1)], 1.0), "rises from 0"),
+        (lambda: hk.Thread([(0, -1)], 1.0), "must be positive"),
+        (lambda: hk.Thread([(0, math.nan)], 1.0), "finite"),
+        (lambda: hk.Thread([0, 1], 1.0), "has shape"),
+        (lambda: hk.Thread([(0, 1)], 1.0, starts=0), "starts of a thread"),
+        (lambda: hk.thread("8", 10.0), "named as"),
+        (lambda: hk.thread(8, 10.0), "named as"),
+        (lambda: hk.thread("M13", 10.0), "no coarse thread M13"),
+        (lambda: hk.thread("M8x7", 10.0), "leaves no core"),
+        (lambda: hk.thread("M8", 1.0), "must be longer"),
+        (lambda: hk.thread("M8", 10.0, clearance=0.2), "clearance of M8"),
+        (lambda: hk.thread("M8", 10.0, clearance=-0.1), "clearance of M8"),
         (lambda: hk.Noise(0.0), "frequency of noise"),
         (lambda: hk.Noise(fade="linear"), "quintic"),
         (lambda: hk.FractalNoise(0), "octaves"),

@@ -32,7 +32,7 @@ def documented() -> set[str]:
 
 
 def test_the_reference_has_every_public_name() -> None:
-    modules = {"backend", "files", "geometry", "rendering", "testing"}
+    modules = {"backend", "files", "geometry", "outline", "rendering", "testing"}
     # Rooms whose public names are names of `harnack`.
     rooms = {"arithmetic", "distance", "enclosures", "fields", "meshing", "tracer"}
     assert set(hk.__all__) - modules - rooms <= documented()

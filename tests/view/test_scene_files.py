@@ -25,6 +25,11 @@ SOLIDS = {
     "cut": hk.Sphere(1.0) - hk.Cuboid((0.5, 0.5, 2.0)) | hk.Capsule((0, 0, -1), (0, 0, 1), 0.2),
     "twisted": hk.Cuboid((0.4, 0.4, 1.0)).twisted(0.5),
     "tube": hk.Tube(shapes.torus_knot(2, 3, 12), 0.1),
+    "outlines": hk.Extruded(
+        [[(0, 0), (2, 0), (0, 2)], [(0.2, 0.2), (1, 0.2), (0.2, 1)]], 0.5, twist=40.0, taper=0.5
+    )
+    | hk.Revolved([(0, 0), (1, 0), (0, 1)]),
+    "threads": hk.thread("M8", 10.0) | hk.Tube.helix(5.0, 2.0, 1.5, 0.3),
     "gyroid": hk.Gyroid(0.5, domain=hk.Ball((0.1, 0.0, 0.0), 1.5)),
     "formula": hk.expression("x^2 + a*y^2 = 1 + z", parameters={"a": 0.1}, level=0.25),
     "curve": CURVE,

@@ -6,6 +6,7 @@ Intervals, jets, parabolas and affine forms; formulas are written once and evalu
 from __future__ import annotations
 
 from harnack.arithmetic.affine import Affine
+from harnack.arithmetic.angles import atan2
 from harnack.arithmetic.functions import (
     ClippedPower,
     Function,
@@ -44,6 +45,7 @@ __all__ = [
     "acos",
     "asin",
     "atan",
+    "atan2",
     "blend_intersection",
     "blend_union",
     "clipped_power",

@@ -9,11 +9,14 @@ Source: Vu, Sam-Haroud and Faltings 2009; Fryazinov, Pasko and Comninos 2010.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 
+from harnack.arithmetic.angles import angle_range, meets_cut, unit_vector
+from harnack.arithmetic.functions import atan, reciprocal
 from harnack.arithmetic.interval import Interval, unit_of
 from harnack.arithmetic.operators import Operators
 from harnack.backend.elementary import fmax, fmin
@@ -140,6 +143,30 @@ class Affine(Operators):
                 dr.select(one, u, dr.select(two, v, w))
                 for u, v, w in zip(_entries(self), _entries(other), _entries(both), strict=True)
             )
+        )
+
+    def angle(self, x: Any) -> Affine:
+        """The angle of a point c in the middle, and of all others as seen from there.
+
+        Proof. With c = (a, b) any vector, the angle of z = (x, y) is that of c plus that of
+        (x a + y b, y a - x b), up to a multiple of 2 pi. Where the box of z does not meet the cut,
+        z and c lie in one of the half-planes x > 0, y > 0, y < 0, so that their angles differ by at
+        most pi; and where x a + y b > 0 that of the second vector is an arc tangent, less than
+        pi/2 in size: so there is no such multiple. Elsewhere only [-pi, pi] is known.
+        """
+        a, b = unit_vector(x.center, self.center)
+        ahead, aside = x * a + self * b, self * a - x * b
+        seen = aside.product(ahead.apply(reciprocal)).apply(atan)
+        turned, _ = angle_range(Interval.exactly(b), Interval.exactly(a))
+        known = ~meets_cut(self.range, x.range) & (ahead.range.low > 0)
+        center = seen.center + turned.middle
+        error = seen.error + turned.radius + _slack(dr.abs(center) + dr.abs(turned.middle))
+        known &= dr.isfinite(center) & dr.isfinite(seen.slope) & dr.isfinite(error)
+        whole = math.pi * (1 + 1e-6)
+        return Affine(
+            dr.select(known, center, 0),
+            dr.select(known, seen.slope, 0),
+            dr.select(known, error, whole),
         )
 
 

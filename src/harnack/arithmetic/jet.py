@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 
-from harnack.arithmetic.functions import Function, exp, log, power, reciprocal
+from harnack.arithmetic.angles import angle_range
+from harnack.arithmetic.functions import Function, exp, log, power, reciprocal, sqrt
 from harnack.arithmetic.interval import ONE, ZERO, Interval, select
 from harnack.arithmetic.operators import Operators, exponent_of
 from harnack.backend.elementary import fmax, fmin
@@ -204,6 +205,41 @@ class Jet(Operators):
             return jet
         return jet.anchored(self.start.maximum(other.start), self.width)
 
+    def angle(self, x: Jet) -> Jet:
+        """The angle of the point (x, y), y this one.
+
+        Proof. The angle is the imaginary part of log z, z = x + i y, whose derivatives are z_i/z
+        and z_ij/z - (z_i/z)(z_j/z). With z_i/z = rho_i + i theta_i these are
+        theta_i = (x y_i - y x_i)/r^2, rho_i = (x x_i + y y_i)/r^2 and
+        theta_ij = (x y_ij - y x_ij)/r^2 - theta_i rho_j - theta_j rho_i.
+        """
+        like = x.kind() if self.value.is_static else self.kind()
+        v, u = self.dynamic_value(like), x.dynamic_value(like)
+        value, met = angle_range(v, u)
+        over = sqrt.ranges(u.square() + v.square())[0]
+        over = Interval(0 * over.low, dr.inf).meet(reciprocal.ranges(over)[0])
+        c, s = (one * over for one in (u, v))
+        c, s = (Interval(fmax(one.low, -1), fmin(one.high, 1)) for one in (c, s))
+        count = range(len(self.first))
+        turn = [across(x, self, u, v, i) * over * over for i in count]
+        growth = [(c * x.first[i] + s * self.first[i]) * over for i in count]
+        second = [
+            (c * self.second[k] - s * x.second[k]) * over
+            - (turn[i] * growth[j] + turn[j] * growth[i])
+            for k, (i, j) in enumerate(self.pairs())
+        ]
+
+        def off_cut(one: Interval) -> Interval:
+            return Interval(
+                select(met, -dr.inf, one.low, like), select(met, dr.inf, one.high, like)
+            )
+
+        first = tuple(off_cut(one) for one in turn)
+        jet = Jet(value, first, tuple(off_cut(one) for one in second), width=self.width)
+        if self.start is None or x.start is None:
+            return jet
+        return jet.anchored(self.start.angle(x.start), self.width)
+
     def selected(self, condition: Mask, other: Jet) -> Jet:
         """This one on lanes where the condition holds, the other on all others."""
         kind = self.kind()
@@ -253,6 +289,20 @@ class Jet(Operators):
             first = first.meet(turned)
         value = self.value.meet(start.value + rise)
         return Jet(value, (first,), self.second, start, width)
+
+
+def across(x: Jet, y: Jet, u: Interval, v: Interval, i: int) -> Interval:
+    """The range of w = x y_i - y x_i, for the ranges u and v of x and y, as numbers of the backend.
+
+    Its derivative x y_ii - y x_ii is 0 along straight lines: the range of w is narrowed from the
+    start of the piece.
+    """
+    found = u * y.first[i] - v * x.first[i]
+    if x.start is None or y.start is None:
+        return found
+    at_start = x.start.value * y.start.first[i] - y.start.value * x.start.first[i]
+    rate = u * y.second[i] - v * x.second[i]
+    return found.meet(at_start + spanned(rate, x.width))
 
 
 def spanned(slope: Interval, width: Real) -> Interval:
@@ -320,6 +370,14 @@ class Dual(Operators):
             return dr.select(real(a) == 0, 0, a * slope)
 
         return Dual(function.plain(self.value), _each(rule, self.first))
+
+    def angle(self, x: Dual) -> Dual:
+        u, v = x.value, self.value
+
+        def rule(a: Any, b: Any) -> Any:
+            return (u * b - v * a) / (u * u + v * v)
+
+        return Dual(dr.atan2(v, u), _each(rule, x.first, self.first))
 
     def larger(self, other: Dual) -> Dual:
         is_own = self.value > other.value

@@ -16,7 +16,7 @@ import numpy as np
 
 from harnack.arithmetic.functions import absolute, power, reciprocal, sqrt
 from harnack.arithmetic.interval import ONE, Interval
-from harnack.arithmetic.jet import Jet, spanned
+from harnack.arithmetic.jet import Jet, across
 from harnack.arithmetic.operators import Operators
 from harnack.backend.elementary import fmax, fmin
 
@@ -159,20 +159,10 @@ def _turning(xs: list[Jet], values: list[Interval], over: Interval, i: int, j: i
     """sum_(k<l) w_kl,i w_kl,j / N^3."""
     parts: list[Interval] = []
     for k, m in itertools.combinations(range(len(xs)), 2):
-        a = _across(xs, values, k, m, i) * over
-        parts.append(a.square() if i == j else a * (_across(xs, values, k, m, j) * over))
+        pair = xs[k], xs[m], values[k], values[m]
+        a = across(*pair, i) * over
+        parts.append(a.square() if i == j else a * (across(*pair, j) * over))
     return _total(parts) * over
-
-
-def _across(xs: list[Jet], values: list[Interval], k: int, m: int, i: int) -> Interval:
-    """w_km = x_k x_m' - x_m x_k'."""
-    across = values[k] * xs[m].first[i] - values[m] * xs[k].first[i]
-    a, b = xs[k].start, xs[m].start
-    if a is None or b is None:
-        return across
-    at_start = a.value * b.first[i] - b.value * a.first[i]
-    rate = values[k] * xs[m].second[i] - values[m] * xs[k].second[i]
-    return across.meet(at_start + spanned(rate, xs[k].width))
 
 
 def _length(values: list[Interval], p: float) -> Interval:

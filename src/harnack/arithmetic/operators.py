@@ -48,14 +48,18 @@ _OPERATORS = {
     "multiply": ("__mul__", "__rmul__"), "divide": ("__truediv__", "__rtruediv__"),
     "true_divide": ("__truediv__", "__rtruediv__"), "power": ("__pow__", "__rpow__"),
     "maximum": ("maximum", "maximum"), "minimum": ("minimum", "minimum"),
+    "arctan2": ("atan2", "_atan2_of"),
 }  # fmt: skip
 # The names of those functions in formulas.
-_NAMES = "sin, cos, tan, exp, log, sqrt, tanh, atan, asin, acos, sinh, cosh, maximum, minimum, norm"
+_NAMES = (
+    "sin, cos, tan, exp, log, sqrt, tanh, atan, atan2, asin, acos, sinh, cosh, "
+    "maximum, minimum, norm"
+)
 
 
 class Operators(abc.ABC):
-    """`+ - * / **`, abs, NumPy's functions, maximum and minimum, from the sums, products, functions
-    of one number and the larger of two that a subclass defines.
+    """`+ - * / **`, abs, NumPy's functions, maximum, minimum and atan2, from the sums, products,
+    functions of one number, the larger of two and the angle that a subclass defines.
 
     A formula is written once and evaluated with numbers of any subclass, such as `Jet`.
     """
@@ -79,6 +83,10 @@ class Operators(abc.ABC):
 
     @abc.abstractmethod
     def larger(self, other: Any) -> Self: ...
+
+    @abc.abstractmethod
+    def angle(self, x: Any) -> Self:
+        """The angle of the point (x, y) with this y: see `harnack.arithmetic.angles`."""
 
     def _operand(self, other: Any) -> Self | None:
         """Another operand as a number of this arithmetic; None if it is no number."""
@@ -179,6 +187,13 @@ class Operators(abc.ABC):
         """The smaller of two functions at each place."""
         return -((-self).larger(-self.of(other)))
 
+    def atan2(self, x: Any) -> Self:
+        """The angle of the point (x, y) with this y."""
+        return self.angle(self.of(x))
+
+    def _atan2_of(self, y: Any) -> Self:
+        return self.of(y).angle(self)
+
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **settings: Any) -> Any:
         """NumPy's functions and operators, applied to these numbers."""
         name = ufunc.__name__
@@ -273,6 +288,10 @@ class Counted(Operators):
     def larger(self, other: Any) -> Counted:
         del other
         return self._spending(_FUNCTION)
+
+    def angle(self, x: Any) -> Counted:
+        del x
+        return self._spending(_FUNCTION + _PRODUCT)
 
     def _spending(self, operations: int) -> Counted:
         self.tally[0] += operations

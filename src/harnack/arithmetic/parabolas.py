@@ -23,7 +23,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import drjit as dr
 
-from harnack.arithmetic.functions import ClippedPower
+from harnack.arithmetic.angles import angle_range, meets_cut, unit_vector
+from harnack.arithmetic.functions import ClippedPower, atan, reciprocal
 from harnack.arithmetic.interval import Interval, unit_of
 from harnack.arithmetic.operators import Operators
 from harnack.backend.elementary import clamp, fmax, fmin
@@ -325,6 +326,33 @@ class Parabolas(Operators):
         below = _where(always_f, f_low, _where(always_g, g_low, below))
         value = Interval(fmax(f.low, g.low), fmax(f.high, g.high))
         return self._made(value, below, above)
+
+    def angle(self, x: Any) -> Parabolas:
+        """The angle of a point, which moves as it does seen from any direction.
+
+        Proof. For any vector c = (a, b) the angle of z = (x, y) differs from that of
+        (x a + y b, y a - x b) by a constant along a path that does not meet the cut, and where
+        x a + y b > 0 the latter is an arc tangent. Elsewhere nothing is known beyond the start.
+        """
+        h = self.length
+        v, u = (_dynamic(one.value, h) for one in (self, x))
+        value, _ = angle_range(v, u)
+        a, b = unit_vector(u.middle, v.middle)
+        ahead, aside = x * a + self * b, self * a - x * b
+        seen = aside.product(ahead.apply(reciprocal)).apply(atan)
+        known = ~meets_cut(self._range(), x._range()) & (ahead._range().low > 0)
+        zero = 0 * h
+        return self._made(
+            value,
+            _where(known, seen.lower, (zero - dr.inf, zero)),
+            _where(known, seen.upper, (zero + dr.inf, zero)),
+        )
+
+    def _range(self) -> Interval:
+        """The range of the function on the whole length."""
+        h, value = self.length, _dynamic(self.value, self.length)
+        fall, rise = _peak(_negative(self.lower), h), _peak(self.upper, h)
+        return Interval((value + Interval(-fall, -fall)).low, (value + Interval(rise, rise)).high)
 
     def _clipped_power(self, function: ClippedPower) -> Parabolas:
         """max(f, 0)^n for a polynomial f.

@@ -28,7 +28,7 @@ _FUNCTIONS: Mapping[str, Callable[..., Any]] = MappingProxyType(
     {
         **{name: getattr(arithmetic, name) for name in (
             "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "exp", "log",
-            "sqrt", "norm",
+            "sqrt", "norm", "atan2",
         )},
         "ln": arithmetic.log, "abs": arithmetic.absolute,
         "max": lambda *several: functools.reduce(arithmetic.maximum, several),
@@ -36,7 +36,7 @@ _FUNCTIONS: Mapping[str, Callable[..., Any]] = MappingProxyType(
     }
 )  # fmt: skip
 # Functions with several arguments: the least and the largest number of them.
-_SEVERAL = {"max": (2, 99), "min": (2, 99), "norm": (2, 3)}
+_SEVERAL = {"max": (2, 99), "min": (2, 99), "norm": (2, 3), "atan2": (2, 2)}
 _OPERATORS: Mapping[type[ast.operator], Callable[[Any, Any], Any]] = MappingProxyType(
     {
         ast.Add: lambda a, b: a + b,
@@ -100,7 +100,7 @@ class TextFormula:
         bare = re.search(rf"\b({'|'.join(_FUNCTIONS)})\s+[A-Za-z0-9]", side)
         if bare:
             raise _wrong(text, f"the argument of {bare[1]} stands in brackets")
-        missing = re.search(r"[0-9)]\s*[A-Za-z(]|[xyz)]\s+[A-Za-z0-9(]", side)
+        missing = re.search(r"(?:[0-9](?<!atan2)|\))\s*[A-Za-z(]|[xyz)]\s+[A-Za-z0-9(]", side)
         hint = f"is a * missing at {missing[0]!r}" if missing else "an operator or bracket is amiss"
         raise _wrong(text, hint)
 
@@ -269,7 +269,7 @@ def expression(
     """The implicit surface f(x, y, z) = level of a formula of your own.
 
     function: of three coordinates, written with + - * / **, abs, and the functions `harnack.sin`,
-        `cos`, `tan`, `exp`, `log`, `sqrt`, `tanh`, `atan`, `asin`, `acos`, `sinh`, `cosh`,
+        `cos`, `tan`, `exp`, `log`, `sqrt`, `tanh`, `atan`, `atan2`, `asin`, `acos`, `sinh`, `cosh`,
         `maximum`, `minimum`, `norm`; NumPy's of the same names do too. Or a text, such as
         "x^2 + y^2 = 1 + sin(2*z)", with `max` and `min`; an equation means left - right.
     parameters: numbers by their names in a text, as of "x^2 + y^2 = a" {"a": 2.0}.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from harnack.files import outline as outline
 from harnack.files.file_format import FileFormatError, write_atomically
 from harnack.files.molecules import Atoms, read_molecule
 from harnack.files.surfaces import (
@@ -22,6 +23,7 @@ __all__ = [
     "Mesh",
     "Metaballs",
     "PolygonSurface",
+    "outline",
     "read_loops",
     "read_molecule",
     "read_surface",

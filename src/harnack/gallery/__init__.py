@@ -10,6 +10,7 @@ from types import MappingProxyType
 
 from harnack.gallery.classic import CURVES, HARMONICS, PLANE, SOLIDS
 from harnack.gallery.damaged import MESHES
+from harnack.gallery.outlines import OUTLINES
 from harnack.gallery.scene import Scene
 from harnack.gallery.shells import EXOSKELETONS, SHELLS
 from harnack.gallery.solids import BLOBS, SHAPES
@@ -28,6 +29,7 @@ SCENES: Mapping[str, Scene] = MappingProxyType(
             *EXOSKELETONS,
             *BLOBS,
             *SHAPES,
+            *OUTLINES,
             *PLANE,
         )
     }

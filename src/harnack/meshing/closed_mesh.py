@@ -10,6 +10,7 @@ import trimesh
 
 from harnack.backend import BoolArray, FloatArray
 from harnack.geometry import Ball, Box, ConvexHull, HalfSpace, Intersection
+from harnack.geometry.outlines import Outline, for_clipper
 from harnack.meshing.checks import (
     LocalError,
     MeshingError,
@@ -21,13 +22,22 @@ from harnack.meshing.edges import IntArray
 from harnack.meshing.lattice_surface import Surface
 
 if TYPE_CHECKING:
-    from manifold3d import Manifold
+    from manifold3d import CrossSection, Manifold
 
     from harnack.geometry import Volume
 
-__all__ = ["ClosedMesh", "box_manifold", "manifold_of", "surface_of", "volume_manifold"]
+__all__ = [
+    "ClosedMesh",
+    "box_manifold",
+    "extruded_manifold",
+    "manifold_of",
+    "revolved_manifold",
+    "surface_of",
+    "volume_manifold",
+]
 
 _MOST_SEGMENTS = 2000
+_MOST_CELLS = 1_000_000
 
 
 def manifold_of(surface: Surface) -> Manifold:
@@ -64,6 +74,72 @@ def box_manifold(lower: FloatArray, upper: FloatArray) -> Manifold:
     x, y, z = (float(v) for v in upper - lower)
     a, b, c = (float(v) for v in lower)
     return Manifold.cube((x, y, z)).translate((a, b, c))
+
+
+def extruded_manifold(
+    outline: Outline, height: float, twist: float, taper: float, tolerance: float
+) -> Manifold:
+    """The outline over 0 <= z <= height, its end turned by `twist` degrees and scaled by `taper`.
+
+    Without a twist the faces are flat, and as they are. Else the vertices lie on the surface, and
+    faces within `tolerance` of it. Proof: a triangle of edges of L at most, mapped, is within
+    M L^2/6 of the mapped triangle, where M bounds second derivatives of the map along lines (it
+    lies within L/sqrt(3) of a point). For turning by a and scaling by k within a unit of length,
+    at distances up to R from the axis, with q = max(1, taper), M = q (a + a^2 R) + k (1 + 2 a R).
+
+    Raises:
+        MeshingError: so fine that it has millions of faces.
+    """
+    section, scale = _section(outline)
+    back = (1 / scale, 1 / scale, 1 / scale)
+    if twist == 0:
+        return section.extrude(height * scale, 0, 0.0, (taper, taper)).scale(back)
+    rate, growth = math.radians(twist) / height, (taper - 1.0) / height
+    radius = max(float(np.linalg.norm(one, axis=1).max()) for one in outline)
+    turn, most = abs(rate), max(1.0, taper)
+    bend = most * (turn + turn**2 * radius) + abs(growth) * (1 + 2 * turn * radius)
+    length = math.sqrt(6 * tolerance / bend)
+    straight = section.extrude(height * scale)
+    count = straight.surface_area() / (scale * length) ** 2
+    if count > _MOST_CELLS:
+        raise MeshingError(
+            f"a twisted outline within {tolerance:.3g} has about {4 * count:,.0f} faces: choose a "
+            "larger `tolerance`"
+        )
+
+    def mapped(points: FloatArray) -> FloatArray:
+        z = points[:, 2] / scale
+        share, c, s = 1 + growth * z, np.cos(rate * z), np.sin(rate * z)
+        x, y = share * points[:, 0], share * points[:, 1]
+        return np.column_stack([c * x - s * y, s * x + c * y, points[:, 2]])
+
+    return straight.refine_to_length(length * scale).warp_batch(mapped).scale(back)
+
+
+def revolved_manifold(outline: Outline, tolerance: float) -> Manifold:
+    """The outline in (r, z) about the z axis, its vertices on the surface and its faces within
+    `tolerance` of it: n segments around leave a sagitta of r (1 - cos(pi/n)) <= r (pi/n)^2/2.
+
+    Raises:
+        MeshingError: so fine that it has millions of faces.
+    """
+    radius = max(float(one[:, 0].max()) for one in outline)
+    segments = 4 * math.ceil(0.25 * math.pi * math.sqrt(radius / (2 * tolerance)))
+    if segments > _MOST_SEGMENTS:
+        raise MeshingError(
+            f"an outline of radius {radius:g} revolved within {tolerance:.3g} has {segments:,} "
+            "segments around: choose a larger `tolerance`"
+        )
+    section, scale = _section(outline)
+    return section.revolve(max(16, segments)).scale((1 / scale, 1 / scale, 1 / scale))
+
+
+def _section(outline: Outline) -> tuple[CrossSection, float]:
+    """An outline, times a scale for which it is not rounded (`for_clipper`)."""
+    from manifold3d import CrossSection
+
+    loops, scale = for_clipper(outline)
+    return CrossSection(loops), scale
 
 
 def volume_manifold(

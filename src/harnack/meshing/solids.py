@@ -26,12 +26,22 @@ from harnack.fields.solids.combined import Combined, Complement, Offset
 from harnack.fields.solids.primitives import Cuboid, Plane
 from harnack.fields.solids.region import Near, Region, bounded_side
 from harnack.fields.solids.region import solid as solid_of
+from harnack.fields.solids.swept import Extruded, Revolved
+from harnack.fields.solids.thread import Thread
 from harnack.geometry import Ball, Box, Intersection, Volume
 from harnack.meshing.checks import LocalError, MeshingError
-from harnack.meshing.closed_mesh import box_manifold, manifold_of, surface_of, volume_manifold
+from harnack.meshing.closed_mesh import (
+    box_manifold,
+    extruded_manifold,
+    manifold_of,
+    revolved_manifold,
+    surface_of,
+    volume_manifold,
+)
 from harnack.meshing.lattice import Lattice
 from harnack.meshing.lattice_surface import MissedError, Surface, closed_surface
 from harnack.meshing.samples import CELLS_PER_WAVE, LevelFunction, Samples, Uploads
+from harnack.meshing.thread_mesh import thread_manifold
 
 if TYPE_CHECKING:
     from manifold3d import Manifold
@@ -93,6 +103,15 @@ class RegionMesher:
         if isinstance(solid, Cuboid) and solid.radius == 0 and level <= 0:
             half = np.array(solid.half_sides) + level
             return box_manifold(-half, half) if (half > 0).all() else Manifold()
+        if isinstance(solid, Extruded) and level == 0:
+            return extruded_manifold(
+                solid.loops, solid.height, solid.twist, solid.taper, self.tolerance
+            )
+        if isinstance(solid, Revolved) and level == 0:
+            return revolved_manifold(solid.loops, self.tolerance)
+        if isinstance(solid, Thread) and level == 0:
+            low, high = float(self.lower[2]), float(self.upper[2])
+            return thread_manifold(solid, low, high, self.tolerance)
         if isinstance(solid, Plane):
             x, y, z = solid.normal
             return self._space().trim_by_plane((-x, -y, -z), -(solid.distance + level))
@@ -208,7 +227,8 @@ def is_smooth(solid: Solid) -> bool:
         return not isinstance(solid.inner, Solid) or is_smooth(solid.inner)
     if isinstance(solid, AffineImage):
         return is_smooth(solid.inner)
-    return not isinstance(solid, Combined | Complement | Offset | Near | Cuboid | Plane)
+    with_edges = Cuboid | Plane | Extruded | Revolved | Thread
+    return not isinstance(solid, Combined | Complement | Offset | Near | with_edges)
 
 
 def _hull(field: Field, level: float) -> Volume | None:

@@ -23,6 +23,7 @@ from harnack.fields.boxed_parts import BoxedField, BoxedParts
 from harnack.fields.field import Field
 from harnack.fields.look import Look, Path, Sample
 from harnack.fields.solids.solid import Solid, box_around
+from harnack.geometry.beziers import flattened
 from harnack.tree.nearest import MOST_BOXES
 
 if TYPE_CHECKING:
@@ -109,8 +110,7 @@ class Tube(Solid):
         tolerance: how far the surface may be from the exact one, in units of length; by default a
             thousandth of the radius. The number of segments grows like its square root.
 
-        Proof. A chord between two parameters h apart is within h^2/8 max |B''| of the curve, taken
-        at equal parameters, and |B''| <= 6 max |second difference of the control points|.
+        Proof: `harnack.geometry.beziers.flattened`.
 
         Raises:
             ValueError: another number of points, or numbers that are not finite.
@@ -129,16 +129,42 @@ class Tube(Solid):
         made = [points[:1]]
         off = 0.0
         for start in range(0, len(points) - 1, 3):
-            curve = points[start : start + 4]
-            bend = 6.0 * float(np.linalg.norm(np.diff(curve, 2, axis=0), axis=1).max())
-            count = max(1, math.ceil(math.sqrt(bend / (8.0 * allowed))))
-            if count > _MOST_SEGMENTS:
-                raise ValueError(f"{count:,} segments for one curve: allow a larger tolerance")
-            t = np.linspace(0.0, 1.0, count + 1)[1:, None]
-            weights = np.hstack([(1 - t) ** 3, 3 * t * (1 - t) ** 2, 3 * t**2 * (1 - t), t**3])
-            made.append(weights @ curve)
-            off = max(off, bend / (8.0 * count**2))
+            more, error = flattened(points[start : start + 4], allowed)
+            made.append(more)
+            off = max(off, error)
         return cls(np.concatenate(made), radius, flattening=off)
+
+    @classmethod
+    def helix(
+        cls, radius: float, pitch: float, turns: float, wire: float, *,
+        left_handed: bool = False, tolerance: float | None = None,
+    ) -> Tube:  # fmt: skip
+        """A coil of round wire about the z axis, from (radius, 0, 0) to z = pitch turns; its ends
+        are round.
+
+        radius: of the helix that is the middle of the wire. pitch: along the axis, of one turn.
+        wire: its radius. left_handed: whether it turns clockwise as it rises.
+        tolerance: how far the surface may be from the exact one, in units of length; by default a
+            thousandth of the radius of the wire.
+
+        Proof. A chord between two angles h apart is within h^2/8 max |c''| of the helix c, taken at
+        equal angles, and |c''| is the radius.
+
+        Raises:
+            ValueError: numbers that are not positive, or more than a million segments.
+        """
+        radius, wire = positive(radius, "the radius of a helix"), positive(wire, "the wire")
+        pitch, turns = positive(pitch, "the pitch of a helix"), positive(turns, "its turns")
+        allowed = 1e-3 * wire if tolerance is None else positive(tolerance, "the tolerance")
+        angle = 2 * math.pi * turns
+        count = max(1.0, angle * math.sqrt(radius / (8.0 * allowed)))
+        if not count <= _MOST_SEGMENTS:
+            raise ValueError(f"{count:,.0f} segments: allow a larger tolerance")
+        t = np.linspace(0.0, angle, math.ceil(count) + 1)
+        y = np.sin(t) * (-radius if left_handed else radius)
+        points = np.column_stack([radius * np.cos(t), y, pitch * t / (2 * math.pi)])
+        off = radius * (angle / math.ceil(count)) ** 2 / 8.0
+        return cls(points, wire, flattening=off)
 
     def leaves(self, change: Callable[[Solid], Solid]) -> Solid:
         return change(self)
@@ -211,7 +237,7 @@ class Tube(Solid):
             off = 8 * unit * (dr.norm(from_start) + dr.norm(side))
             if direction is not None:
                 slope = dr.dot(away, direction) / distance - off / distance * 2
-                lows = _lowered(lows, knots, distance - off, slope, 4 * unit * distance, unit)
+                lows = lowered(lows, knots, distance - off, slope, 4 * unit * distance, unit)
             nearer = distance < nearest
             return (
                 dr.select(nearer, distance, nearest),
@@ -287,7 +313,7 @@ def _by_groups(
             off = 8 * unit * (dr.norm(p) + distance + row[3])
             slope = dr.dot(away, direction) / distance - 2 * off / distance
             start = dr.select(is_near, dr.inf, distance - row[3] - off)
-            found[5:] = _lowered(found[5:], knots, start, slope, 4 * unit * distance, unit)
+            found[5:] = lowered(found[5:], knots, start, slope, 4 * unit * distance, unit)
 
         def each(j: Any, *inner: Any) -> tuple[Any, ...]:
             return j + 1, *body(records.row(i * _GROUP + j), inner)
@@ -306,7 +332,7 @@ def _by_groups(
     return dr.while_loop((index, *start), more_groups, visit, label="tube by groups")[1:]
 
 
-def _lowered(
+def lowered(
     lows: Sequence[Real],
     knots: tuple[Real, ...],
     start: Real,

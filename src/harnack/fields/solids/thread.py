@@ -1,0 +1,330 @@
+"""Screw threads: `Thread`, any profile wound along a helix; `thread`, the metric ones of ISO."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, cast
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend.elementary import clamp, fmax, fmin
+from harnack.backend.numbers import (
+    check_finite,
+    finite,
+    positive,
+    real_array,
+    refuses_derivatives,
+    whole,
+)
+from harnack.enclosures import Enclosure, Gaps, Lipschitz
+from harnack.enclosures.pieces import Pieces
+from harnack.fields.formula import prepared_numbers
+from harnack.fields.look import Look, Path, Sample
+from harnack.fields.solids.solid import Solid, set_checked
+from harnack.fields.solids.swept import Revolved
+from harnack.names import did_you_mean
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Real, Vec3
+    from harnack.geometry import Volume
+
+_MOST_POINTS = 32
+_MOST_STARTS = 32
+
+
+@dataclass(frozen=True, eq=False)
+class Thread(Solid):
+    """An endless screw along the z axis: the points nearer to the axis than a profile that moves by
+    `starts` pitches along it in each turn.
+
+    profile: (n, 2) points (z, r) of a polyline, z rising from 0 to less than the pitch, r positive;
+        behind the last point it goes on to the first, one pitch further. At most 32 points.
+    pitch: the period of the profile along the axis.
+    starts: how many grooves there are side by side.
+    left_handed: whether it turns clockwise as it rises.
+
+    With (r, angle, z) the cylindrical coordinates of p, f is the signed distance d of (r, u),
+    u = z - starts pitch angle/(2 pi), from the periodic polyline in the plane; but it is at least
+    -m/2, with m the least r of the profile. The surface is exact; f is no distance, but close to
+    one where the pitch is small beside the radius.
+
+    Proof of the constant. |grad r| = 1, and grad u has the part 1 along the axis and starts pitch/
+    (2 pi r) around it, at right angles to grad r. So where r >= m/2, |grad f| is at most
+    sqrt(1 + (starts pitch/(pi m))^2). Where r < m/2, d < -m/2, so that f is constant. u jumps by
+    multiples of the pitch, which do not change f.
+
+    Raises:
+        ValueError: another profile.
+    """
+
+    profile: Any
+    pitch: float
+    starts: int = 1
+    left_handed: bool = False
+
+    def __post_init__(self) -> None:
+        set_checked(self, "pitch", positive(self.pitch, "the pitch of a thread"))
+        set_checked(self, "starts", whole(self.starts, "the starts of a thread", 1, _MOST_STARTS))
+        if not isinstance(self.left_handed, bool):  # pyright: ignore[reportUnnecessaryIsInstance]
+            raise TypeError(f"left_handed must be True or False, not {self.left_handed!r}")
+        array = real_array(self.profile, "the profile of a thread")
+        if array.ndim != 2 or array.shape[1] != 2 or not 1 <= len(array) <= _MOST_POINTS:
+            raise ValueError(
+                f"the profile of a thread has shape (n, 2), n from 1 to {_MOST_POINTS}, "
+                f"not {array.shape}"
+            )
+        points = np.array(array, dtype=np.float64)
+        check_finite(points, "point {} of the profile of a thread", ValueError)
+        z = points[:, 0]
+        if z[0] != 0 or (np.diff(z) <= 0).any() or not z[-1] < self.pitch:
+            raise ValueError(
+                "z of the profile of a thread rises from 0 to less than the pitch, "
+                f"{self.pitch:g}: {z.tolist()!r:.80} does not"
+            )
+        if not (points[:, 1] > 0).all():
+            raise ValueError("r of the profile of a thread must be positive")
+        rows = tuple((float(a), float(b)) for a, b in points)
+        set_checked(self, "profile", rows)
+        # Three periods: a nearest point is at most half a period away along the axis.
+        shifted = [(a + k * self.pitch, b) for k in (-1, 0, 1) for a, b in rows]
+        shifted.append((2 * self.pitch, rows[0][1]))
+        set_checked(self, "_points", tuple(shifted))
+        lead = self.starts * self.pitch * (-1 if self.left_handed else 1)
+        set_checked(self, "_lead", lead / (2 * math.pi))
+        least = min(b for _, b in rows)
+        set_checked(self, "_least", 0.5 * least)
+        most = max(b for _, b in rows)
+        set_checked(self, "_most", most)
+        set_checked(self, "_size", most + 2 * self.pitch * self.starts)
+        slope = self.starts * self.pitch / (math.pi * least)
+        set_checked(self, "lipschitz", math.hypot(1.0, slope) * (1 + 1e-6))
+
+    def leaves(self, change: Callable[[Solid], Solid]) -> Solid:
+        return change(self)
+
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        del level, above
+        return None
+
+    def prepare(self, backend: Backend) -> Thread:
+        made = prepared_numbers(self, backend)
+        numbers: Any = cast("Any", self)
+        points = tuple(
+            tuple(dr.opaque(backend.Float, one) for one in row) for row in numbers._points
+        )
+        set_checked(made, "_points", points)
+        for name in ("_lead", "_least", "_most", "_size", "lipschitz"):
+            set_checked(made, name, dr.opaque(backend.Float, getattr(self, name)))
+        return made
+
+    def evaluate(self, p: Vec3) -> Sample:
+        real, on = cast("Any", type(p.x)), cast("Any", self)
+        unit = 2 * float(dr.epsilon(real))
+        r = dr.sqrt(dr.fma(p.x, p.x, p.y * p.y))
+        along = p.z - dr.atan2(p.y, p.x) * on._lead
+        along = along - dr.floor(along / self.pitch) * self.pitch
+        error = 8 * unit * (dr.abs(p.z) + r + on._size)
+        outside = r >= self._height(along)
+        sign = dr.select(outside, real(1), real(-1))
+        distance, by_r, by_z, doubt = self._nearest(r, along, sign, error)
+        value = sign * distance
+        is_core = value <= -on._least
+        value = dr.select(is_core, -on._least, value)
+        by_r, by_z = (dr.select(is_core, 0, one) for one in (by_r, by_z))
+        safe = dr.select(r > 0, r, 1)
+        x, y = p.x / safe, p.y / safe
+        around = -by_z * on._lead / safe
+        gradient = cast("Any", type(p))(by_r * x - around * y, by_r * y + around * x, by_z)
+        constant = 0 * p.x + self.lipschitz
+        doubt = dr.select(is_core, 0, doubt * constant + 16 * unit)
+        return Sample(value, gradient, (Lipschitz(constant),), error, doubt)
+
+    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
+        del ahead, back
+        p, d = path.point(t), path.direction
+        look = path.look(self.evaluate(p))
+        if Pieces not in path.proofs.kinds:
+            return look
+        numbers = cast("Any", self)
+        beside = Beside(
+            look.sample.value, look.sample.error, dr.sqrt(dr.fma(p.x, p.x, p.y * p.y)),
+            dr.fma(p.x, d.x, p.y * d.y), dr.fma(d.x, d.x, d.y * d.y), 0 * p.x + numbers._most,
+            0 * p.x + self.lipschitz,
+        )  # fmt: skip
+        return replace(look, ahead=(*look.ahead, beside))
+
+    def _height(self, z: Real) -> Real:
+        """The polyline's r at z."""
+        height = 0 * z
+        for (a, s), (b, t) in itertools.pairwise(self._corners()):
+            there = s + (z - a) / (b - a) * (t - s)
+            height = dr.select((z >= a) & (z <= b), there, height)
+        return height
+
+    def _corners(self) -> tuple[tuple[Real, Real], ...]:
+        return cast("Any", self)._points
+
+    def _nearest(self, r: Real, z: Real, sign: Real, error: Real) -> tuple[Real, Real, Real, Real]:
+        """The distance of (r, z) from the polyline; the gradient of the signed distance by r and by
+        z, along the normal of an edge or away from a vertex; and a bound of its error."""
+        zero = 0 * r
+        best, by_r, by_z, doubt = zero + dr.inf, zero, zero, zero
+        unit = 2 * float(dr.epsilon(cast("Any", type(r))))
+        for (a, s), (b, t) in itertools.pairwise(self._corners()):
+            side_z, side_r = zero + (b - a), zero + (t - s)
+            over = dr.rsqrt(side_z * side_z + side_r * side_r)
+            from_z, from_r = z - a, r - s
+            share = (from_z * side_z + from_r * side_r) * over * over
+            back = -clamp(share, 0, 1)
+            to_z, to_r = dr.fma(side_z, back, from_z), dr.fma(side_r, back, from_r)
+            across = dr.abs(from_r * side_z - from_z * side_r) * over
+            inner = (share > 0) & (share < 1)
+            distance = dr.select(inner, across, dr.sqrt(to_z * to_z + to_r * to_r))
+            nearer = distance < best
+            plain, way = inner | (distance <= error), sign / distance
+            for_r = dr.select(plain, side_z * over, to_r * way)
+            for_z = dr.select(plain, -side_r * over, to_z * way)
+            by_r, by_z = dr.select(nearer, for_r, by_r), dr.select(nearer, for_z, by_z)
+            off = dr.select(inner, 8 * unit, fmin(2 * error / distance, 2))
+            doubt = dr.select(nearer, off, doubt)
+            best = dr.select(nearer, distance, best)
+        return best, by_r, by_z, doubt
+
+
+@dataclass(frozen=True)
+class Beside(Enclosure):
+    """A function f, along a path, that is at least the distance from an endless cylinder outside of
+    it.
+
+    value, error: of f. r, slope, square: the distance from the axis is that of r(s)^2 = r^2 +
+    2 slope s + square s^2. radius: of the cylinder. constant: a Lipschitz constant of f.
+
+    Proof. f stays above a level L >= 0 as long as r(s) > R + L, R the radius: up to the smaller
+    root of the quadratic, which is computed as for a slightly larger discriminant, so that it is
+    not rounded upwards and no root is missed. A thread lies within the largest r of its profile, so
+    that (r, u) is at least r - R from it. And f rises no faster than its constant allows.
+    """
+
+    value: Real
+    error: Real
+    r: Real
+    slope: Real
+    square: Real
+    radius: Real
+    constant: Real
+
+    def step(self, gaps: Gaps) -> Real:
+        level = self.value - gaps.down + self.error
+        target = self.radius + level
+        left = (self.r - target) * (self.r + target)
+        squared, product = self.slope * self.slope, self.square * left
+        room = squared - product + 1e-5 * (squared + dr.abs(product))
+        root = left / (dr.sqrt(fmax(room, 0)) - self.slope)
+        free = dr.select((self.slope >= 0) | (room < 0), dr.inf, root)
+        known = (gaps.down <= self.value) & (left > 1e-5 * target * target) & (gaps.up >= 0)
+        known &= (free >= 0) & dr.isfinite(left + squared + product)
+        free = dr.select(gaps.down == dr.inf, dr.inf, dr.select(known, free, 0))
+        return fmax(fmin(free, gaps.up / self.constant), 0) * (1 - 1e-5)
+
+
+# ISO 261 and 262: nominal diameters and coarse pitches, in millimeters.
+COARSE: Mapping[str, float] = MappingProxyType(
+    {
+        "M1": 0.25, "M1.1": 0.25, "M1.2": 0.25, "M1.4": 0.3, "M1.6": 0.35, "M1.8": 0.35, "M2": 0.4,
+        "M2.2": 0.45, "M2.5": 0.45, "M3": 0.5, "M3.5": 0.6, "M4": 0.7, "M4.5": 0.75, "M5": 0.8,
+        "M6": 1.0, "M7": 1.0, "M8": 1.25, "M9": 1.25, "M10": 1.5, "M11": 1.5, "M12": 1.75,
+        "M14": 2.0, "M16": 2.0, "M18": 2.5, "M20": 2.5, "M22": 2.5, "M24": 3.0, "M27": 3.0,
+        "M30": 3.5, "M33": 3.5, "M36": 4.0, "M39": 4.0, "M42": 4.5, "M45": 4.5, "M48": 5.0,
+        "M52": 5.0, "M56": 5.5, "M60": 5.5, "M64": 6.0, "M68": 6.0,
+    }
+)  # fmt: skip
+_NAME = re.compile(r"M(\d{1,4}(?:\.\d{1,3})?)(?:\s*[xX]\s*(\d{1,3}(?:\.\d{1,3})?))?")
+# Of the pitch. More would leave next to nothing of the crests.
+_MOST_CLEARANCE = 0.1
+
+
+@refuses_derivatives
+def thread(
+    name: str,
+    length: float,
+    *,
+    internal: bool = False,
+    clearance: float = 0.0,
+    left_handed: bool = False,
+) -> Solid:
+    """A metric screw thread of ISO about the z axis, in millimeters.
+
+    name: "M8" for a coarse one (ISO 261, from M1 to M68), "M8x1" for one of any other pitch.
+    length: an external thread reaches from z = 0 to there, both ends beveled by 45 degrees down to
+        its root. An internal one is what is cut out of a nut, `nut - thread("M8", 20,
+        internal=True)`: it begins one pitch below z = 0, so that it opens a face there, with a
+        bevel, and ends at z = length; let it reach a pitch beyond the other face, if the hole is to
+        go through.
+    internal: whether it is for a nut.
+    clearance: by which the surface lies inside of the basic profile, or outside for an internal
+        thread, across flanks, crests and roots, up to a tenth of the pitch. Printed threads that
+        are to fit want 0.05 to 0.1 on either side.
+
+    The profile is the basic one of ISO 68-1, for bolt and nut: flanks at 60 degrees to each other,
+    a crest of an eighth and a root of a quarter of the pitch P, and between their radii a depth of
+    5/8 H, H = sqrt(3)/2 P. Tolerances of ISO 965 and rounded roots are not in it.
+
+    Raises:
+        ValueError: no such thread, a length that leaves nothing between the bevels, or another
+            clearance.
+    """
+    diameter, pitch = _sizes(name)
+    length = positive(length, "the length of a thread")
+    clearance = finite(clearance, "the clearance of a thread")
+    if not 0 <= clearance <= _MOST_CLEARANCE * pitch:
+        raise ValueError(
+            f"the clearance of {name} must be from 0 to {_MOST_CLEARANCE * pitch:g}, a tenth of "
+            f"its pitch, not {clearance:g}"
+        )
+    depth = 0.625 * math.sqrt(0.75) * pitch
+    sign = 1.0 if internal else -1.0
+    crest, root = 0.5 * diameter + sign * clearance, 0.5 * diameter - depth + sign * clearance
+    # Edges moved across themselves by c meet c tan(30 degrees) farther along.
+    moved = sign * 2 * clearance * math.tan(math.radians(30.0))
+    flat, flank, bottom = pitch / 8 + moved, 5 * pitch / 16, pitch / 4 - moved
+    z = np.cumsum([0.0, flat, flank, bottom])
+    made = Thread(np.column_stack([z, [crest, crest, root, root]]), pitch, 1, left_handed)
+    over = crest + 0.25 * depth  # beyond the crests, so that no faces coincide
+    bevel = over - root
+    if internal:
+        opening = [(over, -pitch), (over, 0.0), (root, bevel)]
+        around = Revolved([(0.0, -pitch), (over, -pitch), (over, length), (0.0, length)])
+        return (made & around) | Revolved([(0.0, -pitch), *opening, (0.0, bevel)])
+    if not length > 2 * bevel:
+        raise ValueError(
+            f"a thread {name} must be longer than {2 * bevel:.3g}, for its bevels, not {length:g}"
+        )
+    ends = [(root, 0.0), (over, bevel), (over, length - bevel), (root, length)]
+    return made & Revolved([(0.0, 0.0), *ends, (0.0, length)])
+
+
+def _sizes(name: Any) -> tuple[float, float]:
+    """Diameter and pitch of a thread by its name."""
+    found = _NAME.fullmatch(name.strip()) if isinstance(name, str) else None
+    if found is None:
+        raise ValueError(f'a thread is named as "M8" or "M8x1", not {name!r:.40}')
+    diameter = float(found[1])
+    if found[2] is None:
+        key = f"M{diameter:g}"
+        if key not in COARSE:
+            raise ValueError(
+                f"there is no coarse thread {key}{did_you_mean(key, COARSE)}: write its pitch, as "
+                f"in {key}x1"
+            )
+        return diameter, COARSE[key]
+    pitch = float(found[2])
+    # Four depths, so that a core is left.
+    if not (pitch > 0 and diameter > 4 * pitch * math.sqrt(0.75) * 0.625):
+        raise ValueError(f"a thread {name} leaves no core: its pitch is too large for it")
+    return diameter, pitch

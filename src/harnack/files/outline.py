@@ -1,0 +1,390 @@
+"""Outlines for `harnack.Extruded` and `harnack.Revolved`: of text, of SVG files, regular polygons.
+
+Curves are flattened to a stated tolerance. What is returned are loops that do not cross, the region
+on their left, as `harnack.geometry.outlines` makes them.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal, cast
+from xml.etree.ElementTree import Element, ParseError, TreeBuilder
+from xml.parsers import expat
+
+import numpy as np
+
+from harnack.backend import FloatArray
+from harnack.backend.numbers import positive, whole
+from harnack.files.file_format import FileFormatError
+from harnack.geometry.beziers import flattened
+from harnack.geometry.outlines import Outline, Rule, outline_loops
+
+__all__ = ["regular", "svg", "text"]
+
+# Of the size of letters, or of a picture.
+_FINE = 1e-3
+_LINE_HEIGHT = 1.2
+_MOST_LETTERS = 10_000
+_MOST_SIDES = 100_000
+
+
+def regular(sides: int, radius: float) -> Outline:
+    """The regular polygon with so many sides, 3 at least, its corners at `radius` from the origin,
+    the first on the x axis: `Extruded(regular(6, 5.0), height)` is a prism.
+
+    Raises:
+        ValueError: fewer sides, or a radius that is not positive.
+    """
+    count = whole(sides, "the number of sides of a polygon", 3, _MOST_SIDES)
+    angle = 2 * math.pi * np.arange(count) / count
+    corners = np.column_stack([np.cos(angle), np.sin(angle)])
+    return outline_loops(positive(radius, "the radius of a polygon") * corners)
+
+
+# Text.
+
+
+def text(
+    words: str,
+    size: float = 1.0,
+    *,
+    font: str | os.PathLike[str] | None = None,
+    align: Literal["left", "center", "right"] = "left",
+    tolerance: float | None = None,
+) -> Outline:
+    """The outline of text, which starts at the origin and runs along x, y upwards.
+
+    words: one line or several, set by matplotlib (`pip install harnack[outlines]`).
+    size: of the font, in units of length: about from the lowest to the highest point of a line.
+    font: a file (.ttf, .otf), or the name of a family that is installed; None for DejaVu Sans,
+        which matplotlib brings.
+    align: of lines to each other, and to the y axis.
+    tolerance: how far polygons may be from the letters' curves; by default a thousandth of the
+        size.
+
+    Raises:
+        ValueError: text without anything to see, or with letters that the font lacks; no such font.
+        ModuleNotFoundError: without matplotlib.
+    """
+    size = positive(size, "the size of text")
+    allowed = _FINE * size if tolerance is None else positive(tolerance, "the tolerance")
+    if not isinstance(words, str) or len(words) > _MOST_LETTERS:  # pyright: ignore
+        raise ValueError(f"words must be a text of at most {_MOST_LETTERS:,} letters")
+    if align not in ("left", "center", "right"):
+        raise ValueError(f'align must be "left", "center" or "right", not {align!r}')
+    loops: list[FloatArray] = []
+    for number, line in enumerate(words.expandtabs(4).splitlines()):
+        made = _line(line, font, size, allowed)
+        if made:
+            x = np.concatenate(made)[:, 0]
+            left, right = float(x.min()), float(x.max())
+            along = {"left": 0.0, "center": 0.5 * (left + right), "right": right}[align]
+            shift = np.array([-along, -number * _LINE_HEIGHT * size])
+            loops += [one + shift for one in made]
+    if not loops:
+        raise ValueError(f"there is nothing to see in the text {words!r:.60}")
+    return outline_loops(loops, "nonzero")
+
+
+def _line(line: str, font: Any, size: float, allowed: float) -> list[FloatArray]:
+    """Loops of one line of text."""
+    try:
+        from matplotlib import font_manager
+        from matplotlib.ft2font import FT2Font
+        from matplotlib.textpath import TextToPath
+    except ModuleNotFoundError:
+        raise ModuleNotFoundError(
+            'outlines of text need matplotlib: pip install "harnack[outlines]"'
+        ) from None
+    manager: Any = font_manager
+    if font is not None and Path(font).suffix.lower() in (".ttf", ".otf", ".ttc"):
+        if not Path(font).is_file():
+            raise ValueError(f"there is no font file {os.fspath(font)}")
+        about: Any = manager.FontProperties(fname=os.fspath(font))
+    else:
+        about = manager.FontProperties(family="DejaVu Sans" if font is None else str(font))
+    try:
+        face: Any = FT2Font(manager.findfont(about, fallback_to_default=False))
+    except ValueError:
+        raise ValueError(
+            f"no font of the family {font!r} is installed: give the path of a .ttf or .otf file"
+        ) from None
+    except RuntimeError as wrong:
+        raise ValueError(f"{font} is no font: {wrong}") from None
+    for letter in line:
+        if not face.get_char_index(ord(letter)):
+            raise ValueError(
+                f"the font {face.family_name} has no letter {letter!r}: choose another by font="
+            )
+    maker: Any = TextToPath()
+    points, codes = maker.get_text_path(about, line, ismath=False)
+    scale = size / maker.FONT_SCALE
+    rows = np.asarray(points, dtype=np.float64).reshape(-1, 2) * scale
+    return _traced(rows, [int(one) for one in codes], allowed)
+
+
+# Codes of matplotlib's paths, and how many points belong to each.
+_MOVE, _CLOSE = 1, 79
+_POINTS = {2: 1, 3: 2, 4: 3}
+
+
+def _traced(points: FloatArray, codes: list[int], allowed: float) -> list[FloatArray]:
+    loops: list[list[FloatArray]] = []
+    k = 0
+    while k < len(codes):
+        code = codes[k]
+        if code == _MOVE:
+            loops.append([points[k : k + 1]])
+        if code in (_MOVE, _CLOSE):
+            k += 1
+            continue
+        count = _POINTS[code]
+        controls = np.concatenate([loops[-1][-1][-1:], points[k : k + count]])
+        loops[-1].append(flattened(controls, allowed)[0] if count > 1 else controls[1:])
+        k += count
+    return _with_area([np.concatenate(one) for one in loops])
+
+
+def _with_area(loops: list[FloatArray]) -> list[FloatArray]:
+    """The loops that have three points which differ: others fill nothing."""
+    return [one for one in loops if len(np.unique(one, axis=0)) > 2]
+
+
+# SVG.
+
+_MOST_BYTES, _MOST_ELEMENTS, _DEEPEST = 32 * 2**20, 200_000, 200
+# What does not show, with all that is in it; and what shows in ways that are not read.
+_HIDDEN = (
+    "defs", "symbol", "clipPath", "mask", "marker", "pattern", "linearGradient", "radialGradient",
+    "filter", "metadata", "title", "desc", "script", "namedview", "style",
+)  # fmt: skip
+_UNREAD = ("use", "text", "image", "foreignObject", "switch")
+_SHAPES = ("path", "rect", "circle", "ellipse", "polygon", "polyline")
+# Of rules in a style sheet those that would change what is filled.
+_OF_RULES = re.compile(r"none|evenodd|transform|hidden|@import|clip|mask", re.IGNORECASE)
+
+
+def svg(
+    path: str | os.PathLike[str], *, scale: float = 1.0, tolerance: float | None = None
+) -> Outline:
+    """The outline of what an SVG file fills, y upwards, by svgpathtools
+    (`pip install harnack[outlines]`).
+
+    path: of a file with paths, rectangles, circles, ellipses and polygons, in groups and with
+        transforms. All that is filled is joined. Strokes have no outline here: a shape with
+        fill="none" is left out.
+    scale: the length of the file's unit (one of its `viewBox`).
+    tolerance: how far polygons may be from curves, in units of length; by default a thousandth of
+        the picture's size.
+
+    Raises:
+        FileFormatError (a ValueError): what is no such file, or holds what would be lost: text
+            (turn it into paths), images, copies of other elements (`use`), clips and masks, style
+            sheets that change what is filled, entities, a size or depth that no drawing has.
+        ModuleNotFoundError: without svgpathtools. OSError: it cannot be read.
+    """
+    scale = positive(scale, "the scale of an SVG file")
+    if tolerance is not None:
+        tolerance = positive(tolerance, "the tolerance") / scale
+    source = Path(path)
+    if source.stat().st_size > _MOST_BYTES:
+        raise FileFormatError(f"{source}: an SVG file has at most {_MOST_BYTES >> 20} MB")
+    try:
+        root = _parsed(source.read_bytes())
+        shapes = [*_filled(root, np.eye(3), {})]
+        return _outline_of(shapes, scale, tolerance)
+    except (ValueError, ArithmeticError, LookupError, ParseError, expat.ExpatError) as wrong:
+        raise FileFormatError(f"{source}: {wrong}") from None
+
+
+def _parsed(data: bytes) -> Element:
+    """The root element. No entity is declared: a few of them can stand for billions of letters."""
+    builder = TreeBuilder()
+    parser = expat.ParserCreate()
+    count = depth = 0
+
+    def start(name: str, attributes: dict[str, str]) -> None:
+        nonlocal count, depth
+        count, depth = count + 1, depth + 1
+        if count > _MOST_ELEMENTS or depth > _DEEPEST:
+            raise ValueError(
+                f"more than {_MOST_ELEMENTS:,} elements, or {_DEEPEST} within each other"
+            )
+        builder.start(name.rpartition(":")[2], attributes)
+
+    def end(name: str) -> None:
+        nonlocal depth
+        depth -= 1
+        builder.end(name.rpartition(":")[2])
+
+    def entity(*about: Any) -> None:
+        raise ValueError(f"it declares the entity {about[0]!r}, and entities are not read")
+
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.CharacterDataHandler = builder.data
+    parser.EntityDeclHandler = entity
+    parser.Parse(data, True)
+    root = builder.close()
+    if root.tag != "svg":
+        raise ValueError(f"its root is <{root.tag}>, and not <svg>")
+    return root
+
+
+def _filled(
+    element: Element, transform: FloatArray, inherited: dict[str, str]
+) -> Iterator[tuple[str, FloatArray, Rule]]:
+    """Path data, transform (3, 3) and fill rule of each shape that is filled."""
+    from svgpathtools.parser import parse_transform
+
+    tag = element.tag
+    if tag == "style" and _OF_RULES.search("".join(element.itertext())):
+        raise ValueError("its style sheet may change what is filled: save it with plain attributes")
+    if tag in _HIDDEN:
+        yield from ()
+        return
+    own = {**inherited, **_styles(element)}
+    if own.get("display") == "none":
+        return
+    if tag in _UNREAD:
+        raise ValueError(f"<{tag}> is not read: turn it into paths before the file is saved")
+    for name in ("clip-path", "mask"):
+        if _styles(element).get(name, "none") != "none":
+            raise ValueError(f"{name} is not read: cut the shapes before the file is saved")
+    if "transform" in element.attrib:
+        more: FloatArray = cast("Any", parse_transform)(element.attrib["transform"], strict=True)
+        transform = transform @ more
+    if tag in _SHAPES and own.get("fill") != "none" and own.get("visibility") != "hidden":
+        yield (
+            _data(element),
+            transform,
+            "even-odd" if own.get("fill-rule") == "evenodd" else "nonzero",
+        )
+    for one in element:
+        yield from _filled(one, transform, {k: v for k, v in own.items() if k in _INHERITED})
+
+
+_INHERITED = ("fill", "fill-rule", "visibility", "display")
+
+
+def _styles(element: Element) -> dict[str, str]:
+    """Properties of an element by their names, those of its style first."""
+    names = (*_INHERITED, "clip-path", "mask")
+    found = {name: element.attrib[name].strip() for name in names if name in element.attrib}
+    for entry in element.attrib.get("style", "").split(";"):
+        name, _, value = entry.partition(":")
+        if name.strip() in names:
+            found[name.strip()] = value.strip()
+    return found
+
+
+def _data(element: Element) -> str:
+    """The path data of a shape."""
+    from svgpathtools import svg_to_paths
+
+    makers: Any = svg_to_paths
+    about, kind = element.attrib, element.tag
+    if kind == "path":
+        return about.get("d", "")
+    sizes = {name: float(about[name]) for name in ("width", "height", "r", "rx", "ry")
+             if name in about and kind != "polygon"}  # fmt: skip
+    if any(not 0 <= one < math.inf for one in sizes.values()):
+        raise ValueError(f"a <{kind}> in it has a size that is negative or not finite")
+    if kind == "rect":
+        # Corners are rounded by half of a side at the most.
+        for name, other, side in (("rx", "ry", "width"), ("ry", "rx", "height")):
+            if name in sizes or other in sizes:
+                radius = sizes.get(name, sizes.get(other, 0.0))
+                about = {**about, name: str(min(radius, 0.5 * sizes.get(side, 0.0)))}
+        return makers.rect2pathd(about)
+    if kind in ("circle", "ellipse"):
+        return makers.ellipse2pathd(about)
+    return makers.polygon2pathd(about, kind == "polygon")
+
+
+def _outline_of(
+    shapes: list[tuple[str, FloatArray, Rule]], scale: float, tolerance: float | None
+) -> Outline:
+    paths: list[tuple[list[Any], FloatArray, Rule]] = [
+        (_segments(data), matrix, rule) for data, matrix, rule in shapes
+    ]
+    if tolerance is None:
+        ends = [
+            matrix[:2, :2] @ _xy(end) + matrix[:2, 2]
+            for segments, matrix, _ in paths for one in segments for end in (one.start, one.end)
+        ]  # fmt: skip
+        size = float(np.ptp(np.array(ends), axis=0).max()) if ends else 0.0
+        if not size > 0:
+            raise ValueError("it fills nothing")
+        tolerance = _FINE * size
+    loops: list[FloatArray] = []
+    flip = np.array([scale, -scale])
+    for segments, matrix, rule in paths:
+        own = [one * flip for one in _loops(segments, matrix, tolerance)]
+        if own:
+            loops += outline_loops(own, rule)
+    if not loops:
+        raise ValueError("it fills nothing: strokes have no outline; turn them into paths")
+    return outline_loops(loops, "nonzero")
+
+
+def _segments(data: str) -> list[Any]:
+    try:
+        from svgpathtools import parse_path
+    except ModuleNotFoundError:
+        raise ModuleNotFoundError(
+            'SVG files need svgpathtools: pip install "harnack[outlines]"'
+        ) from None
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        try:
+            made: list[Any] = [*cast("Any", parse_path)(data)]
+        except (Warning, AssertionError, ArithmeticError, LookupError, ValueError) as wrong:
+            raise ValueError(f"its path {data!r:.60} is none: {wrong}") from None
+    if not all(np.isfinite([one.start, one.end]).all() for one in made):
+        raise ValueError("a number in it is not finite")
+    return made
+
+
+def _loops(segments: list[Any], matrix: FloatArray, tolerance: float) -> list[FloatArray]:
+    """Closed loops of segments that follow on each other, under a transform."""
+    loops: list[list[FloatArray]] = []
+    last: complex | None = None
+    for one in segments:
+        if last is None or one.start != last:
+            loops.append([_mapped(matrix, [one.start])])
+        last = one.end
+        kind = type(one).__name__
+        if kind == "Arc":
+            loops[-1].append(_arc(one, matrix, tolerance))
+            continue
+        controls = _mapped(matrix, [*one.bpoints()])
+        if not np.isfinite(controls).all():
+            raise ValueError("a number in it is not finite")
+        loops[-1].append(flattened(controls, tolerance)[0] if len(controls) > 2 else controls[1:])
+    return _with_area([np.concatenate(one) for one in loops])
+
+
+def _arc(arc: Any, matrix: FloatArray, tolerance: float) -> FloatArray:
+    """Points of an elliptic arc: n chords are within r (angle/n)^2/8 of it, r the larger radius."""
+    angle = math.radians(abs(float(arc.delta)))
+    largest = max(abs(arc.radius.real), abs(arc.radius.imag))
+    largest *= float(np.linalg.norm(matrix[:2, :2], 2))
+    count = max(2.0, angle * math.sqrt(largest / (8 * tolerance)))
+    if not count <= _MOST_SIDES:
+        raise ValueError("an arc in it has too many segments: allow a larger tolerance")
+    t = np.linspace(0.0, 1.0, math.ceil(count) + 1)[1:]
+    points = [arc.point(float(one)) for one in t[:-1]]
+    return _mapped(matrix, [*points, arc.end])
+
+
+def _mapped(matrix: FloatArray, points: list[complex]) -> FloatArray:
+    return np.array([_xy(one) for one in points]) @ matrix[:2, :2].T + matrix[:2, 2]
+
+
+def _xy(z: complex) -> FloatArray:
+    return np.array([z.real, z.imag])
