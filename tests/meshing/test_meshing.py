@@ -39,6 +39,26 @@ def test_closed_surfaces_are_watertight() -> None:
     assert mesh.volume == pytest.approx(4 / 3 * math.pi * 0.8**3, rel=5e-3)
 
 
+def test_a_level_set_is_meshed_as_it_is_traced() -> None:
+    """Level, solid, clip and section are its own, unless others are given."""
+    box, half = hk.Box((-0.3, -0.3, -0.3), (0.3, 0.3, 0.3)), hk.HalfSpace((0, 0, 1), 0.1)
+    coarse: dict[str, Any] = {"tolerance": 2e-2, "spacing": 0.1}
+    field = hk.Gyroid(1.0)
+    made = hk.mesh(hk.level_set(field, 0.2, clip=box, section=half), **coarse)
+    same = hk.mesh(field, 0.2, clip=box, section=half, **coarse)
+    assert (made.vertices == same.vertices).all()
+    solid = hk.level_set(field, solid=(-0.2, 0.2), clip=box)
+    wall = hk.mesh(solid, **coarse)
+    assert (wall.vertices == hk.mesh(field, solid=(-0.2, 0.2), clip=box, **coarse).vertices).all()
+    assert hk.mesh(solid, level=0.1, **coarse).metadata["harnack"]["level"] == 0.1
+    ball = hk.mesh(hk.level_set(hk.Sphere(0.8), 0.1), tolerance=2e-2)  # a `Solid`
+    assert ball.volume == pytest.approx(4 / 3 * math.pi * 0.9**3, rel=0.05)
+    several = hk.level_set(field, [-0.2, 0.2], clip=box)
+    with pytest.raises(ValueError, match=r"of a Gyroid has 2 levels \(-0.2, 0.2\).*level=-0.2"):
+        hk.mesh(several)
+    assert hk.mesh(several, level=0.2, **coarse).metadata["harnack"]["level"] == 0.2
+
+
 @pytest.mark.parametrize(
     ("field", "arguments", "message"),
     [

@@ -85,7 +85,8 @@ def _lobes() -> list[LevelSet]:
 
 
 def _quartic() -> list[LevelSet]:
-    """The talk's x^3 y + x y^3 - 3 x y (w^2 + z^2), which is at most 1/2."""
+    """x^3 y + x y^3 - 3 x y (w^2 + z^2), the example of Gillespie et al. 2024, Appendix E.2. On the
+    sphere it is x y (4 (x^2 + y^2) - 3), hence at most 1/2."""
     terms = {(3, 1, 0, 0): 1.0, (1, 3, 0, 0): 1.0, (1, 1, 0, 2): -3.0, (1, 1, 2, 0): -3.0}
     return _on_the_sphere(HypersphericalHarmonic.from_polynomial(terms), 0.15)
 

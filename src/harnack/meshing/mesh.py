@@ -28,6 +28,7 @@ from harnack.meshing.lattice_surface import Surface, open_surface
 from harnack.meshing.samples import CELLS_PER_WAVE, MOST_FACES, LevelFunction
 from harnack.meshing.solids import AngleMesher, mesh_solid, region_of
 from harnack.meshing.spanned import spanned_surface
+from harnack.tracer import LevelSet
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -47,7 +48,7 @@ _ROOM = 0.05
 
 
 def mesh(
-    field: Field,
+    field: Field | LevelSet,
     level: float | None = None,
     *,
     tolerance: float = 1e-3,
@@ -69,7 +70,9 @@ def mesh(
     onto the surface until middles of edges and centers of triangles are within the tolerance.
     Solids are put together from the meshes of smooth levels by manifold3d, and so cut by the clip.
 
-    field: a `SolidAngle` of polygons, or a real-valued field that is continuous.
+    field: a `SolidAngle` of polygons, or a real-valued field that is continuous; or a `LevelSet` of
+        one level or a solid, whose level, clip, section, solid and largest are used unless others
+        are given here. Its tolerance and its other settings are those of rays, and not used.
     level: None for the field's default.
     tolerance: how far triangles may be from the surface, as a part of the size of the level set's
         box (its longest side), sampled and not proved.
@@ -120,9 +123,15 @@ def mesh(
     Raises:
         MeshingError: a ValueError, if it could not be done; the message says why.
         TypeError: a field that jumps or has parts; a clip that is no volume.
-        ValueError: options out of range, or that contradict each other.
+        ValueError: options out of range, or that contradict each other; a `LevelSet` of several
+            levels.
     """
     report = progress or _silent
+    if isinstance(field, LevelSet):
+        level, solid = _level_and_solid(field, level, solid)
+        clip = field.clip if clip is None else clip
+        section = field.section if section is None else section
+        field, largest = field.field, largest or field.largest > 0
     check_volume(clip, "clip")
     check_volume(section, "section")
     check_options(tolerance, spacing, thickness, seed, max_triangles)
@@ -171,6 +180,24 @@ def mesh(
         made, more = simplified(made, tolerance * size, check)
         facts |= more
     return finished(made, facts, is_closed)
+
+
+def _level_and_solid(
+    surface: LevelSet, level: float | None, solid: tuple[float, float] | bool | None
+) -> tuple[float | None, tuple[float, float] | bool | None]:
+    """The level and the solid to mesh: those that are given, else those of a `LevelSet`."""
+    if level is not None or not (solid is None or isinstance(solid, bool)):
+        return level, solid
+    if surface.solid is not None and solid is not False:
+        return None, surface.solid
+    if len(surface.levels) > 1:
+        kind, numbers = type(surface.field).__name__, ", ".join(f"{x:g}" for x in surface.numbers)
+        raise ValueError(
+            f"this LevelSet of a {kind} has {len(surface.levels)} levels ({numbers}) and a mesh is "
+            f"of one: give it beside, as in mesh(surface, level={surface.numbers[0]:g}), one after "
+            "the other"
+        )
+    return surface.numbers[0], solid
 
 
 def _check_level(

@@ -21,7 +21,7 @@ from harnack.fields.clearance import DetailedField, UnitCoordinates, epsilon_at,
 from harnack.fields.field import Sample, lengthened
 from harnack.fields.solid_angles.far_clusters import Treecode, dipole_rows, hierarchy_of, in_slots
 from harnack.fields.solid_angles.multipole import all_levels
-from harnack.fields.sums import FieldSums, Terms, rounding_of_dipole, rounding_of_sum
+from harnack.fields.sums import FieldSums, Terms, last_roundings, rounding_of_dipole
 from harnack.geometry import Box, CloudError, estimate_areas, estimate_normals, validate_cloud
 
 if TYPE_CHECKING:
@@ -57,9 +57,7 @@ class DipoleTree:
         """
         levels = all_levels(tree, points[:, None], moments[:, None], points, points)
         rows = dipole_rows(points, moments)
-        # The rounding of terms, most of which are about their share of the total weight in size.
-        share = max(1.0, float(rows[:, 6].sum()))
-        rounding = rounding_of_sum(backend, len(points), 16, growth=1 / 8, size=share)
+        rounding = last_roundings(backend, size=max(1.0, float(rows[:, 6].sum())))
         clusters = Treecode.of(backend, tree, levels, in_slots(tree, rows), accuracy)
         return cls(clusters, rounding)
 
@@ -86,9 +84,10 @@ class DipoleTree:
             closer = dr.select(some, closer, 0)
             fourth = row[6] * dr.square(closer * closer)
             nearer = some & (distance <= sums.free_distance)
+            added = sums.plus(terms, active & (inverse < dr.inf))
             new = dataclasses.replace(
-                sums.plus(terms, active & (inverse < dr.inf)),
-                rounding=sums.rounding + rounding_of_dipole(row[6], closer, unit),
+                added,
+                rounding=added.rounding + rounding_of_dipole(row[6], closer, unit),
                 free_distance=dr.select(nearer, distance, sums.free_distance),
                 s4=sums.s4 + fourth,
                 s5=dr.fma(fourth, closer, sums.s5),

@@ -39,6 +39,21 @@ if TYPE_CHECKING:
 _CHUNK = 4
 # The size of the imaginary part of a factor where it would be zero.
 _TINY = 1e-36
+# A bound of the rounding of a product's angle Omega = 2 arg, in units u of half the distance from 1
+# to the next number: so many for each factor, and so many L e' of `LiftedEdge.bounds` besides.
+#
+# Proof. Errors of arguments add up, as each step is compared with the exact product of the numbers
+# that it was given. (1) `times` multiplies by F: each part of the result is off by at most u times
+# the size of one product and u times itself, the result by 2 u of its length, and scaling it by
+# another u. The factor common to both parts does not turn it. (2) F = <chi_a, chi_b>, with chi =
+# (s, a') of length sqrt(2 s |a|), and |F| = P c, P = |chi_a||chi_b|, c the cosine of half the angle
+# that the edge subtends. By Cauchy and Schwarz no partial sum is more than P. The real part has
+# three roundings, of at most u P each, the imaginary part two: F is off by sqrt(13) u P, and turned
+# by 3.61 u/c. Together Omega is off by 2 (3 + 3.61/c) u. Where the edge subtends at most a right
+# angle, 1/c <= sqrt(2): by 16.3 u. Where it subtends more, x lies in the ball over it: with length
+# L = 2h and distance d <= h, 1/c <= sqrt(d^2 + h^2)/d <= L e', e' = h/(d sqrt(d^2 + h^2)): by 7.3
+# u L e' besides.
+FACTOR_ROUNDINGS, STEEP_ROUNDINGS = 16.5, 7.5
 
 
 @dataclass(frozen=True)
@@ -102,26 +117,27 @@ class LiftedEdge:
         """What the edge adds to the derivatives of the sum of angles that are asked for; 0 where it
         is not active."""
         if derivatives == 0:
-            return Terms(0.0)
+            return Terms(None)
         weight, c = self.edge.field()
         gradient = dr.select(active, self.direction * weight, 0) * c
         if derivatives == 1:
-            return Terms(0.0, gradient)
+            return Terms(None, gradient)
         c, rate = self.edge.rates()
         c, rate = dr.select(active, self.direction * c, 0), dr.select(active, rate, 0)
-        return Terms(0.0, gradient, SymmetricSum.zero(type(c.x)).plus(c, rate))
+        return Terms(None, gradient, SymmetricSum.zero(type(c.x)).plus(c, rate))
 
     def bounds(self, unit: Real) -> tuple[Real, Real, Real]:
-        """A bound of the rounding of Omega_e, and what the edge adds to s4 and s5 of `FieldSums`.
+        """A bound of the rounding of Omega_e and of its factor in the product, and what the edge
+        adds to s4 and s5 of `FieldSums`.
 
         unit: the rounding of a coordinate, `epsilon_at`, which is twice that of correct rounding.
 
         Rounding. The ends of the edge, x and their differences are off by half a unit together, and
-        the angle by that times Biot and Savart's field, which is at most twice the first number of
-        `edge_variation`; the roundings of the factor F_e are as if its ends had moved by another
-        half, for those of its terms are |F_e| times a few over the cosine of half the angle that
-        the edge subtends, and the same bits of an end serve both edges there. It is less than 4 pi
-        in any case.
+        the angle by that times Biot and Savart's field, which is at most twice the first number e'
+        of `edge_variation`; roundings of s are as if the ends had moved by another half, and the
+        same bits of an end serve both edges there. What is left is the rounding of the factor's own
+        sums and of the product: `FACTOR_ROUNDINGS`, and `STEEP_ROUNDINGS` L e' where the edge, of
+        length L, subtends more than a right angle. It is less than 4 pi in any case.
 
         Variation. Taylor's remainder after the linear term is at most 3/4 t^2 times the integral of
         |dp|/(rho^3 (1-t/rho)) (`edge_angles.bends`). With a = L/2 and distance d an edge has
@@ -131,7 +147,10 @@ class LiftedEdge:
         """
         distance = fmax(dr.sqrt(self.edge.square) - 2 * unit, 0)
         first, e = edge_variation(distance * distance, self.edge.inverse)
-        return fmin(2 * unit * first, 4 * dr.pi), 0.5 * e, 0.375 * dr.rcp(distance) * e
+        own = FACTOR_ROUNDINGS * float(dr.epsilon(first))
+        steep = STEEP_ROUNDINGS * float(dr.epsilon(first)) * dr.rsqrt(self.edge.inverse)
+        rounding = fmin(dr.fma(dr.fma(2.0, unit, steep), first, own), 4 * dr.pi)
+        return rounding, 0.5 * e, 0.375 * dr.rcp(distance) * e
 
 
 @dataclass(frozen=True)
@@ -159,14 +178,16 @@ class LiftedSums:
         """The sums with an edge added where active; unit: as for `LiftedEdge.bounds`."""
         (re, im), terms = edge.factor(), edge.terms(self.sums.derivatives, active)
         sums = self.sums.plus(terms, True)
-        rounding, s4, s5 = (dr.select(active, one, 0) for one in edge.bounds(unit))
+        rounding, s4, s5 = edge.bounds(unit)
+        # A factor of 1 scales the product, too.
+        rounding = dr.select(active, rounding, 2 * float(dr.epsilon(rounding)))
         free = fmin(dr.sqrt(edge.edge.square), sums.free_distance)
         sums = dataclasses.replace(
             sums,
             rounding=sums.rounding + rounding,
             free_distance=dr.select(active, free, sums.free_distance),
-            s4=sums.s4 + s4,
-            s5=sums.s5 + s5,
+            s4=sums.s4 + dr.select(active, s4, 0),
+            s5=sums.s5 + dr.select(active, s5, 0),
         )
         factor = dr.select(active, re, 1), dr.select(active, im, 0)
         return LiftedSums(sums, self.product.times(*factor))
@@ -178,7 +199,7 @@ class LiftedSums:
 
     def whole(self) -> FieldSums:
         """The sums with the edges' angles added to the value."""
-        return dataclasses.replace(self.sums, value=self.sums.value + self.angle)
+        return self.sums.plus(Terms(self.angle), True)
 
 
 def lifted_sums(edges: LiftedEdges, x: Vec3, derivatives: int) -> LiftedSums:

@@ -20,7 +20,13 @@ from harnack.backend.elementary import clamp, fmax, fmin, largest_coordinate
 from harnack.backend.records import Records
 from harnack.enclosures import Lipschitz
 from harnack.fields.clearance import epsilon_at
-from harnack.fields.solid_angles.edge_lift import LiftedProduct, ends_factor, sight_of
+from harnack.fields.solid_angles.edge_lift import (
+    FACTOR_ROUNDINGS,
+    STEEP_ROUNDINGS,
+    LiftedProduct,
+    ends_factor,
+    sight_of,
+)
 from harnack.fields.solid_angles.edges import Edge, inverse_squares
 from harnack.fields.sums import SUM_ROUNDING, FieldSums
 
@@ -426,19 +432,21 @@ class LiftedTrails:
         d of the nearest serves. So they add to the remainder what s4 += L w/4 and s5 += 3 L w/(16
         d) do (`LiftedEdge.bounds`).
 
-        Rounding. An angle is off by `unit` times Biot and Savart's field, which is at most d L w:
-        |a x e| is the length of e times the distance from its line. By Cauchy and Schwarz these add
-        up over a record to at most the root of (sum of L w) (sum of d^2 L w). In all bounds d is
-        reduced by its rounding.
+        Rounding. As in `LiftedEdge.bounds`, with Biot and Savart's field, which is at most d L w,
+        for 2 e': |a x e| is the length of e times the distance from its line. By Cauchy and Schwarz
+        these add up over a record to at most the root of (sum of L w) (sum of d^2 L w). In all
+        bounds d is reduced by its rounding.
         """
         backend = self.records.backend
         real, unit = backend.Float, fmax(epsilon_at(frame.o), epsilon_at(x))
+        own = 0.5 * backend.epsilon * FACTOR_ROUNDINGS * self.run
+        steep = 0.5 * backend.epsilon * STEEP_ROUNDINGS
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
             product, g, least, rounding, s4, s5 = state
             product = LiftedProduct(*product)
             a = sight_of(self._vertex(row, 0), frame, x)
-            total, spread, nearest = real(0), real(0), real(dr.inf)
+            total, spread, nearest, longest = real(0), real(0), real(dr.inf), real(0)
             for k in range(self.run):
                 p, q = self._vertex(row, k), self._vertex(row, k + 1)
                 inverse, signed = self._edge(row, k)
@@ -452,10 +460,12 @@ class LiftedTrails:
                 integral = dr.abs(signed) * w
                 square = dr.select(is_edge, edge.square, dr.inf)
                 total, nearest = total + integral, fmin(nearest, square)
+                longest = fmax(longest, dr.abs(signed))
                 spread = spread + dr.select(is_edge, integral * square, 0)
                 a = b
             distance = fmax(dr.sqrt(nearest) - 2 * unit, 0)
-            rounding = dr.fma(unit, dr.sqrt(total * spread), rounding)
+            field = dr.fma(steep, longest, unit) * dr.sqrt(total * spread)
+            rounding = rounding + (field + own)
             s5 = dr.fma(0.1875 * total, dr.rcp(distance), s5)
             return product.parts(), g, fmin(nearest, least), rounding, s4 + 0.25 * total, s5
 

@@ -27,7 +27,14 @@ from harnack.fields.clearance import UnitCoordinates
 from harnack.fields.field import Field, Look, Path, Sample, lengthened
 from harnack.fields.solid_angles.edge_angles import bends, swept_ball
 from harnack.fields.solid_angles.edge_trails import Line, known_along, rates_along
-from harnack.fields.solid_angles.edges import Edge, LoopEdges, inner_product, spinor, sum_over_edges
+from harnack.fields.solid_angles.edges import (
+    Edge,
+    LoopEdges,
+    inner_product,
+    near_rounding,
+    spinor,
+    sum_over_edges,
+)
 from harnack.fields.solid_angles.solid_angle import SolidAngle
 from harnack.fields.sums import SUM_ROUNDING
 from harnack.geometry.polygon_meshes import PolygonFaces, validate_polygons
@@ -80,15 +87,16 @@ class FaceCurves:
                 f"{len(x):,} corners of faces are too many: cut the mesh into parts, and give "
                 "them as a list to draw"
             )
-        corners, signed = np.bincount(face), np.where(faces.in_convex_position, -trips, trips)
+        signed = np.where(faces.in_convex_position, -trips, trips)
+        edges = LoopEdges.upload(backend, loops, RUN)
         heads = np.column_stack(
             [
                 center, size, np.cumsum(trips) - trips, signed,
                 backend.epsilon * (6 + 2 * magnitude),
-                backend.epsilon * (8 + 2 * np.sqrt(corners)),
+                edges.rounding(trips),
             ]
         )  # fmt: skip
-        return cls(Records.upload(backend, heads), LoopEdges.upload(backend, loops, RUN))
+        return cls(Records.upload(backend, heads), edges)
 
     def face(self, index: Any) -> FaceCurve:
         """The solid angle of the face with that index, which may differ from lane to lane."""
@@ -146,7 +154,8 @@ class FaceCurve(Field):
         met = sums.distance <= 2 * rounding
         steep = backend.Array3f(0, 0, 4 * PERIOD / rounding)
         gradient = dr.select(met, steep, sums.gradient)
-        error = dr.select(met, 0, 2 * backend.epsilon * sums.squares) + face.value_rounding
+        error = near_rounding(backend.epsilon, x, sums.squares)
+        error = dr.select(met, 0, error) + face.value_rounding
         error = dr.select(met, 8 * PERIOD, error)
         along: tuple[Lipschitz, ...] = ()
         if direction is not None:

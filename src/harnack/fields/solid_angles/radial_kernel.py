@@ -115,9 +115,9 @@ class RadialSums:
     def plus(self, source: Source, rounding: Real, active: Mask) -> RadialSums:
         """The sums with one more dipole or cluster, where active.
 
-        rounding: of the sum of all terms, as a fraction of the sum of their absolute values. The
-            latter is at most the sum of w Q_2/d^2; the rounding of positions adds
-            6 epsilon w Q_2/d^3.
+        rounding: of the term, as a fraction of w Q_2/d^2, which is at least its absolute value; the
+            rounding of positions adds 6 epsilon w Q_2/d^3, and that of the sum is counted by
+            `FieldSums.plus`.
         """
         tail, sums = source.tail, self.sums.plus(source.terms, active)
         steep = source.weight * tail.second * tail.cube

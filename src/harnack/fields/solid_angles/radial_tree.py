@@ -54,7 +54,6 @@ from harnack.fields.solid_angles.radial_kernel import (
     combine,
     seen_dipole,
 )
-from harnack.fields.sums import rounding_of_sum
 from harnack.tree import Hierarchy, PackedTree, pack
 
 if TYPE_CHECKING:
@@ -70,12 +69,12 @@ _CHUNK = 4
 class RadialDipoles(abc.ABC):
     """Dipoles on a backend, and sums over them.
 
-    rounding: of sums over all dipoles, as `RadialSums.plus` takes it.
+    rounding: of a dipole's term, as `RadialSums.plus` takes it.
     """
 
     def __init__(self, backend: Backend, rows: FloatArray, kernel: RadialKernel) -> None:
         self.backend, self.kernel = backend, kernel
-        self.rounding = rounding_of_sum(backend, len(rows), 12)
+        self.rounding = dr.opaque(backend.Float, 12 * backend.epsilon)
 
     def sums(self, x: Vec3, closer: Real, derivatives: int) -> RadialSums:
         """Value, derivatives and bounds at x; clusters are taken as a whole from `closer` times

@@ -40,10 +40,11 @@ from harnack.fields.solid_angles.edges import (
     EdgeSums,
     LoopEdges,
     hessian_over_edges,
+    near_rounding,
     sum_over_edges,
 )
 from harnack.fields.solid_angles.planar import PlanarRegion, planar_region
-from harnack.fields.sums import SECOND_ROUNDINGS, SLOPE_ROUNDINGS, SUM_ROUNDING, rounding_of_sum
+from harnack.fields.sums import SECOND_ROUNDINGS, SLOPE_ROUNDINGS, SUM_ROUNDING
 from harnack.geometry import Circle, ConvexHull, is_convex_position, total_length
 from harnack.geometry.curves import CurveShapeError, Loops, net_circles, validate_curves
 from harnack.geometry.polygons import net_loops, uncanceled_edges
@@ -194,14 +195,15 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
             numbers = (*self._region.normal.tolist(), height)
             plane = tuple(dr.opaque(backend.Float, number) for number in numbers)
         magnitude = float(np.abs(self._points_around()).max() / self._size)
-        factors = sum(len(loop) for loop in self._net)
+        records = 0 if edges is None else sum(-(-len(loop) // edges.run) for loop in unit)
+        value_rounding = 16 * backend.epsilon if edges is None else edges.rounding(records)
         return _CurveBuffers(
             *placed(backend, center, self._size),
             edges,
             circles,
             plane,
             dr.opaque(backend.Float, backend.epsilon * (6 + 2 * magnitude)),
-            rounding_of_sum(backend, factors, own=8, growth=2),
+            dr.opaque(backend.Float, value_rounding),
         )
 
     def evaluate(self, p: Vec3) -> Sample:
@@ -239,9 +241,7 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         steep = on.backend.Array3f(0, 0, 4 * _PERIOD / rounding)
         gradient = dr.select(met, steep, sums.gradient)
         error, gradient_error = on.value_rounding, 0.0
-        # The rounding of its ends changes an edge's angle by at most that rounding times the
-        # integral of |dp|/D^2: where edges nearly cancel, that is more than the gradient tells.
-        error = error + dr.select(met, 0, 2 * epsilon * sums.squares)
+        error = error + dr.select(met, 0, near_rounding(epsilon, x, sums.squares))
         if sums.circles is not None:
             own = sums.circles
             # Measured: 15 units in the last place of a circle's angle and 60 of its gradient (near
@@ -436,7 +436,7 @@ class _CurveBuffers(UnitCoordinates):
     rounding: that of a point's position, in units of the curve. Near the curve p - center is exact,
         division and the curve's own coordinates have a few roundings of size 1, and p itself was
         rounded once, at the curve's distance from 0.
-    value_rounding: that of the product of all factors.
+    value_rounding: that of the angle, by the number of its edges (`LoopEdges.rounding`).
     """
 
     edges: LoopEdges | None

@@ -11,7 +11,6 @@ one pass over the edges at which the triangles do not cancel, however many trian
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -49,7 +48,7 @@ from harnack.fields.solid_angles.multipole import (
     triangle_levels,
     truncation,
 )
-from harnack.fields.sums import FieldSums, free_part, rounding_of_sum
+from harnack.fields.sums import FieldSums, Terms, free_part, last_roundings
 from harnack.tree import (
     NO_PRIMITIVE,
     Hierarchy,
@@ -319,7 +318,7 @@ _SHARE = 1 / (4 * math.pi)
 class ExactWinding:
     """w of a mesh on a backend, in units in which the mesh has a size of about one.
 
-    rounding: of w, by the number of its terms.
+    rounding: of w, after all terms have been added.
     """
 
     backend: Backend
@@ -336,7 +335,7 @@ class ExactWinding:
     ) -> ExactWinding:
         """Everything uploaded; traced: also what `on_stretch` needs."""
         if not len(mesh.singular):
-            return cls(backend, rays, None, None, None, None, rounding_of_sum(backend, 0))
+            return cls(backend, rays, None, None, None, None, last_roundings(backend))
         vertices, edges = mesh.unit_vertices, mesh.singular
         chains, all_edges = None, None
         if traced:
@@ -350,7 +349,7 @@ class ExactWinding:
             EdgeTrails.upload(backend, vertices, edges),
             chains,
             all_edges,
-            rounding_of_sum(backend, len(edges)),
+            last_roundings(backend),
         )
 
     @property
@@ -393,7 +392,7 @@ class ExactWinding:
             nothing = self.backend.Array3f(0), SymmetricSum.zero(real)
             return Values(turns, real(self.rounding), *nothing, real(0), real(0))
         sums, unit = lifted_sums(self.edges, x, derivatives).whole(), epsilon_at(x)
-        sums = dataclasses.replace(sums, value=dr.fma(4 * math.pi, turns, sums.value))
+        sums = sums.plus(Terms(4 * math.pi * turns), True)
         return sums.values(_SHARE, unit, self.rounding)
 
     def start(self, frame: Frame, t: Real, active: Mask) -> Real:
@@ -411,7 +410,7 @@ class ExactWinding:
         if self.chains is None:
             raise RuntimeError("uploaded for points and not for rays")
         found = self._near(self.chains, frame, x, detail)
-        found = dataclasses.replace(found, value=dr.fma(4 * math.pi, turns, found.value))
+        found = found.plus(Terms(4 * math.pi * turns), True)
         unit = fmax(epsilon_at(frame.o), epsilon_at(x))
         line, chains = Line(x, frame.d, 8 * unit), self.chains
 

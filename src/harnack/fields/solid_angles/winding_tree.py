@@ -24,7 +24,7 @@ from harnack.fields.clearance import epsilon_at
 from harnack.fields.solid_angles.edge_lift import LiftedEdge, LiftedProduct, LiftedSums
 from harnack.fields.solid_angles.edge_trails import Line, known_along, with_edge_rates
 from harnack.fields.solid_angles.far_clusters import Treecode
-from harnack.fields.sums import FieldSums, Terms, rounding_of_sum
+from harnack.fields.sums import FieldSums, Terms, last_roundings
 from harnack.tree.triangles import (
     EDGES,
     INDEX,
@@ -99,7 +99,7 @@ class TreeWinding:
         """Everything uploaded."""
         records = np.concatenate([mesh.records, mesh.singular_flags], axis=1)
         slots = in_slots(mesh.tree, records)
-        rounding = rounding_of_sum(backend, len(mesh.triangles))
+        rounding = last_roundings(backend)
         levels = list(mesh.levels)
         return cls(Treecode.of(backend, mesh.tree, levels, slots, accuracy, order), rounding)
 

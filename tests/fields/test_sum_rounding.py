@@ -1,0 +1,63 @@
+"""Rounding of long sums and products: bounds that grow with the number of terms, and are needed."""
+
+from __future__ import annotations
+
+import drjit as dr
+import numpy as np
+
+import harnack as hk
+from harnack.backend import choose_backend
+from harnack.fields.solid_angles.edge_lift import FACTOR_ROUNDINGS, LiftedProduct
+from harnack.fields.sums import FieldSums, Terms
+
+UNIT = 2.0**-24  # the largest relative error of one operation
+
+
+def test_rounding_of_a_product_grows_with_its_factors() -> None:
+    """Factors that turn by less than half a rounding are lost one by one, all in the same way: a
+    bound that grew like the square root of their number would be 30 times too small here."""
+    count, backend = 4000, choose_backend("single")
+    start, turn = (a.ravel() for a in np.meshgrid(np.linspace(-3, 3, 61), [2.9e-8, 1e-7, 2e-7]))
+    re, im, turn = (a.astype(np.float32) for a in (np.cos(start), np.sin(start), turn))
+    product = LiftedProduct(*(backend.Float(a) for a in (re, im, 0 * re)))
+    one, small = backend.Float(1), backend.Float(turn)
+    for k in range(count):
+        product = product.times(one, small)
+        if k % 20 == 0:
+            dr.eval(*product.parts())
+    exact = np.arctan2(im.astype(float), re.astype(float)) + count * np.arctan(turn.astype(float))
+    error = np.abs(product.angle().numpy() - 2 * exact).max()
+    bound = FACTOR_ROUNDINGS * UNIT * count
+    assert 0.05 * bound < error <= bound
+    assert error > 20 * UNIT * (16 + np.sqrt(count))
+
+
+def test_rounding_of_a_sum_is_counted_term_by_term() -> None:
+    """Terms that are lost in a sum of 1; what cancels later is counted; adding 0 is exact."""
+    backend = choose_backend("single")
+    sums = FieldSums.zero(backend, dr.inf, 0).plus(Terms(backend.Float(1)), True)
+    first = float(sums.rounding[0])
+    for _ in range(200):
+        sums = sums.plus(Terms(backend.Float(0.99 * UNIT)), True)
+        sums = sums.plus(Terms(backend.Float(0)), True).plus(Terms(backend.Float(5)), False)
+    lost = 200 * 0.99 * UNIT - float(sums.value[0] - 1)
+    assert 0.3 * (float(sums.rounding[0]) - first) < lost <= float(sums.rounding[0])
+    back = sums.plus(Terms(backend.Float(-1)), True)
+    assert float(back.rounding[0]) >= float(sums.rounding[0])
+
+
+def test_error_of_a_curve_covers_single_precision() -> None:
+    """A side of 20,000 vertices, which turns at each by less than a rounding as seen from x."""
+    z = np.linspace(-1, 1, 20_000)
+    side = np.column_stack([np.ones_like(z), 1.5e-3 * z, z])
+    loop = np.concatenate([side, [[-1, 0.7, 1], [-1, -0.6, -1]]]).astype(np.float32)
+    field = hk.SolidAngle(loop.astype(float))
+    points = np.random.default_rng(0).uniform(-0.4, 0.4, (500, 3)).astype(np.float32)
+    values = []
+    for precision in ("single", "double"):
+        backend = choose_backend(precision)
+        sample = field.prepare(backend).evaluate(backend.Array3f(points.T.astype(backend.dtype)))
+        values.append((sample.value.numpy().astype(float), sample.error.numpy()))
+    (rounded, error), (exact, _) = values
+    assert (np.abs(rounded - exact) <= error).all()
+    assert (np.abs(rounded - exact) > 2 * UNIT * (8 + 2 * np.sqrt(len(z)))).any()
