@@ -15,6 +15,7 @@ from harnack.geometry.mesh_shapes import icosphere
 from harnack.view import scene
 from harnack.view.scene import Live, difference
 from harnack.view.session import Client, QuestionError, Session
+from harnack.view.sliders import ends_of
 
 LOOP = shapes.torus_knot(2, 3, 18)
 FIELD = hk.SolidAngle(LOOP)
@@ -68,7 +69,7 @@ def test_the_tube_follows_the_curve() -> None:
     moved = LOOP.copy()
     moved[0] *= 1.5
     assert compiled(session, [{"loops": [moved.tolist()]}]) == set()
-    _, tube = live.drawn(session.moved({"loops": [moved.tolist()]}))
+    _, tube = live.drawn(session.controls({"loops": [moved.tolist()]}))
     assert abs(float(tube.surface.field.value(moved[0]))) < 0.06
     _, before = live.drawn(live.start)
     assert float(before.surface.field.value(moved[0])) > 0.2
@@ -91,6 +92,48 @@ def test_a_probe_says_the_value_next_to_the_level(live: Live) -> None:
     assert found["value"] == pytest.approx(6.0, abs=0.01)
 
 
+def test_nothing_leaves_the_picture_when_a_slider_is_moved() -> None:
+    """The farthest places of a ball that moves and grows stay within the picture of 4 : 3."""
+    z, r = hk.Slider(-1.0, 3.0, 0.0), hk.Slider(0.2, 0.7, 0.5)
+    live = Live.of(lambda z, r: hk.Sphere(r).moved((0, 0, z)), {"z": z, "r": r})
+    assert outermost(live, hk.Ball((0, 0, 3.0), 0.7)) > 1
+    framed = live.framed(ends_of(live.subject.sliders))
+    for center in (-1.0, 0.0, 3.0):
+        assert outermost(framed, hk.Ball((0, 0, center), 0.7)) < 0.95
+    # What stands on the ground is all of it, in still pictures and in scene files too.
+    assert framed.placement.apply([[0, 0, -1.7]])[0, 2] == pytest.approx(0.0, abs=0.01)
+    camera = hk.Camera(position=(0, -5, 1), target=(0, 0, 0), fov=30)
+    saved = json.loads(framed.saved(framed.start, camera=camera)[0])
+    assert saved["settings"]["camera"]["box"]["Box"]["upper"][2] == pytest.approx(3.7, abs=0.01)
+
+
+def outermost(live: Live, ball: hk.Ball) -> float:
+    """How far a ball is from the middle of the picture, where 1 is its edge."""
+    points = np.random.default_rng(0).normal(size=(999, 3))
+    points = ball.center + ball.radius * points / np.linalg.norm(points, axis=1, keepdims=True)
+    pose = live.pose
+    back = np.subtract(pose["position"], pose["target"])
+    back = back / np.linalg.norm(back)
+    right = np.cross((0, 0, 1), back)
+    right = right / np.linalg.norm(right)
+    away = points - pose["position"]
+    depth = -(away @ back) * np.tan(np.radians(pose["fov"] / 2))
+    across = [np.abs(away @ right), np.abs(away @ np.cross(back, right)) / 0.75]
+    return float((np.array(across) / depth).max())
+
+
+def test_a_place_at_which_nothing_can_be_drawn_is_named() -> None:
+    def torus(r: float) -> hk.Field:
+        return hk.Torus(1.0, r) if r < 0.35 else hk.Plane((0, 0, 1))
+
+    live = Live.of(torus, {"r": hk.Slider(0.2, 0.4, 0.3)})
+    live = live.framed(ends_of(live.subject.sliders))
+    with pytest.raises(ValueError, match=r"at the place r=0\.4 .*reaches to infinity"):
+        Session(live).answer({"kind": "change", "sliders": {"r": 0.4}})
+    with pytest.raises(ValueError, match=r"at the place r=0\.38 .*reaches to infinity"):
+        Live.of(torus, {"r": hk.Slider(0.2, 0.4, 0.38)})
+
+
 def test_more_colors_than_are_drawn_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     live = Live.of([hk.Sphere(1.0), hk.Sphere(0.5)], {})
     assert len(live.first["surfaces"]) == 2
@@ -100,7 +143,7 @@ def test_more_colors_than_are_drawn_are_refused(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_what_is_sent_is_what_has_changed(live: Live) -> None:
-    moved = Session(live).moved({"sliders": {"level": 3.0}, "loops": [(1.1 * LOOP).tolist()]})
+    moved = Session(live).controls({"sliders": {"level": 3.0}, "loops": [(1.1 * LOOP).tolist()]})
     state, first = live.state(moved), live.first
     change = difference(first, state)
     ((new,), (old,), (own,)) = (one["surfaces"] for one in (state, first, change))
@@ -110,7 +153,7 @@ def test_what_is_sent_is_what_has_changed(live: Live) -> None:
     assert 0 < len(own["at"]) < 0.7 * len(data)
     assert "code" not in own
     assert change["curves"] == state["curves"]
-    longer = live.state(Session(live).moved({"loops": [shapes.torus_knot(2, 3, 99).tolist()]}))
+    longer = live.state(Session(live).controls({"loops": [shapes.torus_knot(2, 3, 99).tolist()]}))
     assert difference(first, longer) is longer
 
 
