@@ -102,11 +102,13 @@ class Page:
     def picture(self, name: str = "") -> np.ndarray:
         """(h, w, 3) of what is drawn, without controls. name: of a file in `out/browser`."""
         self.rest()
-        self.do(
-            "() => { panel.controls.style.visibility = panel.said.style.visibility = 'hidden' }"
+        show = (
+            "(shown) => { for (const one of [panel.controls, panel.said, panel.legend])"
+            " one.style.visibility = shown; }"
         )
+        self.do(show, "hidden")
         made = self.tab.screenshot()
-        self.do("() => { panel.controls.style.visibility = panel.said.style.visibility = '' }")
+        self.do(show, "")
         if name:
             folder = Path("out/browser")
             folder.mkdir(parents=True, exist_ok=True)

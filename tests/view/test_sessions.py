@@ -175,10 +175,10 @@ def test_a_drawn_picture_is_that_of_render(live: Live) -> None:
     session = Session(live)
     size = (64, 48)
     asked = {"kind": "draw", "size": size, "eye": EYE, "show": "normal"}
-    drawn = session.answer(asked)
+    drawn = session.answer(asked).pixels
     assert drawn.shape == (48, 64, 4)
     assert 0.05 < (np.ptp(drawn[..., :3].astype(int), axis=2) > 8).mean() < 0.9
-    again = session.answer({**asked, "sliders": {"level": 3.0}})
+    again = session.answer({**asked, "sliders": {"level": 3.0}}).pixels
     assert (again != drawn).any()
 
 
@@ -317,7 +317,7 @@ def test_the_floor_hides_nothing_that_moves_below_it() -> None:
     asked = {"kind": "draw", "size": (64, 64), "eye": eye, "rests": True}
     parts: list[float] = []
     for z in (0.0, -1.0):
-        drawn = session.answer({**asked, "sliders": {"z": z}})
+        drawn = session.answer({**asked, "sliders": {"z": z}}).pixels
         parts.append((np.ptp(drawn[..., :3].astype(int), axis=2) > 40).mean())
     assert parts[0] > 0.01
     assert parts[1] == pytest.approx(parts[0], rel=0.3)

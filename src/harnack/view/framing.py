@@ -30,16 +30,13 @@ class Framing:
     """Where surfaces stand on the stage, and the camera that sees them.
 
     camera: a camera that turns about a target, as camera.js takes it, in the stage's coordinates.
-    box: what stands on the ground, where more is framed than is seen at first; None otherwise.
-    middle, reach: a ball around all that is framed. box, middle, reach: in the coordinates of the
-    surfaces.
+    box: what stands on the ground, in the coordinates of the surfaces, where more is framed than is
+        seen at first; None otherwise.
     """
 
     placement: Placement
     camera: dict[str, Any]
     box: Box | None
-    middle: FloatArray
-    reach: float
 
     @classmethod
     def of(cls, camera: Camera, up: Any, points: FloatArray, *, is_whole: bool) -> Framing:
@@ -56,9 +53,7 @@ class Framing:
             box = Box(*(_three(end) for end in (points.min(axis=0), points.max(axis=0))))
         standing = points if box is None else corners_of(np.array(box.bounds()))
         placement = on_ground(standing, upright(up))
-        middle: FloatArray = 0.5 * (points.min(axis=0) + points.max(axis=0))
-        reach = float(np.linalg.norm(points - middle, axis=1).max())
-        return cls(placement, _orbit(camera, placement, points), box, middle, reach)
+        return cls(placement, _orbit(camera, placement, points), box)
 
     def with_box(self, camera: Camera) -> Camera:
         """A camera of `render` that has the surfaces stand where they stand here."""

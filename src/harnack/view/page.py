@@ -29,7 +29,9 @@ __all__ = ["MODULES", "document", "page", "resource", "script", "still_of"]
 _STILL = (640, 480)
 # Places of a slider without a step, at most; choices of places of several; and of all.
 _PLACES, _CHOICES, _MOST_CHOICES = 33, 300, 1000
-MODULES = ("camera.js", "drawing.js", "frames.js", "link.js", "panel.js")
+MODULES = (
+    "camera.js", "drawing.js", "elements.js", "frames.js", "legend.js", "link.js", "panel.js",
+)  # fmt: skip
 # What brings other states: those in the page, or Python's answers.
 _LINKS = {
     "frames": "scene.sliders.length ? new Frames(scene.frames) : null",

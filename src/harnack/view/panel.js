@@ -3,7 +3,9 @@
 
 import { Camera, along, dot } from "./camera.js";
 import { Drawing, QUICK, SHOWS } from "./drawing.js";
+import { element, format } from "./elements.js";
 import { changed } from "./frames.js";
+import { legend_of } from "./legend.js";
 
 /** @import {Marks, Scene, Slider} from "./drawing.js" */
 /** @import {Change} from "./frames.js" */
@@ -31,14 +33,6 @@ const NEAR = 12;
 // Milliseconds after which nothing moves any more.
 const STILL = 400;
 
-/** @template {keyof HTMLElementTagNameMap} K @param {K} kind @param {object} [given]
- *  @param {(Node | string)[]} within @returns {HTMLElementTagNameMap[K]} */
-function element(kind, given = {}, ...within) {
-  const made = Object.assign(document.createElement(kind), given);
-  made.append(...within);
-  return made;
-}
-
 export class Panel {
   /** @param {HTMLElement} root @param {Scene} scene @param {string} passes @param {Link | null} link
    *  @param {string} still a picture for where there is no GPU */
@@ -57,6 +51,9 @@ export class Panel {
     this.edited = false;
     this.editing = false;
     this.probing = false;
+    /** The least and the greatest depth of the last picture by Python, on the stage.
+     *  @type {[number, number] | null} */
+    this.depth_range = null;
     /** @type {Camera | undefined} */
     this.seen = undefined;
     this.show = scene.show;
@@ -91,7 +88,9 @@ export class Panel {
     this.lines = [];
     /** @type {Marks[]} */
     this.dots = [];
-    root.append(this.still, this.canvas, this.plain, this.said, this.controls);
+    this.legend = element("div");
+    const notes = element("div", { className: "notes" }, this.legend, this.said);
+    root.append(this.still, this.canvas, this.plain, notes, this.controls);
   }
 
   /** @param {string} words @param {boolean} [is_drawn] */
@@ -104,7 +103,7 @@ export class Panel {
 
   build() {
     const { scene } = this;
-    const show = element("select", { onchange: () => { this.show = show.value; this.redraw(); } },
+    const show = element("select", { name: "show", onchange: () => { this.show = show.value; this.redraw(); } },
       ...SHOWS.map((name) => element("option", { value: name }, name)));
     const ground = element("select", { onchange: () => { this.ground = ground.value; this.redraw(); } },
       ...Object.keys(GROUNDS).map((name) => element("option", { value: name }, name)));
@@ -232,6 +231,7 @@ export class Panel {
       return this.fall_back(`This GPU cannot compile the surface (${wrong})`);
     }
     this.drawing = drawing;
+    this.canvas.addEventListener("range", () => this.explain());
     this.say("");
     const { vendor = "", architecture = "", description = "" } = adapter.info ?? {};
     const name = description || `${vendor} ${architecture}`.trim() || "this browser's device";
@@ -372,9 +372,21 @@ export class Panel {
     this.change();
   }
 
+  /** Shows what the colors of the picture mean. */
+  explain() {
+    const legend = this.scene.legends[this.show];
+    const range = this.drawing ? this.drawing.depth_range : this.depth_range;
+    const scale = this.scene.placement[12];
+    const made = legend && (this.drawing || this.is_remote) ? [legend_of(
+      legend, range && [range[0] / scale, range[1] / scale],
+      this.ground === "dark" ? "#1a1a1c" : "#e6e6e3")] : [];
+    this.legend.replaceChildren(...made);
+  }
+
   redraw() {
     const { drawing } = this;
     this.tell();
+    this.explain();
     if (!drawing) { if (this.is_remote) this.draw_remotely(); return; }
     drawing.show = this.show;
     drawing.lines = this.lines;
@@ -394,7 +406,9 @@ export class Panel {
         if (this.stale) step = 0;
         this.stale = false;
         const start = performance.now();
-        const image = await this.drawn(step ? 1 : this.scale, step === 2);
+        const { image, range } = await this.drawn(step ? 1 : this.scale, step === 2);
+        if (this.show === "depth") this.depth_range = range;
+        this.explain();
         this.put(image);
         if (step === 1 && this.show !== "shaded") step = 2;  // no shadow
         if (step) continue;
@@ -444,7 +458,7 @@ export class Panel {
   }
 
   /** A picture by Python of one ray a pixel. @param {number} scale @param {boolean} rests
-   *  @returns {Promise<ImageData>} */
+   *  @returns {Promise<{image: ImageData, range: [number, number]}>} */
   drawn(scale, rests) {
     const camera = this.camera();
     const size = [this.root.clientWidth, this.root.clientHeight].map((x) => Math.max(8, Math.round(scale * x)));
@@ -804,6 +818,3 @@ function said_of(found) {
     : `on triangle ${found.triangle}, where f jumps`;
   return `at ${point(found.position)}, normal ${point(found.normal)}, ${what}${bent}, ${looks}`;
 }
-
-/** @param {number} x */
-function format(x) { return String(Number(x.toPrecision(4))); }

@@ -36,6 +36,7 @@ from harnack.rendering.stage import StudioObject
 from harnack.rendering.studio_scene import studio_objects
 from harnack.tracer import LevelSet, Status, Tolerance
 from harnack.view.framing import Framing, extreme_points
+from harnack.view.legends import EVALUATIONS_TOP, legends
 from harnack.view.scene_file import STILL_SETTINGS, Origins, of_surfaces, text_of
 from harnack.view.sliders import PlaceError, Subject, at_place
 from harnack.webgpu import bits_of, data_of, leaves, record
@@ -185,7 +186,9 @@ class Live:
 
     def scene(self, title: str) -> Plain:
         """All that a page is given when it opens, as plain data for `drawing.js`."""
-        place = self.placement
+        place, points = self.placement, np.concatenate(self.points)
+        # The ball around what is seen at first, by which cuts are measured.
+        middle: FloatArray = 0.5 * (points.min(axis=0) + points.max(axis=0))
         return {
             "title": title,
             "placement": [*place.rotation.ravel().tolist(), *place.translation.tolist(),
@@ -200,8 +203,10 @@ class Live:
                 for name, one in self.subject.sliders.items()
             ],
             "editable": self.editable,
-            "middle": self.framing.middle.tolist(),
-            "reach": self.framing.reach,
+            "middle": middle.tolist(),
+            "reach": float(np.linalg.norm(points - middle, axis=1).max()),
+            "legends": legends(),
+            "evaluations_top": EVALUATIONS_TOP,
             "state": packed(self.first),
         }  # fmt: skip
 

@@ -38,7 +38,7 @@ from harnack.view.sliders import ends_of
 if TYPE_CHECKING:
     from harnack.backend import FloatArray
     from harnack.geometry import Volume
-    from harnack.view.painter import Pixels
+    from harnack.view.painter import Painting
     from harnack.view.scene import Plain
 
 __all__ = ["Client", "QuestionError", "Session", "pose_of"]
@@ -97,8 +97,9 @@ class Client:
         return question
 
     def answer(self, question: Plain, send: Callable[[Plain], None]) -> Plain | bytes:
-        """What to send back: an object, or of a picture its number, height and width, four bytes
-        each, the last byte first, and then its pixels: red, green, blue and alpha, row by row.
+        """What to send back: an object, or of a picture its number, height, width and the ends of
+        its depths (single precision), four bytes each, the last byte first, and then its pixels:
+        red, green, blue and alpha, row by row.
 
         send: sends how much is done of what takes long.
         """
@@ -123,8 +124,8 @@ class Client:
             self._ended.discard(number)
         if isinstance(answer, dict):
             return {"id": number, "answer": answer}
-        head = np.array([number, *answer.shape[:2]], dtype="<u4").tobytes()
-        return head + answer.tobytes()
+        head = np.array([number, *answer.pixels.shape[:2]], dtype="<u4").tobytes()
+        return head + np.array(answer.depths, dtype="<f4").tobytes() + answer.pixels.tobytes()
 
 
 class Session:
@@ -135,8 +136,8 @@ class Session:
         self._painter = Painter()
         self._painted: tuple[Any, list[Painted]] = (None, [])
 
-    def answer(self, question: Mapping[str, Any], tell: Tell = _nobody) -> Plain | Pixels:
-        """The answer to a question; a picture (h, w, 4) to "draw".
+    def answer(self, question: Mapping[str, Any], tell: Tell = _nobody) -> Plain | Painting:
+        """The answer to a question; a picture to "draw".
 
         tell: called during long work with the fraction of it, from 0 to 1, that was finished since
             the last call; an exception that it raises ends the work.
@@ -241,7 +242,7 @@ class Session:
             return there
         return there | {"mean": float(bent.mean[0]), "gaussian": float(bent.gaussian[0])}
 
-    def _draw(self, question: Mapping[str, Any], controls: Controls, tell: Tell) -> Pixels:
+    def _draw(self, question: Mapping[str, Any], controls: Controls, tell: Tell) -> Painting:
         """A picture of one ray a pixel."""
         size = _size(question)
         show, ground = question.get("show", "shaded"), question.get("ground", self.live.ground)
