@@ -134,8 +134,8 @@ class Page:
         self.tab.get_by_label(name).check()
         self.do("() => { panel.controls.open = false; }")
 
-    def set(self, name: str, value: float) -> None:
-        """Moves a slider."""
+    def set(self, name: str, value: float | str) -> None:
+        """Moves a slider, or chooses a color."""
         self.do(
             "([name, value]) => { const one = panel.controls.querySelector(`input[name=${name}]`);"
             " one.value = value; one.dispatchEvent(new Event('input')); }",

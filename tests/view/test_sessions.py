@@ -75,6 +75,29 @@ def test_the_tube_follows_the_curve() -> None:
     assert float(before.surface.field.value(moved[0])) > 0.2
 
 
+def test_material_and_tube_are_changed_and_saved() -> None:
+    live = Live.of(hk.SolidAngle(LOOP), {"level": 6.0, "material": "clay"}, edits=True)
+    session, scene = Session(live), live.scene("T")
+    assert (scene["material"], scene["tube"]) == ("clay", None)
+    assert "gold" in scene["materials"]
+    assert "glass" not in scene["materials"]
+    change = session.answer({"kind": "change", "settings": {"material": "#4682b4"}})
+    (surface,) = change["surfaces"]
+    assert "code" not in surface
+    assert surface["paints"][0]["front"][2] > 2 * surface["paints"][0]["front"][0]
+    settings = {"material": "copper", "boundary": 0.05}
+    controls = session.controls({"settings": settings})
+    surface, tube = live.drawn(controls)
+    assert abs(float(tube.surface.field.value(LOOP[0]))) < 0.06
+    (one,) = live.drawn(session.controls({"settings": {"boundary": None}}))
+    assert one.material != surface.material
+    pose = {"position": [0, -5, 1], "target": [0, 0, 0], "fov": 30}
+    saved = session.answer({"kind": "save", "camera": pose, "settings": settings})
+    opened = session.answer({"kind": "load", "text": saved["text"]})
+    assert (opened["material"], opened["tube"]) == ("copper", 0.05)
+    assert len(opened["state"]["surfaces"]) == 2
+
+
 def test_a_probe_of_a_triangle_says_no_derivatives() -> None:
     vertices, faces = icosphere(1)
     session = Session(Live.of(hk.WindingNumber(vertices, faces[5:]), {}))
@@ -259,6 +282,14 @@ def test_what_is_saved_can_be_opened(live: Live) -> None:
         ({"kind": "change", "cut": {"ball": [0, 0, 0]}}, "4 finite numbers"),
         ({"kind": "change", "cut": {"cone": [0]}}, "one of ball, box, plane"),
         ({"kind": "change", "cut": {"ball": [0, 0, 0, -1]}}, "radius"),
+        ({"kind": "change", "settings": 3}, "an object"),
+        ({"kind": "change", "settings": {"materials": "gold"}}, 'mean "material"'),
+        ({"kind": "change", "settings": {"material": ["gold"]}}, "a name or a color"),
+        ({"kind": "change", "settings": {"material": "glod"}}, 'mean "gold"'),
+        ({"kind": "change", "settings": {"material": "glass"}}, "not drawn transparent"),
+        ({"kind": "change", "settings": {"boundary": True}}, "a positive number"),
+        ({"kind": "change", "settings": {"boundary": float("nan")}}, "a positive number"),
+        ({"kind": "change", "settings": {"boundary": -1}}, "a positive number"),
         ({"kind": "probe"}, "origin"),
         ({"kind": "draw", "size": [99_999, 9]}, "at most 8192|each side"),
         ({"kind": "draw", "size": [64, 48]}, "eye must be"),

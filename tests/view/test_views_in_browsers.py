@@ -124,6 +124,26 @@ def test_colors_that_are_numbers_have_a_legend(drawn_by: str, page: Page) -> Non
     assert page.do(legend) == ""
 
 
+@pytest.mark.parametrize("drawn_by", ["browser", "python"])
+def test_material_and_tube_are_changed(drawn_by: str, page: Page) -> None:
+    if drawn_by == "python":
+        python_draws(page)
+    before = page.picture()
+    choose(page, "material", "gold")
+    golden = page.picture(f"view-gold-{drawn_by}")
+    assert change(before, golden) > 0.05
+    choose(page, "material", "color")
+    page.set("color", "#0000ff")
+    page.set("tube", 0.06)
+    assert page.do("() => panel.state().settings") == {"material": "#0000ff", "boundary": 0.06}
+    blue = page.picture(f"view-tube-{drawn_by}")
+    assert change(golden, blue) > 0.05
+    page.set("tube", 0)
+    choose(page, "material", "as given")
+    assert change(before, page.picture()) < 0.01
+    assert page.said == ""
+
+
 def choose(page: Page, name: str, value: str) -> None:
     """Chooses one of a list among the controls."""
     page.do(

@@ -17,6 +17,7 @@ import { Camera, dot } from "./camera.js";
 /** @typedef {{
  *   title: string, placement: number[], camera: Pose, floor: number, show: string,
  *   ground: number[], sliders: Slider[], editable: boolean, middle: number[], reach: number,
+ *   materials: string[], material: string | null, tube: number | null,
  *   legends: Record<string, Legend>, evaluations_top: number, state: State
  * }} Scene */
 /** @typedef {{points: number[][], color: number[], width: number}} Marks */

@@ -12,9 +12,11 @@ import { legend_of } from "./legend.js";
 /** What brings other states, and in a view with Python behind it what else can be asked for.
  * @typedef {{
  *   change(wanted: {sliders: Record<string, number>, loops: number[][][] | null, cut: Cut | null,
- *     checks: boolean}): Promise<Change>,
+ *     settings: Settings, checks: boolean}): Promise<Change>,
  *   ask?(kind: string, given: object, told?: (done: number, stop: () => void) => void): Promise<any>,
  * }} Link */
+/** Settings of `harnack.render` that are changed here: see `CONTROLLED` in harnack.view.scene.
+ * @typedef {{material?: string, boundary?: number | null}} Settings */
 /** A volume that cuts all surfaces: see `harnack.view.session`.
  * @typedef {{ball?: number[], box?: number[], plane?: number[]}} Cut */
 
@@ -63,6 +65,8 @@ export class Panel {
     this.ground = scene.ground[0] < 0.3 ? "dark" : "light";
     /** @type {Marks[]} */
     this.probed = [];
+    /** @type {Settings} */
+    this.settings = {};
     this.cutter = "none";
     /** @type {Record<string, number>} */
     this.cuts = {};
@@ -137,7 +141,7 @@ export class Panel {
         this.mark();
       } });
       rows.push(element("label", {}, probe, " Probe by click"));
-      rows.push(...this.cutting());
+      rows.push(...this.materials(), ...this.cutting());
       const width = element("input", { type: "number", min: "16", max: "8192", value: "1600", name: "width" });
       const quality = element("select", { name: "quality" },
         ...["shaded", "color"].map((name) => element("option", { value: name }, name)));
@@ -154,6 +158,37 @@ export class Panel {
     this.about = element("small");
     return element("details", { open: innerWidth > 600 && scene.sliders.length > 0 },
       element("summary", {}, "Controls"), ...rows, this.asked, this.about);
+  }
+
+  /** What the surfaces are made of, and how thick the tubes around the curves are at which they end. */
+  materials() {
+    const { materials, material, tube, reach, state } = this.scene;
+    const [GIVEN, COLOR] = ["as given", "color"];
+    const set = () => {
+      if (chosen.value === GIVEN) delete this.settings.material;
+      else this.settings.material = chosen.value === COLOR ? color.value : chosen.value;
+      color.hidden = chosen.value !== COLOR;
+      this.change();
+    };
+    const names = material && materials.includes(material) ? materials : [GIVEN, ...materials];
+    const chosen = element("select", { name: "material", onchange: set },
+      ...[...names, COLOR].map((name) => element("option", { value: name }, name)));
+    chosen.value = material && materials.includes(material) ? material : GIVEN;
+    const color = element("input", { type: "color", name: "color", value: "#4682b4", hidden: true, oninput: set });
+    color.setAttribute("aria-label", "Color");
+    const rows = [element("label", {}, "Material ", chosen, " ", color)];
+    if (!state.curves.length) return rows;
+    const shown = element("output", {}, tube === null ? "none" : format(tube));
+    const radius = element("input", {
+      type: "range", min: "0", max: String(Math.max(0.1 * reach, tube ?? 0)), step: "any",
+      name: "tube", value: String(tube ?? 0),
+      oninput: () => {
+        this.settings.boundary = Number(radius.value) || null;
+        shown.textContent = this.settings.boundary === null ? "none" : format(this.settings.boundary);
+        this.change();
+      },
+    });
+    return [...rows, element("label", {}, "Radius of the edge's tube ", shown, radius)];
   }
 
   /** What cuts the surfaces, and sliders of it. */
@@ -552,7 +587,8 @@ export class Panel {
 
   /** What the sliders and the curves are now. */
   state() {
-    return { sliders: { ...this.values }, loops: this.edited ? this.curves : null, cut: this.cut() };
+    return { sliders: { ...this.values }, loops: this.edited ? this.curves : null,
+      cut: this.cut(), settings: { ...this.settings } };
   }
 
   /** @param {Link} link @param {boolean} checks */

@@ -11,7 +11,7 @@ import hashlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, cast
 
@@ -32,7 +32,7 @@ from harnack.rendering.placement import PlacedSurface
 from harnack.rendering.plugins import register
 from harnack.rendering.scales import linear
 from harnack.rendering.shading import of_mended, of_side, reflectance
-from harnack.rendering.stage import StudioObject
+from harnack.rendering.stage import MATERIALS, Material, StudioObject
 from harnack.rendering.studio_scene import studio_objects
 from harnack.tracer import LevelSet, Status, Tolerance
 from harnack.view.framing import Framing, extreme_points
@@ -49,10 +49,12 @@ if TYPE_CHECKING:
     from harnack.webgpu import Recording
 
 __all__ = [
+    "CONTROLLED",
     "SHOWS",
     "Controls",
     "Live",
     "Plain",
+    "check_opaque",
     "difference",
     "live_settings",
     "packed",
@@ -83,17 +85,24 @@ SHOWS = ("shaded", "normal", "depth", "evaluations", "status")
 """The values of `show` that pages and views have."""
 
 
+CONTROLLED = ("material", "boundary")
+"""Settings of `render` that can be changed in a view: what surfaces are made of, and the radius of
+tubes around the curves at which they end (None for no tubes)."""
+
+
 @dataclass(frozen=True)
 class Controls:
-    """The state of a live scene: its sliders, its edited curve and its cut.
+    """What the controls of a live scene say: its sliders, its edited curve, its cut and settings.
 
     values: of all sliders. loops: vertices (n, 3) in the place of those of the field's curve.
     cut: a volume that cuts all surfaces; a half-space opens them, as `section` of `level_set` does.
+    settings: some of `CONTROLLED`, in the place of those that the scene was opened with.
     """
 
     values: Mapping[str, float]
     loops: Sequence[FloatArray] | None = None
     cut: Volume | None = None
+    settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
 
 @dataclass(frozen=True)
@@ -187,6 +196,8 @@ class Live:
     def scene(self, title: str) -> Plain:
         """All that a page is given when it opens, as plain data for `drawing.js`."""
         place, points = self.placement, np.concatenate(self.points)
+        _, settings = self._at(self.start)
+        material = settings.get("material")
         # The ball around what is seen at first, by which cuts are measured.
         middle: FloatArray = 0.5 * (points.min(axis=0) + points.max(axis=0))
         return {
@@ -203,6 +214,9 @@ class Live:
                 for name, one in self.subject.sliders.items()
             ],
             "editable": self.editable,
+            "materials": [name for name, one in MATERIALS.items() if not one.transparent],
+            "material": material if isinstance(material, str) else None,
+            "tube": None if (tube := settings.get("boundary")) is None else float(tube),
             "middle": middle.tolist(),
             "reach": float(np.linalg.norm(points - middle, axis=1).max()),
             "legends": legends(),
@@ -257,8 +271,16 @@ class Live:
         with at_place(controls.values):
             return self._drawn(controls)
 
-    def _drawn(self, controls: Controls) -> list[StudioObject]:
+    def _at(self, controls: Controls) -> tuple[Any, dict[str, Any]]:
+        """What is drawn, and its settings."""
         what, settings = self.subject.at(controls.values)
+        settings |= controls.settings
+        if "boundary" in controls.settings and settings["boundary"] is None:
+            settings.pop("boundary_material", None)
+        return what, settings
+
+    def _drawn(self, controls: Controls) -> list[StudioObject]:
+        what, settings = self._at(controls)
         drawn = _objects(what, settings)
         curve = _curve_of(drawn) if self.editable else None
         if (
@@ -287,7 +309,7 @@ class Live:
 
     def rendered(self, controls: Controls, **others: Any) -> Picture:
         """A still picture of a state by `render`. others: settings of `render`."""
-        _, settings = self.subject.at(controls.values)
+        _, settings = self._at(controls)
         own = {name: settings[name] for name in ("isolines", "cut_material") if name in settings}
         drawn = self.drawn(controls)
         if isinstance(others.get("camera"), Camera):
@@ -308,7 +330,7 @@ class Live:
         """
         if isinstance(others.get("camera"), Camera):
             others["camera"] = self.framing.with_box(others["camera"])
-        what, settings = self.subject.at(controls.values)
+        what, settings = self._at(controls)
         several: list[Any] = [*what] if isinstance(what, list | tuple) else [what]
         curve = _curve_of(_objects(what, settings)) if controls.loops else None
         if curve is not None:
@@ -383,12 +405,16 @@ def _objects(what: Any, given: Mapping[str, Any]) -> list[StudioObject]:
     isolines = checked_isolines(settings.pop("isolines", None))
     drawn = studio_objects(what, material, settings, cut=cut, isolines=isolines, **studio)
     for one in drawn:
-        if one.material.transparent:
-            raise ValueError(
-                "what moves is not drawn transparent: choose another "
-                'material, such as material="clay"'
-            )
+        check_opaque(one.material)
     return drawn
+
+
+def check_opaque(material: Material) -> None:
+    """Raise ValueError for a material that live pictures cannot show."""
+    if material.transparent:
+        raise ValueError(
+            'what moves is not drawn transparent: choose another material, such as material="clay"'
+        )
 
 
 def _curve_of(drawn: Sequence[StudioObject]) -> SolidAngle | None:

@@ -21,12 +21,15 @@ from harnack.names import did_you_mean
 from harnack.rendering import Camera
 from harnack.rendering.arguments import check_size
 from harnack.rendering.backdrops import GROUNDS
+from harnack.rendering.stage import material_of
 from harnack.tracer import Status, trace
 from harnack.view.painter import Eye, Painted, Painter
 from harnack.view.scene import (
+    CONTROLLED,
     SHOWS,
     Controls,
     Live,
+    check_opaque,
     difference,
     live_settings,
     packed,
@@ -166,7 +169,8 @@ class Session:
             QuestionError: it makes no sense.
         """
         values = self._values(question.get("sliders", {}))
-        return Controls(values, self._loops(question.get("loops")), _volume(question.get("cut")))
+        loops, cut = self._loops(question.get("loops")), _volume(question.get("cut"))
+        return Controls(values, loops, cut, _settings(question.get("settings", {})))
 
     def _values(self, given: Any) -> dict[str, float]:
         sliders = self.live.subject.sliders
@@ -270,7 +274,7 @@ class Session:
     def _surfaces(self, controls: Controls) -> list[Painted]:
         """The surfaces, prepared once as long as only the camera moves."""
         loops = None if controls.loops is None else [one.tobytes() for one in controls.loops]
-        key = controls.values, loops, controls.cut
+        key = controls.values, loops, controls.cut, controls.settings
         if self._painted[0] != key:
             drawn = self.live.drawn(controls)
             made = [Painted(self.live.placed(one), paints_of(one)) for one in drawn]
@@ -360,6 +364,26 @@ def _volume(given: Any) -> Volume | None:
     if kind == "box":
         return Box(tuple(listed[:3]), tuple(listed[3:]))
     return HalfSpace(tuple(listed[:3]), listed[3])
+
+
+def _settings(given: Any) -> dict[str, Any]:
+    """Settings that a person has changed: see `CONTROLLED`."""
+    if not isinstance(given, dict):
+        raise QuestionError("settings must be an object with names")
+    settings = cast("Plain", given)
+    for name, value in settings.items():
+        if name not in CONTROLLED:
+            raise QuestionError(f"there is no setting {name!r:.60}{did_you_mean(name, CONTROLLED)}")
+        if name == "material":
+            if not isinstance(value, str):
+                raise QuestionError(f"material must be a name or a color, not {value!r:.60}")
+            try:
+                check_opaque(material_of(value))
+            except ValueError as wrong:
+                raise QuestionError(str(wrong)) from None
+        elif value is not None and not (_is_number(value) and value > 0):
+            raise QuestionError(f"boundary must be a positive number or null, not {value!r:.60}")
+    return settings
 
 
 def _points(given: Any, name: str) -> FloatArray:
