@@ -257,9 +257,21 @@ def test_what_is_saved_can_be_opened(live: Live) -> None:
     assert np.allclose(scene["state"]["curves"], [moved])
     eye = np.array(scene["camera"]["target"])
     assert np.isfinite(eye).all()
-    cut = session.answer({**asked, "loops": None, "cut": {"ball": [0, 0, 0, 1]}})
-    assert cut["lost"] == ["level"]
-    assert '"Ball"' in cut["text"]
+    asked |= {"loops": None, "sliders": {"level": 5.0}}
+    for kind, numbers in (("ball", [0, 0, 0, 0.9]), ("plane", [0, 0, 1, 0.05])):
+        cut = session.answer({**asked, "cut": {kind: numbers}})
+        assert cut["lost"] == []
+        scene = session.answer({"kind": "load", "text": cut["text"]})
+        assert scene["sliders"][0]["start"] == 5.0
+        (opened,) = session.live.drawn(session.controls({"sliders": {"level": 7.0}}))
+        assert opened.surface.numbers == (7.0,)
+        is_ball = kind == "ball"
+        assert (opened.surface.clip if is_ball else opened.surface.section) is not None
+    solid = Session(Live.of(hk.Sphere(1.0), {"level": hk.Slider(0.0, 0.5, 0.25)}, edits=True))
+    saved = solid.answer({"kind": "save", "camera": pose, "cut": {"plane": [1, 0, 0, 0.1]}})
+    solid.answer({"kind": "load", "text": saved["text"]})
+    (opened,) = solid.live.drawn(solid.controls({"sliders": {"level": 0.5}}))
+    assert opened.surface.solid == (-np.inf, 0.5)  # with a face, at the level of the slider
     text = '{"harnack": 1, "surfaces": [{"field": {"file": "/etc/hosts"}}]}'
     with pytest.raises(hk.SceneFileError, match="must not name files"):
         session.answer({"kind": "load", "text": text})
