@@ -102,11 +102,13 @@ class Page:
     def picture(self, name: str = "") -> np.ndarray:
         """(h, w, 3) of what is drawn, without controls. name: of a file in `out/browser`."""
         self.rest()
-        self.do(
-            "() => { panel.controls.style.visibility = panel.said.style.visibility = 'hidden' }"
+        show = (
+            "(shown) => { for (const one of [panel.controls, panel.said, panel.legend])"
+            " one.style.visibility = shown; }"
         )
+        self.do(show, "hidden")
         made = self.tab.screenshot()
-        self.do("() => { panel.controls.style.visibility = panel.said.style.visibility = '' }")
+        self.do(show, "")
         if name:
             folder = Path("out/browser")
             folder.mkdir(parents=True, exist_ok=True)
@@ -132,8 +134,8 @@ class Page:
         self.tab.get_by_label(name).check()
         self.do("() => { panel.controls.open = false; }")
 
-    def set(self, name: str, value: float) -> None:
-        """Moves a slider."""
+    def set(self, name: str, value: float | str) -> None:
+        """Moves a slider, or chooses a color."""
         self.do(
             "([name, value]) => { const one = panel.controls.querySelector(`input[name=${name}]`);"
             " one.value = value; one.dispatchEvent(new Event('input')); }",

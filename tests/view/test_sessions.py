@@ -15,6 +15,7 @@ from harnack.geometry.mesh_shapes import icosphere
 from harnack.view import scene
 from harnack.view.scene import Live, difference
 from harnack.view.session import Client, QuestionError, Session
+from harnack.view.sliders import ends_of
 
 LOOP = shapes.torus_knot(2, 3, 18)
 FIELD = hk.SolidAngle(LOOP)
@@ -68,10 +69,33 @@ def test_the_tube_follows_the_curve() -> None:
     moved = LOOP.copy()
     moved[0] *= 1.5
     assert compiled(session, [{"loops": [moved.tolist()]}]) == set()
-    _, tube = live.drawn(session.moved({"loops": [moved.tolist()]}))
+    _, tube = live.drawn(session.controls({"loops": [moved.tolist()]}))
     assert abs(float(tube.surface.field.value(moved[0]))) < 0.06
     _, before = live.drawn(live.start)
     assert float(before.surface.field.value(moved[0])) > 0.2
+
+
+def test_material_and_tube_are_changed_and_saved() -> None:
+    live = Live.of(hk.SolidAngle(LOOP), {"level": 6.0, "material": "clay"}, edits=True)
+    session, scene = Session(live), live.scene("T")
+    assert (scene["material"], scene["tube"]) == ("clay", None)
+    assert "gold" in scene["materials"]
+    assert "glass" not in scene["materials"]
+    change = session.answer({"kind": "change", "settings": {"material": "#4682b4"}})
+    (surface,) = change["surfaces"]
+    assert "code" not in surface
+    assert surface["paints"][0]["front"][2] > 2 * surface["paints"][0]["front"][0]
+    settings = {"material": "copper", "boundary": 0.05}
+    controls = session.controls({"settings": settings})
+    surface, tube = live.drawn(controls)
+    assert abs(float(tube.surface.field.value(LOOP[0]))) < 0.06
+    (one,) = live.drawn(session.controls({"settings": {"boundary": None}}))
+    assert one.material != surface.material
+    pose = {"position": [0, -5, 1], "target": [0, 0, 0], "fov": 30}
+    saved = session.answer({"kind": "save", "camera": pose, "settings": settings})
+    opened = session.answer({"kind": "load", "text": saved["text"]})
+    assert (opened["material"], opened["tube"]) == ("copper", 0.05)
+    assert len(opened["state"]["surfaces"]) == 2
 
 
 def test_a_probe_of_a_triangle_says_no_derivatives() -> None:
@@ -91,6 +115,48 @@ def test_a_probe_says_the_value_next_to_the_level(live: Live) -> None:
     assert found["value"] == pytest.approx(6.0, abs=0.01)
 
 
+def test_nothing_leaves_the_picture_when_a_slider_is_moved() -> None:
+    """The farthest places of a ball that moves and grows stay within the picture of 4 : 3."""
+    z, r = hk.Slider(-1.0, 3.0, 0.0), hk.Slider(0.2, 0.7, 0.5)
+    live = Live.of(lambda z, r: hk.Sphere(r).moved((0, 0, z)), {"z": z, "r": r})
+    assert outermost(live, hk.Ball((0, 0, 3.0), 0.7)) > 1
+    framed = live.framed(ends_of(live.subject.sliders))
+    for center in (-1.0, 0.0, 3.0):
+        assert outermost(framed, hk.Ball((0, 0, center), 0.7)) < 0.95
+    # What stands on the ground is all of it, in still pictures and in scene files too.
+    assert framed.placement.apply([[0, 0, -1.7]])[0, 2] == pytest.approx(0.0, abs=0.01)
+    camera = hk.Camera(position=(0, -5, 1), target=(0, 0, 0), fov=30)
+    saved = json.loads(framed.saved(framed.start, camera=camera)[0])
+    assert saved["settings"]["camera"]["box"]["Box"]["upper"][2] == pytest.approx(3.7, abs=0.01)
+
+
+def outermost(live: Live, ball: hk.Ball) -> float:
+    """How far a ball is from the middle of the picture, where 1 is its edge."""
+    points = np.random.default_rng(0).normal(size=(999, 3))
+    points = ball.center + ball.radius * points / np.linalg.norm(points, axis=1, keepdims=True)
+    pose = live.pose
+    back = np.subtract(pose["position"], pose["target"])
+    back = back / np.linalg.norm(back)
+    right = np.cross((0, 0, 1), back)
+    right = right / np.linalg.norm(right)
+    away = points - pose["position"]
+    depth = -(away @ back) * np.tan(np.radians(pose["fov"] / 2))
+    across = [np.abs(away @ right), np.abs(away @ np.cross(back, right)) / 0.75]
+    return float((np.array(across) / depth).max())
+
+
+def test_a_place_at_which_nothing_can_be_drawn_is_named() -> None:
+    def torus(r: float) -> hk.Field:
+        return hk.Torus(1.0, r) if r < 0.35 else hk.Plane((0, 0, 1))
+
+    live = Live.of(torus, {"r": hk.Slider(0.2, 0.4, 0.3)})
+    live = live.framed(ends_of(live.subject.sliders))
+    with pytest.raises(ValueError, match=r"at the place r=0\.4 .*reaches to infinity"):
+        Session(live).answer({"kind": "change", "sliders": {"r": 0.4}})
+    with pytest.raises(ValueError, match=r"at the place r=0\.38 .*reaches to infinity"):
+        Live.of(torus, {"r": hk.Slider(0.2, 0.4, 0.38)})
+
+
 def test_more_colors_than_are_drawn_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     live = Live.of([hk.Sphere(1.0), hk.Sphere(0.5)], {})
     assert len(live.first["surfaces"]) == 2
@@ -100,7 +166,7 @@ def test_more_colors_than_are_drawn_are_refused(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_what_is_sent_is_what_has_changed(live: Live) -> None:
-    moved = Session(live).moved({"sliders": {"level": 3.0}, "loops": [(1.1 * LOOP).tolist()]})
+    moved = Session(live).controls({"sliders": {"level": 3.0}, "loops": [(1.1 * LOOP).tolist()]})
     state, first = live.state(moved), live.first
     change = difference(first, state)
     ((new,), (old,), (own,)) = (one["surfaces"] for one in (state, first, change))
@@ -110,7 +176,7 @@ def test_what_is_sent_is_what_has_changed(live: Live) -> None:
     assert 0 < len(own["at"]) < 0.7 * len(data)
     assert "code" not in own
     assert change["curves"] == state["curves"]
-    longer = live.state(Session(live).moved({"loops": [shapes.torus_knot(2, 3, 99).tolist()]}))
+    longer = live.state(Session(live).controls({"loops": [shapes.torus_knot(2, 3, 99).tolist()]}))
     assert difference(first, longer) is longer
 
 
@@ -132,10 +198,10 @@ def test_a_drawn_picture_is_that_of_render(live: Live) -> None:
     session = Session(live)
     size = (64, 48)
     asked = {"kind": "draw", "size": size, "eye": EYE, "show": "normal"}
-    drawn = session.answer(asked)
+    drawn = session.answer(asked).pixels
     assert drawn.shape == (48, 64, 4)
     assert 0.05 < (np.ptp(drawn[..., :3].astype(int), axis=2) > 8).mean() < 0.9
-    again = session.answer({**asked, "sliders": {"level": 3.0}})
+    again = session.answer({**asked, "sliders": {"level": 3.0}}).pixels
     assert (again != drawn).any()
 
 
@@ -191,9 +257,21 @@ def test_what_is_saved_can_be_opened(live: Live) -> None:
     assert np.allclose(scene["state"]["curves"], [moved])
     eye = np.array(scene["camera"]["target"])
     assert np.isfinite(eye).all()
-    cut = session.answer({**asked, "loops": None, "cut": {"ball": [0, 0, 0, 1]}})
-    assert cut["lost"] == ["level"]
-    assert '"Ball"' in cut["text"]
+    asked |= {"loops": None, "sliders": {"level": 5.0}}
+    for kind, numbers in (("ball", [0, 0, 0, 0.9]), ("plane", [0, 0, 1, 0.05])):
+        cut = session.answer({**asked, "cut": {kind: numbers}})
+        assert cut["lost"] == []
+        scene = session.answer({"kind": "load", "text": cut["text"]})
+        assert scene["sliders"][0]["start"] == 5.0
+        (opened,) = session.live.drawn(session.controls({"sliders": {"level": 7.0}}))
+        assert opened.surface.numbers == (7.0,)
+        is_ball = kind == "ball"
+        assert (opened.surface.clip if is_ball else opened.surface.section) is not None
+    solid = Session(Live.of(hk.Sphere(1.0), {"level": hk.Slider(0.0, 0.5, 0.25)}, edits=True))
+    saved = solid.answer({"kind": "save", "camera": pose, "cut": {"plane": [1, 0, 0, 0.1]}})
+    solid.answer({"kind": "load", "text": saved["text"]})
+    (opened,) = solid.live.drawn(solid.controls({"sliders": {"level": 0.5}}))
+    assert opened.surface.solid == (-np.inf, 0.5)  # with a face, at the level of the slider
     text = '{"harnack": 1, "surfaces": [{"field": {"file": "/etc/hosts"}}]}'
     with pytest.raises(hk.SceneFileError, match="must not name files"):
         session.answer({"kind": "load", "text": text})
@@ -216,6 +294,14 @@ def test_what_is_saved_can_be_opened(live: Live) -> None:
         ({"kind": "change", "cut": {"ball": [0, 0, 0]}}, "4 finite numbers"),
         ({"kind": "change", "cut": {"cone": [0]}}, "one of ball, box, plane"),
         ({"kind": "change", "cut": {"ball": [0, 0, 0, -1]}}, "radius"),
+        ({"kind": "change", "settings": 3}, "an object"),
+        ({"kind": "change", "settings": {"materials": "gold"}}, 'mean "material"'),
+        ({"kind": "change", "settings": {"material": ["gold"]}}, "a name or a color"),
+        ({"kind": "change", "settings": {"material": "glod"}}, 'mean "gold"'),
+        ({"kind": "change", "settings": {"material": "glass"}}, "not drawn transparent"),
+        ({"kind": "change", "settings": {"boundary": True}}, "a positive number"),
+        ({"kind": "change", "settings": {"boundary": float("nan")}}, "a positive number"),
+        ({"kind": "change", "settings": {"boundary": -1}}, "a positive number"),
         ({"kind": "probe"}, "origin"),
         ({"kind": "draw", "size": [99_999, 9]}, "at most 8192|each side"),
         ({"kind": "draw", "size": [64, 48]}, "eye must be"),
@@ -274,7 +360,7 @@ def test_the_floor_hides_nothing_that_moves_below_it() -> None:
     asked = {"kind": "draw", "size": (64, 64), "eye": eye, "rests": True}
     parts: list[float] = []
     for z in (0.0, -1.0):
-        drawn = session.answer({**asked, "sliders": {"z": z}})
+        drawn = session.answer({**asked, "sliders": {"z": z}}).pixels
         parts.append((np.ptp(drawn[..., :3].astype(int), axis=2) > 40).mean())
     assert parts[0] > 0.01
     assert parts[1] == pytest.approx(parts[0], rel=0.3)

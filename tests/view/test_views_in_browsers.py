@@ -37,7 +37,10 @@ def browser() -> Iterator[Any]:
 @pytest.fixture(scope="module")
 def view() -> Iterator[hk.View]:
     level = hk.Slider(2.0, 11.0, 6.0)
-    with hk.view(hk.SolidAngle(LOOP), level=level, title="T", opens=False, waits=False) as one:
+    with hk.view(
+        hk.SolidAngle(LOOP), level=level, title="T", camera=hk.Camera(zoom=1.8), opens=False,
+        waits=False,
+    ) as one:  # fmt: skip
         yield one
 
 
@@ -99,6 +102,57 @@ def test_a_slider_moves_the_level(drawn_by: str, page: Page) -> None:
     assert change(before, page.picture()) < 0.01
 
 
+@pytest.mark.parametrize("drawn_by", ["browser", "python"])
+def test_colors_that_are_numbers_have_a_legend(drawn_by: str, page: Page) -> None:
+    if drawn_by == "python":
+        python_draws(page)
+    legend = "panel.legend.firstChild?.getAttribute('aria-label') ?? ''"
+    assert page.do(legend) == ""
+    choose(page, "show", "depth")
+    page.picture(f"view-depth-{drawn_by}")
+    near, far = map(
+        float, re.findall(r"from ([\d.]+), bright, to ([\d.]+), dark", page.do(legend))[0]
+    )
+    position = page.do("panel.moved().camera.position")
+    away = np.linalg.norm(np.array(position) - shapes.torus_knot(2, 3, 200), axis=1)
+    assert 0.7 * away.min() < near < away.min() * 1.1  # in the unit of the surface
+    assert near < far < 1.3 * away.max()
+    choose(page, "show", "evaluations")
+    page.picture(f"view-evaluations-{drawn_by}")
+    assert "from 0, dark, to 64+, bright" in page.do(legend)
+    choose(page, "show", "shaded")
+    assert page.do(legend) == ""
+
+
+@pytest.mark.parametrize("drawn_by", ["browser", "python"])
+def test_material_and_tube_are_changed(drawn_by: str, page: Page) -> None:
+    if drawn_by == "python":
+        python_draws(page)
+    before = page.picture()
+    choose(page, "material", "gold")
+    golden = page.picture(f"view-gold-{drawn_by}")
+    assert change(before, golden) > 0.05
+    choose(page, "material", "color")
+    page.set("color", "#0000ff")
+    page.set("tube", 0.06)
+    assert page.do("() => panel.state().settings") == {"material": "#0000ff", "boundary": 0.06}
+    blue = page.picture(f"view-tube-{drawn_by}")
+    assert change(golden, blue) > 0.05
+    page.set("tube", 0)
+    choose(page, "material", "as given")
+    assert change(before, page.picture()) < 0.01
+    assert page.said == ""
+
+
+def choose(page: Page, name: str, value: str) -> None:
+    """Chooses one of a list among the controls."""
+    page.do(
+        "([name, value]) => { const one = panel.controls.querySelector(`select[name=${name}]`);"
+        " one.value = value; one.dispatchEvent(new Event('change')); }",
+        [name, value],
+    )
+
+
 def test_points_are_dragged_inserted_removed_smoothed_and_that_undone(page: Page) -> None:
     before = page.picture()
     start = page.do("() => panel.curves")
@@ -143,11 +197,7 @@ def test_a_probe_says_what_is_there_and_draws_the_proved_steps(page: Page) -> No
 def test_a_cut_by_ball_box_and_plane(page: Page) -> None:
     whole = page.picture()
     for kind in ("ball", "box", "plane"):
-        page.do(
-            "(kind) => { const one = panel.controls.querySelector('select[name=cut]');"
-            " one.value = kind; one.dispatchEvent(new Event('change')); }",
-            kind,
-        )
+        choose(page, "cut", kind)
         assert change(whole, page.picture(f"view-{kind}")) > 0.005, kind
     page.set("offset", 0.9)
     page.rest()

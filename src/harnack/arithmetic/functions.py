@@ -44,7 +44,8 @@ class Function:
     numpy: Callable[[Any], Any]
 
     def __reduce__(self) -> str:
-        return self.name  # there is one of each name, in this module
+        # There is one of each name, in this module.
+        return "absolute" if self.name == "abs" else self.name
 
     def __call__(self, x: Any) -> Any:
         """The function of a number of any kind."""

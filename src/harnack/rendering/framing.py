@@ -79,6 +79,10 @@ class UnboundedSurfaceError(ValueError):
         self.usual = usual
 
 
+class NothingVisibleError(ValueError):
+    """A surface of which no ray hits anything: there is nothing to frame."""
+
+
 def box_of(surface: LevelSet) -> FloatArray:
     """Lower and upper corner (2, 3) of a box that holds the surface.
 
@@ -127,7 +131,8 @@ def visible_points(surface: LevelSet, backend: Backend) -> FloatArray:
     only the camera moves, nothing is traced for it.
 
     Raises:
-        ValueError: it has no bounds, or a size that single precision cannot draw; no ray hits it.
+        ValueError: it has no bounds, or a size that single precision cannot draw; a
+            NothingVisibleError where no ray hits it.
     """
     ends = box_of(surface)
     check_size(ends)
@@ -158,11 +163,11 @@ def _found(surface: LevelSet, backend: Backend, ends: FloatArray) -> FloatArray:
     points = _probe(surface, backend, lower, upper, _GRID)
     if len(points) == 0:
         if (lower > upper).any():
-            raise ValueError(
+            raise NothingVisibleError(
                 "nothing is to be seen of this surface: its domain, clip and section do not "
                 "overlap, so that nothing is left to draw"
             )
-        raise ValueError(
+        raise NothingVisibleError(
             "nothing is to be seen of this surface: no ray of a grid on the sides of its box "
             f"{_point(ends[0])} to {_point(ends[1])} meets it; "
             "try another level or clip"

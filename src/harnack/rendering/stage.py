@@ -234,7 +234,7 @@ def studio(
     if camera.box is None:
         points = np.concatenate([visible_points(one.surface, backend) for one in studio_objects])
     else:
-        points = _corners(np.array(camera.box.bounds()))
+        points = corners_of(np.array(camera.box.bounds()))
     placement = on_ground(points, upright(up))
     pose = camera.pose(placement.apply(points), size, placement.apply)
     scene: dict[str, Any] = {
@@ -266,7 +266,7 @@ def studio(
     return Studio(scene, placement, backdrop, pose.azimuth, has_ground)
 
 
-def _corners(ends: FloatArray) -> FloatArray:
+def corners_of(ends: FloatArray) -> FloatArray:
     """Corners (8, 3) of a box (2, 3) of a size that can be drawn."""
     check_size(ends)
     return np.array(list(itertools.product(*ends.T)))

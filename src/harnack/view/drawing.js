@@ -6,6 +6,7 @@
 import { Camera, dot } from "./camera.js";
 
 /** @import {Pose} from "./camera.js" */
+/** @import {Legend} from "./legend.js" */
 /** @typedef {{lanes: string, results: string, count: number}} Check */
 /** @typedef {{
  *   key: string, code: string, data: string | Uint32Array, lanes: number[], results: number[],
@@ -16,7 +17,8 @@ import { Camera, dot } from "./camera.js";
 /** @typedef {{
  *   title: string, placement: number[], camera: Pose, floor: number, show: string,
  *   ground: number[], sliders: Slider[], editable: boolean, middle: number[], reach: number,
- *   state: State
+ *   materials: string[], material: string | null, tube: number | null,
+ *   legends: Record<string, Legend>, evaluations_top: number, state: State
  * }} Scene */
 /** @typedef {{points: number[][], color: number[], width: number}} Marks */
 
@@ -71,7 +73,9 @@ export class Drawing {
     this.camera = new Camera(scene.camera);
     this.ground = scene.ground;
     this.show = "shaded";
-    this.range = [0, 1];
+    /** The least and the greatest depth that is seen, once it is known.
+     *  @type {[number, number] | null} */
+    this.depth_range = null;
     /** @type {Marks[]} */
     this.lines = [];
     /** @type {Marks[]} */
@@ -289,8 +293,8 @@ export class Drawing {
     const { ways = 16, turn = 0.5, kind = 0 } = asked;
     const { floor } = this.scene;
     const [eye, axes] = [this.camera.eye(), this.camera.axes()];
-    const low = this.show === "evaluations" ? 0 : this.range[0];
-    const high = this.show === "evaluations" ? Math.log2(65) : this.range[1];
+    const [low, high] = this.show === "evaluations"
+      ? [0, Math.log2(1 + this.scene.evaluations_top)] : this.depth_range ?? [0, 1];
     const dark = this.ground[0] < 0.3;
     const has_floor = eye[2] > floor ? 1 : 0;
     const made = new ArrayBuffer(VIEW_BYTES);
@@ -459,7 +463,8 @@ export class Drawing {
     let [low, high] = [Infinity, 0];
     for (let k = 0; k < pixels; k++)
       if ((found[8 * k + 7] & 3) === 2) { low = Math.min(low, t[8 * k + 3]); high = Math.max(high, t[8 * k + 3]); }
-    this.range = low < high ? [low, high] : [0, 1];
+    this.depth_range = low < high ? [low, high] : null;
+    this.canvas.dispatchEvent(new Event("range"));
   }
 
   /** Draws: coarsely while something moves, then at every pixel, then with many rays a pixel. */

@@ -28,10 +28,12 @@ class Questions {
     else asked?.resolve(answer);
   }
 
-  /** A picture, its number before it. @param {ArrayBuffer} data */
+  /** A picture; before it its number, its size, and the range of its depths.
+   *  @param {ArrayBuffer} data */
   take(data) {
     const [id, height, width] = new Uint32Array(data, 0, 3);
-    this.waiting.get(id)?.resolve(new ImageData(new Uint8ClampedArray(data, 12), width, height));
+    const image = new ImageData(new Uint8ClampedArray(data, 20), width, height);
+    this.waiting.get(id)?.resolve({ image, range: [...new Float32Array(data, 12, 2)] });
     this.waiting.delete(id);
   }
 

@@ -17,17 +17,21 @@ from typing import TYPE_CHECKING, Any, cast
 from harnack.files.file_format import write_atomically
 from harnack.progress import progress_bar
 from harnack.rendering.camera import Camera
-from harnack.view.scene import Live, Moved, difference, packed
+from harnack.view.scene import Controls, Live, difference, packed
+from harnack.view.sliders import at_place
 
 if TYPE_CHECKING:
     from harnack.view.scene import Plain
+    from harnack.view.sliders import Slider
 
 __all__ = ["MODULES", "document", "page", "resource", "script", "still_of"]
 
 _STILL = (640, 480)
 # Places of a slider without a step, at most; choices of places of several; and of all.
 _PLACES, _CHOICES, _MOST_CHOICES = 33, 300, 1000
-MODULES = ("camera.js", "drawing.js", "frames.js", "link.js", "panel.js")
+MODULES = (
+    "camera.js", "drawing.js", "elements.js", "frames.js", "legend.js", "link.js", "panel.js",
+)  # fmt: skip
 # What brings other states: those in the page, or Python's answers.
 _LINKS = {
     "frames": "scene.sliders.length ? new Frames(scene.frames) : null",
@@ -78,9 +82,11 @@ def page(
     if not target.lower().endswith((".html", ".htm")):
         raise ValueError(f"{target}: a page is written as .html")
     live = Live.of(what, settings)
+    places = _places(live.subject.sliders)
     with progress_bar("page", progress) as advance:
+        live = live.framed(_choices(places))
         scene = live.scene(title or live.subject.name)
-        scene["frames"] = _frames(live, advance)
+        scene["frames"] = _frames(live, places, advance)
     text = document(scene, still_of(live))
     with write_atomically(target) as partial:
         partial.write_text(text, encoding="utf-8")
@@ -93,14 +99,12 @@ def still_of(live: Live) -> str:
     return base64.b64encode(still._repr_png_()).decode()
 
 
-def _frames(live: Live, advance: Any) -> Plain:
-    """The places of the sliders, and what is drawn at each choice of places, the last slider's
-    going fastest.
+def _places(sliders: Mapping[str, Slider]) -> dict[str, list[float]]:
+    """The places of the sliders that a page holds.
 
     Raises:
-        ValueError: there are too many choices.
+        ValueError: there are too many choices of them.
     """
-    sliders = live.subject.sliders
     several = max(2, min(_PLACES, int(_CHOICES ** (1 / max(1, len(sliders))))))
     places = {name: one.places(several) for name, one in sliders.items()}
     total = math.prod(map(len, places.values()))
@@ -110,19 +114,23 @@ def _frames(live: Live, advance: Any) -> Plain:
             f"without Python behind it has to hold, and {_MOST_CHOICES:,} at most: give larger "
             "steps or fewer sliders, or use harnack.view"
         )
+    return places
+
+
+def _choices(places: Mapping[str, list[float]]) -> list[dict[str, float]]:
+    """One place of each slider, in all combinations, the last slider's going fastest."""
+    return [dict(zip(places, one, strict=True)) for one in itertools.product(*places.values())]
+
+
+def _frames(live: Live, places: Mapping[str, list[float]], advance: Any) -> Plain:
+    """The places of the sliders, and what is drawn at each choice of them."""
     frames: list[Plain] = []
-    for choice in itertools.product(*places.values()):
-        values = dict(zip(sliders, choice, strict=True))
-        try:
-            state = live.state(Moved(values))
-        except Exception as wrong:
-            if not values:
-                raise
-            place = ", ".join(f"{name}={value:g}" for name, value in values.items())
-            said = f"at the place {place} of the sliders: {type(wrong).__name__}: {wrong}"
-            raise ValueError(said) from wrong
+    choices = _choices(places)
+    for values in choices:
+        with at_place(values):
+            state = live.state(Controls(values))
         frames.append(packed(difference(live.first, state, checks=False)))
-        advance(1 / total)
+        advance(1 / len(choices))
     return {"places": places, "frames": frames}
 
 

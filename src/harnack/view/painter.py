@@ -24,20 +24,19 @@ from harnack.rendering.plugins import register
 from harnack.rendering.scales import viridis
 from harnack.rendering.shaded import visible_sky
 from harnack.rendering.shading import Floor, Light
+from harnack.view.legends import FAR_GRAY, HIT_COLOR, NEAR_GRAY, evaluations_share
 from harnack.view.scene import paint_of
 
 if TYPE_CHECKING:
     from harnack.backend import FloatArray
     from harnack.rendering.placement import PlacedSurface
 
-__all__ = ["Eye", "Painted", "Painter", "Pixels"]
+__all__ = ["Eye", "Painted", "Painter", "Painting", "Pixels"]
 
 Pixels = npt.NDArray[np.uint8]
 _BEHIND = {"light": (0.90, 0.90, 0.89), "dark": (0.10, 0.10, 0.11)}
 # How much darker the wall behind the stage is straight above, as in `backdrop`.
 _DARKER = 0.45
-# The base-2 logarithm of one more than the evaluations that are brightest.
-_MANY = 6.0224
 
 
 @dataclass(frozen=True)
@@ -50,6 +49,18 @@ class Eye:
     up: FloatArray
     forward: FloatArray
     pixel: float
+
+
+@dataclass(frozen=True)
+class Painting:
+    """A picture.
+
+    pixels: (h, w, 4) of sRGB and 255. depths: the least and the greatest distance that is seen in a
+    picture of depths, on the stage; zeros in others.
+    """
+
+    pixels: Pixels
+    depths: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -71,9 +82,9 @@ class Painter:
     def paint(
         self, painted: Sequence[Painted], eye: Eye, size: tuple[int, int], *, show: str,
         ground: str, rests: bool,
-    ) -> Pixels:  # fmt: skip
-        """A picture (h, w, 4) of sRGB and 255. rests: whether nothing moves, so that it pays to
-        trace the shadow on the floor anew."""
+    ) -> Painting:  # fmt: skip
+        """A picture. rests: whether nothing moves, so that it pays to trace the shadow on the floor
+        anew."""
         mi = register()
         light = Light.of(_matrix(eye))
         has_floor = show == "shaded" and eye.origin[2] > FLOOR
@@ -111,7 +122,7 @@ class Painter:
         )
         red, green, blue = (mi.UInt32(255 * part + 0.5) for part in srgb)
         packed = red | (green << 8) | (blue << 16) | (255 << 24)
-        return to_numpy(packed).astype("<u4").view(np.uint8).reshape(size[1], size[0], 4)
+        return Painting(to_numpy(packed).astype("<u4").view(np.uint8).reshape(size[1], size[0], 4))
 
     def _look(
         self, mi: Any, painted: Sequence[Painted], eye: Eye, size: tuple[int, int], *,
@@ -200,21 +211,22 @@ def _matrix(eye: Eye) -> FloatArray:
 
 def _numbers(
     seen: dict[str, Any], show: str, behind: Sequence[float], size: tuple[int, int]
-) -> Pixels:
+) -> Painting:
     """A picture of normals, depths, evaluations or outcomes, as colors."""
     met, lost = to_numpy(seen["met"]), to_numpy(seen["lost"])
-    picture = np.empty((len(met), 3))
+    picture, depths = np.empty((len(met), 3)), (0.0, 0.0)
     picture[:] = behind
     if show == "normal":
         picture[met] = 0.5 + 0.5 * to_numpy(seen["gradient"])[met]
     elif show == "depth" and met.any():
         t = to_numpy(seen["t"])[met]
-        share = (t - t.min()) / max(float(np.ptp(t)), 1e-12)
-        picture[met] = (0.95 + share * (0.12 - 0.95))[:, None]
+        depths = float(t.min()), float(t.max())
+        share = (t - depths[0]) / max(depths[1] - depths[0], 1e-12)
+        picture[met] = (NEAR_GRAY + share * (FAR_GRAY - NEAR_GRAY))[:, None]
     elif show == "evaluations":
-        picture[:] = viridis(np.log2(1.0 + to_numpy(seen["evaluations"])) / _MANY)
+        picture[:] = viridis(evaluations_share(to_numpy(seen["evaluations"])))
     elif show == "status":
-        picture[met] = (0.93, 0.93, 0.90)
+        picture[met] = HIT_COLOR
     picture[lost] = transferred(np.array(LOST_COLOR))
     opaque = np.column_stack([picture, np.ones(len(picture))])
-    return as_bytes(opaque).reshape(size[1], size[0], 4)
+    return Painting(as_bytes(opaque).reshape(size[1], size[0], 4), depths)

@@ -3,16 +3,20 @@
 
 import { Camera, along, dot } from "./camera.js";
 import { Drawing, QUICK, SHOWS } from "./drawing.js";
+import { element, format } from "./elements.js";
 import { changed } from "./frames.js";
+import { legend_of } from "./legend.js";
 
 /** @import {Marks, Scene, Slider} from "./drawing.js" */
 /** @import {Change} from "./frames.js" */
 /** What brings other states, and in a view with Python behind it what else can be asked for.
  * @typedef {{
  *   change(wanted: {sliders: Record<string, number>, loops: number[][][] | null, cut: Cut | null,
- *     checks: boolean}): Promise<Change>,
+ *     settings: Settings, checks: boolean}): Promise<Change>,
  *   ask?(kind: string, given: object, told?: (done: number, stop: () => void) => void): Promise<any>,
  * }} Link */
+/** Settings of `harnack.render` that are changed here: see `CONTROLLED` in harnack.view.scene.
+ * @typedef {{material?: string, boundary?: number | null}} Settings */
 /** A volume that cuts all surfaces: see `harnack.view.session`.
  * @typedef {{ball?: number[], box?: number[], plane?: number[]}} Cut */
 
@@ -30,14 +34,6 @@ const CURVE = [0.95, 0.75, 0.2, 1];
 const NEAR = 12;
 // Milliseconds after which nothing moves any more.
 const STILL = 400;
-
-/** @template {keyof HTMLElementTagNameMap} K @param {K} kind @param {object} [given]
- *  @param {(Node | string)[]} within @returns {HTMLElementTagNameMap[K]} */
-function element(kind, given = {}, ...within) {
-  const made = Object.assign(document.createElement(kind), given);
-  made.append(...within);
-  return made;
-}
 
 export class Panel {
   /** @param {HTMLElement} root @param {Scene} scene @param {string} passes @param {Link | null} link
@@ -57,6 +53,9 @@ export class Panel {
     this.edited = false;
     this.editing = false;
     this.probing = false;
+    /** The least and the greatest depth of the last picture by Python, on the stage.
+     *  @type {[number, number] | null} */
+    this.depth_range = null;
     /** @type {Camera | undefined} */
     this.seen = undefined;
     this.show = scene.show;
@@ -66,6 +65,8 @@ export class Panel {
     this.ground = scene.ground[0] < 0.3 ? "dark" : "light";
     /** @type {Marks[]} */
     this.probed = [];
+    /** @type {Settings} */
+    this.settings = {};
     this.cutter = "none";
     /** @type {Record<string, number>} */
     this.cuts = {};
@@ -91,7 +92,9 @@ export class Panel {
     this.lines = [];
     /** @type {Marks[]} */
     this.dots = [];
-    root.append(this.still, this.canvas, this.plain, this.said, this.controls);
+    this.legend = element("div");
+    const notes = element("div", { className: "notes" }, this.legend, this.said);
+    root.append(this.still, this.canvas, this.plain, notes, this.controls);
   }
 
   /** @param {string} words @param {boolean} [is_drawn] */
@@ -104,7 +107,7 @@ export class Panel {
 
   build() {
     const { scene } = this;
-    const show = element("select", { onchange: () => { this.show = show.value; this.redraw(); } },
+    const show = element("select", { name: "show", onchange: () => { this.show = show.value; this.redraw(); } },
       ...SHOWS.map((name) => element("option", { value: name }, name)));
     const ground = element("select", { onchange: () => { this.ground = ground.value; this.redraw(); } },
       ...Object.keys(GROUNDS).map((name) => element("option", { value: name }, name)));
@@ -138,7 +141,7 @@ export class Panel {
         this.mark();
       } });
       rows.push(element("label", {}, probe, " Probe by click"));
-      rows.push(...this.cutting());
+      rows.push(...this.materials(), ...this.cutting());
       const width = element("input", { type: "number", min: "16", max: "8192", value: "1600", name: "width" });
       const quality = element("select", { name: "quality" },
         ...["shaded", "color"].map((name) => element("option", { value: name }, name)));
@@ -155,6 +158,37 @@ export class Panel {
     this.about = element("small");
     return element("details", { open: innerWidth > 600 && scene.sliders.length > 0 },
       element("summary", {}, "Controls"), ...rows, this.asked, this.about);
+  }
+
+  /** What the surfaces are made of, and how thick the tubes around the curves are at which they end. */
+  materials() {
+    const { materials, material, tube, reach, state } = this.scene;
+    const [GIVEN, COLOR] = ["as given", "color"];
+    const set = () => {
+      if (chosen.value === GIVEN) delete this.settings.material;
+      else this.settings.material = chosen.value === COLOR ? color.value : chosen.value;
+      color.hidden = chosen.value !== COLOR;
+      this.change();
+    };
+    const names = material && materials.includes(material) ? materials : [GIVEN, ...materials];
+    const chosen = element("select", { name: "material", onchange: set },
+      ...[...names, COLOR].map((name) => element("option", { value: name }, name)));
+    chosen.value = material && materials.includes(material) ? material : GIVEN;
+    const color = element("input", { type: "color", name: "color", value: "#4682b4", hidden: true, oninput: set });
+    color.setAttribute("aria-label", "Color");
+    const rows = [element("label", {}, "Material ", chosen, " ", color)];
+    if (!state.curves.length) return rows;
+    const shown = element("output", {}, tube === null ? "none" : format(tube));
+    const radius = element("input", {
+      type: "range", min: "0", max: String(Math.max(0.1 * reach, tube ?? 0)), step: "any",
+      name: "tube", value: String(tube ?? 0),
+      oninput: () => {
+        this.settings.boundary = Number(radius.value) || null;
+        shown.textContent = this.settings.boundary === null ? "none" : format(this.settings.boundary);
+        this.change();
+      },
+    });
+    return [...rows, element("label", {}, "Radius of the edge's tube ", shown, radius)];
   }
 
   /** What cuts the surfaces, and sliders of it. */
@@ -232,6 +266,7 @@ export class Panel {
       return this.fall_back(`This GPU cannot compile the surface (${wrong})`);
     }
     this.drawing = drawing;
+    this.canvas.addEventListener("range", () => this.explain());
     this.say("");
     const { vendor = "", architecture = "", description = "" } = adapter.info ?? {};
     const name = description || `${vendor} ${architecture}`.trim() || "this browser's device";
@@ -372,9 +407,21 @@ export class Panel {
     this.change();
   }
 
+  /** Shows what the colors of the picture mean. */
+  explain() {
+    const legend = this.scene.legends[this.show];
+    const range = this.drawing ? this.drawing.depth_range : this.depth_range;
+    const scale = this.scene.placement[12];
+    const made = legend && (this.drawing || this.is_remote) ? [legend_of(
+      legend, range && [range[0] / scale, range[1] / scale],
+      this.ground === "dark" ? "#1a1a1c" : "#e6e6e3")] : [];
+    this.legend.replaceChildren(...made);
+  }
+
   redraw() {
     const { drawing } = this;
     this.tell();
+    this.explain();
     if (!drawing) { if (this.is_remote) this.draw_remotely(); return; }
     drawing.show = this.show;
     drawing.lines = this.lines;
@@ -394,7 +441,9 @@ export class Panel {
         if (this.stale) step = 0;
         this.stale = false;
         const start = performance.now();
-        const image = await this.drawn(step ? 1 : this.scale, step === 2);
+        const { image, range } = await this.drawn(step ? 1 : this.scale, step === 2);
+        if (this.show === "depth") this.depth_range = range;
+        this.explain();
         this.put(image);
         if (step === 1 && this.show !== "shaded") step = 2;  // no shadow
         if (step) continue;
@@ -444,7 +493,7 @@ export class Panel {
   }
 
   /** A picture by Python of one ray a pixel. @param {number} scale @param {boolean} rests
-   *  @returns {Promise<ImageData>} */
+   *  @returns {Promise<{image: ImageData, range: [number, number]}>} */
   drawn(scale, rests) {
     const camera = this.camera();
     const size = [this.root.clientWidth, this.root.clientHeight].map((x) => Math.max(8, Math.round(scale * x)));
@@ -538,7 +587,8 @@ export class Panel {
 
   /** What the sliders and the curves are now. */
   state() {
-    return { sliders: { ...this.values }, loops: this.edited ? this.curves : null, cut: this.cut() };
+    return { sliders: { ...this.values }, loops: this.edited ? this.curves : null,
+      cut: this.cut(), settings: { ...this.settings } };
   }
 
   /** @param {Link} link @param {boolean} checks */
@@ -804,6 +854,3 @@ function said_of(found) {
     : `on triangle ${found.triangle}, where f jumps`;
   return `at ${point(found.position)}, normal ${point(found.normal)}, ${what}${bent}, ${looks}`;
 }
-
-/** @param {number} x */
-function format(x) { return String(Number(x.toPrecision(4))); }

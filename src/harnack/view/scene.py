@@ -9,8 +9,9 @@ import base64
 import gzip
 import hashlib
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, cast
 
@@ -24,32 +25,36 @@ from harnack.geometry import HalfSpace, Intersection, Volume
 from harnack.rendering import render
 from harnack.rendering.arguments import OF_STUDIO, SETTINGS, check_camera
 from harnack.rendering.backdrops import FLOOR, Ground, checked_backdrop, reflectance_of
-from harnack.rendering.framing import box_of, upright, visible_points
+from harnack.rendering.camera import Camera
+from harnack.rendering.framing import NothingVisibleError, box_of, visible_points
 from harnack.rendering.isolines import checked_isolines
 from harnack.rendering.placement import PlacedSurface
 from harnack.rendering.plugins import register
 from harnack.rendering.scales import linear
 from harnack.rendering.shading import of_mended, of_side, reflectance
-from harnack.rendering.stage import StudioObject, on_ground
+from harnack.rendering.stage import MATERIALS, Material, StudioObject
 from harnack.rendering.studio_scene import studio_objects
 from harnack.tracer import LevelSet, Status, Tolerance
+from harnack.view.framing import Framing, extreme_points
+from harnack.view.legends import EVALUATIONS_TOP, legends
 from harnack.view.scene_file import STILL_SETTINGS, Origins, of_surfaces, text_of
-from harnack.view.sliders import Subject
+from harnack.view.sliders import PlaceError, Subject, at_place
 from harnack.webgpu import bits_of, data_of, leaves, record
 
 if TYPE_CHECKING:
     from harnack.backend import FloatArray, Real, Vec3
-    from harnack.rendering.camera import Camera
     from harnack.rendering.encounter import SurfaceHit
     from harnack.rendering.images import Picture
     from harnack.rendering.placement import Placement
     from harnack.webgpu import Recording
 
 __all__ = [
+    "CONTROLLED",
     "SHOWS",
+    "Controls",
     "Live",
-    "Moved",
     "Plain",
+    "check_opaque",
     "difference",
     "live_settings",
     "packed",
@@ -78,20 +83,26 @@ _LEVEL = 5
 _OF_STAGE = ("camera", "backdrop", "up", "show")
 SHOWS = ("shaded", "normal", "depth", "evaluations", "status")
 """The values of `show` that pages and views have."""
-_SIZE = (4, 3)
+
+
+CONTROLLED = ("material", "boundary")
+"""Settings of `render` that can be changed in a view: what surfaces are made of, and the radius of
+tubes around the curves at which they end (None for no tubes)."""
 
 
 @dataclass(frozen=True)
-class Moved:
-    """The state of a live scene: its sliders, its edited curve and its cut.
+class Controls:
+    """What the controls of a live scene say: its sliders, its edited curve, its cut and settings.
 
     values: of all sliders. loops: vertices (n, 3) in the place of those of the field's curve.
     cut: a volume that cuts all surfaces; a half-space opens them, as `section` of `level_set` does.
+    settings: some of `CONTROLLED`, in the place of those that the scene was opened with.
     """
 
     values: Mapping[str, float]
     loops: Sequence[FloatArray] | None = None
     cut: Volume | None = None
+    settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
 
 @dataclass(frozen=True)
@@ -99,21 +110,18 @@ class Live:
     """A live scene: what is drawn as a function of sliders, where it stands on the stage, and the
     rays by which devices are checked.
 
-    editable: whether the vertices of its curve can be moved. up: as `render` takes it. show: what
-    is shown at first. middle, reach: a ball around what is seen at first, in the surfaces' own
-    coordinates.
+    points: (n, 3) of each surface, as it is seen at first. camera, up: as `render` takes them.
+    editable: whether the vertices of its curve can be moved. show: what is shown at first.
     """
 
     subject: Subject
-    placement: Placement
-    camera: Plain
-    ground: str
-    rays: tuple[tuple[FloatArray, FloatArray], ...]
-    editable: bool
+    points: tuple[FloatArray, ...]
+    camera: Camera
     up: Any
+    framing: Framing
+    ground: str
+    editable: bool
     show: str
-    middle: FloatArray
-    reach: float
     origins: Origins = ()
 
     @classmethod
@@ -144,30 +152,59 @@ class Live:
         if not isinstance(ground, Ground):
             raise ValueError('backdrop: what is drawn live stands on a ground: "light" or "dark"')
         subject = Subject.of(what, given)
-        drawn = _drawn(subject, subject.starts)
+        start = subject.starts
+        with at_place(start):
+            drawn = _objects_at(subject, start)
+            backend = choose_backend("single")
+            points = tuple(visible_points(one.surface, backend) for one in drawn)
         curve = _curve_of(drawn) if edits else None
-        backend = choose_backend("single")
-        points = [visible_points(one.surface, backend) for one in drawn]
-        together = np.concatenate(points)
-        up = "z" if up is None else up
-        placement = on_ground(together, upright(up))
-        seen = _seen(check_camera(camera), placement, together)
-        rays = tuple(_rays(placement.apply(one)) for one in points)
-        middle: FloatArray = 0.5 * (together.min(axis=0) + together.max(axis=0))
-        reach = float(np.linalg.norm(together - middle, axis=1).max())
+        up, camera = "z" if up is None else up, check_camera(camera)
+        framing = Framing.of(camera, up, np.concatenate(points), is_whole=True)
         return cls(
-            subject, placement, seen, ground.name, rays, curve is not None, up, show, middle, reach,
-            origins,
-        )  # fmt: skip
+            subject, points, camera, up, framing, ground.name, curve is not None, show, origins
+        )
+
+    def framed(self, places: Iterable[Mapping[str, float]]) -> Live:
+        """The same, framed such that nothing leaves the picture at these places of its sliders; a
+        box of the camera stays what is framed.
+
+        Places at which nothing can be drawn are left out: what is wrong there is said where they
+        are drawn.
+        """
+        if not self.subject.sliders or self.camera.box is not None:
+            return self
+        backend = choose_backend("single")
+        points = [*self.points]
+        for values in places:
+            with suppress(PlaceError), at_place(values):
+                for one in _objects_at(self.subject, values):
+                    with suppress(NothingVisibleError):
+                        points.append(extreme_points(visible_points(one.surface, backend)))
+        framing = Framing.of(self.camera, self.up, np.concatenate(points), is_whole=False)
+        return replace(self, framing=framing)
+
+    @property
+    def placement(self) -> Placement:
+        """Where the surfaces stand on the stage."""
+        return self.framing.placement
+
+    @cached_property
+    def rays(self) -> tuple[tuple[FloatArray, FloatArray], ...]:
+        """Rays on the stage by which devices are checked, of each surface."""
+        return tuple(_rays(self.placement.apply(one)) for one in self.points)
 
     def scene(self, title: str) -> Plain:
         """All that a page is given when it opens, as plain data for `drawing.js`."""
-        place = self.placement
+        place, points = self.placement, np.concatenate(self.points)
+        _, settings = self._at(self.start)
+        material = settings.get("material")
+        # The ball around what is seen at first, by which cuts are measured.
+        middle: FloatArray = 0.5 * (points.min(axis=0) + points.max(axis=0))
         return {
             "title": title,
             "placement": [*place.rotation.ravel().tolist(), *place.translation.tolist(),
                           place.scale],
-            "camera": self.camera,
+            "camera": self.framing.camera,
             "floor": FLOOR,
             "show": self.show,
             "ground": reflectance_of(self.ground).tolist(),
@@ -177,8 +214,13 @@ class Live:
                 for name, one in self.subject.sliders.items()
             ],
             "editable": self.editable,
-            "middle": self.middle.tolist(),
-            "reach": self.reach,
+            "materials": [name for name, one in MATERIALS.items() if not one.transparent],
+            "material": material if isinstance(material, str) else None,
+            "tube": None if (tube := settings.get("boundary")) is None else float(tube),
+            "middle": middle.tolist(),
+            "reach": float(np.linalg.norm(points - middle, axis=1).max()),
+            "legends": legends(),
+            "evaluations_top": EVALUATIONS_TOP,
             "state": packed(self.first),
         }  # fmt: skip
 
@@ -190,7 +232,7 @@ class Live:
     @property
     def pose(self) -> Plain:
         """The camera's position, target and field of view, in the surfaces' coordinates."""
-        seen, place = self.camera, self.placement
+        seen, place = self.framing.camera, self.placement
         azimuth, elevation = np.radians([seen["azimuth"], seen["elevation"]])
         back = np.array([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)]) * np.cos(elevation)
         target = np.array(seen["target"])
@@ -198,17 +240,19 @@ class Live:
         return {"position": eye.tolist(), "target": at.tolist(), "fov": seen["fov"]}
 
     @property
-    def start(self) -> Moved:
+    def start(self) -> Controls:
         """The state in which nothing has been moved yet."""
-        return Moved(self.subject.starts)
+        return Controls(self.subject.starts)
 
-    def state(self, moved: Moved) -> Plain:
+    def state(self, controls: Controls) -> Plain:
         """The surfaces of a state as plain data, and the curves at which they end. Its arrays are
         NumPy's; `packed` makes them text."""
-        drawn = self.drawn(moved)
+        drawn = self.drawn(controls)
+        with at_place(controls.values):
+            placed = [self.placed(one) for one in drawn]
         surfaces = [
-            _traced(one, self.placed(one), *self.rays[min(k, len(self.rays) - 1)])
-            for k, one in enumerate(drawn)
+            _traced(one, where, *self.rays[min(k, len(self.rays) - 1)])
+            for k, (one, where) in enumerate(zip(drawn, placed, strict=True))
         ]
         colors = sum(len(one["paints"]) for one in surfaces)
         if colors > _MOST_PAINTS:
@@ -222,23 +266,39 @@ class Live:
                 curves += one.surface.field.boundary_curves
         return {"surfaces": surfaces, "curves": [np.asarray(one).tolist() for one in curves]}
 
-    def drawn(self, moved: Moved) -> list[StudioObject]:
+    def drawn(self, controls: Controls) -> list[StudioObject]:
         """The surfaces of a state as objects of the studio."""
-        what, settings = self.subject.at(moved.values)
+        with at_place(controls.values):
+            return self._drawn(controls)
+
+    def _at(self, controls: Controls) -> tuple[Any, dict[str, Any]]:
+        """What is drawn, and its settings."""
+        what, settings = self.subject.at(controls.values)
+        settings |= controls.settings
+        if "boundary" in controls.settings and settings["boundary"] is None:
+            settings.pop("boundary_material", None)
+        return what, settings
+
+    def _drawn(self, controls: Controls) -> list[StudioObject]:
+        what, settings = self._at(controls)
         drawn = _objects(what, settings)
         curve = _curve_of(drawn) if self.editable else None
-        if curve is not None and moved.loops is not None and settings.get("boundary") is not None:
+        if (
+            curve is not None
+            and controls.loops is not None
+            and settings.get("boundary") is not None
+        ):
             # The tube around the curve is that of the moved one.
-            drawn = _objects(_with_loops(what, curve, moved.loops), settings)
+            drawn = _objects(_with_loops(what, curve, controls.loops), settings)
             curve = _curve_of(drawn)
         drawn = [self._fitted(one) for one in drawn]
-        if moved.cut is not None:
-            drawn = [replace(one, surface=cut_by(one.surface, moved.cut)) for one in drawn]
+        if controls.cut is not None:
+            drawn = [replace(one, surface=cut_by(one.surface, controls.cut)) for one in drawn]
         if curve is None:
             return drawn
         # As Dr.Jit's arrays: those of NumPy decide which proof is taken.
         backend = choose_backend("single")
-        loops = curve.loops if moved.loops is None else moved.loops
+        loops = curve.loops if controls.loops is None else controls.loops
         field = SolidAngle([to_vector3(backend, one) for one in loops])
         return [
             replace(one, surface=replace(one.surface, field=field).in_one_call(begins=True))
@@ -247,18 +307,20 @@ class Live:
             for one in drawn
         ]
 
-    def rendered(self, moved: Moved, **others: Any) -> Picture:
+    def rendered(self, controls: Controls, **others: Any) -> Picture:
         """A still picture of a state by `render`. others: settings of `render`."""
-        _, settings = self.subject.at(moved.values)
+        _, settings = self._at(controls)
         own = {name: settings[name] for name in ("isolines", "cut_material") if name in settings}
-        drawn = self.drawn(moved)
+        drawn = self.drawn(controls)
+        if isinstance(others.get("camera"), Camera):
+            others["camera"] = self.framing.with_box(others["camera"])
         usual: dict[str, Any] = {"backdrop": self.ground, "up": self.up, "progress": False}
         materials = [one.material for one in drawn]
         return render(
             [one.surface for one in drawn], material=materials, **{**usual, **own, **others}
         )
 
-    def saved(self, moved: Moved, **others: Any) -> tuple[str, list[str]]:
+    def saved(self, controls: Controls, **others: Any) -> tuple[str, list[str]]:
         """It as the text of a scene file, and the names of the sliders that are not in it, because
         their functions are Python's: what they make of it is. others: settings of `render` besides
         those of what is drawn.
@@ -266,20 +328,22 @@ class Live:
         Raises:
             SceneFileError: a text cannot hold it.
         """
-        what, settings = self.subject.at(moved.values)
+        if isinstance(others.get("camera"), Camera):
+            others["camera"] = self.framing.with_box(others["camera"])
+        what, settings = self._at(controls)
         several: list[Any] = [*what] if isinstance(what, list | tuple) else [what]
-        curve = _curve_of(_objects(what, settings)) if moved.loops else None
+        curve = _curve_of(_objects(what, settings)) if controls.loops else None
         if curve is not None:
-            several = _with_loops(what, curve, moved.loops)
-        if moved.cut is not None:
+            several = _with_loops(what, curve, controls.loops)
+        if controls.cut is not None:
             own = of_surfaces(settings)
             settings = {name: one for name, one in settings.items() if name not in own}
             made = studio_objects(several, settings.get("material"), own)
-            several = [cut_by(one.surface, moved.cut) for one in made]
+            several = [cut_by(one.surface, controls.cut) for one in made]
         lost: list[str] = []
         for name, one in self.subject.sliders.items():
-            if self.subject.settings.get(name) is one and moved.cut is None:
-                settings[name] = replace(one, start=moved.values[name])
+            if self.subject.settings.get(name) is one:  # in the place of what surfaces have
+                settings[name] = replace(one, start=controls.values[name])
             else:
                 lost.append(name)
         return text_of(several, {**settings, **others}, self.origins), lost
@@ -330,7 +394,7 @@ def _with_loops(what: Any, curve: SolidAngle, loops: Any) -> list[Any]:
     return [edited(one) for one in several]
 
 
-def _drawn(subject: Subject, values: Mapping[str, float]) -> list[StudioObject]:
+def _objects_at(subject: Subject, values: Mapping[str, float]) -> list[StudioObject]:
     return _objects(*subject.at(values))
 
 
@@ -341,12 +405,16 @@ def _objects(what: Any, given: Mapping[str, Any]) -> list[StudioObject]:
     isolines = checked_isolines(settings.pop("isolines", None))
     drawn = studio_objects(what, material, settings, cut=cut, isolines=isolines, **studio)
     for one in drawn:
-        if one.material.transparent:
-            raise ValueError(
-                "what moves is not drawn transparent: choose another "
-                'material, such as material="clay"'
-            )
+        check_opaque(one.material)
     return drawn
+
+
+def check_opaque(material: Material) -> None:
+    """Raise ValueError for a material that live pictures cannot show."""
+    if material.transparent:
+        raise ValueError(
+            'what moves is not drawn transparent: choose another material, such as material="clay"'
+        )
 
 
 def _curve_of(drawn: Sequence[StudioObject]) -> SolidAngle | None:
@@ -354,25 +422,6 @@ def _curve_of(drawn: Sequence[StudioObject]) -> SolidAngle | None:
     found = {id(one.surface.field): one.surface.field for one in drawn}
     curves = [one for one in found.values() if isinstance(one, SolidAngle) and not one.circles]
     return curves[0] if len(curves) == 1 else None
-
-
-def _seen(camera: Camera, placement: Placement, points: FloatArray) -> Plain:
-    """A camera that turns about a point before it, in the coordinates of the stage."""
-    there = placement.apply(points)
-    pose = camera.pose(there, _SIZE, placement.apply)
-    way = pose.target - pose.origin
-    way = way / np.linalg.norm(way)
-    middle = 0.5 * (there.min(axis=0) + there.max(axis=0))
-    distance = max(float((middle - pose.origin) @ way), 1e-3)
-    elevation = np.degrees(np.arcsin(np.clip(-way[2], -1, 1)))
-    azimuth = pose.azimuth if abs(way[2]) > 1 - 1e-9 else np.degrees(np.arctan2(-way[1], -way[0]))
-    return {
-        "target": (pose.origin + distance * way).tolist(),
-        "azimuth": float(azimuth),
-        "elevation": float(elevation),
-        "distance": distance,
-        "fov": float(pose.fov),
-    }
 
 
 def _traced(one: StudioObject, placed: PlacedSurface, o: FloatArray, d: FloatArray) -> Plain:

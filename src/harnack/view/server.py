@@ -18,6 +18,7 @@ from harnack.view.page import document, still_of
 from harnack.view.scene import Live
 from harnack.view.scene_file import Origins
 from harnack.view.session import Client, QuestionError
+from harnack.view.sliders import ends_of
 
 if TYPE_CHECKING:
     from typing import Self
@@ -116,6 +117,7 @@ def view(
     port = whole(port, "port", least=0, most=65535)
     height = whole(height, "height", least=16, most=10_000)
     live = Live.of(what, settings, edits=True, origins=origins)
+    live = live.framed(ends_of(live.subject.sliders))
     title = title or live.subject.name
     if opens and port == 0 and host == _LOCAL[0] and waits is None and in_notebook():
         try:

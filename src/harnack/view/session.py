@@ -21,23 +21,27 @@ from harnack.names import did_you_mean
 from harnack.rendering import Camera
 from harnack.rendering.arguments import check_size
 from harnack.rendering.backdrops import GROUNDS
+from harnack.rendering.stage import material_of
 from harnack.tracer import Status, trace
 from harnack.view.painter import Eye, Painted, Painter
 from harnack.view.scene import (
+    CONTROLLED,
     SHOWS,
+    Controls,
     Live,
-    Moved,
+    check_opaque,
     difference,
     live_settings,
     packed,
     paints_of,
 )
 from harnack.view.scene_file import scene_of
+from harnack.view.sliders import ends_of
 
 if TYPE_CHECKING:
     from harnack.backend import FloatArray
     from harnack.geometry import Volume
-    from harnack.view.painter import Pixels
+    from harnack.view.painter import Painting
     from harnack.view.scene import Plain
 
 __all__ = ["Client", "QuestionError", "Session", "pose_of"]
@@ -96,8 +100,9 @@ class Client:
         return question
 
     def answer(self, question: Plain, send: Callable[[Plain], None]) -> Plain | bytes:
-        """What to send back: an object, or of a picture its number, height and width, four bytes
-        each, the last byte first, and then its pixels: red, green, blue and alpha, row by row.
+        """What to send back: an object, or of a picture its number, height, width and the ends of
+        its depths (single precision), four bytes each, the last byte first, and then its pixels:
+        red, green, blue and alpha, row by row.
 
         send: sends how much is done of what takes long.
         """
@@ -122,8 +127,8 @@ class Client:
             self._ended.discard(number)
         if isinstance(answer, dict):
             return {"id": number, "answer": answer}
-        head = np.array([number, *answer.shape[:2]], dtype="<u4").tobytes()
-        return head + answer.tobytes()
+        head = np.array([number, *answer.pixels.shape[:2]], dtype="<u4").tobytes()
+        return head + np.array(answer.depths, dtype="<f4").tobytes() + answer.pixels.tobytes()
 
 
 class Session:
@@ -134,8 +139,8 @@ class Session:
         self._painter = Painter()
         self._painted: tuple[Any, list[Painted]] = (None, [])
 
-    def answer(self, question: Mapping[str, Any], tell: Tell = _nobody) -> Plain | Pixels:
-        """The answer to a question; a picture (h, w, 4) to "draw".
+    def answer(self, question: Mapping[str, Any], tell: Tell = _nobody) -> Plain | Painting:
+        """The answer to a question; a picture to "draw".
 
         tell: called during long work with the fraction of it, from 0 to 1, that was finished since
             the last call; an exception that it raises ends the work.
@@ -155,16 +160,17 @@ class Session:
         kind = question.get("kind")
         if kind not in kinds:
             raise QuestionError(f"kind must be one of {', '.join(kinds)}, not {kind!r}")
-        return kinds[kind](question, self.moved(question), tell)
+        return kinds[kind](question, self.controls(question), tell)
 
-    def moved(self, question: Mapping[str, Any]) -> Moved:
+    def controls(self, question: Mapping[str, Any]) -> Controls:
         """The state that a question asks about.
 
         Raises:
             QuestionError: it makes no sense.
         """
         values = self._values(question.get("sliders", {}))
-        return Moved(values, self._loops(question.get("loops")), _volume(question.get("cut")))
+        loops, cut = self._loops(question.get("loops")), _volume(question.get("cut"))
+        return Controls(values, loops, cut, _settings(question.get("settings", {})))
 
     def _values(self, given: Any) -> dict[str, float]:
         sliders = self.live.subject.sliders
@@ -194,16 +200,16 @@ class Session:
             raise QuestionError(f"loops: at most {_MOST_POINTS:,} points")
         return loops
 
-    def _change(self, question: Mapping[str, Any], moved: Moved, tell: Tell) -> Plain:
-        state = self.live.state(moved)
+    def _change(self, question: Mapping[str, Any], controls: Controls, tell: Tell) -> Plain:
+        state = self.live.state(controls)
         checks = question.get("checks") is True
         return packed(difference(self.live.first, state, checks=checks))
 
-    def _probe(self, question: Mapping[str, Any], moved: Moved, tell: Tell) -> Plain:
+    def _probe(self, question: Mapping[str, Any], controls: Controls, tell: Tell) -> Plain:
         """The first hit of a ray of the surfaces' coordinates, and how far each step was proved."""
         origin = _points([question.get("origin")], "origin")
         direction = _points([question.get("direction")], "direction")
-        surfaces = [one.surface for one in self.live.drawn(moved)]
+        surfaces = [one.surface for one in self.live.drawn(controls)]
         every = [trace(one, origin, direction) for one in surfaces]
         nearest = min(range(len(every)), key=lambda k: float(every[k].t[0]))
         hits, surface = every[nearest], surfaces[nearest]
@@ -240,7 +246,7 @@ class Session:
             return there
         return there | {"mean": float(bent.mean[0]), "gaussian": float(bent.gaussian[0])}
 
-    def _draw(self, question: Mapping[str, Any], moved: Moved, tell: Tell) -> Pixels:
+    def _draw(self, question: Mapping[str, Any], controls: Controls, tell: Tell) -> Painting:
         """A picture of one ray a pixel."""
         size = _size(question)
         show, ground = question.get("show", "shaded"), question.get("ground", self.live.ground)
@@ -261,25 +267,25 @@ class Session:
             raise QuestionError("eye: pixel must be a positive number")
         seen = Eye(origin, right, up, forward, pixel)
         return self._painter.paint(
-            self._surfaces(moved), seen, size, show=show, ground=ground,
+            self._surfaces(controls), seen, size, show=show, ground=ground,
             rests=question.get("rests") is True,
         )  # fmt: skip
 
-    def _surfaces(self, moved: Moved) -> list[Painted]:
+    def _surfaces(self, controls: Controls) -> list[Painted]:
         """The surfaces, prepared once as long as only the camera moves."""
-        loops = None if moved.loops is None else [one.tobytes() for one in moved.loops]
-        key = moved.values, loops, moved.cut
+        loops = None if controls.loops is None else [one.tobytes() for one in controls.loops]
+        key = controls.values, loops, controls.cut, controls.settings
         if self._painted[0] != key:
-            drawn = self.live.drawn(moved)
+            drawn = self.live.drawn(controls)
             made = [Painted(self.live.placed(one), paints_of(one)) for one in drawn]
             self._painted = key, made
         return self._painted[1]
 
-    def _picture(self, question: Mapping[str, Any], moved: Moved, tell: Tell) -> Plain:
+    def _picture(self, question: Mapping[str, Any], controls: Controls, tell: Tell) -> Plain:
         """A picture of what is seen, as base64 of a PNG file."""
         size = _size(question)
         made: Any = self.live.rendered(
-            moved, show=question.get("show", "shaded"), size=size, progress=tell,
+            controls, show=question.get("show", "shaded"), size=size, progress=tell,
             camera=self._camera(question), spp=question.get("spp"),
             backdrop=question.get("ground", self.live.ground),
         )  # fmt: skip
@@ -292,15 +298,15 @@ class Session:
         eye, target = (place.undo(one[None])[0] for one in (eye, target))
         return Camera(position=tuple(eye.tolist()), target=tuple(target.tolist()), fov=fov)
 
-    def _save(self, question: Mapping[str, Any], moved: Moved, tell: Tell) -> Plain:
+    def _save(self, question: Mapping[str, Any], controls: Controls, tell: Tell) -> Plain:
         """The text of a scene file, and the names of sliders that it cannot hold."""
         text, lost = self.live.saved(
-            moved, camera=self._camera(question), show=question.get("show", "shaded"),
+            controls, camera=self._camera(question), show=question.get("show", "shaded"),
             backdrop=question.get("ground", self.live.ground), up=self.live.up,
         )  # fmt: skip
         return {"text": text, "lost": lost}
 
-    def _load(self, question: Mapping[str, Any], moved: Moved, tell: Tell) -> Plain:
+    def _load(self, question: Mapping[str, Any], controls: Controls, tell: Tell) -> Plain:
         """Replaces the scene by that of a scene file, and returns it as `Live.scene` does.
 
         See `live_settings` for what of its settings is taken.
@@ -310,7 +316,8 @@ class Session:
             raise QuestionError("text must be that of a scene file")
         saved = scene_of(text)
         settings = {**live_settings(saved.settings), **saved.sliders}
-        self.live = Live.of([*saved.surfaces], settings, edits=True, origins=saved.origins)
+        live = Live.of([*saved.surfaces], settings, edits=True, origins=saved.origins)
+        self.live = live.framed(ends_of(live.subject.sliders))
         self._painter, self._painted = Painter(), (None, [])
         return self.live.scene(self.live.subject.name)
 
@@ -357,6 +364,26 @@ def _volume(given: Any) -> Volume | None:
     if kind == "box":
         return Box(tuple(listed[:3]), tuple(listed[3:]))
     return HalfSpace(tuple(listed[:3]), listed[3])
+
+
+def _settings(given: Any) -> dict[str, Any]:
+    """Settings that a person has changed: see `CONTROLLED`."""
+    if not isinstance(given, dict):
+        raise QuestionError("settings must be an object with names")
+    settings = cast("Plain", given)
+    for name, value in settings.items():
+        if name not in CONTROLLED:
+            raise QuestionError(f"there is no setting {name!r:.60}{did_you_mean(name, CONTROLLED)}")
+        if name == "material":
+            if not isinstance(value, str):
+                raise QuestionError(f"material must be a name or a color, not {value!r:.60}")
+            try:
+                check_opaque(material_of(value))
+            except ValueError as wrong:
+                raise QuestionError(str(wrong)) from None
+        elif value is not None and not (_is_number(value) and value > 0):
+            raise QuestionError(f"boundary must be a positive number or null, not {value!r:.60}")
+    return settings
 
 
 def _points(given: Any, name: str) -> FloatArray:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import inspect
+import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -13,7 +15,10 @@ from harnack.fields import Field
 from harnack.names import did_you_mean
 from harnack.tracer import LevelSet, level_set
 
-__all__ = ["Slider", "Subject"]
+__all__ = ["PlaceError", "Slider", "Subject", "at_place", "ends_of"]
+
+# Sliders of which all combinations of ends are few.
+_COMBINED = 3
 
 
 @dataclass(frozen=True)
@@ -139,6 +144,42 @@ class Subject:
             elif argument in values:
                 by_name[argument] = values[argument]
         return one(*by_place, **by_name)
+
+
+class PlaceError(ValueError):
+    """Something wrong with what is drawn at one place of the sliders, which the message names."""
+
+
+@contextmanager
+def at_place(values: Mapping[str, float]) -> Generator[None]:
+    """Has errors within it say for which values of the sliders they were raised; without sliders
+    they stay what they are.
+
+    Raises:
+        PlaceError: in their place.
+    """
+    try:
+        yield
+    except PlaceError:
+        raise
+    except Exception as wrong:
+        if not values:
+            raise
+        place = ", ".join(f"{name}={value:g}" for name, value in values.items())
+        raise PlaceError(
+            f"at the place {place} of the sliders: {type(wrong).__name__}: {wrong} (a slider needs "
+            "ends low and high between which there is something to draw)"
+        ) from wrong
+
+
+def ends_of(sliders: Mapping[str, Slider]) -> list[dict[str, float]]:
+    """All sliders at their ends, in all combinations of up to three sliders; of more, one after the
+    other at its ends while the others stand where they start."""
+    ends = {name: (one.low, one.high) for name, one in sliders.items()}
+    if len(sliders) <= _COMBINED:
+        return [dict(zip(ends, place, strict=True)) for place in itertools.product(*ends.values())]
+    starts = {name: cast("float", one.start) for name, one in sliders.items()}
+    return [{**starts, name: end} for name, both in ends.items() for end in both]
 
 
 def _arguments(function: Any) -> dict[str, inspect.Parameter]:

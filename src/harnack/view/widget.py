@@ -93,9 +93,9 @@ class Widget(anywidget.AnyWidget):
             if name == "camera":
                 pose_of(value)
             elif name == "sliders":
-                value = dict(session.moved({"sliders": {**self.sliders, **value}}).values)
+                value = dict(session.controls({"sliders": {**self.sliders, **value}}).values)
             elif session.live.editable:
-                session.moved({"loops": value})
+                session.controls({"loops": value})
         except (QuestionError, TypeError, ValueError) as wrong:
             raise traitlets.TraitError(f"{name}: {wrong}") from None
         return value
