@@ -6,13 +6,14 @@ on their left, as `harnack.geometry.outlines` makes them.
 
 from __future__ import annotations
 
+import importlib
 import math
 import os
 import re
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal
 from xml.etree.ElementTree import Element, ParseError, TreeBuilder
 from xml.parsers import expat
 
@@ -44,6 +45,17 @@ def regular(sides: int, radius: float) -> Outline:
     angle = 2 * math.pi * np.arange(count) / count
     corners = np.column_stack([np.cos(angle), np.sin(angle)])
     return outline_loops(positive(radius, "the radius of a polygon") * corners)
+
+
+def _library(module: str) -> Any:
+    """A module of matplotlib, which sets text, or of svgpathtools, which reads paths."""
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError:
+        package = module.partition(".")[0]
+        raise ModuleNotFoundError(
+            f'this outline needs {package}: pip install "harnack[outlines]"'
+        ) from None
 
 
 # Text.
@@ -93,23 +105,17 @@ def text(
 
 def _line(line: str, font: Any, size: float, allowed: float) -> list[FloatArray]:
     """Loops of one line of text."""
-    try:
-        from matplotlib import font_manager
-        from matplotlib.ft2font import FT2Font
-        from matplotlib.textpath import TextToPath
-    except ModuleNotFoundError:
-        raise ModuleNotFoundError(
-            'outlines of text need matplotlib: pip install "harnack[outlines]"'
-        ) from None
-    manager: Any = font_manager
+    manager = _library("matplotlib.font_manager")
     if font is not None and Path(font).suffix.lower() in (".ttf", ".otf", ".ttc"):
         if not Path(font).is_file():
             raise ValueError(f"there is no font file {os.fspath(font)}")
-        about: Any = manager.FontProperties(fname=os.fspath(font))
+        about = manager.FontProperties(fname=os.fspath(font))
     else:
         about = manager.FontProperties(family="DejaVu Sans" if font is None else str(font))
     try:
-        face: Any = FT2Font(manager.findfont(about, fallback_to_default=False))
+        face = _library("matplotlib.ft2font").FT2Font(
+            manager.findfont(about, fallback_to_default=False)
+        )
     except ValueError:
         raise ValueError(
             f"no font of the family {font!r} is installed: give the path of a .ttf or .otf file"
@@ -121,7 +127,7 @@ def _line(line: str, font: Any, size: float, allowed: float) -> list[FloatArray]
             raise ValueError(
                 f"the font {face.family_name} has no letter {letter!r}: choose another by font="
             )
-    maker: Any = TextToPath()
+    maker = _library("matplotlib.textpath").TextToPath()
     points, codes = maker.get_text_path(about, line, ismath=False)
     scale = size / maker.FONT_SCALE
     rows = np.asarray(points, dtype=np.float64).reshape(-1, 2) * scale
@@ -239,8 +245,6 @@ def _filled(
     element: Element, transform: FloatArray, inherited: dict[str, str]
 ) -> Iterator[tuple[str, FloatArray, Rule]]:
     """Path data, transform (3, 3) and fill rule of each shape that is filled."""
-    from svgpathtools.parser import parse_transform
-
     tag = element.tag
     if tag == "style" and _OF_RULES.search("".join(element.itertext())):
         raise ValueError("its style sheet may change what is filled: save it with plain attributes")
@@ -256,7 +260,8 @@ def _filled(
         if _styles(element).get(name, "none") != "none":
             raise ValueError(f"{name} is not read: cut the shapes before the file is saved")
     if "transform" in element.attrib:
-        more: FloatArray = cast("Any", parse_transform)(element.attrib["transform"], strict=True)
+        parse_transform = _library("svgpathtools.parser").parse_transform
+        more: FloatArray = parse_transform(element.attrib["transform"], strict=True)
         transform = transform @ more
     if tag in _SHAPES and own.get("fill") != "none" and own.get("visibility") != "hidden":
         yield (
@@ -284,9 +289,7 @@ def _styles(element: Element) -> dict[str, str]:
 
 def _data(element: Element) -> str:
     """The path data of a shape."""
-    from svgpathtools import svg_to_paths
-
-    makers: Any = svg_to_paths
+    makers = _library("svgpathtools.svg_to_paths")
     about, kind = element.attrib, element.tag
     if kind == "path":
         return about.get("d", "")
@@ -333,16 +336,11 @@ def _outline_of(
 
 
 def _segments(data: str) -> list[Any]:
-    try:
-        from svgpathtools import parse_path
-    except ModuleNotFoundError:
-        raise ModuleNotFoundError(
-            'SVG files need svgpathtools: pip install "harnack[outlines]"'
-        ) from None
+    parse_path = _library("svgpathtools.parser").parse_path
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         try:
-            made: list[Any] = [*cast("Any", parse_path)(data)]
+            made: list[Any] = [*parse_path(data)]
         except (Warning, AssertionError, ArithmeticError, LookupError, ValueError) as wrong:
             raise ValueError(f"its path {data!r:.60} is none: {wrong}") from None
     if not all(np.isfinite([one.start, one.end]).all() for one in made):
