@@ -194,7 +194,7 @@ def test_rays_along_faces_and_edges_of_cells(precision: Any, kind: str) -> None:
     if kind == "tiny":
         radii *= 10 ** rng.uniform(-3, 0, 216)
     scene = Sum("compact", centers, radii, np.ones(216), None)
-    lists = scene.blobs.cell_lists()
+    lists = scene.blobs.cell_lists
     assert lists is not None
     low, cell = lists.origin, lists.cell
     count = 60

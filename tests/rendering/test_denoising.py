@@ -114,7 +114,7 @@ def test_a_missing_denoiser_is_told_before_anything_is_drawn(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setitem(sys.modules, "pyoidn", None)
-    monkeypatch.setattr("harnack.rendering.picture.register", pytest.fail)
+    monkeypatch.setattr("harnack.rendering.picture_job.register", pytest.fail)
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'harnack\[denoise\]'"):
         draw(denoise=True)
 

@@ -291,8 +291,9 @@ def test_cameras_that_cannot_be_are_refused(values: dict[str, float]) -> None:
 def test_ctrl_c_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.png").write_bytes(b"old")
 
-    def interrupted(*_: Any, **settings: Any) -> Any:
-        settings["advance"](0.5)
+    def interrupted(exposing: Any, advance: Any, hands: Any) -> Any:
+        del exposing, hands
+        advance(0.5)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(picture, "expose", interrupted)
