@@ -34,6 +34,7 @@ from .arithmetic import (
     tanh,
 )
 from .backend.tensors import wrap_for_jax
+from .cluster.zarr_files import to_zarr
 from .distance import (
     Curvatures,
     DistanceBounds,
@@ -228,6 +229,7 @@ __all__ = [
     "tanh",
     "testing",
     "thread",
+    "to_zarr",
     "trace",
     "tracer",
     "union",

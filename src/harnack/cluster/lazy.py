@@ -1,26 +1,20 @@
 """Dask arrays of points and rays: what is asked of them is computed block by block, when it is
-needed, and can be written to a Zarr file in which finished chunks stay.
-"""
+needed."""
 
 from __future__ import annotations
 
 import functools
 import inspect
-import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import is_dataclass
-from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numpy as np
 
 from harnack.cluster.packing import Packed, load_module, name_of
-from harnack.cluster.workers import alone, as_client
-from harnack.progress import Advance, progress_bar
+from harnack.cluster.workers import alone
 
 Function = TypeVar("Function", bound=Callable[..., Any])
-# The attribute of a Zarr array that says what it holds.
-_MARK = "harnack"
 
 
 def is_lazy(value: Any) -> bool:
@@ -126,111 +120,3 @@ def _run(packed: Packed, blocks: dict[str, Any], start: int) -> dict[str, Any]:
             return _arrays_of(packed.open()(**blocks))
         except (TypeError, ValueError) as error:
             raise type(error)(f"in the block that begins at row {start}: {error}") from error
-
-
-def to_zarr(
-    array: Any,
-    path: str | os.PathLike[str],
-    *,
-    client: Any = None,
-    progress: bool | Advance = True,
-) -> Any:
-    """Write a Dask array to a Zarr file, chunk by chunk, and return the Zarr array.
-
-    A chunk of the file is a block of the array. Chunks that are there already, of the same array,
-    are not computed again, so that what was stopped goes on.
-
-    array: a Dask array; that it is the same is known by its name, which says what it is made of.
-    path: of a folder, by custom with the ending .zarr, that workers see under the same name.
-    client: a `dask.distributed.Client` or the address of a scheduler; by default as Dask chooses.
-    progress: whether to show it, or a function that is told each part, of 1, that is done.
-
-    Raises:
-        ModuleNotFoundError: Dask or Zarr is not installed.
-        TypeError: not a Dask array.
-        ValueError: there is another array at the path, or its blocks have unequal lengths.
-        OSError: it cannot be written there, or workers did not write there.
-    """
-    zarr = load_module("zarr", "to_zarr")
-    dask = load_module("dask", "to_zarr")
-    if not is_lazy(array):
-        raise TypeError(f"to_zarr writes a Dask array, not a {type(array).__name__}")
-    for lengths in array.chunks:
-        if any(one != lengths[0] for one in lengths[:-1]) or lengths[-1] > lengths[0]:
-            raise ValueError(
-                f"the blocks have unequal lengths, {lengths[:9]}: call rechunk() first"
-            )
-    target = Path(path).resolve()
-    file = _zarr_file(zarr, array, target)
-    missing = [
-        index for index in np.ndindex(*array.numblocks) if not _chunk(file, target, index).exists()
-    ]
-    blocks = array.to_delayed()
-    write = dask.delayed(_write, pure=False)
-    tasks = [write(str(target), _places(array, index), blocks[index]) for index in missing]
-    part = 1 / max(1, array.npartitions)
-    with progress_bar("writing", progress) as advance, as_client(client) as one:
-        advance(1 - part * len(missing))
-        for _ in _computed(one, tasks):
-            advance(part)
-    for index in missing:
-        if not _chunk(file, target, index).exists():
-            raise OSError(
-                f"workers did not write to {target}: they see other files than this machine; name "
-                "a folder that all share"
-            )
-    return file
-
-
-def _computed(client: Any, tasks: list[Any]) -> Iterator[None]:
-    """Computes tasks, all at once by a client, else one by one, and yields after each."""
-    if client is None:
-        for task in tasks:
-            task.compute()
-            yield
-        return
-    futures = client.compute(tasks)
-    try:
-        for future in load_module("distributed", "client").as_completed(futures):
-            future.result()
-            yield
-    finally:
-        client.cancel([one for one in futures if one.status == "pending"])
-
-
-def _zarr_file(zarr: Any, array: Any, target: Path) -> Any:
-    """The Zarr array of a Dask array, made if it is not there."""
-    chunks = tuple(max(1, lengths[0]) for lengths in array.chunks)
-    if not target.exists():
-        return zarr.create_array(
-            str(target), shape=array.shape, chunks=chunks, dtype=array.dtype,
-            attributes={_MARK: array.name}, config={"write_empty_chunks": True},
-        )  # fmt: skip
-    try:
-        file = zarr.open_array(str(target), mode="r+")
-    except Exception as error:  # of many kinds
-        raise ValueError(f"{target} is no Zarr array ({error}): name another folder") from None
-    same = file.shape == array.shape and file.chunks == chunks and file.dtype == array.dtype
-    if not same or file.attrs.get(_MARK) != array.name:
-        raise ValueError(
-            f"{target} holds another array, or the same one made of other numbers: delete it, or "
-            "name another folder"
-        )
-    return file
-
-
-def _chunk(file: Any, target: Path, index: tuple[int, ...]) -> Path:
-    """The file of a chunk, which is written under another name first, and then renamed."""
-    return target / file.metadata.encode_chunk_key(index)
-
-
-def _places(array: Any, index: tuple[int, ...]) -> tuple[slice, ...]:
-    starts = [sum(lengths[:k]) for lengths, k in zip(array.chunks, index, strict=True)]
-    ends = [sum(lengths[: k + 1]) for lengths, k in zip(array.chunks, index, strict=True)]
-    return tuple(slice(a, b) for a, b in zip(starts, ends, strict=True))
-
-
-def _write(path: str, places: tuple[slice, ...], block: Any) -> None:
-    zarr = load_module("zarr", "to_zarr")
-    file = zarr.open_array(path, mode="r+", config={"write_empty_chunks": True})
-    file[places] = block

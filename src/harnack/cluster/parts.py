@@ -182,7 +182,7 @@ class _There:
         self.client, self.step = client, step
         self.worker_lost = distributed.KilledWorker
         self.scheduler_lost = load_module("distributed.client", "client").FuturesCancelledError
-        self.done = distributed.as_completed()
+        self.done = distributed.as_completed(loop=client.loop)
         self.names: dict[Any, str] = {}
         # As a task and not as data in a worker's memory, which would be lost with that worker.
         with warnings.catch_warnings():

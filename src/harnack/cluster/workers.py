@@ -17,6 +17,8 @@ import numpy as np
 from harnack.backend import choose_backend, to_numpy
 from harnack.cluster.packing import load_module
 
+# How long to wait for a scheduler.
+_PATIENCE = "10s"
 # Bits of kernels and of pictures depend on these.
 _PACKAGES = ("drjit", "mitsuba", "numpy")
 _INSTALL = "install the same there as here, such as by pip install 'harnack[cluster]=={version}'"
@@ -40,7 +42,7 @@ def connected(client: Any) -> Generator[Any]:
     opened = None
     if isinstance(client, str):
         try:
-            client = opened = distributed.Client(client, timeout="10s", set_as_default=False)
+            client = opened = distributed.Client(client, timeout=_PATIENCE, set_as_default=False)
         except (OSError, ValueError, TimeoutError) as error:
             raise OSError(
                 f"no scheduler answers at {client!r} ({error}); start one by `dask scheduler`, "
