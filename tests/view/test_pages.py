@@ -7,6 +7,7 @@ import functools
 import gzip
 import json
 import re
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,15 @@ import numpy as np
 import pytest
 
 import harnack as hk
+from harnack.cli import main
 from harnack.geometry import shapes
 from harnack.geometry.mesh_shapes import torus_mesh
 from harnack.view.sliders import Subject
 from harnack.webgpu import NoDeviceError, find_device
 from harnack.webgpu.device import Program
 from harnack.webgpu.wgsl import Shader
+
+page_module = import_module("harnack.view.page")  # beside the function of that name
 
 
 def scene_of(path: Path) -> dict[str, Any]:
@@ -113,6 +117,24 @@ def test_the_places_of_sliders_are_in_the_page(tmp_path: Path) -> None:
     assert both.mean() > 0.4
     off = np.abs(found[1].view(np.float32)[both] - scale * expected.t[both])
     assert np.quantile(off, 0.9) < 1e-4
+
+
+def test_a_page_holds_fewer_places_where_they_are_large(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Each place of a parameter of a formula brings a kernel of its own."""
+    formula, path = "x^2 + a*y^2 + z^2 = 1", str(tmp_path / "a.html")
+    command = ["page", formula, "--ball", "0,0,0,2", "-o", path, "--quiet", "--slider"]
+    monkeypatch.setattr(page_module, "_USUAL_BYTES", 1e6)
+    monkeypatch.setattr(page_module, "_MANY_BYTES", 1e6)
+    assert main([*command, "a=1:2"]) == 0
+    assert len(scene_of(Path(path))["frames"]["frames"]) == 9
+    said = capsys.readouterr().out.splitlines()
+    assert "at 9 places of the sliders: give them larger steps, as in --slider" in said[0]
+    assert re.search(r"wrote .*a\.html \(\d\.\d MB\)", said[-1])
+    assert main([*command, "a=1:2:1"]) == 0
+    assert len(scene_of(Path(path))["frames"]["frames"]) == 2
+    assert "step" not in capsys.readouterr().out
 
 
 def test_a_kernel_that_is_not_the_first_one_brings_rays_to_check(tmp_path: Path) -> None:
