@@ -8,10 +8,13 @@ from typing import Any
 import drjit as dr
 import numpy as np
 import pytest
+import trimesh
 
 import harnack as hk
 from harnack.geometry import shapes
 from harnack.geometry.mesh_shapes import icosphere
+from harnack.meshing.checks import LocalError
+from harnack.rendering import studio_scene
 from harnack.view import scene
 from harnack.view.scene import Live, difference
 from harnack.view.session import Client, QuestionError, Session
@@ -155,6 +158,22 @@ def test_a_place_at_which_nothing_can_be_drawn_is_named() -> None:
         Session(live).answer({"kind": "change", "sliders": {"r": 0.4}})
     with pytest.raises(ValueError, match=r"at the place r=0\.38 .*reaches to infinity"):
         Live.of(torus, {"r": hk.Slider(0.2, 0.4, 0.38)})
+
+
+def test_a_thickness_that_fails_says_at_which_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: Any, thickness: float, **__: Any) -> Any:
+        if thickness > 0.2:
+            raise LocalError("sheets meet", np.zeros((1, 3)))
+        return trimesh.creation.icosphere(1)
+
+    monkeypatch.setattr(studio_scene, "mesh", fail)
+    live = Live.of(FIELD, {"level": 6.0, "thickness": hk.Slider(0.1, 0.3, 0.1)})
+    asked = {"kind": "change", "sliders": {"thickness": 0.3}}
+    wrong = r"at the place thickness=0\.3 .*thickness=0\.3: sheets meet; give another thickness"
+    with pytest.raises(ValueError, match=wrong):
+        Session(live).answer(asked)
+    with pytest.raises(ValueError, match=r"at the place t=0\.4 .*give another thickness"):
+        Live.of(FIELD, {"level": 6.0, "thickness": lambda t: t, "t": hk.Slider(0.1, 0.7)})
 
 
 def test_more_colors_than_are_drawn_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
