@@ -192,6 +192,22 @@ def test_what_is_no_page(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("given", "wrong"),
+    [
+        ({"port": True}, "port must be an integer"), ({"port": 1.5}, "port must be an integer"),
+        ({"port": 70_000}, "port must be an integer"), ({"height": True}, "height must be"),
+        ({"height": 3}, "height must be"), ({"title": 3}, "title must be text"),
+        ({"host": None}, "host must be an address"), ({"tolerance": True}, "tolerance"),
+        ({"boundary": np.nan}, "boundary"), ({"level": np.nan}, "level"),
+    ],
+)  # fmt: skip
+def test_what_is_no_view(given: dict[str, Any], wrong: str) -> None:
+    field: Any = hk.SolidAngle(shapes.torus_knot(2, 3, 12))
+    with pytest.raises((TypeError, ValueError), match=wrong):
+        hk.view(field, opens=False, waits=False, **given)
+
+
 def test_sliders() -> None:
     assert hk.Slider(0, 1).start == 0.5
     assert hk.Slider(1, 8, step=2).places(99) == [1, 3, 5, 7]
@@ -202,8 +218,9 @@ def test_sliders() -> None:
     for wrong in ((1, 1), (0, 1, 2), (0, 1, 0.5, 0), (0, 1, 0.5, 2)):
         with pytest.raises(ValueError, match=r"slider goes|step must|start must"):
             hk.Slider(*wrong)
-    with pytest.raises(TypeError, match="low"):
-        hk.Slider("0", 1)  # type: ignore[arg-type]
+    for low in ("0", False, np.False_, 10**400):
+        with pytest.raises(TypeError, match="low"):
+            hk.Slider(low, 1)  # type: ignore[arg-type]
     subject = Subject.of(lambda r: hk.Sphere(r), {"level": hk.Slider(0, 1), "r": hk.Slider(1, 2)})
     what, settings = subject.at({"level": 0.25, "r": 2.0})
     assert (what.radius, settings) == (2.0, {"level": 0.25})

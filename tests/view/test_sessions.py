@@ -26,6 +26,7 @@ EYE = {
     "origin": [0, -6, 0.3], "right": [1, 0, 0], "up": [0, 0, 1], "forward": [0, 1, 0],
     "pixel": 0.008,
 }  # fmt: skip
+POSE = {"position": [0, -5, 1], "target": [0, 0, 0], "fov": 30}
 
 
 @pytest.fixture(scope="module")
@@ -94,8 +95,7 @@ def test_material_and_tube_are_changed_and_saved() -> None:
     assert abs(float(tube.surface.field.value(LOOP[0]))) < 0.06
     (one,) = live.drawn(session.controls({"settings": {"boundary": None}}))
     assert one.material != surface.material
-    pose = {"position": [0, -5, 1], "target": [0, 0, 0], "fov": 30}
-    saved = session.answer({"kind": "save", "camera": pose, "settings": settings})
+    saved = session.answer({"kind": "save", "camera": POSE, "settings": settings})
     opened = session.answer({"kind": "load", "text": saved["text"]})
     assert (opened["material"], opened["tube"]) == ("copper", 0.05)
     assert len(opened["state"]["surfaces"]) == 2
@@ -259,11 +259,10 @@ def test_a_cut_leaves_what_clip_leaves(cut: dict[str, Any], live: Live) -> None:
 
 def test_what_is_saved_can_be_opened(live: Live) -> None:
     session = Session(live)
-    pose = {"position": [0, -5, 1], "target": [0, 0, 0], "fov": 30}
     moved = (LOOP + 0.1).tolist()
     asked = {
         "kind": "save",
-        "camera": pose,
+        "camera": POSE,
         "sliders": {"level": 4.0},
         "loops": [moved],
         "show": "depth",
@@ -287,7 +286,7 @@ def test_what_is_saved_can_be_opened(live: Live) -> None:
         is_ball = kind == "ball"
         assert (opened.surface.clip if is_ball else opened.surface.section) is not None
     solid = Session(Live.of(hk.Sphere(1.0), {"level": hk.Slider(0.0, 0.5, 0.25)}, edits=True))
-    saved = solid.answer({"kind": "save", "camera": pose, "cut": {"plane": [1, 0, 0, 0.1]}})
+    saved = solid.answer({"kind": "save", "camera": POSE, "cut": {"plane": [1, 0, 0, 0.1]}})
     solid.answer({"kind": "load", "text": saved["text"]})
     (opened,) = solid.live.drawn(solid.controls({"sliders": {"level": 0.5}}))
     assert opened.surface.solid == (-np.inf, 0.5)  # with a face, at the level of the slider
@@ -326,7 +325,12 @@ def test_what_is_saved_can_be_opened(live: Live) -> None:
         ({"kind": "draw", "size": [64, 48]}, "eye must be"),
         ({"kind": "draw", "size": [64, 48], "show": "x", "eye": EYE}, "show is one of"),
         ({"kind": "draw", "size": [64, 48], "eye": {**EYE, "pixel": 0}}, "pixel must be"),
+        ({"kind": "draw", "size": [True, True]}, "size must be"),
+        ({"kind": "draw", "size": [64, 48], "eye": {**EYE, "pixel": 10**400}}, "pixel must be"),
         ({"kind": "picture", "size": [64, 48]}, "camera must be"),
+        ({"kind": "picture", "size": [64, 48], "camera": {**POSE, "fov": -5}}, "camera: fov"),
+        ({"kind": "picture", "size": [64, 48], "camera": POSE, "spp": True}, "spp must be"),
+        ({"kind": "change", "loops": [[[10**400, 0, 0]] * 3]}, "three finite numbers"),
         ({"kind": "load"}, "text must be"),
     ],
 )
@@ -358,8 +362,7 @@ def test_texts_that_are_no_questions(live: Live) -> None:
 
 def test_a_picture_can_be_called_off(live: Live) -> None:
     client, said = Client(live), []
-    pose = {"position": [0, -5, 1], "target": [0, 0, 0], "fov": 30}
-    text = json.dumps({"id": 7, "kind": "picture", "camera": pose, "size": [64, 48]})
+    text = json.dumps({"id": 7, "kind": "picture", "camera": POSE, "size": [64, 48]})
     question = client.read(text)
     assert question is not None
     assert client.read('{"kind": "cancel", "which": 7}') is None

@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
+import numpy as np
+
 from harnack.fields import Field
 from harnack.names import did_you_mean
 from harnack.rendering.backdrops import Backdrop, Gradient, Ground, checked_backdrop
@@ -179,7 +181,7 @@ def check_size(size: Any) -> tuple[int, int]:
     """
     wrong = f"size must be (width, height) in pixels, such as (800, 600), not {size!r}"
     try:
-        width, height = (operator.index(side) for side in size)
+        width, height = (_index(side) for side in size)
     except (TypeError, ValueError):
         raise TypeError(wrong) from None
     if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
@@ -203,12 +205,19 @@ def check_integer(name: str, number: Any) -> int:
         ValueError: a max_depth too large for the path tracer's counters.
     """
     try:
-        integer = operator.index(number)
+        integer = _index(number)
     except TypeError:
         raise TypeError(f"{name} must be an integer, not {number!r}") from None
     if name == "max_depth" and integer > _MAX_INTEGER:
         raise ValueError(f"max_depth must be at most {_MAX_INTEGER}, or -1 for no limit")
     return integer
+
+
+def _index(number: Any) -> int:
+    """An integer; True and False are none."""
+    if isinstance(number, bool | np.bool_):
+        raise TypeError
+    return operator.index(number)
 
 
 def check_camera(camera: Any) -> Camera:

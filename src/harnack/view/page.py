@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Mapping
 from importlib import resources
 from string import Template
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from harnack.files.file_format import write_atomically
 from harnack.rendering.camera import Camera
@@ -24,7 +24,7 @@ from harnack.view.sliders import at_place
 if TYPE_CHECKING:
     from harnack.view.scene import Plain
 
-__all__ = ["MODULES", "document", "page", "resource", "script", "still_of"]
+__all__ = ["MODULES", "check_title", "document", "page", "resource", "script", "still_of"]
 
 _STILL = (640, 480)
 # Places of a slider without a step, at most; choices of places of several; and of all.
@@ -83,8 +83,7 @@ def page(
         TypeError: what is no field; an unknown setting; a slider that nothing depends on.
     """
     target = os.fspath(path)
-    if not isinstance(cast("Any", title), str):
-        raise TypeError(f"title must be text, not {title!r:.60}")
+    check_title(title)
     if not target.lower().endswith((".html", ".htm")):
         raise ValueError(f"{target}: a page is written as .html")
     live = Live.of(what, settings)
@@ -104,6 +103,12 @@ def page(
             "harnack.Slider(low, high, step=...)",
             stacklevel=2,
         )
+
+
+def check_title(title: Any) -> None:
+    """Raise TypeError for a title that is no text."""
+    if not isinstance(title, str):
+        raise TypeError(f"title must be text, not {title!r:.60}")
 
 
 def still_of(live: Live) -> str:
