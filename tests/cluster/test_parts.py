@@ -179,9 +179,8 @@ def everything_refused(tmp_path: Path) -> Iterator[tuple[dict[str, Any], str]]:
     yield {"client": "tcp://127.0.0.1:1"}, "no scheduler answers"
     yield {"checkpoint": tmp_path / "file"}, "is a file: name a folder"
     yield {"tiles": 3}, "with a client or a checkpoint"
-    yield {"tiles": 0, "checkpoint": tmp_path}, "at least 1"
-    yield {"tiles": True, "checkpoint": tmp_path}, "at least 1"
-    yield {"tiles": 2.5, "checkpoint": tmp_path}, "integer"
+    for wrong in (0, True, 2.5, "3", float("nan")):
+        yield {"tiles": wrong, "checkpoint": tmp_path}, "tiles must be an integer from 1"
 
 
 def test_wrong_settings_are_refused_by_name(

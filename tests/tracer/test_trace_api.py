@@ -288,7 +288,7 @@ NAN = [[math.nan, 0.0, 0.0]]
         (np.zeros((1, 3)), DOWN, {"tolerance": math.nan}, "distance must be finite and >= 0"),
         (np.zeros((1, 3)), DOWN, {"overstep": 0.9}, r"overstep must lie in \[1, 2\)"),
         (np.zeros((1, 3)), DOWN, {"overstep": 2.0}, r"overstep must lie in \[1, 2\)"),
-        (np.zeros((1, 3)), DOWN, {"max_steps": 0}, "max_steps must be at least 1"),
+        (np.zeros((1, 3)), DOWN, {"max_steps": 0}, "max_steps must be an integer from 1"),
     ],
 )  # fmt: skip
 def test_bad_rays_and_settings(

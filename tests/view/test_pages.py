@@ -7,6 +7,7 @@ import functools
 import gzip
 import json
 import re
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,15 @@ import numpy as np
 import pytest
 
 import harnack as hk
+from harnack.cli import main
 from harnack.geometry import shapes
 from harnack.geometry.mesh_shapes import torus_mesh
 from harnack.view.sliders import Subject
 from harnack.webgpu import NoDeviceError, find_device
 from harnack.webgpu.device import Program
 from harnack.webgpu.wgsl import Shader
+
+page_module = import_module("harnack.view.page")  # beside the function of that name
 
 
 def scene_of(path: Path) -> dict[str, Any]:
@@ -115,6 +119,24 @@ def test_the_places_of_sliders_are_in_the_page(tmp_path: Path) -> None:
     assert np.quantile(off, 0.9) < 1e-4
 
 
+def test_a_page_holds_fewer_places_where_they_are_large(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Each place of a parameter of a formula brings a kernel of its own."""
+    formula, path = "x^2 + a*y^2 + z^2 = 1", str(tmp_path / "a.html")
+    command = ["page", formula, "--ball", "0,0,0,2", "-o", path, "--quiet", "--slider"]
+    monkeypatch.setattr(page_module, "_USUAL_BYTES", 1e6)
+    monkeypatch.setattr(page_module, "_MANY_BYTES", 1e6)
+    assert main([*command, "a=1:2"]) == 0
+    assert len(scene_of(Path(path))["frames"]["frames"]) == 9
+    said = capsys.readouterr().out.splitlines()
+    assert "at 9 places of the sliders: give them larger steps, as in --slider" in said[0]
+    assert re.search(r"wrote .*a\.html \(\d\.\d MB\)", said[-1])
+    assert main([*command, "a=1:2:1"]) == 0
+    assert len(scene_of(Path(path))["frames"]["frames"]) == 2
+    assert "step" not in capsys.readouterr().out
+
+
 def test_a_kernel_that_is_not_the_first_one_brings_rays_to_check(tmp_path: Path) -> None:
     path = tmp_path / "a.html"
 
@@ -170,6 +192,22 @@ def test_what_is_no_page(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("given", "wrong"),
+    [
+        ({"port": True}, "port must be an integer"), ({"port": 1.5}, "port must be an integer"),
+        ({"port": 70_000}, "port must be an integer"), ({"height": True}, "height must be"),
+        ({"height": 3}, "height must be"), ({"title": 3}, "title must be text"),
+        ({"host": None}, "host must be an address"), ({"tolerance": True}, "tolerance"),
+        ({"boundary": np.nan}, "boundary"), ({"level": np.nan}, "level"),
+    ],
+)  # fmt: skip
+def test_what_is_no_view(given: dict[str, Any], wrong: str) -> None:
+    field: Any = hk.SolidAngle(shapes.torus_knot(2, 3, 12))
+    with pytest.raises((TypeError, ValueError), match=wrong):
+        hk.view(field, opens=False, waits=False, **given)
+
+
 def test_sliders() -> None:
     assert hk.Slider(0, 1).start == 0.5
     assert hk.Slider(1, 8, step=2).places(99) == [1, 3, 5, 7]
@@ -180,8 +218,9 @@ def test_sliders() -> None:
     for wrong in ((1, 1), (0, 1, 2), (0, 1, 0.5, 0), (0, 1, 0.5, 2)):
         with pytest.raises(ValueError, match=r"slider goes|step must|start must"):
             hk.Slider(*wrong)
-    with pytest.raises(TypeError, match="low"):
-        hk.Slider("0", 1)  # type: ignore[arg-type]
+    for low in ("0", False, np.False_, 10**400):
+        with pytest.raises(TypeError, match="low"):
+            hk.Slider(low, 1)  # type: ignore[arg-type]
     subject = Subject.of(lambda r: hk.Sphere(r), {"level": hk.Slider(0, 1), "r": hk.Slider(1, 2)})
     what, settings = subject.at({"level": 0.25, "r": 2.0})
     assert (what.radius, settings) == (2.0, {"level": 0.25})

@@ -8,10 +8,13 @@ from typing import Any
 import drjit as dr
 import numpy as np
 import pytest
+import trimesh
 
 import harnack as hk
 from harnack.geometry import shapes
 from harnack.geometry.mesh_shapes import icosphere
+from harnack.meshing.checks import LocalError
+from harnack.rendering import studio_scene
 from harnack.view import scene
 from harnack.view.scene import Live, difference
 from harnack.view.session import Client, QuestionError, Session
@@ -23,6 +26,7 @@ EYE = {
     "origin": [0, -6, 0.3], "right": [1, 0, 0], "up": [0, 0, 1], "forward": [0, 1, 0],
     "pixel": 0.008,
 }  # fmt: skip
+POSE = {"position": [0, -5, 1], "target": [0, 0, 0], "fov": 30}
 
 
 @pytest.fixture(scope="module")
@@ -91,8 +95,7 @@ def test_material_and_tube_are_changed_and_saved() -> None:
     assert abs(float(tube.surface.field.value(LOOP[0]))) < 0.06
     (one,) = live.drawn(session.controls({"settings": {"boundary": None}}))
     assert one.material != surface.material
-    pose = {"position": [0, -5, 1], "target": [0, 0, 0], "fov": 30}
-    saved = session.answer({"kind": "save", "camera": pose, "settings": settings})
+    saved = session.answer({"kind": "save", "camera": POSE, "settings": settings})
     opened = session.answer({"kind": "load", "text": saved["text"]})
     assert (opened["material"], opened["tube"]) == ("copper", 0.05)
     assert len(opened["state"]["surfaces"]) == 2
@@ -155,6 +158,22 @@ def test_a_place_at_which_nothing_can_be_drawn_is_named() -> None:
         Session(live).answer({"kind": "change", "sliders": {"r": 0.4}})
     with pytest.raises(ValueError, match=r"at the place r=0\.38 .*reaches to infinity"):
         Live.of(torus, {"r": hk.Slider(0.2, 0.4, 0.38)})
+
+
+def test_a_thickness_that_fails_says_at_which_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: Any, thickness: float, **__: Any) -> Any:
+        if thickness > 0.2:
+            raise LocalError("sheets meet", np.zeros((1, 3)))
+        return trimesh.creation.icosphere(1)
+
+    monkeypatch.setattr(studio_scene, "mesh", fail)
+    live = Live.of(FIELD, {"level": 6.0, "thickness": hk.Slider(0.1, 0.3, 0.1)})
+    asked = {"kind": "change", "sliders": {"thickness": 0.3}}
+    wrong = r"at the place thickness=0\.3 .*thickness=0\.3: sheets meet; give another thickness"
+    with pytest.raises(ValueError, match=wrong):
+        Session(live).answer(asked)
+    with pytest.raises(ValueError, match=r"at the place t=0\.4 .*give another thickness"):
+        Live.of(FIELD, {"level": 6.0, "thickness": lambda t: t, "t": hk.Slider(0.1, 0.7)})
 
 
 def test_more_colors_than_are_drawn_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -240,11 +259,10 @@ def test_a_cut_leaves_what_clip_leaves(cut: dict[str, Any], live: Live) -> None:
 
 def test_what_is_saved_can_be_opened(live: Live) -> None:
     session = Session(live)
-    pose = {"position": [0, -5, 1], "target": [0, 0, 0], "fov": 30}
     moved = (LOOP + 0.1).tolist()
     asked = {
         "kind": "save",
-        "camera": pose,
+        "camera": POSE,
         "sliders": {"level": 4.0},
         "loops": [moved],
         "show": "depth",
@@ -268,7 +286,7 @@ def test_what_is_saved_can_be_opened(live: Live) -> None:
         is_ball = kind == "ball"
         assert (opened.surface.clip if is_ball else opened.surface.section) is not None
     solid = Session(Live.of(hk.Sphere(1.0), {"level": hk.Slider(0.0, 0.5, 0.25)}, edits=True))
-    saved = solid.answer({"kind": "save", "camera": pose, "cut": {"plane": [1, 0, 0, 0.1]}})
+    saved = solid.answer({"kind": "save", "camera": POSE, "cut": {"plane": [1, 0, 0, 0.1]}})
     solid.answer({"kind": "load", "text": saved["text"]})
     (opened,) = solid.live.drawn(solid.controls({"sliders": {"level": 0.5}}))
     assert opened.surface.solid == (-np.inf, 0.5)  # with a face, at the level of the slider
@@ -307,7 +325,12 @@ def test_what_is_saved_can_be_opened(live: Live) -> None:
         ({"kind": "draw", "size": [64, 48]}, "eye must be"),
         ({"kind": "draw", "size": [64, 48], "show": "x", "eye": EYE}, "show is one of"),
         ({"kind": "draw", "size": [64, 48], "eye": {**EYE, "pixel": 0}}, "pixel must be"),
+        ({"kind": "draw", "size": [True, True]}, "size must be"),
+        ({"kind": "draw", "size": [64, 48], "eye": {**EYE, "pixel": 10**400}}, "pixel must be"),
         ({"kind": "picture", "size": [64, 48]}, "camera must be"),
+        ({"kind": "picture", "size": [64, 48], "camera": {**POSE, "fov": -5}}, "camera: fov"),
+        ({"kind": "picture", "size": [64, 48], "camera": POSE, "spp": True}, "spp must be"),
+        ({"kind": "change", "loops": [[[10**400, 0, 0]] * 3]}, "three finite numbers"),
         ({"kind": "load"}, "text must be"),
     ],
 )
@@ -339,8 +362,7 @@ def test_texts_that_are_no_questions(live: Live) -> None:
 
 def test_a_picture_can_be_called_off(live: Live) -> None:
     client, said = Client(live), []
-    pose = {"position": [0, -5, 1], "target": [0, 0, 0], "fov": 30}
-    text = json.dumps({"id": 7, "kind": "picture", "camera": pose, "size": [64, 48]})
+    text = json.dumps({"id": 7, "kind": "picture", "camera": POSE, "size": [64, 48]})
     question = client.read(text)
     assert question is not None
     assert client.read('{"kind": "cancel", "which": 7}') is None

@@ -42,7 +42,7 @@ def test_attributes_are_what_is_drawn_and_refuse_nonsense(widget: Any) -> None:
     assert [one["name"] for one in heard] == ["sliders", "points"]
     for name, wrong in {
         "sliders": {"levle": 3}, "points": [[[0, 0]]], "camera": {"position": (0, 0, 1)},
-        "show": "colour",
+        "show": "colour", "height": True,
     }.items():  # fmt: skip
         with pytest.raises(traitlets.TraitError):
             setattr(widget, name, wrong)

@@ -235,8 +235,8 @@ def real(value: Any, name: str) -> float:
         TypeError: it is none.
     """
     try:
-        return float("none" if isinstance(value, str | bytes | bool) else value)
-    except (TypeError, ValueError):
+        return float("none" if isinstance(value, str | bytes | bool | np.bool_) else value)
+    except (TypeError, ValueError, OverflowError):
         raise TypeError(f"{name} must be a number, not {value!r}") from None
 
 
@@ -271,7 +271,7 @@ def whole(value: Any, name: str, least: int, most: int) -> int:
         ValueError: it is none.
     """
     try:
-        number = operator.index(value)
+        number = least - 1 if isinstance(value, bool | np.bool_) else operator.index(value)
     except TypeError:
         number = least - 1
     if not least <= number <= most:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -90,8 +91,12 @@ def _page(options: Any) -> int:
         raise ValueError("-o is empty: name the page to write, such as a.html")
     target = options.output or f"{source.stem or 'surface'}.html"
     what, settings, _ = _live(options, source)
-    page(what, target, **settings)
-    _say(f"wrote {target}")
+    with warnings.catch_warnings(record=True) as noted:
+        warnings.simplefilter("always", UserWarning)
+        page(what, target, **settings)
+    for one in noted:
+        _say(f"note: {in_options(str(one.message))}")
+    _say(f"wrote {target} ({Path(target).stat().st_size / 1e6:.1f} MB)")
     return 0
 
 

@@ -73,6 +73,7 @@ _PHRASES = {
     "section=harnack.HalfSpace(normal, offset)": "--section X,Y,Z,OFFSET",
     "target=(x, y, z)": "--target X,Y,Z",
     "boundary=0.03": "--boundary-tube 0.03",
+    "harnack.Slider(low, high, step=...)": "--slider NAME=LOW:HIGH:STEP",
     "solid=True": "--solid",
     "solid=(-math.inf, level)": "--solid :LEVEL",
     "solid=(-math.inf, 0.0)": "--solid :0",

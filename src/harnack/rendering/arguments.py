@@ -10,6 +10,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
+import numpy as np
+
+from harnack.backend.numbers import whole
 from harnack.fields import Field
 from harnack.names import did_you_mean
 from harnack.rendering.backdrops import Backdrop, Gradient, Ground, checked_backdrop
@@ -25,6 +28,7 @@ LINED = ("color", "shaded", "value")
 ANTIALIASING = ("edges", "cones")
 MAX_SIDE = 16384
 MAX_SPP = 1_000_000
+_MOST_TILES = 1_000_000
 # The largest number that the path tracer's counters hold.
 _MAX_INTEGER = 2**31 - 1
 # Names of settings in other programs, and what they are called here.
@@ -179,7 +183,7 @@ def check_size(size: Any) -> tuple[int, int]:
     """
     wrong = f"size must be (width, height) in pixels, such as (800, 600), not {size!r}"
     try:
-        width, height = (operator.index(side) for side in size)
+        width, height = (_index(side) for side in size)
     except (TypeError, ValueError):
         raise TypeError(wrong) from None
     if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
@@ -203,7 +207,7 @@ def check_integer(name: str, number: Any) -> int:
         ValueError: a max_depth too large for the path tracer's counters.
     """
     try:
-        integer = operator.index(number)
+        integer = _index(number)
     except TypeError:
         raise TypeError(f"{name} must be an integer, not {number!r}") from None
     if name == "max_depth" and integer > _MAX_INTEGER:
@@ -213,14 +217,16 @@ def check_integer(name: str, number: Any) -> int:
 
 def check_tiles(tiles: Any, *, divided: bool) -> int | None:
     """How many parts a task is cut into, or None; divided: whether it is cut at all."""
-    if tiles is None:
-        return None
-    count = check_integer("tiles", tiles)
-    if isinstance(tiles, bool) or count < 1:
-        raise ValueError(f"tiles must be a number of parts, at least 1, not {tiles!r}")
-    if not divided:
+    if tiles is not None and not divided:
         raise ValueError("tiles: parts are drawn one by one with a client or a checkpoint only")
-    return count
+    return None if tiles is None else whole(tiles, "tiles", 1, _MOST_TILES)
+
+
+def _index(number: Any) -> int:
+    """An integer; True and False are none."""
+    if isinstance(number, bool | np.bool_):
+        raise TypeError
+    return operator.index(number)
 
 
 def check_camera(camera: Any) -> Camera:

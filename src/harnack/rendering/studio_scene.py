@@ -14,7 +14,9 @@ from harnack.fields import Field, Solid
 from harnack.fields.field import instead_of_field
 from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.fields.solids.tube import Tube
+from harnack.geometry.meshes import MeshError, without_zero_area_faces
 from harnack.meshing import mesh
+from harnack.meshing.checks import MeshingError
 from harnack.rendering.arguments import check_settings
 from harnack.rendering.isolines import Isolines
 from harnack.rendering.scales import Color
@@ -112,11 +114,19 @@ def _thick(surface: LevelSet, thickness: float) -> LevelSet:
         raise ValueError("thickness needs a surface of one level; a solid has an inside already")
     if surface.largest:
         raise ValueError("thickness and largest: mesh the surface by hk.mesh(..., largest=True)")
-    made = mesh(
-        surface.field, surface.numbers[0], clip=surface.clip, section=surface.section,
-        thickness=thickness,
-    )  # fmt: skip
-    field = WindingNumber(made.vertices, made.faces)
+    try:
+        made = mesh(
+            surface.field, surface.numbers[0], clip=surface.clip, section=surface.section,
+            thickness=thickness,
+        )  # fmt: skip
+        # Slivers whose area is lost in rounding say nothing of the inside.
+        field = WindingNumber(*without_zero_area_faces(made.vertices, made.faces))
+    except (MeshError, MeshingError) as wrong:
+        raise ValueError(
+            f"no closed mesh could be made of this surface with thickness={thickness!r}: {wrong}; "
+            "give another thickness (a smaller one where sheets meet), or mesh it by "
+            "hk.mesh(..., thickness=..., spacing=...) and draw hk.WindingNumber of that"
+        ) from wrong
     return level_set(field, tolerance=surface.tolerance, max_steps=surface.max_steps)
 
 

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import drjit as dr
+import numpy as np
 
 from harnack.backend import backend_of, to_float
 from harnack.backend.arrays import as_data
-from harnack.backend.numbers import refuse_derivatives
+from harnack.backend.numbers import refuse_derivatives, whole
 from harnack.backend.tensors import is_tensor, numbers_of
 from harnack.enclosures import Choice, Proofs, TargetLevels, choose_proofs
 from harnack.fields.field import check_is_field
@@ -82,8 +82,9 @@ class LevelSet:
         object.__setattr__(self, "largest", checked_largest(self.largest))
         for name in ("clip", "section"):
             check_volume(getattr(self, name), name)
-        if operator.index(self.max_steps) < 1:
-            raise ValueError(f"max_steps must be at least 1, not {self.max_steps}")
+        object.__setattr__(self, "max_steps", whole(self.max_steps, "max_steps", 1, 2**31 - 1))
+        if not isinstance(cast("Any", self.confirm), bool | np.bool_):
+            raise TypeError(f"confirm must be True or False, not {self.confirm!r:.60}")
         overstep = _as_number(self.overstep, "overstep must be a number in [1, 2)")
         if not 1 <= overstep < 2:
             raise ValueError(f"overstep must lie in [1, 2), not {self.overstep}")
@@ -297,7 +298,7 @@ def _ends(solid: Any) -> tuple[float, float]:
 def _as_number(number: Any, wrong: str) -> float:
     refuse_derivatives("a level or setting that is no Dr.Jit number", number)
     try:
-        return float("nothing" if isinstance(number, str) else number)
+        return float("nothing" if isinstance(number, str | bool | np.bool_) else number)
     except (TypeError, ValueError):
         raise TypeError(f"{wrong}, not {number!r}") from None
 

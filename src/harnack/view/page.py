@@ -9,10 +9,11 @@ import json
 import math
 import os
 import re
+import warnings
 from collections.abc import Mapping
 from importlib import resources
 from string import Template
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from harnack.files.file_format import write_atomically
 from harnack.progress import progress_bar
@@ -22,13 +23,17 @@ from harnack.view.sliders import at_place
 
 if TYPE_CHECKING:
     from harnack.view.scene import Plain
-    from harnack.view.sliders import Slider
 
-__all__ = ["MODULES", "document", "page", "resource", "script", "still_of"]
+__all__ = ["MODULES", "check_title", "document", "page", "resource", "script", "still_of"]
 
 _STILL = (640, 480)
 # Places of a slider without a step, at most; choices of places of several; and of all.
 _PLACES, _CHOICES, _MOST_CHOICES = 33, 300, 1000
+# Choices up to which all are framed; of more, every other place of each slider, and its ends.
+_FRAMED = 100
+# Bytes that all frames together have at most, where sliders have no step, and the fewest places of
+# one slider and of each of several; bytes of a page that are many.
+_USUAL_BYTES, _FEWEST, _MANY_BYTES = 4e6, (9, 5), 8e6
 MODULES = (
     "camera.js", "drawing.js", "elements.js", "frames.js", "legend.js", "link.js", "panel.js",
 )  # fmt: skip
@@ -67,7 +72,8 @@ def page(
         boundary, ..., and backdrop="light" or "dark". A `Slider` may stand in the place of a
         number, and functions of sliders, by the names of their arguments, in the place of anything.
         What is drawn at each place of a slider is in the file: of one without a step 33, of
-        two 17 each.
+        two 17 each, and fewer where they would take more than 4 MB (9, of several 5 each, at
+        least). A page with sliders of more than 8 MB is written with a warning.
 
     Raises:
         ValueError: a path that does not end in .html; a surface without bounds; a transparent
@@ -77,19 +83,32 @@ def page(
         TypeError: what is no field; an unknown setting; a slider that nothing depends on.
     """
     target = os.fspath(path)
-    if not isinstance(cast("Any", title), str):
-        raise TypeError(f"title must be text, not {title!r:.60}")
+    check_title(title)
     if not target.lower().endswith((".html", ".htm")):
         raise ValueError(f"{target}: a page is written as .html")
     live = Live.of(what, settings)
-    places = _places(live.subject.sliders)
     with progress_bar("page", progress) as advance:
-        live = live.framed(_choices(places))
+        places = _places(live)
+        live = live.framed(_choices(_framed(places)))
         scene = live.scene(title or live.subject.name)
         scene["frames"] = _frames(live, places, advance)
-    text = document(scene, still_of(live))
+    text = document(scene, still_of(live)).encode()
     with write_atomically(target) as partial:
-        partial.write_text(text, encoding="utf-8")
+        partial.write_bytes(text)
+    if len(text) > _MANY_BYTES and live.subject.sliders:
+        count = len(scene["frames"]["frames"])
+        warnings.warn(
+            f"{target} has {len(text) / 1e6:.1f} MB, because it holds what is drawn at {count:,} "
+            "places of the sliders: give them larger steps, as in "
+            "harnack.Slider(low, high, step=...)",
+            stacklevel=2,
+        )
+
+
+def check_title(title: Any) -> None:
+    """Raise TypeError for a title that is no text."""
+    if not isinstance(title, str):
+        raise TypeError(f"title must be text, not {title!r:.60}")
 
 
 def still_of(live: Live) -> str:
@@ -99,12 +118,14 @@ def still_of(live: Live) -> str:
     return base64.b64encode(still._repr_png_()).decode()
 
 
-def _places(sliders: Mapping[str, Slider]) -> dict[str, list[float]]:
-    """The places of the sliders that a page holds.
+def _places(live: Live) -> dict[str, list[float]]:
+    """The places of the sliders that a page holds: those of their steps, and of sliders without a
+    step as many as make no large file, where what is drawn changes much from place to place.
 
     Raises:
         ValueError: there are too many choices of them.
     """
+    sliders = live.subject.sliders
     several = max(2, min(_PLACES, int(_CHOICES ** (1 / max(1, len(sliders))))))
     places = {name: one.places(several) for name, one in sliders.items()}
     total = math.prod(map(len, places.values()))
@@ -114,7 +135,22 @@ def _places(sliders: Mapping[str, Slider]) -> dict[str, list[float]]:
             f"without Python behind it has to hold, and {_MOST_CHOICES:,} at most: give larger "
             "steps or fewer sliders, or use harnack.view"
         )
+    if all(one.step is not None for one in sliders.values()):
+        return places
+    ends = ({name: one[k] for name, one in places.items()} for k in (0, -1))
+    largest = max(len(json.dumps(_frame(live, place))) for place in ends)
+    fewest = min(several, _FEWEST[len(sliders) > 1])
+    while several > fewest and largest * math.prod(map(len, places.values())) > _USUAL_BYTES:
+        several = max(fewest, (several + 1) // 2)
+        places = {name: one.places(several) for name, one in sliders.items()}
     return places
+
+
+def _framed(places: Mapping[str, list[float]]) -> Mapping[str, list[float]]:
+    """The places that are framed: all, or of many every other one and the last."""
+    if math.prod(map(len, places.values())) <= _FRAMED:
+        return places
+    return {name: sorted({*one[::2], one[-1]}) for name, one in places.items()}
 
 
 def _choices(places: Mapping[str, list[float]]) -> list[dict[str, float]]:
@@ -122,14 +158,19 @@ def _choices(places: Mapping[str, list[float]]) -> list[dict[str, float]]:
     return [dict(zip(places, one, strict=True)) for one in itertools.product(*places.values())]
 
 
+def _frame(live: Live, values: Mapping[str, float]) -> Plain:
+    """What a place of the sliders changes of the first state."""
+    with at_place(values):
+        state = live.state(Controls(values))
+    return packed(difference(live.first, state, checks=False))
+
+
 def _frames(live: Live, places: Mapping[str, list[float]], advance: Any) -> Plain:
     """The places of the sliders, and what is drawn at each choice of them."""
     frames: list[Plain] = []
     choices = _choices(places)
     for values in choices:
-        with at_place(values):
-            state = live.state(Controls(values))
-        frames.append(packed(difference(live.first, state, checks=False)))
+        frames.append(_frame(live, values))
         advance(1 / len(choices))
     return {"places": places, "frames": frames}
 

@@ -177,7 +177,7 @@ export class Panel {
     const color = element("input", { type: "color", name: "color", value: "#4682b4", hidden: true, oninput: set });
     color.setAttribute("aria-label", "Color");
     const rows = [element("label", {}, "Material ", chosen, " ", color)];
-    if (!state.curves.length) return rows;
+    if (!state.curves.length || "boundary" in this.values) return rows;
     const shown = element("output", {}, tube === null ? "none" : format(tube));
     const radius = element("input", {
       type: "range", min: "0", max: String(Math.max(0.1 * reach, tube ?? 0)), step: "any",

@@ -342,7 +342,9 @@ class Live:
             several = [cut_by(one.surface, controls.cut) for one in made]
         lost: list[str] = []
         for name, one in self.subject.sliders.items():
-            if self.subject.settings.get(name) is one:  # in the place of what surfaces have
+            if (
+                self.subject.settings.get(name) is one and name not in controls.settings
+            ):  # in the place of what surfaces have
                 settings[name] = replace(one, start=controls.values[name])
             else:
                 lost.append(name)

@@ -50,7 +50,7 @@ from harnack.rendering.arguments import OF_STUDIO, SETTINGS, Request
 from harnack.rendering.stage import material_of
 from harnack.rendering.studio_scene import with_settings
 from harnack.tracer import LevelSet, Tolerance, level_set
-from harnack.view.sliders import Slider
+from harnack.view.sliders import NUMBERS, Slider
 
 __all__ = [
     "Origins",
@@ -71,6 +71,7 @@ SURFACE_SETTINGS = (
     "largest",
 )  # fmt: skip
 """Names of the settings that `level_set` takes."""
+_SLIDING = (*SURFACE_SETTINGS, *NUMBERS)
 _UNWRITTEN = ("of", "value_range", "colorbar", "progress")
 _OF_PICTURE = tuple(name for name in SETTINGS if name not in _UNWRITTEN)
 _KNOWN = (*SURFACE_SETTINGS, *_OF_PICTURE)
@@ -193,7 +194,7 @@ def text_of(what: Any, settings: Mapping[str, Any], origins: Origins = ()) -> st
     made: Plain = {"harnack": VERSION, "surfaces": [_surface_text(one, origins) for one in several]}
     sliders = {name: one for name, one in settings.items() if isinstance(one, Slider)}
     for name in sliders:
-        if name not in SURFACE_SETTINGS:
+        if name not in _SLIDING:
             raise SceneFileError(f"a slider of {name} cannot be written: only settings of surfaces")
     written = {
         name: _setting_text(name, one, origins)
@@ -390,7 +391,7 @@ def _scene_of(given: Any, find: Callable[[str], Path] | None) -> SavedScene:
     sliders = _object(whole.get("sliders", {}), "sliders")
     made: dict[str, Slider] = {}
     for name, one in sliders.items():
-        _check_name(name, SURFACE_SETTINGS, "slider")
+        _check_name(name, _SLIDING, "slider")
         made[name] = _called(Slider, one, f"sliders: {name}")
         settings[name] = made[name].start
     scene = SavedScene(surfaces, settings, made, tuple(origins))

@@ -11,10 +11,10 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from harnack.backend.numbers import whole
-from harnack.view.page import document, still_of
+from harnack.view.page import check_title, document, still_of
 from harnack.view.scene import Live
 from harnack.view.scene_file import Origins
 from harnack.view.session import Client, QuestionError
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from harnack.view.scene import Plain
     from harnack.view.widget import Widget
 
-__all__ = ["View", "view"]
+__all__ = ["View", "check_height", "view"]
 
 _LOCAL = ("127.0.0.1", "::1", "localhost")
 # The longest message in bytes, and the most questions of a client that may wait.
@@ -115,7 +115,10 @@ def view(
     OSError for an address that cannot be served at.
     """
     port = whole(port, "port", least=0, most=65535)
-    height = whole(height, "height", least=16, most=10_000)
+    height = check_height(height)
+    check_title(title)
+    if not isinstance(cast("Any", host), str):
+        raise TypeError(f'host must be an address, such as "127.0.0.1", not {host!r:.60}')
     live = Live.of(what, settings, edits=True, origins=origins)
     live = live.framed(ends_of(live.subject.sliders))
     title = title or live.subject.name
@@ -143,6 +146,15 @@ def view(
     if waits:
         made.wait()
     return made
+
+
+def check_height(height: Any) -> int:
+    """The height of a widget in pixels.
+
+    Raises:
+        ValueError: it is none.
+    """
+    return whole(height, "height", least=16, most=10_000)
 
 
 def in_notebook() -> bool:

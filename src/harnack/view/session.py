@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import base64
 import json
-import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from harnack.backend.numbers import finite
 from harnack.distance import curvature
 from harnack.geometry import Ball, Box, HalfSpace
 from harnack.names import did_you_mean
@@ -337,6 +337,10 @@ def pose_of(given: Any) -> tuple[FloatArray, FloatArray, float]:
     fov: Any = pose.get("fov")
     if not _is_number(fov):
         raise QuestionError("camera: fov must be a number of degrees")
+    try:
+        Camera(position=tuple(eye.tolist()), target=tuple(target.tolist()), fov=fov)
+    except ValueError as wrong:
+        raise QuestionError(f"camera: {wrong}") from None
     return eye, target, fov
 
 
@@ -391,7 +395,7 @@ def _points(given: Any, name: str) -> FloatArray:
     wrong = f"{name}: points are three finite numbers each"
     try:
         points: FloatArray = np.array(given, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise QuestionError(wrong) from None
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
         raise QuestionError(wrong)
@@ -399,5 +403,8 @@ def _points(given: Any, name: str) -> FloatArray:
 
 
 def _is_number(value: Any) -> bool:
-    is_real = isinstance(value, int | float) and not isinstance(value, bool)
-    return is_real and math.isfinite(value)
+    try:
+        finite(value, "it")
+    except (TypeError, ValueError):
+        return False
+    return isinstance(value, int | float)

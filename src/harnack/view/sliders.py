@@ -15,8 +15,10 @@ from harnack.fields import Field
 from harnack.names import did_you_mean
 from harnack.tracer import LevelSet, level_set
 
-__all__ = ["PlaceError", "Slider", "Subject", "at_place", "ends_of"]
+__all__ = ["NUMBERS", "PlaceError", "Slider", "Subject", "at_place", "ends_of"]
 
+NUMBERS = ("boundary", "thickness")
+"""Settings of `render` that are numbers of surfaces, besides those of `level_set`."""
 # Sliders of which all combinations of ends are few.
 _COMBINED = 3
 
@@ -91,7 +93,7 @@ class Subject:
             TypeError: a function of what is no slider, or a slider that nothing depends on.
         """
         sliders = {name: one for name, one in given.items() if isinstance(one, Slider)}
-        known = inspect.signature(level_set).parameters
+        known = (*inspect.signature(level_set).parameters, *NUMBERS)
         settings = {name: one for name, one in given.items() if name not in sliders}
         settings |= {name: sliders[name] for name in sliders if name in known}
         asked: set[str] = set(settings) & set(sliders)
@@ -109,7 +111,7 @@ class Subject:
         for name in sliders:
             if name not in asked:
                 raise TypeError(
-                    f"nothing depends on the slider {name!r}: it is no setting of surfaces, and no "
+                    f"nothing depends on the slider {name!r}: it is no number of surfaces, and no "
                     f"function has an argument of that name{did_you_mean(name, known)}"
                 )
         return cls(what, settings, sliders)

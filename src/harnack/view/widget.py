@@ -11,6 +11,7 @@ import traitlets
 
 from harnack.view.page import MODULES, resource, script, still_of
 from harnack.view.scene import SHOWS
+from harnack.view.server import check_height
 from harnack.view.session import Client, QuestionError, pose_of
 
 if TYPE_CHECKING:
@@ -84,6 +85,13 @@ class Widget(anywidget.AnyWidget):
     def _say(self, answer: Plain) -> None:
         self.send(answer)
 
+    @traitlets.validate("height")
+    def _checked_height(self, proposal: Any) -> int:
+        try:
+            return check_height(proposal["value"])
+        except ValueError as wrong:
+            raise traitlets.TraitError(str(wrong)) from None
+
     @traitlets.validate("sliders", "points", "camera")
     def _checked(self, proposal: Any) -> Any:
         name, value = proposal["trait"].name, proposal["value"]
@@ -96,7 +104,7 @@ class Widget(anywidget.AnyWidget):
                 value = dict(session.controls({"sliders": {**self.sliders, **value}}).values)
             elif session.live.editable:
                 session.controls({"loops": value})
-        except (QuestionError, TypeError, ValueError) as wrong:
+        except (QuestionError, TypeError, ValueError, OverflowError) as wrong:
             raise traitlets.TraitError(f"{name}: {wrong}") from None
         return value
 
