@@ -72,6 +72,11 @@ def test_functions_of_formulas_are_sent_by_name() -> None:
         assert pickle.loads(pickle.dumps(one)) is one
 
 
+def test_functions_that_name_modules_are_sent() -> None:
+    there = Packed.of(lambda r: hk.Sphere(r).value(np.zeros((1, 3))), "test").open()
+    assert there(2.0) == -2
+
+
 def test_what_cannot_be_sent_is_refused_by_name() -> None:
     with pytest.raises(TypeError, match=r"^client: it cannot be sent.*generator"):
         Packed.of((k for k in range(3)), "client")

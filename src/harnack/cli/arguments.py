@@ -99,6 +99,7 @@ def _add_render(commands: Any) -> None:
     )  # fmt: skip
     one.add_argument("-o", "--output", metavar="FILE", help="picture, .png or .exr (SCENE.png)")
     _add_drawn(one, "meshes and clouds, else color")
+    _add_cluster(one, tiles=True)
     _add_choice(
         one, "--antialias", ANTIALIASING,
         "which pixels of a shaded picture get all samples: edges in the picture, or also what "
@@ -121,6 +122,7 @@ def _add_turntable(commands: Any) -> None:
         "--turn", type=_angle, metavar="DEG", default=360.0, help="how far it goes around (360)"
     )
     _add_drawn(one, "all")
+    _add_cluster(one)
 
 
 def _add_live(commands: Any) -> None:
@@ -131,6 +133,7 @@ def _add_live(commands: Any) -> None:
     )  # fmt: skip
     page.add_argument("-o", "--output", metavar="FILE", help="the page, .html (SCENE.html)")
     page.add_argument("--quiet", action="store_true", help="no progress bar")
+    _add_cluster(page)
     view = commands.add_parser(
         "view", help="a surface live in the browser: turned, its curve dragged, its level moved",
         description="Serve a page to the browser of this machine, until Ctrl-C. Python prepares "
@@ -416,6 +419,24 @@ def _add_quality(parser: argparse.ArgumentParser) -> None:
         "--seed", type=_seed, metavar="N", default=0, help="another seed, other noise (0)"
     )
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def _add_cluster(one: Any, *, tiles: bool = False) -> None:
+    group = one.add_argument_group("other machines, and going on after a stop")
+    group.add_argument(
+        "--scheduler", metavar="ADDRESS", dest="client",
+        help="have the workers of a Dask cluster do the work, such as tcp://10.0.0.1:8786 "
+        "(needs pip install 'harnack[cluster]')",
+    )  # fmt: skip
+    group.add_argument(
+        "--checkpoint", metavar="FOLDER",
+        help="keep finished parts in this folder, and do not do again those that are there",
+    )  # fmt: skip
+    if tiles:
+        group.add_argument(
+            "--tiles", type=_samples, metavar="N",
+            help="cut the picture into so many parts (as suits the workers)",
+        )  # fmt: skip
 
 
 def _add_choice(parser: Any, option: str, names: Iterable[str], help: str, **settings: Any) -> None:

@@ -50,6 +50,12 @@ def _of_picture(options: Any) -> dict[str, Any]:
     return {**{name: asked[name] for name in given}, "progress": not options.quiet}
 
 
+def _divided(options: Any) -> dict[str, Any]:
+    """Who does the work, and where its parts are kept, as far as it was asked for."""
+    asked = {name: getattr(options, name, None) for name in ("client", "checkpoint", "tiles")}
+    return {name: value for name, value in asked.items() if value is not None}
+
+
 def _render(options: Any) -> int:
     source = _source(options)
     if options.output == "":
@@ -59,7 +65,7 @@ def _render(options: Any) -> int:
         what, settings = _mitsuba_scene(options)
     else:
         what, settings, _ = _drawn(options, source)
-    render(what, target, **settings)
+    render(what, target, **settings, **_divided(options))
     _say(f"wrote {target}")
     return 0
 
@@ -79,7 +85,7 @@ def _turntable(options: Any) -> int:
         "size": (320, 240), **settings, "show": options.show or "shaded",
         "frames": options.frames, "fps": options.fps, "turn": options.turn,
     }  # fmt: skip
-    animate(what, target, **film)
+    animate(what, target, **film, **_divided(options))
     _say(f"wrote {target}")
     return 0
 
@@ -93,7 +99,7 @@ def _page(options: Any) -> int:
     what, settings, _ = _live(options, source)
     with warnings.catch_warnings(record=True) as noted:
         warnings.simplefilter("always", UserWarning)
-        page(what, target, **settings)
+        page(what, target, **settings, **_divided(options))
     for one in noted:
         _say(f"note: {in_options(str(one.message))}")
     _say(f"wrote {target} ({Path(target).stat().st_size / 1e6:.1f} MB)")

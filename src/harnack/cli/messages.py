@@ -67,6 +67,8 @@ _PARAMETER = re.compile(r'parameters=\{"(\w+)": 1\.0\}')
 _ARGUMENT = re.compile(rf'(?<![(\w])({"|".join(OPTIONS)})=("[^"]*"|True\b|[\w.-]+)')
 # What is written otherwise. Longer phrases come before their parts.
 _PHRASES = {
+    "with a client or a checkpoint": "with --scheduler or --checkpoint",
+    "(tiles=)": "(--tiles)",
     "clip=harnack.Ball((0, 0, 0), 1)": "--ball 0,0,0,1",
     "clip=harnack.Box(lower, upper)": "--box X,Y,Z,X,Y,Z",
     "or harnack.Ball(center, radius)": "or --ball X,Y,Z,RADIUS",

@@ -13,8 +13,10 @@ import hashlib
 import importlib
 import io
 import pickle
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Any, TypeVar, cast
 
 from harnack._version import __version__
@@ -119,6 +121,8 @@ def _pickler(base: Any) -> Callable[..., Any]:
 
     class Lean(base):
         def reducer_override(self, obj: Any) -> Any:
+            if isinstance(obj, ModuleType) and sys.modules.get(obj.__name__) is obj:
+                return importlib.import_module, (obj.__name__,)
             kind: type = obj.__class__
             remembered = _remembered(kind)
             if not remembered:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import base64
+import functools
+import hashlib
 import html
 import itertools
 import json
@@ -11,10 +13,14 @@ import os
 import re
 import warnings
 from collections.abc import Mapping
+from dataclasses import dataclass
 from importlib import resources
 from string import Template
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from harnack.cluster.parts import Arrays, Crew, crew
 from harnack.files.file_format import write_atomically
 from harnack.progress import progress_bar
 from harnack.rendering.camera import Camera
@@ -50,6 +56,8 @@ def page(
     *,
     title: str = "",
     progress: bool = True,
+    client: Any = None,
+    checkpoint: str | os.PathLike[str] | None = None,
     **settings: Any,
 ) -> None:
     """Write one HTML file in which surfaces turn under mouse, touch and keys.
@@ -74,6 +82,7 @@ def page(
         What is drawn at each place of a slider is in the file: of one without a step 33, of
         two 17 each, and fewer where they would take more than 4 MB (9, of several 5 each, at
         least). A page with sliders of more than 8 MB is written with a warning.
+    client, checkpoint: as `render` takes them, for the places of sliders.
 
     Raises:
         ValueError: a path that does not end in .html; a surface without bounds; a transparent
@@ -89,9 +98,13 @@ def page(
     live = Live.of(what, settings)
     with progress_bar("page", progress) as advance:
         places = _places(live)
-        live = live.framed(_choices(_framed(places)))
+        job = _PageJob(what, settings, _choices(_framed(places)))
+        if client is None and checkpoint is None:
+            vars(job)["live"] = live.framed(job.framed)
+        live = job.live
         scene = live.scene(title or live.subject.name)
-        scene["frames"] = _frames(live, places, advance)
+        with crew(client, checkpoint) as workers:
+            scene["frames"] = _frames(job, places, workers, advance)
     text = document(scene, still_of(live)).encode()
     with write_atomically(target) as partial:
         partial.write_bytes(text)
@@ -165,13 +178,49 @@ def _frame(live: Live, values: Mapping[str, float]) -> Plain:
     return packed(difference(live.first, state, checks=False))
 
 
-def _frames(live: Live, places: Mapping[str, list[float]], advance: Any) -> Plain:
+@dataclass(frozen=True)
+class _PageJob:
+    """What the states of a page are made of: as `page` was given it, and the choices of places
+    that are framed."""
+
+    what: Any
+    settings: Mapping[str, Any]
+    framed: list[dict[str, float]]
+
+    @functools.cached_property
+    def live(self) -> Live:
+        """What moves."""
+        return Live.of(self.what, dict(self.settings)).framed(self.framed)
+
+    @functools.cached_property
+    def digest(self) -> str:
+        """A number of the first state, from which the others are told by differences."""
+        return hashlib.blake2b(json.dumps(packed(self.live.first)).encode()).hexdigest()
+
+    def state(self, values: Mapping[str, float], digest: str) -> Arrays:
+        """What a place of the sliders changes of the first state, as text in bytes.
+
+        digest: of the first state that is in the page.
+
+        Raises:
+            RuntimeError: the first state is another one here.
+        """
+        if self.digest != digest:
+            raise RuntimeError(
+                "a worker prepares this surface with other numbers than this process does: write "
+                "the page without client and checkpoint"
+            )
+        text = json.dumps(_frame(self.live, values)).encode()
+        return {"text": np.frombuffer(text, np.uint8)}
+
+
+def _frames(job: _PageJob, places: Mapping[str, list[float]], workers: Crew, advance: Any) -> Plain:
     """The places of the sliders, and what is drawn at each choice of them."""
     frames: list[Plain] = []
-    choices = _choices(places)
-    for values in choices:
-        frames.append(_frame(live, values))
-        advance(1 / len(choices))
+    parts = [(values, job.digest) for values in _choices(places)]
+    for found in workers.each(job, "state", parts):
+        frames.append(json.loads(found["text"].tobytes()))
+        advance(1 / len(parts))
     return {"places": places, "frames": frames}
 
 
