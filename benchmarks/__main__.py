@@ -16,6 +16,7 @@ import harnack as hk
 from .agreement import agreement
 from .antialiasing import antialiasing
 from .baselines import baselines
+from .cluster import cluster
 from .convergence import plot
 from .distances import distances
 from .formulas import formulas
@@ -36,6 +37,7 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
 SECTIONS = (
     "rays", "convergence", "winding", "agreement", "versions", "inclusion", "laplacian", "hart",
     "povray", "antialiasing", "baselines", "formulas", "meshes", "distances", "pictures", "live",
+    "cluster",
 )  # fmt: skip
 
 
@@ -82,6 +84,7 @@ def main() -> None:
         "hart": hart,
         "antialiasing": antialiasing,
         "baselines": baselines,
+        "cluster": cluster,
         "distances": distances,
         "formulas": formulas,
         "live": live,

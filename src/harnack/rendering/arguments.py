@@ -26,7 +26,7 @@ SHOW_MODES: tuple[str, ...] = ("color", "shaded", *VIEWS)
 # Pictures that may have isolines.
 LINED = ("color", "shaded", "value")
 ANTIALIASING = ("edges", "cones")
-MAX_SIDE = 16384
+MAX_SIDE = 32768
 MAX_SPP = 1_000_000
 _MOST_TILES = 1_000_000
 # The largest number that the path tracer's counters hold.

@@ -26,6 +26,9 @@ from harnack.rendering.views import VIEWS, View, Viewer
 from harnack.tracer import LevelSet
 
 EDGE_SPP = 9
+# Light paths that a worker follows at a time: some hundred bytes each, of what may be a small
+# memory, and enough for all threads.
+_PATHS_A_BAND = 2**18
 _SIZE = (800, 600)
 
 
@@ -104,7 +107,8 @@ class PictureJob:
 
     def pixels(self, start: int, stop: int) -> Arrays:
         """As of `Exposing`."""
-        return _with_lost(cast("Exposing", self.drawing).pixels(start, stop))
+        drawing = replace(cast("Exposing", self.drawing), paths_a_band=_PATHS_A_BAND)
+        return _with_lost(drawing.pixels(start, stop))
 
     def look(self, start: int, stop: int) -> Arrays:
         """As of `Shading`."""

@@ -141,7 +141,7 @@ def visible_sky(mi: Any, position: Any, normal: Any, width: Any, size: tuple[int
         far = 1.0 + reach * ((k + 0.5) / _TAPS) ** 2
         u, v = x + far * direction.x, y + far * direction.y
         inside = (u >= 0) & (v >= 0) & (u <= columns - 1) & (v <= rows - 1)
-        other = mi.UInt32(dr.fma(dr.round(v), columns, dr.round(u)))
+        other = mi.UInt32(dr.round(v)) * columns + mi.UInt32(dr.round(u))
         way = dr.gather(mi.Vector3f, position, other, inside) - position
         length = dr.norm(way)
         fade = dr.maximum(1 - dr.square(length / radius), 0)
