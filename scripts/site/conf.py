@@ -85,6 +85,7 @@ CONTENTS = {
         "docs/morph",
         "docs/frameworks",
         "docs/cookbook",
+        "docs/cluster",
     ],
     "Reference": [
         f"docs/reference/{page}"
