@@ -16,7 +16,7 @@ DRAWN_BY = {"the browser, SwiftShader": "", "Python, LLVM": "panel.let_python_dr
 # Drags a vertex along a circle. Of each event the time is kept, and of each picture the time and
 # the last event that it shows.
 _DRAG = """async ([seconds, rate]) => {
-  const target = panel.is_remote ? panel.plain : panel.drawing.canvas;
+  const target = panel.is_remote ? panel.remote_canvas : panel.drawing.canvas;
   const events = [], pictures = [];
   let whole = 0;
   const shows = (event) => { pictures.push([performance.now(), event]); };
@@ -26,13 +26,13 @@ _DRAG = """async ([seconds, rate]) => {
     object[name] = (...given) => around(inner, given);
   };
   if (panel.is_remote) {
-    wrap(panel, "drawn", async (inner, given) => {
+    wrap(panel, "fetch_picture", async (inner, given) => {
       const now = events.length - 1;
       const image = await inner(...given);
       drawn = now;
       return image;
     });
-    wrap(panel, "put", (inner, given) => {
+    wrap(panel, "show_image", (inner, given) => {
       inner(...given);
       shows(drawn);
       if (given[0].width >= panel.root.clientWidth && drawn === events.length - 1)
@@ -66,7 +66,7 @@ _DRAG = """async ([seconds, rate]) => {
   const home = panel.curves[c][k];
   panel.editing = true;
   const box = target.getBoundingClientRect();
-  const at = panel.camera().project(panel.place(home), box.width, box.height);
+  const at = panel.camera().project(panel.to_stage(home), box.width, box.height);
   const fire = (kind, x, y) => target.dispatchEvent(new PointerEvent(kind, {
     clientX: box.left + x, clientY: box.top + y, button: 0, buttons: 1, pointerId: 1,
   }));

@@ -60,10 +60,10 @@ class Page:
         self.tab.goto(address)
         self.tab.wait_for_function("window.panel")
         # Nobody is chosen to draw by the speed of this machine.
-        self.do("() => { Object.getPrototypeOf(panel).compare = async () => {}; }")
+        self.do("() => { Object.getPrototypeOf(panel).choose_renderer = async () => {}; }")
         self.tab.wait_for_function(
             "panel.is_remote"
-            " || (panel.root.dataset.state && !/^Compiling/.test(panel.said.textContent))"
+            " || (panel.root.dataset.state && !/^Compiling/.test(panel.message.textContent))"
         )
 
     def _allow(self, route: Any, home: str) -> None:
@@ -82,15 +82,15 @@ class Page:
         return self.tab.evaluate(code, given)
 
     @property
-    def said(self) -> str:
-        return self.do("panel.said.textContent")
+    def message(self) -> str:
+        return self.do("panel.message.textContent")
 
     def rest(self) -> None:
         """Until what is asked for is drawn, all of it."""
         self.do("(n) => { if (panel.drawing) panel.drawing.samples = n; }", self.samples)
         self.tab.wait_for_function(
-            "() => !panel.asking && !panel.wanted && !panel.fetching"
-            " && !/^Compiling/.test(panel.said.textContent)"
+            "() => !panel.is_changing && !panel.is_change_due && !panel.is_fetching"
+            " && !/^Compiling/.test(panel.message.textContent)"
             " && (!panel.drawing || (!panel.drawing.busy && panel.drawing.pictures > 0))"
         )
         # What was drawn is in the window two frames later.
@@ -103,7 +103,7 @@ class Page:
         """(h, w, 3) of what is drawn, without controls. name: of a file in `out/browser`."""
         self.rest()
         show = (
-            "(shown) => { for (const one of [panel.controls, panel.said, panel.legend])"
+            "(shown) => { for (const one of [panel.controls, panel.message, panel.legend])"
             " one.style.visibility = shown; }"
         )
         self.do(show, "hidden")

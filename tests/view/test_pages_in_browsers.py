@@ -66,7 +66,7 @@ def test_a_page_shows_what_render_draws(name: str, browser: Any, tmp_path: Path)
     expected = np.asarray(Image.open(tmp_path / "a.png").convert("RGB")).astype(float)
     with served(tmp_path) as address:
         page = Page(browser, f"{address}/a.html", SIZE)
-        assert page.said == ""
+        assert page.message == ""
         found = page.picture(f"page-{name}").astype(float)
         page.close()
     off = np.abs(found - expected).max(axis=2) / 255

@@ -379,7 +379,7 @@ def test_the_floor_hides_nothing_that_moves_below_it() -> None:
     ball = Live.of(lambda z: hk.Sphere(0.5).moved((0, 0, z)), {"z": hk.Slider(-1.0, 0.0, 0.0)})
     session = Session(ball)
     eye = {**EYE, "origin": [0, -6, 0.8], "pixel": 0.02}
-    asked = {"kind": "draw", "size": (64, 64), "eye": eye, "rests": True}
+    asked = {"kind": "draw", "size": (64, 64), "eye": eye, "is_idle": True}
     parts: list[float] = []
     for z in (0.0, -1.0):
         drawn = session.answer({**asked, "sliders": {"z": z}}).pixels

@@ -38,7 +38,7 @@ def browser() -> Iterator[Any]:
 def view() -> Iterator[hk.View]:
     level = hk.Slider(2.0, 11.0, 6.0)
     with hk.view(
-        hk.SolidAngle(LOOP), level=level, title="T", camera=hk.Camera(zoom=1.8), opens=False,
+        hk.SolidAngle(LOOP), level=level, title="T", camera=hk.Camera(zoom=1.5), opens=False,
         waits=False,
     ) as one:  # fmt: skip
         yield one
@@ -69,7 +69,7 @@ def lowest(page: Page) -> int:
 def screen_of(page: Page, curve: int, number: int) -> tuple[float, float]:
     """Where a point of a curve is in the window."""
     x, y = page.do(
-        "([c, k]) => { const p = panel.camera().project(panel.place(panel.curves[c][k]),"
+        "([c, k]) => { const p = panel.camera().project(panel.to_stage(panel.curves[c][k]),"
         " innerWidth, innerHeight); return [p.x, p.y]; }",
         [curve, number],
     )
@@ -113,7 +113,7 @@ def test_colors_that_are_numbers_have_a_legend(drawn_by: str, page: Page) -> Non
     near, far = map(
         float, re.findall(r"from ([\d.]+), bright, to ([\d.]+), dark", page.do(legend))[0]
     )
-    position = page.do("panel.moved().camera.position")
+    position = page.do("panel.attributes().camera.position")
     away = np.linalg.norm(np.array(position) - shapes.torus_knot(2, 3, 200), axis=1)
     assert 0.7 * away.min() < near < away.min() * 1.1  # in the unit of the surface
     assert near < far < 1.3 * away.max()
@@ -135,13 +135,16 @@ def test_material_and_tube_are_changed(drawn_by: str, page: Page) -> None:
     choose(page, "material", "color")
     page.set("color", "#0000ff")
     page.set("tube", 0.06)
-    assert page.do("() => panel.state().settings") == {"material": "#0000ff", "boundary": 0.06}
+    assert page.do("() => panel.control_values().settings") == {
+        "material": "#0000ff",
+        "boundary": 0.06,
+    }
     blue = page.picture(f"view-tube-{drawn_by}")
     assert change(golden, blue) > 0.05
     page.set("tube", 0)
     choose(page, "material", "as given")
     assert change(before, page.picture()) < 0.01
-    assert page.said == ""
+    assert page.message == ""
 
 
 def choose(page: Page, name: str, value: str) -> None:
@@ -182,15 +185,15 @@ def test_points_are_dragged_inserted_removed_smoothed_and_that_undone(page: Page
     page.press("Smooth")
     page.rest()
     assert np.ptp(page.do("() => panel.curves")[0]) < np.ptp(start[0])
-    assert page.said == ""
+    assert page.message == ""
 
 
 def test_a_probe_says_what_is_there_and_draws_the_proved_steps(page: Page) -> None:
     before = page.picture()
     page.tick("Probe by click")
     page.tab.mouse.click(150, 125)
-    page.tab.wait_for_function("() => panel.said.textContent.includes('evaluations')")
-    assert re.search(r"at \(.*\), normal \(.*\), f = .*mean curvature", page.said)
+    page.tab.wait_for_function("() => panel.message.textContent.includes('evaluations')")
+    assert re.search(r"at \(.*\), normal \(.*\), f = .*mean curvature", page.message)
     assert change(before, page.picture("view-probe")) > 0
 
 
@@ -228,7 +231,7 @@ def test_a_scene_is_saved_and_opened_again(page: Page, tmp_path: Path) -> None:
     assert much < 0.01
     path.write_text('{"harnack": 1, "surfaces": [{"field": {"Spere": {}}}]}')
     page.tab.locator("input[name=scene]").set_input_files(path)
-    page.tab.wait_for_function("() => panel.said.textContent.includes('Sphere')")
+    page.tab.wait_for_function("() => panel.message.textContent.includes('Sphere')")
 
 
 def test_a_picture_is_rendered_and_called_off(page: Page) -> None:
@@ -237,7 +240,7 @@ def test_a_picture_is_rendered_and_called_off(page: Page) -> None:
     assert Path(waiting.value.path()).read_bytes()[:4] == b"\x89PNG"
     page.do("() => { panel.render(2000, 'color'); }")
     page.tab.get_by_role("button", name="Cancel").click()
-    page.tab.wait_for_function("() => panel.said.textContent.includes('stopped')")
+    page.tab.wait_for_function("() => panel.message.textContent.includes('stopped')")
 
 
 def test_two_windows_and_a_hundred_connections(browser: Any, view: hk.View) -> None:
@@ -291,7 +294,7 @@ def test_messages_that_make_no_sense_are_answered_and_harm_nobody(page: Page) ->
     assert answers[1] == 1009  # too long
     page.set("level", 6.0)
     assert change(right, page.picture()) < 0.01
-    assert page.said == ""
+    assert page.message == ""
 
 
 def test_a_tab_that_is_closed_ends_its_work(browser: Any, view: hk.View) -> None:
@@ -303,7 +306,7 @@ def test_a_tab_that_is_closed_ends_its_work(browser: Any, view: hk.View) -> None
     page.tick("Probe by click")
     page.tab.mouse.click(150, 125)
     page.tab.wait_for_function(
-        "() => panel.said.textContent.includes('evaluations')", timeout=20_000
+        "() => panel.message.textContent.includes('evaluations')", timeout=20_000
     )
     page.close()
 
@@ -313,7 +316,7 @@ def test_without_webgpu_python_draws_and_the_page_says_so(browser: Any, view: hk
     with closing(launched(browser.browser_type, *flags)) as plain:
         page = Page(plain, view.address, SIZE, samples=1)
         page.rest()
-        assert "Python draws" in page.said
+        assert "Python draws" in page.message
         before = page.picture("view-python")
         page.drag((100, 100), (180, 120))
         assert change(before, page.picture()) > 0.05

@@ -59,10 +59,10 @@ def test_a_message_is_answered(widget: Any, monkeypatch: pytest.MonkeyPatch) -> 
             done.set()
 
     monkeypatch.setattr(widget, "send", send)
-    widget._hear(widget, json.dumps({"id": 7, "kind": "change", "sliders": {"level": 2}}), [])
+    widget._receive(widget, json.dumps({"id": 7, "kind": "change", "sliders": {"level": 2}}), [])
     assert done.wait(60)
     assert said[-1][0]["answer"]["surfaces"]
-    widget._hear(widget, "no question", [])
+    widget._receive(widget, "no question", [])
     assert said[-1][0]["error"] == "a question is an object in JSON"
 
 
@@ -133,5 +133,5 @@ def test_a_widget_is_moved_and_moves(widget: Any, tmp_path: Path) -> None:
         moved = page.picture("widget-moved")
         assert (np.abs(before.astype(int) - moved).max(axis=2) > 12).mean() > 0.02
         assert page.do("() => panel.values.level") == 9
-        assert page.said == ""
+        assert page.message == ""
         page.close()

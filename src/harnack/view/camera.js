@@ -7,7 +7,7 @@
 /** @param {number[]} a @param {number[]} b */
 export const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 /** a + s b @param {number[]} a @param {number} s @param {number[]} b */
-export const along = (a, s, b) => a.map((x, k) => x + s * b[k]);
+export const add_scaled = (a, s, b) => a.map((x, k) => x + s * b[k]);
 /** @param {number[]} a @param {number[]} b */
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 const RADIANS = Math.PI / 180;
@@ -29,8 +29,8 @@ export class Camera {
 
   /** Stands somewhere and looks at something, upright. @param {number[]} eye
    *  @param {number[]} target @param {number} fov */
-  look(eye, target, fov) {
-    const back = along(eye, -1, target);
+  look_at(eye, target, fov) {
+    const back = add_scaled(eye, -1, target);
     const distance = Math.hypot(...back);
     if (!(distance > 0) || !(fov > 0 && fov < 180)) return;
     Object.assign(this, {
@@ -51,7 +51,7 @@ export class Camera {
     return { right, up, forward: back.map((x) => -x) };
   }
 
-  eye() { return along(this.target, -this.distance, this.axes().forward); }
+  eye() { return add_scaled(this.target, -this.distance, this.axes().forward); }
 
   /** How wide a pixel is at distance 1. A picture of 4 : 3 fits into every window.
    *  @param {number} width @param {number} height */
@@ -63,16 +63,16 @@ export class Camera {
    *  @param {number[]} point @param {number} width @param {number} height */
   project(point, width, height) {
     const { right, up, forward } = this.axes();
-    const way = along(point, -1, this.eye());
-    const z = dot(way, forward);
+    const direction = add_scaled(point, -1, this.eye());
+    const z = dot(direction, forward);
     const pixel = z * this.pixel(width, height);
-    return { x: 0.5 * width + dot(way, right) / pixel, y: 0.5 * height - dot(way, up) / pixel, z };
+    return { x: 0.5 * width + dot(direction, right) / pixel, y: 0.5 * height - dot(direction, up) / pixel, z };
   }
 
   /** How far a point moves with a pointer, in the plane that faces the eye. @param {number} z
    *  before the eye @param {number} x @param {number} y pixels @param {number} width
    *  @param {number} height */
-  moved(z, x, y, width, height) {
+  drag_offset(z, x, y, width, height) {
     const { right, up } = this.axes();
     const pixel = z * this.pixel(width, height);
     return right.map((r, k) => pixel * (x * r - y * up[k]));
@@ -87,7 +87,7 @@ export class Camera {
 
   /** Pixels. @param {number} x @param {number} y @param {number} width @param {number} height */
   pan(x, y, width, height) {
-    this.target = along(this.target, -1, this.moved(this.distance, x, y, width, height));
+    this.target = add_scaled(this.target, -1, this.drag_offset(this.distance, x, y, width, height));
   }
 
   /** @param {number} factor */
@@ -97,15 +97,15 @@ export class Camera {
   }
 
   /** Degrees. @param {number} angle */
-  turn(angle) { this.roll += angle; }
+  roll_by(angle) { this.roll += angle; }
 
   /** Mouse, touch and keys on an element. @param {HTMLElement} element @param {() => void} changed
-   *  @param {(e: PointerEvent) => boolean} [taken] whether a pointer does something else */
-  listen(element, changed, taken = () => false) {
+   *  @param {(e: PointerEvent) => boolean} [is_taken] whether a pointer does something else */
+  listen(element, changed, is_taken = () => false) {
     /** @type {Map<number, PointerEvent>} */
     const down = new Map();
     element.addEventListener("pointerdown", (e) => {
-      if (taken(e)) return;
+      if (is_taken(e)) return;
       element.setPointerCapture(e.pointerId);
       down.set(e.pointerId, e);
     });
@@ -120,7 +120,7 @@ export class Camera {
       if (other) {
         const [now, was] = [e, before].map((one) => [one.clientX - other.clientX, one.clientY - other.clientY]);
         this.zoom(Math.hypot(now[0], now[1]) / Math.max(Math.hypot(was[0], was[1]), 1));
-        this.turn((Math.atan2(now[1], now[0]) - Math.atan2(was[1], was[0])) / RADIANS);
+        this.roll_by((Math.atan2(now[1], now[0]) - Math.atan2(was[1], was[0])) / RADIANS);
         this.pan(0.5 * x, 0.5 * y, width, height);
       } else if (e.shiftKey || before.button === 2) this.pan(x, y, width, height);
       else this.orbit((-220 * x) / Math.min(width, height), (220 * y) / Math.min(width, height));
@@ -140,7 +140,7 @@ export class Camera {
         ArrowLeft: () => this.orbit(-5, 0), ArrowRight: () => this.orbit(5, 0),
         ArrowUp: () => this.orbit(0, 5), ArrowDown: () => this.orbit(0, -5),
         "+": () => this.zoom(1.1), "=": () => this.zoom(1.1), "-": () => this.zoom(1 / 1.1),
-        "[": () => this.turn(-5), "]": () => this.turn(5), Home: () => this.reset(),
+        "[": () => this.roll_by(-5), "]": () => this.roll_by(5), Home: () => this.reset(),
       };
       if (!moves[e.key]) return;
       e.preventDefault();

@@ -28,11 +28,11 @@ export const SHOWS = ["shaded", "normal", "depth", "evaluations", "status"];
 const TILE = 1 << 17;
 const TILE_TIME = 60;
 // Milliseconds that a picture may take while something moves.
-export const QUICK = 40;
+export const FRAME_TIME = 40;
 const SAMPLES = 16;
 const GROUP = 64;
 // What other roundings explain: see `harnack.tracer.hits`.
-const [GRAZING, OTHERWISE, APART, TURNED, RECOUNTED] = [0.1, 1e-3, 0.1, 2e-4, 0.03];
+const [GRAZING, OTHER_STATUS, OTHER_DISTANCE, OTHER_NORMAL, OTHER_EVALUATIONS] = [0.1, 1e-3, 0.1, 2e-4, 0.03];
 const VIEW_BYTES = 176;
 // What passes.wgsl has room for beside a pixel.
 const PAINTS = 2048;
@@ -50,7 +50,7 @@ export async function words(text) {
 }
 
 /** Places in the unit square, spread evenly (Roberts 2018), as `floor._square` has them. */
-function square() {
+function sample_square() {
   const plastic = 1.32471795724474602596;
   const count = BLOCK * BLOCK;
   /** @type {number[][]} */
@@ -82,17 +82,17 @@ export class Drawing {
     this.dots = [];
     this.scale = 0.25;
     this.tile = 1 << 14;
-    this.turn = 0;
+    this.generation = 0;
     this.pictures = 0;
     // Rays of a pixel when nothing moves.
     this.samples = SAMPLES;
-    this.tick = 0;
+    this.can_abort = 0;
     this.stopped = false;
     // Pixels that are traced in a millisecond.
     this.rate = 0;
     this.passes = passes;
     /** @type {Map<string, Promise<GPUComputePipeline>>} */
-    this.traces = new Map();
+    this.pipelines_by_key = new Map();
     /** @type {any} */
     this.pipelines = {};
     /** @type {any[]} */
@@ -107,12 +107,12 @@ export class Drawing {
     this.overlay = this.buffer(VIEW_BYTES, UNIFORM);
     this.lanes = this.buffer(28 * TILE, STORAGE);
     this.results = this.buffer(28 * TILE, STORAGE | COPY_SRC);
-    this.towards = this.buffer(32 * BLOCK * BLOCK * RAYS, STORAGE);
-    this.blocked = this.buffer(8 * CELLS * CELLS * RAYS, STORAGE | COPY_SRC);
+    this.light_directions = this.buffer(32 * BLOCK * BLOCK * RAYS, STORAGE);
+    this.occluded = this.buffer(8 * CELLS * CELLS * RAYS, STORAGE | COPY_SRC);
     this.floor = this.buffer(new Float32Array(2 * CELLS * CELLS).fill(1), STORAGE);
-    this.colors = this.buffer(32 * PAINTS, STORAGE);
+    this.paints = this.buffer(32 * PAINTS, STORAGE);
     this.marks = this.buffer(32, STORAGE);
-    this.most = Math.floor(device.limits.maxStorageBufferBindingSize / 32);
+    this.max_pixels = Math.floor(device.limits.maxStorageBufferBindingSize / 32);
     this.reserve(1024);
   }
 
@@ -128,17 +128,17 @@ export class Drawing {
 
   /** Room for a picture. @param {number} pixels */
   reserve(pixels) {
-    if (this.seen && this.seen.size >= 32 * pixels) return;
-    for (const one of [this.seen, this.sky, this.picture]) one?.destroy();
-    this.seen = this.buffer(32 * pixels, GPUBufferUsage.STORAGE | GPUBufferUsage.COPY_SRC);
-    this.sky = this.buffer(4 * pixels, GPUBufferUsage.STORAGE);
+    if (this.hits && this.hits.size >= 32 * pixels) return;
+    for (const one of [this.hits, this.sky_visibility, this.picture]) one?.destroy();
+    this.hits = this.buffer(32 * pixels, GPUBufferUsage.STORAGE | GPUBufferUsage.COPY_SRC);
+    this.sky_visibility = this.buffer(4 * pixels, GPUBufferUsage.STORAGE);
     this.picture = this.buffer(16 * pixels, GPUBufferUsage.STORAGE);
   }
 
   async compile() {
     const { device, format } = this;
     const module = device.createShaderModule({ code: this.passes });
-    const names = ["aim", "begin", "gather", "look_up", "paint", "aim_up", "gather_up"];
+    const names = ["camera_rays", "clear_hits", "merge_hits", "estimate_sky", "shade", "floor_rays", "merge_floor_hits"];
     const made = await Promise.all(names.map((entryPoint) =>
       device.createComputePipelineAsync({ layout: "auto", compute: { module, entryPoint } })));
     names.forEach((name, k) => { this.pipelines[name] = made[k]; });
@@ -149,21 +149,21 @@ export class Drawing {
       device.createRenderPipelineAsync({
         layout: "auto", vertex: { module, entryPoint: vertex },
         fragment: { module, entryPoint: fragment,
-                    targets: [fragment === "show" ? { format } : { format, blend }] },
+                    targets: [fragment === "display" ? { format } : { format, blend }] },
       });
-    [this.pipelines.show, this.pipelines.line, this.pipelines.dot] = await Promise.all(
-      [drawn("corner", "show"), drawn("line", "mark"), drawn("dot_at", "mark")]);
+    [this.pipelines.display, this.pipelines.line, this.pipelines.dot] = await Promise.all(
+      [drawn("full_screen", "display"), drawn("line", "mark"), drawn("dot_at", "mark")]);
   }
 
   /** The pipeline of a kernel, compiled once. @param {Surface} surface */
-  traced(surface) {
-    const found = this.traces.get(surface.key);
+  pipeline_of(surface) {
+    const found = this.pipelines_by_key.get(surface.key);
     if (found) return found;
     const module = this.device.createShaderModule({ code: surface.code });
     const made = this.device.createComputePipelineAsync({
       layout: "auto", compute: { module, entryPoint: "main" },
     });
-    this.traces.set(surface.key, made);
+    this.pipelines_by_key.set(surface.key, made);
     return made;
   }
 
@@ -178,7 +178,7 @@ export class Drawing {
 
   /** @param {State} state @param {boolean} checks */
   async replace(state, checks) {
-    const made = await Promise.all(state.surfaces.map((one) => this.traced(one)));
+    const made = await Promise.all(state.surfaces.map((one) => this.pipeline_of(one)));
     const data = await Promise.all(state.surfaces.map((one) => words(one.data)));
     let paints = 0;
     const next = state.surfaces.map((given, k) => {
@@ -197,7 +197,7 @@ export class Drawing {
       const colors = new Float32Array(8 * PAINTS);
       colors.set(state.surfaces.flatMap((one) => one.paints).slice(0, PAINTS).flatMap(
         ({ front, back, glossy }) => [...front, glossy ? 1 : 0, ...back, glossy ? 1 : 0]));
-      this.device.queue.writeBuffer(this.colors, 0, colors);
+      this.device.queue.writeBuffer(this.paints, 0, colors);
       this.surfaces = next;
     }
     for (const one of old) { one.data.destroy(); one.numbers.destroy(); }
@@ -208,13 +208,13 @@ export class Drawing {
    *  @param {Record<number, GPUBuffer>} buffers @param {number} count */
   run(pass, pipeline, buffers, count) {
     pass.setPipeline(pipeline);
-    pass.setBindGroup(0, this.bound(pipeline, buffers));
+    pass.setBindGroup(0, this.bind_group(pipeline, buffers));
     pass.dispatchWorkgroups(Math.ceil(count / GROUP));
   }
 
   /** @param {GPUComputePipeline | GPURenderPipeline} pipeline
    *  @param {Record<number, GPUBuffer>} buffers */
-  bound(pipeline, buffers) {
+  bind_group(pipeline, buffers) {
     return this.device.createBindGroup({
       layout: pipeline.getBindGroupLayout(0),
       entries: Object.entries(buffers).map(([binding, buffer]) => ({
@@ -256,13 +256,13 @@ export class Drawing {
     const [wanted, rays] = [new Float32Array(expected.buffer), new Float32Array(asked.buffer)];
     const at = (/** @type {number} */ k, /** @type {number} */ part) => rays[lanes.indexOf(part) * n + k];
     // The criteria are those of `harnack.tracer.hits`, with what was measured there.
-    let [other, stray, many, recounted] = [0, 0, 0, 0];
+    let [other, stray, evaluation_sum, evaluation_difference] = [0, 0, 0, 0];
     /** @type {number[][]} */
     const [off, turned] = [[], []];
     for (let k = 0; k < n; k++) {
-      const [found, looks] = [bits[results[0] * n + k], bits[results[5] * n + k]];
-      const looked = expected[5 * n + k];
-      [many, recounted] = [many + looked, recounted + Math.abs(looks - looked)];
+      const [found, evaluations] = [bits[results[0] * n + k], bits[results[5] * n + k]];
+      const expected_evaluations = expected[5 * n + k];
+      [evaluation_sum, evaluation_difference] = [evaluation_sum + expected_evaluations, evaluation_difference + Math.abs(evaluations - expected_evaluations)];
       const normal = [2, 3, 4].map((p) => wanted[p * n + k]);
       const climb = Math.abs(dot([3, 4, 5].map((p) => at(k, p)), normal));
       if (found !== expected[k]) {
@@ -277,20 +277,20 @@ export class Drawing {
       if (climb >= GRAZING)
         turned.push(Math.hypot(...[2, 3, 4].map((p, c) => numbers[results[p] * n + k] - normal[c])));
     }
-    if (stray || other > OTHERWISE * n) return `${other} of ${n} rays end otherwise`;
-    if (off.filter((one) => one > 2).length > OTHERWISE * n) return "hits lie off the surface";
-    if (largest(off, 0.9) > APART) return "hits lie elsewhere, if within the tolerance";
-    if (!(largest(turned, 0.9) <= TURNED)) return "normals differ";
-    if (recounted > RECOUNTED * (many + n) + 2)
+    if (stray || other > OTHER_STATUS * n) return `${other} of ${n} rays end otherwise`;
+    if (off.filter((one) => one > 2).length > OTHER_STATUS * n) return "hits lie off the surface";
+    if (quantile(off, 0.9) > OTHER_DISTANCE) return "hits lie elsewhere, if within the tolerance";
+    if (!(quantile(turned, 0.9) <= OTHER_NORMAL)) return "normals differ";
+    if (evaluation_difference > OTHER_EVALUATIONS * (evaluation_sum + n) + 2)
       return "rays take another number of evaluations";
     return "";
   }
 
   /** The numbers of a pass. @param {{width: number, height: number, first?: number, count?: number,
-   *  jitter?: number[], weight?: number, ways?: number, turn?: number, kind?: number}} asked */
+   *  jitter?: number[], weight?: number, directions?: number, rotation?: number, kind?: number}} asked */
   numbers(asked) {
     const { width, height, first = 0, count = 0, jitter = [0.5, 0.5], weight = 1 } = asked;
-    const { ways = 16, turn = 0.5, kind = 0 } = asked;
+    const { directions = 16, rotation = 0.5, kind = 0 } = asked;
     const { floor } = this.scene;
     const [eye, axes] = [this.camera.eye(), this.camera.axes()];
     const [low, high] = this.show === "evaluations"
@@ -299,7 +299,7 @@ export class Drawing {
     const has_floor = eye[2] > floor ? 1 : 0;
     const made = new ArrayBuffer(VIEW_BYTES);
     new Float32Array(made).set([
-      ...eye, ways, ...axes.right, this.camera.pixel(width, height), ...axes.up, turn,
+      ...eye, directions, ...axes.right, this.camera.pixel(width, height), ...axes.up, rotation,
       ...axes.forward, Infinity, ...this.key(), floor, ...this.ground, has_floor,
       low, 1 / (high - low), 0, 0, ...(dark ? [0.10, 0.10, 0.11] : [0.90, 0.90, 0.89]), 1,
       this.canvas.width, this.canvas.height, ...jitter,
@@ -318,25 +318,25 @@ export class Drawing {
   }
 
   /** Traces one picture, tile by tile; false if something moved before it was done.
-   *  @param {{width: number, height: number, jitter?: number[], weight?: number, ways?: number,
-   *  turn?: number}} asked @param {number} now */
-  async trace(asked, now) {
+   *  @param {{width: number, height: number, jitter?: number[], weight?: number, directions?: number,
+   *  rotation?: number}} asked @param {number} generation */
+  async trace(asked, generation) {
     const { queue } = this.device;
     const pixels = asked.width * asked.height;
     const { view, lanes, results } = this;
-    const [seen, sky] = [/** @type {GPUBuffer} */ (this.seen), /** @type {GPUBuffer} */ (this.sky)];
+    const [hits, sky_visibility] = [/** @type {GPUBuffer} */ (this.hits), /** @type {GPUBuffer} */ (this.sky_visibility)];
     for (let first = 0; first < pixels; ) {
       const count = Math.min(this.tile, pixels - first);
       const start = performance.now();
       queue.writeBuffer(view, 0, this.numbers({ ...asked, first, count }));
       const encoder = this.device.createCommandEncoder();
       const pass = encoder.beginComputePass();
-      this.run(pass, this.pipelines.begin, { 0: view, 4: seen }, count);
+      this.run(pass, this.pipelines.clear_hits, { 0: view, 4: hits }, count);
       for (const one of this.surfaces) {
         queue.writeBuffer(one.data, 0, new Uint32Array([count]));
-        this.run(pass, this.pipelines.aim, { 0: view, 1: one.numbers, 2: lanes }, count);
+        this.run(pass, this.pipelines.camera_rays, { 0: view, 1: one.numbers, 2: lanes }, count);
         this.run(pass, one.trace, { 0: one.data, 1: lanes, 2: results }, count);
-        this.run(pass, this.pipelines.gather, { 0: view, 1: one.numbers, 3: results, 4: seen }, count);
+        this.run(pass, this.pipelines.merge_hits, { 0: view, 1: one.numbers, 3: results, 4: hits }, count);
       }
       pass.end();
       queue.submit([encoder.finish()]);
@@ -345,15 +345,15 @@ export class Drawing {
       const took = performance.now() - start;
       if (took < 0.5 * TILE_TIME) this.tile = Math.min(TILE, 2 * this.tile);
       else if (took > 2 * TILE_TIME) this.tile = Math.max(1024, this.tile / 2);
-      if (this.stopped || (now !== this.turn && this.tick > 0)) return false;
+      if (this.stopped || (generation !== this.generation && this.can_abort > 0)) return false;
     }
-    if (this.show === "shaded") await this.whole("look_up", asked, { 0: view, 4: seen, 5: sky });
+    if (this.show === "shaded") await this.run_over_pixels("estimate_sky", asked, { 0: view, 4: hits, 5: sky_visibility });
     return true;
   }
 
   /** Runs a pass over all pixels. @param {string} name @param {{width: number, height: number}} asked
    *  @param {Record<number, GPUBuffer>} buffers */
-  async whole(name, asked, buffers) {
+  async run_over_pixels(name, asked, buffers) {
     const pixels = asked.width * asked.height;
     const most = 65535 * GROUP;
     for (let first = 0; first < pixels; first += most) {
@@ -370,21 +370,21 @@ export class Drawing {
 
   /** @param {{width: number, height: number, weight?: number}} asked */
   async paint(asked) {
-    const [seen, sky, picture] = /** @type {GPUBuffer[]} */ ([this.seen, this.sky, this.picture]);
-    await this.whole("paint", asked, {
-      0: this.view, 4: seen, 5: sky, 6: picture, 7: this.colors, 8: this.floor,
+    const [hits, sky_visibility, picture] = /** @type {GPUBuffer[]} */ ([this.hits, this.sky_visibility, this.picture]);
+    await this.run_over_pixels("shade", asked, {
+      0: this.view, 4: hits, 5: sky_visibility, 6: picture, 7: this.paints, 8: this.floor,
     });
   }
 
   /** What of the key light and of the sky reaches the floor, as `harnack.rendering.shading`
-   *  has it. False if something moved before it was done. @param {number} now */
-  async light_floor(now) {
+   *  has it. False if something moved before it was done. @param {number} generation */
+  async light_floor(generation) {
     const { queue } = this.device;
-    const { view, lanes, results, towards, blocked } = this;
+    const { view, lanes, results, light_directions, occluded } = this;
     const key = this.key();
     const rays = CELLS * CELLS * RAYS;
-    queue.writeBuffer(towards, 0, directions(key));
-    queue.writeBuffer(blocked, 0, new Uint32Array(2 * rays));
+    queue.writeBuffer(light_directions, 0, directions(key));
+    queue.writeBuffer(occluded, 0, new Uint32Array(2 * rays));
     for (const kind of [0, 1])
       for (let first = 0; first < rays; ) {
         const count = Math.min(this.tile, rays - first);
@@ -393,19 +393,19 @@ export class Drawing {
           queue.writeBuffer(one.data, 0, new Uint32Array([count]));
           const encoder = this.device.createCommandEncoder();
           const pass = encoder.beginComputePass();
-          this.run(pass, this.pipelines.aim_up,
-            { 0: view, 1: one.numbers, 2: lanes, 9: towards }, count);
+          this.run(pass, this.pipelines.floor_rays,
+            { 0: view, 1: one.numbers, 2: lanes, 9: light_directions }, count);
           this.run(pass, one.trace, { 0: one.data, 1: lanes, 2: results }, count);
-          this.run(pass, this.pipelines.gather_up,
-            { 0: view, 1: one.numbers, 3: results, 10: blocked }, count);
+          this.run(pass, this.pipelines.merge_floor_hits,
+            { 0: view, 1: one.numbers, 3: results, 10: occluded }, count);
           pass.end();
           queue.submit([encoder.finish()]);
         }
         await queue.onSubmittedWorkDone();
-        if (now !== this.turn) return false;
+        if (generation !== this.generation) return false;
         first += count;
       }
-    const found = await this.read(blocked, 8 * rays);
+    const found = await this.read(occluded, 8 * rays);
     const light = new Float32Array(2 * CELLS * CELLS);
     for (const kind of [0, 1]) {
       const free = Array.from({ length: CELLS }, (_, j) => Array.from({ length: CELLS }, (_, i) => {
@@ -424,14 +424,14 @@ export class Drawing {
    *  @param {number} height */
   present(width, height) {
     const { queue } = this.device;
-    const [seen, picture] = /** @type {GPUBuffer[]} */ ([this.seen, this.picture]);
+    const [hits, picture] = /** @type {GPUBuffer[]} */ ([this.hits, this.picture]);
     queue.writeBuffer(this.view, 0, this.numbers({ width, height }));
     const encoder = this.device.createCommandEncoder();
     const pass = encoder.beginRenderPass({ colorAttachments: [{
       view: this.context.getCurrentTexture().createView(), loadOp: "clear", storeOp: "store",
     }] });
-    pass.setPipeline(this.pipelines.show);
-    pass.setBindGroup(0, this.bound(this.pipelines.show, { 0: this.view, 11: picture }));
+    pass.setPipeline(this.pipelines.display);
+    pass.setBindGroup(0, this.bind_group(this.pipelines.display, { 0: this.view, 11: picture }));
     pass.draw(3);
     const kept = [];
     for (const [name, several] of /** @type {[string, Marks[]][]} */ ([["line", this.lines], ["dot", this.dots]]))
@@ -446,19 +446,19 @@ export class Drawing {
         const view = this.buffer(new Uint8Array(this.numbers({ width, height, kind: count })), GPUBufferUsage.UNIFORM);
         kept.push(marks, view);
         pass.setPipeline(this.pipelines[name]);
-        pass.setBindGroup(0, this.bound(this.pipelines[name], { 0: view, 12: seen, 13: marks }));
+        pass.setBindGroup(0, this.bind_group(this.pipelines[name], { 0: view, 12: hits, 13: marks }));
         pass.draw(name === "line" ? 3 * count : 6 * count);
       }
     pass.end();
     queue.submit([encoder.finish()]);
     for (const one of kept) one.destroy();
-    this.shown = [width, height];
+    this.shown_size = [width, height];
     this.pictures++;
   }
 
   /** The depths of what is seen, for their colors. @param {number} pixels */
-  async depths(pixels) {
-    const found = await this.read(/** @type {GPUBuffer} */ (this.seen), 32 * pixels);
+  async measure_depths(pixels) {
+    const found = await this.read(/** @type {GPUBuffer} */ (this.hits), 32 * pixels);
     const t = new Float32Array(found.buffer);
     let [low, high] = [Infinity, 0];
     for (let k = 0; k < pixels; k++)
@@ -469,59 +469,59 @@ export class Drawing {
 
   /** Draws: coarsely while something moves, then at every pixel, then with many rays a pixel. */
   async draw() {
-    const turn = ++this.turn;
+    const requested = ++this.generation;
     if (this.busy) return;
     this.busy = true;
     try {
-      for (let now = turn; !this.stopped; now = this.turn) {
-        this.tick = 0;
-        await this.quickly(now);
+      for (let generation = requested; !this.stopped; generation = this.generation) {
+        this.can_abort = 0;
+        await this.draw_coarse(generation);
         // Something may have moved while the last picture was painted.
-        if (now === this.turn && await this.slowly(now) && now === this.turn) break;
+        if (generation === this.generation && await this.draw_full(generation) && generation === this.generation) break;
       }
     } finally {
       this.busy = false;
     }
-    this.canvas.dispatchEvent(new Event("rest"));
+    this.canvas.dispatchEvent(new Event("idle"));
   }
 
   /** Draws no more. */
   stop() {
     this.stopped = true;
-    this.turn++;
+    this.generation++;
   }
 
-  /** One coarse picture. @param {number} now */
-  async quickly(now) {
+  /** One coarse picture. @param {number} generation */
+  async draw_coarse(generation) {
     const start = performance.now();
     const { width, height } = this.size(this.scale);
-    const asked = { width, height, ways: 6 };
-    await this.trace(asked, now);
+    const asked = { width, height, directions: 6 };
+    await this.trace(asked, generation);
     if (this.stopped) return;
     await this.paint(asked);
     this.present(width, height);
-    const better = this.scale * Math.sqrt(QUICK / Math.max(performance.now() - start, 1));
+    const better = this.scale * Math.sqrt(FRAME_TIME / Math.max(performance.now() - start, 1));
     this.scale = Math.min(1, Math.max(0.06, 0.5 * (this.scale + better)));
   }
 
-  /** Whole pictures; false if something moved. @param {number} now */
-  async slowly(now) {
+  /** Whole pictures; false if something moved. @param {number} generation */
+  async draw_full(generation) {
     const { width, height } = this.size(1);
     for (let k = 0; k < this.samples; k++) {
-      this.tick = 1;
+      this.can_abort = 1;
       const jitter = [(0.5 + k * 0.7548776662) % 1, (0.5 + k * 0.5698402910) % 1];
       const asked = { width, height, jitter, weight: 1 / (k + 1),
-                      ways: k ? 4 : 16, turn: (0.5 + 0.381966 * k) % 1 };
+                      directions: k ? 4 : 16, rotation: (0.5 + 0.381966 * k) % 1 };
       const start = performance.now();
-      if (!await this.trace(asked, now)) return false;
+      if (!await this.trace(asked, generation)) return false;
       this.rate = (width * height) / (performance.now() - start);
-      if (k === 0 && this.show === "depth") await this.depths(width * height);
+      if (k === 0 && this.show === "depth") await this.measure_depths(width * height);
       await this.paint(asked);
       this.present(width, height);
-      if (k === 0) this.canvas.dispatchEvent(new Event("whole"));
-      if (now !== this.turn) return false;
+      if (k === 0) this.canvas.dispatchEvent(new Event("full_picture"));
+      if (generation !== this.generation) return false;
       if (k === 0 && this.show === "shaded") {
-        if (!await this.light_floor(now)) return false;
+        if (!await this.light_floor(generation)) return false;
         await this.paint(asked);
         this.present(width, height);
       }
@@ -533,7 +533,7 @@ export class Drawing {
   /** The size of pictures at a scale. @param {number} scale */
   size(scale) {
     const { canvas } = this;
-    const fit = Math.min(scale, Math.sqrt(this.most / (canvas.width * canvas.height)));
+    const fit = Math.min(scale, Math.sqrt(this.max_pixels / (canvas.width * canvas.height)));
     const [width, height] = [canvas.width, canvas.height].map((x) => Math.max(8, Math.round(x * fit)));
     this.reserve(width * height);
     return { width, height };
@@ -551,7 +551,7 @@ export class Drawing {
 }
 
 /** What a part of numbers is at most; NaN if one of them is. @param {number[]} several @param {number} part */
-function largest(several, part) {
+function quantile(several, part) {
   if (several.some(Number.isNaN)) return NaN;
   return several.sort((a, b) => a - b)[Math.floor(part * (several.length - 1))] ?? 0;
 }
@@ -566,7 +566,7 @@ function directions(key) {
     [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
   const u = unit(cross(key, e));
   const v = cross(key, u);
-  const places = square();
+  const places = sample_square();
   const made = new Float32Array(8 * places.length);
   places.forEach(([s, turn], k) => {
     const [radius, angle] = [SPREAD * Math.sqrt(s), 2 * Math.PI * turn];

@@ -8,7 +8,7 @@ class Questions {
   constructor() {
     this.last = 0;
     /** @type {Map<number, {resolve: (answer: any) => void, reject: (wrong: Error) => void,
-     *                      told?: (done: number, stop: () => void) => void}>} */
+     *                      on_progress?: (done: number, stop: () => void) => void}>} */
     this.waiting = new Map();
   }
 
@@ -17,12 +17,12 @@ class Questions {
   async send(question) { throw new Error(`nobody hears ${JSON.stringify(question)}`); }
 
   /** An answer, or how much of it is done.
-   *  @param {{id: number | null, answer?: any, error?: string, done?: number}} said */
-  hear({ id, answer, error, done }) {
+   *  @param {{id: number | null, answer?: any, error?: string, done?: number}} message */
+  receive({ id, answer, error, done }) {
     // Of a text that is no question Python cannot say which it was.
-    if (id === null) return this.end(new Error(error));
+    if (id === null) return this.reject_all(new Error(error));
     const asked = this.waiting.get(id);
-    if (done !== undefined) return asked?.told?.(done, () => this.cancel(id));
+    if (done !== undefined) return asked?.on_progress?.(done, () => this.cancel(id));
     this.waiting.delete(id);
     if (error) asked?.reject(new Error(error));
     else asked?.resolve(answer);
@@ -30,7 +30,7 @@ class Questions {
 
   /** A picture; before it its number, its size, and the range of its depths.
    *  @param {ArrayBuffer} data */
-  take(data) {
+  receive_picture(data) {
     const [id, height, width] = new Uint32Array(data, 0, 3);
     const image = new ImageData(new Uint8ClampedArray(data, 20), width, height);
     this.waiting.get(id)?.resolve({ image, range: [...new Float32Array(data, 12, 2)] });
@@ -38,20 +38,20 @@ class Questions {
   }
 
   /** Nothing that was asked will be answered. @param {Error} wrong */
-  end(wrong) {
+  reject_all(wrong) {
     for (const one of this.waiting.values()) one.reject(wrong);
     this.waiting.clear();
   }
 
   /** @param {string} kind @param {object} given
-   *  @param {(done: number, stop: () => void) => void} [told] how much of it is done
+   *  @param {(done: number, stop: () => void) => void} [on_progress] how much of it is done
    *  @returns {Promise<any>} */
-  ask(kind, given, told) {
+  ask(kind, given, on_progress) {
     const id = ++this.last;
     return new Promise((resolve, reject) => {
-      this.waiting.set(id, { resolve, reject, told });
+      this.waiting.set(id, { resolve, reject, on_progress });
       this.send({ ...given, id, kind }).catch((wrong) => { this.waiting.delete(id); reject(wrong); });
-      told?.(0, () => this.cancel(id));
+      on_progress?.(0, () => this.cancel(id));
     });
   }
 
@@ -78,9 +78,9 @@ export class Server extends Questions {
     this.socket = socket;
     socket.binaryType = "arraybuffer";
     socket.onmessage = (e) =>
-      (typeof e.data === "string" ? this.hear(JSON.parse(e.data)) : this.take(e.data));
+      (typeof e.data === "string" ? this.receive(JSON.parse(e.data)) : this.receive_picture(e.data));
     socket.onclose = () =>
-      this.end(new Error("Python does not answer any more: it may have been stopped."));
+      this.reject_all(new Error("Python does not answer any more: it may have been stopped."));
     this.opened = new Promise((resolve, reject) => {
       socket.onopen = () => {
         // A socket that is opened again knows nothing of the scene that was opened in the old one.
@@ -97,9 +97,9 @@ export class Server extends Questions {
   async send(question) { (await this.connected()).send(JSON.stringify(question)); }
 
   /** @param {string} kind @param {object} given
-   *  @param {(done: number, stop: () => void) => void} [told] */
-  async ask(kind, given, told) {
-    const answer = await super.ask(kind, given, told);
+   *  @param {(done: number, stop: () => void) => void} [on_progress] */
+  async ask(kind, given, on_progress) {
+    const answer = await super.ask(kind, given, on_progress);
     if (kind === "load") this.loaded = /** @type {any} */ (given).text;
     return answer;
   }
@@ -108,7 +108,7 @@ export class Server extends Questions {
 /** What anywidget gives a widget of its Python side.
  * @typedef {{
  *   get(name: string): any, set(name: string, value: any): void, save_changes(): void,
- *   send(message: any): void, on(event: string, heard: (...given: any[]) => void): void,
+ *   send(message: any): void, on(event: string, handler: (...given: any[]) => void): void,
  * }} Model */
 
 /** The kernel of a notebook, by the messages of a widget. */
@@ -117,10 +117,10 @@ export class Kernel extends Questions {
   constructor(model) {
     super();
     this.model = model;
-    model.on("msg:custom", (said, buffers) => {
-      if (!buffers?.length) return this.hear(said);
+    model.on("msg:custom", (message, buffers) => {
+      if (!buffers?.length) return this.receive(message);
       const { buffer, byteOffset, byteLength } = /** @type {DataView} */ (buffers[0]);
-      return this.take(/** @type {ArrayBuffer} */ (buffer.slice(byteOffset, byteOffset + byteLength)));
+      return this.receive_picture(/** @type {ArrayBuffer} */ (buffer.slice(byteOffset, byteOffset + byteLength)));
     });
   }
 
@@ -136,13 +136,13 @@ export function widget(Panel, model, el) {
   el.append(root);
   let panel = new Panel(root, model.get("_scene"), model.get("_passes"), new Kernel(model), model.get("_still"));
   root.addEventListener("panel", (e) => { panel = /** @type {CustomEvent} */ (e).detail; });
-  root.addEventListener("moved", (e) => {
+  root.addEventListener("attributes", (e) => {
     for (const [name, value] of Object.entries(/** @type {CustomEvent} */ (e).detail))
       model.set(name, value);
     model.save_changes();
   });
   for (const name of ["camera", "sliders", "points", "show"])
-    model.on(`change:${name}`, () => panel.take_over({ [name]: model.get(name) }));
+    model.on(`change:${name}`, () => panel.apply_attributes({ [name]: model.get(name) }));
   panel.open();
   return () => panel.close();
 }

@@ -81,42 +81,42 @@ class Painter:
 
     def paint(
         self, painted: Sequence[Painted], eye: Eye, size: tuple[int, int], *, show: str,
-        ground: str, rests: bool,
+        ground: str, is_idle: bool,
     ) -> Painting:  # fmt: skip
-        """A picture. rests: whether nothing moves, so that it pays to trace the shadow on the floor
-        anew."""
+        """A picture. is_idle: whether nothing moves, so that it pays to trace the shadow on the
+        floor anew."""
         mi = register()
         light = Light.of(_matrix(eye))
         has_floor = show == "shaded" and eye.origin[2] > FLOOR
         numbers = [eye.origin, eye.right, eye.up, eye.forward]
         key = painted, np.ravel(numbers).tolist(), eye.pixel, size, has_floor
         if self._met is None or self._met[0][0] is not painted or self._met[0][1:] != key[1:]:
-            self._met = key, self._look(mi, painted, eye, size, has_floor=has_floor)
+            self._met = key, self._trace(mi, painted, eye, size, has_floor=has_floor)
             dr.eval(self._met[1])
-        seen = self._met[1]
+        hits = self._met[1]
         if show != "shaded":
-            return _numbers(seen, show, _BEHIND[ground], size)
+            return _numbers(hits, show, _BEHIND[ground], size)
         # First: it evaluates, and what is recorded before that makes another kernel of the rest.
-        if has_floor and (rests or self.floor is None):
+        if has_floor and (is_idle or self.floor is None):
             self.floor = Floor.of(_Casting(mi, painted), light)
-        width = seen["t"] * eye.pixel * dr.dot(seen["d"], _vector(mi, eye.forward))
-        sky = visible_sky(mi, seen["position"], seen["normal"], width, size)
+        width = hits["t"] * eye.pixel * dr.dot(hits["d"], _vector(mi, eye.forward))
+        sky = visible_sky(mi, hits["position"], hits["normal"], width, size)
         reflectance = reflectance_of(ground)
-        color = seen["color"]
+        color = hits["color"]
         sun: Any = mi.Float(1)
         if self.floor is not None and has_floor:
-            sun, above = self.floor.at(seen["position"])
-            sun, above = dr.select(seen["ground"], sun, 1), dr.select(seen["ground"], above, 1)
+            sun, above = self.floor.at(hits["position"])
+            sun, above = dr.select(hits["ground"], sun, 1), dr.select(hits["ground"], above, 1)
             sky = dr.minimum(sky, above)
-            color = dr.select(seen["ground"], _vector(mi, reflectance, mi.Color3f), color)
-        lit = light.on(color, seen["normal"], -seen["d"], seen["glossy"], sky, sun)
+            color = dr.select(hits["ground"], _vector(mi, reflectance, mi.Color3f), color)
+        lit = light.on(color, hits["normal"], -hits["d"], hits["glossy"], sky, sun)
         far, z = _vector(mi, reflectance, mi.Color3f), mi.Vector3f(0, 0, 1)
         wall = light.on(far, z, z, mi.Bool(False), mi.Float(1))
-        wall = wall * (1 - _DARKER * dr.power(dr.clip(seen["d"].z, 0, 1), 0.7))
+        wall = wall * (1 - _DARKER * dr.power(dr.clip(hits["d"].z, 0, 1), 0.7))
         room = 1 - SHOULDER
         bright = 1 - room * dr.exp((SHOULDER - lit) / room)
-        shown = dr.select(seen["met"], dr.select(lit > SHOULDER, bright, lit), wall)
-        shown = dr.clip(dr.select(seen["lost"], mi.Color3f(LOST_COLOR), shown), 0, 1)
+        shown = dr.select(hits["met"], dr.select(lit > SHOULDER, bright, lit), wall)
+        shown = dr.clip(dr.select(hits["lost"], mi.Color3f(LOST_COLOR), shown), 0, 1)
         srgb = dr.select(
             shown <= 0.0031308, 12.92 * shown, 1.055 * dr.power(shown, 1 / 2.4) - 0.055
         )
@@ -124,7 +124,7 @@ class Painter:
         packed = red | (green << 8) | (blue << 16) | (255 << 24)
         return Painting(to_numpy(packed).astype("<u4").view(np.uint8).reshape(size[1], size[0], 4))
 
-    def _look(
+    def _trace(
         self, mi: Any, painted: Sequence[Painted], eye: Eye, size: tuple[int, int], *,
         has_floor: bool,
     ) -> dict[str, Any]:  # fmt: skip
@@ -146,10 +146,10 @@ class Painter:
             far = (FLOOR - origin.z) / dr.minimum(d.z, -1e-9)
             ground = (d.z < 0) & (dr.norm(origin + far * d) < 100.0)
             t = dr.select(ground, far, t)
-        looks = mi.UInt32(0)
+        evaluations = mi.UInt32(0)
         for one in painted:
             met = one.placed.meet(o, vector(d), mi.Float(dr.inf), mi.Bool(True))
-            looks += met.evaluations
+            evaluations += met.evaluations
             lost |= met.lost
             # The floor stands below what was drawn at first: it hides nothing that has moved below.
             nearer = met.met & ~met.lost & (ground | (met.t < t))
@@ -164,7 +164,8 @@ class Painter:
         return {
             "t": t, "d": d, "normal": dr.mulsign(normal, -dr.dot(normal, d)),
             "position": dr.select(met, origin + t * d, dr.nan), "color": color, "glossy": glossy,
-            "met": met, "lost": lost, "ground": ground, "evaluations": looks, "gradient": normal,
+            "met": met, "lost": lost, "ground": ground, "evaluations": evaluations,
+            "gradient": normal,
         }  # fmt: skip
 
 
@@ -210,21 +211,21 @@ def _matrix(eye: Eye) -> FloatArray:
 
 
 def _numbers(
-    seen: dict[str, Any], show: str, behind: Sequence[float], size: tuple[int, int]
+    hits: dict[str, Any], show: str, behind: Sequence[float], size: tuple[int, int]
 ) -> Painting:
     """A picture of normals, depths, evaluations or outcomes, as colors."""
-    met, lost = to_numpy(seen["met"]), to_numpy(seen["lost"])
+    met, lost = to_numpy(hits["met"]), to_numpy(hits["lost"])
     picture, depths = np.empty((len(met), 3)), (0.0, 0.0)
     picture[:] = behind
     if show == "normal":
-        picture[met] = 0.5 + 0.5 * to_numpy(seen["gradient"])[met]
+        picture[met] = 0.5 + 0.5 * to_numpy(hits["gradient"])[met]
     elif show == "depth" and met.any():
-        t = to_numpy(seen["t"])[met]
+        t = to_numpy(hits["t"])[met]
         depths = float(t.min()), float(t.max())
         share = (t - depths[0]) / max(depths[1] - depths[0], 1e-12)
         picture[met] = (NEAR_GRAY + share * (FAR_GRAY - NEAR_GRAY))[:, None]
     elif show == "evaluations":
-        picture[:] = viridis(evaluations_share(to_numpy(seen["evaluations"])))
+        picture[:] = viridis(evaluations_share(to_numpy(hits["evaluations"])))
     elif show == "status":
         picture[met] = HIT_COLOR
     picture[lost] = transferred(np.array(LOST_COLOR))

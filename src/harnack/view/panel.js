@@ -1,8 +1,8 @@
 // The window: a canvas, what is said of it, and the controls beside it.
 // @ts-check
 
-import { Camera, along, dot } from "./camera.js";
-import { Drawing, QUICK, SHOWS } from "./drawing.js";
+import { Camera, add_scaled, dot } from "./camera.js";
+import { Drawing, FRAME_TIME, SHOWS } from "./drawing.js";
 import { element, format } from "./elements.js";
 import { changed } from "./frames.js";
 import { legend_of } from "./legend.js";
@@ -13,7 +13,7 @@ import { legend_of } from "./legend.js";
  * @typedef {{
  *   change(wanted: {sliders: Record<string, number>, loops: number[][][] | null, cut: Cut | null,
  *     settings: Settings, checks: boolean}): Promise<Change>,
- *   ask?(kind: string, given: object, told?: (done: number, stop: () => void) => void): Promise<any>,
+ *   ask?(kind: string, given: object, on_progress?: (done: number, stop: () => void) => void): Promise<any>,
  * }} Link */
 /** Settings of `harnack.render` that are changed here: see `CONTROLLED` in harnack.view.scene.
  * @typedef {{material?: string, boundary?: number | null}} Settings */
@@ -27,13 +27,13 @@ const CUTS = {
   none: {},
   ball: { size: [0.02, 1.05, 0.8] },
   box: { "size x": [0.02, 1.05, 0.6], "size y": [0.02, 1.05, 0.6], "size z": [0.02, 1.05, 0.6] },
-  plane: { turn: [-180, 180, -60], tilt: [-90, 90, 20], offset: [-1, 1, 0] },
+  plane: { azimuth: [-180, 180, -60], elevation: [-90, 90, 20], offset: [-1, 1, 0] },
 };
 const CURVE = [0.95, 0.75, 0.2, 1];
 // Pixels within which a pointer takes a point.
-const NEAR = 12;
+const PICK_RADIUS = 12;
 // Milliseconds after which nothing moves any more.
-const STILL = 400;
+const IDLE_TIME = 400;
 
 export class Panel {
   /** @param {HTMLElement} root @param {Scene} scene @param {string} passes @param {Link | null} link
@@ -47,9 +47,9 @@ export class Panel {
     this.values = Object.fromEntries(scene.sliders.map((one) => [one.name, one.start]));
     this.curves = scene.state.curves;
     /** @type {number[][][][]} */
-    this.before = [];
+    this.undo_stack = [];
     /** @type {number[][][][]} */
-    this.after = [];
+    this.redo_stack = [];
     this.edited = false;
     this.editing = false;
     this.probing = false;
@@ -57,35 +57,35 @@ export class Panel {
      *  @type {[number, number] | null} */
     this.depth_range = null;
     /** @type {Camera | undefined} */
-    this.seen = undefined;
+    this.own_camera = undefined;
     this.show = scene.show;
-    /** What was told of each attribute. @type {Record<string, string>} */
-    this.told = {};
-    this.telling = false;
+    /** What was last reported of each attribute. @type {Record<string, string>} */
+    this.reported = {};
+    this.is_report_due = false;
     this.ground = scene.ground[0] < 0.3 ? "dark" : "light";
     /** @type {Marks[]} */
-    this.probed = [];
+    this.probe_marks = [];
     /** @type {Settings} */
     this.settings = {};
-    this.cutter = "none";
+    this.cut_kind = "none";
     /** @type {Record<string, number>} */
-    this.cuts = {};
+    this.cut_numbers = {};
     /** @type {ResizeObserver[]} */
     this.observers = [];
     /** @type {[number, number] | null} */
-    this.chosen = null;
+    this.selected_point = null;
     root.classList.add("harnack");
     this.canvas = element("canvas", { tabIndex: 0 });
     this.canvas.setAttribute("role", "img");
     this.canvas.setAttribute("aria-label",
       `${scene.title}. Drag or use the arrow keys to turn it, the wheel or + and - to come closer.`);
     this.still = element("img", { alt: scene.title, src: still });
-    this.said = element("p", { className: "said" });
-    this.said.setAttribute("role", "status");
+    this.message = element("p", { className: "message" });
+    this.message.setAttribute("role", "status");
     this.controls = this.build();
-    this.plain = element("canvas", { tabIndex: 0, className: "plain" });
-    this.plain.style.display = "none";
-    this.sheet = document.createElement("canvas");
+    this.remote_canvas = element("canvas", { tabIndex: 0, className: "remote" });
+    this.remote_canvas.style.display = "none";
+    this.image_canvas = document.createElement("canvas");
     this.scale = 0.25;
     this.pictures = 0;
     /** @type {Marks[]} */
@@ -93,16 +93,16 @@ export class Panel {
     /** @type {Marks[]} */
     this.dots = [];
     this.legend = element("div");
-    const notes = element("div", { className: "notes" }, this.legend, this.said);
-    root.append(this.still, this.canvas, this.plain, notes, this.controls);
+    const notes = element("div", { className: "notes" }, this.legend, this.message);
+    root.append(this.still, this.canvas, this.remote_canvas, notes, this.controls);
   }
 
   /** @param {string} words @param {boolean} [is_drawn] */
-  say(words, is_drawn = this.drawing !== undefined) {
-    this.said.textContent = words;
+  show_message(words, is_drawn = this.drawing !== undefined) {
+    this.message.textContent = words;
     this.canvas.style.visibility = is_drawn ? "visible" : "hidden";
     this.still.style.display = is_drawn || this.is_remote ? "none" : "";
-    this.root.dataset.state = is_drawn ? "drawn" : words ? "said" : "";
+    this.root.dataset.state = is_drawn ? "drawn" : words ? "message" : "";
   }
 
   build() {
@@ -112,7 +112,7 @@ export class Panel {
     const ground = element("select", { onchange: () => { this.ground = ground.value; this.redraw(); } },
       ...Object.keys(GROUNDS).map((name) => element("option", { value: name }, name)));
     [show.value, ground.value] = [this.show, this.ground];
-    this.shows = show;
+    this.show_select = show;
     /** @type {HTMLElement[]} */
     const rows = [
       element("label", {}, "Show ", show), element("label", {}, "Ground ", ground),
@@ -123,13 +123,13 @@ export class Panel {
     if (scene.editable) {
       const edit = element("input", { type: "checkbox", onchange: () => {
         this.editing = edit.checked;
-        this.chosen = null;
-        this.mark();
+        this.selected_point = null;
+        this.update_marks();
       } });
       rows.push(element("label", {}, edit, " Edit points"));
       buttons.push(
-        this.button("Undo", () => this.undo(this.before, this.after)),
-        this.button("Redo", () => this.undo(this.after, this.before)),
+        this.button("Undo", () => this.undo(this.undo_stack, this.redo_stack)),
+        this.button("Redo", () => this.undo(this.redo_stack, this.undo_stack)),
         this.button("Smooth", () => this.edit(this.curves.map(smoothed))),
       );
     }
@@ -137,11 +137,11 @@ export class Panel {
     if (this.link?.ask) {
       const probe = element("input", { type: "checkbox", onchange: () => {
         this.probing = probe.checked;
-        this.probed = [];
-        this.mark();
+        this.probe_marks = [];
+        this.update_marks();
       } });
       rows.push(element("label", {}, probe, " Probe by click"));
-      rows.push(...this.materials(), ...this.cutting());
+      rows.push(...this.material_controls(), ...this.cut_controls());
       const width = element("input", { type: "number", min: "16", max: "8192", value: "1600", name: "width" });
       const quality = element("select", { name: "quality" },
         ...["shaded", "color"].map((name) => element("option", { value: name }, name)));
@@ -154,29 +154,29 @@ export class Panel {
         this.button("Open scene", () => file.click()), file,
       );
     }
-    this.asked = element("div", { className: "buttons" }, ...buttons);
-    this.about = element("small");
+    this.buttons = element("div", { className: "buttons" }, ...buttons);
+    this.device_note = element("small");
     return element("details", { open: innerWidth > 600 && scene.sliders.length > 0 },
-      element("summary", {}, "Controls"), ...rows, this.asked, this.about);
+      element("summary", {}, "Controls"), ...rows, this.buttons, this.device_note);
   }
 
   /** What the surfaces are made of, and how thick the tubes around the curves are at which they end. */
-  materials() {
+  material_controls() {
     const { materials, material, tube, reach, state } = this.scene;
     const [GIVEN, COLOR] = ["as given", "color"];
     const set = () => {
-      if (chosen.value === GIVEN) delete this.settings.material;
-      else this.settings.material = chosen.value === COLOR ? color.value : chosen.value;
-      color.hidden = chosen.value !== COLOR;
+      if (select.value === GIVEN) delete this.settings.material;
+      else this.settings.material = select.value === COLOR ? color.value : select.value;
+      color.hidden = select.value !== COLOR;
       this.change();
     };
     const names = material && materials.includes(material) ? materials : [GIVEN, ...materials];
-    const chosen = element("select", { name: "material", onchange: set },
+    const select = element("select", { name: "material", onchange: set },
       ...[...names, COLOR].map((name) => element("option", { value: name }, name)));
-    chosen.value = material && materials.includes(material) ? material : GIVEN;
+    select.value = material && materials.includes(material) ? material : GIVEN;
     const color = element("input", { type: "color", name: "color", value: "#4682b4", hidden: true, oninput: set });
     color.setAttribute("aria-label", "Color");
-    const rows = [element("label", {}, "Material ", chosen, " ", color)];
+    const rows = [element("label", {}, "Material ", select, " ", color)];
     if (!state.curves.length || "boundary" in this.values) return rows;
     const shown = element("output", {}, tube === null ? "none" : format(tube));
     const radius = element("input", {
@@ -192,16 +192,16 @@ export class Panel {
   }
 
   /** What cuts the surfaces, and sliders of it. */
-  cutting() {
+  cut_controls() {
     const numbers = element("div", { className: "cut" });
     const chosen = element("select", { name: "cut", onchange: () => {
-      this.cutter = chosen.value;
-      this.cuts = Object.fromEntries(
+      this.cut_kind = chosen.value;
+      this.cut_numbers = Object.fromEntries(
         Object.entries(CUTS[chosen.value]).map(([name, ends]) => [name, ends[2]]));
       numbers.replaceChildren(...Object.entries(CUTS[chosen.value]).map(([name, [low, high, start]]) => {
         const input = element("input", {
           type: "range", min: String(low), max: String(high), step: "any", name, value: String(start),
-          oninput: () => { this.cuts[name] = Number(input.value); this.change(); },
+          oninput: () => { this.cut_numbers[name] = Number(input.value); this.change(); },
         });
         return element("label", {}, `${name} `, input);
       }));
@@ -213,14 +213,14 @@ export class Panel {
   /** What cuts the surfaces now, in their coordinates. @returns {Cut | null} */
   cut() {
     const { middle, reach } = this.scene;
-    const { size, turn, tilt, offset } = this.cuts;
-    if (this.cutter === "ball") return { ball: [...middle, size * reach] };
-    if (this.cutter === "box") {
-      const half = ["x", "y", "z"].map((axis) => reach * this.cuts[`size ${axis}`]);
+    const { size, azimuth, elevation, offset } = this.cut_numbers;
+    if (this.cut_kind === "ball") return { ball: [...middle, size * reach] };
+    if (this.cut_kind === "box") {
+      const half = ["x", "y", "z"].map((axis) => reach * this.cut_numbers[`size ${axis}`]);
       return { box: [...middle.map((x, k) => x - half[k]), ...middle.map((x, k) => x + half[k])] };
     }
-    if (this.cutter !== "plane") return null;
-    const [a, b] = [turn, tilt].map((degrees) => degrees * Math.PI / 180);
+    if (this.cut_kind !== "plane") return null;
+    const [a, b] = [azimuth, elevation].map((degrees) => degrees * Math.PI / 180);
     const normal = [Math.cos(b) * Math.cos(a), Math.cos(b) * Math.sin(a), Math.sin(b)];
     return { plane: [...normal, dot(normal, middle) + offset * reach] };
   }
@@ -246,7 +246,7 @@ export class Panel {
   async open() {
     if (!navigator.gpu) return this.fall_back("This browser has no WebGPU here (the page must come "
       + "from https, or from 127.0.0.1)");
-    this.say("Compiling the surface for this GPU ...");
+    this.show_message("Compiling the surface for this GPU ...");
     const adapter = await navigator.gpu.requestAdapter({ powerPreference: "high-performance" });
     if (!adapter) return this.fall_back("No GPU was found for WebGPU");
     const { maxStorageBufferBindingSize, maxBufferSize, maxStorageBuffersPerShaderStage } = adapter.limits;
@@ -266,22 +266,22 @@ export class Panel {
       return this.fall_back(`This GPU cannot compile the surface (${wrong})`);
     }
     this.drawing = drawing;
-    this.canvas.addEventListener("range", () => this.explain());
-    this.say("");
+    this.canvas.addEventListener("range", () => this.update_legend());
+    this.show_message("");
     const { vendor = "", architecture = "", description = "" } = adapter.info ?? {};
     const name = description || `${vendor} ${architecture}`.trim() || "this browser's device";
     const rays = this.scene.state.surfaces.reduce((sum, one) => sum + (one.check?.count ?? 0), 0);
-    this.tell_who(`Traced by ${name}: ${rays} rays agree with Dr.Jit's.`);
+    this.show_device(`Traced by ${name}: ${rays} rays agree with Dr.Jit's.`);
     this.listen(this.canvas);
     this.observe(this.canvas, () => drawing.resize());
-    this.mark();
+    this.update_marks();
     drawing.resize();
-    if (this.link?.ask) this.canvas.addEventListener("whole", () => this.compare(), { once: true });
+    if (this.link?.ask) this.canvas.addEventListener("full_picture", () => this.choose_renderer(), { once: true });
   }
 
-  /** @param {HTMLElement} target @param {() => void} heard */
-  observe(target, heard) {
-    const one = new ResizeObserver(heard);
+  /** @param {HTMLElement} target @param {() => void} handler */
+  observe(target, handler) {
+    const one = new ResizeObserver(handler);
     one.observe(target);
     this.observers.push(one);
   }
@@ -290,7 +290,7 @@ export class Panel {
   close() {
     this.is_closed = true;
     for (const one of this.observers) one.disconnect();
-    clearTimeout(this.rest);
+    clearTimeout(this.recheck_timer);
     this.drawing?.stop();
     this.drawing?.device.destroy();
     this.drawing = undefined;
@@ -308,9 +308,9 @@ export class Panel {
 
   /** @param {HTMLElement} target */
   listen(target) {
-    this.camera().listen(target, () => this.redraw(), (e) => this.take(e));
+    this.camera().listen(target, () => this.redraw(), (e) => this.grab_point(e));
     target.addEventListener("pointermove", (e) => this.drag(e));
-    target.addEventListener("pointerup", (e) => this.let_go(e));
+    target.addEventListener("pointerup", (e) => this.release(e));
     target.addEventListener("dblclick", (e) => this.insert(e));
     target.addEventListener("keydown", (e) => this.key(e));
   }
@@ -318,8 +318,8 @@ export class Panel {
   /** @returns {Camera} */
   camera() {
     if (this.drawing) return this.drawing.camera;
-    this.seen ??= new Camera(this.scene.camera);
-    return this.seen;
+    this.own_camera ??= new Camera(this.scene.camera);
+    return this.own_camera;
   }
 
   /** Without a GPU that can be trusted: Python draws, where it is; else a picture stands still.
@@ -328,74 +328,74 @@ export class Panel {
     if (this.link?.ask) return this.let_python_draw(`${why}: Python draws.`);
     this.drawing?.stop();
     this.drawing = undefined;
-    this.say(`${why}: this is a still picture.`, false);
+    this.show_message(`${why}: this is a still picture.`, false);
   }
 
   /** Says who traces. @param {string} words */
-  tell_who(words) { if (this.about) this.about.textContent = words; }
+  show_device(words) { if (this.device_note) this.device_note.textContent = words; }
 
   /** @param {string} why */
   let_python_draw(why) {
-    this.tell_who("Traced by Python.");
+    this.show_device("Traced by Python.");
     const camera = this.camera();
     this.drawing?.stop();
     this.drawing = undefined;
-    this.seen = camera;
+    this.own_camera = camera;
     this.is_remote = true;
-    this.plain.style.display = "";
-    this.say(why, false);
-    this.listen(this.plain);
+    this.remote_canvas.style.display = "";
+    this.show_message(why, false);
+    this.listen(this.remote_canvas);
     this.observe(this.root, () => this.redraw());
     this.redraw();
   }
 
   /** What a person has moved, as the attributes of a notebook's widget have it. */
-  moved() {
+  attributes() {
     const camera = this.camera();
     return {
-      camera: { position: this.unplaced(camera.eye()), target: this.unplaced(camera.target), fov: camera.fov },
+      camera: { position: this.from_stage(camera.eye()), target: this.from_stage(camera.target), fov: camera.fov },
       sliders: { ...this.values }, points: this.curves, show: this.show,
     };
   }
 
   /** Tells those who listen what has been moved, once a frame at most. */
-  tell() {
-    if (this.telling) return;
-    this.telling = true;
+  report() {
+    if (this.is_report_due) return;
+    this.is_report_due = true;
     requestAnimationFrame(() => {
-      this.telling = false;
+      this.is_report_due = false;
       if (this.is_closed) return;
-      const now = this.moved();
+      const now = this.attributes();
       const changed = Object.fromEntries(Object.entries(now).filter(
-        ([name, value]) => JSON.stringify(value) !== this.told[name]));
-      for (const [name, value] of Object.entries(changed)) this.told[name] = JSON.stringify(value);
+        ([name, value]) => JSON.stringify(value) !== this.reported[name]));
+      for (const [name, value] of Object.entries(changed)) this.reported[name] = JSON.stringify(value);
       if (Object.keys(changed).length)
-        this.root.dispatchEvent(new CustomEvent("moved", { detail: changed }));
+        this.root.dispatchEvent(new CustomEvent("attributes", { detail: changed }));
     });
   }
 
   /** Moves what somebody else than the person has moved.
    *  @param {{camera?: {position: number[], target: number[], fov: number},
    *  sliders?: Record<string, number>, points?: number[][][], show?: string}} given */
-  take_over(given) {
+  apply_attributes(given) {
     for (const [name, value] of Object.entries(given)) {
-      if (JSON.stringify(value) === this.told[name]) continue;
-      this.told[name] = JSON.stringify(value);
+      if (JSON.stringify(value) === this.reported[name]) continue;
+      this.reported[name] = JSON.stringify(value);
       if (name === "camera") {
         const { position, target, fov } = /** @type {any} */ (value);
-        this.camera().look(this.place(position), this.place(target), fov);
+        this.camera().look_at(this.to_stage(position), this.to_stage(target), fov);
         this.redraw();
       } else if (name === "show") {
         this.show = /** @type {string} */ (value);
-        if (this.shows) this.shows.value = this.show;
+        if (this.show_select) this.show_select.value = this.show;
         this.redraw();
       } else if (name === "points") this.scene.editable && this.edit(/** @type {number[][][]} */ (value));
-      else this.slide(/** @type {Record<string, number>} */ (value));
+      else this.move_sliders(/** @type {Record<string, number>} */ (value));
     }
   }
 
   /** Moves sliders. @param {Record<string, number>} values */
-  slide(values) {
+  move_sliders(values) {
     Object.assign(this.values, values);
     for (const [name, value] of Object.entries(values)) {
       const input = this.controls.querySelector(`input[name="${CSS.escape(name)}"]`);
@@ -408,7 +408,7 @@ export class Panel {
   }
 
   /** Shows what the colors of the picture mean. */
-  explain() {
+  update_legend() {
     const legend = this.scene.legends[this.show];
     const range = this.drawing ? this.drawing.depth_range : this.depth_range;
     const scale = this.scene.placement[12];
@@ -420,8 +420,8 @@ export class Panel {
 
   redraw() {
     const { drawing } = this;
-    this.tell();
-    this.explain();
+    this.report();
+    this.update_legend();
     if (!drawing) { if (this.is_remote) this.draw_remotely(); return; }
     drawing.show = this.show;
     drawing.lines = this.lines;
@@ -433,43 +433,43 @@ export class Panel {
   /** Pictures from Python: coarse ones, and when nothing moves any more a whole one, first with the
    *  shadow that was there and then with its own. */
   async draw_remotely() {
-    this.stale = true;
-    if (this.fetching) return;
-    this.fetching = true;
+    this.is_picture_due = true;
+    if (this.is_fetching) return;
+    this.is_fetching = true;
     try {
-      for (let step = 0; this.stale || step < 3; step++) {
-        if (this.stale) step = 0;
-        this.stale = false;
+      for (let step = 0; this.is_picture_due || step < 3; step++) {
+        if (this.is_picture_due) step = 0;
+        this.is_picture_due = false;
         const start = performance.now();
-        const { image, range } = await this.drawn(step ? 1 : this.scale, step === 2);
+        const { image, range } = await this.fetch_picture(step ? 1 : this.scale, step === 2);
         if (this.show === "depth") this.depth_range = range;
-        this.explain();
-        this.put(image);
+        this.update_legend();
+        this.show_image(image);
         if (step === 1 && this.show !== "shaded") step = 2;  // no shadow
         if (step) continue;
-        const better = this.scale * Math.sqrt(QUICK / Math.max(performance.now() - start, 1));
+        const better = this.scale * Math.sqrt(FRAME_TIME / Math.max(performance.now() - start, 1));
         this.scale = Math.min(1, Math.max(0.06, 0.5 * (this.scale + better)));
       }
-      this.plain.dispatchEvent(new Event("rest"));
+      this.remote_canvas.dispatchEvent(new Event("idle"));
     } catch (wrong) {
-      this.say(/** @type {Error} */ (wrong).message, false);
+      this.show_message(/** @type {Error} */ (wrong).message, false);
     } finally {
-      this.fetching = false;
+      this.is_fetching = false;
     }
   }
 
   /** Puts a picture of any size into the window, and lines and dots before it.
    *  @param {ImageData} image */
-  put(image) {
+  show_image(image) {
     const [width, height] = [this.root.clientWidth, this.root.clientHeight];
-    this.sheet.width = image.width;
-    this.sheet.height = image.height;
-    this.sheet.getContext("2d")?.putImageData(image, 0, 0);
-    this.plain.width = width;
-    this.plain.height = height;
-    const pen = this.plain.getContext("2d");
+    this.image_canvas.width = image.width;
+    this.image_canvas.height = image.height;
+    this.image_canvas.getContext("2d")?.putImageData(image, 0, 0);
+    this.remote_canvas.width = width;
+    this.remote_canvas.height = height;
+    const pen = this.remote_canvas.getContext("2d");
     if (!pen) return;
-    pen.drawImage(this.sheet, 0, 0, width, height);
+    pen.drawImage(this.image_canvas, 0, 0, width, height);
     const camera = this.camera();
     const at = (/** @type {number[]} */ p) => camera.project(p, width, height);
     const color = (/** @type {number[]} */ c) =>
@@ -492,19 +492,19 @@ export class Panel {
     this.pictures++;
   }
 
-  /** A picture by Python of one ray a pixel. @param {number} scale @param {boolean} rests
+  /** A picture by Python of one ray a pixel. @param {number} scale @param {boolean} is_idle
    *  @returns {Promise<{image: ImageData, range: [number, number]}>} */
-  drawn(scale, rests) {
+  fetch_picture(scale, is_idle) {
     const camera = this.camera();
     const size = [this.root.clientWidth, this.root.clientHeight].map((x) => Math.max(8, Math.round(scale * x)));
     const eye = { origin: camera.eye(), ...camera.axes(), pixel: camera.pixel(size[0], size[1]) };
     return /** @type {any} */ (this.link).ask("draw", {
-      ...this.state(), size, show: this.show, ground: this.ground, eye, rests,
+      ...this.control_values(), size, show: this.show, ground: this.ground, eye, is_idle,
     });
   }
 
   /** Lets draw who is quicker: this browser's device, or Python. */
-  async compare() {
+  async choose_renderer() {
     const { drawing } = this;
     if (!drawing || !this.link?.ask) return;
     const pixels = (this.root.clientWidth * this.root.clientHeight) / 16;
@@ -512,39 +512,39 @@ export class Panel {
     try {
       for (let k = 0; k < 2; k++) {  // the first picture compiles kernels
         const start = performance.now();
-        await this.drawn(0.25, false);
+        await this.fetch_picture(0.25, false);
         took = performance.now() - start;
       }
     } catch (wrong) {
-      return this.say(/** @type {Error} */ (wrong).message);
+      return this.show_message(/** @type {Error} */ (wrong).message);
     }
     if (pixels / took > 1.5 * drawing.rate && drawing === this.drawing)
       this.let_python_draw("Python draws: it is quicker here than this browser's device.");
   }
 
   /** What is seen now, at a size: what Python needs to draw the same. @param {number} width */
-  seen_at(width) {
+  render_request(width) {
     const camera = this.camera();
     const shape = this.root.clientHeight / this.root.clientWidth;
     const size = [width, Math.max(1, Math.round(width * shape))];
     // The larger side's, of a camera whose 4 : 3 picture fits into the window.
     const half = 0.5 * camera.pixel(size[0], size[1]) * Math.max(size[0], size[1]);
     return {
-      ...this.state(), size, show: this.show, ground: this.ground,
+      ...this.control_values(), size, show: this.show, ground: this.ground,
       camera: { position: camera.eye(), target: camera.target, fov: (360 / Math.PI) * Math.atan(half) },
     };
   }
 
   /** A picture by Python of what is seen. @param {number} width @param {string} [quality] */
   async picture(width, quality = "shaded") {
-    const seen = this.seen_at(width);
-    const show = quality === "color" && seen.show === "shaded" ? "color" : seen.show;
+    const request = this.render_request(width);
+    const show = quality === "color" && request.show === "shaded" ? "color" : request.show;
     const bar = element("progress", { max: 1, value: 0 });
-    const { png } = await /** @type {Link} */ (this.link).ask?.("picture", { ...seen, show },
+    const { png } = await /** @type {Link} */ (this.link).ask?.("picture", { ...request, show },
       (done, stop) => {
         if (!bar.isConnected) {
-          this.say("Rendering ");
-          this.said.append(bar, " ", this.button("Cancel", stop));
+          this.show_message("Rendering ");
+          this.message.append(bar, " ", this.button("Cancel", stop));
         }
         bar.value = done;
       });
@@ -553,124 +553,124 @@ export class Panel {
 
   /** @param {number} width @param {string} quality */
   async render(width, quality) {
-    await this.tried(async () => {
+    await this.with_errors_shown(async () => {
       element("a", { href: await this.picture(width, quality), download: "surface.png" }).click();
-      this.say("");
+      this.show_message("");
     });
   }
 
   /** Does something, or says what is wrong. @param {() => Promise<void>} what */
-  async tried(what) {
+  async with_errors_shown(what) {
     try {
       await what();
     } catch (wrong) {
-      this.say(/** @type {Error} */ (wrong).message);
+      this.show_message(/** @type {Error} */ (wrong).message);
     }
   }
 
   /** Saves what is seen as a scene file. */
   save_scene() {
-    return this.tried(async () => {
-      const { text, lost } = await this.link?.ask?.("save", this.seen_at(800));
+    return this.with_errors_shown(async () => {
+      const { text, lost } = await this.link?.ask?.("save", this.render_request(800));
       const href = URL.createObjectURL(new Blob([text], { type: "application/json" }));
       element("a", { href, download: "scene.json" }).click();
       setTimeout(() => URL.revokeObjectURL(href), 1000);
-      this.say(lost.length ? `Saved as it stands: a file cannot hold the sliders ${lost.join(", ")}.` : "");
+      this.show_message(lost.length ? `Saved as it stands: a file cannot hold the sliders ${lost.join(", ")}.` : "");
     });
   }
 
   /** Opens a scene file in this window. @param {File} file */
   load(file) {
-    return this.tried(async () => this.replace(
+    return this.with_errors_shown(async () => this.replace(
       await this.link?.ask?.("load", { text: await file.text() })));
   }
 
   /** What the sliders and the curves are now. */
-  state() {
+  control_values() {
     return { sliders: { ...this.values }, loops: this.edited ? this.curves : null,
       cut: this.cut(), settings: { ...this.settings } };
   }
 
   /** @param {Link} link @param {boolean} checks */
-  async asked_for(link, checks) {
-    return changed(this.scene.state, await link.change({ ...this.state(), checks }));
+  async fetch_state(link, checks) {
+    return changed(this.scene.state, await link.change({ ...this.control_values(), checks }));
   }
 
   /** Asks for the state at the sliders and points, one after the other, the last one for sure. */
   async change() {
-    this.wanted = true;
-    if (this.asking || !this.link) return;
-    this.asking = true;
+    this.is_change_due = true;
+    if (this.is_changing || !this.link) return;
+    this.is_changing = true;
     try {
-      while (this.wanted) {
-        this.wanted = false;
-        if (this.is_remote) { this.mark(); continue; }
-        const state = await this.asked_for(this.link, false);
+      while (this.is_change_due) {
+        this.is_change_due = false;
+        if (this.is_remote) { this.update_marks(); continue; }
+        const state = await this.fetch_state(this.link, false);
         if (!this.drawing) continue;
         const wrong = await this.drawing.set(state, state.surfaces.some((one) => one.check));
         if (wrong) return this.fall_back(`This GPU does not compute what the surface was proved with: ${wrong}`);
         // An answer may be to an older question than the last edit.
         if (!this.edited) this.curves = state.curves;
-        this.say("");
-        this.mark();
+        this.show_message("");
+        this.update_marks();
       }
     } catch (wrong) {
-      this.say(/** @type {Error} */ (wrong).message);
+      this.show_message(/** @type {Error} */ (wrong).message);
     } finally {
-      this.asking = false;
+      this.is_changing = false;
     }
     if (!this.link.ask) return;
-    clearTimeout(this.rest);
-    this.rest = setTimeout(() => this.confirm(), STILL);
+    clearTimeout(this.recheck_timer);
+    this.recheck_timer = setTimeout(() => this.recheck(), IDLE_TIME);
   }
 
   /** Has the device checked against Dr.Jit for what is drawn now. */
-  async confirm() {
-    if (this.asking || !this.drawing || !this.link) return;
-    const now = JSON.stringify(this.state());
+  async recheck() {
+    if (this.is_changing || !this.drawing || !this.link) return;
+    const now = JSON.stringify(this.control_values());
     try {
-      const state = await this.asked_for(this.link, true);
-      if (this.asking || !this.drawing || JSON.stringify(this.state()) !== now) return;
+      const state = await this.fetch_state(this.link, true);
+      if (this.is_changing || !this.drawing || JSON.stringify(this.control_values()) !== now) return;
       const wrong = await this.drawing.set(state);
       if (wrong) this.fall_back(`This GPU does not compute what the surface was proved with: ${wrong}`);
       else this.redraw();
     } catch (wrong) {
-      this.say(/** @type {Error} */ (wrong).message);
+      this.show_message(/** @type {Error} */ (wrong).message);
     }
   }
 
   /** Draws the curves and their points while they are edited, and what was probed. */
-  mark() {
+  update_marks() {
     this.lines = !this.editing ? [] : this.curves.map((curve) => ({
-      points: curve.flatMap((p, k) => [this.place(p), this.place(curve[(k + 1) % curve.length])]),
+      points: curve.flatMap((p, k) => [this.to_stage(p), this.to_stage(curve[(k + 1) % curve.length])]),
       color: CURVE, width: 2.5,
     }));
     this.dots = !this.editing ? [] : this.curves.map((curve) => ({
-      points: curve.map((p) => this.place(p)), color: [0.1, 0.1, 0.1, 1], width: 6,
+      points: curve.map((p) => this.to_stage(p)), color: [0.1, 0.1, 0.1, 1], width: 6,
     }));
-    const chosen = this.chosen && this.curves[this.chosen[0]]?.[this.chosen[1]];
+    const chosen = this.selected_point && this.curves[this.selected_point[0]]?.[this.selected_point[1]];
     if (this.editing && chosen)
-      this.dots.push({ points: [this.place(chosen)], color: [1, 0.3, 0.1, 1], width: 8 });
-    this.lines.push(...this.probed.filter((one) => one.width < 4));
-    this.dots.push(...this.probed.filter((one) => one.width >= 4));
+      this.dots.push({ points: [this.to_stage(chosen)], color: [1, 0.3, 0.1, 1], width: 8 });
+    this.lines.push(...this.probe_marks.filter((one) => one.width < 4));
+    this.dots.push(...this.probe_marks.filter((one) => one.width >= 4));
     this.redraw();
   }
 
   /** A point of the surfaces, on the stage. @param {number[]} p */
-  place(p) {
+  to_stage(p) {
     const { placement } = this.scene;
     return [0, 1, 2].map((k) => placement[12] * (placement[3 * k] * p[0] + placement[3 * k + 1] * p[1]
       + placement[3 * k + 2] * p[2]) + placement[9 + k]);
   }
 
   /** A point on the stage, in the surfaces' coordinates. @param {number[]} p */
-  unplaced(p) {
+  from_stage(p) {
     const { placement } = this.scene;
-    return this.unplace(p.map((x, k) => x - placement[9 + k]));
+    return this.direction_from_stage(p.map((x, k) => x - placement[9 + k]));
   }
 
-  /** A way on the stage, in the surfaces' coordinates. @param {number[]} d */
-  unplace(d) {
+  /** A direction on the stage, in the surfaces' coordinates. @param {number[]} d */
+  direction_from_stage(d) {
     const { placement } = this.scene;
     return [0, 1, 2].map((k) => (placement[k] * d[0] + placement[3 + k] * d[1] + placement[6 + k] * d[2])
       / placement[12]);
@@ -683,53 +683,53 @@ export class Panel {
   }
 
   /** The point that is nearest to a pointer; null if none is near. @param {MouseEvent} e */
-  nearest(e) {
+  nearest_point(e) {
     const camera = this.camera();
     const { width, height, x, y } = this.pointer(e);
-    /** @type {{at: [number, number], far: number, z: number} | null} */
+    /** @type {{at: [number, number], distance: number, z: number} | null} */
     let best = null;
     this.curves.forEach((curve, c) => curve.forEach((p, k) => {
-      const there = camera.project(this.place(p), width, height);
-      const far = Math.hypot(there.x - x, there.y - y);
-      if (far < NEAR && (!best || far < best.far)) best = { at: [c, k], far, z: there.z };
+      const there = camera.project(this.to_stage(p), width, height);
+      const distance = Math.hypot(there.x - x, there.y - y);
+      if (distance < PICK_RADIUS && (!best || distance < best.distance)) best = { at: [c, k], distance, z: there.z };
     }));
-    return /** @type {{at: [number, number], far: number, z: number} | null} */ (best);
+    return /** @type {{at: [number, number], distance: number, z: number} | null} */ (best);
   }
 
   /** Whether a pointer takes a point. @param {PointerEvent} e */
-  take(e) {
+  grab_point(e) {
     this.pressed = e;
     if (!this.editing || e.button !== 0) return false;
-    const found = this.nearest(e);
-    this.chosen = found ? found.at : null;
-    if (!found) { this.mark(); return false; }
-    this.remember();
+    const found = this.nearest_point(e);
+    this.selected_point = found ? found.at : null;
+    if (!found) { this.update_marks(); return false; }
+    this.push_undo();
     /** @type {Element} */ (e.target).setPointerCapture(e.pointerId);
-    this.held = { x: e.clientX, y: e.clientY, z: found.z };
-    this.mark();
+    this.dragged = { x: e.clientX, y: e.clientY, z: found.z };
+    this.update_marks();
     return true;
   }
 
   /** @param {PointerEvent} e */
   drag(e) {
-    if (!this.held || !this.chosen) return;
+    if (!this.dragged || !this.selected_point) return;
     const { width, height } = this.pointer(e);
-    const way = this.camera().moved(
-      this.held.z, e.clientX - this.held.x, e.clientY - this.held.y, width, height);
-    this.held = { ...this.held, x: e.clientX, y: e.clientY };
-    const [c, k] = this.chosen;
+    const direction = this.camera().drag_offset(
+      this.dragged.z, e.clientX - this.dragged.x, e.clientY - this.dragged.y, width, height);
+    this.dragged = { ...this.dragged, x: e.clientX, y: e.clientY };
+    const [c, k] = this.selected_point;
     this.curves = this.curves.map((curve, i) => (i !== c ? curve
-      : curve.map((p, j) => (j === k ? along(p, 1, this.unplace(way)) : p))));
+      : curve.map((p, j) => (j === k ? add_scaled(p, 1, this.direction_from_stage(direction)) : p))));
     this.edited = true;
     this.change();
   }
 
   /** @param {PointerEvent} e */
-  let_go(e) {
+  release(e) {
     const { pressed } = this;
     if (this.probing && pressed && Math.hypot(e.clientX - pressed.clientX, e.clientY - pressed.clientY) < 3)
       this.probe(e);
-    this.held = undefined;
+    this.dragged = undefined;
   }
 
   /** Asks Python what the ray through a pointer meets, and draws its proved steps.
@@ -739,23 +739,23 @@ export class Panel {
     const camera = this.camera();
     const { right, up, forward } = camera.axes();
     const pixel = camera.pixel(width, height);
-    const way = along(along(forward, pixel * (x - 0.5 * width), right), -pixel * (y - 0.5 * height), up);
+    const on_stage = add_scaled(add_scaled(forward, pixel * (x - 0.5 * width), right), -pixel * (y - 0.5 * height), up);
     const eye = camera.eye();
-    const origin = this.unplaced(eye);
-    const direction = this.unplace(way);
+    const origin = this.from_stage(eye);
+    const direction = this.direction_from_stage(on_stage);
     try {
-      const found = await this.link?.ask?.("probe", { ...this.state(), origin, direction });
+      const found = await this.link?.ask?.("probe", { ...this.control_values(), origin, direction });
       const length = Math.hypot(...direction);
-      const at = (/** @type {number} */ t) => this.place(along(origin, t / length, direction));
+      const at = (/** @type {number} */ t) => this.to_stage(add_scaled(origin, t / length, direction));
       const ends = [...found.steps, ...(found.t === undefined ? [] : [found.t])].map(at);
-      this.probed = [
+      this.probe_marks = [
         { points: ends.slice(1).flatMap((p, k) => [ends[k], p]), color: [0.1, 0.4, 0.9, 0.9], width: 2 },
         { points: ends.slice(1), color: [0.1, 0.4, 0.9, 1], width: 5 },
       ];
-      this.say(said_of(found));
-      this.mark();
+      this.show_message(probe_text(found));
+      this.update_marks();
     } catch (wrong) {
-      this.say(/** @type {Error} */ (wrong).message);
+      this.show_message(/** @type {Error} */ (wrong).message);
     }
   }
 
@@ -764,20 +764,20 @@ export class Panel {
     const camera = this.camera();
     if (!this.editing) { camera.reset(); this.redraw(); return; }
     const { width, height, x, y } = this.pointer(e);
-    /** @type {{c: number, k: number, point: number[], far: number} | null} */
+    /** @type {{c: number, k: number, point: number[], distance: number} | null} */
     let best = null;
     this.curves.forEach((curve, c) => curve.forEach((p, k) => {
       const q = curve[(k + 1) % curve.length];
-      const [a, b] = [p, q].map((one) => camera.project(this.place(one), width, height));
+      const [a, b] = [p, q].map((one) => camera.project(this.to_stage(one), width, height));
       const [dx, dy] = [b.x - a.x, b.y - a.y];
       const s = Math.max(0, Math.min(1, ((x - a.x) * dx + (y - a.y) * dy) / Math.max(dx * dx + dy * dy, 1e-9)));
-      const far = Math.hypot(a.x + s * dx - x, a.y + s * dy - y);
-      if (far < NEAR && (!best || far < best.far))
-        best = { c, k, point: along(p, s, along(q, -1, p)), far };
+      const distance = Math.hypot(a.x + s * dx - x, a.y + s * dy - y);
+      if (distance < PICK_RADIUS && (!best || distance < best.distance))
+        best = { c, k, point: add_scaled(p, s, add_scaled(q, -1, p)), distance };
     }));
     const found = /** @type {{c: number, k: number, point: number[]} | null} */ (/** @type {unknown} */ (best));
     if (!found) return;
-    this.chosen = [found.c, found.k + 1];
+    this.selected_point = [found.c, found.k + 1];
     this.edit(this.curves.map((curve, c) => (c !== found.c ? curve
       : [...curve.slice(0, found.k + 1), found.point, ...curve.slice(found.k + 1)])));
   }
@@ -787,28 +787,28 @@ export class Panel {
     if (!this.scene.editable) return;
     if ((e.ctrlKey || e.metaKey) && e.key.toLowerCase() === "z") {
       e.preventDefault();
-      if (e.shiftKey) this.undo(this.after, this.before);
-      else this.undo(this.before, this.after);
-    } else if ((e.key === "Delete" || e.key === "Backspace") && this.editing && this.chosen) {
+      if (e.shiftKey) this.undo(this.redo_stack, this.undo_stack);
+      else this.undo(this.undo_stack, this.redo_stack);
+    } else if ((e.key === "Delete" || e.key === "Backspace") && this.editing && this.selected_point) {
       e.preventDefault();
-      const [c, k] = this.chosen;
-      if (this.curves[c].length <= 3) return this.say("A curve has three points at least.");
-      this.chosen = null;
+      const [c, k] = this.selected_point;
+      if (this.curves[c].length <= 3) return this.show_message("A curve has three points at least.");
+      this.selected_point = null;
       this.edit(this.curves.map((curve, i) => (i === c ? curve.filter((_, j) => j !== k) : curve)));
     }
   }
 
-  remember() {
-    this.before.push(this.curves);
-    this.after.length = 0;
+  push_undo() {
+    this.undo_stack.push(this.curves);
+    this.redo_stack.length = 0;
   }
 
   /** @param {number[][][]} curves */
   edit(curves) {
-    this.remember();
+    this.push_undo();
     this.curves = curves;
     this.edited = true;
-    this.mark();
+    this.update_marks();
     this.change();
   }
 
@@ -819,14 +819,14 @@ export class Panel {
     to.push(this.curves);
     this.curves = curves;
     this.edited = true;
-    this.chosen = null;
-    this.mark();
+    this.selected_point = null;
+    this.update_marks();
     this.change();
   }
 
   /** What is on the canvas, as a file. */
   save() {
-    this.drawing?.present(...(/** @type {[number, number]} */ (this.drawing.shown)));
+    this.drawing?.present(...(/** @type {[number, number]} */ (this.drawing.shown_size)));
     this.canvas.toBlob((blob) => {
       if (!blob) return;
       const address = URL.createObjectURL(blob);
@@ -844,7 +844,7 @@ function smoothed(curve) {
 }
 
 /** What a probe has found, in words. @param {any} found */
-function said_of(found) {
+function probe_text(found) {
   const looks = `${found.evaluations} evaluations`;
   if (found.t === undefined) return `${found.status.toLowerCase().replaceAll("_", " ")}, ${looks}`;
   const point = (/** @type {number[]} */ p) => `(${p.map(format).join(", ")})`;

@@ -2,9 +2,9 @@
 // pictures (harnack.rendering.shading), and lines and points in front.
 
 struct View {
-  eye: vec4f,         // on the stage; w: ways across the picture that look for the sky
+  eye: vec4f,         // on the stage; w: directions across the picture in which the sky is looked for
   right: vec4f,       // unit; w: of a pixel, at distance 1
-  up: vec4f,          // unit; w: the turn of these ways
+  up: vec4f,          // unit; w: the rotation of these directions
   forward: vec4f,     // unit; w: where rays end
   key: vec4f,         // unit, to the key light; w: the height of the floor
   ground: vec4f,      // reflectance; w: 1 where there is a floor
@@ -24,15 +24,15 @@ struct Surface {
 @group(0) @binding(1) var<uniform> surface: Surface;
 @group(0) @binding(2) var<storage, read_write> lanes: array<f32>;
 @group(0) @binding(3) var<storage, read> results: array<u32>;
-@group(0) @binding(4) var<storage, read_write> seen: array<u32>;
-@group(0) @binding(5) var<storage, read_write> sky: array<f32>;
+@group(0) @binding(4) var<storage, read_write> hits: array<u32>;
+@group(0) @binding(5) var<storage, read_write> sky_visibility: array<f32>;
 @group(0) @binding(6) var<storage, read_write> picture: array<vec4f>;
 @group(0) @binding(7) var<storage, read> colors: array<vec4f>;
 @group(0) @binding(8) var<storage, read> floor_light: array<vec2f>;
-@group(0) @binding(9) var<storage, read> towards: array<vec4f>;
-@group(0) @binding(10) var<storage, read_write> blocked: array<u32>;
+@group(0) @binding(9) var<storage, read> light_directions: array<vec4f>;
+@group(0) @binding(10) var<storage, read_write> occluded: array<u32>;
 
-const NOWHERE = 99u;
+const NO_OUTPUT = 99u;
 const NOTHING = 0u; const GROUND = 1u; const MET = 2u; const LOST = 3u;
 const HIT = 1u; const OUT_OF_STEPS = 2u;
 const SHADED = 0u; const NORMAL = 1u; const DEPTH = 2u; const EVALUATIONS = 3u; const STATUS = 4u;
@@ -45,7 +45,7 @@ fn direction(pixel: u32) -> vec3f {
   let across = (place - 0.5 * vec2f(f32(view.width), f32(view.height))) * view.right.w;
   return normalize(view.forward.xyz + across.x * view.right.xyz - across.y * view.up.xyz);
 }
-fn give(id: u32, o: vec3f, d: vec3f, end: f32) {
+fn write_lanes(id: u32, o: vec3f, d: vec3f, end: f32) {
   let values = array<f32, 7>(o.x, o.y, o.z, d.x, d.y, d.z, end);
   for (var k = 0u; k < surface.lane_count; k++) {
     lanes[k * view.count + id] = values[surface.lanes[k / 4u][k % 4u]];
@@ -53,21 +53,21 @@ fn give(id: u32, o: vec3f, d: vec3f, end: f32) {
 }
 fn result(k: u32, id: u32) -> u32 {
   let place = surface.results[k / 4u][k % 4u];
-  if (place == NOWHERE) { return 0u; }
+  if (place == NO_OUTPUT) { return 0u; }
   return results[place * view.count + id];
 }
 fn number(k: u32, id: u32) -> f32 { return bitcast<f32>(result(k, id)); }
 
 // Rays through pixels.
 @compute @workgroup_size(64)
-fn aim(@builtin(global_invocation_id) id: vec3u) {
+fn camera_rays(@builtin(global_invocation_id) id: vec3u) {
   if (id.x >= view.count) { return; }
-  give(id.x, view.eye.xyz, direction(view.first + id.x), view.forward.w);
+  write_lanes(id.x, view.eye.xyz, direction(view.first + id.x), view.forward.w);
 }
 
 // Before any surface: the floor, or nothing.
 @compute @workgroup_size(64)
-fn begin(@builtin(global_invocation_id) id: vec3u) {
+fn clear_hits(@builtin(global_invocation_id) id: vec3u) {
   if (id.x >= view.count) { return; }
   let pixel = view.first + id.x;
   let d = direction(pixel);
@@ -78,77 +78,77 @@ fn begin(@builtin(global_invocation_id) id: vec3u) {
   if (view.ground.w > 0.5 && view.show == SHADED && d.z < 0.0 && length(there.xy) < 100.0) {
     t = far; kind = GROUND;
   }
-  put(pixel, t, d, vec3f(0.0, 0.0, 1.0), kind);
+  write_hit(pixel, t, d, vec3f(0.0, 0.0, 1.0), kind);
 }
-fn put(pixel: u32, t: f32, d: vec3f, normal: vec3f, info: u32) {
+fn write_hit(pixel: u32, t: f32, d: vec3f, normal: vec3f, info: u32) {
   let p = view.eye.xyz + t * d;
   let at = 8u * pixel;
-  seen[at] = bitcast<u32>(p.x); seen[at + 1u] = bitcast<u32>(p.y);
-  seen[at + 2u] = bitcast<u32>(p.z); seen[at + 3u] = bitcast<u32>(t);
-  seen[at + 4u] = bitcast<u32>(normal.x); seen[at + 5u] = bitcast<u32>(normal.y);
-  seen[at + 6u] = bitcast<u32>(normal.z); seen[at + 7u] = info;
+  hits[at] = bitcast<u32>(p.x); hits[at + 1u] = bitcast<u32>(p.y);
+  hits[at + 2u] = bitcast<u32>(p.z); hits[at + 3u] = bitcast<u32>(t);
+  hits[at + 4u] = bitcast<u32>(normal.x); hits[at + 5u] = bitcast<u32>(normal.y);
+  hits[at + 6u] = bitcast<u32>(normal.z); hits[at + 7u] = info;
 }
 
 // What rays have met of one surface: kept where it is nearer than what was met before. The word
 // behind a pixel: what it is, whether the side of larger values is seen, its paint, evaluations.
 @compute @workgroup_size(64)
-fn gather(@builtin(global_invocation_id) id: vec3u) {
+fn merge_hits(@builtin(global_invocation_id) id: vec3u) {
   if (id.x >= view.count) { return; }
   let pixel = view.first + id.x;
-  let before = seen[8u * pixel + 7u];
-  let looks = min((before >> 14u) + result(5u, id.x), 0x3ffffu) << 14u;
+  let before = hits[8u * pixel + 7u];
+  let evaluations = min((before >> 14u) + result(5u, id.x), 0x3ffffu) << 14u;
   let status = result(0u, id.x);
   let d = direction(pixel);
   let t = number(1u, id.x);
-  if (status == OUT_OF_STEPS) { put(pixel, t, d, -d, LOST | looks); return; }
+  if (status == OUT_OF_STEPS) { write_hit(pixel, t, d, -d, LOST | evaluations); return; }
   // The floor stands below what was drawn at first: it hides nothing that has moved below it.
-  let in_front = (before & 3u) == GROUND || t < bitcast<f32>(seen[8u * pixel + 3u]);
+  let in_front = (before & 3u) == GROUND || t < bitcast<f32>(hits[8u * pixel + 3u]);
   if (status == HIT && (before & 3u) != LOST && in_front) {
     let n = vec3f(number(2u, id.x), number(3u, id.x), number(4u, id.x));
     let paint = min(surface.number + result(6u, id.x), 2047u);
-    put(pixel, t, d, n, MET | select(0u, 4u, dot(n, d) < 0.0) | (paint << 3u) | looks);
+    write_hit(pixel, t, d, n, MET | select(0u, 4u, dot(n, d) < 0.0) | (paint << 3u) | evaluations);
     return;
   }
-  seen[8u * pixel + 7u] = (before & 0x3fffu) | looks;
+  hits[8u * pixel + 7u] = (before & 0x3fffu) | evaluations;
 }
 
 fn position(pixel: u32) -> vec3f {
   let at = 8u * pixel;
-  return vec3f(bitcast<f32>(seen[at]), bitcast<f32>(seen[at + 1u]), bitcast<f32>(seen[at + 2u]));
+  return vec3f(bitcast<f32>(hits[at]), bitcast<f32>(hits[at + 1u]), bitcast<f32>(hits[at + 2u]));
 }
 fn normal_to_eye(pixel: u32, d: vec3f) -> vec3f {
   let at = 8u * pixel;
-  let n = vec3f(bitcast<f32>(seen[at + 4u]), bitcast<f32>(seen[at + 5u]), bitcast<f32>(seen[at + 6u]));
+  let n = vec3f(bitcast<f32>(hits[at + 4u]), bitcast<f32>(hits[at + 5u]), bitcast<f32>(hits[at + 6u]));
   return select(n, -n, dot(n, d) > 0.0);
 }
 fn is_there(pixel: u32) -> bool {
-  let kind = seen[8u * pixel + 7u] & 3u;
+  let kind = hits[8u * pixel + 7u] & 3u;
   return kind == GROUND || kind == MET;
 }
 
 // The part of the hemisphere over each point that nothing in the picture hides: `visible_sky`.
 @compute @workgroup_size(64)
-fn look_up(@builtin(global_invocation_id) id: vec3u) {
+fn estimate_sky(@builtin(global_invocation_id) id: vec3u) {
   if (id.x >= view.count) { return; }
   let pixel = view.first + id.x;
-  sky[pixel] = 1.0;
+  sky_visibility[pixel] = 1.0;
   if (!is_there(pixel)) { return; }
   let d = direction(pixel);
   let p = position(pixel);
   let n = normal_to_eye(pixel, d);
-  let t = bitcast<f32>(seen[8u * pixel + 3u]);
+  let t = bitcast<f32>(hits[8u * pixel + 3u]);
   let wide = t * view.right.w * dot(d, view.forward.xyz);
   let reach = TAP_REACH * f32(max(view.width, view.height));
   let radius = reach * wide;
   let x = f32(pixel % view.width); let y = f32(pixel / view.width);
-  let ways = view.eye.w;
+  let directions = view.eye.w;
   var hidden = 0.0;
-  for (var way = 0.0; way < ways; way += 1.0) {
-    let angle = (way + view.up.w) * (6.2831853 / ways);
+  for (var k = 0.0; k < directions; k += 1.0) {
+    let angle = (k + view.up.w) * (6.2831853 / directions);
     let across = vec2f(cos(angle), sin(angle));
     var highest = 0.0;
-    for (var k = 0u; k < TAPS; k++) {
-      let share = (f32(k) + fract(5.0 * view.up.w - 2.0)) / f32(TAPS);
+    for (var tap = 0u; tap < TAPS; tap++) {
+      let share = (f32(tap) + fract(5.0 * view.up.w - 2.0)) / f32(TAPS);
       let at = vec2f(x, y) + (1.0 + reach * share * share) * across;
       if (at.x < 0.0 || at.y < 0.0 || at.x > f32(view.width) - 1.0 || at.y > f32(view.height) - 1.0) {
         continue;
@@ -162,7 +162,7 @@ fn look_up(@builtin(global_invocation_id) id: vec3u) {
     }
     hidden += highest * highest;
   }
-  sky[pixel] = 1.0 - hidden / ways;
+  sky_visibility[pixel] = 1.0 - hidden / directions;
 }
 
 const KEY = vec3f(0.74, 0.71, 0.66);
@@ -207,9 +207,9 @@ fn viridis(given: f32) -> vec3f {
 }
 
 // Light and covered part of shaded pictures; sRGB of others.
-fn painted(pixel: u32) -> vec4f {
+fn color_of(pixel: u32) -> vec4f {
   let d = direction(pixel);
-  let info = seen[8u * pixel + 7u];
+  let info = hits[8u * pixel + 7u];
   let kind = info & 3u;
   let n = normal_to_eye(pixel, d);
   if (view.show == EVALUATIONS) {
@@ -220,58 +220,58 @@ fn painted(pixel: u32) -> vec4f {
   if (kind == NOTHING) { return vec4f(0.0); }
   if (view.show == NORMAL) {
     let at = 8u * pixel + 4u;
-    return vec4f(0.5 + 0.5 * vec3f(bitcast<f32>(seen[at]), bitcast<f32>(seen[at + 1u]),
-      bitcast<f32>(seen[at + 2u])), 1.0);
+    return vec4f(0.5 + 0.5 * vec3f(bitcast<f32>(hits[at]), bitcast<f32>(hits[at + 1u]),
+      bitcast<f32>(hits[at + 2u])), 1.0);
   }
   if (view.show == STATUS) { return vec4f(0.93, 0.93, 0.90, 1.0); }
   if (view.show == DEPTH) {
-    let x = (bitcast<f32>(seen[8u * pixel + 3u]) - view.scale.x) * view.scale.y;
+    let x = (bitcast<f32>(hits[8u * pixel + 3u]) - view.scale.x) * view.scale.y;
     return vec4f(vec3f(mix(0.95, 0.12, clamp(x, 0.0, 1.0))), 1.0);
   }
   if (kind == GROUND) {
     let reached = floor_at(position(pixel));
-    return vec4f(lit(view.ground.rgb, n, -d, false, min(sky[pixel], reached.y), reached.x), 1.0);
+    return vec4f(lit(view.ground.rgb, n, -d, false, min(sky_visibility[pixel], reached.y), reached.x), 1.0);
   }
   let color = colors[2u * ((info >> 3u) & 2047u) + select(1u, 0u, (info & 4u) != 0u)];
-  return vec4f(lit(color.rgb, n, -d, color.w > 0.5, sky[pixel], 1.0), 1.0);
+  return vec4f(lit(color.rgb, n, -d, color.w > 0.5, sky_visibility[pixel], 1.0), 1.0);
 }
 
 @compute @workgroup_size(64)
-fn paint(@builtin(global_invocation_id) id: vec3u) {
+fn shade(@builtin(global_invocation_id) id: vec3u) {
   if (id.x >= view.count) { return; }
   let pixel = view.first + id.x;
-  let color = painted(pixel);
+  let color = color_of(pixel);
   if (view.weight > 0.999) { picture[pixel] = color; return; }
   picture[pixel] = mix(picture[pixel], color, view.weight);
 }
 
 // Rays from the floor to the key light (kind 0) or to the sky (kind 1): `floor._parts_seen`.
 @compute @workgroup_size(64)
-fn aim_up(@builtin(global_invocation_id) id: vec3u) {
+fn floor_rays(@builtin(global_invocation_id) id: vec3u) {
   if (id.x >= view.count) { return; }
   let ray = view.first + id.x;
   let cell = ray / RAYS;
   let i = cell % CELLS; let j = cell / CELLS;
   let place = (vec2f(f32(i), f32(j)) + 0.5) / f32(CELLS) * 2.0 * REACH - REACH;
-  let way = ((j % BLOCK) * BLOCK + i % BLOCK) * RAYS + ray % RAYS;
-  let d = towards[view.kind * BLOCK * BLOCK * RAYS + way].xyz;
-  give(id.x, vec3f(place, 0.0), d, FAR);
+  let number = ((j % BLOCK) * BLOCK + i % BLOCK) * RAYS + ray % RAYS;
+  let d = light_directions[view.kind * BLOCK * BLOCK * RAYS + number].xyz;
+  write_lanes(id.x, vec3f(place, 0.0), d, FAR);
 }
 @compute @workgroup_size(64)
-fn gather_up(@builtin(global_invocation_id) id: vec3u) {
+fn merge_floor_hits(@builtin(global_invocation_id) id: vec3u) {
   if (id.x >= view.count) { return; }
   if (result(0u, id.x) != 0u) {
-    blocked[view.kind * CELLS * CELLS * RAYS + view.first + id.x] = 1u;
+    occluded[view.kind * CELLS * CELLS * RAYS + view.first + id.x] = 1u;
   }
 }
 
 // The picture on the canvas.
 @group(0) @binding(11) var<storage, read> shown: array<vec4f>;
-@group(0) @binding(12) var<storage, read> met: array<u32>;
+@group(0) @binding(12) var<storage, read> drawn_hits: array<u32>;
 @group(0) @binding(13) var<storage, read> marks: array<vec4f>;
 
 @vertex
-fn corner(@builtin(vertex_index) k: u32) -> @builtin(position) vec4f {
+fn full_screen(@builtin(vertex_index) k: u32) -> @builtin(position) vec4f {
   return vec4f(f32(k & 1u) * 4.0 - 1.0, f32(k >> 1u) * 4.0 - 1.0, 0.0, 1.0);
 }
 fn to_srgb(x: vec3f) -> vec3f {
@@ -282,7 +282,7 @@ fn shouldered(x: vec3f) -> vec3f {
   return select(1.0 - 0.2 * exp(-(x - 0.8) / 0.2), x, x <= vec3f(0.8));
 }
 @fragment
-fn show(@builtin(position) at: vec4f) -> @location(0) vec4f {
+fn display(@builtin(position) at: vec4f) -> @location(0) vec4f {
   let size = vec2f(f32(view.width), f32(view.height));
   let place = at.xy / view.canvas * size;
   let low = floor(place - 0.5);
@@ -314,10 +314,10 @@ struct Drawn {
   @location(2) across: vec2f,
 }
 fn on_canvas(p: vec3f) -> vec4f {
-  let way = p - view.eye.xyz;
-  let z = dot(way, view.forward.xyz);
+  let from_eye = p - view.eye.xyz;
+  let z = dot(from_eye, view.forward.xyz);
   let wide = 0.5 * view.right.w * vec2f(f32(view.width), f32(view.height));
-  return vec4f(dot(way, view.right.xyz) / wide.x, dot(way, view.up.xyz) / wide.y, 0.5 * z, z);
+  return vec4f(dot(from_eye, view.right.xyz) / wide.x, dot(from_eye, view.up.xyz) / wide.y, 0.5 * z, z);
 }
 @vertex
 fn line(@builtin(vertex_index) k: u32) -> Drawn {
@@ -325,8 +325,8 @@ fn line(@builtin(vertex_index) k: u32) -> Drawn {
   let corners = array<vec2f, 6>(vec2f(0, -1), vec2f(1, -1), vec2f(1, 1), vec2f(0, -1), vec2f(1, 1), vec2f(0, 1));
   let c = corners[k % 6u];
   let a = on_canvas(marks[one].xyz); let b = on_canvas(marks[one + 1u].xyz);
-  let way = (b.xy / b.w - a.xy / a.w) * view.canvas;
-  let side = vec2f(-way.y, way.x) / max(length(way), 1e-6);
+  let along_line = (b.xy / b.w - a.xy / a.w) * view.canvas;
+  let side = vec2f(-along_line.y, along_line.x) / max(length(along_line), 1e-6);
   let here = select(a, b, c.x > 0.5);
   let end = marks[one + u32(c.x)];
   let moved = here.xy + c.y * side * end.w / view.canvas * here.w;
@@ -346,7 +346,7 @@ fn mark(drawn: Drawn) -> @location(0) vec4f {
   let far = length(drawn.across);
   let size = vec2f(f32(view.width), f32(view.height));
   let p = vec2u(clamp(drawn.at.xy / view.canvas * size, vec2f(0.0), size - 1.0));
-  let before = bitcast<f32>(met[8u * (p.y * view.width + p.x) + 3u]);
+  let before = bitcast<f32>(drawn_hits[8u * (p.y * view.width + p.x) + 3u]);
   let hidden = distance(drawn.there, view.eye.xyz) > before * 1.003 + 0.004;
   let edge = 1.0 - smoothstep(0.75, 1.0, far);
   return vec4f(drawn.color.rgb, drawn.color.a * edge * select(1.0, 0.12, hidden));

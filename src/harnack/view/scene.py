@@ -70,8 +70,8 @@ _RAYS = 2048
 _TOLERANCE = 1e-4
 _LANES = ("o 0", "o 1", "o 2", "d 0", "d 1", "d 2", "far")
 _RESULTS = ("status", "t", "normal 0", "normal 1", "normal 2", "evaluations", "paint")
-# The place of a result that is 0 for all rays.
-_NOWHERE = 99
+# The place of a result that no shader writes, because it is 0 for all rays.
+_NO_OUTPUT = 99
 # Paints of a surface: the first is its own, then those of what spans what a mesh leaves open and of
 # faces on a section, then those of isolines.
 _MENDED, _CUT = 1, 2
@@ -486,9 +486,9 @@ def placed_tolerance(one: StudioObject, placed: PlacedSurface) -> float:
 
 
 def _place(made: Recording, label: str) -> int:
-    """The place of a result in the shader's output, or `_NOWHERE` if it is 0 for all rays."""
+    """The place of a result in the shader's output, or `_NO_OUTPUT` if it is 0 for all rays."""
     if label in made.constants:
-        return _NOWHERE
+        return _NO_OUTPUT
     return made.shader.results.index(label)
 
 
@@ -500,8 +500,8 @@ def _rays(points: FloatArray) -> tuple[FloatArray, FloatArray]:
     away /= np.linalg.norm(away, axis=1, keepdims=True)
     o = 0.5 * (points.min(axis=0) + points.max(axis=0)) + 5.0 * away
     aims = points[rng.integers(0, len(points), _RAYS)]
-    way = aims + 0.05 * rng.normal(size=(_RAYS, 3)) - o
-    return o, way / np.linalg.norm(way, axis=1, keepdims=True)
+    direction = aims + 0.05 * rng.normal(size=(_RAYS, 3)) - o
+    return o, direction / np.linalg.norm(direction, axis=1, keepdims=True)
 
 
 def paints_of(one: StudioObject) -> list[Plain]:

@@ -33,6 +33,7 @@ from typing import Any, cast
 import numpy as np
 
 from harnack import geometry
+from harnack.backend.numbers import positive, real
 from harnack.enclosures.proofs import choose_proofs
 from harnack.field_from_file import open_surface
 from harnack.fields import Field, Solid, solids
@@ -47,10 +48,12 @@ from harnack.geometry import Volume
 from harnack.names import did_you_mean
 from harnack.rendering import Camera, Isolines
 from harnack.rendering.arguments import OF_STUDIO, SETTINGS, Request
+from harnack.rendering.framing import upright
 from harnack.rendering.stage import material_of
 from harnack.rendering.studio_scene import with_settings
 from harnack.tracer import LevelSet, Tolerance, level_set
 from harnack.view.sliders import NUMBERS, Slider
+from harnack.view.value_types import check_types
 
 __all__ = [
     "Origins",
@@ -408,6 +411,11 @@ def _check_values(scene: SavedScene) -> None:
         for one in dataclasses.fields(Request):
             if one.name in settings:
                 one.metadata["check"](settings[one.name], show)
+        for name in NUMBERS:
+            if settings.get(name) is not None:
+                positive(settings[name], name)
+        if settings.get("up") is not None:
+            upright(settings["up"])
         for name in ("material", "boundary_material", "cut_material"):
             given: Any = settings.get(name, [])
             for each in cast("list[Any]", given) if isinstance(given, list) else [given]:
@@ -484,10 +492,13 @@ def _origin_of(
         return None
     for name in about:
         _check_name(name, ("file", *_FILE_OPTIONS), "part of a field")
+    options = {"as_" if key == "as" else key: one for key, one in about.items() if key != "file"}
+    check_types(open_surface, options)
+    if not isinstance(about["file"], str):
+        raise SceneFileError(f"{where}: file must be a text, not {about['file']!r:.60}")
     if find is None:
         raise SceneFileError("a scene that is opened in a browser must not name files")
-    options = {"as_" if key == "as" else key: one for key, one in about.items() if key != "file"}
-    opened = open_surface(find(str(about["file"])), **cast("Any", options))
+    opened = open_surface(find(about["file"]), **cast("Any", options))
     return opened.field
 
 
@@ -506,6 +517,9 @@ def _field_of(given: Any, where: str, find: Callable[[str], Path] | None) -> Fie
         own["parameters"] = _object(about.get("parameters", {}), f"{where}: parameters")
         if not isinstance(about["formula"], str):
             raise SceneFileError(f"{where}: a formula is a text")
+        for name, one in own["parameters"].items():
+            real(one, f"{where}: parameters: {name}")
+        check_types(expression, own)
         return expression(about["formula"], **own)
     made = _value_of(about, where)
     if not isinstance(made, Field):
@@ -538,7 +552,9 @@ def _called(kind: type, given: Any, where: str) -> Any:
     for name in about:
         _check_name(name, known, f"argument of {kind.__name__}")
     try:
-        return kind(**{name: _value_of(one, where) for name, one in about.items()})
+        values = {name: _value_of(one, where) for name, one in about.items()}
+        check_types(kind, values)
+        return kind(**values)
     except SceneFileError:
         raise
     except _WRONG as wrong:

@@ -181,9 +181,9 @@ class _Server:
             ) from None
         loop = asyncio.new_event_loop()
         application = web.Application(client_max_size=_LONGEST)
-        application.router.add_get("/", self._give_page)
-        application.router.add_get("/questions", self._talk)
-        application.router.add_get("/clients", self._count)
+        application.router.add_get("/", self._serve_page)
+        application.router.add_get("/questions", self._serve_socket)
+        application.router.add_get("/clients", self._serve_count)
         runner = web.AppRunner(application, handle_signals=False, shutdown_timeout=1.0)
 
         async def begin() -> int:
@@ -210,7 +210,7 @@ class _Server:
         query = f"?token={self.token}" if self.token else ""
         return View(f"http://{shown}:{bound}/{query}", loop, thread)
 
-    def _refuse(self, request: web.Request) -> str:
+    def _reason_to_refuse(self, request: web.Request) -> str:
         """The reason to refuse a request, or "" to answer it. Pages of other servers must not
         reach this one under any host name."""
         name = request.host.rsplit(":", 1)[0].strip("[]")
@@ -225,28 +225,28 @@ class _Server:
             return "this view answers its own page alone"
         return ""
 
-    async def _give_page(self, request: web.Request) -> web.Response:
+    async def _serve_page(self, request: web.Request) -> web.Response:
         from aiohttp import web
 
-        wrong = self._refuse(request)
+        wrong = self._reason_to_refuse(request)
         if wrong:
             return web.Response(status=403, text=wrong)
         return web.Response(
             text=self.page, content_type="text/html", headers={"Cache-Control": "no-store"}
         )
 
-    async def _count(self, request: web.Request) -> web.Response:
+    async def _serve_count(self, request: web.Request) -> web.Response:
         from aiohttp import web
 
-        wrong = self._refuse(request)
+        wrong = self._reason_to_refuse(request)
         if wrong:
             return web.Response(status=403, text=wrong)
         return web.json_response({"clients": self.clients})
 
-    async def _talk(self, request: web.Request) -> web.StreamResponse:
+    async def _serve_socket(self, request: web.Request) -> web.StreamResponse:
         from aiohttp import WSMsgType, web
 
-        wrong = self._refuse(request)
+        wrong = self._reason_to_refuse(request)
         if wrong:
             return web.Response(status=403, text=wrong)
         socket = web.WebSocketResponse(max_msg_size=_LONGEST, heartbeat=30.0)

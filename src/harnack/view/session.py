@@ -51,14 +51,14 @@ _MOST_POINTS = 20_000
 # Steps of a ray that are drawn.
 _MOST_STEPS = 200
 # Seconds between two messages about progress.
-_TELL_EVERY = 0.1
+_PROGRESS_INTERVAL = 0.1
 _LARGEST_PICTURE = 8192
 
 
-Tell = Callable[[float], None]
+Progress = Callable[[float], None]
 
 
-def _nobody(part: float) -> None:
+def _ignore_progress(part: float) -> None:
     """Progress that nobody asked for."""
 
 
@@ -66,7 +66,7 @@ class QuestionError(ValueError):
     """A question that is malformed or asks for something impossible."""
 
 
-class Ended(Exception):
+class Cancelled(Exception):
     """Work was stopped, because nobody waits for its answer any more."""
 
 
@@ -76,7 +76,7 @@ class Client:
     def __init__(self, live: Live) -> None:
         self.session = Session(live)
         self.is_gone = False
-        self._ended: set[int] = set()
+        self._cancelled: set[int] = set()
 
     def read(self, text: str) -> Plain | None:
         """The question in a text; None for a "cancel", which is carried out here.
@@ -92,7 +92,7 @@ class Client:
             raise QuestionError("a question is an object")
         question = cast("Plain", given)
         if question.get("kind") == "cancel" and type(question.get("which")) is int:
-            self._ended.add(question["which"])
+            self._cancelled.add(question["which"])
             return None
         number = question.get("id")
         if type(number) is not int or not 0 <= number < 2**32:
@@ -108,23 +108,23 @@ class Client:
         """
         number, done, last = question["id"], 0.0, time.monotonic()
 
-        def tell(part: float) -> None:
+        def report(part: float) -> None:
             nonlocal done, last
-            if self.is_gone or number in self._ended:
-                raise Ended("stopped, as asked")
+            if self.is_gone or number in self._cancelled:
+                raise Cancelled("stopped, as asked")
             done, now = done + part, time.monotonic()
-            if now > last + _TELL_EVERY:
+            if now > last + _PROGRESS_INTERVAL:
                 last = now
                 send({"id": number, "done": done})
 
         try:
-            tell(0.0)
-            answer = self.session.answer(question, tell)
+            report(0.0)
+            answer = self.session.answer(question, report)
         except Exception as wrong:
-            kind = "" if isinstance(wrong, Ended) else f"{type(wrong).__name__}: "
+            kind = "" if isinstance(wrong, Cancelled) else f"{type(wrong).__name__}: "
             return {"id": number, "error": f"{kind}{wrong}"}
         finally:
-            self._ended.discard(number)
+            self._cancelled.discard(number)
         if isinstance(answer, dict):
             return {"id": number, "answer": answer}
         head = np.array([number, *answer.pixels.shape[:2]], dtype="<u4").tobytes()
@@ -139,11 +139,13 @@ class Session:
         self._painter = Painter()
         self._painted: tuple[Any, list[Painted]] = (None, [])
 
-    def answer(self, question: Mapping[str, Any], tell: Tell = _nobody) -> Plain | Painting:
+    def answer(
+        self, question: Mapping[str, Any], report: Progress = _ignore_progress
+    ) -> Plain | Painting:
         """The answer to a question; a picture to "draw".
 
-        tell: called during long work with the fraction of it, from 0 to 1, that was finished since
-            the last call; an exception that it raises ends the work.
+        report: called during long work with the fraction of it, from 0 to 1, that was finished
+            since the last call; an exception that it raises ends the work.
 
         Raises:
             QuestionError: it makes no sense; the message says what does.
@@ -160,7 +162,7 @@ class Session:
         kind = question.get("kind")
         if kind not in kinds:
             raise QuestionError(f"kind must be one of {', '.join(kinds)}, not {kind!r}")
-        return kinds[kind](question, self.controls(question), tell)
+        return kinds[kind](question, self.controls(question), report)
 
     def controls(self, question: Mapping[str, Any]) -> Controls:
         """The state that a question asks about.
@@ -200,12 +202,12 @@ class Session:
             raise QuestionError(f"loops: at most {_MOST_POINTS:,} points")
         return loops
 
-    def _change(self, question: Mapping[str, Any], controls: Controls, tell: Tell) -> Plain:
+    def _change(self, question: Mapping[str, Any], controls: Controls, report: Progress) -> Plain:
         state = self.live.state(controls)
         checks = question.get("checks") is True
         return packed(difference(self.live.first, state, checks=checks))
 
-    def _probe(self, question: Mapping[str, Any], controls: Controls, tell: Tell) -> Plain:
+    def _probe(self, question: Mapping[str, Any], controls: Controls, report: Progress) -> Plain:
         """The first hit of a ray of the surfaces' coordinates, and how far each step was proved."""
         origin = _points([question.get("origin")], "origin")
         direction = _points([question.get("direction")], "direction")
@@ -246,7 +248,7 @@ class Session:
             return there
         return there | {"mean": float(bent.mean[0]), "gaussian": float(bent.gaussian[0])}
 
-    def _draw(self, question: Mapping[str, Any], controls: Controls, tell: Tell) -> Painting:
+    def _draw(self, question: Mapping[str, Any], controls: Controls, report: Progress) -> Painting:
         """A picture of one ray a pixel."""
         size = _size(question)
         show, ground = question.get("show", "shaded"), question.get("ground", self.live.ground)
@@ -268,7 +270,7 @@ class Session:
         seen = Eye(origin, right, up, forward, pixel)
         return self._painter.paint(
             self._surfaces(controls), seen, size, show=show, ground=ground,
-            rests=question.get("rests") is True,
+            is_idle=question.get("is_idle") is True,
         )  # fmt: skip
 
     def _surfaces(self, controls: Controls) -> list[Painted]:
@@ -281,11 +283,11 @@ class Session:
             self._painted = key, made
         return self._painted[1]
 
-    def _picture(self, question: Mapping[str, Any], controls: Controls, tell: Tell) -> Plain:
+    def _picture(self, question: Mapping[str, Any], controls: Controls, report: Progress) -> Plain:
         """A picture of what is seen, as base64 of a PNG file."""
         size = _size(question)
         made: Any = self.live.rendered(
-            controls, show=question.get("show", "shaded"), size=size, progress=tell,
+            controls, show=question.get("show", "shaded"), size=size, progress=report,
             camera=self._camera(question), spp=question.get("spp"),
             backdrop=question.get("ground", self.live.ground),
         )  # fmt: skip
@@ -298,7 +300,7 @@ class Session:
         eye, target = (place.undo(one[None])[0] for one in (eye, target))
         return Camera(position=tuple(eye.tolist()), target=tuple(target.tolist()), fov=fov)
 
-    def _save(self, question: Mapping[str, Any], controls: Controls, tell: Tell) -> Plain:
+    def _save(self, question: Mapping[str, Any], controls: Controls, report: Progress) -> Plain:
         """The text of a scene file, and the names of sliders that it cannot hold."""
         text, lost = self.live.saved(
             controls, camera=self._camera(question), show=question.get("show", "shaded"),
@@ -306,7 +308,7 @@ class Session:
         )  # fmt: skip
         return {"text": text, "lost": lost}
 
-    def _load(self, question: Mapping[str, Any], controls: Controls, tell: Tell) -> Plain:
+    def _load(self, question: Mapping[str, Any], controls: Controls, report: Progress) -> Plain:
         """Replaces the scene by that of a scene file, and returns it as `Live.scene` does.
 
         See `live_settings` for what of its settings is taken.

@@ -58,7 +58,7 @@ class Widget(anywidget.AnyWidget):
             _still=f"data:image/png;base64,{still_of(live)}", points=scene["state"]["curves"],
             sliders=dict(live.start.values), camera=live.pose,
         )  # fmt: skip
-        self.on_msg(self._hear)
+        self.on_msg(self._receive)
 
     def close(self) -> None:
         """Stop answering, and remove the widget from the page."""
@@ -66,23 +66,23 @@ class Widget(anywidget.AnyWidget):
         self._worker.shutdown(wait=False, cancel_futures=True)
         super().close()
 
-    def _hear(self, _: Any, text: Any, __: Any) -> None:
+    def _receive(self, _: Any, text: Any, __: Any) -> None:
         try:
             question = self._client.read(str(text))
         except QuestionError as wrong:
-            self._say({"id": None, "error": str(wrong)})
+            self._send_answer({"id": None, "error": str(wrong)})
             return
         if question is not None:
             self._worker.submit(self._answer, question)
 
     def _answer(self, question: Plain) -> None:
-        answer = self._client.answer(question, self._say)
+        answer = self._client.answer(question, self._send_answer)
         if isinstance(answer, bytes):
             self.send({"id": question["id"]}, buffers=[answer])
         else:
-            self._say(answer)
+            self._send_answer(answer)
 
-    def _say(self, answer: Plain) -> None:
+    def _send_answer(self, answer: Plain) -> None:
         self.send(answer)
 
     @traitlets.validate("height")

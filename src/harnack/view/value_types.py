@@ -1,0 +1,78 @@
+"""Whether values of a scene file are of the types that a class or a function asks for, so that
+what is something else is refused when the file is read, and not when it is drawn."""
+
+from __future__ import annotations
+
+import types
+import typing
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, cast
+
+import numpy as np
+
+from harnack.fields import Field
+from harnack.geometry import Volume
+
+__all__ = ["ValueTypeError", "check_types"]
+
+# Names that modules import for type checkers alone.
+_NAMES = {"Volume": Volume, "Field": Field}
+_WORDS: dict[Any, str] = {
+    bool: "true or false", int: "a whole number", float: "a number", str: "a text",
+    type(None): "null",
+}  # fmt: skip
+
+
+class ValueTypeError(TypeError):
+    """An argument of another type than that which its name stands for."""
+
+
+def check_types(function: Callable[..., Any], given: dict[str, Any]) -> None:
+    """Check arguments of a class or a function by its annotations. Lists are tuples in `given`, and
+    stand for arrays too, whose numbers the function itself checks.
+
+    Raises:
+        ValueTypeError: the message names the argument, and what it must be.
+    """
+    target = function.__init__ if isinstance(function, type) else function
+    hints = typing.get_type_hints(target, localns=_NAMES)
+    for name, value in given.items():
+        if name in hints and not _fits(value, hints[name]):
+            raise ValueTypeError(f"{name} must be {_words(hints[name])}, not {value!r:.60}")
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if hint is Any or origin is np.ndarray:
+        return True
+    if origin in (typing.Union, types.UnionType):
+        return any(_fits(value, one) for one in arguments)
+    if origin is typing.Literal:
+        return value in arguments
+    if hint is float or hint is int:
+        return isinstance(value, int if hint is int else int | float) and type(value) is not bool
+    if isinstance(origin, type) and issubclass(origin, Mapping):
+        return isinstance(value, dict)
+    if origin is tuple and arguments[-1] is not Ellipsis:
+        several = cast("tuple[Any, ...]", value if isinstance(value, tuple) else ())
+        return len(several) == len(arguments) and all(map(_fits, several, arguments))
+    if origin is tuple or (isinstance(origin, type) and issubclass(origin, Iterable)):
+        is_list = isinstance(value, tuple)
+        return is_list and all(_fits(one, arguments[0]) for one in cast("tuple[Any, ...]", value))
+    return not isinstance(hint, type) or isinstance(value, hint)
+
+
+def _words(hint: Any) -> str:
+    """A type, for those who write scene files."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join(map(_words, arguments))
+    if origin is typing.Literal:
+        return " or ".join(map(repr, arguments))
+    if arguments:
+        kinds = dict.fromkeys(_words(one) for one in arguments if one is not Ellipsis)
+        count = (
+            "" if origin is not tuple or Ellipsis in arguments else f"{len(arguments)} entries, "
+        )
+        return f"a list of {count}each {' or '.join(kinds)}"
+    return _WORDS.get(hint, f"a {getattr(hint, '__name__', hint)}")
