@@ -359,7 +359,15 @@ class ExactWinding:
 
     @property
     def coarsest_detail(self) -> float:
-        """`Field.coarsest_detail`."""
+        """`Field.coarsest_detail`: any number below 1.
+
+        There is nothing between coarse and close here: truncation is at most `_ROUGH` below detail
+        1, and no more than rounding from there on. A sample that is too coarse is repeated at
+        detail 1 or more, and the march returns to coarse ones where f is known well enough for
+        them, whatever the number: from 0.5 down to 0.01, evaluations and hits were the same on
+        five broken meshes in both precisions. With 1 itself the tracer would take truncation for
+        that of detail 1, and for one that more detail reduces.
+        """
         return 0.5
 
     def values(self, x: Vec3) -> Real:
