@@ -75,3 +75,26 @@ def test_a_page_shows_what_render_draws(name: str, browser: Any, tmp_path: Path)
     # Silhouettes: what differs much is nowhere two pixels wide.
     much = ndimage.binary_erosion(off > 0.2, np.ones((3, 3)))
     assert much.mean() < 2e-4
+
+
+def test_all_of_many_surfaces_have_their_own_materials(browser: Any, tmp_path: Path) -> None:
+    """Each surface has three paints, and a byte once counted them: the last are beyond it."""
+    count = 90
+    centers = [(k % 10 - 4.5, k // 10 - 4.0, 0.0) for k in range(count)]
+    colors = [("red", "lime", "blue")[k % 3] for k in range(count)]
+    path = tmp_path / "a.html"
+    hk.page(
+        [hk.Sphere(0.35, center) for center in centers], path, material=colors,
+        camera=hk.Camera(elevation=80), progress=False,
+    )  # fmt: skip
+    with served(tmp_path) as address:
+        page = Page(browser, f"{address}/a.html", SIZE, samples=1)
+        picture = page.picture("page-many")
+        places = page.do(
+            "(centers) => centers.map((p) => panel.camera().project(panel.to_stage(p),"
+            " innerWidth, innerHeight))",
+            centers,
+        )
+        page.close()
+    found = [int(np.argmax(picture[round(p["y"]), round(p["x"])])) for p in places]
+    assert found == [k % 3 for k in range(count)]

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
-from contextlib import closing
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
+import aiohttp
 import numpy as np
 import pytest
 
@@ -385,24 +389,69 @@ def test_others_are_not_answered(view: hk.View) -> None:
         hk.view(field, host="203.0.113.1", opens=False, waits=False)
 
 
-def test_ctrl_c_ends_it_cleanly() -> None:
+def test_a_server_on_ipv6(browser: Any) -> None:
+    try:
+        with socket.socket(socket.AF_INET6) as one:
+            one.bind(("::1", 0))
+    except OSError:
+        pytest.skip("this machine has no IPv6")
+    with hk.view(hk.Sphere(1.0), host="::1", opens=False, waits=False) as view:
+        assert re.fullmatch(r"http://\[::1\]:\d+/", view.address)
+        page = Page(browser, view.address, SIZE, samples=1)
+        python_draws(page)  # by the socket
+        assert np.ptp(page.picture("view-ipv6")) > 100
+        assert page.message == ""
+        page.close()
+        elsewhere = urllib.request.Request(view.address, headers={"Host": "elsewhere.example"})
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(elsewhere)
+
+
+@contextmanager
+def served_by_command() -> Iterator[tuple[Any, str]]:
+    """`harnack view`, and the address of its page."""
     command = [
-        sys.executable,
-        "-m",
-        "harnack.cli",
-        "view",
-        "x^2+y^2+z^2=1",
-        "--ball",
-        "0,0,0,2",
+        sys.executable, "-m", "harnack.cli", "view", "x^2+y^2+z^2=1", "--ball", "0,0,0,2",
         "--no-browser",
-    ]
+    ]  # fmt: skip
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env={**os.environ}) as one:
-        assert one.stderr is not None
-        line = one.stderr.readline()
-        address = re.search(r"http://\S+", line)
-        assert address is not None, line
-        assert urllib.request.urlopen(address[0]).status == 200
-        one.send_signal(signal.SIGINT)
-        said = one.stderr.read()
-        assert one.wait(20) in (0, 130)
+        try:
+            line = one.stderr.readline() if one.stderr else ""
+            address = re.search(r"http://\S+", line)
+            assert address is not None, line
+            yield one, address[0]
+        finally:
+            one.kill()
+
+
+def assert_ended_cleanly(one: Any) -> None:
+    one.send_signal(signal.SIGINT)
+    _, said = one.communicate(timeout=20)
+    assert one.returncode in (0, 130)
     assert "Traceback" not in said
+    assert "stopped" in said
+
+
+def test_ctrl_c_ends_it_cleanly() -> None:
+    with served_by_command() as (one, address):
+        assert urllib.request.urlopen(address).status == 200
+        assert_ended_cleanly(one)
+
+
+def test_ctrl_c_while_a_picture_is_rendered() -> None:
+    async def begin(address: str) -> str:
+        async with (
+            aiohttp.ClientSession() as session,
+            session.ws_connect(f"{address}questions") as talk,
+        ):
+            camera = {"position": [0, -5, 1], "target": [0, 0, 0], "fov": 30}
+            asked = {"id": 1, "kind": "picture", "size": [3000, 2000], "show": "color"}
+            await talk.send_json({**asked, "camera": camera, "spp": 1000})
+            while not json.loads(answer := (await talk.receive()).data).get("done"):
+                assert "error" not in answer, answer
+            assert_ended_cleanly(one)
+            return answer
+
+    # In a thread: Playwright's loop runs in this one.
+    with served_by_command() as (one, address), ThreadPoolExecutor(1) as thread:
+        assert '"done"' in thread.submit(asyncio.run, begin(address)).result()

@@ -66,6 +66,28 @@ def test_a_message_is_answered(widget: Any, monkeypatch: pytest.MonkeyPatch) -> 
     assert said[-1][0]["error"] == "a question is an object in JSON"
 
 
+def test_nan_is_refused_and_a_closed_widget_is_silent(
+    widget: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pose, nan = dict(widget.camera), float("nan")
+    for name, wrong in {
+        "camera": {**pose, "fov": nan}, "sliders": {"level": nan},
+        "points": [[[nan, 0, 0], *LOOP[1:].tolist()]], "height": nan,
+    }.items():  # fmt: skip
+        with pytest.raises(traitlets.TraitError):
+            setattr(widget, name, wrong)
+    with pytest.raises(traitlets.TraitError):
+        widget.camera = {**pose, "position": (10**400, 0, 0)}
+    assert widget.camera == pose
+    assert widget.sliders == {"level": 6.0}
+    said: list[Any] = []
+    monkeypatch.setattr(widget, "send", lambda *given, **_: said.append(given))
+    widget.close()
+    widget._receive(widget, json.dumps({"id": 1, "kind": "change"}), [])
+    widget.close()
+    assert said == []
+
+
 # What a notebook does for a widget, in a page: attributes, and messages by a function of the test.
 MODEL = """
 class Model {

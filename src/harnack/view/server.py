@@ -42,19 +42,20 @@ class View:
 
     address: str
     _loop: asyncio.AbstractEventLoop
-    _thread: threading.Thread
+    # Not its thread: one whose `join` was interrupted by Ctrl-C counts as ended in Python 3.11.
+    _ended: threading.Event
 
     def close(self) -> None:
-        """Stop serving the page."""
-        if self._thread.is_alive():
+        """Stop serving the page. What is being computed for it ends when it reports next."""
+        if not self._ended.is_set():
             self._loop.call_soon_threadsafe(self._loop.stop)
-            self._thread.join()
+            self._ended.wait()
 
     def wait(self) -> None:
         """Wait until Ctrl-C is pressed, or until the view is closed elsewhere."""
         try:
-            while self._thread.is_alive():
-                self._thread.join(0.2)
+            while not self._ended.wait(0.2):
+                pass
         except KeyboardInterrupt:
             print("stopped", file=sys.stderr)
         finally:
@@ -169,7 +170,7 @@ class _Server:
         self.live, self.page, self.token = live, page, token
         # Dr.Jit works on all cores for one question at a time.
         self.worker = ThreadPoolExecutor(1, thread_name_prefix="harnack-view")
-        self.clients = 0
+        self.clients: set[Client] = set()
 
     def start(self, host: str, port: int) -> View:
         """Serves in a thread of its own."""
@@ -191,24 +192,30 @@ class _Server:
             await web.TCPSite(runner, host, port).start()
             return int(runner.addresses[0][1])
 
+        ended = threading.Event()
+
         def serve() -> None:
             asyncio.set_event_loop(loop)
-            loop.run_forever()
-            loop.run_until_complete(runner.cleanup())
-            self.worker.shutdown(wait=False, cancel_futures=True)
-            loop.close()
+            try:
+                loop.run_forever()
+                for one in self.clients:
+                    one.is_gone = True
+                loop.run_until_complete(runner.cleanup())
+                self.worker.shutdown(wait=False, cancel_futures=True)
+                loop.close()
+            finally:
+                ended.set()
 
         # In a thread of its own from the start: notebooks have a loop that runs in this one.
-        thread = threading.Thread(target=serve, name="harnack-view", daemon=True)
-        thread.start()
+        threading.Thread(target=serve, name="harnack-view", daemon=True).start()
         try:
             bound = asyncio.run_coroutine_threadsafe(begin(), loop).result()
         except OSError as wrong:
-            View("", loop, thread).close()
+            View("", loop, ended).close()
             raise OSError(f"a view cannot be served at {host}, port {port}: {wrong}") from None
         shown = f"[{host}]" if ":" in host else host
         query = f"?token={self.token}" if self.token else ""
-        return View(f"http://{shown}:{bound}/{query}", loop, thread)
+        return View(f"http://{shown}:{bound}/{query}", loop, ended)
 
     def _reason_to_refuse(self, request: web.Request) -> str:
         """The reason to refuse a request, or "" to answer it. Pages of other servers must not
@@ -241,7 +248,7 @@ class _Server:
         wrong = self._reason_to_refuse(request)
         if wrong:
             return web.Response(status=403, text=wrong)
-        return web.json_response({"clients": self.clients})
+        return web.json_response({"clients": len(self.clients)})
 
     async def _serve_socket(self, request: web.Request) -> web.StreamResponse:
         from aiohttp import WSMsgType, web
@@ -251,8 +258,8 @@ class _Server:
             return web.Response(status=403, text=wrong)
         socket = web.WebSocketResponse(max_msg_size=_LONGEST, heartbeat=30.0)
         await socket.prepare(request)
-        self.clients += 1
         client, waiting = Client(self.live), set[asyncio.Task[None]]()
+        self.clients.add(client)
         try:
             async for message in socket:
                 if message.type != WSMsgType.TEXT:
@@ -275,7 +282,7 @@ class _Server:
             client.is_gone = True
             for task in waiting:
                 task.cancel()
-            self.clients -= 1
+            self.clients.discard(client)
         return socket
 
     async def _answer(self, socket: web.WebSocketResponse, client: Client, asked: Plain) -> None:

@@ -67,6 +67,8 @@ class Widget(anywidget.AnyWidget):
         super().close()
 
     def _receive(self, _: Any, text: Any, __: Any) -> None:
+        if self._client.is_gone:  # closed, while the message was on its way
+            return
         try:
             question = self._client.read(str(text))
         except QuestionError as wrong:
