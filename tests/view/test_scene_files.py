@@ -16,7 +16,8 @@ from harnack.cli import main
 from harnack.gallery import SCENES
 from harnack.geometry import shapes
 from harnack.geometry.mesh_shapes import icosphere
-from harnack.view.scene_file import scene_of, text_of
+from harnack.view.scene_file import _kinds, scene_of, text_of
+from harnack.view.value_types import check_types
 
 CURVE = hk.SolidAngle(shapes.torus_knot(2, 3, 12))
 SOLIDS = {
@@ -106,6 +107,8 @@ def test_scene_files_know_every_solid() -> None:
     solids = [getattr(hk, name) for name in hk.__all__]
     solids = [one for one in solids if inspect.isclass(one) and issubclass(one, hk.Shape)]
     assert len(solids) > 10
+    for kind in _kinds().values():
+        check_types(kind, {})  # whose annotations can be read
     for one in set(solids) - {hk.Shape}:
         with pytest.raises(hk.SceneFileError, match="argument of"):
             scene_of(json.dumps({"harnack": 1, "surfaces": [{"field": {one.__name__: {"q": 1}}}]}))
