@@ -1,4 +1,5 @@
-"""Pictures of docs/pictures.md with lines, scales and backdrops: `make images` makes them."""
+"""Pictures of docs/pictures.md with lines, scales and backdrops, and that of the cookbook:
+`make images` makes them."""
 
 from __future__ import annotations
 
@@ -7,6 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import harnack as hk
+
+# Those of the cookbook.
+POINTS = [
+    (1.2, 0.0, 0.3), (0.9, 0.8, -0.2), (0.2, 1.1, 0.4), (-0.5, 0.7, -0.3), (-1.2, 0.6, 0.2),
+    (-0.9, -0.3, -0.1), (-1.0, -1.0, 0.4), (-0.1, -0.8, -0.3), (0.6, -1.1, 0.3), (0.8, -0.5, -0.4),
+]  # fmt: skip
 
 
 def main(folder: Path) -> None:
@@ -28,6 +35,9 @@ def main(folder: Path) -> None:
     walls: dict[str, Any] = {"solid": (-0.3, 0.3), "size": (400, 300), "colorbar": True}
     hk.render(gyroid, folder / "view-value.png", show="value", of="z", **walls)
     hk.render(gyroid, folder / "view-evaluations.png", show="evaluations", **walls)
+    smooth = hk.SolidAngle(hk.geometry.smooth_curve(POINTS))
+    camera, size = hk.Camera(azimuth=25), (640, 480)
+    hk.render(smooth, folder / "smooth.png", show="shaded", boundary=0.02, size=size, camera=camera)
 
 
 if __name__ == "__main__":

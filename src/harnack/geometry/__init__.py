@@ -20,6 +20,7 @@ from harnack.geometry.meshes import (
     without_zero_area_faces,
     zero_area_faces,
 )
+from harnack.geometry.splines import smooth_curve
 from harnack.geometry.volume import Volume
 from harnack.geometry.volumes import Ball, Box, HalfSpace, Intersection
 
@@ -41,6 +42,7 @@ __all__ = [
     "is_convex_position",
     "mesh_shapes",
     "shapes",
+    "smooth_curve",
     "total_length",
     "validate_cloud",
     "validate_loops",

@@ -30,6 +30,7 @@ from harnack.geometry.convexity import is_convex_position
 from harnack.names import renamed
 
 __all__ = [
+    "MAX_VERTICES",
     "Circle",
     "CurveError",
     "CurveScaleError",
@@ -178,11 +179,13 @@ class CurveScaleError(CurveError):
     """So large or small that lengths overflow or vanish."""
 
 
-def validate_loops(loops: LoopsLike) -> Loops:
+def validate_loops(loops: LoopsLike, *, closed: bool = True) -> Loops:
     """One array-like (n, 3), or a list of them, as a tuple of float64 arrays of their own.
 
     A loop closes by itself. If its last vertex repeats its first, that one is dropped; any other
     vertex equal to the one before it is an error. Edges that fold back on themselves are allowed.
+
+    closed: False for curves that end at their first and last vertex, which then may be equal.
 
     Raises:
         CurveError: one of its subclasses above, by what is wrong.
@@ -191,7 +194,10 @@ def validate_loops(loops: LoopsLike) -> Loops:
     if not parts:
         raise CurveShapeError("there are no loops: give an array (n, 3) or a list of them")
     several = len(parts) > 1
-    checked = [_validate_loop(part, f"loop {k}" if several else "the loop") for k, part in parts]
+    kind = "loop" if closed else "curve"
+    names = [f"{kind} {k}" if several else f"the {kind}" for k, _ in parts]
+    pairs = zip(parts, names, strict=True)
+    checked = [_validate_loop(part, name, closed) for (_, part), name in pairs]
     total = sum(len(loop) for loop in checked)
     if total > MAX_VERTICES:
         raise TooManyVerticesError(_too_many("the curve", total))
@@ -255,17 +261,18 @@ def _numbered(loops: Any) -> list[tuple[int, Any]]:
     return [(k, loop) for k, loop in enumerate(loops)]
 
 
-def _validate_loop(loop: Any, name: str) -> FloatArray:
+def _validate_loop(loop: Any, name: str, closed: bool = True) -> FloatArray:
     vertices = _as_vertices(loop, name)
     check_finite(vertices, f"vertex {{}} of {name}", NonFiniteVertexError)
-    if len(vertices) > 1 and (vertices[0] == vertices[-1]).all():
+    if closed and len(vertices) > 1 and (vertices[0] == vertices[-1]).all():
         vertices = vertices[:-1]
     distinct = _count_distinct(vertices)
     if distinct < 3:
         raise TooFewVerticesError(
-            f"{name} has {distinct} different vertices: a closed curve needs at least 3"
+            f"{name} has {distinct} different vertices: {'a closed' if closed else 'such a'} curve "
+            "needs at least 3"
         )
-    _check_edges(vertices, name)
+    _check_edges(vertices, name, closed)
     return vertices
 
 
@@ -289,10 +296,13 @@ def _count_distinct(vertices: FloatArray) -> int:
     return 3
 
 
-def _check_edges(vertices: FloatArray, name: str) -> None:
+def _check_edges(vertices: FloatArray, name: str, closed: bool) -> None:
     """No edge of length zero, and no length that overflows or underflows."""
     ends = np.roll(vertices, -1, axis=0)
-    same = np.flatnonzero((vertices == ends).all(axis=1))
+    apart = ends - vertices
+    if not closed:
+        apart = apart[:-1]
+    same = np.flatnonzero((apart == 0).all(axis=1))
     if same.size:
         first, second = int(same[0]), (int(same[0]) + 1) % len(vertices)
         raise RepeatedVertexError(
@@ -300,7 +310,7 @@ def _check_edges(vertices: FloatArray, name: str) -> None:
             f"{and_more(same.size)}: remove one of them"
         )
     size = float(np.abs(vertices).max())
-    shortest = float(np.abs(ends - vertices).max(axis=1).min())
+    shortest = float(np.abs(apart).max(axis=1).min())
     if size > 1e100 or shortest < 1e-100:
         raise CurveScaleError(
             f"{name} has coordinates up to {size:g} and an edge as short as {shortest:g}: "

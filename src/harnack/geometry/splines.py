@@ -1,0 +1,98 @@
+"""Smooth curves through points: `smooth_curve`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from harnack.backend.numbers import FloatArray
+from harnack.geometry.curves import (
+    MAX_VERTICES,
+    CurveScaleError,
+    TooManyVerticesError,
+    validate_loops,
+)
+
+if TYPE_CHECKING:
+    from harnack.geometry.curves import LoopsLike
+
+__all__ = ["smooth_curve"]
+
+Spacing = Literal["centripetal", "chord"]
+# The parameter grows from point to point by this power of their distance.
+_POWERS = {"centripetal": 0.5, "chord": 1.0}
+
+
+def smooth_curve(
+    points: LoopsLike, samples: int = 16, *, closed: bool = True, spacing: Spacing = "centripetal"
+) -> Any:
+    """A smooth curve through points: a cubic spline, which has continuous second derivatives.
+
+        hk.SolidAngle(hk.geometry.smooth_curve(points))
+
+    points: (n, 3) in order, n >= 3, or a list of such arrays. A closed curve returns from the last
+        point to the first, which need not be repeated.
+    samples: vertices from each point to the next, the first of them the point itself, bit by bit.
+    closed: False for a curve that ends at its first and last point. There the third derivative
+        is continuous at the second point and the last but one ("not a knot").
+    spacing: how the parameter grows from point to point: "centripetal" as the root of their
+        distance, by which curves hardly swing out or loop where points are spaced unevenly (Lee
+        1989); "chord" as the distance, which makes rounder curves of evenly spaced points.
+
+    Returns:
+        (n samples, 3) vertices, of an open curve ((n - 1) samples + 1, 3); a list of such arrays
+        for a list. A loop crosses itself where the points make it do so: nothing is checked here.
+
+    Raises:
+        CurveError: fewer than 3 different points, two equal ones in a row, NaN, wrong shapes, or
+            too many vertices.
+        TypeError: samples is no whole number.
+        ValueError: samples less than 1, or an unknown spacing.
+    """
+    samples = _count(samples)
+    if spacing not in _POWERS:
+        raise ValueError(f'spacing is "centripetal" or "chord", not {spacing!r}')
+    loops = validate_loops(points, closed=closed)
+    total = sum(map(len, loops)) * samples
+    if total > MAX_VERTICES:
+        raise TooManyVerticesError(
+            f"{total:,} vertices are more than {MAX_VERTICES:,}: take fewer samples"
+        )
+    made = [_spline(loop, samples, closed, _POWERS[spacing]) for loop in loops]
+    return made if _is_list(points) else made[0]
+
+
+def _count(samples: Any) -> int:
+    if isinstance(samples, bool) or not isinstance(samples, int | np.integer):
+        raise TypeError(f"samples must be a whole number, not {samples!r}")
+    if samples < 1:
+        raise ValueError(f"samples must be at least 1 from each point to the next, not {samples}")
+    return int(samples)
+
+
+def _is_list(points: Any) -> bool:
+    """Whether this is a list of curves, as `validate_loops` reads it."""
+    try:
+        return np.ndim(points) == 3
+    except ValueError:  # curves of different lengths
+        return True
+
+
+def _spline(x: FloatArray, samples: int, closed: bool, power: float) -> FloatArray:
+    knots = np.concatenate([x, x[:1]]) if closed else x
+    apart = np.diff(knots, axis=0)
+    length = np.linalg.norm(apart / np.abs(apart).max(), axis=1)  # so that no square overflows
+    at = np.concatenate([[0.0], np.cumsum(length**power)])
+    if (np.diff(at) <= 0).any():
+        k = int(np.flatnonzero(np.diff(at) <= 0)[0])
+        raise CurveScaleError(
+            f"points {k} and {(k + 1) % len(x)} are nearer to each other than rounding, beside the "
+            "length of the curve: remove one of them"
+        )
+    spline = CubicSpline(at, knots, bc_type="periodic" if closed else "not-a-knot")
+    between = at[:-1, None] + np.diff(at)[:, None] * (np.arange(samples) / samples)
+    made = spline(between.ravel())
+    made[::samples] = knots[:-1]
+    return made if closed else np.concatenate([made, knots[-1:]])
