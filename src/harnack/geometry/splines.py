@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -65,11 +66,12 @@ def smooth_curve(
 
 
 def _count(samples: Any) -> int:
-    if isinstance(samples, bool) or not isinstance(samples, int | np.integer):
+    if isinstance(samples, bool) or not hasattr(samples, "__index__"):
         raise TypeError(f"samples must be a whole number, not {samples!r}")
-    if samples < 1:
-        raise ValueError(f"samples must be at least 1 from each point to the next, not {samples}")
-    return int(samples)
+    count = operator.index(samples)
+    if count < 1:
+        raise ValueError(f"samples must be at least 1 from each point to the next, not {count}")
+    return count
 
 
 def _is_list(points: Any) -> bool:
