@@ -337,7 +337,7 @@ def test_a_device_that_lies_is_not_believed(browser: Any, view: hk.View) -> None
     """
     page = Page(browser, view.address, SIZE, samples=1)
     right, refused = page.picture(), 0
-    for place in np.arange(0.5, 16) / 16:
+    for place in np.arange(0.5, 24) / 24:
         wrong = page.do(
             """async (place) => {
               const state = structuredClone(panel.scene.state);
