@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -54,6 +56,27 @@ def test_workers_draw_the_same_picture(way: dict[str, Any], client: Any) -> None
     alone = hk.render(POLYGON, **SMALL, **way)
     assert_same(hk.render(POLYGON, client=client, **SMALL, **way), alone)
     assert_same(hk.render(POLYGON, client=client, tiles=7, **SMALL, **way), alone)
+
+
+@pytest.mark.slow
+def test_workers_take_the_variant_of_mitsuba(client: Any, tmp_path: Path) -> None:
+    """They drew in the variant that they take by themselves."""
+    code = f"""
+import sys
+sys.path.insert(0, {str(Path(__file__).parents[2])!r})
+import harnack as hk, mitsuba as mi, numpy as np
+from harnack.geometry import shapes
+mi.set_variant("llvm_ad_mono")
+way = {{"size": (24, 18), "progress": False, "show": "color", "spp": 4}}
+field = hk.SolidAngle(shapes.wavy_polygon(24))
+alone = hk.render(field, **way)
+there = hk.render(field, client={client.scheduler.address!r}, **way)
+print(np.array_equal(alone, there), (alone[..., 0] == alone[..., 1]).all())
+"""
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.split() == ["True", "True"]
+    one = hk.render(POLYGON, show="color", spp=4, client=client, **SMALL)
+    assert_same(one, hk.render(POLYGON, show="color", spp=4, **SMALL))
 
 
 @pytest.mark.parametrize("way", WAYS[:2], ids=str)

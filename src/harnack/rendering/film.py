@@ -25,7 +25,7 @@ from harnack.progress import progress_bar
 from harnack.rendering.arguments import OF_PICTURES, check_camera, check_integer, check_size
 from harnack.rendering.camera import Camera
 from harnack.rendering.framing import UnboundedSurfaceError, upright, visible_points
-from harnack.rendering.mitsuba import mitsuba_backend
+from harnack.rendering.mitsuba import mitsuba_backend, take_variant
 from harnack.rendering.picture import render
 from harnack.rendering.plugins import register
 from harnack.rendering.studio_scene import surfaces_of
@@ -126,12 +126,14 @@ def animate(
 
 @dataclass(frozen=True)
 class _FilmJob:
-    """What all pictures of a film have in common, as arguments of `render`."""
+    """What all pictures of a film have in common, as arguments of `render`; Mitsuba's variant."""
 
     arguments: dict[str, Any]
+    variant: str
 
     def frame(self, others: dict[str, Any]) -> Arrays:
         """The pixels of one picture. others: its other arguments."""
+        take_variant(self.variant)
         given = {**self.arguments, **others}
         return {"shown": render(given.pop("what"), **given).shown}
 
@@ -143,7 +145,9 @@ def _job(
     first = frames[0]
     moving = [name for name in first if any(one[name] is not first[name] for one in frames)]
     same = {**same, **{name: first[name] for name in first if name not in moving}}
-    return _FilmJob(same), [({name: one[name] for name in moving},) for one in frames]
+    return _FilmJob(same, register().variant()), [
+        ({name: one[name] for name in moving},) for one in frames
+    ]
 
 
 def check_film_path(path: str | os.PathLike[str]) -> Path:

@@ -53,6 +53,18 @@ def load_mitsuba() -> Any:
     return mi
 
 
+def take_variant(variant: str) -> None:
+    """Set a Mitsuba variant, if another or none is set: that of the process for which this one
+    works.
+
+    Raises:
+        ImportError: this Mitsuba does not have it, or cannot use it here.
+    """
+    mi = importlib.import_module("mitsuba")
+    if mi.variant() != variant:
+        mi.set_variant(variant)
+
+
 def mitsuba_backend(mi: Any) -> Backend:
     """Our name for the arrays of the variant that is set."""
     return backend_of(mi.Float(0))

@@ -29,6 +29,7 @@ from harnack.rendering.light_paths import (
     pace_of,
 )
 from harnack.rendering.picture_job import EDGE_SPP, Elsewhere, PictureJob
+from harnack.rendering.plugins import register
 from harnack.rendering.shaded import Shading, shaded
 from harnack.rendering.shading import Hands, OwnHands, flat, wall
 from harnack.rendering.stage import Studio
@@ -164,7 +165,7 @@ def render(
         raise ValueError(f"{target}: EXR files hold the numbers; a color bar is drawn in .png")
     if not _is_of_studio(what):
         refuse_studio_settings({name: arguments[name] for name in OF_STUDIO} | settings)
-    job = PictureJob(what, replace(asked, progress=None), settings)
+    job = PictureJob(what, replace(asked, progress=None), settings, register().variant())
     drawing = job.drawing
     if client is not None or checkpoint is not None:
         _check_can_be_sent(what, drawing)

@@ -16,7 +16,7 @@ from harnack.fields.field import instead_of_field
 from harnack.rendering.arguments import Request, check_memory, check_spp
 from harnack.rendering.backdrops import Gradient
 from harnack.rendering.light_paths import Exposing
-from harnack.rendering.mitsuba import load_dictionary, load_scene_file
+from harnack.rendering.mitsuba import load_dictionary, load_scene_file, take_variant
 from harnack.rendering.placement import Placement
 from harnack.rendering.plugins import register, stand_in
 from harnack.rendering.shaded import Seen, Shading
@@ -37,7 +37,7 @@ class PictureJob:
     """All that decides what is in a picture.
 
     what: fields or a Mitsuba scene, as `render` takes them. asked: how to draw them. settings: of
-        the surfaces.
+        the surfaces. variant: of Mitsuba.
 
     Methods that are named like those of a drawing draw a part and give plain arrays.
     """
@@ -45,10 +45,12 @@ class PictureJob:
     what: Any
     asked: Request
     settings: Mapping[str, Any]
+    variant: str
 
-    @functools.cached_property
+    @property
     def mi(self) -> Any:
-        """Mitsuba, with our plug-ins."""
+        """Mitsuba, in the variant and with our plug-ins."""
+        take_variant(self.variant)
         return register()
 
     @functools.cached_property
@@ -105,26 +107,31 @@ class PictureJob:
         )
         return Exposing(mi, scene, sensor, tracer, spp, asked.seed, asked.denoise)
 
+    def _drawing_here(self) -> Any:
+        """The drawing, after a worker may have worked in another variant."""
+        take_variant(self.variant)
+        return self.drawing
+
     def pixels(self, start: int, stop: int) -> Arrays:
         """As of `Exposing`."""
-        drawing = replace(cast("Exposing", self.drawing), paths_a_band=_PATHS_A_BAND)
+        drawing = replace(cast("Exposing", self._drawing_here()), paths_a_band=_PATHS_A_BAND)
         return _with_lost(drawing.pixels(start, stop))
 
     def look(self, start: int, stop: int) -> Arrays:
         """As of `Shading`."""
-        return cast("Shading", self.drawing).look(start, stop).numbers()
+        return cast("Shading", self._drawing_here()).look(start, stop).numbers()
 
     def refine(self, *part: Any) -> Arrays:
         """As of `Shading`."""
-        return _with_lost(cast("Shading", self.drawing).refine(*part))
+        return _with_lost(cast("Shading", self._drawing_here()).refine(*part))
 
     def view(self, start: int, stop: int) -> Arrays:
         """As of `Viewer`."""
-        return _arrays_of(cast("Viewer", self.drawing).view(start, stop))
+        return _arrays_of(cast("Viewer", self._drawing_here()).view(start, stop))
 
     def look_again(self, *part: Any) -> Arrays:
         """As of `Viewer`."""
-        return _arrays_of(cast("Viewer", self.drawing).look_again(*part))
+        return _arrays_of(cast("Viewer", self._drawing_here()).look_again(*part))
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,8 @@ from harnack.cluster.parts import Arrays, Crew, crew
 from harnack.files.file_format import write_atomically
 from harnack.progress import progress_bar
 from harnack.rendering.camera import Camera
+from harnack.rendering.mitsuba import take_variant
+from harnack.rendering.plugins import register
 from harnack.view.scene import Controls, Live, difference, packed
 from harnack.view.sliders import at_place
 
@@ -98,7 +100,7 @@ def page(
     live = Live.of(what, settings)
     with progress_bar("page", progress) as advance:
         places = _places(live)
-        job = _PageJob(what, settings, _choices(_framed(places)))
+        job = _PageJob(what, settings, _choices(_framed(places)), register().variant())
         if client is None and checkpoint is None:
             vars(job)["live"] = live.framed(job.framed)
         live = job.live
@@ -180,16 +182,18 @@ def _frame(live: Live, values: Mapping[str, float]) -> Plain:
 
 @dataclass(frozen=True)
 class _PageJob:
-    """What the states of a page are made of: as `page` was given it, and the choices of places
-    that are framed."""
+    """What the states of a page are made of: as `page` was given it, the choices of places that are
+    framed, and Mitsuba's variant."""
 
     what: Any
     settings: Mapping[str, Any]
     framed: list[dict[str, float]]
+    variant: str
 
     @functools.cached_property
     def live(self) -> Live:
         """What moves."""
+        take_variant(self.variant)
         return Live.of(self.what, dict(self.settings)).framed(self.framed)
 
     @functools.cached_property
