@@ -24,7 +24,8 @@ from harnack.enclosures import Lipschitz
 from harnack.fields.batch import prepared_once
 from harnack.fields.clearance import UnitCoordinates, placed, single
 from harnack.fields.formula import is_jet
-from harnack.fields.look import Look, Path as Ray, Sample
+from harnack.fields.look import Look, Sample
+from harnack.fields.look import Path as Ray
 from harnack.fields.solids.solid import Solid, box_around, set_checked
 from harnack.files.surfaces import SURFACE_FILES, Mesh, read_surface
 from harnack.geometry import MeshError, validate_mesh, zero_area_faces
