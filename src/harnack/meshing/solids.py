@@ -23,6 +23,7 @@ from harnack.fields import Field, Solid
 from harnack.fields.solid_angles.solid_angle import SolidAngle
 from harnack.fields.solids.affine import AffineImage
 from harnack.fields.solids.combined import Combined, Complement, Offset
+from harnack.fields.solids.mesh_solid import MeshSolid
 from harnack.fields.solids.primitives import Cuboid, Plane
 from harnack.fields.solids.region import Near, Region, bounded_side
 from harnack.fields.solids.region import solid as solid_of
@@ -34,6 +35,7 @@ from harnack.meshing.closed_mesh import (
     box_manifold,
     extruded_manifold,
     manifold_of,
+    mesh_manifold,
     revolved_manifold,
     surface_of,
     volume_manifold,
@@ -112,6 +114,8 @@ class RegionMesher:
         if isinstance(solid, Thread) and level == 0:
             low, high = float(self.lower[2]), float(self.upper[2])
             return thread_manifold(solid, low, high, self.tolerance)
+        if isinstance(solid, MeshSolid) and level == 0 and (made := mesh_manifold(solid)):
+            return made
         if isinstance(solid, Plane):
             x, y, z = solid.normal
             return self._space().trim_by_plane((-x, -y, -z), -(solid.distance + level))
@@ -227,7 +231,7 @@ def is_smooth(solid: Solid) -> bool:
         return not isinstance(solid.inner, Solid) or is_smooth(solid.inner)
     if isinstance(solid, AffineImage):
         return is_smooth(solid.inner)
-    with_edges = Cuboid | Plane | Extruded | Revolved | Thread
+    with_edges = Cuboid | Plane | Extruded | Revolved | Thread | MeshSolid
     return not isinstance(solid, Combined | Complement | Offset | Near | with_edges)
 
 

@@ -137,11 +137,16 @@ class MeshSolid(Solid):
         set_checked(self, "faces", faces)
         set_checked(self, "_surface", ClosedSurface.of(vertices, faces))
 
+    @property
+    def surface(self) -> ClosedSurface:
+        """What of the mesh bounds the solid."""
+        return cast("Any", self)._surface
+
     def leaves(self, change: Callable[[Solid], Solid]) -> Solid:
         return change(self)
 
     def describe(self) -> dict[str, Any]:
-        surface: ClosedSurface = cast("Any", self)._surface
+        surface = self.surface
         return {"triangles": len(surface.faces), "crosses itself": surface.pieces is not None}
 
     def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
@@ -149,7 +154,7 @@ class MeshSolid(Solid):
         deeper than that is inside, and so within the box."""
         if above:
             return None
-        surface: ClosedSurface = cast("Any", self)._surface
+        surface = self.surface
         low, high = (surface.center + surface.size * end for end in surface.box)
         half, middle = 0.5 * (high - low) + level, 0.5 * (high + low)
         x, y, z = (float(one) for one in half)
@@ -158,7 +163,7 @@ class MeshSolid(Solid):
     @prepared_once
     def prepare(self, backend: Backend) -> MeshSolid:
         made = copy.copy(self)
-        set_checked(made, "_on_device", _Buffers.upload(backend, cast("Any", self)._surface))
+        set_checked(made, "_on_device", _Buffers.upload(backend, self.surface))
         return made
 
     def evaluate(self, p: Vec3) -> Sample:
