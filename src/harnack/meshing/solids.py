@@ -14,7 +14,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -49,6 +49,9 @@ if TYPE_CHECKING:
     from manifold3d import Manifold
 
 __all__ = ["AngleMesher", "RegionMesher", "SolidMesh", "is_smooth", "mesh_solid", "region_of"]
+
+# Cells of offsets of meshes, in tolerances; and the error of roots on their edges.
+_CELLS_OF_OFFSET, _ROOT_ERROR = 5.0, 1e-3
 
 # Meshes the level set of an angle, which ends at its curve: field, level -> vertices and faces.
 AngleMesher = Callable[[SolidAngle, float], Surface]
@@ -114,8 +117,8 @@ class RegionMesher:
         if isinstance(solid, Thread) and level == 0:
             low, high = float(self.lower[2]), float(self.upper[2])
             return thread_manifold(solid, low, high, self.tolerance)
-        if isinstance(solid, MeshSolid) and level == 0 and (made := mesh_manifold(solid)):
-            return made
+        if isinstance(solid, MeshSolid):
+            return (mesh_manifold(solid) if level == 0 else None) or self._offset(solid, level)
         if isinstance(solid, Plane):
             x, y, z = solid.normal
             return self._space().trim_by_plane((-x, -y, -z), -(solid.distance + level))
@@ -206,6 +209,30 @@ class RegionMesher:
         self.levels += 2
         return Surface(vertices, np.concatenate([outer.faces, place[inner.faces][:, ::-1]]))
 
+    def _offset(self, solid: MeshSolid, level: float) -> Manifold:
+        """The points within a distance of a mesh, or deeper inside than that.
+
+        Offsets of meshes have creases wherever the mesh has, too many for cells to be refined
+        beside them. So cells are small at once, and of f, a distance, roots are linear along their
+        edges but at creases. Then triangles in a plane are joined. Parts thinner than a cell, such
+        as the tip of a knife edge, may be left out: points of them are less than a cell from the
+        level.
+        """
+        lower, upper = (np.array(end) for end in _finite_hull(solid, level))
+        if not (lower < upper).all():
+            return manifold_of(Surface(np.zeros((0, 3)), np.zeros((0, 3), np.int64)))
+        cells = min(self.spacing, _CELLS_OF_OFFSET * self.tolerance)
+        self.finest = min(self.finest, cells)
+        function = dataclasses.replace(self._function(solid, level), root_error=_ROOT_ERROR)
+        self.report(f"level {level:g} of a mesh in cells of {cells:.3g}")
+        lattice = Lattice.filling(lower - cells, upper + cells, cells, layers=2)
+        made = manifold_of(
+            closed_surface(function, lattice, self.tolerance, self.report, as_cut=True)
+        )
+        self.evaluations += function.evaluations
+        self.levels += 1
+        return made.simplify(0.5 * self.tolerance)
+
     def _image(self, solid: AffineImage, level: float) -> Manifold:
         """Of a solid under an affine map: the image of its mesh."""
         matrix, offset = np.array(solid.map.matrix), np.array(solid.map.offset)
@@ -233,6 +260,11 @@ def is_smooth(solid: Solid) -> bool:
         return is_smooth(solid.inner)
     with_edges = Cuboid | Plane | Extruded | Revolved | Thread | MeshSolid
     return not isinstance(solid, Combined | Complement | Offset | Near | with_edges)
+
+
+def _finite_hull(solid: MeshSolid, level: float) -> tuple[FloatArray, FloatArray]:
+    low, high = cast("Volume", solid.hull(level)).bounds()
+    return np.array(low), np.array(high)
 
 
 def _hull(field: Field, level: float) -> Volume | None:
