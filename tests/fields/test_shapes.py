@@ -153,8 +153,9 @@ SPIKES = SPIKES[0] * np.where(np.arange(12) % 3, 1.0, 0.4)[:, None], SPIKES[1]
 # Two tetrahedra through each other, as one mesh; and the surface of their union.
 CORNERS_OF_FOUR = np.array([[0, 0, 0.9], [0.9, 0.1, -0.5], [-0.5, 0.8, -0.4], [-0.4, -0.8, -0.5]])
 FOUR = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
-CROSSING = np.concatenate([CORNERS_OF_FOUR, [0.1, 0.2, 0.0] - CORNERS_OF_FOUR[[0, 1, 3, 2]]]), (
-    np.concatenate([FOUR, FOUR + 4])
+CROSSING = (
+    np.concatenate([CORNERS_OF_FOUR, [0.1, 0.2, 0.0] - CORNERS_OF_FOUR[[0, 1, 3, 2]]]),
+    (np.concatenate([FOUR, FOUR + 4])),
 )
 UNITED = surface_of(
     manifold_of(Surface(CROSSING[0], FOUR)) + manifold_of(Surface(CROSSING[0], FOUR + 4))

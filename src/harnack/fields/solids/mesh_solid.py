@@ -18,8 +18,9 @@ import numpy as np
 from harnack.arithmetic import Interval, Jet
 from harnack.arithmetic.jet import spanned
 from harnack.backend import FloatArray, IntArray, backend_of, choose_backend
-from harnack.backend.elementary import fmin
+from harnack.backend.elementary import fmin, largest_coordinate
 from harnack.backend.numbers import vector_text
+from harnack.backend.records import Records
 from harnack.enclosures import Lipschitz
 from harnack.fields.batch import prepared_once
 from harnack.fields.clearance import UnitCoordinates, placed, single
@@ -31,7 +32,7 @@ from harnack.files.surfaces import SURFACE_FILES, Mesh, read_surface
 from harnack.geometry import MeshError, validate_mesh, zero_area_faces
 from harnack.geometry.chains import net_faces, singular_edges, weld_vertices
 from harnack.tree import build_hierarchy
-from harnack.tree.nearest import nearest_triangle, square_to_some_vertex
+from harnack.tree.nearest import NearestTriangle, nearest_triangle, square_to_some_vertex
 from harnack.tree.pieces import pieces_of_faces, windings_beside
 from harnack.tree.triangles import (
     MOST_TRIANGLES,
@@ -51,6 +52,8 @@ _STEEP = 0.99
 # How far rounding may move a distance, in epsilons of coordinates and of the mesh's size, by
 # `tree.nearest.distance_to_triangles`.
 _ROUNDING = 16.0
+# Coordinates in jets that are known only up to more roundings are ranges.
+_ROUNDED_BY = 256.0
 # The nearest triangle decides the side only where the distance is so many times its error.
 _CLEARLY = 8.0
 
@@ -194,11 +197,12 @@ class _Buffers(UnitCoordinates):
     """The triangles on a backend.
 
     rays: of all faces, closed. near: of those that bound the solid, in whatever pieces.
-    low, high: the box of the latter.
+    corners: nine numbers of each of the latter. low, high: their box.
     """
 
     rays: TriangleRays
     near: TriangleRays
+    corners: Records
     low: Vec3
     high: Vec3
 
@@ -207,23 +211,51 @@ class _Buffers(UnitCoordinates):
         vertices, faces, weights = surface.vertices, surface.faces, surface.weights
         near = rays = _tree(backend, vertices, faces, weights, slabs=surface.pieces is None)
         if surface.pieces is not None:
-            corners = surface.pieces.reshape(-1, 3)
-            numbers = np.arange(len(corners)).reshape(-1, 3)
-            near = _tree(backend, corners, numbers, np.ones(len(numbers)), slabs=True)
+            points = surface.pieces.reshape(-1, 3)
+            numbers = np.arange(len(points)).reshape(-1, 3)
+            near = _tree(backend, points, numbers, np.ones(len(numbers)), slabs=True)
+        corners = Records.upload(backend, surface.corners.reshape(-1, 9))
         low, high = (
             backend.Array3f(*(dr.opaque(backend.Float, float(v)) for v in end))
             for end in surface.box
         )
         place = placed(backend, surface.center, surface.size)
-        return cls(*place, rays=rays, near=near, low=low, high=high)
+        return cls(*place, rays=rays, near=near, corners=corners, low=low, high=high)
 
     def sample(self, p: Vec3) -> Sample:
+        """The sample of the signed distance."""
+        x = self.unit(p)
+        return self._sample(p, x, self._nearest(x))
+
+    def bent(self, p: Vec3) -> tuple[Sample, Vec3, Mask, Mask]:
+        """The sample; a unit vector along the edge on which the nearest point lies; and whether
+        that is an edge, and whether a vertex. It is neither inside of a triangle."""
+        vector = self.backend.Array3f
+        x = self.unit(p)
+        found = self._nearest(x)
+        row = self.corners.row(found.number, found.number != NO_TRIANGLE)
+        ends = [vector(*row[k : k + 3]) - (x + found.offset) for k in (0, 3, 6)]
+        close = _ROUNDING * self.backend.epsilon * (1 + dr.max(dr.abs(x)))
+        at_vertex, along, least = self.backend.Bool(False), vector(0), self.backend.Float(dr.inf)
+        for a, b in ((0, 1), (1, 2), (2, 0)):
+            edge = ends[b] - ends[a]
+            length = dr.norm(edge)
+            off = dr.norm(dr.cross(ends[a], edge)) / length
+            along = dr.select(off < least, edge / length, along)
+            least = fmin(off, least)
+            at_vertex |= dr.norm(ends[a]) <= close
+        on_edge = ~found.is_inner & ~at_vertex
+        return self._sample(p, x, found), along, on_edge, ~found.is_inner & at_vertex
+
+    def _nearest(self, x: Vec3) -> NearestTriangle:
+        backend = self.backend
+        limit = square_to_some_vertex(self.near, x)
+        before = backend.Float(-1), backend.UInt32(NO_TRIANGLE)
+        return nearest_triangle(self.near, x, before, limit, backend.Bool(True))
+
+    def _sample(self, p: Vec3, x: Any, found: NearestTriangle) -> Sample:
         backend = self.backend
         real, vector, epsilon = backend.Float, backend.Array3f, backend.epsilon
-        x: Any = self.unit(p)
-        limit = square_to_some_vertex(self.near, x)
-        before = real(-1), backend.UInt32(NO_TRIANGLE)
-        found = nearest_triangle(self.near, x, before, limit, backend.Bool(True))
         distance = dr.sqrt(found.square)
         error = _ROUNDING * epsilon * (1 + dr.max(dr.abs(x)))
 
@@ -278,16 +310,20 @@ def jet_of_signed_distance(solid: MeshSolid, x: Jet, y: Jet, z: Jet) -> Jet:
     Proof. The distance has the constant 1, so a derivative in any variable is at most the length of
     that of (x, y, z), and the value is off by at most what the coordinates are at the start. On a
     piece there may be kinks, so that second derivatives have no bound. At a point they are those of
-    the distance d from the nearest face, edge or vertex: along a unit vector between 0 and 1/d.
+    the distance d from the nearest face, edge or vertex: 0, or 1/d across the gradient, and of an
+    edge across that as well.
     """
     coordinates = (x, y, z)
     starts = [one if one.start is None else one.start for one in coordinates]
     zero = 0 * x.width
     q = backend_of(zero).Array3f(*(zero + one.value.middle for one in starts))
-    there = solid.evaluate(q)
-    off = there.error + zero
-    for one in starts:
-        off = off + one.value.radius
+    there, edge, on_edge, at_vertex = _on(solid, q).bent(q)
+    spread = sum((one.value.radius for one in starts), zero)
+    off = there.error + spread
+    # Of coordinates that are ranges, and not numbers with their rounding, another face may be
+    # nearest.
+    size = largest_coordinate(q) + dr.abs(there.value)
+    is_range = spread > _ROUNDED_BY * float(dr.epsilon(zero)) * size
     value = Interval(there.value, there.value).widened(1e-6, 0.0) + Interval(-off, off)
 
     def speeds(jets: Any) -> list[Real]:
@@ -303,16 +339,34 @@ def jet_of_signed_distance(solid: MeshSolid, x: Jet, y: Jet, z: Jet) -> Jet:
         along = Interval(0.0, 0.0)
         for slope, one in zip(slopes, starts, strict=True):
             along = along + slope * one.first[i]
-        first.append(along.meet(Interval(-most, most)))
-    bend = 1 / dr.abs(there.value)
+        limits = Interval(-most, most)
+        met = along.meet(limits)
+        low, high = (
+            dr.select(is_range, a, b) for a, b in ((-most, zero + met.low), (most, zero + met.high))
+        )
+        first.append(Interval(low, high))
+
+    def component(way: Vec3, jets: Any, i: int) -> Interval:
+        total = Interval(0.0, 0.0)
+        for one, jet in zip(way, jets, strict=True):
+            total = total + Interval.exactly(one) * jet.first[i]
+        return total
+
+    count = range(len(x.first))
+    upward = [component(there.gradient, starts, i) for i in count]
+    onward = [component(edge, starts, i) for i in count]
+    bend = dr.select(on_edge | at_vertex, 1 / there.value, 0)
+    none = dr.select(is_range, dr.inf, zero)
     second: list[Interval] = []
-    fast = speeds(starts)
     for k, (i, j) in enumerate(starts[0].pairs()):
-        most = bend * fast[i] * fast[j] * (1 + 1e-5)
-        along = Interval(-most, most)
+        across = -(upward[i] * upward[j])
+        for one in starts:
+            across = across + one.first[i] * one.first[j]
+        across = across - onward[i] * onward[j] * Interval.exactly(dr.select(on_edge, 1.0, 0.0))
+        along = Interval.exactly(zero + bend).widened(1e-5 + there.gradient_error) * across
         for slope, one in zip(slopes, starts, strict=True):
             along = along + slope * one.second[k]
-        second.append(along)
+        second.append(along + Interval(-none, none))
     start = Jet(value, tuple(first), tuple(second), width=starts[0].width)
     if x.start is None:
         return start
@@ -327,7 +381,7 @@ def jet_of_signed_distance(solid: MeshSolid, x: Jet, y: Jet, z: Jet) -> Jet:
 # Of the mesh's size: triangles not as high as that are not asked what is beside them.
 _THIN = 1e-9
 # Places of a triangle at which the winding numbers on both sides are the same.
-_PLACES = ((0.8, 0.1, 0.1), (0.1, 0.8, 0.1), (0.1, 0.1, 0.8))
+_PLACES = ((0.98, 0.01, 0.01), (0.01, 0.98, 0.01), (0.01, 0.01, 0.98))
 
 
 @dataclass(frozen=True)
@@ -348,6 +402,11 @@ class ClosedSurface:
     size: float
     pieces: FloatArray | None
     box: tuple[FloatArray, FloatArray]
+
+    @property
+    def corners(self) -> FloatArray:
+        """(k, 3, 3) of the triangles that bound the solid."""
+        return self.vertices[self.faces] if self.pieces is None else self.pieces
 
     @classmethod
     def of(cls, vertices: FloatArray, faces: IntArray) -> ClosedSurface:
@@ -407,9 +466,12 @@ def _boundary(
             "faces of that part (trimesh.repair.fix_normals(mesh, multibody=True) tries), or take "
             "harnack.WindingNumber, which asks for no sides"
         )
+    # Across one triangle the winding number jumps by 1, or by how often it counts.
+    odd = high - low < 1 if weights.max() > 1 else high - low != 1
     for shares in _PLACES:
         one, other = windings_beside(rays, pieces, shares)
-        if (odd := is_thick & ((one != low) | (other != high))).any():
+        odd |= (one != low) | (other != high)
+        if (odd := odd & is_thick).any():
             raise MeshError(
                 f"{int(odd.sum()):,} faces of the mesh lie on parts of others, such as near "
                 f"{place(pieces[odd][0])}: join the parts that touch there, as "
