@@ -30,7 +30,7 @@ from harnack.fields.solids.region import solid as solid_of
 from harnack.fields.solids.swept import Extruded, Revolved
 from harnack.fields.solids.thread import Thread
 from harnack.geometry import Ball, Box, Intersection, Volume
-from harnack.meshing.checks import LocalError, MeshingError
+from harnack.meshing.checks import LocalError, MeshingError, intersecting_faces
 from harnack.meshing.closed_mesh import (
     box_manifold,
     extruded_manifold,
@@ -52,6 +52,8 @@ __all__ = ["AngleMesher", "RegionMesher", "SolidMesh", "is_smooth", "mesh_solid"
 
 # Cells of offsets of meshes, in tolerances; and the error of roots on their edges.
 _CELLS_OF_OFFSET, _ROOT_ERROR = 5.0, 1e-3
+# How far joining their triangles may move them, in tolerances: the first that does no harm.
+_JOINED_WITHIN = (0.5, 0.25, 0.1)
 
 # Meshes the level set of an angle, which ends at its curve: field, level -> vertices and faces.
 AngleMesher = Callable[[SolidAngle, float], Surface]
@@ -214,7 +216,8 @@ class RegionMesher:
 
         Offsets of meshes have creases wherever the mesh has, too many for cells to be refined
         beside them. So cells are small at once, and of f, a distance, roots are linear along their
-        edges but at creases. Then triangles in a plane are joined. Parts thinner than a cell, such
+        edges but at creases. Then triangles that are nearly in a plane are joined, where they do not
+        pass through each other by that. Parts thinner than a cell, such
         as the tip of a knife edge, may be left out: points of them are less than a cell from the
         level.
         """
@@ -231,7 +234,11 @@ class RegionMesher:
         )
         self.evaluations += function.evaluations
         self.levels += 1
-        return made.simplify(0.5 * self.tolerance)
+        for share in _JOINED_WITHIN:
+            simpler = surface_of(made.simplify(share * self.tolerance))
+            if not len(intersecting_faces(simpler.vertices, simpler.faces)):
+                return manifold_of(simpler)
+        return made
 
     def _image(self, solid: AffineImage, level: float) -> Manifold:
         """Of a solid under an affine map: the image of its mesh."""
