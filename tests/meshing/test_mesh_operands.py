@@ -20,7 +20,7 @@ def test_a_mesh_is_itself_with_a_hole() -> None:
     made = hk.mesh(solid - hk.Cylinder(0.5).moved((5.0, 0.0, 0.0)), tolerance=2e-3)
     assert made.is_watertight
     assert made.volume == pytest.approx(8 - 2 * math.pi / 4, rel=2e-3)
-    for corner in CUBE.vertices + [5.0, 0.0, 0.0]:
+    for corner in CUBE.vertices + np.array([5.0, 0.0, 0.0]):
         assert (made.vertices == corner).all(axis=1).any()
     plain = hk.mesh(hk.solid(CUBE))
     assert sorted(map(tuple, plain.vertices)) == sorted(map(tuple, CUBE.vertices))

@@ -216,9 +216,9 @@ class RegionMesher:
 
         Offsets of meshes have creases wherever the mesh has, too many for cells to be refined
         beside them. So cells are small at once, and of f, a distance, roots are linear along their
-        edges but at creases. Then triangles that are nearly in a plane are joined, where they do not
-        pass through each other by that. Parts thinner than a cell, such
-        as the tip of a knife edge, may be left out: points of them are less than a cell from the
+        edges but at creases. Then triangles that are nearly in a plane are joined, unless they pass
+        through each other by that. Parts thinner than a cell, such as the tip of a knife edge, may
+        be left out: points of them are less than a cell from the
         level.
         """
         lower, upper = (np.array(end) for end in _finite_hull(solid, level))

@@ -72,14 +72,15 @@ def solid_of_mesh(given: Any) -> MeshSolid:
         if not isinstance(surface, Mesh):
             raise MeshError(f"{given}: it holds no faces, so it bounds no solid")
         return MeshSolid(surface.vertices, surface.faces)
-    if hasattr(given, "vertices") and hasattr(given, "faces"):
-        return MeshSolid(given.vertices, given.faces)
+    mesh: Any = given
+    if hasattr(mesh, "vertices") and hasattr(mesh, "faces"):
+        return MeshSolid(mesh.vertices, mesh.faces)
     if isinstance(given, tuple | list) and len(cast("Any", given)) == 2:
         vertices, faces = cast("Any", given)
         return MeshSolid(vertices, faces)
     raise TypeError(
         "a mesh is a trimesh.Trimesh, a pair (vertices, faces), or the path of a file, not of type "
-        f"{type(given).__name__}"
+        f"{type(mesh).__name__}"
     )
 
 
