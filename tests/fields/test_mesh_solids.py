@@ -10,6 +10,8 @@ import pytest
 import trimesh
 
 import harnack as hk
+from harnack.arithmetic import Jet
+from harnack.backend import choose_backend, to_numpy
 from harnack.fields.solids.mesh_solid import MeshSolid
 from harnack.geometry import MeshError, mesh_shapes
 from harnack.testing import check_field
@@ -131,6 +133,21 @@ def test_meshes_come_from_files_and_go_through_pickles(tmp_path: Any) -> None:
     assert solid.describe() == {"triangles": 20, "crosses itself": False}
     again = pickle.loads(pickle.dumps(solid))
     assert again.value([0.1, 0.2, 0.3]) == solid.value([0.1, 0.2, 0.3])
+
+
+@pytest.mark.parametrize(
+    "solid", [hk.solid(CUBE), hk.Extruded([(-1, -1), (1, -1), (1, 1), (-1, 1)], 2.0)]
+)
+def test_ranges_on_balls_hold_the_slopes_beside_corners(solid: Any) -> None:
+    """At the middle of the ball one face is nearest, elsewhere in it others."""
+    backend, middle, radius = choose_backend("double"), np.array([0.9, 0.7, 0.6]), 0.4
+    coordinates = Jet.within(backend.Array3f(*middle), backend.Float(radius))
+    slopes = solid.prepare(backend).formula(*coordinates).first
+    x = middle + np.random.default_rng(5).uniform(-radius, radius, (200, 3))
+    for slope, own in zip(slopes, solid.gradient(x, precision="double").T, strict=True):
+        low, high = (to_numpy(backend.Float(one))[0] for one in (slope.low, slope.high))
+        assert low <= own.min() + 1e-9
+        assert own.max() - 1e-9 <= high
 
 
 def open_box() -> Any:
