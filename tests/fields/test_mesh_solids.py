@@ -141,7 +141,7 @@ def test_meshes_come_from_files_and_go_through_pickles(tmp_path: Any) -> None:
 def test_ranges_on_balls_hold_the_slopes_beside_corners(solid: Any) -> None:
     """At the middle of the ball one face is nearest, elsewhere in it others."""
     backend, middle, radius = choose_backend("double"), np.array([0.9, 0.7, 0.6]), 0.4
-    coordinates = Jet.within(backend.Array3f(*middle), backend.Float(radius))
+    coordinates = Jet.within(backend.Array3f(*map(float, middle)), backend.Float(radius))
     slopes = solid.prepare(backend).formula(*coordinates).first
     x = middle + np.random.default_rng(5).uniform(-radius, radius, (200, 3))
     for slope, own in zip(slopes, solid.gradient(x, precision="double").T, strict=True):
