@@ -20,7 +20,11 @@ from harnack.enclosures.proofs import longest_step
 from harnack.fields.formula import Formula
 from harnack.fields.look import Path, value_error
 from harnack.fields.solids.fractal import CORNERS, lattice_vector
+from harnack.geometry import mesh_shapes
+from harnack.meshing.closed_mesh import manifold_of, surface_of
+from harnack.meshing.lattice_surface import Surface
 from harnack.testing import check_field
+from tests.oracles.mesh_distance import signed_distance
 
 Oracle = Callable[[Any], Any]
 CURVE = np.array([[0, 0, 0], [1, 0.2, 0], [0.3, 1, 0.4], [-0.5, 0.5, 0.8], [-1, 0, 1],
@@ -144,6 +148,19 @@ STAR = (0.8 + 0.25 * np.cos(5 * TURN))[:, None] * np.column_stack([np.cos(TURN),
 LOOPS = [STAR, [[-0.4, -0.3], [0.45, -0.3], [0.3, 0.4]], [[0.0, -0.2], [0.25, -0.2], [0.2, 0.1]]]
 CUP = [[0.0, -0.6], [0.5, -0.6], [0.9, 0.6], [0.8, 0.65], [0.4, -0.4], [0.0, -0.4]]
 
+SPIKES = mesh_shapes.icosphere(0)
+SPIKES = SPIKES[0] * np.where(np.arange(12) % 3, 1.0, 0.4)[:, None], SPIKES[1]
+# Two tetrahedra through each other, as one mesh; and the surface of their union.
+CORNERS_OF_FOUR = np.array([[0, 0, 0.9], [0.9, 0.1, -0.5], [-0.5, 0.8, -0.4], [-0.4, -0.8, -0.5]])
+FOUR = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
+CROSSING = (
+    np.concatenate([CORNERS_OF_FOUR, [0.1, 0.2, 0.0] - CORNERS_OF_FOUR[[0, 1, 3, 2]]]),
+    (np.concatenate([FOUR, FOUR + 4])),
+)
+UNITED = surface_of(
+    manifold_of(Surface(CROSSING[0], FOUR)) + manifold_of(Surface(CROSSING[0], FOUR + 4))
+)
+
 SHAPES: dict[str, tuple[Any, Oracle]] = {
     "plane": (
         hk.Plane((1.0, 2.0, -2.0), 0.3),
@@ -204,6 +221,11 @@ SHAPES: dict[str, tuple[Any, Oracle]] = {
             np.stack([norm(x[..., :2]), x[..., 2]], -1),
             [np.concatenate([CUP, np.array(CUP)[-2:0:-1] * [-1, 1]])],
         ),
+    ),
+    "mesh": (hk.solid(SPIKES), lambda x: signed_distance(x, *SPIKES)),
+    "crossing mesh": (
+        hk.solid(CROSSING),
+        lambda x: signed_distance(x, UNITED.vertices, UNITED.faces),
     ),
     "thread": (SCREW, lambda x: screw(x, SCREW)),
     "noise": (NOISE, lambda x: noise(x, NOISE)),

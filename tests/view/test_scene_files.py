@@ -31,6 +31,7 @@ SOLIDS = {
     )
     | hk.Revolved([(0, 0), (1, 0), (0, 1)]),
     "threads": hk.thread("M8", 10.0) | hk.Tube.helix(5.0, 2.0, 1.5, 0.3),
+    "mesh": hk.solid(icosphere(0)).shell(0.2) - hk.solid(icosphere(0)).scaled(0.3),
     "gyroid": hk.Gyroid(0.5, domain=hk.Ball((0.1, 0.0, 0.0), 1.5)),
     "formula": hk.expression("x^2 + a*y^2 = 1 + z", parameters={"a": 0.1}, level=0.25),
     "curve": CURVE,

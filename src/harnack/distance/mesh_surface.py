@@ -9,230 +9,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray, IntArray, choose_backend, to_numpy, to_vector3
-from harnack.backend.arrays import aligned_integers
+from harnack.backend import BoolArray, FloatArray, choose_backend
 from harnack.distance.tangent import in_batches
 from harnack.enclosures import TargetLevels
 from harnack.fields.clearance import distance_below, placed, single
 from harnack.fields.field import AtDetail
 from harnack.tree import build_hierarchy
 from harnack.tree.nearest import nearest_triangle, square_to_some_vertex
-from harnack.tree.triangles import NO_TRIANGLE, Frame, TriangleRays, triangle_records
+from harnack.tree.pieces import on_level, pieces_of_faces
+from harnack.tree.triangles import NO_TRIANGLE, TriangleRays, triangle_records
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Vec3
     from harnack.tracer import LevelSet
 
-__all__ = ["MeshSurface", "on_level", "pieces_of_faces"]
-
-# In units of the mesh's size. Nearer than that two places are the same.
-_SAME = 1e-12
-# Pieces thinner than that are left out: others that touch them stand for them.
-_THINNEST = 1e-11
-
-
-def pieces_of_faces(rays: TriangleRays, vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """Triangles (k, 3, 3) that fill the faces (m, 3), none of which passes through another.
-
-    rays: the same faces, with coordinates of at most about one.
-
-    Where two triangles meet in a segment, at either end of it an edge of one of them meets the
-    other. So all edges are followed as rays, and each of the two faces beside an edge is cut by
-    the plane of every triangle that the edge crosses, and these by the planes of the two: as far
-    as the cut would not pass the other triangle by. A cut too many does no harm.
-    """
-    corners = vertices[faces]
-    cut, by = _crossing_faces(rays, vertices, faces)
-    if not len(cut):
-        return corners
-    order = np.argsort(cut, kind="stable")
-    cut, by = cut[order], by[order]
-    turn = np.arange(len(cut)) - np.searchsorted(cut, cut)  # number of the cut of its face
-    whole = np.ones(len(faces), np.bool_)
-    whole[cut] = False
-    owner = np.flatnonzero(~whole)
-    pieces = corners[owner]
-    cutter = np.full(len(faces), -1)
-    for k in range(int(turn.max()) + 1):
-        cutter[:] = -1
-        cutter[cut[turn == k]] = by[turn == k]
-        knife = cutter[owner]
-        rows = np.flatnonzero(knife >= 0)
-        parts, parents = _cut(pieces[rows], corners[knife[rows]])
-        stay = np.ones(len(pieces), np.bool_)
-        stay[rows] = False
-        pieces = np.concatenate([pieces[stay], parts])
-        owner = np.concatenate([owner[stay], owner[rows][parents]])
-    edges = pieces - np.roll(pieces, 1, axis=1)
-    longest = np.linalg.norm(edges, axis=2).max(axis=1)
-    thick = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) > _THINNEST * longest
-    return np.concatenate([corners[whole], pieces[thick]])
-
-
-def on_level(rays: TriangleRays, pieces: FloatArray, levels: tuple[float, ...]) -> BoolArray:
-    """(k,) whether the winding number passes a level from one side of a triangle to the other.
-
-    A ray along the normal of each counts the crossings ahead of its center, and those ahead of a
-    place just behind it: with that, triangles in the same place are passed all at once.
-    """
-    backend = rays.tree.backend
-    a, b, c = np.moveaxis(pieces, 1, 0)
-    normal = np.cross(b - a, c - a)
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
-    normal = np.where(length > 0, normal / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
-    frame = Frame.along(
-        backend, to_vector3(backend, pieces.mean(axis=1)), to_vector3(backend, normal)
-    )
-    ahead, behind = (
-        to_numpy(rays.turns_ahead(frame, backend.Float(dr.opaque(backend.Float, t))))
-        for t in (_SAME, -_SAME)
-    )
-    low, high = np.minimum(ahead, behind), np.maximum(ahead, behind)
-    passes = [(low < level) & (level < high) for level in levels]
-    return np.any(passes, axis=0)
-
-
-def _crossing_faces(
-    rays: TriangleRays, vertices: FloatArray, faces: IntArray
-) -> tuple[IntArray, IntArray]:
-    """Pairs of faces (k,), (k,) that pass through one another, each both ways round."""
-    ends = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    edges, edge = np.unique(ends, axis=0, return_inverse=True)
-    edge = edge.reshape(-1)
-    beside = np.argsort(edge, kind="stable") // 3  # faces, edge after edge
-    first = np.searchsorted(np.sort(edge), np.arange(len(edges) + 1))
-    crossed, crossing = _crossings_of_edges(rays, vertices, faces, edges)
-    count = first[crossed + 1] - first[crossed]
-    rows = np.repeat(first[crossed], count) + _counted(count)
-    one, other = beside[rows], np.repeat(crossing, count)
-    pairs = np.concatenate([np.column_stack([one, other]), np.column_stack([other, one])])
-    pairs = np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0)
-    return pairs[:, 0], pairs[:, 1]
-
-
-def _counted(count: IntArray) -> IntArray:
-    """0, 1, .. for each of the counts in turn."""
-    first = np.cumsum(count) - count
-    return cast("IntArray", np.arange(int(count.sum())) - np.repeat(first, count))
-
-
-def _crossings_of_edges(
-    rays: TriangleRays, vertices: FloatArray, faces: IntArray, edges: IntArray
-) -> tuple[IntArray, IntArray]:
-    """Which edges (m, 2) cross which faces that have neither end: indices of both."""
-    backend = rays.tree.backend
-    corner = [aligned_integers(backend, one) for one in faces.T]
-    way = vertices[edges[:, 1]] - vertices[edges[:, 0]]
-    length = np.linalg.norm(way, axis=1)
-    rows = np.flatnonzero(length > 0)
-    after_t, after_n = np.full(len(edges), -_SAME), np.full(len(edges), NO_TRIANGLE, np.int64)
-    found: list[tuple[IntArray, IntArray]] = []
-    while len(rows):
-        o = to_vector3(backend, vertices[edges[rows, 0]])
-        d = to_vector3(backend, way[rows] / length[rows, None])
-        frame = Frame.along(backend, o, d)
-        end = backend.Float(length[rows] + _SAME)
-        p, q = (aligned_integers(backend, one) for one in edges[rows].T)
-
-        after = backend.Float(after_t[rows]), aligned_integers(backend, after_n[rows])
-        t, n = _next_of_others(rays, corner, frame, (p, q), end, after)
-        number = to_numpy(n).astype(np.int64)
-        hit = number != NO_TRIANGLE
-        after_t[rows], after_n[rows] = to_numpy(t), number
-        rows, number = rows[hit], number[hit]
-        found.append((rows, number))
-    return np.concatenate([one for one, _ in found]), np.concatenate([one for _, one in found])
-
-
-def _next_of_others(
-    rays: TriangleRays, corner: list[Any], frame: Frame, ends: tuple[Any, Any], end: Any,
-    after: tuple[Any, Any],
-) -> tuple[Any, Any]:  # fmt: skip
-    """The first crossing of rays behind another one with a face that has neither of two vertices;
-    corner: those of the faces."""
-    index = rays.tree.backend.UInt32
-
-    def body(t: Any, n: Any, active: Any) -> tuple[Any, ...]:
-        t, n, _, _ = rays.next(frame, (t, n), end, active)
-        known = active & (n != NO_TRIANGLE)
-        ours = [dr.gather(index, one, n, known) for one in corner]
-        return t, n, known & dr.any([(one == ends[0]) | (one == ends[1]) for one in ours])
-
-    def more(t: Any, n: Any, active: Any) -> Any:
-        del t, n
-        return active
-
-    start = (*after, rays.tree.backend.Bool(True))
-    return dr.while_loop(start, more, body, label="crossings of edges")[:2]
-
-
-def _cut(pieces: FloatArray, knives: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Triangles (k, 3, 3) cut by the planes of others, and which of them each part comes from.
-
-    Only where the cut along the plane comes within the other triangle; there each triangle falls
-    into one on one side and two on the other.
-    """
-    height = _heights(pieces, knives)
-    height[np.abs(height) < _SAME] = 0
-    spans = (height.max(axis=1) > 0) & (height.min(axis=1) < 0)
-    spans[spans] = _meets(pieces[spans], height[spans], knives[spans])
-    whole, rows = np.flatnonzero(~spans), np.flatnonzero(spans)
-    # The corner that is alone on its side comes first; one in the plane goes with another.
-    side = np.where(height[rows] > 0, 1, -1)
-    side = np.where((height[rows] == 0), np.where(side.sum(axis=1) > 0, 1, -1)[:, None], side)
-    minority = np.where(side.sum(axis=1) > 0, -1, 1)
-    alone = (side == minority[:, None]).argmax(axis=1)
-    turn = (alone[:, None] + np.arange(3)) % 3
-    a, b, c = np.moveaxis(np.take_along_axis(pieces[rows], turn[:, :, None], axis=1), 1, 0)
-    h = np.take_along_axis(height[rows], turn, axis=1)
-    p = a + (h[:, 0] / (h[:, 0] - h[:, 1]))[:, None] * (b - a)
-    q = a + (h[:, 0] / (h[:, 0] - h[:, 2]))[:, None] * (c - a)
-    parts = [np.stack(one, axis=1) for one in ((a, p, q), (p, b, c), (p, c, q))]
-    return np.concatenate([pieces[whole], *parts]), np.concatenate([whole, rows, rows, rows])
-
-
-def _heights(pieces: FloatArray, knives: FloatArray) -> FloatArray:
-    """(k, 3) of corners of triangles above the planes of others."""
-    a, b, c = np.moveaxis(knives, 1, 0)
-    normal = np.cross(b - a, c - a)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-    return np.einsum("nij,nj->ni", pieces - a[:, None], normal)
-
-
-def _meets(pieces: FloatArray, height: FloatArray, knives: FloatArray) -> BoolArray:
-    """(k,) whether the segment in which a plane cuts a triangle meets the plane's triangle."""
-    a, b, c = np.moveaxis(knives, 1, 0)
-    normal = np.cross(b - a, c - a)
-    ends: list[FloatArray] = []
-    for i, j in ((0, 1), (1, 2), (2, 0)):
-        hi, hj = height[:, i], height[:, j]
-        crosses = (hi * hj < 0) | ((hi == 0) ^ (hj == 0))
-        share = np.where(crosses, hi / np.where(crosses, hi - hj, 1), np.nan)
-        ends.append(pieces[:, i] + share[:, None] * (pieces[:, j] - pieces[:, i]))
-    low, high = np.zeros(len(pieces)), np.ones(len(pieces))
-    points = np.stack(ends, axis=1)
-    # The two ends: of three places at most two differ.
-    start = np.where(np.isnan(points[:, 0]), points[:, 1], points[:, 0])
-    apart = np.nan_to_num(np.linalg.norm(points - start[:, None], axis=2), nan=-1.0)
-    end = points[np.arange(len(points)), apart.argmax(axis=1)]
-    for p, q in ((a, b), (b, c), (c, a)):
-        inward = np.cross(normal, q - p)
-        inward /= np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-300)
-        one, other = (np.einsum("nk,nk->n", x - p, inward) + 1e-9 for x in (start, end))
-        rate = other - one
-        root = -one / np.where(rate == 0, 1, rate)
-        low = np.where(rate > 0, np.maximum(low, root), low)
-        high = np.where(rate < 0, np.minimum(high, root), high)
-        high = np.where((rate == 0) & (one < 0), -1.0, high)
-    return low <= high
-
-
-# The surface.
+__all__ = ["MeshSurface"]
 
 _LEAF_SIZE = 8
 # Of the mesh's size: the distance from a triangle at which f is evaluated on either side.

@@ -49,7 +49,7 @@ __all__ = [
 
 # Methods that only solids have.
 _OF_SOLIDS = frozenset(
-    ("moved", "rotated", "scaled", "transformed", "twisted", "tapered", "grown", "blended")
+    ("moved", "rotated", "scaled", "transformed", "twisted", "tapered", "grown", "shell", "blended")
 )
 
 

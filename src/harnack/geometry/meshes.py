@@ -42,10 +42,14 @@ class MeshError(ValueError):
     """A mesh that cannot be used; the message says why and what to do."""
 
 
-def validate_mesh(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> tuple[FloatArray, IntArray]:
+def validate_mesh(
+    vertices: npt.ArrayLike, faces: npt.ArrayLike, *, flat: bool = False
+) -> tuple[FloatArray, IntArray]:
     """Vertices (n, 3) float64 and faces (m, 3) int64 of a mesh: copies that cannot be written to.
 
     Vertices that no face uses are kept, and checked like the rest.
+
+    flat: whether faces may have zero area, as they join others in closed meshes.
 
     Raises:
         MeshError: not numbers of these shapes, faces that are not triangles of integers, nothing
@@ -53,9 +57,9 @@ def validate_mesh(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> tuple[FloatA
             as `zero_area_faces` has it; sizes whose squares overflow or vanish.
     """
     x, triangles = _checked_arrays(vertices, faces)
-    flat, longest = _measure(x, triangles)
-    if flat.any():
-        raise MeshError(_flat_message(x, triangles, np.flatnonzero(flat)))
+    is_flat, longest = _measure(x, triangles)
+    if is_flat.any() and not flat:
+        raise MeshError(_flat_message(x, triangles, np.flatnonzero(is_flat)))
     _check_size(longest)
     x.setflags(write=False)
     triangles.setflags(write=False)

@@ -24,6 +24,7 @@ from harnack.meshing.lattice_surface import Surface
 if TYPE_CHECKING:
     from manifold3d import CrossSection, Manifold
 
+    from harnack.fields.solids.mesh_solid import MeshSolid
     from harnack.geometry import Volume
 
 __all__ = [
@@ -31,6 +32,7 @@ __all__ = [
     "box_manifold",
     "extruded_manifold",
     "manifold_of",
+    "mesh_manifold",
     "revolved_manifold",
     "surface_of",
     "volume_manifold",
@@ -58,6 +60,33 @@ def manifold_of(surface: Surface) -> Manifold:
             "it; choose a smaller `spacing`"
         )
     return made
+
+
+def mesh_manifold(solid: MeshSolid) -> Manifold | None:
+    """The mesh of a `MeshSolid`, itself: of one that crosses itself the union of its parts, or None
+    where a part crosses itself, or is a cavity.
+
+    Raises:
+        MeshingError: more than two faces meet at an edge.
+    """
+    from manifold3d import Error, Manifold, Mesh64, OpType
+
+    surface = solid.surface
+    # Copies, which can be written to; vertices are as they were given, bit by bit.
+    whole = Manifold(Mesh64(np.array(solid.vertices), np.array(surface.faces, np.uint64)))
+    if whole.status() != Error.NoError:
+        raise MeshingError(
+            f"the faces of the mesh do not meet two by two at its edges ({whole.status().name}): "
+            "join its parts by trimesh.boolean.union, or move them apart"
+        )
+    if surface.pieces is None:
+        return whole
+    parts = whole.decompose()
+    for part in parts:
+        made = surface_of(part)
+        if part.volume() <= 0 or len(intersecting_faces(made.vertices, made.faces)):
+            return None
+    return Manifold.batch_boolean(parts, OpType.Add)
 
 
 def surface_of(manifold: Manifold) -> Surface:

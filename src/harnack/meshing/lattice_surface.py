@@ -216,7 +216,12 @@ def open_surface(
 
 
 def closed_surface(
-    function: LevelFunction, lattice: Lattice, tolerance: float, report: Callable[[str], None]
+    function: LevelFunction,
+    lattice: Lattice,
+    tolerance: float,
+    report: Callable[[str], None],
+    *,
+    as_cut: bool = False,
 ) -> Surface:
     """The boundary of the points of a lattice's box where the function is negative.
 
@@ -224,6 +229,10 @@ def closed_surface(
     the lattice there were on the level. Triangles in the two outermost layers of cells are coarse
     and may touch in vertices: they are to be cut away. There are no faces if the function is
     nowhere negative.
+
+    as_cut: leave the triangles as the cells cut them, which never pass through each other, and
+        leave out what lies between points of the lattice: for functions with creases everywhere, as
+        distances from meshes have, and cells of about the tolerance.
 
     Raises:
         MeshingError: too many cells.
@@ -244,6 +253,8 @@ def closed_surface(
     is_cap = is_on_wall[faces].any(axis=1)
     rest, caps = faces[~is_cap], [faces[is_cap], _wall_faces(points, samples, corners, is_wall)]
     inner = lattice.lower + 2 * lattice.size, lattice.upper - 2 * lattice.size
+    if as_cut:
+        return Surface.of(vertices, np.concatenate([rest, *caps]))
     _check_nothing_missed(function, points, samples, corners, first, faces, lattice, inner)
     # What ends at the outermost cells is moved and cut, its ends are not.
     if len(rest):

@@ -286,7 +286,8 @@ def _roots(
     arguments = (*p.T, *way.T, value, change)
     result = search(
         lifted, (np.zeros(len(a)), np.ones(len(a))), args=arguments,
-        tolerances={"xatol": 1e-10, "fatol": 0.0, "xrtol": 0.0, "frtol": 0.0}, maxiter=60,
+        tolerances={"xatol": function.root_error, "fatol": 0.0, "xrtol": 0.0, "frtol": 0.0},
+        maxiter=60,
     )  # fmt: skip
     if not bool(np.all(result.success)):
         raise MeshingError(

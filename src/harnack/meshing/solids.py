@@ -14,7 +14,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -23,17 +23,19 @@ from harnack.fields import Field, Solid
 from harnack.fields.solid_angles.solid_angle import SolidAngle
 from harnack.fields.solids.affine import AffineImage
 from harnack.fields.solids.combined import Combined, Complement, Offset
+from harnack.fields.solids.mesh_solid import MeshSolid
 from harnack.fields.solids.primitives import Cuboid, Plane
 from harnack.fields.solids.region import Near, Region, bounded_side
 from harnack.fields.solids.region import solid as solid_of
 from harnack.fields.solids.swept import Extruded, Revolved
 from harnack.fields.solids.thread import Thread
 from harnack.geometry import Ball, Box, Intersection, Volume
-from harnack.meshing.checks import LocalError, MeshingError
+from harnack.meshing.checks import LocalError, MeshingError, intersecting_faces
 from harnack.meshing.closed_mesh import (
     box_manifold,
     extruded_manifold,
     manifold_of,
+    mesh_manifold,
     revolved_manifold,
     surface_of,
     volume_manifold,
@@ -47,6 +49,11 @@ if TYPE_CHECKING:
     from manifold3d import Manifold
 
 __all__ = ["AngleMesher", "RegionMesher", "SolidMesh", "is_smooth", "mesh_solid", "region_of"]
+
+# Cells of offsets of meshes, in tolerances; and the error of roots on their edges.
+_CELLS_OF_OFFSET, _ROOT_ERROR = 5.0, 1e-3
+# How far joining their triangles may move them, in tolerances: the first that does no harm.
+_JOINED_WITHIN = (0.5, 0.25, 0.1)
 
 # Meshes the level set of an angle, which ends at its curve: field, level -> vertices and faces.
 AngleMesher = Callable[[SolidAngle, float], Surface]
@@ -112,6 +119,8 @@ class RegionMesher:
         if isinstance(solid, Thread) and level == 0:
             low, high = float(self.lower[2]), float(self.upper[2])
             return thread_manifold(solid, low, high, self.tolerance)
+        if isinstance(solid, MeshSolid):
+            return (mesh_manifold(solid) if level == 0 else None) or self._offset(solid, level)
         if isinstance(solid, Plane):
             x, y, z = solid.normal
             return self._space().trim_by_plane((-x, -y, -z), -(solid.distance + level))
@@ -202,6 +211,35 @@ class RegionMesher:
         self.levels += 2
         return Surface(vertices, np.concatenate([outer.faces, place[inner.faces][:, ::-1]]))
 
+    def _offset(self, solid: MeshSolid, level: float) -> Manifold:
+        """The points within a distance of a mesh, or deeper inside than that.
+
+        Offsets of meshes have creases wherever the mesh has, too many for cells to be refined
+        beside them. So cells are small at once, and of f, a distance, roots are linear along their
+        edges but at creases. Then triangles that are nearly in a plane are joined, unless they pass
+        through each other by that. Parts thinner than a cell, such as the tip of a knife edge, may
+        be left out: points of them are less than a cell from the
+        level.
+        """
+        lower, upper = (np.array(end) for end in _finite_hull(solid, level))
+        if not (lower < upper).all():
+            return manifold_of(Surface(np.zeros((0, 3)), np.zeros((0, 3), np.int64)))
+        cells = min(self.spacing, _CELLS_OF_OFFSET * self.tolerance)
+        self.finest = min(self.finest, cells)
+        function = dataclasses.replace(self._function(solid, level), root_error=_ROOT_ERROR)
+        self.report(f"level {level:g} of a mesh in cells of {cells:.3g}")
+        lattice = Lattice.filling(lower - cells, upper + cells, cells, layers=2)
+        made = manifold_of(
+            closed_surface(function, lattice, self.tolerance, self.report, as_cut=True)
+        )
+        self.evaluations += function.evaluations
+        self.levels += 1
+        for share in _JOINED_WITHIN:
+            simpler = surface_of(made.simplify(share * self.tolerance))
+            if not len(intersecting_faces(simpler.vertices, simpler.faces)):
+                return manifold_of(simpler)
+        return made
+
     def _image(self, solid: AffineImage, level: float) -> Manifold:
         """Of a solid under an affine map: the image of its mesh."""
         matrix, offset = np.array(solid.map.matrix), np.array(solid.map.offset)
@@ -227,8 +265,13 @@ def is_smooth(solid: Solid) -> bool:
         return not isinstance(solid.inner, Solid) or is_smooth(solid.inner)
     if isinstance(solid, AffineImage):
         return is_smooth(solid.inner)
-    with_edges = Cuboid | Plane | Extruded | Revolved | Thread
+    with_edges = Cuboid | Plane | Extruded | Revolved | Thread | MeshSolid
     return not isinstance(solid, Combined | Complement | Offset | Near | with_edges)
+
+
+def _finite_hull(solid: MeshSolid, level: float) -> tuple[FloatArray, FloatArray]:
+    low, high = cast("Volume", solid.hull(level)).bounds()
+    return np.array(low), np.array(high)
 
 
 def _hull(field: Field, level: float) -> Volume | None:

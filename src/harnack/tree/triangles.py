@@ -238,7 +238,7 @@ class TriangleRays:
 
         return walk(self.tree, visit, (real(0),), active)[0]
 
-    def turns_along(self, x: Vec3, way: Real) -> Real:
+    def turns_along(self, x: Vec3, way: Real, active: Mask = True) -> Real:
         """The sum of the signs of all crossings of rays from x up (way 1) or down (-1) the z axis.
 
         For both the signs are those with respect to the upward direction. Testing boxes costs less
@@ -261,7 +261,7 @@ class TriangleRays:
             t, turn = crossing(row, Upwards(x))
             return (state[0] + dr.select(active & (way * t > 0), turn, 0),)
 
-        return walk(self.tree, visit, (real(0),))[0]
+        return walk(self.tree, visit, (real(0),), active)[0]
 
     def _boxes(self, frame: Frame) -> Any:
         """A test whether rays meet a node's box between two t. Rounding may turn a no into a yes,

@@ -19,6 +19,7 @@ from harnack.fields.field import Field, check_is_field
 from harnack.fields.formula import Formula, as_data, is_jet
 from harnack.fields.look import Look, Path, Sample
 from harnack.fields.solids.combined import Complement, Offset, lipschitz_of, negated_sample
+from harnack.fields.solids.mesh_solid import is_mesh, solid_of_mesh
 from harnack.fields.solids.solid import Derived, Solid
 
 if TYPE_CHECKING:
@@ -28,27 +29,39 @@ if TYPE_CHECKING:
 
 @refuses_derivatives
 def solid(
-    field: Field,
+    field: Any,
     *,
     below: float | None = None,
     above: float | None = None,
     between: tuple[float, float] | None = None,
     around: tuple[float, float] | None = None,
 ) -> Solid:
-    """The solid where a field's values are below or above a level, or between two.
+    """The solid of a closed mesh, or that where a field's values are below or above a level, or
+    between two.
 
+    field: a field; or, with none of the levels, a trimesh.Trimesh, a pair (vertices (n, 3), faces
+        (m, 3)), or the path of a surface file, of which the solid is a `MeshSolid`, the signed
+        distance from the mesh.
     below, above: a level.
     between: (low, high).
     around: (level, half_width): where the value is at most half_width from the level. It is the
         one for angle-valued fields, such as a thickened surface that spans a knot.
 
         hk.solid(hk.Gyroid(1.0), between=(-0.3, 0.3)) & hk.Torus(0.8, 0.3)
+        hk.solid("part.stl") - hk.Cylinder(2.0, 50.0)
 
     Raises:
         ValueError: none, or several, of these given; bad numbers; a field that jumps across sheets,
-            or an angle-valued one without `around`.
+            or an angle-valued one without `around`; a mesh that bounds no solid (`MeshError`).
     """
     given = [one for one in (below, above, between, around) if one is not None]
+    if is_mesh(field):
+        if given:
+            raise ValueError(
+                "a mesh is solid by itself: below=, above=, between= and around= are for fields; "
+                "solid(mesh).grown(d) moves its surface by d, and solid(mesh).shell(t) hollows it"
+            )
+        return solid_of_mesh(field)
     if len(given) != 1:
         raise ValueError("give exactly one of below=, above=, between=, around=")
     check_is_field(field)

@@ -11,7 +11,7 @@ import copy
 import functools
 from typing import TYPE_CHECKING, Any
 
-from harnack.backend.numbers import refuses_derivatives
+from harnack.backend.numbers import positive, refuses_derivatives
 from harnack.fields.field import Field
 from harnack.fields.formula import Formula
 from harnack.geometry import Ball, Box, Volume
@@ -189,6 +189,19 @@ class Solid(Field):
         from harnack.fields.solids.combined import Offset
 
         return Offset(self, distance)
+
+    @refuses_derivatives
+    def shell(self, thickness: float) -> Solid:
+        """The solid, hollow: the points where -thickness <= f <= 0, a wall of that thickness inside
+        of the surface where f is a distance, as of a mesh, a sphere or an outline.
+
+        Raises:
+            ValueError: a thickness that is not positive.
+        """
+        from harnack.fields.solids.region import Near
+
+        half = 0.5 * positive(thickness, "the thickness of a shell")
+        return Near(self, -half, half)
 
     # Maps of space. Those that bend lines need a formula.
 

@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 _GROWTH = 4.0
 # Of a signed distance the gradient is a unit vector wherever it exists.
 _STEEP = 0.99
+# Coordinates in jets that are known only up to more roundings are ranges.
+_ROUNDED_BY = 256.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -306,13 +308,17 @@ def jet_of_distance(nearest: Callable[[Real, Real], Nearest], x: Jet, y: Jet) ->
     Proof. The distance has the constant 1, so a derivative in any variable is at most the length of
     that of (x, y), and the value is off by at most what the coordinates are at the start. On a
     piece there may be kinks, so that second derivatives have no bound; at a point they are those of
-    the distance from the nearest edge or vertex, as its gradient is.
+    the distance from the nearest edge or vertex, as its gradient is. On a ball, where coordinates
+    are ranges and not numbers with their rounding, another edge may be nearest, as on a piece.
     """
     starts = [one if one.start is None else one.start for one in (x, y)]
     zero = 0 * x.width
     u, v = (zero + one.value.middle for one in starts)
     there = nearest(u, v)
-    off = there.error + zero + starts[0].value.radius + starts[1].value.radius
+    spread = zero + starts[0].value.radius + starts[1].value.radius
+    size = dr.abs(u) + dr.abs(v) + dr.abs(there.value)
+    is_ball = spread > _ROUNDED_BY * float(dr.epsilon(size)) * size
+    off = there.error + spread
     value = Interval(there.value, there.value).widened(1e-6, 0.0)
     value = value + Interval(-off, off)
 
@@ -321,15 +327,23 @@ def jet_of_distance(nearest: Callable[[Real, Real], Nearest], x: Jet, y: Jet) ->
         most = dr.sqrt(dr.fma(a, a, b * b)) * (1 + 1e-5)
         return Interval(-most, most)
 
+    def unless_ball(one: Interval, most: Interval) -> Interval:
+        low, high = (zero + one.low, most.low), (zero + one.high, most.high)
+        return Interval(*(dr.select(is_ball, b, a) for a, b in (low, high)))
+
+    everything = Interval(zero - dr.inf, zero + dr.inf)
     doubt = Interval(zero - there.gradient_error, zero + there.gradient_error)
     gx, gy = (Interval.exactly(one) + doubt for one in there.gradient)
     count = range(len(x.first))
     u, v = starts
-    slopes = tuple((gx * u.first[i] + gy * v.first[i]).meet(limits(i, u, v)) for i in count)
+    ends = tuple(limits(i, u, v) for i in count)
+    slopes = tuple(
+        unless_ball((gx * u.first[i] + gy * v.first[i]).meet(ends[i]), ends[i]) for i in count
+    )
     across = [gx * v.first[i] - gy * u.first[i] for i in count]
     bend = Interval.exactly(zero + there.bend).widened(1e-5 + there.gradient_error)
     second = tuple(
-        bend * across[i] * across[j] + gx * u.second[k] + gy * v.second[k]
+        unless_ball(bend * across[i] * across[j] + gx * u.second[k] + gy * v.second[k], everything)
         for k, (i, j) in enumerate(u.pairs())
     )
     start = Jet(value, slopes, second, width=u.width)
@@ -337,7 +351,7 @@ def jet_of_distance(nearest: Callable[[Real, Real], Nearest], x: Jet, y: Jet) ->
         return start
     first = tuple(limits(i, x, y) for i in count)
     moved = value + spanned(first[0], x.width)
-    unknown = (Interval(zero - dr.inf, zero + dr.inf),) * len(x.second)
+    unknown = (everything,) * len(x.second)
     return Jet(moved, first, unknown, start, x.width)
 
 

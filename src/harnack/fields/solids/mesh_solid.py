@@ -1,0 +1,512 @@
+"""Closed triangle meshes made solid: `MeshSolid`, the signed distance from their surface.
+
+`closed_surface_of` finds what of a mesh bounds the solid, and refuses meshes that bound none.
+"""
+
+from __future__ import annotations
+
+import copy
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import drjit as dr
+import numpy as np
+
+from harnack.arithmetic import Interval, Jet
+from harnack.arithmetic.jet import spanned
+from harnack.backend import FloatArray, IntArray, backend_of, choose_backend
+from harnack.backend.elementary import fmin, largest_coordinate
+from harnack.backend.numbers import vector_text
+from harnack.backend.records import Records
+from harnack.enclosures import Lipschitz
+from harnack.fields.batch import prepared_once
+from harnack.fields.clearance import UnitCoordinates, placed, single
+from harnack.fields.formula import is_jet
+from harnack.fields.look import Look, Sample
+from harnack.fields.look import Path as Ray
+from harnack.fields.solids.solid import Solid, box_around, set_checked
+from harnack.files.surfaces import SURFACE_FILES, Mesh, read_surface
+from harnack.geometry import MeshError, validate_mesh, zero_area_faces
+from harnack.geometry.chains import net_faces, singular_edges, weld_vertices
+from harnack.tree import build_hierarchy
+from harnack.tree.nearest import NearestTriangle, nearest_triangle, square_to_some_vertex
+from harnack.tree.pieces import pieces_of_faces, windings_beside
+from harnack.tree.triangles import (
+    MOST_TRIANGLES,
+    NO_TRIANGLE,
+    PARITY,
+    TriangleRays,
+    triangle_records,
+)
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.geometry import Volume
+
+_LEAF_SIZE = 8
+# Of a signed distance the gradient is a unit vector wherever it exists.
+_STEEP = 0.99
+# How far rounding may move a distance, in epsilons of coordinates and of the mesh's size, by
+# `tree.nearest.distance_to_triangles`.
+_ROUNDING = 16.0
+# Coordinates in jets that are known only up to more roundings are ranges.
+_ROUNDED_BY = 256.0
+# The nearest triangle decides the side only where the distance is so many times its error.
+_CLEARLY = 8.0
+
+
+def solid_of_mesh(given: Any) -> MeshSolid:
+    """The solid of a mesh: anything with `vertices` and `faces`, a pair of these, or the path of a
+    surface file.
+
+    Raises:
+        MeshError: the mesh bounds no solid; the message says why, and what to do.
+        FileFormatError: a file that cannot be read.
+        TypeError: it is no mesh.
+    """
+    if isinstance(given, str | os.PathLike):
+        surface = read_surface(cast("Any", given), "winding")
+        if not isinstance(surface, Mesh):
+            raise MeshError(f"{given}: it holds no faces, so it bounds no solid")
+        return MeshSolid(surface.vertices, surface.faces)
+    mesh: Any = given
+    if hasattr(mesh, "vertices") and hasattr(mesh, "faces"):
+        return MeshSolid(mesh.vertices, mesh.faces)
+    if isinstance(given, tuple | list) and len(cast("Any", given)) == 2:
+        vertices, faces = cast("Any", given)
+        return MeshSolid(vertices, faces)
+    raise TypeError(
+        "a mesh is a trimesh.Trimesh, a pair (vertices, faces), or the path of a file, not of type "
+        f"{type(mesh).__name__}"
+    )
+
+
+def is_mesh(given: Any) -> bool:
+    """Whether something is meant as a mesh: by its attributes, as a pair, or as a file's name."""
+    if isinstance(given, str | os.PathLike):
+        return Path(cast("Any", given)).suffix.lower() in SURFACE_FILES
+    if hasattr(given, "vertices") and hasattr(given, "faces"):
+        return True
+    return isinstance(given, tuple | list) and len(cast("Any", given)) == 2
+
+
+@dataclass(frozen=True, eq=False)
+class MeshSolid(Solid):
+    """The points inside of a closed triangle mesh: f is the signed distance from its surface.
+
+    vertices: (n, 3). faces: (m, 3), indices of vertices, counter-clockwise as seen from outside.
+        Vertices at exactly the same place are one; faces may have zero area.
+
+    A mesh that crosses or holds itself is the solid of the points around which it winds more than
+    1/2 times, the union where its parts overlap; f is the distance from the boundary of that.
+
+    |f| is the distance from the nearest triangle, by a tree; so its constant is 1. It is off by at
+    most 16 epsilons of the size of the mesh and the distance from its center
+    (`tree.nearest.NearestPoint`).
+
+    Proof of the sign. It is that of the winding number, the sum of the signs of the crossings of a
+    ray along z (`tree.triangles.crossing`), and is right wherever the distance is more than its
+    error e, also for rays through edges and vertices and for triangles without area. Of each
+    triangle that the ray counts as crossed, a point lies within rounding of the ray at the depth
+    that is compared with 0. Let C be a cylinder of that radius around the line; the ball of radius
+    e about x has no point of the surface. So the part of a triangle in C, which is convex, lies
+    ahead of x or behind it as a whole, and its depth says which. Edges that meet C ahead of x are
+    edges of two triangles ahead, where the same bits decide on which side the ray passes, so that
+    they cancel; all other edges are passed at more than rounding. So the sum is that of a ray in
+    general position. Normals of edges and vertices, weighted by angles (Baerentzen and Aanaes
+    2005), would need no ray, but have no direction to trust beside triangles as thin as rounding.
+
+    Where the nearest point is inside of a triangle, its normal says the same without a ray. Proof:
+    from x down to that point, and beside it, the ball about x is free of the surface, so that x is
+    on that side of the triangle. If rounding has taken an edge for the inside, all other triangles
+    there lie at more than a right angle from x (else they would be nearer), so that the first that
+    is met, turning from x, is this one.
+
+    Raises:
+        MeshError: a mesh that is not closed, whose faces do not agree on its two sides, that is
+            inside out somewhere, or whose faces lie on each other; the message says what to do.
+    """
+
+    vertices: Any
+    faces: Any
+
+    lipschitz = 1.0
+
+    def __post_init__(self) -> None:
+        vertices, faces = validate_mesh(self.vertices, self.faces, flat=True)
+        set_checked(self, "vertices", vertices)
+        set_checked(self, "faces", faces)
+        set_checked(self, "_surface", ClosedSurface.of(vertices, faces))
+
+    @property
+    def surface(self) -> ClosedSurface:
+        """What of the mesh bounds the solid."""
+        return cast("Any", self)._surface
+
+    def leaves(self, change: Callable[[Solid], Solid]) -> Solid:
+        return change(self)
+
+    def describe(self) -> dict[str, Any]:
+        surface = self.surface
+        return {"triangles": len(surface.faces), "crosses itself": surface.pieces is not None}
+
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        """The box of the mesh, wider by the level. Proof: a ball of radius -level about a point
+        deeper than that is inside, and so within the box."""
+        if above:
+            return None
+        surface = self.surface
+        low, high = (surface.center + surface.size * end for end in surface.box)
+        half, middle = 0.5 * (high - low) + level, 0.5 * (high + low)
+        x, y, z = (float(one) for one in half)
+        return box_around((x, y, z), tuple(float(one) for one in middle))
+
+    @prepared_once
+    def prepare(self, backend: Backend) -> MeshSolid:
+        made = copy.copy(self)
+        set_checked(made, "_on_device", _Buffers.upload(backend, self.surface))
+        return made
+
+    def evaluate(self, p: Vec3) -> Sample:
+        return _on(self, p).sample(p)
+
+    def look(self, path: Ray, t: Real, ahead: Real, back: Real) -> Look:
+        del ahead, back
+        look = path.look(self.evaluate(path.point(t)))
+        return Look(
+            look.sample, look.ahead, look.back, look.slope, look.growth, least_gradient=_STEEP
+        )
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        if not is_jet(x, type(self).__name__):
+            return self.differentiable_value(backend_of(x).Array3f(x, y, z))
+        return jet_of_signed_distance(self, x, y, z)
+
+
+def _on(solid: Any, like: Any) -> _Buffers:
+    """The solid's data on the backend of some number or point."""
+    if not hasattr(solid, "_on_device"):
+        solid = solid.prepare(backend_of(like))
+    return solid._on_device
+
+
+@dataclass(frozen=True)
+class _Buffers(UnitCoordinates):
+    """The triangles on a backend.
+
+    rays: of all faces, closed. near: of those that bound the solid, in whatever pieces.
+    corners: nine numbers of each of the latter. low, high: their box.
+    """
+
+    rays: TriangleRays
+    near: TriangleRays
+    corners: Records
+    low: Vec3
+    high: Vec3
+
+    @classmethod
+    def upload(cls, backend: Backend, surface: ClosedSurface) -> _Buffers:
+        vertices, faces, weights = surface.vertices, surface.faces, surface.weights
+        near = rays = _tree(backend, vertices, faces, weights, slabs=surface.pieces is None)
+        if surface.pieces is not None:
+            points = surface.pieces.reshape(-1, 3)
+            numbers = np.arange(len(points)).reshape(-1, 3)
+            near = _tree(backend, points, numbers, np.ones(len(numbers)), slabs=True)
+        corners = Records.upload(backend, surface.corners.reshape(-1, 9))
+        low, high = (
+            backend.Array3f(*(dr.opaque(backend.Float, float(v)) for v in end))
+            for end in surface.box
+        )
+        place = placed(backend, surface.center, surface.size)
+        return cls(*place, rays=rays, near=near, corners=corners, low=low, high=high)
+
+    def sample(self, p: Vec3) -> Sample:
+        """The sample of the signed distance."""
+        x = self.unit(p)
+        return self._sample(p, x, self._nearest(x))
+
+    def bent(self, p: Vec3) -> tuple[Sample, Vec3, Mask, Mask]:
+        """The sample; a unit vector along the edge on which the nearest point lies; and whether
+        that is an edge, and whether a vertex. It is neither inside of a triangle."""
+        vector = self.backend.Array3f
+        x = self.unit(p)
+        found = self._nearest(x)
+        row = self.corners.row(found.number, found.number != NO_TRIANGLE)
+        ends = [vector(*row[k : k + 3]) - (x + found.offset) for k in (0, 3, 6)]
+        close = _ROUNDING * self.backend.epsilon * (1 + dr.max(dr.abs(x)))
+        at_vertex, along, least = self.backend.Bool(False), vector(0), self.backend.Float(dr.inf)
+        for a, b in ((0, 1), (1, 2), (2, 0)):
+            edge = ends[b] - ends[a]
+            length = dr.norm(edge)
+            off = dr.norm(dr.cross(ends[a], edge)) / length
+            along = dr.select(off < least, edge / length, along)
+            least = fmin(off, least)
+            at_vertex |= dr.norm(ends[a]) <= close
+        on_edge = ~found.is_inner & ~at_vertex
+        return self._sample(p, x, found), along, on_edge, ~found.is_inner & at_vertex
+
+    def _nearest(self, x: Vec3) -> NearestTriangle:
+        backend = self.backend
+        limit = square_to_some_vertex(self.near, x)
+        before = backend.Float(-1), backend.UInt32(NO_TRIANGLE)
+        return nearest_triangle(self.near, x, before, limit, backend.Bool(True))
+
+    def _sample(self, p: Vec3, x: Any, found: NearestTriangle) -> Sample:
+        backend = self.backend
+        real, vector, epsilon = backend.Float, backend.Array3f, backend.epsilon
+        distance = dr.sqrt(found.square)
+        error = _ROUNDING * epsilon * (1 + dr.max(dr.abs(x)))
+
+        steep = dr.norm(found.normal)
+        has_area = steep > 0
+        normal = dr.select(has_area, found.normal / steep, vector(0, 0, 1))
+        height = -dr.dot(found.offset, normal)  # of x above the triangle's plane
+        by_normal = found.is_inner & (distance > _CLEARLY * error)
+        by_normal &= 2 * dr.abs(height) > distance
+        inside = self._is_inside(x, ~by_normal)
+        inside = dr.select(by_normal, height < 0, inside)
+        sign = dr.select(inside, real(-1), real(1))
+
+        # Across a face the direction is that of its normal, also where the distance is rounding.
+        # Far from it the sign decides the side, as of a wall thinner than rounding both are near.
+        on_face = (found.is_inner & has_area) | (distance == 0)
+        side = dr.select(distance > error, sign * dr.mulsign(real(1), height), 1)
+        gradient = dr.select(on_face, normal * side, -found.offset * (sign / distance))
+        # Corners are rounded: that turns a triangle by as much over its height.
+        turned = 8 * epsilon / steep
+        doubt = dr.select(on_face, fmin(turned, 2), fmin(2 * error / distance, 2))
+        doubt = dr.select((distance == 0) & ~has_area, 2, doubt)
+        return Sample(
+            sign * distance * self.size,
+            gradient,
+            (Lipschitz(0 * p.x + 1),),
+            error * self.size,
+            doubt,
+        )
+
+    def _is_inside(self, x: Vec3, asked: Mask) -> Mask:
+        """Whether the winding number is above 1/2, where asked: by a ray along z, to the side on
+        which less of the mesh lies."""
+        inside = dr.all((x >= self.low) & (x <= self.high))
+        way = dr.select(x.z > 0.5 * (self.low.z + self.high.z), self.backend.Float(1), -1)
+        turns = self.rays.turns_along(x, way, asked & inside)
+        return inside & (way * turns > 0.5)
+
+
+def _tree(
+    backend: Backend, vertices: FloatArray, faces: IntArray, weights: Any, *, slabs: bool
+) -> TriangleRays:
+    tree = build_hierarchy(vertices[faces].mean(axis=1), leaf_size=_LEAF_SIZE)
+    records = triangle_records(vertices, faces)
+    records[:, PARITY] *= weights
+    return TriangleRays.of(backend, tree, records, slabs=slabs)
+
+
+def jet_of_signed_distance(solid: MeshSolid, x: Jet, y: Jet, z: Jet) -> Jet:
+    """The jet of a signed distance, of jets of coordinates.
+
+    Proof. The distance has the constant 1, so a derivative in any variable is at most the length of
+    that of (x, y, z), and the value is off by at most what the coordinates are at the start. On a
+    piece there may be kinks, so that second derivatives have no bound. At a point they are those of
+    the distance d from the nearest face, edge or vertex: 0, or 1/d across the gradient, and of an
+    edge across that as well.
+    """
+    coordinates = (x, y, z)
+    starts = [one if one.start is None else one.start for one in coordinates]
+    zero = 0 * x.width
+    q = backend_of(zero).Array3f(*(zero + one.value.middle for one in starts))
+    there, edge, on_edge, at_vertex = _on(solid, q).bent(q)
+    spread = sum((one.value.radius for one in starts), zero)
+    off = there.error + spread
+    # Of coordinates that are ranges, and not numbers with their rounding, another face may be
+    # nearest.
+    size = largest_coordinate(q) + dr.abs(there.value)
+    is_range = spread > _ROUNDED_BY * float(dr.epsilon(zero)) * size
+    value = Interval(there.value, there.value).widened(1e-6, 0.0) + Interval(-off, off)
+
+    def speeds(jets: Any) -> list[Real]:
+        return [
+            dr.sqrt(sum(dr.square(zero + one.first[i].largest) for one in jets)) * (1 + 1e-5)
+            for i in range(len(x.first))
+        ]
+
+    doubt = Interval(zero - there.gradient_error, zero + there.gradient_error)
+    slopes = [Interval.exactly(one) + doubt for one in there.gradient]
+    first: list[Interval] = []
+    for i, most in enumerate(speeds(starts)):
+        along = Interval(0.0, 0.0)
+        for slope, one in zip(slopes, starts, strict=True):
+            along = along + slope * one.first[i]
+        limits = Interval(-most, most)
+        met = along.meet(limits)
+        low, high = (
+            dr.select(is_range, a, b) for a, b in ((-most, zero + met.low), (most, zero + met.high))
+        )
+        first.append(Interval(low, high))
+
+    def component(way: Vec3, jets: Any, i: int) -> Interval:
+        total = Interval(0.0, 0.0)
+        for one, jet in zip(way, jets, strict=True):
+            total = total + Interval.exactly(one) * jet.first[i]
+        return total
+
+    count = range(len(x.first))
+    upward = [component(there.gradient, starts, i) for i in count]
+    onward = [component(edge, starts, i) for i in count]
+    bend = dr.select(on_edge | at_vertex, 1 / there.value, 0)
+    none = dr.select(is_range, dr.inf, zero)
+    second: list[Interval] = []
+    for k, (i, j) in enumerate(starts[0].pairs()):
+        across = -(upward[i] * upward[j])
+        for one in starts:
+            across = across + one.first[i] * one.first[j]
+        across = across - onward[i] * onward[j] * Interval.exactly(dr.select(on_edge, 1.0, 0.0))
+        along = Interval.exactly(zero + bend).widened(1e-5 + there.gradient_error) * across
+        for slope, one in zip(slopes, starts, strict=True):
+            along = along + slope * one.second[k]
+        second.append(along + Interval(-none, none))
+    start = Jet(value, tuple(first), tuple(second), width=starts[0].width)
+    if x.start is None:
+        return start
+    ranges = tuple(Interval(-most, most) for most in speeds(coordinates))
+    moved = value + spanned(ranges[0], x.width)
+    unknown = (Interval(zero - dr.inf, zero + dr.inf),) * len(x.second)
+    return Jet(moved, ranges, unknown, start, x.width)
+
+
+# The surface of a mesh.
+
+# Of the mesh's size: triangles not as high as that are not asked what is beside them.
+_THIN = 1e-9
+# Places of a triangle at which the winding numbers on both sides are the same.
+_PLACES = ((0.98, 0.01, 0.01), (0.01, 0.98, 0.01), (0.01, 0.01, 0.98))
+
+
+@dataclass(frozen=True)
+class ClosedSurface:
+    """What of a mesh bounds a solid, in coordinates of at most about one: center + size times them
+    are the real ones.
+
+    vertices: (n, 3). faces: (m, 3), closed, no two alike; weights: (m,) how often each counts.
+    pieces: (k, 3, 3) corners of triangles that bound the points of a winding number above 1/2; None
+        if these are just the faces.
+    box: the lowest and the highest coordinates of that boundary.
+    """
+
+    vertices: FloatArray
+    faces: IntArray
+    weights: IntArray
+    center: FloatArray
+    size: float
+    pieces: FloatArray | None
+    box: tuple[FloatArray, FloatArray]
+
+    @property
+    def corners(self) -> FloatArray:
+        """(k, 3, 3) of the triangles that bound the solid."""
+        return self.vertices[self.faces] if self.pieces is None else self.pieces
+
+    @classmethod
+    def of(cls, vertices: FloatArray, faces: IntArray) -> ClosedSurface:
+        """Of a mesh.
+
+        Raises:
+            MeshError: it bounds no solid.
+        """
+        net = net_faces(weld_vertices(vertices)[faces])
+        if not len(net.faces):
+            raise MeshError("the mesh bounds no volume: every face is canceled by a reversed copy")
+        if len(net.faces) >= MOST_TRIANGLES:
+            raise MeshError(f"at most {MOST_TRIANGLES - 1:,} faces are possible: decimate the mesh")
+        _check_closed(vertices, net.faces, net.multiplicity)
+        used = vertices[np.unique(net.faces)]
+        low, high = used.min(axis=0), used.max(axis=0)
+        size = float(2.0 ** np.ceil(np.log2(0.5 * float((high - low).max()))))
+        center = single(0.5 * (low + high))
+        unit = (vertices - center) / size
+
+        def place(corners: FloatArray) -> str:
+            return vector_text(center + size * corners.mean(axis=0))
+
+        pieces = _boundary(unit, net.faces, net.multiplicity, place)
+        corners = unit[net.faces] if pieces is None else pieces
+        box = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+        return cls(unit, net.faces, net.multiplicity, center, size, pieces, box)
+
+
+def _boundary(
+    unit: FloatArray, faces: IntArray, weights: IntArray, place: Callable[[FloatArray], str]
+) -> FloatArray | None:
+    """The pieces of faces between winding numbers below and above 1/2; None if these are all faces,
+    uncut.
+
+    Triangles thinner than `_THIN` have no normal along which to look. They are kept with the
+    others, if these are all faces; else whatever is found beside them moves the surface by no more.
+
+    Raises:
+        MeshError: the mesh is inside out, or faces lie on each other.
+    """
+    rays = _tree(choose_backend("double"), unit, faces, weights, slabs=False)
+    whole = np.delete(faces, zero_area_faces(unit, faces), axis=0)
+    pieces = pieces_of_faces(rays, unit, whole)
+    edges = pieces - np.roll(pieces, 1, axis=1)
+    longest = np.linalg.norm(edges, axis=2).max(axis=1)
+    is_thick = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) > _THIN * longest
+    low, high = windings_beside(rays, pieces)
+    if (odd := is_thick & (low < 0)).any():
+        if (high[is_thick] <= 0).all():
+            raise MeshError(
+                "the mesh is inside out: its faces run clockwise as seen from outside; turn them "
+                "by mesh.invert() or faces[:, ::-1]"
+            )
+        raise MeshError(
+            f"a part of the mesh is inside out, such as near {place(pieces[odd][0])}: turn the "
+            "faces of that part (trimesh.repair.fix_normals(mesh, multibody=True) tries), or take "
+            "harnack.WindingNumber, which asks for no sides"
+        )
+    # Across one triangle the winding number jumps by 1, or by how often it counts.
+    odd = high - low < 1 if weights.max() > 1 else high - low != 1
+    for shares in _PLACES:
+        one, other = windings_beside(rays, pieces, shares)
+        odd |= (one != low) | (other != high)
+        if (odd := odd & is_thick).any():
+            raise MeshError(
+                f"{int(odd.sum()):,} faces of the mesh lie on parts of others, such as near "
+                f"{place(pieces[odd][0])}: join the parts that touch there, as "
+                "trimesh.boolean.union does"
+            )
+    on = (low < 0.5) & (high > 0.5)
+    if on[is_thick].all() and len(pieces) == len(whole):
+        return None
+    if not on.any():
+        raise MeshError("the mesh bounds no volume: its parts cancel each other")
+    return pieces[on]
+
+
+def _check_closed(vertices: FloatArray, faces: IntArray, weights: IntArray) -> None:
+    """Raise MeshError unless every edge is run as often one way as the other."""
+    edges, left = singular_edges(faces, weights)
+    if not len(edges):
+        return
+    ends = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    pairs, count = np.unique(ends, axis=0, return_counts=True)
+    key = len(vertices)
+    at = np.searchsorted(pairs @ [key, 1], np.sort(edges, axis=1) @ [key, 1])
+    is_open = (count[at] == 1) & (left == 1)
+    where = edges[is_open] if is_open.any() else edges
+    first = " and ".join(vector_text(one) for one in vertices[where[0]])
+    if is_open.any():
+        raise MeshError(
+            f"the mesh is not closed: {int(is_open.sum()):,} edges have one face alone, such as "
+            f"that between {first}; harnack.repair(mesh) closes holes. Welding vertices that are "
+            "apart by rounding (mesh.merge_vertices()) may be enough. harnack.WindingNumber draws "
+            "any mesh as it is"
+        )
+    raise MeshError(
+        f"the faces at {len(edges):,} edges do not agree on their two sides, such as at that "
+        f"between {first}: trimesh.repair.fix_winding(mesh) turns faces that were reversed, and "
+        "harnack.WindingNumber draws any mesh as it is"
+    )
