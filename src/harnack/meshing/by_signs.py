@@ -49,8 +49,8 @@ _FROM_ENDS = 1e-4
 _ROUNDS, _MOST_REPAIRS = 2, 12
 # Neighbors lie on each other if the cosine between their normals is less than this.
 _FOLDED = -0.99999
-# Slivers and flat places are left out within this part of the tolerance.
-_SLIVERS = 0.5
+# Slivers and flat places are left out within this part of the tolerance, and this one of a cell.
+_SLIVERS, _SMALL = 0.5, 0.05
 # Edges shorter than this, in tolerances, stay whole.
 _SHORTEST = 4.0
 # An edge is cut no nearer to its ends than this part of it.
@@ -168,7 +168,9 @@ def sign_surface(
         MeshingError: there is none, too many cells, or values that are no numbers.
     """
     first = _marched(function, lattice, closed, report)
-    x, faces, normals = _without_slivers(first, _SLIVERS * tolerance)
+    x, faces, normals = _without_slivers(
+        first, min(_SLIVERS * tolerance, _SMALL * float(lattice.size.min()))
+    )
     report(f"{len(first.faces):,} triangles, {len(faces):,} without slivers")
     flat = x
     bent = np.zeros(len(x), np.bool_)
